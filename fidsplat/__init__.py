@@ -1,0 +1,40 @@
+"""Fiducial markers made of 2D Gaussian splats, and the 2DGS rasterizer that draws them.
+
+Names are loaded on first use, so that ``import fidsplat`` imports no OpenCL, shapely, networkx or cv2.
+"""
+
+from importlib import import_module
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "SplatCloud": "fidsplat.splats",
+    "Camera": "fidsplat.cameras",
+    "Scene": "fidsplat.scenes",
+    "Quality": "fidsplat.quality",
+    "Marker": "fidsplat.markers",
+    "marker": "fidsplat.markers",
+    "load_ply": "fidsplat.formats",
+    "save_ply": "fidsplat.formats",
+    "Renderer": "fidsplat.render",
+    "Frame": "fidsplat.render",
+    "devices": "fidsplat.backends",
+    "FidsplatError": "fidsplat.errors",
+    "InputError": "fidsplat.errors",
+    "DeviceError": "fidsplat.errors",
+}
+
+__all__ = ["__version__", *sorted(_HOME)]  # noqa: PLE0604
+
+
+def __getattr__(name: str):
+    home = _HOME.get(name)
+    if home is None:
+        raise AttributeError(f"module 'fidsplat' has no attribute {name!r}")
+    value = getattr(import_module(home), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME])
