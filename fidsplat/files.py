@@ -1,0 +1,61 @@
+"""Files written as a whole or not at all."""
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from fidsplat.errors import InputError
+
+
+@contextmanager
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Open a temporary file beside ``path`` for binary writing and move it onto ``path`` when all went well.
+
+    A reader never sees half a file, and a run that is stopped leaves the old one as it was.
+
+    Raises InputError when the folder is missing or cannot be written.
+    """
+    target = Path(path)
+    try:
+        descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
+    except OSError as error:
+        raise InputError(f"cannot write {target}: {error.strerror or error}") from error
+    try:
+        with os.fdopen(descriptor, "wb") as stream:
+            yield stream
+        os.chmod(name, 0o666 & ~_umask())
+        os.replace(name, target)
+    except BaseException as error:
+        os.unlink(name)
+        if isinstance(error, OSError):
+            raise InputError(f"cannot write {target}: {error.strerror or error}") from error
+        raise
+
+
+def writable_folder(path: str | os.PathLike[str]) -> Path:
+    """Make the folder ``path`` with its parents and prove that a file can be written in it.
+
+    Asked before long work, so that nobody waits for a picture that cannot be kept.
+
+    Raises InputError when it cannot.
+    """
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(
+            f"cannot write into the folder {folder}: {error.strerror or error}; choose another output folder"
+        ) from error
+    return folder
+
+
+def _umask() -> int:
+    # the only portable way to read the mask is to set it; a temporary file is made with 0600 whatever it is
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

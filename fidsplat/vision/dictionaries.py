@@ -1,0 +1,82 @@
+"""The bits of every tag that OpenCV's aruco module predefines: four AprilTag families and all ArUco ones."""
+
+from functools import cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from fidsplat.errors import InputError
+
+
+class Family(NamedTuple):
+    """A tag family: modules along one edge of the code (border included), and the number of its ids."""
+
+    size: int
+    count: int
+
+
+_APRILTAG = ("16h5", "25h9", "36h10", "36h11")
+_ARUCO = (
+    *(f"{n}x{n}_{count}" for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
+    "original",
+    "mip_36h12",
+)
+_KINDS = {"apriltag": _APRILTAG, "aruco": _ARUCO}
+
+BORDER = 1
+
+
+def families(kind: str | None = None) -> dict[str, Family]:
+    """Every known family by its name, e.g. ``{"36h11": Family(size=8, count=587), ...}``.
+
+    Args:
+        kind: "apriltag" or "aruco"; None for both (names are unique over both).
+
+    Raises InputError for another kind.
+    """
+    if kind is not None and kind not in _KINDS:
+        raise InputError(f"unknown kind of tag {kind!r}; known: {', '.join(_KINDS)}")
+    kinds = _KINDS if kind is None else (kind,)
+    return {name: _family(k, name) for k in kinds for name in _KINDS[k]}
+
+
+def parse_family(text: str) -> tuple[str, str]:
+    """Split "apriltag:36h11", or "36h11" alone, into (kind, family).
+
+    Raises InputError that lists the families when there is none of this name.
+    """
+    kind, colon, name = text.rpartition(":")
+    for known, names in _KINDS.items():
+        if name in names and (not colon or kind == known):
+            return known, name
+    known = "; ".join(f"{k}: {', '.join(names)}" for k, names in _KINDS.items())
+    raise InputError(f"unknown tag family {text!r}; known are {known}")
+
+
+def dictionary_bits(kind: str, family: str, tag_id: int) -> np.ndarray:
+    """The modules of one tag, (size, size) uint8, 1 = dark, its one-module black border included.
+
+    Row 0 is the top of the picture that ``cv2.aruco.generateImageMarker`` prints.
+
+    Raises InputError for an unknown family or an id outside it.
+    """
+    if kind not in _KINDS or family not in _KINDS[kind]:
+        parse_family(f"{kind}:{family}")
+    size, count = _family(kind, family)
+    if not 0 <= tag_id < count:
+        raise InputError(f"{kind}:{family} has no id {tag_id}; its ids are 0 to {count - 1}")
+    printed = cv2.aruco.generateImageMarker(predefined(kind, family), int(tag_id), size, borderBits=BORDER)
+    return (printed == 0).astype(np.uint8)
+
+
+@cache
+def predefined(kind: str, family: str) -> cv2.aruco.Dictionary:
+    """OpenCV's own object for a known family."""
+    prefix = "DICT_APRILTAG_" if kind == "apriltag" else "DICT_ARUCO_" if "x" not in family else "DICT_"
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, (prefix + family).upper()))
+
+
+def _family(kind: str, name: str) -> Family:
+    dictionary = predefined(kind, name)
+    return Family(dictionary.markerSize + 2 * BORDER, len(dictionary.bytesList))

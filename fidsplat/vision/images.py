@@ -1,0 +1,99 @@
+"""Image files in and out: RGB pictures, one-bit marker images, PNG of colours, depth and labels."""
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from fidsplat.errors import InputError
+from fidsplat.files import atomic_write
+
+# a damaged file is our error in one line, not OpenCV's warning on stderr beside it
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+
+def read_image(path: str | os.PathLike[str]) -> np.ndarray:
+    """Read a picture as (h, w, 3) uint8 RGB. Grey is repeated, 16 bits are cut to 8, alpha is dropped.
+
+    Raises InputError when the file is missing or is no picture that OpenCV reads.
+    """
+    return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+
+
+def read_bits(path: str | os.PathLike[str]) -> np.ndarray:
+    """Read a one-bit image as (h, w) uint8, 1 = dark: any file whose pixels have at most two grey levels.
+
+    The darker level is the dark one; a picture of a single level is dark when that is below half. Transparent
+    pixels count as white paper.
+
+    Raises InputError when the file cannot be read or has colours or more grey levels.
+    """
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.ndim == 2:
+        image = image[:, :, None]
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{path} holds {image.dtype} pixels; a marker image must be a one-bit or 8-bit PNG")
+    top = np.iinfo(image.dtype).max
+    colours, alpha = image, None
+    if image.shape[2] == 4:
+        colours, alpha = image[:, :, :3], image[:, :, 3]
+        colours = np.where(alpha[:, :, None] == 0, top, colours)
+    grey = colours[:, :, 0]
+    levels = np.unique(grey)
+    if (colours != grey[:, :, None]).any():
+        raise InputError(f"{path} has colours; a marker image must be black and white: threshold it first")
+    if len(levels) > 2:
+        raise InputError(
+            f"{path} has {len(levels)} grey levels; a marker image must have two, one pixel a module: "
+            "threshold it first and do not smooth it"
+        )
+    dark = levels[0] if len(levels) == 2 or levels[0] <= top // 2 else None
+    return (grey == dark).astype(np.uint8) if dark is not None else np.zeros(grey.shape, np.uint8)
+
+
+def to_uint8(image: np.ndarray) -> np.ndarray:
+    """Floats in [0, 1] to uint8, clamped and rounded; uint8 as it is; bool to 0 and 255."""
+    if image.dtype == np.uint8:
+        return image
+    if image.dtype == bool:
+        return image.astype(np.uint8) * 255
+    # NaN would become an undefined integer
+    return np.rint(np.clip(np.nan_to_num(image, nan=0.0), 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def write_png(path: str | os.PathLike[str], image: np.ndarray) -> Path:
+    """Write a PNG, whole or not at all.
+
+    Args:
+        path: where to; its folder must exist.
+        image: (h, w) or (h, w, 3) RGB; float in [0, 1] (clamped and rounded), uint8, or uint16 (16-bit PNG).
+
+    Raises InputError when the folder cannot be written, ValueError for another shape.
+    """
+    array = np.asarray(image)
+    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3) or array.size == 0:
+        raise ValueError(f"a PNG needs (h, w) or (h, w, 3), not {array.shape}")
+    pixels = array if array.dtype == np.uint16 else to_uint8(array)
+    if pixels.ndim == 3:
+        pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+    done, data = cv2.imencode(".png", np.ascontiguousarray(pixels))
+    if not done:
+        raise ValueError(f"OpenCV could not encode an image of shape {array.shape} as PNG")
+    with atomic_write(path) as stream:
+        stream.write(data.tobytes())
+    return Path(path)
+
+
+def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise InputError(f"cannot read the image {path}: {error.strerror or error}") from error
+    try:
+        image = cv2.imdecode(data, flags) if data.size else None
+    except cv2.error:  # too many pixels for OpenCV's limit
+        image = None
+    if image is None:
+        raise InputError(f"{path} is not an image that can be read; give a PNG, JPEG, BMP, TIFF or WebP file")
+    return image
