@@ -1,0 +1,5 @@
+"""Cameras: plain data, float64, OpenCV axes (x right, y down, z forward)."""
+
+from fidsplat.cameras.pinhole import Camera, look_at_matrix
+
+__all__ = ["Camera", "look_at_matrix"]

@@ -1,0 +1,156 @@
+"""The pinhole camera."""
+
+import math
+import operator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fidsplat.errors import InputError
+from fidsplat.rotations import check_similarity
+
+MAX_SIZE = 32767
+"""largest width and height in pixels: pixel numbers fit 16 bits on every device"""
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Pinhole camera. A point (X, Y, Z) of the camera frame falls on x = fx X / Z + cx, y = fy Y / Z + cy.
+
+    Pixel (row i, column j) has its centre at x = j + 0.5, y = i + 0.5. Raises InputError for values that
+    make no camera.
+    """
+
+    width: int
+    """pixels, 1 to 32767"""
+    height: int
+    """pixels, 1 to 32767"""
+    fx: float
+    """pixels, above 0"""
+    fy: float
+    """pixels, above 0"""
+    cx: float
+    """pixels, anywhere; width / 2 is the middle"""
+    cy: float
+    """pixels, anywhere; height / 2 is the middle"""
+    world_to_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
+    """(4, 4) float64, rigid, read-only"""
+    near: float = 0.01
+    """metres along z, above 0; nothing nearer is drawn"""
+    far: float = math.inf
+    """metres along z, above near; nothing further is drawn"""
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__
+        for name in ("width", "height"):
+            put(self, name, _size(name, getattr(self, name)))
+        for name in ("fx", "fy", "cx", "cy", "near", "far"):
+            put(self, name, _number(name, getattr(self, name)))
+        for name in ("fx", "fy", "near"):
+            if not (0 < getattr(self, name) < math.inf):
+                raise InputError(f"camera {name} must be above 0 and finite, not {getattr(self, name)!r}")
+        for name in ("cx", "cy"):
+            if not math.isfinite(getattr(self, name)):
+                raise InputError(f"camera {name} must be finite, not {getattr(self, name)!r}")
+        if not self.far > self.near:
+            raise InputError(f"camera far ({self.far!r}) must be above near ({self.near!r})")
+        check_similarity(self.world_to_camera, "camera world_to_camera", rigid=True)
+        matrix = np.array(self.world_to_camera, dtype=np.float64)
+        matrix.flags.writeable = False
+        put(self, "world_to_camera", matrix)
+
+    @staticmethod
+    def pinhole(width, height, fx, fy, cx, cy, world_to_camera=None, near=0.01, far=math.inf) -> "Camera":
+        """A camera from its intrinsics (pixels) and its pose (4, 4), the identity when left out."""
+        pose = np.eye(4) if world_to_camera is None else world_to_camera
+        return Camera(width, height, fx, fy, cx, cy, pose, near, far)
+
+    @staticmethod
+    def look_at(
+        width, height, fov_x, position, target, up=(0.0, -1.0, 0.0), near=0.01, far=math.inf
+    ) -> "Camera":
+        """A camera with square pixels at ``position`` whose middle sees ``target`` (3,), metres.
+
+        fov_x: horizontal field of view in radians, between 0 and pi. up: the world direction that points up
+        in the picture; by default -y, so that y points down as it does in a marker.
+        """
+        width, height, fov_x = _size("width", width), _size("height", height), _number("fov_x", fov_x)
+        if not 0 < fov_x < math.pi:
+            raise InputError(f"camera fov_x must lie between 0 and pi radians, not {fov_x!r}")
+        f = width / 2 / math.tan(fov_x / 2)
+        pose = look_at_matrix(position, target, up)
+        return Camera(width, height, f, f, width / 2, height / 2, pose, near, far)
+
+    @property
+    def position(self) -> np.ndarray:
+        """Centre of projection (3,) float64 in the world, metres."""
+        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """Intrinsic matrix K (3, 3) float64."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def project(self, points) -> np.ndarray:
+        """Pixel coordinates (n, 2) float64 of world points (n, 3), NaN where the depth is not above 0."""
+        world = np.asarray(points, dtype=np.float64)
+        if world.ndim != 2 or world.shape[1] != 3:
+            raise InputError(f"points must have the shape (n, 3), but the shape is {world.shape}")
+        x, y, z = (world @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]).T
+        z = np.where(z > 0, z, np.nan)
+        return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=1)
+
+
+def look_at_matrix(position, target, up=(0.0, -1.0, 0.0)) -> np.ndarray:
+    """world_to_camera (4, 4) float64 of a camera at ``position`` looking at ``target`` with ``up`` upwards.
+
+    Raises InputError when a vector is not three finite numbers, the points coincide, or up points along the
+    view.
+    """
+    eye, aim, upward = (_vector(n, v) for n, v in (("position", position), ("look_at", target), ("up", up)))
+    forward = aim - eye
+    distance = np.linalg.norm(forward)
+    if not distance > 0:
+        raise InputError(f"camera position and look_at are the same point {tuple(eye.tolist())}")
+    forward /= distance
+    length = np.linalg.norm(upward)
+    if not length > 0:
+        raise InputError("camera up must not be zero")
+    right = np.cross(forward, upward / length)
+    if np.linalg.norm(right) < 1e-9:
+        raise InputError(f"camera up {tuple(upward.tolist())} points along the view; choose another")
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = -rotation @ eye
+    return matrix + 0.0  # no minus zeros: they would stand in saved scene files
+
+
+def _size(name: str, value) -> int:
+    try:
+        if isinstance(value, bool):
+            raise TypeError
+        size = operator.index(value)
+    except TypeError:
+        raise InputError(f"camera {name} must be a whole number of pixels, not {value!r}") from None
+    if not 1 <= size <= MAX_SIZE:
+        raise InputError(f"camera {name} must be 1 to {MAX_SIZE} pixels, not {size}")
+    return size
+
+
+def _number(name: str, value) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"camera {name} must be a number, not {value!r}") from None
+
+
+def _vector(name: str, value) -> np.ndarray:
+    try:
+        vector = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        vector = np.empty(0)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise InputError(f"camera {name} must be three finite numbers, not {value!r}")
+    return vector
