@@ -1,0 +1,117 @@
+"""SuperSplat's compressed PLY, as PlayCanvas' editor and splat-transform write it.
+
+Every 256 splats share a row of the element chunk, which holds the smallest and largest position, log scale
+and (in newer files) colour. The element vertex has four 32-bit words per splat:
+
+    packed_position, packed_scale   11, 10, 11 bits x, y, z from the top, in [min, max] of the chunk
+    packed_rotation                 2 bits: which of w, x, y, z is the largest (left out, taken as positive);
+                                    3 x 10 bits: the others in that order, in [-1, 1] / sqrt(2)
+    packed_color                    8 bits each of r, g, b (in [min, max] of the chunk, or [0, 1]) and opacity
+
+An element sh holds the bands above 0, a byte per coefficient in [-4, 4], in the order of f_rest.
+"""
+
+import numpy as np
+
+from fidsplat.errors import InputError
+from fidsplat.formats.ply_header import Header
+from fidsplat.harmonics import C0
+
+CHUNK = 256
+_PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+
+
+def is_compressed(header: Header) -> bool:
+    """Whether the file is meant to be a compressed one; ``read_compressed`` checks that it is."""
+    vertex = header.elements.get("vertex")
+    return vertex is not None and any(name in vertex.properties for name in _PACKED)
+
+
+def read_compressed(header: Header) -> dict[str, np.ndarray]:
+    """means (n, 3), quats (n, 4), scales (n, 3), opacities (n,), sh (n, k, 3), all float32.
+
+    Raises InputError when an element or a property is missing, of the wrong type or of the wrong length.
+    """
+    n = header.elements["vertex"].count
+    _check(header, "vertex", _PACKED, "<u4", n)
+    limits = [f"{end}_{part}{axis}" for part in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
+    colour_limits = [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
+    _check(header, "chunk", limits, "<f4", -(-n // CHUNK))
+    coloured = any(name in header.elements["chunk"].properties for name in colour_limits)
+    if coloured:
+        _check(header, "chunk", colour_limits, "<f4", -(-n // CHUNK))
+    rest = len(header.elements["sh"].properties) if "sh" in header.elements else 0
+    if rest:
+        _check(header, "sh", [f"f_rest_{i}" for i in range(rest)], "|u1", n)
+        if rest not in (9, 24, 45):
+            raise InputError(f"{header.path}: the element sh has {rest} properties; not 9, 24 or 45")
+
+    rows, chunks = header.rows("vertex"), header.rows("chunk")
+    chunk_of = np.arange(n) // CHUNK
+
+    def end(which: str, axes: str) -> np.ndarray:
+        return np.stack([chunks[f"{which}_{axis}"] for axis in axes], axis=1)[chunk_of]
+
+    def between(part: str, axes: str, t: np.ndarray) -> np.ndarray:
+        return end(f"min{part}", axes) * (1 - t) + end(f"max{part}", axes) * t
+
+    position, scale = (_unit_fractions(rows[f"packed_{name}"], 11, 10, 11) for name in ("position", "scale"))
+    color = _unit_fractions(rows["packed_color"], 8, 8, 8, 8)
+    sh = np.empty((n, rest // 3 + 1, 3), np.float32)
+    # a damaged chunk row gives values that are not finite, and the cloud leaves those splats out
+    with np.errstate(over="ignore", invalid="ignore"):
+        sh[:, 0] = ((between("", "rgb", color[:, :3]) if coloured else color[:, :3]) - 0.5) / C0
+        if rest:
+            sh[:, 1:] = _bands(header.rows("sh"), rest)
+        return {
+            "means": between("", "xyz", position).astype(np.float32),
+            "quats": _quaternions(rows["packed_rotation"]).astype(np.float32),
+            "scales": np.exp(between("_scale", "xyz", scale)).astype(np.float32),
+            "opacities": color[:, 3].astype(np.float32),
+            "sh": sh,
+        }
+
+
+def _check(header: Header, name: str, properties, kind: str, count: int) -> None:
+    element = header.elements.get(name)
+    if element is None:
+        raise InputError(f"{header.path}: the compressed PLY lacks the element {name}")
+    missing = [p for p in properties if p not in element.properties]
+    if missing:
+        raise InputError(f"{header.path}: the compressed PLY's element {name} lacks {', '.join(missing)}")
+    wrong = [p for p in properties if element.dtype[p] != np.dtype(kind)]
+    if wrong:
+        raise InputError(f"{header.path}: wrong type of {', '.join(wrong)} in the compressed element {name}")
+    if element.count != count:
+        raise InputError(f"{header.path}: the compressed PLY has {element.count} rows of {name}, not {count}")
+
+
+def _unit_fractions(words: np.ndarray, *widths: int) -> np.ndarray:
+    """(n, len(widths)) float64 in [0, 1] from the lowest bits of words (n,), the highest field first."""
+    columns, shift = [], sum(widths)
+    for width in widths:
+        shift -= width
+        mask = (1 << width) - 1
+        columns.append(((words >> shift) & mask) / mask)
+    return np.stack(columns, axis=1)
+
+
+def _quaternions(words: np.ndarray) -> np.ndarray:
+    small = (_unit_fractions(words, 10, 10, 10) - 0.5) * np.sqrt(2.0)
+    large = np.sqrt(np.maximum(0.0, 1.0 - (small * small).sum(axis=1)))
+    quats = np.empty((len(words), 4))
+    for which in range(4):
+        rows = np.flatnonzero(words >> 30 == which)
+        others = [i for i in range(4) if i != which]
+        quats[rows, which] = large[rows]
+        quats[rows[:, None], others] = small[rows]
+    return quats
+
+
+def _bands(rows: np.ndarray, rest: int) -> np.ndarray:
+    """(n, rest / 3, 3) float32: the middle of each byte's bin, and the ends of [-4, 4] for 0 and 255."""
+    fraction = (np.arange(256) + 0.5) / 256
+    fraction[[0, 255]] = 0.0, 1.0
+    value = ((fraction - 0.5) * 8).astype(np.float32)
+    table = np.stack([rows[f"f_rest_{i}"] for i in range(rest)], axis=1)
+    return value[table].reshape(len(rows), 3, rest // 3).transpose(0, 2, 1)

@@ -1,0 +1,162 @@
+"""The header of a binary little-endian PLY file, checked against the file's size before anything is
+mapped."""
+
+import os
+import re
+import stat
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.errors import InputError
+
+MAX_HEADER = 65536
+"""bytes; a splat file's header has some 2,000"""
+
+_TYPES = {
+    "char": "<i1",
+    "uchar": "<u1",
+    "short": "<i2",
+    "ushort": "<u2",
+    "int": "<i4",
+    "uint": "<u4",
+    "float": "<f4",
+    "double": "<f8",
+    "int8": "<i1",
+    "uint8": "<u1",
+    "int16": "<i2",
+    "uint16": "<u2",
+    "int32": "<i4",
+    "uint32": "<u4",
+    "float32": "<f4",
+    "float64": "<f8",
+}
+
+
+@dataclass(frozen=True)
+class Element:
+    """One table of the file: ``count`` rows of ``dtype`` (packed, fields in file order) from byte
+    ``offset``."""
+
+    name: str
+    count: int
+    dtype: np.dtype
+    offset: int
+
+    @property
+    def properties(self) -> tuple[str, ...]:
+        return self.dtype.names or ()
+
+
+@dataclass(frozen=True)
+class Header:
+    """What the header says, and the file it stands in."""
+
+    path: Path
+    elements: dict[str, Element]
+    comments: tuple[str, ...]
+
+    def rows(self, name: str) -> np.ndarray:
+        """The rows of an element as a read-only structured array (count,), mapped from the file, not read."""
+        element = self.elements[name]
+        if element.count == 0:
+            return np.zeros(0, element.dtype)
+        mapped = np.memmap(self.path, element.dtype, "r", element.offset, (element.count,))
+        return mapped.view(np.ndarray)  # indexing a memmap costs several times that of an array
+
+
+def read_header(path: str | os.PathLike[str]) -> Header:
+    """Read and check a header.
+
+    Raises InputError when the path is not a file that can be read, the file is not a binary little-endian
+    PLY, its header is damaged, longer than 64 KiB or holds a list property, or the file is shorter than its
+    header says. Warns when it is longer.
+    """
+    file = Path(path)
+    head, size = _beginning(file)
+    lines, start = _lines(file, head)
+    counts: dict[str, int] = {}
+    fields: dict[str, list[tuple[str, str]]] = {}
+    comments, layout, current = [], None, None
+    for line in lines:
+        words = line.split()
+        keyword = words[0] if words else "comment"
+        if keyword in ("comment", "obj_info"):
+            comments.append(line.partition(" ")[2].strip())
+        elif keyword == "format":
+            layout = words[1] if len(words) == 3 else line
+        elif keyword == "element":
+            if len(words) != 3 or words[1] in counts:
+                raise InputError(f"{file}: the PLY header's line {line!r} is damaged or repeats an element")
+            current = words[1]
+            counts[current], fields[current] = _count(file, line, words[2]), []
+        elif keyword == "property":
+            if current is None:
+                raise InputError(f"{file}: the PLY header has a property before its first element")
+            fields[current].append(_field(file, line, words, fields[current]))
+        else:
+            raise InputError(f"{file}: the PLY header's line {line[:60]!r} is unknown")
+    if layout != "binary_little_endian":
+        raise InputError(
+            f"{file}: the PLY format is {layout}; only binary_little_endian is read, so convert it first"
+        )
+    elements, offset = {}, start
+    for name, count in counts.items():
+        elements[name] = Element(name, count, np.dtype(fields[name]), offset)
+        offset += count * elements[name].dtype.itemsize
+    if size < offset:
+        raise InputError(f"{file}: cut short: its header calls for {offset} bytes, but the file has {size}")
+    if size > offset:
+        warnings.warn(f"{file}: {size - offset} bytes after the PLY data are not read", stacklevel=3)
+    return Header(file, elements, tuple(comments))
+
+
+def _beginning(file: Path) -> tuple[bytes, int]:
+    try:
+        status = file.stat()
+        # asked before opening: to open a pipe would wait for its writer
+        if not stat.S_ISREG(status.st_mode):
+            kind = "a folder" if stat.S_ISDIR(status.st_mode) else "not a regular file"
+            raise InputError(f"{file} is {kind}, not a PLY file")
+        with file.open("rb") as stream:
+            return stream.read(MAX_HEADER), status.st_size
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"cannot read {file}: {getattr(error, 'strerror', None) or error}") from error
+
+
+def _lines(file: Path, head: bytes) -> tuple[list[str], int]:
+    """The header's lines between ``ply`` and ``end_header``, and the number of bytes before the data."""
+    if not head:
+        raise InputError(f"{file} is empty, not a PLY file")
+    if not re.match(rb"ply\r?\n", head):
+        raise InputError(f"{file} is not a PLY file: its first line is not 'ply'")
+    found = re.search(rb"\nend_header\r?\n", head)
+    if found is None:
+        raise InputError(f"{file}: the PLY header has no end_header within {MAX_HEADER} bytes")
+    try:
+        text = head[: found.start()].decode("utf-8")
+    except UnicodeDecodeError:
+        raise InputError(f"{file}: the PLY header is damaged: it holds bytes that are not text") from None
+    return text.replace("\r", "").split("\n")[1:], found.end()
+
+
+def _count(file: Path, line: str, word: str) -> int:
+    if not re.fullmatch(r"[0-9]{1,18}", word):
+        raise InputError(f"{file}: the PLY header's line {line[:60]!r} does not hold a count of 0 or more")
+    return int(word)
+
+
+def _field(file: Path, line: str, words: list[str], before: list[tuple[str, str]]) -> tuple[str, str]:
+    if len(words) > 1 and words[1] == "list":
+        raise InputError(f"{file}: the PLY header's line {line[:60]!r} is a list; a splat file has none")
+    if len(words) != 3 or words[1] not in _TYPES:
+        raise InputError(
+            f"{file}: the PLY header's line {line[:60]!r} is not 'property TYPE NAME' of a known type"
+        )
+    if any(words[2] == name for name, _ in before):
+        raise InputError(f"{file}: the PLY header has the property {words[2]} twice in one element")
+    return words[2], _TYPES[words[1]]

@@ -1,0 +1,76 @@
+"""Writing splats to a PLY file of the 2DGS authors' layout."""
+
+import os
+
+import numpy as np
+
+from fidsplat.files import atomic_write
+from fidsplat.formats.ply import ORIGIN_COMMENT, PADDED_LOG_SCALE
+from fidsplat.harmonics import C0
+from fidsplat.splats import SplatCloud
+
+_BLOCK = 65536
+MAX_LOGIT = 100.0
+"""opacity 0 and 1 are written as logit -100 and 100, which every reader turns back into 0 and 1 in float32"""
+
+
+def save_ply(cloud: SplatCloud, path: str | os.PathLike[str], native_2dgs: bool = False) -> None:
+    """Write binary little-endian PLY, all float32: x y z nx ny nz f_dc_* f_rest_* opacity scale_* rot_*.
+
+    A third scale of log(1e-6) is added so that 3DGS tools open the file; ``native_2dgs`` leaves it out.
+    Plain colours are written as SH of degree 0. Labels follow as an int property when any is not 0. An
+    origin other than 0 is kept in a comment, and x, y, z are relative to it.
+
+    Raises InputError when the file cannot be written; an older file of that name is then left as it was.
+    """
+    rest = 0 if cloud.sh is None else 3 * (cloud.sh.shape[1] - 1)
+    names = [
+        *"xyz",
+        "nx",
+        "ny",
+        "nz",
+        *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(rest)),
+    ]
+    names += [
+        "opacity",
+        "scale_0",
+        "scale_1",
+        *([] if native_2dgs else ["scale_2"]),
+        *(f"rot_{i}" for i in range(4)),
+    ]
+    labelled = bool(cloud.labels.any())
+    column = {name: i for i, name in enumerate(names)}
+    lines = ["ply", "format binary_little_endian 1.0"]
+    if cloud.origin.any():
+        lines.append(f"comment {ORIGIN_COMMENT} {' '.join(repr(float(v)) for v in cloud.origin)}")
+    lines += [f"element vertex {len(cloud)}", *(f"property float {name}" for name in names)]
+    lines += ["property int label"] * labelled + ["end_header", ""]
+    with atomic_write(path) as stream:
+        stream.write("\n".join(lines).encode("ascii"))
+        for start in range(0, len(cloud), _BLOCK):
+            part = slice(start, start + _BLOCK)
+            n = len(cloud.means[part])
+            rows = np.zeros((n, len(names) + labelled), "<f4")
+            rows[:, 0:3] = cloud.means[part]
+            dc = column["f_dc_0"]
+            if cloud.sh is not None:
+                rows[:, dc : dc + 3] = cloud.sh[part, 0]
+                rows[:, dc + 3 : dc + 3 + rest] = cloud.sh[part, 1:].transpose(0, 2, 1).reshape(n, rest)
+            elif cloud.colors is not None:
+                rows[:, dc : dc + 3] = (cloud.colors[part].astype(np.float64) - 0.5) / C0
+            rows[:, column["opacity"]] = _logit(cloud.opacities[part])
+            first = column["scale_0"]
+            rows[:, first : first + 2] = np.log(cloud.scales[part].astype(np.float64))
+            if not native_2dgs:
+                rows[:, first + 2] = PADDED_LOG_SCALE
+            rows[:, column["rot_0"] : column["rot_0"] + 4] = cloud.quats[part]
+            if labelled:
+                rows.view("<i4")[:, -1] = cloud.labels[part]
+            stream.write(rows.data)
+
+
+def _logit(opacities: np.ndarray) -> np.ndarray:
+    p = opacities.astype(np.float64)
+    with np.errstate(divide="ignore"):
+        return np.clip(np.log(p) - np.log1p(-p), -MAX_LOGIT, MAX_LOGIT)
