@@ -1,0 +1,154 @@
+"""What every backend offers, and the plain data that passes between a backend and the renderer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.effects import FeatureSet
+from fidsplat.errors import InputError
+from fidsplat.quality import Quality
+from fidsplat.splats import SplatCloud
+
+MAX_GRID = 32767
+"""Largest side of the sample grid: anchors and rows are kept in 16 bits."""
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """One device that a backend sees."""
+
+    name: str
+    """What to pass as `device=` to get this one."""
+    title: str
+    platform: str
+    version: str
+    kind: str
+    """cpu, gpu or other"""
+    compute_units: int
+    memory_bytes: int
+    largest_allocation_bytes: int
+    float64: bool
+    usable: bool
+    reason: str
+    """Why it cannot be used; empty if it can. For a usable device, a remark (may be empty)."""
+
+
+@dataclass(frozen=True)
+class View:
+    """The uniforms of one picture: numbers that change from view to view, in float64.
+
+    The sample grid is the picture with `samples` x `samples` samples in each pixel.
+    """
+
+    width: int
+    """samples"""
+    height: int
+    """samples"""
+    samples: int
+    """per pixel and axis"""
+    fx: float
+    """samples, as fy, cx, cy"""
+    fy: float
+    cx: float
+    cy: float
+    rotation: np.ndarray
+    """(3, 3) world to camera"""
+    translation: np.ndarray
+    """(3,) metres: where the cloud's origin lies in the camera frame"""
+    eye: np.ndarray
+    """(3,) metres: the camera's centre relative to the cloud's origin, world axes"""
+    near: float
+    far: float
+    log_cut: float
+    """natural logarithm of the alpha cut-off, rounded to float32"""
+    ceiling: float
+    stop: float
+    background: tuple[float, float, float]
+
+    @classmethod
+    def of(cls, camera: Camera, quality: Quality, origin: np.ndarray, background) -> View:
+        """The view of a camera under a quality, for a cloud whose means are relative to `origin` (3,).
+
+        Raises:
+            InputError: the sample grid is too large, or the background is not three finite numbers.
+        """
+        n = quality.samples
+        if max(camera.width, camera.height) * n > MAX_GRID:
+            raise InputError(
+                f"{camera.width} x {camera.height} pixels with {n} x {n} samples each is too large: at most "
+                f"{MAX_GRID} samples along a side; use fewer samples or a smaller picture"
+            )
+        color = np.asarray(background, dtype=np.float64)
+        if color.shape != (3,) or not np.all(np.isfinite(color)):
+            raise InputError(f"background is {background!r}; it must be three finite numbers (r, g, b)")
+        rotation = camera.world_to_camera[:3, :3]
+        # the difference first, then the rotation: nothing large is ever rotated (numerics B5)
+        eye = camera.position - np.asarray(origin, dtype=np.float64)
+        return cls(
+            width=camera.width * n,
+            height=camera.height * n,
+            samples=n,
+            fx=camera.fx * n,
+            fy=camera.fy * n,
+            cx=camera.cx * n,
+            cy=camera.cy * n,
+            rotation=rotation,
+            translation=-rotation @ eye,
+            eye=eye,
+            near=camera.near,
+            far=camera.far,
+            log_cut=float(np.float32(math.log(quality.alpha_cutoff))),
+            ceiling=float(np.float32(quality.opacity_ceiling)),
+            stop=float(np.float32(quality.transmittance_stop)),
+            background=(float(color[0]), float(color[1]), float(color[2])),
+        )
+
+
+class Planes(Protocol):
+    """Finished planes of one picture, on the device until asked for."""
+
+    def read(self, name: str) -> np.ndarray:
+        """The plane as a NumPy array of its own."""
+        ...
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds on the device by stage, in the order in which they ran."""
+        ...
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        """splats, visible, pairs."""
+        ...
+
+
+class Pipeline(Protocol):
+    """The stages compiled for one FeatureSet."""
+
+    def render(self, resident: Any, view: View) -> Planes:
+        """Draw one picture of an uploaded cloud."""
+        ...
+
+    def trace(self, resident: Any, view: View) -> dict[str, np.ndarray]:
+        """Draw one picture and return what passes between the stages, for tests."""
+        ...
+
+
+class Backend(Protocol):
+    """An open device."""
+
+    info: DeviceInfo
+
+    def upload(self, cloud: SplatCloud) -> Any:
+        """The cloud on the device."""
+        ...
+
+    def pipeline(self, features: FeatureSet) -> Pipeline:
+        """The pipeline for these features, compiled on first use."""
+        ...

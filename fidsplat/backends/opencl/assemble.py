@@ -1,0 +1,97 @@
+"""One flat source text from a FeatureSet and the shape of a device.
+
+A kernel file of an effect is cut at lines `//@ section`; a stage file has lines `//@@ section` where the sections of the
+chosen effects go. What nobody fills expands to nothing, so the text names no effect that was not asked for.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from dataclasses import dataclass
+from functools import cache
+
+from fidsplat.effects import FeatureSet
+from fidsplat.errors import DeviceError
+from fidsplat.kernel_files import kernels_folder
+
+BASE_RECORD_BYTES = 64
+BASE_BOUNDS_BYTES = 32
+_STAGES = ("prelude", "math", "splat", "bounds", "project", "scan", "sort", "bin", "blend")
+_HOOK = re.compile(r"^[ \t]*//@@ (\w+)[ \t]*\n", re.MULTILINE)
+_SECTION = re.compile(r"^//@ (\w+)[ \t]*\n", re.MULTILINE)
+_COMMENT = re.compile(r"[ \t]*//[^\n]*")
+_BLANK = re.compile(r"\n\s*\n+")
+
+
+@dataclass(frozen=True)
+class DeviceShape:
+    """Build constants that follow from the kind of device, not from the scene."""
+
+    schedule: str
+    """`lanes` (a tile per work-item, vectors across pixels) or `group` (a work-group per tile)."""
+    lanes: int
+    tile_width: int
+    tile_height: int
+    chunks: int
+    radix_bits: int
+    scan_items: int
+    fast_fma: bool
+
+
+@dataclass(frozen=True)
+class Source:
+    """A flat kernel source with what the host must know of it."""
+
+    text: str
+    digest: str
+    """SHA-256 of the text: the cache key."""
+    record_bytes: int
+    bounds_bytes: int
+
+
+def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
+    """The source text of all stages for these features on a device of this shape."""
+    effects = features.effects
+    record_bytes = BASE_RECORD_BYTES + 4 * sum(effect.record_lanes for effect in effects)
+    bounds_bytes = BASE_BOUNDS_BYTES + 4 * sum(effect.bounds_lanes for effect in effects)
+    defines = {
+        "CHUNKS": shape.chunks,
+        "FAST_FMA": int(shape.fast_fma),
+        "LANES": shape.lanes,
+        "RADIX_BITS": shape.radix_bits,
+        "RECORD_BYTES": record_bytes,
+        "SAMPLES": features.samples,
+        "SCAN_ITEMS": shape.scan_items,
+        "SETUP_FP64": int(features.setup_precision == "float64"),
+        "TILE_H": shape.tile_height,
+        "TILE_W": shape.tile_width,
+    }
+    if features.sh_degree > 0 or "color_sh" in features.slots:
+        defines["SH_DEGREE"] = features.sh_degree
+    sections = [_sections(effect.file) for effect in effects]
+    known: set[str] = set()
+
+    def fill(match: re.Match[str]) -> str:
+        known.add(match[1])
+        return "".join(section.get(match[1], "") for section in sections)
+
+    stages = [*(f"{stage}.cl" for stage in _STAGES), f"schedule/{shape.schedule}.cl", "resolve.cl"]
+    body = "\n".join(_HOOK.sub(fill, _read(stage)) for stage in stages)
+    for effect, section in zip(effects, sections, strict=True):
+        if unknown := set(section) - known:
+            raise DeviceError(f"kernel file {effect.file} fills hooks that no stage has: {sorted(unknown)}")
+    text = "".join(f"#define {name} {value}\n" for name, value in sorted(defines.items()))
+    text += _BLANK.sub("\n", _COMMENT.sub("", body))
+    return Source(text, hashlib.sha256(text.encode()).hexdigest(), record_bytes, bounds_bytes)
+
+
+@cache
+def _read(path: str) -> str:
+    return (kernels_folder() / "opencl" / path).read_text(encoding="utf-8")
+
+
+@cache
+def _sections(path: str) -> dict[str, str]:
+    pieces = _SECTION.split(_read(path))
+    return dict(zip(pieces[1::2], pieces[2::2], strict=True))

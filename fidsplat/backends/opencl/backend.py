@@ -1,0 +1,174 @@
+"""OpenCL devices: listing, choosing, opening; compiled pipelines by FeatureSet."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pyopencl as cl
+
+from fidsplat.backends.base import DeviceInfo
+from fidsplat.backends.opencl import pocl_target
+from fidsplat.backends.opencl.assemble import DeviceShape, assemble
+from fidsplat.backends.opencl.memory import BufferPool, Resident
+from fidsplat.backends.opencl.pipeline import OpenCLPipeline
+from fidsplat.effects import FeatureSet
+from fidsplat.errors import DeviceError, UnknownDeviceError
+from fidsplat.splats import SplatCloud
+
+_NO_PLATFORM = (
+    "no OpenCL platform found; install a CPU one with: pip install 'pyopencl[pocl]' "
+    "(GPUs bring theirs with the driver; its path belongs in a file under /etc/OpenCL/vendors)"
+)
+
+
+def devices() -> list[DeviceInfo]:
+    """Every OpenCL device here, usable or not. An empty list if there is no platform."""
+    return [_describe(device) for device in _all_devices()]
+
+
+def open_device(selector: str = "") -> OpenCLBackend:
+    """The best usable device (GPU before CPU), or the first whose platform, name or vendor contains `selector`.
+
+    Raises:
+        DeviceError: no OpenCL at all, or none of the devices can be used.
+        UnknownDeviceError: nothing matches the selector.
+    """
+    found = list(_all_devices())
+    if not found:
+        raise DeviceError(_NO_PLATFORM)
+    matching = [device for device in found if _matches(device, selector)]
+    if not matching:
+        known = "; ".join(f"{device.platform.name}: {device.name}" for device in found)
+        raise UnknownDeviceError(f"no OpenCL device matches {selector!r}; there are: {known}")
+    usable = [device for device in matching if not _why_unusable(device)]
+    if not usable:
+        reasons = "; ".join(f"{device.name}: {_why_unusable(device)}" for device in matching)
+        raise DeviceError(f"no usable OpenCL device ({reasons})")
+    return OpenCLBackend(min(usable, key=lambda device: not device.type & cl.device_type.GPU))
+
+
+class OpenCLBackend:
+    """An open OpenCL device with its queue, buffer pool and compiled pipelines."""
+
+    def __init__(self, device: cl.Device) -> None:
+        self.info = _describe(device)
+        self.device = device
+        self.target = _target(device)
+        self.shape = _shape(device)
+        self.context = cl.Context([device])
+        self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
+        self.pool = BufferPool(self.context, device)
+        self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
+
+    def upload(self, cloud: SplatCloud) -> Resident:
+        """The cloud in device buffers."""
+        return Resident(self.context, self.queue, self.pool, cloud)
+
+    def pipeline(self, features: FeatureSet, shape: DeviceShape | None = None) -> OpenCLPipeline:
+        """The stages compiled for these features; `shape` replaces the device's own build constants (tests).
+
+        Raises:
+            DeviceError: the compiler refuses; its log is in the message.
+        """
+        if not self.info.float64:
+            features = replace(features, setup_precision="float32")
+        key = (features, shape or self.shape)
+        if key not in self._pipelines:
+            source = assemble(*key)
+            program = self._build(source.text)
+            self._pipelines[key] = OpenCLPipeline(self, source, program, *key)
+        return self._pipelines[key]
+
+    def _build(self, text: str) -> cl.Program:
+        # the target's name is part of pyopencl's cache key: PoCL's own version string does not tell processors apart
+        options = [
+            "-cl-std=CL1.2",
+            "-w",
+            f"-DTARGET_{''.join(c if c.isalnum() else '_' for c in self.target)}",
+        ]
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", cl.CompilerWarning)
+                return cl.Program(self.context, text).build(options=options)
+        except cl.Error as error:
+            raise DeviceError(f"{self.info.title} cannot compile the kernels: {error}") from error
+
+
+def _all_devices() -> Iterator[cl.Device]:
+    try:
+        platforms = cl.get_platforms()
+    except cl.Error:  # the loader's way to say that there is none
+        return
+    for platform in platforms:
+        try:
+            yield from platform.get_devices()
+        except cl.Error:  # a platform without devices
+            continue
+
+
+def _matches(device: cl.Device, selector: str) -> bool:
+    aliases = {"pocl": "portable computing language"}
+    wanted = selector.strip().lower()
+    named = f"{device.platform.name} {device.name} {device.vendor}".lower()
+    if wanted in ("cpu", "gpu"):
+        return bool(device.type & getattr(cl.device_type, wanted.upper()))
+    return wanted in named or aliases.get(wanted, "\0") in named
+
+
+def _why_unusable(device: cl.Device) -> str:
+    if not device.available:
+        return "the driver says that it is not available"
+    if not device.compiler_available:
+        return "it has no compiler for OpenCL C"
+    if not device.endian_little:
+        return "it is big-endian"
+    if pocl_target.needs_correction(device.version) and not pocl_target.correct_target(device.int_ptr):
+        return (
+            "this PoCL's compiler does not know the processor; install a newer one (Debian: pocl-opencl-icd) "
+            "or set POCL_LLVM_CPU_NAME if it is PoCL 3.1 or later"
+        )
+    return ""
+
+
+def _target(device: cl.Device) -> str:
+    """What the kernels are compiled for, as far as the driver tells."""
+    if pocl_target.needs_correction(device.version):
+        return pocl_target.correct_target(device.int_ptr) or "generic"
+    return device.version
+
+
+def _describe(device: cl.Device) -> DeviceInfo:
+    why = _why_unusable(device)
+    kind = (
+        "gpu" if device.type & cl.device_type.GPU else "cpu" if device.type & cl.device_type.CPU else "other"
+    )
+    short = (
+        "pocl" if "Portable Computing Language" in device.platform.name else device.platform.name.split()[0]
+    )
+    float64 = "cl_khr_fp64" in device.extensions
+    return DeviceInfo(
+        name=f"opencl:{short.lower()}",
+        title=device.name.strip(),
+        platform=device.platform.name.strip(),
+        version=device.version.strip(),
+        kind=kind,
+        compute_units=device.max_compute_units,
+        memory_bytes=device.global_mem_size,
+        largest_allocation_bytes=device.max_mem_alloc_size,
+        float64=float64,
+        usable=not why,
+        reason=why or ("" if float64 else "no float64: per-splat set-up in float32"),
+    )
+
+
+def _shape(device: cl.Device) -> DeviceShape:
+    """Build constants for this device. CPUs: the widest vector; GPUs: 16 x 16 pixels per work-group."""
+    fast_fma = bool(device.single_fp_config & cl.device_fp_config.FMA)
+    if device.type & cl.device_type.CPU:
+        lanes = 16 if device.native_vector_width_float >= 16 else 8
+        chunks = int(np.clip(4 * device.max_compute_units, 8, 256))
+        return DeviceShape("lanes", lanes, lanes, 16, chunks, 11, 1, fast_fma)
+    return DeviceShape("group", 1, 16, 16, 1024, 8, 256, fast_fma)

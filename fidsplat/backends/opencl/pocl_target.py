@@ -1,0 +1,80 @@
+"""Lets the PoCL that pip installs compile for processors that its LLVM does not know.
+
+PoCL 3.0 from PyPI asks its LLVM 14 for the processor's name. For one that is newer than LLVM 14 (AMD Zen 5, say) the answer is
+"generic", which PoCL then hands to clang as -target-cpu, where it is an error: every build fails with "unknown target CPU
+'generic'" (pocl issues #512, #1049). PoCL 3.1 and later read POCL_LLVM_CPU_NAME; 3.0 has no such setting, so the name is
+corrected where PoCL keeps it, in the device's record: the field `llvm_cpu`, which follows `llvm_target_triplet`. The new
+name is the one for which PoCL built the kernel library that it picks from the processor's feature flags.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import re
+import struct
+from pathlib import Path
+
+# The x86 levels of PoCL's "distro" kernel libraries, best last, with LLVM's name for each.
+_LEVELS = (
+    ("x86-64", ()),
+    ("core2", ("ssse3", "cx16")),
+    ("penryn", ("sse4_1", "cx16")),
+    ("sandybridge", ("avx", "cx16", "popcnt")),
+    ("ivybridge", ("avx", "cx16", "popcnt", "f16c")),
+    ("haswell", ("avx2", "cx16", "popcnt", "abm", "f16c", "fma", "bmi1", "bmi2")),
+    ("skylake-avx512", ("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl")),
+)
+_RECORD_BYTES = 2048
+_corrected: dict[int, ctypes.Array] = {}  # PoCL keeps pointing at these
+
+
+def needs_correction(device_version: str) -> bool:
+    """Whether this device is one of PoCL 3.0's whose processor LLVM did not recognise."""
+    return (
+        platform.system() == "Linux"
+        and platform.machine() == "x86_64"
+        and re.search(r"PoCL.*-generic$", device_version.strip()) is not None
+    )
+
+
+def correct_target(device_address: int) -> str | None:
+    """Give the PoCL device whose record lies at this address a processor name that its LLVM knows.
+
+    Returns the name, or None if the record does not look as expected (then nothing is changed).
+    """
+    if device_address in _corrected:
+        return _corrected[device_address].value.decode()
+    with Path("/proc/self/mem").open("rb", buffering=0) as memory:
+        record = _read(memory, device_address, _RECORD_BYTES)
+        words = struct.unpack(f"<{len(record) // 8}Q", record[: len(record) // 8 * 8])
+        for index in range(len(words) - 1):
+            is_triplet = _text(memory, words[index]).startswith(b"x86_64-")
+            if is_triplet and _text(memory, words[index + 1]) == b"generic":
+                name = ctypes.create_string_buffer(_processor_name().encode())
+                _corrected[device_address] = name
+                field = ctypes.c_uint64.from_address(device_address + 8 * (index + 1))
+                field.value = ctypes.addressof(name)
+                return name.value.decode()
+    return None
+
+
+def _processor_name() -> str:
+    flags = re.search(r"^flags\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    have = set(flags[1].split()) if flags else set()
+    return [name for name, needed in _LEVELS if have.issuperset(needed)][-1]
+
+
+def _read(memory, address: int, count: int) -> bytes:
+    """Bytes of this process's memory; empty where nothing is mapped (a plain pointer would crash)."""
+    try:
+        return os.pread(memory.fileno(), count, address)
+    except (OSError, OverflowError):
+        return b""
+
+
+def _text(memory, address: int) -> bytes:
+    if not 4096 < address < 1 << 47:
+        return b""
+    return _read(memory, address, 32).split(b"\0")[0]

@@ -1,0 +1,33 @@
+"""Devices by name. A family of devices is a module with `devices()` and `open_device(selector)`, imported on first use."""
+
+from __future__ import annotations
+
+import difflib
+from importlib import import_module
+
+from fidsplat.backends.base import Backend, DeviceInfo
+from fidsplat.errors import UnknownDeviceError
+
+_FAMILIES = {"opencl": "fidsplat.backends.opencl", "reference": "fidsplat.backends.reference"}
+
+
+def open_backend(name: str) -> Backend:
+    """Open a device by name: a family (`opencl`, `reference`) or `family:part of a platform's or device's name`.
+
+    Raises:
+        UnknownDeviceError: no such family, or nothing of the family answers to the selector.
+        DeviceError: the device is there and cannot be used.
+    """
+    family, _, selector = str(name).strip().partition(":")
+    if family.lower() not in _FAMILIES:
+        near = difflib.get_close_matches(family.lower(), _FAMILIES, 1)
+        hint = f" (did you mean {near[0]!r}?)" if near else ""
+        raise UnknownDeviceError(
+            f"unknown device {name!r}{hint}; known families: {', '.join(_FAMILIES)}; `fidsplat devices` lists all"
+        )
+    return import_module(_FAMILIES[family.lower()]).open_device(selector)
+
+
+def devices() -> list[DeviceInfo]:
+    """Every device that can be opened here, and why the others cannot."""
+    return [info for module in _FAMILIES.values() for info in import_module(module).devices()]

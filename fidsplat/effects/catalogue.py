@@ -1,0 +1,70 @@
+"""Every effect: its kernel file and what it adds to the records, buffers and outputs.
+
+A slot is filled by exactly one effect of its kind (camera, color, lowpass, stop); taps are extra planes, any number of
+them; parts are what several taps share. The sections of an effect's kernel file say where its text goes (kernels/README.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Output:
+    """A plane of the finished frame: shape (h, w) if channels is 1, else (h, w, channels)."""
+
+    name: str
+    channels: int
+    dtype: str
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One effect as data."""
+
+    name: str
+    file: str
+    """Path below kernels/<dialect>/."""
+    record_lanes: int = 0
+    """32-bit words that it adds to the record of a visible splat."""
+    bounds_lanes: int = 0
+    """32-bit words that it adds to the bounds of a visible splat."""
+    inputs: tuple[str, ...] = ()
+    """Arrays of the cloud that the projection reads for it, in the order of its kernel arguments."""
+    planes: tuple[int, ...] = ()
+    """Sample planes in each buffer between blending and resolving, in the order of its kernel arguments."""
+    output: Output | None = None
+    parts: tuple[str, ...] = ()
+    """Names of the parts that it needs."""
+
+
+_EFFECTS = (
+    Effect("camera_pinhole", "slot/camera_pinhole.cl"),
+    Effect("color_rgb", "slot/color_rgb.cl", inputs=("colors",)),
+    Effect("color_sh", "slot/color_sh.cl", inputs=("sh",)),
+    Effect("lowpass_none", "slot/lowpass_none.cl"),
+    Effect("lowpass_screen", "slot/lowpass_screen.cl", record_lanes=2, bounds_lanes=3),
+    Effect("stop_inclusive", "slot/stop_inclusive.cl"),
+    Effect("stop_exclusive", "slot/stop_exclusive.cl"),
+    Effect("ray_depth", "slot/ray_depth.cl", record_lanes=3),
+    Effect("alpha", "tap/alpha.cl", output=Output("alpha", 1, "float32")),
+    Effect("depth", "tap/depth.cl", planes=(2,), output=Output("depth", 1, "float32"), parts=("ray_depth",)),
+    Effect(
+        "depth_median",
+        "tap/depth_median.cl",
+        planes=(1,),
+        output=Output("depth_median", 1, "float32"),
+        parts=("ray_depth",),
+    ),
+    Effect("normal", "tap/normal.cl", record_lanes=3, planes=(3,), output=Output("normal", 3, "float32")),
+    Effect(
+        "label",
+        "tap/label.cl",
+        record_lanes=1,
+        inputs=("labels",),
+        planes=(1, 1),
+        output=Output("label", 1, "int32"),
+    ),
+)
+
+CATALOGUE: dict[str, Effect] = {effect.name: effect for effect in _EFFECTS}

@@ -1,0 +1,72 @@
+"""The one place that decides what a scene calls for."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from fidsplat.effects.catalogue import CATALOGUE, Effect, Output
+from fidsplat.errors import InputError
+from fidsplat.quality import Quality
+
+RGB = Output("rgb", 3, "float32")
+OUTPUTS: dict[str, Output] = {
+    "rgb": RGB,
+    **{effect.output.name: effect.output for effect in CATALOGUE.values() if effect.output},
+}
+
+
+@dataclass(frozen=True)
+class FeatureSet:
+    """What one picture calls for: names and small integers only, so that it can be a key.
+
+    Numbers that change from view to view (intrinsics, poses, thresholds, background) are uniforms, never here.
+    """
+
+    slots: tuple[str, ...]
+    """One effect per kind, in the fixed order camera, color, lowpass, stop."""
+    taps: tuple[str, ...]
+    """Sorted names of the planes beside rgb."""
+    sh_degree: int
+    samples: int
+    setup_precision: str
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """All effects in the order in which their text is put together: slots, parts, taps."""
+        parts = sorted({part for tap in self.taps for part in CATALOGUE[tap].parts})
+        return tuple(CATALOGUE[name] for name in (*self.slots, *parts, *self.taps))
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Finished planes, rgb first."""
+        return (RGB, *(OUTPUTS[tap] for tap in self.taps))
+
+
+def select(sh_degree: int, outputs: Iterable[str], quality: Quality) -> FeatureSet:
+    """The features that a cloud (by its SH degree, -1 for plain colours), outputs and quality call for.
+
+    Raises:
+        InputError: an output that nobody declares.
+    """
+    if isinstance(outputs, str):
+        outputs = (outputs,)
+    wanted = set(outputs)
+    for name in wanted:
+        if name not in OUTPUTS:
+            near = difflib.get_close_matches(str(name), OUTPUTS, 1)
+            hint = f" (did you mean {near[0]!r}?)" if near else ""
+            raise InputError(f"unknown output {name!r}{hint}; known: {', '.join(OUTPUTS)}")
+    return FeatureSet(
+        slots=(
+            "camera_pinhole",
+            "color_rgb" if sh_degree < 0 else "color_sh",
+            f"lowpass_{quality.lowpass}",
+            f"stop_{quality.stop_rule}",
+        ),
+        taps=tuple(sorted(wanted - {"rgb"})),
+        sh_degree=max(sh_degree, 0),
+        samples=quality.samples,
+        setup_precision=quality.setup_precision,
+    )

@@ -1,0 +1,133 @@
+"""Renderer: the facade that people use."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends.base import DeviceInfo, Planes, View
+from fidsplat.backends.registry import open_backend
+from fidsplat.cameras import Camera
+from fidsplat.effects import select
+from fidsplat.errors import InputError
+from fidsplat.quality import Quality
+from fidsplat.scenes import Scene
+from fidsplat.splats import SplatCloud
+
+
+class Frame(Mapping):
+    """A finished picture: a mapping from an output's name to a NumPy array, copied from the device on first use.
+
+    Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median` (h, w) metres along z, 0 where
+    nothing was drawn; `normal` (h, w, 3) unit, camera frame, towards the camera; `label` (h, w) int32, -1 where nothing
+    was drawn.
+    """
+
+    def __init__(self, planes: Planes, outputs: tuple[str, ...]) -> None:
+        self._planes = planes
+        self._arrays: dict[str, np.ndarray] = {}
+        self.outputs = outputs
+        """Names of the planes, in the order in which they were asked for."""
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self.outputs:
+            raise KeyError(f"this frame has no {name!r}; it was rendered with {', '.join(self.outputs)}")
+        if name not in self._arrays:
+            self._arrays[name] = self._planes.read(name)
+        return self._arrays[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.outputs)
+
+    def __len__(self) -> int:
+        return len(self.outputs)
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds on the device by stage: project, sort, bin, blend, resolve."""
+        return self._planes.timings
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        """splats (in the cloud), visible (not culled), pairs (of splats and tiles)."""
+        return self._planes.stats
+
+
+class ResidentCloud:
+    """A cloud on a renderer's device; rendering it transfers no splat."""
+
+    def __init__(self, renderer: Renderer, data: Any, count: int) -> None:
+        self._renderer, self._data, self._count = renderer, data, count
+
+    def __len__(self) -> int:
+        return self._count
+
+
+class Renderer:
+    """Draws splats on one device. Compiled pipelines and scratch buffers are kept from picture to picture.
+
+    Args:
+        device: "opencl" (the best OpenCL device), "opencl:NAME" (part of a platform's or device's name, or cpu or
+            gpu), or "reference" (NumPy, float64, slow).
+
+    Raises:
+        DeviceError: the device cannot be used; UnknownDeviceError: there is no such device.
+    """
+
+    def __init__(self, device: str = "opencl") -> None:
+        self.backend = open_backend(device)
+
+    @property
+    def device(self) -> DeviceInfo:
+        """The device that draws."""
+        return self.backend.info
+
+    def upload(self, scene: Scene | SplatCloud) -> ResidentCloud:
+        """Put a scene's splats on the device, to be rendered many times."""
+        cloud = scene.cloud() if isinstance(scene, Scene) else scene
+        if not isinstance(cloud, SplatCloud):
+            raise InputError(f"cannot render a {type(scene).__name__}; give a Scene or a SplatCloud")
+        return ResidentCloud(self, self.backend.upload(cloud), len(cloud))
+
+    def render(
+        self,
+        scene: Scene | SplatCloud | ResidentCloud,
+        camera: Camera | None = None,
+        outputs: Iterable[str] | None = None,
+        quality: Quality | str | None = None,
+        background: Iterable[float] | None = None,
+    ) -> Frame:
+        """Draw one picture.
+
+        Args:
+            scene: what to draw. What a Scene says of camera, outputs, quality and background is used where the
+                arguments are left out.
+            camera: needed unless the scene has one.
+            outputs: names of planes; default rgb.
+            quality: a Quality or a preset's name; default standard.
+            background: (r, g, b) behind the splats; default black.
+
+        Raises:
+            InputError: no camera, an unknown output or preset, a picture that is too large, a cloud uploaded elsewhere.
+            DeviceError: the device fails or lacks memory.
+        """
+        own = scene if isinstance(scene, Scene) else Scene([])
+        camera = camera or own.camera
+        if camera is None:
+            raise InputError("no camera: pass camera=fs.Camera... or give the scene a [camera] table")
+        names = own.outputs if outputs is None else outputs
+        names = (names,) if isinstance(names, str) else tuple(dict.fromkeys(names))
+        chosen = Quality.of(own.quality if quality is None else quality)
+        behind = own.background if background is None else tuple(background)
+
+        resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
+        if resident._renderer is not self:
+            raise InputError(
+                "this cloud was uploaded by another Renderer; upload it with the one that draws it"
+            )
+        data = resident._data
+        features = select(data.sh_degree, names, chosen)
+        view = View.of(camera, chosen, data.origin, behind)
+        return Frame(self.backend.pipeline(features).render(data, view), names)

@@ -1,0 +1,61 @@
+// Lists of splats per tile, each in depth order: a counting sort whose bins are the tiles.
+// Index space of both kernels: one work-item per chunk of the depth-sorted splats.
+
+typedef struct { int first, last; } TileSpan;   // inclusive; empty if first > last
+
+// Tiles of one tile row that the bounds can touch. Both kernels call this, so counts and lists agree.
+static inline TileSpan tile_span(const Bounds *b, int tile_row, int width, int height) {
+    float y0 = (float)(tile_row * TILE_H) + 0.5f, y1 = (float)min(tile_row * TILE_H + TILE_H, height) - 0.5f;
+    float x0, x1;
+    bounds_span(b, y0, y1, &x0, &x1);
+    int first = max(to_pixel(ceil(x0 - 0.5f), width), 0), last = min(to_pixel(floor(x1 - 0.5f), width), width - 1);
+    TileSpan span = {first / TILE_W, first <= last ? last / TILE_W : -1};
+    return span;
+}
+
+// Reads: order, counts[slot] (visible splats), bounds. Writes: this chunk's row of table[CHUNKS][tiles].
+kernel void bin_count(global const uint *restrict order, global const uint *restrict counts, uint slot,
+                      global const Bounds *restrict all_bounds, int width, int height, global uint *restrict table) {
+    uint chunk = get_global_id(0);
+    if (chunk >= CHUNKS) return;
+    int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
+    global uint *row = table + (size_t)chunk * tiles_x * tiles_y;
+    for (int tile = 0; tile < tiles_x * tiles_y; tile++) row[tile] = 0;
+    uint length = counts[slot], each = (length + CHUNKS - 1) / CHUNKS;
+    uint from = min(chunk * each, length), to = min(from + each, length);
+    for (uint k = from; k < to; k++) {
+        Bounds b = all_bounds[order[k]];
+        int y0, y1;
+        bounds_rows(&b, height, &y0, &y1);
+        for (int ty = y0 / TILE_H; ty * TILE_H < y1; ty++) {
+            TileSpan span = tile_span(&b, ty, width, height);
+            for (int tx = span.first; tx <= span.last; tx++) row[ty * tiles_x + tx]++;
+        }
+    }
+}
+
+// Reads: order, counts[slot], bounds, starts. Uses up: table. Writes: lists (pairs; never beyond `capacity`).
+kernel void bin_emit(global const uint *restrict order, global const uint *restrict counts, uint slot,
+                     global const Bounds *restrict all_bounds, int width, int height, global uint *restrict table,
+                     global const uint *restrict starts, uint capacity, global uint *restrict lists) {
+    uint chunk = get_global_id(0);
+    if (chunk >= CHUNKS) return;
+    int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
+    global uint *row = table + (size_t)chunk * tiles_x * tiles_y;
+    uint length = counts[slot], each = (length + CHUNKS - 1) / CHUNKS;
+    uint from = min(chunk * each, length), to = min(from + each, length);
+    for (uint k = from; k < to; k++) {
+        uint index = order[k];
+        Bounds b = all_bounds[index];
+        int y0, y1;
+        bounds_rows(&b, height, &y0, &y1);
+        for (int ty = y0 / TILE_H; ty * TILE_H < y1; ty++) {
+            TileSpan span = tile_span(&b, ty, width, height);
+            for (int tx = span.first; tx <= span.last; tx++) {
+                int tile = ty * tiles_x + tx;
+                uint place = starts[tile] + row[tile]++;
+                if (place < capacity) lists[place] = index;
+            }
+        }
+    }
+}

@@ -1,0 +1,46 @@
+// Front-to-back compositing of one fragment per pixel (the paper, section 3.1): C = sum_k c_k alpha_k prod (1 - alpha_j).
+// The schedules (schedule/*.cl) bring the splats of a tile here in depth order.
+
+typedef struct {
+    vfloat t;               // transmittance in front of the next fragment
+    vfloat r, g, b;
+//@@ state
+} Pixel;
+
+typedef struct {            // uniforms of the blend stage
+    float log_cut, ceiling, stop, filter;
+} BlendConstants;
+
+static inline void pixel_start(Pixel *pixel) {
+    pixel->t = 1.0f;
+    pixel->r = 0.0f;
+    pixel->g = 0.0f;
+    pixel->b = 0.0f;
+//@@ start
+}
+
+//@@ fragment_mask
+//@@ fragment_half_rho
+
+// Draws the fragment where `mask` is set.
+static inline void pixel_blend(Pixel *pixel, const Splat *s, Crossing c, vint mask, vfloat screen,
+                               const BlendConstants *constants) {
+    vfloat inverse_d = 1.0f / c.d;
+    vfloat alpha = splat_alpha(s, fragment_half_rho(c, inverse_d, screen), constants->ceiling);
+    vint live = mask & VMASK(pixel->t > constants->stop);
+//@@ stop
+    alpha = VSELECT((vfloat)0.0f, alpha, live);
+    vfloat weight = pixel->t * alpha;
+    pixel->r = FMA(weight, (vfloat)s->r, pixel->r);
+    pixel->g = FMA(weight, (vfloat)s->g, pixel->g);
+    pixel->b = FMA(weight, (vfloat)s->b, pixel->b);
+//@@ fragment
+    pixel->t = pixel->t - weight;
+}
+
+// Writes LANES pixels at `at` of planes of `plane` samples.
+#define PIXEL_STORE_BASE(pixel, raw, plane, at) \
+    VSTORE((pixel)->r, raw + (at)); \
+    VSTORE((pixel)->g, raw + (plane) + (at)); \
+    VSTORE((pixel)->b, raw + 2 * (plane) + (at)); \
+    VSTORE((pixel)->t, raw + 3 * (plane) + (at))

@@ -1,0 +1,79 @@
+// What part of the picture a splat can touch: the R-sigma ellipse (or a box where the disk crosses the near plane)
+// and, by hook, the support of the low-pass. Everything here is conservative; the per-pixel test decides.
+
+typedef struct {
+    float ex, ey;           // centre [samples]
+    float hx, hy;           // half extents of the axis-aligned box
+    float slope;            // the chord at height Y around the centre is slope * Y +- half_width * sqrt(1 - Y^2 / hy^2)
+    float half_width;
+    float inverse_hy2;      // 0 makes it a box
+    float tip;              // height at which the ellipse is widest to the right
+//@@ bounds
+} Bounds;
+
+// Room for the rounding of the float fields and of the per-pixel test, in samples.
+#define BOUNDS_PAD 0.02f
+#define BOUNDS_PAD_RELATIVE 2e-4f
+
+static inline Bounds box_bounds(real x0, real x1, real y0, real y1) {
+    Bounds b;
+    b.ex = (float)((x0 + x1) * REAL(0.5));
+    b.ey = (float)((y0 + y1) * REAL(0.5));
+    b.hx = (float)((x1 - x0) * REAL(0.5)) * (1.0f + BOUNDS_PAD_RELATIVE) + BOUNDS_PAD;
+    b.hy = (float)((y1 - y0) * REAL(0.5)) * (1.0f + BOUNDS_PAD_RELATIVE) + BOUNDS_PAD;
+    b.slope = 0;
+    b.half_width = b.hx;
+    b.inverse_hy2 = 0;
+    b.tip = 0;
+    return b;
+}
+
+// The image of the R-sigma disk when it lies wholly in front: from its dual conic about the projected centre
+// (numerics A4). tu, tv are relative to the projected centre (their z is 0).
+static inline Bounds ellipse_bounds(real3_ tu, real3_ tv, real3_ tw, real center_x, real center_y, real r2) {
+    real d = r2 * (tw.x * tw.x + tw.y * tw.y) - tw.z * tw.z;   // < 0
+    real mx = r2 * (tu.x * tw.x + tu.y * tw.y) / d;
+    real my = r2 * (tv.x * tw.x + tv.y * tw.y) / d;
+    real qxx = fmax(mx * mx - r2 * (tu.x * tu.x + tu.y * tu.y) / d, REAL(0.0));
+    real qyy = fmax(my * my - r2 * (tv.x * tv.x + tv.y * tv.y) / d, REAL(0.0));
+    real qxy = mx * my - r2 * (tu.x * tv.x + tu.y * tv.y) / d;
+    real hx = sqrt(qxx), hy = sqrt(qyy);
+    Bounds b;
+    b.ex = (float)(center_x + mx);
+    b.ey = (float)(center_y + my);
+    b.hx = (float)hx * (1.0f + BOUNDS_PAD_RELATIVE) + BOUNDS_PAD;
+    b.hy = (float)hy * (1.0f + BOUNDS_PAD_RELATIVE) + BOUNDS_PAD;
+    real shear = qyy > 0 ? qxy / qyy : 0;
+    b.slope = (float)shear;
+    // the pad of the width also covers the shift that padding the height gives a sheared chord
+    float across = (float)sqrt(fmax(qxx - qxy * shear, REAL(0.0)));
+    b.half_width = across * (1.0f + BOUNDS_PAD_RELATIVE) + BOUNDS_PAD + BOUNDS_PAD_RELATIVE * (float)hx
+                   + BOUNDS_PAD * fabs(b.slope);
+    b.inverse_hy2 = 1.0f / (b.hy * b.hy);
+    b.tip = hx > 0 ? (float)(qxy / hx) : 0.0f;
+    return b;
+}
+
+// The chord of the bounds between heights y0 <= y1, [*x0, *x1]; empty if *x0 > *x1.
+static inline void bounds_span(const Bounds *b, float y0, float y1, float *x0, float *x1) {
+    *x0 = INFINITY;
+    *x1 = -INFINITY;
+    float low = fmax(y0 - b->ey, -b->hy), high = fmin(y1 - b->ey, b->hy);
+    if (low <= high) {
+        // 4e-7: 1 - Y^2 / hy^2 cancels at the tips
+        float right = clamp(b->tip, low, high), left = clamp(-b->tip, low, high);
+        float wr = sqrt(fmax(1.0f - right * right * b->inverse_hy2, 0.0f) + 4e-7f);
+        float wl = sqrt(fmax(1.0f - left * left * b->inverse_hy2, 0.0f) + 4e-7f);
+        *x1 = b->ex + fmin(FMA(b->slope, right, b->half_width * wr), b->hx);
+        *x0 = b->ex + fmax(FMA(b->slope, left, -b->half_width * wl), -b->hx);
+    }
+//@@ bounds_span
+}
+
+// Rows of samples [*y0, *y1) whose centres the bounds can reach.
+static inline void bounds_rows(const Bounds *b, int height, int *y0, int *y1) {
+    float low = b->ey - b->hy, high = b->ey + b->hy;
+//@@ bounds_rows
+    *y0 = max(to_pixel(ceil(low - 0.5f), height), 0);
+    *y1 = min(to_pixel(floor(high - 0.5f) + 1.0f, height), height);
+}

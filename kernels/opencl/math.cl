@@ -1,0 +1,57 @@
+// Vectors of LANES pixels, and the few functions whose spelling depends on LANES.
+
+#define GLUE_(a, b) a##b
+#define GLUE(a, b) GLUE_(a, b)
+
+#if LANES == 1
+typedef float vfloat;
+typedef int vint;
+#define VSELECT(no, yes, mask) ((mask) ? (yes) : (no))
+#define VANY(mask) (mask)
+#define VLOAD(p) (*(p))
+#define VSTORE(v, p) (*(p) = (v))
+#define VMASK(condition) (-(condition))
+#define VLANE 0.0f
+#define TO_VFLOAT(x) ((float)(x))
+#else
+typedef GLUE(float, LANES) vfloat;
+typedef GLUE(int, LANES) vint;
+#define VSELECT(no, yes, mask) select(no, yes, mask)
+#define VANY(mask) any(mask)
+#define VLOAD(p) GLUE(vload, LANES)(0, p)
+#define VSTORE(v, p) GLUE(vstore, LANES)(v, 0, p)
+#define VMASK(condition) (condition)
+#define TO_VFLOAT(x) GLUE(convert_float, LANES)(x)
+#if LANES == 16
+#define VLANE ((vfloat)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
+#elif LANES == 8
+#define VLANE ((vfloat)(0, 1, 2, 3, 4, 5, 6, 7))
+#elif LANES == 4
+#define VLANE ((vfloat)(0, 1, 2, 3))
+#endif
+#endif
+
+// A fused multiply-add where the device has one; a device that would emulate it in software rounds twice instead.
+#if FAST_FMA
+#define FMA(a, b, c) fma(a, b, c)
+#else
+#define FMA(a, b, c) ((a) * (b) + (c))
+#endif
+
+typedef struct { real x, y, z; } real3_;
+
+static inline real3_ cross3(real3_ a, real3_ b) {
+    real3_ c = {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+    return c;
+}
+
+static inline real dot3(real3_ a, real3_ b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+
+// Bits of a float in an order that unsigned comparison keeps, negative values and zeros included (numerics C2).
+static inline uint sortable(float x) {
+    uint bits = as_uint(x + 0.0f);  // -0 becomes +0
+    return (bits & 0x80000000u) ? ~bits : (bits | 0x80000000u);
+}
+
+// Pixel coordinate to int without the undefined conversions of huge values (numerics E2).
+static inline int to_pixel(float x, int limit) { return (int)clamp(x, -1.0f, (float)limit + 1.0f); }

@@ -1,0 +1,37 @@
+// Build constants that `assemble` prints above this file, and the numeric types made from them.
+//   LANES          pixels that one work-item computes side by side (1 on a GPU, 8 or 16 on a CPU)
+//   TILE_W TILE_H  pixels of a tile; the lanes schedule needs TILE_W == LANES
+//   CHUNKS         contiguous pieces into which lists are cut where order must be kept without atomics
+//   RADIX_BITS     digit width of the depth sort
+//   SCAN_ITEMS     work-items of the one work-group that scans
+//   SETUP_FP64     1: per-splat set-up in double
+//   RECORD_BYTES   size of one Splat record, computed by the host from the effects' declarations
+//   SAMPLES        n of the n x n samples per pixel
+
+// Contraction is chosen by hand (FMA below), never by the compiler: the same pixel must get the same bits in every
+// schedule, tile size and set of taps, and order and culling must not depend on the device (numerics F1).
+#pragma OPENCL FP_CONTRACT OFF
+
+#if SETUP_FP64
+#pragma OPENCL EXTENSION cl_khr_fp64 : enable
+typedef double real;
+#define REAL(x) x
+#else
+typedef float real;
+#define REAL(x) x##f
+#endif
+
+// indices into the uniform buffer `view`
+enum {
+    VIEW_R = 0,          // 9: world to camera rotation, row-major
+    VIEW_T = 9,          // 3: camera-space position of the cloud's origin [m]
+    VIEW_EYE = 12,       // 3: camera centre relative to the cloud's origin [m]
+    VIEW_FX = 15, VIEW_FY, VIEW_CX, VIEW_CY,  // intrinsics of the sample grid [samples]
+    VIEW_NEAR, VIEW_FAR, // [m]
+    VIEW_LOG_CUT,        // ln(alpha cut-off)
+    VIEW_WIDTH, VIEW_HEIGHT,  // of the sample grid
+    VIEW_FILTER,         // (pixels per sample)^2, for filters that are defined in pixels
+    VIEW_COUNT
+};
+
+#define CULLED 0xFFFFFFFFu   // sort key of a splat that is not drawn

@@ -1,0 +1,144 @@
+// Index space: one work-item per splat.
+// Reads:  view, means, quats, scales, opacities, and what the colour slot and the taps ask for.
+// Writes: splats[i], bounds[i] of visible splats; keys[i]: depth key, or CULLED.
+//
+// The set-up is done in `real` (double where there is one) from float inputs (numerics B1).
+
+// Regular polygon around the R-sigma circle, clipped against the near plane and projected: the bounds of a disk that
+// crosses it (numerics A1 iii). Returns false if nothing is left.
+#define POLYGON 16
+static inline bool clipped_box(real3_ tu, real3_ tv, real3_ tw, real radius, real near, real *box) {
+    real around = radius / cos(REAL(3.14159265358979323846) / POLYGON);
+    box[0] = box[2] = INFINITY;
+    box[1] = box[3] = -INFINITY;
+    real u0 = around, v0 = 0, z0 = tw.x * u0 + tw.z;
+    for (int k = 1; k <= POLYGON; k++) {
+        real angle = REAL(6.28318530717958647692) * k / POLYGON;
+        real u1 = around * cos(angle), v1 = around * sin(angle), z1 = tw.x * u1 + tw.y * v1 + tw.z;
+        real cut = (near - z0) / (z1 - z0);
+        bool crosses = (z0 >= near) != (z1 >= near);
+        for (int end = 0; end < 2; end++) {
+            if (end == 0 ? !crosses : !(z1 >= near)) continue;
+            real u = end == 0 ? u0 + cut * (u1 - u0) : u1, v = end == 0 ? v0 + cut * (v1 - v0) : v1;
+            real z = end == 0 ? near : z1;
+            real x = (tu.x * u + tu.y * v + tu.z) / z, y = (tv.x * u + tv.y * v + tv.z) / z;
+            box[0] = fmin(box[0], x);
+            box[1] = fmax(box[1], x);
+            box[2] = fmin(box[2], y);
+            box[3] = fmax(box[3], y);
+        }
+        u0 = u1, v0 = v1, z0 = z1;
+    }
+    return box[0] <= box[1];
+}
+
+static inline real3_ rotate_to_camera(global const real *view, real3_ v) {
+    real3_ c = {view[0] * v.x + view[1] * v.y + view[2] * v.z, view[3] * v.x + view[4] * v.y + view[5] * v.z,
+                view[6] * v.x + view[7] * v.y + view[8] * v.z};
+    return c;
+}
+
+//@@ camera
+//@@ functions
+
+kernel void project(
+    uint count,
+    global const real *restrict view,
+    global const float *restrict means,       // (n, 3) [m], relative to the cloud's origin
+    global const float *restrict quats,       // (n, 4) w x y z
+    global const float *restrict scales,      // (n, 2) [m]
+    global const float *restrict opacities,   // (n)
+    global Splat *restrict splats,            // (n)
+    global Bounds *restrict all_bounds,       // (n)
+    global uint *restrict keys                // (n)
+//@@ project_args
+) {
+    uint i = get_global_id(0);
+    if (i >= count) return;
+    keys[i] = CULLED;
+
+    float log_opacity = (float)log((real)opacities[i]);
+    float half_r2 = log_opacity - (float)view[VIEW_LOG_CUT];
+    if (!(half_r2 > 0.0f)) return;
+
+    // columns of the splat's rotation, from the quaternion as it is (no unit length assumed)
+    real w = quats[4 * i], x = quats[4 * i + 1], y = quats[4 * i + 2], z = quats[4 * i + 3];
+    real s = REAL(2.0) / (w * w + x * x + y * y + z * z);
+    real3_ tangent_u = {1 - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y)};
+    real3_ tangent_v = {s * (x * y - w * z), 1 - s * (x * x + z * z), s * (y * z + w * x)};
+    real3_ mean = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
+
+    real3_ a = rotate_to_camera(view, tangent_u), b = rotate_to_camera(view, tangent_v);
+    real su = scales[2 * i], sv = scales[2 * i + 1];
+    a.x *= su; a.y *= su; a.z *= su;
+    b.x *= sv; b.y *= sv; b.z *= sv;
+    real3_ p = rotate_to_camera(view, mean);
+    p.x += view[VIEW_T]; p.y += view[VIEW_T + 1]; p.z += view[VIEW_T + 2];
+    real pz = p.z, near = view[VIEW_NEAR];
+
+    // depth range of the disk (numerics A3)
+    real radius = sqrt(REAL(2.0) * half_r2);
+    real reach = radius * sqrt(a.z * a.z + b.z * b.z);
+    if (!(pz + reach >= near) || !(pz - reach <= view[VIEW_FAR])) return;
+
+    real3_ row_x = {a.x, b.x, p.x}, row_y = {a.y, b.y, p.y}, tw = {a.z, b.z, p.z};
+    real3_ tu = image_row(view[VIEW_FX], view[VIEW_CX], row_x, tw);
+    real3_ tv = image_row(view[VIEW_FY], view[VIEW_CY], row_y, tw);
+    real center_x, center_y;
+    Bounds bounds;
+    if (pz - reach >= near) {
+        center_x = tu.z / pz;
+        center_y = tv.z / pz;
+        real3_ cu = image_row(view[VIEW_FX], view[VIEW_CX] - center_x, row_x, tw);
+        real3_ cv = image_row(view[VIEW_FY], view[VIEW_CY] - center_y, row_y, tw);
+        bounds = ellipse_bounds(cu, cv, tw, center_x, center_y, radius * radius);
+    } else {
+        real box[4];
+        if (!clipped_box(tu, tv, tw, radius, near, box)) return;
+        bounds = box_bounds(box[0], box[1], box[2], box[3]);
+        center_x = pz >= near ? tu.z / pz : bounds.ex;
+        center_y = pz >= near ? tv.z / pz : bounds.ey;
+    }
+//@@ bounds_make
+    int width = (int)view[VIEW_WIDTH], height = (int)view[VIEW_HEIGHT];
+    int y0, y1;
+    bounds_rows(&bounds, height, &y0, &y1);
+    float x0, x1;
+    bounds_span(&bounds, (float)y0 + 0.5f, (float)y1 - 0.5f, &x0, &x1);
+    // written so that a NaN is culled (numerics E1)
+    if (!(y0 < y1 && ceil(x0 - 0.5f) <= (float)(width - 1) && floor(x1 - 0.5f) >= 0.0f)) return;
+
+    // re-anchor at the pixel of the picture that is nearest to the centre
+    int anchor_i = (int)clamp(floor((float)center_x), 0.0f, (float)(width - 1));
+    int anchor_j = (int)clamp(floor((float)center_y), 0.0f, (float)(height - 1));
+    real anchor_x = anchor_i + REAL(0.5), anchor_y = anchor_j + REAL(0.5);
+    tu = image_row(view[VIEW_FX], view[VIEW_CX] - anchor_x, row_x, tw);
+    tv = image_row(view[VIEW_FY], view[VIEW_CY] - anchor_y, row_y, tw);
+    real3_ k0 = cross3(tu, tv), kx = cross3(tv, tw), ky = cross3(tw, tu);   // (n_u, n_v, D): constant, per x, per y
+    real determinant = dot3(tw, k0);
+    real steepest = fmax(fmax(fabs(kx.x), fabs(ky.x)), fmax(fabs(kx.y), fabs(ky.y)));
+    if (!(steepest > 0 && steepest < (real)INFINITY)) return;
+    real scale = (determinant < 0 ? -1 : 1) / steepest;
+    real n_scale = scale * REAL(0.70710678118654752440);   // so that q / D^2 is rho / 2
+
+    // Edge-on within rounding: the plane has no visible side, only the low-pass may draw the splat (numerics B2).
+    real size = sqrt(dot3(tw, tw) * dot3(k0, k0));
+    real facing = fabs(determinant) > (SETUP_FP64 ? REAL(1e-13) : REAL(1e-6)) * size ? scale : 0;
+    real z_numerator = determinant * facing;                               // depth = z_numerator / D
+
+    Splat record;
+    record.nu0 = (float)(k0.x * n_scale); record.nux = (float)(kx.x * n_scale); record.nuy = (float)(ky.x * n_scale);
+    record.nv0 = (float)(k0.y * n_scale); record.nvx = (float)(kx.y * n_scale); record.nvy = (float)(ky.y * n_scale);
+    record.d0 = (float)(k0.z * facing); record.dx = (float)(kx.z * facing); record.dy = (float)(ky.z * facing);
+    record.d_near = (float)(z_numerator / near);
+    record.log_opacity = log_opacity;
+    record.ax = (short)anchor_i;
+    record.ay = (short)anchor_j;
+    record.y0 = (short)y0;
+    record.y1 = (short)y1;
+//@@ color
+//@@ project
+    splats[i] = record;
+    all_bounds[i] = bounds;
+    keys[i] = sortable((float)pz);
+}

@@ -1,0 +1,48 @@
+// Counting sort without atomics: a list is cut into CHUNKS contiguous pieces, each piece counts its bins in its own row
+// of table[CHUNKS][bins]. These two kernels turn the counts into places; equal bins keep the list's order.
+
+// Index space: one work-item per bin.
+// Reads and writes: table (counts become offsets within the bin). Writes: totals[bins].
+kernel void scan_chunks(uint bins, global uint *restrict table, global uint *restrict totals) {
+    uint bin = get_global_id(0);
+    if (bin >= bins) return;
+    uint sum = 0;
+    for (uint chunk = 0; chunk < CHUNKS; chunk++) {
+        uint here = table[(size_t)chunk * bins + bin];
+        table[(size_t)chunk * bins + bin] = sum;
+        sum += here;
+    }
+    totals[bin] = sum;
+}
+
+// Index space: one work-group of SCAN_ITEMS.
+// Reads: totals[bins]. Writes: starts[bins + 1], exclusive prefix; counts[slot] and counts[slot + 1], the sum in 64 bits.
+kernel void scan_bins(uint bins, global const uint *restrict totals, global uint *restrict starts,
+                      global uint *restrict counts, uint slot) {
+    local ulong partial[SCAN_ITEMS + 1];
+    uint item = get_local_id(0);
+    uint each = (bins + SCAN_ITEMS - 1) / SCAN_ITEMS;
+    uint from = min(item * each, bins), to = min(from + each, bins);
+    ulong sum = 0;
+    for (uint bin = from; bin < to; bin++) sum += totals[bin];
+    partial[item] = sum;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (item == 0) {
+        ulong running = 0;
+        for (uint k = 0; k < SCAN_ITEMS; k++) {
+            ulong here = partial[k];
+            partial[k] = running;
+            running += here;
+        }
+        partial[SCAN_ITEMS] = running;
+        starts[bins] = (uint)running;
+        counts[slot] = (uint)running;
+        counts[slot + 1] = (uint)(running >> 32);
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    sum = partial[item];
+    for (uint bin = from; bin < to; bin++) {
+        starts[bin] = (uint)sum;
+        sum += totals[bin];
+    }
+}

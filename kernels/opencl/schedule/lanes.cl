@@ -1,0 +1,51 @@
+// For CPUs: one work-item draws one tile, a row of LANES pixels at a time; no barriers, no local memory.
+// Index space: one work-item (and work-group) per tile.
+// Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 planes: r, g, b, transmittance) and the taps' planes, whole tiles.
+kernel void blend(
+    global const Splat *restrict splats,
+    global const uint *restrict lists,
+    global const uint *restrict starts,
+    int width, int height,
+    float log_cut, float ceiling, float stop, float filter,
+    global float *restrict raw
+//@@ blend_args
+) {
+    const BlendConstants constants = {log_cut, ceiling, stop, filter};
+    uint tile = get_global_id(0);
+    int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
+    int x0 = (int)(tile % (uint)tiles_x) * TILE_W, y0 = (int)(tile / (uint)tiles_x) * TILE_H;
+
+    Pixel pixels[TILE_H];
+    for (int row = 0; row < TILE_H; row++) pixel_start(&pixels[row]);
+    // rows that still let light through; those below the picture never do
+    int rows = min(height - y0, TILE_H);
+    uint alive = rows == 32 ? 0xFFFFFFFFu : (1u << rows) - 1u;
+
+    for (uint k = starts[tile], end = starts[tile + 1]; k < end && alive; k++) {
+        const Splat s = splats[lists[k]];
+        float half_r2 = s.log_opacity - constants.log_cut;
+        int first = max(s.y0 - y0, 0), last = min(s.y1 - y0, TILE_H);
+        vfloat x = (vfloat)(float)(x0 - s.ax) + VLANE;
+        vfloat nu_x = FMA((vfloat)s.nux, x, (vfloat)s.nu0);
+        vfloat nv_x = FMA((vfloat)s.nvx, x, (vfloat)s.nv0);
+        vfloat d_x = FMA((vfloat)s.dx, x, (vfloat)s.d0);
+        for (int row = first; row < last; row++) {
+            if (!(alive >> row & 1u)) continue;
+            float y = (float)(y0 + row - s.ay);
+            Crossing c = cross_row(&s, nu_x, nv_x, d_x, y, half_r2);
+            vfloat screen;
+            vint mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
+            if (!VANY(mask)) continue;
+            pixel_blend(&pixels[row], &s, c, mask, screen, &constants);
+            if (!VANY(VMASK(pixels[row].t > constants.stop))) alive &= ~(1u << row);
+        }
+    }
+
+    size_t stride = (size_t)tiles_x * TILE_W, plane = stride * tiles_y * TILE_H;
+    for (int row = 0; row < TILE_H; row++) {
+        size_t at = (y0 + row) * stride + x0;
+        const Pixel *pixel = &pixels[row];
+        PIXEL_STORE_BASE(pixel, raw, plane, at);
+//@@ store
+    }
+}

@@ -1,0 +1,10 @@
+// No low-pass: the exact splat.
+//@ fragment_mask
+static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, float y, float half_r2, float filter,
+                                 vfloat *screen) {
+    return c.inside;
+}
+//@ fragment_half_rho
+static inline vfloat fragment_half_rho(Crossing c, vfloat inverse_d, vfloat screen) {
+    return (c.q * inverse_d) * inverse_d;
+}

@@ -1,0 +1,39 @@
+// The screen-space low-pass of 2DGS (Huang et al. 2024, eq. 11, sigma = sqrt(1/2) px): rho = min(rho_3d, 2 d^2) with d
+// the distance in pixels from the projected centre (numerics A6). The dot belongs to the centre: it is drawn if the centre
+// lies beyond the near plane, whatever the ray through the pixel does (numerics B2).
+//@ record
+    float fx, fy;           // projected centre relative to the anchor's centre; far away if it is not drawn
+//@ bounds
+    float px, py, pr;       // the filter's support: centre and radius [samples]; radius < 0: none
+//@ bounds_make
+        bounds.px = (float)center_x;
+        bounds.py = (float)center_y;
+        bounds.pr = pz >= near ? sqrt(half_r2 / (float)view[VIEW_FILTER]) * (1.0f + BOUNDS_PAD_RELATIVE) + BOUNDS_PAD : -1.0f;
+//@ bounds_span
+    float dot_low = fmax(y0 - b->py, -b->pr), dot_high = fmin(y1 - b->py, b->pr);
+    if (dot_low <= dot_high) {
+        float at = clamp(0.0f, dot_low, dot_high);
+        float half_chord = sqrt(fmax(b->pr * b->pr - at * at, 0.0f)) + BOUNDS_PAD;
+        *x0 = fmin(*x0, b->px - half_chord);
+        *x1 = fmax(*x1, b->px + half_chord);
+    }
+//@ bounds_rows
+    if (b->pr >= 0.0f) {
+        low = fmin(low, b->py - b->pr);
+        high = fmax(high, b->py + b->pr);
+    }
+//@ project
+        record.fx = pz >= near ? (float)(center_x - anchor_x) : 1e18f;
+        record.fy = pz >= near ? (float)(center_y - anchor_y) : 1e18f;
+//@ fragment_mask
+static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, float y, float half_r2, float filter,
+                                 vfloat *screen) {
+    vfloat ex = x - s->fx;
+    float ey = y - s->fy;
+    *screen = FMA(ex, ex, (vfloat)(ey * ey)) * filter;
+    return c.inside | VMASK(*screen <= half_r2);
+}
+//@ fragment_half_rho
+static inline vfloat fragment_half_rho(Crossing c, vfloat inverse_d, vfloat screen) {
+    return VSELECT(screen, fmin((c.q * inverse_d) * inverse_d, screen), c.inside);
+}

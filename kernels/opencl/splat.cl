@@ -1,0 +1,44 @@
+// The ONE ray-splat crossing and weight (2DGS, Huang et al. 2024, section 4; numerics.md section 0, facts 1 to 3).
+//
+// Rows Tu, Tv, Tw of M = K [a b p] (a, b scaled tangents, p centre, camera space). The ray through pixel (x, y)
+// meets the splat's plane at (u, v) with (u, v, 1) D = (n_u, n_v, D) = Tu x Tv + x (Tv x Tw) + y (Tw x Tu):
+// numerators and denominator are affine in the pixel. They are kept relative to an integer anchor pixel near the
+// splat, so that x - anchor is exact and nothing cancels (numerics B1), with a common factor that makes D > 0 in
+// front of the camera, and sqrt(1/2) in the numerators, so that (n_u^2 + n_v^2) / D^2 is rho / 2.
+
+typedef struct {
+    float nu0, nux, nuy;    // n_u = nu0 + nux x + nuy y
+    float nv0, nvx, nvy;
+    float d0, dx, dy;       // D
+    float d_near;           // D at depth `near`: a fragment is in front of the near plane if D <= d_near
+    float log_opacity;
+    float r, g, b;
+    short ax, ay;           // anchor pixel
+    short y0, y1;           // rows [y0, y1) that the splat can touch
+//@@ record
+} Splat;
+
+typedef char record_size_agrees_with_the_host[(sizeof(Splat) == RECORD_BYTES) ? 1 : -1];
+
+typedef struct {
+    vfloat d;               // denominator
+    vfloat q;               // n_u^2 + n_v^2
+    vint inside;            // the ray meets the splat's plane within R and beyond the near plane
+} Crossing;
+
+// Affine forms at a row: `*_x` are the parts that do not change along the tile's rows.
+static inline Crossing cross_row(const Splat *s, vfloat nu_x, vfloat nv_x, vfloat d_x, float y, float half_r2) {
+    Crossing c;
+    vfloat nu = FMA((vfloat)s->nuy, (vfloat)y, nu_x);
+    vfloat nv = FMA((vfloat)s->nvy, (vfloat)y, nv_x);
+    c.d = FMA((vfloat)s->dy, (vfloat)y, d_x);
+    c.q = FMA(nu, nu, nv * nv);
+    // product form: no division, and no special value of D (numerics B2)
+    c.inside = VMASK(c.q <= half_r2 * (c.d * c.d)) & VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);
+    return c;
+}
+
+// alpha of a fragment at half squared distance rho / 2
+static inline vfloat splat_alpha(const Splat *s, vfloat half_rho, float ceiling) {
+    return fmin(exp(s->log_opacity - half_rho), (vfloat)ceiling);
+}

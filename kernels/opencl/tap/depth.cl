@@ -1,0 +1,23 @@
+// depth (h, w): expected depth along z [m], sum w z / sum w; 0 where nothing was drawn.
+//@ state
+    vfloat depth, depth_weight;
+//@ start
+    pixel->depth = 0.0f;
+    pixel->depth_weight = 0.0f;
+//@ fragment
+    pixel->depth = FMA(weight, fragment_z, pixel->depth);
+    pixel->depth_weight += weight;
+//@ blend_args
+    , global float *restrict depth_raw       // 2 planes: sum w z, sum w
+//@ store
+        VSTORE(pixel->depth, depth_raw + at);
+        VSTORE(pixel->depth_weight, depth_raw + plane + at);
+//@ resolve_args
+    , global const float *restrict depth_raw, global float *restrict depth_out
+//@ resolve_start
+    float depth = 0, depth_weight = 0;
+//@ resolve_sample
+            depth += depth_raw[at];
+            depth_weight += depth_raw[plane + at];
+//@ resolve_end
+    depth_out[out] = depth_weight > 0 ? depth / depth_weight : 0.0f;

@@ -1,0 +1,27 @@
+// depth_median (h, w): depth [m] of the last fragment in front of which more than half of the light remains; 0 where nothing
+// was drawn. Of several samples per pixel the lower median of those that hit something.
+//@ state
+    vfloat depth_median;
+//@ start
+    pixel->depth_median = 0.0f;
+//@ fragment
+    pixel->depth_median = VSELECT(pixel->depth_median, fragment_z, live & VMASK(pixel->t > 0.5f));
+//@ blend_args
+    , global float *restrict depth_median_raw
+//@ store
+        VSTORE(pixel->depth_median, depth_median_raw + at);
+//@ resolve_args
+    , global const float *restrict depth_median_raw, global float *restrict depth_median_out
+//@ resolve_start
+    float depth_medians[SAMPLES * SAMPLES];
+    int depth_median_hits = 0;
+//@ resolve_sample
+            float median_here = depth_median_raw[at];
+            if (median_here > 0.0f) {
+                int place = depth_median_hits++;
+                for (; place > 0 && depth_medians[place - 1] > median_here; place--)
+                    depth_medians[place] = depth_medians[place - 1];
+                depth_medians[place] = median_here;
+            }
+//@ resolve_end
+    depth_median_out[out] = depth_median_hits > 0 ? depth_medians[(depth_median_hits - 1) / 2] : 0.0f;

@@ -1,0 +1,42 @@
+// normal (h, w, 3): unit normal in the camera frame, towards the camera, of the mean of the splats' normals by weight; 0 where
+// nothing was drawn.
+//@ record
+    float nx, ny, nz;
+//@ project
+    real3_ normal = cross3(a, b);
+    // the camera is on one side of the whole plane, so the sign is the splat's (numerics B7)
+    real normal_length = sqrt(dot3(normal, normal));
+    real towards = (dot3(normal, p) > 0 ? -1 : 1) / (normal_length > 0 ? normal_length : 1);
+    record.nx = (float)(normal.x * towards);
+    record.ny = (float)(normal.y * towards);
+    record.nz = (float)(normal.z * towards);
+//@ state
+    vfloat normal_x, normal_y, normal_z;
+//@ start
+    pixel->normal_x = 0.0f;
+    pixel->normal_y = 0.0f;
+    pixel->normal_z = 0.0f;
+//@ fragment
+    pixel->normal_x = FMA(weight, (vfloat)s->nx, pixel->normal_x);
+    pixel->normal_y = FMA(weight, (vfloat)s->ny, pixel->normal_y);
+    pixel->normal_z = FMA(weight, (vfloat)s->nz, pixel->normal_z);
+//@ blend_args
+    , global float *restrict normal_raw      // 3 planes
+//@ store
+        VSTORE(pixel->normal_x, normal_raw + at);
+        VSTORE(pixel->normal_y, normal_raw + plane + at);
+        VSTORE(pixel->normal_z, normal_raw + 2 * plane + at);
+//@ resolve_args
+    , global const float *restrict normal_raw, global float *restrict normal_out
+//@ resolve_start
+    float normal_x = 0, normal_y = 0, normal_z = 0;
+//@ resolve_sample
+            normal_x += normal_raw[at];
+            normal_y += normal_raw[plane + at];
+            normal_z += normal_raw[2 * (size_t)plane + at];
+//@ resolve_end
+    float normal_length = sqrt(normal_x * normal_x + normal_y * normal_y + normal_z * normal_z);
+    float normal_scale = normal_length > 0 ? 1.0f / normal_length : 0.0f;
+    normal_out[3 * out] = normal_x * normal_scale;
+    normal_out[3 * out + 1] = normal_y * normal_scale;
+    normal_out[3 * out + 2] = normal_z * normal_scale;
