@@ -87,3 +87,25 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
             raise InputError(f"{name} must be rigid (rotation and translation), but it scales by {scale:g}")
         return linear, 1.0, m[:3, 3]
     return rotation, scale, m[:3, 3]
+
+
+def rigid_matrix(position, quaternion=(1.0, 0.0, 0.0, 0.0), scale: float = 1.0) -> np.ndarray:
+    """4x4 float64 matrix that scales, then turns by a quaternion (w, x, y, z) of any length, then moves.
+
+    Raises InputError when position is not three finite numbers, quaternion not four or all 0, or scale not
+    above 0.
+    """
+    move, turn = np.asarray(position, np.float64), np.asarray(quaternion, np.float64)
+    if move.shape != (3,) or not np.isfinite(move).all():
+        raise InputError(f"position must be three finite numbers, not {position!r}")
+    length = np.linalg.norm(turn) if turn.shape == (4,) else np.nan
+    if not (0 < length < np.inf):
+        raise InputError(
+            f"quaternion must be four finite numbers (w, x, y, z), not all 0, but it is {quaternion!r}"
+        )
+    if not (0 < scale < np.inf):
+        raise InputError(f"scale must be above 0 and finite, not {scale!r}")
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * quaternion_to_matrix(turn)
+    matrix[:3, 3] = move
+    return matrix

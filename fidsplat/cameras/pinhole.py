@@ -74,10 +74,8 @@ class Camera:
         fov_x: horizontal field of view in radians, between 0 and pi. up: the world direction that points up
         in the picture; by default -y, so that y points down as it does in a marker.
         """
-        width, height, fov_x = _size("width", width), _size("height", height), _number("fov_x", fov_x)
-        if not 0 < fov_x < math.pi:
-            raise InputError(f"camera fov_x must lie between 0 and pi radians, not {fov_x!r}")
-        f = width / 2 / math.tan(fov_x / 2)
+        width, height = _size("width", width), _size("height", height)
+        f = focal_length(width, fov_x)
         pose = look_at_matrix(position, target, up)
         return Camera(width, height, f, f, width / 2, height / 2, pose, near, far)
 
@@ -99,6 +97,17 @@ class Camera:
         x, y, z = (world @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]).T
         z = np.where(z > 0, z, np.nan)
         return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=1)
+
+
+def focal_length(width: int, fov_x: float) -> float:
+    """Focal length in pixels of a camera ``width`` pixels wide that sees ``fov_x`` radians from side to side.
+
+    Raises InputError when fov_x does not lie between 0 (above 1e-9) and pi.
+    """
+    angle = _number("fov_x", fov_x)
+    if not 1e-9 < angle < math.pi:
+        raise InputError(f"camera fov_x must lie between 0 and pi radians (180 degrees), not {angle!r}")
+    return width / 2 / math.tan(angle / 2)
 
 
 def look_at_matrix(position, target, up=(0.0, -1.0, 0.0)) -> np.ndarray:

@@ -1,0 +1,139 @@
+"""Scene files: TOML in, Scene out."""
+
+import math
+import os
+import tomllib
+from pathlib import Path
+
+from fidsplat.cameras import Camera, focal_length, look_at_matrix
+from fidsplat.errors import InputError
+from fidsplat.quality import Quality
+from fidsplat.rotations import rigid_matrix
+from fidsplat.scenes.scene import PlacedMarker, Scene
+from fidsplat.scenes.table import Table
+from fidsplat.splats import SplatCloud
+
+MAX_BYTES = 16 * 2**20
+TOP = ("camera", "splats", "markers", "render")
+CAMERA = ("width", "height", "fov_x_deg", "fx", "fy", "cx", "cy")
+CAMERA += ("position", "look_at", "up", "world_to_camera", "near", "far")
+SPLATS = ("file", "position", "quaternion", "scale")
+MARKERS = ("spec", "size", "position", "quaternion", "mixture", "quiet_zone")
+RENDER = ("outputs", "background", "quality", "samples", "device")
+IMAGE = "image:"
+
+
+def read_scene(path: str | os.PathLike[str]) -> Scene:
+    """The scene of a file and of the splat and image files that it names, which are looked for beside it.
+
+    Raises InputError, naming the file and the key, for whatever is wrong.
+    """
+    file = Path(path)
+    top = Table(_parse(file), str(file), "", TOP)
+    camera = _camera(top.table("camera", CAMERA)) if "camera" in top else None
+    render = top.table("render", RENDER)
+    return Scene(
+        clouds=tuple(_splats(table, file.parent) for table in top.tables("splats", SPLATS)),
+        camera=camera,
+        markers=tuple(_marker(table, file.parent) for table in top.tables("markers", MARKERS)),
+        background=render.numbers("background", 3, (0.0, 0.0, 0.0)),
+        outputs=render.texts("outputs", ("rgb",)),
+        quality=_quality(render),
+        device=render.text("device", None),
+    )
+
+
+def _parse(file: Path) -> dict:
+    try:
+        with file.open("rb") as stream:
+            content = stream.read(MAX_BYTES + 1)
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read {file}: {getattr(error, 'strerror', None) or error}") from error
+    if len(content) > MAX_BYTES:
+        raise InputError(f"{file} is longer than {MAX_BYTES} bytes, which no scene file is")
+    try:
+        return tomllib.loads(content.decode("utf-8"))
+    except UnicodeDecodeError:
+        raise InputError(f"{file} is not a scene file: it is not text in UTF-8") from None
+    except RecursionError:
+        raise InputError(f"{file} is not a scene file: its lists are nested too deeply") from None
+    except ValueError as error:  # TOMLDecodeError, and what int() says to a number of thousands of digits
+        raise InputError(f"{file} is not a scene file in TOML: {error}") from None
+
+
+def _camera(table: Table) -> Camera:
+    width, height = table.whole("width"), table.whole("height")
+    near, far = table.number("near", 0.01), table.number("far", math.inf, infinite=True)
+    if "fov_x_deg" in table:
+        for key in ("fx", "fy"):
+            if key in table:
+                raise table.error(key, "and fov_x_deg exclude each other")
+        degrees = table.number("fov_x_deg")
+        with table.at("fov_x_deg"):
+            fx = fy = focal_length(width, math.radians(degrees))
+    elif "fx" in table or "fy" in table:
+        fx, fy = table.number("fx"), table.number("fy")
+    else:
+        raise table.error("fov_x_deg", "is missing (or fx and fy)")
+    cx, cy = table.number("cx", width / 2), table.number("cy", height / 2)
+    if "world_to_camera" in table:
+        for key in ("position", "look_at", "up"):
+            if key in table:
+                raise table.error(key, "and world_to_camera exclude each other")
+        pose = table.matrix("world_to_camera")
+    else:
+        if "position" not in table:
+            raise table.error("position", "is missing (position and look_at, or world_to_camera)")
+        position, look_at = table.numbers("position", 3), table.numbers("look_at", 3)
+        with table.at("look_at"):
+            pose = look_at_matrix(position, look_at, table.numbers("up", 3, (0.0, -1.0, 0.0)))
+    with table.at():
+        return Camera.pinhole(width, height, fx, fy, cx, cy, pose, near, far)
+
+
+def _pose(table: Table, scale: float = 1.0):
+    position, quaternion = (
+        table.numbers("position", 3, (0.0,) * 3),
+        table.numbers("quaternion", 4, (1.0, 0, 0, 0)),
+    )
+    with table.at("quaternion"):
+        return rigid_matrix(position, quaternion, scale)
+
+
+def _splats(table: Table, folder: Path) -> SplatCloud:
+    from fidsplat.formats import load_ply
+
+    name, scale = table.text("file"), table.number("scale", 1.0)
+    if not scale > 0:
+        raise table.error("scale", f"must be above 0, not {scale!r}")
+    pose = _pose(table, scale)
+    with table.at("file"):
+        cloud = load_ply(folder / name)
+        moved = any(key in table for key in ("position", "quaternion", "scale"))
+        return cloud.transformed(pose) if moved else cloud
+
+
+def _marker(table: Table, folder: Path) -> PlacedMarker:
+    from fidsplat.markers import marker
+
+    spec, size = table.text("spec"), table.number("size")
+    if not size > 0:
+        raise table.error("size", f"must be above 0 metres, not {size!r}")
+    if spec.startswith(IMAGE):
+        spec = IMAGE + str(folder / spec.removeprefix(IMAGE))
+    pose = _pose(table)
+    quiet_zone, mixture = table.whole("quiet_zone", None), table.text("mixture", "fitted")
+    if quiet_zone is not None and quiet_zone < 0:
+        raise table.error("quiet_zone", f"must be 0 or more modules, not {quiet_zone}")
+    with table.at():
+        return PlacedMarker(marker(spec, size=size, mixture=mixture, quiet_zone=quiet_zone), pose)
+
+
+def _quality(table: Table) -> Quality | str | None:
+    name = table.text("quality", None)
+    with table.at("quality"):
+        quality = Quality.of(name)
+    if "samples" not in table:
+        return name
+    with table.at("samples"):
+        return quality.with_(samples=table.whole("samples"))

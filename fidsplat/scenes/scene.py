@@ -1,0 +1,122 @@
+"""Scene and PlacedMarker: what is drawn, and how it is looked at."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.errors import InputError
+from fidsplat.rotations import check_similarity
+from fidsplat.splats import SplatCloud
+
+if TYPE_CHECKING:
+    from fidsplat.markers import Marker
+    from fidsplat.quality import Quality
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedMarker:
+    """A marker somewhere in the world. Raises InputError when the pose is not rigid."""
+
+    marker: Marker
+    pose: np.ndarray = field(default_factory=lambda: np.eye(4))
+    """(4, 4) float64, world_from_marker, rigid, read-only"""
+    label: int = 1
+    """label of its splats; a Scene numbers its markers 1, 2, ..."""
+
+    def __post_init__(self) -> None:
+        check_similarity(self.pose, "a marker's pose", rigid=True)
+        pose = np.array(self.pose, dtype=np.float64)
+        pose.flags.writeable = False
+        object.__setattr__(self, "pose", pose)
+
+    @property
+    def corners(self) -> np.ndarray:
+        """Corners (4, 3) float64 of the code's outer edge in the world: top left, top right, bottom right,
+        bottom left."""
+        return np.asarray(self.marker.corners, np.float64) @ self.pose[:3, :3].T + self.pose[:3, 3]
+
+    def cloud(self) -> SplatCloud:
+        """The marker's splats in the world, all with its label."""
+        return self.marker.cloud.transformed(self.pose).with_labels(self.label)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What is drawn and how. Raises InputError for a part of the wrong kind."""
+
+    clouds: tuple[SplatCloud, ...] = ()
+    """splats in the world, with labels of their own (0 unless given)"""
+    camera: Camera | None = None
+    markers: tuple[PlacedMarker, ...] = ()
+    """marker i has the label i + 1, whatever label it came with"""
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """RGB in display space"""
+    outputs: tuple[str, ...] = ("rgb",)
+    """names of the planes that are rendered"""
+    quality: Quality | str | None = None
+    """a Quality, a preset's name, or None for the default"""
+    device: str | None = None
+    """a device's name, or None for the default"""
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__
+        put(self, "clouds", _all_of(self.clouds, SplatCloud, "clouds"))
+        placed = _all_of(self.markers, PlacedMarker, "markers")
+        put(self, "markers", tuple(replace(marker, label=i + 1) for i, marker in enumerate(placed)))
+        if not isinstance(self.camera, Camera | None):
+            raise InputError(f"camera must be a Camera, not {self.camera!r}")
+        try:
+            background = tuple(float(value) for value in self.background)
+        except (TypeError, ValueError):
+            background = ()
+        if len(background) != 3 or not all(map(math.isfinite, background)):
+            raise InputError(f"background must be three finite numbers, not {self.background!r}")
+        put(self, "background", background)
+        outputs = (self.outputs,) if isinstance(self.outputs, str) else tuple(self.outputs)
+        if not outputs or not all(isinstance(name, str) for name in outputs):
+            raise InputError(f"outputs must be one or more names, not {self.outputs!r}")
+        put(self, "outputs", outputs)
+
+    def cloud(self) -> SplatCloud:
+        """All splats in one cloud: the clouds' in their order with their own labels, then each marker's."""
+        return self._merged
+
+    @cached_property
+    def _merged(self) -> SplatCloud:
+        return SplatCloud.concatenate([*self.clouds, *(marker.cloud() for marker in self.markers)])
+
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> Scene:
+        """Read a scene file (docs/scene-files.md). Raises InputError, naming file and key, for whatever is
+        wrong."""
+        from fidsplat.scenes.read import read_scene
+
+        return read_scene(path)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a scene file, and beside it one PLY file STEM-splats-I.ply for each of ``clouds``.
+
+        Raises InputError when a file cannot be written, or a marker or Quality cannot be said in a scene
+        file.
+        """
+        from fidsplat.scenes.write import write_scene
+
+        write_scene(self, path)
+
+
+def _all_of(values: Iterable, kind: type, name: str) -> tuple:
+    try:
+        found = tuple(values)
+    except TypeError:
+        found = (None,)
+    if not all(isinstance(value, kind) for value in found):
+        raise InputError(f"{name} must be a list of {kind.__name__}")
+    return found

@@ -1,0 +1,104 @@
+"""Scene files: Scene in, TOML and PLY files out."""
+
+import os
+from pathlib import Path
+
+from fidsplat.errors import InputError
+from fidsplat.files import atomic_write
+from fidsplat.formats import save_ply
+from fidsplat.quality import PRESETS, Quality
+from fidsplat.rotations import matrix_to_quaternion
+from fidsplat.scenes.read import IMAGE
+from fidsplat.scenes.scene import PlacedMarker, Scene
+
+
+def write_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
+    """Write STEM-splats-I.ply for each cloud, then the scene file, so that it never names a file that is
+    missing.
+
+    Raises InputError when a file cannot be written, or a marker or Quality cannot be said in a scene file.
+    """
+    file = Path(path)
+    render = _render(scene)
+    markers = [_marker(placed, file.parent) for placed in scene.markers]
+    splats = []
+    for i, cloud in enumerate(scene.clouds):
+        name = f"{file.stem}-splats-{i}.ply"
+        save_ply(cloud, file.parent / name)
+        splats.append({"file": name})
+    parts = [] if scene.camera is None else [_table("[camera]", _camera(scene))]
+    parts += [_table("[[splats]]", table) for table in splats]
+    parts += [_table("[[markers]]", table) for table in markers]
+    parts.append(_table("[render]", render))
+    try:
+        content = "\n".join(parts).encode("utf-8")
+    except UnicodeEncodeError as error:
+        raise InputError(
+            f"cannot write {file}: a text in the scene is not Unicode ({error.reason})"
+        ) from error
+    with atomic_write(file) as stream:
+        stream.write(content)
+
+
+def _camera(scene: Scene) -> dict:
+    camera = scene.camera
+    assert camera is not None
+    keys = ("width", "height", "fx", "fy", "cx", "cy", "near", "far")
+    return {key: getattr(camera, key) for key in keys} | {"world_to_camera": camera.world_to_camera.tolist()}
+
+
+def _marker(placed: PlacedMarker, folder: Path) -> dict:
+    marker = placed.marker
+    spec = marker.spec
+    if spec.startswith(IMAGE):
+        spec = IMAGE + os.path.relpath(spec.removeprefix(IMAGE), folder)
+    return {
+        "spec": spec,
+        "size": float(marker.size),
+        "position": placed.pose[:3, 3].tolist(),
+        "quaternion": matrix_to_quaternion(placed.pose[:3, :3]).tolist(),
+        "mixture": marker.mixture,
+        "quiet_zone": int(marker.quiet_zone),
+    }
+
+
+def _render(scene: Scene) -> dict:
+    table: dict = {"outputs": list(scene.outputs), "background": list(scene.background)}
+    if isinstance(scene.quality, Quality):
+        plain = scene.quality.with_(samples=1)
+        names = [name for name, preset in PRESETS.items() if preset.with_(samples=1) == plain]
+        if not names:
+            raise InputError(
+                "a scene file holds a preset's name and samples; this Quality differs from every preset"
+            )
+        table |= {"quality": names[0], "samples": scene.quality.samples}
+    elif scene.quality is not None:
+        table["quality"] = scene.quality
+    if scene.device is not None:
+        table["device"] = scene.device
+    return table
+
+
+def _table(head: str, values: dict) -> str:
+    return "\n".join([head, *(f"{key} = {_value(value)}" for key, value in values.items()), ""])
+
+
+def _value(value) -> str:
+    if isinstance(value, str):
+        return _string(value)
+    if isinstance(value, list):
+        return f"[{', '.join(map(_value, value))}]"
+    return repr(value)  # int and finite float are written alike in Python and TOML, and so is inf
+
+
+def _string(text: str) -> str:
+    """A TOML basic string: quotes, backslashes and control characters escaped."""
+    parts = []
+    for char in text:
+        if char in '"\\':
+            parts.append("\\" + char)
+        elif ord(char) < 0x20 or ord(char) == 0x7F:
+            parts.append(f"\\u{ord(char):04x}")
+        else:
+            parts.append(char)
+    return '"' + "".join(parts) + '"'
