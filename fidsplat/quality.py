@@ -27,22 +27,22 @@ class Quality:
 
     alpha_cutoff: float = 1.0 / 255.0
     """Contributions below this alpha are not drawn, (0, 1). It sets each splat's radius:
-    R^2 = 2 ln(opacity / cutoff), the same R in bounds and in the per-pixel test. Lower costs area, higher bites
-    haze (research: 100 layers of alpha 0.0039 lose 32 % opacity at 1/255)."""
+    R^2 = 2 ln(opacity / cutoff), the same R in bounds and in the per-pixel test. Lower costs area, higher
+    bites haze (research: 100 layers of alpha 0.0039 lose 32 % opacity at 1/255)."""
 
     transmittance_stop: float = 1e-4
     """A pixel is finished once its transmittance is at or below this, [0, 1). 0 never stops."""
 
     stop_rule: str = "inclusive"
-    """`inclusive`: the fragment that reaches the stop is still drawn. `exclusive` (gsplat, 2DGS authors): it is
-    dropped, which leaks up to 1 % of the background through opaque splats; kept for parity only."""
+    """`inclusive`: the fragment that reaches the stop is still drawn. `exclusive` (gsplat, 2DGS authors): it
+    is dropped, which leaks up to 1 % of the background through opaque splats; kept for parity only."""
 
     opacity_ceiling: float = 1.0
     """Upper bound of one fragment's alpha, (0, 1]. gsplat and the 2DGS authors use 0.99."""
 
     lowpass: str = "screen"
-    """`screen`: the object-space low-pass of 2DGS (a Gaussian of sigma 0.707 px around the projected centre, the
-    larger of the two weights wins). `none`: the exact splat; use it with several samples per pixel."""
+    """`screen`: the object-space low-pass of 2DGS (a Gaussian of sigma 0.707 px around the projected centre,
+    the larger of the two weights wins). `none`: the exact splat; use it with several samples per pixel."""
 
     samples: int = 1
     """n: each pixel is the mean of n x n samples on a regular grid, 1 to 8."""
@@ -108,8 +108,9 @@ class Quality:
 
 
 # gsplat: gsplat 1.5/1.6 `rasterization_2dgs`; surfel: the 2DGS authors' diff-surfel-rasterization.
-# Both clamp alpha at 0.99, cut at 1/255 and drop the fragment that would take T below 1e-4. What differs between
-# them (bounding boxes, low-pass centre, near plane) is a defect of theirs, not a constant: see docs/conventions.md.
+# Both clamp alpha at 0.99, cut at 1/255 and drop the fragment that would take T below 1e-4. What differs
+# between them (bounding boxes, low-pass centre, near plane) is a defect of theirs, not a constant: see
+# docs/conventions.md.
 _PARITY = Quality(opacity_ceiling=0.99, stop_rule="exclusive")
 
 PRESETS: dict[str, Quality] = {

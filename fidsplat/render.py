@@ -18,11 +18,12 @@ from fidsplat.splats import SplatCloud
 
 
 class Frame(Mapping):
-    """A finished picture: a mapping from an output's name to a NumPy array, copied from the device on first use.
+    """A finished picture: a mapping from an output's name to a NumPy array, copied from the device on first
+    use.
 
-    Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median` (h, w) metres along z, 0 where
-    nothing was drawn; `normal` (h, w, 3) unit, camera frame, towards the camera; `label` (h, w) int32, -1 where nothing
-    was drawn.
+    Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median` (h, w) metres along z,
+    0 where nothing was drawn; `normal` (h, w, 3) unit, camera frame, towards the camera; `label` (h, w)
+    int32, -1 where nothing was drawn.
     """
 
     def __init__(self, planes: Planes, outputs: tuple[str, ...]) -> None:
@@ -69,8 +70,8 @@ class Renderer:
     """Draws splats on one device. Compiled pipelines and scratch buffers are kept from picture to picture.
 
     Args:
-        device: "opencl" (the best OpenCL device), "opencl:NAME" (part of a platform's or device's name, or cpu or
-            gpu), or "reference" (NumPy, float64, slow).
+        device: "opencl" (the best OpenCL device), "opencl:NAME" (part of a platform's or device's name, or
+            cpu or gpu), or "reference" (NumPy, float64, slow).
 
     Raises:
         DeviceError: the device cannot be used; UnknownDeviceError: there is no such device.
@@ -102,7 +103,7 @@ class Renderer:
         """Draw one picture.
 
         Args:
-            scene: what to draw. What a Scene says of camera, outputs, quality and background is used where the
+            scene: what to draw. A Scene's own camera, outputs, quality and background are used where the
                 arguments are left out.
             camera: needed unless the scene has one.
             outputs: names of planes; default rgb.
@@ -110,7 +111,8 @@ class Renderer:
             background: (r, g, b) behind the splats; default black.
 
         Raises:
-            InputError: no camera, an unknown output or preset, a picture that is too large, a cloud uploaded elsewhere.
+            InputError: no camera, an unknown output or preset, a picture that is too large, a cloud uploaded
+                elsewhere.
             DeviceError: the device fails or lacks memory.
         """
         own = scene if isinstance(scene, Scene) else Scene([])

@@ -1,7 +1,9 @@
-"""The judge of the other backends: NumPy in float64, every sample of the picture against every splat, no tiles, no boxes.
+"""The judge of the other backends: NumPy in float64, every sample of the picture against every splat, no
+tiles, no boxes.
 
-It starts from the same float32 inputs and takes the same decisions (numerics.md, section 3). Beside the planes it gives a
-certificate: how much a pixel may differ because a decision lies within rounding of its threshold.
+It starts from the same float32 inputs and takes the same decisions (numerics.md, section 3). Beside the
+planes it gives a certificate: how much a pixel may differ because a decision lies within rounding of its
+threshold.
 """
 
 from __future__ import annotations
@@ -116,7 +118,9 @@ class ReferencePipeline:
     def pixels(
         self, resident: ReferenceCloud, view: View, rows: np.ndarray, columns: np.ndarray
     ) -> dict[str, np.ndarray]:
-        """Planes at pixels (row, column), each (k,) or (k, 3) float64; `certificate` (k,) beside those asked for."""
+        """Planes at pixels (row, column), each (k,) or (k, 3) float64; `certificate` (k,) beside those asked
+        for.
+        """
         splats = _Splats(resident.cloud, view, self.features)
         n = view.samples
         sub_rows, sub_columns = np.mgrid[0:n, 0:n]

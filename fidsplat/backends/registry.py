@@ -1,4 +1,6 @@
-"""Devices by name. A family of devices is a module with `devices()` and `open_device(selector)`, imported on first use."""
+"""Devices by name. A family of devices is a module with `devices()` and `open_device(selector)`, imported on
+first use.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,8 @@ _FAMILIES = {"opencl": "fidsplat.backends.opencl", "reference": "fidsplat.backen
 
 
 def open_backend(name: str) -> Backend:
-    """Open a device by name: a family (`opencl`, `reference`) or `family:part of a platform's or device's name`.
+    """Open a device by name: a family (`opencl`, `reference`) or `family:part of a platform's or device's
+    name`.
 
     Raises:
         UnknownDeviceError: no such family, or nothing of the family answers to the selector.
@@ -23,7 +26,8 @@ def open_backend(name: str) -> Backend:
         near = difflib.get_close_matches(family.lower(), _FAMILIES, 1)
         hint = f" (did you mean {near[0]!r}?)" if near else ""
         raise UnknownDeviceError(
-            f"unknown device {name!r}{hint}; known families: {', '.join(_FAMILIES)}; `fidsplat devices` lists all"
+            f"unknown device {name!r}{hint}; known families: {', '.join(_FAMILIES)}; `fidsplat "
+            "devices` lists all"
         )
     return import_module(_FAMILIES[family.lower()]).open_device(selector)
 

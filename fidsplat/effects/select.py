@@ -21,7 +21,8 @@ OUTPUTS: dict[str, Output] = {
 class FeatureSet:
     """What one picture calls for: names and small integers only, so that it can be a key.
 
-    Numbers that change from view to view (intrinsics, poses, thresholds, background) are uniforms, never here.
+    Numbers that change from view to view (intrinsics, poses, thresholds, background) are uniforms, never
+    here.
     """
 
     slots: tuple[str, ...]

@@ -1,7 +1,8 @@
 """One flat source text from a FeatureSet and the shape of a device.
 
-A kernel file of an effect is cut at lines `//@ section`; a stage file has lines `//@@ section` where the sections of the
-chosen effects go. What nobody fills expands to nothing, so the text names no effect that was not asked for.
+A kernel file of an effect is cut at lines `//@ section`; a stage file has lines `//@@ section` where the
+sections of the chosen effects go. What nobody fills expands to nothing, so the text names no effect that was
+not asked for.
 """
 
 from __future__ import annotations

@@ -30,7 +30,8 @@ def devices() -> list[DeviceInfo]:
 
 
 def open_device(selector: str = "") -> OpenCLBackend:
-    """The best usable device (GPU before CPU), or the first whose platform, name or vendor contains `selector`.
+    """The best usable device (GPU before CPU), or the first whose platform, name or vendor contains
+    `selector`.
 
     Raises:
         DeviceError: no OpenCL at all, or none of the devices can be used.
@@ -83,7 +84,8 @@ class OpenCLBackend:
         return self._pipelines[key]
 
     def _build(self, text: str) -> cl.Program:
-        # the target's name is part of pyopencl's cache key: PoCL's own version string does not tell processors apart
+        # the target's name is part of pyopencl's cache key: PoCL's own version string does not tell
+        # processors apart
         options = [
             "-cl-std=CL1.2",
             "-w",

@@ -35,8 +35,8 @@ class BufferPool:
         limit = self._device.max_mem_alloc_size
         if size > limit:
             raise DeviceError(
-                f"{name} needs {size / 2**20:.0f} MiB in one piece, but {self._device.name.strip()} gives at most "
-                f"{limit / 2**20:.0f} MiB; use fewer splats or a smaller picture"
+                f"{name} needs {size / 2**20:.0f} MiB in one piece, but {self._device.name.strip()} gives at "
+                f"most {limit / 2**20:.0f} MiB; use fewer splats or a smaller picture"
             )
         try:
             return cl.Buffer(self._context, cl.mem_flags.READ_WRITE, max(size, 16))
@@ -45,7 +45,7 @@ class BufferPool:
 
 
 class Resident:
-    """A SplatCloud on the device. Colours of SH degree 0 do not depend on the view and become plain colours."""
+    """A SplatCloud on the device. SH of degree 0 does not depend on the view and becomes plain colours."""
 
     def __init__(
         self, context: cl.Context, queue: cl.CommandQueue, pool: BufferPool, cloud: SplatCloud

@@ -1,6 +1,7 @@
 """Runs the stages of one FeatureSet on one device: project, sort, bin, blend, resolve.
 
-Nothing passes through the host between the stages but the number of (splat, tile) pairs, which sizes one buffer.
+Nothing passes through the host between the stages but the number of (splat, tile) pairs, which sizes one
+buffer.
 """
 
 from __future__ import annotations
@@ -89,8 +90,8 @@ class OpenCLPipeline:
         """Draw one picture and return what passes between the stages.
 
         keys (n,) uint32; order (visible,) uint32, splat indices by depth; starts (tiles + 1,) uint32;
-        lists (pairs,) uint32; records (n, words) float32 (undefined for culled splats); raw (4, rows, columns)
-        float32: r, g, b, transmittance of the padded sample grid; and the finished outputs by name.
+        lists (pairs,) uint32; records (n, words) float32 (undefined for culled splats); raw (4, rows,
+        columns) float32: r, g, b, transmittance of the padded sample grid; and the finished outputs by name.
         """
         run = _Run(self, resident, view)
         planes = run.planes()
@@ -205,7 +206,8 @@ class _Run:
         visible, pairs = (int(counts[k]) | int(counts[k + 1]) << 32 for k in (_VISIBLE, _PAIRS))
         if pairs > _MAX_PAIRS:
             raise DeviceError(
-                f"{pairs} pairs of splats and tiles are more than {_MAX_PAIRS}: draw a smaller picture or fewer splats"
+                f"{pairs} pairs of splats and tiles are more than {_MAX_PAIRS}: draw a smaller picture "
+                "or fewer splats"
             )
         lists = self._take("lists", 4 * pairs)
         self._launch("bin", "bin_emit", self.shape.chunks, 1, *common, starts, np.uint32(pairs), lists)

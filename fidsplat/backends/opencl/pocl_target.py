@@ -1,10 +1,11 @@
 """Lets the PoCL that pip installs compile for processors that its LLVM does not know.
 
-PoCL 3.0 from PyPI asks its LLVM 14 for the processor's name. For one that is newer than LLVM 14 (AMD Zen 5, say) the answer is
-"generic", which PoCL then hands to clang as -target-cpu, where it is an error: every build fails with "unknown target CPU
-'generic'" (pocl issues #512, #1049). PoCL 3.1 and later read POCL_LLVM_CPU_NAME; 3.0 has no such setting, so the name is
-corrected where PoCL keeps it, in the device's record: the field `llvm_cpu`, which follows `llvm_target_triplet`. The new
-name is the one for which PoCL built the kernel library that it picks from the processor's feature flags.
+PoCL 3.0 from PyPI asks its LLVM 14 for the processor's name. For one that is newer than LLVM 14 (AMD Zen 5,
+say) the answer is "generic", which PoCL then hands to clang as -target-cpu, where it is an error: every build
+fails with "unknown target CPU 'generic'" (pocl issues #512, #1049). PoCL 3.1 and later read
+POCL_LLVM_CPU_NAME; 3.0 has no such setting, so the name is corrected where PoCL keeps it, in the device's
+record: the field `llvm_cpu`, which follows `llvm_target_triplet`. The new name is the one for which PoCL
+built the kernel library that it picks from the processor's feature flags.
 """
 
 from __future__ import annotations
