@@ -107,7 +107,8 @@ class SplatCloud:
     def _replaced(self, **values) -> "SplatCloud":
         """A copy with some arrays exchanged; the values are known to be good."""
         cloud = object.__new__(SplatCloud)
-        cloud._set(**{name: getattr(self, name) for name in self.__dataclass_fields__} | values)
+        old = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        cloud._set(**old | {"dropped": dict(self.dropped)} | values)
         return cloud
 
     def __len__(self) -> int:
@@ -206,8 +207,11 @@ class SplatCloud:
 
 
 def _numbers(name: str, value) -> np.ndarray:
-    array = np.asarray(value)
-    if array.dtype.kind not in "fiub" or array.dtype.itemsize > 8:
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        raise InputError(f"{name} must be an array, but its rows differ in length") from None
+    if array.dtype.kind not in "fiu" or array.dtype.itemsize > 8:
         raise InputError(f"{name} must be an array of real numbers, not of {array.dtype}")
     return array
 
@@ -223,8 +227,8 @@ def _check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
 
 
 def _labels(labels, n: int) -> np.ndarray:
-    array = np.asarray(0 if labels is None else labels)
-    if array.dtype.kind not in "iu" and array.size:
+    array = _numbers("labels", 0 if labels is None else labels)
+    if array.dtype.kind == "f" and array.size:
         raise InputError(f"labels must be ints, not {array.dtype}")
     if array.shape not in ((), (n,)):
         raise InputError(f"labels must be one int or have the shape ({n},), but its shape is {array.shape}")
