@@ -1,0 +1,184 @@
+"""Corners to a few hundredths of a pixel: the known modules of a code laid over its picture by least squares.
+
+Every dark-light edge inside the code takes part, so a QR code, whose outer edge is mostly broken, gets
+corners as good as a tag's. The model is the box average of the pattern over each pixel, which is what a
+camera records; picture and model are blurred alike before they are compared, so the blur that steadies the
+steps moves no edge.
+"""
+
+import cv2
+import numpy as np
+
+ITERATIONS = 8  # in each of three rounds: blurred, sharp, sharp with little weight on what does not fit
+SETTLED = 0.003  # pixels: largest move of a corner in the last step
+FINE_BLUR = 0.7  # pixels, standard deviation
+# share of the contrast by which a pixel may differ from the model before it counts for little, as when
+# something stands in front
+TOLERANCE = 0.25
+# a fit whose correlation with the picture is lower has slid to another place
+MIN_CORRELATION = 0.7
+_POINTS = 3  # the pattern is averaged over 3 x 3 points of each pixel
+_LARGE = 150_000  # pixels of a picture that is halved, or more, before it is compared
+_COARSE_MODULE = 6.0  # pixels: a module is never made smaller than this
+_LARGEST_MODULE = 64  # points of the pattern
+_QUIET = 1  # modules of light ground around the code that the model includes
+
+
+def align(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
+    """Better corners of a code whose modules and rough corners are known.
+
+    Args:
+        grey: (h, w) uint8.
+        corners: (4, 2) pixel coordinates TL, TR, BR, BL of the code's outer edge, within half a module.
+        bits: (n, n) uint8, 1 = dark, without quiet zone.
+
+    Returns (4, 2) float64, or None when the pattern does not settle near the given corners.
+    """
+    window = _window(grey, corners, bits)
+    if window is None:
+        return None
+    picture, offset, shrink = window
+    # the code spans [-1, 1]: well-conditioned parameters
+    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float64)
+    start = (np.asarray(corners, np.float64) - offset) / shrink
+    homography = _homography(square, start)
+    module = np.linalg.norm(start - np.roll(start, 1, 0), axis=1).min() / bits.shape[0]
+    model = _Model(bits, picture.shape, module)
+
+    where = start
+    for blur, robust, settled in (
+        (float(np.clip(0.35 * module, FINE_BLUR, 2.5)), False, 0.1),
+        (FINE_BLUR, False, 0.03),
+        (FINE_BLUR, True, SETTLED),
+    ):
+        smooth = cv2.GaussianBlur(picture, (0, 0), blur)
+        for _ in range(ITERATIONS):
+            step = _step(model, smooth, homography, blur, robust)
+            if step is None:
+                return None
+            homography = homography @ (np.eye(3) + step)
+            moved = _apply(homography, square)
+            if not np.isfinite(moved).all() or np.abs(moved - start).max() > max(1.0, module):
+                return None
+            change, where = np.abs(moved - where).max(), moved
+            if change < settled:
+                break
+    good = model.correlation(smooth, homography, FINE_BLUR) > MIN_CORRELATION
+    return where * shrink + offset if good else None
+
+
+class _Model:
+    """The pattern with its quiet zone, drawn under a homography with every pixel averaged over its area."""
+
+    def __init__(self, bits: np.ndarray, shape: tuple[int, ...], module: float) -> None:
+        self.shape = shape
+        # Each module is made so large that OpenCV's linear ramp between two of its points is as wide as the
+        # step between the points of a pixel: an edge along the rows then moves the model evenly, not in
+        # jumps.
+        k = int(np.clip(np.ceil(_POINTS * module), 1, _LARGEST_MODULE))
+        self.pattern = np.kron(1 - np.pad(bits, _QUIET), np.ones((k, k))).astype(np.float32)
+        n = bits.shape[0]
+        # [-1, 1] to OpenCV's numbers of the pattern's points, of which the first has its centre at 0
+        half, shift = k * n / 2, k * (n / 2 + _QUIET) - 0.5
+        self.to_pattern = np.array([[half, 0, shift], [0, half, shift], [0, 0, 1]])
+        self.reach = 1 + _QUIET / n  # half of the quiet module: blurred ground from further out stays outside
+        rows, columns = np.mgrid[0 : shape[0], 0 : shape[1]]
+        self.pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(shape)]).reshape(3, -1)
+
+    def draw(self, homography: np.ndarray, blur: float) -> np.ndarray:
+        k = _POINTS
+        fine = np.array([[k, 0, -0.5], [0, k, -0.5], [0, 0, 1]])  # pixels to numbers of the fine grid
+        warp = fine @ homography @ np.linalg.inv(self.to_pattern)
+        size = (self.shape[1] * k, self.shape[0] * k)
+        drawn = cv2.warpPerspective(self.pattern, warp, size, flags=cv2.INTER_LINEAR, borderValue=1.0)
+        drawn = cv2.resize(drawn, (self.shape[1], self.shape[0]), interpolation=cv2.INTER_AREA)
+        return cv2.GaussianBlur(drawn, (0, 0), blur)
+
+    def inside(self, homography: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers of the pixels on the code, and their (s, t) in [-1, 1]."""
+        u, v, w = np.linalg.inv(homography) @ self.pixels
+        # the sign of w tells the two sides of the horizon apart; the code's own centre is on the right one
+        with np.errstate(divide="ignore", invalid="ignore"):
+            s, t = u / w, v / w
+        keep = np.flatnonzero((np.abs(s) < self.reach) & (np.abs(t) < self.reach))
+        return keep, np.stack([s[keep], t[keep]])
+
+    def correlation(self, smooth: np.ndarray, homography: np.ndarray, blur: float) -> float:
+        keep, _ = self.inside(homography)
+        if keep.size < 9:
+            return 0.0
+        a, b = self.draw(homography, blur).ravel()[keep], smooth.ravel()[keep]
+        spread = float(a.std() * b.std())
+        return float(np.mean((a - a.mean()) * (b - b.mean()))) / spread if spread > 1e-6 else 0.0
+
+
+def _step(model: _Model, smooth: np.ndarray, homography: np.ndarray, blur: float, robust: bool):
+    """The (3, 3) change X of one Gauss-Newton step, homography (I + X), or None when it is not determined."""
+    keep, (s, t) = model.inside(homography)
+    if keep.size < 16:
+        return None
+    drawn = model.draw(homography, blur)
+    ideal, seen = drawn.ravel()[keep].astype(np.float64), smooth.ravel()[keep].astype(np.float64)
+    weight = np.ones(keep.size)
+    gain, base = _contrast(ideal, seen, weight)
+    if robust:
+        weight = 1.0 / (1.0 + ((seen - gain * ideal - base) / (TOLERANCE * abs(gain) + 1e-6)) ** 2) ** 2
+        gain, base = _contrast(ideal, seen, weight)
+    if gain < 0.02:
+        return None
+    # the mean of both gradients makes the step second order; outside it is the plain derivative
+    slope = np.stack([np.gradient(gain * drawn + smooth, axis=axis) for axis in (1, 0)])
+    slope = 0.5 * slope.reshape(2, -1)[:, keep].astype(np.float64)
+    x, y, z = homography @ np.stack([s, t, np.ones_like(s)])
+    place = np.stack([x / z, y / z])
+    along = [((homography[:2, k, None] - place * homography[2, k]) / z * slope).sum(0) for k in range(3)]
+    columns = np.stack([along[k] * c for k in range(3) for c in (s, t, 1.0)][:8], axis=1)
+    wanted = -(seen - gain * ideal - base)
+    normal = columns.T @ (columns * weight[:, None])
+    try:
+        found = np.linalg.solve(normal, columns.T @ (weight * wanted))
+    except np.linalg.LinAlgError:
+        return None
+    return np.append(found, 0.0).reshape(3, 3)
+
+
+def _contrast(ideal: np.ndarray, seen: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
+    total = weight.sum()
+    mean_ideal, mean_seen = (weight * ideal).sum() / total, (weight * seen).sum() / total
+    spread = (weight * (ideal - mean_ideal) ** 2).sum()
+    gain = (weight * (ideal - mean_ideal) * (seen - mean_seen)).sum() / spread if spread > 0 else 0.0
+    return float(gain), float(mean_seen - gain * mean_ideal)
+
+
+def _window(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray):
+    """The picture around the code (h, w) float32 in [0, 1], its origin (2,) and its pixel's edge in ``grey``.
+
+    None when the code lies outside.
+    """
+    low, high = corners.min(0), corners.max(0)
+    room = 2.0 * (high - low).max() / bits.shape[0] + 4.0
+    x0, y0 = np.maximum(np.floor(low - room), 0).astype(int)
+    x1, y1 = np.minimum(np.ceil(high + room), (grey.shape[1], grey.shape[0])).astype(int)
+    if x1 - x0 < 4 or y1 - y0 < 4:
+        return None
+    module = np.linalg.norm(corners - np.roll(corners, 1, 0), axis=1).min() / bits.shape[0]
+    shrink = max(1, min(int(((x1 - x0) * (y1 - y0) / _LARGE) ** 0.5), int(module / _COARSE_MODULE)))
+    width, height = (x1 - x0) // shrink, (y1 - y0) // shrink
+    part = grey[y0 : y0 + height * shrink, x0 : x0 + width * shrink].astype(np.float32) / 255.0
+    if shrink > 1:
+        part = cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA)
+    return part, np.array([x0, y0], np.float64), shrink
+
+
+def _homography(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """(3, 3) that maps four points (4, 2) onto four others; float64, unlike OpenCV's."""
+    rows = []
+    for (s, t), (x, y) in zip(source, target, strict=True):
+        rows.append([s, t, 1, 0, 0, 0, -x * s, -x * t])
+        rows.append([0, 0, 0, s, t, 1, -y * s, -y * t])
+    return np.append(np.linalg.solve(np.array(rows), target.reshape(-1)), 1.0).reshape(3, 3)
+
+
+def _apply(homography: np.ndarray, points: np.ndarray) -> np.ndarray:
+    x, y, z = homography @ np.column_stack([points, np.ones(len(points))]).T
+    return np.column_stack([x / z, y / z])

@@ -1,0 +1,124 @@
+"""Find AprilTag, ArUco and QR codes in a picture with off-the-shelf detectors: OpenCV's aruco module and
+zxing-cpp.
+
+They decide what is there; `align` then moves their corners onto the edges of the code that they read.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import zxingcpp
+
+from fidsplat.vision.align import align
+from fidsplat.vision.dictionaries import dictionary_bits, parse_family, predefined
+
+# One family for every grid that people print; with each, a random dark square reads as a tag less than once
+# in 300 times. 16h5 (1 in 30), the families of 1000 and 36h10 cost more time or more false tags: searched
+# when asked for.
+DEFAULT_FAMILIES = ("36h11", "25h9", "4x4_50", "5x5_100", "6x6_250", "7x7_250")
+
+# how much taller or wider the picture is made when a plain look finds no QR code: a tilted one has flat
+# modules
+STRETCHES = (1.5, 2.0, 3.0, 4.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """One code found in a picture."""
+
+    kind: str
+    """"apriltag", "aruco" or "qr" """
+    family: str
+    """the tag's dictionary, e.g. "36h11"; of a QR code its version and error level, e.g. "v2-L" """
+    id: int | None
+    """of a tag; None for a QR code"""
+    payload: str | None
+    """text of a QR code; None for a tag"""
+    corners: np.ndarray
+    """(4, 2) float64, pixels: TL, TR, BR, BL as printed, on the code's outer edge; pixel (i, j) has its
+    centre at (j + 0.5, i + 0.5)"""
+
+    @property
+    def name(self) -> str:
+        """As a marker spec says it: "apriltag:36h11:5", "qr:some text"."""
+        return f"qr:{self.payload}" if self.kind == "qr" else f"{self.kind}:{self.family}:{self.id}"
+
+
+def detect(image: np.ndarray, families: Iterable[str] | None = None, qr: bool = True) -> list[Detection]:
+    """Every code in a picture: tags in the order of ``families`` and their ids, then QR codes.
+
+    Args:
+        image: (h, w, 3) RGB or (h, w) grey, uint8.
+        families: tag families to look for ("36h11" or "apriltag:36h11"); None for `DEFAULT_FAMILIES`; ()
+            for none.
+        qr: whether to look for QR codes.
+
+    A square that reads in two families (the small ArUco ones are parts of the large ones) is given once, in
+    the family named first. Raises InputError for an unknown family, ValueError for another kind of array.
+    """
+    pixels = np.asarray(image)
+    if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] != 3):
+        raise ValueError(f"detect needs uint8 (h, w) or (h, w, 3), not {pixels.dtype} {pixels.shape}")
+    wanted = [parse_family(name) for name in (DEFAULT_FAMILIES if families is None else families)]
+    if pixels.size == 0:
+        return []
+    grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if pixels.ndim == 3 else np.ascontiguousarray(pixels)
+    found: list[Detection] = []
+    for kind, family in dict.fromkeys(wanted):
+        found += [tag for tag in _tags(grey, kind, family) if not any(_same_place(tag, old) for old in found)]
+    return found + (_qr_codes(grey) if qr else [])
+
+
+def _tags(grey: np.ndarray, kind: str, family: str) -> list[Detection]:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    detector = cv2.aruco.ArucoDetector(predefined(kind, family), parameters)
+    quads, ids, _ = detector.detectMarkers(grey)
+    if ids is None:
+        return []
+    order = np.argsort(ids.ravel(), kind="stable")
+    return [_tag(grey, kind, family, int(ids.ravel()[k]), quads[k]) for k in order]
+
+
+def _tag(grey: np.ndarray, kind: str, family: str, tag_id: int, quad: np.ndarray) -> Detection:
+    # OpenCV counts from the centre of the first pixel
+    rough = quad.reshape(4, 2).astype(np.float64) + 0.5
+    better = align(grey, rough, dictionary_bits(kind, family, tag_id))
+    return Detection(kind, family, tag_id, None, rough if better is None else better)
+
+
+def _same_place(one: Detection, other: Detection) -> bool:
+    edge = np.linalg.norm(one.corners - np.roll(one.corners, 1, 0), axis=1).max()
+    return bool(np.linalg.norm(one.corners.mean(0) - other.corners.mean(0)) < 0.25 * edge)
+
+
+def _qr_codes(grey: np.ndarray) -> list[Detection]:
+    codes = _read_qr(grey, 1.0, 1.0)
+    for factor in STRETCHES:
+        # the wider picture is tried after the taller one: boards lean back more often than they turn aside
+        codes = codes or _read_qr(grey, 1.0, factor) or _read_qr(grey, factor, 1.0)
+    return sorted(codes, key=lambda code: (code.payload or "", tuple(code.corners[0])))
+
+
+def _read_qr(grey: np.ndarray, wider: float, taller: float) -> list[Detection]:
+    picture = grey
+    if (wider, taller) != (1.0, 1.0):
+        picture = cv2.resize(grey, None, fx=wider, fy=taller, interpolation=cv2.INTER_LINEAR)
+    scale = np.array([grey.shape[1] / picture.shape[1], grey.shape[0] / picture.shape[0]])
+    formats = zxingcpp.BarcodeFormats([zxingcpp.BarcodeFormat.QRCode])
+    read = zxingcpp.read_barcodes(picture, formats=formats, text_mode=zxingcpp.TextMode.Plain)
+    return [_qr(grey, code, scale) for code in read]
+
+
+def _qr(grey: np.ndarray, code: zxingcpp.Barcode, scale: np.ndarray) -> Detection:
+    place = code.position
+    points = (place.top_left, place.top_right, place.bottom_right, place.bottom_left)
+    # zxing-cpp counts from the corner of the first pixel, as we do, in whole pixels
+    rough = np.array([(p.x, p.y) for p in points], np.float64) * scale
+    bits = (np.array(code.to_image(scale=1, add_quiet_zones=False)) == 0).astype(np.uint8)
+    better = align(grey, rough, bits)
+    version = (bits.shape[0] - 17) // 4
+    family = f"v{version}-{code.ec_level}"
+    return Detection("qr", family, None, code.text, rough if better is None else better)

@@ -1,0 +1,60 @@
+"""Pictures of a perfectly printed code under a known pose, for tests of the detectors: no splats, no
+device."""
+
+import math
+
+import numpy as np
+import segno
+
+
+def turned(tilt: float = 0.0, spin: float = 0.0) -> np.ndarray:
+    """Rotation (3, 3): spun in the marker's plane, then leaning back, both in degrees."""
+    a, b = math.radians(spin), math.radians(tilt)
+    flat = np.array([[math.cos(a), -math.sin(a), 0], [math.sin(a), math.cos(a), 0], [0, 0, 1]])
+    back = np.array([[1, 0, 0], [0, math.cos(b), -math.sin(b)], [0, math.sin(b), math.cos(b)]])
+    return back @ flat
+
+
+def pose(rotation: np.ndarray, translation) -> np.ndarray:
+    """camera_from_marker (4, 4)."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, translation
+    return matrix
+
+
+def draw(bits, size, placed, camera, quiet=1, samples=4, ground=0.5) -> tuple[np.ndarray, np.ndarray]:
+    """A code of ``size`` metres at ``placed`` (4, 4) seen by ``camera``: (h, w) float in [0, 1], corners
+    (4, 2).
+
+    Each pixel is the mean of samples x samples points, as a camera's pixel averages over its area.
+    """
+    matrix = camera.matrix @ np.column_stack([placed[:3, :2], placed[:3, 3]])
+    x = (np.arange(camera.width * samples) + 0.5) / samples
+    y = (np.arange(camera.height * samples) + 0.5) / samples
+    points = np.stack([*np.meshgrid(x, y), np.ones((y.size, x.size))]).reshape(3, -1)
+    u, v, w = np.linalg.inv(matrix) @ points
+    printed = np.pad(bits, quiet)
+    module = size / bits.shape[0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        column = np.floor(u / w / module + printed.shape[1] / 2)
+        row = np.floor(v / w / module + printed.shape[0] / 2)
+    inside = (row >= 0) & (column >= 0) & (row < printed.shape[0]) & (column < printed.shape[1])
+    values = np.full(points.shape[1], float(ground))
+    values[inside] = 1.0 - printed[row[inside].astype(int), column[inside].astype(int)]
+    picture = values.reshape(camera.height, samples, camera.width, samples).mean((1, 3))
+    half = size / 2
+    edge = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
+    corners = np.column_stack([edge, np.ones(4)]) @ matrix.T
+    return picture, corners[:, :2] / corners[:, 2:]
+
+
+def photographed(picture: np.ndarray, seed: int = 0, noise: float = 2.0) -> np.ndarray:
+    """uint8 with less than full contrast and sensor noise of ``noise`` grey levels."""
+    levels = 20 + 200 * picture + np.random.default_rng(seed).normal(0, noise, picture.shape)
+    return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+
+
+def qr_bits(text: str) -> np.ndarray:
+    """Modules of a QR code in byte mode at level L, without quiet zone."""
+    code = segno.make_qr(text, error="L", mode="byte", boost_error=False)
+    return np.array([list(row) for row in code.matrix], np.uint8)

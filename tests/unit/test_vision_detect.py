@@ -1,0 +1,164 @@
+"""Detectors on ideal pictures: what is found, where its corners are, what is not there is not found."""
+
+import numpy as np
+import pytest
+from ideal_picture import draw, photographed, pose, qr_bits, turned
+
+from fidsplat.cameras import Camera
+from fidsplat.errors import InputError
+from fidsplat.vision.align import align
+from fidsplat.vision.detect import DEFAULT_FAMILIES, detect
+from fidsplat.vision.dictionaries import dictionary_bits, families, parse_family
+from fidsplat.vision.pose import marker_pose, pose_error
+
+CAMERA = Camera.pinhole(480, 400, 700, 700, 240, 200)
+SIZE = 0.2
+
+
+def seen(bits, pixels, tilt=0.0, spin=0.0, quiet=1, camera=CAMERA, aside=(0.007, -0.011)):
+    """A code about ``pixels`` wide: uint8 picture, corners, camera_from_marker."""
+    placed = pose(turned(tilt, spin), [*aside, camera.fx * SIZE / pixels])
+    picture, corners = draw(bits, SIZE, placed, camera, quiet)
+    return photographed(picture), corners, placed
+
+
+def corner_error(found, corners):
+    return float(np.linalg.norm(found - corners, axis=1).max())
+
+
+@pytest.mark.parametrize("family", families())
+def test_every_family_is_found_and_its_corners_are_those_of_the_print(family):
+    kind, _ = parse_family(family)
+    # the last id of `original` looks the same upside down
+    tag_id = families()[family].count - 2
+    picture, corners, _ = seen(dictionary_bits(kind, family, tag_id), 150, tilt=20, spin=100)
+    found = detect(picture, families=[family], qr=False)
+    assert [(d.kind, d.family, d.id, d.payload) for d in found] == [(kind, family, tag_id, None)]
+    assert corner_error(found[0].corners, corners) < 0.1
+    assert found[0].name == f"{kind}:{family}:{tag_id}"
+
+
+@pytest.mark.parametrize(
+    ("pixels", "tilt", "limit"), [(40, 0, 0.1), (150, 0, 0.05), (300, 10, 0.05), (150, 60, 0.1)]
+)
+def test_tag_corners_and_pose(pixels, tilt, limit):
+    picture, corners, placed = seen(dictionary_bits("apriltag", "36h11", 5), pixels, tilt, spin=8)
+    (tag,) = detect(picture)
+    assert tag.name == "apriltag:36h11:5"
+    assert corner_error(tag.corners, corners) < limit
+    apart, angle = pose_error(marker_pose(tag.corners, SIZE, CAMERA), placed)
+    assert apart < 0.002 * placed[2, 3]
+    assert np.degrees(angle) < (5.0 if pixels == 40 else 1.0)
+
+
+@pytest.mark.parametrize(("length", "pixels"), [(20, 150), (100, 185), (250, 250)])
+@pytest.mark.parametrize(("tilt", "spin"), [(0, 0), (0, 130), (45, 15)])
+def test_qr_codes_are_read_and_their_corners_serve_a_pose(length, pixels, tilt, spin):
+    text = "".join(chr(97 + k % 26) for k in range(length))
+    picture, corners, placed = seen(qr_bits(text), pixels, tilt, spin, quiet=4)
+    (code,) = detect(picture, families=())
+    assert (code.kind, code.id, code.payload) == ("qr", None, text)
+    assert code.family == {20: "v2-L", 100: "v5-L", 250: "v10-L"}[length]
+    assert corner_error(code.corners, corners) < 0.1
+    apart, angle = pose_error(marker_pose(code.corners, SIZE, CAMERA), placed)
+    assert apart < 0.002 * placed[2, 3]
+    assert np.degrees(angle) < 1.0
+
+
+@pytest.mark.parametrize("aside", [True, False])
+def test_a_steep_qr_code_is_read_by_stretching_the_picture(aside):
+    camera = Camera.pinhole(640, 640, 2400, 2400, 320, 320)
+    picture, corners, _ = seen(qr_bits("a" * 20), 350, tilt=80, quiet=4, camera=camera, aside=(0, 0))
+    if aside:
+        picture = np.ascontiguousarray(picture.T)
+    (code,) = detect(picture, families=())
+    assert code.payload == "a" * 20
+    # a transposed picture shows a mirrored code, whose corners go round the other way
+    expected = corners[:, ::-1] if aside else corners
+    best = min(
+        corner_error(np.roll(order, k, 0), expected)
+        for order in (code.corners, code.corners[::-1])
+        for k in range(4)
+    )
+    assert best < 1.0
+
+
+def test_one_square_is_given_once_and_in_the_family_named_first():
+    picture, _, _ = seen(dictionary_bits("aruco", "4x4_50", 7), 150)
+    assert [d.name for d in detect(picture, ["4x4_100", "4x4_50"], qr=False)] == ["aruco:4x4_100:7"]
+    assert [d.name for d in detect(picture, ["4x4_50", "4x4_100", "4x4_50"], qr=False)] == ["aruco:4x4_50:7"]
+
+
+def test_a_picture_with_several_codes():
+    left, _, _ = seen(dictionary_bits("apriltag", "36h11", 300), 150)
+    right, _, _ = seen(dictionary_bits("aruco", "4x4_50", 7), 150, tilt=30)
+    below, _, _ = seen(qr_bits("two words"), 150, quiet=4)
+    found = detect(
+        np.repeat(np.vstack([np.hstack([left, right]), np.hstack([below, below])])[:, :, None], 3, 2)
+    )
+    assert [d.name for d in found] == ["apriltag:36h11:300", "aruco:4x4_50:7", "qr:two words", "qr:two words"]
+    assert found[0].corners[:, 0].max() < 480 < found[1].corners[:, 0].min()
+
+
+def test_nothing_is_found_where_nothing_is():
+    noise = np.random.default_rng(3).integers(0, 256, (240, 320), dtype=np.uint8)
+    assert detect(noise) == []
+    assert detect(np.zeros((3, 3, 3), np.uint8)) == []
+    assert detect(np.zeros((0, 4), np.uint8)) == []
+
+
+def test_what_detect_cannot_use():
+    with pytest.raises(InputError, match="36h11"):
+        detect(np.zeros((9, 9), np.uint8), ["36h12"])
+    with pytest.raises(ValueError, match="uint8"):
+        detect(np.zeros((9, 9)))
+    assert {parse_family(f)[1] for f in DEFAULT_FAMILIES} == set(DEFAULT_FAMILIES)
+
+
+@pytest.mark.parametrize("module", [3, 8, 30])
+def test_align_mends_corners_that_are_off_by_a_third_of_a_module(module):
+    bits = dictionary_bits("apriltag", "36h11", 2)
+    picture, corners, _ = seen(bits, 8 * module, tilt=15, spin=20)
+    rough = corners + np.random.default_rng(module).uniform(-0.3, 0.3, (4, 2)) * module
+    mended = align(picture, rough, bits)
+    assert mended is not None
+    assert corner_error(mended, corners) < 0.15
+
+
+def test_align_gives_up_rather_than_slide_to_another_place():
+    bits = dictionary_bits("apriltag", "36h11", 2)
+    picture, corners, _ = seen(bits, 160)
+    assert align(picture, corners + 45.0, bits) is None
+    assert align(picture, corners + 5000.0, bits) is None
+    assert align(np.full_like(picture, 90), corners, bits) is None
+    assert align(255 - picture, corners, bits) is None
+
+
+def test_align_looks_past_something_in_front():
+    bits = qr_bits("a" * 100)
+    picture, corners, _ = seen(bits, 200, quiet=4)
+    covered = picture.copy()
+    x, y = np.rint(corners[2]).astype(int)
+    covered[y - 40 : y + 9, x - 40 : x + 9] = 128
+    mended = align(covered, corners + 0.8, bits)
+    assert mended is not None
+    assert corner_error(mended, corners) < 0.1
+
+
+def test_pose_error_is_the_distance_and_the_angle():
+    truth = pose(turned(10), [0.1, 0.2, 1.0])
+    moved = pose(turned(10 + 1e-4), [0.1, 0.2, 1.003])
+    apart, angle = pose_error(moved, truth)
+    assert apart == pytest.approx(0.003)
+    assert np.degrees(angle) == pytest.approx(1e-4)
+    assert pose_error(pose(turned(180), [0, 0, 1]), np.eye(4))[1] == pytest.approx(np.pi)
+
+
+@pytest.mark.parametrize("tilt", [-60, -20, 0, 20, 60])
+def test_exact_corners_give_the_exact_pose(tilt):
+    camera = Camera.pinhole(401, 333, 500, 480, 170.3, 190.8)
+    placed = pose(turned(tilt, 77), [0.05, -0.04, 1.2])
+    _, corners = draw(np.ones((1, 1), np.uint8), SIZE, placed, camera, samples=1)
+    apart, angle = pose_error(marker_pose(corners, SIZE, camera), placed)
+    assert apart < 1e-5
+    assert angle < 1e-4
