@@ -1,0 +1,141 @@
+"""Who may import whom (DESIGN: cli, experiments -> render -> backends -> effects -> scenes, cameras ->
+splats)."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import fidsplat
+
+PACKAGE = Path(fidsplat.__file__).parent
+
+BASE = {"errors", "files", "rotations"}
+PLAIN = BASE | {"splats", "harmonics", "cameras", "quality"}
+# wing: what of fidsplat it may import, at the top or inside a function
+MAY_IMPORT = {
+    "errors": set(),
+    "files": BASE,
+    "rotations": BASE,
+    "harmonics": BASE,
+    "quality": BASE,
+    "kernel_files": BASE,
+    "splats": BASE | {"harmonics"},
+    "cameras": BASE,
+    "vision": BASE | {"cameras"},
+    "formats": BASE | {"splats", "harmonics"},
+    "markers": BASE | {"splats", "vision.dictionaries", "vision.images"},
+    "scenes": PLAIN | {"markers", "formats"},
+    "effects": PLAIN | {"scenes"},
+    "backends": PLAIN | {"scenes", "effects", "kernel_files"},
+    "render": PLAIN | {"scenes", "effects", "backends"},
+}
+ANYTHING = {"cli", "commands", "experiments", "__init__"}
+
+# third-party module: the wings that alone may import it
+HOME_OF = {
+    "cv2": ("vision",),
+    "zxingcpp": ("vision",),
+    "shapely": ("markers",),
+    "networkx": ("markers",),
+    "segno": ("markers",),
+    "pyopencl": ("backends.opencl",),
+    "tyro": ("cli", "commands"),
+    "rich": ("cli", "commands"),
+}
+HEAVY = ("pyopencl", "shapely", "networkx", "segno", "cv2", "zxingcpp", "tyro", "rich")
+
+MODULES = {".".join(p.relative_to(PACKAGE).with_suffix("").parts): p for p in PACKAGE.rglob("*.py")}
+
+
+def imported(path: Path) -> set[str]:
+    """Every module that a file names in an import statement, wherever it stands."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: imports are absolute"
+            found.add(node.module or "")
+            if node.module == "fidsplat" or (node.module or "").startswith("fidsplat."):
+                found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def within(name: str, wings) -> bool:
+    return any(name == wing or name.startswith(wing + ".") for wing in wings)
+
+
+@pytest.mark.parametrize("module", sorted(MODULES))
+def test_imports_point_downwards(module):
+    wing = module.split(".")[0]
+    if wing in ANYTHING:
+        return
+    assert wing in MAY_IMPORT, f"say in this test what {wing} may import"
+    inside = {
+        name.removeprefix("fidsplat.") for name in imported(MODULES[module]) if name.startswith("fidsplat.")
+    }
+    # `from fidsplat.a import b` gives both a and a.b: whatever lies in an allowed module is allowed
+    allowed = MAY_IMPORT[wing] | {wing}
+    known = {name for name in inside if name in MODULES or f"{name}.__init__" in MODULES}
+    assert {name for name in known if not within(name, allowed)} == set()
+
+
+@pytest.mark.parametrize("package", sorted(HOME_OF))
+def test_third_party_packages_have_one_home(package):
+    users = {name for name, path in MODULES.items() if within_any(imported(path), package)}
+    assert {name for name in users if not within(name, HOME_OF[package])} == set()
+    assert users, f"nothing uses {package}"
+
+
+def within_any(names, package) -> bool:
+    return any(within(name, (package,)) for name in names)
+
+
+def test_backends_do_not_import_each_other():
+    for module, path in MODULES.items():
+        parts = module.split(".")
+        if parts[0] != "backends" or len(parts) < 2 or parts[1] in ("__init__", "base", "registry"):
+            continue
+        others = {
+            name
+            for name in imported(path)
+            if name.startswith("fidsplat.backends.")
+            and name.split(".")[2] not in ("base", "registry", parts[1])
+        }
+        assert {name for name in others if name.removeprefix("fidsplat.") in MODULES} == set(), module
+
+
+def fresh(code: str) -> str:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_import_fidsplat_is_light():
+    seconds = []
+    for _ in range(5):
+        out = fresh(
+            "import sys, time; t = time.perf_counter(); import fidsplat; t = time.perf_counter() - t;"
+            f"print(t, [m for m in {HEAVY} if m in sys.modules])"
+        )
+        time, loaded = out.split(" ", 1)
+        assert loaded == "[]"
+        seconds.append(float(time))
+    print(f"import fidsplat: {min(seconds):.3f} s, the best of {len(seconds)} (wanted: below 0.25 s)")
+
+
+def test_plain_data_and_the_renderer_open_no_heavy_package():
+    names = "fs.SplatCloud, fs.Camera, fs.Scene, fs.Quality, fs.Renderer, fs.InputError"
+    out = fresh(f"import sys, fidsplat as fs; {names}; print([m for m in {HEAVY} if m in sys.modules])")
+    assert out == "[]"
+
+
+def test_every_public_name_is_there():
+    assert {"SplatCloud", "Camera", "Scene", "Renderer", "marker", "load_ply"} <= set(fidsplat.__all__)
+    for name in fidsplat.__all__:
+        assert getattr(fidsplat, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'rendrer'"):
+        _ = fidsplat.rendrer
