@@ -297,10 +297,10 @@ def _find_defects(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, dic
     """(mask of the rows to keep, or None for all; reason -> count), each row under its first reason."""
     bad: np.ndarray | None = None
     dropped: dict[str, int] = {}
-    q = arrays["quats"].astype(np.float64)
     s, o = arrays["scales"], arrays["opacities"]
     defects = [(f"{name} not finite", _rows_not_finite(array)) for name, array in arrays.items()]
     with np.errstate(over="ignore", invalid="ignore"):
+        q = arrays["quats"].astype(np.float64)
         defects += [
             ("zero quaternion", np.einsum("ij,ij->i", q, q) < 1e-30),
             ("scale not above 0", (s <= 0).any(axis=1)),

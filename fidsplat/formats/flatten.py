@@ -17,8 +17,8 @@ def flatten(quats: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """Make the thinnest axis of each 3D Gaussian the normal of a 2D one.
 
     quats (n, 4) wxyz, scales (n, 3) standard deviations -> quats (n, 4), scales (n, 2), thickness (n,), the
-    thinnest axis over the middle one. The third axis wins ties. A NaN among the three scales spoils both that
-    are kept, so that the splat is not taken for a good one.
+    thinnest axis over the middle one (NaN unless all three are finite). The third axis wins ties. A NaN
+    among the three scales spoils both that are kept, so that the splat is not taken for a good one.
     """
     quats, scales = np.asarray(quats), np.asarray(scales)
     thin = 2 - np.argmin(scales[:, ::-1], axis=1)
@@ -26,9 +26,11 @@ def flatten(quats: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarr
     turned = thin != 2
     if turned.any():
         quats = quats.copy()
-        quats[turned] = quaternion_multiply(quats[turned], _TURNS[thin[turned]])
+        with np.errstate(over="ignore", invalid="ignore"):
+            quats[turned] = quaternion_multiply(quats[turned], _TURNS[thin[turned]])
     with np.errstate(divide="ignore", invalid="ignore"):
         thickness = scales.min(axis=1) / flat_scales.min(axis=1)
+    thickness[~np.isfinite(scales).all(axis=1)] = np.nan
     flat_scales[np.isnan(scales).any(axis=1)] = np.nan
     return quats, flat_scales, thickness
 

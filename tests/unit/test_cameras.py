@@ -1,0 +1,168 @@
+"""The pinhole camera: projection, poses, and what makes no camera."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import fidsplat as fs
+from fidsplat.cameras import focal_length, look_at_matrix
+from fidsplat.rotations import quaternion_to_matrix
+
+coordinate = st.floats(-50, 50)
+point = st.tuples(coordinate, coordinate, coordinate)
+
+
+def test_pixel_centres():
+    camera = fs.Camera.pinhole(5, 3, 100.0, 200.0, 2.5, 1.5)
+    # the middle of an odd picture is the centre of its middle pixel (row 1, column 2)
+    assert camera.project([[0, 0, 1]]).tolist() == [[2.5, 1.5]]
+    np.testing.assert_allclose(camera.project([[0.01, 0, 1], [0, 0.005, 1]]), [[3.5, 1.5], [2.5, 2.5]])
+
+
+def test_any_principal_point():
+    camera = fs.Camera.pinhole(641, 479, 500.0, 510.0, -30.25, 1000.75)
+    np.testing.assert_allclose(camera.project([[1, 2, 4]]), [[500 / 4 - 30.25, 510 * 2 / 4 + 1000.75]])
+    np.testing.assert_allclose(camera.matrix, [[500, 0, -30.25], [0, 510, 1000.75], [0, 0, 1]])
+
+
+def test_nothing_behind_is_projected():
+    camera = fs.Camera.pinhole(10, 10, 10, 10, 5, 5)
+    projected = camera.project([[0, 0, -1], [0, 0, 0], [1, 1, 0], [0, 0, 1e-9]])
+    assert np.isnan(projected).all(axis=1).tolist() == [True, True, True, False]
+    assert camera.project(np.zeros((0, 3))).shape == (0, 2)
+
+
+def test_look_at_by_default_has_y_down():
+    camera = fs.Camera.look_at(640, 480, math.radians(90), [0, 0, -2], [0, 0, 0])
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (pytest.approx(320), camera.fx, 320, 240)
+    # a marker's frame: x right, y down, seen from -z
+    np.testing.assert_allclose(camera.project([[1, 0, 0], [0, 1, 0]]), [[480, 240], [320, 400]])
+    np.testing.assert_allclose(camera.position, [0, 0, -2])
+
+
+def test_look_at_with_z_up():
+    camera = fs.Camera.look_at(100, 100, 1.0, [0, -3, 0], [0, 0, 0], up=[0, 0, 1])
+    x, y = camera.project([[0.1, 0, 0.2]])[0]
+    assert x > 50
+    assert y < 50
+
+
+@given(point, point, point)
+def test_look_at(position, target, up):
+    try:
+        matrix = look_at_matrix(position, target, up)
+    except fs.InputError:
+        forward = np.subtract(target, position)
+        size = np.linalg.norm(np.cross(forward, up))
+        assert size <= 1e-8 * np.linalg.norm(forward) * np.linalg.norm(up) + 1e-150
+        return
+    camera = fs.Camera.pinhole(101, 77, 80, 80, 50.5, 38.5, matrix)
+    np.testing.assert_allclose(camera.position, position, atol=1e-12 + 1e-13 * np.abs(position).max())
+    distance = np.linalg.norm(np.subtract(target, position))
+    seen = matrix @ [*target, 1]
+    np.testing.assert_allclose(seen[:3], [0, 0, distance], atol=1e-10)
+    along_up = matrix[:3, :3] @ (np.array(up) / np.linalg.norm(up))
+    assert along_up[1] < 0
+    assert abs(along_up[0]) < 1e-6
+
+
+@given(st.floats(0.01, 3.1), st.integers(1, 9000))
+def test_field_of_view(fov_x, width):
+    camera = fs.Camera.look_at(width, 10, fov_x, [0, 0, 0], [0, 0, 1])
+    edge = [[-math.tan(fov_x / 2), 0, 1], [math.tan(fov_x / 2), 0, 1]]
+    np.testing.assert_allclose(camera.project(edge)[:, 0], [0, width], atol=1e-8 * width)
+
+
+def test_a_turned_and_moved_camera():
+    turn = quaternion_to_matrix(np.array([0.9, 0.1, -0.3, 0.2]))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, [1, 2, 3]
+    camera = fs.Camera.pinhole(640, 480, 500, 500, 320, 240, pose)
+    world = np.array([[0.3, -0.2, 4.0]])
+    seen = world[0] @ turn.T + [1, 2, 3]
+    np.testing.assert_allclose(camera.project(world)[0], 500 * seen[:2] / seen[2] + [320, 240])
+    np.testing.assert_allclose(turn @ camera.position + [1, 2, 3], 0, atol=1e-12)
+
+
+def test_frozen():
+    pose = np.eye(4)
+    camera = fs.Camera.pinhole(4, 4, 1, 1, 2, 2, pose)
+    pose[0, 3] = 7
+    assert camera.world_to_camera[0, 3] == 0
+    with pytest.raises(ValueError, match="read-only"):
+        camera.world_to_camera[0, 0] = 2
+    with pytest.raises(AttributeError):
+        camera.width = 5
+    assert (camera.near, camera.far) == (0.01, math.inf)
+
+
+GOOD = {"width": 64, "height": 48, "fx": 50.0, "fy": 50.0, "cx": 32.0, "cy": 24.0}
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"width": 0}, "width must be 1 to 32767 pixels, not 0"),
+        ({"height": -3}, "height must be 1 to 32767"),
+        ({"width": 32768}, "width must be 1 to 32767"),
+        ({"height": 10**30}, "height must be 1 to 32767"),
+        ({"width": 64.5}, "width must be a whole number"),
+        ({"width": "64"}, "width must be a whole number"),
+        ({"height": True}, "height must be a whole number"),
+        ({"fx": 0.0}, "fx must be above 0"),
+        ({"fy": -1.0}, "fy must be above 0"),
+        ({"fx": math.inf}, "fx must be above 0 and finite"),
+        ({"fy": math.nan}, "fy must be above 0"),
+        ({"fx": "wide"}, "fx must be a number"),
+        ({"cx": math.nan}, "cx must be finite"),
+        ({"cy": math.inf}, "cy must be finite"),
+        ({"near": 0.0}, "near must be above 0"),
+        ({"near": math.nan}, "near must be above 0"),
+        ({"near": 1.0, "far": 1.0}, "far .* must be above near"),
+        ({"far": math.nan}, "far .* must be above near"),
+        ({"world_to_camera": np.eye(3)}, "world_to_camera must be a 4x4"),
+        ({"world_to_camera": 2 * np.eye(4)}, "last row"),
+        ({"world_to_camera": np.diag([2, 2, 2, 1])}, "world_to_camera must be rigid.*scales by 2"),
+        ({"world_to_camera": np.diag([1, 1, -1, 1])}, "reflection"),
+        ({"world_to_camera": np.diag([1, 2, 1, 1])}, "world_to_camera must be a rotation"),
+        ({"world_to_camera": np.full((4, 4), np.nan)}, "not finite"),
+        ({"world_to_camera": "here"}, "4x4 matrix of numbers"),
+    ],
+)
+def test_what_makes_no_camera(changes, words):
+    with pytest.raises(fs.InputError, match=words):
+        fs.Camera.pinhole(**GOOD | changes)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((0.0, [0, 0, 0], [0, 0, 1]), "fov_x must lie between 0 and pi"),
+        ((math.pi, [0, 0, 0], [0, 0, 1]), "fov_x must lie between"),
+        ((5e-324, [0, 0, 0], [0, 0, 1]), "fov_x must lie between"),
+        ((math.nan, [0, 0, 0], [0, 0, 1]), "fov_x must lie between"),
+        ((1.0, [0, 0, 1], [0, 0, 1]), "the same point"),
+        ((1.0, [0, 0], [0, 0, 1]), "position must be three"),
+        ((1.0, [0, 0, 0], [0, 0, math.inf]), "look_at must be three"),
+        ((1.0, [0, 0, 0], [0, 3, 0]), "up .* points along the view"),
+        ((1.0, [0, 0, 0], [0, 0, 1], [0, 0, 0]), "up must not be zero"),
+        ((1.0, [0, 0, 0], [0, 0, 1], "up"), "up must be three"),
+    ],
+)
+def test_what_cannot_be_looked_at(arguments, words):
+    with pytest.raises(fs.InputError, match=words):
+        fs.Camera.look_at(64, 48, *arguments)
+
+
+def test_whole_numbers_of_numpy_and_the_largest_size():
+    camera = fs.Camera.pinhole(np.int64(32767), np.uint8(1), 1, 1, 0, 0)
+    assert (camera.width, type(camera.width), camera.height) == (32767, int, 1)
+    assert focal_length(32767, math.pi / 2) == pytest.approx(32767 / 2)
+
+
+def test_points_of_another_shape():
+    with pytest.raises(fs.InputError, match=r"\(n, 3\).*\(3,\)"):
+        fs.Camera.pinhole(**GOOD).project([1, 2, 3])

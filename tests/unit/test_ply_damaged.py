@@ -1,0 +1,173 @@
+"""Every way in which a PLY file can be damaged is an InputError that names the file, found without a large
+allocation."""
+
+import os
+import tracemalloc
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+
+N = 300
+
+
+@pytest.fixture(scope="module")
+def content(tmp_path_factory):
+    r = np.random.default_rng(0)
+    f = np.float32
+    cloud = fs.SplatCloud(
+        r.normal(size=(N, 3)).astype(f),
+        r.normal(size=(N, 4)).astype(f),
+        r.uniform(0.1, 1, (N, 2)).astype(f),
+        r.random(N, dtype=f),
+        sh=r.normal(size=(N, 4, 3)).astype(f),
+    )
+    path = tmp_path_factory.mktemp("ply") / "good.ply"
+    fs.save_ply(cloud, path)
+    return path.read_bytes()
+
+
+def refused(path, words):
+    tracemalloc.start()
+    try:
+        with pytest.raises(fs.InputError, match=words) as caught:
+            fs.load_ply(path)
+        assert tracemalloc.get_traced_memory()[1] < 4e6
+    finally:
+        tracemalloc.stop()
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def swap(old, new):
+    def damage(content):
+        assert content.count(old) == 1
+        return content.replace(old, new)
+
+    return damage
+
+
+HEAD = b"ply\nformat binary_little_endian 1.0\n"
+DAMAGES = {
+    "cut in the data": (lambda c: c[:-1], r"cut short: its header calls for \d+ bytes, but the file has \d+"),
+    "cut after the header": (lambda c: c[: c.index(b"end_header\n") + 11], "cut short"),
+    "cut in the header": (lambda c: c[:200], "no end_header"),
+    "empty": (lambda c: b"", "is empty"),
+    "not a PLY": (lambda c: b"\x89PNG\r\n\x1a\n" + c, "is not a PLY file: its first line"),
+    "text": (lambda c: b"hello\n", "is not a PLY file"),
+    "zeros": (lambda c: bytes(5000), "is not a PLY file"),
+    "begins like one": (lambda c: b"plywood\n" + c, "is not a PLY file"),
+    "ascii": (swap(b"binary_little_endian", b"ascii"), "format is ascii; only binary_little_endian"),
+    "big-endian": (swap(b"binary_little_endian", b"binary_big_endian"), "format is binary_big_endian"),
+    "no format": (swap(b"format binary_little_endian 1.0\n", b""), "format is None"),
+    "no end_header": (swap(b"end_header\n", b""), "no end_header"),
+    "endless header": (lambda c: HEAD + b"comment x\n" * 10**6, "no end_header within 65536 bytes"),
+    "endless line": (lambda c: HEAD + b"x" * 10**6, "no end_header within 65536 bytes"),
+    "10^12 vertices": (
+        swap(b"vertex 300", b"vertex 1000000000000"),
+        r"cut short: its header calls for \d{15} bytes",
+    ),
+    "10^17 vertices": (swap(b"vertex 300", b"vertex 100000000000000000"), "cut short"),
+    "10^30 vertices": (swap(b"vertex 300", b"vertex 1" + b"0" * 30), "does not hold a count"),
+    "negative count": (swap(b"vertex 300", b"vertex -300"), "does not hold a count of 0 or more"),
+    "count that is no number": (swap(b"vertex 300", b"vertex many"), "does not hold a count"),
+    "count with a point": (swap(b"vertex 300", b"vertex 3e2"), "does not hold a count"),
+    "no count": (swap(b"vertex 300", b"vertex"), "damaged or repeats an element"),
+    "no vertices": (swap(b"element vertex", b"element face"), "no element vertex"),
+    "two vertex elements": (swap(b"element vertex 300\n", b"element vertex 0\n" * 2), "repeats an element"),
+    "property before the element": (swap(b"element vertex 300\n", b""), "property before its first element"),
+    "list property": (
+        swap(b"end_header", b"element face 1\nproperty list uchar int vertex_indices\nend_header"),
+        "is a list",
+    ),
+    "unknown type": (swap(b"property float x\n", b"property half x\n"), "known type"),
+    "short property line": (swap(b"property float x\n", b"property float\n"), "known type"),
+    "integer position": (swap(b"property float x\n", b"property int x\n"), "must be float or double: x"),
+    "integer SH": (swap(b"float f_rest_4\n", b"int f_rest_4\n"), "must be float or double: f_rest_4"),
+    "integer third scale": (swap(b"float scale_2\n", b"int scale_2\n"), "must be float or double: scale_2"),
+    "repeated property": (swap(b"property float y\n", b"property float x\n"), "property x twice"),
+    "missing properties": (
+        lambda c: c.replace(b"rot_2", b"rat_2").replace(b"opacity", b"density"),
+        "not a splat file: the element vertex lacks opacity, rot_2",
+    ),
+    "a point cloud": (
+        lambda c: HEAD + b"element vertex 1\nproperty float x\nend_header\n1234",
+        "lacks y, z, f_dc_0",
+    ),
+    "SH of no degree": (swap(b"f_rest_8\n", b"g_rest_8\n"), "8 properties f_rest"),
+    "SH numbered wrongly": (swap(b"f_rest_8\n", b"f_rest_9\n"), "numbered from 0"),
+    "unknown keyword": (swap(b"end_header", b"elephant 3\nend_header"), "'elephant 3' is unknown"),
+    "bytes that are no text": (swap(b"element vertex", b"comment \xff\xfe\nelement vertex"), "not text"),
+    "damaged origin": (
+        swap(b"element vertex", b"comment fidsplat origin 1 2\nelement vertex"),
+        "three finite numbers",
+    ),
+    "origin that is nan": (
+        swap(b"element vertex", b"comment fidsplat origin 1 2 nan\nelement vertex"),
+        "three finite",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGES)
+def test_damaged_file(tmp_path, content, kind):
+    damage, words = DAMAGES[kind]
+    path = tmp_path / "bad.ply"
+    path.write_bytes(damage(content))
+    refused(path, words)
+
+
+def test_missing_file(tmp_path):
+    refused(tmp_path / "none.ply", "cannot read .*none.ply: No such file")
+
+
+def test_folder(tmp_path):
+    refused(tmp_path, "is a folder")
+
+
+def test_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe.ply")
+    refused(tmp_path / "pipe.ply", "not a regular file")
+
+
+def test_name_that_cannot_be_one():
+    with pytest.raises(fs.InputError, match="cannot read"):
+        fs.load_ply("a\0b.ply")
+
+
+def test_unreadable_file(tmp_path, content, monkeypatch):
+    path = tmp_path / "secret.ply"
+    path.write_bytes(content)
+
+    def deny(*_):  # the tests may run as root, who may read everything
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(type(path), "open", deny)
+    refused(path, "cannot read .*Permission denied")
+
+
+def test_every_cut_of_the_header_is_an_error(tmp_path, content):
+    path = tmp_path / "bad.ply"
+    for length in range(0, content.index(b"end_header\n") + 11, 7):
+        path.write_bytes(content[:length])
+        with pytest.raises(fs.InputError):
+            fs.load_ply(path)
+
+
+def test_bytes_after_the_data_are_reported(tmp_path, content):
+    path = tmp_path / "long.ply"
+    path.write_bytes(content + b"12345")
+    with pytest.warns(UserWarning, match="5 bytes after the PLY data"):
+        assert len(fs.load_ply(path)) == N
+
+
+def test_random_data_is_left_out_or_drawn_but_never_a_crash(tmp_path, content):
+    start = content.index(b"end_header\n") + 11
+    noise = np.random.default_rng(0).bytes(len(content) - start)
+    path = tmp_path / "noise.ply"
+    path.write_bytes(content[:start] + noise)
+    left_out = pytest.warns(UserWarning, match="of 300 splats left out")
+    with left_out, pytest.warns(UserWarning, match="not flat"):
+        cloud = fs.load_ply(path)
+    assert len(cloud) + sum(cloud.dropped.values()) == N
