@@ -114,8 +114,6 @@ def _splats(table: Table, folder: Path) -> SplatCloud:
 
 
 def _marker(table: Table, folder: Path) -> PlacedMarker:
-    from fidsplat.markers import marker
-
     spec, size = table.text("spec"), table.number("size")
     if not size > 0:
         raise table.error("size", f"must be above 0 metres, not {size!r}")
@@ -125,6 +123,8 @@ def _marker(table: Table, folder: Path) -> PlacedMarker:
     quiet_zone, mixture = table.whole("quiet_zone", None), table.text("mixture", "fitted")
     if quiet_zone is not None and quiet_zone < 0:
         raise table.error("quiet_zone", f"must be 0 or more modules, not {quiet_zone}")
+    from fidsplat.markers import marker  # late: it brings shapely and networkx
+
     with table.at():
         return PlacedMarker(marker(spec, size=size, mixture=mixture, quiet_zone=quiet_zone), pose)
 

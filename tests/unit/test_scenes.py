@@ -1,0 +1,280 @@
+"""Scenes: merging, scene files as the contract shows them, saving and loading again."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import fidsplat as fs
+from fidsplat.rotations import rigid_matrix
+from fidsplat.scenes import PlacedMarker
+
+F32 = np.float32
+
+
+def cloud_of(n=5, seed=0, **changes):
+    r = np.random.default_rng(seed)
+    fields = {
+        "means": r.normal(size=(n, 3)).astype(F32),
+        "quats": r.normal(size=(n, 4)).astype(F32),
+        "scales": r.uniform(0.1, 1, (n, 2)).astype(F32),
+        "opacities": r.random(n, dtype=F32),
+        "sh": r.normal(size=(n, 4, 3)).astype(F32),
+    }
+    return fs.SplatCloud(**fields | changes)
+
+
+def fake_marker(spec, size=1.0, mixture="fitted", quiet_zone=None):
+    """What a scene needs of a marker, without partitioning one: two splats and four corners."""
+    if "unknown" in spec:
+        raise fs.InputError(f"unknown spec {spec!r}")
+    if mixture not in ("fitted", "paper"):
+        raise fs.InputError(f"unknown mixture {mixture!r}")
+    cloud = fs.SplatCloud(
+        [[-size, 0, 0], [size, 0, 0]],
+        [[1, 0, 0, 0]] * 2,
+        [[size, size]] * 2,
+        [1, 1],
+        colors=[[0, 0, 0], [1, 1, 1]],
+    )
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * size / 2
+    quiet_zone = 1 if quiet_zone is None else quiet_zone
+    return SimpleNamespace(
+        spec=spec, size=size, mixture=mixture, quiet_zone=quiet_zone, cloud=cloud, corners=corners
+    )
+
+
+@pytest.fixture(autouse=True)
+def _fake_markers(monkeypatch):
+    monkeypatch.setattr("fidsplat.markers.marker", fake_marker, raising=False)
+
+
+CONTRACT = """
+[camera]
+width = 1280
+height = 720
+fov_x_deg = 60.0
+position = [0.0, 0.0, -1.0]
+look_at = [0.0, 0.0, 0.0]
+
+[[splats]]
+file = "greenhouse.ply"
+
+[[markers]]
+spec = "apriltag:36h11:5"
+size = 0.16
+position = [0.2, 0.0, 0.5]
+quaternion = [1.0, 0.0, 0.0, 0.0]
+
+[render]
+outputs = ["rgb", "depth"]
+background = [0.0, 0.0, 0.0]
+"""
+
+
+@pytest.fixture
+def load(tmp_path):
+    fs.save_ply(cloud_of(), tmp_path / "greenhouse.ply")
+
+    def from_text(text):
+        (tmp_path / "scene.toml").write_text(text, encoding="utf-8")
+        return fs.Scene.load(tmp_path / "scene.toml")
+
+    return from_text
+
+
+def test_the_contracts_scene(load):
+    scene = load(CONTRACT)
+    camera = scene.camera
+    assert (camera.width, camera.height, camera.cx, camera.cy) == (1280, 720, 640, 360)
+    assert camera.fx == camera.fy == pytest.approx(640 / math.tan(math.radians(30)))
+    np.testing.assert_allclose(camera.position, [0, 0, -1])
+    assert (scene.outputs, scene.background, scene.quality, scene.device) == (
+        ("rgb", "depth"),
+        (0, 0, 0),
+        None,
+        None,
+    )
+    assert len(scene.clouds) == 1
+    assert np.array_equal(scene.clouds[0].means, cloud_of().means)
+    (placed,) = scene.markers
+    assert (placed.label, placed.marker.spec, placed.marker.size) == (1, "apriltag:36h11:5", 0.16)
+    np.testing.assert_allclose(placed.corners[0], [0.12, -0.08, 0.5])
+    assert scene.cloud().labels.tolist() == [0] * 5 + [1] * 2
+
+
+def test_everything_that_a_scene_file_can_say(load):
+    scene = load("""
+        markers = [{spec = "qr:a", size = 2, mixture = "paper", quiet_zone = 0}, {spec = "qr:b", size = 1}]
+        [camera]
+        width = 101
+        height = 55
+        fx = 80
+        fy = 81.5
+        cx = -3.5
+        cy = 200
+        near = 0.5
+        far = inf
+        world_to_camera = [[1, 0, 0, 0.5], [0, 0, -1, 0], [0, 1, 0, 3], [0, 0, 0, 1]]
+        [[splats]]
+        file = "greenhouse.ply"
+        position = [1, 2, 3]
+        quaternion = [0, 0, 3, 0]
+        scale = 2
+        [[splats]]
+        file = "./greenhouse.ply"
+        [render]
+        outputs = ["rgb"]
+        background = [1, 0.5, 0]
+        quality = "fast"
+        samples = 2
+        device = "reference"
+    """)
+    camera = scene.camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.near) == (80, 81.5, -3.5, 200, 0.5)
+    assert camera.world_to_camera[:, 3].tolist() == [0.5, 0, 3, 1]
+    base = cloud_of().means
+    np.testing.assert_allclose(scene.clouds[0].means, base * [-2, 2, -2] + [1, 2, 3], atol=1e-6)
+    assert np.array_equal(scene.clouds[1].means, base)
+    assert [(m.label, m.marker.mixture, m.marker.quiet_zone) for m in scene.markers] == [
+        (1, "paper", 0),
+        (2, "fitted", 1),
+    ]
+    assert scene.quality == fs.Quality.named("fast").with_(samples=2)
+    assert (scene.background, scene.device) == ((1, 0.5, 0), "reference")
+    assert scene.cloud().labels.tolist() == [0] * 10 + [1, 1, 2, 2]
+
+
+def test_an_empty_file_is_an_empty_scene(load):
+    scene = load("")
+    assert (scene.camera, scene.clouds, scene.markers, scene.outputs) == (None, (), (), ("rgb",))
+    assert len(scene.cloud()) == 0
+
+
+def test_an_empty_cloud_is_a_scene(tmp_path, load):
+    fs.save_ply(fs.SplatCloud.empty(), tmp_path / "empty.ply")
+    assert len(load('[[splats]]\nfile = "empty.ply"\nscale = 2.0').cloud()) == 0
+
+
+def test_images_of_markers_are_looked_for_beside_the_scene_file(load, tmp_path):
+    scene = load('[[markers]]\nspec = "image:art/tag.png"\nsize = 1.0')
+    assert scene.markers[0].marker.spec == f"image:{tmp_path / 'art' / 'tag.png'}"
+    (tmp_path / "deep").mkdir()
+    scene.save(tmp_path / "deep" / "b.toml")
+    assert 'spec = "image:../art/tag.png"' in (tmp_path / "deep" / "b.toml").read_text()
+
+
+def test_merging_keeps_the_clouds_labels_and_numbers_the_markers():
+    marker = fake_marker("qr:x", 0.5)
+    scene = fs.Scene(
+        [cloud_of(labels=9), cloud_of(2, 1)],
+        markers=[PlacedMarker(marker, label=7), PlacedMarker(marker, rigid_matrix([1e6, 0, 0]))],
+    )
+    assert [m.label for m in scene.markers] == [1, 2]
+    cloud = scene.cloud()
+    assert cloud.labels.tolist() == [9] * 5 + [0, 0] + [1, 1, 2, 2]
+    assert (cloud.sh_degree, cloud is scene.cloud()) == (1, True)
+    np.testing.assert_allclose(cloud.world_means()[-2:, 0], [1e6 - 0.5, 1e6 + 0.5], atol=0.07)
+
+
+def test_a_placed_markers_cloud_is_its_own():
+    far = PlacedMarker(fake_marker("qr:x", 0.5), rigid_matrix([1e6, 0, 0]), 4).cloud()
+    assert far.labels.tolist() == [4, 4]
+    np.testing.assert_allclose(far.world_means()[:, 0], [1e6 - 0.5, 1e6 + 0.5], atol=1e-6)
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    turn=st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1),
+    move=st.tuples(*[st.floats(-100, 100)] * 3),
+    size=st.floats(1e-3, 1e3),
+    text=st.text(st.characters(codec="utf-8"), max_size=20),
+    quality=st.sampled_from([None, "fast", "gsplat", fs.Quality.named("surfel").with_(samples=3)]),
+    origin=st.sampled_from([None, (5e5, 4.5e6, 300.0)]),
+)
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_saved_and_loaded_again(tmp_path, seed, turn, move, size, text, quality, origin):
+    pose = rigid_matrix(move, turn)
+    camera = fs.Camera.pinhole(33, 77, 50.1, 60.2, 1 / 3, 40.0, np.linalg.inv(pose), near=0.3)
+    marker = fake_marker("qr:" + text + '"\\\x7f\n', size, "paper", 3)
+    scene = fs.Scene(
+        [cloud_of(4, seed, labels=range(4), origin=origin), cloud_of(3, seed)],
+        camera=camera,
+        markers=[PlacedMarker(marker, pose)],
+        background=(0.1, 0.2, 1 / 3),
+        outputs=("rgb", "label"),
+        quality=quality,
+        device="opencl:pocl",
+    )
+    scene.save(tmp_path / "a.toml")
+    again = fs.Scene.load(tmp_path / "a.toml")
+    for name in ("width", "height", "fx", "fy", "cx", "cy", "near", "far"):
+        assert getattr(again.camera, name) == getattr(camera, name)
+    assert np.array_equal(again.camera.world_to_camera, camera.world_to_camera)
+    assert (again.background, again.outputs, again.device) == (scene.background, scene.outputs, scene.device)
+    assert again.quality == quality
+    old, new = marker, again.markers[0].marker
+    assert (new.spec, new.size, new.mixture, new.quiet_zone) == (
+        old.spec,
+        old.size,
+        old.mixture,
+        old.quiet_zone,
+    )
+    np.testing.assert_allclose(again.markers[0].pose, pose, atol=1e-14)
+    for a, b in zip(again.clouds, scene.clouds, strict=True):
+        assert np.array_equal(a.means, b.means)
+        assert np.array_equal(a.origin, b.origin)
+        assert np.array_equal(a.labels, b.labels)
+        assert np.array_equal(a.sh, b.sh)
+
+
+def test_files_of_a_saved_scene(tmp_path):
+    fs.Scene([cloud_of(), cloud_of(2, 1)]).save(tmp_path / "lab.toml")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["lab-splats-0.ply", "lab-splats-1.ply", "lab.toml"]
+    loaded = fs.Scene.load(tmp_path / "lab.toml")
+    loaded.save(tmp_path / "lab.toml")
+    assert len(fs.Scene.load(tmp_path / "lab.toml").cloud()) == 7
+
+
+def test_a_quality_between_the_presets_cannot_be_saved(tmp_path):
+    scene = fs.Scene(quality=fs.Quality(alpha_cutoff=0.123))
+    with pytest.raises(fs.InputError, match="differs from every preset"):
+        scene.save(tmp_path / "a.toml")
+    assert not list(tmp_path.iterdir())
+
+
+def test_text_that_is_no_unicode_cannot_be_saved(tmp_path):
+    with pytest.raises(fs.InputError, match="not Unicode"):
+        fs.Scene(markers=[PlacedMarker(fake_marker("qr:\ud800"))]).save(tmp_path / "a.toml")
+
+
+def test_a_folder_that_cannot_be_written(tmp_path):
+    with pytest.raises(fs.InputError, match="cannot write"):
+        fs.Scene([cloud_of()]).save(tmp_path / "missing" / "a.toml")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"clouds": [1]}, "clouds must be a list of SplatCloud"),
+        ({"clouds": cloud_of()}, "clouds must be a list of SplatCloud"),
+        ({"markers": [fake_marker("qr:x")]}, "markers must be a list of PlacedMarker"),
+        ({"camera": "front"}, "camera must be a Camera"),
+        ({"background": (0, 0)}, "background must be three"),
+        ({"background": (0, 0, math.nan)}, "background must be three"),
+        ({"background": "black"}, "background must be three"),
+        ({"outputs": ()}, "outputs must be one or more names"),
+        ({"outputs": (1,)}, "outputs must be one or more names"),
+    ],
+)
+def test_parts_of_the_wrong_kind(arguments, words):
+    with pytest.raises(fs.InputError, match=words):
+        fs.Scene(**arguments)
+
+
+def test_a_pose_must_be_rigid():
+    with pytest.raises(fs.InputError, match="a marker's pose must be rigid"):
+        PlacedMarker(fake_marker("qr:x"), np.diag([2.0, 2, 2, 1]))
