@@ -1,4 +1,4 @@
-"""Comparison with the float64 reference: a tight tolerance, plus the certificate where a decision lies on its threshold."""
+"""Comparison with the float64 reference: a tight tolerance, plus the certificate near thresholds."""
 
 import numpy as np
 
@@ -23,7 +23,9 @@ def reference_pixels(judge, cloud, camera, outputs, quality, background=(0.0, 0.
     return pipeline.render(resident, view).planes
 
 
-def assert_agrees(renderer, judge, cloud, camera, outputs=ALL_OUTPUTS, quality=None, background=(0.1, 0.2, 0.3)):
+def assert_agrees(
+    renderer, judge, cloud, camera, outputs=ALL_OUTPUTS, quality=None, background=(0.1, 0.2, 0.3)
+):
     """Draw with both and compare every plane; returns the frame."""
     quality = Quality.of(quality)
     frame = renderer.render(cloud, camera, outputs=outputs, quality=quality, background=background)

@@ -34,7 +34,7 @@ SCENES = {
 
 
 def random_cloud(count: int, median_scale: float, seed: int = 0, extent: float = 4.0) -> SplatCloud:
-    """`count` splats: uniform centres, random orientations, log-normal scales, opacities from beta(1.2, 1)."""
+    """`count` splats: uniform centres, random orientations, log-normal scales, beta(1.2, 1) opacities."""
     generator = np.random.default_rng(seed)
     means = generator.uniform(-extent, extent, (count, 3)).astype(np.float32)
     means[:, 2] += extent * 2.0

@@ -26,11 +26,11 @@ static inline void pixel_start(Pixel *pixel) {
 static inline void pixel_blend(Pixel *pixel, const Splat *s, Crossing c, vint mask, vfloat screen,
                                const BlendConstants *constants) {
     vfloat inverse_d = 1.0f / c.d;
-    vfloat alpha = splat_alpha(s, fragment_half_rho(c, inverse_d, screen), constants->ceiling);
+    vfloat opacity = fragment_opacity(s, fragment_half_rho(c, inverse_d, screen), constants->ceiling);
     vint live = mask & VMASK(pixel->t > constants->stop);
 //@@ stop
-    alpha = VSELECT((vfloat)0.0f, alpha, live);
-    vfloat weight = pixel->t * alpha;
+    opacity = VSELECT((vfloat)0.0f, opacity, live);
+    vfloat weight = pixel->t * opacity;
     pixel->r = FMA(weight, (vfloat)s->r, pixel->r);
     pixel->g = FMA(weight, (vfloat)s->g, pixel->g);
     pixel->b = FMA(weight, (vfloat)s->b, pixel->b);

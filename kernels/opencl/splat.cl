@@ -38,7 +38,7 @@ static inline Crossing cross_row(const Splat *s, vfloat nu_x, vfloat nv_x, vfloa
     return c;
 }
 
-// alpha of a fragment at half squared distance rho / 2
-static inline vfloat splat_alpha(const Splat *s, vfloat half_rho, float ceiling) {
+// Opacity (the alpha of the paper) of a fragment at half squared distance rho / 2
+static inline vfloat fragment_opacity(const Splat *s, vfloat half_rho, float ceiling) {
     return fmin(exp(s->log_opacity - half_rho), (vfloat)ceiling);
 }

@@ -57,7 +57,7 @@ def test_lowpass_and_samples(renderer, judge, lowpass, samples):
 
 
 def test_fast_preset_is_as_accurate_as_its_constants(renderer, judge):
-    """Float32 set-up costs accuracy (numerics B1), so this preset is held to a tenth of an 8-bit step."""
+    """Float32 set-up costs accuracy (numerics B1): this preset is held to a tenth of an 8-bit step."""
     quality = fs.Quality.named("fast")
     cloud = random_splats(200, seed=0, depth=(0.5, 6.0))
     frame = renderer.render(cloud, CAMERA, quality=quality)
@@ -90,7 +90,7 @@ def test_principal_point_outside_the_picture_and_odd_sizes(renderer, judge):
 
 
 def test_a_hundred_thousand_splats_at_720p(renderer, judge):
-    """r100k_720p at 300 pixels: at least 50 dB (the issue's figure), and within the tolerance of all others."""
+    """r100k_720p at 300 pixels: at least 50 dB (the figure of its issue), and within the usual tolerance."""
     cloud, camera = load_scene("r100k_720p")
     generator = np.random.default_rng(1)
     pixels = generator.integers(0, camera.height, 300), generator.integers(0, camera.width, 300)

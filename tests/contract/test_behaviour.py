@@ -48,7 +48,9 @@ def test_resident_cloud_draws_the_same(renderer):
 
 
 def test_empty_cloud_is_background(renderer):
-    empty = fs.SplatCloud(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 2)), np.zeros(0), colors=np.zeros((0, 3)))
+    empty = fs.SplatCloud(
+        np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 2)), np.zeros(0), colors=np.zeros((0, 3))
+    )
     frame = renderer.render(empty, CAMERA, outputs=ALL_OUTPUTS, background=(0.25, 0.5, 0.75))
     assert np.array_equal(frame["rgb"], np.broadcast_to(np.float32([0.25, 0.5, 0.75]), (70, 130, 3)))
     assert not frame["alpha"].any()
@@ -82,7 +84,11 @@ def test_one_pixel_picture(renderer, judge):
 def test_opaque_splats_hide_what_is_behind(renderer):
     """numerics D1: with the inclusive stop and ceiling 1 nothing leaks; the parity presets leak 1 %."""
     cloud = fs.SplatCloud(
-        [[0, 0, 1], [0, 0, 2]], [[1, 0, 0, 0]] * 2, [[0.5, 0.5]] * 2, [1.0, 1.0], colors=[[0, 0, 0], [1, 1, 1]]
+        [[0, 0, 1], [0, 0, 2]],
+        [[1, 0, 0, 0]] * 2,
+        [[0.5, 0.5]] * 2,
+        [1.0, 1.0],
+        colors=[[0, 0, 0], [1, 1, 1]],
     )
     camera = fs.Camera.pinhole(3, 3, 100.0, 100.0, 1.5, 1.5)
     assert renderer.render(cloud, camera)["rgb"][1, 1].max() < 1e-4
@@ -113,7 +119,10 @@ def test_timings_and_stats_name_the_work(renderer):
         ({"outputs": ("rgb", "dept")}, ["'dept'", "'depth'"]),
         ({"quality": "standrad"}, ["'standrad'", "'standard'"]),
         ({"background": (0, 1)}, ["background", "three"]),
-        ({"quality": fs.Quality(samples=8), "camera": fs.Camera.pinhole(9000, 10, 1, 1, 1, 1)}, ["9000", "32767"]),
+        (
+            {"quality": fs.Quality(samples=8), "camera": fs.Camera.pinhole(9000, 10, 1, 1, 1, 1)},
+            ["9000", "32767"],
+        ),
     ],
 )
 def test_bad_arguments_are_named(renderer, arguments, words):

@@ -6,6 +6,6 @@
     pixel->finished = 0;
 //@ stop
     live &= ~pixel->finished;
-    vint drop = live & VMASK(pixel->t * (1.0f - alpha) <= constants->stop);
+    vint drop = live & VMASK(pixel->t * (1.0f - opacity) <= constants->stop);
     pixel->finished |= drop;
     live &= ~drop;

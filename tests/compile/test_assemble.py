@@ -1,0 +1,94 @@
+"""A scene pays only for what it calls for: the text of the kernels, and what it costs."""
+
+import re
+from itertools import combinations
+
+import numpy as np
+import pytest
+from agreement import random_splats
+
+import fidsplat as fs
+from fidsplat.backends.opencl import assemble as assembly
+from fidsplat.backends.opencl.assemble import DeviceShape, assemble
+from fidsplat.effects import CATALOGUE, OUTPUTS, Effect, Output, select
+from fidsplat.effects import catalogue as catalogue_module
+
+SHAPE = DeviceShape("lanes", 16, 16, 16, 8, 11, 1, True)
+TAPS = [name for name in OUTPUTS if name != "rgb"]
+PLAIN = fs.Quality(lowpass="none")
+
+
+def test_base_text_names_no_effect_that_was_not_asked_for():
+    text = assemble(select(-1, ("rgb",), PLAIN), SHAPE).text
+    assert "//" not in text
+    absent = set(CATALOGUE) - {"camera_pinhole", "color_rgb", "lowpass_none", "stop_inclusive"}
+    for name in (*absent, *TAPS, "sh", "finished"):
+        assert not re.search(rf"\b{name}(_|\b)", text), name
+
+
+@pytest.mark.parametrize("tap", TAPS)
+def test_a_tap_brings_its_text_and_nothing_else(tap):
+    base = assemble(select(-1, ("rgb",), PLAIN), SHAPE)
+    with_tap = assemble(select(-1, (tap,), PLAIN), SHAPE)
+    assert with_tap.digest != base.digest
+    base_lines, tap_lines = base.text.splitlines(), with_tap.text.splitlines()
+    remaining = iter(tap_lines)
+    for line in base_lines:
+        if not line.startswith("#define RECORD_BYTES"):
+            assert line in remaining, f"{tap} removed or moved: {line}"
+    others = [
+        other for other in TAPS if other != tap and not other.startswith(tap) and not tap.startswith(other)
+    ]
+    assert not any(re.search(rf"\b{other}_(out|raw)", with_tap.text) for other in others)
+
+
+def test_an_effect_added_to_the_catalogue_leaves_other_texts_as_they_were(monkeypatch):
+    before = {taps: assemble(select(-1, taps, PLAIN), SHAPE).digest for taps in combinations(TAPS, 2)}
+    dummy = Effect("dummy", "tap/alpha.cl", record_lanes=5, output=Output("dummy", 1, "float32"))
+    monkeypatch.setitem(catalogue_module.CATALOGUE, "dummy", dummy)
+    after = {taps: assemble(select(-1, taps, PLAIN), SHAPE).digest for taps in combinations(TAPS, 2)}
+    assert before == after
+
+
+def test_record_sizes_are_what_the_effects_declare():
+    def record(outputs, quality=PLAIN, degree=-1):
+        return assemble(select(degree, outputs, quality), SHAPE).record_bytes
+
+    assert record(("rgb",)) == 64
+    assert record(("rgb",), fs.Quality()) == 72
+    assert record(("alpha",)) == 64
+    assert record(("depth",)) == record(("depth", "depth_median")) == 76
+    assert record(("normal",)) == 76
+    assert record(("label",)) == 68
+    assert record(("rgb",), degree=3) == 64
+
+
+def test_a_section_that_no_stage_has_is_refused(monkeypatch):
+    monkeypatch.setattr(assembly, "_sections", lambda path: {"no_such_hook": "x"})
+    with pytest.raises(fs.DeviceError, match="no_such_hook"):
+        assemble(select(-1, ("rgb",), PLAIN), SHAPE)
+
+
+def test_text_does_not_depend_on_numbers():
+    numbers = fs.Quality(lowpass="none", alpha_cutoff=0.01, transmittance_stop=0.5, opacity_ceiling=0.7)
+    assert select(-1, ("rgb",), numbers) == select(-1, ("rgb",), PLAIN)
+
+
+def test_features_are_the_same_whatever_the_order_of_outputs():
+    assert select(2, ["rgb", "label", "depth"], PLAIN) == select(2, ("depth", "label"), PLAIN)
+
+
+def test_pipelines_are_compiled_once(renderer):
+    features = select(-1, ("rgb",), PLAIN)
+    assert renderer.backend.pipeline(features) is renderer.backend.pipeline(features)
+
+
+@pytest.mark.parametrize(
+    ("outputs", "degree"), [*((pair, None) for pair in combinations(TAPS, 2)), (TAPS, None), (TAPS, 3)]
+)
+def test_every_pair_of_outputs_compiles_and_runs(renderer, outputs, degree):
+    cloud = random_splats(20, seed=1, depth=(1, 4), sh_degree=degree)
+    camera = fs.Camera.pinhole(20, 12, 20.0, 20.0, 10.0, 6.0)
+    frame = renderer.render(cloud, camera, outputs=("rgb", *outputs), quality=PLAIN)
+    assert all(np.isfinite(frame[name]).all() for name in frame)
+    assert set(CATALOGUE) >= set(outputs)

@@ -1,0 +1,77 @@
+"""Names of devices, and the repair of PoCL's target processor."""
+
+import ctypes
+
+import pytest
+
+import fidsplat as fs
+from fidsplat.backends.opencl import pocl_target
+from fidsplat.errors import UnknownDeviceError
+
+
+def test_devices_lists_pocl_and_the_reference():
+    names = [info.name for info in fs.devices()]
+    assert "opencl:pocl" in names
+    assert "reference" in names
+
+
+def test_pocl_is_usable_with_float64():
+    pocl = next(info for info in fs.devices() if info.name == "opencl:pocl")
+    assert pocl.usable, pocl.reason
+    assert pocl.float64
+    assert pocl.kind == "cpu"
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("openc", ["'openc'", "'opencl'", "reference"]),
+        ("", ["''", "opencl"]),
+        ("opencl:no-such-card", ["'no-such-card'", "there are"]),
+        ("reference:fast", ["'fast'"]),
+    ],
+)
+def test_unknown_devices_are_named(name, words):
+    with pytest.raises(UnknownDeviceError) as caught:
+        fs.Renderer(name)
+    assert all(word in str(caught.value) for word in words)
+    assert caught.value.exit_status == 2
+
+
+def test_no_platform_says_how_to_get_one(monkeypatch):
+    from fidsplat.backends.opencl import backend
+
+    monkeypatch.setattr(backend, "_all_devices", lambda: iter(()))
+    with pytest.raises(fs.DeviceError, match=r"pip install 'pyopencl\[pocl\]'"):
+        fs.Renderer("opencl")
+
+
+def test_target_is_corrected_only_where_the_record_looks_as_expected():
+    triplet = ctypes.create_string_buffer(b"x86_64-unknown-linux-gnu")
+    generic, other = ctypes.create_string_buffer(b"generic"), ctypes.create_string_buffer(b"skylake")
+    Record = ctypes.c_uint64 * 512
+
+    def record(*words):
+        return Record(*words)
+
+    good = record(1, 2, ctypes.addressof(triplet), ctypes.addressof(generic), 5)
+    name = pocl_target.correct_target(ctypes.addressof(good))
+    assert name in [level for level, _ in pocl_target._LEVELS]
+    assert ctypes.string_at(good[3]) == name.encode()
+    assert list(good[:3]) == [1, 2, ctypes.addressof(triplet)]
+    assert good[4] == 5
+
+    for bad in (
+        record(ctypes.addressof(triplet), ctypes.addressof(other)),
+        record(ctypes.addressof(generic), ctypes.addressof(triplet)),
+        record(8, 1 << 63),
+    ):
+        before = list(bad)
+        assert pocl_target.correct_target(ctypes.addressof(bad)) is None
+        assert list(bad) == before
+
+
+def test_only_pocl_with_an_unknown_processor_is_corrected():
+    known = "OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-skylake-avx512"
+    assert not pocl_target.needs_correction(known)
+    assert not pocl_target.needs_correction("OpenCL 3.0 CUDA")
