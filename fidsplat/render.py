@@ -115,7 +115,7 @@ class Renderer:
                 elsewhere.
             DeviceError: the device fails or lacks memory.
         """
-        own = scene if isinstance(scene, Scene) else Scene([])
+        own = scene if isinstance(scene, Scene) else Scene(())
         camera = camera or own.camera
         if camera is None:
             raise InputError("no camera: pass camera=fs.Camera... or give the scene a [camera] table")

@@ -241,7 +241,7 @@ def _composite(
         last = (
             half.shape[1] - 1 - np.argmax(half[:, ::-1], axis=1) if half.shape[1] else np.zeros(len(x), int)
         )
-        out["depth_median"] = _pick(z, last, half.any(1), 0.0)
+        out["depth_median"] = _pick(z, last, np.any(half, axis=1), 0.0)
     if "normal" in features.taps:
         out["normal"] = weight @ s.normal
     if "label" in features.taps:

@@ -60,12 +60,11 @@ class Resident:
             "opacities": cloud.opacities,
             "labels": cloud.labels,
         }
-        if self.sh_degree > 0:
-            arrays["sh"] = cloud.sh
-        elif cloud.sh is not None:
-            arrays["colors"] = np.maximum(np.float32(C0) * cloud.sh[:, 0, :] + np.float32(0.5), 0)
-        else:
+        if cloud.colors is not None:
             arrays["colors"] = cloud.colors
+        elif cloud.sh is not None:  # always: a cloud has one of the two
+            degree_0 = np.maximum(np.float32(C0) * cloud.sh[:, 0, :] + np.float32(0.5), 0)
+            arrays |= {"sh": cloud.sh} if self.sh_degree > 0 else {"colors": degree_0}
         self.buffers: dict[str, cl.Buffer] = {}
         for name, array in arrays.items():
             self.buffers[name] = buffer = pool.fresh(f"the cloud's {name}", array.nbytes)
