@@ -43,7 +43,9 @@ class SplatCloud:
     dropped: dict[str, int] = field(default_factory=dict)
     """reason -> number of splats left out when this cloud was made; empty when nothing was"""
 
-    def __init__(self, means, quats, scales, opacities, colors=None, sh=None, labels=None, origin=None):
+    def __init__(
+        self, means, quats, scales, opacities, colors=None, sh=None, labels=None, origin=None, *, source=None
+    ):
         """Check and freeze n splats.
 
         means (n, 3) metres; quats (n, 4) wxyz of any length but 0; scales (n, 2) metres; opacities (n,) in
@@ -56,8 +58,9 @@ class SplatCloud:
 
         A splat that cannot be drawn (a value that is not finite, |q|^2 < 1e-30, a scale <= 0, an opacity
         outside [0, 1]) is left out and counted in ``dropped`` under its first such reason; one warning
-        reports the counts. Arrays are copied, except float32 arrays that are read-only down to the memory
-        they stand on. Raises InputError, naming the array, for a wrong shape or type.
+        reports the counts, naming ``source`` (a file, say). Arrays are copied, except float32 arrays that
+        are read-only down to the memory they stand on. Raises InputError, naming the array, for a wrong
+        shape or type.
         """
         given = _numbers("means", means)
         n = given.shape[0] if given.ndim else -1
@@ -88,7 +91,7 @@ class SplatCloud:
         if keep is not None:
             single = {name: array[keep] for name, array in single.items()}
             given, new_labels = given[keep], new_labels[keep]
-            warnings.warn(_drop_report(dropped, n), stacklevel=2)
+            warnings.warn(_drop_report(dropped, n, source), stacklevel=2)
         single["quats"] = _unit(single["quats"])
         if origin is not None:
             new_origin = _check_origin(origin)
@@ -316,9 +319,10 @@ def _find_defects(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, dic
     return (None if bad is None else ~bad), dropped
 
 
-def _drop_report(dropped: dict[str, int], n: int) -> str:
+def _drop_report(dropped: dict[str, int], n: int, source) -> str:
     parts = ", ".join(f"{reason}: {count}" for reason, count in dropped.items())
-    return f"{sum(dropped.values())} of {n} splats left out ({parts})"
+    start = "" if source is None else f"{source}: "
+    return f"{start}{sum(dropped.values())} of {n} splats left out ({parts})"
 
 
 def _unit(quats: np.ndarray) -> np.ndarray:

@@ -38,7 +38,7 @@ def load_ply(path: str | os.PathLike[str]) -> SplatCloud:
         fields = _two_scales(header, fields)
     for array in fields.values():
         array.flags.writeable = False  # so that the cloud takes them over without a copy
-    return SplatCloud(**fields)
+    return SplatCloud(**fields, source=header.path)
 
 
 def _read_plain(header: Header) -> dict[str, np.ndarray]:

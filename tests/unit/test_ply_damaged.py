@@ -167,7 +167,7 @@ def test_random_data_is_left_out_or_drawn_but_never_a_crash(tmp_path, content):
     noise = np.random.default_rng(0).bytes(len(content) - start)
     path = tmp_path / "noise.ply"
     path.write_bytes(content[:start] + noise)
-    left_out = pytest.warns(UserWarning, match="of 300 splats left out")
+    left_out = pytest.warns(UserWarning, match=r"noise\.ply: \d+ of 300 splats left out")
     with left_out, pytest.warns(UserWarning, match="not flat"):
         cloud = fs.load_ply(path)
     assert len(cloud) + sum(cloud.dropped.values()) == N
