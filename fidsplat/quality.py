@@ -13,6 +13,7 @@ from fidsplat.errors import InputError
 
 LOWPASS = ("screen", "none")
 STOP_RULES = ("inclusive", "exclusive")
+COPLANAR = ("blend", "order")
 SETUP_PRECISIONS = ("float64", "float32")
 MAX_SAMPLES = 8
 
@@ -44,6 +45,10 @@ class Quality:
     """`screen`: the object-space low-pass of 2DGS (a Gaussian of sigma 0.707 px around the projected centre,
     the larger of the two weights wins). `none`: the exact splat; use it with several samples per pixel."""
 
+    coplanar: str = "blend"
+    """Splats that are printed on one plane (markers). `blend`: one layer whose colour does not depend on
+    their order. `order`: by the depth of their centres, as any other splats, which flips as the camera turns."""
+
     samples: int = 1
     """n: each pixel is the mean of n x n samples on a regular grid, 1 to 8."""
 
@@ -71,10 +76,16 @@ class Quality:
         for name, known in (
             ("stop_rule", STOP_RULES),
             ("lowpass", LOWPASS),
+            ("coplanar", COPLANAR),
             ("setup_precision", SETUP_PRECISIONS),
         ):
             if getattr(self, name) not in known:
                 raise InputError(f"quality: {name} is {getattr(self, name)!r}; known: {', '.join(known)}")
+        if self.stop_rule == "exclusive" and self.coplanar == "blend":
+            raise InputError(
+                "quality: the exclusive stop drops single fragments, which coplanar='blend' does not have; "
+                "use coplanar='order' with it"
+            )
         if not isinstance(self.samples, int) or not 1 <= self.samples <= MAX_SAMPLES:
             raise InputError(
                 f"quality: samples is {self.samples!r}; it must be a whole number from 1 to {MAX_SAMPLES}"
@@ -111,7 +122,7 @@ class Quality:
 # Both clamp alpha at 0.99, cut at 1/255 and drop the fragment that would take T below 1e-4. What differs
 # between them (bounding boxes, low-pass centre, near plane) is a defect of theirs, not a constant: see
 # docs/conventions.md.
-_PARITY = Quality(opacity_ceiling=0.99, stop_rule="exclusive")
+_PARITY = Quality(opacity_ceiling=0.99, stop_rule="exclusive", coplanar="order")
 
 PRESETS: dict[str, Quality] = {
     "standard": Quality(),

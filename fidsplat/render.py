@@ -130,6 +130,6 @@ class Renderer:
                 "this cloud was uploaded by another Renderer; upload it with the one that draws it"
             )
         data = resident._data
-        features = select(data.sh_degree, names, chosen)
+        features = select(data, names, chosen)
         view = View.of(camera, chosen, data.origin, behind)
         return Frame(self.backend.pipeline(features).render(data, view), names)

@@ -40,6 +40,9 @@ class SplatCloud:
     """(n,) int32"""
     origin: np.ndarray
     """(3,) float64, metres, world position of the means' zero"""
+    planes: np.ndarray | None = None
+    """(n,) int32, or None: splats with the same id >= 0 are printed on one plane, where their order means
+    nothing (`with_planes`); -1 for splats of no plane"""
     dropped: dict[str, int] = field(default_factory=dict)
     """reason -> number of splats left out when this cloud was made; empty when nothing was"""
 
@@ -98,7 +101,10 @@ class SplatCloud:
         else:  # after the defects, so that a splat that is left out has no say in it
             single["means"], new_origin = _choose_origin(given, single["means"], single["scales"])
         self._set(
-            **{"colors": None, "sh": None, **single}, labels=new_labels, origin=new_origin, dropped=dropped
+            **{"colors": None, "sh": None, "planes": None, **single},
+            labels=new_labels,
+            origin=new_origin,
+            dropped=dropped,
         )
 
     def _set(self, **values) -> None:
@@ -125,6 +131,11 @@ class SplatCloud:
     def sh_degree(self) -> int:
         """Degree 0 to 3 of the SH colours, -1 for plain colours."""
         return -1 if self.sh is None else int(np.sqrt(self.sh.shape[1])) - 1
+
+    @property
+    def has_planes(self) -> bool:
+        """Whether some splats are printed on planes."""
+        return self.planes is not None
 
     @staticmethod
     def empty() -> "SplatCloud":
@@ -174,13 +185,25 @@ class SplatCloud:
             raise InputError(f"the transform's scale {scale:g} takes splats out of the range of float32")
         return self._replaced(means=means, quats=quats, scales=scales, sh=sh, origin=origin)
 
+    def with_planes(self, planes) -> "SplatCloud":
+        """The same splats, printed on planes: one id or (n,) ids, -1 for none.
+
+        A renderer draws the splats of one plane as one layer: where they meet in a pixel, the result does not
+        depend on their order. They must be coplanar, as those of a marker are. Raises InputError for anything
+        but ints of at least -1.
+        """
+        ids = _labels(planes, len(self), "planes")
+        if (ids < -1).any():
+            raise InputError(f"planes must be ids of at least 0, or -1 for none, not {int(ids.min())}")
+        return self._replaced(planes=ids if (ids >= 0).any() else None)
+
     @staticmethod
     def concatenate(clouds: Sequence["SplatCloud"]) -> "SplatCloud":
         """All splats of several clouds, in order.
 
         When any has SH, all get SH of the highest degree (colours become degree 0, missing bands 0). Clouds
         that share an origin keep their bits; otherwise a common one is chosen as in the constructor.
-        ``dropped`` adds up.
+        Planes of different clouds stay different planes. ``dropped`` adds up.
         """
         clouds = list(clouds)
         dropped: dict[str, int] = {}
@@ -206,6 +229,7 @@ class SplatCloud:
             colors, sh = np.concatenate([cloud.colors for cloud in filled if cloud.colors is not None]), None
         else:
             colors, sh = None, np.concatenate([_sh_of_degree(cloud, degree) for cloud in filled])
+        joined["planes"] = _joined_planes(filled)
         return first._replaced(**joined, colors=colors, sh=sh, dropped=dropped)
 
 
@@ -229,15 +253,26 @@ def _check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
     raise InputError(f"{name} must have the shape {wanted}, but its shape is {array.shape}{hint}")
 
 
-def _labels(labels, n: int) -> np.ndarray:
-    array = _numbers("labels", 0 if labels is None else labels)
+def _joined_planes(clouds: Sequence[SplatCloud]) -> np.ndarray | None:
+    if all(cloud.planes is None for cloud in clouds):
+        return None
+    joined, first_free = [], 0
+    for cloud in clouds:
+        ids = np.full(len(cloud), -1, np.int32) if cloud.planes is None else cloud.planes
+        joined.append(np.where(ids >= 0, ids + first_free, -1).astype(np.int32))
+        first_free = max(first_free, int(joined[-1].max()) + 1)
+    return np.concatenate(joined)
+
+
+def _labels(labels, n: int, name: str = "labels") -> np.ndarray:
+    array = _numbers(name, 0 if labels is None else labels)
     if array.dtype.kind == "f" and array.size:
-        raise InputError(f"labels must be ints, not {array.dtype}")
+        raise InputError(f"{name} must be ints, not {array.dtype}")
     if array.shape not in ((), (n,)):
-        raise InputError(f"labels must be one int or have the shape ({n},), but its shape is {array.shape}")
+        raise InputError(f"{name} must be one int or have the shape ({n},), but its shape is {array.shape}")
     limits = np.iinfo(np.int32)
     if array.size and (int(array.min()) < limits.min or int(array.max()) > limits.max):
-        raise InputError(f"labels must lie in {limits.min} to {limits.max}")
+        raise InputError(f"{name} must lie in {limits.min} to {limits.max}")
     return np.full(n, array, np.int32) if array.ndim == 0 else array.astype(np.int32)
 
 

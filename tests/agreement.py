@@ -15,7 +15,7 @@ RARE = 1e-3  # share of pixels whose median or label may flip, and whose certifi
 def reference_pixels(judge, cloud, camera, outputs, quality, background=(0.0, 0.0, 0.0), pixels=None):
     """Reference planes with the certificate: whole, or at `pixels` = (rows, columns)."""
     quality = Quality.of(quality)
-    features = select(cloud.sh_degree, outputs, quality)
+    features = select(cloud, outputs, quality)
     view = View.of(camera, quality, cloud.origin, background)
     pipeline, resident = judge.backend.pipeline(features), judge.backend.upload(cloud)
     if pixels is not None:

@@ -79,6 +79,7 @@ class ReferenceCloud:
         self.cloud = cloud
         self.origin = cloud.origin
         self.sh_degree = cloud.sh_degree
+        self.has_planes = cloud.planes is not None
 
 
 @dataclass
@@ -187,6 +188,8 @@ class _Splats:
         facing = np.where(np.einsum("ij,ij->i", normal, p) > 0, -1.0, 1.0)[:, None]
         self.normal = normal * facing / np.where(length > 0, length, 1)
         self.screen = "lowpass_screen" in features.slots
+        layered = "compose_planes" in features.slots and cloud.planes is not None
+        self.planes = cloud.planes[order] if layered else None
 
 
 def _colors(cloud: SplatCloud, order: np.ndarray, rays: np.ndarray) -> np.ndarray:
@@ -224,7 +227,8 @@ def _composite(
     z = np.where(d > 0, np.clip(z, s.pz - s.reach, s.pz + s.reach), s.pz)
 
     alpha = np.minimum(np.exp(s.log_opacity - half_rho), view.ceiling)
-    before, live, final = _transmittance(alpha, view.stop, "stop_exclusive" in features.slots)
+    run = None if s.planes is None else _runs(alpha > 0, s.planes)
+    before, live, final = _transmittance(alpha, view.stop, "stop_exclusive" in features.slots, run)
     weight = np.where(live, before * alpha, 0.0)
     # what a risky fragment would weigh, drawn or not; at the near plane it may be anything up to its opacity
     edge = np.where(inside, alpha, np.exp(np.minimum(view.log_cut, s.log_opacity)))
@@ -233,7 +237,8 @@ def _composite(
     near_stop = np.abs(before * (1 - alpha) - view.stop) <= _RISK * view.stop
     certificate += np.where((near_stop & (alpha > 0) & live).any(1), view.stop, 0.0)
 
-    out = {"rgb": weight @ s.colors, "t": final, "certificate": certificate}
+    rgb = weight @ s.colors if run is None else _layered(alpha, weight, live, run, s)
+    out = {"rgb": rgb, "t": final, "certificate": certificate}
     if {"depth", "depth_median"} & set(features.taps):
         out["depth"] = (weight * z).sum(1)
         out["weight"] = weight.sum(1)
@@ -252,13 +257,55 @@ def _composite(
     return out
 
 
+def _runs(hit: np.ndarray, planes: np.ndarray) -> np.ndarray:
+    """Number of the run of each fragment (k, n), -1 where nothing is hit.
+
+    Hits of one plane >= 0 that follow each other in a sample share a run.
+    """
+    run = np.full(hit.shape, -1)
+    row, column = np.nonzero(hit)
+    plane = planes[column]
+    follows = (row[1:] == row[:-1]) & (plane[1:] == plane[:-1]) & (plane[1:] >= 0)
+    run[row, column] = np.cumsum(np.concatenate([[True], ~follows])) - 1 if len(row) else 0
+    return run
+
+
+def _layered(
+    alpha: np.ndarray, weight: np.ndarray, live: np.ndarray, run: np.ndarray, s: _Splats
+) -> np.ndarray:
+    """Colours (k, 3) where a run is one layer: its weight, in the mean colour by optical depth."""
+    row, column = np.nonzero(live & (run >= 0))
+    number = run[row, column]
+    with np.errstate(divide="ignore"):
+        tau = np.minimum(-np.log1p(-alpha[row, column]), 24 * math.log(2))
+    count = int(run.max(initial=-1)) + 1
+    ink = np.zeros((count, 3))
+    np.add.at(ink, number, tau[:, None] * s.colors[column])
+    depth = np.bincount(number, tau, count)
+    total = np.bincount(number, weight[row, column], count)
+    mean = ink / np.where(depth > 0, depth, 1)[:, None]
+    owner = np.zeros(count, int)
+    owner[number] = row
+    rgb = np.zeros((len(alpha), 3))
+    np.add.at(rgb, owner, total[:, None] * mean)
+    return rgb
+
+
 def _transmittance(
-    alpha: np.ndarray, stop: float, exclusive: bool
+    alpha: np.ndarray, stop: float, exclusive: bool, run: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Transmittance before each fragment, which fragments are drawn, and what is left at the end."""
+    """Transmittance before each fragment, which fragments are drawn, and what is left at the end.
+
+    With runs (k, n), all of a run is drawn if its first fragment is.
+    """
     after = np.cumprod(1 - alpha, axis=1)
     before = np.concatenate([np.ones((len(alpha), 1)), after[:, :-1]], axis=1)[:, : alpha.shape[1]]
     live = before > stop
+    if run is not None:
+        row, column = np.nonzero(run >= 0)
+        number = run[row, column]
+        first = np.unique(number, return_index=True)[1]
+        live[row, column] = live[row[first], column[first]][number]
     if exclusive:
         live &= ~np.logical_or.accumulate((alpha > 0) & (after <= stop), axis=1)
     return before, live, np.where(live, 1 - alpha, 1.0).prod(axis=1)

@@ -1,6 +1,7 @@
 """Every effect: its kernel file and what it adds to the records, buffers and outputs.
 
-A slot is filled by exactly one effect of its kind (camera, color, lowpass, stop); taps are extra planes, any
+A slot is filled by exactly one effect of its kind (camera, color, lowpass, stop,
+compose); taps are extra planes, any
 number of them; parts are what several taps share. The sections of an effect's kernel file say where its text
 goes (kernels/README.md).
 """
@@ -47,6 +48,8 @@ _EFFECTS = (
     Effect("lowpass_screen", "slot/lowpass_screen.cl", record_lanes=2, bounds_lanes=3),
     Effect("stop_inclusive", "slot/stop_inclusive.cl"),
     Effect("stop_exclusive", "slot/stop_exclusive.cl"),
+    Effect("compose_ordered", "slot/compose_ordered.cl"),
+    Effect("compose_planes", "slot/compose_planes.cl", record_lanes=1, inputs=("planes",)),
     Effect("ray_depth", "slot/ray_depth.cl", record_lanes=3),
     Effect("alpha", "tap/alpha.cl", output=Output("alpha", 1, "float32")),
     Effect("depth", "tap/depth.cl", planes=(2,), output=Output("depth", 1, "float32"), parts=("ray_depth",)),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Protocol
 
 from fidsplat.effects.catalogue import CATALOGUE, Effect, Output
 from fidsplat.errors import InputError
@@ -26,7 +27,7 @@ class FeatureSet:
     """
 
     slots: tuple[str, ...]
-    """One effect per kind, in the fixed order camera, color, lowpass, stop."""
+    """One effect per kind, in the fixed order camera, color, lowpass, stop, compose."""
     taps: tuple[str, ...]
     """Sorted names of the planes beside rgb."""
     sh_degree: int
@@ -45,8 +46,22 @@ class FeatureSet:
         return (RGB, *(OUTPUTS[tap] for tap in self.taps))
 
 
-def select(sh_degree: int, outputs: Iterable[str], quality: Quality) -> FeatureSet:
-    """The features that a cloud (by its SH degree, -1 for plain colours), outputs and quality call for.
+class Traits(Protocol):
+    """What of a cloud decides the kernels."""
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the colours that depend on the view; -1 for plain colours."""
+        ...
+
+    @property
+    def has_planes(self) -> bool:
+        """Whether splats are printed on planes."""
+        ...
+
+
+def select(cloud: Traits, outputs: Iterable[str], quality: Quality) -> FeatureSet:
+    """The features that a cloud, outputs and quality call for.
 
     Raises:
         InputError: an output that nobody declares.
@@ -62,12 +77,13 @@ def select(sh_degree: int, outputs: Iterable[str], quality: Quality) -> FeatureS
     return FeatureSet(
         slots=(
             "camera_pinhole",
-            "color_rgb" if sh_degree < 0 else "color_sh",
+            "color_rgb" if cloud.sh_degree < 0 else "color_sh",
             f"lowpass_{quality.lowpass}",
             f"stop_{quality.stop_rule}",
+            "compose_planes" if cloud.has_planes and quality.coplanar == "blend" else "compose_ordered",
         ),
         taps=tuple(sorted(wanted - {"rgb"})),
-        sh_degree=max(sh_degree, 0),
+        sh_degree=max(cloud.sh_degree, 0),
         samples=quality.samples,
         setup_precision=quality.setup_precision,
     )

@@ -21,19 +21,28 @@ static inline void pixel_start(Pixel *pixel) {
 
 //@@ fragment_mask
 //@@ fragment_half_rho
+//@@ compose_functions
+
+// Whether anything that follows can still be seen.
+static inline vint pixel_unfinished(const Pixel *pixel, const BlendConstants *constants) {
+//@@ unfinished
+}
+
+// To be called once, after the last fragment.
+static inline void pixel_finish(Pixel *pixel) {
+//@@ finish
+}
 
 // Draws the fragment where `mask` is set.
 static inline void pixel_blend(Pixel *pixel, const Splat *s, Crossing c, vint mask, vfloat screen,
                                const BlendConstants *constants) {
     vfloat inverse_d = 1.0f / c.d;
     vfloat opacity = fragment_opacity(s, fragment_half_rho(c, inverse_d, screen), constants->ceiling);
-    vint live = mask & VMASK(pixel->t > constants->stop);
+//@@ live
 //@@ stop
     opacity = VSELECT((vfloat)0.0f, opacity, live);
     vfloat weight = pixel->t * opacity;
-    pixel->r = FMA(weight, (vfloat)s->r, pixel->r);
-    pixel->g = FMA(weight, (vfloat)s->g, pixel->g);
-    pixel->b = FMA(weight, (vfloat)s->b, pixel->b);
+//@@ compose
 //@@ fragment
     pixel->t = pixel->t - weight;
 }

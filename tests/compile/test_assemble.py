@@ -1,6 +1,7 @@
 """A scene pays only for what it calls for: the text of the kernels, and what it costs."""
 
 import re
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -18,18 +19,35 @@ TAPS = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
 
 
+@dataclass(frozen=True)
+class Cloud:
+    """What of a cloud decides the kernels."""
+
+    sh_degree: int = -1
+    has_planes: bool = False
+
+
+COLORS = Cloud()
+
+
 def test_base_text_names_no_effect_that_was_not_asked_for():
-    text = assemble(select(-1, ("rgb",), PLAIN), SHAPE).text
+    text = assemble(select(COLORS, ("rgb",), PLAIN), SHAPE).text
     assert "//" not in text
-    absent = set(CATALOGUE) - {"camera_pinhole", "color_rgb", "lowpass_none", "stop_inclusive"}
-    for name in (*absent, *TAPS, "sh", "finished"):
+    absent = set(CATALOGUE) - {
+        "camera_pinhole",
+        "color_rgb",
+        "lowpass_none",
+        "stop_inclusive",
+        "compose_ordered",
+    }
+    for name in (*absent, *TAPS, "sh", "finished", "planes", "run", "ink"):
         assert not re.search(rf"\b{name}(_|\b)", text), name
 
 
 @pytest.mark.parametrize("tap", TAPS)
 def test_a_tap_brings_its_text_and_nothing_else(tap):
-    base = assemble(select(-1, ("rgb",), PLAIN), SHAPE)
-    with_tap = assemble(select(-1, (tap,), PLAIN), SHAPE)
+    base = assemble(select(COLORS, ("rgb",), PLAIN), SHAPE)
+    with_tap = assemble(select(COLORS, (tap,), PLAIN), SHAPE)
     assert with_tap.digest != base.digest
     base_lines, tap_lines = base.text.splitlines(), with_tap.text.splitlines()
     remaining = iter(tap_lines)
@@ -43,16 +61,16 @@ def test_a_tap_brings_its_text_and_nothing_else(tap):
 
 
 def test_an_effect_added_to_the_catalogue_leaves_other_texts_as_they_were(monkeypatch):
-    before = {taps: assemble(select(-1, taps, PLAIN), SHAPE).digest for taps in combinations(TAPS, 2)}
+    before = {taps: assemble(select(COLORS, taps, PLAIN), SHAPE).digest for taps in combinations(TAPS, 2)}
     dummy = Effect("dummy", "tap/alpha.cl", record_lanes=5, output=Output("dummy", 1, "float32"))
     monkeypatch.setitem(catalogue_module.CATALOGUE, "dummy", dummy)
-    after = {taps: assemble(select(-1, taps, PLAIN), SHAPE).digest for taps in combinations(TAPS, 2)}
+    after = {taps: assemble(select(COLORS, taps, PLAIN), SHAPE).digest for taps in combinations(TAPS, 2)}
     assert before == after
 
 
 def test_record_sizes_are_what_the_effects_declare():
     def record(outputs, quality=PLAIN, degree=-1):
-        return assemble(select(degree, outputs, quality), SHAPE).record_bytes
+        return assemble(select(Cloud(degree), outputs, quality), SHAPE).record_bytes
 
     assert record(("rgb",)) == 64
     assert record(("rgb",), fs.Quality()) == 72
@@ -66,20 +84,20 @@ def test_record_sizes_are_what_the_effects_declare():
 def test_a_section_that_no_stage_has_is_refused(monkeypatch):
     monkeypatch.setattr(assembly, "_sections", lambda path: {"no_such_hook": "x"})
     with pytest.raises(fs.DeviceError, match="no_such_hook"):
-        assemble(select(-1, ("rgb",), PLAIN), SHAPE)
+        assemble(select(COLORS, ("rgb",), PLAIN), SHAPE)
 
 
 def test_text_does_not_depend_on_numbers():
     numbers = fs.Quality(lowpass="none", alpha_cutoff=0.01, transmittance_stop=0.5, opacity_ceiling=0.7)
-    assert select(-1, ("rgb",), numbers) == select(-1, ("rgb",), PLAIN)
+    assert select(COLORS, ("rgb",), numbers) == select(COLORS, ("rgb",), PLAIN)
 
 
 def test_features_are_the_same_whatever_the_order_of_outputs():
-    assert select(2, ["rgb", "label", "depth"], PLAIN) == select(2, ("depth", "label"), PLAIN)
+    assert select(Cloud(2), ["rgb", "label", "depth"], PLAIN) == select(Cloud(2), ("depth", "label"), PLAIN)
 
 
 def test_pipelines_are_compiled_once(renderer):
-    features = select(-1, ("rgb",), PLAIN)
+    features = select(COLORS, ("rgb",), PLAIN)
     assert renderer.backend.pipeline(features) is renderer.backend.pipeline(features)
 
 

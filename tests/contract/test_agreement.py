@@ -101,3 +101,59 @@ def test_a_hundred_thousand_splats_at_720p(renderer, judge):
     print(f"r100k_720p: {psnr:.1f} dB, largest error {error.max():.1e}")
     assert psnr > 50
     assert (error <= 2e-5 + truth["certificate"]).all()
+
+
+def coplanar_cloud(seed, count=60, planes=2):
+    """Overlapping splats on a few tilted planes, and some of no plane between them."""
+    generator = np.random.default_rng(seed)
+    clouds = [random_splats(20, seed, depth=(1.5, 3.5), scale=(0.02, 0.2), across=0.8)]
+    for _ in range(planes):
+        flat = np.concatenate([generator.uniform(-0.6, 0.6, (count, 2)), np.zeros((count, 1))], 1)
+        turns = generator.uniform(0, np.pi, count) / 2
+        quats = np.stack([np.cos(turns), 0 * turns, 0 * turns, np.sin(turns)], 1)
+        plane = fs.SplatCloud(
+            flat,
+            quats,
+            generator.uniform(0.02, 0.3, (count, 2)),
+            generator.choice([0.1, 0.6, 0.95, 1.0], count),
+            colors=generator.uniform(0, 1, (count, 3)),
+        ).with_planes(0)
+        pose = np.eye(4)
+        axis = generator.normal(size=3) * 0.4
+        pose[:3, :3] = rotation_about(axis)
+        pose[:3, 3] = [0, 0, generator.uniform(1.8, 3.0)]
+        clouds.append(plane.transformed(pose))
+    return fs.SplatCloud.concatenate(clouds)
+
+
+def rotation_about(axis):
+    angle = np.linalg.norm(axis)
+    x, y, z = axis / angle
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + math.sin(angle) * skew + (1 - math.cos(angle)) * skew @ skew
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("samples", [1, 2])
+def test_coplanar_splats_are_one_layer(renderer, judge, seed, samples):
+    cloud = coplanar_cloud(seed)
+    assert cloud.has_planes
+    assert_agrees(renderer, judge, cloud, CAMERA, quality=fs.Quality(samples=samples))
+    assert_agrees(renderer, judge, cloud, CAMERA, quality=fs.Quality(samples=samples, coplanar="order"))
+
+
+def test_the_order_of_coplanar_splats_means_nothing(renderer):
+    cloud = coplanar_cloud(5, planes=1)
+    generator = np.random.default_rng(1)
+    first = renderer.render(cloud, CAMERA)["rgb"]
+    for _ in range(3):
+        shuffle = generator.permutation(len(cloud))
+        again = fs.SplatCloud(
+            cloud.means[shuffle],
+            cloud.quats[shuffle],
+            cloud.scales[shuffle],
+            cloud.opacities[shuffle],
+            colors=cloud.colors[shuffle],
+            origin=cloud.origin,
+        ).with_planes(cloud.planes[shuffle])
+        assert np.abs(renderer.render(again, CAMERA)["rgb"] - first).max() < 2e-5

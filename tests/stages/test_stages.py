@@ -22,7 +22,7 @@ def backend(renderer):
 
 
 def traced(backend, cloud, quality, outputs=("rgb",), shape=None):
-    features = select(cloud.sh_degree, outputs, quality)
+    features = select(cloud, outputs, quality)
     view = View.of(CAMERA, quality, cloud.origin, (0, 0, 0))
     return backend.pipeline(features, shape).trace(backend.upload(cloud), view), view
 

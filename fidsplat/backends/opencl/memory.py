@@ -53,6 +53,7 @@ class Resident:
         self.count = len(cloud)
         self.origin = cloud.origin
         self.sh_degree = cloud.sh_degree if cloud.sh_degree > 0 else -1
+        self.has_planes = cloud.planes is not None
         arrays = {
             "means": cloud.means,
             "quats": cloud.quats,
@@ -60,6 +61,8 @@ class Resident:
             "opacities": cloud.opacities,
             "labels": cloud.labels,
         }
+        if cloud.planes is not None:
+            arrays["planes"] = cloud.planes
         if cloud.colors is not None:
             arrays["colors"] = cloud.colors
         elif cloud.sh is not None:  # always: a cloud has one of the two

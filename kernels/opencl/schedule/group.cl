@@ -37,10 +37,10 @@ kernel __attribute__((reqd_work_group_size(TILE_W * TILE_H, 1, 1))) void blend(
             ((local uint *)staged)[word] = ((global const uint *)(splats + lists[batch + which]))[part];
         }
         barrier(CLK_LOCAL_MEM_FENCE);
-        if (in_picture && pixel->t > constants.stop) alive = 1;
+        if (in_picture && pixel_unfinished(pixel, &constants)) alive = 1;
         for (uint k = 0; k < length; k++) {
             const Splat s = staged[k];
-            if (!in_picture || !(pixel->t > constants.stop) || py < s.y0 || py >= s.y1) continue;
+            if (!in_picture || !pixel_unfinished(pixel, &constants) || py < s.y0 || py >= s.y1) continue;
             float half_r2 = s.log_opacity - constants.log_cut;
             float x = (float)(px - s.ax), y = (float)(py - s.ay);
             Crossing c = cross_row(&s, FMA(s.nux, x, s.nu0), FMA(s.nvx, x, s.nv0), FMA(s.dx, x, s.d0), y, half_r2);
@@ -53,6 +53,7 @@ kernel __attribute__((reqd_work_group_size(TILE_W * TILE_H, 1, 1))) void blend(
         if (!alive) break;
     }
 
+    pixel_finish(pixel);
     size_t stride = (size_t)tiles_x * TILE_W, plane = stride * tiles_y * TILE_H;
     size_t at = py * stride + px;
     PIXEL_STORE_BASE(pixel, raw, plane, at);

@@ -37,14 +37,15 @@ kernel void blend(
             vint mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
             if (!VANY(mask)) continue;
             pixel_blend(&pixels[row], &s, c, mask, screen, &constants);
-            if (!VANY(VMASK(pixels[row].t > constants.stop))) alive &= ~(1u << row);
+            if (!VANY(pixel_unfinished(&pixels[row], &constants))) alive &= ~(1u << row);
         }
     }
 
     size_t stride = (size_t)tiles_x * TILE_W, plane = stride * tiles_y * TILE_H;
     for (int row = 0; row < TILE_H; row++) {
         size_t at = (y0 + row) * stride + x0;
-        const Pixel *pixel = &pixels[row];
+        Pixel *pixel = &pixels[row];
+        pixel_finish(pixel);
         PIXEL_STORE_BASE(pixel, raw, plane, at);
 //@@ store
     }
