@@ -1,0 +1,128 @@
+"""The command line: words in, a command run, an exit status out.
+
+0: done. 1: the run failed. 2: the words or the input cannot be used. Errors are one line on stderr.
+"""
+
+import contextlib
+import functools
+import io
+import operator
+import os
+import sys
+import traceback
+import warnings
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+ABOUT = """Fiducial markers made of 2D Gaussian splats: make them, set them in scenes, draw them, read them
+back.
+
+Examples:
+  fidsplat demo                                     all of it, end to end, with pictures and a table
+  fidsplat devices                                  what can draw here
+  fidsplat marker apriltag:36h11:5 -o tag.ply       a marker as a splat file
+  fidsplat render scene.toml -o picture.png         draw a scene
+  fidsplat detect picture.png --scene scene.toml    read it back, with poses
+
+`fidsplat COMMAND --help` explains a command. --debug, anywhere, shows where an error arose."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit status: 0 done, 1 failed, 2 bad input, 130 interrupted."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in words
+    words = [word for word in words if word != "--debug"]
+    warnings.showwarning = _show_warning
+    try:
+        status = _parse(words).run()
+        sys.stdout.flush()
+        return status
+    except SystemExit as stop:  # help, or words that could not be parsed
+        return stop.code if isinstance(stop.code, int) else 2
+    except KeyboardInterrupt:
+        return _fail("interrupted", 130)
+    except BrokenPipeError:
+        # whoever read our output has gone; nothing is left to say to them, not even by Python at its end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        from fidsplat.errors import FidsplatError
+
+        if isinstance(error, FidsplatError):
+            return _fail(str(error), error.exit_status)
+        if isinstance(error, MemoryError):
+            return _fail("not enough memory for this; use a smaller picture or fewer splats", 1)
+        return _fail(f"{type(error).__name__}: {error} (a fault of fidsplat; --debug shows where)", 1)
+
+
+def _parse(words: list[str]):
+    """The command that the words make. Raises SystemExit: 0 after help, 2 after one line about what is
+    wrong."""
+    import tyro
+
+    from fidsplat.commands import COMMANDS
+
+    name = words[0] if words and words[0] in COMMANDS else ""
+    if name:
+        kind, about, program, words = COMMANDS[name], COMMANDS[name].HELP, f"fidsplat {name}", words[1:]
+    else:
+        kind, about, program = _any_of(COMMANDS), ABOUT, "fidsplat"
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            config = (tyro.conf.FlagCreatePairsOff, tyro.conf.OmitArgPrefixes)
+            # tyro runs lines that begin with a letter together; a space before each keeps them as they are
+            about = "\n".join(f" {line}" for line in about.splitlines())
+            return tyro.cli(kind, prog=program, description=about, args=words, config=config)
+    except SystemExit as stop:
+        if stop.code not in (0, None):
+            _fail(f"{_one_line(said.getvalue())}; see {program} --help", 2)
+            raise SystemExit(2) from None
+        raise
+
+
+def _any_of(commands: dict[str, type]) -> Any:
+    import tyro
+
+    return functools.reduce(
+        operator.or_,
+        (
+            Annotated[kind, tyro.conf.subcommand(name, description=kind.__doc__)]
+            for name, kind in commands.items()
+        ),
+    )
+
+
+def _one_line(box: str) -> str:
+    """tyro's boxed message as one line: what is wrong, the nearest option if it names one, where to read
+    more."""
+    lines = [line.strip(" │|") for line in box.splitlines()]
+    lines = [line for line in lines if line and not line.startswith(("╭", "╰"))]
+    parts: list[list[str]] = [[]]
+    for line in lines:
+        if set(line) == {"─"}:
+            parts.append([])
+        else:
+            parts[-1].append(line)
+    message = " ".join(parts[0]) or "these words make no command"
+    for part in parts[1:]:
+        if part and part[0].startswith("Perhaps you meant"):
+            message += f"; perhaps {part[1]}"
+        elif part and part[0].startswith("Available subcommands"):
+            message += f"; {' '.join(part)}"
+    return message
+
+
+def _fail(message: str, status: int) -> int:
+    print("fidsplat: " + " ".join(message.split()), file=sys.stderr)
+    return status
+
+
+def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
+    print(f"fidsplat: warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

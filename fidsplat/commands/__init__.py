@@ -1,0 +1,14 @@
+"""One module for each command: a dataclass of its options, whose ``run`` does the work and returns the exit
+status. Its docstring is the line in the list of commands, its HELP what `fidsplat COMMAND --help` says.
+
+Nothing heavy is imported before ``run``, so that help and errors come at once.
+"""
+
+from fidsplat.commands.demo import Demo
+from fidsplat.commands.detect import Detect
+from fidsplat.commands.devices import Devices
+from fidsplat.commands.marker import Marker
+from fidsplat.commands.render import Render
+
+COMMANDS = {"demo": Demo, "devices": Devices, "marker": Marker, "render": Render, "detect": Detect}
+"""Every command by its name, in the order in which help lists them."""

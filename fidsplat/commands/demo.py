@@ -1,0 +1,79 @@
+"""`fidsplat demo`."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+from fidsplat.commands.output import Json, console, option, print_json, print_table
+
+if TYPE_CHECKING:
+    from fidsplat.experiments.demo import DemoResult, Sighting
+
+
+@dataclass
+class Demo:
+    """The main job, end to end, with pictures and a table."""
+
+    HELP: ClassVar[str] = """The main job, end to end, with pictures and a table.
+
+Makes an AprilTag, an ArUco tag and a QR code of splats, sets them in a yard of some ten thousand splats,
+draws three views with colour, depth, normals and labels, and reads them back. Exit status 1 when a marker
+that is wholly visible is not found within 1 % of its distance.
+
+Examples:
+  fidsplat demo
+  fidsplat demo --out pictures --json"""
+
+    out: Annotated[
+        str, option("DIR", "folder for pictures, scene and figures (default: fidsplat-demo)", "-o")
+    ] = "fidsplat-demo"
+    device: Annotated[str, option("D", "see `fidsplat devices` (default: opencl)")] = "opencl"
+    json: Json = False
+
+    def run(self) -> int:
+        from fidsplat.experiments.demo import run_demo
+
+        where = console(self.json)
+        with where.status("starting") as status:
+            result = run_demo(self.out, self.device, status.update)
+        if self.json:
+            print_json(result.as_dict())
+        else:
+            heads = ("view", "marker", "visible", "found", "position", "angle", "splats", "frame")
+            print_table(
+                where, f"fidsplat demo on {result.device}", heads, (_row(s, result) for s in result.sightings)
+            )
+            markers = sum(result.marker_splats.values())
+            where.print(
+                f"{result.background_splats:,} background and {markers:,} marker splats; "
+                f"{result.seconds:.1f} s in all; pictures in {self.out}/contact-sheet.png",
+                markup=False,
+                soft_wrap=True,
+            )
+        if not result.passed:
+            missed = [
+                f"{s.reading.placed.marker.spec} in '{s.view}'" for s in result.sightings if s.passed is False
+            ]
+            where.print(
+                "failed: " + "; ".join([*missed, *(f"read {s}" for s in result.strangers)]), markup=False
+            )
+        return 0 if result.passed else 1
+
+
+def _row(sighting: "Sighting", result: "DemoResult") -> tuple[str, ...]:
+    reading = sighting.reading
+    spec = reading.placed.marker.spec
+    if reading.position_error is None or reading.angle_error is None:
+        errors = ("-", "-")
+    else:
+        share = 100 * reading.position_error / reading.distance
+        degrees = reading.as_dict()["angle_error_deg"]
+        errors = (f"{reading.position_error * 1e3:.1f} mm, {share:.2f} %", f"{degrees:.2f} deg")
+    return (
+        sighting.view,
+        spec,
+        f"{100 * sighting.visible:.0f} %",
+        "no" if reading.detection is None else "yes",
+        *errors,
+        str(result.marker_splats[spec]),
+        f"{result.frame_ms[sighting.view]:.1f} ms",
+    )

@@ -1,0 +1,79 @@
+"""`fidsplat marker`."""
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+import tyro
+
+from fidsplat.commands.output import Json, console, option, print_json, print_table, writable_file
+
+
+@dataclass
+class Marker:
+    """Make a marker of splats."""
+
+    HELP: ClassVar[
+        str
+    ] = """Make a marker of splats, say what it is made of, and write it as a PLY file with -o.
+
+SPEC is one of
+  apriltag:FAMILY:ID   16h5, 25h9, 36h10, 36h11         apriltag:36h11:5
+  aruco:FAMILY:ID      4x4_50 ... 7x7_1000, original    aruco:4x4_50:7
+  qr:TEXT              the smallest code that fits      qr:https://example.org
+  qr-vN-L:TEXT         version N, error level L M Q H   qr-v22-L:TEXT
+  image:FILE           any one-bit picture              image:logo.png
+
+Examples:
+  fidsplat marker apriltag:36h11:5 --size 0.16 -o tag.ply
+  fidsplat marker "qr:hello" --mixture paper --json"""
+
+    spec: Annotated[tyro.conf.Positional[str], option("SPEC", "what to make, as above")]
+    out: Annotated[str | None, option("FILE.ply", "write the splats there", "-o")] = None
+    size: Annotated[
+        float, option("M", "edge of the code in metres, its quiet zone not counted (default: 1)")
+    ] = 1.0
+    mixture: Annotated[
+        str, option("NAME", "how rectangles become splats: fitted or paper (default: fitted)")
+    ] = "fitted"
+    json: Json = False
+
+    def run(self) -> int:
+        import fidsplat as fs
+
+        file = writable_file(self.out) if self.out is not None else None
+        made = fs.marker(self.spec, size=self.size, mixture=self.mixture)
+        if file is not None:
+            fs.save_ply(made.cloud, file)
+        dark = sum(1 for rectangle in made.rectangles if rectangle.dark)
+        facts = {
+            "spec": made.spec,
+            "kind": made.kind,
+            "family": made.family,
+            "id": made.id,
+            "payload": made.payload,
+            "shape": list(made.bits.shape),
+            "quiet_zone": made.quiet_zone,
+            "components": made.components,
+            "rectangles": {"dark": dark, "light": len(made.rectangles) - dark},
+            "splats": len(made.cloud),
+            "seconds": made.seconds,
+            "mixture": made.mixture,
+            "size_m": made.size,
+            "module_m": made.module,
+            "file": str(file) if file else None,
+        }
+        if self.json:
+            print_json(facts)
+            return 0
+        rows = [
+            ("modules", f"{made.bits.shape[0]} x {made.bits.shape[1]}, quiet zone {made.quiet_zone}"),
+            ("size", f"{made.size:g} m, a module {made.module * 1e3:.4g} mm"),
+            ("components", made.components),
+            ("rectangles", f"{dark} dark, {len(made.rectangles) - dark} light"),
+            ("splats", f"{len(made.cloud)} ({made.mixture})"),
+            ("seconds", f"{made.seconds:.3f}"),
+        ]
+        if file is not None:
+            rows.append(("written", file))
+        print_table(console(False), made.spec, ("", ""), rows)
+        return 0

@@ -1,0 +1,80 @@
+"""What commands print: with --json one object on stdout and all else on stderr."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from fidsplat.errors import InputError
+from fidsplat.files import writable_folder
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def option(metavar: str, text: str, short: str | None = None):
+    """tyro's description of an argument; its text says the default itself."""
+    aliases = [] if short is None else [short]
+    return tyro.conf.arg(metavar=metavar, help=text, aliases=aliases, help_behavior_hint="")
+
+
+Json = Annotated[
+    bool,
+    tyro.conf.arg(help="print one JSON object on stdout and nothing else there", help_behavior_hint=""),
+]
+"""the --json switch"""
+
+
+def console(as_json: bool) -> Console:
+    """Where tables and progress go."""
+    from rich.console import Console
+
+    return Console(stderr=as_json, highlight=False)
+
+
+def print_json(value: dict[str, Any]) -> None:
+    """The one object; a number that JSON does not have becomes null."""
+    json.dump(_plain(value), sys.stdout, indent=2, allow_nan=False)
+    sys.stdout.write("\n")
+
+
+def print_table(where: Console, title: str, heads: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """A table under its title; texts are taken as they are, not as markup, and broken rather than cut."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(
+        title=Text(title), title_justify="left", show_header=any(heads), box=SIMPLE_HEAD, pad_edge=False
+    )
+    for head in heads:
+        table.add_column(head, overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(str(cell)) for cell in row))
+    where.print(table)
+
+
+def writable_file(path: str | Path) -> Path:
+    """The path, after a proof that a file can be written beside it. Raises InputError."""
+    file = Path(path)
+    if file.is_dir():
+        raise InputError(f"{file} is a folder; give the name of a file")
+    writable_folder(file.parent)
+    return file
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, float):  # NumPy's float64 is one of them
+        return float(value) if math.isfinite(value) else None
+    listed = getattr(value, "tolist", None)  # NumPy's numbers and arrays
+    return value if listed is None else _plain(listed())

@@ -1,0 +1,128 @@
+"""`fidsplat render`."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+import tyro
+
+from fidsplat.commands.output import Json, console, option, print_json, print_table
+from fidsplat.errors import InputError
+from fidsplat.files import writable_folder
+
+if TYPE_CHECKING:
+    from fidsplat.scenes import Scene
+
+_OTHER_PICTURES = (".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".exr", ".gif", ".npy")
+
+
+@dataclass
+class Render:
+    """Draw a scene or a splat file."""
+
+    HELP: ClassVar[str] = """Draw a scene file or a bare splat file.
+
+A splat file without a scene is seen from -z, as large as fits a picture of 1280 x 720.
+OUT.png names the colour picture; other planes stand beside it as OUT-depth.png and so on. Any other OUT is a
+folder for rgb.png, depth.png and so on. Depth comes as .npy (metres), .png (16-bit millimetres) and
+-turbo.png (colours); labels as .npy and .png (colours).
+
+Examples:
+  fidsplat render scene.toml
+  fidsplat render scene.toml -o frames --outputs rgb,depth,normal,label
+  fidsplat render tag.ply -o tag.png --device reference --quality gsplat"""
+
+    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply", "what to draw")]
+    out: Annotated[
+        str | None, option("OUT", "PNG file or folder (default: the source's name with .png, here)", "-o")
+    ] = None
+    outputs: Annotated[
+        str | None,
+        option("A,B,...", "planes: rgb alpha depth depth_median normal label (default: the scene's, or rgb)"),
+    ] = None
+    device: Annotated[str | None, option("D", "see `fidsplat devices` (default: the scene's, or opencl)")] = (
+        None
+    )
+    quality: Annotated[
+        str | None,
+        option("Q", "standard fast reference gsplat surfel (default: the scene's, or standard)"),
+    ] = None
+    json: Json = False
+
+    def run(self) -> int:
+        import fidsplat as fs
+        from fidsplat.effects import select
+        from fidsplat.quality import Quality
+        from fidsplat.vision.planes import save_plane
+
+        names = None if self.outputs is None else tuple(n.strip() for n in self.outputs.split(","))
+        # what is wrong with the words is said before anything is read or opened
+        select(fs.SplatCloud.empty(), names or (), Quality.of(self.quality))
+        name_of = _names(self.out, Path(self.source))
+        where = console(self.json)
+        with where.status("reading"):
+            scene = _load(self.source)
+        with where.status("opening the device"):
+            renderer = fs.Renderer(self.device or scene.device or "opencl")
+        begun = time.perf_counter()
+        with where.status("drawing"):
+            frame = renderer.render(scene, outputs=names, quality=self.quality)
+            planes = {name: frame[name] for name in frame.outputs}
+        seconds = time.perf_counter() - begun
+        files = [file for name, plane in planes.items() for file in save_plane(name, plane, name_of)]
+        if self.json:
+            print_json(
+                {
+                    "source": self.source,
+                    "device": renderer.device.name,
+                    "width": scene.camera.width if scene.camera else None,
+                    "height": scene.camera.height if scene.camera else None,
+                    "outputs": list(frame.outputs),
+                    "stats": dict(frame.stats),
+                    "timings_ms": dict(frame.timings),
+                    "seconds": seconds,
+                    "files": [str(file) for file in files],
+                }
+            )
+            return 0
+        rows = [(stage, f"{ms:.2f} ms") for stage, ms in frame.timings.items()]
+        rows += [(what, f"{count:,}") for what, count in frame.stats.items()]
+        rows += [("with compilation and transfer", f"{seconds:.2f} s")]
+        print_table(where, f"{self.source} on {renderer.device.title}", ("", ""), rows)
+        for file in files:
+            where.print(str(file), markup=False, soft_wrap=True)
+        return 0
+
+
+def _names(out: str | None, source: Path):
+    """A function from a plane's name and a suffix to the file that it goes to, in a folder known to be
+    writable."""
+    file = Path(out) if out is not None else Path(source.name).with_suffix(".png")
+    if file.suffix.lower() in _OTHER_PICTURES:
+        raise InputError(f"pictures are written as PNG: name {file.with_suffix('.png')}, or a folder")
+    if file.suffix.lower() == ".png" and not file.is_dir():
+        writable_folder(file.parent)
+        return lambda plane, suffix: file.with_name(
+            f"{file.stem}{'' if plane == 'rgb' else '-' + plane}{suffix}"
+        )
+    writable_folder(file)
+    return lambda plane, suffix: file / f"{plane}{suffix}"
+
+
+def _load(source: str) -> "Scene":
+    import fidsplat as fs
+    from fidsplat.commands.framing import framing_camera
+
+    suffix = Path(source).suffix.lower()
+    if suffix == ".toml":
+        scene = fs.Scene.load(source)
+        if scene.camera is None:
+            raise InputError(
+                f"{source} has no [camera] table; add one with width, height, fov_x_deg, position, look_at"
+            )
+        return scene
+    if suffix == ".ply":
+        cloud = fs.load_ply(source)
+        return fs.Scene([cloud], camera=framing_camera(cloud))
+    raise InputError(f"cannot draw {source}: give a scene file (.toml) or a splat file (.ply)")

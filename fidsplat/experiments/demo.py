@@ -1,0 +1,186 @@
+"""The main job end to end: markers from text to splats, three views drawn, read back, judged and pictured."""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.experiments.demo_scene import OUTPUTS, demo_scene, demo_views
+from fidsplat.experiments.readback import Reading, families_of, read_back, visible_share
+from fidsplat.files import atomic_write, writable_folder
+from fidsplat.formats import save_ply
+from fidsplat.render import Renderer
+from fidsplat.scenes import Scene
+from fidsplat.vision.detect import detect
+from fidsplat.vision.images import to_uint8, write_png
+from fidsplat.vision.paint import (
+    contact_sheet,
+    depth_picture,
+    label_picture,
+    normal_picture,
+    outlined,
+)
+from fidsplat.vision.planes import save_plane
+
+# a marker counts as wholly visible from this share of its area on; the rest is the soft edge of its quiet
+# zone
+WHOLE = 0.98
+MAX_POSITION_ERROR = 0.01  # of the distance
+_FRAMES = 3  # timed after the one that compiles; the median counts
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """One marker in one view."""
+
+    view: str
+    reading: Reading
+    visible: float
+    """share of the marker that can be seen, 0 to 1"""
+
+    @property
+    def passed(self) -> bool | None:
+        """Found where it is; None for a marker that is not wholly visible, which nobody has to find."""
+        if self.visible < WHOLE:
+            return None
+        error = self.reading.position_error
+        return error is not None and error < MAX_POSITION_ERROR * self.reading.distance
+
+
+@dataclass(frozen=True, eq=False)
+class DemoResult:
+    """What the demo found out."""
+
+    device: str
+    background_splats: int
+    marker_splats: dict[str, int]
+    sightings: list[Sighting]
+    strangers: list[str]
+    """codes that a detector saw and that nobody placed"""
+    frame_ms: dict[str, float]
+    """by view: milliseconds on the device for one frame with all planes"""
+    visible_splats: dict[str, int]
+    """by view: splats that were not culled"""
+    seconds: float
+    """the whole run"""
+    files: list[Path]
+
+    @property
+    def passed(self) -> bool:
+        """Every wholly visible marker was found within the limit, there was one, and nothing else was
+        seen."""
+        judged = [s.passed for s in self.sightings if s.passed is not None]
+        return bool(judged) and all(judged) and not self.strangers
+
+    def as_dict(self) -> dict:
+        """For JSON."""
+        return {
+            "passed": self.passed,
+            "device": self.device,
+            "background_splats": self.background_splats,
+            "marker_splats": self.marker_splats,
+            "frame_ms": self.frame_ms,
+            "visible_splats": self.visible_splats,
+            "seconds": self.seconds,
+            "strangers": self.strangers,
+            "sightings": [
+                {"view": s.view, "visible": s.visible, "passed": s.passed, **s.reading.as_dict()}
+                for s in self.sightings
+            ],
+            "files": [str(file) for file in self.files],
+        }
+
+
+def run_demo(
+    out: str | Path, device: str = "opencl", tell: Callable[[str], None] = lambda text: None
+) -> DemoResult:
+    """Run the demo and write its pictures, its scene and its figures into the folder ``out``.
+
+    Args:
+        out: made when it is missing; files of an earlier run are overwritten.
+        device: as for `Renderer`.
+        tell: called with what is being done, for a progress display.
+
+    Raises InputError when the folder cannot be written, DeviceError when the device cannot be used.
+    """
+    begun = time.perf_counter()
+    folder = writable_folder(out)
+    tell("making three markers and their scene")
+    scene = demo_scene()
+    tell("opening the device")
+    renderer = Renderer(device)
+    resident = renderer.upload(scene)
+    files = [folder / "scene.toml", folder / "scene.ply"]
+    scene.save(files[0])
+    files += sorted(folder.glob("scene-splats-*.ply"))
+    save_ply(scene.cloud(), files[1])
+
+    sightings, strangers, frame_ms, visible, sheet = [], [], {}, {}, []
+    for view, camera in demo_views().items():
+        tell(f"drawing and reading: {view}")
+        planes, frame_ms[view], visible[view] = _draw(renderer, resident, scene, camera)
+        image = to_uint8(planes["rgb"])
+        readings, others = read_back(detect(image, families_of(scene.markers)), scene.markers, camera)
+        sightings += [Sighting(view, r, visible_share(r.placed, camera, planes["label"])) for r in readings]
+        strangers += [code.name for code in others]
+        marked = _marked(image, readings)
+        files += _save(folder, view.replace(" ", "-"), planes, marked)
+        sheet.append(_row(view, planes, image, marked))
+    files.append(write_png(folder / "contact-sheet.png", contact_sheet(sheet)))
+
+    result = DemoResult(
+        device=renderer.device.title,
+        background_splats=sum(len(cloud) for cloud in scene.clouds),
+        marker_splats={p.marker.spec: len(p.marker.cloud) for p in scene.markers},
+        sightings=sightings,
+        strangers=strangers,
+        frame_ms=frame_ms,
+        visible_splats=visible,
+        seconds=time.perf_counter() - begun,
+        files=[*files, folder / "demo.json"],
+    )
+    with atomic_write(folder / "demo.json") as stream:
+        stream.write(json.dumps(result.as_dict(), indent=2).encode())
+    return result
+
+
+def _draw(
+    renderer: Renderer, resident, scene: Scene, camera: Camera
+) -> tuple[dict[str, np.ndarray], float, int]:
+    """Planes, milliseconds of a frame once all is compiled, splats that were not culled."""
+    times = []
+    for _ in range(1 + _FRAMES):
+        frame = renderer.render(resident, camera, outputs=OUTPUTS, background=scene.background)
+        times.append(sum(frame.timings.values()))
+    return {name: frame[name] for name in OUTPUTS}, float(np.median(times[1:])), int(frame.stats["visible"])
+
+
+def _marked(image: np.ndarray, readings: list[Reading]) -> np.ndarray:
+    for reading in readings:
+        if reading.detection is not None:
+            image = outlined(image, reading.detection.corners, reading.placed.marker.spec)
+    return image
+
+
+def _save(folder: Path, stem: str, planes: dict[str, np.ndarray], marked: np.ndarray) -> list[Path]:
+    files = [
+        file
+        for name, plane in planes.items()
+        for file in save_plane(name, plane, lambda kind, suffix: folder / f"{stem}-{kind}{suffix}")
+    ]
+    return [*files, write_png(folder / f"{stem}-detection.png", marked)]
+
+
+def _row(view: str, planes: dict[str, np.ndarray], image: np.ndarray, marked: np.ndarray):
+    pictures = {
+        "rgb": image,
+        "depth": depth_picture(planes["depth"]),
+        "normal": normal_picture(planes["normal"]),
+        "label": label_picture(planes["label"]),
+        "detection": marked,
+    }
+    return [(f"{view}: {name}", picture) for name, picture in pictures.items()]

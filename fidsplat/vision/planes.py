@@ -1,0 +1,38 @@
+"""The planes of a frame as files."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.files import atomic_write
+from fidsplat.vision.images import write_png
+from fidsplat.vision.paint import depth_millimetres, depth_picture, label_picture, normal_picture
+
+
+def save_plane(name: str, plane: np.ndarray, name_of: Callable[[str, str], Path]) -> list[Path]:
+    """Write one plane and return the files.
+
+    Args:
+        name: "rgb", "depth", ...
+        plane: (h, w) or (h, w, 3).
+        name_of: gives the file for a plane's name and a suffix such as ".png" or "-turbo.png".
+    """
+    if name in ("depth", "depth_median"):
+        return [
+            _write_array(name_of(name, ".npy"), plane),
+            write_png(name_of(name, ".png"), depth_millimetres(plane)),
+            write_png(name_of(name, "-turbo.png"), depth_picture(plane)),
+        ]
+    if name == "label":
+        return [
+            _write_array(name_of(name, ".npy"), plane),
+            write_png(name_of(name, ".png"), label_picture(plane)),
+        ]
+    return [write_png(name_of(name, ".png"), normal_picture(plane) if name == "normal" else plane)]
+
+
+def _write_array(path: Path, array: np.ndarray) -> Path:
+    with atomic_write(path) as stream:
+        np.save(stream, array)
+    return path
