@@ -229,8 +229,8 @@ class SplatCloud:
             colors, sh = np.concatenate([cloud.colors for cloud in filled if cloud.colors is not None]), None
         else:
             colors, sh = None, np.concatenate([_sh_of_degree(cloud, degree) for cloud in filled])
-        joined["planes"] = _joined_planes(filled)
-        return first._replaced(**joined, colors=colors, sh=sh, dropped=dropped)
+        planes = _joined_planes(filled)
+        return first._replaced(**joined, planes=planes, colors=colors, sh=sh, dropped=dropped)
 
 
 def _numbers(name: str, value) -> np.ndarray:
