@@ -30,11 +30,15 @@ Examples:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status: 0 done, 1 failed, 2 bad input, 130 interrupted."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal that lacks a sign is no reason to stop
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
-    warnings.showwarning = _show_warning
     try:
-        status = _parse(words).run()
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            status = _parse(words).run()
         sys.stdout.flush()
         return status
     except SystemExit as stop:  # help, or words that could not be parsed
@@ -98,14 +102,15 @@ def _any_of(commands: dict[str, type]) -> Any:
 def _one_line(box: str) -> str:
     """tyro's boxed message as one line: what is wrong, the nearest option if it names one, where to read
     more."""
-    lines = [line.strip(" │|") for line in box.splitlines()]
-    lines = [line for line in lines if line and not line.startswith(("╭", "╰"))]
+    lines = [line.strip(" │") for line in box.splitlines()]
     parts: list[list[str]] = [[]]
     for line in lines:
-        if set(line) == {"─"}:
+        # the box is Unicode, or has its title above a line of hyphens where the terminal knows ASCII only
+        if line.startswith("╭") or set(line) == {"-"} or set(line) == {"─"}:
             parts.append([])
-        else:
+        elif line and not line.startswith("╰"):
             parts[-1].append(line)
+    parts = parts[1:]
     message = " ".join(parts[0]) or "these words make no command"
     for part in parts[1:]:
         if part and part[0].startswith("Perhaps you meant"):

@@ -1,0 +1,258 @@
+"""The command line: exit statuses, one line for an error, --json alone on stdout, the words of the
+contract."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from ideal_picture import draw, photographed, pose, qr_bits, turned
+
+import fidsplat as fs
+from fidsplat.cli import main
+from fidsplat.commands import COMMANDS
+from fidsplat.vision.dictionaries import dictionary_bits
+from fidsplat.vision.images import write_png
+
+CAMERA = fs.Camera.pinhole(320, 240, 400, 400, 160, 120)
+
+
+def fails(capsys, *words) -> tuple[int, str]:
+    """Run and return exit status and the one line on stderr; nothing stands on stdout."""
+    status = main([str(word) for word in words])
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("fidsplat: "), err
+    assert err.count("\n") == 1, f"one line, not {err!r}"
+    return status, err
+
+
+def prints_json(capsys, *words) -> dict:
+    assert main([*map(str, words), "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+@pytest.fixture
+def picture(tmp_path):
+    """A PNG with an AprilTag and a QR code side by side."""
+    pictures = [
+        draw(bits, 0.2, pose(turned(20), [0, 0, 0.6]), CAMERA, quiet)[0]
+        for bits, quiet in ((dictionary_bits("apriltag", "36h11", 5), 1), (qr_bits("hello"), 4))
+    ]
+    return write_png(tmp_path / "codes.png", photographed(np.hstack(pictures)))
+
+
+# --- words
+
+
+@pytest.mark.parametrize("words", [["--help"], *([name, "--help"] for name in COMMANDS)])
+def test_help_teaches_with_examples(words, capsys):
+    assert main(words) == 0
+    out, err = capsys.readouterr()
+    assert "Examples:" in out
+    assert err == ""
+    if words == ["--help"]:
+        assert all(name in out for name in COMMANDS)
+
+
+def test_help_loads_nothing_heavy():
+    code = (
+        "import sys; sys.argv = ['fidsplat', '--help']; from fidsplat.cli import main; status = main();"
+        "heavy = {'numpy', 'cv2', 'pyopencl', 'shapely', 'networkx', 'rich.table'} & set(sys.modules);"
+        "sys.exit(f'loaded {heavy}' if heavy or status else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ([], "demo, devices, marker, render, detect"),
+        (["mraker"], "Available subcommands: demo, devices"),
+        (["marker"], "SPEC"),
+        (["marker", "qr:a", "--sise", "1"], "perhaps --size M; see fidsplat marker --help"),
+        (["marker", "qr:a", "--size", "big"], "--size"),
+        (["marker", "qr:a", "qr:b"], "Unrecognized options: qr:b"),
+        (["render"], "SCENE.toml"),
+        (["detect", "--json"], "IMAGE"),
+    ],
+)
+def test_words_that_make_no_command(words, says, capsys):
+    status, line = fails(capsys, *words)
+    assert status == 2
+    assert says in line
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["marker", "apriltag:36h12:5"], "36h11"),
+        (["marker", "apriltag:36h11:587"], "0 to 586"),
+        (["marker", "aruco:4x4_50:-1"], "0 to 49"),
+        (["marker", "barcode:5"], "barcode"),
+        (["marker", "qr-v2-L:" + "x" * 200], "2"),
+        (["marker", "image:missing.png"], "missing.png"),
+        (["marker", "apriltag:36h11:5", "--size", "0"], "size"),
+        (["marker", "apriltag:36h11:5", "--size", "-1"], "size"),
+        (["marker", "apriltag:36h11:5", "--mixture", "bricks"], "fitted"),
+        (["marker", "apriltag:36h11:5", "-o", "/proc/nowhere/tag.ply"], "/proc/nowhere"),
+        (["detect", "missing.png"], "missing.png"),
+        (["render", "missing.toml"], "missing.toml"),
+        (["render", "missing.ply"], "missing.ply"),
+        (["render", "scene.yaml"], "scene.yaml"),
+        (["render", "missing.ply", "--outputs", "rgb,dpth"], "depth"),
+        (["render", "missing.ply", "--quality", "best"], "standard"),
+        (["render", "missing.ply", "-o", "picture.jpg"], "picture.png"),
+        (["render", "missing.ply", "-o", "/proc/nowhere/frames"], "/proc/nowhere"),
+        (["demo", "--out", "/proc/nowhere"], "/proc/nowhere"),
+    ],
+)
+def test_input_that_cannot_be_used(words, says, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    status, line = fails(capsys, *words)
+    assert status == 2
+    assert says in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_detect_refuses_families_and_pictures_that_it_does_not_know(capsys, picture, tmp_path):
+    status, line = fails(capsys, "detect", picture, "--family", "36h12")
+    assert status == 2
+    assert "36h11" in line
+    broken = tmp_path / "broken.png"
+    broken.write_bytes(picture.read_bytes()[:400])
+    assert fails(capsys, "detect", broken)[0] == 2
+
+
+def test_a_terminal_without_unicode_gets_help_and_errors(tmp_path):
+    plain = {**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
+
+    def run(*words):
+        command = [sys.executable, "-m", "fidsplat.cli", *words]
+        return subprocess.run(command, capture_output=True, text=True, env=plain, cwd=tmp_path)
+
+    assert run("--help").returncode == 0
+    assert run("devices").returncode == 0
+    wrong = run("marker", "qr:a", "--sise", "1")
+    assert (wrong.returncode, wrong.stderr.count("\n")) == (2, 1)
+    assert "perhaps --size M" in wrong.stderr
+
+
+# --- statuses
+
+
+def test_a_failed_run_is_1_and_a_fault_of_ours_says_so(capsys, monkeypatch):
+    def broken(self):
+        raise fs.DeviceError("the device\ngave up")
+
+    monkeypatch.setattr(COMMANDS["devices"], "run", broken)
+    assert fails(capsys, "devices") == (1, "fidsplat: the device gave up\n")
+
+    def faulty(self):
+        raise KeyError("surprise")
+
+    monkeypatch.setattr(COMMANDS["devices"], "run", faulty)
+    status, line = fails(capsys, "devices")
+    assert status == 1
+    assert "--debug" in line
+
+    def interrupted(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(COMMANDS["devices"], "run", interrupted)
+    assert fails(capsys, "devices") == (130, "fidsplat: interrupted\n")
+
+
+@pytest.mark.parametrize(
+    "words", [["--debug", "detect", "missing.png"], ["detect", "missing.png", "--debug"]]
+)
+def test_debug_anywhere_shows_the_traceback(words, capsys):
+    assert main(words) == 2
+    err = capsys.readouterr().err
+    assert "Traceback" in err
+    assert err.splitlines()[-1].startswith("fidsplat: ")
+
+
+def test_output_that_nobody_reads_any_more_is_no_traceback(picture):
+    # the reader is gone before the first word is written
+    words = ["detect", str(picture)]
+    code = f"import time, sys; time.sleep(1); from fidsplat.cli import main; sys.exit(main({words}))"
+    done = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert done.stdout is not None
+    assert done.stderr is not None
+    done.stdout.close()
+    err = done.stderr.read()
+    done.stderr.close()
+    assert done.wait() == 1
+    assert "Traceback" not in err
+    assert "BrokenPipe" not in err
+
+
+def test_warnings_are_one_line_each_and_leave_no_trace(capsys, monkeypatch):
+    import warnings
+
+    def warn(self):
+        warnings.warn("two\nlines", stacklevel=1)
+        return 0
+
+    before = warnings.showwarning
+    monkeypatch.setattr(COMMANDS["devices"], "run", warn)
+    assert main(["devices"]) == 0
+    assert capsys.readouterr().err == "fidsplat: warning: two lines\n"
+    assert warnings.showwarning is before
+
+
+# --- devices, marker, detect
+
+
+def test_devices(capsys):
+    found = prints_json(capsys, "devices")["devices"]
+    assert "reference" in {device["name"] for device in found}
+    assert {"platform", "version", "memory_bytes", "float64", "usable", "reason"} <= set(found[0])
+    assert main(["devices"]) == 0
+    assert "reference" in capsys.readouterr().out
+
+
+def test_marker_says_what_it_is_made_of(capsys, tmp_path):
+    file = tmp_path / "new" / "tag.ply"
+    facts = prints_json(capsys, "marker", "apriltag:36h11:5", "--size", "0.16", "-o", file)
+    made = fs.marker("apriltag:36h11:5", size=0.16)
+    assert facts["shape"] == [8, 8]
+    assert facts["components"] == made.components
+    assert sum(facts["rectangles"].values()) == len(made.rectangles)
+    assert facts["splats"] == len(made.cloud) == len(fs.load_ply(file))
+    assert facts["mixture"] == "fitted"
+    assert facts["size_m"] == 0.16
+    assert 0 < facts["seconds"] < 30
+    assert main(["marker", "apriltag:36h11:5"]) == 0
+    assert "rectangles" in capsys.readouterr().out
+
+
+def test_marker_with_the_mixture_of_the_paper(capsys):
+    assert prints_json(capsys, "marker", "qr:hello", "--mixture", "paper")["mixture"] == "paper"
+
+
+def test_detect(capsys, picture):
+    result = prints_json(capsys, "detect", picture)
+    assert [code["name"] for code in result["detections"]] == ["apriltag:36h11:5", "qr:hello"]
+    assert np.array(result["detections"][0]["corners"]).shape == (4, 2)
+    assert main(["detect", str(picture)]) == 0
+    assert "apriltag:36h11:5" in capsys.readouterr().out
+    assert (
+        prints_json(capsys, "detect", picture, "--family", "4x4_50", "--family", "25h9")["detections"][0][
+            "id"
+        ]
+        is None
+    )
+
+
+def test_detect_where_nothing_is(capsys, tmp_path):
+    empty = write_png(tmp_path / "empty.png", np.zeros((90, 120)))
+    assert prints_json(capsys, "detect", empty)["detections"] == []
+    assert main(["detect", str(empty)]) == 0
+    assert "no code found" in capsys.readouterr().out

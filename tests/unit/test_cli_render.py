@@ -1,0 +1,195 @@
+"""`fidsplat render` and what it writes, and `fidsplat detect --scene` on what it wrote."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.cli import main
+from fidsplat.commands.framing import framing_camera
+from fidsplat.vision.images import read_image
+
+SCENE = """
+[camera]
+width = 160
+height = 120
+fov_x_deg = 60.0
+position = [0.0, 0.0, -0.5]
+look_at = [0.0, 0.0, 0.0]
+
+[[markers]]
+spec = "apriltag:36h11:5"
+size = 0.25
+position = [0.02, 0.0, 0.1]
+
+[render]
+background = [0.5, 0.5, 0.5]
+"""
+
+
+@pytest.fixture
+def scene(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(SCENE)
+    return "scene.toml"
+
+
+def tag_cloud() -> fs.SplatCloud:
+    return fs.marker("apriltag:36h11:5", size=0.4).cloud
+
+
+def said(capsys) -> dict:
+    return json.loads(capsys.readouterr().out)
+
+
+def names(folder) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_a_scene_is_drawn_and_read_back(scene, tmp_path, capsys):
+    assert main(["render", scene, "--json"]) == 0
+    facts = said(capsys)
+    assert facts["files"] == ["scene.png"]
+    assert (facts["width"], facts["height"], facts["outputs"]) == (160, 120, ["rgb"])
+    assert facts["stats"]["splats"] > 0
+    assert facts["timings_ms"]
+    assert read_image("scene.png").shape == (120, 160, 3)
+
+    assert main(["detect", "scene.png", "--scene", scene, "--json"]) == 0
+    facts = said(capsys)
+    (marker,) = facts["markers"]
+    assert marker["found"]
+    assert marker["position_error_mm"] < 6
+    assert marker["angle_error_deg"] < 5
+    assert marker["corner_error_px"] < 0.5
+    assert facts["not_in_scene"] == []
+    assert main(["detect", "scene.png", "--scene", scene]) == 0
+    assert "position error [mm]" in capsys.readouterr().out
+
+
+def test_every_plane_is_a_file(scene, tmp_path, capsys):
+    words = "rgb,alpha,depth,depth_median,normal,label"
+    assert main(["render", scene, "-o", "frames", "--outputs", words, "--device", "reference", "--json"]) == 0
+    assert sorted(said(capsys)["files"]) == sorted(f"frames/{name}" for name in names(tmp_path / "frames"))
+    assert names(tmp_path / "frames") == {
+        *("rgb.png", "alpha.png", "normal.png", "label.png", "label.npy"),
+        *("depth.png", "depth.npy", "depth-turbo.png"),
+        *("depth_median.png", "depth_median.npy", "depth_median-turbo.png"),
+    }
+    depth = np.load("frames/depth.npy")
+    assert depth.shape == (120, 160)
+    assert depth[60, 80] == pytest.approx(0.6, abs=0.01)
+    millimetres = cv2.imread("frames/depth.png", cv2.IMREAD_UNCHANGED)
+    assert millimetres is not None
+    assert millimetres.dtype == np.uint16
+    assert millimetres[60, 80] == round(float(depth[60, 80]) * 1000)
+    assert set(np.unique(np.load("frames/label.npy"))) == {-1, 1}
+    assert read_image("frames/normal.png")[60, 80].tolist() == [128, 128, 0]
+
+
+def test_a_name_with_png_is_the_colour_picture_and_other_planes_stand_beside_it(scene, tmp_path):
+    assert main(["render", scene, "-o", "new/view.png", "--outputs", "rgb,label"]) == 0
+    assert names(tmp_path / "new") == {"view.png", "view-label.png", "view-label.npy"}
+
+
+def test_the_outputs_of_the_scene_are_the_default(scene, tmp_path):
+    (tmp_path / "scene.toml").write_text(SCENE + 'outputs = ["depth"]\ndevice = "reference"\n')
+    assert main(["render", scene]) == 0
+    assert {"scene-depth.npy", "scene-depth.png", "scene-depth-turbo.png"} <= names(tmp_path)
+    assert "scene.png" not in names(tmp_path)
+
+
+def test_a_bare_splat_file_is_framed(scene, tmp_path, capsys):
+    fs.save_ply(tag_cloud(), "tag.ply")
+    assert main(["render", "tag.ply", "--json"]) == 0
+    facts = said(capsys)
+    assert facts["files"] == ["tag.png"]
+    image = read_image("tag.png")
+    assert image.shape == (720, 1280, 3)
+    rows = np.flatnonzero(image.max((1, 2)) > 128)
+    assert rows[0] > 5
+    assert rows[-1] < 714
+    assert rows[-1] - rows[0] > 500, "it fills the picture"
+    assert main(["detect", "tag.png", "--json"]) == 0
+    assert [code["name"] for code in said(capsys)["detections"]] == ["apriltag:36h11:5"]
+
+
+def test_nothing_to_draw_is_the_background(scene, tmp_path):
+    fs.save_ply(fs.SplatCloud.empty(), "empty.ply")
+    text = (
+        SCENE.split("[[markers]]")[0]
+        + '[[splats]]\nfile = "empty.ply"\n[render]\nbackground = [0.2, 0.4, 0.6]\n'
+    )
+    (tmp_path / "scene.toml").write_text(text)
+    assert main(["render", scene]) == 0
+    assert np.unique(read_image("scene.png").reshape(-1, 3), axis=0).tolist() == [[51, 102, 153]]
+    assert main(["render", "empty.ply"]) == 0
+    assert read_image("empty.png").max() == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "says"),
+    [
+        (["--device", "opencl:nosuchthing"], 2, "nosuchthing"),
+        (["--device", "vulkan"], 2, "vulkan"),
+        (["--quality", "standrad"], 2, "standard"),
+        (["--outputs", ""], 2, "output"),
+    ],
+)
+def test_what_cannot_be_drawn(scene, words, status, says, capsys):
+    assert main(["render", scene, *words]) == status
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert says in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("fov_x_deg", "fov_x_degs"), "fov_x_deg"),
+        (("[[markers]]", '[[splats]]\nfile = "gone.ply"\n[[markers]]'), "gone.ply"),
+        (("36h11:5", "36h11:5000"), "586"),
+        (("size = 0.25", "size = 0.0"), "size"),
+        (("[camera]", "[camra]"), "camera"),
+    ],
+)
+def test_scene_files_that_are_wrong(scene, tmp_path, change, says, capsys):
+    (tmp_path / "scene.toml").write_text(SCENE.replace(*change))
+    assert main(["render", scene]) == 2
+    err = capsys.readouterr().err
+    assert says in err
+    assert err.count("\n") == 1
+
+
+def test_a_scene_needs_a_camera(scene, tmp_path, capsys):
+    (tmp_path / "scene.toml").write_text("[render]\n")
+    assert main(["render", scene]) == 2
+    assert "[camera]" in capsys.readouterr().err
+
+
+def test_detect_wants_the_picture_of_that_scene(scene, tmp_path, capsys):
+    from fidsplat.vision.images import write_png
+
+    write_png("other.png", np.zeros((50, 60)))
+    assert main(["detect", "other.png", "--scene", scene]) == 2
+    assert "160 x 120" in capsys.readouterr().err
+
+
+def test_the_frame_leaves_strays_out_only_when_there_are_many():
+    random = np.random.default_rng(0)
+    means = random.uniform(-1, 1, (20_000, 3))
+    means[0] = (500, 0, 0)
+    many = fs.SplatCloud(
+        means,
+        np.tile([1.0, 0, 0, 0], (20_000, 1)),
+        np.full((20_000, 2), 0.01),
+        np.ones(20_000),
+        colors=means * 0,
+    )
+    assert np.linalg.norm(framing_camera(many).position) < 5
+    few = fs.SplatCloud(means[:5], many.quats[:5], many.scales[:5], np.ones(5), colors=np.zeros((5, 3)))
+    inside = framing_camera(few).project(means[:5])
+    assert ((inside > 0) & (inside < (1280, 720))).all()

@@ -1,0 +1,118 @@
+"""The demo end to end on the best device that is here, and the judging that it rests on."""
+
+import json
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.cli import main
+from fidsplat.experiments.demo_scene import demo_scene, demo_views
+from fidsplat.experiments.readback import families_of, read_back, visible_share
+from fidsplat.vision.detect import Detection
+from fidsplat.vision.images import read_image
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return demo_scene()
+
+
+def test_the_demo_passes_and_writes_what_it_made(tmp_path, capsys):
+    folder = tmp_path / "made" / "demo"
+    assert main(["demo", "--out", str(folder), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["passed"]
+    assert 8_000 < result["background_splats"] < 12_000
+    assert result == json.loads((folder / "demo.json").read_text())
+
+    whole = [s for s in result["sightings"] if s["passed"] is not None]
+    assert len(result["sightings"]) == 9
+    assert len(whole) == 8
+    for sighting in whole:
+        assert sighting["found"]
+        assert sighting["position_error_mm"] < 10 * sighting["distance_m"]
+    (hidden,) = [s for s in result["sightings"] if s["passed"] is None]
+    assert hidden["view"] == "hidden"
+    assert 0.3 < hidden["visible"] < 0.9
+
+    names = {path.name for path in folder.iterdir()}
+    assert {path.rsplit("/", 1)[-1] for path in result["files"]} == names
+    for view in ("frontal", "60-degrees", "hidden"):
+        assert {f"{view}-{name}.png" for name in ("rgb", "depth", "normal", "label", "detection")} <= names
+    assert read_image(folder / "contact-sheet.png").shape[1] > 1500
+
+    loaded = fs.Scene.load(folder / "scene.toml")
+    assert len(loaded.cloud()) == len(fs.load_ply(folder / "scene.ply"))
+    assert [p.marker.spec for p in loaded.markers] == list(result["marker_splats"])
+    # the scene file gives the picture that the demo saved
+    assert main(["render", str(folder / "scene.toml"), "-o", str(folder / "again.png")]) == 0
+    apart = np.abs(read_image(folder / "again.png").astype(int) - read_image(folder / "frontal-rgb.png"))
+    assert apart.max() <= 2, "PLY files hold logarithms of scales and logits of opacities in single precision"
+    assert main(["detect", str(folder / "frontal-rgb.png"), "--scene", str(folder / "scene.toml")]) == 0
+
+
+def test_a_marker_that_is_missed_fails_the_demo(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("fidsplat.experiments.demo.detect", lambda image, families: [])
+    assert main(["demo", "--out", str(tmp_path)]) == 1
+    out = capsys.readouterr().out
+    assert "failed: " in out
+    assert "apriltag:36h11:5 in 'frontal'" in out
+    assert "aruco:4x4_50:7 in 'hidden'" not in out
+
+
+def test_the_scene_is_the_same_every_time(scene):
+    again = demo_scene().cloud()
+    one = scene.cloud()
+    for name in ("means", "quats", "scales", "opacities", "colors", "labels"):
+        assert np.array_equal(getattr(one, name), getattr(again, name)), name
+    assert set(np.unique(one.labels)) == {0, 1, 2, 3}
+
+
+def test_visible_share_counts_the_labels_inside_the_outline(scene):
+    camera = demo_views()["frontal"]
+    placed = scene.markers[0]
+    label = np.full((camera.height, camera.width), placed.label)
+    assert visible_share(placed, camera, label) == 1.0
+    middle = camera.project(placed.pose[None, :3, 3])[0]
+    label[:, round(middle[0]) :] = 0
+    assert visible_share(placed, camera, label) == pytest.approx(0.5, abs=0.01)
+    assert visible_share(placed, camera, np.zeros_like(label)) == 0.0
+
+
+def test_what_is_outside_the_picture_or_turned_away_is_not_visible(scene):
+    placed = scene.markers[0]
+    camera = demo_views()["frontal"]
+    half = fs.Camera.pinhole(
+        camera.width, camera.height, camera.fx, camera.fy, 0, camera.cy, camera.world_to_camera
+    )
+    label = np.full((camera.height, camera.width), placed.label)
+    assert visible_share(placed, half, label) == 0.0
+    behind = fs.Camera.look_at(640, 480, 1.0, (0, 0, 3), (0, 0, 0))
+    assert visible_share(placed, behind, np.full((480, 640), placed.label)) == 0.0
+    away = fs.Camera.look_at(640, 480, 1.0, (0, 0, -3), (0, 0, -4))
+    assert visible_share(placed, away, np.full((480, 640), placed.label)) == 0.0
+
+
+def test_detections_are_matched_by_what_they_say_and_then_by_nearness(scene):
+    camera = demo_views()["frontal"]
+    tag, aruco, qr = scene.markers
+    twice = (tag, fs.scenes.PlacedMarker(tag.marker, pose=aruco.pose), qr)
+
+    def seen(placed, kind="apriltag", family="36h11", tag_id=5, payload=None):
+        return Detection(kind, family, tag_id, payload, camera.project(placed.corners))
+
+    found = [
+        seen(twice[1]),
+        seen(twice[0]),
+        seen(twice[0], tag_id=6),
+        seen(qr, "qr", "v2-L", None, "something else"),
+    ]
+    readings, strangers = read_back(found, twice, camera)
+    assert [reading.detection for reading in readings] == [found[1], found[0], None]
+    assert strangers == found[2:]
+    for reading in readings[:2]:
+        assert reading.position_error == pytest.approx(0, abs=1e-6)
+        assert reading.corner_error == 0
+    assert readings[2].as_dict()["found"] is False
+    assert families_of((tag, aruco, qr, tag)) == ("apriltag:36h11", "aruco:4x4_50")
