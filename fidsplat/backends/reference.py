@@ -188,8 +188,9 @@ class _Splats:
         facing = np.where(np.einsum("ij,ij->i", normal, p) > 0, -1.0, 1.0)[:, None]
         self.normal = normal * facing / np.where(length > 0, length, 1)
         self.screen = "lowpass_screen" in features.slots
-        layered = "compose_planes" in features.slots and cloud.planes is not None
-        self.planes = cloud.planes[order] if layered else None
+        self.planes = None
+        if "compose_planes" in features.slots and cloud.planes is not None:
+            self.planes = cloud.planes[order]
 
 
 def _colors(cloud: SplatCloud, order: np.ndarray, rays: np.ndarray) -> np.ndarray:

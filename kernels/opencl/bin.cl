@@ -34,10 +34,12 @@ kernel void bin_count(global const uint *restrict order, global const uint *rest
     }
 }
 
-// Reads: order, counts[slot], bounds, starts. Uses up: table. Writes: lists (pairs; never beyond `capacity`).
+// Reads: order, counts[slot], bounds, starts. Uses up: table, of the tiles in the band.
+// Writes: lists of the tiles of the band [band_first, band_end), from 0; never beyond `capacity`.
 kernel void bin_emit(global const uint *restrict order, global const uint *restrict counts, uint slot,
                      global const Bounds *restrict all_bounds, int width, int height, global uint *restrict table,
-                     global const uint *restrict starts, uint capacity, global uint *restrict lists) {
+                     global const uint *restrict starts, int band_first, int band_end, uint capacity,
+                     global uint *restrict lists) {
     uint chunk = get_global_id(0);
     if (chunk >= CHUNKS) return;
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
@@ -49,11 +51,13 @@ kernel void bin_emit(global const uint *restrict order, global const uint *restr
         Bounds b = all_bounds[index];
         int y0, y1;
         bounds_rows(&b, height, &y0, &y1);
-        for (int ty = y0 / TILE_H; ty * TILE_H < y1; ty++) {
+        for (int ty = max(y0 / TILE_H, band_first / tiles_x); ty * TILE_H < y1 && ty * tiles_x < band_end; ty++) {
             TileSpan span = tile_span(&b, ty, width, height);
             for (int tx = span.first; tx <= span.last; tx++) {
                 int tile = ty * tiles_x + tx;
-                uint place = starts[tile] + row[tile]++;
+                if (tile < band_first || tile >= band_end) continue;
+                // modulo 2^32: a place within the band is right even where the picture has more pairs than that
+                uint place = starts[tile] - starts[band_first] + row[tile]++;
                 if (place < capacity) lists[place] = index;
             }
         }

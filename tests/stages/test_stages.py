@@ -150,3 +150,19 @@ def test_both_schedules_draw_the_same_picture(backend):
     for name in ("rgb", "alpha", "normal", "depth"):
         assert np.allclose(other[name], base[name], rtol=1e-5, atol=2e-6), name
     assert np.array_equal(other["label"], base["label"])
+
+
+@pytest.mark.parametrize("budget", [1, 50, 1000])
+def test_a_small_pair_budget_gives_the_same_bits(backend, monkeypatch, budget):
+    """numerics E3: a picture with more pairs than fit is drawn in bands of tiles."""
+    cloud = random_splats(300, seed=12)
+    features = select(cloud, ALL_OUTPUTS, fs.Quality())
+    view = View.of(CAMERA, fs.Quality(), cloud.origin, (0, 0, 0))
+    pipeline, resident = backend.pipeline(features), backend.upload(cloud)
+    whole = pipeline.render(resident, view)
+    assert whole.stats["pairs"] > 1000
+    monkeypatch.setattr(backend, "pair_budget", budget)
+    banded = pipeline.render(resident, view)
+    assert banded.stats == whole.stats
+    for name in ALL_OUTPUTS:
+        assert np.array_equal(banded.read(name), whole.read(name)), name

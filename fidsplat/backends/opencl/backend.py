@@ -62,6 +62,8 @@ class OpenCLBackend:
         self.context = cl.Context([device])
         self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
         self.pool = BufferPool(self.context, device)
+        self.pair_budget = min(device.max_mem_alloc_size // 4, 2**32 - 1)
+        """Most pairs of splats and tiles that are listed at once; tests make it small."""
         self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
 
     def upload(self, cloud: SplatCloud) -> Resident:

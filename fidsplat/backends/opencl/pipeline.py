@@ -1,12 +1,13 @@
 """Runs the stages of one FeatureSet on one device: project, sort, bin, blend, resolve.
 
 Nothing passes through the host between the stages but the number of (splat, tile) pairs, which sizes one
-buffer.
+buffer. A picture with more pairs than the device's budget is listed and blended in bands of tiles, with the
+same bits.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
 # words of the buffer `counts`: lists' lengths (64 bits each) that kernels read
 _ALL, _VISIBLE, _PAIRS = 0, 2, 4
-_MAX_PAIRS = 2**32 - 1
 
 
 class OpenCLPlanes:
@@ -90,8 +90,9 @@ class OpenCLPipeline:
         """Draw one picture and return what passes between the stages.
 
         keys (n,) uint32; order (visible,) uint32, splat indices by depth; starts (tiles + 1,) uint32;
-        lists (pairs,) uint32; records (n, words) float32 (undefined for culled splats); raw (4, rows,
-        columns) float32: r, g, b, transmittance of the padded sample grid; and the finished outputs by name.
+        lists (pairs,) uint32, of the last band; records (n, words) float32 (undefined for culled splats);
+        raw (4, rows, columns) float32: r, g, b, transmittance of the padded sample grid; and the finished
+        outputs by name.
         """
         run = _Run(self, resident, view)
         planes = run.planes()
@@ -126,8 +127,11 @@ class _Run:
     def planes(self) -> OpenCLPlanes:
         self._project()
         self._sort()
-        visible, pairs = self._bin()
-        raw_planes = self._blend()
+        visible, pairs = self._count()
+        raw_planes = self._sample_planes()
+        for first, end, listed in self._bands(pairs):
+            self._list(first, end, listed)
+            self._blend(first, end, raw_planes)
         outputs = self._resolve(raw_planes)
         size = (self.view.height // self.view.samples, self.view.width // self.view.samples)
         stats = {"splats": self.resident.count, "visible": visible, "pairs": pairs}
@@ -187,11 +191,11 @@ class _Run:
             keys, order = keys_out, order_out
         self.held["order"] = order
 
-    def _bin(self) -> tuple[int, int]:
-        """Lists of splats per tile; returns the numbers of visible splats and of pairs."""
+    def _count(self) -> tuple[int, int]:
+        """Lengths of the tiles' lists; returns the numbers of visible splats and of pairs."""
         table = self._take("bin table", 4 * self.tiles * self.shape.chunks)
         size = (np.int32(self.view.width), np.int32(self.view.height))
-        common = (
+        self.walk = (
             self.held["order"],
             self.held["counts"],
             np.uint32(_VISIBLE),
@@ -199,22 +203,37 @@ class _Run:
             *size,
             table,
         )
-        self._launch("bin", "bin_count", self.shape.chunks, 1, *common)
-        starts = self.held["starts"] = self._starts("bin", table, self.tiles, _PAIRS)
+        self._launch("bin", "bin_count", self.shape.chunks, 1, *self.walk)
+        self.held["starts"] = self._starts("bin", table, self.tiles, _PAIRS)
         counts = np.empty(6, np.uint32)
         cl.enqueue_copy(self.queue, counts, self.held["counts"])
         visible, pairs = (int(counts[k]) | int(counts[k + 1]) << 32 for k in (_VISIBLE, _PAIRS))
-        if pairs > _MAX_PAIRS:
-            raise DeviceError(
-                f"{pairs} pairs of splats and tiles are more than {_MAX_PAIRS}: draw a smaller picture "
-                "or fewer splats"
-            )
-        lists = self._take("lists", 4 * pairs)
-        self._launch("bin", "bin_emit", self.shape.chunks, 1, *common, starts, np.uint32(pairs), lists)
         return visible, pairs
 
-    def _blend(self) -> list[cl.Buffer]:
-        """Sample planes: raw, then those of the taps in order."""
+    def _bands(self, pairs: int) -> Iterator[tuple[int, int, int]]:
+        """Ranges of tiles (first, end, pairs) whose lists fit the budget; one, unless the picture is crowded.
+
+        A band holds at least one tile, whatever its list.
+        """
+        if pairs <= self.backend.pair_budget:
+            yield 0, self.tiles, pairs
+            return
+        ends = np.cumsum(self.read("bin totals", np.uint32, (self.tiles,)), dtype=np.int64)
+        first, done = 0, 0
+        while first < self.tiles:
+            end = int(np.searchsorted(ends, done + self.backend.pair_budget, side="right"))
+            end = max(end, first + 1)
+            yield first, end, int(ends[end - 1]) - done
+            first, done = end, int(ends[end - 1])
+
+    def _list(self, first: int, end: int, pairs: int) -> None:
+        """The lists of the tiles of one band."""
+        lists = self._take("lists", 4 * pairs)
+        band = (self.held["starts"], np.int32(first), np.int32(end), np.uint32(pairs))
+        self._launch("bin", "bin_emit", self.shape.chunks, 1, *self.walk, *band, lists)
+
+    def _sample_planes(self) -> list[cl.Buffer]:
+        """Planes that blending fills: raw, then those of the taps in order."""
         plane = 4 * self.rows * self.stride
         raw = self._take("raw", 4 * plane)
         extra = [
@@ -222,24 +241,27 @@ class _Run:
             for effect in self.pipeline.features.effects
             for k, planes in enumerate(effect.planes)
         ]
+        return [raw, *extra]
+
+    def _blend(self, first: int, end: int, sample_planes: list[cl.Buffer]) -> None:
+        """Draws the tiles of one band."""
         group = 1 if self.shape.schedule == "lanes" else self.shape.tile_width * self.shape.tile_height
         view = self.view
         self._launch(
             "blend",
             "blend",
-            self.tiles * group,
+            (end - first) * group,
             group,
             *(self.held[name] for name in ("splats", "lists", "starts")),
+            np.uint32(first),
             np.int32(view.width),
             np.int32(view.height),
             np.float32(view.log_cut),
             np.float32(view.ceiling),
             np.float32(view.stop),
             np.float32(1.0 / view.samples**2),
-            raw,
-            *extra,
+            *sample_planes,
         )
-        return [raw, *extra]
 
     def _resolve(self, raw_planes: list[cl.Buffer]) -> dict[str, tuple[Output, cl.Buffer]]:
         view, features = self.view, self.pipeline.features

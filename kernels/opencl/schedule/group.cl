@@ -8,6 +8,7 @@ kernel __attribute__((reqd_work_group_size(TILE_W * TILE_H, 1, 1))) void blend(
     global const Splat *restrict splats,
     global const uint *restrict lists,
     global const uint *restrict starts,
+    uint band_first,                         // the first tile of this launch; lists begin with its list
     int width, int height,
     float log_cut, float ceiling, float stop, float filter,
     global float *restrict raw
@@ -16,7 +17,7 @@ kernel __attribute__((reqd_work_group_size(TILE_W * TILE_H, 1, 1))) void blend(
     local Splat staged[STAGED];
     local int alive;
     const BlendConstants constants = {log_cut, ceiling, stop, filter};
-    uint tile = get_group_id(0), item = get_local_id(0);
+    uint tile = band_first + get_group_id(0), item = get_local_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
     int px = (int)(tile % (uint)tiles_x) * TILE_W + (int)(item % TILE_W);
     int py = (int)(tile / (uint)tiles_x) * TILE_H + (int)(item / TILE_W);
@@ -26,7 +27,7 @@ kernel __attribute__((reqd_work_group_size(TILE_W * TILE_H, 1, 1))) void blend(
     pixel_start(pixel);
     bool in_picture = px < width && py < height;
 
-    uint start = starts[tile], end = starts[tile + 1];
+    uint base = starts[band_first], start = starts[tile] - base, end = starts[tile + 1] - base;
     for (uint batch = start; batch < end; batch += STAGED) {
         uint length = min(end - batch, (uint)STAGED);
         barrier(CLK_LOCAL_MEM_FENCE);

@@ -5,13 +5,14 @@ kernel void blend(
     global const Splat *restrict splats,
     global const uint *restrict lists,
     global const uint *restrict starts,
+    uint band_first,                         // the first tile of this launch; lists begin with its list
     int width, int height,
     float log_cut, float ceiling, float stop, float filter,
     global float *restrict raw
 //@@ blend_args
 ) {
     const BlendConstants constants = {log_cut, ceiling, stop, filter};
-    uint tile = get_global_id(0);
+    uint tile = band_first + get_global_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
     int x0 = (int)(tile % (uint)tiles_x) * TILE_W, y0 = (int)(tile / (uint)tiles_x) * TILE_H;
 
@@ -21,7 +22,8 @@ kernel void blend(
     int rows = min(height - y0, TILE_H);
     uint alive = rows == 32 ? 0xFFFFFFFFu : (1u << rows) - 1u;
 
-    for (uint k = starts[tile], end = starts[tile + 1]; k < end && alive; k++) {
+    uint base = starts[band_first];
+    for (uint k = starts[tile] - base, end = starts[tile + 1] - base; k < end && alive; k++) {
         const Splat s = splats[lists[k]];
         float half_r2 = s.log_opacity - constants.log_cut;
         int first = max(s.y0 - y0, 0), last = min(s.y1 - y0, TILE_H);
