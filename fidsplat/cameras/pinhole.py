@@ -36,9 +36,9 @@ class Camera:
     world_to_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
     """(4, 4) float64, rigid, read-only"""
     near: float = 0.01
-    """metres along z, above 0; nothing nearer is drawn"""
+    """metres along z, above 0; no part of a splat that is nearer is drawn"""
     far: float = math.inf
-    """metres along z, above near; nothing further is drawn"""
+    """metres along z, above near; a splat that lies wholly beyond it is not drawn"""
 
     def __post_init__(self) -> None:
         put = object.__setattr__
