@@ -6,6 +6,7 @@ from typing import Annotated, ClassVar
 import tyro
 
 from fidsplat.commands.output import Json, console, option, print_json, print_table, writable_file
+from fidsplat.errors import InputError
 
 
 @dataclass
@@ -35,15 +36,21 @@ Examples:
     mixture: Annotated[
         str, option("NAME", "how rectangles become splats: fitted or paper (default: fitted)")
     ] = "fitted"
+    native_2dgs: Annotated[
+        bool,
+        tyro.conf.arg(help="leave the third scale out of the file, as 2DGS does", help_behavior_hint=""),
+    ] = False
     json: Json = False
 
     def run(self) -> int:
         import fidsplat as fs
 
+        if self.native_2dgs and self.out is None:
+            raise InputError("--native-2dgs is about the file that -o names; give -o FILE.ply")
         file = writable_file(self.out) if self.out is not None else None
         made = fs.marker(self.spec, size=self.size, mixture=self.mixture)
         if file is not None:
-            fs.save_ply(made.cloud, file)
+            fs.save_ply(made.cloud, file, native_2dgs=self.native_2dgs)
         dark = sum(1 for rectangle in made.rectangles if rectangle.dark)
         facts = {
             "spec": made.spec,

@@ -63,10 +63,14 @@ def write(
 ) -> None:
     """Put a line of text on an image, in place, its lower left corner at ``place`` (x, y), readable on any
     ground."""
-    plain = text.encode("ascii", "replace").decode()  # all that OpenCV's built-in font holds
+    plain = text.encode("ascii", "replace").decode()  # all that every version's built-in font holds
+    x, y = place
     width = max(1, round(2 * size))
-    for ink, extra in (((0, 0, 0), 3), (colour, 0)):
-        cv2.putText(image, plain, place, cv2.FONT_HERSHEY_SIMPLEX, size, ink, width + extra, cv2.LINE_AA)
+    # a thicker stroke under it would be a wider text in OpenCV 5, so the dark rim is the same text moved
+    for right, down in ((-1, 0), (1, 0), (0, -1), (0, 1), (0, 0)):
+        ink = colour if (right, down) == (0, 0) else (0, 0, 0)
+        at = (x + right, y + down)
+        cv2.putText(image, plain, at, cv2.FONT_HERSHEY_SIMPLEX, size, ink, width, cv2.LINE_AA)
 
 
 def shrunk(image: np.ndarray, width: int) -> np.ndarray:

@@ -233,6 +233,16 @@ def test_marker_says_what_it_is_made_of(capsys, tmp_path):
     assert "rectangles" in capsys.readouterr().out
 
 
+def test_marker_writes_two_scales_when_asked(capsys, tmp_path):
+    for words, scales in (([], 3), (["--native-2dgs"], 2)):
+        assert main(["marker", "apriltag:36h11:5", "-o", str(tmp_path / "tag.ply"), *words]) == 0
+        assert (tmp_path / "tag.ply").read_bytes().count(b"property float scale_") == scales
+    capsys.readouterr()
+    status, line = fails(capsys, "marker", "apriltag:36h11:5", "--native-2dgs")
+    assert status == 2
+    assert "-o FILE.ply" in line
+
+
 def test_marker_with_the_mixture_of_the_paper(capsys):
     assert prints_json(capsys, "marker", "qr:hello", "--mixture", "paper")["mixture"] == "paper"
 
