@@ -1,0 +1,83 @@
+"""Splats and cameras that the cases are made of: the camera at the origin looks down +z, x right, y down."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.rotations import matrix_to_quaternion
+from fidsplat.splats import SplatCloud
+
+HARD_OPACITIES = np.float32([0.002, 0.05, 0.3, 0.5, 0.9, 0.99, 1.0])
+
+
+def camera(width: int = 100, height: int = 80, focal: float = 80.0, **changes) -> Camera:
+    """A pinhole camera at the origin; `cx`, `cy`, `world_to_camera`, `near`, `far` may be given."""
+    center = {"cx": width / 2, "cy": height / 2}
+    return Camera.pinhole(width, height, focal, focal, **center | changes)
+
+
+def quaternion(tangent_u, tangent_v) -> np.ndarray:
+    """(4,) of the splat whose tangents point along u and v (each (3,), made orthonormal, u first)."""
+    u = np.asarray(tangent_u, float) / np.linalg.norm(tangent_u)
+    v = np.asarray(tangent_v, float) - np.dot(tangent_v, u) * u
+    v /= np.linalg.norm(v)
+    return matrix_to_quaternion(np.stack([u, v, np.cross(u, v)], axis=1))
+
+
+def turned(axis, degrees: float) -> np.ndarray:
+    """Quaternion (4,) of a turn by an angle about an axis (3,)."""
+    half = math.radians(degrees) / 2
+    unit = np.asarray(axis, float) / np.linalg.norm(axis)
+    return np.array([math.cos(half), *(math.sin(half) * unit)])
+
+
+def splats(means, quats, scales, opacities=1.0, colors=(0.9, 0.5, 0.2), **more) -> SplatCloud:
+    """A cloud of n splats: means (n, 3); the others (n, ...) or the value of them all."""
+    n = len(means)
+    spread = [np.broadcast_to(np.asarray(value, float), (n, k)) for value, k in ((quats, 4), (scales, 2))]
+    alike = (
+        np.broadcast_to(np.asarray(opacities, float), n),
+        np.broadcast_to(np.asarray(colors, float), (n, 3)),
+    )
+    more.setdefault("labels", np.arange(n) % 100)
+    return SplatCloud(means, *spread, alike[0], colors=alike[1], **more)
+
+
+def random_splats(
+    count: int,
+    seed: int,
+    depth: tuple[float, float] = (-1.0, 6.0),
+    scale: tuple[float, float] = (1e-3, 2.0),
+    across: float = 2.0,
+) -> SplatCloud:
+    """Random splats with hard opacities: centres uniform in a box, scales log-uniform, orientations uniform."""
+    generator = np.random.default_rng(seed)
+    means = np.column_stack(
+        [generator.uniform(-across, across, (count, 2)), generator.uniform(*depth, count)]
+    )
+    return splats(
+        means.astype(np.float32),
+        generator.normal(size=(count, 4)),
+        np.exp(generator.uniform(*np.log(scale), (count, 2))),
+        generator.choice(HARD_OPACITIES, count),
+        generator.uniform(0, 1, (count, 3)),
+        labels=generator.integers(0, 9, count),
+    )
+
+
+def taken(cloud: SplatCloud, index) -> SplatCloud:
+    """The splats at an index array, in its order."""
+    chosen = SplatCloud(
+        cloud.means[index],
+        cloud.quats[index],
+        cloud.scales[index],
+        cloud.opacities[index],
+        colors=None if cloud.colors is None else cloud.colors[index],
+        sh=None if cloud.sh is None else cloud.sh[index],
+        labels=cloud.labels[index],
+        origin=cloud.origin,
+    )
+    return chosen if cloud.planes is None else chosen.with_planes(cloud.planes[index])
