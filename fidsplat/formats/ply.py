@@ -27,8 +27,8 @@ def load_ply(path: str | os.PathLike[str]) -> SplatCloud:
     """Read a splat file: 2DGS layout (two scales), 3DGS layout (three), or SuperSplat's compressed PLY.
 
     Properties are found by name, in any order and among any others. Three scales become two: the thinnest
-    axis of each splat becomes its normal, and one warning says how many splats were not flat. An integer
-    property ``label`` is taken up. Colours come as SH of degree 0 to 3.
+    axis of each splat becomes its normal, and one warning says how many splats were not flat. Integer
+    properties ``label`` and ``plane`` are taken up. Colours come as SH of degree 0 to 3.
 
     Raises InputError for a file that is missing, damaged, of another kind, or lacks a property.
     """
@@ -38,7 +38,13 @@ def load_ply(path: str | os.PathLike[str]) -> SplatCloud:
         fields = _two_scales(header, fields)
     for array in fields.values():
         array.flags.writeable = False  # so that the cloud takes them over without a copy
-    return SplatCloud(**fields, source=header.path)
+    planes = fields.pop("planes", None)
+    if planes is None:
+        return SplatCloud(**fields, source=header.path)
+    # the cloud leaves out splats that cannot be drawn: row numbers in place of labels tell which stayed
+    labels = fields.pop("labels", np.zeros(len(planes), np.int32))
+    cloud = SplatCloud(**fields, labels=np.arange(len(planes), dtype=np.int32), source=header.path)
+    return cloud.with_planes(planes[cloud.labels]).with_labels(labels[cloud.labels])
 
 
 def _read_plain(header: Header) -> dict[str, np.ndarray]:
@@ -66,9 +72,9 @@ def _read_plain(header: Header) -> dict[str, np.ndarray]:
     targets |= {
         f"f_rest_{c * (k - 1) + i}": fields["sh"][:, 1 + i, c] for c in range(3) for i in range(k - 1)
     }
-    if "label" in names and np.can_cast(element.dtype["label"], np.int32):
-        fields["labels"] = np.empty(n, np.int32)
-        targets["label"] = fields["labels"]
+    for name in ("label", "plane"):
+        if name in names and np.can_cast(element.dtype[name], np.int32):
+            fields[f"{name}s"] = targets[name] = np.empty(n, np.int32)
     rows = header.rows("vertex")
     with np.errstate(over="ignore", invalid="ignore"):
         for start in range(0, n, _BLOCK):
@@ -77,6 +83,11 @@ def _read_plain(header: Header) -> dict[str, np.ndarray]:
                 target[start : start + _BLOCK] = block[name]
         np.exp(fields["scales"], out=fields["scales"])
         _sigmoid(fields["opacities"])
+    if "planes" in fields and fields["planes"].min(initial=-1) < -1:
+        raise InputError(
+            f"{header.path}: the property plane holds {fields['planes'].min()}; it must be an id of at least "
+            "0, or -1 for a splat of no plane"
+        )
     origin = _origin(header)
     return fields if origin is None else fields | {"origin": origin}
 

@@ -18,8 +18,9 @@ def save_ply(cloud: SplatCloud, path: str | os.PathLike[str], native_2dgs: bool 
     """Write binary little-endian PLY, all float32: x y z nx ny nz f_dc_* f_rest_* opacity scale_* rot_*.
 
     A third scale of log(1e-6) is added so that 3DGS tools open the file; ``native_2dgs`` leaves it out.
-    Plain colours are written as SH of degree 0. Labels follow as an int property when any is not 0. An
-    origin other than 0 is kept in a comment, and x, y, z are relative to it.
+    Plain colours are written as SH of degree 0. An int property label follows when any label is not 0, and an
+    int property plane when the cloud has planes. An origin other than 0 is kept in a comment, and x, y, z are
+    relative to it.
 
     Raises InputError when the file cannot be written; an older file of that name is then left as it was.
     """
@@ -39,19 +40,21 @@ def save_ply(cloud: SplatCloud, path: str | os.PathLike[str], native_2dgs: bool 
         *([] if native_2dgs else ["scale_2"]),
         *(f"rot_{i}" for i in range(4)),
     ]
-    labelled = bool(cloud.labels.any())
+    whole = {"label": cloud.labels} if cloud.labels.any() else {}
+    if cloud.planes is not None:
+        whole["plane"] = cloud.planes
     column = {name: i for i, name in enumerate(names)}
     lines = ["ply", "format binary_little_endian 1.0"]
     if cloud.origin.any():
         lines.append(f"comment {ORIGIN_COMMENT} {' '.join(repr(float(v)) for v in cloud.origin)}")
     lines += [f"element vertex {len(cloud)}", *(f"property float {name}" for name in names)]
-    lines += ["property int label"] * labelled + ["end_header", ""]
+    lines += [*(f"property int {name}" for name in whole), "end_header", ""]
     with atomic_write(path) as stream:
         stream.write("\n".join(lines).encode("ascii"))
         for start in range(0, len(cloud), _BLOCK):
             part = slice(start, start + _BLOCK)
             n = len(cloud.means[part])
-            rows = np.zeros((n, len(names) + labelled), "<f4")
+            rows = np.zeros((n, len(names) + len(whole)), "<f4")
             rows[:, 0:3] = cloud.means[part]
             dc = column["f_dc_0"]
             if cloud.sh is not None:
@@ -65,8 +68,8 @@ def save_ply(cloud: SplatCloud, path: str | os.PathLike[str], native_2dgs: bool 
             if not native_2dgs:
                 rows[:, first + 2] = PADDED_LOG_SCALE
             rows[:, column["rot_0"] : column["rot_0"] + 4] = cloud.quats[part]
-            if labelled:
-                rows.view("<i4")[:, -1] = cloud.labels[part]
+            for place, numbers in enumerate(whole.values(), len(names)):
+                rows.view("<i4")[:, place] = numbers[part]
             stream.write(rows.data)
 
 
