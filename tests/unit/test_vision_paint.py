@@ -1,0 +1,99 @@
+"""Planes as pictures: what a colour means, what nothing looks like."""
+
+import cv2
+import numpy as np
+import pytest
+
+from fidsplat.vision.paint import (
+    contact_sheet,
+    depth_millimetres,
+    depth_picture,
+    label_picture,
+    normal_picture,
+    outlined,
+)
+from fidsplat.vision.planes import save_plane
+
+
+def test_near_is_red_far_is_blue_and_nothing_is_black():
+    depth = np.linspace(1, 5, 100).reshape(1, 100)
+    depth[0, 50], depth[0, 51], depth[0, 52] = 0, np.nan, np.inf
+    colours = depth_picture(depth).astype(int)
+    assert colours.shape == (1, 100, 3)
+    assert colours[0, 2, 0] > colours[0, 2, 2], "red above blue"
+    assert colours[0, 90, 2] > colours[0, 90, 0], "blue above red"
+    assert (colours[0, 50:53] == 0).all()
+    assert (depth_picture(np.zeros((3, 4))) == 0).all()
+    assert depth_picture(np.full((3, 4), 2.0)).any(), "a flat picture has a colour"
+
+
+def test_one_stray_splat_does_not_use_up_the_colours():
+    depth = np.tile(np.linspace(1, 2, 200), (10, 1))
+    plain = depth_picture(depth)
+    depth[0, 0] = 1000.0
+    assert np.abs(depth_picture(depth)[1:].astype(int) - plain[1:]).max() < 12
+
+
+def test_millimetres():
+    depth = np.array([[0.0, 0.0004, 1.2346, 65.535, 70.0, np.inf, np.nan]])
+    assert depth_millimetres(depth).tolist() == [[0, 0, 1235, 65535, 65535, 65535, 0]]
+
+
+def test_normals():
+    normal = np.array([[[0, 0, -1], [1, 0, 0], [0, 0, 0]]], float)
+    assert normal_picture(normal).tolist() == [[[128, 128, 0], [255, 128, 128], [0, 0, 0]]]
+
+
+def test_labels_have_colours_of_their_own():
+    label = np.array([[-1, 0, 1, 2, 3, 4, 5, 6, 7, 8]])
+    colours = [tuple(c) for c in label_picture(label)[0].tolist()]
+    assert len(set(colours)) == 10
+    assert colours[0] == (0, 0, 0)
+    assert len(set(colours[1])) == 1
+
+
+def test_an_outline_stands_on_its_corners_and_leaves_the_picture_alone():
+    image = np.zeros((60, 80, 3), np.uint8)
+    corners = np.array([[20.5, 10.5], [60.5, 10.5], [60.5, 40.5], [20.5, 40.5]])
+    drawn = outlined(image, corners, "näme", thickness=1)
+    assert not image.any()
+    assert drawn[25, 20].any()
+    assert drawn[25, 60].any()
+    assert not drawn[25, 40].any()
+    assert drawn[10, 20].sum() > 400, "the first corner is marked"
+
+
+def test_a_sheet_holds_every_picture_under_its_title():
+    rows = [
+        [(f"{i}{j}", np.full((30, 40, 3), 50 * i + 10 * j + 40, np.uint8)) for j in range(3)]
+        for i in range(2)
+    ]
+    sheet = contact_sheet(rows, width=80, gap=4)
+    assert sheet.shape == (4 + 2 * (22 + 60 + 4), 4 + 3 * 84, 3)
+    for i in range(2):
+        for j in range(3):
+            y, x = 4 + i * 86 + 22, 4 + j * 84
+            assert (sheet[y : y + 60, x : x + 80] == 50 * i + 10 * j + 40).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "files"),
+    [
+        ("rgb", (4, 5, 3), ["rgb.png"]),
+        ("alpha", (4, 5), ["alpha.png"]),
+        ("normal", (4, 5, 3), ["normal.png"]),
+        ("depth", (4, 5), ["depth.npy", "depth.png", "depth-turbo.png"]),
+        ("label", (4, 5), ["label.npy", "label.png"]),
+    ],
+)
+def test_planes_as_files(tmp_path, name, shape, files):
+    plane = np.random.default_rng(0).uniform(0, 1, shape).astype(np.float32)
+    plane = (plane * 5).astype(np.int32) if name == "label" else plane
+    written = save_plane(name, plane, lambda kind, suffix: tmp_path / f"{kind}{suffix}")
+    assert [path.name for path in written] == files
+    assert {path.name for path in tmp_path.iterdir()} == set(files)
+    if name in ("depth", "label"):
+        assert np.array_equal(np.load(written[0]), plane)
+    image = cv2.imread(str(tmp_path / f"{name}.png"), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    assert image.shape[:2] == (4, 5)
