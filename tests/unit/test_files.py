@@ -11,9 +11,14 @@ from fidsplat.files import atomic_write, writable_folder
 def test_a_file_takes_the_place_of_the_old_one_only_when_it_is_whole(tmp_path):
     path = tmp_path / "a.bin"
     path.write_bytes(b"old")
-    with pytest.raises(KeyError), atomic_write(path) as stream:
-        stream.write(b"half")
-        raise KeyError
+
+    def write_half():
+        with atomic_write(path) as stream:
+            stream.write(b"half")
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        write_half()
     assert path.read_bytes() == b"old"
     with atomic_write(path) as stream:
         stream.write(b"new")

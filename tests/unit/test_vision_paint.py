@@ -29,9 +29,9 @@ def test_near_is_red_far_is_blue_and_nothing_is_black():
 
 def test_one_stray_splat_does_not_use_up_the_colours():
     depth = np.tile(np.linspace(1, 2, 200), (10, 1))
-    plain = depth_picture(depth)
     depth[0, 0] = 1000.0
-    assert np.abs(depth_picture(depth)[1:].astype(int) - plain[1:]).max() < 12
+    # stretched to 1000 m, all of the first row would be of one colour
+    assert len(np.unique(depth_picture(depth)[1], axis=0)) > 150
 
 
 def test_millimetres():
