@@ -1,0 +1,29 @@
+"""Markers: from text to bits, components, a minimum rectilinear partition, and splats.
+
+Importing this package is light: names are loaded on first use, and shapely, segno and OpenCV only when a
+marker needs them.
+"""
+
+from importlib import import_module
+
+_HOME = {
+    "Marker": "fidsplat.markers.build",
+    "Rectangle": "fidsplat.markers.build",
+    "marker": "fidsplat.markers.build",
+    "parse_spec": "fidsplat.markers.spec",
+}
+
+__all__ = sorted(_HOME)
+
+
+def __getattr__(name: str):
+    home = _HOME.get(name)
+    if home is None:
+        raise AttributeError(f"module 'fidsplat.markers' has no attribute {name!r}")
+    value = getattr(import_module(home), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME])

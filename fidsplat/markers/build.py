@@ -1,0 +1,220 @@
+"""marker(): from a spec to splats."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from fidsplat.errors import InputError
+from fidsplat.markers.mixture import Template, fitted_growth, fitted_templates, paper_template, place
+from fidsplat.markers.partition import partition
+from fidsplat.markers.regions import label_components, polygons
+from fidsplat.markers.seams import grow
+from fidsplat.markers.spec import QUIET_ZONE, bits_of, parse_spec
+from fidsplat.splats import SplatCloud
+
+if TYPE_CHECKING:
+    from shapely import Polygon
+
+MIXTURES = ("fitted", "paper")
+MAX_MODULES = 4096
+"""Longest edge of a grid with its quiet zone."""
+
+
+class Rectangle(NamedTuple):
+    """One rectangle of a partition, in modules of the grid with quiet zone: x right, y down, half-open."""
+
+    x0: int
+    y0: int
+    x1: int
+    y1: int
+    dark: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Marker:
+    """A fiducial marker and the splats that show it, made by `marker`."""
+
+    spec: str
+    """the text that it was made from"""
+    kind: str
+    """"apriltag", "aruco", "qr" or "image\""""
+    family: str | None
+    """tag family, e.g. "36h11"; QR version and level, e.g. "v5-L"; None for an image"""
+    id: int | None
+    """tag id, None for QR codes and images"""
+    payload: str | None
+    """text of a QR code, path of an image, None for tags"""
+    bits: np.ndarray
+    """(h, w) uint8, 1 = dark, the code alone"""
+    quiet_zone: int
+    """modules of white around the code"""
+    size: float
+    """metres, the code's edge; its width where it is not square"""
+    mixture: str
+    """"fitted" or "paper\""""
+    grid: np.ndarray = field(repr=False)
+    """(H, W) uint8, the code with its quiet zone"""
+    boxes: np.ndarray = field(repr=False)
+    """(n, 4) int64 x0, y0, x1, y1: the minimum partition of the grid, in modules"""
+    labels: np.ndarray = field(repr=False)
+    """(H, W) int32, the 4-connected component of each module of the grid"""
+    components: int
+    """number of components, both colours"""
+    cloud: SplatCloud = field(repr=False)
+    """the splats in the marker's frame: plane z = 0, x right, y down as printed, origin at the code's
+    centre
+    """
+    seconds: float
+    """time from the spec to the cloud"""
+
+    def __repr__(self) -> str:
+        return (
+            f"Marker({self.spec!r}, {self.size:g} m, {len(self.boxes)} rectangles, {len(self.cloud)} splats)"
+        )
+
+    @property
+    def module(self) -> float:
+        """Metres per module."""
+        return self.size / self.bits.shape[1]
+
+    @cached_property
+    def rectangles(self) -> list[Rectangle]:
+        """The minimum partition of every component of both colours, in raster order."""
+        dark = self.grid[self.boxes[:, 1], self.boxes[:, 0]] == 1
+        return [Rectangle(*row) for row in zip(*self.boxes.T.tolist(), dark.tolist(), strict=True)]
+
+    @cached_property
+    def polygons(self) -> list[Polygon]:
+        """Each component as a shapely polygon with holes, in modules of the grid (needs shapely)."""
+        return polygons(self.grid, self.labels, self.components)
+
+    @property
+    def corners(self) -> np.ndarray:
+        """(4, 3) float64 metres, the code's outer corners as printed: top left, top right, bottom right,
+        bottom left.
+        """
+        h, w = self.bits.shape
+        x, y = w * self.module / 2, h * self.module / 2
+        return np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
+
+
+def marker(
+    spec: str,
+    size: float = 1.0,
+    mixture: str = "fitted",
+    quiet_zone: int | None = None,
+    *,
+    levels: int | None = None,
+    density: int | None = None,
+    duplicates: bool | None = None,
+    growth: float | None = None,
+) -> Marker:
+    """Make a marker of splats.
+
+    Args:
+        spec: apriltag:36h11:5, aruco:4x4_50:7, qr:TEXT, qr-v22-L:TEXT or image:FILE.png.
+        size: metres, edge of the code itself, quiet zone not counted (an image's width).
+        mixture: "fitted" (default) or "paper".
+        quiet_zone: modules of white around it; default 1 for AprilTag and ArUco, 4 for QR, 0 for images.
+        levels, density, duplicates: of the mixture `paper` only, see `paper_template`; default 4, 3, False.
+        growth: modules, 0 to 1, by which a rectangle reaches into its own colour beyond a side that is wholly
+            shared with it, against seams; default what the fitted templates were optimised with, and 0 for
+            paper.
+
+    Raises:
+        InputError: a value above that cannot be used; the message gives the valid range.
+    """
+    start = time.perf_counter()
+    parsed = parse_spec(spec)
+    templates, growth = _mixture(mixture, levels, density, duplicates, growth)
+    _check_size(size)
+    parsed, bits = bits_of(parsed)
+    quiet = QUIET_ZONE[parsed.kind] if quiet_zone is None else quiet_zone
+    longest = MAX_MODULES - max(bits.shape)
+    if longest < 0:
+        raise InputError(
+            f"{spec} has {bits.shape[1]} x {bits.shape[0]} modules; at most {MAX_MODULES} a side are made"
+        )
+    if isinstance(quiet, bool) or int(quiet) != quiet or not 0 <= quiet <= longest // 2:
+        raise InputError(
+            f"the quiet zone is {quiet!r}; it must be a whole number of modules from 0 to {longest // 2}"
+        )
+    quiet = int(quiet)
+
+    grid = np.pad(bits, quiet)
+    labels, components = label_components(grid)
+    boxes = partition(grid)
+    cloud = _cloud(grid, boxes, templates, growth, size / bits.shape[1])
+    for array in (bits, grid, boxes, labels):
+        array.flags.writeable = False
+    return Marker(
+        spec=spec,
+        kind=parsed.kind,
+        family=parsed.family,
+        id=parsed.id,
+        payload=parsed.payload,
+        bits=bits,
+        quiet_zone=quiet,
+        size=float(size),
+        mixture=mixture,
+        grid=grid,
+        boxes=boxes,
+        labels=labels,
+        components=components,
+        cloud=cloud,
+        seconds=time.perf_counter() - start,
+    )
+
+
+def _mixture(
+    name: str, levels: int | None, density: int | None, duplicates: bool | None, growth: float | None
+) -> tuple[tuple[Template, ...], float]:
+    options = {"levels": levels, "density": density, "duplicates": duplicates}
+    given = {key: value for key, value in options.items() if value is not None}
+    if name == "paper":
+        templates, default = (Template(math.inf, paper_template(**given)),), 0.0
+    elif name == "fitted":
+        if given:
+            raise InputError(f"{', '.join(given)}: only the mixture 'paper' has this; write mixture='paper'")
+        templates, default = fitted_templates(), fitted_growth()
+    else:
+        raise InputError(f"unknown mixture {name!r}; known: {', '.join(MIXTURES)}")
+    growth = default if growth is None else growth
+    if not 0 <= growth <= 1:
+        raise InputError(f"growth is {growth!r}; it must lie from 0 to 1 module")
+    return templates, float(growth)
+
+
+def _check_size(size: float) -> None:
+    # below and above, a module or a splat's scale leaves the range of float32
+    if not (isinstance(size, (int, float)) and 1e-9 <= size <= 1e9):
+        raise InputError(f"the marker's size is {size!r}; it must be a length from 1e-9 to 1e9 metres")
+
+
+def _cloud(
+    grid: np.ndarray, boxes: np.ndarray, templates: tuple[Template, ...], growth: float, module: float
+) -> SplatCloud:
+    width, height = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
+    gaussians, owner = place(grow(grid, boxes, growth), width / height, templates)
+    n = len(owner)
+    means = np.zeros((n, 3), np.float32)
+    means[:, 0] = (gaussians[:, 0] - grid.shape[1] / 2) * module
+    means[:, 1] = (gaussians[:, 1] - grid.shape[0] / 2) * module
+    quats = np.zeros((n, 4), np.float32)
+    quats[:, 0] = 1
+    light = 1 - grid[boxes[:, 1], boxes[:, 0]].astype(np.float32)
+    cloud = SplatCloud(
+        means,
+        quats,
+        (gaussians[:, 2:4] * module).astype(np.float32),
+        gaussians[:, 4].astype(np.float32),
+        colors=np.broadcast_to(light[owner, None], (n, 3)),
+    )
+    # one sheet of paper: where its splats meet, their order means nothing
+    return cloud.with_planes(0)

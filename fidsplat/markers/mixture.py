@@ -1,0 +1,132 @@
+"""Mixtures: how one rectangle becomes 2D Gaussians.
+
+A template lists the Gaussians of a rectangle whose half sizes are 1: rows of x, y, sigma_x, sigma_y,
+opacity. `paper` (`paper_template`) is the construction of the paper's section 3.2. `fitted`
+(`fitted_templates`) are templates that tools/fit_templates.py has optimised off line for whole markers; see
+docs/markers.md.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from importlib.resources import files
+from typing import NamedTuple
+
+import numpy as np
+
+from fidsplat.errors import InputError
+
+GAMMA = 3.0
+"""The paper's cut-off: a Gaussian ends at 3 standard deviations."""
+
+MAX_LEVELS, MAX_DENSITY = 8, 100
+
+
+class Template(NamedTuple):
+    """Gaussians of rectangles up to an aspect ratio, in units of the rectangle's half sizes."""
+
+    max_aspect: float
+    """longest over shortest side up to which it is used"""
+    gaussians: np.ndarray
+    """(n, 5) float64: place along the long side, along the short side, sigma along each, opacity"""
+
+
+def paper_template(levels: int = 4, density: int = 3, duplicates: bool = False) -> np.ndarray:
+    """The paper's mixture of a rectangle (section 3.2): (n, 5) float64 x, y, sigma_x, sigma_y, opacity.
+
+    Level 0 is one Gaussian of sigma 1/3. Each level l = 1 ... levels-1 puts a corner Gaussian at d = 1 -
+    2^-l and two arms of 2^(l-1) Gaussians at offsets evenly spaced in [0, d); all opacities are 1.
+
+    Args:
+        levels: L of the paper, 1 to 8.
+        density: rho of the paper, a whole number of copies. Which levels are the "early" ones it does not
+            say; here all but the last are repeated (with one level, nothing is).
+        duplicates: the paper mirrors the first quadrant across both axes, and the arms' first Gaussians lie
+            on an axis: taken at its word each of them comes twice. True keeps the twins,
+            2^(L+2) + 4 L - 11 Gaussians at density 1; False leaves them out, 2^(L+2) - 7.
+
+    Raises:
+        InputError: levels or density out of range.
+    """
+    levels = _whole("levels", levels, MAX_LEVELS)
+    density = _whole("density", density, MAX_DENSITY)
+    rows = [np.array([[0.0, 0.0, 1 / GAMMA, 1 / GAMMA, 1.0]])] * (density if levels > 1 else 1)
+    for level in range(1, levels):
+        d, sigma = 1 - 2.0**-level, 2.0**-level / GAMMA
+        offset = d * np.arange(2 ** (level - 1)) / 2 ** (level - 1)
+        along = (1 - offset) / GAMMA
+        quadrant = [(d, d, sigma, sigma)]
+        quadrant += [(o, d, a, sigma) for o, a in zip(offset, along, strict=True)]
+        quadrant += [(d, o, sigma, a) for o, a in zip(offset, along, strict=True)]
+        mirrored = [
+            (sx * x, sy * y, a, b, 1.0)
+            for x, y, a, b in quadrant
+            for sx, sy in ((1, 1), (-1, 1), (1, -1), (-1, -1))
+            if duplicates or ((x or sx > 0) and (y or sy > 0))
+        ]
+        rows += [np.array(mirrored)] * (density if level < levels - 1 else 1)
+    return np.concatenate(rows)
+
+
+def _whole(name: str, value: int, largest: int) -> int:
+    if isinstance(value, bool) or int(value) != value or not 1 <= value <= largest:
+        raise InputError(f"{name} is {value!r}; it must be a whole number from 1 to {largest}")
+    return int(value)
+
+
+@cache
+def _fitted() -> tuple[tuple[Template, ...], float]:
+    data = json.loads(files("fidsplat.markers").joinpath("templates.json").read_text("utf-8"))
+    templates = []
+    for entry in data["templates"]:
+        gaussians = np.array([mirror for row in entry["quadrant"] for mirror in _mirrors(row)])
+        gaussians.flags.writeable = False
+        limit = entry["max_aspect"]
+        templates.append(Template(np.inf if limit is None else limit, gaussians))
+    return tuple(templates), data["growth"]
+
+
+def _mirrors(row: list[float]) -> list[list[float]]:
+    """A Gaussian of the first quadrant and its distinct mirror images."""
+    x, y, *rest = row
+    return [[sx * x, sy * y, *rest] for sy in ((1, -1) if y else (1,)) for sx in ((1, -1) if x else (1,))]
+
+
+def fitted_templates() -> tuple[Template, ...]:
+    """The shipped templates in rising order of aspect ratio; the last has no limit."""
+    return _fitted()[0]
+
+
+def fitted_growth() -> float:
+    """Modules by which the shipped templates expect rectangles to reach into their own colour."""
+    return _fitted()[1]
+
+
+def place(
+    rectangles: np.ndarray, aspect: np.ndarray, templates: tuple[Template, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The Gaussians of n rectangles, in the order of the rectangles.
+
+    rectangles: (n, 4) float64 x0, y0, x1, y1. aspect: (n,) width over height, which chooses the template;
+    its first axis goes along the longer side. Returns (m, 5) float64 x, y, sigma_x, sigma_y, opacity and
+    (m,) int64 the rectangle that each belongs to.
+    """
+    upright = aspect < 1
+    which = np.searchsorted([t.max_aspect for t in templates], np.maximum(aspect, 1 / aspect) * (1 - 1e-9))
+    counts = np.array([len(t.gaussians) for t in templates])
+    # every template twice: as it is, and turned for upright rectangles
+    lying = np.concatenate([t.gaussians for t in templates])
+    table = np.concatenate([lying, lying[:, [1, 0, 3, 2, 4]]])
+    first = np.cumsum(counts) - counts
+
+    n = counts[which]
+    start = first[which] + np.where(upright, len(lying), 0)
+    owner = np.repeat(np.arange(len(n)), n)
+    row = np.arange(len(owner)) + np.repeat(start - (np.cumsum(n) - n), n)
+    centre = (rectangles[:, :2] + rectangles[:, 2:]) / 2
+    half = (rectangles[:, 2:] - rectangles[:, :2]) / 2
+    out = table[row]
+    out[:, 0:2] = centre[owner] + half[owner] * out[:, 0:2]
+    out[:, 2:4] *= half[owner]
+    return out, owner
