@@ -216,29 +216,28 @@ def _composite(
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         half_rho = np.where(inside, q / (2 * d * d), np.inf)
         z = s.z_numerator / d
-    risky = (d > 0) & (
-        (np.abs(q - band) <= _RISK * band) & beyond_near
-        | (np.abs(d * view.near - s.z_numerator) <= _RISK * s.z_numerator) & (q <= band)
-    )
+    at_rim = (d > 0) & beyond_near & (np.abs(q - band) <= _RISK * band)
+    at_near = (d > 0) & (q <= band) & (np.abs(d * view.near - s.z_numerator) <= _RISK * s.z_numerator)
     if s.screen:
         offset = ((x - s.center_x) ** 2 + (y - s.center_y) ** 2) / view.samples**2
-        near_dot = np.where(offset <= s.half_r2, offset, np.inf)
-        half_rho = np.minimum(half_rho, near_dot)
-        risky |= s.dot & (np.abs(offset - s.half_r2) <= _RISK * s.half_r2)
+        half_rho = np.minimum(half_rho, np.where(offset <= s.half_r2, offset, np.inf))
+        at_rim |= s.dot & (np.abs(offset - s.half_r2) <= _RISK * s.half_r2)
     z = np.where(d > 0, np.clip(z, s.pz - s.reach, s.pz + s.reach), s.pz)
 
     alpha = np.minimum(np.exp(s.log_opacity - half_rho), view.ceiling)
     run = None if s.planes is None else _runs(alpha > 0, s.planes)
     before, live, final = _transmittance(alpha, view.stop, "stop_exclusive" in features.slots, run)
     weight = np.where(live, before * alpha, 0.0)
-    # what a risky fragment would weigh, drawn or not; at the near plane it may be anything up to its opacity
-    edge = np.where(inside, alpha, np.exp(np.minimum(view.log_cut, s.log_opacity)))
-    edge = np.where(np.abs(q - band) <= _RISK * band, edge, np.exp(s.log_opacity))
-    certificate = (np.where(risky, before * np.minimum(edge, 1.0), 0.0)).sum(1)
+    if s.planes is None or run is None:
+        rgb, worth = weight @ s.colors, before
+    else:
+        rgb, worth = _layered(alpha, before, weight, live, run, s, s.planes)
+    # What a risky fragment weighs, drawn or not: the cut-off at its rim, at the near plane its opacity at most.
+    stake = at_rim * math.exp(view.log_cut) + at_near * np.exp(s.log_opacity)
+    certificate = (worth * stake).sum(1)
     near_stop = np.abs(before * (1 - alpha) - view.stop) <= _RISK * view.stop
     certificate += np.where((near_stop & (alpha > 0) & live).any(1), view.stop, 0.0)
 
-    rgb = weight @ s.colors if run is None else _layered(alpha, weight, live, run, s)
     out = {"rgb": rgb, "t": final, "certificate": certificate}
     if {"depth", "depth_median"} & set(features.taps):
         out["depth"] = (weight * z).sum(1)
@@ -272,24 +271,43 @@ def _runs(hit: np.ndarray, planes: np.ndarray) -> np.ndarray:
 
 
 def _layered(
-    alpha: np.ndarray, weight: np.ndarray, live: np.ndarray, run: np.ndarray, s: _Splats
-) -> np.ndarray:
-    """Colours (k, 3) where a run is one layer: its weight, in the mean colour by optical depth."""
+    alpha: np.ndarray,
+    before: np.ndarray,
+    weight: np.ndarray,
+    live: np.ndarray,
+    run: np.ndarray,
+    s: _Splats,
+    planes: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Colours (k, 3) where a run is one layer: its weight, in the mean colour by optical depth.
+
+    Also what a little more opacity of each splat would change (k, n): the light in front of it or of its run,
+    shared with the run's other splats.
+    """
     row, column = np.nonzero(live & (run >= 0))
     number = run[row, column]
-    with np.errstate(divide="ignore"):
-        tau = np.minimum(-np.log1p(-alpha[row, column]), 24 * math.log(2))
+    tau = np.minimum(-np.log1p(-np.minimum(alpha[row, column], 1 - 2.0**-24)), 24 * math.log(2))
     count = int(run.max(initial=-1)) + 1
     ink = np.zeros((count, 3))
     np.add.at(ink, number, tau[:, None] * s.colors[column])
     depth = np.bincount(number, tau, count)
     total = np.bincount(number, weight[row, column], count)
     mean = ink / np.where(depth > 0, depth, 1)[:, None]
-    owner = np.zeros(count, int)
+    owner, front = np.zeros(count, int), np.zeros(count)
     owner[number] = row
+    np.maximum.at(front, number, before[row, column])
     rgb = np.zeros((len(alpha), 3))
     np.add.at(rgb, owner, total[:, None] * mean)
-    return rgb
+    # a splat at its rim would join the sample's run of its plane, or be the only one
+    joint = np.zeros((len(alpha), planes.max(initial=-1) + 1))
+    plane = np.zeros(count, int)
+    plane[number] = planes[column]
+    printed = plane >= 0
+    share = front[printed] / np.maximum(depth[printed], 1)
+    np.maximum.at(joint, (owner[printed], plane[printed]), share)
+    shared = joint[:, np.maximum(planes, 0)] if joint.size else before
+    worth = np.where((planes >= 0) & (shared > 0), shared, before)
+    return rgb, worth
 
 
 def _transmittance(
