@@ -93,7 +93,8 @@ class SplatCloud:
         keep, dropped = _find_defects(single)
         if keep is not None:
             single = {name: array[keep] for name, array in single.items()}
-            given, new_labels = given[keep], new_labels[keep]
+            given = single["means"] if given.dtype == _F32 else given[keep]
+            new_labels = new_labels[keep]
             warnings.warn(_drop_report(dropped, n, source), stacklevel=2)
         single["quats"] = _unit(single["quats"])
         if origin is not None:
@@ -338,9 +339,8 @@ def _find_defects(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, dic
     s, o = arrays["scales"], arrays["opacities"]
     defects = [(f"{name} not finite", _rows_not_finite(array)) for name, array in arrays.items()]
     with np.errstate(over="ignore", invalid="ignore"):
-        q = arrays["quats"].astype(np.float64)
         defects += [
-            ("zero quaternion", np.einsum("ij,ij->i", q, q) < 1e-30),
+            ("zero quaternion", _square(arrays["quats"]) < 1e-30),
             ("scale not above 0", (s <= 0).any(axis=1)),
             ("opacity outside [0, 1]", (o < 0) | (o > 1)),
         ]
@@ -363,12 +363,19 @@ def _drop_report(dropped: dict[str, int], n: int, source) -> str:
 def _unit(quats: np.ndarray) -> np.ndarray:
     """Quaternions of length 1. Those that are so to float32 rounding keep their bits: twice is the same as
     once."""
-    q = quats.astype(np.float64)
-    square = np.einsum("ij,ij->i", q, q)
-    off = np.abs(square - 1.0) > 2.4e-7
-    if not off.any():
-        return quats
-    return np.where(off[:, None], q / np.sqrt(square)[:, None], q).astype(_F32)
+    unit = quats  # only a cloud's own array can be written to
+    for start in range(0, len(quats), 4096):  # so that millions of them need no copy in float64
+        part = slice(start, start + 4096)
+        square = _square(quats[part])
+        off = np.abs(square - 1.0) > 2.4e-7
+        if off.any():
+            unit = unit if unit.flags.writeable else unit.copy()
+            unit[part][off] = quats[part][off] / np.sqrt(square[off])[:, None]
+    return unit
+
+
+def _square(quats: np.ndarray) -> np.ndarray:
+    return np.einsum("ij,ij->i", quats, quats, dtype=np.float64)
 
 
 def _sh_of_degree(cloud: SplatCloud, degree: int) -> np.ndarray:

@@ -18,6 +18,7 @@ from fidsplat.formats.ply_header import Header
 from fidsplat.harmonics import C0
 
 CHUNK = 256
+_CHUNKS_AT_ONCE = 8
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 
@@ -46,8 +47,32 @@ def read_compressed(header: Header) -> dict[str, np.ndarray]:
         if rest not in (9, 24, 45):
             raise InputError(f"{header.path}: the element sh has {rest} properties; not 9, 24 or 45")
 
+    fields = {
+        "means": np.empty((n, 3), np.float32),
+        "quats": np.empty((n, 4), np.float32),
+        "scales": np.empty((n, 3), np.float32),
+        "opacities": np.empty(n, np.float32),
+        "sh": np.empty((n, rest // 3 + 1, 3), np.float32),
+    }
     rows, chunks = header.rows("vertex"), header.rows("chunk")
-    chunk_of = np.arange(n) // CHUNK
+    bands = header.rows("sh") if rest else None
+    # a damaged chunk row gives values that are not finite, and the cloud leaves those splats out
+    with np.errstate(over="ignore", invalid="ignore"):
+        for first in range(0, n, _CHUNKS_AT_ONCE * CHUNK):  # so that the float64 stays small
+            part = slice(first, first + _CHUNKS_AT_ONCE * CHUNK)
+            owners = chunks[first // CHUNK : first // CHUNK + _CHUNKS_AT_ONCE]
+            unpacked = _unpack(rows[part], owners, coloured)
+            fields["sh"][part, 0] = unpacked.pop("dc")
+            for name, values in unpacked.items():
+                fields[name][part] = values
+            if bands is not None:
+                fields["sh"][part, 1:] = _bands(bands[part], rest)
+    return fields
+
+
+def _unpack(rows: np.ndarray, chunks: np.ndarray, coloured: bool) -> dict[str, np.ndarray]:
+    """The splats of some chunks, float64: means, quats, scales, opacities, and dc (k, 3), SH of degree 0."""
+    chunk_of = np.arange(len(rows)) // CHUNK
 
     def end(which: str, axes: str) -> np.ndarray:
         return np.stack([chunks[f"{which}_{axis}"] for axis in axes], axis=1)[chunk_of]
@@ -57,19 +82,13 @@ def read_compressed(header: Header) -> dict[str, np.ndarray]:
 
     position, scale = (_unit_fractions(rows[f"packed_{name}"], 11, 10, 11) for name in ("position", "scale"))
     color = _unit_fractions(rows["packed_color"], 8, 8, 8, 8)
-    sh = np.empty((n, rest // 3 + 1, 3), np.float32)
-    # a damaged chunk row gives values that are not finite, and the cloud leaves those splats out
-    with np.errstate(over="ignore", invalid="ignore"):
-        sh[:, 0] = ((between("", "rgb", color[:, :3]) if coloured else color[:, :3]) - 0.5) / C0
-        if rest:
-            sh[:, 1:] = _bands(header.rows("sh"), rest)
-        return {
-            "means": between("", "xyz", position).astype(np.float32),
-            "quats": _quaternions(rows["packed_rotation"]).astype(np.float32),
-            "scales": np.exp(between("_scale", "xyz", scale)).astype(np.float32),
-            "opacities": color[:, 3].astype(np.float32),
-            "sh": sh,
-        }
+    return {
+        "means": between("", "xyz", position),
+        "quats": _quaternions(rows["packed_rotation"]),
+        "scales": np.exp(between("_scale", "xyz", scale)),
+        "opacities": color[:, 3],
+        "dc": ((between("", "rgb", color[:, :3]) if coloured else color[:, :3]) - 0.5) / C0,
+    }
 
 
 def _check(header: Header, name: str, properties, kind: str, count: int) -> None:

@@ -125,11 +125,15 @@ def _two_scales(header: Header, fields: dict[str, np.ndarray]) -> dict[str, np.n
     # splat's own scales are smaller still
     if np.allclose(scales[:, 2], np.exp(PADDED_LOG_SCALE), rtol=1e-5, atol=0):
         return fields | {"scales": scales[:, :2].copy()}
-    quats, two, thickness = flatten(fields["quats"], scales)
+    quats, two = fields["quats"], np.empty((len(scales), 2), scales.dtype)
+    thickness = np.empty(len(scales), scales.dtype)
+    for start in range(0, len(scales), _BLOCK):
+        part = slice(start, start + _BLOCK)
+        quats[part], two[part], thickness[part] = flatten(quats[part], scales[part])
     report = not_flat_report(thickness)
     if report:
         warnings.warn(f"{header.path}: {report}", stacklevel=3)
-    return fields | {"quats": quats, "scales": two}
+    return fields | {"scales": two}
 
 
 def _origin(header: Header) -> np.ndarray | None:
