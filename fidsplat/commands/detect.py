@@ -89,11 +89,13 @@ Examples:
                 "marker",
                 "found",
                 "distance [m]",
-                "position error [mm]",
-                "angle error [deg]",
-                "corner error [px]",
+                "position [mm]",
+                "angle [deg]",
+                "corners [px]",
             )
-            print_table(where, f"Against {self.scene}", heads, map(reading_row, readings))
+            print_table(
+                where, f"Against {self.scene}: distance, and errors", heads, map(reading_row, readings)
+            )
         return 0
 
     def _load_scene(self, shape: tuple[int, ...]):

@@ -19,33 +19,45 @@ TOLERANCE = 0.25
 MIN_CORRELATION = 0.7
 _POINTS = 3  # the pattern is averaged over 3 x 3 points of each pixel
 _LARGE = 150_000  # pixels of a picture that is halved, or more, before it is compared
-_COARSE_MODULE = 6.0  # pixels: a module is never made smaller than this
+_SMALL = 10_000  # the same where many places are tried
+_COARSE_MODULE = 4.0  # pixels: a module is never made smaller than this
+# the code spans [-1, 1]: well-conditioned parameters
+_SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float64)
 _LARGEST_MODULE = 64  # points of the pattern
 _QUIET = 1  # modules of light ground around the code that the model includes
 
 
-def align(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
+def align(
+    grey: np.ndarray, corners: np.ndarray, bits: np.ndarray, unsure: int | None = None
+) -> np.ndarray | None:
     """Better corners of a code whose modules and rough corners are known.
 
     Args:
         grey: (h, w) uint8.
         corners: (4, 2) pixel coordinates TL, TR, BR, BL of the code's outer edge, within half a module.
         bits: (n, n) uint8, 1 = dark, without quiet zone.
+        unsure: number of a corner that may be off by two modules; it is looked for when all is not well.
 
     Returns (4, 2) float64, or None when the pattern does not settle near the given corners.
     """
-    window = _window(grey, corners, bits)
+    rough = np.asarray(corners, np.float64)
+    found = _settled(grey, rough, bits)
+    if found is None and unsure is not None:
+        found = _settled(grey, _best_start(grey, rough, bits, unsure), bits)
+    return found
+
+
+def _settled(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
+    window = _window(grey, corners, bits, _LARGE)
     if window is None:
         return None
     picture, offset, shrink = window
-    # the code spans [-1, 1]: well-conditioned parameters
-    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float64)
-    start = (np.asarray(corners, np.float64) - offset) / shrink
-    homography = _homography(square, start)
-    module = np.linalg.norm(start - np.roll(start, 1, 0), axis=1).min() / bits.shape[0]
+    start = (corners - offset) / shrink
+    homography = _homography(_SQUARE, start)
+    module = _module(start, bits)
     model = _Model(bits, picture.shape, module)
 
-    where = start
+    where, smooth = start, picture
     for blur, robust, settled in (
         (float(np.clip(0.35 * module, FINE_BLUR, 2.5)), False, 0.1),
         (FINE_BLUR, False, 0.03),
@@ -57,7 +69,7 @@ def align(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> np.ndarray
             if step is None:
                 return None
             homography = homography @ (np.eye(3) + step)
-            moved = _apply(homography, square)
+            moved = _apply(homography, _SQUARE)
             if not np.isfinite(moved).all() or np.abs(moved - start).max() > max(1.0, module):
                 return None
             change, where = np.abs(moved - where).max(), moved
@@ -65,6 +77,28 @@ def align(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> np.ndarray
                 break
     good = model.correlation(smooth, homography, FINE_BLUR) > MIN_CORRELATION
     return where * shrink + offset if good else None
+
+
+def _best_start(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray, unsure: int) -> np.ndarray:
+    """The corners with the unsure one where, of places half a module apart, the pattern fits best."""
+    window = _window(grey, corners, bits, _SMALL)
+    if window is None:
+        return corners
+    picture, offset, shrink = window
+    start = (corners - offset) / shrink
+    model = _Model(bits, picture.shape, _module(start, bits))
+    smooth = cv2.GaussianBlur(picture, (0, 0), FINE_BLUR)
+    before, after = start[unsure - 1], start[(unsure + 1) % 4]
+    steps = np.arange(-4, 5) / 2 / bits.shape[0]
+    best, most = start, -1.0
+    for along in steps:
+        for across in steps:
+            tried = start.copy()
+            tried[unsure] += along * (start[unsure] - before) + across * (start[unsure] - after)
+            fit = model.correlation(smooth, _homography(_SQUARE, tried), FINE_BLUR)
+            if fit > most:
+                best, most = tried, fit
+    return best * shrink + offset
 
 
 class _Model:
@@ -150,7 +184,12 @@ def _contrast(ideal: np.ndarray, seen: np.ndarray, weight: np.ndarray) -> tuple[
     return float(gain), float(mean_seen - gain * mean_ideal)
 
 
-def _window(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray):
+def _module(corners: np.ndarray, bits: np.ndarray) -> float:
+    """Pixels of a module on the code's shortest side."""
+    return float(np.linalg.norm(corners - np.roll(corners, 1, 0), axis=1).min() / bits.shape[0])
+
+
+def _window(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray, large: int):
     """The picture around the code (h, w) float32 in [0, 1], its origin (2,) and its pixel's edge in ``grey``.
 
     None when the code lies outside.
@@ -161,8 +200,8 @@ def _window(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray):
     x1, y1 = np.minimum(np.ceil(high + room), (grey.shape[1], grey.shape[0])).astype(int)
     if x1 - x0 < 4 or y1 - y0 < 4:
         return None
-    module = np.linalg.norm(corners - np.roll(corners, 1, 0), axis=1).min() / bits.shape[0]
-    shrink = max(1, min(int(((x1 - x0) * (y1 - y0) / _LARGE) ** 0.5), int(module / _COARSE_MODULE)))
+    shrink = ((x1 - x0) * (y1 - y0) / large) ** 0.5
+    shrink = max(1, min(int(shrink), int(_module(corners, bits) / _COARSE_MODULE)))
     width, height = (x1 - x0) // shrink, (y1 - y0) // shrink
     part = grey[y0 : y0 + height * shrink, x0 : x0 + width * shrink].astype(np.float32) / 255.0
     if shrink > 1:

@@ -118,7 +118,8 @@ def _qr(grey: np.ndarray, code: zxingcpp.Barcode, scale: np.ndarray) -> Detectio
     # zxing-cpp counts from the corner of the first pixel, as we do, in whole pixels
     rough = np.array([(p.x, p.y) for p in points], np.float64) * scale
     bits = (np.array(code.to_image(scale=1, add_quiet_zones=False)) == 0).astype(np.uint8)
-    better = align(grey, rough, bits)
+    # its fourth corner has no finder pattern and, in the smallest codes, nothing else: it can be a module off
+    better = align(grey, rough, bits, unsure=2)
     version = (bits.shape[0] - 17) // 4
     family = f"v{version}-{code.ec_level}"
     return Detection("qr", family, None, code.text, rough if better is None else better)

@@ -91,7 +91,8 @@ def test_words_that_make_no_command(words, says, capsys):
     [
         (["marker", "apriltag:36h12:5"], "36h11"),
         (["marker", "apriltag:36h11:587"], "0 to 586"),
-        (["marker", "aruco:4x4_50:-1"], "0 to 49"),
+        (["marker", "aruco:4x4_50:50"], "0 to 49"),
+        (["marker", "aruco:4x4_50:-1"], "whole number"),
         (["marker", "barcode:5"], "barcode"),
         (["marker", "qr-v2-L:" + "x" * 200], "2"),
         (["marker", "image:missing.png"], "missing.png"),

@@ -66,7 +66,7 @@ def test_a_scene_is_drawn_and_read_back(scene, tmp_path, capsys):
     assert marker["corner_error_px"] < 0.5
     assert facts["not_in_scene"] == []
     assert main(["detect", "scene.png", "--scene", scene]) == 0
-    assert "position error [mm]" in capsys.readouterr().out
+    assert "Against scene.toml" in capsys.readouterr().out
 
 
 def test_every_plane_is_a_file(scene, tmp_path, capsys):
@@ -111,7 +111,7 @@ def test_a_bare_splat_file_is_framed(scene, tmp_path, capsys):
     rows = np.flatnonzero(image.max((1, 2)) > 128)
     assert rows[0] > 5
     assert rows[-1] < 714
-    assert rows[-1] - rows[0] > 500, "it fills the picture"
+    assert rows[-1] - rows[0] > 400, "it fills the picture, all but the reach of its widest splats"
     assert main(["detect", "tag.png", "--json"]) == 0
     assert [code["name"] for code in said(capsys)["detections"]] == ["apriltag:36h11:5"]
 

@@ -30,6 +30,7 @@ MAY_IMPORT = {
     "scenes": PLAIN | {"markers", "formats"},
     "effects": PLAIN | {"scenes"},
     "backends": PLAIN | {"scenes", "effects", "kernel_files"},
+    "hard_cases": PLAIN | {"scenes", "effects", "backends", "render"},
     "render": PLAIN | {"scenes", "effects", "backends"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__"}
@@ -39,7 +40,6 @@ HOME_OF = {
     "cv2": ("vision",),
     "zxingcpp": ("vision",),
     "shapely": ("markers",),
-    "networkx": ("markers",),
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
     "tyro": ("cli", "commands"),

@@ -134,6 +134,18 @@ def test_align_gives_up_rather_than_slide_to_another_place():
     assert align(255 - picture, corners, bits) is None
 
 
+@pytest.mark.parametrize(("along", "across"), [(1.2, 0.0), (-1.0, 1.1), (0.4, -1.6)])
+def test_align_finds_a_fourth_corner_that_is_a_module_off(along, across):
+    bits = qr_bits("fourteen signs")
+    picture, corners, _ = seen(bits, 210, tilt=40, spin=10, quiet=4)
+    rough = corners.copy()
+    rough[2] += (along * (corners[2] - corners[3]) + across * (corners[2] - corners[1])) / bits.shape[0]
+    assert align(picture, rough, bits) is None
+    mended = align(picture, rough, bits, unsure=2)
+    assert mended is not None
+    assert corner_error(mended, corners) < 0.1
+
+
 def test_align_looks_past_something_in_front():
     bits = qr_bits("a" * 100)
     picture, corners, _ = seen(bits, 200, quiet=4)
