@@ -152,8 +152,8 @@ class _Splats:
         tangent_v = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], 1)
         mean, scale = cloud.means.astype(np.float64), cloud.scales.astype(np.float64)
         rotation = view.rotation
-        a = tangent_u @ rotation.T * scale[:, :1]
-        b = tangent_v @ rotation.T * scale[:, 1:]
+        unit_a, unit_b = tangent_u @ rotation.T, tangent_v @ rotation.T
+        a, b = unit_a * scale[:, :1], unit_b * scale[:, 1:]
         p = mean @ rotation.T + view.translation
         self.key = p[:, 2].astype(np.float32)
         with np.errstate(divide="ignore"):
@@ -165,6 +165,7 @@ class _Splats:
         order = order[np.argsort(self.key[order], kind="stable")]
         self.order = order
 
+        normal = np.cross(unit_a, unit_b)[order]
         a, b, p, mean = a[order], b[order], p[order], mean[order]
         self.log_opacity, self.half_r2, self.reach = log_opacity[order], half_r2[order], reach[order]
         self.labels = cloud.labels[order]
@@ -175,18 +176,16 @@ class _Splats:
         tv = view.fy * rows[:, 1] + view.cy * tw
         self.k0, self.kx, self.ky = np.cross(tu, tv), np.cross(tv, tw), np.cross(tw, tu)
         determinant = np.einsum("ij,ij->i", tw, self.k0)
-        size = np.linalg.norm(tw, axis=1) * np.linalg.norm(self.k0, axis=1)
-        self.sign = np.where(np.abs(determinant) > 1e-13 * size, np.sign(determinant), 0.0)
+        height = np.einsum("ij,ij->i", normal, p)
+        edge_on = np.abs(height) <= 1e-13 * np.linalg.norm(p, axis=1)
+        self.sign = np.where(edge_on, 0.0, np.sign(determinant))
         self.z_numerator = np.abs(determinant) * np.abs(self.sign)
         self.dot = self.pz >= view.near  # the low-pass dot belongs to the centre
         with np.errstate(divide="ignore", invalid="ignore"):
             self.center_x = np.where(self.dot, tu[:, 2] / self.pz, np.inf)
             self.center_y = np.where(self.dot, tv[:, 2] / self.pz, np.inf)
         self.colors = _colors(cloud, order, mean - view.eye)
-        normal = np.cross(a, b)
-        length = np.linalg.norm(normal, axis=1, keepdims=True)
-        facing = np.where(np.einsum("ij,ij->i", normal, p) > 0, -1.0, 1.0)[:, None]
-        self.normal = normal * facing / np.where(length > 0, length, 1)
+        self.normal = normal * np.where(height > 0, -1.0, 1.0)[:, None]
         self.screen = "lowpass_screen" in features.slots
         self.planes = None
         if "compose_planes" in features.slots and cloud.planes is not None:
@@ -232,7 +231,7 @@ def _composite(
         rgb, worth = weight @ s.colors, before
     else:
         rgb, worth = _layered(alpha, before, weight, live, run, s, s.planes)
-    # What a risky fragment weighs, drawn or not: the cut-off at its rim, at the near plane its opacity at most.
+    # What a risky fragment weighs, drawn or not: the cut-off at its rim; its opacity at the near plane.
     stake = at_rim * math.exp(view.log_cut) + at_near * np.exp(s.log_opacity)
     certificate = (worth * stake).sum(1)
     near_stop = np.abs(before * (1 - alpha) - view.stop) <= _RISK * view.stop
