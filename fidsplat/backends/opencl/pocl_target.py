@@ -48,21 +48,27 @@ def correct_target(device_address: int) -> str | None:
     if device_address in _corrected:
         return _corrected[device_address].value.decode()
     try:
-        memory = Path("/proc/self/mem").open("rb", buffering=0)
+        memory = os.open("/proc/self/mem", os.O_RDONLY)
     except OSError:  # a system that hides it
         return None
-    with memory:
+    try:
         record = _read(memory, device_address, _RECORD_BYTES)
         words = struct.unpack(f"<{len(record) // 8}Q", record[: len(record) // 8 * 8])
-        for index in range(len(words) - 1):
-            is_triplet = _text(memory, words[index]).startswith(b"x86_64-")
-            if is_triplet and _text(memory, words[index + 1]) == b"generic":
-                name = ctypes.create_string_buffer(_processor_name().encode())
-                _corrected[device_address] = name
-                field = ctypes.c_uint64.from_address(device_address + 8 * (index + 1))
-                field.value = ctypes.addressof(name)
-                return name.value.decode()
-    return None
+        places = [
+            index + 1
+            for index in range(len(words) - 1)
+            if _text(memory, words[index]).startswith(b"x86_64-")
+            and _text(memory, words[index + 1]) == b"generic"
+        ]
+    finally:
+        os.close(memory)
+    if len(places) != 1:
+        return None
+    name = ctypes.create_string_buffer(_processor_name().encode())
+    _corrected[device_address] = name
+    field = ctypes.c_uint64.from_address(device_address + 8 * places[0])
+    field.value = ctypes.addressof(name)
+    return name.value.decode()
 
 
 def _processor_name() -> str:
@@ -71,15 +77,15 @@ def _processor_name() -> str:
     return [name for name, needed in _LEVELS if have.issuperset(needed)][-1]
 
 
-def _read(memory, address: int, count: int) -> bytes:
+def _read(memory: int, address: int, count: int) -> bytes:
     """Bytes of this process's memory; empty where nothing is mapped (a plain pointer would crash)."""
     try:
-        return os.pread(memory.fileno(), count, address)
+        return os.pread(memory, count, address)
     except (OSError, OverflowError):
         return b""
 
 
-def _text(memory, address: int) -> bytes:
+def _text(memory: int, address: int) -> bytes:
     if not 4096 < address < 1 << 47:
         return b""
     return _read(memory, address, 32).split(b"\0")[0]
