@@ -37,13 +37,12 @@ def turned(axis, degrees: float) -> np.ndarray:
 def splats(means, quats, scales, opacities=1.0, colors=(0.9, 0.5, 0.2), **more) -> SplatCloud:
     """A cloud of n splats: means (n, 3); the others (n, ...) or the value of them all."""
     n = len(means)
-    spread = [np.broadcast_to(np.asarray(value, float), (n, k)) for value, k in ((quats, 4), (scales, 2))]
-    alike = (
-        np.broadcast_to(np.asarray(opacities, float), n),
-        np.broadcast_to(np.asarray(colors, float), (n, 3)),
-    )
+
+    def each(value, *shape) -> np.ndarray:
+        return np.broadcast_to(np.asarray(value, float), (n, *shape))
+
     more.setdefault("labels", np.arange(n) % 100)
-    return SplatCloud(means, *spread, alike[0], colors=alike[1], **more)
+    return SplatCloud(means, each(quats, 4), each(scales, 2), each(opacities), colors=each(colors, 3), **more)
 
 
 def random_splats(
@@ -53,7 +52,7 @@ def random_splats(
     scale: tuple[float, float] = (1e-3, 2.0),
     across: float = 2.0,
 ) -> SplatCloud:
-    """Random splats with hard opacities: centres uniform in a box, scales log-uniform, orientations uniform."""
+    """Splats with hard opacities: centres uniform in a box, scales log-uniform, orientations uniform."""
     generator = np.random.default_rng(seed)
     means = np.column_stack(
         [generator.uniform(-across, across, (count, 2)), generator.uniform(*depth, count)]
