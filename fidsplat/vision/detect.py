@@ -5,7 +5,7 @@ They decide what is there; `align` then moves their corners onto the edges of th
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -72,21 +72,26 @@ def detect(image: np.ndarray, families: Iterable[str] | None = None, qr: bool = 
 
 
 def _tags(grey: np.ndarray, kind: str, family: str) -> list[Detection]:
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    detector = cv2.aruco.ArucoDetector(predefined(kind, family), parameters)
-    quads, ids, _ = detector.detectMarkers(grey)
-    if ids is None:
-        return []
-    order = np.argsort(ids.ravel(), kind="stable")
-    return [_tag(grey, kind, family, int(ids.ravel()[k]), quads[k]) for k in order]
-
-
-def _tag(grey: np.ndarray, kind: str, family: str, tag_id: int, quad: np.ndarray) -> Detection:
-    # OpenCV counts from the centre of the first pixel
-    rough = quad.reshape(4, 2).astype(np.float64) + 0.5
-    better = align(grey, rough, dictionary_bits(kind, family, tag_id))
-    return Detection(kind, family, tag_id, None, rough if better is None else better)
+    """Tags of one family, sorted by id."""
+    contours = cv2.aruco.DetectorParameters()
+    contours.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    # OpenCV's other way to squares, that of the AprilTag library, bridges a hair across the white ring, which
+    # opens a contour; at half size, where it costs no more than the first and small tags are the first one's
+    segments = cv2.aruco.DetectorParameters()
+    segments.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
+    segments.aprilTagQuadDecimate = 2.0
+    found: list[Detection] = []
+    for parameters in (contours, segments):
+        detector = cv2.aruco.ArucoDetector(predefined(kind, family), parameters)
+        quads, ids, _ = detector.detectMarkers(grey)
+        for quad, tag_id in zip(quads, [] if ids is None else ids.ravel(), strict=True):
+            # OpenCV counts from the centre of the first pixel
+            rough = quad.reshape(4, 2).astype(np.float64) + 0.5
+            tag = Detection(kind, family, int(tag_id), None, rough)
+            if not any(_same_place(tag, old) for old in found):
+                better = align(grey, rough, dictionary_bits(kind, family, int(tag_id)))
+                found.append(tag if better is None else replace(tag, corners=better))
+    return sorted(found, key=lambda tag: tag.id or 0)
 
 
 def _same_place(one: Detection, other: Detection) -> bool:

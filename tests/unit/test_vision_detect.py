@@ -1,5 +1,6 @@
 """Detectors on ideal pictures: what is found, where its corners are, what is not there is not found."""
 
+import cv2
 import numpy as np
 import pytest
 from ideal_picture import draw, photographed, pose, qr_bits, turned
@@ -98,6 +99,26 @@ def test_a_picture_with_several_codes():
     )
     assert [d.name for d in found] == ["apriltag:36h11:300", "aruco:4x4_50:7", "qr:two words", "qr:two words"]
     assert found[0].corners[:, 0].max() < 480 < found[1].corners[:, 0].min()
+
+
+@pytest.mark.parametrize("fails", [cv2.aruco.CORNER_REFINE_SUBPIX, cv2.aruco.CORNER_REFINE_APRILTAG])
+def test_either_way_to_squares_is_enough_and_both_give_a_tag_once(fails, monkeypatch):
+    picture, corners, _ = seen(dictionary_bits("apriltag", "36h11", 5), 160, tilt=20)
+    assert len(detect(picture)) == 1
+
+    class Detector:
+        def __init__(self, dictionary, parameters):
+            self.blind = parameters.cornerRefinementMethod == fails
+            self.real = real(dictionary, parameters)
+
+        def detectMarkers(self, image):
+            return ((), None, ()) if self.blind else self.real.detectMarkers(image)
+
+    real = cv2.aruco.ArucoDetector
+    monkeypatch.setattr(cv2.aruco, "ArucoDetector", Detector)
+    (tag,) = detect(picture)
+    assert tag.name == "apriltag:36h11:5"
+    assert corner_error(tag.corners, corners) < 0.05
 
 
 def test_nothing_is_found_where_nothing_is():
