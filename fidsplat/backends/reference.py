@@ -176,8 +176,8 @@ class _Splats:
         tv = view.fy * rows[:, 1] + view.cy * tw
         self.k0, self.kx, self.ky = np.cross(tu, tv), np.cross(tv, tw), np.cross(tw, tu)
         determinant = np.einsum("ij,ij->i", tw, self.k0)
-        height = np.einsum("ij,ij->i", normal, p)
-        edge_on = np.abs(height) <= 1e-13 * np.linalg.norm(p, axis=1)
+        offset = np.einsum("ij,ij->i", normal, p)
+        edge_on = np.abs(offset) <= 1e-13 * np.linalg.norm(p, axis=1)
         self.sign = np.where(edge_on, 0.0, np.sign(determinant))
         self.z_numerator = np.abs(determinant) * np.abs(self.sign)
         self.dot = self.pz >= view.near  # the low-pass dot belongs to the centre
@@ -185,7 +185,7 @@ class _Splats:
             self.center_x = np.where(self.dot, tu[:, 2] / self.pz, np.inf)
             self.center_y = np.where(self.dot, tv[:, 2] / self.pz, np.inf)
         self.colors = _colors(cloud, order, mean - view.eye)
-        self.normal = normal * np.where(height > 0, -1.0, 1.0)[:, None]
+        self.normal = normal * np.where(offset > 0, -1.0, 1.0)[:, None]
         self.screen = "lowpass_screen" in features.slots
         self.planes = None
         if "compose_planes" in features.slots and cloud.planes is not None:

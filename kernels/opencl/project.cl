@@ -69,12 +69,14 @@ kernel void project(
     real3_ mean = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
 
     real3_ a = rotate_to_camera(view, tangent_u), b = rotate_to_camera(view, tangent_v);
-    real su = scales[2 * i], sv = scales[2 * i + 1];
-    a.x *= su; a.y *= su; a.z *= su;
-    b.x *= sv; b.y *= sv; b.z *= sv;
     real3_ p = rotate_to_camera(view, mean);
     p.x += view[VIEW_T]; p.y += view[VIEW_T + 1]; p.z += view[VIEW_T + 2];
     real pz = p.z, near = view[VIEW_NEAR];
+    real3_ facet = cross3(a, b);        // unit normal
+    real offset = dot3(facet, p);       // of the plane from the camera's centre
+    real su = scales[2 * i], sv = scales[2 * i + 1];
+    a.x *= su; a.y *= su; a.z *= su;
+    b.x *= sv; b.y *= sv; b.z *= sv;
 
     // depth range of the disk (numerics A3)
     real radius = sqrt(REAL(2.0) * half_r2);
@@ -121,9 +123,9 @@ kernel void project(
     real scale = (determinant < 0 ? -1 : 1) / steepest;
     real n_scale = scale * REAL(0.70710678118654752440);   // so that q / D^2 is rho / 2
 
-    // Edge-on within rounding: the plane has no visible side, only the low-pass may draw the splat (numerics B2).
-    real size = sqrt(dot3(tw, tw) * dot3(k0, k0));
-    real facing = fabs(determinant) > (SETUP_FP64 ? REAL(1e-13) : REAL(1e-6)) * size ? scale : 0;
+    // Edge-on within rounding: the plane has no visible side, only the low-pass may draw the splat (numerics B2). Asked
+    // of the plane alone, so that neither the splat's size nor the focal length has a say.
+    real facing = fabs(offset) > (SETUP_FP64 ? REAL(1e-13) : REAL(1e-6)) * sqrt(dot3(p, p)) ? scale : 0;
     real z_numerator = determinant * facing;                               // depth = z_numerator / D
 
     Splat record;

@@ -3,13 +3,11 @@
 //@ record
     float nx, ny, nz;
 //@ project
-    real3_ normal = cross3(a, b);
     // the camera is on one side of the whole plane, so the sign is the splat's (numerics B7)
-    real normal_length = sqrt(dot3(normal, normal));
-    real towards = (dot3(normal, p) > 0 ? -1 : 1) / (normal_length > 0 ? normal_length : 1);
-    record.nx = (float)(normal.x * towards);
-    record.ny = (float)(normal.y * towards);
-    record.nz = (float)(normal.z * towards);
+    real towards = offset > 0 ? -1 : 1;
+    record.nx = (float)(facet.x * towards);
+    record.ny = (float)(facet.y * towards);
+    record.nz = (float)(facet.z * towards);
 //@ state
     vfloat normal_x, normal_y, normal_z;
 //@ start
