@@ -26,7 +26,8 @@ def draw(bits, size, placed, camera, quiet=1, samples=4, ground=0.5) -> tuple[np
     """A code of ``size`` metres at ``placed`` (4, 4) seen by ``camera``: (h, w) float in [0, 1], corners
     (4, 2).
 
-    Each pixel is the mean of samples x samples points, as a camera's pixel averages over its area.
+    Each pixel is the mean of samples x samples points, as a camera's pixel averages over its area. An edge
+    along the rows or columns therefore lies up to 1 / (2 samples) px beside where it should.
     """
     matrix = camera.matrix @ np.column_stack([placed[:3, :2], placed[:3, 3]])
     x = (np.arange(camera.width * samples) + 0.5) / samples

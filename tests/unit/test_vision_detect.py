@@ -103,7 +103,7 @@ def test_a_picture_with_several_codes():
 
 @pytest.mark.parametrize("fails", [cv2.aruco.CORNER_REFINE_SUBPIX, cv2.aruco.CORNER_REFINE_APRILTAG])
 def test_either_way_to_squares_is_enough_and_both_give_a_tag_once(fails, monkeypatch):
-    picture, corners, _ = seen(dictionary_bits("apriltag", "36h11", 5), 160, tilt=20)
+    picture, corners, _ = seen(dictionary_bits("apriltag", "36h11", 5), 160, tilt=20, spin=8)
     assert len(detect(picture)) == 1
 
     class Detector:
