@@ -30,23 +30,31 @@ def draw(bits, size, placed, camera, quiet=1, samples=4, ground=0.5) -> tuple[np
     along the rows or columns therefore lies up to 1 / (2 samples) px beside where it should.
     """
     matrix = camera.matrix @ np.column_stack([placed[:3, :2], placed[:3, 3]])
-    x = (np.arange(camera.width * samples) + 0.5) / samples
-    y = (np.arange(camera.height * samples) + 0.5) / samples
+    module = size / bits.shape[0]
+    half = size / 2
+    unit = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    printed = np.pad(bits, quiet)
+    # only what the paper covers is computed
+    outline = _project(matrix, unit * (half + quiet * module))
+    x0, y0 = np.clip(np.floor(outline.min(0)), 0, (camera.width, camera.height)).astype(int)
+    x1, y1 = np.clip(np.ceil(outline.max(0)), 0, (camera.width, camera.height)).astype(int)
+    x = x0 + (np.arange((x1 - x0) * samples) + 0.5) / samples
+    y = y0 + (np.arange((y1 - y0) * samples) + 0.5) / samples
     points = np.stack([*np.meshgrid(x, y), np.ones((y.size, x.size))]).reshape(3, -1)
     u, v, w = np.linalg.inv(matrix) @ points
-    printed = np.pad(bits, quiet)
-    module = size / bits.shape[0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        column = np.floor(u / w / module + printed.shape[1] / 2)
-        row = np.floor(v / w / module + printed.shape[0] / 2)
+    column = np.floor(u / w / module + printed.shape[1] / 2)
+    row = np.floor(v / w / module + printed.shape[0] / 2)
     inside = (row >= 0) & (column >= 0) & (row < printed.shape[0]) & (column < printed.shape[1])
     values = np.full(points.shape[1], float(ground))
     values[inside] = 1.0 - printed[row[inside].astype(int), column[inside].astype(int)]
-    picture = values.reshape(camera.height, samples, camera.width, samples).mean((1, 3))
-    half = size / 2
-    edge = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
-    corners = np.column_stack([edge, np.ones(4)]) @ matrix.T
-    return picture, corners[:, :2] / corners[:, 2:]
+    picture = np.full((camera.height, camera.width), float(ground))
+    picture[y0:y1, x0:x1] = values.reshape(y1 - y0, samples, x1 - x0, samples).mean((1, 3))
+    return picture, _project(matrix, unit * half)
+
+
+def _project(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    seen = np.column_stack([points, np.ones(len(points))]) @ matrix.T
+    return seen[:, :2] / seen[:, 2:]
 
 
 def photographed(picture: np.ndarray, seed: int = 0, noise: float = 2.0) -> np.ndarray:
