@@ -18,6 +18,8 @@ from fidsplat.rotations import (
 __all__ = ["SplatCloud", "sh_basis"]
 
 _F32 = np.dtype(np.float32)
+LARGEST = 1e15
+"""metres, or units of colour: with anything larger, products of single precision would overflow on devices"""
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -59,9 +61,9 @@ class SplatCloud:
         means get an origin when float32 would blur them. origin (3,): means are relative to it, as the
         attribute is.
 
-        A splat that cannot be drawn (a value that is not finite, |q|^2 < 1e-30, a scale <= 0, an opacity
-        outside [0, 1]) is left out and counted in ``dropped`` under its first such reason; one warning
-        reports the counts, naming ``source`` (a file, say). Arrays are copied, except float32 arrays that
+        A splat that cannot be drawn (a value that is not finite or, quaternions apart, beyond 1e15,
+        |q|^2 < 1e-30, a scale <= 0, an opacity outside [0, 1]) is left out and counted in ``dropped`` under
+        its first such reason; one warning reports the counts, naming ``source`` (a file, say). Arrays are copied, except float32 arrays that
         are read-only down to the memory they stand on. Raises InputError, naming the array, for a wrong
         shape or type.
         """
@@ -182,8 +184,12 @@ class SplatCloud:
         if sh is not None and sh.shape[1] > 1:
             sh = rotation_of_coefficients(self.sh_degree, rotation).astype(_F32) @ sh
         scales = _single(self.scales * scale)
-        if not (np.isfinite(means).all() and np.isfinite(scales).all() and (scales > 0).all()):
-            raise InputError(f"the transform's scale {scale:g} takes splats out of the range of float32")
+        within = all(_rows_beyond(array, LARGEST) is None for array in (means, scales))
+        if not (within and (scales > 0).all()):
+            raise InputError(
+                f"the transform takes splats out of range (its scale is {scale:g}): means and scales may be at "
+                f"most {LARGEST:g}, and scales must stay above 0"
+            )
         return self._replaced(means=means, quats=quats, scales=scales, sh=sh, origin=origin)
 
     def with_planes(self, planes) -> "SplatCloud":
@@ -323,13 +329,14 @@ def _choose_origin(
     return _single(means - origin), origin
 
 
-def _rows_not_finite(array: np.ndarray) -> np.ndarray | None:
-    # one pass and no temporary when all is well: a sum is finite only if every term is
-    with np.errstate(over="ignore", invalid="ignore"):
-        if np.isfinite(array.sum()):
+def _rows_beyond(array: np.ndarray, limit: float) -> np.ndarray | None:
+    """Which rows hold a value that is not finite or beyond +-limit; None, without a temporary, if none does."""
+    with np.errstate(invalid="ignore"):
+        if not array.size or (array.min() >= -limit and array.max() <= limit):  # false where there is a NaN
             return None
-    finite = np.isfinite(array)
-    return ~np.asarray(finite.all(axis=tuple(range(1, array.ndim))))
+        good = array <= limit
+        good &= array >= -limit
+    return ~np.asarray(good.all(axis=tuple(range(1, array.ndim))))
 
 
 def _find_defects(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, dict[str, int]]:
@@ -337,7 +344,11 @@ def _find_defects(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, dic
     bad: np.ndarray | None = None
     dropped: dict[str, int] = {}
     s, o = arrays["scales"], arrays["opacities"]
-    defects = [(f"{name} not finite", _rows_not_finite(array)) for name, array in arrays.items()]
+    finite = float(np.finfo(_F32).max)
+    beyond = {n: _rows_beyond(array, finite if n == "quats" else LARGEST) for n, array in arrays.items()}
+    beyond = {name: rows for name, rows in beyond.items() if rows is not None}
+    defects = [(f"{name} not finite", _rows_beyond(arrays[name], finite)) for name in beyond]
+    defects += [(f"{name} beyond {LARGEST:g}", rows) for name, rows in beyond.items()]
     with np.errstate(over="ignore", invalid="ignore"):
         defects += [
             ("zero quaternion", _square(arrays["quats"]) < 1e-30),

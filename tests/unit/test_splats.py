@@ -155,8 +155,17 @@ def test_a_splat_with_two_defects_counts_once():
         assert fs.SplatCloud(**given).dropped == {"means not finite": 1, "opacity outside [0, 1]": 1}
 
 
-def test_large_finite_values_are_not_defects():
-    given = parts(means=np.full((6, 3), 3e38, F32))
+@pytest.mark.parametrize("value", [1.1e15, -1e38])
+@pytest.mark.parametrize("name", ["means", "colors"])
+def test_values_that_would_overflow_on_devices_are_left_out(name, value):
+    given = parts()
+    given[name][2, 1] = value
+    with pytest.warns(UserWarning, match="1 of 6"):
+        assert fs.SplatCloud(**given).dropped == {f"{name} beyond 1e+15": 1}
+
+
+def test_large_values_are_not_defects():
+    given = parts(means=np.full((6, 3), 1e15, F32), quats=np.full((6, 4), 3e38, F32))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert len(fs.SplatCloud(**given)) == 6
