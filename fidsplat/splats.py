@@ -63,9 +63,9 @@ class SplatCloud:
 
         A splat that cannot be drawn (a value that is not finite or, quaternions apart, beyond 1e15,
         |q|^2 < 1e-30, a scale <= 0, an opacity outside [0, 1]) is left out and counted in ``dropped`` under
-        its first such reason; one warning reports the counts, naming ``source`` (a file, say). Arrays are copied, except float32 arrays that
-        are read-only down to the memory they stand on. Raises InputError, naming the array, for a wrong
-        shape or type.
+        its first such reason; one warning reports the counts, naming ``source`` (a file, say). Arrays are
+        copied, except float32 arrays that are read-only down to the memory they stand on. Raises InputError,
+        naming the array, for a wrong shape or type.
         """
         given = _numbers("means", means)
         n = given.shape[0] if given.ndim else -1
@@ -187,8 +187,8 @@ class SplatCloud:
         within = all(_rows_beyond(array, LARGEST) is None for array in (means, scales))
         if not (within and (scales > 0).all()):
             raise InputError(
-                f"the transform takes splats out of range (its scale is {scale:g}): means and scales may be at "
-                f"most {LARGEST:g}, and scales must stay above 0"
+                f"the transform takes splats out of range (its scale is {scale:g}): means and scales may be "
+                f"at most {LARGEST:g}, and scales must stay above 0"
             )
         return self._replaced(means=means, quats=quats, scales=scales, sh=sh, origin=origin)
 
@@ -330,7 +330,7 @@ def _choose_origin(
 
 
 def _rows_beyond(array: np.ndarray, limit: float) -> np.ndarray | None:
-    """Which rows hold a value that is not finite or beyond +-limit; None, without a temporary, if none does."""
+    """Which rows hold a value that is not finite or beyond +-limit; None, at no cost in memory, if none."""
     with np.errstate(invalid="ignore"):
         if not array.size or (array.min() >= -limit and array.max() <= limit):  # false where there is a NaN
             return None
