@@ -151,6 +151,7 @@ class _Splats:
         tangent_u = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], 1)
         tangent_v = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], 1)
         mean, scale = cloud.means.astype(np.float64), cloud.scales.astype(np.float64)
+        scale = np.maximum(scale, np.float32(1e-20))  # as the kernels' SMALLEST_SCALE
         rotation = view.rotation
         unit_a, unit_b = tangent_u @ rotation.T, tangent_v @ rotation.T
         a, b = unit_a * scale[:, :1], unit_b * scale[:, 1:]

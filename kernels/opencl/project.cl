@@ -4,6 +4,9 @@
 //
 // The set-up is done in `real` (double where there is one) from float inputs (numerics B1).
 
+// [m]; nobody sees the difference, and what is divided by it stays above float32's denormals (numerics B6)
+#define SMALLEST_SCALE 1e-20f
+
 // Regular polygon around the R-sigma circle, clipped against the near plane and projected: the bounds of a disk that
 // crosses it (numerics A1 iii). Returns false if nothing is left.
 #define POLYGON 16
@@ -74,7 +77,7 @@ kernel void project(
     real pz = p.z, near = view[VIEW_NEAR];
     real3_ facet = cross3(a, b);        // unit normal
     real offset = dot3(facet, p);       // of the plane from the camera's centre
-    real su = scales[2 * i], sv = scales[2 * i + 1];
+    real su = fmax(scales[2 * i], SMALLEST_SCALE), sv = fmax(scales[2 * i + 1], SMALLEST_SCALE);
     a.x *= su; a.y *= su; a.z *= su;
     b.x *= sv; b.y *= sv; b.z *= sv;
 
