@@ -2,7 +2,8 @@
 
 
 class FidsplatError(Exception):
-    """Base of every error that fidsplat raises on purpose; its text says what was wrong and what would be right."""
+    """Base of every error that fidsplat raises on purpose; its text says what was wrong and what would be
+    right."""
 
     exit_status = 1
 

@@ -1,4 +1,4 @@
-"""Finds the device wing: `kernels/` beside the package in a checkout, `fidsplat/_kernels` in an installed wheel."""
+"""Finds the device wing: `kernels/` beside the package in a checkout, `fidsplat/_kernels` in a wheel."""
 
 from pathlib import Path
 
@@ -16,4 +16,6 @@ def kernels_folder() -> Path:
     for place in places:
         if (place / "opencl").is_dir():
             return place
-    raise DeviceError(f"the kernels are missing: neither {places[0]} nor {places[1]} is there; reinstall fidsplat")
+    raise DeviceError(
+        f"the kernels are missing: neither {places[0]} nor {places[1]} is there; reinstall fidsplat"
+    )
