@@ -78,7 +78,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         return "".join(section.get(match[1], "") for section in sections)
 
     stages = [*(f"{stage}.cl" for stage in _STAGES), f"schedule/{shape.schedule}.cl", "resolve.cl"]
-    body = "\n".join(_HOOK.sub(fill, _read(stage)) for stage in stages)
+    body = "\n".join(_HOOK.sub(fill, kernel_text(stage)) for stage in stages)
     for effect, section in zip(effects, sections, strict=True):
         if unknown := set(section) - known:
             raise DeviceError(f"kernel file {effect.file} fills hooks that no stage has: {sorted(unknown)}")
@@ -88,11 +88,12 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
 
 
 @cache
-def _read(path: str) -> str:
+def kernel_text(path: str) -> str:
+    """A file below kernels/opencl/, as it stands."""
     return (kernels_folder() / "opencl" / path).read_text(encoding="utf-8")
 
 
 @cache
 def _sections(path: str) -> dict[str, str]:
-    pieces = _SECTION.split(_read(path))
+    pieces = _SECTION.split(kernel_text(path))
     return dict(zip(pieces[1::2], pieces[2::2], strict=True))

@@ -81,22 +81,28 @@ class OpenCLBackend:
         key = (features, shape or self.shape)
         if key not in self._pipelines:
             source = assemble(*key)
-            program = self._build(source.text)
+            program = self.build(source.text)
             self._pipelines[key] = OpenCLPipeline(self, source, program, *key)
         return self._pipelines[key]
 
-    def _build(self, text: str) -> cl.Program:
+    @property
+    def build_options(self) -> list[str]:
+        """What every program here is compiled with: no option that lets go of IEEE arithmetic."""
         # the target's name is part of pyopencl's cache key: PoCL's own version string does not tell
         # processors apart
-        options = [
-            "-cl-std=CL1.2",
-            "-w",
-            f"-DTARGET_{''.join(c if c.isalnum() else '_' for c in self.target)}",
-        ]
+        target = "".join(c if c.isalnum() else "_" for c in self.target)
+        return ["-cl-std=CL1.2", "-w", f"-DTARGET_{target}"]
+
+    def build(self, text: str) -> cl.Program:
+        """A program from OpenCL C.
+
+        Raises:
+            DeviceError: the compiler refuses; its log is in the message.
+        """
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", cl.CompilerWarning)
-                return cl.Program(self.context, text).build(options=options)
+                return cl.Program(self.context, text).build(options=self.build_options)
         except cl.Error as error:
             raise DeviceError(f"{self.info.title} cannot compile the kernels: {error}") from error
 

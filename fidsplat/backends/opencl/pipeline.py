@@ -71,8 +71,8 @@ class OpenCLPipeline:
         self.source = source
         self.features = features
         self.shape = shape
-        self._backend = backend
-        self._kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
+        self.backend = backend
+        self.kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
         self._real = np.float64 if features.setup_precision == "float64" else np.float32
 
     def render(self, resident: Resident, view: View) -> OpenCLPlanes:
@@ -84,7 +84,7 @@ class OpenCLPipeline:
         try:
             return _Run(self, resident, view).planes()
         except cl.Error as error:
-            raise DeviceError(f"{self._backend.info.title} failed while drawing: {error}") from error
+            raise DeviceError(f"{self.backend.info.title} failed while drawing: {error}") from error
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Draw one picture and return what passes between the stages.
@@ -114,7 +114,7 @@ class _Run:
 
     def __init__(self, pipeline: OpenCLPipeline, resident: Resident, view: View) -> None:
         self.pipeline, self.resident, self.view = pipeline, resident, view
-        self.backend, self.shape = pipeline._backend, pipeline.shape
+        self.backend, self.shape = pipeline.backend, pipeline.shape
         self.queue, self.pool = self.backend.queue, self.backend.pool
         self.tiles_x = -(-view.width // self.shape.tile_width)
         self.tiles_y = -(-view.height // self.shape.tile_height)
@@ -275,7 +275,7 @@ class _Run:
             extra += [next(rest) for _ in effect.planes]
             if effect.output:
                 extra.append(outputs[effect.output.name][1])
-        kernel = self.pipeline._kernels["resolve"]
+        kernel = self.pipeline.kernels["resolve"]
         local = (16, 4)
         size = (-(-width // 16) * 16, -(-height // 4) * 4)
         background = (np.float32(channel) for channel in view.background)
@@ -315,5 +315,5 @@ class _Run:
     def _launch(self, stage: str, kernel: str, items: int, group: int, *args) -> None:
         """One-dimensional launch of at least `items` work-items; the kernels check their index."""
         size = -(-items // group) * group
-        event = self.pipeline._kernels[kernel](self.queue, (size,), (group,), *args)
+        event = self.pipeline.kernels[kernel](self.queue, (size,), (group,), *args)
         self.events.append((stage, event))

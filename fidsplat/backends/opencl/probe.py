@@ -1,0 +1,91 @@
+"""Looks into an open device: small kernels under the build options and the pragmas of the stages, single
+stages on made-up input, and buffers that are filled with rubbish first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+import pyopencl as cl
+
+from fidsplat.backends.opencl.assemble import kernel_text
+from fidsplat.backends.opencl.backend import OpenCLBackend
+from fidsplat.backends.opencl.memory import BufferPool
+from fidsplat.backends.opencl.pipeline import OpenCLPipeline
+
+
+def evaluate(
+    backend: OpenCLBackend, text: str, inputs: Sequence[np.ndarray], outputs: Sequence[np.dtype | type]
+) -> list[np.ndarray]:
+    """Run `kernel void probe(...)` of `text`, compiled as the stages are: after prelude.cl and math.cl.
+
+    One work-item per element: inputs are arrays (n,) of one length, outputs the types of arrays (n,). The
+    kernel's arguments are the pointers to the inputs, then to the outputs. A device without float64 has
+    SETUP_FP64 0 and `real` is float.
+
+    Raises:
+        DeviceError: the compiler refuses.
+    """
+    defines = {
+        "LANES": 1,
+        "FAST_FMA": int(backend.shape.fast_fma),
+        "SETUP_FP64": int(backend.info.float64),
+    }
+    head = "".join(f"#define {name} {value}\n" for name, value in defines.items())
+    program = backend.build(head + kernel_text("prelude.cl") + kernel_text("math.cl") + text)
+    given = [_buffer(backend, array) for array in inputs]
+    made = [np.empty(len(inputs[0]), dtype) for dtype in outputs]
+    taken = [_buffer(backend, array) for array in made]
+    program.probe(backend.queue, (len(inputs[0]),), None, *given, *taken)
+    for array, buffer in zip(made, taken, strict=True):
+        cl.enqueue_copy(backend.queue, array, buffer)
+    return made
+
+
+def scan(pipeline: OpenCLPipeline, totals: np.ndarray) -> tuple[np.ndarray, int]:
+    """What `scan_bins` makes of list lengths (n,) uint32: where each list starts (n + 1,) uint32, and the sum
+    of all in 64 bits.
+    """
+    backend = pipeline.backend
+    starts, counts = np.empty(len(totals) + 1, np.uint32), np.zeros(6, np.uint32)
+    lengths, places, sums = (_buffer(backend, array) for array in (totals, starts, counts))
+    items = (pipeline.shape.scan_items,)
+    kernel = pipeline.kernels["scan_bins"]
+    kernel(backend.queue, items, items, np.uint32(len(totals)), lengths, places, sums, np.uint32(4))
+    cl.enqueue_copy(backend.queue, starts, places)
+    cl.enqueue_copy(backend.queue, counts, sums)
+    return starts, int(counts[4]) | int(counts[5]) << 32
+
+
+@contextmanager
+def poisoned(backend: OpenCLBackend) -> Iterator[None]:
+    """Within it, every buffer that a picture takes is filled with 0xFF first: NaN, or the integer -1."""
+    pool = backend.pool
+    backend.pool = _PoisonedPool(backend)
+    try:
+        yield
+    finally:
+        backend.pool = pool
+
+
+class _PoisonedPool(BufferPool):
+    def __init__(self, backend: OpenCLBackend) -> None:
+        super().__init__(backend.context, backend.device)
+        self._queue = backend.queue
+
+    def scratch(self, name: str, size: int) -> cl.Buffer:
+        return self._filled(super().scratch(name, size))
+
+    def fresh(self, name: str, size: int) -> cl.Buffer:
+        return self._filled(super().fresh(name, size))
+
+    def _filled(self, buffer: cl.Buffer) -> cl.Buffer:
+        cl.enqueue_fill_buffer(self._queue, buffer, np.uint8(0xFF), 0, buffer.size)
+        return buffer
+
+
+def _buffer(backend: OpenCLBackend, array: np.ndarray) -> cl.Buffer:
+    flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
+    return cl.Buffer(backend.context, flags, hostbuf=np.ascontiguousarray(array))
