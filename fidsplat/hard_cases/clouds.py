@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fidsplat.cameras import Camera
 from fidsplat.rotations import matrix_to_quaternion
 from fidsplat.splats import SplatCloud
 
-HARD_OPACITIES = np.float32([0.002, 0.05, 0.3, 0.5, 0.9, 0.99, 1.0])
+HARD_OPACITIES = np.array([0.002, 0.05, 0.3, 0.5, 0.9, 0.99, 1.0], np.float32)
+ORANGE = (0.9, 0.5, 0.2)
 
 
 def camera(width: int = 100, height: int = 80, focal: float = 80.0, **changes) -> Camera:
@@ -34,7 +36,9 @@ def turned(axis, degrees: float) -> np.ndarray:
     return np.array([math.cos(half), *(math.sin(half) * unit)])
 
 
-def splats(means, quats, scales, opacities=1.0, colors=(0.9, 0.5, 0.2), **more) -> SplatCloud:
+def splats(
+    means, quats, scales, opacities: ArrayLike = 1.0, colors: ArrayLike = ORANGE, **more
+) -> SplatCloud:
     """A cloud of n splats: means (n, 3); the others (n, ...) or the value of them all."""
     n = len(means)
 
@@ -43,6 +47,11 @@ def splats(means, quats, scales, opacities=1.0, colors=(0.9, 0.5, 0.2), **more) 
 
     more.setdefault("labels", np.arange(n) % 100)
     return SplatCloud(means, each(quats, 4), each(scales, 2), each(opacities), colors=each(colors, 3), **more)
+
+
+def log_uniform(generator: np.random.Generator, low: float, high: float, shape=()) -> np.ndarray:
+    """Random numbers whose logarithms are uniform."""
+    return np.exp(generator.uniform(math.log(low), math.log(high), shape))
 
 
 def random_splats(
@@ -60,7 +69,7 @@ def random_splats(
     return splats(
         means.astype(np.float32),
         generator.normal(size=(count, 4)),
-        np.exp(generator.uniform(*np.log(scale), (count, 2))),
+        log_uniform(generator, *scale, (count, 2)),
         generator.choice(HARD_OPACITIES, count),
         generator.uniform(0, 1, (count, 3)),
         labels=generator.integers(0, 9, count),

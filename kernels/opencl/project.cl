@@ -120,7 +120,7 @@ kernel void project(
     tu = image_row(view[VIEW_FX], view[VIEW_CX] - anchor_x, row_x, tw);
     tv = image_row(view[VIEW_FY], view[VIEW_CY] - anchor_y, row_y, tw);
     real3_ k0 = cross3(tu, tv), kx = cross3(tv, tw), ky = cross3(tw, tu);   // (n_u, n_v, D): constant, per x, per y
-    real determinant = dot3(tw, k0);
+    real determinant = view[VIEW_FX] * view[VIEW_FY] * su * sv * offset;   // of M: exact where tw . k0 cancels
     real steepest = fmax(fmax(fabs(kx.x), fabs(ky.x)), fmax(fabs(kx.y), fabs(ky.y)));
     if (!(steepest > 0 && steepest < (real)INFINITY)) return;
     real scale = (determinant < 0 ? -1 : 1) / steepest;

@@ -1,0 +1,11 @@
+"""The judge of the other backends: NumPy in float64, every sample of the picture against every splat, no
+tiles, no boxes.
+
+It starts from the same float32 inputs and takes the same decisions (numerics.md, section 3). Beside the
+planes it gives certificates: how much a pixel may differ because single precision may decide or round
+otherwise.
+"""
+
+from fidsplat.backends.reference.backend import ReferenceBackend, devices, open_device
+
+__all__ = ["ReferenceBackend", "devices", "open_device"]

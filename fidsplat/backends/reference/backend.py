@@ -1,0 +1,136 @@
+"""The reference as a backend: it opens, uploads and draws as the others do."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from fidsplat.backends.base import DeviceInfo, View
+from fidsplat.backends.reference.blend import composite
+from fidsplat.backends.reference.resolve import resolve
+from fidsplat.backends.reference.setup import Setup
+from fidsplat.effects import FeatureSet
+from fidsplat.errors import UnknownDeviceError
+from fidsplat.splats import SplatCloud
+
+_BLOCK = 1 << 19  # (sample, splat) pairs that are evaluated at once
+
+
+def devices() -> list[DeviceInfo]:
+    """The one reference device: this machine's NumPy."""
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0
+    return [
+        DeviceInfo(
+            name="reference",
+            title="NumPy, float64, every pixel against every splat",
+            platform="reference",
+            version=f"NumPy {np.__version__}",
+            kind="cpu",
+            compute_units=1,
+            memory_bytes=memory,
+            largest_allocation_bytes=memory,
+            float64=True,
+            usable=True,
+            reason=f"slow; for comparison only ({platform.machine()})",
+        )
+    ]
+
+
+def open_device(selector: str = "") -> ReferenceBackend:
+    """The reference; it has no variants.
+
+    Raises:
+        UnknownDeviceError: a selector was given.
+    """
+    if selector:
+        raise UnknownDeviceError(f"the reference has no device {selector!r}; its name is just 'reference'")
+    return ReferenceBackend()
+
+
+class ReferenceBackend:
+    """NumPy in float64."""
+
+    def __init__(self) -> None:
+        self.info = devices()[0]
+
+    def upload(self, cloud: SplatCloud) -> ReferenceCloud:
+        """The cloud itself."""
+        return ReferenceCloud(cloud)
+
+    def pipeline(self, features: FeatureSet) -> ReferencePipeline:
+        """Nothing to compile."""
+        return ReferencePipeline(features)
+
+
+class ReferenceCloud:
+    """A cloud with what the renderer asks of a resident one."""
+
+    def __init__(self, cloud: SplatCloud) -> None:
+        self.cloud = cloud
+        self.origin = cloud.origin
+        self.sh_degree = cloud.sh_degree
+        self.has_planes = cloud.planes is not None
+
+
+@dataclass
+class ReferencePlanes:
+    """Finished planes in memory."""
+
+    planes: dict[str, np.ndarray]
+    timings: Mapping[str, float]
+    stats: Mapping[str, int]
+
+    def read(self, name: str) -> np.ndarray:
+        return self.planes[name]
+
+
+class ReferencePipeline:
+    """Draws whole pictures (`render`) or chosen pixels (`pixels`)."""
+
+    def __init__(self, features: FeatureSet) -> None:
+        self.features = features
+
+    def render(self, resident: ReferenceCloud, view: View) -> ReferencePlanes:
+        """Draw every pixel; planes in float64."""
+        height, width = view.height // view.samples, view.width // view.samples
+        rows, columns = np.mgrid[0:height, 0:width]
+        start = time.perf_counter()
+        flat = self.pixels(resident, view, rows.ravel(), columns.ravel())
+        planes = {name: plane.reshape(height, width, *plane.shape[1:]) for name, plane in flat.items()}
+        took = (time.perf_counter() - start) * 1e3
+        count = len(resident.cloud)
+        return ReferencePlanes(planes, {"reference": took}, {"splats": count, "visible": count, "pairs": 0})
+
+    def trace(self, resident: ReferenceCloud, view: View) -> dict[str, np.ndarray]:
+        """The depth order, the float32 keys, and the finished planes with the certificate."""
+        splats = Setup(resident.cloud, view, self.features)
+        return {"order": splats.order, "keys": splats.key, **self.render(resident, view).planes}
+
+    def pixels(
+        self, resident: ReferenceCloud, view: View, rows: np.ndarray, columns: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Planes at pixels (row, column), each (k,) or (k, 3) float64; `certificate` (k,) beside those asked
+        for.
+        """
+        splats = Setup(resident.cloud, view, self.features)
+        n = view.samples
+        sub_rows, sub_columns = np.mgrid[0:n, 0:n]
+        y = (np.asarray(rows)[:, None] * n + sub_rows.ravel() + 0.5).ravel()
+        x = (np.asarray(columns)[:, None] * n + sub_columns.ravel() + 0.5).ravel()
+        step = max(1, _BLOCK // max(1, len(splats.order)))
+        blocks = [
+            composite(splats, view, self.features, x[k : k + step], y[k : k + step])
+            for k in range(0, len(x), step)
+        ]
+        samples = {
+            name: np.concatenate([block[name] for block in blocks]).reshape(
+                -1, n * n, *blocks[0][name].shape[1:]
+            )
+            for name in blocks[0]
+        }
+        return resolve(samples, view, self.features)

@@ -1,0 +1,82 @@
+"""Per-splat set-up of the reference."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fidsplat.backends.base import View
+from fidsplat.effects import FeatureSet
+from fidsplat.splats import SplatCloud, sh_basis
+
+
+class Setup:
+    """What the samples need of the splats that may be drawn; float64 arrays (n, ...) in depth order."""
+
+    def __init__(self, cloud: SplatCloud, view: View, features: FeatureSet) -> None:
+        q = cloud.quats.astype(np.float64)
+        q /= np.linalg.norm(q, axis=1, keepdims=True)
+        w, x, y, z = q.T
+        tangent_u = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], 1)
+        tangent_v = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], 1)
+        mean, scale = cloud.means.astype(np.float64), cloud.scales.astype(np.float64)
+        scale = np.maximum(scale, np.float32(1e-20))  # as the kernels' SMALLEST_SCALE
+        rotation = view.rotation
+        unit_a, unit_b = tangent_u @ rotation.T, tangent_v @ rotation.T
+        a, b = unit_a * scale[:, :1], unit_b * scale[:, 1:]
+        p = mean @ rotation.T + view.translation
+        self.key = p[:, 2].astype(np.float32)
+        with np.errstate(divide="ignore"):
+            log_opacity = np.log(cloud.opacities.astype(np.float64))
+        half_r2 = log_opacity - view.log_cut
+        reach = np.sqrt(np.maximum(2 * half_r2, 0)) * np.hypot(a[:, 2], b[:, 2])
+        drawn = (half_r2 > 0) & (p[:, 2] + reach >= view.near) & (p[:, 2] - reach <= view.far)
+        order = np.flatnonzero(drawn)
+        order = order[np.argsort(self.key[order], kind="stable")]
+        self.order = order
+
+        normal = np.cross(unit_a, unit_b)[order]
+        a, b, p, mean, scale = a[order], b[order], p[order], mean[order], scale[order]
+        self.log_opacity, self.half_r2, self.reach = log_opacity[order], half_r2[order], reach[order]
+        self.labels = cloud.labels[order]
+        self.pz = p[:, 2]
+        rows = np.stack([a, b, p], axis=2)  # (n, xyz, uv1)
+        tw = rows[:, 2]
+        tu = view.fx * rows[:, 0] + view.cx * tw
+        tv = view.fy * rows[:, 1] + view.cy * tw
+        # the plane's height above the camera's centre decides its side, and whether it is edge-on
+        height = np.einsum("ij,ij->i", normal, p)
+        edge_on = np.abs(height) <= 1e-13 * np.linalg.norm(p, axis=1)
+        sign = np.where(edge_on, 0.0, np.sign(height))
+        self.z_numerator = view.fx * view.fy * scale.prod(axis=1) * np.abs(height * sign)
+        self.forms = np.stack([np.cross(tu, tv), np.cross(tv, tw), np.cross(tw, tu)])
+        """(3, n, 3): constant, per x, per y; of n_u, n_v, D"""
+        self.forms[:, :, 2] *= sign
+
+        self.dot = self.pz >= view.near  # the low-pass dot belongs to the centre
+        with np.errstate(divide="ignore", invalid="ignore"):
+            self.center_x = np.where(self.dot, tu[:, 2] / self.pz, np.inf)
+            self.center_y = np.where(self.dot, tv[:, 2] / self.pz, np.inf)
+        # devices keep the forms about the pixel nearest to the centre; unknown here where that is behind
+        self.anchor_x = _anchor(self.center_x, self.dot, view.width)
+        self.anchor_y = _anchor(self.center_y, self.dot, view.height)
+        self.colors = _colors(cloud, order, mean - view.eye)
+        self.normal = normal * np.where(height > 0, -1.0, 1.0)[:, None]
+        self.screen = "lowpass_screen" in features.slots
+        self.exclusive = "stop_exclusive" in features.slots
+        self.planes = None
+        if "compose_planes" in features.slots and cloud.planes is not None:
+            self.planes = cloud.planes[order]
+
+
+def _anchor(center: np.ndarray, known: np.ndarray, size: int) -> np.ndarray:
+    nearest = np.clip(np.floor(np.where(known, center, 0.0)) + 0.5, 0.5, size - 0.5)
+    return np.where(known, nearest, -float(size))
+
+
+def _colors(cloud: SplatCloud, order: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    if cloud.sh is None:
+        return cloud.colors[order].astype(np.float64)  # type: ignore[index]
+    length = np.linalg.norm(rays, axis=1, keepdims=True)
+    directions = rays / np.where(length > 0, length, 1)
+    basis = sh_basis(cloud.sh_degree, directions)
+    return np.maximum(0.5 + np.einsum("nk,nkc->nc", basis, cloud.sh[order].astype(np.float64)), 0)
