@@ -1,6 +1,8 @@
 """Image files in and out: RGB pictures, one-bit marker images, PNG of colours, depth and labels."""
 
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -8,9 +10,6 @@ import numpy as np
 
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
-
-# a damaged file is our error in one line, not OpenCV's warning on stderr beside it
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
 def read_image(path: str | os.PathLike[str]) -> np.ndarray:
@@ -90,10 +89,25 @@ def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
         data = np.fromfile(path, np.uint8)
     except OSError as error:
         raise InputError(f"cannot read the image {path}: {error.strerror or error}") from error
-    try:
+    image = None
+    # OpenCV raises when there are more pixels than its limit
+    with _silent_opencv(), contextlib.suppress(cv2.error):
         image = cv2.imdecode(data, flags) if data.size else None
-    except cv2.error:  # too many pixels for OpenCV's limit
-        image = None
     if image is None:
         raise InputError(f"{path} is not an image that can be read; give a PNG, JPEG, BMP, TIFF or WebP file")
     return image
+
+
+@contextlib.contextmanager
+def _silent_opencv() -> Iterator[None]:
+    """A damaged file is our error in one line, without OpenCV's warnings on stderr beside it."""
+    if hasattr(cv2, "setLogLevel"):  # OpenCV 4
+        read, write = cv2.getLogLevel, cv2.setLogLevel  # type: ignore[attr-defined]
+    else:
+        read, write = cv2.utils.logging.getLogLevel, cv2.utils.logging.setLogLevel
+    before = read()
+    write(0)
+    try:
+        yield
+    finally:
+        write(before)
