@@ -40,6 +40,10 @@ class Camera:
     far: float = math.inf
     """metres along z, above near; a splat that lies wholly beyond it is not drawn"""
 
+    position: np.ndarray = None  # type: ignore[assignment]
+    """(3,) float64, centre of projection in the world, metres, read-only. By default it follows from
+    world_to_camera, which far from the origin has rounded it; a camera made from its position keeps it"""
+
     def __post_init__(self) -> None:
         put = object.__setattr__
         for name in ("width", "height"):
@@ -56,14 +60,31 @@ class Camera:
             raise InputError(f"camera far ({self.far!r}) must be above near ({self.near!r})")
         check_similarity(self.world_to_camera, "camera world_to_camera", rigid=True)
         matrix = np.array(self.world_to_camera, dtype=np.float64)
-        matrix.flags.writeable = False
-        put(self, "world_to_camera", matrix)
+        rotation, moved = matrix[:3, :3], matrix[:3, 3]
+        if self.position is None:
+            # by the inverse, not the transpose: a rotation from a float32 file is orthonormal to 1e-7 only
+            position = np.linalg.solve(rotation, -moved) + 0.0
+        else:
+            position = _vector("position", self.position)
+            if np.abs(rotation @ position + moved).max() > 1e-6 * (1 + np.abs(position).max()):
+                raise InputError(
+                    f"camera position {tuple(position.tolist())} is not that of its world_to_camera; "
+                    "leave it out"
+                )
+        for name, array in (("world_to_camera", matrix), ("position", position)):
+            array.flags.writeable = False
+            put(self, name, array)
 
     @staticmethod
-    def pinhole(width, height, fx, fy, cx, cy, world_to_camera=None, near=0.01, far=math.inf) -> "Camera":
-        """A camera from its intrinsics (pixels) and its pose (4, 4), the identity when left out."""
+    def pinhole(
+        width, height, fx, fy, cx, cy, world_to_camera=None, near=0.01, far=math.inf, position=None
+    ) -> "Camera":
+        """A camera from its intrinsics (pixels) and its pose (4, 4), the identity when left out.
+
+        position (3,): the exact centre of projection, where the pose was made from one.
+        """
         pose = np.eye(4) if world_to_camera is None else world_to_camera
-        return Camera(width, height, fx, fy, cx, cy, pose, near, far)
+        return Camera(width, height, fx, fy, cx, cy, pose, near, far, position)  # type: ignore[arg-type]
 
     @staticmethod
     def look_at(
@@ -77,12 +98,7 @@ class Camera:
         width, height = _size("width", width), _size("height", height)
         f = focal_length(width, fov_x)
         pose = look_at_matrix(position, target, up)
-        return Camera(width, height, f, f, width / 2, height / 2, pose, near, far)
-
-    @property
-    def position(self) -> np.ndarray:
-        """Centre of projection (3,) float64 in the world, metres."""
-        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+        return Camera(width, height, f, f, width / 2, height / 2, pose, near, far, position)
 
     @property
     def matrix(self) -> np.ndarray:
@@ -94,7 +110,7 @@ class Camera:
         world = np.asarray(points, dtype=np.float64)
         if world.ndim != 2 or world.shape[1] != 3:
             raise InputError(f"points must have the shape (n, 3), but the shape is {world.shape}")
-        x, y, z = (world @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]).T
+        x, y, z = ((world - self.position) @ self.world_to_camera[:3, :3].T).T
         z = np.where(z > 0, z, np.nan)
         return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=1)
 

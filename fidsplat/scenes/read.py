@@ -76,6 +76,7 @@ def _camera(table: Table) -> Camera:
     else:
         raise table.error("fov_x_deg", "is missing (or fx and fy)")
     cx, cy = table.number("cx", width / 2), table.number("cy", height / 2)
+    position = None
     if "world_to_camera" in table:
         for key in ("position", "look_at", "up"):
             if key in table:
@@ -88,7 +89,7 @@ def _camera(table: Table) -> Camera:
         with table.at("look_at"):
             pose = look_at_matrix(position, look_at, table.numbers("up", 3, (0.0, -1.0, 0.0)))
     with table.at():
-        return Camera.pinhole(width, height, fx, fy, cx, cy, pose, near, far)
+        return Camera.pinhole(width, height, fx, fy, cx, cy, pose, near, far, position)
 
 
 def _pose(table: Table, scale: float = 1.0):

@@ -87,6 +87,24 @@ def test_a_turned_and_moved_camera():
     np.testing.assert_allclose(turn @ camera.position + [1, 2, 3], 0, atol=1e-12)
 
 
+def test_a_position_far_from_the_origin_is_kept():
+    position = [500_000.125, 4_500_000.25, 300.5]
+    camera = fs.Camera.look_at(64, 48, 1.0, position, [500_003, 4_500_001, 301])
+    assert camera.position.tolist() == position
+    assert camera.project([[500_003, 4_500_001, 301]])[0] == pytest.approx([32, 24], abs=1e-9)
+    # a rotation that is orthonormal to float32 only: the transpose would be off by 0.3 m
+    pose = np.eye(4)
+    pose[:3, :3] = quaternion_to_matrix(np.array([0.9, 0.1, -0.3, 0.2])) * (1 + 1e-7)
+    pose[:3, 3] = -pose[:3, :3] @ position
+    camera = fs.Camera.pinhole(64, 48, 50, 50, 32, 24, pose)
+    np.testing.assert_allclose(camera.position, position, atol=1e-8, rtol=0)
+
+
+def test_a_position_of_another_pose():
+    with pytest.raises(fs.InputError, match="position .* is not that of its world_to_camera"):
+        fs.Camera.pinhole(64, 48, 50, 50, 32, 24, np.eye(4), position=(0, 0, 1))
+
+
 def test_frozen():
     pose = np.eye(4)
     camera = fs.Camera.pinhole(4, 4, 1, 1, 2, 2, pose)
