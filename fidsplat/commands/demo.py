@@ -1,5 +1,6 @@
 """`fidsplat demo`."""
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
@@ -38,9 +39,12 @@ Examples:
         if self.json:
             print_json(result.as_dict())
         else:
-            heads = ("view", "marker", "visible", "found", "position", "angle", "splats", "frame")
-            print_table(
-                where, f"fidsplat demo on {result.device}", heads, (_row(s, result) for s in result.sightings)
+            heads = ("view", "marker", "seen", "found", "mm", "%", "deg", "splats", "ms")
+            rows = (_row(s, result) for s in result.sightings)
+            print_table(where, f"fidsplat demo on {result.device}", heads, rows)
+            where.print(
+                "seen: how much of it is in view. Errors: position in mm and in % of the distance, angle in "
+                "degrees. ms: a frame with colour, depth, normals and labels."
             )
             markers = sum(result.marker_splats.values())
             where.print(
@@ -62,12 +66,11 @@ Examples:
 def _row(sighting: "Sighting", result: "DemoResult") -> tuple[str, ...]:
     reading = sighting.reading
     spec = reading.placed.marker.spec
-    if reading.position_error is None or reading.angle_error is None:
-        errors = ("-", "-")
-    else:
+    errors = ("-", "-", "-")
+    if reading.position_error is not None and reading.angle_error is not None:
         share = 100 * reading.position_error / reading.distance
-        degrees = reading.as_dict()["angle_error_deg"]
-        errors = (f"{reading.position_error * 1e3:.1f} mm, {share:.2f} %", f"{degrees:.2f} deg")
+        angle = math.degrees(reading.angle_error)
+        errors = (f"{reading.position_error * 1e3:.1f}", f"{share:.2f}", f"{angle:.2f}")
     return (
         sighting.view,
         spec,
@@ -75,5 +78,5 @@ def _row(sighting: "Sighting", result: "DemoResult") -> tuple[str, ...]:
         "no" if reading.detection is None else "yes",
         *errors,
         str(result.marker_splats[spec]),
-        f"{result.frame_ms[sighting.view]:.1f} ms",
+        f"{result.frame_ms[sighting.view]:.1f}",
     )

@@ -46,15 +46,19 @@ def print_json(value: dict[str, Any]) -> None:
 
 def print_table(where: Console, title: str, heads: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """A table under its title; texts are taken as they are, not as markup, and broken rather than cut."""
-    from rich.box import SIMPLE_HEAD
     from rich.table import Table
     from rich.text import Text
 
     table = Table(
-        title=Text(title), title_justify="left", show_header=any(heads), box=SIMPLE_HEAD, pad_edge=False
+        title=Text(title, "bold"),
+        title_justify="left",
+        show_header=any(heads),
+        header_style="underline",
+        box=None,
+        padding=(0, 2, 0, 0),
     )
     for head in heads:
-        table.add_column(head, overflow="fold")
+        table.add_column(Text(head), overflow="fold")
     for row in rows:
         table.add_row(*(Text(str(cell)) for cell in row))
     where.print(table)

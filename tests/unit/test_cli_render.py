@@ -66,7 +66,9 @@ def test_a_scene_is_drawn_and_read_back(scene, tmp_path, capsys):
     assert marker["corner_error_px"] < 0.5
     assert facts["not_in_scene"] == []
     assert main(["detect", "scene.png", "--scene", scene]) == 0
-    assert "Against scene.toml" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "Against scene.toml" in out
+    assert "position [mm]" in out
 
 
 def test_every_plane_is_a_file(scene, tmp_path, capsys):
