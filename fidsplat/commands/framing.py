@@ -5,18 +5,21 @@ import math
 import numpy as np
 
 from fidsplat.cameras import Camera
+from fidsplat.rotations import quaternion_to_matrix
 from fidsplat.splats import SplatCloud
 
 WIDTH, HEIGHT = 1280, 720
 FOV_X = math.radians(60.0)
-MARGIN = 1.05
-# captured scenes have strays far away; a cloud of this many is framed without the outermost 1 % of its
-# centres
+MARGIN = 1.1
+# a splat counts as far as it is plainly seen; at 3 standard deviations it would be fitted tails that fill
+# the picture
+REACH = 1.5
+# captured scenes have strays far away; a cloud of this many is framed without the outermost 1 % of its splats
 MANY = 10_000
 
 
 def framing_camera(cloud: SplatCloud) -> Camera:
-    """A camera on the -z side, y down, that sees the whole cloud; 1280 x 720 pixels, 60 degrees wide."""
+    """A camera on the -z side, y down, that sees all of the cloud; 1280 x 720 pixels, 60 degrees wide."""
     low, high = _extent(cloud)
     middle, half = (low + high) / 2, np.maximum((high - low) / 2, 1e-6)
     tangent = math.tan(FOV_X / 2)
@@ -27,7 +30,9 @@ def framing_camera(cloud: SplatCloud) -> Camera:
 def _extent(cloud: SplatCloud) -> tuple[np.ndarray, np.ndarray]:
     if len(cloud) == 0:
         return -np.ones(3), np.ones(3)
-    if len(cloud) < MANY:
-        return cloud.bounds()
-    low, high = np.percentile(cloud.means.astype(np.float64), (0.5, 99.5), axis=0)
+    tangents = quaternion_to_matrix(cloud.quats)[:, :, :2]
+    reach = REACH * np.sqrt(((tangents * cloud.scales[:, None, :]) ** 2).sum(2))
+    share = 0.5 if len(cloud) >= MANY else 0.0
+    low = np.percentile(cloud.means - reach, share, axis=0)
+    high = np.percentile(cloud.means + reach, 100 - share, axis=0)
     return low + cloud.origin, high + cloud.origin

@@ -6,6 +6,8 @@ camera records; picture and model are blurred alike before they are compared, so
 steps moves no edge.
 """
 
+from collections.abc import Iterable
+
 import cv2
 import numpy as np
 
@@ -28,7 +30,7 @@ _QUIET = 1  # modules of light ground around the code that the model includes
 
 
 def align(
-    grey: np.ndarray, corners: np.ndarray, bits: np.ndarray, unsure: int | None = None
+    grey: np.ndarray, corners: np.ndarray, bits: np.ndarray, unsure: Iterable[int] = ()
 ) -> np.ndarray | None:
     """Better corners of a code whose modules and rough corners are known.
 
@@ -36,14 +38,17 @@ def align(
         grey: (h, w) uint8.
         corners: (4, 2) pixel coordinates TL, TR, BR, BL of the code's outer edge, within half a module.
         bits: (n, n) uint8, 1 = dark, without quiet zone.
-        unsure: number of a corner that may be off by two modules; it is looked for when all is not well.
+        unsure: numbers of corners of which one may be off by two modules; each in turn is looked for when the
+            given corners lead nowhere.
 
     Returns (4, 2) float64, or None when the pattern does not settle near the given corners.
     """
     rough = np.asarray(corners, np.float64)
     found = _settled(grey, rough, bits)
-    if found is None and unsure is not None:
-        found = _settled(grey, _best_start(grey, rough, bits, unsure), bits)
+    for corner in unsure:
+        if found is not None:
+            break
+        found = _settled(grey, _best_start(grey, rough, bits, corner), bits)
     return found
 
 

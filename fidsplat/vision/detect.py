@@ -89,7 +89,8 @@ def _tags(grey: np.ndarray, kind: str, family: str) -> list[Detection]:
             rough = quad.reshape(4, 2).astype(np.float64) + 0.5
             tag = Detection(kind, family, int(tag_id), None, rough)
             if not any(_same_place(tag, old) for old in found):
-                better = align(grey, rough, dictionary_bits(kind, family, int(tag_id)))
+                # a dark line that touches a corner can pull it a module away
+                better = align(grey, rough, dictionary_bits(kind, family, int(tag_id)), unsure=range(4))
                 found.append(tag if better is None else replace(tag, corners=better))
     return sorted(found, key=lambda tag: tag.id or 0)
 
@@ -124,7 +125,7 @@ def _qr(grey: np.ndarray, code: zxingcpp.Barcode, scale: np.ndarray) -> Detectio
     rough = np.array([(p.x, p.y) for p in points], np.float64) * scale
     bits = (np.array(code.to_image(scale=1, add_quiet_zones=False)) == 0).astype(np.uint8)
     # its fourth corner has no finder pattern and, in the smallest codes, nothing else: it can be a module off
-    better = align(grey, rough, bits, unsure=2)
+    better = align(grey, rough, bits, unsure=(2,))
     version = (bits.shape[0] - 17) // 4
     family = f"v{version}-{code.ec_level}"
     return Detection("qr", family, None, code.text, rough if better is None else better)

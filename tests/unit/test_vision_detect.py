@@ -9,7 +9,7 @@ from fidsplat.cameras import Camera
 from fidsplat.errors import InputError
 from fidsplat.vision.align import align
 from fidsplat.vision.detect import DEFAULT_FAMILIES, detect
-from fidsplat.vision.dictionaries import dictionary_bits, families, parse_family
+from fidsplat.vision.dictionaries import dictionary_bits, families, parse_family, predefined
 from fidsplat.vision.pose import marker_pose, pose_error
 
 CAMERA = Camera.pinhole(480, 400, 700, 700, 240, 200)
@@ -155,6 +155,16 @@ def test_align_gives_up_rather_than_slide_to_another_place():
     assert align(255 - picture, corners, bits) is None
 
 
+def test_a_dark_line_at_a_corner_does_not_move_it():
+    picture, corners, _ = seen(dictionary_bits("apriltag", "36h11", 5), 240, tilt=5, spin=3)
+    x, y = np.rint(corners[0]).astype(int)
+    picture[y + 1 : y + 6, x - 30 : x + 3] = 25
+    rough, _, _ = cv2.aruco.ArucoDetector(predefined("apriltag", "36h11")).detectMarkers(picture)
+    assert corner_error(rough[0].reshape(4, 2) + 0.5, corners) > 10, "it misleads OpenCV"
+    (tag,) = detect(picture)
+    assert corner_error(tag.corners, corners) < 0.1
+
+
 @pytest.mark.parametrize(("along", "across"), [(1.2, 0.0), (-1.0, 1.1), (0.4, -1.6)])
 def test_align_finds_a_fourth_corner_that_is_a_module_off(along, across):
     bits = qr_bits("fourteen signs")
@@ -162,7 +172,7 @@ def test_align_finds_a_fourth_corner_that_is_a_module_off(along, across):
     rough = corners.copy()
     rough[2] += (along * (corners[2] - corners[3]) + across * (corners[2] - corners[1])) / bits.shape[0]
     assert align(picture, rough, bits) is None
-    mended = align(picture, rough, bits, unsure=2)
+    mended = align(picture, rough, bits, unsure=[2])
     assert mended is not None
     assert corner_error(mended, corners) < 0.1
 
