@@ -83,7 +83,9 @@ def main() -> None:
             f"{row['pairs']:,}",
             f"{row['mean_rgb']:.4f}",
         )
-    Console().print(table)
+    console = Console()
+    console.width = max(console.width, 120)  # numbers are not to be broken
+    console.print(table)
 
 
 if __name__ == "__main__":
