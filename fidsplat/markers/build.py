@@ -6,12 +6,20 @@ import math
 import time
 from dataclasses import dataclass, field
 from functools import cached_property
+from numbers import Real
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.markers.mixture import Template, fitted_growth, fitted_templates, paper_template, place
+from fidsplat.markers.mixture import (
+    Template,
+    fitted_growth,
+    fitted_templates,
+    paper_template,
+    place,
+    whole_number,
+)
 from fidsplat.markers.partition import partition
 from fidsplat.markers.regions import label_components, polygons
 from fidsplat.markers.seams import grow
@@ -141,11 +149,7 @@ def marker(
         raise InputError(
             f"{spec} has {bits.shape[1]} x {bits.shape[0]} modules; at most {MAX_MODULES} a side are made"
         )
-    if isinstance(quiet, bool) or int(quiet) != quiet or not 0 <= quiet <= longest // 2:
-        raise InputError(
-            f"the quiet zone is {quiet!r}; it must be a whole number of modules from 0 to {longest // 2}"
-        )
-    quiet = int(quiet)
+    quiet = whole_number("the quiet zone", quiet, 0, longest // 2)
 
     grid = np.pad(bits, quiet)
     labels, components = label_components(grid)
@@ -186,14 +190,14 @@ def _mixture(
     else:
         raise InputError(f"unknown mixture {name!r}; known: {', '.join(MIXTURES)}")
     growth = default if growth is None else growth
-    if not 0 <= growth <= 1:
+    if not (isinstance(growth, Real) and 0 <= growth <= 1):
         raise InputError(f"growth is {growth!r}; it must lie from 0 to 1 module")
     return templates, float(growth)
 
 
 def _check_size(size: float) -> None:
-    # below and above, a module or a splat's scale leaves the range of float32
-    if not (isinstance(size, (int, float)) and 1e-9 <= size <= 1e9):
+    # beyond these, a module or a splat's scale leaves the range of float32
+    if not (isinstance(size, Real) and 1e-9 <= size <= 1e9):
         raise InputError(f"the marker's size is {size!r}; it must be a length from 1e-9 to 1e9 metres")
 
 

@@ -9,6 +9,7 @@ docs/markers.md.
 from __future__ import annotations
 
 import json
+import operator
 from functools import cache
 from importlib.resources import files
 from typing import NamedTuple
@@ -49,8 +50,8 @@ def paper_template(levels: int = 4, density: int = 3, duplicates: bool = False) 
     Raises:
         InputError: levels or density out of range.
     """
-    levels = _whole("levels", levels, MAX_LEVELS)
-    density = _whole("density", density, MAX_DENSITY)
+    levels = whole_number("levels", levels, 1, MAX_LEVELS)
+    density = whole_number("density", density, 1, MAX_DENSITY)
     rows = [np.array([[0.0, 0.0, 1 / GAMMA, 1 / GAMMA, 1.0]])] * (density if levels > 1 else 1)
     for level in range(1, levels):
         d, sigma = 1 - 2.0**-level, 2.0**-level / GAMMA
@@ -69,10 +70,15 @@ def paper_template(levels: int = 4, density: int = 3, duplicates: bool = False) 
     return np.concatenate(rows)
 
 
-def _whole(name: str, value: int, largest: int) -> int:
-    if isinstance(value, bool) or int(value) != value or not 1 <= value <= largest:
-        raise InputError(f"{name} is {value!r}; it must be a whole number from 1 to {largest}")
-    return int(value)
+def whole_number(name: str, value: int, low: int, high: int) -> int:
+    """The value as an int. Raises InputError unless it is a whole number within the range."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or not low <= number <= high:
+        raise InputError(f"{name} is {value!r}; it must be a whole number from {low} to {high}")
+    return number
 
 
 @cache

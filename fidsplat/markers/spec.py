@@ -114,12 +114,14 @@ def _qr_bits(spec: Spec) -> tuple[Spec, np.ndarray]:
 
     payload = spec.payload or ""
     try:
-        code = segno.make_qr(payload, error=spec.level, version=spec.version, mode="byte", boost_error=False)
+        encoding = _encoding(payload)
+        options = {"version": spec.version, "encoding": encoding, "mode": "byte", "boost_error": False}
+        code = segno.make_qr(payload, error=spec.level, **options)
     except DataOverflowError:
-        version = spec.version or _VERSIONS[-1]
+        version, size = spec.version or _VERSIONS[-1], len(payload.encode(_encoding(payload)))
         raise InputError(
-            f"the text takes {_byte_count(payload)} bytes, but a QR code of version {version} at level "
-            f"{spec.level} holds {qr_capacity(version, spec.level)}; shorten it"
+            f"the text takes {size} bytes, but a QR code of version {version} at level {spec.level} "
+            f"holds {qr_capacity(version, spec.level)}; shorten it"
             + ("" if version == _VERSIONS[-1] else ", or ask for a higher version")
             + ("" if spec.level == "L" else ", or a lower level")
         ) from None
@@ -129,24 +131,18 @@ def _qr_bits(spec: Spec) -> tuple[Spec, np.ndarray]:
     return replace(spec, family=f"v{code.version}-{code.error}", version=int(code.version)), bits
 
 
-def _byte_count(text: str) -> int:
-    """Bytes that segno writes: ISO 8859-1 where the text fits into it, else UTF-8."""
+def _encoding(text: str) -> str:
+    """ISO 8859-1, which readers assume, where the text fits into it; else UTF-8, which they recognise."""
     try:
-        return len(text.encode("iso-8859-1"))
+        text.encode("iso-8859-1")
     except UnicodeEncodeError:
-        return len(text.encode("utf-8"))
+        return "utf-8"
+    return "iso-8859-1"
 
 
 def qr_capacity(version: int, level: str) -> int:
     """Bytes that a QR code of that version (1 to 40) and level (L, M, Q, H) holds in byte mode."""
     from segno import consts
 
-    bits = consts.SYMBOL_CAPACITY[version][
-        {
-            "L": consts.ERROR_LEVEL_L,
-            "M": consts.ERROR_LEVEL_M,
-            "Q": consts.ERROR_LEVEL_Q,
-            "H": consts.ERROR_LEVEL_H,
-        }[level]
-    ]
+    bits = consts.SYMBOL_CAPACITY[version][consts.ERROR_MAPPING[level]]
     return (bits - 4 - (8 if version < 10 else 16)) // 8

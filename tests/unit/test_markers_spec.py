@@ -1,0 +1,123 @@
+"""Marker specs and the bits that they stand for."""
+
+import cv2
+import numpy as np
+import pytest
+
+from fidsplat.errors import InputError
+from fidsplat.markers import marker, parse_spec
+from fidsplat.markers.spec import bits_of, qr_capacity
+from fidsplat.vision.detect import detect
+from fidsplat.vision.dictionaries import dictionary_bits, families
+
+
+def printed(bits: np.ndarray, pixels: int = 8) -> np.ndarray:
+    """A picture of the code, with 4 modules of white around."""
+    return np.kron(255 * (1 - np.pad(bits, 4)), np.ones((pixels, pixels))).astype(np.uint8)
+
+
+def test_parts_of_a_spec():
+    tag = parse_spec("apriltag:36h11:5")
+    assert (tag.kind, tag.family, tag.id) == ("apriltag", "36h11", 5)
+    tag = parse_spec("ArUco:4X4_50:07")
+    assert (tag.kind, tag.family, tag.id) == ("aruco", "4x4_50", 7)
+    code = parse_spec("qr:a:b ")
+    assert (code.kind, code.payload, code.version, code.level) == ("qr", "a:b ", None, "L")
+    for text, version, level in (("qr-v22-H:x", 22, "H"), ("qr-v3:x", 3, "L"), ("qr-q:x", None, "Q")):
+        code = parse_spec(text)
+        assert (code.version, code.level) == (version, level)
+    image = parse_spec("image:C:\\logo.png")
+    assert (image.kind, image.payload) == ("image", "C:\\logo.png")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "apriltag:FAMILY:ID"),
+        ("36h11", "apriltag:FAMILY:ID"),
+        ("datamatrix:x", "unknown kind of marker 'datamatrix'"),
+        ("apriltag:36h11", "lacks a family or an id"),
+        ("apriltag:36h11:five", "'five' is not a whole number"),
+        ("apriltag:36h11:-1", "'-1' is not a whole number"),
+        ("apriltag:36h11:²", "is not a whole number"),
+        ("apriltag:36h11:587", "0 to 586"),
+        ("apriltag:36h12:0", "36h10, 36h11"),
+        ("aruco:36h11:0", "4x4_50"),
+        ("aruco:4x4_50:50", "0 to 49"),
+        ("qr:", "no text"),
+        ("qr-v0:x", "versions are 1 to 40"),
+        ("qr-v41-L:x", "versions are 1 to 40"),
+        ("qr-v2-X:x", "levels are L, M, Q, H"),
+        ("qr-2:x", "qr-v22-L:TEXT"),
+        ("qr:\ud800", "UTF-8"),
+        ("image:", "names no file"),
+        ("image:/no/such/file.png", "/no/such/file.png"),
+    ],
+)
+def test_errors_say_what_would_be_right(text, says):
+    with pytest.raises(InputError) as error:
+        bits_of(parse_spec(text))
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_spec_is_text():
+    with pytest.raises(InputError, match="not 5"):
+        parse_spec(5)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", ["apriltag", "aruco"])
+def test_every_dictionary(kind):
+    for family, (size, count) in families(kind).items():
+        made = marker(f"{kind}:{family}:{count - 1}")
+        assert made.bits.shape == (size, size)
+        assert np.array_equal(made.bits, dictionary_bits(kind, family, count - 1))
+        assert made.grid.shape == (size + 2, size + 2)
+        with pytest.raises(InputError, match=f"0 to {count - 1}"):
+            marker(f"{kind}:{family}:{count}")
+
+
+@pytest.mark.parametrize("level", "LMQH")
+def test_qr_level_is_never_boosted_and_the_smallest_version_is_taken(level):
+    spec, bits = bits_of(parse_spec(f"qr-{level}:{'x' * 14}"))
+    # 14 bytes: version 1 up to M, 2 at Q and H; segno alone would raise L to M
+    assert spec.family == f"v{1 if level in 'LM' else 2}-{level}"
+    # the level stands in the first two format bits, masked with 10
+    bits_of_level = {"L": (1, 1), "M": (1, 0), "Q": (0, 1), "H": (0, 0)}
+    assert tuple(bits[8, :2]) == bits_of_level[level]
+
+
+@pytest.mark.parametrize("version", [1, 2, 5, 9, 10, 22, 26, 27, 40])
+@pytest.mark.parametrize("level", "LH")
+def test_qr_capacity_is_exact(version, level):
+    room = qr_capacity(version, level)
+    spec, bits = bits_of(parse_spec(f"qr-v{version}-{level}:{'x' * room}"))
+    assert spec.family == f"v{version}-{level}"
+    assert bits.shape == (17 + 4 * version,) * 2
+    with pytest.raises(InputError, match=f"takes {room + 1} bytes.*version {version} .*holds {room};"):
+        bits_of(parse_spec(f"qr-v{version}-{level}:{'x' * (room + 1)}"))
+
+
+def test_a_version_higher_than_needed_is_kept():
+    assert bits_of(parse_spec("qr-v22-L:hello"))[1].shape == (105, 105)
+
+
+@pytest.mark.parametrize("text", ["hello", "123456", "HELLO", "café: 5 µm", "10 € für 日本語", "a:b:c"])
+def test_qr_codes_read_back_as_written(text):
+    bits = bits_of(parse_spec(f"qr:{text}"))[1]
+    assert [found.payload for found in detect(printed(bits), families=())] == [text]
+
+
+def test_image_files(tmp_path):
+    bits = np.array([[1, 0, 1], [0, 0, 1]], np.uint8)
+    file = tmp_path / "a picture.png"
+    cv2.imwrite(str(file), 255 * (1 - bits))
+    made = marker(f"image:{file}", size=0.3)
+    assert np.array_equal(made.bits, bits)
+    assert np.array_equal(made.grid, bits)
+    assert (made.kind, made.family, made.id, made.payload) == ("image", None, None, str(file))
+    assert made.module == pytest.approx(0.1)
+    assert marker(f"image:{file}", quiet_zone=2).grid.shape == (6, 7)
+    cv2.imwrite(str(file), np.arange(12, dtype=np.uint8).reshape(3, 4))
+    with pytest.raises(InputError, match=r"a picture\.png"):
+        marker(f"image:{file}")
