@@ -73,7 +73,7 @@ def test_a_scene_is_drawn_and_read_back(scene, tmp_path, capsys):
 
 def test_every_plane_is_a_file(scene, tmp_path, capsys):
     words = "rgb,alpha,depth,depth_median,normal,label"
-    assert main(["render", scene, "-o", "frames", "--outputs", words, "--device", "reference", "--json"]) == 0
+    assert main(["render", scene, "-o", "frames", "--outputs", words, "--json"]) == 0
     assert sorted(said(capsys)["files"]) == sorted(f"frames/{name}" for name in names(tmp_path / "frames"))
     assert names(tmp_path / "frames") == {
         *("rgb.png", "alpha.png", "normal.png", "label.png", "label.npy"),
@@ -96,9 +96,11 @@ def test_a_name_with_png_is_the_colour_picture_and_other_planes_stand_beside_it(
     assert names(tmp_path / "new") == {"view.png", "view-label.png", "view-label.npy"}
 
 
-def test_the_outputs_of_the_scene_are_the_default(scene, tmp_path):
-    (tmp_path / "scene.toml").write_text(SCENE + 'outputs = ["depth"]\ndevice = "reference"\n')
-    assert main(["render", scene]) == 0
+def test_the_outputs_and_the_device_of_the_scene_are_the_default(scene, tmp_path, capsys):
+    small = SCENE.replace("width = 160", "width = 16").replace("height = 120", "height = 12")
+    (tmp_path / "scene.toml").write_text(small + 'outputs = ["depth"]\ndevice = "reference"\n')
+    assert main(["render", scene, "--json"]) == 0
+    assert said(capsys)["device"] == "reference"
     assert {"scene-depth.npy", "scene-depth.png", "scene-depth-turbo.png"} <= names(tmp_path)
     assert "scene.png" not in names(tmp_path)
 
