@@ -77,7 +77,10 @@ kernel void project(
     real pz = p.z, near = view[VIEW_NEAR];
     real3_ facet = cross3(a, b);        // unit normal
     real offset = dot3(facet, p);       // of the plane from the camera's centre
-    real su = fmax(scales[2 * i], SMALLEST_SCALE), sv = fmax(scales[2 * i + 1], SMALLEST_SCALE);
+    float scale_u = scales[2 * i], scale_v = scales[2 * i + 1];
+    // before fmax, which would make a number of a NaN (numerics E1)
+    if (!(scale_u >= 0.0f && scale_u < INFINITY && scale_v >= 0.0f && scale_v < INFINITY)) return;
+    real su = fmax(scale_u, SMALLEST_SCALE), sv = fmax(scale_v, SMALLEST_SCALE);
     a.x *= su; a.y *= su; a.z *= su;
     b.x *= sv; b.y *= sv; b.z *= sv;
 

@@ -82,8 +82,15 @@ class _PoisonedPool(BufferPool):
         return self._filled(super().fresh(name, size))
 
     def _filled(self, buffer: cl.Buffer) -> cl.Buffer:
-        cl.enqueue_fill_buffer(self._queue, buffer, np.uint8(0xFF), 0, buffer.size)
+        cl.enqueue_fill_buffer(self._queue, buffer, np.full(1, 0xFF, np.uint8), 0, buffer.size)
         return buffer
+
+
+def contents(backend: OpenCLBackend, buffer: cl.Buffer) -> np.ndarray:
+    """The bytes of a buffer (size,) uint8."""
+    array = np.empty(buffer.size, np.uint8)
+    cl.enqueue_copy(backend.queue, array, buffer)
+    return array
 
 
 def _buffer(backend: OpenCLBackend, array: np.ndarray) -> cl.Buffer:

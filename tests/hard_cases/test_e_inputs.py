@@ -1,0 +1,63 @@
+"""Group E: inputs, sizes, integers."""
+
+import numpy as np
+import pytest
+from agreement import random_splats
+from cases import assert_holds
+
+import fidsplat as fs
+from fidsplat.hard_cases import group_e
+from fidsplat.hard_cases.agreement import COLOR_TOLERANCE, Picture, truth_of
+
+
+@pytest.mark.parametrize("case", group_e.CASES, ids=lambda case: case.name)
+def test_case(renderer, case):
+    assert_holds(renderer, case)
+
+
+def test_every_entry_of_the_catalogue_is_there():
+    assert [case.name for case in group_e.CASES] == ["E1", "E2", "E3", "E4", "E5"]
+
+
+@pytest.mark.parametrize(("width", "height"), [(32767, 3), (3, 32767), (4001, 1003)])
+def test_the_largest_grids_at_a_few_pixels(renderer, width, height):
+    """E4: tens of thousands of tiles; the reference judges 200 pixels."""
+    cloud = random_splats(60, seed=45, depth=(1.0, 4.0), scale=(0.01, 0.3))
+    camera = group_e.sized(width, height)
+    generator = np.random.default_rng(0)
+    pixels = generator.integers(0, height, 200), generator.integers(0, width, 200)
+    truth = truth_of(Picture(cloud, camera), pixels)
+    frame = renderer.render(cloud, camera, ("rgb", "alpha"), background=(0.1, 0.2, 0.3))
+    for name in ("rgb", "alpha"):
+        error = np.abs(frame[name][pixels] - truth[name])
+        error = error.max(-1) if error.ndim > 1 else error
+        assert (error <= COLOR_TOLERANCE + truth["certificate"]).all(), name
+
+
+def opencl(renderer):
+    if not renderer.device.name.startswith("opencl"):
+        pytest.skip("buffers of the OpenCL backend")
+    return renderer.backend
+
+
+def test_a_buffer_that_the_device_cannot_give_is_an_error_with_a_remedy(renderer):
+    """E3: nothing is allocated beyond the device's limit, and the message says what to do."""
+    backend = opencl(renderer)
+    limit = renderer.device.largest_allocation_bytes
+    with pytest.raises(fs.DeviceError, match=r"lists needs \d+ MiB .* use fewer splats or a smaller picture"):
+        backend.pool.fresh("lists", limit + 1)
+
+
+def test_poison_reaches_every_buffer(renderer):
+    """E5 would prove nothing if the buffers were clean."""
+    from fidsplat.backends.opencl import probe
+
+    backend = opencl(renderer)
+    taken = []
+    with probe.poisoned(backend):
+        filled = backend.pool._filled
+        backend.pool._filled = lambda buffer: taken.append(buffer) or filled(buffer)
+        renderer.render(random_splats(20, seed=1, depth=(1, 3)), group_e.VIEW, ("rgb", "depth"))
+        again = probe.contents(backend, filled(backend.pool.scratch("splats", 64)))
+    assert len(taken) > 15
+    assert (again == 0xFF).all()
