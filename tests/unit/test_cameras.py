@@ -101,7 +101,7 @@ def test_a_position_far_from_the_origin_is_kept():
 
 
 def test_a_position_of_another_pose():
-    with pytest.raises(fs.InputError, match="position .* is not that of its world_to_camera"):
+    with pytest.raises(fs.InputError, match=r"position .* is not that of its world_to_camera"):
         fs.Camera.pinhole(64, 48, 50, 50, 32, 24, np.eye(4), position=(0, 0, 1))
 
 

@@ -1,0 +1,73 @@
+"""Runs the device's own functions on given numbers (kernels/opencl/check/arithmetic.cl)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyopencl as cl
+
+from fidsplat.backends.opencl.assemble import kernel_text
+from fidsplat.errors import DeviceError
+
+if TYPE_CHECKING:
+    from fidsplat.backends.opencl.backend import OpenCLBackend
+
+_FILES = ("prelude.cl", "math.cl", "check/arithmetic.cl")
+
+
+def run_arithmetic(
+    backend: OpenCLBackend, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Results of the device's functions, float32 ones as the blend stage calls them.
+
+    Args:
+        exponents, shares, above, below: (n,) float64, n a multiple of 16; they are rounded to float32 where
+            float32 is computed.
+
+    Returns:
+        (n,) float32: `exp` of exponents, `log` of shares, `division` above / below, `sqrt` of below, `fma`
+        above * below + above, `native_exp`, `native_recip`; (n,) float64 where the device has it:
+        `division64`, `sqrt64`, `log64`; `denormal` (2,) float32: half of the smallest normal number, and
+        twice that.
+
+    Raises:
+        DeviceError: the device cannot compile or run the kernels.
+    """
+    lanes = backend.shape.lanes
+    defines = {"LANES": lanes, "FAST_FMA": 0, "SETUP_FP64": int(backend.info.float64)}
+    text = "".join(f"#define {name} {value}\n" for name, value in defines.items())
+    program = backend.build(text + "".join(map(kernel_text, _FILES)))
+    kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
+    n = len(exponents)
+    single = [array.astype(np.float32) for array in (exponents, shares, above, below)]
+    try:
+        planes = _run(backend, kernels["arithmetic_float"], n // lanes, n, single, 7)
+        names = ("exp", "log", "division", "sqrt", "fma", "native_exp", "native_recip")
+        results = dict(zip(names, planes, strict=True))
+        if backend.info.float64:
+            planes = _run(backend, kernels["arithmetic_real"], n, n, [above, below], 3)
+            results |= dict(zip(("division64", "sqrt64", "log64"), planes, strict=True))
+        smallest = np.array([np.finfo(np.float32).tiny, 0.5], np.float32)
+        given, out = (backend.pool.fresh("arithmetic", 16) for _ in range(2))
+        cl.enqueue_copy(backend.queue, given, smallest)
+        kernels["arithmetic_denormal"](backend.queue, (1,), (1,), given, out)
+        results["denormal"] = np.empty(2, np.float32)
+        cl.enqueue_copy(backend.queue, results["denormal"], out)
+    except cl.Error as error:
+        raise DeviceError(f"{backend.info.title} failed in a test of its arithmetic: {error}") from error
+    return results
+
+
+def _run(
+    backend: OpenCLBackend, kernel: cl.Kernel, items: int, n: int, inputs: list[np.ndarray], outputs: int
+) -> np.ndarray:
+    buffers = []
+    for array in inputs:
+        buffers.append(backend.pool.fresh("arithmetic", array.nbytes))
+        cl.enqueue_copy(backend.queue, buffers[-1], array)
+    planes = np.empty((outputs, n), inputs[0].dtype)
+    out = backend.pool.fresh("arithmetic", planes.nbytes)
+    kernel(backend.queue, (items,), None, np.uint32(n), *buffers, out)
+    cl.enqueue_copy(backend.queue, planes, out)
+    return planes

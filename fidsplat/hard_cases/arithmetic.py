@@ -1,0 +1,96 @@
+"""The error of a device's own arithmetic, in units of the last place (ulp), over the ranges that rendering
+uses.
+
+Only the precise functions are used (kernels/README.md); the fast ones are measured to show why.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fidsplat.hard_cases.case import Finding
+from fidsplat.hard_cases.clouds import log_uniform
+from fidsplat.render import Renderer
+
+_COUNT = 1 << 18
+# what OpenCL C 1.2 (section 7.4) promises of each function, in ulp
+BOUNDS = {
+    "exp": 3.0,
+    "log": 3.0,
+    "division": 2.5,
+    "sqrt": 3.0,
+    "fma": 0.5,
+    "division64": 0.5,
+    "sqrt64": 0.5,
+    "log64": 3.0,
+}
+FAST = ("native_exp", "native_recip")
+"""Functions of which nothing is promised, and which nothing uses."""
+
+
+@dataclass(frozen=True)
+class Arithmetic:
+    """What was measured on one device."""
+
+    float64: bool
+    """whether it has float64, for the per-splat set-up"""
+    denormals: bool
+    """whether it keeps float32 numbers below 1.2e-38"""
+    ulp: dict[str, float]
+    """largest error of each function of `BOUNDS` and `FAST` that the device has"""
+
+    @property
+    def findings(self) -> list[Finding]:
+        """Each function against what OpenCL promises, with room for the rounding of the truth itself."""
+        return [
+            Finding(f"{name} [ulp]", self.ulp[name], bound * 1.001)
+            for name, bound in BOUNDS.items()
+            if name in self.ulp
+        ]
+
+
+def measure(renderer: Renderer, seed: int = 0) -> Arithmetic | None:
+    """Measure a device on a quarter of a million arguments of each function; None for the reference.
+
+    exp of -14 to 0 (1e-6, the least cut-off of a preset, to 1), log of 2^-24 to 1 (transmittances), quotients
+    of 1e-9 to 1e9 by the same, roots of the same.
+
+    Raises:
+        DeviceError: the device cannot compile or run the kernels.
+    """
+    if renderer.device.platform == "reference":
+        return None
+    from fidsplat.backends.opencl.arithmetic import run_arithmetic
+
+    generator = np.random.default_rng(seed)
+    exponents = generator.uniform(-14, 0, _COUNT).astype(np.float32).astype(float)
+    shares = log_uniform(generator, 2.0**-24, 1.0, _COUNT).astype(np.float32).astype(float)
+    above, below = (
+        log_uniform(generator, 1e-9, 1e9, _COUNT).astype(np.float32).astype(float) for _ in range(2)
+    )
+    got = run_arithmetic(renderer.backend, exponents, shares, above, below)  # type: ignore[arg-type]
+    wide_above, wide_below = above.astype(np.longdouble), below.astype(np.longdouble)
+    truth = {
+        "exp": np.exp(exponents),
+        "log": np.log(shares),
+        "division": above / below,
+        "sqrt": np.sqrt(below),
+        "fma": above * below + above,
+        "native_exp": np.exp(exponents),
+        "native_recip": 1 / below,
+        "division64": wide_above / wide_below,
+        "sqrt64": np.sqrt(wide_below),
+        "log64": np.log(wide_below),
+    }
+    ulp = {name: _worst(got[name], truth[name]) for name in truth if name in got}
+    kept = bool(got["denormal"][0] > 0 and got["denormal"][1] == np.finfo(np.float32).tiny)
+    return Arithmetic(renderer.device.float64, kept, ulp)
+
+
+def _worst(got: np.ndarray, truth: np.ndarray) -> float:
+    spacing = np.spacing(np.abs(truth).astype(got.dtype))
+    # not np.max of the errors alone: a NaN must not be lost
+    errors = np.abs(got - truth) / spacing
+    return float(errors.max()) if np.isfinite(errors).all() else float("inf")

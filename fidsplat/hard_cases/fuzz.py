@@ -1,0 +1,112 @@
+"""Random scenes that are hard on purpose, each from its seed alone, and their comparison with the reference.
+
+The distribution is that of numerics.md, section 3: scales log-uniform from 1e-6 to 1e3 m, anisotropy to 1e6,
+depths from -5 to 1e5 m, every tenth splat edge-on within 1e-6 rad, every tenth across the near plane, every
+tenth in an exactly coplanar group, opacities on the thresholds.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
+from fidsplat.hard_cases.clouds import quaternion
+from fidsplat.quality import Quality
+from fidsplat.rotations import quaternion_multiply, quaternion_to_matrix
+from fidsplat.splats import SplatCloud
+
+LARGEST_SCENE = 200
+CUT = 1.0 / 255.0
+OPACITIES = np.float32([0.0, CUT * (1 - 1e-6), CUT * (1 + 1e-6), 0.5, 0.99, 1.0])
+# share of the scenes, and the quality they are drawn with
+QUALITIES = (
+    (0.5, Quality()),
+    (0.15, Quality.named("reference")),
+    (0.15, Quality(lowpass="none")),
+    (0.1, Quality(samples=2)),
+    (0.1, Quality.named("gsplat")),
+)
+
+
+def scene_of(seed: int) -> Picture:
+    """The picture of a seed: 1 to 200 splats, at most 80 x 64 pixels, the camera anywhere."""
+    generator = np.random.default_rng(seed)
+    count = int(generator.integers(1, LARGEST_SCENE + 1))
+    width, height = (int(generator.integers(1, limit + 1)) for limit in (80, 64))
+    focal = max(width, height) * math.exp(generator.uniform(math.log(0.4), math.log(4.0)))
+    near = float(generator.choice([0.01, 0.01, 0.2, 1.0]))
+
+    kind = generator.choice(4, count, p=[0.7, 0.1, 0.1, 0.1])  # plain, edge-on, crossing near, coplanar
+    depth = np.where(
+        generator.random(count) < 0.4,
+        generator.uniform(-5, 5, count),
+        np.exp(generator.uniform(math.log(near), math.log(1e5), count)),
+    )
+    span = np.array([width, height]) / 2 / focal
+    sideways = generator.uniform(-1.3, 1.3, (count, 2)) * span * np.maximum(np.abs(depth), 0.1)[:, None]
+    means = np.column_stack([sideways, depth])
+    quats = generator.normal(size=(count, 4))
+    large = np.exp(generator.uniform(math.log(1e-6), math.log(1e3), count))
+    scales = np.column_stack([large, large / np.exp(generator.uniform(0, math.log(1e6), count))])
+    swap = generator.random(count) < 0.5
+    scales[swap] = scales[swap, ::-1]
+
+    for k in np.flatnonzero(kind == 1):
+        quats[k] = _edge_on(generator, means[k])
+    for k in np.flatnonzero(kind == 2):
+        # the disk's reach along z is up to three standard deviations: the centre lies within it
+        axes = quaternion_to_matrix(quats[k])[2, :2] * scales[k]
+        means[k, 2] = near + generator.uniform(-3, 3) * np.linalg.norm(axes)
+    planes = _coplanar(generator, np.flatnonzero(kind == 3), means, quats)
+
+    pose = np.eye(4)
+    if generator.random() < 0.5:
+        turn = generator.normal(size=4)
+        turn /= np.linalg.norm(turn)
+        pose[:3, :3] = quaternion_to_matrix(turn)
+        means = means @ pose[:3, :3]
+        quats = quaternion_multiply(turn * [1, -1, -1, -1], quats)
+    cloud = SplatCloud(
+        means.astype(np.float32),
+        quats,
+        scales,
+        generator.choice(OPACITIES, count),
+        colors=generator.uniform(0, 1, (count, 3)),
+        labels=generator.integers(0, 9, count),
+    ).with_planes(planes)
+    center = generator.uniform(-0.2, 1.2, 2) * [width, height]
+    camera = Camera.pinhole(width, height, focal, focal, *center, pose, near=near)
+    shares, qualities = zip(*QUALITIES, strict=True)
+    quality = qualities[int(generator.choice(len(qualities), p=shares))]
+    return Picture(cloud, camera, quality, ALL_OUTPUTS)
+
+
+def _edge_on(generator: np.random.Generator, mean: np.ndarray) -> np.ndarray:
+    """Quaternion (4,) of a splat at `mean` whose plane holds the camera within 1e-6 rad."""
+    ray = mean / np.linalg.norm(mean)
+    across = np.cross(ray, generator.normal(size=3))
+    across /= np.linalg.norm(across)
+    normal = across + generator.uniform(-1e-6, 1e-6) * ray
+    along = np.cross(normal, generator.normal(size=3))
+    return quaternion(along, np.cross(normal, along))
+
+
+def _coplanar(generator, chosen: np.ndarray, means: np.ndarray, quats: np.ndarray) -> np.ndarray:
+    """Puts the chosen splats on a few planes z = const, turned within them; returns ids of planes (n,)."""
+    planes = np.full(len(means), -1)
+    groups = generator.integers(0, 3, len(chosen))
+    for group in range(3):
+        members = chosen[groups == group]
+        depth = float(np.float32(math.exp(generator.uniform(math.log(0.3), math.log(30.0)))))
+        # half of the groups are known to be coplanar, the others only happen to be
+        known = generator.random() < 0.5
+        for k in members:
+            means[k, :2] *= depth / max(abs(means[k, 2]), 0.1)
+            means[k, 2] = depth
+            angle = generator.uniform(0, math.pi)
+            quats[k] = [math.cos(angle / 2), 0, 0, math.sin(angle / 2)]
+            planes[k] = group if known else -1
+    return planes

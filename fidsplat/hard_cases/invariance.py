@@ -1,0 +1,59 @@
+"""Pictures that must have the same bits: drawn again, in tiles of another size, without what is not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from fidsplat.backends.base import View
+from fidsplat.effects import select
+from fidsplat.hard_cases.agreement import Picture
+from fidsplat.render import Frame, Renderer
+
+CULLED = 0xFFFFFFFF
+"""depth key of a splat that is not drawn, on devices"""
+
+
+def draw(renderer: Renderer, picture: Picture) -> Frame:
+    """The picture on a device."""
+    return renderer.render(
+        picture.cloud, picture.camera, picture.outputs, picture.quality, picture.background
+    )
+
+
+def trace(renderer: Renderer, picture: Picture, shape=None) -> dict[str, np.ndarray]:
+    """What passes between the stages of a device, with the planes; `shape` replaces its build constants."""
+    features = select(picture.cloud, picture.outputs, picture.quality)
+    view = View.of(picture.camera, picture.quality, picture.cloud.origin, picture.background)
+    backend = renderer.backend
+    pipeline = backend.pipeline(features) if shape is None else backend.pipeline(features, shape)  # type: ignore[call-arg]
+    return pipeline.trace(backend.upload(picture.cloud), view)
+
+
+def differing(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray], outputs) -> int:
+    """Number of pixels whose bits differ in any of the outputs; all of them where the shapes differ."""
+    different = np.zeros((), bool)
+    for name in outputs:
+        one, other = (np.ascontiguousarray(planes[name]) for planes in (first, second))
+        if one.shape != other.shape:
+            return max(one.size, other.size)
+        unlike = one.view(np.uint32) != other.view(np.uint32)
+        different = different | (unlike.any(-1) if unlike.ndim == 3 else unlike)
+    return int(different.sum())
+
+
+def has_tiles(renderer: Renderer) -> bool:
+    """Whether the device draws in tiles whose size can be chosen."""
+    return hasattr(renderer.backend, "shape")
+
+
+def tile_shapes(renderer: Renderer) -> list:
+    """Build constants with other tiles: 8, 16 and 32 pixels where the schedule has them."""
+    own = renderer.backend.shape  # type: ignore[attr-defined]
+    if own.schedule == "lanes":
+        # a tile is as wide as the vector; a scalar exp may round otherwise than a vector one
+        sizes = [(lanes, height) for lanes, height in ((8, 8), (own.lanes, 32), (4, 16))]
+        return [replace(own, lanes=w, tile_width=w, tile_height=h) for w, h in sizes]
+    return [replace(own, tile_width=side, tile_height=side) for side in (8, 32)]
