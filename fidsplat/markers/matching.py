@@ -1,8 +1,8 @@
 """Maximum independent set of a bipartite graph: Hopcroft-Karp matching, then Koenig's vertex cover.
 
 Our own instead of networkx, which recurses once per edge of an augmenting path: a chord graph that is a long
-path, as a picture can bring about, overflows Python's stack. It is also three times as fast on the graph of a QR
-code of version 22, and spares an import that takes as long as the whole marker.
+path, as a picture can bring about, overflows Python's stack. It is also three times as fast on the graph of
+a QR code of version 22, and spares an import that takes as long as the whole marker.
 """
 
 from __future__ import annotations
