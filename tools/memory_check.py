@@ -1,0 +1,193 @@
+"""Runs the kernels under oclgrind, an interpreter of OpenCL that sees every access to memory, and reports
+invalid reads and writes, data races between work-items, and values used before anything has set them.
+
+    python tools/memory_check.py [--log FILE]
+
+It needs oclgrind (21.10 was used); on Debian: apt-get update && apt-get install oclgrind. Exit status 0:
+nothing was reported, and every picture agrees with the reference. Kernels with planted errors run first: if
+oclgrind does not report those, the check is worth nothing and fails too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+# Without optimisation, which may remove the very access that is wrong, and brings in LLVM's `freeze`, which
+# oclgrind's record of what has been set does not know.
+OCLGRIND = ["--data-races", "--uninitialized", "--build-options", "-cl-opt-disable", "--max-errors", "1000"]
+INSTALL = "apt-get update && apt-get install oclgrind"
+
+PLANTED = {
+    "Invalid read": "a[i] = b[i + 64];",
+    "Invalid write": "a[i - 64] = 1;",
+    "data race": "a[0] = a[0] + i;",
+    "uninitialized": "int x[4]; x[i & 1] = 1; if (x[2 + (b[i] & 1)] > 0) a[i] = 3;",
+}
+"""part of oclgrind's message -> body of a kernel that has this error"""
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--log", type=Path, help="keep oclgrind's messages about our kernels in this file")
+    parser.add_argument("--inside", choices=("planted", "pictures"), help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.inside:
+        return plant() if arguments.inside == "planted" else draw()
+    if shutil.which("oclgrind") is None:
+        print(f"oclgrind is not here; on Debian install it with: {INSTALL}", file=sys.stderr)
+        return 2
+    version = subprocess.run(["oclgrind", "--version"], capture_output=True, text=True).stdout.split()[1]
+    print(f"oclgrind {version} {' '.join(OCLGRIND)}", flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        planted, _ = under_oclgrind("planted", Path(folder))
+        missing = [words for words in PLANTED if not any(words in message for message in planted)]
+        print(f"planted errors: {len(PLANTED)}, not reported: {', '.join(missing) or 'none'}", flush=True)
+        messages, status = under_oclgrind("pictures", Path(folder), arguments.log)
+    print(f"errors in our kernels: {sum(messages.values())}")
+    for message, count in messages.most_common(20):
+        print(f"  {count} x {message}")
+    clean = status == 0 and not missing and not messages
+    print("clean" if clean else "NOT CLEAN")
+    return 0 if clean else 1
+
+
+def under_oclgrind(part: str, folder: Path, keep: Path | None = None) -> tuple[Counter[str], int]:
+    """Run a part of this script; oclgrind's messages, each with the kernel's name, and the exit status."""
+    log = folder / f"{part}.log"
+    command = ["oclgrind", *OCLGRIND, "--log", str(log), sys.executable, __file__, "--inside", part]
+    # what an earlier run compiled with other options must not be taken from pyopencl's cache
+    status = subprocess.run(command, env=os.environ | {"PYOPENCL_NO_CACHE": "1"}).returncode
+    text = log.read_text("utf-8", "replace") if log.exists() else ""
+    if keep:
+        keep.write_text(text, "utf-8")
+    found = re.findall(r"^(\S.*)\n\tKernel: (\S+)", text, re.MULTILINE)
+    addresses = re.compile(r" (global |local |private )?memory address 0x[0-9a-f]+")
+    return Counter(f"{addresses.sub('', message)}, in {kernel}" for message, kernel in found), status
+
+
+def plant() -> int:
+    """Under oclgrind: kernels that each have an error."""
+    import numpy as np
+    import pyopencl as cl
+
+    context = cl.Context(cl.get_platforms()[0].get_devices())
+    queue = cl.CommandQueue(context)
+    for body in PLANTED.values():
+        text = f"kernel void faulty(global int *a, global int *b) {{ int i = get_global_id(0); {body} }}"
+        program = cl.Program(context, text).build()
+        flags, zeros = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR, np.zeros(64, np.int32)
+        buffers = [cl.Buffer(context, flags, hostbuf=zeros) for _ in range(2)]
+        program.faulty(queue, (64,), (64,), *buffers)
+        queue.finish()
+    return 0
+
+
+def draw() -> int:
+    """Under oclgrind: pictures in both schedules, each compared with the reference."""
+    import fidsplat as fs
+    from fidsplat.backends.opencl.memory import BufferPool
+
+    renderer = fs.Renderer("opencl:oclgrind")
+    kept = []
+
+    class Keeping(BufferPool):
+        """Releases no buffer: oclgrind gives the address of a released one to the next, and takes what is in
+        that for never written if it is larger.
+        """
+
+        def fresh(self, name, size):
+            kept.append(super().fresh(name, size))
+            return kept[-1]
+
+    wrong = 0
+    for title, work in pictures(renderer):
+        # new ones for each picture, so that none reads what an earlier one wrote
+        renderer.backend.pool = Keeping(renderer.backend.context, renderer.backend.device)
+        start = time.perf_counter()
+        error = work()
+        wrong += not error < 2e-5
+        print(f"  {title:58} {time.perf_counter() - start:5.1f} s, largest error {error:.1e}", flush=True)
+    return 1 if wrong else 0
+
+
+def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
+    """A title, and what draws it and gives its largest error beyond certificates, in colour and alpha."""
+    import numpy as np
+
+    import fidsplat as fs
+    from fidsplat.backends.base import View
+    from fidsplat.effects import select
+    from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture, truth_of
+    from fidsplat.hard_cases.clouds import camera, random_splats, splats
+
+    backend = renderer.backend
+    lanes = replace(backend.shape, schedule="lanes", lanes=4, tile_width=4, tile_height=8, scan_items=1)
+    group = replace(backend.shape, schedule="group", lanes=1, tile_width=4, tile_height=4, scan_items=8)
+    shapes = {
+        "lanes": replace(lanes, chunks=3, radix_bits=5),
+        "group": replace(group, chunks=5, radix_bits=4),
+    }
+
+    def task(shape, cloud, view_from, outputs=("rgb", "alpha"), quality=None, budget=None):
+        def work() -> float:
+            chosen = quality or fs.Quality()
+            features = select(cloud, outputs, chosen)
+            view = View.of(view_from, chosen, cloud.origin, (0.1, 0.2, 0.3))
+            backend.pair_budget, kept = budget or backend.pair_budget, backend.pair_budget
+            planes = backend.pipeline(features, shape).render(backend.upload(cloud), view)
+            drawn = {name: planes.read(name) for name in ("rgb", *features.taps)}
+            backend.pair_budget = kept
+            truth = truth_of(Picture(cloud, view_from, chosen, outputs))
+            worst = 0.0
+            for name in {"rgb", "alpha"} & set(drawn):
+                error = np.abs(drawn[name] - truth[name])
+                error = error.max(-1) if error.ndim > 2 else error
+                worst = max(worst, float((error - truth["certificate"]).max()))
+            return worst if all(np.isfinite(plane).all() for plane in drawn.values()) else float("nan")
+
+        return work
+
+    small, wide, dot = camera(21, 14, 16.0), camera(37, 3, 20.0), camera(1, 1, 5.0)
+    around = random_splats(24, 71, depth=(-1.0, 4.0), scale=(1e-3, 3.0))
+    crowded = random_splats(90, 72, depth=(1.0, 3.0), scale=(0.02, 0.2), across=0.2)
+    harmonic = fs.SplatCloud(
+        around.means,
+        around.quats,
+        around.scales,
+        around.opacities,
+        sh=np.random.default_rng(73).normal(0, 0.3, (len(around), 16, 3)),
+    )
+    far = splats([[1e6, 0, 2], [-3e9, 1e9, 1], [0, 0, 1e9], [0, 0, 1e-3]], (1, 0.2, 0.3, 0), (2e6, 1e6), 0.8)
+    planes = crowded.with_planes(np.arange(90) % 3 - 1)
+    plain = fs.Quality(lowpass="none", samples=2)
+    for name, shape in shapes.items():
+        yield f"{name}: splats around the camera, all outputs", task(shape, around, small, ALL_OUTPUTS)
+        yield f"{name}: a crowded tile, all outputs", task(shape, crowded, small, ALL_OUTPUTS)
+        yield f"{name}: the same in bands of 40 pairs", task(shape, crowded, small, ALL_OUTPUTS, budget=40)
+        yield f"{name}: no low-pass, 2 x 2 samples", task(shape, around, small, ALL_OUTPUTS, plain)
+        yield f"{name}: coplanar splats, all outputs", task(shape, planes, small, ALL_OUTPUTS)
+        yield f"{name}: the gsplat preset", task(shape, crowded, small, quality=fs.Quality.named("gsplat"))
+        yield f"{name}: spherical harmonics of degree 3", task(shape, harmonic, small)
+        yield (
+            f"{name}: set-up in float32",
+            task(shape, crowded, small, quality=fs.Quality(setup_precision="float32")),
+        )
+        yield f"{name}: centres 1e7 and more pixels off", task(shape, far, small)
+        yield f"{name}: 37 x 3 pixels", task(shape, around, wide)
+        yield f"{name}: 1 x 1 pixel, all outputs", task(shape, crowded, dot, ALL_OUTPUTS)
+        yield f"{name}: no splats, all outputs", task(shape, fs.SplatCloud.empty(), small, ALL_OUTPUTS)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
