@@ -1,0 +1,254 @@
+"""Group F of the catalogue: the device's own arithmetic, barriers, sorting."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends.base import View
+from fidsplat.effects import select
+from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
+from fidsplat.hard_cases.arithmetic import measure
+from fidsplat.hard_cases.case import Case, Finding
+from fidsplat.hard_cases.clouds import camera, random_splats, splats
+from fidsplat.quality import Quality
+from fidsplat.render import Renderer
+from fidsplat.splats import SplatCloud
+
+CULLED = np.uint32(0xFFFFFFFF)
+VIEW = camera(60, 45, 48.0)
+UNSAFE = ("fast", "unsafe", "finite", "denorms", "mad-enable", "signed-zeros")
+"""words of build options that let go of IEEE arithmetic"""
+
+CONTRACTION = """
+kernel void probe(global const float *a, global const float *b, global const float *c,
+                  global float *difference, global float *sum, global real *wide, global float *fused) {
+    int i = get_global_id(0);
+    difference[i] = a[i] * b[i] - c[i] * b[i];      // a is c: 0 unless one product is not rounded
+    sum[i] = a[i] * b[i] + c[i];
+    wide[i] = (real)a[i] / 3 * ((real)b[i] / 3) - (real)c[i] / 3 * ((real)b[i] / 3);
+    float product = a[i] * b[i];
+    fused[i] = FMA(a[i], b[i], -product);
+}
+"""
+NOT_A_NUMBER = """
+kernel void probe(global const float *x, global int *unequal, global int *named, global int *survives,
+                  global int *infinite) {
+    int i = get_global_id(0);
+    unequal[i] = x[i] != x[i];
+    named[i] = isnan(x[i]);
+    survives[i] = !(x[i] > 0.0f) && !(x[i] <= 0.0f);
+    infinite[i] = isinf(x[i]);
+}
+"""
+
+
+def opencl(renderer: Renderer) -> Any:
+    """The OpenCL backend of a renderer, or None if it has another."""
+    return renderer.backend if renderer.device.name.startswith("opencl") else None
+
+
+def contraction_check(renderer: Renderer) -> Iterator[Finding]:
+    """Products that are subtracted round alike, and FMA fuses where the device is said to."""
+    backend = opencl(renderer)
+    if backend is None:
+        return
+    from fidsplat.backends.opencl import probe
+
+    generator = np.random.default_rng(61)
+    a, b = generator.uniform(0.5, 2.0, (2, 4096)).astype(np.float32)
+    real = np.float64 if renderer.device.float64 else np.float32
+    types = (np.float32, np.float32, real, np.float32)
+    difference, total, wide, fused = probe.evaluate(backend, CONTRACTION, (a, b, a), types)
+    yield Finding("a b - a b that is not 0", int(np.count_nonzero(difference)), 0)
+    yield Finding("the same in the set-up's precision", int(np.count_nonzero(wide)), 0)
+    yield Finding("a b + c that is not rounded twice", int(np.count_nonzero(total != a * b + a)), 0)
+    product = a.astype(float) * b.astype(float)  # exact, and so is its rounding error
+    wanted = (product - (a * b)) if backend.shape.fast_fma else np.zeros(len(a))
+    yield Finding(
+        "FMA(a, b, c) that is not rounded as it should be", int(np.count_nonzero(fused != wanted)), 0
+    )
+
+
+def function_check(renderer: Renderer) -> Iterator[Finding]:
+    """exp, log, division and square root against float64, by what OpenCL promises."""
+    measured = measure(renderer)
+    yield from measured.findings if measured else ()
+
+
+def option_check(renderer: Renderer) -> Iterator[Finding]:
+    """No build option lets go of NaN, and the compiler does not by itself."""
+    backend = opencl(renderer)
+    if backend is None:
+        return
+    from fidsplat.backends.opencl import probe
+
+    unsafe = [option for option in backend.build_options if any(word in option for word in UNSAFE)]
+    yield Finding("build options that let go of IEEE arithmetic", len(unsafe), 0)
+    bits = [
+        0x7FC00000,
+        0xFFC00000,
+        0x7F800001,
+        0x7F800000,
+        0xFF800000,
+        0,
+        0x80000000,
+        0x3F800000,
+        0xBF800000,
+        1,
+    ]
+    x = np.array(bits, np.uint32).view(np.float32)
+    unequal, named, survives, infinite = probe.evaluate(backend, NOT_A_NUMBER, (x,), (np.int32,) * 4)
+    is_nan = np.isnan(x)
+    for name, seen in (("x != x", unequal), ("isnan(x)", named), ("a comparison that fails", survives)):
+        yield Finding(f"NaN told wrongly by {name}", int((seen.astype(bool) != is_nan).sum()), 0)
+    yield Finding("infinities told wrongly", int((infinite.astype(bool) != np.isinf(x)).sum()), 0)
+
+
+def denormal_pictures() -> Iterator[Picture]:
+    """Weights, scales, colours and positions at and below the smallest normal number."""
+    quality = Quality(alpha_cutoff=1e-30, transmittance_stop=0.0)
+    means = [[0.1 * k - 0.4, 0.05 * k - 0.2, 1.0 + 0.2 * k] for k in range(9)]
+    opacities = [1e-38, 1e-40, 1e-30, 1e-20, 1e-10, 1e-5, 0.5, 1.0, 0.9]
+    faint = splats(means, (1, 0.2, 0.1, 0), (0.2, 0.3), opacities)
+    yield Picture(faint, VIEW, quality)
+    thin = splats(means, (1, 0.2, 0.1, 0), [[1e-38, 0.3]] * 4 + [[0.3, 1e-42]] * 5, 0.8)
+    yield Picture(thin, VIEW, outputs=ALL_OUTPUTS)
+    dark = splats(means, (1, 0.2, 0.1, 0), (0.2, 0.3), 0.7, (1e-39, 1e-44, 1e-38))
+    yield Picture(dark, VIEW, background=(1e-40, 0.0, 1e-45))
+
+
+def denormal_check(renderer: Renderer) -> Iterator[Finding]:
+    measured = measure(renderer)
+    if measured:
+        # either will do: nothing that is drawn is as small (the cut-off of the presets is at least 1e-6)
+        yield Finding("denormals are flushed to 0 (1) or kept (0)", float(not measured.denormals), 1)
+
+
+def barrier_check(renderer: Renderer) -> Iterator[Finding]:
+    """The schedule with barriers against the one without; on a GPU, against other sizes of its groups."""
+    backend = opencl(renderer)
+    if backend is None:
+        return
+    # lists from none to several times what a group stages at once (64), and pixels that finish early
+    crowded = random_splats(260, 65, depth=(0.8, 1.5), scale=(0.02, 0.25), across=0.25)
+    cloud = SplatCloud.concatenate([crowded, random_splats(60, 66, depth=(1.5, 6.0), scale=(0.05, 0.5))])
+    features = select(cloud, ALL_OUTPUTS, Quality())
+    view = View.of(VIEW, Quality(), cloud.origin, (0.1, 0.2, 0.3))
+    resident = backend.upload(cloud)
+    base = backend.pipeline(features).render(resident, view)
+    shape = replace(backend.shape, schedule="group", lanes=1, tile_width=8, tile_height=8, scan_items=64)
+    if backend.shape.schedule == "group":
+        shape = replace(backend.shape, tile_width=8, tile_height=8)
+    other = backend.pipeline(features, shape).render(resident, view)
+    for name in ("rgb", "alpha", "depth"):
+        error = np.abs(other.read(name) - base.read(name)).max()
+        yield Finding(f"{name}: difference between schedules", float(error), 5e-6)
+    labels = (other.read("label") != base.read("label")).mean()
+    yield Finding("share of pixels with another label", float(labels), 1e-3)
+
+
+def in_a_row(depths) -> SplatCloud:
+    """One splat on the axis for each depth."""
+    means = np.zeros((len(depths), 3))
+    means[:, 2] = depths
+    return splats(means, (1, 0, 0, 0), (0.05, 0.05), 0.05)
+
+
+def sort_check(renderer: Renderer) -> Iterator[Finding]:
+    """Depth order, tile lists and their starts at awkward lengths, against NumPy's stable sort."""
+    backend = opencl(renderer)
+    if backend is None:
+        return
+    generator = np.random.default_rng(67)
+    own = backend.shape
+    odd = replace(own, chunks=7, radix_bits=5)
+    features = select(in_a_row([1.0]), ("rgb",), Quality())
+    view = View.of(VIEW, Quality(), np.zeros(3), (0.0, 0.0, 0.0))
+    unsorted = unlisted = tried = 0
+    for shape in (own, odd):
+        pipeline = backend.pipeline(features, shape)
+        c = min(shape.chunks, 2000)
+        for n in sorted({1, 2, 3, c - 1, c, c + 1, 2 * c + 1, 255, 256, 257, 1000, 4097}):
+            for kind in ("random", "few values", "one value", "descending", "half culled"):
+                depths = generator.uniform(1.0, 9.0, n)
+                if kind == "few values":
+                    depths = np.round(depths)
+                elif kind == "one value":
+                    depths[:] = 3.0
+                elif kind == "descending":
+                    depths = np.sort(depths)[::-1]
+                elif kind == "half culled":
+                    depths[::2] *= -1
+                trace = pipeline.trace(backend.upload(in_a_row(depths)), view)
+                keys, order = trace["keys"], trace["order"]
+                visible = np.flatnonzero(keys != CULLED)
+                wanted = visible[np.argsort(keys[visible], kind="stable")]
+                unsorted += not np.array_equal(order, wanted)
+                unsorted += not np.array_equal(visible, np.flatnonzero(depths > 0))
+                unlisted += not _lists_are_right(trace, wanted)
+                tried += 1
+    yield Finding(f"of {tried} depth orders, those that are not the stable one", unsorted, 0)
+    yield Finding("tile lists that are not in that order, or whose starts are wrong", unlisted, 0)
+
+
+def _lists_are_right(trace: dict[str, np.ndarray], order: np.ndarray) -> bool:
+    starts, lists = trace["starts"], trace["lists"]
+    rank = np.full(len(trace["keys"]), -1)
+    rank[order] = np.arange(len(order))
+    pieces = [rank[lists[a:b]] for a, b in pairwise(starts)]
+    whole = (
+        starts[0] == 0 and starts[-1] == len(lists) and bool((np.diff(starts.astype(np.int64)) >= 0).all())
+    )
+    # all lie on the axis: the tiles around the middle have every one of them
+    return whole and all((np.diff(p) > 0).all() for p in pieces) and max(map(len, pieces)) == len(order)
+
+
+CASES = (
+    Case(
+        "F1",
+        "products are rounded before they are subtracted",
+        "a b - a b in float32 and in the set-up's precision; FMA where it is asked for",
+        None,
+        contraction_check,
+    ),
+    Case(
+        "F2",
+        "precision of exp, log, division and square root",
+        "a quarter of a million arguments each: exp of -14 to 0, quotients and roots of 1e-9 to 1e9",
+        None,
+        function_check,
+    ),
+    Case(
+        "F3",
+        "NaN and infinity are told from numbers",
+        "quiet, negative and signalling NaN; the build options",
+        None,
+        option_check,
+    ),
+    Case(
+        "F4",
+        "denormals",
+        "opacities, scales, colours and backgrounds of 1e-45 to 1e-30",
+        denormal_pictures,
+        denormal_check,
+    ),
+    Case(
+        "F5",
+        "barriers",
+        "tile lists of 0 to 300 splats with 64 staged at a time, pixels that finish at different times",
+        None,
+        barrier_check,
+    ),
+    Case(
+        "F6",
+        "sorting and prefix sums",
+        "1 to 4097 splats around the number of chunks; ties, one depth, descending, half of them culled",
+        None,
+        sort_check,
+    ),
+)
