@@ -4,11 +4,19 @@ status. Its docstring is the line in the list of commands, its HELP what `fidspl
 Nothing heavy is imported before ``run``, so that help and errors come at once.
 """
 
+from fidsplat.commands.check import Check
 from fidsplat.commands.demo import Demo
 from fidsplat.commands.detect import Detect
 from fidsplat.commands.devices import Devices
 from fidsplat.commands.marker import Marker
 from fidsplat.commands.render import Render
 
-COMMANDS = {"demo": Demo, "devices": Devices, "marker": Marker, "render": Render, "detect": Detect}
+COMMANDS = {
+    "demo": Demo,
+    "devices": Devices,
+    "marker": Marker,
+    "render": Render,
+    "detect": Detect,
+    "check": Check,
+}
 """Every command by its name, in the order in which help lists them."""

@@ -25,6 +25,15 @@ ALL_OUTPUTS = ("rgb", "alpha", "depth", "depth_median", "normal", "label")
 COLOR_TOLERANCE = 2e-5
 DEPTH_TOLERANCE = 1e-4
 """relative"""
+TOLERANCE = {
+    "rgb": COLOR_TOLERANCE,
+    "alpha": COLOR_TOLERANCE,
+    "depth": DEPTH_TOLERANCE,
+    "depth_median": 0.0,
+    "normal": COLOR_TOLERANCE,
+    "label": 0.0,
+}
+"""What each output may be wrong beyond its certificate."""
 RARE = 1e-3
 """share of pixels whose certificate may exceed `RISKY`"""
 RISKY = 0.05
@@ -43,19 +52,23 @@ class Picture:
 
 @dataclass(frozen=True)
 class Difference:
-    """One plane of one picture against the reference. Errors are absolute for rgb and alpha, relative for
-    depth.
+    """One plane of one picture against the reference. Errors are absolute for rgb, alpha and normals,
+    relative for depth; for median depth and labels they are the share of pixels that differ.
     """
 
     output: str
     error: float
     """largest error, certified pixels included"""
     excess: float
-    """largest error beyond tolerance and certificate; at most 0 in agreement. For median depth and labels:
-    share of the pixels that differ and may not"""
+    """largest error beyond certificate and `TOLERANCE`; at most 0 in agreement"""
     risky: float
     """share of pixels whose certificate exceeds `RISKY`"""
     finite: bool
+
+    @property
+    def uncertified(self) -> float:
+        """Largest error beyond the certificate."""
+        return self.excess + TOLERANCE[self.output]
 
     @property
     def agrees(self) -> bool:
@@ -86,21 +99,20 @@ def compare(planes: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], o
         error = np.abs(plane - want)
         if error.ndim > risk.ndim:
             error = error.max(-1)
-        if name in ("rgb", "alpha"):
-            excess = (error - risk * brightest).max(initial=0.0) - COLOR_TOLERANCE
-        elif name == "normal":
-            beyond = np.where(covered, error - truth["certificate_normal"], 0.0)
-            excess = beyond.max(initial=0.0) - COLOR_TOLERANCE
-        elif name == "depth":
-            size = np.maximum(want, 1e-30)
-            beyond = np.where(covered, error - truth["certificate_depth"], 0.0)
-            excess = (beyond / size).max(initial=0.0) - DEPTH_TOLERANCE
-            error = error / size
+        if name in ("depth_median", "label"):
+            error = error > (DEPTH_TOLERANCE * want if name == "depth_median" else 0)
+            worst = float(error.mean())
+            beyond = float((error & ~truth[f"{name}_may_flip"]).mean())
         else:
-            limit = DEPTH_TOLERANCE * want if name == "depth_median" else 0.0
-            excess = ((error > limit) & ~truth[f"{name}_may_flip"]).mean()
-        worst = float(np.max(error, initial=0.0))
-        differences.append(Difference(name, worst, float(excess), risky, bool(np.isfinite(plane).all())))
+            if name in ("rgb", "alpha"):
+                certified = risk * brightest
+            else:  # where next to nothing is drawn, its depth and normal mean nothing
+                certified = np.where(covered, truth[f"certificate_{name}"], np.inf)
+            size = np.maximum(want, 1e-30) if name == "depth" else 1.0
+            worst = float((error / size).max(initial=0.0))
+            beyond = float(((error - certified) / size).max(initial=0.0))
+        excess, finite = beyond - TOLERANCE[name], bool(np.isfinite(plane).all())
+        differences.append(Difference(name, worst, excess, risky, finite))
     return differences
 
 

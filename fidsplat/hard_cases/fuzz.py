@@ -13,22 +13,23 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
-from fidsplat.hard_cases.clouds import quaternion
+from fidsplat.hard_cases.clouds import log_uniform, quaternion
 from fidsplat.quality import Quality
 from fidsplat.rotations import quaternion_multiply, quaternion_to_matrix
 from fidsplat.splats import SplatCloud
 
 LARGEST_SCENE = 200
 CUT = 1.0 / 255.0
-OPACITIES = np.float32([0.0, CUT * (1 - 1e-6), CUT * (1 + 1e-6), 0.5, 0.99, 1.0])
-# share of the scenes, and the quality they are drawn with
+OPACITIES = np.array([0.0, CUT * (1 - 1e-6), CUT * (1 + 1e-6), 0.5, 0.99, 1.0], np.float32)
 QUALITIES = (
-    (0.5, Quality()),
-    (0.15, Quality.named("reference")),
-    (0.15, Quality(lowpass="none")),
-    (0.1, Quality(samples=2)),
-    (0.1, Quality.named("gsplat")),
+    Quality(),
+    Quality.named("reference"),
+    Quality(lowpass="none"),
+    Quality(samples=2),
+    Quality.named("gsplat"),
 )
+SHARES = (0.5, 0.15, 0.15, 0.1, 0.1)
+"""of the scenes that are drawn with each quality"""
 
 
 def scene_of(seed: int) -> Picture:
@@ -36,21 +37,21 @@ def scene_of(seed: int) -> Picture:
     generator = np.random.default_rng(seed)
     count = int(generator.integers(1, LARGEST_SCENE + 1))
     width, height = (int(generator.integers(1, limit + 1)) for limit in (80, 64))
-    focal = max(width, height) * math.exp(generator.uniform(math.log(0.4), math.log(4.0)))
+    focal = max(width, height) * float(log_uniform(generator, 0.4, 4.0))
     near = float(generator.choice([0.01, 0.01, 0.2, 1.0]))
 
     kind = generator.choice(4, count, p=[0.7, 0.1, 0.1, 0.1])  # plain, edge-on, crossing near, coplanar
     depth = np.where(
         generator.random(count) < 0.4,
         generator.uniform(-5, 5, count),
-        np.exp(generator.uniform(math.log(near), math.log(1e5), count)),
+        log_uniform(generator, near, 1e5, count),
     )
     span = np.array([width, height]) / 2 / focal
     sideways = generator.uniform(-1.3, 1.3, (count, 2)) * span * np.maximum(np.abs(depth), 0.1)[:, None]
     means = np.column_stack([sideways, depth])
     quats = generator.normal(size=(count, 4))
-    large = np.exp(generator.uniform(math.log(1e-6), math.log(1e3), count))
-    scales = np.column_stack([large, large / np.exp(generator.uniform(0, math.log(1e6), count))])
+    large = log_uniform(generator, 1e-6, 1e3, count)
+    scales = np.column_stack([large, large / log_uniform(generator, 1, 1e6, count)])
     swap = generator.random(count) < 0.5
     scales[swap] = scales[swap, ::-1]
 
@@ -77,10 +78,9 @@ def scene_of(seed: int) -> Picture:
         colors=generator.uniform(0, 1, (count, 3)),
         labels=generator.integers(0, 9, count),
     ).with_planes(planes)
-    center = generator.uniform(-0.2, 1.2, 2) * [width, height]
-    camera = Camera.pinhole(width, height, focal, focal, *center, pose, near=near)
-    shares, qualities = zip(*QUALITIES, strict=True)
-    quality = qualities[int(generator.choice(len(qualities), p=shares))]
+    cx, cy = generator.uniform(-0.2, 1.2, 2) * [width, height]
+    camera = Camera.pinhole(width, height, focal, focal, cx, cy, pose, near=near)
+    quality = QUALITIES[int(generator.choice(len(QUALITIES), p=SHARES))]
     return Picture(cloud, camera, quality, ALL_OUTPUTS)
 
 
@@ -100,7 +100,7 @@ def _coplanar(generator, chosen: np.ndarray, means: np.ndarray, quats: np.ndarra
     groups = generator.integers(0, 3, len(chosen))
     for group in range(3):
         members = chosen[groups == group]
-        depth = float(np.float32(math.exp(generator.uniform(math.log(0.3), math.log(30.0)))))
+        depth = float(np.float32(log_uniform(generator, 0.3, 30.0)))
         # half of the groups are known to be coplanar, the others only happen to be
         known = generator.random() < 0.5
         for k in members:

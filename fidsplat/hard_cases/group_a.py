@@ -20,8 +20,8 @@ FLAT = quaternion((1, 0, 0), (0, 0, 1))
 CUT = 1.0 / 255.0
 
 
-def _picture(cloud: SplatCloud, **view) -> Picture:
-    return Picture(cloud, camera(**{"focal": FOCAL} | view), outputs=ALL_OUTPUTS)
+def _picture(cloud: SplatCloud, focal: float = FOCAL, **view) -> Picture:
+    return Picture(cloud, camera(focal=focal, **view), outputs=ALL_OUTPUTS)
 
 
 def _ground(scale: float, depth: float = 5.0, below: float = 1.5) -> SplatCloud:

@@ -39,7 +39,8 @@ def differing(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray],
         one, other = (np.ascontiguousarray(planes[name]) for planes in (first, second))
         if one.shape != other.shape:
             return max(one.size, other.size)
-        unlike = one.view(np.uint32) != other.view(np.uint32)
+        bits = f"u{one.itemsize}"
+        unlike = one.view(bits) != other.view(bits)
         different = different | (unlike.any(-1) if unlike.ndim == 3 else unlike)
     return int(different.sum())
 

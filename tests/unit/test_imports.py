@@ -30,7 +30,7 @@ MAY_IMPORT = {
     "scenes": PLAIN | {"markers", "formats"},
     "effects": PLAIN | {"scenes"},
     "backends": PLAIN | {"scenes", "effects", "kernel_files"},
-    "hard_cases": PLAIN | {"scenes", "effects", "backends", "render"},
+    "hard_cases": PLAIN | {"scenes", "effects", "backends", "render", "vision", "kernel_files"},
     "render": PLAIN | {"scenes", "effects", "backends"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__"}

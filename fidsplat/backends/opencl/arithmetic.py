@@ -44,7 +44,7 @@ def run_arithmetic(
     try:
         planes = _run(backend, kernels["arithmetic_float"], n // lanes, n, single, 7)
         names = ("exp", "log", "division", "sqrt", "fma", "native_exp", "native_recip")
-        results = dict(zip(names, planes, strict=True))
+        results: dict[str, np.ndarray] = dict(zip(names, planes, strict=True))
         if backend.info.float64:
             planes = _run(backend, kernels["arithmetic_real"], n, n, [above, below], 3)
             results |= dict(zip(("division64", "sqrt64", "log64"), planes, strict=True))

@@ -1,0 +1,153 @@
+"""`fidsplat check`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+from fidsplat.commands.output import Json, console, option, print_json, print_table
+from fidsplat.errors import InputError
+from fidsplat.files import writable_folder
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from fidsplat.hard_cases.arithmetic import Arithmetic
+    from fidsplat.hard_cases.check import CheckResult, GroupResult
+    from fidsplat.hard_cases.fuzz_run import FuzzState
+    from fidsplat.render import Renderer
+
+
+@dataclass
+class Check:
+    """Test a device with the hard cases."""
+
+    HELP: ClassVar[str] = """Test a device with the hard cases of splat rendering.
+
+Draws scenes that are known to break renderers and compares them with a float64 reference, pixel by pixel;
+measures the device's own arithmetic; and says what does not hold. Under two minutes on two cores. Writes a
+picture of the worst case to DIR/worst.png. Exit status 1 when anything does not hold.
+
+--fuzz draws random scenes of up to 200 splats instead, until they hold N splats. A run that was stopped goes
+on where it was (DIR/fuzz.json).
+
+Examples:
+  fidsplat check
+  fidsplat check --device opencl:nvidia --json
+  fidsplat check --fuzz 100000"""
+
+    device: Annotated[str, option("D", "see `fidsplat devices` (default: opencl)")] = "opencl"
+    out: Annotated[
+        str, option("DIR", "folder for the picture and the fuzzer's state (default: fidsplat-check)", "-o")
+    ] = "fidsplat-check"
+    fuzz: Annotated[int | None, option("N", "draw random scenes until they hold N splats")] = None
+    json: Json = False
+
+    def run(self) -> int:
+        import fidsplat as fs
+
+        if self.fuzz is not None and self.fuzz < 1:
+            raise InputError(f"--fuzz is {self.fuzz}; give the number of splats, at least 1")
+        folder = writable_folder(self.out)
+        where = console(self.json)
+        with where.status("opening the device"):
+            renderer = fs.Renderer(self.device)
+        if self.fuzz is not None:
+            return self._fuzz(renderer, folder, where)
+        from fidsplat.hard_cases import all_cases
+        from fidsplat.hard_cases.check import run_check, worst_picture
+        from fidsplat.vision.images import write_png
+
+        with where.status("starting") as status:
+            result = run_check(renderer, all_cases(), status.update)
+        file = None if result.worst is None else write_png(folder / "worst.png", worst_picture(result.worst))
+        if self.json:
+            print_json({**result.as_dict(), "picture": file and str(file)})
+        else:
+            _print(result, where)
+            if file is not None:
+                where.print(f"worst case in {file}", markup=False, soft_wrap=True)
+        return 0 if result.passed else 1
+
+    def _fuzz(self, renderer: "Renderer", folder: Path, where: "Console") -> int:
+        from rich.progress import Progress
+
+        from fidsplat.hard_cases.fuzz_run import fuzz_run
+
+        wanted = self.fuzz or 0
+        state = None
+        with Progress(console=where, transient=True) as progress:
+            task = progress.add_task("splats", total=wanted)
+            for state in fuzz_run(renderer, wanted, folder / "fuzz.json"):
+                progress.update(task, completed=state.splats)
+        assert state is not None
+        if self.json:
+            print_json({"device": renderer.device.name, "passed": state.passed, **vars(state)})
+        else:
+            _print_fuzz(state, renderer, where)
+        return 0 if state.passed else 1
+
+
+def _print(result: "CheckResult", where: "Console") -> None:
+    from fidsplat.hard_cases.agreement import COLOR_TOLERANCE, DEPTH_TOLERANCE
+
+    device = result.device
+    if result.arithmetic is not None:
+        facts = result.arithmetic
+        heads = ("function", "error [ulp]", "promised", "")
+        print_table(where, f"Arithmetic of {device.title}", heads, _ulps(facts))
+        where.print(
+            f"float64: {'yes' if facts.float64 else 'no'}; "
+            f"float32 below 1.2e-38: {'kept' if facts.denormals else 'flushed to 0'}\n",
+            markup=False,
+        )
+    where.print(f"Hard cases on {device.title}, {device.version}", markup=False)
+    heads = ("group", "cases", "pictures", "colour", "uncertified", "depth", "uncertified", "verdict")
+    bounds = ("bound", "", "", "", f"{COLOR_TOLERANCE:.0e}", "", f"{DEPTH_TOLERANCE:.0e}", "")
+    print_table(where, "Largest errors", heads, [bounds, *map(_row, result.groups)])
+    for words in result.failures:
+        where.print(f"failed: {words}", markup=False, soft_wrap=True)
+    wrong = len(result.failures)
+    verdict = f"{wrong} check{' does' if wrong == 1 else 's do'} not hold" if wrong else "everything holds"
+    where.print(f"{verdict}; {result.seconds:.0f} s", markup=False)
+
+
+def _ulps(facts: "Arithmetic") -> list[tuple[str, ...]]:
+    from fidsplat.hard_cases.arithmetic import BOUNDS
+
+    rows = []
+    for name, ulp in facts.ulp.items():
+        bound = BOUNDS.get(name)
+        verdict = "not used" if bound is None else "ok" if ulp <= bound * 1.001 else "too large"
+        rows.append((name, f"{ulp:.2f}", "-" if bound is None else f"{bound:g}", verdict))
+    return rows
+
+
+def _row(group: "GroupResult") -> tuple[str, ...]:
+    cells = [f"{group.letter} {group.title}", str(len(group.cases)), str(group.pictures)]
+    for outputs in (("rgb", "alpha"), ("depth",)):
+        for errors in ("largest", "uncertified"):
+            value = group.error(errors, *outputs)
+            cells.append("-" if value is None else f"{value:.0e}")
+    return (*cells, "ok" if group.passed else "failed")
+
+
+def _print_fuzz(state: "FuzzState", renderer: "Renderer", where: "Console") -> None:
+    rows = [
+        (
+            name,
+            f"{state.uncertified[name][0]:.1e}",
+            str(state.uncertified[name][1]),
+            f"{state.largest[name][0]:.1e}",
+            str(state.largest[name][1]),
+        )
+        for name in state.largest
+    ]
+    heads = ("output", "beyond the certificate", "seed", "with it", "seed")
+    print_table(where, f"Largest errors of random scenes on {renderer.device.title}", heads, rows)
+    where.print(
+        f"{state.splats:,} splats in {state.scenes:,} scenes, {state.pixels:,} pixels, "
+        f"{state.risky / max(state.pixels, 1):.2%} with certificates above 0.05; {state.seconds:.0f} s\n"
+        f"failing seeds: {' '.join(map(str, state.failing)) or 'none'}",
+        markup=False,
+        soft_wrap=True,
+    )

@@ -1,0 +1,177 @@
+"""`fidsplat check`: what it says when a device is right, and when it is not."""
+
+import json
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat import hard_cases
+from fidsplat.cli import main
+from fidsplat.errors import DeviceError
+from fidsplat.hard_cases import check
+from fidsplat.hard_cases.agreement import Picture
+from fidsplat.hard_cases.arithmetic import BOUNDS, measure
+from fidsplat.hard_cases.case import Case, Finding
+from fidsplat.hard_cases.clouds import camera, random_splats
+from fidsplat.vision.images import read_image
+
+CLOUD = random_splats(40, seed=41, depth=(1.0, 4.0), scale=(0.02, 0.5))
+
+
+def pictures():
+    yield Picture(CLOUD, camera(40, 30, 40.0), outputs=("rgb", "alpha", "depth"))
+
+
+GOOD = Case("A1", "a good case", "nothing", pictures, lambda renderer: [Finding("a number", 1.0, 1.0)])
+
+
+class Broken:
+    """A renderer that draws something else."""
+
+    def __init__(self, renderer, spoil):
+        self.device, self.backend, self._renderer, self._spoil = (
+            renderer.device,
+            renderer.backend,
+            renderer,
+            spoil,
+        )
+
+    def render(self, *arguments, **named):
+        frame = self._renderer.render(*arguments, **named)
+        return {name: self._spoil(name, frame[name].copy()) for name in frame}
+
+
+def test_a_good_device_passes(renderer):
+    told = []
+    result = check.run_check(renderer, [GOOD], told.append)
+    assert result.passed
+    assert result.failures == []
+    assert told == ["arithmetic", "A1: a good case"]
+    assert [(group.letter, group.pictures, group.passed) for group in result.groups] == [("A", 1, True)]
+    assert result.groups[0].error("uncertified", "rgb", "alpha") <= 2e-5
+    assert result.groups[0].error("largest", "normal") is None
+    assert result.worst is not None
+    image = check.worst_picture(result.worst)
+    assert image.dtype == np.uint8
+    assert image.shape[1] > 800
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda name, plane: plane + (name == "alpha") * np.float32(1e-4), "alpha is wrong by"),
+        (lambda name, plane: plane * np.float32(1 + (name == "depth") * 1e-2), "depth is wrong by"),
+        (lambda name, plane: np.where(plane > 9, plane, np.nan), "not finite"),
+    ],
+)
+def test_a_bad_device_fails(renderer, spoil, words):
+    result = check.run_check(Broken(renderer, spoil), [GOOD])
+    assert not result.passed
+    assert any(words in failure for failure in result.failures), result.failures
+    assert result.worst is not None
+    assert result.worst.rank[0]
+    assert check.worst_picture(result.worst).ndim == 3
+
+
+def test_findings_that_do_not_hold(renderer):
+    bad = Case("B2", "bad", "", None, lambda _: [Finding("jump", np.nan, 1.0), Finding("slip", 2.0, 1.0)])
+    result = check.run_check(renderer, [GOOD, bad])
+    assert result.failures == ["B2: jump is nan, above 1", "B2: slip is 2, above 1"]
+    assert [group.passed for group in result.groups] == [True, False]
+
+
+def test_a_device_that_fails_fails_its_case_only(renderer):
+    def fails(_):
+        raise DeviceError("out of memory")
+        yield
+
+    result = check.run_check(renderer, [Case("A2", "fails", "", None, fails), GOOD])
+    assert result.failures == ["A2: out of memory"]
+    assert result.cases[1].passed
+
+
+def test_too_many_doubtful_pixels_fail(renderer, monkeypatch):
+    truth_of = check.truth_of
+
+    def doubtful(picture):
+        truth = truth_of(picture)
+        return truth | {"certificate": truth["certificate"] + 0.06}
+
+    monkeypatch.setattr(check, "truth_of", doubtful)
+    failures = check.run_check(renderer, [GOOD]).failures
+    assert "certificates above 0.05" in failures[0]
+
+
+def test_arithmetic(renderer, judge):
+    facts = measure(renderer)
+    assert set(BOUNDS) <= set(facts.ulp) or not facts.float64
+    assert all(finding.holds for finding in facts.findings), facts.findings
+    assert facts.ulp["division"] > 0.3  # it does measure
+    assert measure(judge) is None
+
+
+def test_the_reference_judges_itself(judge):
+    assert check.run_check(judge, hard_cases.all_cases("A")[:2]).passed
+
+
+def test_the_catalogue_is_whole():
+    """numerics.md: A1 to F6, each once."""
+    counts = {"A": 7, "B": 8, "C": 3, "D": 5, "E": 5, "F": 6}
+    cases = hard_cases.all_cases()
+    names = [case.name for case in cases]
+    assert names == [f"{letter}{n}" for letter, count in counts.items() for n in range(1, count + 1)]
+    assert all(
+        case.title and case.trigger and (case.pictures or case.check) for case in hard_cases.all_cases()
+    )
+
+
+def test_the_command(renderer, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(hard_cases, "all_cases", lambda: (GOOD,))
+    words = ["check", "--device", renderer.device.name, "--out", str(tmp_path / "here")]
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert "everything holds" in out
+    assert "A bounds" in out
+    assert "exp" in out
+    assert read_image(tmp_path / "here" / "worst.png").shape[2] == 3
+    assert main([*words, "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["passed"] is True
+    assert facts["cases"][0]["name"] == "A1"
+    assert facts["arithmetic"]["ulp"]["exp"] <= 3
+    assert facts["picture"].endswith("worst.png")
+
+
+def test_the_command_fails_with_the_device(renderer, tmp_path, capsys, monkeypatch):
+    bad = Case("C1", "bad", "", None, lambda _: [Finding("slip", 2.0, 1.0)])
+    monkeypatch.setattr(hard_cases, "all_cases", lambda: (bad,))
+    assert main(["check", "--device", renderer.device.name, "-o", str(tmp_path)]) == 1
+    out = capsys.readouterr().out
+    assert "failed: C1: slip is 2, above 1" in out
+    assert "1 check does not hold" in out
+    assert not (tmp_path / "worst.png").exists()
+
+
+def test_the_command_fuzzes(renderer, tmp_path, capsys):
+    words = ["check", "--device", renderer.device.name, "-o", str(tmp_path), "--fuzz", "300"]
+    assert main(words) == 0
+    assert "failing seeds: none" in capsys.readouterr().out
+    assert main([*words, "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["splats"] >= 300
+    assert (tmp_path / "fuzz.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "says"), [(["--fuzz", "0"], "--fuzz is 0"), (["--device", "opncl"], "'opencl'")]
+)
+def test_bad_words(words, says, tmp_path, capsys):
+    assert main(["check", "-o", str(tmp_path), *words]) == 2
+    assert says in capsys.readouterr().err
+
+
+def test_the_result_is_plain_data(renderer):
+    facts = check.run_check(renderer, [GOOD]).as_dict()
+    assert fs.Renderer(facts["device"]).device.title == facts["title"]
+    json.dumps(facts)

@@ -1,0 +1,105 @@
+"""Random hard scenes: what they hold, a short run, and a long one that is stopped and goes on."""
+
+import json
+
+import numpy as np
+import pytest
+
+from fidsplat.hard_cases import fuzz, fuzz_run
+from fidsplat.rotations import quaternion_to_matrix
+
+
+def test_two_thousand_splats(renderer):
+    *_, state = fuzz_run.fuzz_run(renderer, 2000)
+    assert state.failing == []
+    assert state.passed
+    assert state.splats >= 2000
+    assert set(state.largest) == {"rgb", "alpha", "depth", "depth_median", "normal", "label"}
+    assert state.uncertified["rgb"][0] <= 2e-5
+
+
+@pytest.mark.parametrize("seed", [12, 45, 68, 94, 174, 194, 223, 229, 248])
+def test_seeds_that_failed_once(renderer, seed):
+    """Tiny splats called edge-on; opacities at the cut-off in depth and labels; optical depth near 1."""
+    state = fuzz_run.FuzzState("")
+    state.add(seed, renderer)
+    assert state.failing == []
+
+
+def test_a_scene_is_its_seed():
+    one, other = fuzz.scene_of(7), fuzz.scene_of(7)
+    assert np.array_equal(one.cloud.means, other.cloud.means)
+    assert one.quality == other.quality
+    assert not np.array_equal(one.camera.matrix, fuzz.scene_of(8).camera.matrix)
+
+
+def test_the_scenes_are_hard():
+    """The distribution of numerics.md, section 3, in what the splats turn out to be."""
+    edge_on = near = total = grouped = 0
+    largest, smallest, counts, flat, opacities = 0.0, np.inf, [], 1.0, set()
+    for seed in range(150):
+        picture = fuzz.scene_of(seed)
+        cloud, view = picture.cloud, picture.camera
+        turn = view.world_to_camera[:3, :3]
+        p = cloud.means @ turn.T
+        axes = turn @ quaternion_to_matrix(cloud.quats)
+        sine = np.einsum("nk,nk->n", axes[:, :, 2], p) / np.linalg.norm(p, axis=1)
+        reach = 3.33 * np.hypot(*(axes[:, 2, :2] * cloud.scales).T)
+        edge_on += (np.abs(sine) < 1.5e-6).sum()
+        near += (np.abs(p[:, 2] - view.near) < reach).sum()
+        total, grouped = total + len(cloud), grouped + cloud.has_planes
+        largest, smallest = max(largest, cloud.scales.max()), min(smallest, cloud.scales.min())
+        flat = max(flat, float((cloud.scales.max(1) / cloud.scales.min(1)).max()))
+        counts.append(len(cloud))
+        opacities |= set(cloud.opacities.tolist())
+        assert p[:, 2].min() > -5000
+    assert 0.07 < edge_on / total < 0.13
+    assert near / total > 0.1
+    assert grouped > 50
+    assert largest > 500
+    assert smallest < 1e-10
+    assert flat > 5e5
+    assert min(counts) <= 5
+    assert max(counts) >= 195
+    assert opacities == set(fuzz.OPACITIES.tolist())
+
+
+def test_a_stopped_run_goes_on(renderer, tmp_path, monkeypatch):
+    monkeypatch.setattr(fuzz_run, "_SAVE_EVERY", 0.0)
+    file = tmp_path / "fuzz.json"
+    whole = list(fuzz_run.fuzz_run(renderer, 700))[-1]
+    run = fuzz_run.fuzz_run(renderer, 700, file)
+    first = next(run)
+    run.close()
+    saved = json.loads(file.read_text())
+    assert (saved["scenes"], saved["splats"]) == (1, first.splats)
+    *_, state = fuzz_run.fuzz_run(renderer, 700, file)
+    assert (state.scenes, state.pixels, state.largest) == (whole.scenes, whole.pixels, whole.largest)
+    # more splats go on from there; the same number starts again
+    *_, more = fuzz_run.fuzz_run(renderer, 900, file)
+    assert more.scenes > state.scenes
+    assert next(fuzz_run.fuzz_run(renderer, 700, file)).scenes == 1
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"key": 3}', '{"key": "%s", "scenes": "a", "new": 1}'])
+def test_a_file_of_something_else_is_no_hindrance(renderer, tmp_path, content):
+    file = tmp_path / "fuzz.json"
+    file.write_text(content.replace("%s", fuzz_run._key(renderer)))
+    assert next(fuzz_run.fuzz_run(renderer, 50, file)).scenes == 1
+
+
+def test_a_failing_seed_is_named(renderer, monkeypatch):
+    class Wrong(dict):
+        """Planes of a device that is off by a little where it is sure."""
+
+    def wrong(one, picture):
+        frame = draw(one, picture)
+        return Wrong({name: frame[name] + (1e-3 if name == "alpha" else 0) for name in frame})
+
+    draw = fuzz_run.draw
+    monkeypatch.setattr(fuzz_run, "draw", wrong)
+    state = fuzz_run.FuzzState("")
+    state.add(3, renderer)
+    assert state.failing == [3]
+    assert not state.passed
+    assert state.uncertified["alpha"][1] == 3
