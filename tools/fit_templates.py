@@ -35,6 +35,7 @@ from fidsplat.markers.seams import grow
 
 GROWTH = 0.4  # modules; measured together with the templates, see docs/markers.md
 THINNEST = 0.025  # least sigma in half widths: thinner lines alias between the samples of a pixel
+LONGEST = 0.42  # largest sigma in half widths: longer lines stand out of the corners like hairs
 CUT = 1 / 255
 # largest aspect ratio, aspect ratio of stage 1, and, beside the one in the middle: pairs on the long axis,
 # pairs on the short axis, fours
@@ -79,7 +80,7 @@ class Symmetric:
 def minimise(function, raw: np.ndarray, thinnest: np.ndarray, iterations: int) -> tuple[np.ndarray, float]:
     """L-BFGS-B within bounds; thinnest (m, 2) are the least sigmas."""
     low = np.column_stack([np.zeros((len(raw), 2)), np.log(thinnest), np.full(len(raw), 0.02)])
-    high = np.tile([1.3, 1.3, np.log(3.0), np.log(3.0), 1.0], (len(raw), 1))
+    high = np.tile([1.3, 1.3, np.log(LONGEST), np.log(LONGEST), 1.0], (len(raw), 1))
     bounds = list(zip(low.ravel(), high.ravel(), strict=True))
     options = {"maxiter": iterations, "maxcor": 20, "ftol": 1e-8}
     found = minimize(function, np.clip(raw, low, high).ravel(), jac=True, bounds=bounds, options=options)

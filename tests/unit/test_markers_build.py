@@ -106,15 +106,23 @@ def test_fitted_is_nearer_to_the_print_with_a_quarter_of_the_splats(spec):
     fitted, paper = marker(spec), marker(spec, mixture="paper")
     assert 3.5 * len(fitted.cloud) < len(paper.cloud)
     assert psnr(fitted) > 23
-    assert psnr(fitted) > psnr(paper) + 3
+    assert psnr(fitted) > psnr(paper) + 2.5
     assert psnr(fitted) > psnr(marker(spec, growth=0.0))
+
+
+def test_no_hairs_stand_out_of_the_paper():
+    """A line that is much longer than its rectangle gains a few tenths of a decibel and shows as a hair."""
+    made = marker("apriltag:36h11:5")
+    edge = made.grid.shape[1] * made.module / 2
+    low, high = made.cloud.bounds()
+    assert np.all(np.abs([low[:2], high[:2]]) < 1.3 * edge)
 
 
 def test_fitted_beats_paper_on_a_qr_code():
     spec = f"qr-v2-L:{text_of(20)}"
     fitted, paper = marker(spec), marker(spec, mixture="paper")
     assert 4 * len(fitted.cloud) <= len(paper.cloud)
-    assert psnr(fitted) > psnr(paper) + 3
+    assert psnr(fitted) > psnr(paper) + 2.5
 
 
 def test_the_same_bits_on_every_run():
