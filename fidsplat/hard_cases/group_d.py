@@ -48,6 +48,10 @@ def opaque_pictures() -> Iterator[Picture]:
         yield Picture(layers, SMALL)
         yield Picture(layers, SMALL, Quality.named("gsplat"))
     yield Picture(stack([1.0, 0.999, 0.5], stripes[:3]), SMALL, Quality.named("surfel"))
+    # on one plane: opaque splats share what they cover
+    yield Picture(
+        stack([1.0, 1.0, 0.5, 1.0], stripes, step=0.0, size=0.3).with_planes(0), camera(61, 45, 48.0)
+    )
 
 
 def opaque_check(renderer: Renderer) -> Iterator[Finding]:
