@@ -35,7 +35,7 @@ from fidsplat.markers.seams import grow
 
 GROWTH = 0.4  # modules; measured together with the templates, see docs/markers.md
 THINNEST = 0.025  # least sigma in half widths: thinner lines alias between the samples of a pixel
-LONGEST = 0.42  # largest sigma in half widths: longer lines stand out of the corners like hairs
+LONGEST = {"c": 0.42, "x": 0.42, "y": 0.42, "q": 0.25}  # largest sigma: longer lines show as hairs at corners
 CUT = 1 / 255
 # largest aspect ratio, aspect ratio of stage 1, and, beside the one in the middle: pairs on the long axis,
 # pairs on the short axis, fours
@@ -53,7 +53,7 @@ class Symmetric:
     """
 
     def __init__(self, counts: list[tuple[int, int, int]]) -> None:
-        parameter, signs, self.first, self.quadrant = [], [], [0], [0]
+        parameter, signs, longest, self.first, self.quadrant = [], [], [], [0], [0]
         m = 0
         for long, short, fours in counts:
             for kind, number in (("c", 1), ("x", long), ("y", short), ("q", fours)):
@@ -62,11 +62,12 @@ class Symmetric:
                     ys = (1, -1) if kind in "yq" else (0,)
                     signs += [(sx, sy) for sy in ys for sx in xs]
                     parameter += [m] * (len(xs) * len(ys))
+                    longest.append(LONGEST[kind])
                     m += 1
             self.first.append(len(parameter))
             self.quadrant.append(m)
         self.parameter, self.m = np.array(parameter), m
-        self.signs = np.array(signs, float)
+        self.signs, self.longest = np.array(signs, float), np.array(longest)
 
     def slots(self, raw: np.ndarray) -> np.ndarray:
         t = raw[self.parameter]
@@ -77,10 +78,13 @@ class Symmetric:
         return np.column_stack([np.bincount(self.parameter, column, self.m) for column in full.T])
 
 
-def minimise(function, raw: np.ndarray, thinnest: np.ndarray, iterations: int) -> tuple[np.ndarray, float]:
-    """L-BFGS-B within bounds; thinnest (m, 2) are the least sigmas."""
+def minimise(
+    function, raw: np.ndarray, thinnest: np.ndarray, longest: np.ndarray, iterations: int
+) -> tuple[np.ndarray, float]:
+    """L-BFGS-B within bounds; thinnest (m, 2) and longest (m,) are the least and largest sigmas."""
     low = np.column_stack([np.zeros((len(raw), 2)), np.log(thinnest), np.full(len(raw), 0.02)])
-    high = np.tile([1.3, 1.3, np.log(LONGEST), np.log(LONGEST), 1.0], (len(raw), 1))
+    reach, one = np.log(longest), np.ones(len(raw))
+    high = np.column_stack([1.3 * one, 1.3 * one, reach, reach, one])
     bounds = list(zip(low.ravel(), high.ravel(), strict=True))
     options = {"maxiter": iterations, "maxcor": 20, "ftol": 1e-8}
     found = minimize(function, np.clip(raw, low, high).ravel(), jac=True, bounds=bounds, options=options)
@@ -122,7 +126,7 @@ def fit_alone(aspect: float, counts: tuple[int, int, int], starts: int) -> np.nd
             error, g = alone(slots, x, y, inside)
             return error, model.gradient(slots, g).ravel()
 
-        return minimise(function, raw, thinnest, iterations)
+        return minimise(function, raw, thinnest, model.longest, iterations)
 
     found = []
     for seed in range(starts):
@@ -307,7 +311,7 @@ def fit_together(raw: np.ndarray, model: Symmetric, rounds: int) -> np.ndarray:
     for number in range(rounds):
         for layout in layouts:
             layout.freeze(model.slots(raw))
-        raw, error = minimise(function, raw, thinnest, 15)
+        raw, error = minimise(function, raw, thinnest, model.longest, 15)
         print(f"round {number + 1}: {-10 * np.log10(error / 100):.3f} dB", flush=True)
     return raw
 

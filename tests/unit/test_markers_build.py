@@ -115,7 +115,7 @@ def test_no_hairs_stand_out_of_the_paper():
     made = marker("apriltag:36h11:5")
     edge = made.grid.shape[1] * made.module / 2
     low, high = made.cloud.bounds()
-    assert np.all(np.abs([low[:2], high[:2]]) < 1.3 * edge)
+    assert np.all(np.abs([low[:2], high[:2]]) < 1.4 * edge)
 
 
 def test_fitted_beats_paper_on_a_qr_code():
