@@ -122,11 +122,16 @@ def draw() -> int:
 
 
 def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
-    """A title, and what draws it and gives its largest error beyond certificates, in colour and alpha."""
+    """A title, and what draws it and gives its largest error beyond certificates, in colour and alpha.
+
+    Few splats and few pixels in small tiles: lists of none to 90 splats, tiles cut by the picture's edge, and
+    several groups in each launch.
+    """
     import numpy as np
 
     import fidsplat as fs
     from fidsplat.backends.base import View
+    from fidsplat.backends.opencl.arithmetic import run_arithmetic
     from fidsplat.effects import select
     from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture, truth_of
     from fidsplat.hard_cases.clouds import camera, random_splats, splats
@@ -158,6 +163,12 @@ def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
 
         return work
 
+    def arithmetic() -> float:
+        numbers = np.linspace(0.5, 1.0, 64)
+        results = run_arithmetic(backend, -numbers, numbers, numbers, numbers)
+        return float(np.abs(results["exp"] - np.exp(-numbers)).max())
+
+    yield "the self-test's arithmetic", arithmetic
     small, wide, dot = camera(21, 14, 16.0), camera(37, 3, 20.0), camera(1, 1, 5.0)
     around = random_splats(24, 71, depth=(-1.0, 4.0), scale=(1e-3, 3.0))
     crowded = random_splats(90, 72, depth=(1.0, 3.0), scale=(0.02, 0.2), across=0.2)

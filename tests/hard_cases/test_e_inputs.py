@@ -40,6 +40,30 @@ def opencl(renderer):
     return renderer.backend
 
 
+@pytest.mark.parametrize("budget", [None, 40])
+def test_places_of_lists_wrap_around_at_two_to_the_32(renderer, monkeypatch, budget):
+    """E3: a picture of more than 2^32 pairs keeps its places modulo 2^32. The places of a small one are moved
+    up until they wrap amid its tiles.
+    """
+    from fidsplat.backends.opencl import pipeline, probe
+
+    backend = opencl(renderer)
+    cloud = random_splats(60, seed=46, depth=(1.0, 4.0), scale=(0.05, 0.4))
+    wanted = renderer.render(cloud, group_e.VIEW, ("rgb", "depth"))
+    count = pipeline._Run._count
+
+    def moved(run):
+        visible, pairs = count(run)
+        starts = run.read("starts", np.uint32, (run.tiles + 1,))
+        run.held["starts"] = probe.buffer_of(backend, starts + np.uint32(2**32 - pairs // 2))
+        return visible, pairs
+
+    monkeypatch.setattr(pipeline._Run, "_count", moved)
+    monkeypatch.setattr(backend, "pair_budget", budget or backend.pair_budget)
+    frame = renderer.render(cloud, group_e.VIEW, ("rgb", "depth"))
+    assert all(np.array_equal(frame[name], wanted[name]) for name in frame)
+
+
 def test_a_buffer_that_the_device_cannot_give_is_an_error_with_a_remedy(renderer):
     """E3: nothing is allocated beyond the device's limit, and the message says what to do."""
     backend = opencl(renderer)

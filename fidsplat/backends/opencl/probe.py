@@ -35,9 +35,9 @@ def evaluate(
     }
     head = "".join(f"#define {name} {value}\n" for name, value in defines.items())
     program = backend.build(head + kernel_text("prelude.cl") + kernel_text("math.cl") + text)
-    given = [_buffer(backend, array) for array in inputs]
+    given = [buffer_of(backend, array) for array in inputs]
     made = [np.empty(len(inputs[0]), dtype) for dtype in outputs]
-    taken = [_buffer(backend, array) for array in made]
+    taken = [buffer_of(backend, array) for array in made]
     program.probe(backend.queue, (len(inputs[0]),), None, *given, *taken)
     for array, buffer in zip(made, taken, strict=True):
         cl.enqueue_copy(backend.queue, array, buffer)
@@ -50,7 +50,7 @@ def scan(pipeline: OpenCLPipeline, totals: np.ndarray) -> tuple[np.ndarray, int]
     """
     backend = pipeline.backend
     starts, counts = np.empty(len(totals) + 1, np.uint32), np.zeros(6, np.uint32)
-    lengths, places, sums = (_buffer(backend, array) for array in (totals, starts, counts))
+    lengths, places, sums = (buffer_of(backend, array) for array in (totals, starts, counts))
     items = (pipeline.shape.scan_items,)
     kernel = pipeline.kernels["scan_bins"]
     kernel(backend.queue, items, items, np.uint32(len(totals)), lengths, places, sums, np.uint32(4))
@@ -93,6 +93,7 @@ def contents(backend: OpenCLBackend, buffer: cl.Buffer) -> np.ndarray:
     return array
 
 
-def _buffer(backend: OpenCLBackend, array: np.ndarray) -> cl.Buffer:
+def buffer_of(backend: OpenCLBackend, array: np.ndarray) -> cl.Buffer:
+    """An array in a buffer of its own."""
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
     return cl.Buffer(backend.context, flags, hostbuf=np.ascontiguousarray(array))
