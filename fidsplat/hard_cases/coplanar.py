@@ -32,14 +32,16 @@ def tag(side: int = 8, seed: int = 0) -> SplatCloud:
 def turning(
     cloud: SplatCloud, coplanar: str, steps: int = 8, tilt: float = 0.0, width: int = 96, height: int = 80
 ) -> Iterator[Picture]:
-    """Pictures of a tag 1 m wide from 1.6 m, the camera going round it in steps of 1e-4 degrees.
+    """Pictures of a tag 1 m wide from 1.6 m, the camera turning about it in steps of 1e-4 degrees.
 
-    tilt: degrees about the vertical axis, in the middle of the steps; 0 is face to face.
+    It goes round it and rises with it, and is level with its middle halfway. tilt: degrees about the vertical
+    axis halfway; 0 is face to face.
     """
     quality = Quality(coplanar=coplanar)
     for step in range(-steps, steps + 1):
-        angle = math.radians(tilt) + (step + 0.5) * STEP
-        position = -1.6 * math.sin(angle), 0.0, -1.6 * math.cos(angle)
+        rise = (step + 0.5) * STEP
+        round_it, level = math.radians(tilt) + rise, 1.6 * math.cos(rise)
+        position = -level * math.sin(round_it), -1.6 * math.sin(rise), -level * math.cos(round_it)
         camera = Camera.look_at(width, height, 0.8, position, (0, 0, 0))
         yield Picture(cloud, camera, quality, ("rgb",))
 

@@ -13,6 +13,7 @@ from fidsplat.hard_cases.case import Case, Finding
 from fidsplat.hard_cases.clouds import camera, quaternion, random_splats, splats, turned
 from fidsplat.hard_cases.homography import grazing_errors
 from fidsplat.hard_cases.invariance import differing, draw
+from fidsplat.quality import Quality
 from fidsplat.render import Renderer
 from fidsplat.splats import SplatCloud
 
@@ -163,7 +164,9 @@ def _b7_sides(renderer: Renderer) -> Iterator[Finding]:
 def _b8() -> Iterator[Picture]:
     for width, height in ((1, 1), (7, 5), (33, 1), (101, 79)):
         yield Picture(_centred(), camera(width, height, 30.0), outputs=ALL_OUTPUTS)
-    yield Picture(random_splats(80, seed=2), camera(53, 31, 60.0, cx=-20.5, cy=44.25), outputs=ALL_OUTPUTS)
+    beside = camera(53, 31, 60.0, cx=-20.5, cy=44.25)
+    yield Picture(random_splats(80, seed=2), beside, outputs=ALL_OUTPUTS)
+    yield Picture(random_splats(60, seed=13), camera(47, 33, 40.0), Quality(samples=3), ALL_OUTPUTS)
 
 
 def _centred() -> SplatCloud:
@@ -192,5 +195,5 @@ CASES = (
     Case("B5", "far from the world's origin", "camera and cloud at (5e5, 4.5e6, 300) m", _b5, _b5_bits),
     Case("B6", "scales whose products underflow", "1e-38 to 1e9 m", _b6),
     Case("B7", "normals", "both sides of a splat", _b7, _b7_sides),
-    Case("B8", "pixel centres", "odd sizes, 1 x 1; principal point outside", _b8, _b8_mirror),
+    Case("B8", "pixel centres", "odd sizes, 1 x 1; principal point outside; 3 x 3 samples", _b8, _b8_mirror),
 )

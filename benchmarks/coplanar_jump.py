@@ -1,0 +1,115 @@
+"""How far a pixel jumps when a camera turns about a marker in steps of 1e-4 degrees, and when the marker's
+splats are re-ordered.
+
+    python benchmarks/coplanar_jump.py [--device opencl] [-o docs/images/coplanar-jump.png] [--json]
+
+"order" composites a marker's splats by the depth of their centres, as other renderers do and fidsplat does
+with Quality(coplanar="order"); "blend" draws them as one layer. 20 steps about the view in which centres
+change places; 240 x 192 pixels. The picture shows the QR code face to face before and after the worst step.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+import fidsplat as fs
+from fidsplat.hard_cases.clouds import taken
+from fidsplat.hard_cases.coplanar import largest_jump, turning
+from fidsplat.hard_cases.invariance import draw
+from fidsplat.vision.images import to_uint8, write_png
+from fidsplat.vision.paint import contact_sheet
+
+SPECS = {"AprilTag 36h11": "apriltag:36h11:5", "ArUco 4x4": "aruco:4x4_50:7", "QR 5": "qr-v5-L:fidsplat"}
+TILTS = (0.0, 30.0, 60.0)
+MODES = ("order", "blend")
+SIZE = {"width": 240, "height": 192}
+
+
+def measure(renderer: fs.Renderer, name: str, panels: dict) -> list[dict]:
+    """Jumps of one marker; the worst face to face goes to `panels`."""
+    cloud = fs.marker(SPECS[name], size=1.0).cloud
+    shuffled = taken(cloud, np.random.default_rng(0).permutation(len(cloud)))
+    rows = []
+    for tilt in TILTS:
+        row = {"marker": name, "splats": len(cloud), "tilt_deg": tilt}
+        for mode in MODES:
+            jump, before, after = largest_jump(renderer, turning(cloud, mode, 10, tilt, **SIZE))
+            first = next(turning(cloud, mode, 0, tilt, **SIZE))
+            again = next(turning(shuffled, mode, 0, tilt, **SIZE))
+            change = np.abs(draw(renderer, first)["rgb"] - draw(renderer, again)["rgb"]).max()
+            row[f"step_{mode}"], row[f"shuffle_{mode}"] = jump, float(change)
+            if tilt == 0:
+                panels[name, mode] = (jump, before, after)
+        rows.append(row)
+    return rows
+
+
+def picture(panels: dict) -> np.ndarray:
+    """Before, after and the difference of both modes, (h, w, 3) uint8."""
+    rows = []
+    for mode in MODES:
+        jump, before, after = panels["QR 5", mode]
+        titled = (
+            (f"coplanar={mode}", before),
+            ("0.0001 deg on", after),
+            (f"difference, {jump:.2g}", np.abs(after - before)),
+        )
+        # the code's middle, each pixel two wide
+        crop = np.s_[48:144, 72:168]
+        rows.append(
+            [(title, to_uint8(image[crop]).repeat(2, axis=0).repeat(2, axis=1)) for title, image in titled]
+        )
+    return contact_sheet(rows, width=192)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--device", default="opencl")
+    parser.add_argument("-o", "--out", type=Path, help="PNG file for the picture")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    renderer = fs.Renderer(options.device)
+    panels: dict = {}
+    console = Console(stderr=True)
+    rows = [
+        row for name in track(SPECS, "markers", console=console) for row in measure(renderer, name, panels)
+    ]
+    if options.out is not None:
+        write_png(options.out, picture(panels))
+    if options.json:
+        facts = {"date": date.today().isoformat(), "device": renderer.device.title, "rows": rows}
+        json.dump(facts, sys.stdout, indent=2)
+        print()
+        return
+    table = Table(title=f"Largest jump of a pixel on {renderer.device.title}", title_justify="left")
+    for head in (
+        "marker",
+        "splats",
+        "tilt",
+        "step, order",
+        "step, blend",
+        "shuffled, order",
+        "shuffled, blend",
+    ):
+        table.add_column(head, justify="left" if head == "marker" else "right")
+    for row in rows:
+        jumps = (row[f"{what}_{mode}"] for what in ("step", "shuffle") for mode in MODES)
+        table.add_row(
+            row["marker"], str(row["splats"]), f"{row['tilt_deg']:g}", *(f"{jump:.1e}" for jump in jumps)
+        )
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
