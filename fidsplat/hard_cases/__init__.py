@@ -11,12 +11,12 @@ if TYPE_CHECKING:
     from fidsplat.hard_cases.case import Case
 
 GROUPS = {
-    "A": "bounds and near plane",
-    "B": "homography arithmetic",
-    "C": "order and ties",
-    "D": "alpha, transmittance, depth outputs",
-    "E": "inputs, sizes, integers",
-    "F": "device arithmetic",
+    "A": "bounds, near plane",
+    "B": "homography",
+    "C": "order, ties",
+    "D": "alpha, depth",
+    "E": "inputs, sizes",
+    "F": "arithmetic",
 }
 """Letter of each group of the catalogue -> what it is about."""
 
