@@ -10,10 +10,10 @@ from fidsplat import hard_cases
 from fidsplat.cli import main
 from fidsplat.errors import DeviceError
 from fidsplat.hard_cases import check
-from fidsplat.hard_cases.agreement import Picture
+from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
 from fidsplat.hard_cases.arithmetic import BOUNDS, measure
 from fidsplat.hard_cases.case import Case, Finding
-from fidsplat.hard_cases.clouds import camera, random_splats
+from fidsplat.hard_cases.clouds import camera, random_splats, splats, turned
 from fidsplat.vision.images import read_image
 
 CLOUD = random_splats(40, seed=41, depth=(1.0, 4.0), scale=(0.02, 0.5))
@@ -89,6 +89,29 @@ def test_a_device_that_fails_fails_its_case_only(renderer):
     result = check.run_check(renderer, [Case("A2", "fails", "", None, fails), GOOD])
     assert result.failures == ["A2: out of memory"]
     assert result.cases[1].passed
+
+
+def test_certificates_are_small_where_nothing_is_hard():
+    """They are no loose tolerance: below it in every pixel of an ordinary scene, where nothing may flip."""
+    cloud = random_splats(300, seed=1, depth=(1.0, 6.0), scale=(0.01, 0.3))
+    truth = check.truth_of(Picture(cloud, camera(), outputs=ALL_OUTPUTS))
+    assert truth["alpha"].max() > 0.9
+    assert truth["certificate"].max() < 1e-5
+    assert np.median(truth["certificate"]) < 2e-6
+    assert not truth["label_may_flip"].any()
+    assert not truth["depth_median_may_flip"].any()
+
+
+def test_certificates_name_what_single_precision_cannot_decide():
+    # a needle 1e-4 px wide across the picture, through pixel centres; a splat at the cut-off; a tie
+    needle = splats([[0.00625, 0.00625, 1]], turned((0, 0, 1), 45), (0.4, 1.25e-6))
+    faint = splats([[0, 0, 1]], (1, 0, 0, 0), 0.2, np.float32(1 / 255) * (1 + 1e-6))
+    tie = splats([[0, 0, 1], [0, 0, 2]], (1, 0, 0, 0), 50.0, [0.5, 1.0], labels=[1, 2])
+    doubt = [check.truth_of(Picture(cloud, camera(), outputs=ALL_OUTPUTS)) for cloud in (needle, faint, tie)]
+    assert doubt[0]["certificate"].max() > 1e-3
+    assert 0.003 < doubt[1]["certificate"].max() < 0.005
+    assert doubt[2]["label_may_flip"].mean() > 0.5
+    assert all(truth["certificate"][0, 0] < 1e-5 for truth in doubt)
 
 
 def test_too_many_doubtful_pixels_fail(renderer, monkeypatch):
