@@ -19,6 +19,10 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     Raises InputError when the folder is missing or cannot be written.
     """
     target = Path(path)
+    if (
+        target.exists() and not target.is_file()
+    ):  # a folder, a device, a pipe: moving onto it would replace it
+        raise InputError(f"{target} is not an ordinary file; give the name of a file")
     try:
         descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
     except OSError as error:

@@ -18,8 +18,8 @@ from fidsplat.splats import SplatCloud
 
 
 class Frame(Mapping):
-    """A finished picture: a mapping from an output's name to a NumPy array, copied from the device on first
-    use.
+    """A finished picture: a mapping from an output's name to a read-only NumPy array, copied from the
+    device on first use.
 
     Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median` (h, w) metres along z,
     0 where nothing was drawn; `normal` (h, w, 3) unit, camera frame, towards the camera; `label` (h, w)
@@ -36,7 +36,8 @@ class Frame(Mapping):
         if name not in self.outputs:
             raise KeyError(f"this frame has no {name!r}; it was rendered with {', '.join(self.outputs)}")
         if name not in self._arrays:
-            self._arrays[name] = self._planes.read(name)
+            self._arrays[name] = plane = self._planes.read(name)
+            plane.flags.writeable = False  # what is kept is what was drawn
         return self._arrays[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -119,8 +120,12 @@ class Renderer:
         camera = camera or own.camera
         if camera is None:
             raise InputError("no camera: pass camera=fs.Camera... or give the scene a [camera] table")
+        if not isinstance(camera, Camera):
+            raise InputError(f"camera is {camera!r}; it must be a Camera, e.g. fs.Camera.look_at(...)")
         names = own.outputs if outputs is None else outputs
         names = (names,) if isinstance(names, str) else tuple(dict.fromkeys(names))
+        if not names:
+            raise InputError("outputs is empty; name at least one, e.g. 'rgb'")
         chosen = Quality.of(own.quality if quality is None else quality)
         behind = own.background if background is None else tuple(background)
 

@@ -48,6 +48,8 @@ Examples:
         if self.native_2dgs and self.out is None:
             raise InputError("--native-2dgs is about the file that -o names; give -o FILE.ply")
         file = writable_file(self.out) if self.out is not None else None
+        if file is not None and file.suffix.lower() != ".ply":
+            raise InputError(f"splats are written as PLY: name {file.with_suffix('.ply')}, not {file}")
         made = fs.marker(self.spec, size=self.size, mixture=self.mixture)
         if file is not None:
             fs.save_ply(made.cloud, file, native_2dgs=self.native_2dgs)

@@ -69,6 +69,8 @@ def writable_file(path: str | Path) -> Path:
     file = Path(path)
     if file.is_dir():
         raise InputError(f"{file} is a folder; give the name of a file")
+    if file.exists() and not file.is_file():
+        raise InputError(f"{file} is not an ordinary file; give the name of a file")
     writable_folder(file.parent)
     return file
 

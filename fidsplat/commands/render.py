@@ -98,6 +98,10 @@ Examples:
 def _names(out: str | None, source: Path):
     """A function from a plane's name and a suffix to the file that it goes to, in a folder known to be
     writable."""
+    if out == "" or not source.name:
+        raise InputError(
+            "an empty name; give a scene (.toml) or splat file (.ply), and a PNG file or a folder"
+        )
     file = Path(out) if out is not None else Path(source.name).with_suffix(".png")
     if file.suffix.lower() in _OTHER_PICTURES:
         raise InputError(f"pictures are written as PNG: name {file.with_suffix('.png')}, or a folder")

@@ -55,3 +55,11 @@ def test_a_folder_that_is_missing_or_full_is_an_input_error(tmp_path, monkeypatc
     with pytest.raises(InputError, match="No space left"), atomic_write(tmp_path / "a") as stream:
         stream.write(b"x")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_no_ordinary_file_is_not_replaced(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with pytest.raises(InputError, match="not an ordinary file"), atomic_write(pipe):
+        pass
+    assert pipe.is_fifo()

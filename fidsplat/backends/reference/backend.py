@@ -14,7 +14,7 @@ from fidsplat.backends.base import DeviceInfo, View
 from fidsplat.backends.reference.blend import composite
 from fidsplat.backends.reference.resolve import resolve
 from fidsplat.backends.reference.setup import Setup
-from fidsplat.effects import FeatureSet
+from fidsplat.effects import OUTPUTS, FeatureSet
 from fidsplat.errors import UnknownDeviceError
 from fidsplat.splats import SplatCloud
 
@@ -86,7 +86,8 @@ class ReferencePlanes:
     stats: Mapping[str, int]
 
     def read(self, name: str) -> np.ndarray:
-        return self.planes[name]
+        """The plane in the type that every device gives; `planes` keeps float64."""
+        return self.planes[name].astype(OUTPUTS[name].dtype)
 
 
 class ReferencePipeline:
