@@ -22,7 +22,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     if (
         target.exists() and not target.is_file()
     ):  # a folder, a device, a pipe: moving onto it would replace it
-        raise InputError(f"{target} is not an ordinary file; give the name of a file")
+        raise InputError(f"cannot write {target}: it is not an ordinary file; give the name of a file")
     try:
         descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
     except OSError as error:
