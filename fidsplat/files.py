@@ -10,6 +10,17 @@ from typing import BinaryIO
 from fidsplat.errors import InputError
 
 
+def ordinary_file(path: str | os.PathLike[str]) -> Path:
+    """The path of a file, there or yet to be made.
+
+    Raises InputError for a folder, a device or a pipe: moving a file onto one would replace it.
+    """
+    target = Path(path)
+    if target.exists() and not target.is_file():
+        raise InputError(f"cannot write {target}: it is not an ordinary file; give the name of a file")
+    return target
+
+
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """Open a temporary file beside ``path`` for binary writing and move it onto ``path`` when all went well.
@@ -18,11 +29,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
     Raises InputError when the folder is missing or cannot be written.
     """
-    target = Path(path)
-    if (
-        target.exists() and not target.is_file()
-    ):  # a folder, a device, a pipe: moving onto it would replace it
-        raise InputError(f"cannot write {target}: it is not an ordinary file; give the name of a file")
+    target = ordinary_file(path)
     try:
         descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
     except OSError as error:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from fidsplat.errors import InputError
-from fidsplat.files import writable_folder
+from fidsplat.files import ordinary_file, writable_folder
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -69,10 +69,8 @@ def writable_file(path: str | Path) -> Path:
     file = Path(path)
     if file.is_dir():
         raise InputError(f"{file} is a folder; give the name of a file")
-    if file.exists() and not file.is_file():
-        raise InputError(f"{file} is not an ordinary file; give the name of a file")
     writable_folder(file.parent)
-    return file
+    return ordinary_file(file)
 
 
 def _plain(value: Any) -> Any:

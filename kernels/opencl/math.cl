@@ -12,7 +12,6 @@ typedef int vint;
 #define VSTORE(v, p) (*(p) = (v))
 #define VMASK(condition) (-(condition))
 #define VLANE 0.0f
-#define TO_VFLOAT(x) ((float)(x))
 #else
 typedef GLUE(float, LANES) vfloat;
 typedef GLUE(int, LANES) vint;
@@ -21,7 +20,6 @@ typedef GLUE(int, LANES) vint;
 #define VLOAD(p) GLUE(vload, LANES)(0, p)
 #define VSTORE(v, p) GLUE(vstore, LANES)(v, 0, p)
 #define VMASK(condition) (condition)
-#define TO_VFLOAT(x) GLUE(convert_float, LANES)(x)
 #if LANES == 16
 #define VLANE ((vfloat)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
 #elif LANES == 8

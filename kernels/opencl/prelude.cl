@@ -30,8 +30,7 @@ enum {
     VIEW_NEAR, VIEW_FAR, // [m]
     VIEW_LOG_CUT,        // ln(alpha cut-off)
     VIEW_WIDTH, VIEW_HEIGHT,  // of the sample grid
-    VIEW_FILTER,         // (pixels per sample)^2, for filters that are defined in pixels
-    VIEW_COUNT
+    VIEW_FILTER         // (pixels per sample)^2, for filters that are defined in pixels
 };
 
 #define CULLED 0xFFFFFFFFu   // sort key of a splat that is not drawn
