@@ -16,6 +16,8 @@ from fidsplat.quality import Quality
 from fidsplat.scenes import Scene
 from fidsplat.splats import SplatCloud
 
+_NO_SCENE = Scene(())
+
 
 class Frame(Mapping):
     """A finished picture: a mapping from an output's name to a read-only NumPy array, copied from the
@@ -116,7 +118,7 @@ class Renderer:
                 elsewhere.
             DeviceError: the device fails or lacks memory.
         """
-        own = scene if isinstance(scene, Scene) else Scene(())
+        own = scene if isinstance(scene, Scene) else _NO_SCENE
         camera = camera or own.camera
         if camera is None:
             raise InputError("no camera: pass camera=fs.Camera... or give the scene a [camera] table")

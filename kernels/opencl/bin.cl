@@ -1,18 +1,6 @@
 // Lists of splats per tile, each in depth order: a counting sort whose bins are the tiles.
 // Index space of both kernels: one work-item per chunk of the depth-sorted splats.
 
-typedef struct { int first, last; } TileSpan;   // inclusive; empty if first > last
-
-// Tiles of one tile row that the bounds can touch. Both kernels call this, so counts and lists agree.
-static inline TileSpan tile_span(const Bounds *b, int tile_row, int width, int height) {
-    float y0 = (float)(tile_row * TILE_H) + 0.5f, y1 = (float)min(tile_row * TILE_H + TILE_H, height) - 0.5f;
-    float x0, x1;
-    bounds_span(b, y0, y1, &x0, &x1);
-    int first = max(to_pixel(ceil(x0 - 0.5f), width), 0), last = min(to_pixel(floor(x1 - 0.5f), width), width - 1);
-    TileSpan span = {first / TILE_W, first <= last ? last / TILE_W : -1};
-    return span;
-}
-
 // Reads: order, counts[slot] (visible splats), bounds. Writes: this chunk's row of table[CHUNKS][tiles].
 kernel void bin_count(global const uint *restrict order, global const uint *restrict counts, uint slot,
                       global const Bounds *restrict all_bounds, int width, int height, global uint *restrict table) {

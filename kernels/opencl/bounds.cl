@@ -77,3 +77,15 @@ static inline void bounds_rows(const Bounds *b, int height, int *y0, int *y1) {
     *y0 = max(to_pixel(ceil(low - 0.5f), height), 0);
     *y1 = min(to_pixel(floor(high - 0.5f) + 1.0f, height), height);
 }
+
+typedef struct { int first, last; } TileSpan;   // inclusive; empty if first > last
+
+// Tiles of one row of tiles that the bounds can touch. Counts and lists both come from this, so they agree.
+static inline TileSpan tile_span(const Bounds *b, int tile_row, int width, int height) {
+    float y0 = (float)(tile_row * TILE_H) + 0.5f, y1 = (float)min(tile_row * TILE_H + TILE_H, height) - 0.5f;
+    float x0, x1;
+    bounds_span(b, y0, y1, &x0, &x1);
+    int first = max(to_pixel(ceil(x0 - 0.5f), width), 0), last = min(to_pixel(floor(x1 - 0.5f), width), width - 1);
+    TileSpan span = {first / TILE_W, first <= last ? last / TILE_W : -1};
+    return span;
+}

@@ -34,3 +34,6 @@ enum {
 };
 
 #define CULLED 0xFFFFFFFFu   // sort key of a splat that is not drawn
+
+// places in the buffer `tallies`: numbers of splats and pairs (64 bits each), then one word per tile
+enum { TALLY_VISIBLE = 0, TALLY_PAIRS = 2, TALLY_BIG = 4, TALLIES = 8 };

@@ -1,6 +1,6 @@
 // Index space: one work-item per splat.
 // Reads:  view, means, quats, scales, opacities, and what the colour slot and the taps ask for.
-// Writes: splats[i], bounds[i] of visible splats; keys[i]: depth key, or CULLED.
+// Writes: splats[i] of visible splats; keys[i]: depth key, or CULLED; and what the lists are made from (list/*.cl).
 //
 // The set-up is done in `real` (double where there is one) from float inputs (numerics B1).
 
@@ -43,6 +43,7 @@ static inline real3_ rotate_to_camera(global const real *view, real3_ v) {
 
 //@@ camera
 //@@ functions
+//@@ list_functions
 
 kernel void project(
     uint count,
@@ -52,13 +53,14 @@ kernel void project(
     global const float *restrict scales,      // (n, 2) [m]
     global const float *restrict opacities,   // (n)
     global Splat *restrict splats,            // (n)
-    global Bounds *restrict all_bounds,       // (n)
     global uint *restrict keys                // (n)
+//@@ list_args
 //@@ project_args
 ) {
     uint i = get_global_id(0);
     if (i >= count) return;
     keys[i] = CULLED;
+//@@ list_culled
 
     float log_opacity = (float)log((real)opacities[i]);
     float half_r2 = log_opacity - (float)view[VIEW_LOG_CUT];
@@ -144,9 +146,11 @@ kernel void project(
     record.ay = (short)anchor_j;
     record.y0 = (short)y0;
     record.y1 = (short)y1;
+    record.x0 = (short)max(to_pixel(ceil(x0 - 0.5f), width), 0);
+    record.x1 = (short)min(to_pixel(floor(x1 - 0.5f) + 1.0f, width), width);
 //@@ color
 //@@ project
     splats[i] = record;
-    all_bounds[i] = bounds;
+//@@ list
     keys[i] = sortable((float)pz);
 }

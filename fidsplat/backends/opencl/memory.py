@@ -17,6 +17,23 @@ class BufferPool:
         self._context = context
         self._device = device
         self._buffers: dict[str, cl.Buffer] = {}
+        self._spare: dict[tuple[str, int], list[cl.Buffer]] = {}
+
+    def size(self, name: str) -> int:
+        """Bytes of the scratch buffer of that name; 0 if there is none yet."""
+        return self._buffers[name].size if name in self._buffers else 0
+
+    def lease(self, name: str, size: int) -> cl.Buffer:
+        """A buffer for somebody who gives it back (`give_back`) when it is not needed any more."""
+        spare = self._spare.get((name, size))
+        return spare.pop() if spare else self.fresh(name, size)
+
+    def give_back(self, buffers: list[tuple[str, cl.Buffer]]) -> None:
+        """Keeps a few leased buffers for the next picture of the same size."""
+        for name, buffer in buffers:
+            spare = self._spare.setdefault((name, buffer.size), [])
+            if len(spare) < 2:
+                spare.append(buffer)
 
     def scratch(self, name: str, size: int) -> cl.Buffer:
         """A buffer of at least `size` bytes whose content is undefined."""
