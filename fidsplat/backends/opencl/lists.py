@@ -159,7 +159,7 @@ class TiledLists:
         tallies = run.take("tallies", 4 * (_TALLIES + run.tiles))
         windows = run.take("windows", 8 * run.resident.count)
         splats, bounds = run.take("big", 4 * big), run.take("big bounds", size * big)
-        cl.enqueue_fill_buffer(run.queue, tallies, np.uint32(0), 0, 4 * (_TALLIES + run.tiles))
+        cl.enqueue_fill_buffer(run.queue, tallies, np.zeros(1, np.uint32), 0, 4 * (_TALLIES + run.tiles))
         run.project(windows, tallies, np.uint32(big), splats, bounds)
         self._launch_big("tally_big", *self._size(), np.uint32(big), bounds, tallies)
         return big

@@ -69,7 +69,7 @@ class OpenCLPipeline:
         self.features = features
         self.shape = shape
         self.backend = backend
-        self.kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
+        self._kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
         self._bound: dict[str, tuple] = {}
         self.real = np.float64 if features.setup_precision == "float64" else np.float32
 
@@ -89,7 +89,7 @@ class OpenCLPipeline:
         """Launch a kernel, setting only those arguments that have changed since its last launch: from picture
         to picture hardly any do, and setting them takes the host longer than a small stage takes a GPU.
         """
-        kernel, bound = self.kernels[name], self._bound.pop(name, (None,) * len(args))
+        kernel, bound = self._kernels[name], self._bound.pop(name, (None,) * len(args))
         for index, (new, old) in enumerate(zip(args, bound, strict=True)):
             if new is not old and (type(new) is not type(old) or new != old):
                 kernel.set_arg(index, new)

@@ -18,7 +18,9 @@ static inline uint tile_window(const Bounds *b, int x0, int x1, int y0, int y1, 
     uint mask = 0;
     for (int row = 0; row < rows; row++) {
         TileSpan span = tile_span(b, top + row, width, height);
-        if (span.first <= span.last) mask |= ((2u << (span.last - span.first)) - 1u) << (span.first - left) << (row * WINDOW_W);
+        // a chord between two rows of pixels may be wider than those at the rows
+        int first = max(span.first - left, 0), last = min(span.last - left, columns - 1);
+        if (first <= last) mask |= ((2u << (last - first)) - 1u) << first << (row * WINDOW_W);
     }
     return mask;
 }
