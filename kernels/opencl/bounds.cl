@@ -89,3 +89,31 @@ static inline TileSpan tile_span(const Bounds *b, int tile_row, int width, int h
     TileSpan span = {first / TILE_W, first <= last ? last / TILE_W : -1};
     return span;
 }
+
+#define WINDOW_W 8
+#define WINDOW_H 4
+
+// Which tiles the bounds can touch, as bits of a window of WINDOW_W x WINDOW_H tiles with its corner at tile
+// (*corner & 0xFFFF, *corner >> 16); 0 if they reach beyond one. Columns [x0, x1) and rows [y0, y1) enclose them.
+static inline uint tile_window(const Bounds *b, int x0, int x1, int y0, int y1, int width, int height, uint *corner) {
+    int left = x0 / TILE_W, columns = (x1 - 1) / TILE_W - left + 1;
+    int top = y0 / TILE_H, rows = (y1 - 1) / TILE_H - top + 1;
+    *corner = (uint)left | (uint)top << 16;
+    if (rows > WINDOW_H || columns > WINDOW_W) return 0;
+    if (rows == 1) return (1u << columns) - 1u;
+    if (columns == 1) return 0x01010101u >> (WINDOW_W * (WINDOW_H - rows));
+    uint mask = 0;
+    for (int row = 0; row < rows; row++) {
+        TileSpan span = tile_span(b, top + row, width, height);
+        // a chord between two rows of pixels may be wider than those at the rows
+        int first = max(span.first - left, 0), last = min(span.last - left, columns - 1);
+        if (first <= last) mask |= ((2u << (last - first)) - 1u) << first << (row * WINDOW_W);
+    }
+    return mask;
+}
+
+// The tile of the lowest bit of a window (corner, bits).
+static inline int window_tile(uint2 window, int tiles_x) {
+    int bit = 31 - clz(window.y & -window.y);
+    return (int)(window.x >> 16) * tiles_x + (int)(window.x & 0xFFFFu) + bit / WINDOW_W * tiles_x + bit % WINDOW_W;
+}

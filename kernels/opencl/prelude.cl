@@ -35,5 +35,6 @@ enum {
 
 #define CULLED 0xFFFFFFFFu   // sort key of a splat that is not drawn
 
-// places in the buffer `tallies`: numbers of splats and pairs (64 bits each), then one word per tile
-enum { TALLY_VISIBLE = 0, TALLY_PAIRS = 2, TALLY_BIG = 4, TALLIES = 8 };
+// places in the buffer `tallies`: numbers of visible splats, of pairs and of splats (64 bits each) and of big splats; then
+// one word per tile
+enum { TALLY_VISIBLE = 0, TALLY_PAIRS = 2, TALLY_ALL = 4, TALLY_BIG = 6, TALLIES = 8 };

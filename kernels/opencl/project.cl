@@ -1,6 +1,7 @@
 // Index space: one work-item per splat.
 // Reads:  view, means, quats, scales, opacities, and what the colour slot and the taps ask for.
-// Writes: splats[i] of visible splats; keys[i]: depth key, or CULLED; and what the lists are made from (list/*.cl).
+// Writes: splats[i] of visible splats; keys[i]: depth key, or CULLED; windows[i]
+//         of visible splats: the tiles that they touch; big, big_bounds and their number in tallies (numerics A5).
 //
 // The set-up is done in `real` (double where there is one) from float inputs (numerics B1).
 
@@ -43,7 +44,6 @@ static inline real3_ rotate_to_camera(global const real *view, real3_ v) {
 
 //@@ camera
 //@@ functions
-//@@ list_functions
 
 kernel void project(
     uint count,
@@ -53,14 +53,17 @@ kernel void project(
     global const float *restrict scales,      // (n, 2) [m]
     global const float *restrict opacities,   // (n)
     global Splat *restrict splats,            // (n)
-    global uint *restrict keys                // (n)
-//@@ list_args
+    global uint *restrict keys,               // (n)
+    global uint2 *restrict windows,           // (n): corner and bits, or a place in `big` and 0
+    global uint *restrict tallies,
+    uint big_capacity,
+    global uint *restrict big,                // splats that touch more than a window
+    global Bounds *restrict big_bounds
 //@@ project_args
 ) {
     uint i = get_global_id(0);
     if (i >= count) return;
     keys[i] = CULLED;
-//@@ list_culled
 
     float log_opacity = (float)log((real)opacities[i]);
     float half_r2 = log_opacity - (float)view[VIEW_LOG_CUT];
@@ -151,6 +154,16 @@ kernel void project(
 //@@ color
 //@@ project
     splats[i] = record;
+    uint corner, window = tile_window(&bounds, record.x0, record.x1, y0, y1, width, height, &corner);
+    if (window == 0) {
+        // in any order: what is kept of them is looked up by its place or sorted
+        corner = atomic_inc(tallies + TALLY_BIG);
+        if (corner < big_capacity) {
+            big[corner] = i;
+            big_bounds[corner] = bounds;
+        }
+    }
+    windows[i] = (uint2)(corner, window);
 //@@ list
     keys[i] = sortable((float)pz);
 }

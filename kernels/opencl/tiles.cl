@@ -1,4 +1,4 @@
-// Lists of splats per tile for GPUs (list/tiled.cl): places from the tiles' tallies, pairs of (depth key, splat) written
+// Lists of splats per tile for GPUs: places from the tiles' tallies, pairs of (depth key, splat) written
 // there in any order, and a sort of each list. Keys are unique (the splat's index breaks ties), so the sorted lists are
 // the same on every run.
 
@@ -79,9 +79,8 @@ typedef struct {
     uint start, capacity;
 } Band;
 
-static inline void emit_pair(int row, int column, const Band *band, uint key, uint splat,
-                             global uint *restrict cursors, global uint2 *restrict pairs) {
-    int tile = row * band->tiles_x + column;
+static inline void emit_pair(int tile, const Band *band, uint key, uint splat, global uint *restrict cursors,
+                             global uint2 *restrict pairs) {
     if (tile < band->first || tile >= band->end) return;
     // modulo 2^32: a place within the band is right even where the picture has more pairs than that
     uint place = atomic_inc(cursors + tile) - band->start;
@@ -102,13 +101,9 @@ kernel void emit(
     uint key = i < count ? keys[i] : CULLED;
     if (key != CULLED) {
         if (first_band) atomic_inc(&visible);
-        uint2 window = windows[i];
-        int x = window.x & 0xFFFFu, y = window.x >> 16;
         const Band band = {tiles_x, band_first, band_end, starts[band_first], capacity};
-        for (uint mask = window.y; mask != 0; mask &= mask - 1) {
-            int bit = 31 - clz(mask & -mask);
-            emit_pair(y + bit / WINDOW_W, x + bit % WINDOW_W, &band, key, i, cursors, pairs);
-        }
+        for (uint2 window = windows[i]; window.y != 0; window.y &= window.y - 1)
+            emit_pair(window_tile(window, tiles_x), &band, key, i, cursors, pairs);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     if (get_local_id(0) == 0 && visible != 0) atomic_add(tallies + TALLY_VISIBLE, visible);
@@ -132,7 +127,8 @@ kernel __attribute__((reqd_work_group_size(BIG_ITEMS, 1, 1))) void emit_big(
         for (int cell = get_local_id(0); cell < rows * band.tiles_x; cell += BIG_ITEMS) {
             int row = top + cell / band.tiles_x, column = cell % band.tiles_x;
             TileSpan span = tile_span(&b, row, width, height);
-            if (column >= span.first && column <= span.last) emit_pair(row, column, &band, key, splat, cursors, pairs);
+            if (column >= span.first && column <= span.last)
+                emit_pair(row * band.tiles_x + column, &band, key, splat, cursors, pairs);
         }
     }
 }

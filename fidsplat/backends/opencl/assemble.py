@@ -82,7 +82,9 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     }
     if features.sh_degree > 0 or "color_sh" in features.slots:
         defines["SH_DEGREE"] = features.sh_degree
-    files = [f"list/{shape.lists}.cl", *(effect.file for effect in effects)]
+    files = [effect.file for effect in effects]
+    if shape.lists == "tiled":
+        files.append("list/tiled.cl")
     sections = [_sections(file) for file in files]
     known: set[str] = set()
 

@@ -17,17 +17,39 @@ import pyopencl as cl
 if TYPE_CHECKING:
     from fidsplat.backends.opencl.run import Run
 
-# words of the buffer `counts` (ordered): lengths of lists, 64 bits each, that kernels read
-_ALL, _VISIBLE, _PAIRS = 0, 2, 4
-# words of the buffer `tallies` (tiled), as in prelude.cl
-_TALLY_VISIBLE, _TALLY_PAIRS, _TALLY_BIG, _TALLIES = 0, 2, 4, 8
+# words of the buffer `tallies`, as in prelude.cl
+_VISIBLE, _PAIRS, _ALL, _BIG, _TALLIES = 0, 2, 4, 6, 8
 
 
-class OrderedLists:
-    """Kernels scan.cl, sort.cl, bin.cl."""
+class Lists:
+    """What both ways share: the projection and its room for big splats."""
 
     def __init__(self, run: Run) -> None:
         self.run, self.shape = run, run.shape
+        self.size = np.int32(run.view.width), np.int32(run.view.height)
+        self.big = np.uint32(0)
+        """big splats for which there is room"""
+
+    def project(self, words: int, needed: int = 0) -> None:
+        """Zeroes `words` words of the tallies and projects every splat."""
+        run = self.run
+        room = max(needed * 5 // 4, run.pool.size("big") // 4, 4096)
+        self.big = np.uint32(room)
+        tallies = run.take("tallies", 4 * words)
+        windows = run.take("windows", 8 * run.resident.count)
+        big, bounds = (
+            run.take("big", 4 * room),
+            run.take("big bounds", run.pipeline.source.bounds_bytes * room),
+        )
+        cl.enqueue_fill_buffer(run.queue, tallies, np.zeros(1, np.uint32), 0, 4 * words)
+        run.project(windows, tallies, self.big, big, bounds)
+
+
+class OrderedLists(Lists):
+    """Kernels scan.cl, sort.cl, bin.cl."""
+
+    def __init__(self, run: Run) -> None:
+        super().__init__(run)
         self._stats: dict[str, int] = {}
 
     def stats(self) -> dict[str, int]:
@@ -36,13 +58,14 @@ class OrderedLists:
 
     def bands(self) -> Iterator[tuple[int, int]]:
         """Projects and sorts; yields ranges of tiles (first, end), each when its lists are on the device."""
-        run = self.run
-        counts = np.zeros(6, np.uint32)
-        counts[_ALL] = run.resident.count
-        run.put("counts", counts)
-        run.project(run.take("bounds", run.resident.count * run.pipeline.source.bounds_bytes))
-        self._sort()
-        visible, pairs = self._count()
+        run, words = self.run, np.zeros(_TALLIES, np.uint32)
+        while True:
+            self.project(_TALLIES, int(words[_BIG]))
+            self._sort()
+            words = self._count()
+            if words[_BIG] <= self.big:
+                break
+        visible, pairs = (int(words[k]) | int(words[k + 1]) << 32 for k in (_VISIBLE, _PAIRS))
         self._stats = {"splats": run.resident.count, "visible": visible, "pairs": pairs}
         bands = [(0, run.tiles, pairs)]
         if pairs > run.backend.pair_budget:
@@ -56,14 +79,18 @@ class OrderedLists:
     def _sort(self) -> None:
         """Visible splats by depth, ties by index."""
         run = self.run
-        size, bins = run.resident.count * 4, 1 << self.shape.radix_bits
+        count, bins = run.resident.count, 1 << self.shape.radix_bits
         table = run.take("sort table", 4 * bins * self.shape.chunks)
-        keys, order, counts = run.held["keys"], run.take("order 0", size), run.held["counts"]
+        keys, order, tallies = run.held["keys"], run.take("order 0", 4 * count), run.held["tallies"]
+        length = np.array([count, 0], np.uint32)
+        run.uploads.append(
+            cl.enqueue_copy(run.queue, tallies, length, dst_offset=4 * _ALL, is_blocking=False)
+        )
         for number, shift in enumerate(range(0, 32, self.shape.radix_bits)):
             slot = np.uint32(_ALL if number == 0 else _VISIBLE)
-            keys_out = run.take(f"sorted keys {number % 2}", size)
-            order_out = run.take(f"order {(number + 1) % 2}", size)
-            digit = (counts, slot, np.uint32(shift))
+            keys_out = run.take(f"sorted keys {number % 2}", 4 * count)
+            order_out = run.take(f"order {(number + 1) % 2}", 4 * count)
+            digit = (tallies, slot, np.uint32(shift))
             run.launch("sort", "sort_count", self.shape.chunks, 1, keys, *digit, table)
             starts = self._starts("sort", table, bins, _VISIBLE)
             args = (keys, order, *digit, np.uint32(number == 0), table, starts)
@@ -71,18 +98,15 @@ class OrderedLists:
             keys, order = keys_out, order_out
         run.held["order"] = order
 
-    def _count(self) -> tuple[int, int]:
-        """Lengths of the tiles' lists; returns the numbers of visible splats and of pairs."""
+    def _count(self) -> np.ndarray:
+        """Lengths of the tiles' lists; returns the tallies."""
         run = self.run
         table = run.take("bin table", 4 * run.tiles * self.shape.chunks)
-        size = (np.int32(run.view.width), np.int32(run.view.height))
-        counts = run.held["counts"]
-        self._walk = (run.held["order"], counts, np.uint32(_VISIBLE), run.held["bounds"], *size, table)
+        held = (run.held[name] for name in ("order", "tallies", "windows"))
+        self._walk = (*held, self.big, run.held["big bounds"], *self.size, table)
         run.launch("bin", "bin_count", self.shape.chunks, 1, *self._walk)
         run.held["starts"] = self._starts("bin", table, run.tiles, _PAIRS)
-        words = run.read("counts", np.uint32, (6,))
-        visible, pairs = (int(words[k]) | int(words[k + 1]) << 32 for k in (_VISIBLE, _PAIRS))
-        return visible, pairs
+        return run.read("tallies", np.uint32, (_TALLIES,))
 
     def _starts(self, stage: str, table: cl.Buffer, bins: int, slot: int) -> cl.Buffer:
         """Turns a table of counts into places: returns where each bin starts (bins + 1)."""
@@ -91,18 +115,18 @@ class OrderedLists:
         starts = run.take(f"{stage} starts", 4 * (bins + 1))
         items = self.shape.scan_items
         run.launch(stage, "scan_chunks", bins, 64, np.uint32(bins), table, totals)
-        scan = (np.uint32(bins), totals, starts, run.held["counts"], np.uint32(slot))
+        scan = (np.uint32(bins), totals, starts, run.held["tallies"], np.uint32(slot))
         run.launch(stage, "scan_bins", items, items, *scan)
         return starts
 
 
-class TiledLists:
+class TiledLists(Lists):
     """Kernels tiles.cl. The buffers are as large as the last pictures needed, and the stages are launched
     before the host knows whether that is enough; if it is not, the lists are empty and it is all done again.
     """
 
     def __init__(self, run: Run) -> None:
-        self.run = run
+        super().__init__(run)
         self._pairs = 0
         self._visible: tuple[np.ndarray, cl.Event] | None = None
 
@@ -112,24 +136,24 @@ class TiledLists:
         if self._visible is not None:
             words, event = self._visible
             event.wait()
-            visible = int(words[_TALLY_VISIBLE])
+            visible = int(words[_VISIBLE])
         return {"splats": self.run.resident.count, "visible": visible, "pairs": self._pairs}
 
     def bands(self) -> Iterator[tuple[int, int]]:
         """Projects; yields ranges of tiles (first, end), each when its lists are on the device."""
         run = self.run
         capacity = min(run.pool.size("lists") // 4, run.pool.size("pairs") // 8, run.backend.pair_budget)
-        big = self._project()
+        self._project()
         counted = self._starts(capacity)
         if capacity:
             self._list(0, run.tiles, capacity, True)
             yield 0, run.tiles
         words = self._read(counted)
-        while int(words[_TALLY_BIG]) > big:
-            big = self._project(int(words[_TALLY_BIG]))
+        while words[_BIG] > self.big:
+            self._project(int(words[_BIG]))
             counted, capacity = self._starts(0), 0
             words = self._read(counted)
-        self._pairs = int(words[_TALLY_PAIRS]) | int(words[_TALLY_PAIRS + 1]) << 32
+        self._pairs = int(words[_PAIRS]) | int(words[_PAIRS + 1]) << 32
         if self._pairs > capacity or not capacity:
             yield from self._again()
         # the number of visible splats is complete only now; nobody may ask
@@ -151,18 +175,11 @@ class TiledLists:
             self._list(first, end, room, first == 0)
             yield first, end
 
-    def _project(self, big: int = 0) -> int:
-        """Projects and tallies; returns the number of big splats for which there is room."""
-        run = self.run
-        size = run.pipeline.source.bounds_bytes
-        big = max(big * 5 // 4, run.pool.size("big") // 4, 4096)
-        tallies = run.take("tallies", 4 * (_TALLIES + run.tiles))
-        windows = run.take("windows", 8 * run.resident.count)
-        splats, bounds = run.take("big", 4 * big), run.take("big bounds", size * big)
-        cl.enqueue_fill_buffer(run.queue, tallies, np.zeros(1, np.uint32), 0, 4 * (_TALLIES + run.tiles))
-        run.project(windows, tallies, np.uint32(big), splats, bounds)
-        self._launch_big("tally_big", *self._size(), np.uint32(big), bounds, tallies)
-        return big
+    def _project(self, needed: int = 0) -> None:
+        """Projects and tallies."""
+        self.project(_TALLIES + self.run.tiles, needed)
+        held = self.run.held
+        self._launch_big("tally_big", *self.size, self.big, held["big bounds"], held["tallies"])
 
     def _starts(self, capacity: int) -> cl.Event:
         """Where each tile's list starts; all lists are empty if there are more pairs than `capacity`."""
@@ -182,9 +199,8 @@ class TiledLists:
         if count:
             walk = (np.uint32(count), np.uint32(first_band), np.int32(run.tiles_x), *band)
             run.launch("bin", "emit", count, 256, *walk, held["windows"], held["keys"], *places)
-        big = np.uint32(held["big"].size // 4)
         bounds = (held["big"], held["big bounds"], held["keys"])
-        self._launch_big("emit_big", *self._size(), *band, big, *bounds, *places)
+        self._launch_big("emit_big", *self.size, *band, self.big, *bounds, *places)
         sort = (np.int32(first), held["starts"], pairs, lists)
         run.launch("sort", "sort_tiles", (end - first) * 256, 256, *sort)
 
@@ -199,9 +215,6 @@ class TiledLists:
     def _launch_big(self, kernel: str, *args) -> None:
         groups = 4 * self.run.backend.device.max_compute_units
         self.run.launch("bin", kernel, groups * 128, 128, *args)
-
-    def _size(self) -> tuple[np.int32, np.int32]:
-        return np.int32(self.run.view.width), np.int32(self.run.view.height)
 
 
 LISTS = {"ordered": OrderedLists, "tiled": TiledLists}

@@ -55,7 +55,7 @@ def scan(pipeline: OpenCLPipeline, lengths: np.ndarray) -> tuple[np.ndarray, int
         cursors = buffer_of(backend, lengths)
         args, kernel, place = (count, np.uint32(2**32 - 1), tallies, starts, cursors), "tile_starts", 2
     else:
-        tallies = buffer_of(backend, np.zeros(6, np.uint32))
+        tallies = buffer_of(backend, np.zeros(8, np.uint32))
         args, kernel, place = (
             (count, buffer_of(backend, lengths), starts, tallies, np.uint32(4)),
             "scan_bins",
