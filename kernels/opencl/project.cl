@@ -1,6 +1,6 @@
 // Index space: one work-item per splat.
 // Reads:  view, means, quats, scales, opacities, and what the colour slot and the taps ask for.
-// Writes: splats[i] of visible splats; keys[i]: depth key, or CULLED; windows[i]
+// Writes: splats[i] of visible splats; keys[i]: depth key, or CULLED or OUTSIDE; windows[i]
 //         of visible splats: the tiles that they touch; big, big_bounds and their number in tallies (numerics A5).
 //
 // The set-up is done in `real` (double where there is one) from float inputs (numerics B1).
@@ -120,6 +120,11 @@ kernel void project(
     bounds_span(&bounds, (float)y0 + 0.5f, (float)y1 - 0.5f, &x0, &x1);
     // written so that a NaN is culled (numerics E1)
     if (!(y0 < y1 && ceil(x0 - 0.5f) <= (float)(width - 1) && floor(x1 - 0.5f) >= 0.0f)) return;
+
+    if (y1 <= (int)view[VIEW_BAND] || y0 >= (int)view[VIEW_BAND_END]) {
+        keys[i] = OUTSIDE;
+        return;
+    }
 
     // re-anchor at the pixel of the picture that is nearest to the centre
     int anchor_i = (int)clamp(floor((float)center_x), 0.0f, (float)(width - 1));

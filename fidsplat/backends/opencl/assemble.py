@@ -19,7 +19,7 @@ from fidsplat.kernel_files import kernels_folder
 BASE_RECORD_BYTES = 68
 RECORD_ALIGNMENT = 16
 BASE_BOUNDS_BYTES = 32
-_LISTS = {"ordered": ("scan", "sort", "bin"), "tiled": ("tiles",)}
+_LISTS = {"ordered": ("scan", "sort", "bin", "pack"), "tiled": ("tiles",)}
 _HOOK = re.compile(r"^[ \t]*//@@ (\w+)[ \t]*\n", re.MULTILINE)
 _SECTION = re.compile(r"^//@ (\w+)[ \t]*\n", re.MULTILINE)
 _COMMENT = re.compile(r"[ \t]*//[^\n]*")

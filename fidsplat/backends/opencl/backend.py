@@ -15,6 +15,7 @@ from fidsplat.backends.opencl import pocl_target
 from fidsplat.backends.opencl.assemble import DeviceShape, assemble
 from fidsplat.backends.opencl.memory import BufferPool, Resident
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
+from fidsplat.backends.opencl.plan import PAIR
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
@@ -65,13 +66,22 @@ class OpenCLBackend:
         self.side_queue = cl.CommandQueue(self.context)
         """for what the host reads while the stages run"""
         self.pool = BufferPool(self.context, device)
-        self.pair_budget = min(device.max_mem_alloc_size // 4, 2**32 - 1)
-        """Most pairs of splats and tiles that are listed at once; tests make it small."""
+        self.limit_memory(self.info.memory_bytes * 9 // 10)
         self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
 
     def upload(self, cloud: SplatCloud) -> Resident:
         """The cloud in device buffers."""
-        return Resident(self.context, self.queue, self.pool, cloud)
+        return Resident(self, cloud)
+
+    def limit_memory(self, budget: int) -> None:
+        """Lets a picture and the cloud take at most `budget` bytes of the device.
+
+        Pictures that need more are drawn in bands of tiles and chunks of splats, with the same bits.
+        """
+        self.memory_budget = budget
+        largest = self.device.max_mem_alloc_size // 8
+        self.pair_budget = max(1, min(largest, budget // 8 // PAIR[self.shape.lists], 2**32 - 1))
+        """most pairs of splats and tiles that are listed at once"""
 
     def pipeline(self, features: FeatureSet, shape: DeviceShape | None = None) -> OpenCLPipeline:
         """The stages compiled for these features; `shape` replaces the device's own build constants (tests).

@@ -9,10 +9,14 @@ in local memory: few launches, all of them wide. docs/performance.md has both on
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pyopencl as cl
+
+from fidsplat.backends.opencl.plan import KEYS, WINDOWS
+from fidsplat.errors import DeviceError
 
 if TYPE_CHECKING:
     from fidsplat.backends.opencl.run import Run
@@ -22,7 +26,7 @@ _VISIBLE, _PAIRS, _ALL, _BIG, _TALLIES = 0, 2, 4, 6, 8
 
 
 class Lists:
-    """What both ways share: the projection and its room for big splats."""
+    """What all ways share: the projection and its room for big splats."""
 
     def __init__(self, run: Run) -> None:
         self.run, self.shape = run, run.shape
@@ -30,19 +34,29 @@ class Lists:
         self.big = np.uint32(0)
         """big splats for which there is room"""
 
-    def project(self, words: int, needed: int = 0) -> None:
-        """Zeroes `words` words of the tallies and projects every splat."""
+    def make_room(self, words: int, needed: int = 0) -> None:
+        """Zeroes `words` words of the tallies; takes room for at least `needed` big splats."""
         run = self.run
         room = max(needed * 5 // 4, run.pool.size("big") // 4, 4096)
         self.big = np.uint32(room)
         tallies = run.take("tallies", 4 * words)
-        windows = run.take("windows", 8 * run.resident.count)
-        big, bounds = (
-            run.take("big", 4 * room),
-            run.take("big bounds", run.pipeline.source.bounds_bytes * room),
-        )
+        run.take("big", 4 * room)
+        run.take("big bounds", run.pipeline.source.bounds_bytes * room)
         cl.enqueue_fill_buffer(run.queue, tallies, np.zeros(1, np.uint32), 0, 4 * words)
-        run.project(windows, tallies, self.big, big, bounds)
+
+    def project(self, first: int, end: int) -> None:
+        """Records, keys and windows of splats [first, end)."""
+        run, count = self.run, end - first
+        splats = run.take("splats", count * run.pipeline.source.record_bytes)
+        keys, windows = run.take("keys", KEYS * count), run.take("windows", WINDOWS * count)
+        if count == 0:
+            return
+        inputs = [name for effect in run.pipeline.features.effects for name in effect.inputs]
+        arrays = [run.resident.part(name, first, end) for name in ("means", "quats", "scales", "opacities")]
+        extra = [run.resident.part(name, first, end) for name in inputs]
+        big = (run.held["tallies"], self.big, run.held["big"], run.held["big bounds"])
+        args = (np.uint32(count), run.held["view"], *arrays, splats, keys, windows, *big)
+        run.launch("project", "project", count, 64, *args, *extra)
 
 
 class OrderedLists(Lists):
@@ -51,6 +65,7 @@ class OrderedLists(Lists):
     def __init__(self, run: Run) -> None:
         super().__init__(run)
         self._stats: dict[str, int] = {}
+        self._count = run.resident.count
 
     def stats(self) -> dict[str, int]:
         """splats, visible, pairs."""
@@ -59,27 +74,35 @@ class OrderedLists(Lists):
     def bands(self) -> Iterator[tuple[int, int]]:
         """Projects and sorts; yields ranges of tiles (first, end), each when its lists are on the device."""
         run, words = self.run, np.zeros(_TALLIES, np.uint32)
+        run.put_view(0, run.rows)
         while True:
-            self.project(_TALLIES, int(words[_BIG]))
+            self.make_room(_TALLIES, int(words[_BIG]))
+            self.project(0, self._count)
             self._sort()
-            words = self._count()
+            words = self._tally()
             if words[_BIG] <= self.big:
                 break
         visible, pairs = (int(words[k]) | int(words[k + 1]) << 32 for k in (_VISIBLE, _PAIRS))
         self._stats = {"splats": run.resident.count, "visible": visible, "pairs": pairs}
-        bands = [(0, run.tiles, pairs)]
+        yield from self._list(0, run.tiles, pairs)
+
+    def _list(self, first: int, end: int, pairs: int) -> Iterator[tuple[int, int]]:
+        """Lists the tiles [first, end), in as many bands as the budget of pairs asks for."""
+        run = self.run
+        bands = [(first, end, pairs)]
         if pairs > run.backend.pair_budget:
-            bands = run.bands_of(run.read("bin totals", np.uint32, (run.tiles,)))
-        for first, end, listed in bands:
+            totals = run.read("bin totals", np.uint32, (run.tiles,))[first:end]
+            bands = run.bands_of(totals, first)
+        for start, stop, listed in bands:
             lists = run.take("lists", 4 * listed)
-            band = (run.held["starts"], np.int32(first), np.int32(end), np.uint32(listed))
+            band = (run.held["starts"], np.int32(start), np.int32(stop), np.uint32(listed))
             run.launch("bin", "bin_emit", self.shape.chunks, 1, *self._walk, *band, lists)
-            yield first, end
+            yield start, stop
 
     def _sort(self) -> None:
         """Visible splats by depth, ties by index."""
         run = self.run
-        count, bins = run.resident.count, 1 << self.shape.radix_bits
+        count, bins = self._count, 1 << self.shape.radix_bits
         table = run.take("sort table", 4 * bins * self.shape.chunks)
         keys, order, tallies = run.held["keys"], run.take("order 0", 4 * count), run.held["tallies"]
         length = np.array([count, 0], np.uint32)
@@ -98,7 +121,7 @@ class OrderedLists(Lists):
             keys, order = keys_out, order_out
         run.held["order"] = order
 
-    def _count(self) -> np.ndarray:
+    def _tally(self) -> np.ndarray:
         """Lengths of the tiles' lists; returns the tallies."""
         run = self.run
         table = run.take("bin table", 4 * run.tiles * self.shape.chunks)
@@ -118,6 +141,86 @@ class OrderedLists(Lists):
         scan = (np.uint32(bins), totals, starts, run.held["tallies"], np.uint32(slot))
         run.launch(stage, "scan_bins", items, items, *scan)
         return starts
+
+
+class ChunkedLists(OrderedLists):
+    """Kernels pack.cl beside those of OrderedLists: the cloud is projected a chunk at a time, and only what
+    is seen is kept. If that is still too much, the picture is drawn in bands of rows of tiles, the whole
+    cloud being projected for each. A tile's list is the same as ever, and so is the picture.
+    """
+
+    def bands(self) -> Iterator[tuple[int, int]]:
+        """Projects and sorts; yields ranges of tiles (first, end), each when its lists are on the device."""
+        run = self.run
+        rows = [(0, run.tiles_y)]
+        visible = pairs = 0
+        while rows:
+            top, end = rows.pop(0)
+            needed, seen = self._gather(top, end)
+            if needed > run.plan.capacity:
+                rows[:0] = self._split(top, end, needed)
+                continue
+            visible = max(visible, seen)
+            self._sort()
+            self._tally()
+            first, last = top * run.tiles_x, end * run.tiles_x
+            totals = run.read("bin totals", np.uint32, (run.tiles,))[first:last]
+            listed = int(totals.sum(dtype=np.int64))
+            pairs += listed
+            yield from self._list(first, last, listed)
+        self._stats = {"splats": run.resident.count, "visible": visible, "pairs": pairs}
+
+    def _split(self, top: int, end: int, needed: int) -> list[tuple[int, int]]:
+        """A band in parts that each hold few enough splats, if they are spread evenly."""
+        if end - top == 1:
+            raise DeviceError(
+                f"a row of tiles sees more than the {self.run.plan.capacity:,} splats for which the memory "
+                "budget has room; raise memory_budget or draw fewer splats"
+            )
+        parts = min(max(2, -(-needed * 11 // (10 * self.run.plan.capacity))), end - top)
+        cuts = np.linspace(top, end, parts + 1).round().astype(int).tolist()
+        return list(pairwise(cuts))
+
+    def _gather(self, top: int, end: int) -> tuple[int, int]:
+        """Packs the splats of rows of tiles [top, end).
+
+        Returns how many there are (an estimate if they are too many), and how many the picture shows.
+        """
+        run, height = self.run, self.shape.tile_height
+        count, chunk, chunks = run.resident.count, run.plan.chunk, self.shape.chunks
+        run.put_view(top * height, end * height)
+        self.make_room(_TALLIES)
+        source = run.pipeline.source
+        packed = [
+            run.take(f"packed {name}", size * run.plan.capacity)
+            for name, size in (("splats", source.record_bytes), ("keys", KEYS), ("windows", WINDOWS))
+        ]
+        total = seen = 0
+        for start in range(0, count, chunk):
+            stop = min(start + chunk, count)
+            self.project(start, stop)
+            held = run.take("held", 8 * chunks)
+            kept = (np.uint32(stop - start), run.held["keys"])
+            run.launch("project", "pack_count", chunks, 1, *kept, held)
+            counts = run.read("held", np.uint32, (2, chunks)).astype(np.int64)
+            seen += int(counts[1].sum())
+            places = np.concatenate([[0], np.cumsum(counts[0])]) + total
+            total = int(places[-1])
+            if total > run.plan.capacity:
+                return -(-total * count // stop), seen
+            if int(run.read("tallies", np.uint32, (_TALLIES,))[_BIG]) > self.big:
+                self._more_room_for_big()
+                return self._gather(top, end)
+            where = run.put("places", places[:-1].astype(np.uint32))
+            made = (run.held[name] for name in ("splats", "keys", "windows"))
+            run.launch("project", "pack_move", chunks, 1, kept[0], where, *made, *packed)
+        run.held |= dict(zip(("splats", "keys", "windows"), packed, strict=True))
+        self._count = total
+        return total, seen
+
+    def _more_room_for_big(self) -> None:
+        needed = int(self.run.read("tallies", np.uint32, (_TALLIES,))[_BIG])
+        self.make_room(_TALLIES, 2 * needed)
 
 
 class TiledLists(Lists):
@@ -142,6 +245,7 @@ class TiledLists(Lists):
     def bands(self) -> Iterator[tuple[int, int]]:
         """Projects; yields ranges of tiles (first, end), each when its lists are on the device."""
         run = self.run
+        run.put_view(0, run.rows)
         capacity = min(run.pool.size("lists") // 4, run.pool.size("pairs") // 8, run.backend.pair_budget)
         self._project()
         counted = self._starts(capacity)
@@ -177,8 +281,9 @@ class TiledLists(Lists):
 
     def _project(self, needed: int = 0) -> None:
         """Projects and tallies."""
-        self.project(_TALLIES + self.run.tiles, needed)
+        self.make_room(_TALLIES + self.run.tiles, needed)
         held = self.run.held
+        self.project(0, self.run.resident.count)
         self._launch_big("tally_big", *self.size, self.big, held["big bounds"], held["tallies"])
 
     def _starts(self, capacity: int) -> cl.Event:
@@ -217,4 +322,4 @@ class TiledLists(Lists):
         self.run.launch("bin", kernel, groups * 128, 128, *args)
 
 
-LISTS = {"ordered": OrderedLists, "tiled": TiledLists}
+LISTS = {"ordered": OrderedLists, "chunked": ChunkedLists, "tiled": TiledLists}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +13,7 @@ import pyopencl as cl
 from fidsplat.backends.base import View
 from fidsplat.backends.opencl.assemble import DeviceShape, Source
 from fidsplat.backends.opencl.memory import Resident
+from fidsplat.backends.opencl.plan import Plan, plan_of
 from fidsplat.backends.opencl.run import Run
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.catalogue import Output
@@ -79,11 +81,26 @@ class OpenCLPipeline:
         Raises:
             DeviceError: the device runs out of memory or fails.
         """
+        plan = self._plan(resident, view)
+        if plan.chunk and self.shape.lists != "ordered":
+            # one way of drawing in chunks is enough: where memory is short, sorting takes the least time
+            shape = replace(self.shape, lists="ordered")
+            return self.backend.pipeline(self.features, shape).render(resident, view)
         try:
-            run = Run(self, resident, view)
+            run = Run(self, resident, view, plan)
             return OpenCLPlanes(run, run.draw())
         except cl.Error as error:
             raise DeviceError(f"{self.backend.info.title} failed while drawing: {error}") from error
+
+    def _plan(self, resident: Resident, view: View) -> Plan:
+        pixels = view.width * view.height
+        planes = 4 + sum(planes for effect in self.features.effects for planes in effect.planes)
+        channels = sum(output.channels for output in self.features.outputs)
+        fixed = 4 * pixels * planes + 4 * pixels // view.samples**2 * channels + resident.device_bytes
+        backend, record = self.backend, self.source.record_bytes
+        budget, largest = backend.memory_budget, backend.device.max_mem_alloc_size
+        upload = resident.bytes_per_splat if resident.streamed else 0
+        return plan_of(resident.count, record, upload, fixed, self.shape.lists, budget, largest)
 
     def launch(self, queue: cl.CommandQueue, name: str, size: tuple, group: tuple, args: tuple) -> cl.Event:
         """Launch a kernel, setting only those arguments that have changed since its last launch: from picture
@@ -103,7 +120,7 @@ class OpenCLPipeline:
         (n, words) float32 (undefined for culled splats); raw (4, rows, columns) float32: r, g, b,
         transmittance of the padded sample grid; and the finished outputs by name.
         """
-        run = Run(self, resident, view)
+        run = Run(self, resident, view, Plan(0, resident.count))
         planes = OpenCLPlanes(run, run.draw())
         stats = planes.stats
         words = self.source.record_bytes // 4

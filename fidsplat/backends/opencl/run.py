@@ -16,6 +16,7 @@ import pyopencl as cl
 from fidsplat.backends.base import View
 from fidsplat.backends.opencl.lists import LISTS
 from fidsplat.backends.opencl.memory import Resident
+from fidsplat.backends.opencl.plan import Plan
 from fidsplat.effects.catalogue import Output
 
 if TYPE_CHECKING:
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
 class Run:
     """The buffers and launches of one picture."""
 
-    def __init__(self, pipeline: OpenCLPipeline, resident: Resident, view: View) -> None:
-        self.pipeline, self.resident, self.view = pipeline, resident, view
+    def __init__(self, pipeline: OpenCLPipeline, resident: Resident, view: View, plan: Plan) -> None:
+        self.pipeline, self.resident, self.view, self.plan = pipeline, resident, view, plan
         self.backend, self.shape = pipeline.backend, pipeline.shape
         self.queue, self.pool = self.backend.queue, self.backend.pool
         self.tiles_x = -(-view.width // self.shape.tile_width)
@@ -37,31 +38,17 @@ class Run:
         self.events: list[tuple[str, cl.Event]] = []
         self.uploads: list[cl.Event] = []
         self.held: dict[str, cl.Buffer] = {}
-        self.lists = LISTS[self.shape.lists](self)
+        self.lists = LISTS["chunked" if plan.chunk else self.shape.lists](self)
         self.stats: Callable[[], dict[str, int]] = self.lists.stats
 
     def draw(self) -> dict[str, tuple[Output, cl.Buffer]]:
         """All stages; returns the outputs by name."""
         raw_planes = self._sample_planes()
-        self.put("view", self._uniforms())
         for first, end in self.lists.bands():
             self._blend(first, end, raw_planes)
         return self._resolve(raw_planes)
 
     # stages
-
-    def project(self, *list_buffers) -> None:
-        """Records, keys, and what the lists are made from, of every splat."""
-        count, cloud = self.resident.count, self.resident.buffers
-        splats = self.take("splats", count * self.pipeline.source.record_bytes)
-        keys = self.take("keys", count * 4)
-        if count == 0:
-            return
-        extra = [cloud[name] for effect in self.pipeline.features.effects for name in effect.inputs]
-        arrays = (cloud[name] for name in ("means", "quats", "scales", "opacities"))
-        view = self.held["view"]
-        args = (np.uint32(count), view, *arrays, splats, keys, *list_buffers, *extra)
-        self.launch("project", "project", count, 64, *args)
 
     def _sample_planes(self) -> list[cl.Buffer]:
         """Planes that blending fills: raw, then those of the taps in order."""
@@ -140,23 +127,24 @@ class Run:
         self.events.append((stage, event))
         return event
 
-    def bands_of(self, totals: np.ndarray) -> list[tuple[int, int, int]]:
-        """Ranges of tiles (first, end, pairs) whose lists fit the budget; `totals` (tiles,): their lengths.
+    def bands_of(self, totals: np.ndarray, start: int = 0) -> list[tuple[int, int, int]]:
+        """Ranges of tiles (first, end, pairs) whose lists fit the budget.
 
-        A band holds at least one tile, whatever its list.
+        totals (k,): lengths of the lists of the tiles from `start` on. A band holds at least one tile.
         """
         ends = np.cumsum(totals, dtype=np.int64)
         bands, first, done = [], 0, 0
-        while first < self.tiles:
+        while first < len(totals):
             end = int(np.searchsorted(ends, done + self.backend.pair_budget, side="right"))
             end = max(end, first + 1)
-            bands.append((first, end, int(ends[end - 1]) - done))
+            bands.append((start + first, start + end, int(ends[end - 1]) - done))
             first, done = end, int(ends[end - 1])
         return bands
 
-    def _uniforms(self) -> np.ndarray:
+    def put_view(self, row: int, end: int) -> None:
+        """The uniforms of the projection, for rows of samples [row, end)."""
         view = self.view
         tail = [view.fx, view.fy, view.cx, view.cy, view.near, view.far, view.log_cut]
-        tail += [view.width, view.height, 1.0 / view.samples**2]
+        tail += [view.width, view.height, 1.0 / view.samples**2, row, end]
         parts = [view.rotation.ravel(), view.translation, view.eye, tail]
-        return np.concatenate(parts).astype(self.pipeline.real)
+        self.put("view", np.concatenate(parts).astype(self.pipeline.real))
