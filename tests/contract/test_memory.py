@@ -55,7 +55,7 @@ def test_many_big_splats_in_chunks(opencl):
     """More splats that touch many tiles than the first guess has room for."""
     crowd = random_splats(20000, seed=2, scale=(0.5, 5.0))
     wanted = opencl.render(crowd, CAMERA, ("rgb", "depth"))
-    own = small(opencl, 2.2)
+    own = small(opencl, 3.2)
     frame = own.render(crowd, CAMERA, ("rgb", "depth"))
     assert "packed splats" in own.backend.pool._buffers
     assert frame.stats == wanted.stats
