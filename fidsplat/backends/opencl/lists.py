@@ -53,7 +53,10 @@ class Lists:
             return
         inputs = [name for effect in run.pipeline.features.effects for name in effect.inputs]
         arrays = [run.resident.part(name, first, end) for name in ("means", "quats", "scales", "opacities")]
-        extra = [run.resident.part(name, first, end) for name in inputs]
+        # the keys of planes are the view's, all else is the cloud's
+        extra = [
+            run.held[name] if name == "plane_keys" else run.resident.part(name, first, end) for name in inputs
+        ]
         big = (run.held["tallies"], self.big, run.held["big"], run.held["big bounds"])
         args = (np.uint32(count), run.held["view"], *arrays, splats, keys, windows, *big)
         run.launch("project", "project", count, 64, *args, *extra)

@@ -158,3 +158,5 @@ class Run:
         tail += [view.width, view.height, 1.0 / view.samples**2, row, end]
         parts = [view.rotation.ravel(), view.translation, view.eye, tail]
         self.put("view", np.concatenate(parts).astype(self.pipeline.real))
+        if self.resident.planes is not None:
+            self.put("plane_keys", self.resident.planes.keys(view))
