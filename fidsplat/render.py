@@ -66,6 +66,11 @@ class ResidentCloud:
     def __len__(self) -> int:
         return self._count
 
+    @property
+    def memory_bytes(self) -> int:
+        """Device memory that it takes; 0 where a backend does not say."""
+        return getattr(self._data, "memory_bytes", 0)
+
 
 class Renderer:
     """Draws splats on one device. Compiled pipelines and scratch buffers are kept from picture to picture.

@@ -4,6 +4,7 @@ status. Its docstring is the line in the list of commands, its HELP what `fidspl
 Nothing heavy is imported before ``run``, so that help and errors come at once.
 """
 
+from fidsplat.commands.bench import Bench
 from fidsplat.commands.check import Check
 from fidsplat.commands.demo import Demo
 from fidsplat.commands.detect import Detect
@@ -18,5 +19,6 @@ COMMANDS = {
     "render": Render,
     "detect": Detect,
     "check": Check,
+    "bench": Bench,
 }
 """Every command by its name, in the order in which help lists them."""

@@ -18,6 +18,11 @@ class BufferPool:
         self._device = device
         self._buffers: dict[str, cl.Buffer] = {}
 
+    @property
+    def memory_bytes(self) -> int:
+        """What the scratch buffers hold."""
+        return sum(buffer.size for buffer in self._buffers.values())
+
     def scratch(self, name: str, size: int) -> cl.Buffer:
         """A buffer of at least `size` bytes whose content is undefined."""
         held = self._buffers.get(name)
@@ -74,3 +79,8 @@ class Resident:
             if array.nbytes:
                 cl.enqueue_copy(queue, buffer, np.ascontiguousarray(array))
         queue.finish()
+
+    @property
+    def memory_bytes(self) -> int:
+        """What the cloud's buffers hold."""
+        return sum(buffer.size for buffer in self.buffers.values())
