@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 _LEGEND = (
     "ms: median (quartiles) of whole frames, medians of the stages by the device's own clock; splats "
-    "resident, picture left on the device. x floor: how many times what the device would need at its measured best "
-    "(docs/performance.md)."
+    "resident, picture left on the device. x floor: how many times what the device would need at its "
+    "measured best (docs/performance.md)."
 )
 
 
@@ -30,7 +30,8 @@ class Bench:
 
 The devices draw the same frames in turn. For each scene: milliseconds per frame and per stage, what there was
 to draw, device memory, and how many times the device's measured floor that is. Without --scenes: tag,
-r100k_720p, r1m_1080p and tag_in_million, about a minute on two cores. A run that is stopped shows what it has.
+r100k_720p, r1m_1080p and tag_in_million, about a minute on two cores. A run that is stopped shows what it
+has.
 
   tag             an AprilTag alone, 640 x 480
   r100k_720p      100,000 random splats, 1280 x 720

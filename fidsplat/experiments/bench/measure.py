@@ -30,7 +30,9 @@ class Result:
     device: DeviceInfo
     width: int
     height: int
-    rates: Rates | None
+    rates: Rates | None = None
+    renderer: str = "fidsplat"
+    """who draws; benchmarks/peers has others"""
     first_frame_ms: float = 0.0
     """with compilation, or with what a kernel cache leaves of it"""
     counts: dict[str, int] = field(default_factory=dict)
@@ -68,7 +70,7 @@ class Result:
         """For JSON: one flat record."""
         record = {
             "scene": self.scene,
-            "renderer": "fidsplat",
+            "renderer": self.renderer,
             "device": self.device.name,
             "title": self.device.title,
             "platform": self.device.platform,
@@ -130,7 +132,7 @@ class Bench:
         runs = []
         for name, rates in self.devices.items():
             self._tell(f"{scene}: first frame on {name}")
-            runs.append(_Run(scene, name, rates, cloud, camera))
+            runs.append(SceneRun(scene, name, rates, cloud, camera))
             self.results.append(runs[-1].result)
         self._tell(scene)
         for number in range(WARM_UP + repeats):
@@ -140,7 +142,7 @@ class Bench:
                     self._tick()
 
 
-class _Run:
+class SceneRun:
     """One scene on one device. A renderer of its own, so that memory is that of this scene alone."""
 
     def __init__(
@@ -149,12 +151,15 @@ class _Run:
         self.renderer = Renderer(device)
         self.camera = camera
         self.result = Result(scene, self.renderer.device, camera.width, camera.height, rates)
+        self.picture = np.zeros((camera.height, camera.width, 3), np.float32)
+        """what was drawn, (h, w, 3)"""
         try:
             self.resident = self.renderer.upload(cloud)
             start = time.perf_counter()
             frame = self.renderer.render(self.resident, camera)
-            self.result.mean_rgb = float(frame["rgb"].mean(dtype=np.float64))
+            self.picture = frame["rgb"]
             self.result.first_frame_ms = 1e3 * (time.perf_counter() - start)
+            self.result.mean_rgb = float(self.picture.mean(dtype=np.float64))
             self._count(frame, cloud)
         except FidsplatError as error:
             self.result.error = str(error)
@@ -174,7 +179,7 @@ class _Run:
         result.floors = floor_ms(counts, result.rates)
 
     def draw(self, counts: bool) -> None:
-        """One frame, timed; it goes into the result if it counts."""
+        """Draw one frame and time it; it goes into the result if it counts."""
         if self.result.error:
             return
         try:
