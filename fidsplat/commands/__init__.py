@@ -11,6 +11,7 @@ from fidsplat.commands.detect import Detect
 from fidsplat.commands.devices import Devices
 from fidsplat.commands.marker import Marker
 from fidsplat.commands.render import Render
+from fidsplat.commands.warm import Warm
 
 COMMANDS = {
     "demo": Demo,
@@ -20,5 +21,6 @@ COMMANDS = {
     "detect": Detect,
     "check": Check,
     "bench": Bench,
+    "warm": Warm,
 }
 """Every command by its name, in the order in which help lists them."""
