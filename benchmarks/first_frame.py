@@ -1,5 +1,5 @@
-"""How long the first picture takes in a new process: with empty kernel caches, with those that `fidsplat warm`
-filled, and with those that the same scene left.
+"""How long the first picture takes in a new process: with empty kernel caches, with those that
+`fidsplat warm` filled, and with those that the same scene left.
 
     python benchmarks/first_frame.py [tag] [demo] [--device opencl] [--repeats 5] [--json FILE]
 

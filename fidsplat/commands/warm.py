@@ -51,6 +51,8 @@ Examples:
                 sets = [{"set": words, "seconds": seconds} for words, seconds in done]
                 print_json(record | {"sets": sets, "of": len(wanted), "seconds": took})
             else:
-                words = f"{len(done)} of {len(wanted)} sets of kernels are ready on {device.title}; {took:.1f} s"
+                words = (
+                    f"{len(done)} of {len(wanted)} sets of kernels are ready on {device.title}; {took:.1f} s"
+                )
                 where.print(words, markup=False, soft_wrap=True)
         return 0

@@ -69,7 +69,7 @@ def _random(name: str) -> BenchScene:
 BENCH_SCENES: dict[str, BenchScene] = {
     "tag": BenchScene("an AprilTag alone, 640 x 480", tag),
     **{name: _random(name) for name in SCENES},
-    "qr_wall": BenchScene("200 QR codes of version 22 on a wall, 1920 x 1080", qr_wall),
+    "qr_wall": BenchScene("200 QR codes of version 22 on a wall, 1920 x 1080", qr_wall, heavy=True),
     "tag_in_million": BenchScene("an AprilTag before 1,000,000 random splats, 1920 x 1080", tag_in_million),
 }
 """In the order in which they are listed."""

@@ -19,6 +19,7 @@ COUNTS = (2, 70_000)
 """Splats of the pictures that are drawn: launches of few and of many work-items."""
 
 _PLANES = (("rgb",), ("rgb", "depth"), ("rgb", "depth", "normal", "label"))
+_STANDARD = Quality()
 _SHARP = Quality(lowpass="none", samples=3)  # what docs/rendering.md advises for dense codes
 
 
@@ -31,14 +32,14 @@ class Recipe:
     markers: bool
     """whether splats are printed on planes, as those of markers are"""
     outputs: tuple[str, ...]
-    quality: Quality = Quality()
+    quality: Quality = _STANDARD
 
     @property
     def words(self) -> str:
         """For people."""
         colors = "plain colours" if self.sh_degree < 0 else f"SH of degree {self.sh_degree}"
         markers = "markers" if self.markers else "no markers"
-        quality = "" if self.quality == Quality() else "; no low-pass, 3 x 3 samples"
+        quality = "" if self.quality == _STANDARD else "; no low-pass, 3 x 3 samples"
         return f"{colors}, {markers}: {', '.join(self.outputs)}{quality}"
 
 
