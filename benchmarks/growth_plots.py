@@ -40,13 +40,13 @@ def plot(series: str, records: list[dict], file: Path) -> None:
         over, dashes = [abscissa(record) for record in own], ("-", "--", ":", "-.")[number % 4]
         slope = slopes[title]
         words = title if slope is None else f"{title}: frame ~ x^{slope:.2f}"
-        axes.loglog(over, [r["frame_ms"] for r in own], f"k{dashes}", marker="o", lw=2, ms=4, label=words)
-        for stage in own[0]["stages_ms"]:
+        axes.loglog(over, [r["fastest_ms"] for r in own], f"k{dashes}", marker="o", lw=2, ms=4, label=words)
+        for stage in own[0]["fastest_stages_ms"]:
             color = styles.setdefault(stage, f"C{len(styles)}")
-            times = [record["stages_ms"].get(stage) for record in own]
+            times = [record["fastest_stages_ms"].get(stage) for record in own]
             label = stage if number == 0 else None
             axes.loglog(over, times, color=color, ls=dashes, lw=1, marker=".", ms=4, label=label)
-    axes.set(xlabel=UNITS[series], ylabel="ms", title=TITLES[series])
+    axes.set(xlabel=UNITS[series], ylabel="ms, fastest of the repeats", title=TITLES[series])
     axes.grid(which="both", alpha=0.25, lw=0.5)
     axes.legend(fontsize=8)
     with atomic_write(file) as stream:

@@ -89,13 +89,15 @@ def exponent(x: Sequence[float], y: Sequence[float]) -> float | None:
 
 
 def exponents(records: Sequence[dict]) -> Iterator[tuple[str, str, dict[str, float | None]]]:
-    """For each device and series: the exponents of `frame` and of each stage."""
+    """For each device and series: the exponents of `frame` and of each stage, from the fastest of the
+    repeats, which other work on the machine disturbs least."""
     drawn = [record for record in records if not record.get("error") and "frame_ms" in record]
     for title, series in dict.fromkeys((record["title"], record["series"]) for record in drawn):
         chosen = [record for record in drawn if (record["title"], record["series"]) == (title, series)]
         chosen.sort(key=abscissa)
         over = [abscissa(record) for record in chosen]
-        found = {"frame": exponent(over, [record["frame_ms"] for record in chosen])}
-        for stage in chosen[0]["stages_ms"]:
-            found[stage] = exponent(over, [record["stages_ms"].get(stage, 0.0) for record in chosen])
+        found = {"frame": exponent(over, [record["fastest_ms"] for record in chosen])}
+        for stage in chosen[0]["fastest_stages_ms"]:
+            times = [record["fastest_stages_ms"].get(stage, 0.0) for record in chosen]
+            found[stage] = exponent(over, times)
         yield title, series, found

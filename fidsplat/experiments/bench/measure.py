@@ -88,8 +88,10 @@ class Result:
         return record | {
             "frame_ms": middle,
             "quartiles_ms": [low, high],
+            "fastest_ms": min(self.frames),
             "first_frame_ms": self.first_frame_ms,
             "stages_ms": self.stage_ms,
+            "fastest_stages_ms": {stage: min(times) for stage, times in self.stages.items()},
             **self.counts,
             "splats_per_second": 1e3 * self.counts["splats"] / middle,
             "memory_bytes": self.memory_bytes,
