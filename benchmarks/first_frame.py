@@ -25,6 +25,8 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from fidsplat.files import atomic_write
+
 SCENES = ("tag", "demo")
 CACHES = ("empty", "warmed", "kept")
 PARTS = ("python", "import", "scene", "device", "frame")
@@ -133,7 +135,8 @@ def main() -> None:
     console.print(table)
     console.print(f"fidsplat warm, with empty caches: {records[0]['warm_seconds']:.1f} s")
     if options.json:
-        Path(options.json).write_text(json.dumps(records, indent=2) + "\n", encoding="utf-8")
+        with atomic_write(options.json) as stream:
+            stream.write(json.dumps(records, indent=2).encode() + b"\n")
 
 
 if __name__ == "__main__":

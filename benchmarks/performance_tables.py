@@ -17,6 +17,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
+from fidsplat.experiments.bench.catalogue import BENCH_SCENES
 from fidsplat.experiments.bench.growth import exponents
 from fidsplat.files import atomic_write
 
@@ -36,6 +37,9 @@ def load(files: Iterable[Path]) -> dict[str, list[dict]]:
         results = [record for record in content["results"] if record.get("frame_ms")]
         with_peer = any(record["renderer"] != "fidsplat" for record in results)
         found["peers" if with_peer else "frames"] += results
+    scenes = list(BENCH_SCENES)
+    for kind in ("frames", "peers"):  # devices of one scene stand together, whichever file they come from
+        found[kind].sort(key=lambda record: scenes.index(record["scene"]))
     return found
 
 

@@ -170,7 +170,8 @@ class Backend(Protocol):
 
 @runtime_checkable
 class Measurable(Protocol):
-    """A backend that can also be held against its hardware; not all can."""
+    """A backend that can also be held against its hardware: it has these, and kernels for the effect
+    `overdraw`. Not all have."""
 
     @property
     def memory_bytes(self) -> int:
