@@ -21,7 +21,7 @@ from matplotlib import pyplot as plt
 from fidsplat.experiments.bench.growth import abscissa, exponents
 from fidsplat.files import atomic_write
 
-UNITS = {"splats": "splats", "pixels": "pixels", "overdraw": "drawn fragments per pixel"}
+UNITS = {"splats": "splats", "pixels": "pixels", "overdraw": "splats over a pixel, seen or hidden"}
 TITLES = {
     "splats": "1920 x 1080, the same covered area",
     "pixels": "a million splats",

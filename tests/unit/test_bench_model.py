@@ -74,11 +74,11 @@ def record(title: str, series: str, x: float, ms: float, **changes) -> dict:
 
 def test_exponents_by_device_and_series_leave_out_what_failed():
     records = [record("cpu", "splats", x, x**0.5) for x in (100.0, 10.0, 1000.0)]
-    records += [record("gpu", "overdraw", f, f, fragments_per_pixel=f**2) for f in (1.0, 2.0, 4.0)]
+    records += [record("gpu", "overdraw", f, f, layers_per_pixel=f**2) for f in (1.0, 2.0, 4.0)]
     records.append({"title": "gpu", "series": "overdraw", "x": 8.0, "error": "no memory"})
     found = {(title, series): powers for title, series, powers in exponents(records)}
     assert found["cpu", "splats"] == {"frame": pytest.approx(0.5), "blend": pytest.approx(0.5)}
-    assert found["gpu", "overdraw"]["frame"] == pytest.approx(0.5)  # over the fragments, not the factor
+    assert found["gpu", "overdraw"]["frame"] == pytest.approx(0.5)  # over the layers, not the factor
 
 
 def test_series_cover_what_they_promise():

@@ -132,7 +132,10 @@ def test_growth_goes_on_where_it_was(tmp_path, capsys):
     assert again[:2] == first  # not measured anew
     assert file.read_text().startswith(lines)
     assert growth.read(file) == again
-    assert all(record["fragments_per_pixel"] > 0 for record in again)
+    (thick,) = growth.run(
+        {"overdraw": [Point("overdraw", 2, 400, 1.0, 64, 48)]}, "opencl", 1, 60.0, tmp_path / "o"
+    )
+    assert thick["layers_per_pixel"] > thick["fragments"] / (64 * 48) > 1
 
 
 def test_growth_stops_where_it_takes_too_long(tmp_path, capsys):

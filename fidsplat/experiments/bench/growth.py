@@ -1,5 +1,4 @@
-"""How the time of a frame grows: with the number of splats, of pixels, and of splats that lie over one
-another."""
+"""How the time of a frame grows: with the splats, the pixels, and the splats that lie over one another."""
 
 from __future__ import annotations
 
@@ -12,7 +11,9 @@ import numpy as np
 from fidsplat.backends.base import Rates
 from fidsplat.cameras import Camera
 from fidsplat.experiments.bench.measure import WARM_UP, SceneRun
+from fidsplat.experiments.bench.overdraw import overdraw
 from fidsplat.experiments.scenes import random_cloud, standard_camera
+from fidsplat.quality import Quality
 from fidsplat.splats import SplatCloud
 
 MILLION = 1_000_000
@@ -57,7 +58,8 @@ def points() -> dict[str, list[Point]]:
 
 
 def measure(point: Point, device: str, rates: Rates | None, repeats: int) -> dict:
-    """The record of a point: as in `fidsplat bench --json`, with its series, its x and `fragments_per_pixel`.
+    """The record of a point: as in `fidsplat bench --json`, with its series and x; for the series `overdraw`
+    also `layers_per_pixel`, the fragments that lie over a pixel whether or not it lets light through to them.
 
     A device that cannot draw it says so in `error`.
     """
@@ -67,14 +69,15 @@ def measure(point: Point, device: str, rates: Rates | None, repeats: int) -> dic
     for number in range(WARM_UP + repeats):
         run.draw(counts=number >= WARM_UP)
     record = run.result.as_dict() | {"series": point.series, "x": point.x}
-    if "fragments" in record:
-        record["fragments_per_pixel"] = record["fragments"] / (point.width * point.height)
+    if point.series == "overdraw" and "fragments" in record:
+        layers = overdraw(run.renderer, run.resident, camera, Quality(transmittance_stop=0.0))
+        record["layers_per_pixel"] = float(layers.mean(dtype=np.float64))
     return record
 
 
 def abscissa(record: dict) -> float:
-    """What a record is plotted over: x, but in the series `overdraw` the fragments per pixel."""
-    return record.get("fragments_per_pixel", record["x"]) if record["series"] == "overdraw" else record["x"]
+    """What a record is plotted over: x, but in the series `overdraw` the layers per pixel."""
+    return record.get("layers_per_pixel", record["x"])
 
 
 def exponent(x: Sequence[float], y: Sequence[float]) -> float | None:
