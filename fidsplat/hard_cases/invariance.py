@@ -45,6 +45,18 @@ def differing(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray],
     return int(different.sum())
 
 
+def out_of_order(traced: Mapping[str, np.ndarray], wanted: np.ndarray) -> int:
+    """How many splats of a trace do not follow the order `wanted` (visible,), in tiles' lists or at all."""
+    if "lists" not in traced:
+        return int((traced["order"] != wanted).sum())
+    rank = np.full(len(traced["keys"]), -1)
+    rank[wanted] = np.arange(len(wanted))
+    places, starts = rank[traced["lists"]], traced["starts"].astype(np.int64)
+    follows = np.ones(len(places), bool)  # the one before it in the same list
+    follows[starts[:-1][starts[:-1] < len(places)]] = False
+    return int((places < 0).sum() + (follows[1:] & (np.diff(places) <= 0)).sum())
+
+
 def has_tiles(renderer: Renderer) -> bool:
     """Whether the device draws in tiles whose size can be chosen."""
     return hasattr(renderer.backend, "shape")

@@ -14,7 +14,7 @@ from fidsplat.backends.base import Rates
 # if it is
 _DECIDE, _ROTATION, _COLOR = 12 + 8 + 4, 16, 12
 RECORD = 64  # what the crossing and the colour of a splat take, as in splat.cl
-BOUNDS = 32  # what says which tiles a splat can touch, as in bounds.cl
+WINDOW = 8  # what says which tiles a splat can touch
 _KEY, _INDEX = 4, 4
 # operations that a multiply-add unit can do one of per cycle
 _DECIDE_FMA, _SET_UP_FMA, _SET_UP_DIVISIONS = 20, 160, 4
@@ -58,12 +58,12 @@ def floor_work(counts: Counts) -> dict[str, Work]:
     n, visible, colors = counts.splats, counts.visible, 1 + counts.sh_coefficients
     return {
         "project": Work(
-            bytes=n * _DECIDE + visible * (_ROTATION + _COLOR * colors + RECORD + BOUNDS + _KEY),
+            bytes=n * _DECIDE + visible * (_ROTATION + _COLOR * colors + RECORD + WINDOW + _KEY),
             fma=n * _DECIDE_FMA + visible * (_SET_UP_FMA + 3 * counts.sh_coefficients),
             division=visible * _SET_UP_DIVISIONS,
         ),
         "sort": Work(bytes=visible * (_KEY + _INDEX)),
-        "bin": Work(bytes=visible * (_INDEX + BOUNDS) + counts.pairs * _INDEX),
+        "bin": Work(bytes=visible * (_INDEX + WINDOW) + counts.pairs * _INDEX),
         "blend": Work(
             bytes=counts.pairs * _INDEX + visible * RECORD,
             fma=counts.fragments * FRAGMENT_FMA,
