@@ -53,7 +53,7 @@ def test_little_memory_gives_the_same_bits(opencl, cloud, whole, mebibytes, stre
 
 def test_many_big_splats_in_chunks(opencl):
     """More splats that touch many tiles than the first guess has room for."""
-    crowd = random_splats(20000, seed=2, scale=(0.5, 5.0))
+    crowd = random_splats(26000, seed=2, depth=(-19.0, 9.0), scale=(0.5, 3.0))
     wanted = opencl.render(crowd, CAMERA, ("rgb", "depth"))
     own = small(opencl, 3.2)
     frame = own.render(crowd, CAMERA, ("rgb", "depth"))
