@@ -170,5 +170,7 @@ kernel void project(
     }
     windows[i] = (uint2)(corner, window);
 //@@ list
-    keys[i] = sortable((float)pz);
+    float key = (float)pz;
+//@@ key
+    keys[i] = sortable(key);
 }

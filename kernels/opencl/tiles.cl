@@ -50,12 +50,15 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
     }
 }
 
-// Adds all tiles of big splats to the tallies (tally_big), or their pairs to the lists (emit_big).
-// Index space: any number of work-groups of BIG_ITEMS; each takes every so many-th splat, its items share the tiles.
-// Reads: tallies' number of big splats, big, big_bounds.
-#define BIG_ITEMS 128
+// Work-groups of WALK_ITEMS, for what is done splat by splat. Of a splat that touches more than a window a whole group
+// shares the tiles.
+#define WALK_ITEMS 256
 
-kernel __attribute__((reqd_work_group_size(BIG_ITEMS, 1, 1))) void tally_big(
+// Adds the tiles of big splats to the tallies.
+// Index space: any number of work-groups; each takes every so many-th splat.
+// Reads: tallies' number of big splats, big_bounds.
+
+kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void tally_big(
     int width, int height, uint big_capacity, global const Bounds *restrict big_bounds, global uint *restrict tallies
 ) {
     int tiles_x = (width + TILE_W - 1) / TILE_W;
@@ -65,7 +68,7 @@ kernel __attribute__((reqd_work_group_size(BIG_ITEMS, 1, 1))) void tally_big(
         int y0, y1;
         bounds_rows(&b, height, &y0, &y1);
         int top = y0 / TILE_H, rows = (y1 - 1) / TILE_H - top + 1;
-        for (int cell = get_local_id(0); cell < rows * tiles_x; cell += BIG_ITEMS) {
+        for (int cell = get_local_id(0); cell < rows * tiles_x; cell += WALK_ITEMS) {
             int row = top + cell / tiles_x, column = cell % tiles_x;
             TileSpan span = tile_span(&b, row, width, height);
             if (column >= span.first && column <= span.last) atomic_inc(tallies + TALLIES + row * tiles_x + column);
@@ -87,50 +90,45 @@ static inline void emit_pair(int tile, const Band *band, uint key, uint splat, g
     if (place < band->capacity) pairs[place] = (uint2)(splat, key);
 }
 
-// Index space: one work-item per splat, work-groups of any size.
-// Reads: windows, keys, starts. Uses up: cursors of the band. Writes: pairs; adds to tallies' number of visible splats.
-kernel void emit(
-    uint count, uint first_band, int tiles_x, int band_first, int band_end, uint capacity,
-    global const uint2 *restrict windows, global const uint *restrict keys, global const uint *restrict starts,
+// Index space: `splat_groups` work-groups, a work-item per splat; then any number of them that share out the big splats.
+// Reads: windows, keys, starts, big, big_bounds. Uses up: cursors of the band. Writes: pairs; adds to tallies' number of
+// visible splats.
+kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void emit(
+    uint count, uint splat_groups, uint first_band, int width, int height, int band_first, int band_end, uint capacity,
+    uint big_capacity, global const uint2 *restrict windows, global const uint *restrict keys,
+    global const uint *restrict big, global const Bounds *restrict big_bounds, global const uint *restrict starts,
     global uint *restrict tallies, global uint *restrict cursors, global uint2 *restrict pairs
 ) {
     local uint visible;
-    if (get_local_id(0) == 0) visible = 0;
+    const Band band = {(width + TILE_W - 1) / TILE_W, band_first, band_end, starts[band_first], capacity};
+    uint item = get_local_id(0), big_count = min(tallies[TALLY_BIG], big_capacity);
+    if (get_group_id(0) >= splat_groups) {
+        for (uint k = get_group_id(0) - splat_groups; k < big_count; k += get_num_groups(0) - splat_groups) {
+            Bounds b = big_bounds[k];
+            uint splat = big[k], key = keys[splat];
+            int y0, y1;
+            bounds_rows(&b, height, &y0, &y1);
+            int top = y0 / TILE_H, rows = (y1 - 1) / TILE_H - top + 1;
+            for (int cell = item; cell < rows * band.tiles_x; cell += WALK_ITEMS) {
+                int row = top + cell / band.tiles_x, column = cell % band.tiles_x;
+                TileSpan span = tile_span(&b, row, width, height);
+                if (column >= span.first && column <= span.last)
+                    emit_pair(row * band.tiles_x + column, &band, key, splat, cursors, pairs);
+            }
+        }
+        return;   // the whole group
+    }
+    if (item == 0) visible = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
     uint i = get_global_id(0);
     uint key = i < count ? keys[i] : CULLED;
     if (key != CULLED) {
         if (first_band) atomic_inc(&visible);
-        const Band band = {tiles_x, band_first, band_end, starts[band_first], capacity};
         for (uint2 window = windows[i]; window.y != 0; window.y &= window.y - 1)
-            emit_pair(window_tile(window, tiles_x), &band, key, i, cursors, pairs);
+            emit_pair(window_tile(window, band.tiles_x), &band, key, i, cursors, pairs);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (get_local_id(0) == 0 && visible != 0) atomic_add(tallies + TALLY_VISIBLE, visible);
-}
-
-// As tally_big. Reads also: keys, starts. Uses up: cursors of the band. Writes: pairs.
-kernel __attribute__((reqd_work_group_size(BIG_ITEMS, 1, 1))) void emit_big(
-    int width, int height, int band_first, int band_end, uint capacity, uint big_capacity,
-    global const uint *restrict big, global const Bounds *restrict big_bounds, global const uint *restrict keys,
-    global const uint *restrict starts, global const uint *restrict tallies, global uint *restrict cursors,
-    global uint2 *restrict pairs
-) {
-    const Band band = {(width + TILE_W - 1) / TILE_W, band_first, band_end, starts[band_first], capacity};
-    uint count = min(tallies[TALLY_BIG], big_capacity);
-    for (uint k = get_group_id(0); k < count; k += get_num_groups(0)) {
-        Bounds b = big_bounds[k];
-        uint splat = big[k], key = keys[splat];
-        int y0, y1;
-        bounds_rows(&b, height, &y0, &y1);
-        int top = y0 / TILE_H, rows = (y1 - 1) / TILE_H - top + 1;
-        for (int cell = get_local_id(0); cell < rows * band.tiles_x; cell += BIG_ITEMS) {
-            int row = top + cell / band.tiles_x, column = cell % band.tiles_x;
-            TileSpan span = tile_span(&b, row, width, height);
-            if (column >= span.first && column <= span.last)
-                emit_pair(row * band.tiles_x + column, &band, key, splat, cursors, pairs);
-        }
-    }
+    if (item == 0 && visible != 0) atomic_add(tallies + TALLY_VISIBLE, visible);
 }
 
 // Sorts each list by (depth key, splat): a bitonic network whose every comparison puts the smaller first, so a list of

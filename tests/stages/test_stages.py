@@ -1,6 +1,7 @@
 """What passes between the stages of the OpenCL backend, against brute force."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from agreement import ALL_OUTPUTS, random_splats
 
 import fidsplat as fs
 from fidsplat.backends.base import View
+from fidsplat.backends.planes import PlaneTable
 from fidsplat.effects import select
 from fidsplat.hard_cases.invariance import out_of_order
 
@@ -144,6 +146,40 @@ def test_tile_size_leaves_every_bit_as_it_was(backend):
         trace, _ = traced(backend, cloud, quality, ALL_OUTPUTS, other)
         for name in ALL_OUTPUTS:
             assert np.array_equal(trace[name], base[name]), f"{name} differs with {other}"
+
+
+def test_layers_are_the_same_in_every_tile_size_and_schedule(backend):
+    """Four planes whose layers wait for one another, and splats of none."""
+    planes = np.random.default_rng(9).choice([-1, -1, -1, 0, 1, 2, 3], 300)
+    cloud = random_splats(300, seed=9, scale=(0.05, 0.5)).with_planes(planes)
+    base, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS)
+    shape = backend.shape
+    if shape.schedule == "lanes":
+        taller = replace(shape, tile_height=32)
+        groups = replace(shape, schedule="group", lanes=1, tile_width=8, tile_height=8, scan_items=64)
+        other, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS, groups)
+        for name in ("rgb", "alpha", "normal", "depth"):
+            assert np.abs(other[name] - base[name]).max() < 2e-5, name
+    else:
+        taller = replace(shape, tile_width=32, tile_height=32)
+    again, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS, taller)
+    for name in ALL_OUTPUTS:
+        assert np.array_equal(again[name], base[name]), name
+
+
+def test_splats_of_a_plane_share_its_key(backend):
+    """They arrive together, whatever lies between their centres."""
+    generator = np.random.default_rng(2)
+    cloud = random_splats(200, seed=2, depth=(2.0, 4.0)).with_planes(generator.integers(-1, 3, 200))
+    trace, view = traced(backend, cloud, fs.Quality())
+    for plane, key in enumerate(PlaneTable(cloud).keys(view)):
+        keys = trace["keys"][cloud.planes == plane]
+        bits = np.array([key]).view(np.uint32)
+        wanted = ~bits if bits[0] & 0x80000000 else bits | 0x80000000
+        assert (keys[keys != CULLED] == wanted).all()
+        for start, end in pairwise(trace["starts"]):
+            places = np.flatnonzero(cloud.planes[trace["lists"][start:end]] == plane)
+            assert len(places) == 0 or len(places) == np.ptp(places) + 1
 
 
 def test_both_schedules_draw_the_same_picture(backend):

@@ -39,7 +39,7 @@ class Lists:
         run = self.run
         room = max(needed * 5 // 4, run.pool.size("big") // 4, 4096)
         self.big = np.uint32(room)
-        tallies = run.take("tallies", 4 * words)
+        tallies = run.lease("tallies", 4 * words)
         run.take("big", 4 * room)
         run.take("big bounds", run.pipeline.source.bounds_bytes * room)
         cl.enqueue_fill_buffer(run.queue, tallies, np.zeros(1, np.uint32), 0, 4 * words)
@@ -53,7 +53,10 @@ class Lists:
             return
         inputs = [name for effect in run.pipeline.features.effects for name in effect.inputs]
         arrays = [run.resident.part(name, first, end) for name in ("means", "quats", "scales", "opacities")]
-        extra = [run.resident.part(name, first, end) for name in inputs]
+        # the keys of planes are the view's, all else is the cloud's
+        extra = [
+            run.held[name] if name == "plane_keys" else run.resident.part(name, first, end) for name in inputs
+        ]
         big = (run.held["tallies"], self.big, run.held["big"], run.held["big bounds"])
         args = (np.uint32(count), run.held["view"], *arrays, splats, keys, windows, *big)
         run.launch("project", "project", count, 64, *args, *extra)
@@ -224,22 +227,21 @@ class ChunkedLists(OrderedLists):
 
 
 class TiledLists(Lists):
-    """Kernels tiles.cl. The buffers are as large as the last pictures needed, and the stages are launched
+    """Kernels tiles.cl. The buffers are as large as the last pictures needed, and all stages are launched
     before the host knows whether that is enough; if it is not, the lists are empty and it is all done again.
     """
+
+    _ITEMS = 256  # WALK_ITEMS and SORT_ITEMS
 
     def __init__(self, run: Run) -> None:
         super().__init__(run)
         self._pairs = 0
-        self._visible: tuple[np.ndarray, cl.Event] | None = None
+        # work-groups that share out the splats of many tiles
+        self._big_groups = 4 * run.backend.device.max_compute_units
 
     def stats(self) -> dict[str, int]:
         """splats, visible, pairs."""
-        visible = 0
-        if self._visible is not None:
-            words, event = self._visible
-            event.wait()
-            visible = int(words[_VISIBLE])
+        visible = int(self.run.read("tallies", np.uint32, (_TALLIES,))[_VISIBLE])
         return {"splats": self.run.resident.count, "visible": visible, "pairs": self._pairs}
 
     def bands(self) -> Iterator[tuple[int, int]]:
@@ -260,9 +262,6 @@ class TiledLists(Lists):
         self._pairs = int(words[_PAIRS]) | int(words[_PAIRS + 1]) << 32
         if self._pairs > capacity or not capacity:
             yield from self._again()
-        # the number of visible splats is complete only now; nobody may ask
-        tallies = np.empty(_TALLIES, np.uint32)
-        self._visible = tallies, cl.enqueue_copy(run.queue, tallies, run.held["tallies"], is_blocking=False)
 
     def _again(self) -> Iterator[tuple[int, int]]:
         """The lists in buffers that fit, in bands if need be."""
@@ -273,8 +272,6 @@ class TiledLists(Lists):
             tallies = run.read("tallies", np.uint32, (_TALLIES + run.tiles,))
             bands = run.bands_of(tallies[_TALLIES:])
         room = max(max(listed for _, _, listed in bands), min(self._pairs * 5 // 4, budget))
-        run.take("pairs", 8 * room)
-        run.take("lists", 4 * room)
         for first, end, _ in bands:
             self._list(first, end, room, first == 0)
             yield first, end
@@ -284,7 +281,8 @@ class TiledLists(Lists):
         self.make_room(_TALLIES + self.run.tiles, needed)
         held = self.run.held
         self.project(0, self.run.resident.count)
-        self._launch_big("tally_big", *self.size, self.big, held["big bounds"], held["tallies"])
+        args = (*self.size, self.big, held["big bounds"], held["tallies"])
+        self.run.launch("bin", "tally_big", self._big_groups * self._ITEMS, self._ITEMS, *args)
 
     def _starts(self, capacity: int) -> cl.Event:
         """Where each tile's list starts; all lists are empty if there are more pairs than `capacity`."""
@@ -296,18 +294,17 @@ class TiledLists(Lists):
 
     def _list(self, first: int, end: int, capacity: int, first_band: bool) -> None:
         """The sorted lists of the tiles of one band."""
-        run, held = self.run, self.run.held
+        run, held, items = self.run, self.run.held, self._ITEMS
         pairs, lists = run.take("pairs", 8 * capacity), run.take("lists", 4 * capacity)
-        band = (np.int32(first), np.int32(end), np.uint32(capacity))
-        places = (held["starts"], held["tallies"], held["cursors"], pairs)
-        count = run.resident.count
-        if count:
-            walk = (np.uint32(count), np.uint32(first_band), np.int32(run.tiles_x), *band)
-            run.launch("bin", "emit", count, 256, *walk, held["windows"], held["keys"], *places)
-        bounds = (held["big"], held["big bounds"], held["keys"])
-        self._launch_big("emit_big", *self.size, *band, self.big, *bounds, *places)
+        groups = -(-run.resident.count // items)
+        walk = (np.uint32(run.resident.count), np.uint32(groups), np.uint32(first_band), *self.size)
+        band = (np.int32(first), np.int32(end), np.uint32(capacity), self.big)
+        read = (
+            held[name] for name in ("windows", "keys", "big", "big bounds", "starts", "tallies", "cursors")
+        )
+        run.launch("bin", "emit", (groups + self._big_groups) * items, items, *walk, *band, *read, pairs)
         sort = (np.int32(first), held["starts"], pairs, lists)
-        run.launch("sort", "sort_tiles", (end - first) * 256, 256, *sort)
+        run.launch("sort", "sort_tiles", (end - first) * items, items, *sort)
 
     def _read(self, counted: cl.Event) -> np.ndarray:
         """The tallies' head as it was when `counted` had ended, while later stages run."""
@@ -316,10 +313,6 @@ class TiledLists(Lists):
         side = self.run.backend.side_queue
         cl.enqueue_copy(side, words, self.run.held["tallies"], wait_for=[counted])
         return words
-
-    def _launch_big(self, kernel: str, *args) -> None:
-        groups = 4 * self.run.backend.device.max_compute_units
-        self.run.launch("bin", kernel, groups * 128, 128, *args)
 
 
 LISTS = {"ordered": OrderedLists, "chunked": ChunkedLists, "tiled": TiledLists}

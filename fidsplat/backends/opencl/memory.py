@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyopencl as cl
 
+from fidsplat.backends.planes import PlaneTable
 from fidsplat.errors import DeviceError
 from fidsplat.harmonics import C0
 from fidsplat.splats import SplatCloud
@@ -86,6 +87,7 @@ class Resident:
         self.origin = cloud.origin
         self.sh_degree = cloud.sh_degree if cloud.sh_degree > 0 else -1
         self.has_planes = cloud.planes is not None
+        self.planes = PlaneTable(cloud) if self.has_planes else None
         self._arrays = {
             "means": cloud.means,
             "quats": cloud.quats,
@@ -93,8 +95,8 @@ class Resident:
             "opacities": cloud.opacities,
             "labels": cloud.labels,
         }
-        if cloud.planes is not None:
-            self._arrays["planes"] = cloud.planes
+        if self.planes is not None:
+            self._arrays["planes"] = self.planes.index
         if cloud.colors is not None:
             self._arrays["colors"] = cloud.colors
         elif cloud.sh is not None:  # always: a cloud has one of the two

@@ -33,8 +33,7 @@ class OpenCLPlanes:
         self._queue, self._outputs, self._events, self._stats = run.queue, outputs, run.events, run.stats
         self._uploads = run.uploads  # kept until the device has read them
         self._size = (run.view.height // run.view.samples, run.view.width // run.view.samples)
-        buffers = [(output.name, buffer) for output, buffer in outputs.values()]
-        weakref.finalize(self, run.pool.give_back, buffers)
+        weakref.finalize(self, run.pool.give_back, run.leased)
 
     def read(self, name: str) -> np.ndarray:
         output, buffer = self._outputs[name]

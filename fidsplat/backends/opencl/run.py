@@ -38,15 +38,19 @@ class Run:
         self.events: list[tuple[str, cl.Event]] = []
         self.uploads: list[cl.Event] = []
         self.held: dict[str, cl.Buffer] = {}
+        self.leased: list[tuple[str, cl.Buffer]] = []
         self.lists = LISTS["chunked" if plan.chunk else self.shape.lists](self)
         self.stats: Callable[[], dict[str, int]] = self.lists.stats
 
     def draw(self) -> dict[str, tuple[Output, cl.Buffer]]:
         """All stages; returns the outputs by name."""
         raw_planes = self._sample_planes()
+        outputs = {}
         for first, end in self.lists.bands():
             self._blend(first, end, raw_planes)
-        return self._resolve(raw_planes)
+            if end == self.tiles:
+                outputs = self._resolve(raw_planes)
+        return outputs
 
     # stages
 
@@ -85,7 +89,7 @@ class Run:
         view, features = self.view, self.pipeline.features
         height, width = view.height // view.samples, view.width // view.samples
         outputs = {
-            output.name: (output, self.pool.lease(output.name, 4 * height * width * output.channels))
+            output.name: (output, self.lease(output.name, 4 * height * width * output.channels))
             for output in features.outputs
         }
         extra, rest = [], iter(raw_planes[1:])
@@ -112,6 +116,12 @@ class Run:
     def take(self, name: str, size: int) -> cl.Buffer:
         """A scratch buffer that this picture calls `name`."""
         self.held[name] = buffer = self.pool.scratch(name, size)
+        return buffer
+
+    def lease(self, name: str, size: int) -> cl.Buffer:
+        """A buffer that is this picture's own until its planes are not needed any more."""
+        self.held[name] = buffer = self.pool.lease(name, size)
+        self.leased.append((name, buffer))
         return buffer
 
     def put(self, name: str, array: np.ndarray) -> cl.Buffer:
@@ -148,3 +158,5 @@ class Run:
         tail += [view.width, view.height, 1.0 / view.samples**2, row, end]
         parts = [view.rotation.ravel(), view.translation, view.eye, tail]
         self.put("view", np.concatenate(parts).astype(self.pipeline.real))
+        if self.resident.planes is not None:
+            self.put("plane_keys", self.resident.planes.keys(view))

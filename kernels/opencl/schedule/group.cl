@@ -88,7 +88,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
     for (int row = 0; row < ROWS; row++) {
         size_t at = (py + row) * stride + px;
         Pixel *pixel = &pixels[row];
-        pixel_finish(pixel);
+        pixel_finish(pixel, &constants);
         PIXEL_STORE_BASE(pixel, raw, plane, at);
 //@@ store
     }
