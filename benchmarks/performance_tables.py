@@ -4,9 +4,9 @@
     python benchmarks/performance_tables.py benchmarks/results/*.json* --into docs/performance.md
 
 Takes what `fidsplat bench --json`, benchmarks/peers, benchmarks/first_frame.py --json,
-benchmarks/listing_ways.py --json and benchmarks/growth.py write, in any mixture. Without --into the tables are printed. With it, each replaces what
-stands in that page between `<!-- begin NAME -->` and `<!-- end NAME -->`; a table for which nothing was
-measured is left alone.
+benchmarks/listing_ways.py --json and benchmarks/growth.py write, in any mixture. Without --into the tables
+are printed. With it, each replaces what stands in that page between `<!-- begin NAME -->` and
+`<!-- end NAME -->`; a table for which nothing was measured is left alone.
 """
 
 from __future__ import annotations
