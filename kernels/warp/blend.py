@@ -29,6 +29,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool):
         parts.unfinished,
         parts.blend,
     )
+    finish = parts.finish
 
     @wp.func
     def store(
@@ -58,6 +59,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool):
         view: View,
         lines: wp.array(dtype=wp.vec4),
         labels: wp.array(dtype=wp.int32),
+        planes: wp.array(dtype=wp.int32),
         starts: wp.array(dtype=wp.int32),
         lists: wp.array(dtype=wp.int32),
         raw: wp.array(dtype=wp.vec4),  # out, as all below: r, g, b, transmittance
@@ -102,18 +104,18 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool):
             c2 = cross(s, u, v, d, x + 2.0, y, view)
             c3 = cross(s, u, v, d, x + 3.0, y, view)
             if c0.drawn and open0:
-                p0 = blend_one(p0, s, c0, index, lines, labels, view)
+                p0 = blend_one(p0, s, c0, index, lines, labels, planes, view)
             if c1.drawn and open1:
-                p1 = blend_one(p1, s, c1, index, lines, labels, view)
+                p1 = blend_one(p1, s, c1, index, lines, labels, planes, view)
             if c2.drawn and open2:
-                p2 = blend_one(p2, s, c2, index, lines, labels, view)
+                p2 = blend_one(p2, s, c2, index, lines, labels, planes, view)
             if c3.drawn and open3:
-                p3 = blend_one(p3, s, c3, index, lines, labels, view)
+                p3 = blend_one(p3, s, c3, index, lines, labels, planes, view)
         at = y0 * view.tiles_x * view.tile_w + x0
-        store(p0, at, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
-        store(p1, at + 1, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
-        store(p2, at + 2, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
-        store(p3, at + 3, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
+        store(finish(p0, view), at, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
+        store(finish(p1, view), at + 1, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
+        store(finish(p2, view), at + 2, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
+        store(finish(p3, view), at + 3, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def blend_cpu(
@@ -121,6 +123,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool):
         view: View,
         lines: wp.array(dtype=wp.vec4),
         labels: wp.array(dtype=wp.int32),
+        planes: wp.array(dtype=wp.int32),
         starts: wp.array(dtype=wp.int32),
         lists: wp.array(dtype=wp.int32),
         raw: wp.array(dtype=wp.vec4),
@@ -161,7 +164,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool):
                         at = state_first + (row - y0) * view.tile_w + column - x0
                         p = state[at]
                         if unfinished(p, view):
-                            p = blend_one(p, s, c, index, lines, labels, view)
+                            p = blend_one(p, s, c, index, lines, labels, planes, view)
                             if not unfinished(p, view):
                                 alive -= 1
                             state[at] = p
@@ -170,6 +173,6 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool):
             for column in range(view.tile_w):
                 p = state[state_first + row * view.tile_w + column]
                 at = (y0 + row) * stride + x0 + column
-                store(p, at, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
+                store(finish(p, view), at, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
 
     return (blend_gpu if on_gpu else blend_cpu), Pixel

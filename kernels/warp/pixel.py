@@ -1,4 +1,9 @@
-"""One sample: its fragments, and what it keeps of them. Front to back, C = sum_k c_k alpha_k prod_{j<k} (1 - alpha_j)."""
+"""One sample: its fragments, and what it keeps of them. Front to back, C = sum_k c_k alpha_k prod_{j<k} (1 - alpha_j).
+
+Splats of one plane are one layer at a sample (docs/rendering.md, coplanar splats): its colour and depth are means of its fragments
+by optical depth. They arrive together, before anything that the layer is compared with; it is laid before the first fragment of
+no plane that lies behind it there, or at the end. Two layers may be pending; when a third begins the nearer of them is laid.
+"""
 
 from functools import cache
 from types import SimpleNamespace
@@ -15,6 +20,10 @@ _STATE = {
     "normal": {"normal": wp.vec3},
     "label": {"label_weight": wp.float32, "label": wp.int32},
 }
+
+
+DARKEST = wp.constant(wp.float32(2.0**-24))
+"""transmittance of an opaque fragment, whose optical depth would be infinite"""
 
 
 @wp.struct
@@ -39,10 +48,21 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         name in effects
         for name in ("lowpass_screen", "stop_exclusive", "ray_depth", "depth", "depth_median", "normal", "label")
     )
+    layers = "compose_planes" in effects
+    seen = {"rgb": wp.vec3}
+    seen |= {"z": wp.float32} if ray_depth else {}
+    seen |= {"normal": wp.vec3} if normal else {}
+    seen |= {"label": wp.int32} if label else {}
+    Seen = _struct("Seen", "What shows where something is drawn.", seen)
+    # `mean` holds sums over the layer's fragments, each times its optical depth
+    layer = {"plane": wp.int32, "t": wp.float32, "ink": wp.float32, "mean": Seen, "thickest": wp.float32}
+    Layer = _struct("Layer", "What a sample sees of one plane; plane -1: nothing.", layer)
     fields = {"t": wp.float32, "r": wp.float32, "g": wp.float32, "b": wp.float32}
     for effect in effects:
         fields |= _STATE.get(effect, {})
-    Pixel = wp.struct(type("Pixel", (), {"__annotations__": fields, "__doc__": "What a sample keeps.", "__module__": __name__}))
+    # pending: the layer that still gathers, and one that arrived before it
+    fields |= {"open": Layer, "waiting": Layer} if layers else {}
+    Pixel = _struct("Pixel", "What a sample keeps.", fields)
     dot_line, dot_lane = layout.place("dot_x")
     dot_y_line, dot_y_lane = layout.place("dot_y")
     z_line, z_lane = layout.place("z_numerator")
@@ -77,11 +97,21 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         return s
 
     @wp.func
+    def no_layer():
+        layer = Layer()
+        layer.plane = -1
+        layer.t = 1.0
+        return layer
+
+    @wp.func
     def start():
         p = Pixel()
         p.t = 1.0
         if wp.static(label):
             p.label = -1
+        if wp.static(layers):
+            p.open = no_layer()
+            p.waiting = no_layer()
         return p
 
     @wp.func
@@ -142,6 +172,124 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         )
 
     @wp.func
+    def see(s: Splat, c: Crossing, inverse_d: float, index: int, lines: wp.array(dtype=wp.vec4), labels: wp.array(dtype=wp.int32)):
+        """What a fragment shows."""
+        seen = Seen()
+        seen.rgb = wp.vec3(s.c[1], s.c[2], s.c[3])
+        if wp.static(ray_depth):
+            seen.z = depth_of(lines, index, c, inverse_d)
+        if wp.static(normal):
+            seen.normal = normal_of(lines, index)
+        if wp.static(label):
+            seen.label = labels[index]
+        return seen
+
+    @wp.func
+    def lay(pixel: Pixel, seen: Seen, opacity: float, view: View):
+        """The pixel with something over all that follows; as it was if it lets no light through."""
+        p = pixel
+        if not (p.t > view.stop):
+            return p
+        if wp.static(exclusive):
+            # as gsplat and the 2DGS authors: what would close the pixel is dropped (for parity; numerics D1)
+            if p.t * (1.0 - opacity) <= view.stop:
+                p.finished = 1
+                return p
+        weight = p.t * opacity
+        p.r = fma(weight, seen.rgb[0], p.r)
+        p.g = fma(weight, seen.rgb[1], p.g)
+        p.b = fma(weight, seen.rgb[2], p.b)
+        if wp.static(depth):
+            p.depth = fma(weight, seen.z, p.depth)
+            p.depth_weight += weight
+        if wp.static(median):
+            if p.t > 0.5:
+                p.depth_median = seen.z
+        if wp.static(normal):
+            p.normal += weight * seen.normal
+        if wp.static(label):
+            if weight > p.label_weight:
+                p.label_weight = weight
+                p.label = seen.label
+        p.t = p.t - weight
+        return p
+
+    @wp.func
+    def depth_of_layer(layer: Layer) -> float:
+        return layer.mean.z / layer.ink
+
+    @wp.func
+    def lay_layer(pixel: Pixel, layer: Layer, view: View):
+        """The pixel with a layer laid as one thing."""
+        seen = layer.mean
+        seen.rgb = layer.mean.rgb / layer.ink
+        seen.z = depth_of_layer(layer)
+        if wp.static(normal):
+            seen.normal = layer.mean.normal / layer.ink
+        return lay(pixel, seen, 1.0 - layer.t, view)
+
+    @wp.func
+    def lay_before(pixel: Pixel, z: float, view: View):
+        """The pixel with its pending layers laid that lie before depth z, the nearer first."""
+        p = pixel
+        for turn in range(2):
+            has_open = bool(False)
+            has_waiting = bool(False)
+            if p.open.plane >= 0:
+                has_open = depth_of_layer(p.open) < z
+            if p.waiting.plane >= 0:
+                has_waiting = depth_of_layer(p.waiting) < z
+            if has_open and has_waiting:
+                # of equals the one that arrived first
+                if depth_of_layer(p.open) < depth_of_layer(p.waiting):
+                    has_waiting = False
+                else:
+                    has_open = False
+            if has_waiting:
+                p = lay_layer(p, p.waiting, view)
+                p.waiting = no_layer()
+            if has_open:
+                p = lay_layer(p, p.open, view)
+                p.open = no_layer()
+        return p
+
+    @wp.func
+    def begin(pixel: Pixel, view: View):
+        """The pixel with no open layer: it waits, and of two that would wait the nearer is laid."""
+        p = pixel
+        if p.waiting.plane >= 0:
+            if depth_of_layer(p.open) < depth_of_layer(p.waiting):
+                p = lay_layer(p, p.open, view)
+                p.open = no_layer()
+                return p
+            p = lay_layer(p, p.waiting, view)
+        p.waiting = p.open
+        p.open = no_layer()
+        return p
+
+    @wp.func
+    def gather(layer: Layer, plane: int, seen: Seen, opacity: float):
+        """The layer with one more fragment: optical depths -ln(1 - opacity) add up."""
+        after = layer
+        bare = 1.0 - opacity
+        # an opaque fragment has the optical depth at which float32 leaves no light
+        tau = -wp.log(wp.max(bare, DARKEST))
+        after.plane = plane
+        after.t = layer.t * bare
+        after.ink = layer.ink + tau
+        mean = layer.mean
+        mean.rgb = layer.mean.rgb + tau * seen.rgb
+        mean.z = fma(tau, seen.z, layer.mean.z)
+        if wp.static(normal):
+            mean.normal = layer.mean.normal + tau * seen.normal
+        if wp.static(label):
+            if tau > layer.thickest:
+                after.thickest = tau
+                mean.label = seen.label
+        after.mean = mean
+        return after
+
+    @wp.func
     def blend(
         pixel: Pixel,
         s: Splat,
@@ -149,38 +297,46 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         index: int,
         lines: wp.array(dtype=wp.vec4),
         labels: wp.array(dtype=wp.int32),
+        planes: wp.array(dtype=wp.int32),
         view: View,
     ):
-        """The pixel after a fragment that is drawn, of a splat whose pixel is not finished."""
-        p = pixel
+        """The pixel after a fragment that is drawn, of a pixel that is not finished."""
         inverse_d = 1.0 / c.d
         opacity = opacity_of(s, c, inverse_d, view)
-        if wp.static(exclusive):
-            # as gsplat and the 2DGS authors: what would close the pixel is dropped (for parity; numerics D1)
-            if p.t * (1.0 - opacity) <= view.stop:
-                p.finished = 1
-                return p
-        weight = p.t * opacity
-        p.r = fma(weight, s.c[1], p.r)
-        p.g = fma(weight, s.c[2], p.g)
-        p.b = fma(weight, s.c[3], p.b)
-        if wp.static(ray_depth):
-            z = depth_of(lines, index, c, inverse_d)
-            if wp.static(depth):
-                p.depth = fma(weight, z, p.depth)
-                p.depth_weight += weight
-            if wp.static(median):
-                if p.t > 0.5:
-                    p.depth_median = z
-        if wp.static(normal):
-            p.normal += weight * normal_of(lines, index)
-        if wp.static(label):
-            if weight > p.label_weight:
-                p.label_weight = weight
-                p.label = labels[index]
-        p.t = p.t - weight
-        return p
+        seen = see(s, c, inverse_d, index, lines, labels)
+        if wp.static(layers):
+            p = pixel
+            plane = planes[index]
+            if plane < 0:
+                p = lay_before(p, seen.z, view)
+                return lay(p, seen, opacity, view)
+            if p.open.plane >= 0 and p.open.plane != plane:
+                p = begin(p, view)
+            p.open = gather(p.open, plane, seen, opacity)
+            return p
+        else:
+            return lay(pixel, seen, opacity, view)
+
+    @wp.func
+    def finish(pixel: Pixel, view: View):
+        """The pixel after the last fragment."""
+        if wp.static(layers):
+            return lay_before(pixel, float(wp.inf), view)
+        else:
+            return pixel
 
     return SimpleNamespace(
-        Pixel=Pixel, Splat=Splat, load=load, start=start, row=row, cross=cross, unfinished=unfinished, blend=blend
+        Pixel=Pixel,
+        Splat=Splat,
+        load=load,
+        start=start,
+        row=row,
+        cross=cross,
+        unfinished=unfinished,
+        blend=blend,
+        finish=finish,
     )
+
+
+def _struct(name: str, words: str, fields: dict):
+    return wp.struct(type(name, (), {"__annotations__": fields, "__doc__": words, "__module__": __name__}))

@@ -26,7 +26,9 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str):
     """The kernel for these record effects; sh_terms: coefficients per colour, 0 for plain colours."""
     layout = Layout(effects)
     lines_each = layout.lines
-    has_normal, has_depth, screen = (name in effects for name in ("normal", "ray_depth", "lowpass_screen"))
+    has_normal, has_depth, screen, layers = (
+        name in effects for name in ("normal", "ray_depth", "lowpass_screen", "compose_planes")
+    )
     real = wp.float64 if precision == "float64" else wp.float32
     vec2, vec3, mat33 = wp.types.vector(2, real), wp.types.vector(3, real), wp.types.matrix((3, 3), real)
     words = wp.types.vector(4 * layout.lines, wp.float32)
@@ -133,6 +135,8 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str):
         scales: wp.array(dtype=wp.vec2),  # (n) [m]
         opacities: wp.array(dtype=wp.float32),  # (n)
         colors: wp.array(dtype=wp.vec3),  # (n), or (n sh_terms)
+        planes: wp.array(dtype=wp.int32),  # (n) index of the splat's plane; -1: none
+        plane_keys: wp.array(dtype=wp.float32),  # (planes) depth at which a plane's splats are sorted in [m]
         lines: wp.array(dtype=wp.vec4),  # (n lines_each) out: records of splats that are drawn
         bounds: wp.array(dtype=Bounds),  # (n) out
         keys: wp.array(dtype=wp.uint32),  # (n) out: depth key, or CULLED
@@ -266,7 +270,11 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str):
             k = 4 * line
             lines[i * lines_each + line] = wp.vec4(record[k], record[k + 1], record[k + 2], record[k + 3])
         bounds[i] = box
-        keys[i] = sortable(float(p[2]))
+        depth = float(p[2])
+        if wp.static(layers):
+            if planes[i] >= 0:
+                depth = plane_keys[planes[i]]
+        keys[i] = sortable(depth)
         counts[i] = wp.int64(tiles)
         drawn[i] = 1
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.backends.planes import PlaneTable
 from fidsplat.backends.warp import runtime
 from fidsplat.errors import DeviceError, InputError
 from fidsplat.harmonics import C0, MAX_DEGREE
@@ -48,9 +49,11 @@ class ArrayPool:
 class Resident:
     """Splats on the device. SH of degree 0 does not depend on the view and becomes plain colours."""
 
-    def __init__(self, arrays: dict[str, Any], count: int, origin: np.ndarray, sh_degree: int, has_planes: bool) -> None:
+    def __init__(
+        self, arrays: dict[str, Any], count: int, origin: np.ndarray, sh_degree: int, planes: PlaneTable | None = None
+    ) -> None:
         self.arrays, self.count, self.origin = arrays, count, origin
-        self.sh_degree, self.has_planes = sh_degree, has_planes
+        self.sh_degree, self.planes, self.has_planes = sh_degree, planes, planes is not None
 
     @classmethod
     def of(cls, cloud: SplatCloud, pool: ArrayPool) -> Resident:
@@ -68,11 +71,12 @@ class Resident:
             "colors": colors,
             "labels": cloud.labels,
         }
-        if cloud.planes is not None:
-            arrays["planes"] = cloud.planes
+        planes = None if cloud.planes is None else PlaneTable(cloud)
+        if planes is not None:
+            arrays["planes"] = planes.index
         device = {name: _uploaded(name, array, pool) for name, array in arrays.items()}
         degree = cloud.sh_degree if cloud.sh_degree > 0 else -1
-        return cls(device, len(cloud), cloud.origin, degree, cloud.planes is not None)
+        return cls(device, len(cloud), cloud.origin, degree, planes)
 
     @classmethod
     def around(cls, given: Mapping[str, Any], origin: np.ndarray, pool: ArrayPool) -> Resident:
@@ -97,7 +101,7 @@ class Resident:
             wanted = count * max(terms, 1) if name == "colors" else count
             if count and array.size != wanted:
                 raise InputError(f"{name} holds {array.size} elements, but {count} means need {wanted}")
-        return cls(arrays, count, origin, int(np.sqrt(terms)) - 1 if terms else -1, False)
+        return cls(arrays, count, origin, int(np.sqrt(terms)) - 1 if terms else -1)
 
 
 def _dtype(name: str) -> Any:

@@ -29,8 +29,8 @@ KNOWN = frozenset(
 )
 """effects that kernels/warp has"""
 # of these depend on an effect: a stage is compiled once for all feature sets that mean the same to it
-_RECORD = ("lowpass_screen", "ray_depth", "normal")
-_SAMPLE = (*_RECORD, "stop_exclusive", "compose_planes", "depth", "depth_median", "label")
+_RECORD = ("lowpass_screen", "ray_depth", "normal", "compose_planes")
+_SAMPLE = (*_RECORD, "stop_exclusive", "depth", "depth_median", "label")
 
 
 class WarpPlanes:
@@ -184,6 +184,7 @@ class _Run:
         drawn, places = self._take("drawn", n, wp.int32), self._take("places", n, wp.int32)
         ends = self._take("ends", n, wp.int64)
         cloud = [self.resident.arrays[name] for name in ("means", "quats", "scales", "opacities", "colors")]
+        cloud += self._planes()
         records = [lines, self._take("bounds", n, bounds), keys, counts, drawn]
         self.launch(self.pipeline.project, n, self.u, *cloud, *records)
         wp.utils.array_scan(drawn[:n], places[:n], inclusive=True)
@@ -192,6 +193,16 @@ class _Run:
         wp.launch(self.pipeline.sort.sum_up, 1, [n, places, ends, totals], device=self.backend.device, record_tape=False)
         visible, pairs = self.launcher.read_back(totals)
         return visible, pairs
+
+    def _planes(self) -> list[Any]:
+        """Each splat's plane, and the planes' sort keys in this view."""
+        planes = self.resident.planes
+        if planes is None or "compose_planes" not in self.pipeline.features.slots:
+            return [self._take("no planes", 1, self.wp.int32), self._take("plane keys", 1, self.wp.float32)]
+        keys = planes.keys(self.view)
+        array = self._take("plane keys", len(keys), self.wp.float32)
+        self.wp.copy(array, self.wp.array(keys, dtype=self.wp.float32, device="cpu"), count=len(keys))
+        return [self.resident.arrays["planes"], array]
 
     def _sort(self, visible: int) -> None:
         """Splats that are drawn by depth, ties by index."""
@@ -261,8 +272,8 @@ class _Run:
     def _blend(self, first: int, end: int, samples: list[Any]) -> None:
         """Draws the tiles of one band."""
         pipeline, held = self.pipeline, self.held
-        labels = self.resident.arrays["labels"]
-        args = (self.u, held.get("lines", samples[0]), labels, held["starts"], held["lists"], *samples)
+        splats = (self.resident.arrays["labels"], self.resident.arrays.get("planes", samples[4]))
+        args = (self.u, held.get("lines", samples[0]), *splats, held["starts"], held["lists"], *samples)
         area = pipeline.shape.tile_width * pipeline.shape.tile_height
         if pipeline.shape.schedule == "group":
             count = (end - first) * pipeline.block_dim
