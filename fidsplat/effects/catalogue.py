@@ -2,7 +2,7 @@
 
 A slot is filled by exactly one effect of its kind (camera, color, lowpass, stop,
 compose); taps are extra planes, any
-number of them; parts are what several taps share. The sections of an effect's kernel file say where its text
+number of them; parts are what several of them share. The sections of an effect's kernel file say where its text
 goes (kernels/README.md).
 """
 
@@ -32,7 +32,8 @@ class Effect:
     bounds_lanes: int = 0
     """32-bit words that it adds to the bounds of a visible splat."""
     inputs: tuple[str, ...] = ()
-    """Arrays of the cloud that the projection reads for it, in the order of its kernel arguments."""
+    """Arrays of the cloud, and those made from it for each view, that the projection reads for it, in the
+    order of its kernel arguments."""
     planes: tuple[int, ...] = ()
     """Sample planes in each buffer between blending and resolving, in the order of its kernel arguments."""
     output: Output | None = None
@@ -49,7 +50,13 @@ _EFFECTS = (
     Effect("stop_inclusive", "slot/stop_inclusive.cl"),
     Effect("stop_exclusive", "slot/stop_exclusive.cl"),
     Effect("compose_ordered", "slot/compose_ordered.cl"),
-    Effect("compose_planes", "slot/compose_planes.cl", record_lanes=1, inputs=("planes",)),
+    Effect(
+        "compose_planes",
+        "slot/compose_planes.cl",
+        record_lanes=1,
+        inputs=("planes", "plane_keys"),
+        parts=("ray_depth",),
+    ),
     Effect("ray_depth", "slot/ray_depth.cl", record_lanes=3),
     Effect("alpha", "tap/alpha.cl", output=Output("alpha", 1, "float32")),
     Effect("depth", "tap/depth.cl", planes=(2,), output=Output("depth", 1, "float32"), parts=("ray_depth",)),

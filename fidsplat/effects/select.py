@@ -37,7 +37,7 @@ class FeatureSet:
     @property
     def effects(self) -> tuple[Effect, ...]:
         """All effects in the order in which their text is put together: slots, parts, taps."""
-        parts = sorted({part for tap in self.taps for part in CATALOGUE[tap].parts})
+        parts = sorted({part for name in (*self.slots, *self.taps) for part in CATALOGUE[name].parts})
         return tuple(CATALOGUE[name] for name in (*self.slots, *parts, *self.taps))
 
     @property

@@ -1,6 +1,12 @@
 // Front-to-back compositing of one fragment per pixel (the paper, section 3.1): C = sum_k c_k alpha_k prod (1 - alpha_j).
 // The schedules (schedule/*.cl) bring the splats of a tile here in depth order.
 
+typedef struct {            // what shows where something is drawn
+    vfloat r, g, b;
+//@@ seen
+} Seen;
+
+//@@ compose_types
 typedef struct {
     vfloat t;               // transmittance in front of the next fragment
     vfloat r, g, b;
@@ -21,15 +27,37 @@ static inline void pixel_start(Pixel *pixel) {
 
 //@@ fragment_mask
 //@@ fragment_half_rho
-//@@ compose_functions
 
+// What a fragment shows.
+static inline Seen see(const Splat *s, Crossing c, vfloat inverse_d) {
+    Seen seen;
+    seen.r = s->r;
+    seen.g = s->g;
+    seen.b = s->b;
+//@@ see
+    return seen;
+}
+
+// Lays it over all that follows, where `mask` is set and the pixel still lets light through.
+static inline void lay(Pixel *pixel, const Seen *seen, vfloat opacity, vint mask, const BlendConstants *constants) {
+    vint live = mask & VMASK(pixel->t > constants->stop);
+//@@ stop
+    vfloat weight = pixel->t * VSELECT((vfloat)0.0f, opacity, live);
+    pixel->r = FMA(weight, seen->r, pixel->r);
+    pixel->g = FMA(weight, seen->g, pixel->g);
+    pixel->b = FMA(weight, seen->b, pixel->b);
+//@@ lay
+    pixel->t = pixel->t - weight;
+}
+
+//@@ compose_functions
 // Whether anything that follows can still be seen.
 static inline vint pixel_unfinished(const Pixel *pixel, const BlendConstants *constants) {
-//@@ unfinished
+    return VMASK(pixel->t > constants->stop);
 }
 
 // To be called once, after the last fragment.
-static inline void pixel_finish(Pixel *pixel) {
+static inline void pixel_finish(Pixel *pixel, const BlendConstants *constants) {
 //@@ finish
 }
 
@@ -38,13 +66,8 @@ static inline void pixel_blend(Pixel *pixel, const Splat *s, Crossing c, vint ma
                                const BlendConstants *constants) {
     vfloat inverse_d = 1.0f / c.d;
     vfloat opacity = fragment_opacity(s, fragment_half_rho(c, inverse_d, screen), constants->ceiling);
-//@@ live
-//@@ stop
-    opacity = VSELECT((vfloat)0.0f, opacity, live);
-    vfloat weight = pixel->t * opacity;
+    const Seen seen = see(s, c, inverse_d);
 //@@ compose
-//@@ fragment
-    pixel->t = pixel->t - weight;
 }
 
 // Writes LANES pixels at `at` of planes of `plane` samples.

@@ -148,5 +148,7 @@ kernel void project(
 //@@ project
     splats[i] = record;
     all_bounds[i] = bounds;
-    keys[i] = sortable((float)pz);
+    float key = (float)pz;
+//@@ key
+    keys[i] = sortable(key);
 }

@@ -1,8 +1,8 @@
 """One flat source text from a FeatureSet and the shape of a device.
 
-A kernel file of an effect is cut at lines `//@ section`; a stage file has lines `//@@ section` where the
-sections of the chosen effects go. What nobody fills expands to nothing, so the text names no effect that was
-not asked for.
+A kernel file of an effect is cut at lines `//@ section`; a stage file, or a section, has lines `//@@ section`
+where the sections of the chosen effects go. What nobody fills expands to nothing, so the text names no effect
+that was not asked for.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import re
 from dataclasses import dataclass
 from functools import cache
 
-from fidsplat.effects import FeatureSet
+from fidsplat.effects import CATALOGUE, FeatureSet
 from fidsplat.errors import DeviceError
 from fidsplat.kernel_files import kernels_folder
 
@@ -71,17 +71,16 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     if features.sh_degree > 0 or "color_sh" in features.slots:
         defines["SH_DEGREE"] = features.sh_degree
     sections = [_sections(effect.file) for effect in effects]
-    known: set[str] = set()
 
     def fill(match: re.Match[str]) -> str:
-        known.add(match[1])
-        return "".join(section.get(match[1], "") for section in sections)
+        return "".join(_HOOK.sub(fill, section.get(match[1], "")) for section in sections)
 
     stages = [*(f"{stage}.cl" for stage in _STAGES), f"schedule/{shape.schedule}.cl", "resolve.cl"]
     body = "\n".join(_HOOK.sub(fill, kernel_text(stage)) for stage in stages)
+    known = {hook for file in {*stages, *(one.file for one in CATALOGUE.values())} for hook in _hooks(file)}
     for effect, section in zip(effects, sections, strict=True):
         if unknown := set(section) - known:
-            raise DeviceError(f"kernel file {effect.file} fills hooks that no stage has: {sorted(unknown)}")
+            raise DeviceError(f"kernel file {effect.file} fills hooks that no file has: {sorted(unknown)}")
     text = "".join(f"#define {name} {value}\n" for name, value in sorted(defines.items()))
     text += _BLANK.sub("\n", _COMMENT.sub("", body))
     return Source(text, hashlib.sha256(text.encode()).hexdigest(), record_bytes, bounds_bytes)
@@ -91,6 +90,11 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
 def kernel_text(path: str) -> str:
     """A file below kernels/opencl/, as it stands."""
     return (kernels_folder() / "opencl" / path).read_text(encoding="utf-8")
+
+
+@cache
+def _hooks(path: str) -> tuple[str, ...]:
+    return tuple(_HOOK.findall(kernel_text(path)))
 
 
 @cache

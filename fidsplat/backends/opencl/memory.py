@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pyopencl as cl
 
+from fidsplat.backends.planes import PlaneTable
 from fidsplat.errors import DeviceError
 from fidsplat.harmonics import C0
 from fidsplat.splats import SplatCloud
@@ -54,6 +55,7 @@ class Resident:
         self.origin = cloud.origin
         self.sh_degree = cloud.sh_degree if cloud.sh_degree > 0 else -1
         self.has_planes = cloud.planes is not None
+        self.planes = PlaneTable(cloud) if self.has_planes else None
         arrays = {
             "means": cloud.means,
             "quats": cloud.quats,
@@ -61,8 +63,8 @@ class Resident:
             "opacities": cloud.opacities,
             "labels": cloud.labels,
         }
-        if cloud.planes is not None:
-            arrays["planes"] = cloud.planes
+        if self.planes is not None:
+            arrays["planes"] = self.planes.index
         if cloud.colors is not None:
             arrays["colors"] = cloud.colors
         elif cloud.sh is not None:  # always: a cloud has one of the two

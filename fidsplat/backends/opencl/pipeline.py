@@ -157,7 +157,10 @@ class _Run:
         if count == 0:
             return
         cloud = self.resident.buffers
-        extra = [cloud[name] for effect in self.pipeline.features.effects for name in effect.inputs]
+        inputs = [name for effect in self.pipeline.features.effects for name in effect.inputs]
+        if self.resident.planes is not None and "plane_keys" in inputs:
+            cloud = cloud | {"plane_keys": self._put("plane keys", self.resident.planes.keys(self.view))}
+        extra = [cloud[name] for name in inputs]
         self._launch(
             "project",
             "project",

@@ -1,4 +1,4 @@
-"""Compositing of fragments, with every decision that devices take."""
+"""Compositing of fragments and layers, with every decision that devices take."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import numpy as np
 
 from fidsplat.backends.base import View
 from fidsplat.backends.reference import doubt
-from fidsplat.backends.reference.fragments import fragments_of, optical_depth, runs, shifted
+from fidsplat.backends.reference.fragments import fragments_of, shifted
+from fidsplat.backends.reference.layers import in_layers, in_order
 from fidsplat.backends.reference.setup import Setup
 from fidsplat.effects import FeatureSet
 
@@ -16,73 +17,55 @@ def composite(
 ) -> dict[str, np.ndarray]:
     """Samples (k,) at grid positions x, y against all splats: what blending leaves, before resolving."""
     f = fragments_of(s, view, x, y)
-    alpha = f.alpha
-    run = None if s.planes is None else runs(alpha > 0, s.planes)
-    before, live, final = _transmittance(alpha, view.stop, s.exclusive, run)
-    weight = np.where(live, before * alpha, 0.0)
     span = doubt.span_of(s, view, f)
+    laid = in_order(s, f, span) if s.planes is None else in_layers(s, f, span, s.planes)
+    alpha, z, span = laid.alpha, laid.z, laid.span
+    before, live, final = _transmittance(alpha, view.stop, s.exclusive)
+    weight = np.where(live, before * alpha, 0.0)
     out = {
-        "rgb": weight @ s.colors if run is None else _layered(alpha, weight, live, run, s.colors),
+        "rgb": _sum(weight, laid.colors),
         "t": final,
-        "certificate": doubt.of_color(s, view, span, before, weight),
+        "certificate": doubt.of_color(s, view, span, before, laid.moved) + laid.reordered,
     }
     drawn = live & (alpha > 0)
     if {"depth", "depth_median"} & set(features.taps):
         out["weight"] = weight.sum(1)
-        out["depth"] = (weight * f.z).sum(1)
-        out |= doubt.of_depth(span, weight, f.z)
+        out["depth"] = (weight * z).sum(1)
+        out |= doubt.of_depth(span, weight, z)
         half = drawn & (before > 0.5)
         last, seen = half.shape[1] - 1 - _first(half[:, ::-1]), np.asarray(half.any(1))
-        out["depth_median"] = _pick(f.z, last, seen, 0.0)
-        out["depth_median_may_flip"] = doubt.of_median(span) | (
-            _pick(span.z_high - span.z_low, last, seen, 0.0) > 1e-5 * out["depth_median"]
+        out["depth_median"] = _pick(z, last, seen, 0.0)
+        out["depth_median_may_flip"] = (
+            doubt.of_median(span)
+            | (_pick(span.z_high - span.z_low, last, seen, 0.0) > 1e-5 * out["depth_median"])
+            | (laid.reordered > 0)
         )
     if "normal" in features.taps:
-        out["normal"] = weight @ s.normal
+        out["normal"] = _sum(weight, laid.normal)
     if "label" in features.taps:
         heaviest = _first(weight)
         out["label_weight"] = _pick(weight, heaviest, np.asarray(drawn.any(1)), 0.0)
-        labels = np.broadcast_to(s.labels, weight.shape)
-        out["label"] = _pick(labels, heaviest, out["label_weight"] > 0, -1)
-        out["label_may_flip"] = doubt.of_label(span, labels, out["label"])
+        out["label"] = _pick(laid.labels, heaviest, out["label_weight"] > 0, -1)
+        out["label_may_flip"] = (
+            doubt.of_label(span, laid.labels, out["label"])
+            | laid.label_may_flip.any(1)
+            | (laid.reordered > 0)
+        )
     return out
 
 
-def _layered(
-    alpha: np.ndarray, weight: np.ndarray, live: np.ndarray, run: np.ndarray, colors: np.ndarray
-) -> np.ndarray:
-    """Colours (k, 3) where a run is one layer: its weight, in the mean colour by optical depth."""
-    row, column = np.nonzero(live & (run >= 0))
-    number = run[row, column]
-    tau = optical_depth(alpha[row, column])
-    count = int(run.max(initial=-1)) + 1
-    ink = np.zeros((count, 3))
-    np.add.at(ink, number, tau[:, None] * colors[column])
-    depth = np.bincount(number, tau, count)
-    total = np.bincount(number, weight[row, column], count)
-    mean = ink / np.where(depth > 0, depth, 1)[:, None]
-    owner = np.zeros(count, int)
-    owner[number] = row
-    rgb = np.zeros((len(alpha), 3))
-    np.add.at(rgb, owner, total[:, None] * mean)
-    return rgb
+def _sum(weight: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Sum (k, 3) of weights (k, m) times values (m, 3) or (k, m, 3)."""
+    return (weight[:, None, :] @ values)[:, 0]
 
 
 def _transmittance(
-    alpha: np.ndarray, stop: float, exclusive: bool, run: np.ndarray | None
+    alpha: np.ndarray, stop: float, exclusive: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Transmittance before each fragment, which fragments are drawn, and what is left at the end.
-
-    With runs (k, n), all of a run is drawn if its first fragment is.
-    """
+    """Transmittance before each thing, which are drawn, and what is left at the end."""
     after = np.cumprod(1 - alpha, axis=1)
     before = shifted(after)
     live = before > stop
-    if run is not None:
-        row, column = np.nonzero(run >= 0)
-        number = run[row, column]
-        first = np.unique(number, return_index=True)[1]
-        live[row, column] = live[row[first], column[first]][number]
     if exclusive:
         live &= ~np.logical_or.accumulate((alpha > 0) & (after <= stop), axis=1)
     return before, live, np.where(live, 1 - alpha, 1.0).prod(axis=1)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fidsplat.backends.base import View
-from fidsplat.backends.reference.fragments import Fragments, optical_depth, runs, shifted
+from fidsplat.backends.reference.fragments import Fragments, shifted
 from fidsplat.backends.reference.setup import Setup
 
 _ROUND = 4 * 2.0**-24  # of a form, relative to its terms: its coefficients' rounding, and its sums'
@@ -24,7 +24,7 @@ _STOP = 5e-5  # relative, of a transmittance at a threshold
 
 @dataclass
 class Span:
-    """Between which values fragments (k, n) may lie."""
+    """Between which values fragments or layers (k, n) may lie."""
 
     low: np.ndarray
     """opacity"""
@@ -36,10 +36,11 @@ class Span:
     """transmittance in front of the fragment"""
     front_high: np.ndarray
 
-    @property
-    def undecided(self) -> np.ndarray:
-        """Whether a fragment may be drawn or not."""
-        return (self.low <= 0) & (self.high > 0)
+    @classmethod
+    def of(cls, low: np.ndarray, high: np.ndarray, z_low: np.ndarray, z_high: np.ndarray) -> Span:
+        """With the transmittances that follow, for things in the order in which they are laid."""
+        fronts = shifted(np.cumprod(1 - high, axis=1)), shifted(np.cumprod(1 - low, axis=1))
+        return cls(low, high, z_low, z_high, *fronts)
 
 
 def span_of(s: Setup, view: View, f: Fragments) -> Span:
@@ -73,12 +74,11 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
     z_high = np.clip(z_high, s.pz - s.reach, s.pz + s.reach)
     missed = d_high <= 0
     z_low, z_high = np.where(missed, s.pz, z_low), np.where(missed, s.pz, z_high)
-    fronts = shifted(np.cumprod(1 - high, axis=1)), shifted(np.cumprod(1 - low, axis=1))
-    return Span(low, high, z_low, z_high, *fronts)
+    return Span.of(low, high, z_low, z_high)
 
 
-def of_color(s: Setup, view: View, span: Span, before: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """What may change (k,) in colour and alpha, per unit of colour."""
+def of_color(s: Setup, view: View, span: Span, before: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """What may change (k,) in colour and alpha, per unit of colour; moved (k, m): in what is laid itself."""
     doubt = (before * (span.high - span.low)).sum(1)
     t_low = span.front_low * (1 - span.high) * (1 - _STOP)
     t_high = span.front_high * (1 - span.low) * (1 + _STOP)
@@ -86,46 +86,89 @@ def of_color(s: Setup, view: View, span: Span, before: np.ndarray, weight: np.nd
     # an exclusive stop drops a fragment, an inclusive one only what follows
     lost = span.front_high * span.high if s.exclusive else np.full_like(before, view.stop)
     doubt += np.where(may_stop, lost, 0.0).max(1, initial=0.0)
-    if s.planes is not None:
-        doubt += _of_layers(span, s.planes) + _of_cuts(span, s.planes, weight)
-    return doubt
+    return doubt + (span.front_high * moved).sum(1)
 
 
-def _of_layers(span: Span, planes: np.ndarray) -> np.ndarray:
-    """What may change (k,) where splats of a plane share a layer's colour by their optical depths."""
-    run = runs(span.high > 0, planes)
-    row, column = np.nonzero(run >= 0)
-    number = run[row, column]
-    count = int(run.max(initial=-1)) + 1
-    # 1 - opacity is rounded too
-    thin = optical_depth(span.low[row, column] - 2.0**-23)
-    thick = optical_depth(span.high[row, column] + 2.0**-23)
-    least = np.bincount(number, thin, count)[number]
-    others = np.bincount(number, thick, count)[number] - thick
-    front = np.zeros(count)
-    np.maximum.at(front, number, span.front_high[row, column])
+def of_layer_color(thin: np.ndarray, thick: np.ndarray) -> np.ndarray:
+    """What may change (k, 1) in the colour of a layer, per unit of light in front of it, whose n splats have
+    optical depths (k, n) between `thin` and `thick`.
+    """
+    least = thin.sum(1, keepdims=True)
+    others = thick.sum(1, keepdims=True) - thick
     # slope of the layer's colour over one splat's depth, at most: by the light left and the others' share
     slope = np.exp(-least) + np.minimum(1.0, others / np.maximum(least, 1e-9)) / np.maximum(least, 1.0)
-    moved = front[number] * np.minimum(1.0, slope * (thick - thin))
-    several = np.bincount(number, minlength=count)[number] > 1
-    return np.bincount(row, np.where(several, moved, 0.0), len(run))
+    moved = np.minimum(1.0, slope * (thick - thin)).sum(1, keepdims=True)
+    return np.where((thick > 0).sum(1, keepdims=True) > 1, moved, 0.0)
 
 
-def _of_cuts(span: Span, planes: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """What may change (k,) where a fragment of something else may or may not cut a run in two."""
-    doubt = np.zeros(len(weight))
-    rows = np.flatnonzero(span.undecided.any(1))
-    undecided, drawn = span.undecided[rows], span.low[rows] > 0
-    count = len(planes)
-    places = np.arange(count)
-    before = np.maximum.accumulate(np.where(drawn, places, -1), axis=1)
-    behind = np.minimum.accumulate(np.where(drawn, places, count)[:, ::-1], axis=1)[:, ::-1]
-    inner = undecided & (before >= 0) & (behind < count)
-    around = np.where(inner, planes[np.clip(before, 0, None)], -1)
-    same = around == planes[np.clip(behind, None, count - 1)]
-    cuts = (inner & same & (around >= 0) & (planes != around)).any(1)
-    doubt[rows] = np.where(cuts, np.where(planes >= 0, weight[rows], 0.0).sum(1), 0.0)
-    return doubt
+def of_layer_depth(
+    z_low: np.ndarray, z_high: np.ndarray, share: np.ndarray, thin: np.ndarray, thick: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Between which depths (k, 1) the mean by optical depth of n fragments (k, n) may lie."""
+    may = thick > 0
+    count = may.sum(1, keepdims=True)
+    none = count == 0
+    nearest = np.where(may, z_low, np.inf).min(1, keepdims=True, initial=np.inf)
+    furthest = np.where(may, z_high, -np.inf).max(1, keepdims=True, initial=-np.inf)
+    nearest, furthest = np.where(none, 0.0, nearest), np.where(none, 0.0, furthest)
+    least = thin.sum(1, keepdims=True)
+    spread = furthest - nearest
+    moved = spread * np.minimum(1.0, 2 * (thick - thin).sum(1, keepdims=True) / np.maximum(least, 1e-9))
+    low = np.where(share > 0, share * z_low, 0.0).sum(1, keepdims=True) - moved
+    high = np.where(share > 0, share * z_high, 0.0).sum(1, keepdims=True) + moved
+    drawn = share.any(1, keepdims=True)
+    low = np.where(drawn, np.maximum(low, nearest), nearest)
+    high = np.where(drawn, np.minimum(high, furthest), furthest)
+    # a running mean rounds at every fragment
+    off = (2 + count) * 2.0**-24 * np.maximum(np.abs(nearest), np.abs(furthest))
+    return low - off, high + off
+
+
+def first_column(mask: np.ndarray, start: int) -> np.ndarray:
+    """The first column (k,) where mask (k, m) is set, counted from `start`; start + m where none is."""
+    k, m = mask.shape
+    return start + np.where(mask.any(1), np.argmax(mask, axis=1), m) if m else np.full(k, start)
+
+
+def of_places(span: Span, is_layer: np.ndarray) -> np.ndarray:
+    """What may change (k,) in colour where it is not certain in which order layers and fragments are laid.
+
+    Columns (k, m) in the order in which they arrive. Two things laid the other way round change a colour by
+    the product of their opacities and the light in front of them, at most.
+    """
+    doubt = np.zeros(len(span.low))
+    layers = np.flatnonzero(is_layer)
+    fragment = ~is_layer
+    may, must = (span.high > 0) & fragment, (span.low > 0) & fragment
+    light = shifted(np.cumprod(np.where(fragment, 1 - span.low, 1.0), axis=1), last=True)
+    rows = np.arange(len(doubt))
+    earliest, latest = (np.zeros((len(doubt), len(layers)), int) for _ in range(2))
+    for number, c in enumerate(layers):
+        after = np.s_[:, c + 1 :]
+        earliest[:, number] = first_column(may[after] & (span.z_high[after] > span.z_low[:, c, None]), c + 1)
+        latest[:, number] = first_column(must[after] & (span.z_low[after] > span.z_high[:, c, None]), c + 1)
+    drawn, present = span.high[:, layers] > 0, span.low[:, layers] > 0
+    uncertain = drawn & (earliest < latest)
+    for number, c in enumerate(layers):
+        unsure = np.flatnonzero(uncertain[:, number])
+        columns = np.arange(span.low.shape[1])
+        first, end = earliest[unsure, number], latest[unsure, number]
+        between = fragment & (columns >= first[:, None]) & (columns < end[:, None])
+        others = 1 - np.where(between, 1 - span.high[unsure], 1.0).prod(1)
+        doubt[unsure] += light[unsure, first] * span.high[unsure, c] * others
+    wrong = uncertain.any(1) | (drawn & ~present).any(1)
+    for number, c in enumerate(layers):
+        for second, d in enumerate(layers[:number]):
+            meet = (earliest[:, number] <= latest[:, second]) & (earliest[:, second] <= latest[:, number])
+            level = (span.z_low[:, c] <= span.z_high[:, d]) & (span.z_low[:, d] <= span.z_high[:, c])
+            unsure = drawn[:, number] & drawn[:, second] & meet
+            unsure &= level | uncertain[:, number] | uncertain[:, second]
+            front = light[rows, np.minimum(earliest[:, number], earliest[:, second])]
+            doubt += np.where(unsure, front * span.high[:, c] * span.high[:, d], 0.0)
+            wrong |= unsure
+    # of three layers the first may be laid early, and which one it is hangs on all of them
+    crowded = (drawn.sum(1) > 2) & wrong
+    return np.where(crowded, 1.0, doubt)
 
 
 def of_depth(span: Span, weight: np.ndarray, z: np.ndarray) -> dict[str, np.ndarray]:

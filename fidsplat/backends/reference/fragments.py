@@ -47,24 +47,12 @@ def fragments_of(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Fragment
     return Fragments(np.abs(x - s.anchor_x), np.abs(y - s.anchor_y), n_u, n_v, d, offset, alpha, z)
 
 
-def runs(hit: np.ndarray, planes: np.ndarray) -> np.ndarray:
-    """Number of the run of each fragment (k, n), -1 where nothing is hit.
-
-    Hits of one plane >= 0 that follow each other in a sample share a run.
-    """
-    run = np.full(hit.shape, -1)
-    row, column = np.nonzero(hit)
-    plane = planes[column]
-    follows = (row[1:] == row[:-1]) & (plane[1:] == plane[:-1]) & (plane[1:] >= 0)
-    run[row, column] = np.cumsum(np.concatenate([[True], ~follows])) - 1 if len(row) else 0
-    return run
-
-
 def optical_depth(alpha: np.ndarray) -> np.ndarray:
     """-ln(1 - alpha), at most `DARKEST`."""
     return np.minimum(-np.log1p(-np.clip(alpha, 0.0, 1 - 2.0**-24)), DARKEST)
 
 
-def shifted(after: np.ndarray) -> np.ndarray:
-    """What is in front of each fragment (k, n), from what is left behind each."""
-    return np.concatenate([np.ones((len(after), 1)), after[:, :-1]], axis=1)[:, : after.shape[1]]
+def shifted(after: np.ndarray, last: bool = False) -> np.ndarray:
+    """What is in front of each fragment (k, n), from what is left behind each; `last`: and of the end (k, n + 1)."""
+    before = np.concatenate([np.ones((len(after), 1)), after], axis=1)
+    return before if last else before[:, :-1]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fidsplat.backends.base import View
+from fidsplat.backends.planes import PlaneTable
 from fidsplat.effects import FeatureSet
 from fidsplat.splats import SplatCloud, sh_basis
 
@@ -25,6 +26,11 @@ class Setup:
         a, b = unit_a * scale[:, :1], unit_b * scale[:, 1:]
         p = mean @ rotation.T + view.translation
         self.key = p[:, 2].astype(np.float32)
+        planes = None
+        if "compose_planes" in features.slots:
+            table = PlaneTable(cloud)
+            planes = table.index
+            self.key = np.where(planes < 0, self.key, np.append(table.keys(view), 0)[planes])
         with np.errstate(divide="ignore"):
             log_opacity = np.log(cloud.opacities.astype(np.float64))
         half_r2 = log_opacity - view.log_cut
@@ -63,9 +69,7 @@ class Setup:
         self.normal = normal * np.where(height > 0, -1.0, 1.0)[:, None]
         self.screen = "lowpass_screen" in features.slots
         self.exclusive = "stop_exclusive" in features.slots
-        self.planes = None
-        if "compose_planes" in features.slots and cloud.planes is not None:
-            self.planes = cloud.planes[order]
+        self.planes = None if planes is None else planes[order]
 
 
 def _anchor(center: np.ndarray, known: np.ndarray, size: int) -> np.ndarray:

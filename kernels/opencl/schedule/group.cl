@@ -54,7 +54,7 @@ kernel __attribute__((reqd_work_group_size(TILE_W * TILE_H, 1, 1))) void blend(
         if (!alive) break;
     }
 
-    pixel_finish(pixel);
+    pixel_finish(pixel, &constants);
     size_t stride = (size_t)tiles_x * TILE_W, plane = stride * tiles_y * TILE_H;
     size_t at = py * stride + px;
     PIXEL_STORE_BASE(pixel, raw, plane, at);

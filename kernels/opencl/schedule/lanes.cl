@@ -47,7 +47,7 @@ kernel void blend(
     for (int row = 0; row < TILE_H; row++) {
         size_t at = (y0 + row) * stride + x0;
         Pixel *pixel = &pixels[row];
-        pixel_finish(pixel);
+        pixel_finish(pixel, &constants);
         PIXEL_STORE_BASE(pixel, raw, plane, at);
 //@@ store
     }

@@ -1,63 +1,101 @@
-// Splats that are printed on one plane (same id >= 0) have no order: where they meet in a pixel they are one layer.
-// Cutting each into ever thinner sheets and shuffling the sheets gives the limit that does not depend on the order:
-// optical depths tau = -ln(1 - opacity) add up, and the layer's colour is the mean of the colours weighted by tau.
-// So a marker does not change when its splats are re-ordered or when a turning camera re-orders their centres (numerics C1).
-// A run is what one pixel sees of one plane until a fragment of something else follows; its colour is laid down
-// when it ends. Splats of no plane (-1) are composited as ever.
+// Splats that are printed on one plane have no order: at a pixel they are one layer, which nothing cuts. Cutting each into
+// ever thinner sheets and shuffling the sheets gives the limit that does not depend on the order: optical depths
+// tau = -ln(1 - opacity) add up, and what the layer shows is the mean of its fragments weighted by tau. So a marker does
+// not change when its splats are re-ordered or when a turning camera re-orders their centres (numerics C1).
+//
+// The splats of a plane arrive together (plane_keys), before anything that the layer is compared with. It is pending until
+// a fragment of no plane (-1) arrives whose own depth at the pixel lies behind the layer's, or nothing more arrives. Of
+// more than two pending layers the nearer of the first two is laid when the third begins.
 //@ record
     int plane;
 //@ project_args
-    , global const int *restrict planes      // (n)
+    , global const int *restrict planes      // (n) index of the splat's plane; -1: none
+    , global const float *restrict plane_keys // (planes) depth at which its splats are sorted in [m]
 //@ project
     record.plane = planes[i];
-//@ state
-    vint run;                // plane of the open run; -1: none
-    vfloat front;            // transmittance where the run began
-    vfloat ink;              // sum of optical depths of the run
-    vfloat ink_r, ink_g, ink_b;
-//@ start
-    pixel->run = -1;
-    pixel->front = 1.0f;
-    pixel->ink = 0.0f;
-    pixel->ink_r = 0.0f;
-    pixel->ink_g = 0.0f;
-    pixel->ink_b = 0.0f;
-//@ compose_functions
-// Lays down the colour of the runs where `ends` is set.
-static inline void end_run(Pixel *pixel, vint ends) {
-    vfloat share = VSELECT((vfloat)0.0f, (pixel->front - pixel->t) / pixel->ink, ends & VMASK(pixel->ink > 0.0f));
-    pixel->r = FMA(share, pixel->ink_r, pixel->r);
-    pixel->g = FMA(share, pixel->ink_g, pixel->g);
-    pixel->b = FMA(share, pixel->ink_b, pixel->b);
-    pixel->run = VSELECT(pixel->run, (vint)-1, ends);
-    pixel->front = VSELECT(pixel->front, pixel->t, ends);
-    pixel->ink = VSELECT(pixel->ink, (vfloat)0.0f, ends);
-    pixel->ink_r = VSELECT(pixel->ink_r, (vfloat)0.0f, ends);
-    pixel->ink_g = VSELECT(pixel->ink_g, (vfloat)0.0f, ends);
-    pixel->ink_b = VSELECT(pixel->ink_b, (vfloat)0.0f, ends);
+//@ key
+    if (planes[i] >= 0) key = plane_keys[planes[i]];
+//@ compose_types
+typedef struct {
+    vint plane;             // -1: no layer
+    vfloat t;               // transmittance
+    vfloat ink;             // sum of optical depths
+    Seen mean;              // of its fragments by optical depth
+//@@ layer
+} Layer;
+
+static inline Layer no_layer(void) {
+    Layer layer = {-1, 1.0f};
+    return layer;
 }
-//@ live
-    vint begins = mask & VMASK(pixel->run != (vint)s->plane);
-    vint open = begins & VMASK(pixel->run >= 0);
-    if (VANY(open)) end_run(pixel, open);
-    // all of a run is drawn if its first fragment is: what stops it may not depend on the order within
-    vint live = mask & VMASK(pixel->front > constants->stop);
+
+//@ state
+    Layer open, waiting;    // pending: the one that still gathers, and one that arrived before it
+//@ start
+    pixel->open = pixel->waiting = no_layer();
+//@ compose_functions
+// Makes a layer another one where `mask` is set.
+static inline void layer_pick(Layer *layer, const Layer *other, vint mask) {
+    layer->plane = VSELECT(layer->plane, other->plane, mask);
+    layer->t = VSELECT(layer->t, other->t, mask);
+    layer->ink = VSELECT(layer->ink, other->ink, mask);
+    layer->mean.r = VSELECT(layer->mean.r, other->mean.r, mask);
+    layer->mean.g = VSELECT(layer->mean.g, other->mean.g, mask);
+    layer->mean.b = VSELECT(layer->mean.b, other->mean.b, mask);
+//@@ pick
+}
+
+// Adds a fragment where `mask` is set.
+static inline void layer_gather(Layer *layer, const Splat *s, const Seen *seen, vfloat opacity, vint mask) {
+    vfloat bare = 1.0f - opacity;
+    // an opaque fragment has the optical depth at which float32 leaves no light
+    vfloat tau = VSELECT((vfloat)0.0f, -log(fmax(bare, (vfloat)0x1p-24f)), mask);
+    layer->plane = VSELECT(layer->plane, (vint)s->plane, mask);
+    layer->t = VSELECT(layer->t, layer->t * bare, mask);
+    layer->ink += tau;
+    vfloat share = VSELECT((vfloat)0.0f, tau / layer->ink, VMASK(tau > 0.0f));
+    layer->mean.r = FMA(share, seen->r - layer->mean.r, layer->mean.r);
+    layer->mean.g = FMA(share, seen->g - layer->mean.g, layer->mean.g);
+    layer->mean.b = FMA(share, seen->b - layer->mean.b, layer->mean.b);
+//@@ gather
+}
+
+static inline void layer_lay(Pixel *pixel, Layer *layer, vint mask, const BlendConstants *constants) {
+    if (!VANY(mask)) return;
+    const Layer none = no_layer();
+    lay(pixel, &layer->mean, 1.0f - layer->t, mask, constants);
+    layer_pick(layer, &none, mask);
+}
+
+// Lays the pending layers `open` and `waiting` (masks), the nearer first.
+static inline void layers_lay(Pixel *pixel, vint open, vint waiting, const BlendConstants *constants) {
+    vint nearer = open & waiting & VMASK(pixel->open.mean.z < pixel->waiting.mean.z);
+    layer_lay(pixel, &pixel->open, nearer, constants);
+    layer_lay(pixel, &pixel->waiting, waiting, constants);
+    layer_lay(pixel, &pixel->open, open & ~nearer, constants);
+}
+
+// A layer of another plane begins: the open one waits, and of two that would wait the nearer is laid.
+static inline void layers_shift(Pixel *pixel, vint begins, const BlendConstants *constants) {
+    vint both = begins & VMASK(pixel->waiting.plane >= 0);
+    vint nearer = both & VMASK(pixel->open.mean.z < pixel->waiting.mean.z);
+    layer_lay(pixel, &pixel->open, nearer, constants);
+    layer_lay(pixel, &pixel->waiting, both & ~nearer, constants);
+    const Layer none = no_layer();
+    vint moves = begins & ~nearer;
+    layer_pick(&pixel->waiting, &pixel->open, moves);
+    layer_pick(&pixel->open, &none, moves);
+}
 //@ compose
     if (s->plane < 0) {
-        pixel->r = FMA(weight, (vfloat)s->r, pixel->r);
-        pixel->g = FMA(weight, (vfloat)s->g, pixel->g);
-        pixel->b = FMA(weight, (vfloat)s->b, pixel->b);
-        pixel->front = pixel->front - weight;
+        vint open = mask & VMASK(pixel->open.plane >= 0) & VMASK(pixel->open.mean.z < seen.z);
+        vint waiting = mask & VMASK(pixel->waiting.plane >= 0) & VMASK(pixel->waiting.mean.z < seen.z);
+        if (VANY(open | waiting)) layers_lay(pixel, open, waiting, constants);
+        lay(pixel, &seen, opacity, mask, constants);
     } else {
-        // an opaque fragment has the optical depth at which float32 leaves no light
-        vfloat tau = -log(fmax(1.0f - opacity, (vfloat)0x1p-24f));
-        pixel->run = VSELECT(pixel->run, (vint)s->plane, live);
-        pixel->ink += tau;
-        pixel->ink_r = FMA(tau, (vfloat)s->r, pixel->ink_r);
-        pixel->ink_g = FMA(tau, (vfloat)s->g, pixel->ink_g);
-        pixel->ink_b = FMA(tau, (vfloat)s->b, pixel->ink_b);
+        vint begins = mask & VMASK(pixel->open.plane >= 0) & VMASK(pixel->open.plane != (vint)s->plane);
+        if (VANY(begins)) layers_shift(pixel, begins, constants);
+        layer_gather(&pixel->open, s, &seen, opacity, mask);
     }
-//@ unfinished
-    return VMASK(pixel->front > constants->stop);
 //@ finish
-    end_run(pixel, VMASK(pixel->run >= 0));
+    layers_lay(pixel, VMASK(pixel->open.plane >= 0), VMASK(pixel->waiting.plane >= 0), constants);

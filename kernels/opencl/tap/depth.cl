@@ -4,8 +4,8 @@
 //@ start
     pixel->depth = 0.0f;
     pixel->depth_weight = 0.0f;
-//@ fragment
-    pixel->depth = FMA(weight, fragment_z, pixel->depth);
+//@ lay
+    pixel->depth = FMA(weight, seen->z, pixel->depth);
     pixel->depth_weight += weight;
 //@ blend_args
     , global float *restrict depth_raw       // 2 planes: sum w z, sum w

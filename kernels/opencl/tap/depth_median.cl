@@ -4,8 +4,8 @@
     vfloat depth_median;
 //@ start
     pixel->depth_median = 0.0f;
-//@ fragment
-    pixel->depth_median = VSELECT(pixel->depth_median, fragment_z, live & VMASK(pixel->t > 0.5f));
+//@ lay
+    pixel->depth_median = VSELECT(pixel->depth_median, seen->z, live & VMASK(pixel->t > 0.5f));
 //@ blend_args
     , global float *restrict depth_median_raw
 //@ store

@@ -1,4 +1,4 @@
-// label (h, w) int: label of the fragment with the largest weight, the nearest of equals; -1 where nothing was drawn.
+// label (h, w) int: label of the fragment or layer with the largest weight, the nearest of equals; -1 where nothing was drawn.
 //@ record
     int label;
 //@ project_args
@@ -11,9 +11,21 @@
 //@ start
     pixel->label_weight = 0.0f;
     pixel->label = -1;
-//@ fragment
+//@ seen
+    vint label;
+//@ see
+    seen.label = s->label;
+//@ layer
+    vfloat label_tau;       // greatest optical depth of its fragments: that one's label is the layer's
+//@ pick
+    layer->label_tau = VSELECT(layer->label_tau, other->label_tau, mask);
+    layer->mean.label = VSELECT(layer->mean.label, other->mean.label, mask);
+//@ gather
+    layer->mean.label = VSELECT(layer->mean.label, seen->label, VMASK(tau > layer->label_tau));
+    layer->label_tau = fmax(layer->label_tau, tau);
+//@ lay
     vint heavier = VMASK(weight > pixel->label_weight);
-    pixel->label = VSELECT(pixel->label, (vint)s->label, heavier);
+    pixel->label = VSELECT(pixel->label, seen->label, heavier);
     pixel->label_weight = fmax(pixel->label_weight, weight);
 //@ blend_args
     , global float *restrict label_raw, global int *restrict label_id_raw

@@ -14,10 +14,24 @@
     pixel->normal_x = 0.0f;
     pixel->normal_y = 0.0f;
     pixel->normal_z = 0.0f;
-//@ fragment
-    pixel->normal_x = FMA(weight, (vfloat)s->nx, pixel->normal_x);
-    pixel->normal_y = FMA(weight, (vfloat)s->ny, pixel->normal_y);
-    pixel->normal_z = FMA(weight, (vfloat)s->nz, pixel->normal_z);
+//@ seen
+    vfloat nx, ny, nz;
+//@ see
+    seen.nx = s->nx;
+    seen.ny = s->ny;
+    seen.nz = s->nz;
+//@ pick
+    layer->mean.nx = VSELECT(layer->mean.nx, other->mean.nx, mask);
+    layer->mean.ny = VSELECT(layer->mean.ny, other->mean.ny, mask);
+    layer->mean.nz = VSELECT(layer->mean.nz, other->mean.nz, mask);
+//@ gather
+    layer->mean.nx = FMA(share, seen->nx - layer->mean.nx, layer->mean.nx);
+    layer->mean.ny = FMA(share, seen->ny - layer->mean.ny, layer->mean.ny);
+    layer->mean.nz = FMA(share, seen->nz - layer->mean.nz, layer->mean.nz);
+//@ lay
+    pixel->normal_x = FMA(weight, seen->nx, pixel->normal_x);
+    pixel->normal_y = FMA(weight, seen->ny, pixel->normal_y);
+    pixel->normal_z = FMA(weight, seen->nz, pixel->normal_z);
 //@ blend_args
     , global float *restrict normal_raw      // 3 planes
 //@ store

@@ -1,0 +1,66 @@
+"""Where the splats of a plane arrive in the depth order: together, before anything they are compared with.
+
+At a pixel the splats of a plane are one layer, which is placed by its own depth there. So they may not arrive
+one by one, by the depth of their centres: a plane has one sort key for each view. Every backend takes it
+from here.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fidsplat.backends.base import View
+from fidsplat.rotations import quaternion_to_matrix
+from fidsplat.splats import SplatCloud
+
+
+class PlaneTable:
+    """The planes of a cloud, by a dense index in the order of their ids, and boxes that bound their splats.
+
+    A box stands in the frame of one of the plane's splats (two tangents and the normal), whichever the order
+    in which they are stored.
+    """
+
+    index: np.ndarray
+    """(n,) int32: which plane each splat is printed on, from 0; -1 for none"""
+
+    def __init__(self, cloud: SplatCloud) -> None:
+        ids = np.full(len(cloud), -1, np.int32) if cloud.planes is None else cloud.planes
+        on_plane = np.flatnonzero(ids >= 0)
+        on_plane = on_plane[np.lexsort((*cloud.quats[on_plane].T, *cloud.means[on_plane].T))]
+        known, first, which = np.unique(ids[on_plane], return_index=True, return_inverse=True)
+        self.index = np.full(len(cloud), -1, np.int32)
+        self.index[on_plane] = which
+        turns = quaternion_to_matrix(cloud.quats[on_plane])
+        self._axes = np.swapaxes(turns[first], 1, 2)  # (p, 3, 3): rows are unit axes
+        axes = self._axes[which]
+        centers = np.einsum("nkj,nj->nk", axes, cloud.means[on_plane].astype(np.float64))
+        tangents = turns[:, :, :2] * cloud.scales[on_plane].astype(np.float64)[:, None, :]
+        spread = np.linalg.norm(axes @ tangents, axis=2)
+        shape = (len(known), 3)
+        low, high, self._sigma = np.full(shape, np.inf), np.full(shape, -np.inf), np.zeros(shape)
+        np.minimum.at(low, which, centers)
+        np.maximum.at(high, which, centers)
+        np.maximum.at(self._sigma, which, spread)
+        self._center, self._half = (low + high) / 2, (high - low) / 2
+
+    def keys(self, view: View) -> np.ndarray:
+        """(p,) float32, all different: a plane's nearest depth less its splats' diameter [m].
+
+        Whatever lies before the plane at some pixel, with its centre at most a diameter nearer than the
+        plane, arrives after it and can be placed before it; so can what lies behind.
+        """
+        radius = math.sqrt(-2 * view.log_cut)
+        half = self._half + radius * self._sigma
+        along = self._axes @ view.rotation[2]  # (p, 3): depth per metre along each axis
+        depth = np.einsum("pk,pk->p", along, self._center) + view.translation[2]
+        nearest = depth - (np.abs(along) * half).sum(1)
+        keys = (nearest - 2 * np.linalg.norm(half, axis=1)).astype(np.float32)
+        # of equal keys the index decides, and shuffled splats of two planes would mix
+        order = np.argsort(keys, kind="stable")
+        for before, here in zip(order[:-1], order[1:], strict=True):
+            if keys[here] <= keys[before]:
+                keys[here] = np.nextafter(keys[before], np.float32(np.inf))
+        return keys
