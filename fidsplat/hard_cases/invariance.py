@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from importlib import import_module
+from types import ModuleType
 
 import numpy as np
 
@@ -58,3 +60,22 @@ def tile_shapes(renderer: Renderer) -> list:
         sizes = [(lanes, height) for lanes, height in ((8, 8), (own.lanes, 32), (4, 16))]
         return [replace(own, lanes=w, tile_width=w, tile_height=h) for w, h in sizes]
     return [replace(own, tile_width=side, tile_height=side) for side in (8, 32)]
+
+
+def other_schedule(renderer: Renderer):
+    """Build constants of the schedule for GPUs; on a GPU, with other tiles."""
+    own = renderer.backend.shape  # type: ignore[attr-defined]
+    eight = replace(own, schedule="group", tile_width=8, tile_height=8)
+    return replace(eight, lanes=1, scan_items=64) if own.schedule == "lanes" else eight
+
+
+def odd_shapes(renderer: Renderer) -> list:
+    """The device's build constants, and odd ones for its sorting where it has its own."""
+    own = renderer.backend.shape  # type: ignore[attr-defined]
+    return [own, replace(own, chunks=7, radix_bits=5)] if hasattr(own, "chunks") else [own]
+
+
+def probe_of(renderer: Renderer) -> ModuleType | None:
+    """The module that looks into the renderer's device; None for the reference."""
+    family = renderer.device.name.split(":")[0]
+    return None if family == "reference" else import_module(f"fidsplat.backends.{family}.probe")

@@ -1,5 +1,5 @@
-"""Tiles from their lists: a block of threads per tile on a GPU, four samples in a row per thread; on a CPU a thread per tile that
-walks each splat's box within it. The same functions see every sample, so both take the same decisions.
+"""Tiles from their lists: a block of threads per tile on a GPU; on a CPU a thread per tile that walks each splat's box within it.
+The same functions see every sample, so both take the same decisions.
 """
 
 from functools import cache
@@ -10,14 +10,18 @@ from .bounds import Bounds, make_bounds
 from .common import STRICT, View
 from .pixel import make_pixel
 
-STRIP = wp.constant(4)
-"""samples in a row that one GPU thread draws"""
+
+def strip_of(effects: tuple[str, ...]) -> int:
+    """Samples in a row that one GPU thread draws: four share the reading of a record. Pending layers leave no registers for that."""
+    return 1 if "compose_planes" in effects else 4
 
 
 @cache
 def make_blend(effects: tuple[str, ...], on_gpu: bool):
     """The kernel for these effects of splats and samples."""
     parts = make_pixel(effects)
+    strip = strip_of(effects)
+    several = strip == 4
     Pixel = parts.Pixel
     limits = make_bounds("lowpass_screen" in effects)
     depth, median, normal, label = (name in effects for name in ("depth", "depth_median", "normal", "label"))
@@ -70,21 +74,22 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool):
         raw_label_weight: wp.array(dtype=wp.float32),
     ):
         thread = wp.tid()
-        across = view.tile_w / STRIP
+        across = view.tile_w / strip
         threads = across * view.tile_h
         tile = band_first + thread / threads
         item = thread % threads
-        x0 = (tile % view.tiles_x) * view.tile_w + (item % across) * STRIP
+        x0 = (tile % view.tiles_x) * view.tile_w + (item % across) * strip
         y0 = (tile / view.tiles_x) * view.tile_h + item / across
         p0, p1, p2, p3 = start(), start(), start(), start()
         # what lies beyond the picture is finished from the start
-        if y0 >= view.height or x0 >= view.width:
+        below = y0 >= view.height
+        if below or x0 >= view.width:
             p0.t = 0.0
-        if y0 >= view.height or x0 + 1 >= view.width:
+        if below or x0 + 1 >= view.width:
             p1.t = 0.0
-        if y0 >= view.height or x0 + 2 >= view.width:
+        if below or x0 + 2 >= view.width:
             p2.t = 0.0
-        if y0 >= view.height or x0 + 3 >= view.width:
+        if below or x0 + 3 >= view.width:
             p3.t = 0.0
         k = starts[tile]
         end = starts[tile + 1]
@@ -95,27 +100,32 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool):
             x = float(x0) - s.d[3]
             y = float(y0) - s.c[0]
             u, v, d = row_of(s.u, y), row_of(s.v, y), row_of(s.d, y)
-            open0, open1 = unfinished(p0, view), unfinished(p1, view)
-            open2, open3 = unfinished(p2, view), unfinished(p3, view)
-            if not (open0 or open1 or open2 or open3):
-                break
+            open0 = unfinished(p0, view)
+            if wp.static(several):
+                open1, open2, open3 = unfinished(p1, view), unfinished(p2, view), unfinished(p3, view)
+                if not (open0 or open1 or open2 or open3):
+                    break
+                c1 = cross(s, u, v, d, x + 1.0, y, view)
+                c2 = cross(s, u, v, d, x + 2.0, y, view)
+                c3 = cross(s, u, v, d, x + 3.0, y, view)
+                if c1.drawn and open1:
+                    p1 = blend_one(p1, s, c1, index, lines, labels, planes, view)
+                if c2.drawn and open2:
+                    p2 = blend_one(p2, s, c2, index, lines, labels, planes, view)
+                if c3.drawn and open3:
+                    p3 = blend_one(p3, s, c3, index, lines, labels, planes, view)
+            else:
+                if not open0:
+                    break
             c0 = cross(s, u, v, d, x, y, view)
-            c1 = cross(s, u, v, d, x + 1.0, y, view)
-            c2 = cross(s, u, v, d, x + 2.0, y, view)
-            c3 = cross(s, u, v, d, x + 3.0, y, view)
             if c0.drawn and open0:
                 p0 = blend_one(p0, s, c0, index, lines, labels, planes, view)
-            if c1.drawn and open1:
-                p1 = blend_one(p1, s, c1, index, lines, labels, planes, view)
-            if c2.drawn and open2:
-                p2 = blend_one(p2, s, c2, index, lines, labels, planes, view)
-            if c3.drawn and open3:
-                p3 = blend_one(p3, s, c3, index, lines, labels, planes, view)
         at = y0 * view.tiles_x * view.tile_w + x0
         store(finish(p0, view), at, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
-        store(finish(p1, view), at + 1, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
-        store(finish(p2, view), at + 2, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
-        store(finish(p3, view), at + 3, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
+        if wp.static(several):
+            store(finish(p1, view), at + 1, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
+            store(finish(p2, view), at + 2, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
+            store(finish(p3, view), at + 3, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def blend_cpu(

@@ -4,7 +4,7 @@ import warp as wp
 
 # Order and culling must not depend on what a compiler fuses: contraction is off everywhere, and fused operations are
 # written out as `fma` (numerics F1). No fast maths: a NaN must fail a comparison (numerics F3).
-STRICT = {"fuse_fp": False, "fast_math": False, "enable_backward": False}
+STRICT = {"fuse_fp": False, "fast_math": False, "enable_backward": False, "default_grid_stride": False}
 
 CULLED = wp.constant(wp.uint32(0xFFFFFFFF))
 """key of a splat that is not drawn"""

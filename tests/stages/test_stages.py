@@ -1,4 +1,4 @@
-"""What passes between the stages of the OpenCL backend, against brute force."""
+"""What passes between the stages of each backend that has them, against brute force."""
 
 from dataclasses import replace
 
@@ -9,6 +9,7 @@ from agreement import ALL_OUTPUTS, random_splats
 import fidsplat as fs
 from fidsplat.backends.base import View
 from fidsplat.effects import select
+from fidsplat.hard_cases.invariance import has_tiles, odd_shapes, other_schedule
 
 CULLED = np.uint32(0xFFFFFFFF)
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
@@ -16,8 +17,8 @@ CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 
 @pytest.fixture(scope="module")
 def backend(renderer):
-    if not renderer.device.name.startswith("opencl"):
-        pytest.skip("stages of the OpenCL backend")
+    if not has_tiles(renderer):
+        pytest.skip("draws in one piece")
     return renderer.backend
 
 
@@ -123,7 +124,7 @@ def test_culled_splats_change_nothing(backend):
     assert np.array_equal(traced(backend, fewer, fs.Quality())[0]["rgb"], trace["rgb"])
 
 
-def test_tile_size_leaves_every_bit_as_it_was(backend):
+def test_tile_size_leaves_every_bit_as_it_was(backend, renderer):
     """numerics A4 and A5: one test that finds every bug of the bounds."""
     cloud = random_splats(300, seed=3)
     quality = fs.Quality()
@@ -135,18 +136,17 @@ def test_tile_size_leaves_every_bit_as_it_was(backend):
         shapes += [replace(shape, lanes=lanes, tile_width=lanes) for lanes in (4, 8) if lanes != shape.lanes]
     else:
         shapes = [replace(shape, tile_width=side, tile_height=side) for side in (8, 32)]
-    shapes += [replace(shape, chunks=3, radix_bits=5)]
+    shapes += odd_shapes(renderer)[1:]
     for other in shapes:
         trace, _ = traced(backend, cloud, quality, ALL_OUTPUTS, other)
         for name in ALL_OUTPUTS:
             assert np.array_equal(trace[name], base[name]), f"{name} differs with {other}"
 
 
-def test_both_schedules_draw_the_same_picture(backend):
+def test_both_schedules_draw_the_same_picture(backend, renderer):
     cloud = random_splats(300, seed=9)
     base, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS)
-    groups = replace(backend.shape, schedule="group", lanes=1, tile_width=8, tile_height=8, scan_items=64)
-    other, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS, groups)
+    other, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS, other_schedule(renderer))
     for name in ("rgb", "alpha", "normal", "depth"):
         assert np.allclose(other[name], base[name], rtol=1e-5, atol=2e-6), name
     assert np.array_equal(other["label"], base["label"])

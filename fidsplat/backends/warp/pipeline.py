@@ -67,6 +67,7 @@ class WarpPipeline:
                 f"{backend.info.name} ({backend.info.platform}) has no {', '.join(lacking)}; use an OpenCL device for it"
             )
         self.backend, self.features, self.shape = backend, features, shape
+        area = shape.tile_width * shape.tile_height
         record = tuple(name for name in _RECORD if name in names)
         sample = tuple(name for name in _SAMPLE if name in names)
         terms = (features.sh_degree + 1) ** 2 if "color_sh" in names else 0
@@ -77,6 +78,8 @@ class WarpPipeline:
             self.lists = runtime.kernels("lists").make_lists(screen)
             self.sort = runtime.kernels("lists")
             self.blend, self.state = runtime.kernels("blend").make_blend(sample, shape.schedule == "group")
+            self.block_dim = area // runtime.kernels("blend").strip_of(sample)
+            """threads that draw a tile on a GPU"""
             self.resolve = runtime.kernels("resolve").make_resolve(features.taps, features.samples)
             common = [self.sort.compact, self.sort.gather, self.sort.find_starts, self.sort.sum_up]
             for kernel in (self.project, self.lists.emit, self.blend, self.resolve, *common):
@@ -94,10 +97,11 @@ class WarpPipeline:
         if loaded is None:
             raise DeviceError(f"{self.backend.info.name} cannot compile {kernel.key}; Warp says more on stderr")
 
-    @property
-    def block_dim(self) -> int:
-        """Threads that draw a tile on a GPU: four samples each."""
-        return self.shape.tile_width * self.shape.tile_height // 4
+    def load_banding(self) -> None:
+        """Compile what only a picture with more pairs than the budget needs."""
+        with runtime.quiet():
+            self._compile(self.lists.histogram)
+            self._compile(self.lists.count)
 
     def render(self, resident: Resident, view: View) -> WarpPlanes:
         """Draw one picture.
@@ -156,6 +160,8 @@ class _Run:
         self._take("starts", self.tiles + 1, self.wp.int32)
         self._take("lists", 1, self.wp.int32)
         self._take("order", 1, self.wp.int32)
+        self._take("bounds", resident.count, runtime.kernels("bounds").Bounds)
+        self._take("lines", resident.count * pipeline.layout.lines, self.wp.vec4)
 
         self.launcher.stage("project")
         visible, pairs = self._project() if resident.count else (0, 0)
@@ -178,14 +184,12 @@ class _Run:
 
     def _project(self) -> tuple[int, int]:
         wp, n = self.wp, self.resident.count
-        bounds = runtime.kernels("bounds").Bounds
-        lines = self._take("lines", n * self.pipeline.layout.lines, wp.vec4)
         keys, counts = self._take("keys", n, wp.uint32), self._take("counts", n, wp.int64)
         drawn, places = self._take("drawn", n, wp.int32), self._take("places", n, wp.int32)
         ends = self._take("ends", n, wp.int64)
         cloud = [self.resident.arrays[name] for name in ("means", "quats", "scales", "opacities", "colors")]
         cloud += self._planes()
-        records = [lines, self._take("bounds", n, bounds), keys, counts, drawn]
+        records = [self.held["lines"], self.held["bounds"], keys, counts, drawn]
         self.launch(self.pipeline.project, n, self.u, *cloud, *records)
         wp.utils.array_scan(drawn[:n], places[:n], inclusive=True)
         wp.utils.array_scan(counts[:n], ends[:n], inclusive=True)
@@ -225,6 +229,7 @@ class _Run:
             return
         totals = self._take("tile totals", self.tiles, self.wp.int32)
         totals.zero_()
+        self.pipeline.load_banding()
         # one launch: on the CPU its sums are plain additions
         args = [0, self.u, self.held["order"], self.held["bounds"], totals]
         self.wp.launch(self.pipeline.lists.histogram, visible, args, device=self.backend.device, record_tape=False)
@@ -273,15 +278,14 @@ class _Run:
         """Draws the tiles of one band."""
         pipeline, held = self.pipeline, self.held
         splats = (self.resident.arrays["labels"], self.resident.arrays.get("planes", samples[4]))
-        args = (self.u, held.get("lines", samples[0]), *splats, held["starts"], held["lists"], *samples)
+        args = (self.u, held["lines"], *splats, held["starts"], held["lists"], *samples)
         area = pipeline.shape.tile_width * pipeline.shape.tile_height
         if pipeline.shape.schedule == "group":
             count = (end - first) * pipeline.block_dim
             self.launcher.blocks(pipeline.blend, count, pipeline.block_dim, first, *args)
             return
-        bounds = self._take("bounds", 1, runtime.kernels("bounds").Bounds)
         state = self._take("state", self.launcher.pieces * area, pipeline.state)
-        self.launcher.tiles(pipeline.blend, first, end, area, *args, bounds, state)
+        self.launcher.tiles(pipeline.blend, first, end, area, *args, held["bounds"], state)
 
     def _resolve(self, samples: list[Any]) -> tuple[dict[str, tuple[Output, Any]], tuple[int, int]]:
         view, features, wp = self.view, self.pipeline.features, self.wp
@@ -290,7 +294,7 @@ class _Run:
         for output in features.outputs:
             dtype = wp.int32 if output.dtype == "int32" else wp.float32
             # asked for anew: the caller keeps them
-            outputs[output.name] = output, wp.empty(height * width * output.channels, dtype=dtype, device=self.backend.device)
+            outputs[output.name] = output, self.pool.fresh(output.name, height * width * output.channels, dtype)
         arrays = [
             outputs[name][1] if name in outputs else self._take(f"no {name}", 1, dtype)
             for name, dtype in (
