@@ -150,7 +150,7 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str):
         # conditions are written so that a NaN culls (numerics E1)
         log_opacity = float(wp.log(real(opacities[i])))
         half_r2 = log_opacity - view.log_cut
-        if not (half_r2 > 0.0):
+        if not (half_r2 > 0.0 and opacities[i] <= 1.0):
             return
         size = scales[i]
         if not (size[0] >= 0.0 and size[0] < wp.inf and size[1] >= 0.0 and size[1] < wp.inf):

@@ -125,7 +125,7 @@ def _uploaded(name: str, array: np.ndarray, pool: ArrayPool) -> Any:
     if array.size == 0:
         return pool.fresh(name, 1, _dtype(name))
     try:
-        return wp.array(np.ascontiguousarray(array), dtype=_dtype(name), device=pool.device)
+        return wp.array(np.ascontiguousarray(array), dtype=_dtype(name), device=pool.device).flatten()
     except (RuntimeError, MemoryError) as error:
         size = array.nbytes / 2**20
         raise DeviceError(f"the cloud's {name} need {size:.0f} MiB, which {pool.device} has not; use fewer splats") from error
@@ -151,7 +151,7 @@ def _adopted(name: str, value: Any, pool: ArrayPool) -> Any:
         raise InputError(f"{name} is not contiguous; give a contiguous array")
     if array.dtype == scalar and width > 1 and array.shape[-1] == width:
         array = wp.from_dlpack(array, dtype=dtype)
-    if wp.types.type_size(array.dtype) != width or wp.types.type_scalar_type(array.dtype) != scalar:
+    if wp.types.type_size(array.dtype) != width or getattr(array.dtype, "_wp_scalar_type_", array.dtype) != scalar:
         raise InputError(
             f"{name} has the type {wp.types.type_repr(array.dtype)} and the shape {array.shape}; it must hold "
             f"{scalar.__name__}, {width} to an element"
