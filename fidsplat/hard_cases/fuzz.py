@@ -2,7 +2,7 @@
 
 The distribution is that of numerics.md, section 3: scales log-uniform from 1e-6 to 1e3 m, anisotropy to 1e6,
 depths from -5 to 1e5 m, every tenth splat edge-on within 1e-6 rad, every tenth across the near plane, every
-tenth in an exactly coplanar group, opacities on the thresholds.
+tenth in a coplanar group, half of those that are known as planes tilted, opacities on the thresholds.
 """
 
 from __future__ import annotations
@@ -62,6 +62,7 @@ def scene_of(seed: int) -> Picture:
         axes = quaternion_to_matrix(quats[k])[2, :2] * scales[k]
         means[k, 2] = near + generator.uniform(-3, 3) * np.linalg.norm(axes)
     planes = _coplanar(generator, np.flatnonzero(kind == 3), means, quats)
+    _tilt(np.random.default_rng([seed, 1]), planes, means, quats)
 
     pose = np.eye(4)
     if generator.random() < 0.5:
@@ -110,3 +111,17 @@ def _coplanar(generator, chosen: np.ndarray, means: np.ndarray, quats: np.ndarra
             quats[k] = [math.cos(angle / 2), 0, 0, math.sin(angle / 2)]
             planes[k] = group if known else -1
     return planes
+
+
+def _tilt(generator: np.random.Generator, planes: np.ndarray, means: np.ndarray, quats: np.ndarray) -> None:
+    """Turns half of the planes about their middle, so that they cross one another and what lies around."""
+    for plane in np.unique(planes[planes >= 0]):
+        axis = generator.normal(size=3) * [1, 1, 0.3]
+        angle = generator.uniform(0, math.pi / 2)
+        if generator.random() < 0.5:
+            continue
+        own = np.flatnonzero(planes == plane)
+        turn = np.array([math.cos(angle / 2), *(math.sin(angle / 2) * axis / np.linalg.norm(axis))])
+        middle = means[own].mean(axis=0)
+        means[own] = middle + (means[own] - middle) @ quaternion_to_matrix(turn).T
+        quats[own] = quaternion_multiply(turn, quats[own])

@@ -11,7 +11,16 @@ from fidsplat.cameras import Camera
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, COLOR_TOLERANCE, Picture
 from fidsplat.hard_cases.case import Case, Finding
 from fidsplat.hard_cases.clouds import camera, random_splats, splats, taken, turned
-from fidsplat.hard_cases.coplanar import largest_jump, tag, turning
+from fidsplat.hard_cases.coplanar import (
+    WALL_STEP,
+    beside_a_big_splat,
+    faint_between,
+    largest_jump,
+    layered,
+    tag,
+    turning,
+    wall,
+)
 from fidsplat.hard_cases.invariance import CULLED, differing, draw, has_tiles, tile_shapes, trace
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer
@@ -34,14 +43,38 @@ def fronto_parallel(away: float, count: int = 200) -> Picture:
     return Picture(splats(world, facing, 0.25, 0.9, grey), camera(world_to_camera=pose), outputs=ALL_OUTPUTS)
 
 
+ON_TAGS = Camera.look_at(96, 80, 0.8, (0.05, -0.03, -1.6), (0, 0, 0))
+SIDES = ("before", "behind", "through")
+
+
+def crossing_tags() -> list[SplatCloud]:
+    """Two tilted tags that cross."""
+    pose = np.eye(4)
+    pose[:3, :3] = quaternion_to_matrix(turned((0.2, 1, 0), 50))
+    return [tag(6), tag(6, seed=1).transformed(pose)]
+
+
 def _tilted_planes(quality: Quality) -> Picture:
     """Two tags that cross, and splats of no plane between."""
     others = random_splats(30, seed=10, depth=(-0.6, 0.6), scale=(0.02, 0.2), across=0.6)
-    pose = np.eye(4)
-    pose[:3, :3] = quaternion_to_matrix(turned((0.2, 1, 0), 50))
-    cloud = SplatCloud.concatenate([tag(6), tag(6, seed=1).transformed(pose), others])
+    cloud = SplatCloud.concatenate([*crossing_tags(), others])
     view = Camera.look_at(100, 80, 0.8, (0.9, -0.4, -1.4), (0, 0, 0))
     return Picture(cloud, view, quality, ALL_OUTPUTS)
+
+
+def _three_tags() -> Picture:
+    """Three tags that cross, of which no more than two wait at a pixel, and splats of no plane between."""
+    pose = np.eye(4)
+    pose[:3, :3] = quaternion_to_matrix(turned((1, 0.3, 0), -35))
+    pose[2, 3] = 0.1
+    others = random_splats(30, seed=13, depth=(-0.6, 0.6), scale=(0.02, 0.2), across=0.6)
+    cloud = SplatCloud.concatenate([*crossing_tags(), others, tag(6, seed=2).transformed(pose)])
+    return Picture(cloud, ON_TAGS, outputs=ALL_OUTPUTS)
+
+
+def before_a_wall(count: int) -> SplatCloud:
+    """A tag 5 cm before a wall of splats of no plane."""
+    return SplatCloud.concatenate([tag(), wall(count)])
 
 
 def _c1() -> Iterator[Picture]:
@@ -49,6 +82,16 @@ def _c1() -> Iterator[Picture]:
         yield fronto_parallel(away)
     yield _tilted_planes(Quality())
     yield _tilted_planes(Quality(coplanar="order"))
+    yield _three_tags()
+    for side in SIDES:
+        cloud = SplatCloud.concatenate(beside_a_big_splat(side))
+        yield Picture(cloud, ON_TAGS, outputs=ALL_OUTPUTS)
+    at_wall = next(turning(before_a_wall(150), "blend", 0, 30))
+    yield Picture(at_wall.cloud, at_wall.camera, outputs=ALL_OUTPUTS)
+
+
+def _shuffled(cloud: SplatCloud) -> SplatCloud:
+    return taken(cloud, np.random.default_rng(3).permutation(len(cloud)))
 
 
 def _c1_order(renderer: Renderer) -> Iterator[Finding]:
@@ -62,12 +105,41 @@ def _c1_order(renderer: Renderer) -> Iterator[Finding]:
     yield Finding("splats out of the order by key and index", wrong_order, 0)
 
     cloud = tag()
-    views = list(turning(cloud, "blend", steps=2))
-    yield Finding("jump of a tag in steps of 1e-4 deg", largest_jump(renderer, iter(views))[0], 2e-3)
-    shuffled = taken(cloud, np.random.default_rng(3).permutation(len(cloud)))
-    again = Picture(shuffled, views[0].camera, views[0].quality, ("rgb",))
-    change = np.abs(draw(renderer, again)["rgb"] - draw(renderer, views[0])["rgb"]).max()
-    yield Finding("change when a tag's splats are re-ordered", float(change), COLOR_TOLERANCE)
+    yield Finding(
+        "jump of a tag in steps of 1e-4 deg", largest_jump(renderer, turning(cloud, "blend", 2))[0], 2e-3
+    )
+    tilted = next(turning(before_a_wall(150), "blend", 0, 30))
+    for what, picture in (
+        ("a tag's splats", next(turning(cloud, "blend", 0))),
+        ("a tag's splats among others", tilted),
+    ):
+        again = Picture(_shuffled(picture.cloud), picture.camera, picture.quality, ("rgb",))
+        change = np.abs(draw(renderer, again)["rgb"] - draw(renderer, picture)["rgb"]).max()
+        yield Finding(f"change when {what} are re-ordered", float(change), COLOR_TOLERANCE)
+
+
+def _c1_layers(renderer: Renderer) -> Iterator[Finding]:
+    for tilt in (0.0, 30.0, 60.0):
+        ordered, blended = (
+            largest_jump(renderer, turning(before_a_wall(150), mode, 2, tilt, step=WALL_STEP))[0]
+            for mode in ("order", "blend")
+        )
+        yield Finding(f"jump before a wall, share of that in order, {tilt:g} deg", blended / ordered, 0.5)
+    # a splat that is just drawn, and one that is just not, with its own opacity between
+    with_it, without = (draw(renderer, faint_between(n / 255))["rgb"] for n in (1.01, 0.99))
+    change = float(np.abs(with_it - without).max())
+    yield Finding("change when a faint splat comes between", change, 1.01 / 255)
+    for title, parts in (
+        *((f"tag with a big splat {side} it", beside_a_big_splat(side)) for side in SIDES),
+        ("tags that cross", crossing_tags()),
+    ):
+        got, wanted = layered(renderer, parts, ON_TAGS)
+        yield Finding(f"{title}, from pictures of each", float(np.abs(got - wanted).max()), COLOR_TOLERANCE)
+
+
+def _c1_check(renderer: Renderer) -> Iterator[Finding]:
+    yield from _c1_order(renderer)
+    yield from _c1_layers(renderer)
 
 
 def _keys_and_order(renderer: Renderer, picture: Picture) -> tuple[int, int]:
@@ -133,7 +205,7 @@ def _c3(renderer: Renderer) -> Iterator[Finding]:
 
 CASES = (
     Case(
-        "C1", "coplanar splats and ties", "200 at depth 5, 0 to 1000 m from the origin; tags", _c1, _c1_order
+        "C1", "coplanar splats and ties", "200 at depth 5, 0 to 1000 m from the origin; tags", _c1, _c1_check
     ),
     Case("C2", "precision and sign of keys", "depths 1 ulp apart, below 0, 1e12 m", _key_pictures, _c2_order),
     Case("C3", "the same bits every time", "300 splats, again and in other tiles", None, _c3),

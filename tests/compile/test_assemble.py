@@ -40,7 +40,7 @@ def test_base_text_names_no_effect_that_was_not_asked_for():
         "stop_inclusive",
         "compose_ordered",
     }
-    for name in (*absent, *TAPS, "sh", "finished", "planes", "run", "ink"):
+    for name in (*absent, *TAPS, "sh", "finished", "planes", "plane_keys", "layer", "Layer", "open", "waiting", "ink"):
         assert not re.search(rf"\b{name}(_|\b)", text), name
 
 
@@ -58,6 +58,20 @@ def test_a_tap_brings_its_text_and_nothing_else(tap):
         other for other in TAPS if other != tap and not other.startswith(tap) and not tap.startswith(other)
     ]
     assert not any(re.search(rf"\b{other}_(out|raw)", with_tap.text) for other in others)
+
+
+@pytest.mark.parametrize("taps", [("rgb",), tuple(TAPS)])
+def test_only_splats_on_planes_bring_layers(taps):
+    """What a tap says of layers stays out as well, and layers bring the depth that places them."""
+    words = ("Layer", "layer_pick", "layer_gather", "plane_keys", "label_tau", "share")
+    plain = assemble(select(COLORS, taps, PLAIN), SHAPE).text
+    layered = assemble(select(Cloud(has_planes=True), taps, PLAIN), SHAPE).text
+    in_order = assemble(select(Cloud(has_planes=True), taps, PLAIN.with_(coplanar="order")), SHAPE).text
+    for word in words:
+        assert not re.search(rf"\b{word}\b", plain), word
+        assert re.search(rf"\b{word}\b", layered) or (word == "label_tau" and "label" not in taps), word
+    assert in_order == plain
+    assert layered.count("float z_numerator;") == 1
 
 
 def test_an_effect_added_to_the_catalogue_leaves_other_texts_as_they_were(monkeypatch):
@@ -79,6 +93,8 @@ def test_record_sizes_are_what_the_effects_declare():
     assert record(("normal",)) == 76
     assert record(("label",)) == 68
     assert record(("rgb",), degree=3) == 64
+    on_planes = select(Cloud(has_planes=True), ("rgb",), PLAIN)
+    assert assemble(on_planes, SHAPE).record_bytes == 80
 
 
 def test_a_section_that_no_stage_has_is_refused(monkeypatch):

@@ -35,7 +35,7 @@ def test_a_scene_is_its_seed():
 
 def test_the_scenes_are_hard():
     """The distribution of numerics.md, section 3, in what the splats turn out to be."""
-    edge_on = near = total = grouped = 0
+    edge_on = near = total = grouped = tilted = 0
     largest, smallest, counts, flat, opacities = 0.0, np.inf, [], 1.0, set()
     for seed in range(150):
         picture = fuzz.scene_of(seed)
@@ -48,6 +48,7 @@ def test_the_scenes_are_hard():
         edge_on += (np.abs(sine) < 1.5e-6).sum()
         near += (np.abs(p[:, 2] - view.near) < reach).sum()
         total, grouped = total + len(cloud), grouped + cloud.has_planes
+        tilted += (np.abs(axes[:, 2, 2])[cloud.planes >= 0] < 0.9).any() if cloud.has_planes else 0
         largest, smallest = max(largest, cloud.scales.max()), min(smallest, cloud.scales.min())
         flat = max(flat, float((cloud.scales.max(1) / cloud.scales.min(1)).max()))
         counts.append(len(cloud))
@@ -56,6 +57,7 @@ def test_the_scenes_are_hard():
     assert 0.07 < edge_on / total < 0.13
     assert near / total > 0.1
     assert grouped > 50
+    assert tilted > 30
     assert largest > 500
     assert smallest < 1e-10
     assert flat > 5e5

@@ -1,0 +1,83 @@
+"""Sort keys of planes."""
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.backends.base import View
+from fidsplat.backends.planes import PlaneTable
+from fidsplat.hard_cases.clouds import splats, taken, turned
+from fidsplat.rotations import quaternion_to_matrix
+
+CAMERA = fs.Camera.look_at(64, 48, 1.0, (0.4, -0.2, -2.0), (0, 0, 0))
+
+
+def view_of(cloud, camera=CAMERA, quality=None):
+    return View.of(camera, quality or fs.Quality(), cloud.origin, (0, 0, 0))
+
+
+def some_planes(seed=0, ids=(7, 3, 2_000_000_000)):
+    """Three tilted planes of 20 splats and 10 splats of none, shuffled."""
+    generator = np.random.default_rng(seed)
+    parts = []
+    for _ in ids:
+        turn = turned(generator.normal(size=3), generator.uniform(0, 70))
+        axes = quaternion_to_matrix(turn)
+        means = generator.uniform(-0.5, 0.5, (20, 2)) @ axes[:, :2].T + generator.uniform(-0.5, 0.5, 3)
+        parts.append(splats(means.astype(np.float32), turn, generator.uniform(0.01, 0.2, (20, 2))))
+    parts.append(splats(generator.uniform(-1, 1, (10, 3)), (1, 0, 0, 0), 0.1))
+    cloud = fs.SplatCloud.concatenate(parts).with_planes(np.repeat([*ids, -1], [20, 20, 20, 10]))
+    return taken(cloud, generator.permutation(len(cloud)))
+
+
+@pytest.mark.parametrize("cutoff", [1 / 255, 1e-6])
+def test_a_key_is_a_diameter_before_every_point_of_the_splats(cutoff):
+    quality = fs.Quality(alpha_cutoff=cutoff)
+    cloud = some_planes()
+    view = view_of(cloud, quality=quality)
+    keys = PlaneTable(cloud).keys(view)
+    radius = np.sqrt(2 * np.log(1 / cutoff))
+    angle = np.linspace(0, 2 * np.pi, 60)
+    for number, plane in enumerate((3, 7, 2_000_000_000)):
+        own = cloud.planes == plane
+        axes = quaternion_to_matrix(cloud.quats[own])[:, :, :2] * cloud.scales[own][:, None, :]
+        rim = cloud.means[own][:, None] + radius * np.einsum(
+            "nij,jk->nki", axes, np.stack([np.cos(angle), np.sin(angle)])
+        )
+        points = rim.reshape(-1, 3)
+        depth = points @ view.rotation[2] + view.translation[2]
+        diameter = np.linalg.norm(points[:, None] - points[None], axis=2).max()
+        assert keys[number] <= depth.min() - diameter
+        # and not much more than that: a box has corners
+        assert keys[number] >= depth.min() - 3 * diameter
+
+
+def test_index_is_dense_whatever_the_ids():
+    cloud = some_planes()
+    index = PlaneTable(cloud).index
+    assert index.dtype == np.int32
+    assert np.array_equal(index < 0, cloud.planes < 0)
+    for number, plane in enumerate((3, 7, 2_000_000_000)):
+        assert np.array_equal(index == number, cloud.planes == plane)
+
+
+def test_keys_do_not_depend_on_the_order_of_splats():
+    cloud = some_planes()
+    shuffled = taken(cloud, np.random.default_rng(5).permutation(len(cloud)))
+    assert np.array_equal(PlaneTable(cloud).keys(view_of(cloud)), PlaneTable(shuffled).keys(view_of(cloud)))
+
+
+def test_planes_at_one_place_have_different_keys():
+    one = splats([(0, 0, 1), (0.1, 0, 1)], (1, 0, 0, 0), 0.1)
+    cloud = fs.SplatCloud.concatenate([one, one, one]).with_planes([0, 0, 1, 1, 2, 2])
+    keys = PlaneTable(cloud).keys(view_of(cloud))
+    assert keys.dtype == np.float32
+    assert len(np.unique(keys)) == 3
+    assert np.ptp(keys) < 1e-5
+
+
+def test_a_cloud_without_planes_has_none():
+    cloud = splats([(0, 0, 1)], (1, 0, 0, 0), 0.1)
+    table = PlaneTable(cloud)
+    assert table.index.tolist() == [-1]
+    assert table.keys(view_of(cloud)).shape == (0,)
