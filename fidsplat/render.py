@@ -97,7 +97,8 @@ class Renderer:
 
     Args:
         device: "opencl" (the best OpenCL device), "opencl:NAME" (part of a platform's or device's name, or
-            cpu or gpu), "warp:cpu", "warp:cuda" (NVIDIA Warp), or "reference" (NumPy, float64, slow). None: what
+            cpu or gpu), "warp:cpu", "warp:cuda" (NVIDIA Warp), or "reference" (NumPy, float64, slow). None:
+            what
             the environment variable FIDSPLAT_DEVICE says, else "opencl".
 
     Raises:
@@ -133,10 +134,14 @@ class Renderer:
     ) -> ResidentCloud:
         """Splats in arrays that are on the device already: drawn where they lie, without a copy.
 
-        Shapes and units are those of SplatCloud, float32 (labels int32): wp.array, or what gives DLPack (torch,
-        CuPy, JAX); NumPy arrays are copied. What is in the arrays when a picture is drawn is what it shows, so a
-        simulation may move the splats between pictures. Quaternions need no unit length; a splat that cannot be drawn
-        (a value that is not finite, a scale below 0) is left out of the picture without a word. `origin` (3,): world
+        Shapes and units are those of SplatCloud, float32 (labels int32): wp.array, or what gives DLPack
+        (torch,
+        CuPy, JAX); NumPy arrays are copied. What is in the arrays when a picture is drawn is what it shows,
+        so a
+        simulation may move the splats between pictures. Quaternions need no unit length; a splat that cannot
+        be drawn
+        (a value that is not finite, a scale below 0) is left out of the picture without a word. `origin`
+        (3,): world
         position of the means' zero.
 
         Raises:
@@ -144,7 +149,9 @@ class Renderer:
         """
         take = getattr(self.backend, "adopt", None)
         if take is None:
-            raise InputError(f"{self.device.name} takes no arrays of a device; use a Warp device, or a SplatCloud")
+            raise InputError(
+                f"{self.device.name} takes no arrays of a device; use a Warp device, or a SplatCloud"
+            )
         if (colors is None) == (sh is None):
             raise InputError("give exactly one of colors (n, 3) and sh (n, k, 3)")
         given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}

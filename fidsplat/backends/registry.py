@@ -18,7 +18,8 @@ _FAMILIES = {
 
 
 def open_backend(name: str) -> Backend:
-    """Open a device by name: a family (`opencl`, `warp`, `reference`) or `family:part of a platform's or device's
+    """Open a device by name: a family (`opencl`, `warp`, `reference`) or `family:part of a platform's or
+    device's
     name`.
 
     Raises:

@@ -1,4 +1,5 @@
-"""Tiles from their lists: a block of threads per tile on a GPU; on a CPU a thread per tile that walks each splat's box within it.
+"""Tiles from their lists: a block of threads per tile on a GPU; on a CPU a thread per tile that walks each
+splat's box within it.
 The same functions see every sample, so both take the same decisions.
 """
 
@@ -12,7 +13,9 @@ from .pixel import make_pixel
 
 
 def strip_of(effects: tuple[str, ...]) -> int:
-    """Samples in a row that one GPU thread draws: four share the reading of a record. Pending layers leave no registers for that."""
+    """Samples in a row that one GPU thread draws: four share the reading of a record. Pending layers leave no
+    registers for that.
+    """
     return 1 if "compose_planes" in effects else 4
 
 
@@ -123,9 +126,15 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool):
         at = y0 * view.tiles_x * view.tile_w + x0
         store(finish(p0, view), at, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
         if wp.static(several):
-            store(finish(p1, view), at + 1, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
-            store(finish(p2, view), at + 2, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
-            store(finish(p3, view), at + 3, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
+            store(
+                finish(p1, view), at + 1, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight
+            )
+            store(
+                finish(p2, view), at + 2, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight
+            )
+            store(
+                finish(p3, view), at + 3, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight
+            )
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def blend_cpu(
@@ -143,7 +152,9 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool):
         raw_label: wp.array(dtype=wp.int32),
         raw_label_weight: wp.array(dtype=wp.float32),
         bounds: wp.array(dtype=Bounds),
-        state: wp.array(dtype=Pixel),  # the samples of one tile, from `state_first`: tiles of a launch come one after the other
+        state: wp.array(
+            dtype=Pixel
+        ),  # the samples of one tile, from `state_first`: tiles of a launch come one after the other
         state_first: int,
     ):
         tile = band_first + wp.tid()
@@ -183,6 +194,8 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool):
             for column in range(view.tile_w):
                 p = state[state_first + row * view.tile_w + column]
                 at = (y0 + row) * stride + x0 + column
-                store(finish(p, view), at, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
+                store(
+                    finish(p, view), at, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight
+                )
 
     return (blend_gpu if on_gpu else blend_cpu), Pixel

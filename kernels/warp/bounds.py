@@ -1,4 +1,5 @@
-"""What part of the picture a splat can touch: its ellipse, or a box where the disk crosses the near plane, and the low-pass dot.
+"""What part of the picture a splat can touch: its ellipse, or a box where the disk crosses the near plane,
+and the low-pass dot.
 
 Everything here is conservative; the test of each sample decides.
 """
@@ -17,7 +18,9 @@ PAD_RELATIVE = wp.constant(2e-4)
 
 @wp.struct
 class Bounds:
-    """At height h from the centre the ellipse reaches from shear h - w to shear h + w, w = half_width sqrt(1 - h^2 inverse_hy2)."""
+    """At height h from the centre the ellipse reaches from shear h - w to shear h + w, w = half_width sqrt(1
+    - h^2 inverse_hy2).
+    """
 
     x: float
     y: float
@@ -81,7 +84,9 @@ def make_bounds(screen: bool) -> SimpleNamespace:
 
     @wp.func
     def span(b: Bounds, y0: int, y1: int, width: int):
-        """First and last column, last excluded, of samples in rows y0 to y1, last excluded, that can be reached."""
+        """First and last column, last excluded, of samples in rows y0 to y1, last excluded, that can be
+        reached.
+        """
         top = float(y0) + 0.5
         bottom = float(y1) - 0.5
         x0 = float(wp.inf)
@@ -116,7 +121,9 @@ def make_bounds(screen: bool) -> SimpleNamespace:
 
     @wp.func
     def tile_span(b: Bounds, row: int, view: View):
-        """First and last tile, last excluded, of a row of tiles. Counting and listing both ask here, so they agree."""
+        """First and last tile, last excluded, of a row of tiles. Counting and listing both ask here, so they
+        agree.
+        """
         y0 = row * view.tile_h
         first, end = span(b, y0, wp.min(y0 + view.tile_h, view.height), view.width)
         if first >= end:

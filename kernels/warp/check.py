@@ -1,4 +1,5 @@
-"""For the self-test alone (`fidsplat check`): what the device's own functions give, as the stages call them."""
+"""For the self-test alone (`fidsplat check`): what the device's own functions give, as the stages call
+them."""
 
 import warp as wp
 
@@ -54,7 +55,9 @@ def contraction(
     three = wp.float64(3.0)
     difference[i] = a[i] * b[i] - c[i] * b[i]  # a is c: 0 unless one product is not rounded
     total[i] = a[i] * b[i] + c[i]
-    wide[i] = wp.float64(a[i]) / three * (wp.float64(b[i]) / three) - wp.float64(c[i]) / three * (wp.float64(b[i]) / three)
+    wide[i] = wp.float64(a[i]) / three * (wp.float64(b[i]) / three) - wp.float64(c[i]) / three * (
+        wp.float64(b[i]) / three
+    )
     product = a[i] * b[i]
     fused[i] = fma(a[i], b[i], -product)
 

@@ -1,4 +1,6 @@
-"""Colour of a splat: plain, or spherical harmonics in the direction from the camera (convention of gsplat and the 2DGS authors)."""
+"""Colour of a splat: plain, or spherical harmonics in the direction from the camera (convention of gsplat and
+the 2DGS authors).
+"""
 
 from functools import cache
 

@@ -2,7 +2,8 @@
 
 import warp as wp
 
-# Order and culling must not depend on what a compiler fuses: contraction is off everywhere, and fused operations are
+# Order and culling must not depend on what a compiler fuses: contraction is off everywhere, and fused
+# operations are
 # written out as `fma` (numerics F1). No fast maths: a NaN must fail a comparison (numerics F3).
 STRICT = {"fuse_fp": False, "fast_math": False, "enable_backward": False, "default_grid_stride": False}
 
@@ -47,7 +48,8 @@ def fma(a: float, b: float, c: float) -> float:
     ...
 
 
-# One 16-byte load where the device has it: Warp's vectors are not known to be aligned, so the compiler would take four.
+# One 16-byte load where the device has it: Warp's vectors are not known to be aligned, so the compiler would
+# take four.
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     const float4 quad = __ldg(reinterpret_cast<const float4*>(lines.data) + at);
@@ -63,7 +65,9 @@ def line_of(lines: wp.array(dtype=wp.vec4), at: int) -> wp.vec4:
 
 @wp.func
 def sortable(x: float) -> wp.uint32:
-    """Bits of a float in an order that unsigned comparison keeps, negative values and zeros included (numerics C2)."""
+    """Bits of a float in an order that unsigned comparison keeps, negative values and zeros included
+    (numerics C2).
+    """
     bits = wp.cast(x + 0.0, wp.uint32)  # -0 becomes +0
     if (bits & _SIGN) != _NONE:
         return ~bits
@@ -72,5 +76,7 @@ def sortable(x: float) -> wp.uint32:
 
 @wp.func
 def to_sample(x: float, limit: int) -> int:
-    """A sample's coordinate to int; clamped as a float, since conversions of huge values are undefined (numerics E2)."""
+    """A sample's coordinate to int; clamped as a float, since conversions of huge values are undefined
+    (numerics E2).
+    """
     return int(wp.clamp(x, -1.0, float(limit) + 1.0))

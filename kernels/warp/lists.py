@@ -1,7 +1,9 @@
 """From keys to tile lists: splats in depth order, then their pairs with tiles in that order.
 
-Between these kernels stand Warp's scan and its stable radix sort: of the splats drawn by key (ties by index, since they are
-gathered in that order), then of the pairs by tile (ties by depth, since they are emitted in that order). No atomics.
+Between these kernels stand Warp's scan and its stable radix sort: of the splats drawn by key (ties by index,
+since they are
+gathered in that order), then of the pairs by tile (ties by depth, since they are emitted in that order). No
+atomics.
 """
 
 from functools import cache

@@ -1,8 +1,12 @@
-"""One sample: its fragments, and what it keeps of them. Front to back, C = sum_k c_k alpha_k prod_{j<k} (1 - alpha_j).
+"""One sample: its fragments, and what it keeps of them. Front to back, C = sum_k c_k alpha_k prod_{j<k} (1 -
+alpha_j).
 
-Splats of one plane are one layer at a sample (docs/rendering.md, coplanar splats): its colour and depth are means of its fragments
-by optical depth. They arrive together, before anything that the layer is compared with; it is laid before the first fragment of
-no plane that lies behind it there, or at the end. Two layers may be pending; when a third begins the nearer of them is laid.
+Splats of one plane are one layer at a sample (docs/rendering.md, coplanar splats): its colour and depth are
+means of its fragments
+by optical depth. They arrive together, before anything that the layer is compared with; it is laid before the
+first fragment of
+no plane that lies behind it there, or at the end. Two layers may be pending; when a third begins the nearer
+of them is laid.
 """
 
 from functools import cache
@@ -39,14 +43,23 @@ class Crossing:
 
 @cache
 def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
-    """The state of a sample and what is done with it: Pixel, Splat, load, start, cross, open, blend; Splat is what of a record each
+    """The state of a sample and what is done with it: Pixel, Splat, load, start, cross, open, blend; Splat is
+    what of a record each
     sample needs.
     """
     layout = Layout(effects)
     each = layout.lines
     screen, exclusive, ray_depth, depth, median, normal, label = (
         name in effects
-        for name in ("lowpass_screen", "stop_exclusive", "ray_depth", "depth", "depth_median", "normal", "label")
+        for name in (
+            "lowpass_screen",
+            "stop_exclusive",
+            "ray_depth",
+            "depth",
+            "depth_median",
+            "normal",
+            "label",
+        )
     )
     layers = "compose_planes" in effects
     seen = {"rgb": wp.vec3}
@@ -155,7 +168,9 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
 
     @wp.func
     def depth_of(lines: wp.array(dtype=wp.vec4), index: int, c: Crossing, inverse_d: float) -> float:
-        """Depth of ray and plane within the disk's own range; the centre's where the ray misses the plane (numerics B2, B4)."""
+        """Depth of ray and plane within the disk's own range; the centre's where the ray misses the plane
+        (numerics B2, B4).
+        """
         at = index * each
         center = line_of(lines, at + zc_line)[zc_lane]
         reach = line_of(lines, at + zr_line)[zr_lane]
@@ -168,11 +183,20 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     def normal_of(lines: wp.array(dtype=wp.vec4), index: int):
         at = index * each
         return wp.vec3(
-            line_of(lines, at + nx_line)[nx_lane], line_of(lines, at + ny_line)[ny_lane], line_of(lines, at + nz_line)[nz_lane]
+            line_of(lines, at + nx_line)[nx_lane],
+            line_of(lines, at + ny_line)[ny_lane],
+            line_of(lines, at + nz_line)[nz_lane],
         )
 
     @wp.func
-    def see(s: Splat, c: Crossing, inverse_d: float, index: int, lines: wp.array(dtype=wp.vec4), labels: wp.array(dtype=wp.int32)):
+    def see(
+        s: Splat,
+        c: Crossing,
+        inverse_d: float,
+        index: int,
+        lines: wp.array(dtype=wp.vec4),
+        labels: wp.array(dtype=wp.int32),
+    ):
         """What a fragment shows."""
         seen = Seen()
         seen.rgb = wp.vec3(s.c[1], s.c[2], s.c[3])

@@ -1,9 +1,13 @@
 """Per splat: is it drawn, where, in which order, and the affine forms that each sample evaluates.
 
-A ray r = ((x - cx) / fx, (y - cy) / fy, 1) meets the plane of a splat with centre p, unit tangents t_u, t_v, normal n at depth
-(n p) / (n r), and there u = (t_v x p) r / (s_u n r), v = (p x t_u) r / (s_v n r): from n x (r x p) = r (n p) - p (n r). All three of
-n_u, n_v, D = n r are affine in the sample, and since p is orthogonal to the first two, n_u and n_v vanish at the projected centre.
-They are scaled by one factor: D > 0 in front of the camera, the steepest slope is 1; n_u, n_v also by sqrt(1/2), so that
+A ray r = ((x - cx) / fx, (y - cy) / fy, 1) meets the plane of a splat with centre p, unit tangents t_u, t_v,
+normal n at depth
+(n p) / (n r), and there u = (t_v x p) r / (s_u n r), v = (p x t_u) r / (s_v n r): from n x (r x p) = r (n p)
+- p (n r). All three of
+n_u, n_v, D = n r are affine in the sample, and since p is orthogonal to the first two, n_u and n_v vanish at
+the projected centre.
+They are scaled by one factor: D > 0 in front of the camera, the steepest slope is 1; n_u, n_v also by
+sqrt(1/2), so that
 (n_u^2 + n_v^2) / D^2 is rho / 2.
 """
 
@@ -42,7 +46,8 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str):
 
     @wp.func
     def extremes(a: real, b: real, p: real, depth: vec3, radius: real, near: real):
-        """Least and greatest (a u + b v + p) / (depth (u, v, 1)) on the arc u^2 + v^2 = radius^2 beyond `near`.
+        """Least and greatest (a u + b v + p) / (depth (u, v, 1)) on the arc u^2 + v^2 = radius^2 beyond
+        `near`.
 
         The ratio's derivative along the arc vanishes where e cos + f sin = -g.
         """
@@ -69,7 +74,8 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str):
 
     @wp.func
     def clipped(a: vec3, b: vec3, p: vec3, radius: real, reach: real, view: View):
-        """Box of the part of the disk beyond the near plane: of its arc, and of the chord in which the plane cuts it.
+        """Box of the part of the disk beyond the near plane: of its arc, and of the chord in which the plane
+        cuts it.
 
         The part is convex and depth is positive in it, so ratios are largest on its rim (numerics A1 ii).
         """
@@ -96,7 +102,9 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str):
 
     @wp.func
     def ellipse(a: vec3, b: vec3, p: vec3, radius: real, reach: real, view: View):
-        """Image of a disk that lies wholly beyond the near plane, from its dual conic about the projected centre (numerics A4)."""
+        """Image of a disk that lies wholly beyond the near plane, from its dual conic about the projected
+        centre (numerics A4).
+        """
         fx, fy = real(view.fx), real(view.fy)
         px, py = p[0] / p[2], p[1] / p[2]
         r2 = radius * radius

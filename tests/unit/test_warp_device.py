@@ -1,4 +1,4 @@
-"""The Warp backend: its devices, what it says when it is missing, and arrays that are shared without a copy."""
+"""The Warp backend: its devices, what it says when it is missing, arrays that are shared without a copy."""
 
 import subprocess
 import sys
@@ -17,7 +17,10 @@ CAMERA = fs.Camera.look_at(64, 48, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 CLOUD = random_splats(200, seed=1, depth=(1.0, 4.0), scale=(0.02, 0.4))
 DEVICES = [info.name for info in fs.devices() if info.name.startswith("warp:") and info.usable]
 GPUS = [name for name in DEVICES if name != "warp:cpu"]
-CUDA = pytest.param(GPUS[0] if GPUS else "warp:cuda", marks=pytest.mark.skipif(not GPUS, reason="no CUDA device for Warp here"))
+CUDA = pytest.param(
+    GPUS[0] if GPUS else "warp:cuda",
+    marks=pytest.mark.skipif(not GPUS, reason="no CUDA device for Warp here"),
+)
 
 
 @pytest.fixture(scope="module", params=["warp:cpu", CUDA])
@@ -27,7 +30,13 @@ def renderer(request):
 
 def arrays_of(cloud, device):
     """The cloud as wp.arrays of vectors on a device."""
-    types = {"means": wp.vec3, "quats": wp.vec4, "scales": wp.vec2, "opacities": wp.float32, "colors": wp.vec3}
+    types = {
+        "means": wp.vec3,
+        "quats": wp.vec4,
+        "scales": wp.vec2,
+        "opacities": wp.float32,
+        "colors": wp.vec3,
+    }
     return {name: wp.array(getattr(cloud, name), dtype=dtype, device=device) for name, dtype in types.items()}
 
 
@@ -61,7 +70,10 @@ def test_without_warp_devices_are_listed_and_the_error_says_how_to_install(monke
 
 
 def test_nothing_is_said_on_stdout_or_stderr(tmp_path):
-    code = "import fidsplat as fs; r = fs.Renderer('warp:cpu'); r.render(fs.SplatCloud.empty(), fs.Camera.pinhole(4, 4, 4, 4, 2, 2))"
+    code = (
+        "import fidsplat as fs; view = fs.Camera.pinhole(4, 4, 4, 4, 2, 2);"
+        "fs.Renderer('warp:cpu').render(fs.SplatCloud.empty(), view)"
+    )
     # an empty cache: everything is compiled, which Warp would tell
     env = {"PATH": "", "WARP_CACHE_PATH": str(tmp_path), "PYTHONPATH": ":".join(sys.path)}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
@@ -71,7 +83,9 @@ def test_nothing_is_said_on_stdout_or_stderr(tmp_path):
 def test_an_effect_that_warp_lacks_is_an_error_that_names_both(renderer, monkeypatch):
     monkeypatch.setattr("fidsplat.backends.warp.pipeline.KNOWN", frozenset())
     features = FeatureSet(("camera_pinhole",), (), 0, 1, "float64")
-    with pytest.raises(fs.DeviceError, match=rf"{renderer.device.name} .* has no camera_pinhole; use an OpenCL device"):
+    with pytest.raises(
+        fs.DeviceError, match=rf"{renderer.device.name} .* has no camera_pinhole; use an OpenCL device"
+    ):
         renderer.backend.pipeline(features)
 
 
@@ -122,7 +136,10 @@ def test_other_backends_say_that_they_share_nothing(judge):
 def test_adopted_arrays_draw_what_the_cloud_draws(renderer):
     wanted = renderer.render(CLOUD, CAMERA)["rgb"]
     vectors = arrays_of(CLOUD, renderer.backend.device)
-    rows = {name: wp.array(getattr(CLOUD, name), dtype=wp.float32, device=renderer.backend.device) for name in vectors}
+    rows = {
+        name: wp.array(getattr(CLOUD, name), dtype=wp.float32, device=renderer.backend.device)
+        for name in vectors
+    }
     plain = {name: getattr(CLOUD, name) for name in vectors}
     for arrays in (vectors, rows, plain):
         assert np.array_equal(renderer.render(renderer.adopt(**arrays), CAMERA)["rgb"], wanted)
@@ -159,14 +176,19 @@ def test_adopted_values_that_are_not_finite_leave_no_trace(renderer, name, value
     arrays = {each: getattr(CLOUD, each).copy() for each in names}
     without = {each: array[keep] for each, array in arrays.items()}
     arrays[name][7] = value
-    frame, wanted = (renderer.render(renderer.adopt(**a), CAMERA, ("rgb", "alpha")) for a in (arrays, without))
+    frame, wanted = (
+        renderer.render(renderer.adopt(**a), CAMERA, ("rgb", "alpha")) for a in (arrays, without)
+    )
     assert all(np.array_equal(frame[plane], wanted[plane]) for plane in frame)
 
 
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"means": np.zeros((200, 2), np.float32)}, r"means has the shape \(200, 2\); its last axis must be 3"),
+        (
+            {"means": np.zeros((200, 2), np.float32)},
+            r"means has the shape \(200, 2\); its last axis must be 3",
+        ),
         ({"opacities": np.zeros(3, np.float32)}, "opacities holds 3 elements, but 200 means need 200"),
         ({"sh": np.zeros((200, 4, 3), np.float32)}, "exactly one of colors"),
         ({"colors": None, "sh": np.zeros((200, 5, 3), np.float32)}, "sh holds 5 coefficients"),
@@ -180,7 +202,10 @@ def test_arrays_that_cannot_be_adopted(renderer, changes, words):
         "wp.float64": wp.zeros((200, 2), dtype=wp.float64, device=device),
         "strided": wp.zeros((200, 6), dtype=wp.float32, device=device)[:, :3],
     }
-    changes = {name: special.get(value, value) if isinstance(value, str) else value for name, value in changes.items()}
+    changes = {
+        name: special.get(value, value) if isinstance(value, str) else value
+        for name, value in changes.items()
+    }
     with pytest.raises(fs.InputError, match=words):
         renderer.adopt(**{**arrays_of(CLOUD, device), **changes})
 
@@ -223,7 +248,9 @@ def test_warp_pipelines_share_kernels_that_mean_the_same():
     """A stage is compiled once for all feature sets that it cannot tell apart."""
     backend = warp_backend.open_device("cpu")
     slots = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "compose_ordered")
-    one, two = (backend.pipeline(FeatureSet(slots, taps, 0, n, "float64")) for taps, n in (((), 1), (("alpha",), 2)))
+    one, two = (
+        backend.pipeline(FeatureSet(slots, taps, 0, n, "float64")) for taps, n in (((), 1), (("alpha",), 2))
+    )
     assert one.project is two.project
     assert one.blend is two.blend
     assert one.resolve is not two.resolve

@@ -123,7 +123,8 @@ kernel void probe(global const float *x, global int *unequal, global int *named,
 
 
 def contraction(backend: OpenCLBackend, a: np.ndarray, b: np.ndarray) -> tuple[list[np.ndarray], bool]:
-    """a b - a b; a b + a; the difference in the set-up's precision, of thirds; a b - (a b), fused: each (n,), from a, b (n,)
+    """a b - a b; a b + a; the difference in the set-up's precision, of thirds; a b - (a b), fused: each (n,),
+    from a, b (n,)
     float32. And whether the device fuses where it is asked to.
     """
     real = np.float64 if backend.info.float64 else np.float32

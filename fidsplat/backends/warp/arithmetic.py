@@ -31,7 +31,7 @@ def run_arithmetic(
     n = len(exponents)
     single = [array.astype(np.float32) for array in (exponents, shares, above, below)]
     (planes,) = run(backend, "arithmetic", n, single, [np.zeros((5, n), np.float32)])
-    results = dict(zip(("exp", "log", "division", "sqrt", "fma"), planes, strict=True))
+    results: dict[str, np.ndarray] = dict(zip(("exp", "log", "division", "sqrt", "fma"), planes, strict=True))
     (planes,) = run(backend, "arithmetic_wide", n, [above, below], [np.zeros((3, n))])
     results |= dict(zip(("division64", "sqrt64", "log64"), planes, strict=True))
     smallest = np.array([np.finfo(np.float32).tiny, 0.5], np.float32)

@@ -12,6 +12,7 @@ import numpy as np
 
 from fidsplat.backends.base import DeviceInfo
 from fidsplat.backends.warp import runtime
+from fidsplat.backends.warp.launch import Commands
 from fidsplat.backends.warp.memory import ArrayPool, Resident
 from fidsplat.backends.warp.pipeline import WarpPipeline
 from fidsplat.effects import FeatureSet
@@ -40,7 +41,8 @@ def devices() -> list[DeviceInfo]:
 
 
 def open_device(selector: str = "") -> WarpBackend:
-    """`cpu`, `cuda` (the first), `cuda:1`, or part of a device's name; without a selector CUDA before the CPU.
+    """`cpu`, `cuda` (the first), `cuda:1`, or part of a device's name; without a selector CUDA before the
+    CPU.
 
     Raises:
         DeviceError: Warp is missing or cannot be started, or there is no CUDA device.
@@ -51,7 +53,9 @@ def open_device(selector: str = "") -> WarpBackend:
     matching = [d for d in found if wanted in (d.alias, d.alias.split(":")[0]) or wanted in d.name.lower()]
     if not matching:
         if wanted.split(":")[0] == "cuda" and not any(device.is_cuda for device in found):
-            raise DeviceError("Warp sees no CUDA device here (no NVIDIA driver, or no GPU); use device='warp:cpu'")
+            raise DeviceError(
+                "Warp sees no CUDA device here (no NVIDIA driver, or no GPU); use device='warp:cpu'"
+            )
         known = ", ".join(f"warp:{device.alias}" for device in found)
         raise UnknownDeviceError(f"no Warp device matches {selector!r}; there are: {known}")
     return WarpBackend(min(matching, key=lambda device: not device.is_cuda))
@@ -70,6 +74,7 @@ class WarpBackend:
         self.threads = 1 if device.is_cuda else self.info.compute_units
         # Warp runs a CPU launch on the thread that calls it, without the interpreter's lock
         self.workers = None if device.is_cuda else ThreadPoolExecutor(self.threads, "fidsplat-warp")
+        self.commands = Commands(device)
         self._pipelines: dict[tuple[FeatureSet, WarpShape], WarpPipeline] = {}
 
     def upload(self, cloud: SplatCloud) -> Resident:

@@ -20,6 +20,8 @@ class ArrayPool:
     def __init__(self, device: Any) -> None:
         self.device = device
         self._arrays: dict[tuple[str, Any], Any] = {}
+        self._parts: dict[tuple[str, Any], Any] = {}
+        self._hosts: dict[str, Any] = {}
 
     def scratch(self, name: str, size: int, dtype: Any) -> Any:
         """An array of at least `size` elements whose content is undefined."""
@@ -28,6 +30,22 @@ class ArrayPool:
             self._arrays.pop((name, dtype), None)
             held = self._arrays[name, dtype] = self.fresh(name, size, dtype)
         return held
+
+    def exact(self, name: str, size: int, dtype: Any) -> Any:
+        """The first `size` elements of a scratch array."""
+        whole = self.scratch(name, size, dtype)
+        part = self._parts.get((name, dtype))
+        if part is None or part.ptr != whole.ptr or part.size != size:
+            part = self._parts[name, dtype] = whole[:size]
+        return part
+
+    def host(self, name: str, size: int, dtype: Any) -> Any:
+        """An array of the host that the device can write to without a detour."""
+        import warp as wp
+
+        if name not in self._hosts:
+            self._hosts[name] = wp.empty(size, dtype=dtype, device="cpu", pinned=self.device.is_cuda)
+        return self._hosts[name]
 
     def fresh(self, name: str, size: int, dtype: Any) -> Any:
         """An array that nobody else holds.
@@ -41,8 +59,8 @@ class ArrayPool:
             return wp.empty(max(size, 1), dtype=dtype, device=self.device)
         except (RuntimeError, MemoryError) as error:
             raise DeviceError(
-                f"{name} needs {size * wp.types.type_size_in_bytes(dtype) / 2**20:.0f} MiB, which {self.device} has "
-                "not; use fewer splats or a smaller picture"
+                f"{name} needs {size * wp.types.type_size_in_bytes(dtype) / 2**20:.0f} MiB, which "
+                f"{self.device} has not; use fewer splats or a smaller picture"
             ) from error
 
 
@@ -50,7 +68,12 @@ class Resident:
     """Splats on the device. SH of degree 0 does not depend on the view and becomes plain colours."""
 
     def __init__(
-        self, arrays: dict[str, Any], count: int, origin: np.ndarray, sh_degree: int, planes: PlaneTable | None = None
+        self,
+        arrays: dict[str, Any],
+        count: int,
+        origin: np.ndarray,
+        sh_degree: int,
+        planes: PlaneTable | None = None,
     ) -> None:
         self.arrays, self.count, self.origin = arrays, count, origin
         self.sh_degree, self.planes, self.has_planes = sh_degree, planes, planes is not None
@@ -93,7 +116,9 @@ class Resident:
             terms = arrays["colors"].size // max(count, 1)
             known = [(degree + 1) ** 2 for degree in range(1, MAX_DEGREE + 1)]
             if count and terms not in known:
-                raise InputError(f"sh holds {terms} coefficients per splat; on a device it must be one of {known}")
+                raise InputError(
+                    f"sh holds {terms} coefficients per splat; on a device it must be one of {known}"
+                )
         if "labels" not in arrays:
             arrays["labels"] = pool.fresh("labels", count, runtime.load().int32)
             arrays["labels"].zero_()
@@ -128,7 +153,9 @@ def _uploaded(name: str, array: np.ndarray, pool: ArrayPool) -> Any:
         return wp.array(np.ascontiguousarray(array), dtype=_dtype(name), device=pool.device).flatten()
     except (RuntimeError, MemoryError) as error:
         size = array.nbytes / 2**20
-        raise DeviceError(f"the cloud's {name} need {size:.0f} MiB, which {pool.device} has not; use fewer splats") from error
+        raise DeviceError(
+            f"the cloud's {name} need {size:.0f} MiB, which {pool.device} has not; use fewer splats"
+        ) from error
 
 
 def _adopted(name: str, value: Any, pool: ArrayPool) -> Any:
@@ -144,16 +171,21 @@ def _adopted(name: str, value: Any, pool: ArrayPool) -> Any:
         if width > 1 and (typed.ndim < 2 or typed.shape[-1] != width):
             raise InputError(f"{name} has the shape {typed.shape}; its last axis must be {width}")
         return _uploaded(name, typed, pool)
-    array = value if isinstance(value, wp.array) else wp.from_dlpack(value)
+    array: Any = value if isinstance(value, wp.array) else wp.from_dlpack(value)
     if array.device != pool.device:
-        raise InputError(f"{name} lies on {array.device}, but this renderer draws on {pool.device}; move it there")
+        raise InputError(
+            f"{name} lies on {array.device}, but this renderer draws on {pool.device}; move it there"
+        )
     if not array.is_contiguous:
         raise InputError(f"{name} is not contiguous; give a contiguous array")
     if array.dtype == scalar and width > 1 and array.shape[-1] == width:
         array = wp.from_dlpack(array, dtype=dtype)
-    if wp.types.type_size(array.dtype) != width or getattr(array.dtype, "_wp_scalar_type_", array.dtype) != scalar:
+    if (
+        wp.types.type_size(array.dtype) != width
+        or getattr(array.dtype, "_wp_scalar_type_", array.dtype) != scalar
+    ):
         raise InputError(
-            f"{name} has the type {wp.types.type_repr(array.dtype)} and the shape {array.shape}; it must hold "
-            f"{scalar.__name__}, {width} to an element"
+            f"{name} has the type {wp.types.type_repr(array.dtype)} and the shape {array.shape}; it must "
+            f"hold {scalar.__name__}, {width} to an element"
         )
     return array.flatten()

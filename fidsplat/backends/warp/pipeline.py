@@ -1,12 +1,13 @@
 """Runs the stages of one FeatureSet on one Warp device: project, sort, bin, blend, resolve.
 
-The host reads two numbers between the stages, how many splats are drawn and how many pairs of splats and tiles there are: they
-size arrays and launches. A picture with more pairs than the device's budget is drawn in bands of tiles, with the same bits.
+The host reads two numbers between the stages, how many splats are drawn and how many pairs of splats and
+tiles there are: they
+size arrays and launches. A picture with more pairs than the device's budget is drawn in bands of tiles, with
+the same bits.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -24,8 +25,9 @@ if TYPE_CHECKING:
     from fidsplat.backends.warp.backend import WarpBackend, WarpShape
 
 KNOWN = frozenset(
-    """camera_pinhole color_rgb color_sh lowpass_none lowpass_screen stop_inclusive stop_exclusive compose_ordered
-    compose_planes ray_depth alpha depth depth_median normal label""".split()
+    {"camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen", "stop_inclusive"}
+    | {"stop_exclusive", "compose_ordered", "compose_planes", "ray_depth"}
+    | {"alpha", "depth", "depth_median", "normal", "label"}
 )
 """effects that kernels/warp has"""
 # of these depend on an effect: a stage is compiled once for all feature sets that mean the same to it
@@ -37,7 +39,11 @@ class WarpPlanes:
     """Finished planes on the device."""
 
     def __init__(
-        self, outputs: dict[str, tuple[Output, Any]], size: tuple[int, int], launcher: Launcher, stats: dict[str, int]
+        self,
+        outputs: dict[str, tuple[Output, Any]],
+        size: tuple[int, int],
+        launcher: Launcher,
+        stats: dict[str, int],
     ) -> None:
         self._outputs, self._size, self._launcher = outputs, size, launcher
         self.stats: Mapping[str, int] = stats
@@ -64,7 +70,8 @@ class WarpPipeline:
         lacking = sorted(names - KNOWN)
         if lacking:
             raise DeviceError(
-                f"{backend.info.name} ({backend.info.platform}) has no {', '.join(lacking)}; use an OpenCL device for it"
+                f"{backend.info.name} ({backend.info.platform}) has no {', '.join(lacking)}; "
+                "use an OpenCL device for it"
             )
         self.backend, self.features, self.shape = backend, features, shape
         area = shape.tile_width * shape.tile_height
@@ -95,7 +102,9 @@ class WarpPipeline:
         except Exception as error:
             raise DeviceError(f"{self.backend.info.name} cannot compile {kernel.key}: {error}") from error
         if loaded is None:
-            raise DeviceError(f"{self.backend.info.name} cannot compile {kernel.key}; Warp says more on stderr")
+            raise DeviceError(
+                f"{self.backend.info.name} cannot compile {kernel.key}; Warp says more on stderr"
+            )
 
     def load_banding(self) -> None:
         """Compile what only a picture with more pairs than the budget needs."""
@@ -114,8 +123,10 @@ class WarpPipeline:
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Draw one picture and return what passes between the stages.
 
-        keys (n,) uint32; order (visible,), splat indices by depth; starts (tiles + 1,); lists (pairs,), of the last band;
-        records (n, words) float32 (undefined for culled splats); raw (4, rows, columns) float32: r, g, b, transmittance of the
+        keys (n,) uint32; order (visible,), splat indices by depth; starts (tiles + 1,); lists (pairs,), of
+        the last band;
+        records (n, words) float32 (undefined for culled splats); raw (4, rows, columns) float32: r, g, b,
+        transmittance of the
         padded sample grid; and the finished outputs by name.
         """
         run = self._drawn(resident, view)
@@ -127,7 +138,10 @@ class WarpPipeline:
             "order": run.held["order"].numpy()[: stats["visible"]].astype(np.uint32),
             "starts": run.held["starts"].numpy()[: run.tiles + 1].astype(np.uint32),
             "lists": run.held["lists"].numpy()[: stats["pairs"]].astype(np.uint32),
-            "records": run.held["lines"].numpy()[: resident.count * self.layout.lines].reshape(resident.count, -1).copy(),
+            "records": run.held["lines"]
+            .numpy()[: resident.count * self.layout.lines]
+            .reshape(resident.count, -1)
+            .copy(),
             "raw": raw.reshape(rows, stride, 4).transpose(2, 0, 1).copy(),
             **{output.name: run.planes.read(output.name) for output in self.features.outputs},
         }
@@ -184,18 +198,18 @@ class _Run:
 
     def _project(self) -> tuple[int, int]:
         wp, n = self.wp, self.resident.count
-        keys, counts = self._take("keys", n, wp.uint32), self._take("counts", n, wp.int64)
-        drawn, places = self._take("drawn", n, wp.int32), self._take("places", n, wp.int32)
-        ends = self._take("ends", n, wp.int64)
+        keys, counts = self._take("keys", n, wp.uint32), self._exact("counts", n, wp.int64)
+        drawn, places = self._exact("drawn", n, wp.int32), self._exact("places", n, wp.int32)
+        ends = self._exact("ends by index", n, wp.int64)
         cloud = [self.resident.arrays[name] for name in ("means", "quats", "scales", "opacities", "colors")]
         cloud += self._planes()
         records = [self.held["lines"], self.held["bounds"], keys, counts, drawn]
         self.launch(self.pipeline.project, n, self.u, *cloud, *records)
-        wp.utils.array_scan(drawn[:n], places[:n], inclusive=True)
-        wp.utils.array_scan(counts[:n], ends[:n], inclusive=True)
+        wp.utils.array_scan(drawn, places, inclusive=True)
+        wp.utils.array_scan(counts, ends, inclusive=True)
         totals = self._take("totals", 2, wp.int64)
-        wp.launch(self.pipeline.sort.sum_up, 1, [n, places, ends, totals], device=self.backend.device, record_tape=False)
-        visible, pairs = self.launcher.read_back(totals)
+        self.launcher.once(self.pipeline.sort.sum_up, 1, n, places, ends, totals)
+        visible, pairs = self.launcher.read_back(totals, self.pool.host("totals", 2, wp.int64))
         return visible, pairs
 
     def _planes(self) -> list[Any]:
@@ -230,9 +244,9 @@ class _Run:
         totals = self._take("tile totals", self.tiles, self.wp.int32)
         totals.zero_()
         self.pipeline.load_banding()
-        # one launch: on the CPU its sums are plain additions
-        args = [0, self.u, self.held["order"], self.held["bounds"], totals]
-        self.wp.launch(self.pipeline.lists.histogram, visible, args, device=self.backend.device, record_tape=False)
+        # in one piece: on the CPU its sums are plain additions
+        args = (0, self.u, self.held["order"], self.held["bounds"], totals)
+        self.launcher.once(self.pipeline.lists.histogram, visible, *args)
         ends = np.cumsum(totals.numpy()[: self.tiles], dtype=np.int64)
         first, done = 0, 0
         while first < self.tiles:
@@ -247,8 +261,10 @@ class _Run:
         lists = self._take("lists", 2 * pairs, wp.int32)
         if pairs:
             if pairs >= 2**30:
-                raise DeviceError(f"a band of tiles {first} to {end} lists {pairs} splats; use fewer or a smaller picture")
-            lengths, ends = (self._take(name, visible, wp.int64)[:visible] for name in ("lengths", "ends"))
+                raise DeviceError(
+                    f"a band of tiles {first} to {end} lists {pairs} splats; use fewer or a smaller picture"
+                )
+            lengths, ends = (self._exact(name, visible, wp.int64) for name in ("lengths", "ends"))
             if whole:
                 self.launch(self.pipeline.sort.gather, visible, held["order"], held["counts"], lengths)
             else:
@@ -294,7 +310,10 @@ class _Run:
         for output in features.outputs:
             dtype = wp.int32 if output.dtype == "int32" else wp.float32
             # asked for anew: the caller keeps them
-            outputs[output.name] = output, self.pool.fresh(output.name, height * width * output.channels, dtype)
+            outputs[output.name] = (
+                output,
+                self.pool.fresh(output.name, height * width * output.channels, dtype),
+            )
         arrays = [
             outputs[name][1] if name in outputs else self._take(f"no {name}", 1, dtype)
             for name, dtype in (
@@ -315,12 +334,29 @@ class _Run:
         self.held[name] = array = self.pool.scratch(name, size, dtype)
         return array
 
+    def _exact(self, name: str, size: int, dtype: Any) -> Any:
+        self.held[name] = array = self.pool.exact(name, size, dtype)
+        return array
+
     def _uniforms(self, tiles_x: int, tiles_y: int) -> Any:
         view, shape, wp = self.view, self.pipeline.shape, self.wp
         u = runtime.kernels("common").View()
         u.rotation = wp.mat33d(*view.rotation.ravel().tolist())
         u.translation, u.eye = wp.vec3d(*view.translation.tolist()), wp.vec3d(*view.eye.tolist())
-        for name in ("fx", "fy", "cx", "cy", "near", "far", "width", "height", "samples", "log_cut", "ceiling", "stop"):
+        for name in (
+            "fx",
+            "fy",
+            "cx",
+            "cy",
+            "near",
+            "far",
+            "width",
+            "height",
+            "samples",
+            "log_cut",
+            "ceiling",
+            "stop",
+        ):
             setattr(u, name, getattr(view, name))
         u.tile_w, u.tile_h, u.tiles_x, u.tiles_y = shape.tile_width, shape.tile_height, tiles_x, tiles_y
         u.per_pixel = 1.0 / view.samples**2

@@ -1,4 +1,6 @@
-"""Looks into an open device: single kernels of kernels/warp/check.py, and arrays that are filled with rubbish first."""
+"""Looks into an open device: single kernels of kernels/warp/check.py, and arrays that are filled with rubbish
+first.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ if TYPE_CHECKING:
 def run(
     backend: WarpBackend, kernel: str, count: int, inputs: Sequence[np.ndarray], outputs: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
-    """Launch `count` threads of a kernel of kernels/warp/check.py on arrays; what stands in `outputs` afterwards.
+    """Launch `count` threads of a kernel of kernels/warp/check.py on arrays; what stands in `outputs`
+    afterwards.
 
     Raises:
         DeviceError: the compiler refuses, or the device fails.
@@ -36,7 +39,8 @@ def run(
 
 
 def contraction(backend: WarpBackend, a: np.ndarray, b: np.ndarray) -> tuple[list[np.ndarray], bool]:
-    """a b - a b; a b + a; (a / 3) (b / 3) - (a / 3) (b / 3) in float64; a b - (a b), fused: each (n,), from a, b (n,) float32.
+    """a b - a b; a b + a; (a / 3) (b / 3) - (a / 3) (b / 3) in float64; a b - (a b), fused: each (n,), from
+    a, b (n,) float32.
     And whether the device fuses where it is asked to.
     """
     n = len(a)
@@ -47,7 +51,7 @@ def contraction(backend: WarpBackend, a: np.ndarray, b: np.ndarray) -> tuple[lis
 def not_a_number(backend: WarpBackend, x: np.ndarray) -> Sequence[np.ndarray]:
     """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
     (told,) = run(backend, "not_a_number", len(x), (x,), [np.zeros((4, len(x)), np.int32)])
-    return told
+    return list(told)
 
 
 def options(backend: WarpBackend) -> list[str]:
@@ -56,7 +60,9 @@ def options(backend: WarpBackend) -> list[str]:
 
 
 def scan(pipeline: WarpPipeline, lengths: np.ndarray) -> tuple[np.ndarray, int]:
-    """Where lists of these lengths (n,) uint32 start, modulo 2^32, (n + 1,) uint32; and the sum of all in 64 bits."""
+    """Where lists of these lengths (n,) uint32 start, modulo 2^32, (n + 1,) uint32; and the sum of all in 64
+    bits.
+    """
     wp, device = runtime.load(), pipeline.backend.device
     with wp.ScopedDevice(device):
         given = wp.array(lengths.astype(np.int64), dtype=wp.int64, device=device)

@@ -55,7 +55,8 @@ def quiet() -> Iterator[None]:
 
 @contextmanager
 def _without_stderr() -> Iterator[None]:
-    # Warp's native start says there that no CUDA driver is here, which is no error: `fidsplat devices` lists what is
+    # Warp's native start says there that no CUDA driver is here, which is no error: `fidsplat devices` lists
+    # what is
     sys.stderr.flush()
     kept = os.dup(2)
     try:
