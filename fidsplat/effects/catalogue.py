@@ -2,8 +2,7 @@
 
 A slot is filled by exactly one effect of its kind (camera, color, lowpass, stop,
 compose); taps are extra planes, any
-number of them; parts are what several of them share. The sections of an effect's kernel file say where its
-text
+number of them; parts are what several of them share. The sections of an effect's kernel file say where its text
 goes (kernels/README.md).
 """
 
