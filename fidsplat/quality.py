@@ -47,8 +47,8 @@ class Quality:
 
     coplanar: str = "blend"
     """Splats that are printed on one plane (markers). `blend`: one layer whose colour does not depend on
-    their order. `order`: by the depth of their centres, as any other splats, which flips as the camera
-    turns."""
+    their order, placed by its own depth at each pixel. `order`: by the depth of their centres, as any other
+    splats, which flips as the camera turns."""
 
     samples: int = 1
     """n: each pixel is the mean of n x n samples on a regular grid, 1 to 8."""

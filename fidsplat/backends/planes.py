@@ -8,6 +8,7 @@ from here.
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 
@@ -60,7 +61,7 @@ class PlaneTable:
         keys = (nearest - 2 * np.linalg.norm(half, axis=1)).astype(np.float32)
         # of equal keys the index decides, and shuffled splats of two planes would mix
         order = np.argsort(keys, kind="stable")
-        for before, here in zip(order[:-1], order[1:], strict=True):
+        for before, here in pairwise(order):
             if keys[here] <= keys[before]:
                 keys[here] = np.nextafter(keys[before], np.float32(np.inf))
         return keys

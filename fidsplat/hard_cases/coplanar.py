@@ -92,7 +92,7 @@ def layered(renderer: Renderer, parts: Sequence[SplatCloud], camera: Camera) -> 
         light *= 1 - np.take_along_axis(alpha, index, 0)[0]
     ranked = np.sort(np.where(alpha > 0, depth, np.inf), axis=0)
     with np.errstate(invalid="ignore"):
-        clear = ~(np.diff(ranked, axis=0) < 1e-4).any(0)[..., None]
+        clear = 1.0 - np.any(np.diff(ranked, axis=0) < 1e-4, axis=0)[..., None]
     return draw(renderer, whole)["rgb"] * clear, wanted * clear
 
 

@@ -26,6 +26,8 @@ _STATE = {
 }
 
 
+FAINT = wp.constant(1e-3)
+"""below it the optical depth of an opacity a is a + a^2 / 2, to 1 part in 10^6"""
 DARKEST = wp.constant(wp.float32(2.0**-24))
 """transmittance of an opaque fragment, whose optical depth would be infinite"""
 
@@ -68,7 +70,13 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     seen |= {"label": wp.int32} if label else {}
     Seen = _struct("Seen", "What shows where something is drawn.", seen)
     # `mean` holds sums over the layer's fragments, each times its optical depth
-    layer = {"plane": wp.int32, "t": wp.float32, "ink": wp.float32, "mean": Seen, "thickest": wp.float32}
+    layer = {
+        "plane": wp.int32,
+        "opacity": wp.float32,
+        "ink": wp.float32,
+        "mean": Seen,
+        "thickest": wp.float32,
+    }
     Layer = _struct("Layer", "What a sample sees of one plane; plane -1: nothing.", layer)
     fields = {"t": wp.float32, "r": wp.float32, "g": wp.float32, "b": wp.float32}
     for effect in effects:
@@ -113,7 +121,6 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     def no_layer():
         layer = Layer()
         layer.plane = -1
-        layer.t = 1.0
         return layer
 
     @wp.func
@@ -250,7 +257,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         seen.z = depth_of_layer(layer)
         if wp.static(normal):
             seen.normal = layer.mean.normal / layer.ink
-        return lay(pixel, seen, 1.0 - layer.t, view)
+        return lay(pixel, seen, layer.opacity, view)
 
     @wp.func
     def lay_before(pixel: Pixel, z: float, view: View):
@@ -295,11 +302,12 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     def gather(layer: Layer, plane: int, seen: Seen, opacity: float):
         """The layer with one more fragment: optical depths -ln(1 - opacity) add up."""
         after = layer
-        bare = 1.0 - opacity
-        # an opaque fragment has the optical depth at which float32 leaves no light
-        tau = -wp.log(wp.max(bare, DARKEST))
+        tau = opacity + 0.5 * opacity * opacity  # of a faint one, which 1 - opacity would blur
+        if opacity > FAINT:
+            # an opaque fragment has the optical depth at which float32 leaves no light
+            tau = -wp.log(wp.max(1.0 - opacity, DARKEST))
         after.plane = plane
-        after.t = layer.t * bare
+        after.opacity = fma(opacity, 1.0 - layer.opacity, layer.opacity)
         after.ink = layer.ink + tau
         mean = layer.mean
         mean.rgb = layer.mean.rgb + tau * seen.rgb
@@ -330,6 +338,8 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         seen = see(s, c, inverse_d, index, lines, labels)
         if wp.static(layers):
             p = pixel
+            if not (opacity > 0.0):
+                return p  # of no optical depth: a mean over it would be 0 / 0
             plane = planes[index]
             if plane < 0:
                 p = lay_before(p, seen.z, view)

@@ -40,7 +40,8 @@ def test_base_text_names_no_effect_that_was_not_asked_for():
         "stop_inclusive",
         "compose_ordered",
     }
-    for name in (*absent, *TAPS, "sh", "finished", "planes", "plane_keys", "layer", "Layer", "open", "waiting", "ink"):
+    of_layers = ("planes", "plane_keys", "layer", "Layer", "open", "waiting", "ink")
+    for name in (*absent, *TAPS, "sh", "finished", *of_layers):
         assert not re.search(rf"\b{name}(_|\b)", text), name
 
 

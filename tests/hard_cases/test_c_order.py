@@ -5,9 +5,19 @@ import pytest
 from cases import assert_holds
 
 import fidsplat as fs
+from fidsplat.cameras import Camera
 from fidsplat.hard_cases import group_c
-from fidsplat.hard_cases.coplanar import largest_jump, tag, turning
-from fidsplat.hard_cases.invariance import trace
+from fidsplat.hard_cases.clouds import splats
+from fidsplat.hard_cases.coplanar import (
+    WALL_STEP,
+    beside_a_big_splat,
+    faint_between,
+    largest_jump,
+    layered,
+    tag,
+    turning,
+)
+from fidsplat.hard_cases.invariance import draw, trace
 
 
 @pytest.mark.parametrize("case", group_c.CASES, ids=lambda case: case.name)
@@ -33,6 +43,43 @@ def test_a_tag_jumps_only_where_depth_decides(renderer):
     after = largest_jump(renderer, turning(cloud, "blend", steps=2))[0]
     assert before > 0.2
     assert after < 1e-4
+
+
+def test_a_tag_before_a_wall_does_not_jump(renderer):
+    """No centre of a wall's splat cuts the layer; what moves is the wall's own order."""
+    cloud = group_c.before_a_wall(2000)
+    for tilt in (0.0, 30.0, 60.0):
+        before, after = (
+            largest_jump(renderer, turning(cloud, mode, 4, tilt, step=WALL_STEP))[0]
+            for mode in ("order", "blend")
+        )
+        assert before > 0.15
+        assert after < 0.2 * before
+
+
+def test_a_faint_splat_between_decides_nothing(renderer):
+    """Drawn or not, with 1/255: a cut layer changed by 0.26."""
+    with_it, without = (draw(renderer, faint_between(n / 255))["rgb"] for n in (1.01, 0.99))
+    assert 0 < np.abs(with_it - without).max() < 1.01 / 255
+
+
+@pytest.mark.parametrize("side", group_c.SIDES)
+def test_a_layer_lies_where_its_depth_says(renderer, side):
+    """The big splat's centre alone would put it on the other side."""
+    got, wanted = layered(renderer, beside_a_big_splat(side), group_c.ON_TAGS)
+    assert wanted.max() > 0.5
+    assert np.abs(got - wanted).max() < 1e-6
+
+
+def test_of_three_layers_the_nearer_of_the_first_two_is_laid(renderer):
+    """Three sheets one behind the other, and a big splat between."""
+    colors = np.eye(3)
+    sheets = [
+        splats([(0, 0, z)], (1, 0, 0, 0), 0.5, 0.6, colors[k]).with_planes(0) for k, z in enumerate((2, 4, 6))
+    ]
+    view = Camera.pinhole(17, 17, 20.0, 20.0, 8.5, 8.5)
+    got, wanted = layered(renderer, [*sheets, splats([(0, 0, 5)], (1, 0, 0, 0), 2.0, 0.5)], view)
+    assert np.abs(got - wanted).max() < 1e-6
 
 
 def test_a_real_marker_does_not_jump(renderer):

@@ -8,6 +8,7 @@ from agreement import ALL_OUTPUTS, random_splats
 
 import fidsplat as fs
 from fidsplat.backends.base import View
+from fidsplat.backends.planes import PlaneTable
 from fidsplat.effects import select
 from fidsplat.hard_cases.invariance import has_tiles, odd_shapes, other_schedule
 
@@ -141,6 +142,36 @@ def test_tile_size_leaves_every_bit_as_it_was(backend, renderer):
         trace, _ = traced(backend, cloud, quality, ALL_OUTPUTS, other)
         for name in ALL_OUTPUTS:
             assert np.array_equal(trace[name], base[name]), f"{name} differs with {other}"
+
+
+def test_layers_are_the_same_in_every_tile_size_and_schedule(backend, renderer):
+    """Four planes whose layers wait for one another, and splats of none."""
+    planes = np.random.default_rng(9).choice([-1, -1, -1, 0, 1, 2, 3], 300)
+    cloud = random_splats(300, seed=9, scale=(0.05, 0.5)).with_planes(planes)
+    base, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS)
+    other, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS, other_schedule(renderer))
+    for name in ("rgb", "alpha", "normal", "depth"):
+        assert np.abs(other[name] - base[name]).max() < 2e-5, name
+    width = backend.shape.tile_width if backend.shape.schedule == "lanes" else 32
+    again, _ = traced(
+        backend, cloud, fs.Quality(), ALL_OUTPUTS, replace(backend.shape, tile_width=width, tile_height=32)
+    )
+    for name in ALL_OUTPUTS:
+        assert np.array_equal(again[name], base[name]), name
+
+
+def test_splats_of_a_plane_share_its_key(backend):
+    """They arrive together, whatever lies between their centres."""
+    generator = np.random.default_rng(2)
+    cloud = random_splats(200, seed=2, depth=(2.0, 4.0)).with_planes(generator.integers(-1, 3, 200))
+    trace, view = traced(backend, cloud, fs.Quality())
+    for plane, key in enumerate(PlaneTable(cloud).keys(view)):
+        keys = trace["keys"][cloud.planes == plane]
+        bits = np.array([key]).view(np.uint32)
+        wanted = ~bits if bits[0] & 0x80000000 else bits | 0x80000000
+        assert (keys[keys != CULLED] == wanted).all()
+        places = np.flatnonzero(cloud.planes[trace["order"]] == plane)
+        assert len(places) == np.ptp(places) + 1
 
 
 def test_both_schedules_draw_the_same_picture(backend, renderer):

@@ -137,7 +137,7 @@ def of_places(span: Span, is_layer: np.ndarray) -> np.ndarray:
     the product of their opacities and the light in front of them, at most.
     """
     doubt = np.zeros(len(span.low))
-    layers = np.flatnonzero(is_layer)
+    layers = np.flatnonzero(is_layer).tolist()
     fragment = ~is_layer
     may, must = (span.high > 0) & fragment, (span.low > 0) & fragment
     light = shifted(np.cumprod(np.where(fragment, 1 - span.low, 1.0), axis=1), last=True)

@@ -53,6 +53,9 @@ def optical_depth(alpha: np.ndarray) -> np.ndarray:
 
 
 def shifted(after: np.ndarray, last: bool = False) -> np.ndarray:
-    """What is in front of each fragment (k, n), from what is left behind each; `last`: and of the end (k, n + 1)."""
+    """What is in front of each fragment (k, n), from what is left behind each.
+
+    last: also of what comes after them all, (k, n + 1).
+    """
     before = np.concatenate([np.ones((len(after), 1)), after], axis=1)
     return before if last else before[:, :-1]

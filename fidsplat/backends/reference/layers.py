@@ -1,4 +1,4 @@
-"""The splats of a plane as one layer per sample, placed by its own depth (docs/rendering.md, coplanar splats).
+"""The splats of a plane as one layer per sample, placed by its own depth (docs/rendering.md).
 
 Columns are what arrives in the depth order: splats of no plane one by one, the splats of a plane together,
 where their common key puts them. A layer is pending from there until a fragment of no plane arrives that lies
@@ -132,22 +132,22 @@ def _side_by_side(parts: list[Laid]) -> Laid:
         np.concatenate([getattr(part.span, name) for part in parts], axis=1)
         for name in ("low", "high", "z_low", "z_high")
     )
-    return Laid(
-        span=Span.of(*spans), reordered=parts[0].reordered, **{name: joined(name) for name in names}
-    )
+    return Laid(span=Span.of(*spans), reordered=parts[0].reordered, **{name: joined(name) for name in names})
 
 
 def _places(columns: Laid, is_layer: np.ndarray) -> np.ndarray:
-    """Before which column (k, m) each column is laid; a fragment at its own, m for what is laid at the end."""
+    """Before which column (k, m) each is laid; a fragment at its own, m for what is laid at the end."""
     k, m = columns.alpha.shape
     place = np.tile(np.arange(m), (k, 1))
     drawn = columns.alpha > 0
     rows = np.arange(k)
     # columns of the two pending layers, the one that arrived first in front; -1: none
     waiting, opened = np.full(k, -1), np.full(k, -1)
-    for column in np.flatnonzero(is_layer):
+    for column in np.flatnonzero(is_layer).tolist():
         behind = columns.z[:, column + 1 :] > columns.z[:, column, None]
-        place[:, column] = doubt.first_column(behind & drawn[:, column + 1 :] & ~is_layer[column + 1 :], column + 1)
+        place[:, column] = doubt.first_column(
+            behind & drawn[:, column + 1 :] & ~is_layer[column + 1 :], column + 1
+        )
         begins = drawn[:, column]
         waiting = np.where(place[rows, waiting] < column, -1, waiting)
         opened = np.where(place[rows, opened] < column, -1, opened)

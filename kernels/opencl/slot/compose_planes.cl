@@ -18,14 +18,14 @@
 //@ compose_types
 typedef struct {
     vint plane;             // -1: no layer
-    vfloat t;               // transmittance
+    vfloat opacity;         // 1 - the product of its fragments' transmittances; itself, so that a faint one stays exact
     vfloat ink;             // sum of optical depths
     Seen mean;              // of its fragments by optical depth
 //@@ layer
 } Layer;
 
 static inline Layer no_layer(void) {
-    Layer layer = {-1, 1.0f};
+    Layer layer = {(vint)(-1)};     // and the rest 0
     return layer;
 }
 
@@ -37,7 +37,7 @@ static inline Layer no_layer(void) {
 // Makes a layer another one where `mask` is set.
 static inline void layer_pick(Layer *layer, const Layer *other, vint mask) {
     layer->plane = VSELECT(layer->plane, other->plane, mask);
-    layer->t = VSELECT(layer->t, other->t, mask);
+    layer->opacity = VSELECT(layer->opacity, other->opacity, mask);
     layer->ink = VSELECT(layer->ink, other->ink, mask);
     layer->mean.r = VSELECT(layer->mean.r, other->mean.r, mask);
     layer->mean.g = VSELECT(layer->mean.g, other->mean.g, mask);
@@ -47,11 +47,11 @@ static inline void layer_pick(Layer *layer, const Layer *other, vint mask) {
 
 // Adds a fragment where `mask` is set.
 static inline void layer_gather(Layer *layer, const Splat *s, const Seen *seen, vfloat opacity, vint mask) {
-    vfloat bare = 1.0f - opacity;
+    opacity = VSELECT((vfloat)0.0f, opacity, mask);
     // an opaque fragment has the optical depth at which float32 leaves no light
-    vfloat tau = VSELECT((vfloat)0.0f, -log(fmax(bare, (vfloat)0x1p-24f)), mask);
+    vfloat tau = -log(fmax(1.0f - opacity, (vfloat)0x1p-24f));
     layer->plane = VSELECT(layer->plane, (vint)s->plane, mask);
-    layer->t = VSELECT(layer->t, layer->t * bare, mask);
+    layer->opacity = FMA(opacity, 1.0f - layer->opacity, layer->opacity);
     layer->ink += tau;
     vfloat share = VSELECT((vfloat)0.0f, tau / layer->ink, VMASK(tau > 0.0f));
     layer->mean.r = FMA(share, seen->r - layer->mean.r, layer->mean.r);
@@ -63,7 +63,7 @@ static inline void layer_gather(Layer *layer, const Splat *s, const Seen *seen, 
 static inline void layer_lay(Pixel *pixel, Layer *layer, vint mask, const BlendConstants *constants) {
     if (!VANY(mask)) return;
     const Layer none = no_layer();
-    lay(pixel, &layer->mean, 1.0f - layer->t, mask, constants);
+    lay(pixel, &layer->mean, layer->opacity, mask, constants);
     layer_pick(layer, &none, mask);
 }
 
