@@ -27,20 +27,9 @@ _STATE = {
 
 
 FAINT = wp.constant(1e-3)
-"""below it the optical depth of an opacity a is a + a^2 / 2, to 1 part in 10^6"""
+"""below it the optical depth of an opacity a is a + a^2 / 2, to 3 parts in 10^7"""
 DARKEST = wp.constant(wp.float32(2.0**-24))
 """transmittance of an opaque fragment, whose optical depth would be infinite"""
-
-
-@wp.struct
-class Crossing:
-    """Where the ray of a sample meets a splat."""
-
-    d: float
-    q: float  # n_u^2 + n_v^2: rho / 2 is q / d^2
-    screen: float  # squared distance from the projected centre in pixels, which is rho / 2 of the low-pass
-    inside: bool  # the ray meets the disk within R and beyond the near plane
-    drawn: bool
 
 
 @cache
@@ -63,6 +52,15 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             "label",
         )
     )
+    # u: nu0, nux, nuy, log opacity; v: nv0, nvx, nvy, D at the near plane; d: d0, dx, dy, ax; c: ay, r, g, b
+    splat = {"u": wp.vec4, "v": wp.vec4, "d": wp.vec4, "c": wp.vec4, "half_r2": wp.float32}
+    splat |= {"dot_x": wp.float32, "dot_y": wp.float32} if screen else {}
+    Splat = _struct("Splat", "What of a record each sample needs.", splat)
+    # q / d^2 is rho / 2; inside: the ray meets the disk within R and beyond the near plane
+    crossing = {"d": wp.float32, "q": wp.float32, "inside": wp.bool, "drawn": wp.bool}
+    # screen: squared distance from the projected centre in pixels, which is rho / 2 of the low-pass
+    crossing |= {"screen": wp.float32} if screen else {}
+    Crossing = _struct("Crossing", "Where the ray of a sample meets a splat.", crossing)
     layers = "compose_planes" in effects
     seen = {"rgb": wp.vec3}
     seen |= {"z": wp.float32} if ray_depth else {}
@@ -92,16 +90,6 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     nx_line, nx_lane = layout.place("nx")
     ny_line, ny_lane = layout.place("ny")
     nz_line, nz_lane = layout.place("nz")
-
-    @wp.struct
-    class Splat:
-        u: wp.vec4  # nu0, nux, nuy, log opacity
-        v: wp.vec4  # nv0, nvx, nvy, D at the near plane
-        d: wp.vec4  # d0, dx, dy, ax
-        c: wp.vec4  # ay, r, g, b
-        dot_x: float
-        dot_y: float
-        half_r2: float
 
     @wp.func
     def load(lines: wp.array(dtype=wp.vec4), index: int, view: View):
@@ -166,11 +154,12 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
 
     @wp.func
     def opacity_of(s: Splat, c: Crossing, inverse_d: float, view: View) -> float:
-        half_rho = c.screen
-        if c.inside:
-            half_rho = c.q * inverse_d * inverse_d
-            if wp.static(screen):
+        half_rho = c.q * inverse_d * inverse_d
+        if wp.static(screen):
+            if c.inside:
                 half_rho = wp.min(half_rho, c.screen)
+            else:
+                half_rho = c.screen
         return wp.min(wp.exp(s.u[3] - half_rho), view.ceiling)
 
     @wp.func
