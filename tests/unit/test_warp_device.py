@@ -1,7 +1,9 @@
 """The Warp backend: its devices, what it says when it is missing, arrays that are shared without a copy."""
 
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -255,3 +257,14 @@ def test_warp_pipelines_share_kernels_that_mean_the_same():
     assert one.blend is two.blend
     assert one.resolve is not two.resolve
     assert one is backend.pipeline(FeatureSet(slots, (), 0, 1, "float64"))
+
+
+@pytest.mark.parametrize("device", ["warp:cpu", CUDA])
+def test_the_example_draws_each_step(device):
+    example = Path(__file__).resolve().parents[2] / "examples" / "warp_loop.py"
+    words = [sys.executable, str(example), "--device", device, "--steps", "11"]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    covered = [int(count) for count in re.findall(r"covers +(\d+) pixels", done.stdout)]
+    assert len(covered) == 2
+    assert 0 < covered[0] != covered[1] > 0

@@ -103,7 +103,8 @@ def _describe(device: Any) -> DeviceInfo:
         title, kind, units = device.name, "gpu", device.sm_count
         memory = device.total_memory
     else:
-        title, kind, units = "CPU, a thread for each of its cores", "cpu", len(os.sched_getaffinity(0))
+        units = len(os.sched_getaffinity(0))
+        title, kind = f"CPU, {units} thread{'s' if units > 1 else ''}", "cpu"
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return DeviceInfo(
         name=f"warp:{device.alias}",
