@@ -3,10 +3,10 @@
     python examples/warp_loop.py                        30 steps on the CPU, in seconds
     python examples/warp_loop.py --device warp:cuda --steps 1000
 
-An AprilTag rocks on a spring above a floor of splats. A kernel moves its splats where they lie on the device;
-the renderer draws them; another kernel takes the picture as an input, as a policy or a sensor model would (here:
-how much of the tag is in view, from the labels). Newton and MuJoCo Warp fit in the place of `swing`: what they
-leave in wp.arrays is what is drawn.
+An AprilTag rocks on a spring above a floor of splats. A kernel moves its splats where they lie on the
+device; the renderer draws them; another kernel takes the picture as an input, as a policy or a sensor model
+would (here: how much of the tag is in view, from the labels). Newton and MuJoCo Warp fit in the place of
+`swing`: what they leave in wp.arrays is what is drawn.
 """
 
 import argparse
