@@ -105,7 +105,7 @@ class Quality:
     def of(cls, quality: Quality | str | None) -> Quality:
         """A `Quality` from itself, from a preset's name, or the default from None."""
         if quality is None:
-            return cls()
+            return PRESETS["standard"]
         if isinstance(quality, cls):
             return quality
         return cls.named(quality)  # type: ignore[arg-type]

@@ -17,6 +17,8 @@ from fidsplat.quality import Quality
 from fidsplat.scenes import Scene
 from fidsplat.splats import SplatCloud
 
+_NO_SCENE = Scene(())
+
 
 class Frame(Mapping):
     """A finished picture: a mapping from an output's name to a read-only NumPy array, copied from the
@@ -97,16 +99,25 @@ class Renderer:
 
     Args:
         device: "opencl" (the best OpenCL device), "opencl:NAME" (part of a platform's or device's name, or
-            cpu or gpu), "warp:cpu", "warp:cuda" (NVIDIA Warp), or "reference" (NumPy, float64, slow). None:
-            what
-            the environment variable FIDSPLAT_DEVICE says, else "opencl".
+            cpu or gpu), "warp:cpu", "warp:cuda" (NVIDIA Warp), or "reference" (NumPy, float64, slow).
+            None: what the environment variable FIDSPLAT_DEVICE says, else "opencl".
+        memory_budget: bytes of the device that a picture and its cloud may take; by default nine tenths of
+            what the device says it has. What needs more is drawn in bands of the picture and, by OpenCL,
+            chunks of the cloud, which takes longer and gives the same bits.
 
     Raises:
         DeviceError: the device cannot be used; UnknownDeviceError: there is no such device.
+        InputError: the memory budget is no positive number, or the device has none.
     """
 
-    def __init__(self, device: str | None = None) -> None:
+    def __init__(self, device: str | None = None, memory_budget: int | None = None) -> None:
         self.backend = open_backend(default_device() if device is None else device)
+        if memory_budget is not None:
+            if isinstance(memory_budget, bool) or not isinstance(memory_budget, int) or memory_budget <= 0:
+                raise InputError(
+                    f"memory_budget is {memory_budget!r}; it must be a whole number of bytes, e.g. 2 * 2**30"
+                )
+            self.backend.limit_memory(memory_budget)
 
     @property
     def device(self) -> DeviceInfo:
@@ -183,7 +194,7 @@ class Renderer:
                 elsewhere.
             DeviceError: the device fails or lacks memory.
         """
-        own = scene if isinstance(scene, Scene) else Scene(())
+        own = scene if isinstance(scene, Scene) else _NO_SCENE
         camera = camera or own.camera
         if camera is None:
             raise InputError("no camera: pass camera=fs.Camera... or give the scene a [camera] table")
@@ -205,3 +216,30 @@ class Renderer:
         features = select(data, names, chosen)
         view = View.of(camera, chosen, data.origin, behind)
         return Frame(self.backend.pipeline(features).render(data, view), names)
+
+    def render_views(
+        self,
+        scene: Scene | SplatCloud | ResidentCloud,
+        cameras: Iterable[Camera],
+        outputs: Iterable[str] | None = None,
+        quality: Quality | str | None = None,
+        background: Iterable[float] | None = None,
+    ) -> Iterator[Frame]:
+        """Draw one cloud from many cameras, one Frame for each, in their order.
+
+        The cloud is uploaded once, kernels and buffers are used again, and on a device that works beside the
+        host the next picture is under way while the caller has the last. Arguments and errors: as `render`.
+        """
+        own = scene if isinstance(scene, Scene) else _NO_SCENE
+        chosen = own.quality if quality is None else quality
+        names = own.outputs if outputs is None else outputs
+        behind = own.background if background is None else background
+        resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
+        waiting: Frame | None = None
+        for camera in cameras:
+            frame = self.render(resident, camera, names, chosen, behind)
+            if waiting is not None:
+                yield waiting
+            waiting = frame
+        if waiting is not None:
+            yield waiting

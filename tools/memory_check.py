@@ -138,10 +138,10 @@ def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
 
     backend = renderer.backend
     lanes = replace(backend.shape, schedule="lanes", lanes=4, tile_width=4, tile_height=8, scan_items=1)
-    group = replace(backend.shape, schedule="group", lanes=1, tile_width=4, tile_height=4, scan_items=8)
+    group = replace(backend.shape, schedule="group", lists="tiled", lanes=1, tile_width=8, tile_height=8)
     shapes = {
         "lanes": replace(lanes, chunks=3, radix_bits=5),
-        "group": replace(group, chunks=5, radix_bits=4),
+        "group": replace(group, scan_items=8),
     }
 
     def task(shape, cloud, view_from, outputs=("rgb", "alpha"), quality=None, budget=None):

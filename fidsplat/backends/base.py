@@ -145,6 +145,10 @@ class Backend(Protocol):
 
     info: DeviceInfo
 
+    def limit_memory(self, budget: int) -> None:
+        """Let a picture and its cloud take at most `budget` bytes of the device."""
+        ...
+
     def upload(self, cloud: SplatCloud) -> Any:
         """The cloud on the device."""
         ...

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 from fidsplat.effects.catalogue import CATALOGUE, Effect, Output
@@ -34,13 +35,13 @@ class FeatureSet:
     samples: int
     setup_precision: str
 
-    @property
+    @cached_property
     def effects(self) -> tuple[Effect, ...]:
         """All effects in the order in which their text is put together: slots, parts, taps."""
         parts = sorted({part for name in (*self.slots, *self.taps) for part in CATALOGUE[name].parts})
         return tuple(CATALOGUE[name] for name in (*self.slots, *parts, *self.taps))
 
-    @property
+    @cached_property
     def outputs(self) -> tuple[Output, ...]:
         """Finished planes, rgb first."""
         return (RGB, *(OUTPUTS[tap] for tap in self.taps))

@@ -21,7 +21,15 @@ from fidsplat.hard_cases.coplanar import (
     turning,
     wall,
 )
-from fidsplat.hard_cases.invariance import CULLED, differing, draw, has_tiles, tile_shapes, trace
+from fidsplat.hard_cases.invariance import (
+    CULLED,
+    differing,
+    draw,
+    has_tiles,
+    out_of_order,
+    tile_shapes,
+    trace,
+)
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer
 from fidsplat.rotations import quaternion_to_matrix
@@ -147,17 +155,17 @@ def _keys_and_order(renderer: Renderer, picture: Picture) -> tuple[int, int]:
     planes = trace(renderer, picture)
     view = View.of(picture.camera, picture.quality, picture.cloud.origin, picture.background)
     depth = (picture.cloud.means.astype(float) @ view.rotation.T + view.translation)[:, 2]
-    keys, order = planes["keys"], planes["order"]
+    keys = planes["keys"]
     if keys.dtype == np.uint32:
         visible = np.flatnonzero(keys != CULLED)
         bits = keys[visible]
         decoded = np.where(bits & 0x80000000, bits & 0x7FFFFFFF, ~bits).view(np.float32)
     else:  # the reference keeps depths
-        visible = np.sort(order)
+        visible = np.sort(planes["order"])
         decoded = keys[visible]
     off = np.abs(decoded - depth[visible]) > 2 * np.spacing(np.abs(depth[visible]).astype(np.float32))
     wanted = visible[np.argsort(decoded, kind="stable")]
-    return int(off.sum()), int((wanted != order).sum())
+    return int(off.sum()), out_of_order(planes, wanted)
 
 
 def _depths(values) -> Picture:

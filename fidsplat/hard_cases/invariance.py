@@ -47,6 +47,18 @@ def differing(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray],
     return int(different.sum())
 
 
+def out_of_order(traced: Mapping[str, np.ndarray], wanted: np.ndarray) -> int:
+    """How many splats of a trace do not follow the order `wanted` (visible,), in tiles' lists or at all."""
+    if "lists" not in traced:
+        return int((traced["order"] != wanted).sum())
+    rank = np.full(len(traced["keys"]), -1)
+    rank[wanted] = np.arange(len(wanted))
+    places, starts = rank[traced["lists"]], traced["starts"].astype(np.int64)
+    follows = np.ones(len(places), bool)  # the one before it in the same list
+    follows[starts[:-1][starts[:-1] < len(places)]] = False
+    return int((places < 0).sum() + (follows[1:] & (np.diff(places) <= 0)).sum())
+
+
 def has_tiles(renderer: Renderer) -> bool:
     """Whether the device draws in tiles whose size can be chosen."""
     return hasattr(renderer.backend, "shape")
@@ -62,17 +74,23 @@ def tile_shapes(renderer: Renderer) -> list:
     return [replace(own, tile_width=side, tile_height=side) for side in (8, 32)]
 
 
+def group_shape(own, side: int):
+    """Build constants `own` with the schedule that a GPU would be given, in tiles of side x side."""
+    groups = replace(own, schedule="group", tile_width=side, tile_height=side)
+    return replace(groups, lists="tiled", lanes=1, scan_items=64) if hasattr(own, "lists") else groups
+
+
 def other_schedule(renderer: Renderer):
     """Build constants of the schedule for GPUs; on a GPU, with other tiles."""
-    own = renderer.backend.shape  # type: ignore[attr-defined]
-    eight = replace(own, schedule="group", tile_width=8, tile_height=8)
-    return replace(eight, lanes=1, scan_items=64) if own.schedule == "lanes" else eight
+    return group_shape(renderer.backend.shape, 8)  # type: ignore[attr-defined]
 
 
 def odd_shapes(renderer: Renderer) -> list:
-    """The device's build constants, and odd ones for its sorting where it has its own."""
+    """The device's build constants, and others for its sorting where it has its own."""
     own = renderer.backend.shape  # type: ignore[attr-defined]
-    return [own, replace(own, chunks=7, radix_bits=5)] if hasattr(own, "chunks") else [own]
+    if not hasattr(own, "chunks"):
+        return [own]
+    return [own, replace(own, chunks=7, radix_bits=5), group_shape(own, 16)]
 
 
 def probe_of(renderer: Renderer) -> ModuleType | None:

@@ -1,65 +1,83 @@
-// Lists of splats per tile, each in depth order: a counting sort whose bins are the tiles.
+// Lists of splats per tile for CPUs, each in depth order: a counting sort whose bins are the tiles.
 // Index space of both kernels: one work-item per chunk of the depth-sorted splats.
 
-typedef struct { int first, last; } TileSpan;   // inclusive; empty if first > last
+// The next splats' windows are fetched ahead: their places in memory follow no order.
+#define AHEAD 16
 
-// Tiles of one tile row that the bounds can touch. Both kernels call this, so counts and lists agree.
-static inline TileSpan tile_span(const Bounds *b, int tile_row, int width, int height) {
-    float y0 = (float)(tile_row * TILE_H) + 0.5f, y1 = (float)min(tile_row * TILE_H + TILE_H, height) - 0.5f;
-    float x0, x1;
-    bounds_span(b, y0, y1, &x0, &x1);
-    int first = max(to_pixel(ceil(x0 - 0.5f), width), 0), last = min(to_pixel(floor(x1 - 0.5f), width), width - 1);
-    TileSpan span = {first / TILE_W, first <= last ? last / TILE_W : -1};
-    return span;
+typedef struct {
+    int tiles_x, tiles_y, width, height;
+    uint from, to;           // this chunk of the order
+    global uint *row;        // its row of table[CHUNKS][tiles]
+} Chunk;
+
+static inline Chunk chunk_of(uint length, int width, int height, global uint *restrict table) {
+    Chunk c;
+    uint number = get_global_id(0), each = (length + CHUNKS - 1) / CHUNKS;
+    c.width = width;
+    c.height = height;
+    c.tiles_x = (width + TILE_W - 1) / TILE_W;
+    c.tiles_y = (height + TILE_H - 1) / TILE_H;
+    c.from = min(number * each, length);
+    c.to = min(c.from + each, length);
+    c.row = table + (size_t)number * c.tiles_x * c.tiles_y;
+    return c;
 }
 
-// Reads: order, counts[slot] (visible splats), bounds. Writes: this chunk's row of table[CHUNKS][tiles].
-kernel void bin_count(global const uint *restrict order, global const uint *restrict counts, uint slot,
-                      global const Bounds *restrict all_bounds, int width, int height, global uint *restrict table) {
-    uint chunk = get_global_id(0);
-    if (chunk >= CHUNKS) return;
-    int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
-    global uint *row = table + (size_t)chunk * tiles_x * tiles_y;
-    for (int tile = 0; tile < tiles_x * tiles_y; tile++) row[tile] = 0;
-    uint length = counts[slot], each = (length + CHUNKS - 1) / CHUNKS;
-    uint from = min(chunk * each, length), to = min(from + each, length);
-    for (uint k = from; k < to; k++) {
-        Bounds b = all_bounds[order[k]];
-        int y0, y1;
-        bounds_rows(&b, height, &y0, &y1);
-        for (int ty = y0 / TILE_H; ty * TILE_H < y1; ty++) {
-            TileSpan span = tile_span(&b, ty, width, height);
-            for (int tx = span.first; tx <= span.last; tx++) row[ty * tiles_x + tx]++;
-        }
+typedef struct {             // of bin_emit; lists of the tiles of the band [first, end), from 0; never beyond `capacity`
+    int first, end;
+    uint capacity;
+    global const uint *starts;
+    global uint *lists;
+} Emission;
+
+// Counts a splat's tile or, with an emission, lists the splat there: counts and lists come from the same walk.
+static inline void bin_tile(int tile, uint index, const Chunk *c, const Emission *e) {
+    if (e) {
+        if (tile < e->first || tile >= e->end) return;
+        // modulo 2^32: a place within the band is right even where the picture has more pairs than that
+        uint place = e->starts[tile] - e->starts[e->first] + c->row[tile];
+        if (place < e->capacity) e->lists[place] = index;
     }
+    c->row[tile]++;
 }
 
-// Reads: order, counts[slot], bounds, starts. Uses up: table, of the tiles in the band.
-// Writes: lists of the tiles of the band [band_first, band_end), from 0; never beyond `capacity`.
-kernel void bin_emit(global const uint *restrict order, global const uint *restrict counts, uint slot,
-                     global const Bounds *restrict all_bounds, int width, int height, global uint *restrict table,
-                     global const uint *restrict starts, int band_first, int band_end, uint capacity,
-                     global uint *restrict lists) {
-    uint chunk = get_global_id(0);
-    if (chunk >= CHUNKS) return;
-    int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
-    global uint *row = table + (size_t)chunk * tiles_x * tiles_y;
-    uint length = counts[slot], each = (length + CHUNKS - 1) / CHUNKS;
-    uint from = min(chunk * each, length), to = min(from + each, length);
-    for (uint k = from; k < to; k++) {
+static inline void bin_splats(global const uint *restrict order, global const uint2 *restrict windows,
+                              uint big_capacity, global const Bounds *restrict big_bounds, const Chunk *c,
+                              const Emission *e) {
+    for (uint k = c->from; k < c->to; k++) {
+        FETCH_AHEAD(windows + order[min(k + AHEAD, c->to - 1)]);
         uint index = order[k];
-        Bounds b = all_bounds[index];
-        int y0, y1;
-        bounds_rows(&b, height, &y0, &y1);
-        for (int ty = max(y0 / TILE_H, band_first / tiles_x); ty * TILE_H < y1 && ty * tiles_x < band_end; ty++) {
-            TileSpan span = tile_span(&b, ty, width, height);
-            for (int tx = span.first; tx <= span.last; tx++) {
-                int tile = ty * tiles_x + tx;
-                if (tile < band_first || tile >= band_end) continue;
-                // modulo 2^32: a place within the band is right even where the picture has more pairs than that
-                uint place = starts[tile] - starts[band_first] + row[tile]++;
-                if (place < capacity) lists[place] = index;
+        uint2 window = windows[index];
+        if (window.y == 0 && window.x < big_capacity) {
+            Bounds b = big_bounds[window.x];
+            int y0, y1;
+            bounds_rows(&b, c->height, &y0, &y1);
+            for (int ty = y0 / TILE_H; ty * TILE_H < y1; ty++) {
+                TileSpan span = tile_span(&b, ty, c->width, c->height);
+                for (int tx = span.first; tx <= span.last; tx++) bin_tile(ty * c->tiles_x + tx, index, c, e);
             }
         }
+        for (; window.y != 0; window.y &= window.y - 1) bin_tile(window_tile(window, c->tiles_x), index, c, e);
     }
+}
+
+// Reads: order, tallies' number of visible splats, windows, big_bounds. Writes: this chunk's row of table.
+kernel void bin_count(global const uint *restrict order, global const uint *restrict tallies,
+                      global const uint2 *restrict windows, uint big_capacity, global const Bounds *restrict big_bounds,
+                      int width, int height, global uint *restrict table) {
+    if (get_global_id(0) >= CHUNKS) return;
+    const Chunk c = chunk_of(tallies[TALLY_VISIBLE], width, height, table);
+    for (int tile = 0; tile < c.tiles_x * c.tiles_y; tile++) c.row[tile] = 0;
+    bin_splats(order, windows, big_capacity, big_bounds, &c, 0);
+}
+
+// Reads: as bin_count, and starts. Uses up: table, of the tiles in the band. Writes: lists.
+kernel void bin_emit(global const uint *restrict order, global const uint *restrict tallies,
+                     global const uint2 *restrict windows, uint big_capacity, global const Bounds *restrict big_bounds,
+                     int width, int height, global uint *restrict table, global const uint *restrict starts,
+                     int band_first, int band_end, uint capacity, global uint *restrict lists) {
+    if (get_global_id(0) >= CHUNKS) return;
+    const Chunk c = chunk_of(tallies[TALLY_VISIBLE], width, height, table);
+    const Emission e = {band_first, band_end, capacity, starts, lists};
+    bin_splats(order, windows, big_capacity, big_bounds, &c, &e);
 }

@@ -77,3 +77,43 @@ static inline void bounds_rows(const Bounds *b, int height, int *y0, int *y1) {
     *y0 = max(to_pixel(ceil(low - 0.5f), height), 0);
     *y1 = min(to_pixel(floor(high - 0.5f) + 1.0f, height), height);
 }
+
+typedef struct { int first, last; } TileSpan;   // inclusive; empty if first > last
+
+// Tiles of one row of tiles that the bounds can touch. Counts and lists both come from this, so they agree.
+static inline TileSpan tile_span(const Bounds *b, int tile_row, int width, int height) {
+    float y0 = (float)(tile_row * TILE_H) + 0.5f, y1 = (float)min(tile_row * TILE_H + TILE_H, height) - 0.5f;
+    float x0, x1;
+    bounds_span(b, y0, y1, &x0, &x1);
+    int first = max(to_pixel(ceil(x0 - 0.5f), width), 0), last = min(to_pixel(floor(x1 - 0.5f), width), width - 1);
+    TileSpan span = {first / TILE_W, first <= last ? last / TILE_W : -1};
+    return span;
+}
+
+#define WINDOW_W 8
+#define WINDOW_H 4
+
+// Which tiles the bounds can touch, as bits of a window of WINDOW_W x WINDOW_H tiles with its corner at tile
+// (*corner & 0xFFFF, *corner >> 16); 0 if they reach beyond one. Columns [x0, x1) and rows [y0, y1) enclose them.
+static inline uint tile_window(const Bounds *b, int x0, int x1, int y0, int y1, int width, int height, uint *corner) {
+    int left = x0 / TILE_W, columns = (x1 - 1) / TILE_W - left + 1;
+    int top = y0 / TILE_H, rows = (y1 - 1) / TILE_H - top + 1;
+    *corner = (uint)left | (uint)top << 16;
+    if (rows > WINDOW_H || columns > WINDOW_W) return 0;
+    if (rows == 1) return (1u << columns) - 1u;
+    if (columns == 1) return 0x01010101u >> (WINDOW_W * (WINDOW_H - rows));
+    uint mask = 0;
+    for (int row = 0; row < rows; row++) {
+        TileSpan span = tile_span(b, top + row, width, height);
+        // a chord between two rows of pixels may be wider than those at the rows
+        int first = max(span.first - left, 0), last = min(span.last - left, columns - 1);
+        if (first <= last) mask |= ((2u << (last - first)) - 1u) << first << (row * WINDOW_W);
+    }
+    return mask;
+}
+
+// The tile of the lowest bit of a window (corner, bits).
+static inline int window_tile(uint2 window, int tiles_x) {
+    int bit = 31 - clz(window.y & -window.y);
+    return (int)(window.x >> 16) * tiles_x + (int)(window.x & 0xFFFFu) + bit / WINDOW_W * tiles_x + bit % WINDOW_W;
+}

@@ -53,3 +53,13 @@ static inline uint sortable(float x) {
 
 // Pixel coordinate to int without the undefined conversions of huge values (numerics E2).
 static inline int to_pixel(float x, int limit) { return (int)clamp(x, -1.0f, (float)limit + 1.0f); }
+
+// A hint on CPUs whose compiler has one: they then wait less for what lies at an unforeseeable place.
+#if LANES > 1 && defined(__has_builtin)
+#if __has_builtin(__builtin_prefetch)
+#define FETCH_AHEAD(p) __builtin_prefetch((const void *)(size_t)(p))
+#endif
+#endif
+#ifndef FETCH_AHEAD
+#define FETCH_AHEAD(p)
+#endif

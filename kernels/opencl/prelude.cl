@@ -30,7 +30,13 @@ enum {
     VIEW_NEAR, VIEW_FAR, // [m]
     VIEW_LOG_CUT,        // ln(alpha cut-off)
     VIEW_WIDTH, VIEW_HEIGHT,  // of the sample grid
-    VIEW_FILTER         // (pixels per sample)^2, for filters that are defined in pixels
+    VIEW_FILTER,        // (pixels per sample)^2, for filters that are defined in pixels
+    VIEW_BAND, VIEW_BAND_END  // rows of samples that are drawn now
 };
 
 #define CULLED 0xFFFFFFFFu   // sort key of a splat that is not drawn
+#define OUTSIDE 0xFFFFFFFEu  // of one that is drawn in another band of rows only
+
+// places in the buffer `tallies`: numbers of visible splats, of pairs and of splats (64 bits each) and of big splats; then
+// one word per tile
+enum { TALLY_VISIBLE = 0, TALLY_PAIRS = 2, TALLY_ALL = 4, TALLY_BIG = 6, TALLIES = 8 };

@@ -1,6 +1,7 @@
 // Index space: one work-item per splat.
 // Reads:  view, means, quats, scales, opacities, and what the colour slot and the taps ask for.
-// Writes: splats[i], bounds[i] of visible splats; keys[i]: depth key, or CULLED.
+// Writes: splats[i] of visible splats; keys[i]: depth key, or CULLED or OUTSIDE; windows[i]
+//         of visible splats: the tiles that they touch; big, big_bounds and their number in tallies (numerics A5).
 //
 // The set-up is done in `real` (double where there is one) from float inputs (numerics B1).
 
@@ -52,8 +53,12 @@ kernel void project(
     global const float *restrict scales,      // (n, 2) [m]
     global const float *restrict opacities,   // (n)
     global Splat *restrict splats,            // (n)
-    global Bounds *restrict all_bounds,       // (n)
-    global uint *restrict keys                // (n)
+    global uint *restrict keys,               // (n)
+    global uint2 *restrict windows,           // (n): corner and bits, or a place in `big` and 0
+    global uint *restrict tallies,
+    uint big_capacity,
+    global uint *restrict big,                // splats that touch more than a window
+    global Bounds *restrict big_bounds
 //@@ project_args
 ) {
     uint i = get_global_id(0);
@@ -116,6 +121,11 @@ kernel void project(
     // written so that a NaN is culled (numerics E1)
     if (!(y0 < y1 && ceil(x0 - 0.5f) <= (float)(width - 1) && floor(x1 - 0.5f) >= 0.0f)) return;
 
+    if (y1 <= (int)view[VIEW_BAND] || y0 >= (int)view[VIEW_BAND_END]) {
+        keys[i] = OUTSIDE;
+        return;
+    }
+
     // re-anchor at the pixel of the picture that is nearest to the centre
     int anchor_i = (int)clamp(floor((float)center_x), 0.0f, (float)(width - 1));
     int anchor_j = (int)clamp(floor((float)center_y), 0.0f, (float)(height - 1));
@@ -144,10 +154,22 @@ kernel void project(
     record.ay = (short)anchor_j;
     record.y0 = (short)y0;
     record.y1 = (short)y1;
+    record.x0 = (short)max(to_pixel(ceil(x0 - 0.5f), width), 0);
+    record.x1 = (short)min(to_pixel(floor(x1 - 0.5f) + 1.0f, width), width);
 //@@ color
 //@@ project
     splats[i] = record;
-    all_bounds[i] = bounds;
+    uint corner, window = tile_window(&bounds, record.x0, record.x1, y0, y1, width, height, &corner);
+    if (window == 0) {
+        // in any order: what is kept of them is looked up by its place or sorted
+        corner = atomic_inc(tallies + TALLY_BIG);
+        if (corner < big_capacity) {
+            big[corner] = i;
+            big_bounds[corner] = bounds;
+        }
+    }
+    windows[i] = (uint2)(corner, window);
+//@@ list
     float key = (float)pz;
 //@@ key
     keys[i] = sortable(key);

@@ -16,9 +16,9 @@ kernel void scan_chunks(uint bins, global uint *restrict table, global uint *res
 }
 
 // Index space: one work-group of SCAN_ITEMS.
-// Reads: totals[bins]. Writes: starts[bins + 1], exclusive prefix; counts[slot] and counts[slot + 1], the sum in 64 bits.
+// Reads: totals[bins]. Writes: starts[bins + 1], exclusive prefix; tallies[slot] and tallies[slot + 1], the sum in 64 bits.
 kernel void scan_bins(uint bins, global const uint *restrict totals, global uint *restrict starts,
-                      global uint *restrict counts, uint slot) {
+                      global uint *restrict tallies, uint slot) {
     local ulong partial[SCAN_ITEMS + 1];
     uint item = get_local_id(0);
     uint each = (bins + SCAN_ITEMS - 1) / SCAN_ITEMS;
@@ -36,8 +36,8 @@ kernel void scan_bins(uint bins, global const uint *restrict totals, global uint
         }
         partial[SCAN_ITEMS] = running;
         starts[bins] = (uint)running;
-        counts[slot] = (uint)running;
-        counts[slot + 1] = (uint)(running >> 32);
+        tallies[slot] = (uint)running;
+        tallies[slot + 1] = (uint)(running >> 32);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     sum = partial[item];

@@ -3,14 +3,14 @@
 
 #define RADIX_BINS (1u << RADIX_BITS)
 
-// Reads: keys, counts[slot] (length). Writes: this chunk's row of table.
-kernel void sort_count(global const uint *restrict keys, global const uint *restrict counts, uint slot, uint shift,
+// Reads: keys, tallies[slot] (length). Writes: this chunk's row of table.
+kernel void sort_count(global const uint *restrict keys, global const uint *restrict tallies, uint slot, uint shift,
                        global uint *restrict table) {
     uint chunk = get_global_id(0);
     if (chunk >= CHUNKS) return;
     global uint *row = table + (size_t)chunk * RADIX_BINS;
     for (uint bin = 0; bin < RADIX_BINS; bin++) row[bin] = 0;
-    uint length = counts[slot], each = (length + CHUNKS - 1) / CHUNKS;
+    uint length = tallies[slot], each = (length + CHUNKS - 1) / CHUNKS;
     uint from = min(chunk * each, length), to = min(from + each, length);
     for (uint k = from; k < to; k++)
         if (keys[k] != CULLED) row[(keys[k] >> shift) & (RADIX_BINS - 1)]++;
@@ -19,13 +19,13 @@ kernel void sort_count(global const uint *restrict keys, global const uint *rest
 // Reads: keys, indices (or none in the first pass, where the index is the place), starts. Uses up: table.
 // Writes: keys_out, indices_out.
 kernel void sort_scatter(global const uint *restrict keys, global const uint *restrict indices,
-                         global const uint *restrict counts, uint slot, uint shift, uint first,
+                         global const uint *restrict tallies, uint slot, uint shift, uint first,
                          global uint *restrict table, global const uint *restrict starts,
                          global uint *restrict keys_out, global uint *restrict indices_out) {
     uint chunk = get_global_id(0);
     if (chunk >= CHUNKS) return;
     global uint *row = table + (size_t)chunk * RADIX_BINS;
-    uint length = counts[slot], each = (length + CHUNKS - 1) / CHUNKS;
+    uint length = tallies[slot], each = (length + CHUNKS - 1) / CHUNKS;
     uint from = min(chunk * each, length), to = min(from + each, length);
     for (uint k = from; k < to; k++) {
         uint key = keys[k];

@@ -6,7 +6,7 @@
 // splat, so that x - anchor is exact and nothing cancels (numerics B1), with a common factor that makes D > 0 in
 // front of the camera, and sqrt(1/2) in the numerators, so that (n_u^2 + n_v^2) / D^2 is rho / 2.
 
-typedef struct {
+typedef struct __attribute__((aligned(16))) {   // whole vectors of 16 bytes are read and written
     float nu0, nux, nuy;    // n_u = nu0 + nux x + nuy y
     float nv0, nvx, nvy;
     float d0, dx, dy;       // D
@@ -15,6 +15,7 @@ typedef struct {
     float r, g, b;
     short ax, ay;           // anchor pixel
     short y0, y1;           // rows [y0, y1) that the splat can touch
+    short x0, x1;           // columns [x0, x1)
 //@@ record
 } Splat;
 

@@ -14,7 +14,7 @@ from fidsplat.backends.opencl.assemble import DeviceShape, assemble
 from fidsplat.effects import CATALOGUE, OUTPUTS, Effect, Output, select
 from fidsplat.effects import catalogue as catalogue_module
 
-SHAPE = DeviceShape("lanes", 16, 16, 16, 8, 11, 1, True)
+SHAPE = DeviceShape("lanes", "ordered", 16, 16, 16, 8, 11, 1, True)
 TAPS = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
 
@@ -87,15 +87,13 @@ def test_record_sizes_are_what_the_effects_declare():
     def record(outputs, quality=PLAIN, degree=-1):
         return assemble(select(Cloud(degree), outputs, quality), SHAPE).record_bytes
 
-    assert record(("rgb",)) == 64
-    assert record(("rgb",), fs.Quality()) == 72
-    assert record(("alpha",)) == 64
-    assert record(("depth",)) == record(("depth", "depth_median")) == 76
-    assert record(("normal",)) == 76
-    assert record(("label",)) == 68
-    assert record(("rgb",), degree=3) == 64
+    # 68 bytes and 4 for each lane that an effect adds, in whole vectors of 16
+    assert record(("rgb",)) == record(("alpha",)) == record(("rgb",), degree=3) == 80
+    assert record(("rgb",), fs.Quality()) == record(("label",)) == 80
+    assert record(("depth",)) == record(("depth", "depth_median")) == record(("normal",)) == 80
+    assert record(("depth", "normal")) == record(("depth", "label"), fs.Quality()) == 96
     on_planes = select(Cloud(has_planes=True), ("rgb",), PLAIN)
-    assert assemble(on_planes, SHAPE).record_bytes == 80
+    assert assemble(on_planes, SHAPE).record_bytes == 96
 
 
 def test_a_section_that_no_stage_has_is_refused(monkeypatch):

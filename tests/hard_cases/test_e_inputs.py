@@ -45,20 +45,23 @@ def test_places_of_lists_wrap_around_at_two_to_the_32(renderer, monkeypatch, bud
     """E3: a picture of more than 2^32 pairs keeps its places modulo 2^32. The places of a small one are moved
     up until they wrap amid its tiles.
     """
-    from fidsplat.backends.opencl import pipeline, probe
+    from fidsplat.backends.opencl import probe
+    from fidsplat.backends.opencl.lists import LISTS
 
     backend = opencl(renderer)
     cloud = random_splats(60, seed=46, depth=(1.0, 4.0), scale=(0.05, 0.4))
     wanted = renderer.render(cloud, group_e.VIEW, ("rgb", "depth"))
-    count = pipeline._Run._count
+    method = {"ordered": "_tally", "tiled": "_starts"}[backend.shape.lists]
+    original = getattr(LISTS[backend.shape.lists], method)
 
-    def moved(run):
-        visible, pairs = count(run)
+    def moved(own, *args):
+        result, run = original(own, *args), own.run
         starts = run.read("starts", np.uint32, (run.tiles + 1,))
-        run.held["starts"] = probe.buffer_of(backend, starts + np.uint32(2**32 - pairs // 2))
-        return visible, pairs
+        starts += np.uint32(-(int(starts[-1]) // 2) % 2**32)
+        run.held["starts"], run.held["cursors"] = (probe.buffer_of(backend, s) for s in (starts, starts[:-1]))
+        return result
 
-    monkeypatch.setattr(pipeline._Run, "_count", moved)
+    monkeypatch.setattr(LISTS[backend.shape.lists], method, moved)
     monkeypatch.setattr(backend, "pair_budget", budget or backend.pair_budget)
     frame = renderer.render(cloud, group_e.VIEW, ("rgb", "depth"))
     assert all(np.array_equal(frame[name], wanted[name]) for name in frame)

@@ -268,3 +268,16 @@ def test_the_example_draws_each_step(device):
     covered = [int(count) for count in re.findall(r"covers +(\d+) pixels", done.stdout)]
     assert len(covered) == 2
     assert 0 < covered[0] != covered[1] > 0
+
+
+def test_a_memory_budget_draws_in_bands_with_the_same_bits():
+    cloud = random_splats(300, seed=5, depth=(0.5, 4.0), scale=(0.05, 1.0))
+    view = fs.Camera.look_at(320, 240, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
+    wanted = fs.Renderer("warp:cpu").render(cloud, view, ALL_OUTPUTS)
+    own = fs.Renderer("warp:cpu", memory_budget=6_280_000)
+    frame = own.render(cloud, view, ALL_OUTPUTS)
+    assert own.backend.pool._arrays["tile totals", wp.int32].size == 300, "it was drawn in bands"
+    assert frame.stats == wanted.stats
+    assert all(np.array_equal(frame[name], wanted[name]) for name in ALL_OUTPUTS)
+    with pytest.raises(fs.DeviceError, match=r"budget of 1 MiB is too small .* raise memory_budget"):
+        fs.Renderer("warp:cpu", memory_budget=2**20).render(cloud, view, ALL_OUTPUTS)

@@ -16,9 +16,10 @@ from fidsplat.effects import CATALOGUE, FeatureSet
 from fidsplat.errors import DeviceError
 from fidsplat.kernel_files import kernels_folder
 
-BASE_RECORD_BYTES = 64
+BASE_RECORD_BYTES = 68
+RECORD_ALIGNMENT = 16
 BASE_BOUNDS_BYTES = 32
-_STAGES = ("prelude", "math", "splat", "bounds", "project", "scan", "sort", "bin", "blend")
+_LISTS = {"ordered": ("scan", "sort", "bin", "pack"), "tiled": ("tiles",)}
 _HOOK = re.compile(r"^[ \t]*//@@ (\w+)[ \t]*\n", re.MULTILINE)
 _SECTION = re.compile(r"^//@ (\w+)[ \t]*\n", re.MULTILINE)
 _COMMENT = re.compile(r"[ \t]*//[^\n]*")
@@ -31,13 +32,23 @@ class DeviceShape:
 
     schedule: str
     """`lanes` (a tile per work-item, vectors across pixels) or `group` (a work-group per tile)."""
+    lists: str
+    """`ordered` (sort the splats by depth, then list them per tile in that order) or `tiled` (list them per
+    tile, then sort each list)."""
     lanes: int
     tile_width: int
     tile_height: int
     chunks: int
+    """pieces of the counting sorts (`ordered`)"""
     radix_bits: int
+    """of the depth sort (`ordered`)"""
     scan_items: int
     fast_fma: bool
+
+    @property
+    def blend_items(self) -> int:
+        """Work-items of a work-group of the blend stage; schedule/group.cl draws two pixels in each."""
+        return 1 if self.schedule == "lanes" else self.tile_width * self.tile_height // 2
 
 
 @dataclass(frozen=True)
@@ -55,6 +66,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     """The source text of all stages for these features on a device of this shape."""
     effects = features.effects
     record_bytes = BASE_RECORD_BYTES + 4 * sum(effect.record_lanes for effect in effects)
+    record_bytes += -record_bytes % RECORD_ALIGNMENT
     bounds_bytes = BASE_BOUNDS_BYTES + 4 * sum(effect.bounds_lanes for effect in effects)
     defines = {
         "CHUNKS": shape.chunks,
@@ -70,17 +82,21 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     }
     if features.sh_degree > 0 or "color_sh" in features.slots:
         defines["SH_DEGREE"] = features.sh_degree
-    sections = [_sections(effect.file) for effect in effects]
+    files = [effect.file for effect in effects]
+    if shape.lists == "tiled":
+        files.append("list/tiled.cl")
+    sections = [_sections(file) for file in files]
 
     def fill(match: re.Match[str]) -> str:
         return "".join(_HOOK.sub(fill, section.get(match[1], "")) for section in sections)
 
-    stages = [*(f"{stage}.cl" for stage in _STAGES), f"schedule/{shape.schedule}.cl", "resolve.cl"]
+    stages = ["prelude", "math", "splat", "bounds", "project", *_LISTS[shape.lists], "blend"]
+    stages = [f"{stage}.cl" for stage in (*stages, f"schedule/{shape.schedule}", "resolve")]
     body = "\n".join(_HOOK.sub(fill, kernel_text(stage)) for stage in stages)
     known = {hook for file in {*stages, *(one.file for one in CATALOGUE.values())} for hook in _hooks(file)}
-    for effect, section in zip(effects, sections, strict=True):
+    for file, section in zip(files, sections, strict=True):
         if unknown := set(section) - known:
-            raise DeviceError(f"kernel file {effect.file} fills hooks that no file has: {sorted(unknown)}")
+            raise DeviceError(f"kernel file {file} fills hooks that no file has: {sorted(unknown)}")
     text = "".join(f"#define {name} {value}\n" for name, value in sorted(defines.items()))
     text += _BLANK.sub("\n", _COMMENT.sub("", body))
     return Source(text, hashlib.sha256(text.encode()).hexdigest(), record_bytes, bounds_bytes)

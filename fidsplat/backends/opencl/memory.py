@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pyopencl as cl
 
@@ -9,6 +11,9 @@ from fidsplat.backends.planes import PlaneTable
 from fidsplat.errors import DeviceError
 from fidsplat.harmonics import C0
 from fidsplat.splats import SplatCloud
+
+if TYPE_CHECKING:
+    from fidsplat.backends.opencl.backend import OpenCLBackend
 
 
 class BufferPool:
@@ -18,6 +23,23 @@ class BufferPool:
         self._context = context
         self._device = device
         self._buffers: dict[str, cl.Buffer] = {}
+        self._spare: dict[tuple[str, int], list[cl.Buffer]] = {}
+
+    def size(self, name: str) -> int:
+        """Bytes of the scratch buffer of that name; 0 if there is none yet."""
+        return self._buffers[name].size if name in self._buffers else 0
+
+    def lease(self, name: str, size: int) -> cl.Buffer:
+        """A buffer for somebody who gives it back (`give_back`) when it is not needed any more."""
+        spare = self._spare.get((name, size))
+        return spare.pop() if spare else self.fresh(name, size)
+
+    def give_back(self, buffers: list[tuple[str, cl.Buffer]]) -> None:
+        """Keeps a few leased buffers for the next picture of the same size."""
+        for name, buffer in buffers:
+            spare = self._spare.setdefault((name, buffer.size), [])
+            if len(spare) < 2:
+                spare.append(buffer)
 
     def scratch(self, name: str, size: int) -> cl.Buffer:
         """A buffer of at least `size` bytes whose content is undefined."""
@@ -46,17 +68,21 @@ class BufferPool:
 
 
 class Resident:
-    """A SplatCloud on the device. SH of degree 0 does not depend on the view and becomes plain colours."""
+    """A SplatCloud on the device. SH of degree 0 does not depend on the view and becomes plain colours.
 
-    def __init__(
-        self, context: cl.Context, queue: cl.CommandQueue, pool: BufferPool, cloud: SplatCloud
-    ) -> None:
+    A CPU reads the cloud's own arrays, without a copy. On other devices they are copied when a picture first
+    asks for them, or, where they would take more than half of the memory budget, a chunk at a time for
+    every picture (`streamed`).
+    """
+
+    def __init__(self, backend: OpenCLBackend, cloud: SplatCloud) -> None:
+        self._backend = backend
         self.count = len(cloud)
         self.origin = cloud.origin
         self.sh_degree = cloud.sh_degree if cloud.sh_degree > 0 else -1
         self.has_planes = cloud.planes is not None
         self.planes = PlaneTable(cloud) if self.has_planes else None
-        arrays = {
+        self._arrays = {
             "means": cloud.means,
             "quats": cloud.quats,
             "scales": cloud.scales,
@@ -64,15 +90,58 @@ class Resident:
             "labels": cloud.labels,
         }
         if self.planes is not None:
-            arrays["planes"] = self.planes.index
+            self._arrays["planes"] = self.planes.index
         if cloud.colors is not None:
-            arrays["colors"] = cloud.colors
+            self._arrays["colors"] = cloud.colors
         elif cloud.sh is not None:  # always: a cloud has one of the two
             degree_0 = np.maximum(np.float32(C0) * cloud.sh[:, 0, :] + np.float32(0.5), 0)
-            arrays |= {"sh": cloud.sh} if self.sh_degree > 0 else {"colors": degree_0}
-        self.buffers: dict[str, cl.Buffer] = {}
-        for name, array in arrays.items():
-            self.buffers[name] = buffer = pool.fresh(f"the cloud's {name}", array.nbytes)
-            if array.nbytes:
-                cl.enqueue_copy(queue, buffer, np.ascontiguousarray(array))
-        queue.finish()
+            self._arrays |= {"sh": cloud.sh} if self.sh_degree > 0 else {"colors": degree_0}
+        self._buffers: dict[str, cl.Buffer] = {}
+        total = self.count * self.bytes_per_splat
+        widest = max(array.nbytes for array in self._arrays.values())
+        device = backend.device
+        self._shared = backend.info.kind == "cpu" and bool(device.host_unified_memory)
+        self.streamed = not self._shared and (
+            total > backend.memory_budget // 2 or widest > device.max_mem_alloc_size
+        )
+        if not self._shared and not self.streamed:
+            for name in self._arrays.keys() - {"labels"}:
+                self._whole(name)
+            backend.queue.finish()
+
+    @property
+    def bytes_per_splat(self) -> int:
+        """Bytes of a splat in all arrays of the cloud."""
+        return sum(array.nbytes // max(self.count, 1) for array in self._arrays.values())
+
+    @property
+    def device_bytes(self) -> int:
+        """Bytes that the cloud holds on the device; a CPU's are the host's."""
+        return 0 if self._shared else sum(buffer.size for buffer in self._buffers.values())
+
+    def part(self, name: str, first: int, end: int) -> cl.Buffer:
+        """The array of splats [first, end)."""
+        if self.streamed:
+            piece = np.ascontiguousarray(self._arrays[name][first:end])
+            buffer = self._backend.pool.scratch(f"chunk of {name}", piece.nbytes)
+            cl.enqueue_copy(self._backend.queue, buffer, piece)
+            return buffer
+        whole = self._whole(name)
+        if end - first == self.count:
+            return whole
+        row = self._arrays[name].nbytes // self.count
+        return whole.get_sub_region(first * row, (end - first) * row)
+
+    def _whole(self, name: str) -> cl.Buffer:
+        if name not in self._buffers:
+            array = np.ascontiguousarray(self._arrays[name])
+            flags = cl.mem_flags
+            if array.size == 0:
+                buffer = self._backend.pool.fresh(f"the cloud's {name}", 16)
+            elif self._shared:
+                buffer = cl.Buffer(self._backend.context, flags.READ_ONLY | flags.USE_HOST_PTR, hostbuf=array)
+            else:
+                buffer = self._backend.pool.fresh(f"the cloud's {name}", array.nbytes)
+                cl.enqueue_copy(self._backend.queue, buffer, array)
+            self._buffers[name] = buffer
+        return self._buffers[name]

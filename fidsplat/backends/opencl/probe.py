@@ -44,19 +44,27 @@ def evaluate(
     return made
 
 
-def scan(pipeline: OpenCLPipeline, totals: np.ndarray) -> tuple[np.ndarray, int]:
-    """What `scan_bins` makes of list lengths (n,) uint32: where each list starts (n + 1,) uint32, and the sum
-    of all in 64 bits.
+def scan(pipeline: OpenCLPipeline, lengths: np.ndarray) -> tuple[np.ndarray, int]:
+    """What the device makes of lengths of lists (n,) uint32: where each list starts (n + 1,) uint32,
+    and the sum of all in 64 bits.
     """
-    backend = pipeline.backend
-    starts, counts = np.empty(len(totals) + 1, np.uint32), np.zeros(6, np.uint32)
-    lengths, places, sums = (buffer_of(backend, array) for array in (totals, starts, counts))
-    items = (pipeline.shape.scan_items,)
-    kernel = pipeline.kernels["scan_bins"]
-    kernel(backend.queue, items, items, np.uint32(len(totals)), lengths, places, sums, np.uint32(4))
-    cl.enqueue_copy(backend.queue, starts, places)
-    cl.enqueue_copy(backend.queue, counts, sums)
-    return starts, int(counts[4]) | int(counts[5]) << 32
+    backend, items = pipeline.backend, (pipeline.shape.scan_items,)
+    count, starts = np.uint32(len(lengths)), buffer_of(backend, np.empty(len(lengths) + 1, np.uint32))
+    if pipeline.shape.lists == "tiled":
+        tallies = buffer_of(backend, np.concatenate([np.zeros(8, np.uint32), lengths]))
+        cursors = buffer_of(backend, lengths)
+        args, kernel, place = (count, np.uint32(2**32 - 1), tallies, starts, cursors), "tile_starts", 2
+    else:
+        tallies = buffer_of(backend, np.zeros(8, np.uint32))
+        args, kernel, place = (
+            (count, buffer_of(backend, lengths), starts, tallies, np.uint32(4)),
+            "scan_bins",
+            4,
+        )
+    pipeline.launch(backend.queue, kernel, items, items, args)
+    places = contents(backend, starts).view(np.uint32)
+    words = contents(backend, tallies).view(np.uint32)
+    return places, int(words[place]) | int(words[place + 1]) << 32
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from fidsplat.backends.reference.blend import composite
 from fidsplat.backends.reference.resolve import resolve
 from fidsplat.backends.reference.setup import Setup
 from fidsplat.effects import OUTPUTS, FeatureSet
-from fidsplat.errors import UnknownDeviceError
+from fidsplat.errors import InputError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
 
 _BLOCK = 1 << 19  # (sample, splat) pairs that are evaluated at once
@@ -57,6 +57,14 @@ class ReferenceBackend:
 
     def __init__(self) -> None:
         self.info = devices()[0]
+
+    def limit_memory(self, budget: int) -> None:
+        """Not offered.
+
+        Raises:
+            InputError: always.
+        """
+        raise InputError(f"memory_budget is {budget}, but the reference has none: it takes pixels in blocks")
 
     def upload(self, cloud: SplatCloud) -> ReferenceCloud:
         """The cloud itself."""

@@ -161,8 +161,10 @@ def of_places(span: Span, is_layer: np.ndarray) -> np.ndarray:
         for second, d in enumerate(layers[:number]):
             meet = (earliest[:, number] <= latest[:, second]) & (earliest[:, second] <= latest[:, number])
             level = (span.z_low[:, c] <= span.z_high[:, d]) & (span.z_low[:, d] <= span.z_high[:, c])
-            unsure = drawn[:, number] & drawn[:, second] & meet
-            unsure &= level | uncertain[:, number] | uncertain[:, second]
+            # what lies behind the further one lies behind the nearer too and lays both, unless that is late
+            apart = span.z_low[:, d] > span.z_high[:, c]
+            late = apart & (earliest[:, second] < c) & (latest[:, second] > c)
+            unsure = drawn[:, number] & drawn[:, second] & ((level & meet) | late)
             front = light[rows, np.minimum(earliest[:, number], earliest[:, second])]
             doubt += np.where(unsure, front * span.high[:, c] * span.high[:, d], 0.0)
             wrong |= unsure

@@ -69,13 +69,23 @@ class WarpBackend:
         self.device = device
         self.shape = WarpShape("group" if device.is_cuda else "tiles", 16, 16)
         self.pool = ArrayPool(device)
-        self.pair_budget = min(2**30, max(self.info.memory_bytes // 64, 2**20))
+        self.pair_budget = 2**30 - 1
         """Most pairs of splats and tiles that are listed at once; tests make it small."""
+        self.memory_budget = self.info.memory_bytes // 10 * 9
+        """bytes of the device that a picture and its cloud may take"""
         self.threads = 1 if device.is_cuda else self.info.compute_units
         # Warp runs a CPU launch on the thread that calls it, without the interpreter's lock
         self.workers = None if device.is_cuda else ThreadPoolExecutor(self.threads, "fidsplat-warp")
         self.commands = Commands(device)
         self._pipelines: dict[tuple[FeatureSet, WarpShape], WarpPipeline] = {}
+
+    def limit_memory(self, budget: int) -> None:
+        """Let a picture and its cloud take at most `budget` bytes of the device.
+
+        Pictures that need more for their lists are drawn in bands of tiles, with the same bits; a cloud that
+        does not fit is an error.
+        """
+        self.memory_budget = budget
 
     def upload(self, cloud: SplatCloud) -> Resident:
         """The cloud in arrays on the device."""

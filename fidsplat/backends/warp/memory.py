@@ -78,6 +78,11 @@ class Resident:
         self.arrays, self.count, self.origin = arrays, count, origin
         self.sh_degree, self.planes, self.has_planes = sh_degree, planes, planes is not None
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the splats take."""
+        return sum(array.size * array.strides[0] for array in self.arrays.values())
+
     @classmethod
     def of(cls, cloud: SplatCloud, pool: ArrayPool) -> Resident:
         """The cloud on the device."""

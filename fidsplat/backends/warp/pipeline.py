@@ -35,6 +35,11 @@ _RECORD = ("lowpass_screen", "ray_depth", "normal", "compose_planes")
 _SAMPLE = (*_RECORD, "stop_exclusive", "depth", "depth_median", "label")
 
 
+# bytes: of one splat's bounds; of its keys, counts, drawn, places and their sums; of one that is drawn, in the
+# sort and the lists; of a sample in all planes; of a pair with the scratch of its sort
+_BOUNDS, _PROJECTED, _VISIBLE, _SAMPLE_BYTES, _PAIR = 44, 28, 40, 60, 24
+
+
 class WarpPlanes:
     """Finished planes on the device."""
 
@@ -237,7 +242,7 @@ class _Run:
 
         A band holds at least one tile, whatever its list.
         """
-        budget = self.backend.pair_budget
+        budget = min(self.backend.pair_budget, self._room(visible))
         if pairs <= budget:
             yield 0, self.tiles, pairs
             return
@@ -254,16 +259,32 @@ class _Run:
             yield first, end, int(ends[end - 1]) - done
             first, done = end, int(ends[end - 1])
 
+    def _room(self, visible: int) -> int:
+        """How many pairs may be listed at once within the memory budget.
+
+        Raises:
+            DeviceError: what else the picture needs is more than that.
+        """
+        budget, resident = self.backend.memory_budget, self.resident
+        # as `_project`, `_sort`, `_list`, `_samples` and `_resolve` take them; the sorts have as much again
+        each = 16 * self.pipeline.layout.lines + _BOUNDS + _PROJECTED
+        fixed = resident.nbytes + each * resident.count + _VISIBLE * visible
+        fixed += self.grid[0] * self.grid[1] * (_SAMPLE_BYTES + 4 * len(self.pipeline.features.taps))
+        room = (budget - fixed) // _PAIR
+        if room < 1:
+            raise DeviceError(
+                f"a memory budget of {budget / 2**20:.0f} MiB is too small for {resident.count} splats in "
+                f"this picture, which take {fixed / 2**20:.0f} MiB before their lists; raise memory_budget, or "
+                "use an OpenCL device, which draws a cloud in chunks"
+            )
+        return room
+
     def _list(self, visible: int, first: int, end: int, pairs: int, whole: bool) -> None:
         """The lists of the tiles of one band, each in depth order."""
         wp, held = self.wp, self.held
         tiles = self._take("tiles", 2 * pairs, wp.int32)
         lists = self._take("lists", 2 * pairs, wp.int32)
         if pairs:
-            if pairs >= 2**30:
-                raise DeviceError(
-                    f"a band of tiles {first} to {end} lists {pairs} splats; use fewer or a smaller picture"
-                )
             lengths, ends = (self._exact(name, visible, wp.int64) for name in ("lengths", "ends"))
             if whole:
                 self.launch(self.pipeline.sort.gather, visible, held["order"], held["counts"], lengths)

@@ -1,10 +1,21 @@
-// For GPUs: one work-group draws one tile, one pixel per work-item; splats are staged in local memory.
+// For GPUs: one work-group draws one tile, ROWS pixels of a column per work-item; splats are staged in local memory.
 // Barriers stand in loops whose bounds are the same for the whole group (numerics F5).
-// Index space: work-groups of TILE_W * TILE_H, one per tile.
+// Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile.
 // Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 planes: r, g, b, transmittance) and the taps' planes, whole tiles.
-#define STAGED 64
+#define ROWS 2
+#define GROUP (TILE_W * TILE_H / ROWS)
+// Neighbours in a group draw a block of BLOCK_W x BLOCK_H pixels, so that a splat that misses it costs it nothing.
+#define BLOCK_W 8
+#define BLOCK_H (4 * ROWS)
+#define BLOCKS (TILE_W * TILE_H / (BLOCK_W * BLOCK_H))
+#define STAGED 128
 
-kernel __attribute__((reqd_work_group_size(TILE_W * TILE_H, 1, 1))) void blend(
+typedef union {              // what is staged of a splat, as vectors for fewer reads
+    Splat splat;
+    float4 words[RECORD_BYTES / 16];
+} Staged;
+
+kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
     global const Splat *restrict splats,
     global const uint *restrict lists,
     global const uint *restrict starts,
@@ -14,49 +25,71 @@ kernel __attribute__((reqd_work_group_size(TILE_W * TILE_H, 1, 1))) void blend(
     global float *restrict raw
 //@@ blend_args
 ) {
-    local Splat staged[STAGED];
+    local Staged staged[STAGED];
+    local uint touched[BLOCKS][STAGED / 32]; // bits: which staged splats can touch a block
     local int alive;
     const BlendConstants constants = {log_cut, ceiling, stop, filter};
     uint tile = band_first + get_group_id(0), item = get_local_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
-    int px = (int)(tile % (uint)tiles_x) * TILE_W + (int)(item % TILE_W);
-    int py = (int)(tile / (uint)tiles_x) * TILE_H + (int)(item / TILE_W);
+    int x0 = (int)(tile % (uint)tiles_x) * TILE_W, y0 = (int)(tile / (uint)tiles_x) * TILE_H;
+    uint block = item / 32;
+    int px = x0 + (int)(block % (TILE_W / BLOCK_W) * BLOCK_W + item % BLOCK_W);
+    int py = y0 + (int)(block / (TILE_W / BLOCK_W) * BLOCK_H + item % 32 / BLOCK_W * ROWS);
 
-    Pixel own;
-    Pixel *pixel = &own;
-    pixel_start(pixel);
-    bool in_picture = px < width && py < height;
+    Pixel pixels[ROWS];
+    for (int row = 0; row < ROWS; row++) pixel_start(&pixels[row]);
 
     uint base = starts[band_first], start = starts[tile] - base, end = starts[tile + 1] - base;
     for (uint batch = start; batch < end; batch += STAGED) {
         uint length = min(end - batch, (uint)STAGED);
         barrier(CLK_LOCAL_MEM_FENCE);
         if (item == 0) alive = 0;
-        // word by word, so that neighbours in the group read neighbours in memory
-        for (uint word = item; word < length * (RECORD_BYTES / 4); word += TILE_W * TILE_H) {
-            uint which = word / (RECORD_BYTES / 4), part = word % (RECORD_BYTES / 4);
-            ((local uint *)staged)[word] = ((global const uint *)(splats + lists[batch + which]))[part];
+        for (uint word = item; word < BLOCKS * (STAGED / 32); word += GROUP) touched[word / (STAGED / 32)][word % (STAGED / 32)] = 0;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        // vector by vector, so that neighbours in the group read neighbours in memory
+        for (uint word = item; word < length * (RECORD_BYTES / 16); word += GROUP) {
+            uint which = word / (RECORD_BYTES / 16), part = word % (RECORD_BYTES / 16);
+            staged[which].words[part] = ((global const float4 *)(splats + lists[batch + which]))[part];
+        }
+        for (int row = 0; row < ROWS; row++)
+            if (px < width && py + row < height && pixel_unfinished(&pixels[row], &constants)) alive = 1;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (uint cell = item; cell < length * BLOCKS; cell += GROUP) {
+            uint which = cell / BLOCKS, other = cell % BLOCKS;
+            int left = x0 + (int)(other % (TILE_W / BLOCK_W)) * BLOCK_W, top = y0 + (int)(other / (TILE_W / BLOCK_W)) * BLOCK_H;
+            local const Splat *s = &staged[which].splat;
+            if (s->x0 < left + BLOCK_W && s->x1 > left && s->y0 < top + BLOCK_H && s->y1 > top)
+                atomic_or(&touched[other][which / 32], 1u << (which % 32));
         }
         barrier(CLK_LOCAL_MEM_FENCE);
-        if (in_picture && pixel_unfinished(pixel, &constants)) alive = 1;
-        for (uint k = 0; k < length; k++) {
-            const Splat s = staged[k];
-            if (!in_picture || !pixel_unfinished(pixel, &constants) || py < s.y0 || py >= s.y1) continue;
-            float half_r2 = s.log_opacity - constants.log_cut;
-            float x = (float)(px - s.ax), y = (float)(py - s.ay);
-            Crossing c = cross_row(&s, FMA(s.nux, x, s.nu0), FMA(s.nvx, x, s.nv0), FMA(s.dx, x, s.d0), y, half_r2);
-            float screen;
-            int mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
-            if (VANY(mask)) pixel_blend(pixel, &s, c, mask, screen, &constants);
-        }
-        barrier(CLK_LOCAL_MEM_FENCE);
-        // uniform: every work-item reads the same vote, taken before this batch was drawn
+        // uniform: every work-item reads the same vote, taken before this batch is drawn
         if (!alive) break;
+        for (uint word = 0; word < STAGED / 32; word++)
+            for (uint bits = touched[block][word]; bits != 0; bits &= bits - 1) {
+                Staged copy;
+                for (int part = 0; part < RECORD_BYTES / 16; part++)
+                    copy.words[part] = staged[word * 32 + 31 - clz(bits & -bits)].words[part];
+                const Splat s = copy.splat;
+                float half_r2 = s.log_opacity - constants.log_cut;
+                float x = (float)(px - s.ax);
+                float nu_x = FMA(s.nux, x, s.nu0), nv_x = FMA(s.nvx, x, s.nv0), d_x = FMA(s.dx, x, s.d0);
+                for (int row = 0; row < ROWS; row++) {
+                    if (!pixel_unfinished(&pixels[row], &constants)) continue;
+                    float y = (float)(py + row - s.ay);
+                    Crossing c = cross_row(&s, nu_x, nv_x, d_x, y, half_r2);
+                    float screen;
+                    int mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
+                    if (VANY(mask)) pixel_blend(&pixels[row], &s, c, mask, screen, &constants);
+                }
+            }
     }
 
-    pixel_finish(pixel, &constants);
     size_t stride = (size_t)tiles_x * TILE_W, plane = stride * tiles_y * TILE_H;
-    size_t at = py * stride + px;
-    PIXEL_STORE_BASE(pixel, raw, plane, at);
+    for (int row = 0; row < ROWS; row++) {
+        size_t at = (py + row) * stride + px;
+        Pixel *pixel = &pixels[row];
+        pixel_finish(pixel, &constants);
+        PIXEL_STORE_BASE(pixel, raw, plane, at);
 //@@ store
+    }
 }

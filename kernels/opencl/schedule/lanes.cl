@@ -1,6 +1,9 @@
 // For CPUs: one work-item draws one tile, a row of LANES pixels at a time; no barriers, no local memory.
 // Index space: one work-item (and work-group) per tile.
 // Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 planes: r, g, b, transmittance) and the taps' planes, whole tiles.
+// Splats of a tile lie anywhere in memory; the ones to come are fetched ahead.
+#define AHEAD_SPLATS 8
+
 kernel void blend(
     global const Splat *restrict splats,
     global const uint *restrict lists,
@@ -24,6 +27,8 @@ kernel void blend(
 
     uint base = starts[band_first];
     for (uint k = starts[tile] - base, end = starts[tile + 1] - base; k < end && alive; k++) {
+        FETCH_AHEAD(splats + lists[min(k + AHEAD_SPLATS, end - 1)]);
+        FETCH_AHEAD((global const char *)(splats + lists[min(k + AHEAD_SPLATS, end - 1)]) + 64);
         const Splat s = splats[lists[k]];
         float half_r2 = s.log_opacity - constants.log_cut;
         int first = max(s.y0 - y0, 0), last = min(s.y1 - y0, TILE_H);

@@ -1,0 +1,162 @@
+"""One picture: the stages project, lists, blend, resolve on an in-order queue.
+
+Nothing passes through the host between the stages but the number of (splat, tile) pairs, which sizes one
+buffer. A picture with more pairs than the device's budget is listed and blended in bands of tiles, with the
+same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyopencl as cl
+
+from fidsplat.backends.base import View
+from fidsplat.backends.opencl.lists import LISTS
+from fidsplat.backends.opencl.memory import Resident
+from fidsplat.backends.opencl.plan import Plan
+from fidsplat.effects.catalogue import Output
+
+if TYPE_CHECKING:
+    from fidsplat.backends.opencl.pipeline import OpenCLPipeline
+
+
+class Run:
+    """The buffers and launches of one picture."""
+
+    def __init__(self, pipeline: OpenCLPipeline, resident: Resident, view: View, plan: Plan) -> None:
+        self.pipeline, self.resident, self.view, self.plan = pipeline, resident, view, plan
+        self.backend, self.shape = pipeline.backend, pipeline.shape
+        self.queue, self.pool = self.backend.queue, self.backend.pool
+        self.tiles_x = -(-view.width // self.shape.tile_width)
+        self.tiles_y = -(-view.height // self.shape.tile_height)
+        self.tiles = self.tiles_x * self.tiles_y
+        self.stride = self.tiles_x * self.shape.tile_width
+        self.rows = self.tiles_y * self.shape.tile_height
+        self.events: list[tuple[str, cl.Event]] = []
+        self.uploads: list[cl.Event] = []
+        self.held: dict[str, cl.Buffer] = {}
+        self.leased: list[tuple[str, cl.Buffer]] = []
+        self.lists = LISTS["chunked" if plan.chunk else self.shape.lists](self)
+        self.stats: Callable[[], dict[str, int]] = self.lists.stats
+
+    def draw(self) -> dict[str, tuple[Output, cl.Buffer]]:
+        """All stages; returns the outputs by name."""
+        raw_planes = self._sample_planes()
+        outputs = {}
+        for first, end in self.lists.bands():
+            self._blend(first, end, raw_planes)
+            if end == self.tiles:
+                outputs = self._resolve(raw_planes)
+        return outputs
+
+    # stages
+
+    def _sample_planes(self) -> list[cl.Buffer]:
+        """Planes that blending fills: raw, then those of the taps in order."""
+        plane = 4 * self.rows * self.stride
+        raw = self.take("raw", 4 * plane)
+        extra = [
+            self.take(f"raw {effect.name} {k}", planes * plane)
+            for effect in self.pipeline.features.effects
+            for k, planes in enumerate(effect.planes)
+        ]
+        return [raw, *extra]
+
+    def _blend(self, first: int, end: int, sample_planes: list[cl.Buffer]) -> None:
+        """Draws the tiles of one band."""
+        group = self.shape.blend_items
+        view = self.view
+        self.launch(
+            "blend",
+            "blend",
+            (end - first) * group,
+            group,
+            *(self.held[name] for name in ("splats", "lists", "starts")),
+            np.uint32(first),
+            np.int32(view.width),
+            np.int32(view.height),
+            np.float32(view.log_cut),
+            np.float32(view.ceiling),
+            np.float32(view.stop),
+            np.float32(1.0 / view.samples**2),
+            *sample_planes,
+        )
+
+    def _resolve(self, raw_planes: list[cl.Buffer]) -> dict[str, tuple[Output, cl.Buffer]]:
+        view, features = self.view, self.pipeline.features
+        height, width = view.height // view.samples, view.width // view.samples
+        outputs = {
+            output.name: (output, self.lease(output.name, 4 * height * width * output.channels))
+            for output in features.outputs
+        }
+        extra, rest = [], iter(raw_planes[1:])
+        for effect in features.effects:
+            extra += [next(rest) for _ in effect.planes]
+            if effect.output:
+                extra.append(outputs[effect.output.name][1])
+        background = (np.float32(channel) for channel in view.background)
+        fixed = (np.int32(width), np.int32(height), np.int32(self.stride), np.uint32(self.rows * self.stride))
+        args = (*fixed, *background, raw_planes[0], outputs["rgb"][1], *extra)
+        size = (-(-width // 16) * 16, -(-height // 4) * 4)
+        self.events.append(("resolve", self.pipeline.launch(self.queue, "resolve", size, (16, 4), args)))
+        return outputs
+
+    # what the stages and the lists share
+
+    def read(self, name: str, dtype, shape: tuple[int, ...]) -> np.ndarray:
+        """The contents of a buffer; waits for the device."""
+        array = np.empty(shape, dtype)
+        if array.size:
+            cl.enqueue_copy(self.queue, array, self.held[name])
+        return array
+
+    def take(self, name: str, size: int) -> cl.Buffer:
+        """A scratch buffer that this picture calls `name`."""
+        self.held[name] = buffer = self.pool.scratch(name, size)
+        return buffer
+
+    def lease(self, name: str, size: int) -> cl.Buffer:
+        """A buffer that is this picture's own until its planes are not needed any more."""
+        self.held[name] = buffer = self.pool.lease(name, size)
+        self.leased.append((name, buffer))
+        return buffer
+
+    def put(self, name: str, array: np.ndarray) -> cl.Buffer:
+        """A scratch buffer with these contents; does not wait."""
+        buffer = self.take(name, array.nbytes)
+        self.uploads.append(cl.enqueue_copy(self.queue, buffer, array, is_blocking=False))
+        return buffer
+
+    def launch(self, stage: str, kernel: str, items: int, group: int, *args) -> cl.Event:
+        """One-dimensional launch of at least `items` work-items; the kernels check their index."""
+        size = -(-items // group) * group
+        event = self.pipeline.launch(self.queue, kernel, (size,), (group,), args)
+        self.events.append((stage, event))
+        return event
+
+    def bands_of(self, totals: np.ndarray, start: int = 0) -> list[tuple[int, int, int]]:
+        """Ranges of tiles (first, end, pairs) whose lists fit the budget.
+
+        totals (k,): lengths of the lists of the tiles from `start` on. A band holds at least one tile.
+        """
+        ends = np.cumsum(totals, dtype=np.int64)
+        bands, first, done = [], 0, 0
+        while first < len(totals):
+            end = int(np.searchsorted(ends, done + self.backend.pair_budget, side="right"))
+            end = max(end, first + 1)
+            bands.append((start + first, start + end, int(ends[end - 1]) - done))
+            first, done = end, int(ends[end - 1])
+        return bands
+
+    def put_view(self, row: int, end: int) -> None:
+        """The uniforms of the projection, for rows of samples [row, end)."""
+        view = self.view
+        tail = [view.fx, view.fy, view.cx, view.cy, view.near, view.far, view.log_cut]
+        tail += [view.width, view.height, 1.0 / view.samples**2, row, end]
+        parts = [view.rotation.ravel(), view.translation, view.eye, tail]
+        self.put("view", np.concatenate(parts).astype(self.pipeline.real))
+        if self.resident.planes is not None:
+            self.put("plane_keys", self.resident.planes.keys(view))

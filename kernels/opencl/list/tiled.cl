@@ -1,0 +1,6 @@
+// For GPUs: the splat is added to the tallies of its tiles as soon as they are known (tiles.cl). The tallies are integers,
+// so their sums do not depend on the order of the additions.
+//@ list
+    int tiles_x = (width + TILE_W - 1) / TILE_W;
+    for (uint mask = window; mask != 0; mask &= mask - 1)
+        atomic_inc(tallies + TALLIES + window_tile((uint2)(corner, mask), tiles_x));

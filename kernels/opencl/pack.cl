@@ -1,0 +1,37 @@
+// For clouds that are projected in chunks: moves the splats of a chunk that may be seen behind those of the chunks
+// before, in their order. The chunk is cut into CHUNKS pieces; the host adds up what they hold.
+
+// Index space: one work-item per piece. Reads: keys. Writes: held[0 .. CHUNKS): splats of the piece to be kept,
+// held[CHUNKS .. 2 * CHUNKS): splats seen in this picture, if only in another band of it.
+kernel void pack_count(uint count, global const uint *restrict keys, global uint *restrict held) {
+    uint piece = get_global_id(0);
+    if (piece >= CHUNKS) return;
+    uint each = (count + CHUNKS - 1) / CHUNKS;
+    uint from = min(piece * each, count), to = min(from + each, count), kept = 0, seen = 0;
+    for (uint k = from; k < to; k++) {
+        kept += keys[k] < OUTSIDE;
+        seen += keys[k] != CULLED;
+    }
+    held[piece] = kept;
+    held[CHUNKS + piece] = seen;
+}
+
+// Index space: one work-item per piece. Reads: places (where each piece goes), splats, keys, windows.
+// Writes: splats_out, keys_out, windows_out.
+kernel void pack_move(
+    uint count, global const uint *restrict places, global const Splat *restrict splats,
+    global const uint *restrict keys, global const uint2 *restrict windows, global Splat *restrict splats_out,
+    global uint *restrict keys_out, global uint2 *restrict windows_out
+) {
+    uint piece = get_global_id(0);
+    if (piece >= CHUNKS) return;
+    uint each = (count + CHUNKS - 1) / CHUNKS;
+    uint from = min(piece * each, count), to = min(from + each, count), place = places[piece];
+    for (uint k = from; k < to; k++)
+        if (keys[k] < OUTSIDE) {
+            splats_out[place] = splats[k];
+            keys_out[place] = keys[k];
+            windows_out[place] = windows[k];
+            place++;
+        }
+}

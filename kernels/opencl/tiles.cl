@@ -1,0 +1,222 @@
+// Lists of splats per tile for GPUs: places from the tiles' tallies, pairs of (depth key, splat) written
+// there in any order, and a sort of each list. Keys are unique (the splat's index breaks ties), so the sorted lists are
+// the same on every run.
+
+// Exclusive prefix sum of `mine` over a work-group of SCAN_ITEMS; *total is the sum of all. partial: SCAN_ITEMS values.
+static inline ulong scan_group(local ulong *partial, uint item, ulong mine, ulong *total) {
+    partial[item] = mine;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint step = 1; step < SCAN_ITEMS; step *= 2) {
+        ulong before = item >= step ? partial[item - step] : 0;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        partial[item] += before;
+        barrier(CLK_LOCAL_MEM_FENCE);
+    }
+    *total = partial[SCAN_ITEMS - 1];
+    ulong exclusive = partial[item] - mine;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    return exclusive;
+}
+
+// Index space: one work-group of SCAN_ITEMS.
+// Reads: tallies. Writes: starts[tiles + 1] modulo 2^32, cursors[tiles] (the same); tallies' number of pairs in 64 bits.
+// If there are more pairs than `capacity` (and that is not 2^32 - 1), all lists are made empty.
+kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
+    uint tiles, uint capacity, global uint *restrict tallies, global uint *restrict starts, global uint *restrict cursors
+) {
+    local ulong partial[SCAN_ITEMS];
+    uint item = get_local_id(0);
+    ulong running = 0;
+    for (uint first = 0; first < tiles; first += 4 * SCAN_ITEMS) {
+        uint from = min(first + 4 * item, tiles), to = min(from + 4, tiles);
+        ulong mine = 0, total;
+        for (uint tile = from; tile < to; tile++) mine += tallies[TALLIES + tile];
+        ulong place = running + scan_group(partial, item, mine, &total);
+        for (uint tile = from; tile < to; tile++) {
+            starts[tile] = cursors[tile] = (uint)place;
+            place += tallies[TALLIES + tile];
+        }
+        running += total;
+    }
+    if (item == 0) {
+        starts[tiles] = (uint)running;
+        tallies[TALLY_VISIBLE] = 0;   // emit adds them up
+        tallies[TALLY_PAIRS] = (uint)running;
+        tallies[TALLY_PAIRS + 1] = (uint)(running >> 32);
+    }
+    if (capacity != 0xFFFFFFFFu && running > capacity) {
+        barrier(CLK_GLOBAL_MEM_FENCE);
+        for (uint tile = item; tile <= tiles; tile += SCAN_ITEMS) starts[tile] = 0;
+    }
+}
+
+// Work-groups of WALK_ITEMS, for what is done splat by splat. Of a splat that touches more than a window a whole group
+// shares the tiles.
+#define WALK_ITEMS 256
+
+// Adds the tiles of big splats to the tallies.
+// Index space: any number of work-groups; each takes every so many-th splat.
+// Reads: tallies' number of big splats, big_bounds.
+
+kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void tally_big(
+    int width, int height, uint big_capacity, global const Bounds *restrict big_bounds, global uint *restrict tallies
+) {
+    int tiles_x = (width + TILE_W - 1) / TILE_W;
+    uint count = min(tallies[TALLY_BIG], big_capacity);
+    for (uint k = get_group_id(0); k < count; k += get_num_groups(0)) {
+        Bounds b = big_bounds[k];
+        int y0, y1;
+        bounds_rows(&b, height, &y0, &y1);
+        int top = y0 / TILE_H, rows = (y1 - 1) / TILE_H - top + 1;
+        for (int cell = get_local_id(0); cell < rows * tiles_x; cell += WALK_ITEMS) {
+            int row = top + cell / tiles_x, column = cell % tiles_x;
+            TileSpan span = tile_span(&b, row, width, height);
+            if (column >= span.first && column <= span.last) atomic_inc(tallies + TALLIES + row * tiles_x + column);
+        }
+    }
+}
+
+// Lists of the tiles of the band [band_first, band_end), from 0; never beyond `capacity`.
+typedef struct {
+    int tiles_x, first, end;
+    uint start, capacity;
+} Band;
+
+static inline void emit_pair(int tile, const Band *band, uint key, uint splat, global uint *restrict cursors,
+                             global uint2 *restrict pairs) {
+    if (tile < band->first || tile >= band->end) return;
+    // modulo 2^32: a place within the band is right even where the picture has more pairs than that
+    uint place = atomic_inc(cursors + tile) - band->start;
+    if (place < band->capacity) pairs[place] = (uint2)(splat, key);
+}
+
+// Index space: `splat_groups` work-groups, a work-item per splat; then any number of them that share out the big splats.
+// Reads: windows, keys, starts, big, big_bounds. Uses up: cursors of the band. Writes: pairs; adds to tallies' number of
+// visible splats.
+kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void emit(
+    uint count, uint splat_groups, uint first_band, int width, int height, int band_first, int band_end, uint capacity,
+    uint big_capacity, global const uint2 *restrict windows, global const uint *restrict keys,
+    global const uint *restrict big, global const Bounds *restrict big_bounds, global const uint *restrict starts,
+    global uint *restrict tallies, global uint *restrict cursors, global uint2 *restrict pairs
+) {
+    local uint visible;
+    const Band band = {(width + TILE_W - 1) / TILE_W, band_first, band_end, starts[band_first], capacity};
+    uint item = get_local_id(0), big_count = min(tallies[TALLY_BIG], big_capacity);
+    if (get_group_id(0) >= splat_groups) {
+        for (uint k = get_group_id(0) - splat_groups; k < big_count; k += get_num_groups(0) - splat_groups) {
+            Bounds b = big_bounds[k];
+            uint splat = big[k], key = keys[splat];
+            int y0, y1;
+            bounds_rows(&b, height, &y0, &y1);
+            int top = y0 / TILE_H, rows = (y1 - 1) / TILE_H - top + 1;
+            for (int cell = item; cell < rows * band.tiles_x; cell += WALK_ITEMS) {
+                int row = top + cell / band.tiles_x, column = cell % band.tiles_x;
+                TileSpan span = tile_span(&b, row, width, height);
+                if (column >= span.first && column <= span.last)
+                    emit_pair(row * band.tiles_x + column, &band, key, splat, cursors, pairs);
+            }
+        }
+        return;   // the whole group
+    }
+    if (item == 0) visible = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    uint i = get_global_id(0);
+    uint key = i < count ? keys[i] : CULLED;
+    if (key != CULLED) {
+        if (first_band) atomic_inc(&visible);
+        for (uint2 window = windows[i]; window.y != 0; window.y &= window.y - 1)
+            emit_pair(window_tile(window, band.tiles_x), &band, key, i, cursors, pairs);
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (item == 0 && visible != 0) atomic_add(tallies + TALLY_VISIBLE, visible);
+}
+
+// Sorts each list by (depth key, splat): a bitonic network whose every comparison puts the smaller first, so a list of
+// any length is sorted as if it were followed by infinities.
+// Index space: work-groups of SORT_ITEMS, one per tile of the band.
+// Reads: starts. Uses up: pairs. Writes: lists.
+#define SORT_ITEMS 256
+#define SORT_LOCAL 2048          // pairs that are sorted in local memory at once
+
+// The places i < j of comparator t in the step whose partners are `stride` (a power of two) apart; in the first step of a
+// block of 2 * stride places (`mirrored`) partners are mirror images.
+static inline void comparator(uint t, uint stride, bool mirrored, uint *i, uint *j) {
+    uint inside = t & (stride - 1);
+    *i = 2 * t - inside;
+    *j = mirrored ? *i + 2 * (stride - inside) - 1 : *i + stride;
+}
+
+static inline void local_step(local ulong *items, uint length, uint comparators, uint stride, bool mirrored) {
+    for (uint t = get_local_id(0); t < comparators; t += SORT_ITEMS) {
+        uint i, j;
+        comparator(t, stride, mirrored, &i, &j);
+        if (j < length) {
+            ulong a = items[i], b = items[j];
+            if (a > b) {
+                items[i] = b;
+                items[j] = a;
+            }
+        }
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+}
+
+static inline void global_step(global ulong *items, uint length, uint comparators, uint stride, bool mirrored) {
+    for (uint t = get_local_id(0); t < comparators; t += SORT_ITEMS) {
+        uint i, j;
+        comparator(t, stride, mirrored, &i, &j);
+        if (j < length) {
+            ulong a = items[i], b = items[j];
+            if (a > b) {
+                items[i] = b;
+                items[j] = a;
+            }
+        }
+    }
+    barrier(CLK_GLOBAL_MEM_FENCE);
+}
+
+kernel __attribute__((reqd_work_group_size(SORT_ITEMS, 1, 1))) void sort_tiles(
+    int band_first, global const uint *restrict starts, global ulong *restrict pairs, global uint *restrict lists
+) {
+    local ulong items[SORT_LOCAL];
+    uint tile = band_first + get_group_id(0), item = get_local_id(0);
+    uint start = starts[tile] - starts[band_first], length = starts[tile + 1] - starts[tile];
+    global ulong *list = pairs + start;
+    uint padded = 1;
+    while (padded < length) padded *= 2;
+
+    // blocks that fit local memory: all of a short list
+    uint block = min(padded, (uint)SORT_LOCAL);
+    for (uint from = 0; from < length; from += block) {
+        uint here = min(length - from, block);
+        for (uint k = item; k < here; k += SORT_ITEMS) items[k] = list[from + k];
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (uint size = 2; size <= block; size *= 2)
+            for (uint stride = size / 2; stride > 0; stride /= 2)
+                local_step(items, here, block / 2, stride, stride == size / 2);
+        if (length <= SORT_LOCAL) {
+            for (uint k = item; k < here; k += SORT_ITEMS) lists[start + k] = (uint)items[k];
+        } else {
+            for (uint k = item; k < here; k += SORT_ITEMS) list[from + k] = items[k];
+            barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
+        }
+    }
+    // longer ones: wide steps in global memory, the rest of each stage in blocks again
+    for (uint size = 2 * SORT_LOCAL; size <= padded; size *= 2) {
+        for (uint stride = size / 2; stride >= SORT_LOCAL; stride /= 2)
+            global_step(list, length, padded / 2, stride, stride == size / 2);
+        for (uint from = 0; from < length; from += SORT_LOCAL) {
+            uint here = min(length - from, (uint)SORT_LOCAL);
+            for (uint k = item; k < here; k += SORT_ITEMS) items[k] = list[from + k];
+            barrier(CLK_LOCAL_MEM_FENCE);
+            for (uint stride = SORT_LOCAL / 2; stride > 0; stride /= 2)
+                local_step(items, here, SORT_LOCAL / 2, stride, false);
+            for (uint k = item; k < here; k += SORT_ITEMS) {
+                list[from + k] = items[k];
+                if (size == padded) lists[start + k + from] = (uint)items[k];
+            }
+            barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
+        }
+    }
+}

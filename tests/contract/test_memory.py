@@ -1,0 +1,107 @@
+"""A memory budget changes how a picture is drawn, never what it shows."""
+
+import numpy as np
+import pytest
+from agreement import ALL_OUTPUTS, random_splats
+
+import fidsplat as fs
+from fidsplat.backends.opencl.plan import plan_of
+
+CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
+
+
+@pytest.fixture(scope="module")
+def opencl(renderer):
+    if not renderer.device.name.startswith("opencl"):
+        pytest.skip("memory of the OpenCL backend")
+    return renderer
+
+
+def small(renderer, mebibytes):
+    """The same device with little memory."""
+    own = fs.Renderer(renderer.device.name, memory_budget=round(mebibytes * 2**20))
+    return own
+
+
+@pytest.fixture(scope="module")
+def cloud():
+    made = random_splats(30000, 1, scale=(1e-3, 0.5), sh_degree=2)
+    return made.with_planes(np.where(np.arange(len(made)) < 200, 0, -1))
+
+
+@pytest.fixture(scope="module")
+def whole(opencl, cloud):
+    frame = opencl.render(cloud, CAMERA, ALL_OUTPUTS)
+    return {name: frame[name] for name in frame}, dict(frame.stats)
+
+
+@pytest.mark.parametrize("mebibytes", [3.5, 4, 6])
+@pytest.mark.parametrize("streamed", [False, True])
+def test_little_memory_gives_the_same_bits(opencl, cloud, whole, mebibytes, streamed):
+    """Chunks of splats, bands of rows, and a cloud that is copied chunk by chunk or stays where it is."""
+    own = small(opencl, mebibytes if streamed or opencl.device.kind == "cpu" else mebibytes + 6)
+    resident = own.upload(cloud)
+    resident._data._shared &= not streamed  # a CPU reads the host's arrays; make it copy them
+    resident._data.streamed = streamed
+    for _ in range(2):
+        frame = own.render(resident, CAMERA, ALL_OUTPUTS)
+        assert frame.stats == whole[1]
+        for name in ALL_OUTPUTS:
+            assert np.array_equal(frame[name], whole[0][name]), name
+    assert "packed splats" in own.backend.pool._buffers, "it was drawn in chunks"
+
+
+def test_many_big_splats_in_chunks(opencl):
+    """More splats that touch many tiles than the first guess has room for."""
+    crowd = random_splats(26000, seed=2, depth=(-19.0, 9.0), scale=(0.5, 3.0))
+    wanted = opencl.render(crowd, CAMERA, ("rgb", "depth"))
+    own = small(opencl, 3.2)
+    frame = own.render(crowd, CAMERA, ("rgb", "depth"))
+    assert "packed splats" in own.backend.pool._buffers
+    assert frame.stats == wanted.stats
+    assert all(np.array_equal(frame[name], wanted[name]) for name in frame)
+
+
+def test_a_budget_below_the_picture_is_an_error_with_a_remedy(opencl, cloud):
+    with pytest.raises(fs.DeviceError, match=r"budget of 1 MiB is too small.*raise memory_budget"):
+        small(opencl, 1).render(cloud, CAMERA, ALL_OUTPUTS)
+
+
+def test_a_row_of_tiles_with_too_many_splats_is_an_error(opencl):
+    crowd = random_splats(40000, seed=3, depth=(2.0, 3.0), scale=(1e-3, 1e-2), across=0.01)
+    with pytest.raises(fs.DeviceError, match=r"row of tiles sees more than the .* raise memory_budget"):
+        small(opencl, 2).render(crowd, CAMERA)
+
+
+@pytest.mark.parametrize("budget", [0, -1, 1.5e9, "2 GiB", True])
+def test_odd_budgets_are_refused(opencl, budget):
+    with pytest.raises(fs.InputError, match=r"memory_budget is .* whole number of bytes"):
+        fs.Renderer(opencl.device.name, memory_budget=budget)
+
+
+def test_the_reference_has_no_budget():
+    with pytest.raises(fs.InputError, match="reference has none"):
+        fs.Renderer("reference", memory_budget=2**30)
+
+
+def test_plans_hold_to_the_budget():
+    for count in (10**5, 2 * 10**7, 10**8):
+        for budget in (2**28, 2**30, 2**34):
+            for upload in (0, 52):
+                plan = plan_of(count, 80, upload, 2**27, "ordered", budget, budget // 4)
+                held = plan.capacity * (80 + 12 + 16) + plan.chunk * (80 + 12 + upload) + budget // 8 + 2**27
+                assert held <= budget, (count, budget, upload, plan)
+                assert plan.capacity * 80 <= budget // 4
+                assert plan.chunk or (plan.capacity == count and not upload)
+
+
+def test_views_are_drawn_as_single_pictures_are(renderer):
+    """Renderer.render_views: one upload, pictures in the order of the cameras."""
+    some = random_splats(300, seed=4)
+    cameras = [fs.Camera.look_at(40, 30, 1.0, (x, 0.0, -0.1), (0.0, 0.0, 3.0)) for x in (-0.5, 0.0, 0.5)]
+    frames = list(renderer.render_views(some, cameras, ("rgb", "depth")))
+    assert len(frames) == 3
+    for frame, camera in zip(frames, cameras, strict=True):
+        single = renderer.render(some, camera, ("rgb", "depth"))
+        assert all(np.array_equal(frame[name], single[name]) for name in frame)
+    assert list(renderer.render_views(some, [])) == []
