@@ -47,22 +47,12 @@ def find_starts(
     first: int,
     count: int,  # pairs
     band_first: int,
-    band_end: int,
     tiles: wp.array(dtype=wp.int32),  # sorted
-    starts: wp.array(dtype=wp.int32),  # out [band_first, band_end]: where each tile's list begins
+    starts: wp.array(dtype=wp.int32),  # out: where each tile's list begins
 ):
-    """A thread for each gap between neighbours in the sorted pairs, the two ends included."""
-    k = wp.tid() + first
-    before = band_first - 1
-    after = band_end
-    if k > 0:
-        before = tiles[k - 1]
-    if k < count:
-        after = tiles[k]
-    tile = before + 1
-    while tile <= after:
-        starts[tile] = k
-        tile += 1
+    tile = band_first + first + wp.tid()
+    # Warp's search answers with its last place at most, so its end is one further
+    starts[tile] = wp.lower_bound(tiles, 0, count + 1, tile)
 
 
 @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)

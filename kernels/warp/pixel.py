@@ -34,9 +34,8 @@ DARKEST = wp.constant(wp.float32(2.0**-24))
 
 @cache
 def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
-    """The state of a sample and what is done with it: Pixel, Splat, load, start, cross, open, blend; Splat is
-    what of a record each
-    sample needs.
+    """The state of a sample, what it reads of a splat, and what is done with them: Pixel, Splat; load, start,
+    row, cross, unfinished, blend, finish.
     """
     layout = Layout(effects)
     each = layout.lines

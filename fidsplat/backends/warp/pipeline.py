@@ -35,8 +35,15 @@ _RECORD = ("lowpass_screen", "ray_depth", "normal", "compose_planes")
 _SAMPLE = (*_RECORD, "stop_exclusive", "depth", "depth_median", "label")
 
 
-# bytes: of one splat's bounds; of its keys, counts, drawn, places and their sums; of one that is drawn, in the
-# sort and the lists; of a sample in all planes; of a pair with the scratch of its sort
+# in the order of the kernel's arguments
+_OUTPUTS = ("rgb", "alpha", "depth", "depth_median", "normal", "label")
+# of a View, by the names that the kernels have for them too
+_UNIFORMS = (
+    *("fx", "fy", "cx", "cy", "near", "far", "width", "height", "samples"),
+    *("log_cut", "ceiling", "stop"),
+)
+# bytes: of one splat's bounds; of its keys, counts, drawn, places, sums; of one that is drawn, in sort and
+# lists; of a sample in all planes; of a pair with the scratch of its sort
 _BOUNDS, _PROJECTED, _VISIBLE, _SAMPLE_BYTES, _PAIR = 44, 28, 40, 60, 24
 
 
@@ -274,8 +281,8 @@ class _Run:
         if room < 1:
             raise DeviceError(
                 f"a memory budget of {budget / 2**20:.0f} MiB is too small for {resident.count} splats in "
-                f"this picture, which take {fixed / 2**20:.0f} MiB before their lists; raise memory_budget, or "
-                "use an OpenCL device, which draws a cloud in chunks"
+                f"this picture, which take {fixed / 2**20:.0f} MiB before their lists; raise memory_budget, "
+                "or use an OpenCL device, which draws a cloud in chunks"
             )
         return room
 
@@ -295,7 +302,7 @@ class _Run:
             band = (first, end, held["order"], held["bounds"], ends, lengths, tiles, lists)
             self.launch(self.pipeline.lists.emit, visible, self.u, *band)
             wp.utils.radix_sort_pairs(tiles, lists, pairs, 0, max(self.tiles - 1, 1).bit_length())
-        self.launch(self.pipeline.sort.find_starts, pairs + 1, pairs, first, end, tiles, held["starts"])
+        self.launch(self.pipeline.sort.find_starts, end - first + 1, pairs, first, tiles, held["starts"])
 
     def _samples(self) -> list[Any]:
         """Planes that blending fills: raw, depth, median, normal, label, the label's weight."""
@@ -336,15 +343,10 @@ class _Run:
                 self.pool.fresh(output.name, height * width * output.channels, dtype),
             )
         arrays = [
-            outputs[name][1] if name in outputs else self._take(f"no {name}", 1, dtype)
-            for name, dtype in (
-                ("rgb", wp.float32),
-                ("alpha", wp.float32),
-                ("depth", wp.float32),
-                ("depth_median", wp.float32),
-                ("normal", wp.float32),
-                ("label", wp.int32),
-            )
+            outputs[name][1]
+            if name in outputs
+            else self._take(f"no {name}", 1, wp.int32 if name == "label" else wp.float32)
+            for name in _OUTPUTS
         ]
         self.launch(self.pipeline.resolve, height * width, self.u, width, *samples, *arrays)
         return outputs, (height, width)
@@ -364,20 +366,7 @@ class _Run:
         u = runtime.kernels("common").View()
         u.rotation = wp.mat33d(*view.rotation.ravel().tolist())
         u.translation, u.eye = wp.vec3d(*view.translation.tolist()), wp.vec3d(*view.eye.tolist())
-        for name in (
-            "fx",
-            "fy",
-            "cx",
-            "cy",
-            "near",
-            "far",
-            "width",
-            "height",
-            "samples",
-            "log_cut",
-            "ceiling",
-            "stop",
-        ):
+        for name in _UNIFORMS:
             setattr(u, name, getattr(view, name))
         u.tile_w, u.tile_h, u.tiles_x, u.tiles_y = shape.tile_width, shape.tile_height, tiles_x, tiles_y
         u.per_pixel = 1.0 / view.samples**2
