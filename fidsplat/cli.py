@@ -23,6 +23,7 @@ Examples:
   fidsplat marker apriltag:36h11:5 -o tag.ply       a marker as a splat file
   fidsplat render scene.toml -o picture.png         draw a scene
   fidsplat detect picture.png --scene scene.toml    read it back, with poses
+  fidsplat bench                                    what a frame costs here
 
 `fidsplat COMMAND --help` explains a command. --debug, anywhere, shows where an error arose."""
 

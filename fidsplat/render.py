@@ -93,6 +93,11 @@ class ResidentCloud:
     def __len__(self) -> int:
         return self._count
 
+    @property
+    def memory_bytes(self) -> int:
+        """Device memory that it takes; 0 on a CPU, which reads the host's own arrays."""
+        return getattr(self._data, "device_bytes", 0)
+
 
 class Renderer:
     """Draws splats on one device. Compiled pipelines and scratch buffers are kept from picture to picture.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -37,6 +37,20 @@ class DeviceInfo:
     usable: bool
     reason: str
     """Why it cannot be used; empty if it can. For a usable device, a remark (may be empty)."""
+
+
+@dataclass(frozen=True)
+class Rates:
+    """What a device can do at best, measured: per second."""
+
+    copy_bytes: float
+    """bytes read and bytes written by a copy, together"""
+    fma: float
+    """float32 multiply-adds"""
+    exp: float
+    """float32 exponentials, as the blend stage calls them"""
+    division: float
+    """float32 divisions, as the blend stage writes them"""
 
 
 @dataclass(frozen=True)
@@ -155,4 +169,19 @@ class Backend(Protocol):
 
     def pipeline(self, features: FeatureSet) -> Pipeline:
         """The pipeline for these features, compiled on first use."""
+        ...
+
+
+@runtime_checkable
+class Measurable(Protocol):
+    """A backend that can also be held against its hardware: it has these, and kernels for the effect
+    `overdraw`. Not all have."""
+
+    @property
+    def memory_bytes(self) -> int:
+        """Device memory that scratch buffers hold; clouds and finished planes are not among them."""
+        ...
+
+    def rates(self) -> Rates:
+        """What the device can do at best; measured anew at each call."""
         ...

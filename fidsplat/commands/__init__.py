@@ -4,12 +4,14 @@ status. Its docstring is the line in the list of commands, its HELP what `fidspl
 Nothing heavy is imported before ``run``, so that help and errors come at once.
 """
 
+from fidsplat.commands.bench import Bench
 from fidsplat.commands.check import Check
 from fidsplat.commands.demo import Demo
 from fidsplat.commands.detect import Detect
 from fidsplat.commands.devices import Devices
 from fidsplat.commands.marker import Marker
 from fidsplat.commands.render import Render
+from fidsplat.commands.warm import Warm
 
 COMMANDS = {
     "demo": Demo,
@@ -18,5 +20,7 @@ COMMANDS = {
     "render": Render,
     "detect": Detect,
     "check": Check,
+    "bench": Bench,
+    "warm": Warm,
 }
 """Every command by its name, in the order in which help lists them."""

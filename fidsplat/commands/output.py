@@ -40,8 +40,12 @@ def console(as_json: bool) -> Console:
 
 def print_json(value: dict[str, Any]) -> None:
     """The one object; a number that JSON does not have becomes null."""
-    json.dump(_plain(value), sys.stdout, indent=2, allow_nan=False)
-    sys.stdout.write("\n")
+    sys.stdout.write(json_text(value) + "\n")
+
+
+def json_text(value: dict[str, Any]) -> str:
+    """An object as JSON; a number that JSON does not have becomes null."""
+    return json.dumps(_plain(value), indent=2, allow_nan=False)
 
 
 def print_table(where: Console, title: str, heads: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

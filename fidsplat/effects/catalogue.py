@@ -17,6 +17,8 @@ class Output:
     name: str
     channels: int
     dtype: str
+    public: bool = True
+    """False: for measuring only; users cannot ask for it."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,12 @@ _EFFECTS = (
         inputs=("labels",),
         planes=(1, 1),
         output=Output("label", 1, "int32"),
+    ),
+    Effect(
+        "overdraw",
+        "tap/overdraw.cl",
+        planes=(1,),
+        output=Output("overdraw", 1, "int32", public=False),
     ),
 )
 

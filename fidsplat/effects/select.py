@@ -15,7 +15,11 @@ from fidsplat.quality import Quality
 RGB = Output("rgb", 3, "float32")
 OUTPUTS: dict[str, Output] = {
     "rgb": RGB,
-    **{effect.output.name: effect.output for effect in CATALOGUE.values() if effect.output},
+    **{
+        effect.output.name: effect.output
+        for effect in CATALOGUE.values()
+        if effect.output and effect.output.public
+    },
 }
 
 
@@ -44,7 +48,8 @@ class FeatureSet:
     @cached_property
     def outputs(self) -> tuple[Output, ...]:
         """Finished planes, rgb first."""
-        return (RGB, *(OUTPUTS[tap] for tap in self.taps))
+        planes = (CATALOGUE[tap].output for tap in self.taps)
+        return (RGB, *(plane for plane in planes if plane is not None))
 
 
 class Traits(Protocol):

@@ -10,9 +10,10 @@ from functools import cached_property
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.base import DeviceInfo
+from fidsplat.backends.base import DeviceInfo, Rates
 from fidsplat.backends.opencl import pocl_target
 from fidsplat.backends.opencl.assemble import DeviceShape, assemble
+from fidsplat.backends.opencl.floor import measure_rates
 from fidsplat.backends.opencl.memory import BufferPool, Resident
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.plan import PAIR
@@ -97,6 +98,15 @@ class OpenCLBackend:
             program = self.build(source.text)
             self._pipelines[key] = OpenCLPipeline(self, source, program, *key)
         return self._pipelines[key]
+
+    @property
+    def memory_bytes(self) -> int:
+        """Device memory that scratch buffers hold, and finished planes that nobody has any more."""
+        return self.pool.memory_bytes
+
+    def rates(self) -> Rates:
+        """What the device can do at best; measured anew at each call."""
+        return measure_rates(self)
 
     @cached_property
     def build_options(self) -> list[str]:

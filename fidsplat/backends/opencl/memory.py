@@ -41,6 +41,12 @@ class BufferPool:
             if len(spare) < 2:
                 spare.append(buffer)
 
+    @property
+    def memory_bytes(self) -> int:
+        """What the scratch buffers hold, and leased ones that were given back."""
+        spare = (buffer for buffers in self._spare.values() for buffer in buffers)
+        return sum(buffer.size for buffer in (*self._buffers.values(), *spare))
+
     def scratch(self, name: str, size: int) -> cl.Buffer:
         """A buffer of at least `size` bytes whose content is undefined."""
         held = self._buffers.get(name)

@@ -1,0 +1,73 @@
+"""The benchmark suite: `pytest benchmarks/`, with `--device D` for another device and `--big` for scenes that
+are left out on a small machine. `--benchmark-json FILE` keeps the figures, with facts of the device.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import pytest
+
+import fidsplat as fs
+from fidsplat.experiments.bench.catalogue import BENCH_SCENES
+from fidsplat.experiments.bench.measure import SceneRun
+
+try:
+    import pytest_benchmark  # noqa: F401  the fixture `benchmark`
+except ImportError:
+    pytest.exit("these benchmarks need pytest-benchmark: pip install '.[bench]'", returncode=4)
+
+SMALL_MACHINE = 8
+"""Compute units of a processor below which heavy scenes are left out."""
+
+
+class Clock:
+    """A timer that what is measured moves on: a stage by the device's clock, a part of a child process."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def __call__(self) -> float:
+        return self.seconds
+
+
+CLOCK = Clock()
+
+
+def pytest_addoption(parser) -> None:
+    parser.addoption("--device", default="opencl", help="where the benchmarks draw")
+    parser.addoption("--big", action="store_true", help="draw heavy scenes on a small machine too")
+
+
+def pytest_benchmark_update_machine_info(config, machine_info) -> None:
+    renderer = fs.Renderer(config.getoption("--device"))
+    rates = getattr(renderer.backend, "rates", None)
+    machine_info["fidsplat"] = {
+        "version": fs.__version__,
+        "device": asdict(renderer.device),
+        "rates": asdict(rates()) if rates else None,
+    }
+
+
+def pytest_generate_tests(metafunc) -> None:
+    if "stage" in metafunc.fixturenames:
+        frame = fs.Renderer(metafunc.config.getoption("--device")).render(*BENCH_SCENES["tag"].make())
+        metafunc.parametrize("stage", list(frame.timings))
+
+
+@pytest.fixture(scope="session")
+def device(pytestconfig) -> str:
+    return pytestconfig.getoption("--device")
+
+
+@pytest.fixture(scope="session", params=list(BENCH_SCENES))
+def run(request, device) -> SceneRun:
+    """A scene on the device, with its first frame drawn."""
+    scene = BENCH_SCENES[request.param]
+    info = fs.Renderer(device).device
+    small = info.kind == "cpu" and info.compute_units < SMALL_MACHINE
+    if scene.heavy and small and not request.config.getoption("--big"):
+        pytest.skip(f"{request.param} takes long on {info.compute_units} cores; --big draws it all the same")
+    made = SceneRun(request.param, device, None, *scene.make())
+    assert not made.result.error, made.result.error
+    return made

@@ -1,0 +1,143 @@
+"""How long the first picture takes in a new process: with empty kernel caches, with those that
+`fidsplat warm` filled, and with those that the same scene left.
+
+    python benchmarks/first_frame.py [tag] [demo] [--device opencl] [--repeats 5] [--json FILE]
+
+Seconds from starting Python to the picture in NumPy, and what became of them: starting Python, importing,
+making the scene (markers included), opening the device, uploading and drawing, which includes all that is
+compiled. The caches of pyopencl, PoCL and NVIDIA's driver are pointed at folders of our own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from datetime import date
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from fidsplat.files import atomic_write
+
+SCENES = ("tag", "demo")
+CACHES = ("empty", "warmed", "kept")
+PARTS = ("python", "import", "scene", "device", "frame")
+
+# prints the time at which each part was done, in seconds since the epoch
+CHILD = """
+import time; marks = [time.time()]
+import sys, fidsplat as fs, numpy; marks.append(time.time())
+if sys.argv[1] == "demo":
+    from fidsplat.experiments.demo_scene import demo_scene
+    scene, camera = demo_scene(), None
+else:
+    from fidsplat.experiments.bench.catalogue import BENCH_SCENES
+    scene, camera = BENCH_SCENES[sys.argv[1]].make()
+marks.append(time.time())
+renderer = fs.Renderer(sys.argv[2]); marks.append(time.time())
+frame = renderer.render(scene, camera)
+for name in frame: frame[name]
+marks.append(time.time())
+print(*marks)
+"""
+
+
+def caches_in(folder: Path) -> dict[str, str]:
+    """An environment in which everything that is compiled is kept below `folder`."""
+    places = {
+        "POCL_CACHE_DIR": str(folder / "pocl"),
+        "XDG_CACHE_HOME": str(folder / "xdg"),
+        "CUDA_CACHE_PATH": str(folder / "nv"),
+    }
+    for place in places.values():
+        Path(place).mkdir(parents=True, exist_ok=True)
+    return os.environ | places
+
+
+def first_frame(scene: str, device: str, folder: Path) -> dict[str, float]:
+    """Seconds of each part, and in `total`, of a new process that draws one picture."""
+    begun = time.time()
+    done = subprocess.run(
+        [sys.executable, "-c", CHILD, scene, device], capture_output=True, text=True, env=caches_in(folder)
+    )
+    if done.returncode:
+        raise SystemExit(f"first_frame: {done.stderr.strip().splitlines()[-1]}")
+    marks = [begun, *map(float, done.stdout.split())]
+    parts = {part: after - before for part, before, after in zip(PARTS, marks[:-1], marks[1:], strict=True)}
+    return parts | {"total": marks[-1] - begun}
+
+
+def warm(device: str, folder: Path) -> float:
+    """Seconds that `fidsplat warm` takes with empty caches."""
+    begun = time.time()
+    command = [sys.executable, "-m", "fidsplat.cli", "warm", "--device", device]
+    subprocess.run(command, capture_output=True, check=True, env=caches_in(folder))
+    return time.time() - begun
+
+
+def measure(scenes: list[str], device: str, repeats: int) -> list[dict]:
+    """A record for each scene and state of the caches: medians, and the extremes of the total."""
+    records = []
+    with tempfile.TemporaryDirectory() as name:
+        top = Path(name)
+        console = Console(stderr=True)
+        with console.status("fidsplat warm"):
+            warmed_in = warm(device, top / "warmed")
+        for scene in scenes:
+            runs: dict[str, list[dict[str, float]]] = {cache: [] for cache in CACHES}
+            for number in track(range(repeats), description=scene, console=console):
+                # kept: what the first of the empty ones left
+                folders = {"empty": top / f"{scene} {number}", "kept": top / f"{scene} 0"}
+                for cache in CACHES:
+                    runs[cache].append(first_frame(scene, device, folders.get(cache, top / "warmed")))
+            for cache, taken in runs.items():
+                totals = [run["total"] for run in taken]
+                records.append(
+                    {
+                        "scene": scene,
+                        "device": device,
+                        "date": date.today().isoformat(),
+                        "caches": cache,
+                        "repeats": repeats,
+                        "seconds": {p: statistics.median(run[p] for run in taken) for p in taken[0]},
+                        "range": [min(totals), max(totals)],
+                        "warm_seconds": warmed_in,
+                    }
+                )
+    return records
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scenes", nargs="*", default=list(SCENES), metavar="SCENE")
+    parser.add_argument("--device", default="opencl")
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--json", metavar="FILE")
+    options = parser.parse_args()
+    records = measure(options.scenes, options.device, max(options.repeats, 1))
+    table = Table("scene", "caches", "seconds", "range", *PARTS, title=f"First frame on {options.device}")
+    for record in records:
+        seconds, (low, high) = record["seconds"], record["range"]
+        parts = (f"{seconds[part]:.2f}" for part in PARTS)
+        total = f"{seconds['total']:.2f}"
+        table.add_row(record["scene"], record["caches"], total, f"{low:.2f} to {high:.2f}", *parts)
+    console = Console()
+    console.print(table)
+    console.print(f"fidsplat warm, with empty caches: {records[0]['warm_seconds']:.1f} s")
+    if options.json:
+        with atomic_write(options.json) as stream:
+            stream.write(json.dumps(records, indent=2).encode() + b"\n")
+
+
+if __name__ == "__main__":
+    main()

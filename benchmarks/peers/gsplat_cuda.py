@@ -1,0 +1,99 @@
+"""fidsplat beside gsplat's `rasterization_2dgs` on one NVIDIA GPU, the same scenes in the same run.
+
+    pip install . torch gsplat       # 1.5.3; the latest: git+https://github.com/nerfstudio-project/gsplat
+    python benchmarks/peers/gsplat_cuda.py r100k_720p r1m_1080p r5m_1080p r20m_4k --json gsplat.json
+
+Written from gsplat's documentation and signature (1.5.3); it needs CUDA and has not been run where it was
+written. The driver's OpenCL must be visible to us (docs/rendering.md, "Devices"). Both keep the splats and
+the picture on the GPU; both are timed from the call until the GPU is done. gsplat draws with its own
+constants (opacity ceiling 0.99, exclusive stop), we with our standard ones, which leave no less undone.
+"""
+
+from __future__ import annotations
+
+import gsplat
+import numpy as np
+import torch
+from turns import arguments, peer_device, report, take_turns
+
+from fidsplat.cameras import Camera
+from fidsplat.experiments.bench.catalogue import BENCH_SCENES, scene_names
+from fidsplat.experiments.bench.measure import Result, SceneRun
+from fidsplat.splats import SplatCloud
+
+
+def tensors(cloud: SplatCloud, camera: Camera) -> dict:
+    """The arguments of `rasterization_2dgs`, on the GPU: one camera, plain colours, three scales of which the
+    last is not used."""
+    if cloud.colors is None:
+        raise SystemExit("gsplat_cuda: this scene has colours that depend on the view; choose another")
+    scales = np.concatenate([cloud.scales, np.ones((len(cloud), 1), np.float32)], 1)
+    arrays = {
+        "means": cloud.means + cloud.origin.astype(np.float32),
+        "quats": cloud.quats,
+        "scales": scales,
+        "opacities": cloud.opacities,
+        "colors": cloud.colors,
+        "viewmats": camera.world_to_camera[None],
+        "Ks": camera.matrix[None],
+    }
+    on_gpu = {
+        name: torch.tensor(np.asarray(array, np.float32), device="cuda") for name, array in arrays.items()
+    }
+    return on_gpu | {"width": camera.width, "height": camera.height}
+
+
+def main() -> None:
+    parser = arguments(__doc__, repeats=30, device="opencl:nvidia")
+    parser.add_argument("--packed", action="store_true", help="gsplat's packed mode: less memory")
+    options = parser.parse_args()
+    if not torch.cuda.is_available():
+        raise SystemExit("gsplat_cuda: PyTorch sees no CUDA device; gsplat draws on nothing else")
+    facts = torch.cuda.get_device_properties(0)
+    version = f"PyTorch {torch.__version__}, CUDA {torch.version.cuda}"
+    device = peer_device("cuda:0", facts.name, "CUDA", version, "gpu", facts.multi_processor_count)
+
+    records, names = [], scene_names(options.scenes)
+    for name in names:
+        cloud, camera = BENCH_SCENES[name].make()
+        ours = SceneRun(name, options.device, None, cloud, camera)
+        if ours.result.error:
+            raise SystemExit(f"gsplat_cuda: {ours.result.error}")
+        peer = Result(name, device, camera.width, camera.height, renderer=f"gsplat {gsplat.__version__}")
+        given = tensors(cloud, camera)
+        torch.cuda.reset_peak_memory_stats()
+
+        last = {}  # what gsplat tells of the latest frame
+
+        def draw(given=given, last=last):
+            with torch.no_grad():
+                colors, *_, last["meta"] = gsplat.rasterization_2dgs(**given, packed=options.packed)
+            torch.cuda.synchronize()
+            return _Picture(colors)
+
+        peer.counts = {"splats": len(cloud)}
+        records += take_turns(ours, peer, draw, max(options.repeats, 1))
+        radii, pairs = last["meta"]["radii"], last["meta"]["flatten_ids"]
+        seen = radii.reshape(-1, 2).amin(-1) if radii.shape[-1] == 2 else radii.reshape(-1)  # 1.4: one radius
+        records[-1] |= {
+            "visible": int((seen > 0).sum()),
+            "pairs": int(pairs.shape[0]),
+            "memory_bytes": torch.cuda.max_memory_allocated(),
+        }
+        del given, last, draw, radii, pairs, seen
+        torch.cuda.empty_cache()
+    report(records, list(names), options.json)
+
+
+class _Picture:
+    """A picture on the GPU that NumPy can read."""
+
+    def __init__(self, colors: torch.Tensor) -> None:
+        self.colors = colors  # (1, h, w, 3)
+
+    def __array__(self, dtype=None, copy=None) -> np.ndarray:
+        return self.colors[0].cpu().numpy()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,28 @@
+"""Whole frames and single stages of each scene: splats resident, the picture left on the device."""
+
+import pytest
+from conftest import CLOCK
+
+
+def drawn(run):
+    """One frame, finished; its stages in ms."""
+    return run.renderer.render(run.resident, run.camera).timings
+
+
+def facts(benchmark, run) -> None:
+    benchmark.extra_info |= {"width": run.camera.width, "height": run.camera.height, **run.result.counts}
+
+
+@pytest.mark.benchmark(group="frame")
+def test_frame(benchmark, run):
+    facts(benchmark, run)
+    benchmark.pedantic(drawn, (run,), rounds=10, warmup_rounds=2)
+
+
+@pytest.mark.benchmark(group="stage", timer=CLOCK)
+def test_stage(benchmark, run, stage):
+    def one():
+        CLOCK.seconds += 1e-3 * drawn(run)[stage]
+
+    facts(benchmark, run)
+    benchmark.pedantic(one, rounds=10, warmup_rounds=2)

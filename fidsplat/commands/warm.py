@@ -1,0 +1,60 @@
+"""`fidsplat warm`."""
+
+import time
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+from fidsplat.commands.output import Json, console, option, print_json
+
+
+@dataclass
+class Warm:
+    """Compile what scenes commonly call for, so that first pictures come at once."""
+
+    HELP: ClassVar[str] = """Compile what scenes commonly call for, so that first pictures come at once.
+
+The kernels of a scene are compiled when it is first drawn, which takes a second or more, and kept in the
+caches of pyopencl, of Warp and of the driver. This fills them: plain colours and spherical harmonics, with
+and without markers, the usual outputs. Worth it once after an installation, an update or a change of the
+driver. What is there already takes no time.
+
+Examples:
+  fidsplat warm
+  fidsplat warm --device opencl:nvidia --json"""
+
+    device: Annotated[
+        str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")
+    ] = None
+    json: Json = False
+
+    def run(self) -> int:
+        from rich.progress import Progress, TextColumn
+
+        from fidsplat.experiments.bench.warm import recipes, warm
+        from fidsplat.render import Renderer
+
+        where = console(self.json)
+        begun = time.perf_counter()
+        renderer = Renderer(self.device)
+        wanted = recipes()
+        done: list[tuple[str, float]] = []
+        columns = (*Progress.get_default_columns(), TextColumn("{task.fields[now]}"))
+        try:
+            with Progress(*columns, console=where, transient=True) as progress:
+                task = progress.add_task("sets of kernels", total=len(wanted), now=wanted[0].words)
+                for recipe, seconds in warm(renderer, wanted):
+                    done.append((recipe.words, seconds))
+                    following = wanted[len(done)].words if len(done) < len(wanted) else ""
+                    progress.update(task, advance=1, now=following)
+        finally:  # what a run that is stopped has compiled stays compiled
+            device, took = renderer.device, time.perf_counter() - begun
+            if self.json:
+                record = {"device": device.name, "title": device.title, "version": device.version}
+                sets = [{"set": words, "seconds": seconds} for words, seconds in done]
+                print_json(record | {"sets": sets, "of": len(wanted), "seconds": took})
+            else:
+                words = (
+                    f"{len(done)} of {len(wanted)} sets of kernels are ready on {device.title}; {took:.1f} s"
+                )
+                where.print(words, markup=False, soft_wrap=True)
+        return 0

@@ -1,0 +1,101 @@
+"""The scenes that are timed, by name."""
+
+from __future__ import annotations
+
+import difflib
+import random
+import string
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.errors import InputError
+from fidsplat.experiments.scenes import SCENES, load_scene, standard_camera
+from fidsplat.markers import marker
+from fidsplat.scenes import PlacedMarker, Scene
+from fidsplat.splats import SplatCloud
+
+WALL_COLUMNS, WALL_ROWS = 20, 10
+_WALL_CODES = 10  # different ones; each hangs in as many places
+
+
+@dataclass(frozen=True)
+class BenchScene:
+    """One entry: what it is, and how it is made."""
+
+    about: str
+    make: Callable[[], tuple[SplatCloud, Camera]]
+    heavy: bool = False
+    """needs a machine of more than a few cores, or patience"""
+
+
+def tag() -> tuple[SplatCloud, Camera]:
+    """A single AprilTag, a third of the picture's height: what a frame costs when there is next to nothing to
+    draw."""
+    placed = PlacedMarker(marker("apriltag:36h11:5", size=0.16), _at(0.0, 0.0, 0.55))
+    return Scene((), markers=(placed,)).cloud(), standard_camera(640, 480)
+
+
+def tag_in_million() -> tuple[SplatCloud, Camera]:
+    """An AprilTag of 0.4 m, 3 m from the camera, before the million splats of r1m_1080p."""
+    background, camera = load_scene("r1m_1080p")
+    placed = PlacedMarker(marker("apriltag:36h11:5", size=0.4), _at(0.0, 0.0, 3.0))
+    return Scene((background,), markers=(placed,)).cloud(), camera
+
+
+def qr_wall() -> tuple[SplatCloud, Camera]:
+    """200 QR codes of version 22 (1000 characters, level L) in 20 columns and 10 rows on a wall that fills
+    1920 x 1080 pixels; ten different codes take turns."""
+    letters = random.Random(0)
+    texts = ("".join(letters.choices(string.ascii_letters, k=1000)) for _ in range(_WALL_CODES))
+    codes = [marker(f"qr-v22-L:{text}", size=0.1) for text in texts]
+    pitch = 0.115
+    placed = []
+    for number in range(WALL_COLUMNS * WALL_ROWS):
+        row, column = divmod(number, WALL_COLUMNS)
+        x, y = (column - (WALL_COLUMNS - 1) / 2) * pitch, (row - (WALL_ROWS - 1) / 2) * pitch
+        placed.append(PlacedMarker(codes[number % _WALL_CODES], _at(x, y, 2.0)))
+    return Scene((), markers=tuple(placed)).cloud(), standard_camera(1920, 1080)
+
+
+def _random(name: str) -> BenchScene:
+    scene = SCENES[name]
+    about = f"{scene.count:,} random splats, {scene.width} x {scene.height}"
+    return BenchScene(about, lambda: load_scene(name), heavy=scene.count > 2_000_000)
+
+
+BENCH_SCENES: dict[str, BenchScene] = {
+    "tag": BenchScene("an AprilTag alone, 640 x 480", tag),
+    **{name: _random(name) for name in SCENES},
+    "qr_wall": BenchScene("200 QR codes of version 22 on a wall, 1920 x 1080", qr_wall, heavy=True),
+    "tag_in_million": BenchScene("an AprilTag before 1,000,000 random splats, 1920 x 1080", tag_in_million),
+}
+"""In the order in which they are listed."""
+
+DEFAULT_SCENES = ("tag", "r100k_720p", "r1m_1080p", "tag_in_million")
+"""About a minute on two cores."""
+
+
+def scene_names(words: Iterable[str]) -> tuple[str, ...]:
+    """Names from words: `all` is every scene, none the default; each once.
+
+    Raises:
+        InputError: a name that no scene has.
+    """
+    names: list[str] = []
+    for word in words:
+        names += BENCH_SCENES if word == "all" else (word,)
+    for name in names:
+        if name not in BENCH_SCENES:
+            near = difflib.get_close_matches(name, BENCH_SCENES, 1)
+            hint = f" (did you mean {near[0]!r}?)" if near else ""
+            raise InputError(f"there is no scene {name!r}{hint}; known: all, {', '.join(BENCH_SCENES)}")
+    return tuple(dict.fromkeys(names)) or DEFAULT_SCENES
+
+
+def _at(x: float, y: float, z: float) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = x, y, z
+    return pose

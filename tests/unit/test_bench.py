@@ -1,0 +1,243 @@
+"""fidsplat bench: what is measured, what becomes of errors and interrupts, the record for programs."""
+
+import json
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.backends.base import Measurable
+from fidsplat.cli import main
+from fidsplat.experiments.bench import catalogue, measure
+from fidsplat.experiments.bench.catalogue import BENCH_SCENES, BenchScene, scene_names
+from fidsplat.experiments.bench.overdraw import overdraw
+from fidsplat.experiments.scenes import random_cloud, standard_camera
+
+CAMERA = standard_camera(64, 48)
+# of every record, and of one that has frames
+KEYS = (
+    *("scene", "renderer", "device", "title", "platform", "driver", "compute_units", "date"),
+    *("width", "height", "repeats", "error"),
+)
+FIGURES = (
+    *("frame_ms", "quartiles_ms", "fastest_ms", "first_frame_ms", "stages_ms", "fastest_stages_ms"),
+    *("splats", "visible", "pairs", "fragments", "splats_per_second", "memory_bytes", "mean_rgb"),
+    *("rates", "floors_ms", "times_floor"),
+)
+
+
+@pytest.fixture(autouse=True)
+def small_scenes(monkeypatch):
+    for name in ("small", "other"):
+        scene = BenchScene("200 splats", lambda: (random_cloud(200, 0.2), CAMERA))
+        monkeypatch.setitem(BENCH_SCENES, name, scene)
+
+
+def bench(*words) -> int:
+    return main(["bench", "--repeats", "3", *map(str, words)])
+
+
+def facing(depths, opacity: float) -> fs.SplatCloud:
+    """Splats in the middle of the view that face the camera, one at each depth, ten pixels of sigma."""
+    n = len(depths)
+    means = np.column_stack([np.zeros((n, 2)), depths])
+    scales = np.repeat(np.asarray(depths)[:, None] * 10 / CAMERA.fx, 2, 1)
+    return fs.SplatCloud(
+        means, np.tile((1.0, 0, 0, 0), (n, 1)), scales, [opacity] * n, colors=np.ones((n, 3))
+    )
+
+
+# --- what is measured
+
+
+def test_rates_of_a_device_are_those_of_a_computer(renderer):
+    backend = renderer.backend
+    assert isinstance(backend, Measurable)
+    rates = backend.rates()
+    assert 1e8 < rates.copy_bytes < 1e14
+    # results per second: a multiply-add is never slower than an exponential or a division
+    assert 1e7 < rates.exp < rates.fma < 1e16
+    assert 1e7 < rates.division < rates.fma
+
+
+def test_drawn_fragments_are_counted_exactly(renderer):
+    def count(cloud, **quality):
+        return overdraw(renderer, renderer.upload(cloud), CAMERA, fs.Quality(**quality))
+
+    one = facing([2.0], 0.5)
+    drawn = count(one)
+    assert drawn.shape == (48, 64)
+    assert drawn.dtype == np.int32
+    alpha = renderer.render(one, CAMERA, outputs=("alpha",))["alpha"]
+    np.testing.assert_array_equal(drawn, (alpha > 0).astype(np.int32))
+    np.testing.assert_array_equal(count(facing([2.0, 2.5, 3.0], 0.1)), 3 * count(facing([2.0], 0.1)))
+    # nothing is drawn behind what lets no light through, here 1 - 0.9 a layer
+    stack = count(facing([2.0, 2.1, 2.2, 2.3, 2.4], 0.9), transmittance_stop=0.05)
+    assert stack[24, 32] == 2
+    assert stack.max() == 5  # towards the rim every layer lets light through
+    # a layer is made of as many fragments as lie in it
+    printed = facing([2.0, 2.0, 2.0], 0.5).with_planes(0)
+    np.testing.assert_array_equal(count(printed), 3 * drawn)
+    assert count(one, samples=2).sum() == pytest.approx(4 * drawn.sum(), rel=0.02)
+
+
+def test_the_count_is_no_output_for_users(renderer):
+    with pytest.raises(fs.InputError, match="unknown output 'overdraw'"):
+        renderer.render(facing([2.0], 0.5), CAMERA, outputs=("overdraw",))
+
+
+def test_memory_is_that_of_cloud_buffers_and_picture(renderer):
+    before = renderer.backend.memory_bytes
+    resident = renderer.upload(random_cloud(1000, 0.1))
+    assert renderer.backend.memory_bytes == before  # a cloud is no scratch
+    frame = renderer.render(resident, standard_camera(640, 480))
+    assert resident.memory_bytes in (0, 1000 * 4 * (3 + 4 + 2 + 1 + 3))  # 0: the host's own arrays
+    assert (resident.memory_bytes == 0) == (renderer.device.kind == "cpu")
+    held = renderer.backend.memory_bytes
+    assert held >= 640 * 480 * 16  # samples: colours and transmittance
+    del frame
+    assert renderer.backend.memory_bytes >= held  # a plane that is given back is kept for the next picture
+
+
+def test_devices_take_turns(monkeypatch):
+    turns = []
+    draw = measure.SceneRun.draw
+
+    def noted(self, counts):
+        turns.append(self.renderer.device.name)
+        draw(self, counts)
+
+    monkeypatch.setattr(measure.SceneRun, "draw", noted)
+    monkeypatch.setattr(measure, "WARM_UP", 0)
+    running = measure.Bench(["reference", "opencl"], lambda words: None, lambda: None)
+    running.run("small", 2)
+    first, second = (result.device.name for result in running.results)
+    assert turns == [first, second, first, second]
+    assert [len(result.frames) for result in running.results] == [2, 2]
+    reference = running.results[0].as_dict()
+    assert reference["rates"] is None
+    assert reference["memory_bytes"] is None
+    assert reference["times_floor"] == {}
+    assert running.results[1].as_dict()["mean_rgb"] == pytest.approx(reference["mean_rgb"], abs=1e-5)
+
+
+# --- the command
+
+
+def test_json_on_stdout_is_all_that_stands_there(capsys):
+    assert bench("--scenes", "small", "other", "--json", "-") == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["scenes"] == ["small", "other"]
+    assert content["interrupted"] is False
+    assert [record["scene"] for record in content["results"]] == ["small", "other"]
+    for record in content["results"]:
+        assert tuple(record) == KEYS + FIGURES
+        assert record["repeats"] == 3
+        assert record["error"] is None
+        low, high = record["quartiles_ms"]
+        assert 0 < record["fastest_ms"] <= low <= record["frame_ms"] <= high
+        assert sum(record["fastest_stages_ms"].values()) <= high
+        assert 0 < record["visible"] <= record["splats"] == 200
+        assert 0 < record["pairs"] < record["fragments"]
+        assert set(record["times_floor"]) == {"frame", *record["stages_ms"]}
+        assert record["times_floor"]["frame"] == pytest.approx(
+            record["frame_ms"] / sum(record["floors_ms"].values())
+        )
+
+
+def test_a_table_for_people_and_a_file_for_programs(capsys, tmp_path):
+    file = tmp_path / "figures.json"
+    assert bench("--scenes", "small", "--json", file) == 0
+    out = capsys.readouterr().out
+    for words in ("small: 200 splats", "x floor", "blend", "splats/s", "memory", "3 frames"):
+        assert words in out
+    assert json.loads(file.read_text())["results"][0]["scene"] == "small"
+
+
+def test_an_interrupt_keeps_what_was_measured(capsys, tmp_path, monkeypatch):
+    draws = []
+
+    def stopped(self, counts, draw=measure.SceneRun.draw):
+        draws.append(counts)
+        if draws.count(True) == 3 + 2:  # the second frame of the second scene
+            raise KeyboardInterrupt
+        draw(self, counts)
+
+    monkeypatch.setattr(measure.SceneRun, "draw", stopped)
+    file = tmp_path / "figures.json"
+    assert bench("--scenes", "small", "other", "--json", file) == 130
+    out, err = capsys.readouterr()
+    assert "small: 200 splats" in out
+    assert "other: 200 splats" in out
+    assert err.endswith("fidsplat: interrupted\n")
+    content = json.loads(file.read_text())
+    assert content["interrupted"] is True
+    assert [record["repeats"] for record in content["results"]] == [3, 1]
+
+
+def test_what_a_device_cannot_draw_is_said_and_the_rest_is_drawn(capsys, monkeypatch):
+    def refuse_empty(self, scene, upload=fs.Renderer.upload):
+        if len(scene) == 0:
+            raise fs.DeviceError("no memory for this")
+        return upload(self, scene)
+
+    monkeypatch.setattr(fs.Renderer, "upload", refuse_empty)
+    monkeypatch.setitem(BENCH_SCENES, "other", BenchScene("empty", lambda: (fs.SplatCloud.empty(), CAMERA)))
+    assert bench("--scenes", "other", "small", "--json", "-") == 1
+    failed, drawn = json.loads(capsys.readouterr().out)["results"]
+    assert failed["error"] == "no memory for this"
+    assert tuple(failed) == KEYS
+    assert drawn["repeats"] == 3
+    assert bench("--scenes", "other", "small") == 1
+    assert "other on opencl" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--scenes", "smal"], "did you mean 'small'"),
+        (["--repeats", "0"], "at least 1"),
+        (["--device", "opencl:nonsense"], "nonsense"),
+        (["--json", "/proc/nowhere/figures.json"], "/proc/nowhere"),
+    ],
+)
+def test_words_that_cannot_be_used(words, says, capsys):
+    assert main(["bench", *words]) == 2
+    assert says in capsys.readouterr().err
+
+
+# --- scenes
+
+
+def test_names_of_scenes():
+    assert scene_names(()) == catalogue.DEFAULT_SCENES
+    assert set(scene_names(["all"])) == set(BENCH_SCENES)
+    assert scene_names(["tag", "r1m_1080p", "tag"]) == ("tag", "r1m_1080p")
+
+
+def test_the_help_names_every_scene(capsys):
+    assert main(["bench", "--help"]) == 0
+    out = capsys.readouterr().out
+    assert all(name in out for name in BENCH_SCENES if name not in ("small", "other"))
+
+
+def test_the_tag_stands_in_the_middle_of_its_picture():
+    cloud, camera = catalogue.tag()
+    shown = camera.project(cloud.means + cloud.origin)
+    np.testing.assert_allclose(shown.mean(0), (320, 240), atol=5)
+    assert shown.min() > 0
+    assert 160 < np.ptp(shown[:, 1]) < 210  # with its quiet zone
+
+
+def test_the_wall_fills_the_picture_with_200_codes(monkeypatch):
+    plain = fs.marker("qr-v1-L:a", size=0.1, quiet_zone=0)  # made at once, and no larger than a dense one
+    asked = []
+    monkeypatch.setattr(catalogue, "marker", lambda spec, size: asked.append((spec, size)) or plain)
+    cloud, camera = catalogue.qr_wall()
+    assert len(cloud) == 200 * len(plain.cloud)
+    assert len(asked) == len(set(asked)) == 10
+    assert all(spec.startswith("qr-v22-L:") and len(spec) == 1009 and size == 0.1 for spec, size in asked)
+    shown = camera.project(cloud.means + cloud.origin)
+    assert shown.min() > 0
+    assert np.all(shown.max(0) < (1920, 1080))
+    assert np.ptp(shown[:, 0]) > 0.9 * 1920

@@ -1,0 +1,145 @@
+"""The measuring scripts: tables from figures, and a growth run that goes on where it was."""
+
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+
+from fidsplat.experiments.bench.growth import Point
+
+FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
+
+
+def script(name: str):
+    spec = importlib.util.spec_from_file_location(f"benchmarks_{name}", FOLDER / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+tables, growth = script("performance_tables"), script("growth")
+
+RECORD = {
+    "scene": "tag",
+    "renderer": "fidsplat",
+    "title": "a CPU",
+    "date": "2026-11-21",
+    "width": 640,
+    "height": 480,
+    "error": None,
+    "frame_ms": 1.234,
+    "quartiles_ms": [1.1, 1.5],
+    "stages_ms": {"project": 0.25, "blend": 0.75},
+    "splats": 691,
+    "visible": 690,
+    "fragments": 202902,
+    "splats_per_second": 5.6e5,
+    "memory_bytes": 2**30,
+    "rates": {"copy_bytes": 45e9, "fma": 250e9, "exp": 12.5e9, "division": 50e9},
+    "times_floor": {"blend": 15.5, "frame": 12.25},
+}
+PEER = RECORD | {
+    "renderer": "Peer 1",
+    "title": "2 threads",
+    "frame_ms": 1234.0,
+    "times_ours": 1000.0,
+    "psnr_db": 39.7,
+}
+FIRST = {
+    "scene": "tag",
+    "device": "opencl",
+    "date": "2026-11-21",
+    "caches": "empty",
+    "seconds": {"python": 0.01, "frame": 1.3, "total": 1.68},
+    "range": [1.5, 2.0],
+}
+
+
+@pytest.fixture
+def files(tmp_path):
+    """One of each kind."""
+    failed = {"scene": "r20m_4k", "renderer": "fidsplat", "title": "a CPU", "error": "no memory"}
+    kinds = {
+        "bench.json": {"results": [RECORD, failed]},
+        "peer.json": {"results": [RECORD | {"frame_ms": 1.2}, PEER]},
+        "first.json": [FIRST],
+    }
+    for name, content in kinds.items():
+        (tmp_path / name).write_text(json.dumps(content))
+    times = {
+        "frame_ms": 9.0,
+        "stages_ms": {"blend": 9.0},
+        "series": "splats",
+        "title": "a CPU",
+        "error": None,
+    }
+    curve = [
+        times | {"x": x, "fastest_ms": x**0.5, "fastest_stages_ms": {"blend": x}}
+        for x in (10.0, 100.0, 1000.0)
+    ]
+    (tmp_path / "growth.jsonl").write_text("".join(json.dumps(record) + "\n" for record in curve))
+    return sorted(tmp_path.iterdir())
+
+
+def rows(text: str) -> list[str]:
+    return text.splitlines()[2:]
+
+
+def test_each_kind_of_figures_becomes_its_table(files):
+    made = {name: make(tables.load(files)) for name, make in tables.TABLES.items()}
+    assert rows(made["counts"]) == ["| tag | 640 x 480 | 691 | 690 | 202,902 |"]
+    assert rows(made["rates"]) == ["| a CPU | 45 GB/s | 250 G/s | 12.5 G/s | 50 G/s |"]
+    assert rows(made["frames"]) == [
+        "| tag | a CPU | 1.23 (1.1 to 1.5) | 12.2 | 0.56 M | 1 GiB | 2026-11-21 |"
+    ]
+    assert rows(made["stages"]) == ["| tag | a CPU | 0.25 (-) | 0.75 (15.5) |"]
+    assert rows(made["peers"]) == [
+        "| tag | Peer 1, 2 threads | 1234 | a CPU: 1.2 | 1e+03 | 39.7 dB | 2026-11-21 |"
+    ]
+    assert rows(made["first"]) == [
+        "| tag | opencl | empty | 1.68 s (1.50 to 2.00) | 0.01 | 1.30 | 2026-11-21 |"
+    ]
+    assert rows(made["growth"]) == ["| a CPU | splats | 0.50 | 1.00 |"]
+
+
+def test_a_table_replaces_what_stands_between_its_marks():
+    page = "before\n<!-- begin rates -->\nold\n<!-- end rates -->\nafter\n"
+    wanted = "before\n<!-- begin rates -->\nnew\n<!-- end rates -->\nafter\n"
+    assert tables.insert(page, "rates", "new") == wanted
+    assert tables.insert(wanted, "rates", "new") == wanted
+    with pytest.raises(SystemExit, match="begin stages"):
+        tables.insert(page, "stages", "new")
+
+
+def test_the_page_has_a_place_for_every_table():
+    page = (FOLDER.parent / "docs" / "performance.md").read_text("utf-8")
+    for name in tables.TABLES:
+        assert page != tables.insert(page, name, "new")
+
+
+def test_growth_goes_on_where_it_was(tmp_path, capsys):
+    file = tmp_path / "growth.jsonl"
+    small = [Point("splats", n, n, 0.1, 64, 48) for n in (20, 40, 80)]
+    first = growth.run({"splats": small[:2]}, "opencl", 2, 60.0, file)
+    assert [record["x"] for record in first] == [20, 40]
+    lines = file.read_text()
+    file.write_text(lines + '{"cut off')  # as a run that is killed leaves it
+    again = growth.run({"splats": small}, "opencl", 2, 60.0, file)
+    assert [record["x"] for record in again] == [20, 40, 80]
+    assert again[:2] == first  # not measured anew
+    assert file.read_text().startswith(lines)
+    assert growth.read(file) == again
+    (thick,) = growth.run(
+        {"overdraw": [Point("overdraw", 2, 400, 1.0, 64, 48)]}, "opencl", 1, 60.0, tmp_path / "o"
+    )
+    assert thick["layers_per_pixel"] > thick["fragments"] / (64 * 48) > 1
+
+
+def test_growth_stops_where_it_takes_too_long(tmp_path, capsys):
+    small = [Point("splats", n, n, 0.1, 64, 48) for n in (20, 40)]
+    records = growth.run({"splats": small}, "opencl", 1, 1e-9, tmp_path / "growth.jsonl")
+    assert [record["x"] for record in records] == [20]
+    assert "splats ends at 20" in capsys.readouterr().err
