@@ -12,7 +12,8 @@ from agreement import ALL_OUTPUTS, random_splats
 import fidsplat as fs
 from fidsplat.backends.warp import backend as warp_backend
 from fidsplat.backends.warp import runtime
-from fidsplat.effects import FeatureSet
+from fidsplat.backends.warp.pipeline import KNOWN
+from fidsplat.effects import CATALOGUE, FeatureSet
 
 wp = pytest.importorskip("warp")
 CAMERA = fs.Camera.look_at(64, 48, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
@@ -82,13 +83,18 @@ def test_nothing_is_said_on_stdout_or_stderr(tmp_path):
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-def test_an_effect_that_warp_lacks_is_an_error_that_names_both(renderer, monkeypatch):
-    monkeypatch.setattr("fidsplat.backends.warp.pipeline.KNOWN", frozenset())
-    features = FeatureSet(("camera_pinhole",), (), 0, 1, "float64")
+def test_an_effect_that_warp_lacks_is_an_error_that_names_both(renderer):
+    slots = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "compose_ordered")
+    features = FeatureSet(slots, ("overdraw",), 0, 1, "float64")
     with pytest.raises(
-        fs.DeviceError, match=rf"{renderer.device.name} .* has no camera_pinhole; use an OpenCL device"
+        fs.DeviceError, match=rf"{renderer.device.name} .* has no overdraw; use an OpenCL device"
     ):
         renderer.backend.pipeline(features)
+
+
+def test_warp_has_every_effect_that_a_user_can_ask_for():
+    internal = {name for name, effect in CATALOGUE.items() if effect.output and not effect.output.public}
+    assert set(CATALOGUE) - internal == KNOWN
 
 
 def test_the_environment_names_the_default(monkeypatch):
