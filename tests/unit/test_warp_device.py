@@ -287,3 +287,22 @@ def test_a_memory_budget_draws_in_bands_with_the_same_bits():
     assert all(np.array_equal(frame[name], wanted[name]) for name in ALL_OUTPUTS)
     with pytest.raises(fs.DeviceError, match=r"budget of 1 MiB is too small .* raise memory_budget"):
         fs.Renderer("warp:cpu", memory_budget=2**20).render(cloud, view, ALL_OUTPUTS)
+
+
+def test_poison_reaches_every_array(renderer, monkeypatch):
+    """Hard case E5 would prove nothing if the arrays were clean."""
+    from fidsplat.backends.warp import probe
+
+    taken, poison = [], probe.poison
+    monkeypatch.setattr(probe, "poison", lambda array: taken.append(poison(array)) or taken[-1])
+    with probe.poisoned(renderer.backend):
+        renderer.render(CLOUD, CAMERA, ("rgb", "depth"))
+        again = renderer.backend.pool.scratch("lines", 4, wp.vec4)
+    assert len(taken) > 15
+    assert (again.numpy().view(np.uint8) == 0xFF).all()
+
+
+@pytest.mark.parametrize("size", [2**46, 2**31])
+def test_an_array_that_the_device_cannot_give_is_an_error_with_a_remedy(renderer, size):
+    with pytest.raises(fs.DeviceError, match=r"lists needs \d+ MiB, which .* use fewer splats or a smaller"):
+        renderer.backend.pool.fresh("lists", size, wp.int32)

@@ -57,7 +57,7 @@ class ArrayPool:
 
         try:
             return wp.empty(max(size, 1), dtype=dtype, device=self.device)
-        except (RuntimeError, MemoryError) as error:
+        except (RuntimeError, MemoryError, ValueError) as error:  # the last: 2^31 elements and more
             raise DeviceError(
                 f"{name} needs {size * wp.types.type_size_in_bytes(dtype) / 2**20:.0f} MiB, which "
                 f"{self.device} has not; use fewer splats or a smaller picture"
