@@ -3,10 +3,10 @@
     python benchmarks/performance_tables.py benchmarks/results/*.json*
     python benchmarks/performance_tables.py benchmarks/results/*.json* --into docs/performance.md
 
-Takes what `fidsplat bench --json`, benchmarks/peers, benchmarks/first_frame.py --json and
-benchmarks/growth.py write, in any mixture. Without --into the tables are printed. With it, each replaces what
-stands in that page between `<!-- begin NAME -->` and `<!-- end NAME -->`; a table for which nothing was
-measured is left alone.
+Takes what `fidsplat bench --json`, benchmarks/peers, benchmarks/first_frame.py --json,
+benchmarks/listing_ways.py --json and benchmarks/growth.py write, in any mixture. Without --into the tables
+are printed. With it, each replaces what stands in that page between `<!-- begin NAME -->` and
+`<!-- end NAME -->`; a table for which nothing was measured is left alone.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from fidsplat.files import atomic_write
 
 
 def load(files: Iterable[Path]) -> dict[str, list[dict]]:
-    """Records by kind: `frames`, `peers` (a peer and the fidsplat beside it), `first`, `growth`."""
-    found: dict[str, list[dict]] = {"frames": [], "peers": [], "first": [], "growth": []}
+    """Records by kind: `frames`, `peers` (a peer and the fidsplat beside it), `first`, `ways`, `growth`."""
+    found: dict[str, list[dict]] = {"frames": [], "peers": [], "first": [], "ways": [], "growth": []}
     for file in files:
         text = file.read_text("utf-8")
         if file.suffix == ".jsonl":
@@ -32,7 +32,7 @@ def load(files: Iterable[Path]) -> dict[str, list[dict]]:
             continue
         content = json.loads(text)
         if isinstance(content, list):
-            found["first"] += content
+            found["ways" if "way" in content[0] else "first"] += content
             continue
         results = [record for record in content["results"] if record.get("frame_ms")]
         with_peer = any(record["renderer"] != "fidsplat" for record in results)
@@ -141,6 +141,16 @@ def first(records: dict[str, list[dict]]) -> str:
     return table(("scene", "device", "caches", "first frame", *parts, "date"), rows)
 
 
+def ways(records: dict[str, list[dict]]) -> str:
+    """Both ways of listing, sort and bin together."""
+    rows = []
+    for record in records["ways"]:
+        parts = record["stages_ms"]["sort"], record["stages_ms"]["bin"]
+        cells = (ms(value) for value in (*parts, sum(parts)))
+        rows.append((record["scene"], record["device"], record["way"], *cells, record["date"]))
+    return table(("scene", "device", "lists", "sort", "bin", "both, ms", "date"), rows)
+
+
 def growth(records: dict[str, list[dict]]) -> str:
     """Exponents of the growth curves."""
     drawn = records["growth"]
@@ -159,6 +169,7 @@ TABLES: dict[str, Callable[[dict[str, list[dict]]], str]] = {
     "stages": stages,
     "peers": peers,
     "first": first,
+    "ways": ways,
     "growth": growth,
 }
 

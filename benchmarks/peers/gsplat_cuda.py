@@ -3,8 +3,8 @@
     pip install . torch gsplat       # 1.5.3; the latest: git+https://github.com/nerfstudio-project/gsplat
     python benchmarks/peers/gsplat_cuda.py r100k_720p r1m_1080p r5m_1080p r20m_4k --json gsplat.json
 
-Written from gsplat's documentation and signature (1.5.3); it needs CUDA and has not been run where it was
-written. The driver's OpenCL must be visible to us (docs/rendering.md, "Devices"). Both keep the splats and
+It needs CUDA, and a compiler for it: gsplat builds its kernels on first use (a minute on 16 cores). The
+driver's OpenCL must be visible to us (docs/rendering.md, "Devices"). Both keep the splats and
 the picture on the GPU; both are timed from the call until the GPU is done. gsplat draws with its own
 constants (opacity ceiling 0.99, exclusive stop), we with our standard ones, which leave no less undone.
 """
@@ -33,7 +33,7 @@ def tensors(cloud: SplatCloud, camera: Camera) -> dict:
         "quats": cloud.quats,
         "scales": scales,
         "opacities": cloud.opacities,
-        "colors": cloud.colors,
+        "colors": cloud.colors[None],  # for each camera
         "viewmats": camera.world_to_camera[None],
         "Ks": camera.matrix[None],
     }

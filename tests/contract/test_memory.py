@@ -116,3 +116,19 @@ def test_views_are_drawn_as_single_pictures_are(renderer):
         single = renderer.render(some, camera, ("rgb", "depth"))
         assert all(np.array_equal(frame[name], single[name]) for name in frame)
     assert list(renderer.render_views(some, [])) == []
+
+
+def test_pictures_of_many_sizes_leave_no_heap_of_buffers(opencl):
+    """Planes go back to the pool when their frame dies; those of another size are let go."""
+    some = random_splats(50, seed=5)
+    own = fs.Renderer(opencl.device.name)
+    held = []
+    for width in (64, 32, 48, 64, 16, 64):
+        frames = [
+            own.render(some, fs.Camera.look_at(width, 32, 1.0, (0, 0, -0.1), (0, 0, 3))) for _ in range(4)
+        ]
+        assert frames[0]["rgb"].shape == (32, width, 3)
+        del frames
+        own.render(some, fs.Camera.look_at(64, 32, 1.0, (0, 0, -0.1), (0, 0, 3)))
+        held.append(own.backend.pool.memory_bytes)
+    assert max(held) <= held[0]

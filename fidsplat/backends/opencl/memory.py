@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from fidsplat.backends.opencl.backend import OpenCLBackend
 
 
+_LEAST = 16  # bytes; OpenCL has no empty buffers
+
+
 class BufferPool:
     """Scratch buffers by name, kept from frame to frame and replaced only when one is too small."""
 
@@ -23,7 +26,7 @@ class BufferPool:
         self._context = context
         self._device = device
         self._buffers: dict[str, cl.Buffer] = {}
-        self._spare: dict[tuple[str, int], list[cl.Buffer]] = {}
+        self._spare: dict[str, list[cl.Buffer]] = {}
 
     def size(self, name: str) -> int:
         """Bytes of the scratch buffer of that name; 0 if there is none yet."""
@@ -31,14 +34,16 @@ class BufferPool:
 
     def lease(self, name: str, size: int) -> cl.Buffer:
         """A buffer for somebody who gives it back (`give_back`) when it is not needed any more."""
-        spare = self._spare.get((name, size))
+        spare = self._spare.get(name)
+        if spare and spare[0].size != max(size, _LEAST):
+            spare.clear()  # of pictures of another size
         return spare.pop() if spare else self.fresh(name, size)
 
     def give_back(self, buffers: list[tuple[str, cl.Buffer]]) -> None:
-        """Keeps a few leased buffers for the next picture of the same size."""
+        """Keeps one or two leased buffers of a name for the next picture of the same size."""
         for name, buffer in buffers:
-            spare = self._spare.setdefault((name, buffer.size), [])
-            if len(spare) < 2:
+            spare = self._spare.setdefault(name, [])
+            if not spare or (len(spare) == 1 and spare[0].size == buffer.size):
                 spare.append(buffer)
 
     @property
@@ -68,7 +73,7 @@ class BufferPool:
                 f"most {limit / 2**20:.0f} MiB; use fewer splats or a smaller picture"
             )
         try:
-            return cl.Buffer(self._context, cl.mem_flags.READ_WRITE, max(size, 16))
+            return cl.Buffer(self._context, cl.mem_flags.READ_WRITE, max(size, _LEAST))
         except cl.Error as error:
             raise DeviceError(f"no memory for {name} ({size / 2**20:.0f} MiB): {error}") from error
 

@@ -1,0 +1,83 @@
+"""Times both ways of making the tiles' lists on a device, frame by frame in turn.
+
+    python benchmarks/listing_ways.py r100k_720p r1m_1080p --device opencl [--repeats 10] [--json FILE]
+
+`ordered` sorts all visible splats by depth and lists them per tile in that order (counting sorts, no
+atomics); `tiled` writes the pairs to their tiles in any order and sorts each tile's list in local memory.
+Both give the same lists. docs/performance.md says which one a device gets, and why.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+from dataclasses import replace
+from datetime import date
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+import fidsplat as fs
+from fidsplat.backends.base import View
+from fidsplat.effects import select
+from fidsplat.experiments.scenes import SCENES, load_scene
+
+WAYS = ("ordered", "tiled")
+
+
+def measure(renderer: fs.Renderer, name: str, repeats: int) -> list[dict]:
+    """Medians of the stages in milliseconds, one row for each way."""
+    backend, quality = renderer.backend, fs.Quality()
+    cloud, camera = load_scene(name)
+    resident = backend.upload(cloud)
+    view = View.of(camera, quality, cloud.origin, (0, 0, 0))
+    features = select(resident, ("rgb",), quality)
+    # the GPU's way scans with many work-items, the CPU's with one
+    items = {"ordered": backend.shape.scan_items, "tiled": max(backend.shape.scan_items, 64)}
+    ways = {
+        way: backend.pipeline(features, replace(backend.shape, lists=way, scan_items=items[way]))
+        for way in WAYS
+    }
+    times: dict[str, list[dict]] = {way: [] for way in WAYS}
+    for _ in track(range(repeats + 1), name, console=Console(stderr=True)):
+        for way, pipeline in ways.items():
+            times[way].append(dict(pipeline.render(resident, view).timings))
+    return [
+        {
+            "scene": name,
+            "way": way,
+            "device": f"{renderer.device.title}, {renderer.device.version}",
+            "date": date.today().isoformat(),
+            "repeats": repeats,
+            "stages_ms": {stage: statistics.median(row[stage] for row in rows[1:]) for stage in rows[0]},
+        }
+        for way, rows in times.items()
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scenes", nargs="*", default=["r100k_720p"], choices=[*SCENES, []], metavar="SCENE")
+    parser.add_argument("--device", default="opencl")
+    parser.add_argument("--repeats", type=int, default=10)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    renderer = fs.Renderer(options.device)
+    rows = [row for name in options.scenes for row in measure(renderer, name, max(options.repeats, 1))]
+    if options.json:
+        options.json.write_text(json.dumps(rows, indent=1) + "\n", "utf-8")
+    table = Table("scene", "way", "project", "sort", "bin", "both", title=f"ms on {renderer.device.title}")
+    for row in rows:
+        stages = row["stages_ms"]
+        figures = (stages["project"], stages["sort"], stages["bin"], stages["sort"] + stages["bin"])
+        table.add_row(row["scene"], row["way"], *(f"{figure:.2f}" for figure in figures))
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
