@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
@@ -42,6 +43,25 @@ class Frame(Mapping):
             plane.flags.writeable = False  # what is kept is what was drawn
         return self._arrays[name]
 
+    def device_array(self, name: str) -> Any:
+        """The plane where it was drawn, without a copy: on a Warp device a wp.array, (h, w) or (h, w, 3).
+
+        It belongs to this frame: the next picture is drawn into another array. `wp.to_torch`, DLPack and
+        `__cuda_array_interface__` make a tensor of it on the same device.
+
+        Raises:
+            KeyError: a plane that was not asked for; InputError: the backend has no arrays to give.
+        """
+        if name not in self.outputs:
+            raise KeyError(f"this frame has no {name!r}; it was rendered with {', '.join(self.outputs)}")
+        give = getattr(self._planes, "device_array", None)
+        if give is None:
+            raise InputError(
+                f"this device keeps {name} in no array that others can use; draw with device='warp:cuda' or "
+                "'warp:cpu', or take frame[name], which is copied to the host"
+            )
+        return give(name)
+
     def __iter__(self) -> Iterator[str]:
         return iter(self.outputs)
 
@@ -57,6 +77,11 @@ class Frame(Mapping):
     def stats(self) -> Mapping[str, int]:
         """splats (in the cloud), visible (not culled), pairs (of splats and tiles)."""
         return self._planes.stats
+
+
+def default_device() -> str:
+    """The device that is used where none is named: FIDSPLAT_DEVICE, else opencl."""
+    return os.environ.get("FIDSPLAT_DEVICE", "").strip() or "opencl"
 
 
 class ResidentCloud:
@@ -79,18 +104,19 @@ class Renderer:
 
     Args:
         device: "opencl" (the best OpenCL device), "opencl:NAME" (part of a platform's or device's name, or
-            cpu or gpu), or "reference" (NumPy, float64, slow).
+            cpu or gpu), "warp:cpu", "warp:cuda" (NVIDIA Warp), or "reference" (NumPy, float64, slow).
+            None: what the environment variable FIDSPLAT_DEVICE says, else "opencl".
         memory_budget: bytes of the device that a picture and its cloud may take; by default nine tenths of
-            what the device says it has. What needs more is drawn in bands of the picture and chunks of the
-            cloud, which takes longer and gives the same bits.
+            what the device says it has. What needs more is drawn in bands of the picture and, by OpenCL,
+            chunks of the cloud, which takes longer and gives the same bits.
 
     Raises:
         DeviceError: the device cannot be used; UnknownDeviceError: there is no such device.
         InputError: the memory budget is no positive number, or the device has none.
     """
 
-    def __init__(self, device: str = "opencl", memory_budget: int | None = None) -> None:
-        self.backend = open_backend(device)
+    def __init__(self, device: str | None = None, memory_budget: int | None = None) -> None:
+        self.backend = open_backend(default_device() if device is None else device)
         if memory_budget is not None:
             if isinstance(memory_budget, bool) or not isinstance(memory_budget, int) or memory_budget <= 0:
                 raise InputError(
@@ -109,6 +135,46 @@ class Renderer:
         if not isinstance(cloud, SplatCloud):
             raise InputError(f"cannot render a {type(scene).__name__}; give a Scene or a SplatCloud")
         return ResidentCloud(self, self.backend.upload(cloud), len(cloud))
+
+    def adopt(
+        self,
+        *,
+        means: Any,
+        quats: Any,
+        scales: Any,
+        opacities: Any,
+        colors: Any = None,
+        sh: Any = None,
+        labels: Any = None,
+        origin: Iterable[float] = (0.0, 0.0, 0.0),
+    ) -> ResidentCloud:
+        """Splats in arrays that are on the device already: drawn where they lie, without a copy.
+
+        Shapes and units are those of SplatCloud, float32 (labels int32): wp.array, or what gives DLPack
+        (torch,
+        CuPy, JAX); NumPy arrays are copied. What is in the arrays when a picture is drawn is what it shows,
+        so a
+        simulation may move the splats between pictures. Quaternions need no unit length; a splat that cannot
+        be drawn
+        (a value that is not finite, a scale below 0) is left out of the picture without a word. `origin`
+        (3,): world
+        position of the means' zero.
+
+        Raises:
+            InputError: the backend takes no arrays, or one has the wrong shape, type or device.
+        """
+        take = getattr(self.backend, "adopt", None)
+        if take is None:
+            raise InputError(
+                f"{self.device.name} takes no arrays of a device; use a Warp device, or a SplatCloud"
+            )
+        if (colors is None) == (sh is None):
+            raise InputError("give exactly one of colors (n, 3) and sh (n, k, 3)")
+        given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+        given |= {"colors": colors} if sh is None else {"sh": sh}
+        given |= {} if labels is None else {"labels": labels}
+        data = take(given, np.asarray(tuple(origin), dtype=np.float64))
+        return ResidentCloud(self, data, data.count)
 
     def render(
         self,

@@ -10,11 +10,16 @@ from importlib import import_module
 from fidsplat.backends.base import Backend, DeviceInfo
 from fidsplat.errors import UnknownDeviceError
 
-_FAMILIES = {"opencl": "fidsplat.backends.opencl", "reference": "fidsplat.backends.reference"}
+_FAMILIES = {
+    "opencl": "fidsplat.backends.opencl",
+    "warp": "fidsplat.backends.warp",
+    "reference": "fidsplat.backends.reference",
+}
 
 
 def open_backend(name: str) -> Backend:
-    """Open a device by name: a family (`opencl`, `reference`) or `family:part of a platform's or device's
+    """Open a device by name: a family (`opencl`, `warp`, `reference`) or `family:part of a platform's or
+    device's
     name`.
 
     Raises:

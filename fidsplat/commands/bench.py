@@ -53,7 +53,7 @@ Examples:
     ] = ()
     device: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
-        option("D", "see `fidsplat devices`; once more for each (default: opencl)"),
+        option("D", "see `fidsplat devices`; once more for each (default: FIDSPLAT_DEVICE, or opencl)"),
     ] = ()
     repeats: Annotated[int, option("N", "frames of each scene on each device that count (default: 20)")] = 20
     json: Annotated[
@@ -66,6 +66,7 @@ Examples:
 
         from fidsplat.experiments.bench.catalogue import scene_names
         from fidsplat.experiments.bench.measure import Bench as Measuring
+        from fidsplat.render import default_device
 
         if self.repeats < 1:
             raise InputError(f"--repeats is {self.repeats}; give a number of frames, at least 1")
@@ -74,7 +75,7 @@ Examples:
             writable_file(self.json)
         where = console(self.json == "-")
         interrupted, measuring = False, None
-        devices = self.device or ("opencl",)
+        devices = self.device or (default_device(),)
         frames = len(scenes) * len(set(devices)) * self.repeats
         with Progress(
             *Progress.get_default_columns(), TextColumn("{task.fields[now]}"), console=where, transient=True

@@ -35,7 +35,9 @@ Examples:
   fidsplat check --device opencl:nvidia --json
   fidsplat check --fuzz 100000"""
 
-    device: Annotated[str, option("D", "see `fidsplat devices` (default: opencl)")] = "opencl"
+    device: Annotated[
+        str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")
+    ] = None
     out: Annotated[
         str, option("DIR", "folder for the picture and the fuzzer's state (default: fidsplat-check)", "-o")
     ] = "fidsplat-check"

@@ -27,7 +27,9 @@ Examples:
     out: Annotated[
         str, option("DIR", "folder for pictures, scene and figures (default: fidsplat-demo)", "-o")
     ] = "fidsplat-demo"
-    device: Annotated[str, option("D", "see `fidsplat devices` (default: opencl)")] = "opencl"
+    device: Annotated[
+        str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")
+    ] = None
     json: Json = False
 
     def run(self) -> int:

@@ -41,9 +41,10 @@ Examples:
         str | None,
         option("A,B,...", "planes: rgb alpha depth depth_median normal label (default: the scene's, or rgb)"),
     ] = None
-    device: Annotated[str | None, option("D", "see `fidsplat devices` (default: the scene's, or opencl)")] = (
-        None
-    )
+    device: Annotated[
+        str | None,
+        option("D", "see `fidsplat devices` (default: the scene's, or FIDSPLAT_DEVICE, or opencl)"),
+    ] = None
     quality: Annotated[
         str | None,
         option("Q", "standard fast reference gsplat surfel (default: the scene's, or standard)"),
@@ -64,7 +65,7 @@ Examples:
         with where.status("reading"):
             scene = _load(self.source)
         with where.status("opening the device"):
-            renderer = fs.Renderer(self.device or scene.device or "opencl")
+            renderer = fs.Renderer(self.device or scene.device)
         begun = time.perf_counter()
         with where.status("drawing"):
             frame = renderer.render(scene, outputs=names, quality=self.quality)

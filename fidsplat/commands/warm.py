@@ -14,15 +14,17 @@ class Warm:
     HELP: ClassVar[str] = """Compile what scenes commonly call for, so that first pictures come at once.
 
 The kernels of a scene are compiled when it is first drawn, which takes a second or more, and kept in the
-caches of pyopencl and of the driver. This fills them: plain colours and spherical harmonics, with and without
-markers, the usual outputs. Worth it once after an installation, an update or a change of the driver. What is
-there already takes no time.
+caches of pyopencl, of Warp and of the driver. This fills them: plain colours and spherical harmonics, with
+and without markers, the usual outputs. Worth it once after an installation, an update or a change of the
+driver. What is there already takes no time.
 
 Examples:
   fidsplat warm
   fidsplat warm --device opencl:nvidia --json"""
 
-    device: Annotated[str, option("D", "see `fidsplat devices` (default: opencl)")] = "opencl"
+    device: Annotated[
+        str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")
+    ] = None
     json: Json = False
 
     def run(self) -> int:

@@ -96,7 +96,7 @@ class DemoResult:
 
 
 def run_demo(
-    out: str | Path, device: str = "opencl", tell: Callable[[str], None] = lambda text: None
+    out: str | Path, device: str | None = None, tell: Callable[[str], None] = lambda text: None
 ) -> DemoResult:
     """Run the demo and write its pictures, its scene and its figures into the folder ``out``.
 

@@ -7,6 +7,7 @@ Only the precise functions are used (kernels/README.md); the fast ones are measu
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 
 import numpy as np
 
@@ -62,7 +63,8 @@ def measure(renderer: Renderer, seed: int = 0) -> Arithmetic | None:
     """
     if renderer.device.platform == "reference":
         return None
-    from fidsplat.backends.opencl.arithmetic import run_arithmetic
+    family = renderer.device.name.split(":")[0]
+    run_arithmetic = import_module(f"fidsplat.backends.{family}.arithmetic").run_arithmetic
 
     generator = np.random.default_rng(seed)
     exponents = generator.uniform(-14, 0, _COUNT).astype(np.float32).astype(float)
@@ -70,7 +72,7 @@ def measure(renderer: Renderer, seed: int = 0) -> Arithmetic | None:
     above, below = (
         log_uniform(generator, 1e-9, 1e9, _COUNT).astype(np.float32).astype(float) for _ in range(2)
     )
-    got = run_arithmetic(renderer.backend, exponents, shares, above, below)  # type: ignore[arg-type]
+    got = run_arithmetic(renderer.backend, exponents, shares, above, below)
     wide_above, wide_below = above.astype(np.longdouble), below.astype(np.longdouble)
     truth = {
         "exp": np.exp(exponents),

@@ -90,7 +90,7 @@ def fuzz_run(renderer: Renderer, splats: int, file: Path | None = None) -> Itera
 
 def _key(renderer: Renderer) -> str:
     code = hashlib.sha256(Path(fuzz.__file__).read_bytes())
-    for path in sorted(kernels_folder().rglob("*.cl")):
+    for path in sorted([*kernels_folder().rglob("*.cl"), *kernels_folder().rglob("*.py")]):
         code.update(path.read_bytes())
     device = renderer.device
     return " | ".join((device.title, device.platform, device.version, __version__, code.hexdigest()[:16]))

@@ -13,6 +13,7 @@ from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
 from fidsplat.hard_cases.case import Case, Finding
 from fidsplat.hard_cases.clouds import camera, random_splats, splats, taken, turned
+from fidsplat.hard_cases.invariance import probe_of
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer
 from fidsplat.splats import SplatCloud
@@ -140,10 +141,9 @@ def far_check(renderer: Renderer) -> Iterator[Finding]:
 def count_check(renderer: Renderer) -> Iterator[Finding]:
     """Pairs of splats and tiles: sums beyond 32 bits, and a picture that is drawn in bands of tiles."""
     backend: Any = renderer.backend
-    if not hasattr(backend, "pair_budget"):
+    probe = probe_of(renderer)
+    if probe is None:
         return
-    from fidsplat.backends.opencl import probe
-
     cloud = random_splats(200, 43, depth=(0.5, 4.0), scale=(0.05, 1.0))
     pipeline = backend.pipeline(select(cloud, ("rgb", "alpha"), Quality()))
     generator = np.random.default_rng(0)
@@ -227,10 +227,9 @@ def frame_check(renderer: Renderer) -> Iterator[Finding]:
 def unwritten_check(renderer: Renderer) -> Iterator[Finding]:
     """Buffers full of NaN before the picture is drawn: nothing of them may survive."""
     backend: Any = renderer.backend
-    if not hasattr(backend, "pool"):
+    probe = probe_of(renderer)
+    if probe is None:
         return
-    from fidsplat.backends.opencl import probe
-
     different = 0
     for cloud in (crowd(), crowd().with_planes(0), SplatCloud.empty()):
         for width, height in ((60, 45), (33, 1), (1, 1)):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
 from fidsplat.hard_cases.arithmetic import measure
 from fidsplat.hard_cases.case import Case, Finding
 from fidsplat.hard_cases.clouds import camera, random_splats, splats
-from fidsplat.hard_cases.invariance import out_of_order
+from fidsplat.hard_cases.invariance import has_tiles, odd_shapes, other_schedule, out_of_order, probe_of
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer
 from fidsplat.splats import SplatCloud
@@ -24,51 +23,20 @@ VIEW = camera(60, 45, 48.0)
 UNSAFE = ("fast", "unsafe", "finite", "denorms", "mad-enable", "signed-zeros")
 """words of build options that let go of IEEE arithmetic"""
 
-CONTRACTION = """
-kernel void probe(global const float *a, global const float *b, global const float *c,
-                  global float *difference, global float *sum, global real *wide, global float *fused) {
-    int i = get_global_id(0);
-    difference[i] = a[i] * b[i] - c[i] * b[i];      // a is c: 0 unless one product is not rounded
-    sum[i] = a[i] * b[i] + c[i];
-    wide[i] = (real)a[i] / 3 * ((real)b[i] / 3) - (real)c[i] / 3 * ((real)b[i] / 3);
-    float product = a[i] * b[i];
-    fused[i] = FMA(a[i], b[i], -product);
-}
-"""
-NOT_A_NUMBER = """
-kernel void probe(global const float *x, global int *unequal, global int *named, global int *survives,
-                  global int *infinite) {
-    int i = get_global_id(0);
-    unequal[i] = x[i] != x[i];
-    named[i] = isnan(x[i]);
-    survives[i] = !(x[i] > 0.0f) && !(x[i] <= 0.0f);
-    infinite[i] = isinf(x[i]);
-}
-"""
-
-
-def opencl(renderer: Renderer) -> Any:
-    """The OpenCL backend of a renderer, or None if it has another."""
-    return renderer.backend if renderer.device.name.startswith("opencl") else None
-
 
 def contraction_check(renderer: Renderer) -> Iterator[Finding]:
     """Products that are subtracted round alike, and FMA fuses where the device is said to."""
-    backend = opencl(renderer)
-    if backend is None:
+    probe = probe_of(renderer)
+    if probe is None:
         return
-    from fidsplat.backends.opencl import probe
-
     generator = np.random.default_rng(61)
     a, b = generator.uniform(0.5, 2.0, (2, 4096)).astype(np.float32)
-    real = np.float64 if renderer.device.float64 else np.float32
-    types = (np.float32, np.float32, real, np.float32)
-    difference, total, wide, fused = probe.evaluate(backend, CONTRACTION, (a, b, a), types)
+    (difference, total, wide, fused), fuses = probe.contraction(renderer.backend, a, b)
     yield Finding("a b - a b that is not 0", int(np.count_nonzero(difference)), 0)
     yield Finding("the same in the set-up's precision", int(np.count_nonzero(wide)), 0)
     yield Finding("a b + c that is not rounded twice", int(np.count_nonzero(total != a * b + a)), 0)
     product = a.astype(float) * b.astype(float)  # exact, and so is its rounding error
-    wanted = (product - (a * b)) if backend.shape.fast_fma else np.zeros(len(a))
+    wanted = (product - (a * b)) if fuses else np.zeros(len(a))
     yield Finding(
         "FMA(a, b, c) that is not rounded as it should be", int(np.count_nonzero(fused != wanted)), 0
     )
@@ -82,12 +50,10 @@ def function_check(renderer: Renderer) -> Iterator[Finding]:
 
 def option_check(renderer: Renderer) -> Iterator[Finding]:
     """No build option lets go of NaN, and the compiler does not by itself."""
-    backend = opencl(renderer)
-    if backend is None:
+    probe = probe_of(renderer)
+    if probe is None:
         return
-    from fidsplat.backends.opencl import probe
-
-    unsafe = [option for option in backend.build_options if any(word in option for word in UNSAFE)]
+    unsafe = [option for option in probe.options(renderer.backend) if any(word in option for word in UNSAFE)]
     yield Finding("build options that let go of IEEE arithmetic", len(unsafe), 0)
     bits = [
         0x7FC00000,
@@ -102,7 +68,7 @@ def option_check(renderer: Renderer) -> Iterator[Finding]:
         1,
     ]
     x = np.array(bits, np.uint32).view(np.float32)
-    unequal, named, survives, infinite = probe.evaluate(backend, NOT_A_NUMBER, (x,), (np.int32,) * 4)
+    unequal, named, survives, infinite = probe.not_a_number(renderer.backend, x)
     is_nan = np.isnan(x)
     for name, seen in (("x != x", unequal), ("isnan(x)", named), ("a comparison that fails", survives)):
         yield Finding(f"NaN told wrongly by {name}", int((seen.astype(bool) != is_nan).sum()), 0)
@@ -131,8 +97,8 @@ def denormal_check(renderer: Renderer) -> Iterator[Finding]:
 
 def barrier_check(renderer: Renderer) -> Iterator[Finding]:
     """The schedule with barriers against the one without; on a GPU, against other sizes of its groups."""
-    backend = opencl(renderer)
-    if backend is None:
+    backend: Any = renderer.backend
+    if not has_tiles(renderer):
         return
     # lists from none to several times what a group stages at once (128), and pixels that finish early
     crowded = random_splats(260, 65, depth=(0.8, 1.5), scale=(0.02, 0.25), across=0.25)
@@ -141,11 +107,7 @@ def barrier_check(renderer: Renderer) -> Iterator[Finding]:
     view = View.of(VIEW, Quality(), cloud.origin, (0.1, 0.2, 0.3))
     resident = backend.upload(cloud)
     base = backend.pipeline(features).render(resident, view)
-    small = {"tile_width": 8, "tile_height": 8}
-    shape = replace(backend.shape, schedule="group", lists="tiled", lanes=1, scan_items=64, **small)
-    if backend.shape.schedule == "group":
-        shape = replace(backend.shape, **small)
-    other = backend.pipeline(features, shape).render(resident, view)
+    other = backend.pipeline(features, other_schedule(renderer)).render(resident, view)
     for name in ("rgb", "alpha", "depth"):
         error = np.abs(other.read(name) - base.read(name)).max()
         yield Finding(f"{name}: difference between schedules", float(error), 5e-6)
@@ -162,21 +124,16 @@ def in_a_row(depths) -> SplatCloud:
 
 def sort_check(renderer: Renderer) -> Iterator[Finding]:
     """Depth order, tile lists and their starts at awkward lengths, against NumPy's stable sort."""
-    backend = opencl(renderer)
-    if backend is None:
+    backend: Any = renderer.backend
+    if not has_tiles(renderer):
         return
     generator = np.random.default_rng(67)
-    own = backend.shape
-    odd = replace(own, chunks=7, radix_bits=5)
     features = select(in_a_row([1.0]), ("rgb",), Quality())
     view = View.of(VIEW, Quality(), np.zeros(3), (0.0, 0.0, 0.0))
     unsorted = unlisted = tried = 0
-    tiled = replace(
-        own, schedule="group", lists="tiled", lanes=1, tile_width=16, tile_height=16, scan_items=64
-    )
-    for shape in (own, odd, tiled):
+    for shape in odd_shapes(renderer):
         pipeline = backend.pipeline(features, shape)
-        c = min(shape.chunks, 2000)
+        c = min(getattr(shape, "chunks", 2048), 2000)
         for n in sorted({1, 2, 3, c - 1, c, c + 1, 2 * c + 1, 255, 256, 257, 1000, 4097}):
             for kind in ("random", "few values", "one value", "descending", "half culled"):
                 depths = generator.uniform(1.0, 9.0, n)

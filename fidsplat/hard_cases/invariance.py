@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from importlib import import_module
+from types import ModuleType
 
 import numpy as np
 
@@ -70,3 +72,28 @@ def tile_shapes(renderer: Renderer) -> list:
         sizes = [(lanes, height) for lanes, height in ((8, 8), (own.lanes, 32), (4, 16))]
         return [replace(own, lanes=w, tile_width=w, tile_height=h) for w, h in sizes]
     return [replace(own, tile_width=side, tile_height=side) for side in (8, 32)]
+
+
+def group_shape(own, side: int):
+    """Build constants `own` with the schedule that a GPU would be given, in tiles of side x side."""
+    groups = replace(own, schedule="group", tile_width=side, tile_height=side)
+    return replace(groups, lists="tiled", lanes=1, scan_items=64) if hasattr(own, "lists") else groups
+
+
+def other_schedule(renderer: Renderer):
+    """Build constants of the schedule for GPUs; on a GPU, with other tiles."""
+    return group_shape(renderer.backend.shape, 8)  # type: ignore[attr-defined]
+
+
+def odd_shapes(renderer: Renderer) -> list:
+    """The device's build constants, and others for its sorting where it has its own."""
+    own = renderer.backend.shape  # type: ignore[attr-defined]
+    if not hasattr(own, "chunks"):
+        return [own]
+    return [own, replace(own, chunks=7, radix_bits=5), group_shape(own, 16)]
+
+
+def probe_of(renderer: Renderer) -> ModuleType | None:
+    """The module that looks into the renderer's device; None for the reference."""
+    family = renderer.device.name.split(":")[0]
+    return None if family == "reference" else import_module(f"fidsplat.backends.{family}.probe")

@@ -42,10 +42,11 @@ HOME_OF = {
     "shapely": ("markers",),
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
+    "warp": ("backends.warp",),
     "tyro": ("cli", "commands"),
     "rich": ("cli", "commands"),
 }
-HEAVY = ("pyopencl", "shapely", "networkx", "segno", "cv2", "zxingcpp", "tyro", "rich")
+HEAVY = ("pyopencl", "warp", "shapely", "networkx", "segno", "cv2", "zxingcpp", "tyro", "rich")
 
 MODULES = {".".join(p.relative_to(PACKAGE).with_suffix("").parts): p for p in PACKAGE.rglob("*.py")}
 

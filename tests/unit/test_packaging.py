@@ -13,7 +13,11 @@ import pytest
 TREE = Path(__file__).resolve().parents[2]
 PARTS = ("fidsplat", "kernels", "docs", "benchmarks")
 FILES = ("pyproject.toml", "README.md", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", ".gitignore")
-KERNELS = {p.relative_to(TREE / "kernels").as_posix() for p in (TREE / "kernels").rglob("*.cl")}
+KERNELS = {
+    path.relative_to(TREE / "kernels").as_posix()
+    for ending in ("*.cl", "*.py")
+    for path in (TREE / "kernels").rglob(ending)
+}
 
 # prints the folder of the kernels and every kernel file under it
 ASK = """
@@ -24,7 +28,7 @@ sys.path[:] = [p for p in sys.path if p not in others] + others  # before this e
 from fidsplat.kernel_files import kernels_folder
 folder = kernels_folder()
 print(folder)
-for path in sorted(folder.rglob("*.cl")):
+for path in sorted([*folder.rglob("*.cl"), *folder.rglob("*.py")]):
     print(path.relative_to(folder).as_posix())
 """
 

@@ -105,3 +105,46 @@ def buffer_of(backend: OpenCLBackend, array: np.ndarray) -> cl.Buffer:
     """An array in a buffer of its own."""
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
     return cl.Buffer(backend.context, flags, hostbuf=np.ascontiguousarray(array))
+
+
+CONTRACTION = """
+kernel void probe(global const float *a, global const float *b, global const float *c,
+                  global float *difference, global float *sum, global real *wide, global float *fused) {
+    int i = get_global_id(0);
+    difference[i] = a[i] * b[i] - c[i] * b[i];      // a is c: 0 unless one product is not rounded
+    sum[i] = a[i] * b[i] + c[i];
+    wide[i] = (real)a[i] / 3 * ((real)b[i] / 3) - (real)c[i] / 3 * ((real)b[i] / 3);
+    float product = a[i] * b[i];
+    fused[i] = FMA(a[i], b[i], -product);
+}
+"""
+NOT_A_NUMBER = """
+kernel void probe(global const float *x, global int *unequal, global int *named, global int *survives,
+                  global int *infinite) {
+    int i = get_global_id(0);
+    unequal[i] = x[i] != x[i];
+    named[i] = isnan(x[i]);
+    survives[i] = !(x[i] > 0.0f) && !(x[i] <= 0.0f);
+    infinite[i] = isinf(x[i]);
+}
+"""
+
+
+def contraction(backend: OpenCLBackend, a: np.ndarray, b: np.ndarray) -> tuple[list[np.ndarray], bool]:
+    """a b - a b; a b + a; the difference in the set-up's precision, of thirds; a b - (a b), fused: each (n,),
+    from a, b (n,)
+    float32. And whether the device fuses where it is asked to.
+    """
+    real = np.float64 if backend.info.float64 else np.float32
+    types = (np.float32, np.float32, real, np.float32)
+    return evaluate(backend, CONTRACTION, (a, b, a), types), backend.shape.fast_fma
+
+
+def not_a_number(backend: OpenCLBackend, x: np.ndarray) -> Sequence[np.ndarray]:
+    """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
+    return evaluate(backend, NOT_A_NUMBER, (x,), (np.int32,) * 4)
+
+
+def options(backend: OpenCLBackend) -> list[str]:
+    """What every program is compiled with."""
+    return backend.build_options

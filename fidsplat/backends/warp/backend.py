@@ -1,0 +1,147 @@
+"""Warp devices: listing, choosing, opening; compiled pipelines by FeatureSet."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends.base import DeviceInfo
+from fidsplat.backends.warp import runtime
+from fidsplat.backends.warp.launch import Commands
+from fidsplat.backends.warp.memory import ArrayPool, Resident
+from fidsplat.backends.warp.pipeline import WarpPipeline
+from fidsplat.effects import FeatureSet
+from fidsplat.errors import DeviceError, UnknownDeviceError
+from fidsplat.splats import SplatCloud
+
+
+@dataclass(frozen=True)
+class WarpShape:
+    """How pictures are cut for a device."""
+
+    schedule: str
+    """`tiles`: a thread draws a tile (CPU). `group`: a block of threads draws a tile (CUDA)."""
+    tile_width: int
+    """samples, a multiple of 4"""
+    tile_height: int
+
+
+def devices() -> list[DeviceInfo]:
+    """Warp's devices here; one that says how to install Warp if it is missing."""
+    try:
+        wp = runtime.load()
+    except DeviceError as error:
+        return [_describe_missing(str(error))]
+    return [_describe(device) for device in wp.get_devices()]
+
+
+def open_device(selector: str = "") -> WarpBackend:
+    """`cpu`, `cuda` (the first), `cuda:1`, or part of a device's name; without a selector CUDA before the
+    CPU.
+
+    Raises:
+        DeviceError: Warp is missing or cannot be started, or there is no CUDA device.
+        UnknownDeviceError: nothing matches the selector.
+    """
+    found = runtime.load().get_devices()
+    wanted = selector.strip().lower()
+    matching = [d for d in found if wanted in (d.alias, d.alias.split(":")[0]) or wanted in d.name.lower()]
+    if not matching:
+        if wanted.split(":")[0] == "cuda" and not any(device.is_cuda for device in found):
+            raise DeviceError(
+                "Warp sees no CUDA device here (no NVIDIA driver, or no GPU); use device='warp:cpu'"
+            )
+        known = ", ".join(f"warp:{device.alias}" for device in found)
+        raise UnknownDeviceError(f"no Warp device matches {selector!r}; there are: {known}")
+    return WarpBackend(min(matching, key=lambda device: not device.is_cuda))
+
+
+class WarpBackend:
+    """An open Warp device with its pool of arrays and compiled pipelines."""
+
+    def __init__(self, device: Any) -> None:
+        self.info = _describe(device)
+        self.device = device
+        self.shape = WarpShape("group" if device.is_cuda else "tiles", 16, 16)
+        self.pool = ArrayPool(device)
+        self.pair_budget = 2**30 - 1
+        """Most pairs of splats and tiles that are listed at once; tests make it small."""
+        self.memory_budget = self.info.memory_bytes // 10 * 9
+        """bytes of the device that a picture and its cloud may take"""
+        self.threads = 1 if device.is_cuda else self.info.compute_units
+        # Warp runs a CPU launch on the thread that calls it, without the interpreter's lock
+        self.workers = None if device.is_cuda else ThreadPoolExecutor(self.threads, "fidsplat-warp")
+        self.commands = Commands(device)
+        self._pipelines: dict[tuple[FeatureSet, WarpShape], WarpPipeline] = {}
+
+    def limit_memory(self, budget: int) -> None:
+        """Let a picture and its cloud take at most `budget` bytes of the device.
+
+        Pictures that need more for their lists are drawn in bands of tiles, with the same bits; a cloud that
+        does not fit is an error.
+        """
+        self.memory_budget = budget
+
+    def upload(self, cloud: SplatCloud) -> Resident:
+        """The cloud in arrays on the device."""
+        return Resident.of(cloud, self.pool)
+
+    def adopt(self, arrays: Mapping[str, Any], origin: np.ndarray) -> Resident:
+        """Arrays (`means`, `quats`, ...) that are on the device already, used where they lie."""
+        return Resident.around(arrays, origin, self.pool)
+
+    def pipeline(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpPipeline:
+        """The stages compiled for these features; `shape` replaces the device's own tiles (tests).
+
+        Raises:
+            DeviceError: an effect that the Warp kernels have not, or the compiler refuses.
+        """
+        key = (features, shape or self.shape)
+        if key not in self._pipelines:
+            self._pipelines[key] = WarpPipeline(self, *key)
+        return self._pipelines[key]
+
+
+def _describe(device: Any) -> DeviceInfo:
+    wp = runtime.load()
+    if device.is_cuda:
+        title, kind, units = device.name, "gpu", device.sm_count
+        memory = device.total_memory
+    else:
+        units = len(os.sched_getaffinity(0))
+        title, kind = f"CPU, {units} thread{'s' if units > 1 else ''}", "cpu"
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return DeviceInfo(
+        name=f"warp:{device.alias}",
+        title=title,
+        platform="NVIDIA Warp",
+        version=f"Warp {wp.__version__}",
+        kind=kind,
+        compute_units=units,
+        memory_bytes=memory,
+        largest_allocation_bytes=memory,
+        float64=True,
+        usable=True,
+        reason="",
+    )
+
+
+def _describe_missing(why: str) -> DeviceInfo:
+    return DeviceInfo(
+        name="warp",
+        title="NVIDIA Warp: CPU and CUDA",
+        platform="NVIDIA Warp",
+        version="not installed",
+        kind="other",
+        compute_units=0,
+        memory_bytes=0,
+        largest_allocation_bytes=0,
+        float64=True,
+        usable=False,
+        reason=why,
+    )

@@ -1,0 +1,84 @@
+"""Warp itself: imported on first use, without a word on stdout, and the kernel package beside it."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from types import ModuleType
+
+from fidsplat.errors import DeviceError
+from fidsplat.kernel_files import kernels_folder
+
+MISSING = "Warp is not installed; install it with: pip install 'fidsplat[warp]' (or pip install warp-lang)"
+_PACKAGE = "fidsplat_warp_kernels"
+
+
+def installed() -> bool:
+    """Whether Warp can be imported."""
+    return importlib.util.find_spec("warp") is not None
+
+
+@cache
+def load() -> ModuleType:
+    """The module `warp`, initialised.
+
+    Raises:
+        DeviceError: it is not installed, or cannot be started.
+    """
+    if not installed():
+        raise DeviceError(MISSING)
+    try:
+        import warp
+    except Exception as error:  # a broken installation, whatever it raises
+        raise DeviceError(f"Warp cannot be imported: {error}") from error
+    with quiet(), _without_stderr():
+        warp.init()
+    return warp
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Within it Warp tells warnings only: what it says of modules would stand amid a command's output."""
+    import warp
+
+    level, warp.config.log_level = warp.config.log_level, warp.LOG_WARNING
+    try:
+        yield
+    finally:
+        warp.config.log_level = level
+
+
+@contextmanager
+def _without_stderr() -> Iterator[None]:
+    # Warp's native start says there that no CUDA driver is here, which is no error: `fidsplat devices` lists
+    # what is
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with open(os.devnull, "w") as nothing:
+            os.dup2(nothing.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+@cache
+def kernels(name: str) -> ModuleType:
+    """A module of kernels/warp."""
+    folder = kernels_folder() / "warp"
+    if _PACKAGE not in sys.modules:
+        spec = importlib.util.spec_from_file_location(
+            _PACKAGE, folder / "__init__.py", submodule_search_locations=[str(folder)]
+        )
+        if spec is None or spec.loader is None:
+            raise DeviceError(f"the Warp kernels are missing from {folder}; reinstall fidsplat")
+        package = importlib.util.module_from_spec(spec)
+        sys.modules[_PACKAGE] = package
+        spec.loader.exec_module(package)
+    return importlib.import_module(f"{_PACKAGE}.{name}")

@@ -1,0 +1,133 @@
+"""What part of the picture a splat can touch: its ellipse, or a box where the disk crosses the near plane,
+and the low-pass dot.
+
+Everything here is conservative; the test of each sample decides.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from .common import View, fma, to_sample
+
+# room for the rounding of the fields and of the per-sample test: samples, and relative
+PAD = wp.constant(0.02)
+PAD_RELATIVE = wp.constant(2e-4)
+
+
+@wp.struct
+class Bounds:
+    """At height h from the centre the ellipse reaches from shear h - w to shear h + w, w = half_width sqrt(1
+    - h^2 inverse_hy2).
+    """
+
+    x: float
+    y: float
+    half_x: float
+    half_y: float
+    shear: float
+    half_width: float
+    inverse_hy2: float  # 0: a box
+    tip: float  # height at which it is widest to the right
+    dot_x: float
+    dot_y: float
+    dot_r: float  # below 0: no dot
+
+
+@wp.func
+def box_bounds(x0: float, x1: float, y0: float, y1: float):
+    """The box [x0, x1] x [y0, y1]."""
+    b = Bounds()
+    b.x = 0.5 * (x0 + x1)
+    b.y = 0.5 * (y0 + y1)
+    b.half_x = 0.5 * (x1 - x0) * (1.0 + PAD_RELATIVE) + PAD
+    b.half_y = 0.5 * (y1 - y0) * (1.0 + PAD_RELATIVE) + PAD
+    b.half_width = b.half_x
+    b.dot_r = -1.0
+    return b
+
+
+@wp.func
+def ellipse_bounds(x: float, y: float, half_x: float, half_y: float, shear: float, across: float, tip: float):
+    """The ellipse around (x, y) whose chord at height h is shear h +- across sqrt(1 - h^2 / half_y^2)."""
+    b = Bounds()
+    b.x = x
+    b.y = y
+    b.half_x = half_x * (1.0 + PAD_RELATIVE) + PAD
+    b.half_y = half_y * (1.0 + PAD_RELATIVE) + PAD
+    b.shear = shear
+    b.tip = tip
+    # the pad of the height shifts a sheared chord too
+    b.half_width = across * (1.0 + PAD_RELATIVE) + PAD_RELATIVE * half_x + PAD * (1.0 + wp.abs(shear))
+    b.inverse_hy2 = 1.0 / (b.half_y * b.half_y)
+    b.dot_r = -1.0
+    return b
+
+
+@cache
+def make_bounds(screen: bool) -> SimpleNamespace:
+    """rows(bounds, height) and span(bounds, y0, y1, width), with or without the low-pass dot."""
+
+    @wp.func
+    def rows(b: Bounds, height: int):
+        """First and last row of samples, last excluded, whose centres can be reached."""
+        low = b.y - b.half_y
+        high = b.y + b.half_y
+        if wp.static(screen):
+            if b.dot_r >= 0.0:
+                low = wp.min(low, b.dot_y - b.dot_r)
+                high = wp.max(high, b.dot_y + b.dot_r)
+        first = wp.max(to_sample(wp.ceil(low - 0.5), height), 0)
+        end = wp.min(to_sample(wp.floor(high - 0.5) + 1.0, height), height)
+        return first, end
+
+    @wp.func
+    def span(b: Bounds, y0: int, y1: int, width: int):
+        """First and last column, last excluded, of samples in rows y0 to y1, last excluded, that can be
+        reached.
+        """
+        top = float(y0) + 0.5
+        bottom = float(y1) - 0.5
+        x0 = float(wp.inf)
+        x1 = -float(wp.inf)
+        low = wp.max(top - b.y, -b.half_y)
+        high = wp.min(bottom - b.y, b.half_y)
+        if low <= high:
+            right = wp.clamp(b.tip, low, high)
+            left = wp.clamp(-b.tip, low, high)
+            # 4e-7: 1 - h^2 / hy^2 cancels at the tips
+            over = wp.sqrt(wp.max(1.0 - right * right * b.inverse_hy2, 0.0) + 4e-7)
+            under = wp.sqrt(wp.max(1.0 - left * left * b.inverse_hy2, 0.0) + 4e-7)
+            x1 = b.x + wp.min(fma(b.shear, right, b.half_width * over), b.half_x)
+            x0 = b.x + wp.max(fma(b.shear, left, -b.half_width * under), -b.half_x)
+        if wp.static(screen):
+            low = wp.max(top - b.dot_y, -b.dot_r)
+            high = wp.min(bottom - b.dot_y, b.dot_r)
+            if low <= high:
+                at = wp.clamp(0.0, low, high)
+                half = wp.sqrt(wp.max(b.dot_r * b.dot_r - at * at, 0.0)) + PAD
+                x0 = wp.min(x0, b.dot_x - half)
+                x1 = wp.max(x1, b.dot_x + half)
+        first = wp.max(to_sample(wp.ceil(x0 - 0.5), width), 0)
+        end = wp.min(to_sample(wp.floor(x1 - 0.5) + 1.0, width), width)
+        return first, end
+
+    @wp.func
+    def tile_rows(b: Bounds, view: View):
+        """First and last row of tiles, last excluded."""
+        first, end = rows(b, view.height)
+        return first / view.tile_h, (end + view.tile_h - 1) / view.tile_h
+
+    @wp.func
+    def tile_span(b: Bounds, row: int, view: View):
+        """First and last tile, last excluded, of a row of tiles. Counting and listing both ask here, so they
+        agree.
+        """
+        y0 = row * view.tile_h
+        first, end = span(b, y0, wp.min(y0 + view.tile_h, view.height), view.width)
+        if first >= end:
+            return 0, 0
+        return first / view.tile_w, (end + view.tile_w - 1) / view.tile_w
+
+    return SimpleNamespace(rows=rows, span=span, tile_rows=tile_rows, tile_span=tile_span)

@@ -1,0 +1,82 @@
+"""What all stages share: module options, uniforms, fused multiply-adds, packed loads."""
+
+import warp as wp
+
+# Order and culling must not depend on what a compiler fuses: contraction is off everywhere, and fused
+# operations are
+# written out as `fma` (numerics F1). No fast maths: a NaN must fail a comparison (numerics F3).
+STRICT = {"fuse_fp": False, "fast_math": False, "enable_backward": False, "default_grid_stride": False}
+
+CULLED = wp.constant(wp.uint32(0xFFFFFFFF))
+"""key of a splat that is not drawn"""
+
+
+_SIGN = wp.constant(wp.uint32(0x80000000))
+_NONE = wp.constant(wp.uint32(0))
+
+
+@wp.struct
+class View:
+    """Uniforms of one picture. Lengths in metres, pixels are samples of the grid."""
+
+    rotation: wp.mat33d  # world to camera
+    translation: wp.vec3d  # where the cloud's origin lies in the camera frame
+    eye: wp.vec3d  # the camera's centre relative to the cloud's origin, world axes
+    fx: wp.float64
+    fy: wp.float64
+    cx: wp.float64
+    cy: wp.float64
+    near: wp.float64
+    far: wp.float64
+    width: int
+    height: int
+    tile_w: int
+    tile_h: int
+    tiles_x: int
+    tiles_y: int
+    samples: int  # per pixel and axis
+    per_pixel: float  # (pixels per sample)^2: from squared samples to squared pixels
+    log_cut: float
+    ceiling: float
+    stop: float
+    background: wp.vec3
+
+
+@wp.func_native("return fmaf(a, b, c);")
+def fma(a: float, b: float, c: float) -> float:
+    """a b + c, rounded once."""
+    ...
+
+
+# One 16-byte load where the device has it: Warp's vectors are not known to be aligned, so the compiler would
+# take four.
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const float4 quad = __ldg(reinterpret_cast<const float4*>(lines.data) + at);
+    return wp::vec_t<4, wp::float32>(quad.x, quad.y, quad.z, quad.w);
+#else
+    return lines.data[at];
+#endif
+""")
+def line_of(lines: wp.array(dtype=wp.vec4), at: int) -> wp.vec4:
+    """lines[at], which nothing writes during the launch."""
+    ...
+
+
+@wp.func
+def sortable(x: float) -> wp.uint32:
+    """Bits of a float in an order that unsigned comparison keeps, negative values and zeros included
+    (numerics C2).
+    """
+    bits = wp.cast(x + 0.0, wp.uint32)  # -0 becomes +0
+    if (bits & _SIGN) != _NONE:
+        return ~bits
+    return bits | _SIGN
+
+
+@wp.func
+def to_sample(x: float, limit: int) -> int:
+    """A sample's coordinate to int; clamped as a float, since conversions of huge values are undefined
+    (numerics E2).
+    """
+    return int(wp.clamp(x, -1.0, float(limit) + 1.0))

@@ -1,0 +1,142 @@
+"""From keys to tile lists: splats in depth order, then their pairs with tiles in that order.
+
+Between these kernels stand Warp's scan and its stable radix sort: of the splats drawn by key (ties by index,
+since they are
+gathered in that order), then of the pairs by tile (ties by depth, since they are emitted in that order). No
+atomics.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from .bounds import Bounds, make_bounds
+from .common import STRICT, View
+
+
+@wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+def compact(
+    first: int,
+    keys: wp.array(dtype=wp.uint32),  # (n)
+    drawn: wp.array(dtype=wp.int32),  # (n)
+    places: wp.array(dtype=wp.int32),  # (n) inclusive sums of drawn
+    sorted_keys: wp.array(dtype=wp.uint32),  # out: keys of those drawn, by index
+    order: wp.array(dtype=wp.int32),  # out: their indices
+):
+    i = wp.tid() + first
+    if drawn[i] != 0:
+        k = places[i] - 1
+        sorted_keys[k] = keys[i]
+        order[k] = i
+
+
+@wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+def gather(
+    first: int,
+    order: wp.array(dtype=wp.int32),
+    counts: wp.array(dtype=wp.int64),
+    lengths: wp.array(dtype=wp.int64),  # out: counts in depth order
+):
+    k = wp.tid() + first
+    lengths[k] = counts[order[k]]
+
+
+@wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+def find_starts(
+    first: int,
+    count: int,  # pairs
+    band_first: int,
+    tiles: wp.array(dtype=wp.int32),  # sorted
+    starts: wp.array(dtype=wp.int32),  # out: where each tile's list begins
+):
+    tile = band_first + first + wp.tid()
+    # Warp's search answers with its last place at most, so its end is one further
+    starts[tile] = wp.lower_bound(tiles, 0, count + 1, tile)
+
+
+@wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+def sum_up(
+    count: int,
+    places: wp.array(dtype=wp.int32),  # inclusive sums
+    ends: wp.array(dtype=wp.int64),  # inclusive sums
+    totals: wp.array(dtype=wp.int64),  # (2) out: splats drawn, pairs
+):
+    totals[0] = wp.int64(places[count - 1])
+    totals[1] = ends[count - 1]
+
+
+@cache
+def make_lists(screen: bool) -> SimpleNamespace:
+    """count, histogram and emit, with or without the low-pass dot in the bounds."""
+    limits = make_bounds(screen)
+
+    @wp.func
+    def band_span(b: Bounds, row: int, view: View, band_first: int, band_end: int):
+        left, right = limits.tile_span(b, row, view)
+        base = row * view.tiles_x
+        return wp.max(left + base, band_first), wp.min(right + base, band_end)
+
+    @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+    def histogram(
+        first: int,
+        view: View,
+        order: wp.array(dtype=wp.int32),
+        bounds: wp.array(dtype=Bounds),
+        totals: wp.array(dtype=wp.int32),  # out: length of each tile's list; sums of integers have no order
+    ):
+        b = bounds[order[wp.tid() + first]]
+        row, end = limits.tile_rows(b, view)
+        while row < end:
+            left, right = limits.tile_span(b, row, view)
+            for column in range(left, right):
+                wp.atomic_add(totals, row * view.tiles_x + column, 1)
+            row += 1
+
+    @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+    def count(
+        first: int,
+        view: View,
+        band_first: int,
+        band_end: int,
+        order: wp.array(dtype=wp.int32),
+        bounds: wp.array(dtype=Bounds),
+        lengths: wp.array(dtype=wp.int64),  # out: pairs of each splat in the band, in depth order
+    ):
+        k = wp.tid() + first
+        b = bounds[order[k]]
+        row, end = limits.tile_rows(b, view)
+        total = int(0)
+        while row < end:
+            left, right = band_span(b, row, view, band_first, band_end)
+            total += wp.max(right - left, 0)
+            row += 1
+        lengths[k] = wp.int64(total)
+
+    @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+    def emit(
+        first: int,
+        view: View,
+        band_first: int,
+        band_end: int,
+        order: wp.array(dtype=wp.int32),
+        bounds: wp.array(dtype=Bounds),
+        ends: wp.array(dtype=wp.int64),  # inclusive sums of lengths
+        lengths: wp.array(dtype=wp.int64),
+        tiles: wp.array(dtype=wp.int32),  # out: pairs in depth order
+        lists: wp.array(dtype=wp.int32),  # out: their splats
+    ):
+        k = wp.tid() + first
+        index = order[k]
+        b = bounds[index]
+        place = int(ends[k] - lengths[k])
+        row, end = limits.tile_rows(b, view)
+        while row < end:
+            left, right = band_span(b, row, view, band_first, band_end)
+            for tile in range(left, right):
+                tiles[place] = tile
+                lists[place] = index
+                place += 1
+            row += 1
+
+    return SimpleNamespace(histogram=histogram, count=count, emit=emit)

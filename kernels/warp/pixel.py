@@ -1,0 +1,364 @@
+"""One sample: its fragments, and what it keeps of them. Front to back, C = sum_k c_k alpha_k prod_{j<k} (1 -
+alpha_j).
+
+Splats of one plane are one layer at a sample (docs/rendering.md, coplanar splats): its colour and depth are
+means of its fragments
+by optical depth. They arrive together, before anything that the layer is compared with; it is laid before the
+first fragment of
+no plane that lies behind it there, or at the end. Two layers may be pending; when a third begins the nearer
+of them is laid.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from .common import View, fma, line_of
+from .records import Layout
+
+_STATE = {
+    "stop_exclusive": {"finished": wp.int32},
+    "depth": {"depth": wp.float32, "depth_weight": wp.float32},
+    "depth_median": {"depth_median": wp.float32},
+    "normal": {"normal": wp.vec3},
+    "label": {"label_weight": wp.float32, "label": wp.int32},
+}
+
+
+FAINT = wp.constant(1e-3)
+"""below it the optical depth of an opacity a is a + a^2 / 2, to 3 parts in 10^7"""
+DARKEST = wp.constant(wp.float32(2.0**-24))
+"""transmittance of an opaque fragment, whose optical depth would be infinite"""
+
+
+@cache
+def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
+    """The state of a sample, what it reads of a splat, and what is done with them: Pixel, Splat; load, start,
+    row, cross, unfinished, blend, finish.
+    """
+    layout = Layout(effects)
+    each = layout.lines
+    screen, exclusive, ray_depth, depth, median, normal, label = (
+        name in effects
+        for name in (
+            "lowpass_screen",
+            "stop_exclusive",
+            "ray_depth",
+            "depth",
+            "depth_median",
+            "normal",
+            "label",
+        )
+    )
+    # u: nu0, nux, nuy, log opacity; v: nv0, nvx, nvy, D at the near plane; d: d0, dx, dy, ax; c: ay, r, g, b
+    splat = {"u": wp.vec4, "v": wp.vec4, "d": wp.vec4, "c": wp.vec4, "half_r2": wp.float32}
+    splat |= {"dot_x": wp.float32, "dot_y": wp.float32} if screen else {}
+    Splat = _struct("Splat", "What of a record each sample needs.", splat)
+    # q / d^2 is rho / 2; inside: the ray meets the disk within R and beyond the near plane
+    crossing = {"d": wp.float32, "q": wp.float32, "inside": wp.bool, "drawn": wp.bool}
+    # screen: squared distance from the projected centre in pixels, which is rho / 2 of the low-pass
+    crossing |= {"screen": wp.float32} if screen else {}
+    Crossing = _struct("Crossing", "Where the ray of a sample meets a splat.", crossing)
+    layers = "compose_planes" in effects
+    seen = {"rgb": wp.vec3}
+    seen |= {"z": wp.float32} if ray_depth else {}
+    seen |= {"normal": wp.vec3} if normal else {}
+    seen |= {"label": wp.int32} if label else {}
+    Seen = _struct("Seen", "What shows where something is drawn.", seen)
+    # `mean` holds sums over the layer's fragments, each times its optical depth
+    layer = {
+        "plane": wp.int32,
+        "opacity": wp.float32,
+        "ink": wp.float32,
+        "mean": Seen,
+        "thickest": wp.float32,
+    }
+    Layer = _struct("Layer", "What a sample sees of one plane; plane -1: nothing.", layer)
+    fields = {"t": wp.float32, "r": wp.float32, "g": wp.float32, "b": wp.float32}
+    for effect in effects:
+        fields |= _STATE.get(effect, {})
+    # pending: the layer that still gathers, and one that arrived before it
+    fields |= {"open": Layer, "waiting": Layer} if layers else {}
+    Pixel = _struct("Pixel", "What a sample keeps.", fields)
+    dot_line, dot_lane = layout.place("dot_x")
+    dot_y_line, dot_y_lane = layout.place("dot_y")
+    z_line, z_lane = layout.place("z_numerator")
+    zc_line, zc_lane = layout.place("z_center")
+    zr_line, zr_lane = layout.place("z_reach")
+    nx_line, nx_lane = layout.place("nx")
+    ny_line, ny_lane = layout.place("ny")
+    nz_line, nz_lane = layout.place("nz")
+
+    @wp.func
+    def load(lines: wp.array(dtype=wp.vec4), index: int, view: View):
+        s = Splat()
+        at = index * each
+        s.u = line_of(lines, at)
+        s.v = line_of(lines, at + 1)
+        s.d = line_of(lines, at + 2)
+        s.c = line_of(lines, at + 3)
+        if wp.static(screen):
+            s.dot_x = line_of(lines, at + dot_line)[dot_lane]
+            s.dot_y = line_of(lines, at + dot_y_line)[dot_y_lane]
+        s.half_r2 = s.u[3] - view.log_cut
+        return s
+
+    @wp.func
+    def no_layer():
+        layer = Layer()
+        layer.plane = -1
+        return layer
+
+    @wp.func
+    def start():
+        p = Pixel()
+        p.t = 1.0
+        if wp.static(label):
+            p.label = -1
+        if wp.static(layers):
+            p.open = no_layer()
+            p.waiting = no_layer()
+        return p
+
+    @wp.func
+    def row(form: wp.vec4, y: float) -> float:
+        """The part of an affine form that does not change along a row of samples."""
+        return fma(form[2], y, form[0])
+
+    @wp.func
+    def cross(s: Splat, row_u: float, row_v: float, row_d: float, x: float, y: float, view: View):
+        """x, y: the sample from the anchor; row_*: `row` of the three forms at y."""
+        c = Crossing()
+        nu = fma(s.u[1], x, row_u)
+        nv = fma(s.v[1], x, row_v)
+        c.d = fma(s.d[1], x, row_d)
+        c.q = fma(nu, nu, nv * nv)
+        # product form: no division, no special value of D (numerics B2)
+        c.inside = c.q <= s.half_r2 * (c.d * c.d) and c.d > 0.0 and c.d <= s.v[3]
+        c.drawn = c.inside
+        if wp.static(screen):
+            ex = x - s.dot_x
+            ey = y - s.dot_y
+            c.screen = fma(ex, ex, ey * ey) * view.per_pixel
+            c.drawn = c.inside or c.screen <= s.half_r2
+        return c
+
+    @wp.func
+    def unfinished(p: Pixel, view: View) -> bool:
+        """Whether anything that follows can still be seen."""
+        if wp.static(exclusive):
+            return p.t > view.stop and p.finished == 0
+        return p.t > view.stop
+
+    @wp.func
+    def opacity_of(s: Splat, c: Crossing, inverse_d: float, view: View) -> float:
+        half_rho = c.q * inverse_d * inverse_d
+        if wp.static(screen):
+            if c.inside:
+                half_rho = wp.min(half_rho, c.screen)
+            else:
+                half_rho = c.screen
+        return wp.min(wp.exp(s.u[3] - half_rho), view.ceiling)
+
+    @wp.func
+    def depth_of(lines: wp.array(dtype=wp.vec4), index: int, c: Crossing, inverse_d: float) -> float:
+        """Depth of ray and plane within the disk's own range; the centre's where the ray misses the plane
+        (numerics B2, B4).
+        """
+        at = index * each
+        center = line_of(lines, at + zc_line)[zc_lane]
+        reach = line_of(lines, at + zr_line)[zr_lane]
+        if c.d > 0.0:
+            met = line_of(lines, at + z_line)[z_lane] * inverse_d
+            return wp.clamp(met, center - reach, center + reach)
+        return center
+
+    @wp.func
+    def normal_of(lines: wp.array(dtype=wp.vec4), index: int):
+        at = index * each
+        return wp.vec3(
+            line_of(lines, at + nx_line)[nx_lane],
+            line_of(lines, at + ny_line)[ny_lane],
+            line_of(lines, at + nz_line)[nz_lane],
+        )
+
+    @wp.func
+    def see(
+        s: Splat,
+        c: Crossing,
+        inverse_d: float,
+        index: int,
+        lines: wp.array(dtype=wp.vec4),
+        labels: wp.array(dtype=wp.int32),
+    ):
+        """What a fragment shows."""
+        seen = Seen()
+        seen.rgb = wp.vec3(s.c[1], s.c[2], s.c[3])
+        if wp.static(ray_depth):
+            seen.z = depth_of(lines, index, c, inverse_d)
+        if wp.static(normal):
+            seen.normal = normal_of(lines, index)
+        if wp.static(label):
+            seen.label = labels[index]
+        return seen
+
+    @wp.func
+    def lay(pixel: Pixel, seen: Seen, opacity: float, view: View):
+        """The pixel with something over all that follows; as it was if it lets no light through."""
+        p = pixel
+        if not (p.t > view.stop):
+            return p
+        if wp.static(exclusive):
+            # as gsplat and the 2DGS authors: what would close the pixel is dropped (for parity; numerics D1)
+            if p.t * (1.0 - opacity) <= view.stop:
+                p.finished = 1
+                return p
+        weight = p.t * opacity
+        p.r = fma(weight, seen.rgb[0], p.r)
+        p.g = fma(weight, seen.rgb[1], p.g)
+        p.b = fma(weight, seen.rgb[2], p.b)
+        if wp.static(depth):
+            p.depth = fma(weight, seen.z, p.depth)
+            p.depth_weight += weight
+        if wp.static(median):
+            if p.t > 0.5:
+                p.depth_median = seen.z
+        if wp.static(normal):
+            p.normal += weight * seen.normal
+        if wp.static(label):
+            if weight > p.label_weight:
+                p.label_weight = weight
+                p.label = seen.label
+        p.t = p.t - weight
+        return p
+
+    @wp.func
+    def depth_of_layer(layer: Layer) -> float:
+        return layer.mean.z / layer.ink
+
+    @wp.func
+    def lay_layer(pixel: Pixel, layer: Layer, view: View):
+        """The pixel with a layer laid as one thing."""
+        seen = layer.mean
+        seen.rgb = layer.mean.rgb / layer.ink
+        seen.z = depth_of_layer(layer)
+        if wp.static(normal):
+            seen.normal = layer.mean.normal / layer.ink
+        return lay(pixel, seen, layer.opacity, view)
+
+    @wp.func
+    def lay_before(pixel: Pixel, z: float, view: View):
+        """The pixel with its pending layers laid that lie before depth z, the nearer first."""
+        p = pixel
+        for turn in range(2):
+            has_open = bool(False)
+            has_waiting = bool(False)
+            if p.open.plane >= 0:
+                has_open = depth_of_layer(p.open) < z
+            if p.waiting.plane >= 0:
+                has_waiting = depth_of_layer(p.waiting) < z
+            if has_open and has_waiting:
+                # of equals the one that arrived first
+                if depth_of_layer(p.open) < depth_of_layer(p.waiting):
+                    has_waiting = False
+                else:
+                    has_open = False
+            if has_waiting:
+                p = lay_layer(p, p.waiting, view)
+                p.waiting = no_layer()
+            if has_open:
+                p = lay_layer(p, p.open, view)
+                p.open = no_layer()
+        return p
+
+    @wp.func
+    def begin(pixel: Pixel, view: View):
+        """The pixel with no open layer: it waits, and of two that would wait the nearer is laid."""
+        p = pixel
+        if p.waiting.plane >= 0:
+            if depth_of_layer(p.open) < depth_of_layer(p.waiting):
+                p = lay_layer(p, p.open, view)
+                p.open = no_layer()
+                return p
+            p = lay_layer(p, p.waiting, view)
+        p.waiting = p.open
+        p.open = no_layer()
+        return p
+
+    @wp.func
+    def gather(layer: Layer, plane: int, seen: Seen, opacity: float):
+        """The layer with one more fragment: optical depths -ln(1 - opacity) add up."""
+        after = layer
+        tau = opacity + 0.5 * opacity * opacity  # of a faint one, which 1 - opacity would blur
+        if opacity > FAINT:
+            # an opaque fragment has the optical depth at which float32 leaves no light
+            tau = -wp.log(wp.max(1.0 - opacity, DARKEST))
+        after.plane = plane
+        after.opacity = fma(opacity, 1.0 - layer.opacity, layer.opacity)
+        after.ink = layer.ink + tau
+        mean = layer.mean
+        mean.rgb = layer.mean.rgb + tau * seen.rgb
+        mean.z = fma(tau, seen.z, layer.mean.z)
+        if wp.static(normal):
+            mean.normal = layer.mean.normal + tau * seen.normal
+        if wp.static(label):
+            if tau > layer.thickest:
+                after.thickest = tau
+                mean.label = seen.label
+        after.mean = mean
+        return after
+
+    @wp.func
+    def blend(
+        pixel: Pixel,
+        s: Splat,
+        c: Crossing,
+        index: int,
+        lines: wp.array(dtype=wp.vec4),
+        labels: wp.array(dtype=wp.int32),
+        planes: wp.array(dtype=wp.int32),
+        view: View,
+    ):
+        """The pixel after a fragment that is drawn, of a pixel that is not finished."""
+        inverse_d = 1.0 / c.d
+        opacity = opacity_of(s, c, inverse_d, view)
+        seen = see(s, c, inverse_d, index, lines, labels)
+        if wp.static(layers):
+            p = pixel
+            if not (opacity > 0.0):
+                return p  # of no optical depth: a mean over it would be 0 / 0
+            plane = planes[index]
+            if plane < 0:
+                p = lay_before(p, seen.z, view)
+                return lay(p, seen, opacity, view)
+            if p.open.plane >= 0 and p.open.plane != plane:
+                p = begin(p, view)
+            p.open = gather(p.open, plane, seen, opacity)
+            return p
+        else:
+            return lay(pixel, seen, opacity, view)
+
+    @wp.func
+    def finish(pixel: Pixel, view: View):
+        """The pixel after the last fragment."""
+        if wp.static(layers):
+            return lay_before(pixel, float(wp.inf), view)
+        else:
+            return pixel
+
+    return SimpleNamespace(
+        Pixel=Pixel,
+        Splat=Splat,
+        load=load,
+        start=start,
+        row=row,
+        cross=cross,
+        unfinished=unfinished,
+        blend=blend,
+        finish=finish,
+    )
+
+
+def _struct(name: str, words: str, fields: dict):
+    return wp.struct(type(name, (), {"__annotations__": fields, "__doc__": words, "__module__": __name__}))

@@ -1,0 +1,289 @@
+"""Per splat: is it drawn, where, in which order, and the affine forms that each sample evaluates.
+
+A ray r = ((x - cx) / fx, (y - cy) / fy, 1) meets the plane of a splat with centre p, unit tangents t_u, t_v,
+normal n at depth
+(n p) / (n r), and there u = (t_v x p) r / (s_u n r), v = (p x t_u) r / (s_v n r): from n x (r x p) = r (n p)
+- p (n r). All three of
+n_u, n_v, D = n r are affine in the sample, and since p is orthogonal to the first two, n_u and n_v vanish at
+the projected centre.
+They are scaled by one factor: D > 0 in front of the camera, the steepest slope is 1; n_u, n_v also by
+sqrt(1/2), so that
+(n_u^2 + n_v^2) / D^2 is rho / 2.
+"""
+
+import math
+from functools import cache
+
+import warp as wp
+
+from .bounds import PAD, PAD_RELATIVE, Bounds, box_bounds, ellipse_bounds, make_bounds
+from .color import make_color
+from .common import CULLED, STRICT, View, sortable
+from .records import Layout
+
+# [m]; nobody sees the difference, and what is divided by it stays above float32's denormals (numerics B6)
+SMALLEST_SCALE = wp.constant(wp.float32(1e-20))
+
+
+@cache
+def make_project(effects: tuple[str, ...], sh_terms: int, precision: str):
+    """The kernel for these record effects; sh_terms: coefficients per colour, 0 for plain colours."""
+    layout = Layout(effects)
+    lines_each = layout.lines
+    has_normal, has_depth, screen, layers = (
+        name in effects for name in ("normal", "ray_depth", "lowpass_screen", "compose_planes")
+    )
+    real = wp.float64 if precision == "float64" else wp.float32
+    vec2, vec3, mat33 = wp.types.vector(2, real), wp.types.vector(3, real), wp.types.matrix((3, 3), real)
+    words = wp.types.vector(4 * layout.lines, wp.float32)
+    sqrt_half = real(math.sqrt(0.5))
+    edge_on = real(1e-13 if precision == "float64" else 1e-6)
+    one, two, half, zero = real(1.0), real(2.0), real(0.5), real(0.0)
+    limits, color_of = make_bounds(screen), make_color(sh_terms, real)
+    word = {name: layout.names.index(name) for name in layout.names}
+    first_extra = {name: word.get(name, 0) for name in ("dot_x", "z_numerator", "nx")}
+    at_dot, at_depth, at_normal = first_extra["dot_x"], first_extra["z_numerator"], first_extra["nx"]
+
+    @wp.func
+    def extremes(a: real, b: real, p: real, depth: vec3, radius: real, near: real):
+        """Least and greatest (a u + b v + p) / (depth (u, v, 1)) on the arc u^2 + v^2 = radius^2 beyond
+        `near`.
+
+        The ratio's derivative along the arc vanishes where e cos + f sin = -g.
+        """
+        low = real(wp.inf)
+        high = -real(wp.inf)
+        e = b * depth[2] - p * depth[1]
+        f = p * depth[0] - a * depth[2]
+        g = (b * depth[0] - a * depth[1]) * radius
+        h = wp.sqrt(e * e + f * f)
+        if h > zero:
+            along = -g / h
+            if wp.abs(along) <= one:
+                aside = wp.sqrt(one - along * along)
+                for side in range(2):
+                    s = wp.where(side == 0, aside, -aside)
+                    u = radius * (along * e - s * f) / h
+                    v = radius * (along * f + s * e) / h
+                    z = depth[0] * u + depth[1] * v + depth[2]
+                    if z >= near:
+                        ratio = (a * u + b * v + p) / z
+                        low = wp.min(low, ratio)
+                        high = wp.max(high, ratio)
+        return low, high
+
+    @wp.func
+    def clipped(a: vec3, b: vec3, p: vec3, radius: real, reach: real, view: View):
+        """Box of the part of the disk beyond the near plane: of its arc, and of the chord in which the plane
+        cuts it.
+
+        The part is convex and depth is positive in it, so ratios are largest on its rim (numerics A1 ii).
+        """
+        near = real(view.near)
+        depth = vec3(a[2], b[2], p[2])
+        x0, x1 = extremes(a[0], b[0], p[0], depth, radius, near)
+        y0, y1 = extremes(a[1], b[1], p[1], depth, radius, near)
+        g = a[2] * a[2] + b[2] * b[2]
+        if p[2] - reach < near and g > zero:
+            k = near - p[2]
+            swing = wp.sqrt(wp.max(radius * radius * g - k * k, zero))
+            for side in range(2):
+                s = wp.where(side == 0, swing, -swing)
+                u = (k * a[2] - s * b[2]) / g
+                v = (k * b[2] + s * a[2]) / g
+                x = (a[0] * u + b[0] * v + p[0]) / near
+                y = (a[1] * u + b[1] * v + p[1]) / near
+                x0 = wp.min(x0, x)
+                x1 = wp.max(x1, x)
+                y0 = wp.min(y0, y)
+                y1 = wp.max(y1, y)
+        fx, fy, cx, cy = real(view.fx), real(view.fy), real(view.cx), real(view.cy)
+        return box_bounds(float(x0 * fx + cx), float(x1 * fx + cx), float(y0 * fy + cy), float(y1 * fy + cy))
+
+    @wp.func
+    def ellipse(a: vec3, b: vec3, p: vec3, radius: real, reach: real, view: View):
+        """Image of a disk that lies wholly beyond the near plane, from its dual conic about the projected
+        centre (numerics A4).
+        """
+        fx, fy = real(view.fx), real(view.fy)
+        px, py = p[0] / p[2], p[1] / p[2]
+        r2 = radius * radius
+        x = vec2(fx * (a[0] - px * a[2]), fx * (b[0] - px * b[2]))
+        y = vec2(fy * (a[1] - py * a[2]), fy * (b[1] - py * b[2]))
+        z = vec2(a[2], b[2])
+        g = (p[2] - reach) * (p[2] + reach)
+        mx = -r2 * wp.dot(x, z) / g
+        my = -r2 * wp.dot(y, z) / g
+        qxx = wp.max(mx * mx + r2 * wp.dot(x, x) / g, zero)
+        qyy = wp.max(my * my + r2 * wp.dot(y, y) / g, zero)
+        qxy = mx * my + r2 * wp.dot(x, y) / g
+        half_x, half_y = wp.sqrt(qxx), wp.sqrt(qyy)
+        shear, tip = zero, zero
+        if qyy > zero:
+            shear = qxy / qyy
+        if half_x > zero:
+            tip = qxy / half_x
+        across = wp.sqrt(wp.max(qxx - qxy * shear, zero))
+        return ellipse_bounds(
+            float(fx * px + real(view.cx) + mx),
+            float(fy * py + real(view.cy) + my),
+            float(half_x),
+            float(half_y),
+            float(shear),
+            float(across),
+            float(tip),
+        )
+
+    @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+    def project(
+        first: int,  # splat of thread 0
+        view: View,
+        means: wp.array(dtype=wp.vec3),  # (n) [m], relative to the cloud's origin
+        quats: wp.array(dtype=wp.vec4),  # (n) w x y z
+        scales: wp.array(dtype=wp.vec2),  # (n) [m]
+        opacities: wp.array(dtype=wp.float32),  # (n)
+        colors: wp.array(dtype=wp.vec3),  # (n), or (n sh_terms)
+        planes: wp.array(dtype=wp.int32),  # (n) index of the splat's plane; -1: none
+        plane_keys: wp.array(dtype=wp.float32),  # (planes) depth at which a plane's splats are sorted in [m]
+        lines: wp.array(dtype=wp.vec4),  # (n lines_each) out: records of splats that are drawn
+        bounds: wp.array(dtype=Bounds),  # (n) out
+        keys: wp.array(dtype=wp.uint32),  # (n) out: depth key, or CULLED
+        counts: wp.array(dtype=wp.int64),  # (n) out: tiles that the splat can touch
+        drawn: wp.array(dtype=wp.int32),  # (n) out: 1 or 0
+    ):
+        i = wp.tid() + first
+        keys[i] = CULLED
+        counts[i] = wp.int64(0)
+        drawn[i] = 0
+        # conditions are written so that a NaN culls (numerics E1)
+        log_opacity = float(wp.log(real(opacities[i])))
+        half_r2 = log_opacity - view.log_cut
+        if not (half_r2 > 0.0 and opacities[i] <= 1.0):
+            return
+        size = scales[i]
+        if not (size[0] >= 0.0 and size[0] < wp.inf and size[1] >= 0.0 and size[1] < wp.inf):
+            return
+        su = real(wp.max(size[0], SMALLEST_SCALE))
+        sv = real(wp.max(size[1], SMALLEST_SCALE))
+
+        # tangents: the first two columns of the rotation of a quaternion of any length
+        q = quats[i]
+        w, x, y, z = real(q[0]), real(q[1]), real(q[2]), real(q[3])
+        s = two / (w * w + x * x + y * y + z * z)
+        turn = mat33(view.rotation)
+        tangent_u = turn * vec3(one - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y))
+        tangent_v = turn * vec3(s * (x * y - w * z), one - s * (x * x + z * z), s * (y * z + w * x))
+        center = means[i]
+        mean = vec3(real(center[0]), real(center[1]), real(center[2]))
+        p = turn * mean + vec3(view.translation)
+        a = tangent_u * su
+        b = tangent_v * sv
+
+        near = real(view.near)
+        radius = wp.sqrt(two * real(half_r2))
+        reach = radius * wp.sqrt(a[2] * a[2] + b[2] * b[2])  # half of the disk's depth range (numerics A3)
+        if not (p[2] + reach >= near and p[2] - reach <= real(view.far)):
+            return
+
+        # where it can be seen
+        fx, fy, cx, cy = real(view.fx), real(view.fy), real(view.cx), real(view.cy)
+        in_front = p[2] >= near
+        center_x, center_y = zero, zero
+        box = Bounds()
+        if in_front:
+            center_x = fx * (p[0] / p[2]) + cx
+            center_y = fy * (p[1] / p[2]) + cy
+        if p[2] - reach >= near:
+            box = ellipse(a, b, p, radius, reach, view)
+        else:
+            box = clipped(a, b, p, radius, reach, view)
+        if not in_front:
+            center_x = real(box.x)
+            center_y = real(box.y)
+        if wp.static(screen):
+            if in_front:
+                box.dot_x = float(center_x)
+                box.dot_y = float(center_y)
+                box.dot_r = wp.sqrt(half_r2 / view.per_pixel) * (1.0 + PAD_RELATIVE) + PAD
+        tiles = int(0)
+        row, rows_end = limits.tile_rows(box, view)
+        while row < rows_end:
+            left, right = limits.tile_span(box, row, view)
+            tiles += right - left
+            row += 1
+        if tiles == 0:
+            return
+
+        # affine forms about the sample of the picture that is nearest to the centre (numerics B1)
+        ax = wp.clamp(wp.floor(float(center_x)), 0.0, float(view.width - 1))
+        ay = wp.clamp(wp.floor(float(center_y)), 0.0, float(view.height - 1))
+        anchor_x = real(ax) + half
+        anchor_y = real(ay) + half
+        normal = wp.cross(tangent_u, tangent_v)
+        height = wp.dot(normal, p)  # of the camera's centre above the plane, with its side
+        ray = vec3((anchor_x - cx) / fx, (anchor_y - cy) / fy, one)
+        form_u = wp.cross(tangent_v, p) / su
+        form_v = wp.cross(p, tangent_u) / sv
+        nux, nuy, nvx, nvy = form_u[0] / fx, form_u[1] / fy, form_v[0] / fx, form_v[1] / fy
+        steepest = wp.max(wp.max(wp.abs(nux), wp.abs(nuy)), wp.max(wp.abs(nvx), wp.abs(nvy)))
+        if not (steepest > zero and steepest < real(wp.inf)):
+            return
+        nu0 = wp.dot(form_u, ray)
+        nv0 = wp.dot(form_v, ray)
+        if in_front:
+            # both vanish at the projected centre
+            nu0 = nux * (anchor_x - center_x) + nuy * (anchor_y - center_y)
+            nv0 = nvx * (anchor_x - center_x) + nvy * (anchor_y - center_y)
+        scale = wp.where(height < zero, -one, one) / steepest
+        n_scale = scale * sqrt_half
+        # edge-on within rounding: no ray meets the plane, only the low-pass dot is drawn (numerics B2)
+        facing = wp.where(wp.abs(height) > edge_on * wp.length(p), scale, zero)
+
+        rgb = color_of(i, colors, mean - vec3(view.eye))
+        if not (wp.isfinite(rgb[0]) and wp.isfinite(rgb[1]) and wp.isfinite(rgb[2])):
+            return
+
+        record = words()
+        record[0] = float(nu0 * n_scale)
+        record[1] = float(nux * n_scale)
+        record[2] = float(nuy * n_scale)
+        record[3] = log_opacity
+        record[4] = float(nv0 * n_scale)
+        record[5] = float(nvx * n_scale)
+        record[6] = float(nvy * n_scale)
+        record[7] = float(height * facing / near)
+        record[8] = float(wp.dot(normal, ray) * facing)
+        record[9] = float(normal[0] / fx * facing)
+        record[10] = float(normal[1] / fy * facing)
+        record[11] = ax
+        record[12] = ay
+        record[13] = rgb[0]
+        record[14] = rgb[1]
+        record[15] = rgb[2]
+        if wp.static(screen):
+            # far away if there is none
+            record[at_dot] = wp.where(in_front, float(center_x - anchor_x), 1.0e18)
+            record[at_dot + 1] = wp.where(in_front, float(center_y - anchor_y), 1.0e18)
+        if wp.static(has_depth):
+            record[at_depth] = float(height * facing)
+            record[at_depth + 1] = float(p[2])
+            record[at_depth + 2] = float(reach)
+        if wp.static(has_normal):
+            # the camera is on one side of the whole plane, so the sign is the splat's (numerics B7)
+            towards = wp.where(height > zero, -one, one)
+            record[at_normal] = float(normal[0] * towards)
+            record[at_normal + 1] = float(normal[1] * towards)
+            record[at_normal + 2] = float(normal[2] * towards)
+        for line in range(wp.static(lines_each)):
+            k = 4 * line
+            lines[i * lines_each + line] = wp.vec4(record[k], record[k + 1], record[k + 2], record[k + 3])
+        bounds[i] = box
+        depth = float(p[2])
+        if wp.static(layers):
+            if planes[i] >= 0:
+                depth = plane_keys[planes[i]]
+        keys[i] = sortable(depth)
+        counts[i] = wp.int64(tiles)
+        drawn[i] = 1
+
+    return project

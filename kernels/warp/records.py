@@ -1,0 +1,43 @@
+"""Where each number of a visible splat's record lies."""
+
+_BASE = (
+    "nu0",
+    "nux",
+    "nuy",
+    "log_opacity",
+    "nv0",
+    "nvx",
+    "nvy",
+    "d_near",
+    "d0",
+    "dx",
+    "dy",
+    "ax",
+    "ay",
+    "r",
+    "g",
+    "b",
+)
+_EXTRA = {
+    "lowpass_screen": ("dot_x", "dot_y"),
+    "ray_depth": ("z_numerator", "z_center", "z_reach"),
+    "normal": ("nx", "ny", "nz"),
+}
+
+
+class Layout:
+    """A record as lines of four floats: `lines` of them, and the place of each number.
+
+    nu0 + nux x + nuy y is n_u, likewise n_v and D, with x, y in samples from the centre of the anchor sample
+    (ax, ay); D is at
+    most d_near beyond the near plane. dot_x, dot_y: projected centre from the anchor's; z_numerator / D is
+    the depth.
+    """
+
+    def __init__(self, effects: tuple[str, ...]) -> None:
+        self.names = [*_BASE, *(name for effect in effects for name in _EXTRA.get(effect, ()))]
+        self.lines = -(-len(self.names) // 4)
+
+    def place(self, name: str) -> tuple[int, int]:
+        """Line and lane of a number; (0, 0) for one that this record has not, which no kernel then reads."""
+        return divmod(self.names.index(name), 4) if name in self.names else (0, 0)

@@ -1,0 +1,86 @@
+"""The Warp kernels' text: what a scene asked for and nothing else; CUDA's compiler takes it, GPU or not."""
+
+import re
+
+import pytest
+
+from fidsplat.backends.warp import runtime
+
+wp = pytest.importorskip("warp")
+ALL = ("lowpass_screen", "ray_depth", "normal", "compose_planes", "depth", "depth_median", "label")
+RECORD = ALL[:4]
+
+
+def made(name, *arguments):
+    kernel = getattr(runtime.kernels(name.split(".")[0]), name.split(".")[1])
+    return kernel(*arguments) if arguments else kernel
+
+
+def compiled(kernel, folder, block=256):
+    """Source text, without comments, that NVRTC compiled for a GPU of 2020."""
+    kernel.module.options["block_dim"] = block
+    with runtime.quiet():
+        wp.compile_aot_module(kernel.module, arch=80, module_dir=folder, use_ptx=True)
+    assert list(folder.glob("*.ptx"))
+    (source,) = folder.glob("*.cu")
+    return re.sub(r"//[^\n]*", "", source.read_text())
+
+
+@pytest.fixture(autouse=True)
+def started():
+    runtime.load()
+
+
+@pytest.mark.parametrize(
+    "kernel",
+    [
+        lambda: made("project.make_project", RECORD, 16, "float64"),
+        lambda: made("project.make_project", (), 0, "float32"),
+        lambda: made("blend.make_blend", ALL, True)[0],
+        lambda: made("blend.make_blend", ("lowpass_screen", "stop_exclusive"), True)[0],
+        lambda: made("resolve.make_resolve", ("alpha", "depth", "depth_median", "label", "normal"), 3),
+        lambda: made("lists.make_lists", True).emit,
+        lambda: made("lists.make_lists", True).count,
+        lambda: made("lists.make_lists", False).histogram,
+        lambda: made("lists.compact"),
+        lambda: made("lists.find_starts"),
+    ],
+    ids=[
+        *("project", "project-float32", "blend-all", "blend-exclusive", "resolve", "emit", "count"),
+        *("histogram", "compact", "starts"),
+    ],
+)
+def test_the_kernels_compile_for_cuda(kernel, tmp_path):
+    assert "wp::launch_bounds_t" in compiled(kernel(), tmp_path)
+
+
+def test_the_base_text_has_nothing_of_absent_effects(tmp_path):
+    text = compiled(made("blend.make_blend", (), True)[0], tmp_path, 64)
+    for name in (
+        "depth_weight",
+        "depth_median",
+        "label_weight",
+        "finished",
+        "dot_x",
+        "Layer",
+        "thickest",
+        "ink",
+    ):
+        assert not re.search(rf"\b{name}", text), name
+    everything = compiled(made("blend.make_blend", ALL, True)[0], tmp_path / "all")
+    for name in ("depth_weight", "depth_median", "label_weight", "Layer", "thickest", "ink"):
+        assert re.search(rf"\b{name}", everything), name
+
+
+def test_a_record_grows_by_what_is_asked_for():
+    layout = runtime.kernels("records").Layout
+    assert layout(()).lines == 4
+    assert layout(("lowpass_screen",)).names[-2:] == ["dot_x", "dot_y"]
+    assert layout(RECORD).lines == 6
+    assert layout(RECORD).place("nz") == (5, 3)
+    assert layout(()).place("nz") == (0, 0)
+
+
+def test_a_factory_makes_one_kernel_of_a_set():
+    assert made("project.make_project", (), 0, "float64") is made("project.make_project", (), 0, "float64")
+    assert made("blend.make_blend", (), True) is not made("blend.make_blend", (), False)

@@ -1,0 +1,308 @@
+"""The Warp backend: its devices, what it says when it is missing, arrays that are shared without a copy."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from agreement import ALL_OUTPUTS, random_splats
+
+import fidsplat as fs
+from fidsplat.backends.warp import backend as warp_backend
+from fidsplat.backends.warp import runtime
+from fidsplat.backends.warp.pipeline import KNOWN
+from fidsplat.effects import CATALOGUE, FeatureSet
+
+wp = pytest.importorskip("warp")
+CAMERA = fs.Camera.look_at(64, 48, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
+CLOUD = random_splats(200, seed=1, depth=(1.0, 4.0), scale=(0.02, 0.4))
+DEVICES = [info.name for info in fs.devices() if info.name.startswith("warp:") and info.usable]
+GPUS = [name for name in DEVICES if name != "warp:cpu"]
+CUDA = pytest.param(
+    GPUS[0] if GPUS else "warp:cuda",
+    marks=pytest.mark.skipif(not GPUS, reason="no CUDA device for Warp here"),
+)
+
+
+@pytest.fixture(scope="module", params=["warp:cpu", CUDA])
+def renderer(request):
+    return fs.Renderer(request.param)
+
+
+def arrays_of(cloud, device):
+    """The cloud as wp.arrays of vectors on a device."""
+    types = {
+        "means": wp.vec3,
+        "quats": wp.vec4,
+        "scales": wp.vec2,
+        "opacities": wp.float32,
+        "colors": wp.vec3,
+    }
+    return {name: wp.array(getattr(cloud, name), dtype=dtype, device=device) for name, dtype in types.items()}
+
+
+def test_the_cpu_is_listed_and_opened_by_its_name():
+    info = next(info for info in fs.devices() if info.name == "warp:cpu")
+    assert info.usable
+    assert info.kind == "cpu"
+    assert fs.Renderer("warp:cpu").device == info
+    assert fs.Renderer("WARP: CPU").device == info
+
+
+def test_unknown_devices_and_missing_gpus_are_named():
+    with pytest.raises(fs.DeviceError, match=r"no Warp device matches 'tpu'; there are: warp:cpu"):
+        fs.Renderer("warp:tpu")
+    if not GPUS:
+        with pytest.raises(fs.DeviceError, match=r"no CUDA device .* use device='warp:cpu'"):
+            fs.Renderer("warp:cuda")
+
+
+def test_without_warp_devices_are_listed_and_the_error_says_how_to_install(monkeypatch):
+    runtime.load.cache_clear()
+    monkeypatch.setattr(runtime, "installed", lambda: False)
+    try:
+        listed = next(info for info in fs.devices() if info.name == "warp")
+        assert not listed.usable
+        assert "pip install 'fidsplat[warp]'" in listed.reason
+        with pytest.raises(fs.DeviceError, match=r"pip install 'fidsplat\[warp\]'"):
+            fs.Renderer("warp:cpu")
+    finally:
+        runtime.load.cache_clear()
+
+
+def test_nothing_is_said_on_stdout_or_stderr(tmp_path):
+    code = (
+        "import fidsplat as fs; view = fs.Camera.pinhole(4, 4, 4, 4, 2, 2);"
+        "fs.Renderer('warp:cpu').render(fs.SplatCloud.empty(), view)"
+    )
+    # an empty cache: everything is compiled, which Warp would tell
+    env = {"PATH": "", "WARP_CACHE_PATH": str(tmp_path), "PYTHONPATH": ":".join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_an_effect_that_warp_lacks_is_an_error_that_names_both(renderer):
+    slots = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "compose_ordered")
+    features = FeatureSet(slots, ("overdraw",), 0, 1, "float64")
+    with pytest.raises(
+        fs.DeviceError, match=rf"{renderer.device.name} .* has no overdraw; use an OpenCL device"
+    ):
+        renderer.backend.pipeline(features)
+
+
+def test_warp_has_every_effect_that_a_user_can_ask_for():
+    internal = {name for name, effect in CATALOGUE.items() if effect.output and not effect.output.public}
+    assert set(CATALOGUE) - internal == KNOWN
+
+
+def test_the_environment_names_the_default(monkeypatch):
+    monkeypatch.setenv("FIDSPLAT_DEVICE", "warp:cpu")
+    assert fs.Renderer().device.name == "warp:cpu"
+    assert fs.Renderer("reference").device.name == "reference"
+    monkeypatch.setenv("FIDSPLAT_DEVICE", "")
+    assert fs.Renderer().device.name.startswith("opencl")
+
+
+def test_planes_are_warp_arrays_without_a_copy(renderer):
+    frame = renderer.render(CLOUD, CAMERA, outputs=ALL_OUTPUTS)
+    for name in ALL_OUTPUTS:
+        array = frame.device_array(name)
+        assert isinstance(array, wp.array)
+        assert array.device == renderer.backend.device
+        assert array.shape == frame[name].shape
+        assert array.ptr == frame.device_array(name).ptr
+        assert np.array_equal(array.numpy(), frame[name])
+    with pytest.raises(KeyError, match="no 'depth'"):
+        renderer.render(CLOUD, CAMERA).device_array("depth")
+
+
+def test_what_is_done_to_a_shared_plane_is_not_done_to_what_was_read(renderer):
+    frame = renderer.render(CLOUD, CAMERA)
+    before = frame["rgb"].copy()
+    frame.device_array("rgb").zero_()
+    assert np.array_equal(frame["rgb"], before)
+    assert before.any()
+
+
+def test_a_frame_keeps_its_arrays_when_the_next_is_drawn(renderer):
+    kept = renderer.render(CLOUD, CAMERA).device_array("rgb")
+    before = kept.numpy().copy()
+    renderer.render(random_splats(50, seed=2, depth=(1, 3)), CAMERA)
+    assert np.array_equal(kept.numpy(), before)
+
+
+def test_other_backends_say_that_they_share_nothing(judge):
+    frame = judge.render(CLOUD, CAMERA)
+    with pytest.raises(fs.InputError, match="warp:cpu"):
+        frame.device_array("rgb")
+    with pytest.raises(fs.InputError, match="reference takes no arrays"):
+        judge.adopt(means=0, quats=0, scales=0, opacities=0, colors=0)
+
+
+def test_adopted_arrays_draw_what_the_cloud_draws(renderer):
+    wanted = renderer.render(CLOUD, CAMERA)["rgb"]
+    vectors = arrays_of(CLOUD, renderer.backend.device)
+    rows = {
+        name: wp.array(getattr(CLOUD, name), dtype=wp.float32, device=renderer.backend.device)
+        for name in vectors
+    }
+    plain = {name: getattr(CLOUD, name) for name in vectors}
+    for arrays in (vectors, rows, plain):
+        assert np.array_equal(renderer.render(renderer.adopt(**arrays), CAMERA)["rgb"], wanted)
+
+
+def test_adopted_labels_harmonics_and_origins(renderer):
+    cloud = random_splats(100, seed=3, depth=(1, 4), scale=(0.02, 0.4), sh_degree=2)
+    names = ("means", "quats", "scales", "opacities", "sh", "labels")
+    resident = renderer.adopt(**{name: getattr(cloud, name) for name in names})
+    frame, wanted = (renderer.render(what, CAMERA, ("rgb", "label")) for what in (resident, cloud))
+    assert all(np.array_equal(frame[name], wanted[name]) for name in frame)
+    moved = renderer.adopt(**{name: getattr(cloud, name) for name in names}, origin=(1e6, 0, 0))
+    view = fs.Camera.look_at(64, 48, 1.0, (1e6, 0.0, -0.1), (1e6, 0.0, 3.0))
+    assert np.allclose(renderer.render(moved, view)["rgb"], wanted["rgb"], atol=1e-5)
+
+
+def test_moving_an_adopted_array_moves_the_splats(renderer):
+    arrays = arrays_of(CLOUD, renderer.backend.device)
+    resident = renderer.adopt(**arrays)
+    before = renderer.render(resident, CAMERA)["rgb"].copy()
+    moved = CLOUD.means + np.float32([0.2, 0, 0])
+    arrays["means"].assign(wp.array(moved, dtype=wp.vec3, device="cpu"))
+    wanted = fs.SplatCloud(moved, CLOUD.quats, CLOUD.scales, CLOUD.opacities, colors=CLOUD.colors)
+    after = renderer.render(resident, CAMERA)["rgb"]
+    assert np.array_equal(after, renderer.render(wanted, CAMERA)["rgb"])
+    assert not np.array_equal(after, before)
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "colors"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_adopted_values_that_are_not_finite_leave_no_trace(renderer, name, value):
+    keep = np.arange(len(CLOUD)) != 7
+    names = ("means", "quats", "scales", "opacities", "colors")
+    arrays = {each: getattr(CLOUD, each).copy() for each in names}
+    without = {each: array[keep] for each, array in arrays.items()}
+    arrays[name][7] = value
+    frame, wanted = (
+        renderer.render(renderer.adopt(**a), CAMERA, ("rgb", "alpha")) for a in (arrays, without)
+    )
+    assert all(np.array_equal(frame[plane], wanted[plane]) for plane in frame)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (
+            {"means": np.zeros((200, 2), np.float32)},
+            r"means has the shape \(200, 2\); its last axis must be 3",
+        ),
+        ({"opacities": np.zeros(3, np.float32)}, "opacities holds 3 elements, but 200 means need 200"),
+        ({"sh": np.zeros((200, 4, 3), np.float32)}, "exactly one of colors"),
+        ({"colors": None, "sh": np.zeros((200, 5, 3), np.float32)}, "sh holds 5 coefficients"),
+        ({"scales": "wp.float64"}, "scales has the type"),
+        ({"means": "strided"}, "not contiguous"),
+    ],
+)
+def test_arrays_that_cannot_be_adopted(renderer, changes, words):
+    device = renderer.backend.device
+    special = {
+        "wp.float64": wp.zeros((200, 2), dtype=wp.float64, device=device),
+        "strided": wp.zeros((200, 6), dtype=wp.float32, device=device)[:, :3],
+    }
+    changes = {
+        name: special.get(value, value) if isinstance(value, str) else value
+        for name, value in changes.items()
+    }
+    with pytest.raises(fs.InputError, match=words):
+        renderer.adopt(**{**arrays_of(CLOUD, device), **changes})
+
+
+def test_numpy_sees_the_plane_of_a_cpu_through_dlpack():
+    frame = fs.Renderer("warp:cpu").render(CLOUD, CAMERA, outputs=("rgb", "label"))
+    for name in frame:
+        seen = np.from_dlpack(frame.device_array(name))
+        assert np.array_equal(seen, frame[name])
+        assert seen.ctypes.data == frame.device_array(name).ptr
+
+
+@pytest.mark.skipif(not GPUS, reason="no CUDA device for Warp here")
+@pytest.mark.parametrize("library", ["torch", "cupy"])
+def test_gpu_planes_are_tensors_on_the_same_device(library):
+    module = pytest.importorskip(library)
+    renderer = fs.Renderer(GPUS[0])
+    frame = renderer.render(CLOUD, CAMERA)
+    plane = frame.device_array("rgb")
+    assert plane.__cuda_array_interface__["data"][0] == plane.ptr
+    tensor = module.from_dlpack(plane)
+    pointer = tensor.data_ptr() if library == "torch" else tensor.data.ptr
+    assert pointer == plane.ptr
+    host = tensor.cpu().numpy() if library == "torch" else tensor.get()
+    assert np.array_equal(host, frame["rgb"])
+    # and back: splats that the library made
+    names = ("means", "quats", "scales", "opacities", "colors")
+    there = {name: module.asarray(getattr(CLOUD, name).copy()) for name in names}
+    there = {name: each.cuda() for name, each in there.items()} if library == "torch" else there
+    assert np.array_equal(renderer.render(renderer.adopt(**there), CAMERA)["rgb"], frame["rgb"])
+
+
+@pytest.mark.skipif(not GPUS, reason="no CUDA device for Warp here")
+def test_arrays_of_another_device_are_refused():
+    with pytest.raises(fs.InputError, match="means lies on cpu, but this renderer draws on cuda"):
+        fs.Renderer(GPUS[0]).adopt(**arrays_of(CLOUD, "cpu"))
+
+
+def test_warp_pipelines_share_kernels_that_mean_the_same():
+    """A stage is compiled once for all feature sets that it cannot tell apart."""
+    backend = warp_backend.open_device("cpu")
+    slots = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "compose_ordered")
+    one, two = (
+        backend.pipeline(FeatureSet(slots, taps, 0, n, "float64")) for taps, n in (((), 1), (("alpha",), 2))
+    )
+    assert one.project is two.project
+    assert one.blend is two.blend
+    assert one.resolve is not two.resolve
+    assert one is backend.pipeline(FeatureSet(slots, (), 0, 1, "float64"))
+
+
+@pytest.mark.parametrize("device", ["warp:cpu", CUDA])
+def test_the_example_draws_each_step(device):
+    example = Path(__file__).resolve().parents[2] / "examples" / "warp_loop.py"
+    words = [sys.executable, str(example), "--device", device, "--steps", "11"]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    covered = [int(count) for count in re.findall(r"covers +(\d+) pixels", done.stdout)]
+    assert len(covered) == 2
+    assert 0 < covered[0] != covered[1] > 0
+
+
+def test_a_memory_budget_draws_in_bands_with_the_same_bits():
+    cloud = random_splats(300, seed=5, depth=(0.5, 4.0), scale=(0.05, 1.0))
+    view = fs.Camera.look_at(320, 240, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
+    wanted = fs.Renderer("warp:cpu").render(cloud, view, ALL_OUTPUTS)
+    own = fs.Renderer("warp:cpu", memory_budget=6_280_000)
+    frame = own.render(cloud, view, ALL_OUTPUTS)
+    assert own.backend.pool._arrays["tile totals", wp.int32].size == 300, "it was drawn in bands"
+    assert frame.stats == wanted.stats
+    assert all(np.array_equal(frame[name], wanted[name]) for name in ALL_OUTPUTS)
+    with pytest.raises(fs.DeviceError, match=r"budget of 1 MiB is too small .* raise memory_budget"):
+        fs.Renderer("warp:cpu", memory_budget=2**20).render(cloud, view, ALL_OUTPUTS)
+
+
+def test_poison_reaches_every_array(renderer, monkeypatch):
+    """Hard case E5 would prove nothing if the arrays were clean."""
+    from fidsplat.backends.warp import probe
+
+    taken, poison = [], probe.poison
+    monkeypatch.setattr(probe, "poison", lambda array: taken.append(poison(array)) or taken[-1])
+    with probe.poisoned(renderer.backend):
+        renderer.render(CLOUD, CAMERA, ("rgb", "depth"))
+        again = renderer.backend.pool.scratch("lines", 4, wp.vec4)
+    assert len(taken) > 15
+    assert (again.numpy().view(np.uint8) == 0xFF).all()
+
+
+@pytest.mark.parametrize("size", [2**46, 2**31])
+def test_an_array_that_the_device_cannot_give_is_an_error_with_a_remedy(renderer, size):
+    with pytest.raises(fs.DeviceError, match=r"lists needs \d+ MiB, which .* use fewer splats or a smaller"):
+        renderer.backend.pool.fresh("lists", size, wp.int32)
