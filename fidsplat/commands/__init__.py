@@ -1,5 +1,6 @@
 """One module for each command: a dataclass of its options, whose ``run`` does the work and returns the exit
 status. Its docstring is the line in the list of commands, its HELP what `fidsplat COMMAND --help` says.
+A group of commands has PARTS instead: its commands by the word that follows.
 
 Nothing heavy is imported before ``run``, so that help and errors come at once.
 """
@@ -8,6 +9,7 @@ from fidsplat.commands.check import Check
 from fidsplat.commands.demo import Demo
 from fidsplat.commands.detect import Detect
 from fidsplat.commands.devices import Devices
+from fidsplat.commands.experiment import Experiment
 from fidsplat.commands.marker import Marker
 from fidsplat.commands.render import Render
 
@@ -18,5 +20,6 @@ COMMANDS = {
     "render": Render,
     "detect": Detect,
     "check": Check,
+    "experiment": Experiment,
 }
 """Every command by its name, in the order in which help lists them."""
