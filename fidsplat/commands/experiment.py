@@ -3,7 +3,7 @@
 from typing import ClassVar
 
 from fidsplat.commands.experiment_files import Blender, Dataset, Merge, Report
-from fidsplat.commands.experiment_measure import All, Angles, Counts, Localisation, Views
+from fidsplat.commands.experiment_measure import All, Angles, Counts, Localisation, Pictures, Views
 
 
 class Experiment:
@@ -26,6 +26,7 @@ Examples:
         "views": Views,
         "counts": Counts,
         "localisation": Localisation,
+        "pictures": Pictures,
         "dataset": Dataset,
         "blender": Blender,
         "merge": Merge,

@@ -12,6 +12,8 @@ from fidsplat.commands.experiment_files import CATEGORY_HELP, Names, write_repor
 from fidsplat.commands.output import Json, console, option, print_json
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from fidsplat.experiments.run import Settings
 
 Out = Annotated[
@@ -188,8 +190,8 @@ class Localisation(Measuring):
 
     HELP: ClassVar[str] = """Pose errors of AprilTags and small QR codes by distance and tilt.
 
-Codes of 0.16 m; 1280 x 720, 60 degrees; 0.5 to 4 m, 0 to 70 degrees; corners by `fidsplat detect`. The same cameras for every
-method, the ideal texture's errors beside them. A run that was stopped goes on where it was.
+Codes of 0.16 m; 1280 x 720, 60 degrees; 0.5 to 4 m, 0 to 70 degrees; corners by `fidsplat detect`. The same
+cameras for every method, the ideal texture's errors beside them. A run that was stopped goes on where it was.
 
 Examples:
   fidsplat experiment localisation --quick
@@ -197,6 +199,48 @@ Examples:
 
     def run(self) -> int:
         return measure(("localisation",), self.settings(), self.json)
+
+
+@dataclass
+class Pictures(Measuring):
+    """Picture sheets: every method beside the ideal."""
+
+    HELP: ClassVar[
+        str
+    ] = """Draw sheets of marker 0 of each category, by every method, at tilts of 0, 45 and 70 degrees.
+
+The report takes them in.
+
+Examples:
+  fidsplat experiment pictures
+  fidsplat experiment pictures --category huge --mixture fitted"""
+
+    def run(self) -> int:
+        files = draw_sheets(self.settings(), console(self.json))
+        if self.json:
+            print_json({"files": files})
+        return 0
+
+
+def draw_sheets(settings: Settings, where: Console) -> list[str]:
+    """Draw the sheets with a progress bar; returns the files."""
+    from rich.progress import track
+
+    from fidsplat.experiments.methods import Painter
+    from fidsplat.experiments.pictures import write_sheets
+    from fidsplat.experiments.run import check
+    from fidsplat.experiments.setup import chosen_categories
+    from fidsplat.render import Renderer
+
+    check(settings)
+    categories = chosen_categories(settings.categories)
+    painter = Painter(Renderer(settings.device), settings.trained)
+    sheets = write_sheets(categories, settings.methods, painter, settings.seed, settings.out)
+    bars = track(sheets, "pictures", total=len(categories), console=where, transient=True)
+    files = [str(file) for file in bars]
+    for file in files:
+        where.print(file, markup=False, soft_wrap=True)
+    return files
 
 
 @dataclass
@@ -221,4 +265,5 @@ Examples:
         status = measure(NAMES, settings, self.json)
         if self.shard is not None:
             return status
+        draw_sheets(settings, console(True))
         return write_report([settings.out], settings.out, console(True))

@@ -1,0 +1,103 @@
+"""The report: every table and figure that the results of a folder allow, in Markdown and HTML."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from fidsplat.errors import InputError
+from fidsplat.experiments import angles, counts, localisation, views
+from fidsplat.experiments.document import Document
+from fidsplat.experiments.pictures import sheet_files
+from fidsplat.experiments.records import read_lines
+from fidsplat.experiments.report_angles import Angles, report_angles
+from fidsplat.experiments.report_counts import Counts, report_counts
+from fidsplat.experiments.report_localisation import report_localisation
+from fidsplat.experiments.report_views import Views, report_views
+from fidsplat.experiments.targets import report_targets
+from fidsplat.files import atomic_write, writable_folder
+
+_COMMANDS = "fidsplat experiment {}"
+
+
+def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
+    """Write report.md and report.html with their plots and sheets into ``out``; returns the files.
+
+    Args:
+        folders: where results lie (`NAME.jsonl`, and sheets in the first that has any).
+        out: made when it is missing.
+
+    Raises InputError when there are no results or the folder cannot be written.
+    """
+    lines = {
+        name: [line for folder in folders for line in read_lines(folder / f"{name}.jsonl")]
+        for name in (counts.NAME, angles.NAME, views.NAME, localisation.NAME)
+    }
+    if not any(lines.values()):
+        raise InputError(
+            f"no results in {', '.join(map(str, folders))}; run fidsplat experiment all first, or give the folder"
+        )
+    writable_folder(out)
+    document = Document("Results of the paper's experiments")
+    _provenance(document, lines)
+    report_targets(
+        document,
+        Angles(lines[angles.NAME]) if lines[angles.NAME] else None,
+        Views(lines[views.NAME]) if lines[views.NAME] else None,
+        Counts(lines[counts.NAME]) if lines[counts.NAME] else None,
+    )
+    charts: dict[str, str] = {}
+    for name, report in (
+        (counts.NAME, report_counts),
+        (angles.NAME, report_angles),
+        (views.NAME, report_views),
+        (localisation.NAME, report_localisation),
+    ):
+        if lines[name]:
+            charts |= report(document, lines[name])
+        else:
+            document.text(f"Nothing was measured by `{_COMMANDS.format(name)}`.")
+    sheets = next((found for folder in folders if (found := sheet_files(folder))), [])
+    files = []
+    if sheets:
+        document.heading("Pictures")
+        document.text("The middle 200 x 200 pixels of 800 x 800, marker 0 of each category.")
+    for sheet in sheets:
+        document.picture(sheet.name, sheet.stem)
+        if sheet.parent.resolve() != out.resolve():
+            with atomic_write(out / sheet.name) as stream, open(sheet, "rb") as source:
+                shutil.copyfileobj(source, stream)
+    for name, text in {**charts, "report.md": document.markdown(), "report.html": document.html()}.items():
+        with atomic_write(out / name) as stream:
+            stream.write(text.encode())
+        files.append(out / name)
+    return [*files[-2:], *files[:-2]]
+
+
+def _provenance(document: Document, lines: dict[str, list[dict]]) -> None:
+    """What made the numbers: one line for each experiment and set of circumstances."""
+    rows = []
+    for name, found in lines.items():
+        runs: dict[str, tuple[dict, int]] = {}
+        for line in found:
+            key = json.dumps(line["run"], sort_keys=True)
+            runs[key] = line["run"], runs.get(key, (None, 0))[1] + 1
+        for run, count in runs.values():
+            versions = ", ".join(f"{package} {number}" for package, number in run["versions"].items())
+            rows.append(
+                (
+                    f"{_COMMANDS.format(name)}",
+                    str(count),
+                    run["device"] or "nothing drawn",
+                    run["machine"],
+                    versions,
+                    f"{run['commit']} / {run['code']}",
+                    str(run["seed"]),
+                    run["date"],
+                )
+            )
+    heads = ("command", "parts", "device", "machine", "versions", "commit / code", "seed", "date")
+    document.heading("Where the numbers come from")
+    document.table(heads, rows)
