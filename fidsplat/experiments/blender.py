@@ -95,11 +95,12 @@ def marker_job(category: Category, index: int, seed: int, folder: Path, view: st
         "name": f"{category.name}-{index}",
         "grid": grid.tolist(),
         "module": PROTOCOLS["fixed-plane"].module(grid.shape[0]),
-        "shots": [{"file": str(file.absolute()), **_camera(camera)} for file, camera in shots],
+        "shots": [{"file": str(file.absolute()), **camera_facts(camera)} for file, camera in shots],
     }
 
 
-def _camera(camera: Camera) -> dict:
+def camera_facts(camera: Camera) -> dict:
+    """A camera as the worker takes it. Raises InputError when its pixels are not square."""
     if camera.fx != camera.fy:
         raise InputError("Blender's camera has square pixels; fx and fy must be equal")
     names = ("width", "height", "fx", "cx", "cy")

@@ -17,8 +17,8 @@ MARKERS = 5
 """markers of each category"""
 PLANE = 2.0
 """metres, edge of the plane that carries a marker with its quiet zone"""
-BACKGROUND = 0.5
-"""grey beside the plane, display value"""
+BACKGROUND = 128 / 255
+"""grey beside the plane, display value: one that 8 bits hold, so that nothing hangs on a rounding"""
 
 
 @dataclass(frozen=True)
