@@ -64,7 +64,7 @@ Examples:
         folder = writable_folder(self.out)
         work = dataset_work(chosen_categories(self.category), self.markers)
         where = console(self.json)
-        with Progress(console=where, transient=True) as bars:
+        with Progress(console=console(True), transient=True) as bars:
             scenes = [
                 write_scene(part, folder, self.seed, self.truth, self.blender)
                 for part in bars.track(work, description="scenes")
@@ -130,12 +130,16 @@ Examples:
             return 0
         if not (1 <= self.markers <= MARKERS and self.samples >= 1):
             raise InputError(f"--markers must be 1 to {MARKERS} and --samples at least 1")
+        views = self.view or blender.VIEW_NAMES
+        categories = chosen_categories(self.category)
+        for view in views:
+            blender.ready(view, environment)
         folder, done = Path(self.out), 0
-        with Progress(console=where, transient=True) as bars:
-            for view in self.view or blender.VIEW_NAMES:
+        with Progress(console=console(True), transient=True) as bars:
+            for view in views:
                 jobs = [
                     blender.marker_job(category, index, self.seed, folder, view, self.training)
-                    for category in chosen_categories(self.category)
+                    for category in categories
                     for index in range(self.markers)
                 ]
                 bar = bars.add_task(f"view {view}", total=sum(len(job["shots"]) for job in jobs))

@@ -12,39 +12,99 @@ from fidsplat.commands.experiment_files import CATEGORY_HELP, Names, write_repor
 from fidsplat.commands.output import Json, console, option, print_json
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from fidsplat.experiments.run import Settings
-
-Out = Annotated[
-    str | None,
-    option(
-        "DIR",
-        "folder for results (default: fidsplat-experiments, with --quick fidsplat-experiments-quick)",
-        "-o",
-    ),
-]
-"""the -o of every experiment"""
 
 
 @dataclass
-class Measuring:
+class Basic:
+    """Options of every word that works on markers."""
+
+    out: Annotated[
+        str | None,
+        option(
+            "DIR",
+            "folder for results (default: fidsplat-experiments, with --quick fidsplat-experiments-quick)",
+            "-o",
+        ),
+    ] = None
+    category: Annotated[Names, option("NAME", CATEGORY_HELP)] = ()
+    seed: Annotated[int, option("N", "of texts and views (default: 0)")] = 0
+    json: Json = False
+
+    def settings(self) -> Settings:
+        """The options as the experiments take them; those that a word does not have are left out."""
+        from fidsplat.experiments.run import Settings
+
+        given = {name: getattr(self, name) for name in _SETTINGS if getattr(self, name, None) is not None}
+        out = Path(self.out or default_folder(getattr(self, "quick", False)))
+        return Settings(out=out, **{_SETTINGS[name]: value for name, value in given.items()})
+
+
+# option: what it is called in Settings
+_SETTINGS = {
+    "category": "categories",
+    "mixture": "mixtures",
+    "protocol": "protocols",
+    "shard": "part",
+    "ideal": "ideal_only",
+} | {
+    name: name
+    for name in (
+        "device",
+        "quick",
+        "seed",
+        "tilts",
+        "markers",
+        "trained",
+        "blender",
+        "lpips",
+        "workers",
+        "anew",
+    )
+}
+
+
+@dataclass
+class Measuring(Basic):
     """Options of the experiments that measure."""
 
-    out: Out = None
     quick: Annotated[
         bool,
         tyro.conf.arg(help="a rough picture in minutes: one marker of each category", help_behavior_hint=""),
     ] = False
-    device: Annotated[str, option("D", "see `fidsplat devices` (default: opencl)")] = "opencl"
-    category: Annotated[Names, option("NAME", CATEGORY_HELP)] = ()
-    mixture: Annotated[Names, option("NAME", "mixture of Gaussians, once more for each (default: all)")] = ()
     markers: Annotated[int | None, option("N", "of each category, 1 to 5 (default: 5, with --quick 1)")] = (
         None
     )
+    shard: Annotated[str | None, option("i/n", "measure the i-th of n shares, then see `merge`")] = None
+    anew: Annotated[
+        bool, tyro.conf.arg(help="measure again what is in the results' folder", help_behavior_hint="")
+    ] = False
+
+
+@dataclass
+class Drawn:
+    """Options of what draws splats."""
+
+    device: Annotated[str, option("D", "see `fidsplat devices` (default: opencl)")] = "opencl"
+    mixture: Annotated[Names, option("NAME", "mixture of Gaussians, once more for each (default: all)")] = ()
     trained: Annotated[
         Path | None, option("DIR", "trained models for the 2DGS columns, as 2dgs-17/small-0.ply")
     ] = None
+
+
+@dataclass
+class Threaded(Drawn, Measuring):
+    """Options of experiments that look at pictures in several threads."""
+
+    workers: Annotated[
+        int | None, option("N", "threads that look at pictures (default: one for each core)")
+    ] = None
+
+
+@dataclass
+class Compared(Threaded):
+    """Options of experiments that compare pictures."""
+
     blender: Annotated[
         Path | None, option("DIR", "Blender's pictures for `views` (default: blender in the results' folder)")
     ] = None
@@ -52,35 +112,6 @@ class Measuring:
         Path | None,
         option("FILE.npz", "weights for LPIPS in `views`; how to make the file: docs/experiments.md"),
     ] = None
-    shard: Annotated[str | None, option("i/n", "measure the i-th of n shares, then see `merge`")] = None
-    workers: Annotated[int | None, option("N", "threads that detect (default: one for each core)")] = None
-    seed: Annotated[int, option("N", "of texts and views (default: 0)")] = 0
-    anew: Annotated[
-        bool, tyro.conf.arg(help="measure again what is in the results' folder", help_behavior_hint="")
-    ] = False
-    json: Json = False
-
-    def settings(self, **more) -> Settings:
-        """The options as the experiments take them."""
-        from fidsplat.experiments.run import Settings
-
-        workers = {} if self.workers is None else {"workers": self.workers}
-        return Settings(
-            out=Path(self.out or default_folder(self.quick)),
-            device=self.device,
-            quick=self.quick,
-            seed=self.seed,
-            categories=self.category,
-            mixtures=self.mixture,
-            markers=self.markers,
-            trained=self.trained,
-            blender=self.blender,
-            lpips=self.lpips,
-            part=self.shard,
-            anew=self.anew,
-            **workers,
-            **more,
-        )
 
 
 def default_folder(quick: bool) -> str:
@@ -95,22 +126,21 @@ def measure(names: tuple[str, ...], settings: Settings, as_json: bool) -> int:
 
     from fidsplat.experiments.run import planned
 
-    where = console(as_json)
     files: dict[str, str] = {}
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, TimeElapsedColumn(), Remaining(), console=where) as bars:
-        for name in names:
-            with planned(name, settings) as plan:
-                bar = bars.add_task(name, total=len(plan.work), completed=len(plan.work) - plan.left)
-                for done, line in plan.run():
-                    bars.update(bar, completed=done, description=f"{name} {_what(line['key'])}")
-                bars.update(bar, description=name)
-                files[name] = str(plan.records.file)
+    columns = (*columns, TimeElapsedColumn(), Remaining())
+    for name in names:
+        with planned(name, settings) as plan, Progress(*columns, console=console(True)) as bars:
+            bar = bars.add_task(name, total=len(plan.work), completed=len(plan.work) - plan.left)
+            for done, line in plan.run():
+                bars.update(bar, completed=done, description=f"{name} {_what(line['key'])}")
+            bars.update(bar, description=name)
+            files[name] = str(plan.records.file)
     if as_json:
         print_json({"files": files})
     else:
         for file in files.values():
-            where.print(file, markup=False, soft_wrap=True)
+            console(False).print(file, markup=False, soft_wrap=True)
     return 0
 
 
@@ -120,7 +150,7 @@ def _what(key: dict) -> str:
 
 
 @dataclass
-class Angles(Measuring):
+class Angles(Threaded):
     """Table 3: how far markers may tilt and still be found and read."""
 
     HELP: ClassVar[str] = """The largest tilt at which each detector finds and reads each marker (table 3).
@@ -144,12 +174,11 @@ Examples:
     ] = False
 
     def run(self) -> int:
-        settings = self.settings(protocols=self.protocol, tilts=self.tilts, ideal_only=self.ideal)
-        return measure(("angles",), settings, self.json)
+        return measure(("angles",), self.settings(), self.json)
 
 
 @dataclass
-class Views(Measuring):
+class Views(Compared):
     """Table 4: PSNR, SSIM, FLIP and LPIPS of 20 novel views."""
 
     HELP: ClassVar[str] = """PSNR, SSIM, FLIP and LPIPS of 20 random views of each marker (table 4).
@@ -185,7 +214,7 @@ Examples:
 
 
 @dataclass
-class Localisation(Measuring):
+class Localisation(Threaded):
     """Pose errors by distance and tilt."""
 
     HELP: ClassVar[str] = """Pose errors of AprilTags and small QR codes by distance and tilt.
@@ -202,7 +231,7 @@ Examples:
 
 
 @dataclass
-class Pictures(Measuring):
+class Pictures(Drawn, Basic):
     """Picture sheets: every method beside the ideal."""
 
     HELP: ClassVar[
@@ -216,13 +245,16 @@ Examples:
   fidsplat experiment pictures --category huge --mixture fitted"""
 
     def run(self) -> int:
-        files = draw_sheets(self.settings(), console(self.json))
+        files = draw_sheets(self.settings())
         if self.json:
             print_json({"files": files})
+        else:
+            for file in files:
+                console(False).print(file, markup=False, soft_wrap=True)
         return 0
 
 
-def draw_sheets(settings: Settings, where: Console) -> list[str]:
+def draw_sheets(settings: Settings) -> list[str]:
     """Draw the sheets with a progress bar; returns the files."""
     from rich.progress import track
 
@@ -236,15 +268,12 @@ def draw_sheets(settings: Settings, where: Console) -> list[str]:
     categories = chosen_categories(settings.categories)
     painter = Painter(Renderer(settings.device), settings.trained)
     sheets = write_sheets(categories, settings.methods, painter, settings.seed, settings.out)
-    bars = track(sheets, "pictures", total=len(categories), console=where, transient=True)
-    files = [str(file) for file in bars]
-    for file in files:
-        where.print(file, markup=False, soft_wrap=True)
-    return files
+    bars = track(sheets, "pictures", total=len(categories), console=console(True), transient=True)
+    return [str(file) for file in bars]
 
 
 @dataclass
-class All(Measuring):
+class All(Compared):
     """Every experiment, then the report."""
 
     HELP: ClassVar[str] = """Counts, localisation, views and angles, then the report.
@@ -265,5 +294,5 @@ Examples:
         status = measure(NAMES, settings, self.json)
         if self.shard is not None:
             return status
-        draw_sheets(settings, console(True))
+        draw_sheets(settings)
         return write_report([settings.out], settings.out, console(True))

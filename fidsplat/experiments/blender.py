@@ -99,6 +99,18 @@ def marker_job(category: Category, index: int, seed: int, folder: Path, view: st
     }
 
 
+def ready(view: str, environment: Path) -> Path:
+    """The Python that draws. Raises InputError for an unknown view or without Blender."""
+    if view not in VIEW_NAMES:
+        raise InputError(f"unknown view {view!r}; known: {', '.join(VIEW_NAMES)}")
+    python = environment_python(environment)
+    if not python.is_file():
+        raise InputError(
+            f"Blender is not installed in {environment}; run fidsplat experiment blender --install"
+        )
+    return python
+
+
 def camera_facts(camera: Camera) -> dict:
     """A camera as the worker takes it. Raises InputError when its pixels are not square."""
     if camera.fx != camera.fy:
@@ -127,13 +139,7 @@ def render(
 
     Raises InputError when Blender is not installed, DeviceError when it fails; pictures done stay.
     """
-    if view not in VIEW_NAMES:
-        raise InputError(f"unknown view {view!r}; known: {', '.join(VIEW_NAMES)}")
-    python = environment_python(environment)
-    if not python.is_file():
-        raise InputError(
-            f"Blender is not installed in {environment}; run fidsplat experiment blender --install"
-        )
+    python = ready(view, environment)
     missing = []
     for marker in markers:
         there = [Path(shot["file"]) for shot in marker["shots"] if Path(shot["file"]).is_file()]

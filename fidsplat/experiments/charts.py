@@ -67,9 +67,8 @@ def bar_chart(
             x, y = x0 + 0.08 * wide + s * thick, place(bar.value)
             floor = _HEIGHT - _BOTTOM - y
             colour = _COLOURS[s % len(_COLOURS)]
-            parts.append(
-                f'<rect x="{x:.1f}" y="{y:.1f}" width="{0.92 * thick:.1f}" height="{floor:.1f}" fill="{colour}"/>'
-            )
+            size = f'width="{0.92 * thick:.1f}" height="{floor:.1f}"'
+            parts.append(f'<rect x="{x:.1f}" y="{y:.1f}" {size} fill="{colour}"/>')
             if bar.spread > 0:
                 ends = place(bar.value + bar.spread), place(bar.value - bar.spread)
                 middle = x + 0.46 * thick

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.experiments.methods import Painter, plain_marker
 from fidsplat.experiments.setup import CATEGORIES, Category
+from fidsplat.markers import Marker
 from fidsplat.vision.detect import detect
 from fidsplat.vision.images import to_uint8
 from fidsplat.vision.pose import marker_pose, pose_error
@@ -44,7 +46,7 @@ def localisation_work(
     ]
 
 
-def measure_localisation(part: dict, painter: Painter, seed: int) -> dict:
+def measure_localisation(part: dict, painter: Painter, seed: int, pool: ThreadPoolExecutor) -> dict:
     """Look at one marker from every distance and tilt.
 
     Each camera turns about its axis and looks a little past the marker, by seeded amounts that are the same
@@ -58,23 +60,28 @@ def measure_localisation(part: dict, painter: Painter, seed: int) -> dict:
     spec = category.spec(part["index"], seed)
     plain = plain_marker(spec)
     draw = painter.open(part["method"], name, spec, SIZE / plain.bits.shape[1])
-    corners = plain.corners * (SIZE / plain.size)
-    families = (f"{plain.kind}:{plain.family}",) if plain.kind == "apriltag" else ()
-    views = []
+    waiting = []
     for distance in part["distances"]:
         for tilt in part["tilts"]:
             camera = camera_at(distance, tilt, f"{seed} pose {name} {distance} {tilt}")
-            errors: tuple[float | None, ...] = (None, None, None)
-            for code in detect(to_uint8(draw(camera)), families, qr=plain.kind == "qr"):
-                if (code.kind, code.id, code.payload) == (plain.kind, plain.id, plain.payload):
-                    away, turn = pose_error(marker_pose(code.corners, SIZE, camera), camera.world_to_camera)
-                    off = code.corners - camera.project(corners)
-                    errors = away * 1e3, math.degrees(turn), float(np.sqrt((off**2).sum(1).mean()))
-            views.append(
-                {"distance_m": distance, "tilt_deg": tilt}
-                | dict(zip(("position_mm", "angle_deg", "corners_px"), errors, strict=True))
-            )
-    return {"views": views}
+            errors = pool.submit(_errors, plain, camera, draw(camera))
+            waiting.append(({"distance_m": distance, "tilt_deg": tilt}, errors))
+    return {"views": [place | errors.result() for place, errors in waiting]}
+
+
+def _errors(plain: Marker, camera: Camera, picture: np.ndarray) -> dict[str, float | None]:
+    families = (f"{plain.kind}:{plain.family}",) if plain.kind == "apriltag" else ()
+    corners = plain.corners * (SIZE / plain.size)
+    for code in detect(to_uint8(picture), families, qr=plain.kind == "qr"):
+        if (code.kind, code.id, code.payload) == (plain.kind, plain.id, plain.payload):
+            away, turn = pose_error(marker_pose(code.corners, SIZE, camera), camera.world_to_camera)
+            off = code.corners - camera.project(corners)
+            return {
+                "position_mm": away * 1e3,
+                "angle_deg": math.degrees(turn),
+                "corners_px": float(np.sqrt((off**2).sum(1).mean())),
+            }
+    return {"position_mm": None, "angle_deg": None, "corners_px": None}
 
 
 def camera_at(distance: float, tilt: float, seed: str) -> Camera:

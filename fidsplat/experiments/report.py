@@ -37,7 +37,8 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
     }
     if not any(lines.values()):
         raise InputError(
-            f"no results in {', '.join(map(str, folders))}; run fidsplat experiment all first, or give the folder"
+            f"no results in {', '.join(map(str, folders))}; run fidsplat experiment all first, or give their "
+            "folder"
         )
     writable_folder(out)
     document = Document("Results of the paper's experiments")

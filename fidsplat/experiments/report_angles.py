@@ -93,9 +93,10 @@ def report_angles(document: Document, lines: Sequence[dict]) -> dict[str, str]:
     angles = Angles(lines)
     document.heading("Table 3: largest tilts at which markers are found and read")
     document.text(
-        f"Tilts {' and '.join(angles.tilts)} (first:last:step, degrees). Each cell: the largest single tilt / "
-        "the tilt below which there is no miss; mean ± standard deviation over the markers. The ideal texture "
-        "is the ceiling that the detector itself has. The paper does not say its camera or its decoder."
+        f"Tilts {' and '.join(angles.tilts)} (first:last:step, degrees). Each cell of the long tables: the "
+        "largest single tilt / the largest below which no tilt is missed; mean ± standard deviation over the "
+        "markers. The ideal texture is the ceiling that the detector itself has. The paper does not say its "
+        "camera or its decoder."
     )
     charts = {}
     for protocol in (name for name in PROTOCOLS if name in angles.names(0)):
@@ -130,8 +131,7 @@ def _short(document: Document, angles: Angles, protocol: str) -> None:
             scans = angles.of(protocol, category, f"2dgs-{views}", reader).values()
             pairs = [(largest(s.tilts, s.found)[0], largest(s.tilts, s.read)[0]) for s in scans]
             own = " ".join(_plain([pair[k] for pair in pairs]) for k in (0, 1)) if pairs else NOTHING
-            theirs = NOTHING if paper is None else "{:.1f} {:.1f}".format(*paper[views])
-            row.append(f"{own} (paper {theirs})")
+            row.append(own if paper is None else "{} (paper {:.1f} {:.1f})".format(own, *paper[views]))
         rows.append(row)
     document.text(
         "As the paper has it: largest angle of detection and of decoding, mean over the markers, with "

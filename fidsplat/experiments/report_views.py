@@ -61,9 +61,9 @@ def report_views(document: Document, lines: Sequence[dict]) -> dict[str, str]:
     views = Views(lines)
     document.heading("Table 4: novel views")
     document.text(
-        f"PSNR in dB / SSIM / LPIPS / FLIP, mean over {_list(views.views)} random views of each marker and over "
-        "the markers, 800 x 800, whole frame, 8 bits. LPIPS is measured with weights that the user supplies "
-        "(--lpips), FLIP where flip-evaluator is installed; '-' where not."
+        f"PSNR in dB / SSIM / LPIPS / FLIP, mean over {_list(views.views)} random views of each marker and "
+        "over the markers, 800 x 800, whole frame, 8 bits. LPIPS is measured with weights that the user "
+        "supplies (--lpips), FLIP where flip-evaluator is installed; '-' where not."
     )
     charts = {}
     for truth in (name for name in TRUTHS if name in views.names(0)):
@@ -92,10 +92,10 @@ def report_views(document: Document, lines: Sequence[dict]) -> dict[str, str]:
         document.picture(f"psnr-{truth}.svg", f"PSNR against {truth}")
     if "exact-linear" in views.names(0):
         document.text(
-            "The ideal row against exact-linear is what a picture that is perfect in display values loses when "
-            "the truth takes its means in linear light, as Blender's 'Standard' view does: the difference sits "
-            "on module edges, so it grows with the number of modules. No renderer that blends display values, "
-            "as splat renderers do, can be closer to such a truth than about this."
+            "The ideal against exact-linear is what a picture that is perfect in display values loses when "
+            "the truth takes its means in linear light, as Blender's 'Standard' view does: the difference "
+            "sits on module edges, so it grows with the number of modules. A renderer that blends display "
+            "values, as splat renderers do, comes no closer to such a truth, but by luck."
         )
     return charts
 

@@ -48,7 +48,7 @@ class Settings:
     part: str | None = None
     """"i/n\""""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)
-    """threads that detect"""
+    """threads that look at pictures"""
     anew: bool = False
     ideal_only: bool = False
     """only the ceiling: no splat is drawn and no device opened"""
@@ -56,7 +56,7 @@ class Settings:
     @property
     def marker_count(self) -> int:
         """Markers of each category."""
-        return self.markers or (1 if self.quick else MARKERS)
+        return (1 if self.quick else MARKERS) if self.markers is None else self.markers
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -123,7 +123,7 @@ def check(settings: Settings) -> None:
     if not 1 <= settings.marker_count <= MARKERS:
         raise InputError(f"--markers is {settings.markers}; each category has 1 to {MARKERS}")
     if settings.workers < 1:
-        raise InputError(f"--workers is {settings.workers}; at least 1 thread detects")
+        raise InputError(f"--workers is {settings.workers}; at least 1 thread looks at pictures")
     if settings.trained is not None and not settings.trained.is_dir():
         raise InputError(
             f"{settings.trained} is not a folder; give one with 2dgs-17/small-0.ply and the like"
@@ -138,7 +138,8 @@ def _work(name: str, settings: Settings) -> list[dict]:
     categories, count = chosen_categories(settings.categories), settings.marker_count
     if name == counts.NAME:
         repeats = counts.QUICK_REPEATS if settings.quick else counts.FULL_REPEATS
-        return counts.counts_work(categories, repeats, settings.markers or MARKERS)
+        # all five cost a second
+        return counts.counts_work(categories, repeats, MARKERS if settings.markers is None else count)
     if name == localisation.NAME:
         located = tuple(c for c in categories if c.name in localisation.LOCATED)
         spans = (localisation.DISTANCES, localisation.TILTS)
@@ -162,7 +163,7 @@ def _measure(
     if name == counts.NAME:
         return lambda part: counts.measure_counts(part, seed)
     if name == localisation.NAME:
-        return lambda part: localisation.measure_localisation(part, painter, seed)
+        return lambda part: localisation.measure_localisation(part, painter, seed, pool)
     if name == views.NAME:
         perceptual = None if settings.lpips is None else load_lpips(settings.lpips)
         return lambda part: views.measure_views(

@@ -5,7 +5,7 @@ Unlike `detect`, which combines them and refines corners, these are for measurin
 
 from __future__ import annotations
 
-import threading
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -24,7 +24,8 @@ UNFORESHORTEN = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
 MIN_OVERLAP = 0.5
 _MARGIN = 16  # pixels kept around what is not background
 
-_local = threading.local()
+_idle: dict[str, deque] = {}
+"""AprilTag detectors that no thread uses, by family"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,14 +63,26 @@ def _aruco(grey: np.ndarray, target: Target) -> Attempt:
 
 def _pupil(grey: np.ndarray, target: Target) -> Attempt:
     """The AprilTag library at full resolution. It tells nothing of tags that it cannot decode."""
-    name = "tag" + target.family
-    detectors = vars(_local).setdefault("pupil", {})
-    if name not in detectors:  # the library keeps scratch memory in it: one for each thread
-        import pupil_apriltags  # type: ignore[import-not-found]  # of the extra `experiments`
-
-        detectors[name] = pupil_apriltags.Detector(families=name, nthreads=1, quad_decimate=1.0)
-    read = any(tag.tag_id == target.id for tag in detectors[name].detect(grey))
+    idle = _idle.setdefault(target.family, deque())
+    try:
+        detector = idle.pop()  # one picture at a time: the library keeps scratch memory in it
+    except IndexError:
+        detector = _pupil_detector("tag" + target.family)
+    read = any(tag.tag_id == target.id for tag in detector.detect(grey))
+    idle.append(detector)
     return Attempt(read, read)
+
+
+def _pupil_detector(family: str):
+    import pupil_apriltags  # type: ignore[import-not-found]  # of the extra `experiments`
+
+    class Detector(pupil_apriltags.Detector):
+        # theirs frees the family and then the detector, which looks into it: a crash, now and then. As many as
+        # there are threads are made, and kept.
+        def __del__(self) -> None:
+            pass
+
+    return Detector(families=family, nthreads=1, quad_decimate=1.0)
 
 
 def _cv2_qr(grey: np.ndarray, target: Target) -> Attempt:
