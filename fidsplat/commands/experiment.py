@@ -1,11 +1,13 @@
 """`fidsplat experiment ...`: the words that may follow."""
 
+from dataclasses import dataclass
 from typing import ClassVar
 
 from fidsplat.commands.experiment_files import Blender, Dataset, Merge, Report
 from fidsplat.commands.experiment_measure import All, Angles, Counts, Localisation, Pictures, Views
 
 
+@dataclass
 class Experiment:
     """The paper's experiments: tables, figures, data set."""
 

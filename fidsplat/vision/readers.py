@@ -77,8 +77,8 @@ def _pupil_detector(family: str):
     import pupil_apriltags  # type: ignore[import-not-found]  # of the extra `experiments`
 
     class Detector(pupil_apriltags.Detector):
-        # theirs frees the family and then the detector, which looks into it: a crash, now and then. As many as
-        # there are threads are made, and kept.
+        # theirs frees the family and then the detector, which looks into it: a crash, now and then. As many
+        # as there are threads are made, and kept.
         def __del__(self) -> None:
             pass
 
