@@ -21,8 +21,8 @@ from fidsplat.experiments.paper import ANGLES
 from fidsplat.experiments.setup import CATEGORIES, COLLECTIONS, PROTOCOLS
 from fidsplat.vision.readers import TITLES
 
-# the detector of each kind that the short table shows: that which reads furthest on the ideal texture
-_FURTHEST = {"apriltag": "pupil", "qr": "zxing-tall"}
+# the detectors of each kind by how far they read on the ideal texture: the first that is there is shown
+_FURTHEST = {"apriltag": ("pupil", "aruco"), "qr": ("zxing-tall", "zxing", "cv2")}
 
 
 class Scan(NamedTuple):
@@ -58,6 +58,11 @@ class Angles:
     def names(self, place: int) -> set[str]:
         """What occurs: 0 protocols, 1 categories, 3 methods, 4 detectors."""
         return {str(key[place]) for key in self.scans}
+
+    def furthest(self, kind: str) -> str:
+        """The detector that the short table shows for "apriltag" or "qr"."""
+        there = self.names(4)
+        return next((name for name in _FURTHEST[kind] if name in there), _FURTHEST[kind][0])
 
     def behind(self, protocol: str, category: str, method: str, reader: str) -> list[float]:
         """By how many degrees each marker's unbroken reading ends below that of the ideal texture, on the
@@ -118,7 +123,7 @@ def _short(document: Document, angles: Angles, protocol: str) -> None:
     methods = [m for m in method_order(angles.names(3)) if not m.startswith("2dgs-")]
     rows = []
     for category in category_order(angles.names(1)):
-        reader = _FURTHEST[CATEGORIES[category].kind]
+        reader = angles.furthest(CATEGORIES[category].kind)
         paper = ANGLES.get(category)
         row = [CATEGORIES[category].title]
         row.append(NOTHING if paper is None else "{:.1f} {:.1f}".format(*paper["ours"]))
@@ -135,7 +140,7 @@ def _short(document: Document, angles: Angles, protocol: str) -> None:
         rows.append(row)
     document.text(
         "As the paper has it: largest angle of detection and of decoding, mean over the markers, with "
-        f"{TITLES[_FURTHEST['apriltag']]} and {TITLES[_FURTHEST['qr']]}."
+        f"{TITLES[angles.furthest('apriltag')]} and {TITLES[angles.furthest('qr')]}."
     )
     baselines = [f"2DGS, {views} views" for views in COLLECTIONS]
     document.table(("category", "paper, its own", *methods, *baselines), rows)
@@ -174,7 +179,7 @@ def _chart(angles: Angles, protocol: str) -> str:
     for method in method_order(angles.names(3)):
         row = []
         for category in categories:
-            reader = _FURTHEST[CATEGORIES[category].kind]
+            reader = angles.furthest(CATEGORIES[category].kind)
             scans = angles.of(protocol, category, method, reader).values()
             row.append(bar([largest(s.tilts, s.read)[1] for s in scans]))
         if any(row):

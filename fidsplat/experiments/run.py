@@ -44,7 +44,7 @@ class Settings:
     blender: Path | None = None
     """folder with Blender's pictures; None for "blender" in ``out``"""
     lpips: Path | None = None
-    """file with LPIPS weights, see `fidsplat.vision.lpips`"""
+    """file with LPIPS weights, see `fidsplat.vision.lpips.load_lpips`"""
     part: str | None = None
     """"i/n\""""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)

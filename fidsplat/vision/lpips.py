@@ -1,16 +1,8 @@
 """LPIPS (Zhang et al. 2018) with AlexNet, in NumPy, for weights that the user has.
 
 The weights are no part of fidsplat and nothing here fetches them. `load_lpips` reads a NumPy file with the
-five convolutions of torchvision's AlexNet and the five linear layers of LPIPS version 0.1; with PyTorch and
-the lpips package it is written by
-
-    import lpips, numpy as np
-    net = lpips.LPIPS(net="alex")
-    alex = {f"conv{k}": m for k, m in enumerate((m for s in (net.net.slice1, net.net.slice2, net.net.slice3,
-            net.net.slice4, net.net.slice5) for m in s if hasattr(m, "weight")), 1)}
-    arrays = {f"{n}.{p}": getattr(m, p).detach().numpy() for n, m in alex.items() for p in ("weight", "bias")}
-    arrays |= {f"lin{k}": getattr(net, f"lin{k}").model[1].weight.detach().numpy().ravel() for k in range(5)}
-    np.savez("lpips-alex.npz", **arrays)
+five convolutions of torchvision's AlexNet and the five linear layers of LPIPS version 0.1; docs/experiments.md
+says how it is written with PyTorch and the lpips package.
 """
 
 from __future__ import annotations
@@ -42,7 +34,7 @@ def weights_name(file: Path) -> str:
 
 
 def load_lpips(file: Path) -> Callable[[np.ndarray, np.ndarray], float]:
-    """LPIPS of two (h, w) pictures of display values in [0, 1], by the weights in a .npz file (see above).
+    """LPIPS of two (h, w) pictures of display values in [0, 1], by the weights in a .npz file.
 
     Raises InputError when the file cannot be read or lacks an array or one has another shape.
     """
@@ -59,7 +51,7 @@ def load_lpips(file: Path) -> Callable[[np.ndarray, np.ndarray], float]:
         }
         for name, shape in shapes.items():
             if name not in weights or weights[name].shape != shape:
-                raise InputError(f"{file} needs an array {name} of shape {shape} (see fidsplat.vision.lpips)")
+                raise InputError(f"{file} needs an array {name} of shape {shape} (see docs/experiments.md)")
 
     def measure(picture: np.ndarray, truth: np.ndarray) -> float:
         total = 0.0

@@ -202,6 +202,13 @@ def test_the_scan_with_more_tilts_counts_and_gaps_use_common_tilts():
     assert angles.behind("fixed-module", "small", "fitted/best", "zxing-tall") == [0.0]
 
 
+def test_without_the_apriltag_library_the_short_table_shows_opencv():
+    key, result = scan("apriltag", 0, "ideal", "111111100")
+    seen = {"aruco": result["readers"]["pupil"]}
+    assert Angles([{"key": key, "result": result}]).furthest("apriltag") == "pupil"
+    assert Angles([{"key": key, "result": {"readers": seen}}]).furthest("apriltag") == "aruco"
+
+
 def test_means_with_their_spread():
     assert mean_spread([1.0, 3.0], 1) == "2.0 ± 1.4"
     assert mean_spread([2.0], 2) == "2.00"
