@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 _COLOURS = ("#777777", "#d1495b", "#edae49", "#00798c", "#30638e", "#7b4f9d", "#2e8b57", "#c26a2d", "#1f2d3d")
 _WIDTH, _HEIGHT = 900, 360
-_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 16, 54, 34
+_LEFT, _RIGHT, _BOTTOM = 62, 16, 34
+_ROW = 16  # of the legend
 
 
 class Bar(NamedTuple):
@@ -43,14 +44,17 @@ def bar_chart(
     ticks = _powers(bars) if logarithmic else _steps(bars)
     low, high = ticks[0], ticks[-1]
 
+    legend, rows = _legend(list(series))
+    top = 44 + _ROW * rows
+
     def place(value: float) -> float:
         if logarithmic:
             share = math.log10(max(value, low) / low) / math.log10(high / low)
         else:
             share = (max(value, low) - low) / (high - low)
-        return _HEIGHT - _BOTTOM - share * (_HEIGHT - _TOP - _BOTTOM)
+        return _HEIGHT - _BOTTOM - share * (_HEIGHT - top - _BOTTOM)
 
-    parts = [_text(_WIDTH / 2, 18, title, "middle", 15), _text(8, _TOP - 8, axis, "start", 11)]
+    parts = [_text(_WIDTH / 2, 18, title, "middle", 15), _text(8, top - 8, axis, "start", 11), *legend]
     for tick in ticks:
         y = place(tick)
         parts.append(f'<path d="M{_LEFT} {y:.1f}H{_WIDTH - _RIGHT}" stroke="#ddd"/>')
@@ -73,21 +77,28 @@ def bar_chart(
                 ends = place(bar.value + bar.spread), place(bar.value - bar.spread)
                 middle = x + 0.46 * thick
                 parts.append(f'<path d="M{middle:.1f} {ends[0]:.1f}V{ends[1]:.1f}" stroke="#000"/>')
-    x = float(_LEFT)
-    for s, name in enumerate(series):
-        parts.append(
-            f'<rect x="{x:.0f}" y="26" width="10" height="10" fill="{_COLOURS[s % len(_COLOURS)]}"/>'
-        )
-        parts.append(_text(x + 14, 35, name, "start", 11))
-        x += 30 + 6.4 * len(name)
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {_HEIGHT}" font-family="sans-serif">'
         f'<rect width="{_WIDTH}" height="{_HEIGHT}" fill="#fff"/>{"".join(parts)}</svg>\n'
     )
 
 
+def _legend(names: list[str]) -> tuple[list[str], int]:
+    """Squares and names in as many rows as they need; the number of rows."""
+    parts, x, rows = [], float(_LEFT), 1
+    for s, name in enumerate(names):
+        length = 30 + 6.4 * len(name)
+        if x + length > _WIDTH and x > _LEFT:
+            x, rows = float(_LEFT), rows + 1
+        y = 10 + _ROW * rows
+        square = f'width="10" height="10" fill="{_COLOURS[s % len(_COLOURS)]}"'
+        parts += [f'<rect x="{x:.0f}" y="{y}" {square}/>', _text(x + 14, y + 9, name, "start", 11)]
+        x += length
+    return parts, rows
+
+
 def _steps(bars: list[Bar]) -> list[float]:
-    top = max(bar.value + bar.spread for bar in bars)
+    top = max(bar.value + bar.spread for bar in bars) or 1.0
     unit = 10 ** math.floor(math.log10(max(top, 1e-12)))
     step = next(unit * k for k in (0.1, 0.2, 0.5, 1, 2) if top / (unit * k) <= 8)
     return [round(i * step, 12) for i in range(math.ceil(top / step - 1e-9) + 1)]

@@ -17,6 +17,7 @@ from fidsplat.experiments.setup import MARKERS, PROTOCOLS, SEED, TEST_VIEWS, cho
 from fidsplat.files import writable_folder
 from fidsplat.render import Renderer
 from fidsplat.vision.lpips import load_lpips, weights_name
+from fidsplat.vision.metrics import metric_versions
 from fidsplat.vision.readers import reader_versions
 
 NAMES = (counts.NAME, localisation.NAME, views.NAME, angles.NAME)
@@ -104,7 +105,8 @@ def planned(name: str, settings: Settings) -> Iterator[Plan]:
     draws = name != counts.NAME and not settings.ideal_only
     renderer = Renderer(settings.device) if draws else None
     device = None if renderer is None else f"{renderer.device.title}, {renderer.device.version}"
-    facts = run_facts(name, device, settings.seed, reader_versions())
+    versions = reader_versions() | (metric_versions() if name == views.NAME else {})
+    facts = run_facts(name, device, settings.seed, versions)
     records = Records(settings.file(name), facts, settings.anew)
     pool = ThreadPoolExecutor(settings.workers)
     try:

@@ -1,8 +1,8 @@
 """LPIPS (Zhang et al. 2018) with AlexNet, in NumPy, for weights that the user has.
 
 The weights are no part of fidsplat and nothing here fetches them. `load_lpips` reads a NumPy file with the
-five convolutions of torchvision's AlexNet and the five linear layers of LPIPS version 0.1; docs/experiments.md
-says how it is written with PyTorch and the lpips package.
+five convolutions of torchvision's AlexNet and the five linear layers of LPIPS version 0.1;
+docs/experiments.md says how it is written with PyTorch and the lpips package.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from importlib.metadata import version
 from importlib.util import find_spec
 
 import cv2
@@ -41,6 +42,11 @@ def ssim(picture: np.ndarray, truth: np.ndarray) -> float:
 def has_flip() -> bool:
     """Whether FLIP can be measured: the package flip-evaluator is installed."""
     return find_spec("flip_evaluator") is not None
+
+
+def metric_versions() -> dict[str, str]:
+    """Versions of the packages that metrics come from."""
+    return {"flip-evaluator": version("flip-evaluator")} if has_flip() else {}
 
 
 def flip(picture: np.ndarray, truth: np.ndarray) -> float:

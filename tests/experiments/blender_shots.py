@@ -1,8 +1,9 @@
 """Small pictures by Blender, and what the exact renderer makes of the same.
 
-    python tests/experiments/blender_shots.py ENVIRONMENT
+    python tests/experiments/blender_shots.py [ENVIRONMENT]
 
-draws those in `data` that are missing, with the environment of `fidsplat experiment blender --install`.
+prints how well they agree, after drawing those in `data` that are missing with the environment of
+`fidsplat experiment blender --install`.
 """
 
 import math
@@ -18,6 +19,8 @@ from fidsplat.experiments.methods import plain_marker
 from fidsplat.experiments.plane import plane_picture
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES
 from fidsplat.experiments.views import from_srgb, srgb
+from fidsplat.vision.images import read_image
+from fidsplat.vision.metrics import psnr
 
 DATA = Path(__file__).parent / "data"
 SAMPLES = 1024
@@ -46,20 +49,23 @@ def grid_of(name: str) -> np.ndarray:
     return plain_marker(CATEGORIES[SHOTS[name][0]].spec(0)).grid
 
 
-def ours(name: str, finer: int = 1) -> np.ndarray:
-    """The exact picture of a shot, each pixel divided into finer x finer: display values."""
+def ours(name: str, finer: int = 1, border: int = 0) -> np.ndarray:
+    """The exact picture of a shot with ``border`` more pixels around it, each divided into finer x finer:
+    display values."""
     _, camera, view, _ = SHOTS[name]
-    grid, camera = grid_of(name), finely(CAMERAS[camera], finer)
+    grid, camera = grid_of(name), finely(CAMERAS[camera], finer, border)
     module = EDGE / grid.shape[0]
     if view == "raw":
         return plane_picture(grid, module, camera, background=BACKGROUND)
     return srgb(plane_picture(grid, module, camera, background=from_srgb(BACKGROUND)))
 
 
-def finely(camera: Camera, finer: int) -> Camera:
-    """The camera with every pixel divided into finer x finer."""
-    scaled = {name: getattr(camera, name) * finer for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    return replace(camera, **scaled)
+def finely(camera: Camera, finer: int, border: int) -> Camera:
+    """The camera with more pixels around and every pixel divided into finer x finer."""
+    facts = {name: getattr(camera, name) for name in ("fx", "fy")}
+    facts |= {name: getattr(camera, name) + 2 * border for name in ("width", "height")}
+    facts |= {name: getattr(camera, name) + border for name in ("cx", "cy")}
+    return replace(camera, **{name: value * finer for name, value in facts.items()})
 
 
 def flat(name: str, room: int) -> np.ndarray:
@@ -73,7 +79,35 @@ def flat(name: str, room: int) -> np.ndarray:
     return same
 
 
-def main(environment: Path) -> None:
+def theirs(name: str) -> np.ndarray:
+    """Blender's picture of a shot: display values."""
+    return read_image(DATA / f"{name}.png")[:, :, 0] / 255.0
+
+
+def blackman_harris(name: str, finer: int = 16) -> np.ndarray:
+    """Our picture under the Blackman-Harris window of 3 pixels, Blender's filter of width 1.5."""
+    fine = ours(name, finer, border=1)
+    x = (np.arange(3 * finer) + 0.5) / finer - 1.5
+    turn = 2 * np.pi * (x / 3 + 0.5)
+    weight = 0.35875 - 0.48829 * np.cos(turn) + 0.14128 * np.cos(2 * turn) - 0.01168 * np.cos(3 * turn)
+    weight /= weight.sum()
+    rows = np.stack([weight @ fine[i * finer : (i + 3) * finer] for i in range(HEIGHT)])
+    return np.stack([rows[:, j * finer : (j + 3) * finer] @ weight for j in range(WIDTH)], 1)
+
+
+def compare() -> None:
+    """Print PSNR in dB of each shot, inside cells and at edges."""
+    for name in SHOTS:
+        inside = flat(name, 2)
+        pictures = {"": ours(name)}
+        if name not in BOXES:
+            pictures[", our picture under that filter"] = blackman_harris(name)
+        for what, picture in pictures.items():
+            ratios = [psnr(picture[where], theirs(name)[where]) for where in (inside, ~inside)]
+            print(f"{name}{what}: {ratios[0]:.1f} inside cells, {ratios[1]:.1f} at edges")
+
+
+def draw(environment: Path) -> None:
     """Draw what is missing."""
     for name, (_, camera, view, pixel_filter) in SHOTS.items():
         grid = grid_of(name)
@@ -84,4 +118,6 @@ def main(environment: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    if len(sys.argv) > 1:
+        draw(Path(sys.argv[1]))
+    compare()

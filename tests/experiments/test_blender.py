@@ -6,17 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from experiments.blender_shots import BOXES, DATA, HEIGHT, SHOTS, WIDTH, flat, ours
+from experiments.blender_shots import BOXES, SHOTS, blackman_harris, flat, ours, theirs
 
 import fidsplat as fs
 from fidsplat.experiments import blender
 from fidsplat.experiments.setup import CATEGORIES
-from fidsplat.vision.images import read_image
 from fidsplat.vision.metrics import psnr
-
-
-def theirs(name: str) -> np.ndarray:
-    return read_image(DATA / f"{name}.png")[:, :, 0] / 255.0
 
 
 @pytest.mark.parametrize("name", SHOTS)
@@ -40,24 +35,12 @@ def test_edges_differ_by_the_pixel_filter_and_by_nothing_else():
     edges = ~flat(name, 2)
     seen = theirs(name)
     box = psnr(ours(name)[edges], seen[edges])
-    filtered = _blackman_harris(name)
+    filtered = blackman_harris(name)
     own = psnr(filtered[edges], seen[edges])
     assert box < 35
     assert own >= 45
     # and it is the filter that makes the difference: theirs from ours is what the two filters differ by
-    away = np.abs(filtered - seen)
-    assert away[2:-2, 2:-2].max() < 3 / 255
-
-
-def _blackman_harris(name: str, finer: int = 16) -> np.ndarray:
-    """Our picture under the Blackman-Harris window of 3 pixels, Blender's filter of width 1.5."""
-    fine = np.pad(ours(name, finer), finer, mode="edge")
-    x = (np.arange(3 * finer) + 0.5) / finer - 1.5
-    turn = 2 * np.pi * (x / 3 + 0.5)
-    weight = 0.35875 - 0.48829 * np.cos(turn) + 0.14128 * np.cos(2 * turn) - 0.01168 * np.cos(3 * turn)
-    weight /= weight.sum()
-    rows = np.stack([weight @ fine[i * finer : (i + 3) * finer] for i in range(HEIGHT)])
-    return np.stack([rows[:, j * finer : (j + 3) * finer] @ weight for j in range(WIDTH)], 1)
+    assert np.abs(filtered - seen).max() < 3 / 255
 
 
 def test_the_standard_view_averages_linear_light():

@@ -239,6 +239,7 @@ def test_a_logarithmic_scale_has_equal_steps_for_equal_factors():
     bars = [r for r in svg.iter("{http://www.w3.org/2000/svg}rect") if r.get("fill") == "#777777"]
     heights = [float(bar.get("height")) for bar in bars if bar.get("y") != "26"]
     assert heights[2] - heights[1] == pytest.approx(heights[1] - heights[0], abs=0.2)
+    assert "<rect" in bar_chart("t", "n", ["a"], {"s": [Bar(0)]})
     with pytest.raises(ValueError, match="at or below 0"):
         bar_chart("t", "n", ["a"], {"s": [Bar(0)]}, True)
     with pytest.raises(ValueError, match="at least one bar"):
