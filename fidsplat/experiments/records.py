@@ -53,9 +53,13 @@ def _differences(old: dict, new: dict) -> list[str]:
 
 def _commit() -> str | None:
     """Commit of the working tree, with "+" when files differ from it; None outside one."""
-    here = Path(__file__).parent
+    here = Path(__file__)
     try:
-        git = ["git", "-C", str(here)]
+        git = ["git", "-C", str(here.parent)]
+        # an environment may lie inside somebody else's repository
+        tracked = subprocess.run([*git, "ls-files", "--error-unmatch", here.name], capture_output=True)
+        if tracked.returncode:
+            return None
         head = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True)
         if head.returncode:
             return None
@@ -73,7 +77,8 @@ def _code_hash(experiment: str) -> str:
     files += [package / "experiments" / f"{name}.py" for name in (*_SHARED, experiment)]
     files += kernels_folder().rglob("*.cl")
     found = hashlib.sha256()
-    for file in sorted(files):
+    # by name: kernels lie elsewhere in a wheel
+    for file in sorted(files, key=lambda f: (f.name, f.parent.name)):
         found.update(file.name.encode() + b"\0" + file.read_bytes())
     return found.hexdigest()[:16]
 

@@ -132,8 +132,7 @@ def check(settings: Settings) -> None:
         )
     if settings.tilts is not None:
         angles.parse_tilts(settings.tilts)
-    if settings.methods == (IDEAL,) and not settings.ideal_only:
-        raise InputError("no mixture is known")
+    method_names(settings.mixtures)
 
 
 def _work(name: str, settings: Settings) -> list[dict]:
