@@ -202,19 +202,20 @@ class Report:
         str
     ] = """Write report.md and report.html: tables as in the paper, beside the paper's figures.
 
-Plots and pictures lie in its folder. Tables say what is missing.
+Plots and pictures lie in its folder, or for FILE.md in a folder of that name. Tables say what is
+missing.
 
 Examples:
   fidsplat experiment report
-  fidsplat experiment report results -o docs/results"""
+  fidsplat experiment report results -o docs/results.md"""
 
     folders: Annotated[
         tyro.conf.Positional[tuple[str, ...]],
         option("DIR", "folders with results (default: fidsplat-experiments)"),
     ] = ()
-    out: Annotated[str | None, option("DIR", "folder for the report (default: the first folder)", "-o")] = (
-        None
-    )
+    out: Annotated[
+        str | None, option("DIR|FILE.md", "folder or file for the report (default: the first folder)", "-o")
+    ] = None
     json: Json = False
 
     def run(self) -> int:

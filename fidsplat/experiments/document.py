@@ -30,8 +30,8 @@ class Document:
         """A picture by its name relative to the report."""
         self.blocks.append(("picture", file, title))
 
-    def markdown(self) -> str:
-        """The document in Markdown."""
+    def markdown(self, folder: str = "") -> str:
+        """The document in Markdown; ``folder`` comes before the names of pictures, e.g. "results/"."""
         parts = [f"# {self.title}"]
         for kind, *values in self.blocks:
             if kind == "heading":
@@ -39,15 +39,15 @@ class Document:
             elif kind == "text":
                 parts.append(values[0])
             elif kind == "picture":
-                parts.append(f"![{values[1]}]({values[0]})")
+                parts.append(f"![{values[1]}]({folder}{values[0]})")
             else:
                 heads, rows = values
                 lines = [heads, ("---", *["---:"] * (len(heads) - 1)), *rows]
                 parts.append("\n".join("| " + " | ".join(map(_cell, line)) + " |" for line in lines))
         return "\n\n".join(parts) + "\n"
 
-    def html(self) -> str:
-        """The document as one HTML page without scripts."""
+    def html(self, folder: str = "") -> str:
+        """The document as one HTML page without scripts; ``folder`` as for `markdown`."""
         parts = [f"<h1>{html.escape(self.title)}</h1>"]
         for kind, *values in self.blocks:
             if kind == "heading":
@@ -55,7 +55,7 @@ class Document:
             elif kind == "text":
                 parts.append(f"<p>{html.escape(values[0])}</p>")
             elif kind == "picture":
-                source, title = (html.escape(value, quote=True) for value in values)
+                source, title = (html.escape(v, quote=True) for v in (folder + values[0], values[1]))
                 parts.append(f'<figure><img src="{source}" alt="{title}"></figure>')
             else:
                 heads, rows = values

@@ -23,11 +23,12 @@ _COMMANDS = "fidsplat experiment {}"
 
 
 def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
-    """Write report.md and report.html with their plots and sheets into ``out``; returns the files.
+    """Write a report as Markdown and HTML with its plots and sheets; returns the files, the Markdown first.
 
     Args:
         folders: where results lie (`NAME.jsonl`, and sheets in the first that has any).
-        out: made when it is missing.
+        out: a folder for report.md and all that belongs to it; or a name that ends in .md, and the pictures
+            go into a folder of that name without .md.
 
     Raises InputError when there are no results or the folder cannot be written.
     """
@@ -40,7 +41,9 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
             f"no results in {', '.join(map(str, folders))}; run fidsplat experiment all first, or give their "
             "folder"
         )
-    writable_folder(out)
+    page = out if out.suffix == ".md" else out / "report.md"
+    pictures = out.with_suffix("") if out.suffix == ".md" else out
+    writable_folder(pictures)
     document = Document("Results of the paper's experiments")
     _provenance(document, lines)
     report_targets(
@@ -61,20 +64,21 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
         else:
             document.text(f"Nothing was measured by `{_COMMANDS.format(name)}`.")
     sheets = next((found for folder in folders if (found := sheet_files(folder))), [])
-    files = []
     if sheets:
         document.heading("Pictures")
         document.text("The middle 200 x 200 pixels of 800 x 800, marker 0 of each category.")
     for sheet in sheets:
         document.picture(sheet.name, sheet.stem)
-        if sheet.parent.resolve() != out.resolve():
-            with atomic_write(out / sheet.name) as stream, open(sheet, "rb") as source:
+        if sheet.parent.resolve() != pictures.resolve():
+            with atomic_write(pictures / sheet.name) as stream, open(sheet, "rb") as source:
                 shutil.copyfileobj(source, stream)
-    for name, text in {**charts, "report.md": document.markdown(), "report.html": document.html()}.items():
-        with atomic_write(out / name) as stream:
+    before = "" if pictures == page.parent else f"{pictures.name}/"
+    texts = {page: document.markdown(before), page.with_suffix(".html"): document.html(before)}
+    texts |= {pictures / name: chart for name, chart in charts.items()}
+    for file, text in texts.items():
+        with atomic_write(file) as stream:
             stream.write(text.encode())
-        files.append(out / name)
-    return [*files[-2:], *files[:-2]]
+    return list(texts)
 
 
 def _provenance(document: Document, lines: dict[str, list[dict]]) -> None:

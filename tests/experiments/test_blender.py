@@ -3,6 +3,7 @@
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -103,3 +104,24 @@ def test_without_blender_the_error_says_how_to_get_it(tmp_path):
     camera = fs.Camera.pinhole(10, 10, 9.0, 8.0, 5.0, 5.0)
     with pytest.raises(fs.InputError, match="square pixels"):
         blender.camera_facts(camera)
+
+
+def test_installing_where_it_cannot_be(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("x")
+    monkeypatch.setattr(blender, "sys", SimpleNamespace(version_info=(3, 11, 0), executable=sys.executable))
+    with pytest.raises(fs.InputError, match="cannot write into the folder"):
+        blender.install(tmp_path / "file" / "environment")
+    monkeypatch.setattr(blender, "sys", SimpleNamespace(version_info=(3, 12, 1), executable=sys.executable))
+    monkeypatch.setattr(blender.shutil, "which", lambda name: None)
+    with pytest.raises(fs.InputError, match=r"needs Python 3\.11, and python3\.11 is not on the path"):
+        blender.install(tmp_path / "environment")
+
+
+def test_what_pip_says_last_is_the_error(tmp_path, monkeypatch):
+    monkeypatch.setattr(blender, "sys", SimpleNamespace(version_info=(3, 11, 0), executable=sys.executable))
+    monkeypatch.setattr(blender, "environment_python", lambda environment: Path(sys.executable))
+    monkeypatch.setattr(blender, "BPY", str(tmp_path / "no-such-package"))
+    with pytest.raises(
+        fs.DeviceError, match=r"installing Blender failed at '-m pip install'.*no-such-package"
+    ):
+        blender.install(tmp_path / "environment")

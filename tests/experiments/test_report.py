@@ -180,6 +180,15 @@ def test_both_forms_say_the_same_and_their_pictures_are_there(results):
     assert cells <= {piece.strip() for piece in page.texts}
 
 
+def test_a_page_of_its_own_name_has_its_pictures_in_a_folder(results):
+    files = make_report([results], results / "docs" / "results.md")
+    assert files[:2] == [results / "docs" / "results.md", results / "docs" / "results.html"]
+    assert {file.parent.name for file in files[2:]} == {"results"}
+    for name in re.findall(r"!\[[^]]*\]\(([^)]+)\)", files[0].read_text()):
+        assert (results / "docs" / name).is_file()
+        assert f'src="{name}"' in files[1].read_text()
+
+
 def test_a_part_of_the_results_is_enough_and_none_is_an_error(tmp_path):
     write(tmp_path, "counts", COUNTS)
     text = make_report([tmp_path], tmp_path)[0].read_text()
