@@ -58,7 +58,7 @@ def bar_chart(
     for tick in ticks:
         y = place(tick)
         parts.append(f'<path d="M{_LEFT} {y:.1f}H{_WIDTH - _RIGHT}" stroke="#ddd"/>')
-        parts.append(_text(_LEFT - 6, y + 4, f"{tick:g}", "end", 11))
+        parts.append(_text(_LEFT - 6, y + 4, f"{tick:,.10g}", "end", 11))
     wide = (_WIDTH - _LEFT - _RIGHT) / len(groups)
     thick = 0.84 * wide / len(series)
     for g, group in enumerate(groups):

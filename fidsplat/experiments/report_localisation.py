@@ -68,6 +68,6 @@ def _cell(seen: list[dict]) -> str:
     read = [view for view in seen if view["position_mm"] is not None]
     if not read:
         return "not read" if seen else NOTHING
-    columns = (("position_mm", 2), ("angle_deg", 3), ("corners_px", 3))
+    columns = (("position_mm", 3), ("angle_deg", 3), ("corners_px", 3))
     text = " / ".join(f"{statistics.median(view[n] for view in read):.{digits}f}" for n, digits in columns)
     return text if len(read) == len(seen) else f"{text} ({len(read)} of {len(seen)})"

@@ -85,7 +85,7 @@ def report_views(document: Document, lines: Sequence[dict]) -> dict[str, str]:
             method: [bar(views.values(truth, category, method, "psnr")) for category in categories]
             for method in methods
         }
-        series = {"paper, its own": [bar([VIEWS[c]["ours"][0]]) for c in categories]} | series
+        series["paper, its own"] = [bar([VIEWS[c]["ours"][0]]) for c in categories]
         titles = [CATEGORIES[name].title for name in categories]
         shown = {name: row for name, row in series.items() if any(row)}
         charts[f"psnr-{truth}.svg"] = bar_chart(f"PSNR against {truth}", "dB", titles, shown)

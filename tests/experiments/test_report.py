@@ -118,7 +118,7 @@ def test_the_report_says_what_was_measured(results):
     ]
     assert row_of(text, "huge", "fitted/best")[4:] == ["never / never", "not read frontally"]
     assert "31.50 / 0.980 / - / 0.050" in text
-    assert row_of(text, "1 m, 0 deg")[1] == "0.50 / 0.100 / 0.020 (1 of 2)"
+    assert row_of(text, "1 m, 0 deg")[1] == "0.500 / 0.100 / 0.020 (1 of 2)"
     assert row_of(text, "QR Huge", "7.0 + 8.0")[2:] == ["5000.0 + 6000.0", "300.0 + 200.0", "60.0 + 40.0"]
     assert "a device" in text
     assert "(paper 73.8 60.0)" in text  # the columns of the trained baseline wait with the paper's figures
