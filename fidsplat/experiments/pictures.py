@@ -14,7 +14,7 @@ from fidsplat.vision.images import to_uint8, write_png
 from fidsplat.vision.paint import contact_sheet
 
 TILTS = (0.0, 45.0, 70.0)
-_PIXELS = 200  # of the cut-out in the middle of each picture, at most
+_PIXELS = 160  # of the cut-out in the middle of each picture, at most
 
 
 def sheet_files(folder: Path) -> list[Path]:
@@ -27,7 +27,7 @@ def write_sheets(
 ) -> Iterator[Path]:
     """Draw marker 0 of each category by every method, rows of equal tilt; yields each file as it is written.
 
-    The middle of the 800 x 800 picture, enlarged, so that edges show.
+    The middle of the 800 x 800 picture, pixel by pixel, so that edges show.
     """
     writable_folder(folder)
     protocol = PROTOCOLS["fixed-plane"]
@@ -40,11 +40,12 @@ def write_sheets(
             [(f"{name}, {tilt:g} deg", _middle(draw(protocol.camera(tilt)))) for name, draw in draws.items()]
             for tilt in TILTS
         ]
-        yield write_png(folder / f"sheet-{category.name}.png", contact_sheet(rows, width=2 * _PIXELS))
+        sheet = contact_sheet(rows, width=_PIXELS)
+        yield write_png(folder / f"sheet-{category.name}.png", sheet[:, :, 0])  # there is no colour in it
 
 
 def _middle(picture: np.ndarray) -> np.ndarray:
     h, w = picture.shape
     y, x = max((h - _PIXELS) // 2, 0), max((w - _PIXELS) // 2, 0)
     part = to_uint8(picture[y : y + _PIXELS, x : x + _PIXELS])
-    return np.repeat(np.kron(part, np.ones((2, 2), np.uint8))[:, :, None], 3, axis=2)
+    return np.repeat(part[:, :, None], 3, axis=2)

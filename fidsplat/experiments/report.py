@@ -66,7 +66,7 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
     sheets = next((found for folder in folders if (found := sheet_files(folder))), [])
     if sheets:
         document.heading("Pictures")
-        document.text("The middle 200 x 200 pixels of 800 x 800, marker 0 of each category.")
+        document.text("The middle 160 x 160 pixels of 800 x 800, marker 0 of each category.")
     for sheet in sheets:
         document.picture(sheet.name, sheet.stem)
         if sheet.parent.resolve() != pictures.resolve():
