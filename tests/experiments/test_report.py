@@ -132,7 +132,7 @@ def test_targets_are_judged(results):
 
     gap = "zxing-tall, fixed-module: behind the ideal"
     assert verdict(f"fitted/best, small, {gap}") == ["83.0 deg, worst of 2", "no"]
-    assert verdict(f"fitted/best, huge, {gap}") == ["never read", "no"]
+    assert verdict(f"fitted/best, huge, {gap}") == ["not read frontally", "no"]
     assert verdict("fitted/best above paper/screen, small, PSNR against exact")[-1] == "yes"
     assert "+5.50 dB (31.50 and 26.00)" in text
     share = "fitted, huge: Gaussians of those of the paper's mixture"
