@@ -26,7 +26,8 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
     """Write a report as Markdown and HTML with its plots and sheets; returns the files, the Markdown first.
 
     Args:
-        folders: where results lie (`NAME.jsonl`, and sheets in the first that has any).
+        folders: where results lie (`NAME.jsonl`, and sheets in the first that has any; else those
+            that lie beside the plots stay).
         out: a folder for report.md and all that belongs to it; or a name that ends in .md, and the pictures
             go into a folder of that name without .md.
 
@@ -63,7 +64,7 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
             charts |= report(document, lines[name])
         else:
             document.text(f"Nothing was measured by `{_COMMANDS.format(name)}`.")
-    sheets = next((found for folder in folders if (found := sheet_files(folder))), [])
+    sheets = next((found for folder in (*folders, pictures) if (found := sheet_files(folder))), [])
     if sheets:
         document.heading("Pictures")
         document.text("The middle 160 x 160 pixels of 800 x 800, marker 0 of each category.")
