@@ -28,7 +28,7 @@ class Dataset:
     ] = """Write the data set of section 4.1: 100 scenes for COLMAP, 25 markers x 4 collections.
 
 Each scene has training views (3, 5, 9 or 17), 20 test views, and models as text and binary. Scenes that are
-there stay. About 200 MB.
+there stay. About 300 MB.
 
 Examples:
   fidsplat experiment dataset -o dataset
