@@ -69,11 +69,14 @@ def _parse(words: list[str]):
 
     from fidsplat.commands import COMMANDS
 
-    name = words[0] if words and words[0] in COMMANDS else ""
-    if name:
-        kind, about, program, words = COMMANDS[name], COMMANDS[name].HELP, f"fidsplat {name}", words[1:]
-    else:
-        kind, about, program = _any_of(COMMANDS), ABOUT, "fidsplat"
+    known: dict[str, Any] = COMMANDS
+    kind: Any = None
+    about, program = ABOUT, "fidsplat"
+    while words and words[0] in known:
+        kind, about, program = known[words[0]], known[words[0]].HELP, f"{program} {words[0]}"
+        known, words = getattr(kind, "PARTS", {}), words[1:]
+    if known:  # a group, and no word that leads on
+        kind = _any_of(known)
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):

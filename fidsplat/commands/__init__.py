@@ -1,5 +1,6 @@
 """One module for each command: a dataclass of its options, whose ``run`` does the work and returns the exit
 status. Its docstring is the line in the list of commands, its HELP what `fidsplat COMMAND --help` says.
+A group of commands has PARTS instead: its commands by the word that follows.
 
 Nothing heavy is imported before ``run``, so that help and errors come at once.
 """
@@ -9,6 +10,7 @@ from fidsplat.commands.check import Check
 from fidsplat.commands.demo import Demo
 from fidsplat.commands.detect import Detect
 from fidsplat.commands.devices import Devices
+from fidsplat.commands.experiment import Experiment
 from fidsplat.commands.marker import Marker
 from fidsplat.commands.render import Render
 from fidsplat.commands.warm import Warm
@@ -22,5 +24,6 @@ COMMANDS = {
     "check": Check,
     "bench": Bench,
     "warm": Warm,
+    "experiment": Experiment,
 }
 """Every command by its name, in the order in which help lists them."""

@@ -25,7 +25,7 @@ MAY_IMPORT = {
     "splats": BASE | {"harmonics"},
     "cameras": BASE,
     "vision": BASE | {"cameras"},
-    "formats": BASE | {"splats", "harmonics"},
+    "formats": BASE | {"splats", "harmonics", "cameras"},
     "markers": BASE | {"splats", "vision.dictionaries", "vision.images"},
     "scenes": PLAIN | {"markers", "formats"},
     "effects": PLAIN | {"scenes"},
@@ -39,6 +39,9 @@ ANYTHING = {"cli", "commands", "experiments", "__init__"}
 HOME_OF = {
     "cv2": ("vision",),
     "zxingcpp": ("vision",),
+    "pupil_apriltags": ("vision",),
+    "flip_evaluator": ("vision",),
+    "bpy": ("experiments.blender_worker",),
     "shapely": ("markers",),
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),

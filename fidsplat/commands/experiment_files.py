@@ -1,0 +1,235 @@
+"""`fidsplat experiment`: data sets, Blender's pictures, results of shards, reports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+import tyro
+
+from fidsplat.commands.output import Json, console, option, print_json
+from fidsplat.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+Names = tyro.conf.UseAppendAction[tuple[str, ...]]
+"""an option that may be given several times"""
+CATEGORY_HELP = "apriltag, small, medium, large or huge, once more for each (default: all)"
+
+
+@dataclass
+class Dataset:
+    """The paper's 100 scenes in COLMAP format."""
+
+    HELP: ClassVar[
+        str
+    ] = """Write the data set of section 4.1: 100 scenes for COLMAP, 25 markers x 4 collections.
+
+Each scene has training views (3, 5, 9 or 17), 20 test views, and models as text and binary. Scenes that are
+there stay. About 300 MB.
+
+Examples:
+  fidsplat experiment dataset -o dataset
+  fidsplat experiment dataset --truth blender-standard --blender fidsplat-experiments/blender"""
+
+    out: Annotated[str, option("DIR", "folder for the scenes (default: fidsplat-dataset)", "-o")] = (
+        "fidsplat-dataset"
+    )
+    category: Annotated[Names, option("NAME", CATEGORY_HELP)] = ()
+    markers: Annotated[int, option("N", "of each category, 1 to 5 (default: 5)")] = 5
+    truth: Annotated[
+        str,
+        option("NAME", "who draws: exact, exact-linear, blender-standard or blender-raw (default: exact)"),
+    ] = "exact"
+    blender: Annotated[Path, option("DIR", "Blender's pictures (default: fidsplat-experiments/blender)")] = (
+        Path("fidsplat-experiments/blender")
+    )
+    seed: Annotated[int, option("N", "of texts and views (default: 0)")] = 0
+    json: Json = False
+
+    def run(self) -> int:
+        from rich.progress import Progress
+
+        from fidsplat.experiments.dataset import dataset_work, write_scene
+        from fidsplat.experiments.setup import MARKERS, chosen_categories
+        from fidsplat.experiments.views import TRUTHS
+        from fidsplat.files import writable_folder
+
+        if self.truth not in TRUTHS:
+            raise InputError(f"unknown truth {self.truth!r}; known: {', '.join(TRUTHS)}")
+        if not 1 <= self.markers <= MARKERS:
+            raise InputError(f"--markers is {self.markers}; each category has 1 to {MARKERS}")
+        folder = writable_folder(self.out)
+        work = dataset_work(chosen_categories(self.category), self.markers)
+        where = console(self.json)
+        with Progress(console=console(True), transient=True) as bars:
+            scenes = [
+                write_scene(part, folder, self.seed, self.truth, self.blender)
+                for part in bars.track(work, description="scenes")
+            ]
+        if self.json:
+            print_json({"folder": str(folder), "scenes": [scene.name for scene in scenes]})
+        else:
+            where.print(f"{len(scenes)} scenes in {folder}", markup=False, soft_wrap=True)
+        return 0
+
+
+@dataclass
+class Blender:
+    """Ground truth by Blender: install it, render with it."""
+
+    HELP: ClassVar[
+        str
+    ] = """Draw every marker's views with Blender (Cycles on the CPU), the paper's ground truth.
+
+--install makes a virtual environment of its own (about 1 GB, Python 3.11 needed) with bpy. Without it,
+pictures are rendered; those that are there stay. About 3 s a picture on two cores; 20 test views for each of
+25 markers, with --training 17 more.
+
+Examples:
+  fidsplat experiment blender --install
+  fidsplat experiment blender
+  fidsplat experiment blender --view raw --category small --markers 1 --samples 16"""
+
+    out: Annotated[
+        str, option("DIR", "folder for the pictures (default: fidsplat-experiments/blender)", "-o")
+    ] = "fidsplat-experiments/blender"
+    install: Annotated[
+        bool, tyro.conf.arg(help="install Blender instead of rendering", help_behavior_hint="")
+    ] = False
+    environment: Annotated[
+        Path | None,
+        option("DIR", "Blender's virtual environment (default: fidsplat/blender in the user's cache)"),
+    ] = None
+    view: Annotated[Names, option("NAME", "standard or raw (default: both)")] = ()
+    category: Annotated[Names, option("NAME", CATEGORY_HELP)] = ()
+    markers: Annotated[int, option("N", "of each category, 1 to 5 (default: 5)")] = 5
+    training: Annotated[bool, tyro.conf.arg(help="the training views as well", help_behavior_hint="")] = False
+    samples: Annotated[int, option("N", "for each pixel (default: 64)")] = 64
+    threads: Annotated[int | None, option("N", "of Cycles (default: one for each core)")] = None
+    seed: Annotated[int, option("N", "of texts and views (default: 0)")] = 0
+    json: Json = False
+
+    def run(self) -> int:
+        from rich.progress import Progress
+
+        from fidsplat.experiments import blender
+        from fidsplat.experiments.setup import MARKERS, chosen_categories
+
+        where = console(self.json)
+        environment = self.environment or blender.default_environment()
+        if self.install:
+            with where.status("") as status:
+                python = blender.install(environment, status.update)
+            if self.json:
+                print_json({"python": str(python)})
+            else:
+                where.print(f"Blender is in {environment}", markup=False, soft_wrap=True)
+            return 0
+        if not (1 <= self.markers <= MARKERS and self.samples >= 1):
+            raise InputError(f"--markers must be 1 to {MARKERS} and --samples at least 1")
+        views = self.view or blender.VIEW_NAMES
+        categories = chosen_categories(self.category)
+        for view in views:
+            blender.ready(view, environment)
+        folder, done = Path(self.out), 0
+        with Progress(console=console(True), transient=True) as bars:
+            for view in views:
+                jobs = [
+                    blender.marker_job(category, index, self.seed, folder, view, self.training)
+                    for category in categories
+                    for index in range(self.markers)
+                ]
+                bar = bars.add_task(f"view {view}", total=sum(len(job["shots"]) for job in jobs))
+                for _ in blender.render(jobs, view, environment, self.samples, threads=self.threads):
+                    bars.advance(bar)
+                    done += 1
+        if self.json:
+            print_json({"folder": str(folder), "pictures": done})
+        else:
+            where.print(f"{done} pictures in {folder}", markup=False, soft_wrap=True)
+        return 0
+
+
+@dataclass
+class Merge:
+    """Join the results of shards."""
+
+    HELP: ClassVar[
+        str
+    ] = """Join results of shards: NAME-1-of-4.jsonl and so on in the folders become NAME.jsonl.
+
+Examples:
+  fidsplat experiment merge shards -o results
+  fidsplat experiment merge machine-1 machine-2 -o results"""
+
+    folders: Annotated[tyro.conf.Positional[tuple[str, ...]], option("DIR", "folders with results of shards")]
+    out: Annotated[
+        str, option("DIR", "folder for the joined results (default: fidsplat-experiments)", "-o")
+    ] = "fidsplat-experiments"
+    json: Json = False
+
+    def run(self) -> int:
+        from fidsplat.experiments.records import merge
+        from fidsplat.experiments.run import NAMES
+
+        result = {}
+        for name in NAMES:
+            files = [f for folder in self.folders for f in sorted(Path(folder).glob(f"{name}-*-of-*.jsonl"))]
+            files += [f for folder in self.folders for f in [Path(folder) / f"{name}.jsonl"] if f.is_file()]
+            if files:
+                target = Path(self.out) / f"{name}.jsonl"
+                lines, twice = merge(files, target)
+                result[name] = {"file": str(target), "files": len(files), "lines": lines, "repeated": twice}
+        if not result:
+            raise InputError(f"no results of shards in {', '.join(self.folders) or 'no folder'}")
+        if self.json:
+            print_json(result)
+        else:
+            for facts in result.values():
+                text = f"{facts['file']}: {facts['lines']} results of {facts['files']} files"
+                console(False).print(text, markup=False, soft_wrap=True)
+        return 0
+
+
+@dataclass
+class Report:
+    """Tables, plots and picture sheets from results."""
+
+    HELP: ClassVar[
+        str
+    ] = """Write report.md and report.html: tables as in the paper, beside the paper's figures.
+
+Plots and pictures lie in its folder, or for FILE.md in a folder of that name. Tables say what is
+missing.
+
+Examples:
+  fidsplat experiment report
+  fidsplat experiment report results -o docs/results.md"""
+
+    folders: Annotated[
+        tyro.conf.Positional[tuple[str, ...]],
+        option("DIR", "folders with results (default: fidsplat-experiments)"),
+    ] = ()
+    out: Annotated[
+        str | None, option("DIR|FILE.md", "folder or file for the report (default: the first folder)", "-o")
+    ] = None
+    json: Json = False
+
+    def run(self) -> int:
+        folders = [Path(folder) for folder in self.folders or ("fidsplat-experiments",)]
+        return write_report(folders, Path(self.out or folders[0]), console(self.json), self.json)
+
+
+def write_report(folders: list[Path], out: Path, where: Console, as_json: bool = False) -> int:
+    """Write the report and say where it is."""
+    from fidsplat.experiments.report import make_report
+
+    files = make_report(folders, out)
+    if as_json:
+        print_json({"files": [str(file) for file in files]})
+    else:
+        where.print(f"report in {files[0]}", markup=False, soft_wrap=True)
+    return 0

@@ -1,0 +1,113 @@
+"""Table 3: the largest tilts at which markers are found and read.
+
+Every tilt of the scan is drawn and shown to every detector; nothing is skipped, so that holes show.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import numpy as np
+
+from fidsplat.errors import InputError
+from fidsplat.experiments.methods import IDEAL, Painter, plain_marker
+from fidsplat.experiments.setup import CATEGORIES, PROTOCOLS, Category
+from fidsplat.vision.images import to_uint8
+from fidsplat.vision.readers import Target, attempt, readers
+
+NAME = "angles"
+FULL_TILTS = "0:89.8:0.2"
+QUICK_TILTS = "0:60:20,64:88:2"
+
+
+def parse_tilts(text: str) -> list[float]:
+    """Degrees of "first:last:step[,first:last:step...]", rising. Raises InputError for anything else."""
+    found: set[float] = set()
+    for part in text.split(","):
+        try:
+            first, last, step = (float(number) for number in part.split(":"))
+            if not (0 <= first <= last < 90 and 0.01 <= step <= 90):
+                raise ValueError
+        except ValueError:
+            raise InputError(
+                f"tilts are {text!r}; write first:last:step in degrees, 0 <= first <= last < 90, "
+                f"joined by commas, e.g. {FULL_TILTS}"
+            ) from None
+        count = math.floor((last - first) / step + 1e-6) + 1
+        found |= {round(first + i * step, 6) for i in range(count)}
+    return sorted(found)
+
+
+def angles_work(
+    categories: Iterable[Category],
+    protocols: Iterable[str],
+    methods: Iterable[str],
+    tilts: str = FULL_TILTS,
+    markers: int = 5,
+) -> list[dict]:
+    """The parts of the experiment: one scan of one marker by one method under one protocol."""
+    parse_tilts(tilts)
+    return [
+        {"protocol": p, "category": c.name, "index": i, "method": m, "tilts": tilts}
+        for p in protocols
+        for c in categories
+        for i in range(markers)
+        for m in methods
+    ]
+
+
+def measure_angles(part: dict, painter: Painter, seed: int, pool: ThreadPoolExecutor, workers: int) -> dict:
+    """Scan one marker.
+
+    Returns for each detector two strings of 0 and 1, one sign for each tilt: whether the code was `found`
+    (its outline overlaps the code by half), and `read` exactly.
+    """
+    category, protocol = CATEGORIES[part["category"]], PROTOCOLS[part["protocol"]]
+    spec = category.spec(part["index"], seed)
+    made = plain_marker(spec)
+    module = protocol.module(made.grid.shape[0])
+    draw = painter.open(part["method"], f"{category.name}-{part['index']}", spec, module)
+    names = readers(category.kind)
+    outline = made.corners / made.module * module
+    in_pool = part["method"] == IDEAL  # a renderer draws one picture after the other
+
+    def look(picture: np.ndarray, tilt: float) -> list[tuple[bool, bool]]:
+        target = Target(
+            category.kind, made.family or "", made.id, made.payload, protocol.camera(tilt).project(outline)
+        )
+        grey = to_uint8(picture)
+        tries = [attempt(name, grey, target) for name in names]
+        return [(one.found, one.read) for one in tries]
+
+    waiting: deque[Future] = deque()
+    seen: list[list[tuple[bool, bool]]] = []
+    for tilt in parse_tilts(part["tilts"]):
+        camera = protocol.camera(tilt)
+        if in_pool:
+            waiting.append(pool.submit(lambda c, t: look(draw(c), t), camera, tilt))
+        else:
+            waiting.append(pool.submit(look, draw(camera), tilt))
+        while len(waiting) > 2 * workers:  # pictures that wait are memory
+            seen.append(waiting.popleft().result())
+    seen += [future.result() for future in waiting]
+    return {
+        "spec": spec if category.kind == "apriltag" else made.family,
+        "readers": {
+            name: {
+                key: "".join("01"[tries[i][which]] for tries in seen)
+                for which, key in enumerate(("found", "read"))
+            }
+            for i, name in enumerate(names)
+        },
+    }
+
+
+def largest(tilts: Sequence[float], hits: str) -> tuple[float | None, float | None]:
+    """The largest tilt of all hits, and the largest below which (itself included) there is no miss; None
+    where there is none."""
+    good = [tilt for tilt, hit in zip(tilts, hits, strict=True) if hit == "1"]
+    unbroken = len(hits) - len(hits.lstrip("1"))
+    return (good[-1] if good else None), (tilts[unbroken - 1] if unbroken else None)

@@ -1,0 +1,188 @@
+"""Ground truth by Blender, the paper's way: Cycles on a textured plane, through `bpy` in a process and an
+environment of its own (bpy wants Python 3.11 and NumPy below 2, and its licence is the GPL)."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+from fidsplat.cameras import Camera
+from fidsplat.errors import DeviceError, InputError
+from fidsplat.experiments.methods import plain_marker
+from fidsplat.experiments.setup import (
+    BACKGROUND,
+    COLLECTIONS,
+    PROTOCOLS,
+    Category,
+    novel_cameras,
+    training_cameras,
+)
+from fidsplat.files import writable_folder
+
+BPY = "bpy==5.0.1"
+VIEW_NAMES = ("standard", "raw")
+"""`standard`: sRGB texture, linear light, the 'Standard' view, as the paper's authors would have it; `raw`:
+display values all the way, so that edges are means of what is displayed"""
+FULL_SAMPLES, QUICK_SAMPLES = 64, 16
+WORKER = Path(__file__).with_name("blender_worker.py")
+
+
+def novel_picture(folder: Path, view: str, category: str, index: int, number: int) -> Path:
+    """The file of one test view."""
+    return folder / view / f"{category}-{index}" / f"test-{number:02d}.png"
+
+
+def training_picture(folder: Path, view: str, category: str, index: int, number: int) -> Path:
+    """The file of one training view of the densest collection."""
+    return folder / view / f"{category}-{index}" / f"view-{number:02d}.png"
+
+
+def default_environment() -> Path:
+    """Where Blender is installed unless told otherwise: the user's cache folder."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fidsplat" / "blender"
+
+
+def install(environment: Path, tell: Callable[[str], None] = lambda text: None) -> Path:
+    """Make a virtual environment with bpy, about 1 GB; returns its Python.
+
+    Raises InputError when there is no Python 3.11, DeviceError when pip fails.
+    """
+    python = sys.executable if sys.version_info[:2] == (3, 11) else shutil.which("python3.11")
+    if python is None:
+        raise InputError(f"{BPY} needs Python 3.11, and python3.11 is not on the path; install it first")
+    writable_folder(environment.parent)
+    tell(f"making the environment {environment}")
+    _call([python, "-m", "venv", "--clear", str(environment)])
+    own = environment_python(environment)
+    tell(f"installing {BPY}, about 400 MB to fetch")
+    _call([str(own), "-m", "pip", "install", "--quiet", BPY, "numpy<2"])
+    tell("starting it once")
+    _call([str(own), "-c", "import bpy"])
+    return own
+
+
+def environment_python(environment: Path) -> Path:
+    """The Python of a virtual environment."""
+    return environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+def _call(command: list[str]) -> None:
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        lines = (done.stderr or done.stdout).strip().splitlines() or ["no message"]
+        raise DeviceError(f"installing Blender failed at '{' '.join(command[1:4])}': {lines[-1]}")
+
+
+def marker_job(category: Category, index: int, seed: int, folder: Path, view: str, training: bool) -> dict:
+    """What the worker needs to draw one marker's views: the test views, and the training views if wanted."""
+    grid = plain_marker(category.spec(index, seed)).grid
+    shots = [
+        (novel_picture(folder, view, category.name, index, i), camera)
+        for i, camera in enumerate(novel_cameras(category, index, seed))
+    ]
+    if training:
+        shots += [
+            (training_picture(folder, view, category.name, index, i), camera)
+            for i, camera in enumerate(training_cameras(COLLECTIONS[-1]))
+        ]
+    return {
+        "name": f"{category.name}-{index}",
+        "grid": grid.tolist(),
+        "module": PROTOCOLS["fixed-plane"].module(grid.shape[0]),
+        "shots": [{"file": str(file.absolute()), **camera_facts(camera)} for file, camera in shots],
+    }
+
+
+def ready(view: str, environment: Path) -> Path:
+    """The Python that draws. Raises InputError for an unknown view or without Blender."""
+    if view not in VIEW_NAMES:
+        raise InputError(f"unknown view {view!r}; known: {', '.join(VIEW_NAMES)}")
+    python = environment_python(environment)
+    if not python.is_file():
+        raise InputError(
+            f"Blender is not installed in {environment}; run fidsplat experiment blender --install"
+        )
+    return python
+
+
+def camera_facts(camera: Camera) -> dict:
+    """A camera as the worker takes it. Raises InputError when its pixels are not square."""
+    if camera.fx != camera.fy:
+        raise InputError("Blender's camera has square pixels; fx and fy must be equal")
+    names = ("width", "height", "fx", "cx", "cy")
+    return {name: getattr(camera, name) for name in names} | {"matrix": camera.world_to_camera.tolist()}
+
+
+def render(
+    markers: Iterable[dict],
+    view: str,
+    environment: Path,
+    samples: int = FULL_SAMPLES,
+    pixel_filter: str = "BOX",
+    threads: int | None = None,
+) -> Iterator[Path]:
+    """Draw every picture that is not there yet; yields each file as it is done, those that are there first.
+
+    Args:
+        markers: of `marker_job`.
+        view: one of `VIEW_NAMES`.
+        environment: of `install`.
+        samples: for each pixel.
+        pixel_filter: "BOX" (1 px, a mean over the pixel) or "BLACKMAN_HARRIS" (Blender's default, 1.5 px).
+        threads: of Cycles, all by default.
+
+    Raises InputError when Blender is not installed, DeviceError when it fails; pictures done stay.
+    """
+    python = ready(view, environment)
+    missing = []
+    for marker in markers:
+        there = [Path(shot["file"]) for shot in marker["shots"] if Path(shot["file"]).is_file()]
+        yield from there
+        left = [shot for shot in marker["shots"] if Path(shot["file"]) not in there]
+        if left:
+            missing.append({**marker, "shots": left})
+    if not missing:
+        return
+    for folder in {Path(shot["file"]).parent for marker in missing for shot in marker["shots"]}:
+        writable_folder(folder)
+    job = {
+        "markers": missing,
+        "view": view,
+        "samples": samples,
+        "filter": pixel_filter,
+        "threads": threads or os.cpu_count() or 1,
+        "background": BACKGROUND,
+    }
+    with tempfile.TemporaryDirectory() as work:
+        file = Path(work) / "job.json"
+        file.write_text(json.dumps(job), "utf-8")
+        log = Path(work) / "stderr.txt"
+        with open(log, "wb") as errors:
+            worker = subprocess.Popen(
+                [str(python), str(WORKER), str(file)],
+                stdout=subprocess.PIPE, stderr=errors, text=True, env=_clean_environment(),
+            )  # fmt: skip
+            try:
+                assert worker.stdout is not None
+                for line in worker.stdout:
+                    if line.startswith("done "):  # Blender says much else
+                        yield Path(line.removeprefix("done ").rstrip("\n"))
+                status = worker.wait()
+            finally:
+                if worker.poll() is None:
+                    worker.terminate()
+                    worker.wait()
+        if status:
+            lines = log.read_text("utf-8", "replace").strip().splitlines() or ["no message"]
+            raise DeviceError(f"Blender stopped with status {status}: {lines[-1]}")
+
+
+def _clean_environment() -> dict[str, str]:
+    """Without what points Python at our own packages."""
+    return {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}

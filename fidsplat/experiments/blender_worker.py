@@ -1,0 +1,118 @@
+"""Runs inside Blender's own Python: draws the textured planes of a job. Imports nothing of fidsplat.
+
+    python blender_worker.py JOB.json
+
+Prints "done FILE" for each picture.
+"""
+
+import json
+import os
+import sys
+
+import bpy  # type: ignore[import-not-found]
+import numpy as np
+from mathutils import Matrix  # type: ignore[import-not-found]
+
+
+def main(job: dict) -> None:
+    """Draw every shot of every marker."""
+    scene = prepare(job)
+    for marker in job["markers"]:
+        plane = build(marker, job["view"])
+        for shot in marker["shots"]:
+            aim(scene, shot)
+            part = shot["file"] + ".part.png"
+            scene.render.filepath = part
+            bpy.ops.render.render(write_still=True)
+            os.replace(part, shot["file"])
+            print("done", shot["file"], flush=True)
+        bpy.data.objects.remove(plane, do_unlink=True)
+
+
+def prepare(job: dict):
+    """An empty scene: Cycles on the CPU, no bounce, no denoising, no dither."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    scene.render.engine = "CYCLES"
+    cycles = scene.cycles
+    cycles.device = "CPU"
+    cycles.samples = job["samples"]
+    cycles.use_adaptive_sampling = False
+    cycles.use_denoising = False
+    cycles.max_bounces = 0
+    cycles.seed = 0
+    cycles.pixel_filter_type = job["filter"]
+    if job["filter"] != "BOX":
+        cycles.filter_width = 1.5
+    render = scene.render
+    render.threads_mode, render.threads = "FIXED", job["threads"]
+    render.dither_intensity = 0.0  # the default turns level 123 into a mixture of 123 and 124
+    render.image_settings.file_format = "PNG"
+    render.image_settings.color_mode = "RGB"
+    render.image_settings.color_depth = "8"
+    render.resolution_percentage = 100
+    # the default, AgX, shows white as 196
+    scene.view_settings.view_transform = "Standard" if job["view"] == "standard" else "Raw"
+    scene.view_settings.look = "None"
+    ground = job["background"]
+    if job["view"] == "standard":
+        ground = ground / 12.92 if ground <= 0.04045 else ((ground + 0.055) / 1.055) ** 2.4
+    world = bpy.data.worlds.new("world")
+    world.use_nodes = True
+    world.node_tree.nodes["Background"].inputs["Color"].default_value = (ground, ground, ground, 1)
+    scene.world = world
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    camera.data.sensor_fit = "HORIZONTAL"
+    camera.data.clip_start = 0.01
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    return scene
+
+
+def build(marker: dict, view: str):
+    """The plane, z = 0, x right, y down, its texture one pixel a module."""
+    grid = np.array(marker["grid"])
+    rows, columns = grid.shape
+    x, y = columns * marker["module"] / 2, rows * marker["module"] / 2
+    mesh = bpy.data.meshes.new(marker["name"])
+    mesh.from_pydata([(-x, -y, 0), (x, -y, 0), (x, y, 0), (-x, y, 0)], [], [(0, 1, 2, 3)])
+    corners = mesh.uv_layers.new().data
+    for corner, place in zip(corners, [(0, 1), (1, 1), (1, 0), (0, 0)], strict=True):
+        corner.uv = place
+    image = bpy.data.images.new(marker["name"], columns, rows)
+    image.colorspace_settings.name = "sRGB" if view == "standard" else "Non-Color"
+    pixels = np.ones((rows, columns, 4), np.float32)
+    pixels[:, :, :3] = 1 - grid[::-1, :, None]  # Blender's first row is the lowest
+    image.pixels.foreach_set(pixels.ravel())
+    image.update()
+    material = bpy.data.materials.new(marker["name"])
+    material.use_nodes = True
+    tree = material.node_tree
+    tree.nodes.clear()
+    texture = tree.nodes.new("ShaderNodeTexImage")
+    texture.image, texture.interpolation, texture.extension = image, "Closest", "EXTEND"
+    emission = tree.nodes.new("ShaderNodeEmission")
+    output = tree.nodes.new("ShaderNodeOutputMaterial")
+    tree.links.new(texture.outputs["Color"], emission.inputs["Color"])
+    tree.links.new(emission.outputs["Emission"], output.inputs["Surface"])
+    mesh.materials.append(material)
+    plane = bpy.data.objects.new(marker["name"], mesh)
+    bpy.context.scene.collection.objects.link(plane)
+    return plane
+
+
+def aim(scene, shot: dict) -> None:
+    """Set the camera. Blender's looks along -z with y up, ours along z with y down."""
+    width, height = shot["width"], shot["height"]
+    scene.render.resolution_x, scene.render.resolution_y = width, height
+    data = scene.camera.data
+    data.lens = shot["fx"] / width * data.sensor_width
+    data.shift_x = (width / 2 - shot["cx"]) / width
+    data.shift_y = (shot["cy"] - height / 2) / width
+    turned = np.linalg.inv(np.array(shot["matrix"])) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    scene.camera.matrix_world = Matrix(turned.tolist())
+
+
+if __name__ == "__main__":
+    with open(sys.argv[1], encoding="utf-8") as stream:
+        main(json.load(stream))

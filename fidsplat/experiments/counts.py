@@ -1,0 +1,79 @@
+"""The figure of counts and table 2: components, rectangles, Gaussians and seconds of each marker."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from fidsplat.experiments.methods import mixtures, plain_marker
+from fidsplat.experiments.setup import CATEGORIES, Category
+from fidsplat.markers import marker
+from fidsplat.markers.mixture import fitted_templates, paper_template
+
+NAME = "counts"
+FULL_REPEATS, QUICK_REPEATS = 15, 3
+
+
+def counts_work(categories: Iterable[Category], repeats: int, markers: int = 5) -> list[dict]:
+    """The parts of the experiment: one marker each."""
+    return [{"category": c.name, "index": i, "repeats": repeats} for c in categories for i in range(markers)]
+
+
+def measure_counts(part: dict, seed: int) -> dict:
+    """Count one marker's parts, and time its construction.
+
+    Returns dark and light (quiet zone included) numbers of `cells`, `runs` (of each row) and `rectangles` of
+    the minimum partition, `components`, `gaussians` by mixture and partition, and `seconds` by mixture: one
+    for each repeat, from the text to the splats, after one that is not counted.
+    """
+    spec = CATEGORIES[part["category"]].spec(part["index"], seed)
+    plain = plain_marker(spec)
+    grid = plain.grid
+    boxes = {"cells": _cells(grid), "runs": _runs(grid), "rectangles": plain.boxes}
+    result: dict = {name: _by_colour(grid, found) for name, found in boxes.items()}
+    first = np.zeros(plain.components, int)
+    first[plain.labels.ravel()] = grid.ravel()
+    result["components"] = {"dark": int(first.sum()), "light": int(plain.components - first.sum())}
+    result["gaussians"], result["seconds"] = {}, {}
+    for mixture in mixtures():
+        made = [marker(spec, mixture=mixture) for _ in range(1 + part["repeats"])]
+        result["seconds"][mixture] = [one.seconds for one in made[1:]]
+        result["gaussians"][mixture] = {"rectangles": len(made[0].cloud)} | {
+            name: count
+            for name in ("cells", "runs")
+            if (count := _gaussians(mixture, boxes[name])) is not None
+        }
+    return result
+
+
+def _cells(grid: np.ndarray) -> np.ndarray:
+    y, x = np.indices(grid.shape).reshape(2, -1)
+    return np.stack([x, y, x + 1, y + 1], 1)
+
+
+def _runs(grid: np.ndarray) -> np.ndarray:
+    """Runs of one colour in each row."""
+    ends = np.ones((grid.shape[0], grid.shape[1] + 1), bool)
+    ends[:, 1:-1] = grid[:, 1:] != grid[:, :-1]
+    y, x0 = np.nonzero(ends[:, :-1])
+    x1 = np.nonzero(ends[:, 1:])[1] + 1
+    return np.stack([x0, y, x1, y + 1], 1)
+
+
+def _by_colour(grid: np.ndarray, boxes: np.ndarray) -> dict[str, int]:
+    dark = int(grid[boxes[:, 1], boxes[:, 0]].sum())
+    return {"dark": dark, "light": len(boxes) - dark}
+
+
+def _gaussians(mixture: str, boxes: np.ndarray) -> int | None:
+    """How many a mixture of templates would need for other rectangles; None for one without templates."""
+    if mixture == "paper":
+        return len(boxes) * len(paper_template())
+    if mixture != "fitted":
+        return None
+    sides = boxes[:, 2:] - boxes[:, :2]
+    aspect = sides.max(1) / sides.min(1)
+    templates = fitted_templates()
+    which = np.searchsorted([t.max_aspect for t in templates], aspect)
+    return int(np.array([len(t.gaussians) for t in templates])[which].sum())

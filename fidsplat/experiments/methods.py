@@ -1,0 +1,105 @@
+"""The rows of the tables: how a marker becomes a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.errors import InputError
+from fidsplat.experiments.plane import plane_picture
+from fidsplat.experiments.setup import BACKGROUND, COLLECTIONS, PLANE
+from fidsplat.markers import Marker, marker
+from fidsplat.quality import Quality
+from fidsplat.render import Renderer
+
+IDEAL = "ideal"
+FILTERS = {"screen": Quality(), "best": Quality(lowpass="none", samples=3)}
+"""the low-pass of 2DGS, and ours: none, the mean of 3 x 3 samples"""
+# as the paper's authors drew the models that they trained
+_TRAINED_QUALITY = "surfel"
+
+Draw = Callable[[Camera], np.ndarray]
+"""camera -> (height, width) float grey, display values, not clamped"""
+
+
+def mixtures() -> tuple[str, ...]:
+    """Every mixture that markers can be made of, the paper's first, the default after it."""
+    from fidsplat.markers.build import MIXTURES
+
+    first = [name for name in ("paper", "fitted") if name in MIXTURES]
+    return (*first, *(name for name in MIXTURES if name not in first))
+
+
+def method_names(chosen: tuple[str, ...] = (), trained: Path | None = None) -> tuple[str, ...]:
+    """Rows: "ideal", "MIXTURE/FILTER" for every mixture, "2dgs-N" for trained models that are there.
+
+    Args:
+        chosen: mixtures to take part, all when empty.
+        trained: folder with trained models, see `Painter`.
+
+    Raises InputError for an unknown mixture.
+    """
+    known = mixtures()
+    for name in chosen:
+        if name not in known:
+            raise InputError(f"unknown mixture {name!r}; known: {', '.join(known)}")
+    own = [f"{m}/{f}" for m in known if not chosen or m in chosen for f in FILTERS]
+    models = [] if trained is None else [f"2dgs-{n}" for n in COLLECTIONS if (trained / f"2dgs-{n}").is_dir()]
+    return (IDEAL, *own, *models)
+
+
+@dataclass(eq=False)
+class Painter:
+    """Draws markers by any method.
+
+    Trained models are looked for in ``trained``/2dgs-17/small-0.ply: collection, marker.
+    """
+
+    renderer: Renderer | None
+    """None when only the ideal is drawn"""
+    trained: Path | None = None
+
+    def open(self, method: str, name: str, spec: str, module: float) -> Draw:
+        """Get ready to draw a marker.
+
+        Args:
+            method: one of `method_names`.
+            name: the marker's, e.g. "small-0".
+            spec: the marker's.
+            module: metres.
+
+        Raises InputError for an unknown method or a trained model that is missing.
+        """
+        plain = plain_marker(spec)
+        if method == IDEAL:
+            return lambda camera: plane_picture(plain.grid, module, camera, background=BACKGROUND)
+        renderer = self.renderer
+        if renderer is None:
+            raise InputError(f"the method {method} needs a renderer")
+        head, _, filtered = method.partition("/")
+        if filtered:
+            cloud, quality = marker(spec, module * plain.bits.shape[1], mixture=head).cloud, FILTERS[filtered]
+        elif self.trained is not None:
+            from fidsplat.formats import load_ply
+
+            scale = np.diag([*[module * plain.grid.shape[1] / PLANE] * 3, 1.0])
+            cloud = load_ply(self.trained / method / f"{name}.ply").transformed(scale)
+            quality = Quality.named(_TRAINED_QUALITY)
+        else:
+            raise InputError(f"the method {method} needs a folder of trained models")
+        resident = renderer.upload(cloud)
+
+        def draw(camera: Camera) -> np.ndarray:
+            frame = renderer.render(resident, camera, quality=quality, background=(BACKGROUND,) * 3)
+            return frame["rgb"].mean(2) if not filtered else frame["rgb"][:, :, 0]
+
+        return draw
+
+
+def plain_marker(spec: str) -> Marker:
+    """The marker's bits and grid; its splats do not matter."""
+    return marker(spec)

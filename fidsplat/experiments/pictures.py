@@ -1,0 +1,51 @@
+"""Picture sheets: every method beside the ideal, at several tilts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.experiments.methods import Painter, plain_marker
+from fidsplat.experiments.setup import PROTOCOLS, Category
+from fidsplat.files import writable_folder
+from fidsplat.vision.images import to_uint8, write_png
+from fidsplat.vision.paint import contact_sheet
+
+TILTS = (0.0, 45.0, 70.0)
+_PIXELS = 160  # of the cut-out in the middle of each picture, at most
+
+
+def sheet_files(folder: Path) -> list[Path]:
+    """The sheets that a folder holds."""
+    return sorted(folder.glob("sheet-*.png"))
+
+
+def write_sheets(
+    categories: Iterable[Category], methods: Iterable[str], painter: Painter, seed: int, folder: Path
+) -> Iterator[Path]:
+    """Draw marker 0 of each category by every method, rows of equal tilt; yields each file as it is written.
+
+    The middle of the 800 x 800 picture, pixel by pixel, so that edges show.
+    """
+    writable_folder(folder)
+    protocol = PROTOCOLS["fixed-plane"]
+    methods = list(methods)
+    for category in categories:
+        spec = category.spec(0, seed)
+        module = protocol.module(plain_marker(spec).grid.shape[0])
+        draws = {name: painter.open(name, f"{category.name}-0", spec, module) for name in methods}
+        rows = [
+            [(f"{name}, {tilt:g} deg", _middle(draw(protocol.camera(tilt)))) for name, draw in draws.items()]
+            for tilt in TILTS
+        ]
+        sheet = contact_sheet(rows, width=_PIXELS)
+        yield write_png(folder / f"sheet-{category.name}.png", sheet[:, :, 0])  # there is no colour in it
+
+
+def _middle(picture: np.ndarray) -> np.ndarray:
+    h, w = picture.shape
+    y, x = max((h - _PIXELS) // 2, 0), max((w - _PIXELS) // 2, 0)
+    part = to_uint8(picture[y : y + _PIXELS, x : x + _PIXELS])
+    return np.repeat(part[:, :, None], 3, axis=2)

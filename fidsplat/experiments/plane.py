@@ -1,0 +1,127 @@
+"""The ideal picture of a printed plane: every pixel the exact mean of the texture over its square.
+
+A texture of square modules is constant but for jumps across module edges. Seen by a pinhole camera an edge is
+a straight segment, so by Green's theorem a pixel's mean is a sum over the segments that cross it or pass on
+its left: each segment is cut where it crosses the lines between pixels, and each piece adds its jump times
+its height times the share of its pixel that lies to its right (as exact rasterisers of fonts do). Nothing is
+sampled: the result is right to the rounding of float64.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.errors import InputError
+
+
+def plane_picture(
+    grid: np.ndarray,
+    module: float,
+    camera: Camera,
+    dark: float = 0.0,
+    light: float = 1.0,
+    background: float = 0.5,
+) -> np.ndarray:
+    """The picture of a plane with square modules, centred on the world's origin in z = 0, x right, y down.
+
+    Args:
+        grid: (h, w) uint8, 1 = dark, quiet zone included.
+        module: metres.
+        camera: the plane lies wholly in front of its near distance.
+        dark, light, background: values of dark modules, light modules and what is beside the plane. Means are
+            taken of these values, so what they stand for (display values, linear light) is what is averaged.
+
+    Returns (height, width) float64.
+
+    Raises InputError when a part of the plane is nearer than the camera's near distance.
+    """
+    start, stop, jump = _edges(grid, light - dark, light - background)
+    offset = np.array([grid.shape[1], grid.shape[0]]) / 2
+    begin, end = (_project((points - offset) * module, camera) for points in (start, stop))
+    # seen from behind, right and left change places
+    turn = np.linalg.det(camera.world_to_camera[:3, [0, 1, 3]])
+    picture = _accumulate(begin, end, jump * np.sign(turn), (camera.height, camera.width))
+    return background + picture
+
+
+def _edges(grid: np.ndarray, contrast: float, paper: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Segments (n, 2) and (n, 2) in modules between modules of different value, and by how much the value on
+    the right of their direction (y down) exceeds that on the left.
+
+    Segments run down along vertical lines and to the left along horizontal ones; runs of equal jumps are one
+    segment.
+    """
+    value = np.pad(paper - contrast * np.asarray(grid, np.float64), 1)  # beside the plane: 0
+    across = np.diff(value, axis=1)[1:-1]  # at vertical lines, from left to right
+    down = np.diff(value, axis=0)[:, 1:-1].T  # at horizontal lines, from above to below
+    parts = []
+    for jumps, swapped in ((across, False), (down, True)):
+        # runs along each line: columns of `jumps` are lines
+        line, first, last, size = _runs(jumps.T)
+        a, b = np.stack([line, first], 1), np.stack([line, last], 1)
+        # an edge that has the larger value to the right of "downwards" has it on the left of "rightwards"
+        parts.append((a[:, ::-1], b[:, ::-1], -size) if swapped else (a, b, size))
+    start, stop, jump = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return start.astype(np.float64), stop.astype(np.float64), jump
+
+
+def _runs(jumps: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Runs of equal values other than 0 in the rows of an array: row, first, last + 1, value."""
+    ends = np.ones((jumps.shape[0], jumps.shape[1] + 1), bool)
+    ends[:, 1:-1] = jumps[:, 1:] != jumps[:, :-1]
+    there = jumps != 0
+    row, first = np.nonzero(ends[:, :-1] & there)
+    last = np.nonzero(ends[:, 1:] & there)[1] + 1
+    return row, first, last, jumps[row, first]
+
+
+def _project(points: np.ndarray, camera: Camera) -> np.ndarray:
+    world = np.column_stack([points, np.zeros(len(points))])
+    depth = (world - camera.position) @ camera.world_to_camera[2, :3]
+    if len(depth) and depth.min() < camera.near:
+        raise InputError(
+            f"a part of the plane is {depth.min():.3g} m in front of the camera; the ideal picture needs all "
+            f"of it beyond {camera.near:g} m: move the camera away"
+        )
+    return camera.project(world)
+
+
+def _accumulate(begin: np.ndarray, end: np.ndarray, jump: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Sum over directed segments (n, 2) pixels of jump * (share of each pixel to their right), (h, w)."""
+    h, w = shape
+    which, t0, t1 = _pieces(begin, end)
+    step = (end - begin)[which]
+    a, b = begin[which] + step * t0[:, None], begin[which] + step * t1[:, None]
+    middle = (a + b) / 2
+    rise = (b[:, 1] - a[:, 1]) * jump[which]  # y grows downwards: positive on the way down
+    row, column = np.floor(middle[:, 1]), np.floor(middle[:, 0])
+    keep = (row >= 0) & (row < h) & (column < w) & (rise != 0)
+    row, column, rise, x = row[keep].astype(int), column[keep], rise[keep], middle[keep, 0]
+    # what passes on the picture's left counts wholly from the first column on
+    share = np.where(column >= 0, column + 1 - x, 1.0)
+    column = np.maximum(column, 0).astype(int)
+    flat = row * (w + 1) + column
+    size = h * (w + 1)
+    own = np.bincount(flat, rise * share, size) + np.bincount(flat + 1, rise * (1 - share), size + 1)[:size]
+    return np.cumsum(own.reshape(h, w + 1), axis=1)[:, :w]
+
+
+def _pieces(begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Segments cut where x or y is a whole number: number of the segment, and the piece's parameters in
+    [0, 1]."""
+    n = len(begin)
+    owner, cut = [np.arange(n), np.arange(n)], [np.zeros(n), np.ones(n)]
+    for axis in (0, 1):
+        low, high = np.minimum(begin, end)[:, axis], np.maximum(begin, end)[:, axis]
+        first = np.floor(low) + 1
+        count = np.maximum(np.ceil(high) - first, 0).astype(int)
+        own = np.repeat(np.arange(n), count)
+        line = first[own] + np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count)
+        owner.append(own)
+        cut.append((line - begin[own, axis]) / (end - begin)[own, axis])
+    who, t = np.concatenate(owner), np.clip(np.concatenate(cut), 0.0, 1.0)
+    order = np.lexsort((t, who))
+    who, t = who[order], t[order]
+    same = who[1:] == who[:-1]
+    return who[:-1][same], t[:-1][same], t[1:][same]

@@ -1,0 +1,214 @@
+"""Results in JSON lines: one line for each finished part, so that a run that is stopped goes on, shards of it
+are joined, and every number keeps the device, versions, commit and seed that it came from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Callable, Iterable, Iterator
+from datetime import date
+from importlib.metadata import version
+from pathlib import Path
+
+from fidsplat import __version__
+from fidsplat.errors import InputError
+from fidsplat.files import atomic_write, ordinary_file, writable_folder
+from fidsplat.kernel_files import kernels_folder
+
+_CODE = ("markers", "backends", "effects", "cameras", "vision")
+# of this folder: what every experiment stands on
+_SHARED = ("setup", "methods", "plane")
+
+
+def run_facts(experiment: str, device: str | None, seed: int, extra: dict[str, str] | None = None) -> dict:
+    """What a run's numbers depend on, for every line.
+
+    Args:
+        experiment: name of its module in this folder.
+        device: title and driver of what draws; None when nothing is drawn.
+        seed: of texts and views.
+        extra: versions of packages, by name.
+    """
+    versions = {"fidsplat": __version__, "numpy": version("numpy"), **(extra or {})}
+    return {
+        "device": device,
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
+        "versions": versions,
+        "commit": _commit(),
+        "code": _code_hash(experiment),
+        "seed": seed,
+        "date": date.today().isoformat(),
+    }
+
+
+def _differences(old: dict, new: dict) -> list[str]:
+    """The facts on which numbers depend and that are not the same. A run that draws nothing has no device."""
+    names = [name for name in ("versions", "code", "seed") if old.get(name) != new[name]]
+    devices = (old.get("device"), new["device"])
+    return names + (["device"] if None not in devices and devices[0] != devices[1] else [])
+
+
+def _commit() -> str | None:
+    """Commit of the working tree, with "+" when files differ from it; None outside one."""
+    here = Path(__file__)
+    try:
+        git = ["git", "-C", str(here.parent)]
+        # an environment may lie inside somebody else's repository
+        tracked = subprocess.run([*git, "ls-files", "--error-unmatch", here.name], capture_output=True)
+        if tracked.returncode:
+            return None
+        head = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True)
+        if head.returncode:
+            return None
+        dirty = subprocess.run([*git, "status", "--porcelain", "-uno"], capture_output=True, text=True)
+        return head.stdout.strip() + ("+" if dirty.stdout.strip() else "")
+    except OSError:
+        return None
+
+
+def _code_hash(experiment: str) -> str:
+    """Of everything that decides what is drawn and read."""
+    package = Path(__file__).parent.parent
+    files = [f for part in _CODE for f in (package / part).rglob("*") if f.suffix in (".py", ".json")]
+    files += [f for f in package.glob("*.py") if f.name != "cli.py"]
+    files += [package / "experiments" / f"{name}.py" for name in (*_SHARED, experiment)]
+    files += kernels_folder().rglob("*.cl")
+    found = hashlib.sha256()
+    # by name: kernels lie elsewhere in a wheel
+    for file in sorted(files, key=lambda f: (f.name, f.parent.name)):
+        found.update(file.name.encode() + b"\0" + file.read_bytes())
+    return found.hexdigest()[:16]
+
+
+class Records:
+    """The lines of one file.
+
+    Args:
+        file: made when it is missing.
+        run: `run_facts` of this run.
+        anew: drop what the file holds.
+
+    Raises InputError when the file cannot be written, is none of ours, or holds results of another device,
+    version or seed.
+    """
+
+    def __init__(self, file: Path, run: dict, anew: bool = False) -> None:
+        writable_folder(file.parent)
+        self.file, self.run = ordinary_file(file), run
+        lines = [] if anew else read_lines(file)
+        for line in lines:
+            differ = _differences(line.get("run", {}), run)
+            if differ:
+                raise InputError(
+                    f"{file} holds results of another {' and '.join(differ)}; give another folder with -o, "
+                    "or --anew to measure again"
+                )
+        self.done = {key_of(line): line for line in lines}
+        # what a killed run left half written goes; so does all with --anew
+        if anew or file.exists():
+            _write(file, self.done.values())
+
+    def measure(self, work: Iterable[dict], measure: Callable[[dict], dict]) -> Iterator[tuple[int, dict]]:
+        """Measure what is not done yet; yields (parts done so far, the line) after each, old ones first."""
+        parts = [{**part} for part in work]
+        keys = [_canonical(part) for part in parts]
+        count = 0
+        for key in keys:
+            if key in self.done:
+                count += 1
+                yield count, self.done[key]
+        for key, part in zip(keys, parts, strict=True):
+            if key in self.done:
+                continue
+            line = {"key": part, "result": measure(part), "run": self.run}
+            with open(self.file, "a", encoding="utf-8") as stream:
+                stream.write(_dump(line))
+                stream.flush()
+                os.fsync(stream.fileno())
+            self.done[key] = line
+            count += 1
+            yield count, line
+
+    def missing(self, work: Iterable[dict]) -> int:
+        """How many parts are not done yet."""
+        return sum(_canonical(part) not in self.done for part in work)
+
+
+def key_of(line: dict) -> str:
+    """What a line is about, as one string."""
+    return _canonical(line["key"])
+
+
+def _canonical(key: dict) -> str:
+    return json.dumps(key, sort_keys=True)
+
+
+def _dump(line: dict) -> str:
+    # NaN and infinities are not JSON: a result that has them is a fault, found here
+    return json.dumps(line, allow_nan=False) + "\n"
+
+
+def _write(file: Path, lines: Iterable[dict]) -> None:
+    with atomic_write(file) as stream:
+        for line in lines:
+            stream.write(_dump(line).encode())
+
+
+def read_lines(file: Path) -> list[dict]:
+    """Every whole line of a file, [] when it is missing; a last line that was cut short is left out.
+
+    Raises InputError when another line is none of ours.
+    """
+    try:
+        text = file.read_text("utf-8")
+    except FileNotFoundError:
+        return []
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read {file}: {error}") from error
+    lines = text.split("\n")
+    found = []
+    for number, line in enumerate(lines[:-1], 1):
+        try:
+            value = json.loads(line)
+            if not (isinstance(value["key"], dict) and isinstance(value["result"], dict)):
+                raise TypeError
+        except (ValueError, KeyError, TypeError):
+            raise InputError(
+                f"{file}, line {number}: not a result of fidsplat experiment; give another folder with -o"
+            ) from None
+        found.append(value)
+    return found
+
+
+def shard(work: list[dict], text: str | None) -> list[dict]:
+    """Every n-th part, from the i-th on, of "i/n"; all of them for None.
+
+    Raises InputError for anything but i/n with 1 <= i <= n.
+    """
+    if text is None:
+        return work
+    first, _, of = text.partition("/")
+    if not (first.isdigit() and of.isdigit() and 1 <= int(first) <= int(of)):
+        raise InputError(f"--shard is {text!r}; write i/n with 1 <= i <= n, e.g. 1/4")
+    return work[int(first) - 1 :: int(of)]
+
+
+def merge(files: list[Path], target: Path) -> tuple[int, int]:
+    """Join files of shards into one; returns the numbers of lines, and of parts that more than one file had.
+
+    Of such parts the first stays. Raises InputError when a file is missing or none of ours.
+    """
+    found: dict[str, dict] = {}
+    twice = 0
+    for file in files:
+        if not file.is_file():
+            raise InputError(f"{file} is not a file; give the .jsonl files of the shards")
+        for line in read_lines(file):
+            twice += key_of(line) in found
+            found.setdefault(key_of(line), line)
+    writable_folder(target.parent)
+    _write(target, found.values())
+    return len(found), twice

@@ -1,0 +1,173 @@
+"""Running the experiments: what each consists of, with which settings, and where its results go."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from fidsplat.errors import InputError
+from fidsplat.experiments import angles, counts, localisation, views
+from fidsplat.experiments.methods import IDEAL, Painter, method_names
+from fidsplat.experiments.records import Records, run_facts, shard
+from fidsplat.experiments.setup import MARKERS, PROTOCOLS, SEED, TEST_VIEWS, chosen_categories
+from fidsplat.files import writable_folder
+from fidsplat.render import Renderer
+from fidsplat.vision.lpips import load_lpips, weights_name
+from fidsplat.vision.metrics import metric_versions
+from fidsplat.vision.readers import reader_versions
+
+NAMES = (counts.NAME, localisation.NAME, views.NAME, angles.NAME)
+"""the experiments that measure, quickest first"""
+QUICK_VIEWS = 2
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a run is to measure."""
+
+    out: Path
+    device: str = "opencl"
+    quick: bool = False
+    """one marker of each category, few tilts and views"""
+    seed: int = SEED
+    categories: tuple[str, ...] = ()
+    mixtures: tuple[str, ...] = ()
+    protocols: tuple[str, ...] = ()
+    tilts: str | None = None
+    markers: int | None = None
+    """of each category; None for 5, or 1 in a quick run"""
+    trained: Path | None = None
+    """folder with trained models, see `Painter`"""
+    blender: Path | None = None
+    """folder with Blender's pictures; None for "blender" in ``out``"""
+    lpips: Path | None = None
+    """file with LPIPS weights, see `fidsplat.vision.lpips.load_lpips`"""
+    part: str | None = None
+    """"i/n\""""
+    workers: int = field(default_factory=lambda: os.cpu_count() or 1)
+    """threads that look at pictures"""
+    anew: bool = False
+    ideal_only: bool = False
+    """only the ceiling: no splat is drawn and no device opened"""
+
+    @property
+    def marker_count(self) -> int:
+        """Markers of each category."""
+        return (1 if self.quick else MARKERS) if self.markers is None else self.markers
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Rows of the tables."""
+        return (IDEAL,) if self.ideal_only else method_names(self.mixtures, self.trained)
+
+    def file(self, name: str) -> Path:
+        """Where the results of an experiment go."""
+        ending = "" if self.part is None else "-" + self.part.replace("/", "-of-")
+        return self.out / f"{name}{ending}.jsonl"
+
+    @property
+    def blender_folder(self) -> Path:
+        """Where Blender's pictures are."""
+        return self.out / "blender" if self.blender is None else self.blender
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """An experiment that is ready to run."""
+
+    records: Records
+    work: list[dict]
+    measure: Callable[[dict], dict]
+
+    def run(self) -> Iterator[tuple[int, dict]]:
+        """Measure what is missing; yields (parts done, line)."""
+        return self.records.measure(self.work, self.measure)
+
+    @property
+    def left(self) -> int:
+        """Parts that are still to be measured."""
+        return self.records.missing(self.work)
+
+
+@contextmanager
+def planned(name: str, settings: Settings) -> Iterator[Plan]:
+    """An experiment with all that it needs, opened for as long as the context lasts.
+
+    Raises InputError for settings that cannot be used, DeviceError when the device cannot be opened.
+    """
+    check(settings)
+    work = shard(_work(name, settings), settings.part)
+    writable_folder(settings.out)
+    draws = name != counts.NAME and not settings.ideal_only
+    renderer = Renderer(settings.device) if draws else None
+    device = None if renderer is None else f"{renderer.device.title}, {renderer.device.version}"
+    versions = reader_versions() | (metric_versions() if name == views.NAME else {})
+    facts = run_facts(name, device, settings.seed, versions)
+    records = Records(settings.file(name), facts, settings.anew)
+    pool = ThreadPoolExecutor(settings.workers)
+    try:
+        yield Plan(records, work, _measure(name, settings, Painter(renderer, settings.trained), pool))
+    finally:
+        # an interrupt must not wait for pictures that nobody will look at
+        pool.shutdown(cancel_futures=True)
+
+
+def check(settings: Settings) -> None:
+    """Raises InputError for settings that cannot be used."""
+    chosen_categories(settings.categories)
+    for name in settings.protocols:
+        if name not in PROTOCOLS:
+            raise InputError(f"unknown protocol {name!r}; known: {', '.join(PROTOCOLS)}")
+    if not 1 <= settings.marker_count <= MARKERS:
+        raise InputError(f"--markers is {settings.markers}; each category has 1 to {MARKERS}")
+    if settings.workers < 1:
+        raise InputError(f"--workers is {settings.workers}; at least 1 thread looks at pictures")
+    if settings.trained is not None and not settings.trained.is_dir():
+        raise InputError(
+            f"{settings.trained} is not a folder; give one with 2dgs-17/small-0.ply and the like"
+        )
+    if settings.tilts is not None:
+        angles.parse_tilts(settings.tilts)
+    method_names(settings.mixtures)
+
+
+def _work(name: str, settings: Settings) -> list[dict]:
+    categories, count = chosen_categories(settings.categories), settings.marker_count
+    if name == counts.NAME:
+        repeats = counts.QUICK_REPEATS if settings.quick else counts.FULL_REPEATS
+        # all five cost a second
+        return counts.counts_work(categories, repeats, MARKERS if settings.markers is None else count)
+    if name == localisation.NAME:
+        located = tuple(c for c in categories if c.name in localisation.LOCATED)
+        spans = (localisation.DISTANCES, localisation.TILTS)
+        if settings.quick:
+            spans = (localisation.QUICK_DISTANCES, localisation.QUICK_TILTS)
+        return localisation.localisation_work(located, settings.methods, *spans, count)
+    if name == views.NAME:
+        number = QUICK_VIEWS if settings.quick else TEST_VIEWS
+        weights = None if settings.lpips is None else weights_name(settings.lpips)
+        return views.views_work(categories, settings.methods, settings.blender_folder, count, number, weights)
+    tilts = settings.tilts or (angles.QUICK_TILTS if settings.quick else angles.FULL_TILTS)
+    return angles.angles_work(
+        categories, settings.protocols or tuple(PROTOCOLS), settings.methods, tilts, count
+    )
+
+
+def _measure(
+    name: str, settings: Settings, painter: Painter, pool: ThreadPoolExecutor
+) -> Callable[[dict], dict]:
+    seed = settings.seed
+    if name == counts.NAME:
+        return lambda part: counts.measure_counts(part, seed)
+    if name == localisation.NAME:
+        return lambda part: localisation.measure_localisation(part, painter, seed, pool)
+    if name == views.NAME:
+        perceptual = None if settings.lpips is None else load_lpips(settings.lpips)
+        return lambda part: views.measure_views(
+            part, painter, seed, settings.blender_folder, pool, perceptual
+        )
+    return lambda part: angles.measure_angles(part, painter, seed, pool, settings.workers)

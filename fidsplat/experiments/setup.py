@@ -1,0 +1,137 @@
+"""The set-up of the paper's section 4.1: markers, planes, viewpoints; and the two protocols for angles."""
+
+from __future__ import annotations
+
+import math
+import random
+import string
+from dataclasses import dataclass
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.errors import InputError
+
+SEED = 0
+MARKERS = 5
+"""markers of each category"""
+PLANE = 2.0
+"""metres, edge of the plane that carries a marker with its quiet zone"""
+BACKGROUND = 128 / 255
+"""grey beside the plane, display value: one that 8 bits hold, so that nothing hangs on a rounding"""
+
+
+@dataclass(frozen=True)
+class Category:
+    """One row of the paper's tables."""
+
+    name: str
+    title: str
+    kind: str
+    length: int | None = None
+    """characters of a QR code's text"""
+    version: int | None = None
+    """of the QR code"""
+
+    def spec(self, index: int, seed: int = SEED) -> str:
+        """Marker spec of marker 0 to 4: tags 0 to 4 of 36h11, QR codes of seeded random letters and
+        digits."""
+        if self.kind == "apriltag":
+            return f"apriltag:36h11:{index}"
+        letters = string.ascii_letters + string.digits
+        text = "".join(random.Random(f"{seed} {self.name} {index}").choices(letters, k=self.length or 0))
+        return f"qr-v{self.version}-L:{text}"
+
+
+CATEGORIES = {
+    category.name: category
+    for category in (
+        Category("apriltag", "AR Tag", "apriltag"),
+        Category("small", "QR Small", "qr", 20, 2),
+        Category("medium", "QR Medium", "qr", 100, 5),
+        Category("large", "QR Large", "qr", 250, 10),
+        Category("huge", "QR Huge", "qr", 1000, 22),
+    )
+}
+
+
+def chosen_categories(names: tuple[str, ...]) -> tuple[Category, ...]:
+    """The categories of these names, all when there are none. Raises InputError for an unknown name."""
+    for name in names:
+        if name not in CATEGORIES:
+            raise InputError(f"unknown category {name!r}; known: {', '.join(CATEGORIES)}")
+    return tuple(category for name, category in CATEGORIES.items() if not names or name in names)
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How a marker is looked at while it tilts: azimuth 0, always towards its middle."""
+
+    title: str
+    pixels: int
+    """width and height of the picture"""
+    distance: float
+    """metres"""
+    fov: float
+    """degrees"""
+    module_px: float | None
+    """pixels of a module seen frontally; None: the plane is `PLANE` wide whatever the code"""
+
+    def module(self, cells: int) -> float:
+        """Metres per module of a marker with ``cells`` modules a side, quiet zone included."""
+        if self.module_px is None:
+            return PLANE / cells
+        return self.module_px * self.distance / self.camera(0.0).fx
+
+    def camera(self, tilt: float) -> Camera:
+        """The camera at ``tilt`` degrees from the marker's normal, above it."""
+        a = math.radians(tilt)
+        place = (0.0, -self.distance * math.sin(a), -self.distance * math.cos(a))
+        return Camera.look_at(self.pixels, self.pixels, math.radians(self.fov), place, (0.0, 0.0, 0.0))
+
+
+PROTOCOLS = {
+    "fixed-plane": Protocol("2 x 2 plane, 800 x 800, 4 m, 50 degrees", 800, 4.0, 50.0, None),
+    "fixed-module": Protocol("P*: 8 px a module, 1600 x 1600, 12 m, 17.7 degrees", 1600, 12.0, 17.7, 8.0),
+}
+"""the paper's plane (its camera is not stated), and one that makes modules of all codes equally large"""
+
+COLLECTIONS = (3, 5, 9, 17)
+"""numbers of training views, from narrow to dense; each collection holds the smaller ones"""
+TEST_VIEWS = 20
+MAX_TEST_TILT = 60.0
+"""degrees; the test views lie within the ring of the densest collection"""
+
+# tilt and azimuth in degrees: the front, to the sides, above and below, diagonals, a wide ring
+_VIEWS = (
+    (0, 0), (15, 0), (15, 180),
+    (30, 90), (30, 270),
+    (45, 45), (45, 135), (45, 225), (45, 315),
+    *((60, azimuth) for azimuth in range(0, 360, 45)),
+)  # fmt: skip
+
+
+def training_cameras(views: int = COLLECTIONS[-1]) -> list[Camera]:
+    """The cameras of a collection. Raises InputError for a number that is not in `COLLECTIONS`."""
+    if views not in COLLECTIONS:
+        raise InputError(f"there is no collection of {views} views; known: 3, 5, 9, 17")
+    return [_around(tilt, azimuth) for tilt, azimuth in _VIEWS[:views]]
+
+
+def novel_cameras(category: Category, index: int, seed: int = SEED) -> list[Camera]:
+    """20 random cameras of a marker, uniform over directions up to 60 degrees from its normal."""
+    generator = random.Random(f"{seed} views {category.name} {index}")
+    lowest = math.cos(math.radians(MAX_TEST_TILT))
+    views = []
+    for _ in range(TEST_VIEWS):
+        tilt = math.degrees(math.acos(generator.uniform(lowest, 1.0)))
+        views.append(_around(tilt, generator.uniform(0.0, 360.0)))
+    return views
+
+
+def _around(tilt: float, azimuth: float) -> Camera:
+    protocol = PROTOCOLS["fixed-plane"]
+    a, b = math.radians(tilt), math.radians(azimuth)
+    towards = np.array([math.sin(a) * math.cos(b), -math.sin(a) * math.sin(b), -math.cos(a)])
+    size, fov = protocol.pixels, math.radians(protocol.fov)
+    return Camera.look_at(size, size, fov, protocol.distance * towards, (0.0, 0.0, 0.0))

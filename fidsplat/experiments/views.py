@@ -1,0 +1,133 @@
+"""Table 4: novel views. Pictures from 20 random viewpoints against ground truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.errors import InputError
+from fidsplat.experiments.blender import VIEW_NAMES, novel_picture
+from fidsplat.experiments.methods import IDEAL, Painter, plain_marker
+from fidsplat.experiments.plane import plane_picture
+from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS, TEST_VIEWS, Category, novel_cameras
+from fidsplat.vision.images import read_image, to_uint8
+from fidsplat.vision.metrics import flip, has_flip, psnr, ssim
+
+NAME = "views"
+TRUTHS = {
+    "exact": "exact renderer, means of display values",
+    "exact-linear": "exact renderer, means of linear light, then the sRGB curve",
+    "blender-standard": "Blender, view 'Standard'",
+    "blender-raw": "Blender, view 'Raw' on display values",
+}
+Perceptual = Callable[[np.ndarray, np.ndarray], float]
+
+
+def views_work(
+    categories: Iterable[Category],
+    methods: Iterable[str],
+    blender: Path,
+    markers: int = 5,
+    views: int = TEST_VIEWS,
+    lpips: str | None = None,
+) -> list[dict]:
+    """The parts of the experiment: one marker by one method against one ground truth.
+
+    Args:
+        blender: folder of `fidsplat experiment blender`; its pictures take part where a marker has all of
+            them.
+        views: how many of the 20.
+        lpips: what tells the weights of LPIPS apart, when it is measured.
+    """
+    work = []
+    for category in categories:
+        for index in range(markers):
+            truths = ["exact", "exact-linear"]
+            truths += [
+                f"blender-{view}"
+                for view in VIEW_NAMES
+                if all(novel_picture(blender, view, category.name, index, i).is_file() for i in range(views))
+            ]
+            for method in methods:
+                for truth in truths:
+                    part = {
+                        "category": category.name,
+                        "index": index,
+                        "method": method,
+                        "truth": truth,
+                        "views": views,
+                        "flip": has_flip(),
+                        "lpips": lpips,
+                    }
+                    if not (method == IDEAL and truth == "exact"):  # equal by definition
+                        work.append(part)
+    return work
+
+
+def measure_views(
+    part: dict,
+    painter: Painter,
+    seed: int,
+    blender: Path,
+    pool: ThreadPoolExecutor,
+    lpips: Perceptual | None = None,
+) -> dict:
+    """Compare one marker's pictures, in 8 bits, with the truth.
+
+    Returns `psnr` (dB), `ssim`, `flip` and `lpips`: a number for each view; None for a metric that cannot be
+    measured here, and for the PSNR of equal pictures.
+    """
+    category = CATEGORIES[part["category"]]
+    spec = category.spec(part["index"], seed)
+    module = PROTOCOLS["fixed-plane"].module(plain_marker(spec).grid.shape[0])
+    draw = painter.open(part["method"], f"{category.name}-{part['index']}", spec, module)
+
+    def compare(number: int, camera: Camera, picture: np.ndarray) -> dict[str, float | None]:
+        if part["truth"].startswith("exact"):
+            truth = exact_view(spec, camera, part["truth"] == "exact-linear")
+        else:
+            view = part["truth"].removeprefix("blender-")
+            truth = read_image(novel_picture(blender, view, category.name, part["index"], number))[:, :, 0]
+            if truth.shape != picture.shape:
+                raise InputError(f"the Blender pictures in {blender} have another size; render them again")
+        ours, theirs = to_uint8(picture) / 255.0, to_uint8(truth) / 255.0
+        ratio = psnr(ours, theirs)
+        found = {"psnr": None if np.isinf(ratio) else ratio, "ssim": ssim(ours, theirs)}
+        if part["flip"]:
+            found["flip"] = flip(ours, theirs)
+        if lpips is not None:
+            found["lpips"] = lpips(ours, theirs)
+        return found
+
+    cameras = novel_cameras(category, part["index"], seed)[: part["views"]]
+    waiting = [pool.submit(compare, i, camera, draw(camera)) for i, camera in enumerate(cameras)]
+    measured = [future.result() for future in waiting]
+    names = ("psnr", "ssim", "flip", "lpips")
+    return {name: [one[name] for one in measured] if name in measured[0] else None for name in names}
+
+
+def exact_view(spec: str, camera: Camera, linear: bool) -> np.ndarray:
+    """The ground truth of one view, (h, w) display values.
+
+    linear: a pixel's mean is taken of linear light and then encoded, as Blender's 'Standard' view does it.
+    """
+    grid = plain_marker(spec).grid
+    module = PROTOCOLS["fixed-plane"].module(grid.shape[0])
+    if not linear:
+        return plane_picture(grid, module, camera, background=BACKGROUND)
+    return srgb(plane_picture(grid, module, camera, background=from_srgb(BACKGROUND)))
+
+
+def srgb(light: np.ndarray) -> np.ndarray:
+    """Linear light in [0, 1] to display values (IEC 61966-2-1)."""
+    light = np.clip(light, 0.0, 1.0)
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+def from_srgb(value: float) -> float:
+    """A display value to linear light."""
+    return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4

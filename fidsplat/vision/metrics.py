@@ -1,0 +1,58 @@
+"""How far two pictures differ: PSNR, SSIM, FLIP, LPIPS. Pictures are display values in [0, 1]."""
+
+from __future__ import annotations
+
+import math
+from importlib.metadata import version
+from importlib.util import find_spec
+
+import cv2
+import numpy as np
+
+_SIGMA, _RADIUS = 1.5, 5  # pixels: Wang et al. 2004, as in the 3DGS and 2DGS papers
+_C1, _C2 = 0.01**2, 0.03**2
+
+
+def psnr(picture: np.ndarray, truth: np.ndarray) -> float:
+    """Peak signal-to-noise ratio in dB over all pixels, infinite for equal pictures."""
+    error = float(np.mean((np.asarray(picture, np.float64) - truth) ** 2))
+    return math.inf if error == 0 else -10 * math.log10(error)
+
+
+def ssim(picture: np.ndarray, truth: np.ndarray) -> float:
+    """Structural similarity (Wang et al. 2004) of two (h, w) pictures: Gaussian window of sigma 1.5, 11 px.
+
+    The same as scikit-image's with gaussian_weights, sigma 1.5, data_range 1 and use_sample_covariance
+    False: windows that leave the picture do not count.
+    """
+    a, b = np.asarray(picture, np.float64), np.asarray(truth, np.float64)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        size = (2 * _RADIUS + 1,) * 2
+        blurred = cv2.GaussianBlur(values, size, _SIGMA, borderType=cv2.BORDER_REFLECT)
+        return blurred[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
+
+    mean_a, mean_b = mean(a), mean(b)
+    var_a, var_b = mean(a * a) - mean_a**2, mean(b * b) - mean_b**2
+    shared = mean(a * b) - mean_a * mean_b
+    top = (2 * mean_a * mean_b + _C1) * (2 * shared + _C2)
+    return float(np.mean(top / ((mean_a**2 + mean_b**2 + _C1) * (var_a + var_b + _C2))))
+
+
+def has_flip() -> bool:
+    """Whether FLIP can be measured: the package flip-evaluator is installed."""
+    return find_spec("flip_evaluator") is not None
+
+
+def metric_versions() -> dict[str, str]:
+    """Versions of the packages that metrics come from."""
+    return {"flip-evaluator": version("flip-evaluator")} if has_flip() else {}
+
+
+def flip(picture: np.ndarray, truth: np.ndarray) -> float:
+    """Mean LDR-FLIP (Andersson et al. 2020) of two (h, w) pictures at 67 pixels per degree, 0 for equal."""
+    import flip_evaluator  # type: ignore[import-not-found]  # of the extra `experiments`
+
+    a, b = (np.repeat(np.asarray(p, np.float32)[:, :, None], 3, axis=2) for p in (picture, truth))
+    _, mean, _ = flip_evaluator.evaluate(b, a, "LDR", applyMagma=False, computeMeanError=True)
+    return float(mean)

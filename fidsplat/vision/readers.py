@@ -1,0 +1,191 @@
+"""Off-the-shelf detectors as they come, asked one question each: is this code seen, and is it read?
+
+Unlike `detect`, which combines them and refines corners, these are for measuring how far each detector goes.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+
+import cv2
+import numpy as np
+import zxingcpp
+
+from fidsplat.errors import InputError
+from fidsplat.vision.dictionaries import predefined
+
+# how much taller the picture is made, one after the other, until zxing-cpp reads the code
+UNFORESHORTEN = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
+# a quadrilateral is that of the code when it shares more than this part of their union with it
+MIN_OVERLAP = 0.5
+_MARGIN = 16  # pixels kept around what is not background
+
+_idle: dict[str, deque] = {}
+"""AprilTag detectors that no thread uses, by family"""
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """The code that a picture shows."""
+
+    kind: str
+    """"apriltag" or "qr\""""
+    family: str
+    """tag family, e.g. "36h11"; anything for a QR code"""
+    id: int | None
+    payload: str | None
+    corners: np.ndarray
+    """(4, 2) pixels, the code's outer edge, where it truly is"""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What one detector made of one picture."""
+
+    found: bool
+    """a quadrilateral that overlaps the code (`MIN_OVERLAP`), decoded or not"""
+    read: bool
+    """exactly this id or text was decoded"""
+
+
+def _aruco(grey: np.ndarray, target: Target) -> Attempt:
+    """OpenCV's aruco module with its defaults."""
+    detector = cv2.aruco.ArucoDetector(predefined(target.kind, target.family))
+    quads, ids, rejected = detector.detectMarkers(grey)
+    read = ids is not None and target.id in ids.ravel()
+    # OpenCV counts from the centre of the first pixel
+    return Attempt(read or _any_over((q.reshape(4, 2) + 0.5 for q in (*quads, *rejected)), target), read)
+
+
+def _pupil(grey: np.ndarray, target: Target) -> Attempt:
+    """The AprilTag library at full resolution. It tells nothing of tags that it cannot decode."""
+    idle = _idle.setdefault(target.family, deque())
+    try:
+        detector = idle.pop()  # one picture at a time: the library keeps scratch memory in it
+    except IndexError:
+        detector = _pupil_detector("tag" + target.family)
+    read = any(tag.tag_id == target.id for tag in detector.detect(grey))
+    idle.append(detector)
+    return Attempt(read, read)
+
+
+def _pupil_detector(family: str):
+    import pupil_apriltags  # type: ignore[import-not-found]  # of the extra `experiments`
+
+    class Detector(pupil_apriltags.Detector):
+        # theirs frees the family and then the detector, which looks into it: a crash, now and then. As many
+        # as there are threads are made, and kept.
+        def __del__(self) -> None:
+            pass
+
+    return Detector(families=family, nthreads=1, quad_decimate=1.0)
+
+
+def _cv2_qr(grey: np.ndarray, target: Target) -> Attempt:
+    """OpenCV's QRCodeDetector."""
+    text, quad, _ = cv2.QRCodeDetector().detectAndDecode(grey)
+    read = text == target.payload
+    return Attempt(read or (quad is not None and _any_over([quad.reshape(4, 2) + 0.5], target)), read)
+
+
+def _zxing(grey: np.ndarray, target: Target, taller: float = 1.0) -> Attempt:
+    """zxing-cpp with its defaults, for QR codes."""
+    formats = zxingcpp.BarcodeFormats([zxingcpp.BarcodeFormat.QRCode])
+    codes = zxingcpp.read_barcodes(
+        grey, formats=formats, text_mode=zxingcpp.TextMode.Plain, return_errors=True
+    )
+    quads = (_position(code) / (1.0, taller) for code in codes)
+    read = any(code.valid and code.text == target.payload for code in codes)
+    return Attempt(read or _any_over(quads, target), read)
+
+
+def _zxing_tall(grey: np.ndarray, target: Target) -> Attempt:
+    """zxing-cpp after un-foreshortening: the rows that differ from the background, made taller and taller."""
+    top, bottom = _content_rows(grey)
+    part = np.ascontiguousarray(grey[top:bottom])
+    moved = Target(target.kind, target.family, target.id, target.payload, target.corners - (0.0, top))
+    found = False
+    for factor in UNFORESHORTEN:
+        tall = cv2.resize(part, None, fx=1.0, fy=factor, interpolation=cv2.INTER_LINEAR)
+        attempt = _zxing(tall, moved, tall.shape[0] / part.shape[0])
+        found = found or attempt.found
+        if attempt.read:
+            return attempt
+    return Attempt(found, False)
+
+
+_READERS: dict[str, dict[str, Callable[[np.ndarray, Target], Attempt]]] = {
+    "apriltag": {"aruco": _aruco, "pupil": _pupil},
+    "qr": {"cv2": _cv2_qr, "zxing": _zxing, "zxing-tall": _zxing_tall},
+}
+_PACKAGES = {"aruco": "cv2", "cv2": "cv2", "pupil": "pupil_apriltags"}
+TITLES = {
+    "aruco": "OpenCV aruco",
+    "pupil": "AprilTag library (pupil-apriltags)",
+    "cv2": "OpenCV QRCodeDetector",
+    "zxing": "zxing-cpp",
+    "zxing-tall": "zxing-cpp, un-foreshortened",
+}
+"""every detector's name in words"""
+
+
+def readers(kind: str) -> tuple[str, ...]:
+    """Names of the detectors for "apriltag" or "qr" that are installed here."""
+    return tuple(name for name in _READERS[kind] if find_spec(_PACKAGES.get(name, "zxingcpp")) is not None)
+
+
+def attempt(name: str, grey: np.ndarray, target: Target) -> Attempt:
+    """Show a picture to one detector. May be called from several threads.
+
+    Args:
+        name: one of `readers` of the target's kind.
+        grey: (h, w) uint8.
+
+    Raises InputError for an unknown name.
+    """
+    known = _READERS.get(target.kind, {})
+    if name not in known:
+        raise InputError(f"unknown detector {name!r} for {target.kind}; known: {', '.join(known)}")
+    return known[name](grey, target)
+
+
+def reader_versions() -> dict[str, str]:
+    """Versions of the detectors' packages."""
+    found = {"opencv": cv2.__version__}
+    for package in ("zxing-cpp", "pupil-apriltags"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def overlap(one: np.ndarray, other: np.ndarray) -> float:
+    """Intersection over union of the convex hulls of two quadrilaterals (4, 2), 0 to 1."""
+    a, b = (cv2.convexHull(np.asarray(quad, np.float32)) for quad in (one, other))
+    shared, _ = cv2.intersectConvexConvex(a, b)
+    union = cv2.contourArea(a) + cv2.contourArea(b) - shared
+    return float(shared / union) if union > 0 else 0.0
+
+
+def _any_over(quads: Iterable[np.ndarray], target: Target) -> bool:
+    return any(overlap(quad, target.corners) > MIN_OVERLAP for quad in quads)
+
+
+def _position(code: zxingcpp.Barcode) -> np.ndarray:
+    place = code.position
+    points = (place.top_left, place.top_right, place.bottom_right, place.bottom_left)
+    return np.array([(p.x, p.y) for p in points], np.float64)
+
+
+def _content_rows(grey: np.ndarray) -> tuple[int, int]:
+    """The rows that hold anything but the level of the picture's first pixel, and a margin."""
+    level = int(grey[0, 0])
+    rows = np.flatnonzero((grey.max(1) > level + 2) | (grey.min(1) < level - 2))
+    if rows.size == 0:
+        return 0, grey.shape[0]
+    return max(int(rows[0]) - _MARGIN, 0), min(int(rows[-1]) + 1 + _MARGIN, grey.shape[0])

@@ -1,0 +1,159 @@
+"""`fidsplat experiment` as a user meets it."""
+
+import json
+
+import numpy as np
+import pytest
+
+from fidsplat.cli import main
+from fidsplat.commands.experiment import Experiment
+from fidsplat.experiments import angles
+from fidsplat.experiments.records import read_lines
+from fidsplat.vision.images import write_png
+
+SMALL = ["--category", "apriltag", "--markers", "1"]
+
+
+def run(capsys, *words) -> tuple[int, str, str]:
+    status = main(["experiment", *map(str, words)])
+    return status, *capsys.readouterr()
+
+
+@pytest.mark.parametrize("word", Experiment.PARTS)
+def test_help_teaches(capsys, word):
+    status, out, err = run(capsys, word, "--help")
+    assert (status, err) == (0, "")
+    assert f"usage: fidsplat experiment {word}" in out
+    assert f"  fidsplat experiment {word}" in out
+    assert Experiment.PARTS[word].HELP.splitlines()[0] in out
+
+
+def test_the_group_lists_its_words(capsys):
+    status, out, _ = run(capsys, "--help")
+    assert status == 0
+    assert all(word in out for word in Experiment.PARTS)
+    status, out, err = run(capsys)
+    assert (status, out) == (2, "")
+    assert "angles" in err
+    status, _, err = run(capsys, "angels")
+    assert status == 2
+    assert err.count("\n") == 1
+    assert "see fidsplat experiment --help" in err
+
+
+def test_an_interrupted_scan_goes_on(capsys, tmp_path, monkeypatch):
+    words = ("angles", "--ideal", *SMALL, "--tilts", "0:80:40", "-o", tmp_path, "--json")
+    real, done = angles.measure_angles, []
+
+    def stopped(part, *others):
+        if done:
+            raise KeyboardInterrupt
+        done.append(part)
+        return real(part, *others)
+
+    monkeypatch.setattr(angles, "measure_angles", stopped)
+    status, out, err = run(capsys, *words)
+    assert (status, out) == (130, "")
+    assert "interrupted" in err
+    first = read_lines(tmp_path / "angles.jsonl")
+    assert len(first) == 1
+
+    monkeypatch.setattr(angles, "measure_angles", real)
+    status, out, _ = run(capsys, *words)
+    assert status == 0
+    assert json.loads(out) == {"files": {"angles": str(tmp_path / "angles.jsonl")}}
+    lines = read_lines(tmp_path / "angles.jsonl")
+    assert lines[0] == first[0]
+    assert [line["key"]["protocol"] for line in lines] == ["fixed-plane", "fixed-module"]
+    assert lines[0]["result"]["readers"]["pupil"]["read"] == "111"
+
+
+def test_shards_merge_into_what_one_run_gives(capsys, tmp_path):
+    words = ("angles", "--ideal", *SMALL, "--tilts", "0:80:40")
+    assert run(capsys, *words, "-o", tmp_path / "whole")[0] == 0
+    for i in (1, 2):
+        assert run(capsys, *words, "--shard", f"{i}/2", "-o", tmp_path / f"machine-{i}")[0] == 0
+    status, out, _ = run(
+        capsys, "merge", tmp_path / "machine-1", tmp_path / "machine-2", "-o", tmp_path / "both", "--json"
+    )
+    assert status == 0
+    assert json.loads(out)["angles"] == {
+        "file": str(tmp_path / "both" / "angles.jsonl"), "files": 2, "lines": 2, "repeated": 0,
+    }  # fmt: skip
+
+    def found(folder):
+        lines = read_lines(tmp_path / folder / "angles.jsonl")
+        return {json.dumps(line["key"], sort_keys=True): line["result"] for line in lines}
+
+    assert found("both") == found("whole")
+
+
+def test_everything_quick_and_its_report(capsys, tmp_path):
+    status, out, err = run(
+        capsys, "all", "--quick", *SMALL, "--mixture", "fitted", "--device", "opencl", "-o", tmp_path
+    )
+    assert status == 0, err
+    for name in ("counts", "localisation", "views", "angles"):
+        assert read_lines(tmp_path / f"{name}.jsonl")
+    text = (tmp_path / "report.md").read_text()
+    assert "fitted/best, apriltag, pupil, fixed-plane: behind the ideal" in text
+    assert (tmp_path / "sheet-apriltag.png").is_file()
+    assert "(sheet-apriltag.png)" in text
+    before = {file: file.read_bytes() for file in tmp_path.glob("*.jsonl")}
+    status, out, _ = run(
+        capsys, "all", "--quick", *SMALL, "--mixture", "fitted", "-o", tmp_path, "--json"
+    )  # nothing is left to do
+    assert status == 0
+    assert set(json.loads(out)["files"]) == {"counts", "localisation", "views", "angles"}
+    assert {file: file.read_bytes() for file in tmp_path.glob("*.jsonl")} == before
+
+
+def test_scenes_for_trainers(capsys, tmp_path):
+    folder = tmp_path / "blender" / "raw" / "apriltag-0"
+    folder.mkdir(parents=True)
+    for stem, count in (("view", 17), ("test", 20)):
+        for i in range(count):
+            write_png(folder / f"{stem}-{i:02d}.png", np.zeros((8, 8), np.uint8))
+    words = ("dataset", *SMALL, "--truth", "blender-raw", "--blender", tmp_path / "blender")
+    status, out, _ = run(capsys, *words, "-o", tmp_path / "out", "--json")
+    assert status == 0
+    names = [f"apriltag-0-views-{n}" for n in (3, 5, 9, 17)]
+    assert json.loads(out)["scenes"] == names
+    assert [len(list((tmp_path / "out" / name / "images").iterdir())) for name in names] == [3, 5, 9, 17]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["angles", "--category", "tiny"], "unknown category 'tiny'"),
+        (["angles", "--mixture", "boxes"], "unknown mixture 'boxes'"),
+        (["angles", "--protocol", "P*"], "unknown protocol 'P*'; known: fixed-plane, fixed-module"),
+        (["angles", "--tilts", "0-90"], "first:last:step"),
+        (["angles", "--shard", "3/2", "--ideal"], "write i/n"),
+        (["angles", "--markers", "6"], "--markers is 6; each category has 1 to 5"),
+        (["angles", "--workers", "0"], "--workers is 0"),
+        (["views", "--trained", "nowhere"], "nowhere is not a folder"),
+        (["views", "--lpips", "nowhere.npz", "--quick"], "cannot read the LPIPS weights"),
+        (["counts", "--category", "huge", "--markers", "0"], "--markers is 0"),
+        (["dataset", "--truth", "photo"], "unknown truth 'photo'; known: exact"),
+        (["dataset", "--markers", "9"], "--markers is 9"),
+        (["blender", "--environment", "nowhere"], "fidsplat experiment blender --install"),
+        (["blender", "--samples", "0"], "--samples at least 1"),
+        (["blender", "--view", "agx"], "unknown view 'agx'"),
+        (["merge", "nowhere"], "no results of shards in nowhere"),
+        (["report", "nowhere"], "no results in nowhere"),
+    ],
+)
+def test_wrong_words_are_one_line(capsys, tmp_path, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    status, out, err = run(capsys, *words)
+    assert (status, out) == (2, "")
+    assert err.count("\n") == 1
+    assert message in err
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_the_work(capsys, tmp_path):
+    (tmp_path / "file").write_text("x")
+    status, _, err = run(capsys, "counts", "-o", tmp_path / "file" / "deeper")
+    assert status == 2
+    assert "cannot write into the folder" in err

@@ -1,0 +1,100 @@
+"""Off-the-shelf detectors, each asked by itself."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.experiments.methods import plain_marker
+from fidsplat.experiments.plane import plane_picture
+from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS
+from fidsplat.vision.images import to_uint8
+from fidsplat.vision.readers import Attempt, Target, attempt, overlap, reader_versions, readers
+
+ALL = [("apriltag", name) for name in readers("apriltag")] + [("qr", name) for name in readers("qr")]
+
+
+def ideal(category: str, tilt: float, protocol: str = "fixed-module") -> tuple[np.ndarray, Target]:
+    spec = CATEGORIES[category].spec(1)
+    made, setting = plain_marker(spec), PROTOCOLS[protocol]
+    module, camera = setting.module(made.grid.shape[0]), setting.camera(tilt)
+    picture = plane_picture(made.grid, module, camera, background=BACKGROUND)
+    corners = camera.project(made.corners / made.module * module)
+    return to_uint8(picture), Target(made.kind, made.family or "", made.id, made.payload, corners)
+
+
+def test_the_extra_detector_is_among_those_tested():
+    assert readers("apriltag") == ("aruco", "pupil")
+    assert readers("qr") == ("cv2", "zxing", "zxing-tall")
+    assert set(reader_versions()) == {"opencv", "zxing-cpp", "pupil-apriltags"}
+
+
+@pytest.mark.parametrize(("kind", "name"), ALL)
+def test_each_reads_the_ideal_texture_in_front_and_nothing_in_grey(kind, name):
+    picture, target = ideal("apriltag" if kind == "apriltag" else "small", 10.0)
+    assert attempt(name, picture, target) == Attempt(True, True)
+    assert attempt(name, np.full_like(picture, 128), target) == Attempt(False, False)
+
+
+@pytest.mark.parametrize(("kind", "name"), ALL)
+def test_another_code_in_its_place_is_found_at_most_and_not_read(kind, name):
+    picture, target = ideal("apriltag" if kind == "apriltag" else "small", 10.0)
+    other = replace(target, id=99) if kind == "apriltag" else replace(target, payload="another")
+    result = attempt(name, picture, other)
+    assert not result.read
+    # the AprilTag library tells nothing of what it does not read as this tag
+    assert result.found == (name != "pupil")
+
+
+@pytest.mark.parametrize("name", ["aruco", "cv2", "zxing"])
+def test_a_quadrilateral_elsewhere_is_not_the_code(name):
+    picture, target = ideal("apriltag" if name == "aruco" else "small", 10.0)
+    wrong = replace(target, id=99, payload="another", corners=target.corners + 300.0)
+    assert attempt(name, picture, wrong) == Attempt(False, False)
+
+
+@pytest.mark.parametrize("category", ["small", "large"])
+def test_a_tilted_code_is_read_once_it_is_made_taller(category):
+    picture, target = ideal(category, 80.0)
+    assert not attempt("zxing", picture, target).read
+    assert attempt("zxing-tall", picture, target) == Attempt(True, True)
+
+
+def test_places_that_were_found_are_those_of_the_untouched_picture():
+    """The rows are cut out and stretched; the outline must come back to where the code is."""
+    picture, target = ideal("medium", 75.0)
+    assert not attempt("zxing", picture, target).read
+    moved = replace(target, payload="another")  # so that only the place counts
+    assert attempt("zxing-tall", picture, moved) == Attempt(True, False)
+    assert not attempt(
+        "zxing-tall", picture, replace(moved, corners=moved.corners + np.array([0.0, 120.0]))
+    ).found
+
+
+def test_threads_do_not_disturb_each_other():
+    shots = [ideal("apriltag", tilt, "fixed-plane") for tilt in range(0, 90, 6)]
+    alone = [attempt(name, *shot) for shot in shots for name in readers("apriltag")]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(
+            pool.map(
+                lambda one: attempt(one[1], *one[0]), [(s, n) for s in shots for n in readers("apriltag")]
+            )
+        )
+    assert together == alone
+
+
+def test_overlap_of_quadrilaterals():
+    unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
+    assert overlap(unit, unit) == pytest.approx(1.0)
+    assert overlap(unit, unit[::-1]) == pytest.approx(1.0)
+    assert overlap(unit, unit + np.array([0.5, 0])) == pytest.approx(1 / 3)
+    assert overlap(unit, unit + 2.0) == 0.0
+    assert overlap(unit, np.zeros((4, 2))) == 0.0
+
+
+def test_an_unknown_detector_is_an_error():
+    picture, target = ideal("small", 0.0)
+    with pytest.raises(fs.InputError, match="unknown detector 'aruco' for qr; known: cv2, zxing, zxing-tall"):
+        attempt("aruco", picture, target)
