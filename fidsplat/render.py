@@ -147,7 +147,7 @@ class Renderer:
                 "this cloud was uploaded by another Renderer; upload it with the one that draws it"
             )
         data = resident._data
-        features = select(data, names, chosen)
+        features = select(data, names, chosen, camera)
         view = View.of(camera, chosen, data.origin, behind)
         return Frame(self.backend.pipeline(features).render(data, view), names)
 

@@ -9,12 +9,15 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from fidsplat.cameras import Camera
+from fidsplat.cameras import Camera, Orthographic
+from fidsplat.cameras.raster import RayRaster, raster_of
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
 from fidsplat.splats import SplatCloud
 
+FAR_EYE = 1e9
+"""metres: where the eye of a parallel projection is taken to be"""
 MAX_GRID = 32767
 """Largest side of the sample grid: anchors and rows are kept in 16 bits."""
 
@@ -62,7 +65,8 @@ class View:
     translation: np.ndarray
     """(3,) metres: where the cloud's origin lies in the camera frame"""
     eye: np.ndarray
-    """(3,) metres: the camera's centre relative to the cloud's origin, world axes"""
+    """(3,) metres: where it is looked from, relative to the cloud's origin, world axes; the camera's centre, or a
+    point far behind it for parallel rays"""
     near: float
     far: float
     log_cut: float
@@ -70,6 +74,12 @@ class View:
     ceiling: float
     stop: float
     background: tuple[float, float, float]
+    raster: RayRaster | None = None
+    """the samples' rays behind a lens; None for a pinhole and for parallel rays"""
+    along_ray: bool = False
+    """whether near, far, sort keys and depths are distances from the camera's centre; else they are along z"""
+    parallel: bool = False
+    """whether all rays are parallel to z; fx and fy are samples per metre then"""
 
     @classmethod
     def of(cls, camera: Camera, quality: Quality, origin: np.ndarray, background) -> View:
@@ -90,6 +100,10 @@ class View:
         rotation = camera.world_to_camera[:3, :3]
         # the difference first, then the rotation: nothing large is ever rotated (numerics B5)
         eye = camera.position - np.asarray(origin, dtype=np.float64)
+        lens, grid = camera.lens, (camera.width * n, camera.height * n)
+        intrinsics = camera.fx * n, camera.fy * n, camera.cx * n, camera.cy * n
+        parallel = isinstance(lens, Orthographic)
+        raster = None if lens is None or parallel else raster_of(lens, *grid, *intrinsics)
         return cls(
             width=camera.width * n,
             height=camera.height * n,
@@ -100,13 +114,17 @@ class View:
             cy=camera.cy * n,
             rotation=rotation,
             translation=-rotation @ eye,
-            eye=eye,
+            # colours that depend on the view see parallel rays come from very far away
+            eye=eye - FAR_EYE * rotation[2] if parallel else eye,
             near=camera.near,
             far=camera.far,
             log_cut=float(np.float32(math.log(quality.alpha_cutoff))),
             ceiling=float(np.float32(quality.opacity_ceiling)),
             stop=float(np.float32(quality.transmittance_stop)),
             background=(float(color[0]), float(color[1]), float(color[2])),
+            raster=raster,
+            along_ray=lens is not None and lens.along_ray,
+            parallel=parallel,
         )
 
 

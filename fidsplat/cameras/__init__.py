@@ -1,5 +1,16 @@
 """Cameras: plain data, float64, OpenCV axes (x right, y down, z forward)."""
 
-from fidsplat.cameras.pinhole import Camera, focal_length, look_at_matrix
+from fidsplat.cameras.lenses import BrownConrady, Equirectangular, Fisheye, Lens, Orthographic
+from fidsplat.cameras.pinhole import Camera, fisheye_focal_length, focal_length, look_at_matrix
 
-__all__ = ["Camera", "focal_length", "look_at_matrix"]
+__all__ = [
+    "BrownConrady",
+    "Camera",
+    "Equirectangular",
+    "Fisheye",
+    "Lens",
+    "Orthographic",
+    "fisheye_focal_length",
+    "focal_length",
+    "look_at_matrix",
+]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
+from fidsplat.cameras import Camera
 from fidsplat.effects.catalogue import CATALOGUE, Effect, Output
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
@@ -61,8 +62,10 @@ class Traits(Protocol):
         ...
 
 
-def select(cloud: Traits, outputs: Iterable[str], quality: Quality) -> FeatureSet:
-    """The features that a cloud, outputs and quality call for.
+def select(
+    cloud: Traits, outputs: Iterable[str], quality: Quality, camera: Camera | None = None
+) -> FeatureSet:
+    """The features that a cloud, outputs, quality and camera (None: a pinhole) call for.
 
     Raises:
         InputError: an output that nobody declares.
@@ -77,7 +80,7 @@ def select(cloud: Traits, outputs: Iterable[str], quality: Quality) -> FeatureSe
             raise InputError(f"unknown output {name!r}{hint}; known: {', '.join(OUTPUTS)}")
     return FeatureSet(
         slots=(
-            "camera_pinhole",
+            f"camera_{camera.lens.kind if camera is not None and camera.lens else 'pinhole'}",
             "color_rgb" if cloud.sh_degree < 0 else "color_sh",
             f"lowpass_{quality.lowpass}",
             f"stop_{quality.stop_rule}",

@@ -82,7 +82,9 @@ class Run:
             np.float32(view.ceiling),
             np.float32(view.stop),
             np.float32(1.0 / view.samples**2),
-            *sample_planes,
+            sample_planes[0],
+            *(self.held[name] for effect in self.pipeline.features.effects for name in effect.blend_inputs),
+            *sample_planes[1:],
         )
 
     def _resolve(self, raw_planes: list[cl.Buffer]) -> dict[str, tuple[Output, cl.Buffer]]:
@@ -156,6 +158,9 @@ class Run:
         view = self.view
         tail = [view.fx, view.fy, view.cx, view.cy, view.near, view.far, view.log_cut]
         tail += [view.width, view.height, 1.0 / view.samples**2, row, end]
+        if view.raster is not None:
+            self.held |= self.backend.ray_buffers.of(view.raster, self.rows, self.stride)
+            tail += view.raster.uniforms
         parts = [view.rotation.ravel(), view.translation, view.eye, tail]
         self.put("view", np.concatenate(parts).astype(self.pipeline.real))
         if self.resident.planes is not None:
