@@ -48,16 +48,21 @@ class PlaneTable:
         self._center, self._half = (low + high) / 2, (high - low) / 2
 
     def keys(self, view: View) -> np.ndarray:
-        """(p,) float32, all different: a plane's nearest depth less its splats' diameter [m].
+        """(p,) float32, all different: a plane's nearest depth less its splats' diameter [m]; the distance instead of
+        the depth where the view's depths are distances.
 
         Whatever lies before the plane at some pixel, with its centre at most a diameter nearer than the
         plane, arrives after it and can be placed before it; so can what lies behind.
         """
         radius = math.sqrt(-2 * view.log_cut)
         half = self._half + radius * self._sigma
-        along = self._axes @ view.rotation[2]  # (p, 3): depth per metre along each axis
-        depth = np.einsum("pk,pk->p", along, self._center) + view.translation[2]
-        nearest = depth - (np.abs(along) * half).sum(1)
+        if view.along_ray:
+            aside = np.abs(self._axes @ view.eye - self._center) - half
+            nearest = np.linalg.norm(np.maximum(aside, 0.0), axis=1)
+        else:
+            along = self._axes @ view.rotation[2]  # (p, 3): depth per metre along each axis
+            depth = np.einsum("pk,pk->p", along, self._center) + view.translation[2]
+            nearest = depth - (np.abs(along) * half).sum(1)
         keys = (nearest - 2 * np.linalg.norm(half, axis=1)).astype(np.float32)
         # of equal keys the index decides, and shuffled splats of two planes would mix
         order = np.argsort(keys, kind="stable")
