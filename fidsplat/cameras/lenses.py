@@ -249,7 +249,11 @@ Lens: TypeAlias = BrownConrady | Fisheye | Equirectangular | Orthographic
 def _check(lens) -> None:
     for field in fields(lens):
         value = getattr(lens, field.name)
-        if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not np.isfinite(value):
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, (int, float, np.number))
+            or not np.isfinite(value)
+        ):
             raise InputError(f"lens coefficient {field.name} must be a finite number, not {value!r}")
         object.__setattr__(lens, field.name, float(value))
 

@@ -129,14 +129,10 @@ class Camera:
         width, height = _size("width", width), _size("height", height)
         pose = np.eye(4) if world_to_camera is None else world_to_camera
         fx, fy = width / (2 * math.pi), height / math.pi
-        return Camera(
-            width, height, fx, fy, width / 2, height / 2, pose, near, far, lens=Equirectangular()
-        )
+        return Camera(width, height, fx, fy, width / 2, height / 2, pose, near, far, lens=Equirectangular())
 
     @staticmethod
-    def orthographic(
-        width, height, metres_wide, world_to_camera=None, near=0.01, far=math.inf
-    ) -> "Camera":
+    def orthographic(width, height, metres_wide, world_to_camera=None, near=0.01, far=math.inf) -> "Camera":
         """A camera of parallel rays whose picture is ``metres_wide`` metres across, with square pixels."""
         width, height = _size("width", width), _size("height", height)
         across = _number("metres_wide", metres_wide)
@@ -177,7 +173,6 @@ class Camera:
         x, y, z = seen.T
         z = np.where(z > 0, z, np.nan)
         return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=1)
-
 
     def rays(self, pixels) -> np.ndarray:
         """Directions (n, 3) float64 in the camera frame of pixel coordinates (n, 2), NaN where nothing is seen.

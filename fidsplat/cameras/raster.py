@@ -92,8 +92,6 @@ class RayRaster:
 
 
 @lru_cache(maxsize=4)
-def raster_of(
-    lens: Lens, width: int, height: int, fx: float, fy: float, cx: float, cy: float
-) -> RayRaster:
+def raster_of(lens: Lens, width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> RayRaster:
     """The raster of these numbers; the last few are kept, for pictures from many poses."""
     return RayRaster(lens, width, height, fx, fy, cx, cy)

@@ -46,9 +46,7 @@ class Effect:
 
 _EFFECTS = (
     Effect("camera_pinhole", "slot/camera_pinhole.cl", parts=("perspective",)),
-    Effect(
-        "camera_brown_conrady", "slot/camera_brown_conrady.cl", parts=("perspective", "ray_map", "rays")
-    ),
+    Effect("camera_brown_conrady", "slot/camera_brown_conrady.cl", parts=("perspective", "ray_map", "rays")),
     Effect("camera_fisheye", "slot/camera_fisheye.cl", parts=("ray_map", "rays")),
     Effect("camera_equirectangular", "slot/camera_equirectangular.cl", parts=("rays",)),
     Effect("camera_orthographic", "slot/camera_orthographic.cl", record_lanes=4),

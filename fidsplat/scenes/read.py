@@ -5,10 +5,11 @@ import os
 import tomllib
 from pathlib import Path
 
-from fidsplat.cameras import Camera, focal_length, look_at_matrix
+from fidsplat.cameras import Camera, look_at_matrix
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
 from fidsplat.rotations import rigid_matrix
+from fidsplat.scenes.lens import TABLES, read_focal_lengths, read_lens
 from fidsplat.scenes.scene import PlacedMarker, Scene
 from fidsplat.scenes.table import Table
 from fidsplat.splats import SplatCloud
@@ -16,7 +17,7 @@ from fidsplat.splats import SplatCloud
 MAX_BYTES = 16 * 2**20
 TOP = ("camera", "splats", "markers", "render")
 CAMERA = ("width", "height", "fov_x_deg", "fx", "fy", "cx", "cy")
-CAMERA += ("position", "look_at", "up", "world_to_camera", "near", "far")
+CAMERA += ("position", "look_at", "up", "world_to_camera", "near", "far", *TABLES)
 SPLATS = ("file", "position", "quaternion", "scale")
 MARKERS = ("spec", "size", "position", "quaternion", "mixture", "quiet_zone")
 RENDER = ("outputs", "background", "quality", "samples", "device")
@@ -64,17 +65,8 @@ def _parse(file: Path) -> dict:
 def _camera(table: Table) -> Camera:
     width, height = table.whole("width"), table.whole("height")
     near, far = table.number("near", 0.01), table.number("far", math.inf, infinite=True)
-    if "fov_x_deg" in table:
-        for key in ("fx", "fy"):
-            if key in table:
-                raise table.error(key, "and fov_x_deg exclude each other")
-        degrees = table.number("fov_x_deg")
-        with table.at("fov_x_deg"):
-            fx = fy = focal_length(width, math.radians(degrees))
-    elif "fx" in table or "fy" in table:
-        fx, fy = table.number("fx"), table.number("fy")
-    else:
-        raise table.error("fov_x_deg", "is missing (or fx and fy)")
+    lens = read_lens(table)
+    fx, fy = read_focal_lengths(table, width, height, lens)
     cx, cy = table.number("cx", width / 2), table.number("cy", height / 2)
     position = None
     if "world_to_camera" in table:
@@ -89,7 +81,7 @@ def _camera(table: Table) -> Camera:
         with table.at("look_at"):
             pose = look_at_matrix(position, look_at, table.numbers("up", 3, (0.0, -1.0, 0.0)))
     with table.at():
-        return Camera.pinhole(width, height, fx, fy, cx, cy, pose, near, far, position)
+        return Camera.pinhole(width, height, fx, fy, cx, cy, pose, near, far, position, lens)
 
 
 def _pose(table: Table, scale: float = 1.0):

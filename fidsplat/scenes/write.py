@@ -8,6 +8,7 @@ from fidsplat.files import atomic_write
 from fidsplat.formats import save_ply
 from fidsplat.quality import PRESETS, Quality
 from fidsplat.rotations import matrix_to_quaternion
+from fidsplat.scenes.lens import lens_table
 from fidsplat.scenes.read import IMAGE
 from fidsplat.scenes.scene import PlacedMarker, Scene
 
@@ -27,6 +28,8 @@ def write_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
         save_ply(cloud, file.parent / name)
         splats.append({"file": name})
     parts = [] if scene.camera is None else [_table("[camera]", _camera(scene))]
+    lens = None if scene.camera is None else lens_table(scene.camera)
+    parts += [] if lens is None else [_table(f"[camera.{lens[0]}]", lens[1])]
     parts += [_table("[[splats]]", table) for table in splats]
     parts += [_table("[[markers]]", table) for table in markers]
     parts.append(_table("[render]", render))

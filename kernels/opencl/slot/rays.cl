@@ -21,16 +21,16 @@ static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfl
     size_t ray_plane = ray_stride * ((height + TILE_H - 1) / TILE_H * TILE_H);
     float near_x = center_x == center_x ? (float)center_x : bounds.ex, near_y = center_y == center_y ? (float)center_y : bounds.ey;
     size_t ray_at = (size_t)clamp(floor(near_y), 0.0f, (float)(height - 1)) * ray_stride + (size_t)clamp(floor(near_x), 0.0f, (float)(width - 1));
-    float ray[3] = {rays[ray_at], rays[ray_plane + ray_at], rays[2 * ray_plane + ray_at]};
-    if (!(ray[0] == ray[0])) {
+    float anchor_ray[3] = {rays[ray_at], rays[ray_plane + ray_at], rays[2 * ray_plane + ray_at]};
+    if (!(anchor_ray[0] == anchor_ray[0])) {
         real away = sqrt(dot3(p, p));
         away = away > 0 ? 1 / away : 0;
-        ray[0] = (float)(p.x * away);
-        ray[1] = (float)(p.y * away);
-        ray[2] = (float)(p.z * away);
+        anchor_ray[0] = (float)(p.x * away);
+        anchor_ray[1] = (float)(p.y * away);
+        anchor_ray[2] = (float)(p.z * away);
     }
     real3_ of_u = cross3(b, p), of_v = cross3(p, a), of_d = {facet.x * su * sv, facet.y * su * sv, facet.z * su * sv};
-    real3_ anchor = {ray[0], ray[1], ray[2]};
+    real3_ anchor = {anchor_ray[0], anchor_ray[1], anchor_ray[2]};
     real3_ k0 = {dot3(of_u, anchor), dot3(of_v, anchor), dot3(of_d, anchor)};
     real3_ kx = {of_u.x, of_v.x, of_d.x}, ky = {of_u.y, of_v.y, of_d.y}, kz = {of_u.z, of_v.z, of_d.z};
     real determinant = su * sv * offset;
@@ -40,9 +40,9 @@ static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfl
     record.nuz = (float)(kz.x * n_scale);
     record.nvz = (float)(kz.y * n_scale);
     record.dz = (float)(kz.z * facing);
-    record.ray_x = ray[0];
-    record.ray_y = ray[1];
-    record.ray_z = ray[2];
+    record.ray_x = anchor_ray[0];
+    record.ray_y = anchor_ray[1];
+    record.ray_z = anchor_ray[2];
 //@ blend_args
     , global const float *restrict rays
 //@ lanes_start
