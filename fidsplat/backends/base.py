@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from fidsplat.effects import FeatureSet
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
 from fidsplat.splats import SplatCloud
+
+if TYPE_CHECKING:
+    from fidsplat.backends.exposure import Shot
 
 FAR_EYE = 1e9
 """metres: where the eye of a parallel projection is taken to be"""
@@ -80,6 +83,22 @@ class View:
     """whether near, far, sort keys and depths are distances from the camera's centre; else they are along z"""
     parallel: bool = False
     """whether all rays are parallel to z; fx and fy are samples per metre then"""
+    groups: tuple[tuple[int, View], ...] = ()
+    """(label, the view that its splats have), for splats that move by themselves"""
+    shots: tuple[Shot, ...] = ()
+    """the sub-pictures of which this picture is made; none: it is one"""
+
+    def rows(self, top: int, end: int) -> View:
+        """The view of rows of samples [top, end) alone."""
+        if (top, end) == (0, self.height):
+            return self
+        return replace(
+            self,
+            height=end - top,
+            cy=self.cy - top,
+            raster=None if self.raster is None else self.raster.cropped(top, end),
+            groups=tuple((label, view.rows(top, end)) for label, view in self.groups),
+        )
 
     @classmethod
     def of(cls, camera: Camera, quality: Quality, origin: np.ndarray, background) -> View:

@@ -1,6 +1,7 @@
 """Cameras: plain data, float64, OpenCV axes (x right, y down, z forward)."""
 
 from fidsplat.cameras.lenses import BrownConrady, Equirectangular, Fisheye, Lens, Orthographic
+from fidsplat.cameras.motion import Motion, Shutter, Trajectory
 from fidsplat.cameras.pinhole import Camera, fisheye_focal_length, focal_length, look_at_matrix
 
 __all__ = [
@@ -9,7 +10,10 @@ __all__ = [
     "Equirectangular",
     "Fisheye",
     "Lens",
+    "Motion",
     "Orthographic",
+    "Shutter",
+    "Trajectory",
     "fisheye_focal_length",
     "focal_length",
     "look_at_matrix",

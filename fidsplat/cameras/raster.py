@@ -26,11 +26,23 @@ class RayRaster:
     fy: float
     cx: float
     cy: float
+    whole: RayRaster | None = None
+    """the raster of which this one is a few rows"""
+    top: int = 0
+    """which row of it the first one is"""
+
+    def cropped(self, top: int, end: int) -> RayRaster:
+        """Rows [top, end); they share the map of the whole."""
+        return RayRaster(
+            self.lens, self.width, end - top, self.fx, self.fy, self.cx, self.cy - top, self, top
+        )
 
     @cached_property
     def rays(self) -> np.ndarray:
         """(h, w, 3) float32: the direction of each sample's ray, with Z = 1 or of unit length; NaN where nothing
         is seen. The picture is that of these rounded rays, on every device and in the reference."""
+        if self.whole is not None:
+            return self.whole.rays[self.top : self.top + self.height]
         rays = np.empty((self.height, self.width, 3), np.float32)
         step = max(1, _ROWS // self.width)
         a = (np.arange(self.width) + 0.5 - self.cx) / self.fx
@@ -59,6 +71,8 @@ class RayRaster:
             the samples in a cell (last < first: none), for grids of cells, cells / 2, ..., 1 cells a side,
             row by row; and (low_x, low_y, cells per unit along x, along y, cells).
         """
+        if self.whole is not None:
+            return self.whole.map
         rows, columns = np.nonzero(np.isfinite(self.rays[..., 0]))
         cells = 1
         while 2 * cells <= min(CELLS, max(self.width, self.height) // 2):
@@ -86,9 +100,13 @@ class RayRaster:
 
     @property
     def uniforms(self) -> tuple[float, ...]:
-        """Numbers that the kernels take: the lens's, then the map's."""
-        mapped = () if self.lens.kind == "equirectangular" else self.map[1]
-        return (*self.lens.uniforms, *map(float, mapped))
+        """Numbers that the kernels take: the lens's, then the map's and the first row."""
+        if self.lens.kind == "equirectangular":
+            return self.lens.uniforms
+        low_x, low_y, *rest = map(float, self.map[1])
+        if not isinstance(self.lens, Fisheye):
+            low_y -= self.top  # the chart counts rows as the picture does
+        return (*self.lens.uniforms, low_x, low_y, *rest, float(self.top))
 
 
 @lru_cache(maxsize=4)

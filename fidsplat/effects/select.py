@@ -29,7 +29,8 @@ class FeatureSet:
     """
 
     slots: tuple[str, ...]
-    """One effect per kind, in the fixed order camera, color, lowpass, stop, compose."""
+    """One effect per kind, in the fixed order camera, color, lowpass, stop, compose; then motion and shutter, if
+    any."""
     taps: tuple[str, ...]
     """Sorted names of the planes beside rgb."""
     sh_degree: int
@@ -63,9 +64,16 @@ class Traits(Protocol):
 
 
 def select(
-    cloud: Traits, outputs: Iterable[str], quality: Quality, camera: Camera | None = None
+    cloud: Traits,
+    outputs: Iterable[str],
+    quality: Quality,
+    camera: Camera | None = None,
+    moving: bool = False,
+    exposed: bool = False,
 ) -> FeatureSet:
     """The features that a cloud, outputs, quality and camera (None: a pinhole) call for.
+
+    moving: groups of splats move by themselves. exposed: the picture is made of several poses.
 
     Raises:
         InputError: an output that nobody declares.
@@ -85,6 +93,8 @@ def select(
             f"lowpass_{quality.lowpass}",
             f"stop_{quality.stop_rule}",
             "compose_planes" if cloud.has_planes and quality.coplanar == "blend" else "compose_ordered",
+            *(("motion_groups",) if moving else ()),
+            *(("shutter_exposure",) if exposed else ()),
         ),
         taps=tuple(sorted(wanted - {"rgb"})),
         sh_degree=max(cloud.sh_degree, 0),

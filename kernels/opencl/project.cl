@@ -64,6 +64,7 @@ kernel void project(
     uint i = get_global_id(0);
     if (i >= count) return;
     keys[i] = CULLED;
+//@@ splat_view
 
     float log_opacity = (float)log((real)opacities[i]);
     float half_r2 = log_opacity - (float)view[VIEW_LOG_CUT];

@@ -29,11 +29,16 @@ class RayBuffers:
         if (rows, columns) not in sizes:
             planes = np.full((3, rows, columns), np.nan, np.float32)
             planes[:, : raster.height, : raster.width] = np.moveaxis(raster.rays, 2, 0)
-            arrays = {"rays": planes}
+            sizes[rows, columns] = {"rays": self._put("rays", planes)}
             if raster.lens.kind != "equirectangular":
-                arrays["ray_map"] = raster.map[0]
-            sizes[rows, columns] = {name: self._put(name, array) for name, array in arrays.items()}
+                sizes[rows, columns]["ray_map"] = self._map(raster.whole or raster)
         return sizes[rows, columns]
+
+    def _map(self, raster: RayRaster) -> cl.Buffer:
+        maps = self._held.setdefault(raster, {}).setdefault((0, 0), {})
+        if "ray_map" not in maps:
+            maps["ray_map"] = self._put("ray_map", raster.map[0])
+        return maps["ray_map"]
 
     def _put(self, name: str, array: np.ndarray) -> cl.Buffer:
         buffer = self._backend.pool.fresh(name, array.nbytes)

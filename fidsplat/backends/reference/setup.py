@@ -22,10 +22,15 @@ class Setup:
         tangent_v = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], 1)
         mean, scale = cloud.means.astype(np.float64), cloud.scales.astype(np.float64)
         scale = np.maximum(scale, np.float32(1e-20))  # as the kernels' SMALLEST_SCALE
-        rotation = view.rotation
-        unit_a, unit_b = tangent_u @ rotation.T, tangent_v @ rotation.T
+        unit_a, unit_b, p, outward = _posed(view, tangent_u, tangent_v, mean)
+        for label, own in view.groups:
+            mine = (cloud.labels == label)[:, None]
+            moved = _posed(own, tangent_u, tangent_v, mean)
+            unit_a, unit_b, p, outward = (
+                np.where(mine, there, here)
+                for there, here in zip(moved, (unit_a, unit_b, p, outward), strict=True)
+            )
         a, b = unit_a * scale[:, :1], unit_b * scale[:, 1:]
-        p = mean @ rotation.T + view.translation
         depth = np.linalg.norm(p, axis=1) if view.along_ray else p[:, 2]
         self.key = depth.astype(np.float32)
         planes = None
@@ -46,7 +51,7 @@ class Setup:
         self.order = order
 
         normal = np.cross(unit_a, unit_b)[order]
-        a, b, p, mean, scale = a[order], b[order], p[order], mean[order], scale[order]
+        a, b, p, scale = a[order], b[order], p[order], scale[order]
         self.log_opacity, self.half_r2, self.reach = log_opacity[order], half_r2[order], reach[order]
         self.labels = cloud.labels[order]
         self.pz = depth[order]
@@ -70,11 +75,19 @@ class Setup:
         self.anchors = optics.anchors_of(view, self.anchor_x, self.anchor_y)
         self.round = optics.ROUND if view.raster is None else optics.ROUND_OF_RAYS
         """of a form in float32, relative to its terms"""
-        self.colors = _colors(cloud, order, mean - view.eye)
+        self.colors = _colors(cloud, order, outward[order])
         self.normal = normal * np.where(height > 0, -1.0, 1.0)[:, None]
         self.screen = "lowpass_screen" in features.slots
         self.exclusive = "stop_exclusive" in features.slots
         self.planes = None if planes is None else planes[order]
+
+
+def _posed(
+    view: View, tangent_u: np.ndarray, tangent_v: np.ndarray, mean: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """Unit tangents and centre in the camera frame, and the centre from the eye in the cloud's, (n, 3) each."""
+    turn = view.rotation.T
+    return tangent_u @ turn, tangent_v @ turn, mean @ turn + view.translation, mean - view.eye
 
 
 def _anchor(center: np.ndarray, known: np.ndarray, size: int) -> np.ndarray:

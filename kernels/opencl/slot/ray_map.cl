@@ -3,7 +3,7 @@
 // follow, each of half as many cells a side. So bounds hold for whatever the rays are.
 //@ camera
 // The samples whose rays lie in [x0, x1] x [y0, y1] of the chart, as bounds; empty ones if there are none.
-// numbers: low corner, cells per unit along x and y, cells a side.
+// numbers: low corner, cells per unit along x and y, cells a side, the row of the map that is the first of this picture.
 static inline Bounds mapped_bounds(global const real *numbers, global const short4 *map, real x0, real x1, real y0, real y1) {
     real cells = numbers[4];
     // 0.02 of a cell for the rounding of the chart
@@ -28,7 +28,8 @@ static inline Bounds mapped_bounds(global const real *numbers, global const shor
             }
     }
     if (box.x > box.y) return box_bounds(1, 0, 1, 0);
-    return box_bounds(box.x + REAL(0.5), box.y + REAL(0.5), box.z + REAL(0.5), box.w + REAL(0.5));
+    real top = numbers[5] - REAL(0.5);
+    return box_bounds(box.x + REAL(0.5), box.y + REAL(0.5), box.z - top, box.w - top);
 }
 //@ project_args
     , global const short4 *restrict ray_map
