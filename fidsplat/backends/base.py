@@ -68,8 +68,8 @@ class View:
     translation: np.ndarray
     """(3,) metres: where the cloud's origin lies in the camera frame"""
     eye: np.ndarray
-    """(3,) metres: where it is looked from, relative to the cloud's origin, world axes; the camera's centre, or a
-    point far behind it for parallel rays"""
+    """(3,) metres: the camera's centre relative to the cloud's origin, world axes; far behind it for parallel
+    rays"""
     near: float
     far: float
     log_cut: float
@@ -80,7 +80,7 @@ class View:
     raster: RayRaster | None = None
     """the samples' rays behind a lens; None for a pinhole and for parallel rays"""
     along_ray: bool = False
-    """whether near, far, sort keys and depths are distances from the camera's centre; else they are along z"""
+    """whether near, far, sort keys and depths are distances from the camera's centre; else along z"""
     parallel: bool = False
     """whether all rays are parallel to z; fx and fy are samples per metre then"""
     groups: tuple[tuple[int, View], ...] = ()

@@ -36,7 +36,8 @@ def exposed_view(
     motion: Motion,
     shutter: Shutter,
 ) -> View:
-    """The view of a picture under a shutter: with `shots` if it takes more than one pose, else just at its time.
+    """The view of a picture under a shutter: with `shots` if it takes more than one pose, else just at its
+    time.
 
     Raises:
         InputError: as View.of; a pose that is not rigid.
@@ -58,9 +59,7 @@ def exposed_view(
         times = shutter.times(middle)
         for k, time in enumerate(times):
             view = at(time).rows(top * quality.samples, end * quality.samples)
-            shots.append(
-                Shot(view, top * quality.samples, 1 / len(times), k == 0, k == len(times) // 2)
-            )
+            shots.append(Shot(view, top * quality.samples, 1 / len(times), k == 0, k == len(times) // 2))
     return replace(whole, shots=tuple(shots))
 
 

@@ -49,8 +49,8 @@ class PlaneTable:
         self._center, self._half = (low + high) / 2, (high - low) / 2
 
     def keys(self, view: View) -> np.ndarray:
-        """(p,) float32, all different: a plane's nearest depth less its splats' diameter [m]; the distance instead of
-        the depth where the view's depths are distances.
+        """(p,) float32, all different: a plane's nearest depth less its splats' diameter [m]. Depth is what
+        the view means by it: along z, or the distance from the camera's centre.
 
         Whatever lies before the plane at some pixel, with its centre at most a diameter nearer than the
         plane, arrives after it and can be placed before it; so can what lies behind.

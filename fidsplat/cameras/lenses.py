@@ -23,8 +23,8 @@ _ITERATIONS = 12
 
 @dataclass(frozen=True)
 class BrownConrady:
-    """Radial (k1 to k6), tangential (p1, p2) and thin-prism (s1 to s4) distortion of a perspective picture, as
-    `cv2.projectPoints` has them. All 0 is a pinhole.
+    """Radial (k1 to k6), tangential (p1, p2) and thin-prism (s1 to s4) distortion of a perspective picture,
+    as `cv2.projectPoints` has them. All 0 is a pinhole.
 
     Directions beyond the first fold of the radial part are not seen. Raises InputError for a coefficient
     that is not finite.
@@ -143,8 +143,8 @@ class BrownConrady:
 
 @dataclass(frozen=True)
 class Fisheye:
-    """Kannala-Brandt fisheye as `cv2.fisheye` has it: a ray at the angle t from the axis falls at the distance
-    t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) from the middle. All 0 is the equidistant lens.
+    """Kannala-Brandt fisheye as `cv2.fisheye` has it: a ray at the angle t from the axis falls at the
+    distance t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) from the middle. All 0 is the equidistant lens.
 
     Sees up to 100 degrees from the axis, or less where that polynomial turns back. Raises InputError for a
     coefficient that is not finite.
@@ -177,7 +177,7 @@ class Fisheye:
         """Image coordinates (n, 2) of points (n, 3); NaN where they are not seen."""
         across = np.hypot(points[:, 0], points[:, 1])
         angle = np.arctan2(across, points[:, 2])
-        seen = (angle <= self.limit) & ((across > 0) | (points[:, 2] > 0))
+        seen = np.asarray(angle <= self.limit) & ((across > 0) | (points[:, 2] > 0))
         a, b = _scaled(points[:, 0], points[:, 1], across, self.distance(angle))
         return np.where(seen[:, None], np.stack([a, b], 1), np.nan)
 
@@ -243,7 +243,9 @@ class Orthographic:
         return np.where(points[:, 2:] > 0, points[:, :2], np.nan)
 
 
-Lens: TypeAlias = BrownConrady | Fisheye | Equirectangular | Orthographic
+RayLens: TypeAlias = BrownConrady | Fisheye | Equirectangular
+"""lenses whose rays start at one point"""
+Lens: TypeAlias = RayLens | Orthographic
 
 
 def _check(lens) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.rotations import check_similarity
+from fidsplat.rotations import check_similarity, matrix_to_quaternion
 
 MAX_SUB_POSES = 1024
 
@@ -23,8 +24,8 @@ Pose: TypeAlias = Callable[[float], np.ndarray]
 class Shutter:
     """When the rows of a picture are exposed. All 0 is the instant global shutter.
 
-    The middle row's exposure has its middle at `time`. Row i of h is exposed `readout` * ((i + 1/2) / h - 1/2)
-    seconds later. Raises InputError for a value out of range.
+    The middle row's exposure has its middle at `time`. Row i of h is exposed
+    `readout` * ((i + 1/2) / h - 1/2) seconds later. Raises InputError for a value out of range.
     """
 
     time: float = 0.0
@@ -36,8 +37,8 @@ class Shutter:
     readout: float = 0.0
     """seconds from the first row's exposure to the last's (rolling shutter)"""
     rows_per_band: int = 8
-    """rows that share their poses, those of the band's middle row. What crosses v pixels during the readout of
-    h rows is off by at most v (rows_per_band - 1) / (2 h) pixels; 1 is exact, and slow"""
+    """rows that share their poses, those of the band's middle row. What crosses v pixels during the readout
+    of h rows is off by at most v (rows_per_band - 1) / (2 h) pixels; 1 is exact, and slow"""
 
     def __post_init__(self) -> None:
         for name in ("time", "exposure", "readout"):
@@ -58,7 +59,7 @@ class Shutter:
         cuts = [*range(0, height, rows), height]
         return [
             (top, end, self.time + self.readout * ((top + end) / 2 / height - 0.5))
-            for top, end in zip(cuts, cuts[1:], strict=False)
+            for top, end in itertools.pairwise(cuts)
         ]
 
     def times(self, middle: float) -> list[float]:
@@ -69,8 +70,8 @@ class Shutter:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """A pose between keyframes: the screw motion from one to the next (a geodesic of SE(3)), at rest before the
-    first and after the last. Call it with a time in seconds.
+    """A pose between keyframes: the screw motion from one to the next (a geodesic of SE(3)), at rest before
+    the first and after the last. Call it with a time in seconds.
 
     Raises InputError for times that do not increase and poses that are not rigid.
     """
@@ -123,8 +124,6 @@ def _skew(axis: np.ndarray) -> np.ndarray:
 
 def _rotation_vector(turn: np.ndarray) -> np.ndarray:
     """Axis times angle (0 to pi) of a rotation matrix."""
-    from fidsplat.rotations import matrix_to_quaternion
-
     w, *xyz = matrix_to_quaternion(turn)
     length = np.linalg.norm(xyz)
     return np.array(xyz) * (2 * math.atan2(length, w) / length if length > 0 else 2.0)
@@ -156,7 +155,9 @@ class Motion:
 
     def __post_init__(self) -> None:
         if self.camera is not None and not callable(self.camera):
-            raise InputError(f"motion of the camera is {self.camera!r}; it must be a Trajectory or a function")
+            raise InputError(
+                f"motion of the camera is {self.camera!r}; it must be a Trajectory or a function"
+            )
         if not isinstance(self.groups, Mapping) or not all(map(callable, self.groups.values())):
             raise InputError("motion of groups must be {label: Trajectory or function of the time}")
         object.__setattr__(self, "groups", MappingProxyType(dict(self.groups)))

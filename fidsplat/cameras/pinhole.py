@@ -94,8 +94,8 @@ class Camera:
             seen = np.isfinite(self.rays(np.stack([x.ravel(), y.ravel()], 1))[:, 0]).mean()
             if seen == 0 or (seen < 0.5 and lens.kind == "brown_conrady"):
                 raise InputError(
-                    f"camera distortion cannot be inverted in {100 * (1 - seen):.0f} % of the picture: it turns "
-                    "back before its edge; check the coefficients and the focal length (pixels)"
+                    f"camera distortion cannot be inverted in {100 * (1 - seen):.0f} % of the picture: it "
+                    "turns back before its edge; check the coefficients and the focal length (pixels)"
                 )
 
     @staticmethod
@@ -162,8 +162,8 @@ class Camera:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def project(self, points) -> np.ndarray:
-        """Pixel coordinates (n, 2) float64 of world points (n, 3), NaN where they cannot be seen: the depth is not
-        above 0, or they lie outside the lens."""
+        """Pixel coordinates (n, 2) float64 of world points (n, 3), NaN where they cannot be seen: the depth
+        is not above 0, or they lie outside the lens."""
         world = np.asarray(points, dtype=np.float64)
         if world.ndim != 2 or world.shape[1] != 3:
             raise InputError(f"points must have the shape (n, 3), but the shape is {world.shape}")
@@ -175,7 +175,8 @@ class Camera:
         return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=1)
 
     def rays(self, pixels) -> np.ndarray:
-        """Directions (n, 3) float64 in the camera frame of pixel coordinates (n, 2), NaN where nothing is seen.
+        """Directions (n, 3) float64 in the camera frame of pixel coordinates (n, 2), NaN where nothing is
+        seen.
 
         Scaled to Z = 1, or to unit length for a fisheye or panorama. Raises InputError for an orthographic
         camera, whose rays differ by where they start.
@@ -189,15 +190,16 @@ class Camera:
 
 
 def fisheye_focal_length(width: int, fov_x: float, lens: Fisheye) -> float:
-    """Focal length in pixels of a fisheye ``width`` pixels wide that sees ``fov_x`` radians from side to side.
+    """Focal length in pixels of a fisheye ``width`` pixels wide that sees ``fov_x`` radians from side to
+    side.
 
     Raises InputError when fov_x is not above 0 (1e-9), or beyond what the lens sees.
     """
     angle = _number("fov_x", fov_x)
     if not 1e-9 < angle <= 2 * lens.limit + 1e-12:
         raise InputError(
-            f"camera fov_x of this fisheye must lie between 0 and {math.degrees(2 * lens.limit):.4g} degrees, not "
-            f"{math.degrees(angle):.6g}"
+            f"camera fov_x of this fisheye must lie between 0 and {math.degrees(2 * lens.limit):.4g} "
+            f"degrees, not {math.degrees(angle):.6g}"
         )
     return width / 2 / float(lens.distance(angle / 2))
 

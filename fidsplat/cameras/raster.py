@@ -39,8 +39,8 @@ class RayRaster:
 
     @cached_property
     def rays(self) -> np.ndarray:
-        """(h, w, 3) float32: the direction of each sample's ray, with Z = 1 or of unit length; NaN where nothing
-        is seen. The picture is that of these rounded rays, on every device and in the reference."""
+        """(h, w, 3) float32: the direction of each sample's ray, with Z = 1 or of unit length; NaN where
+        nothing is seen. The picture is that of these rounded rays, on every device and in the reference."""
         if self.whole is not None:
             return self.whole.rays[self.top : self.top + self.height]
         rays = np.empty((self.height, self.width, 3), np.float32)
@@ -54,8 +54,8 @@ class RayRaster:
         return rays
 
     def chart(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates in which the kernels enclose a splat: those of the ideal pinhole picture [samples], or, for a
-        fisheye, the stereographic ones (X, Y) / (|ray| + Z)."""
+        """Coordinates in which the kernels enclose a splat: those of the ideal pinhole picture [samples], or,
+        for a fisheye, the stereographic ones (X, Y) / (|ray| + Z)."""
         x, y, z = np.moveaxis(rays.astype(np.float64), -1, 0)
         if isinstance(self.lens, Fisheye):
             below = z + np.sqrt(x * x + y * y + z * z)

@@ -60,9 +60,7 @@ _EFFECTS = (
         view_inputs=("rays",),
         blend_inputs=("rays",),
     ),
-    Effect(
-        "motion_groups", "slot/motion_groups.cl", inputs=("labels", "moving"), view_inputs=("moving",)
-    ),
+    Effect("motion_groups", "slot/motion_groups.cl", inputs=("labels", "moving"), view_inputs=("moving",)),
     Effect("shutter_exposure", "slot/shutter_exposure.cl"),
     Effect("color_rgb", "slot/color_rgb.cl", inputs=("colors",)),
     Effect("color_sh", "slot/color_sh.cl", inputs=("sh",)),

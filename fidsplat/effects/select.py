@@ -29,8 +29,8 @@ class FeatureSet:
     """
 
     slots: tuple[str, ...]
-    """One effect per kind, in the fixed order camera, color, lowpass, stop, compose; then motion and shutter, if
-    any."""
+    """One effect per kind, in the fixed order camera, color, lowpass, stop, compose; then motion and shutter,
+    if any."""
     taps: tuple[str, ...]
     """Sorted names of the planes beside rgb."""
     sh_degree: int

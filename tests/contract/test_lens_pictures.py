@@ -1,4 +1,5 @@
-"""Pictures through lenses against the reference, which sees every splat at every pixel: what bounds lose shows."""
+"""Pictures through lenses against the reference, which sees every splat at every pixel: what bounds lose
+shows."""
 
 import math
 

@@ -1,4 +1,5 @@
-"""Motion blur, rolling shutter and moving groups, against the reference and against pictures of single poses."""
+"""Motion blur, rolling shutter and moving groups, against the reference and against pictures of single
+poses."""
 
 import math
 
@@ -89,7 +90,9 @@ def test_colours_that_depend_on_the_view_turn_with_their_group(renderer):
 
 
 def test_a_moved_group_is_the_transformed_cloud(renderer):
-    still, moving = (random_splats(100, seed, depth=(1, 5), scale=(0.02, 0.3), sh_degree=2) for seed in (1, 2))
+    still, moving = (
+        random_splats(100, seed, depth=(1, 5), scale=(0.02, 0.3), sh_degree=2) for seed in (1, 2)
+    )
     together = fs.SplatCloud.concatenate([still.with_labels(0), moving.with_labels(1)])
     motion, time = fs.Motion(None, {1: turned}), 0.7
     frame = renderer.render(together, CAMERAS["pinhole"], motion=motion, shutter=fs.Shutter(time=time))
@@ -126,7 +129,8 @@ def test_a_rolling_shutter_takes_each_row_at_its_own_time(renderer):
 
 @pytest.mark.parametrize("rows", [1, 4, 15])
 def test_bands_are_off_by_at_most_their_stated_bound(renderer, rows):
-    """A dot that crosses the picture while it is read out: its middle in each row, where the row's time puts it."""
+    """A bar that crosses the picture while it is read out: its middle in each row, and where the time puts
+    it."""
     height, speed, readout = 60, 40.0, 1.0
     camera = fs.Camera.pinhole(80, height, 100.0, 100.0, 40.0, 30.0)
 
@@ -147,8 +151,10 @@ def test_bands_are_off_by_at_most_their_stated_bound(renderer, rows):
     want = 40 + speed * readout * ((np.arange(height) + 0.5) / height - 0.5)
     bound = speed * readout * (rows - 1) / (2 * height)
     error = np.abs(middle - want).max()
-    assert error <= bound + 2e-3
-    assert error >= 0.9 * bound - 2e-3
+    # one sample of 1/255 at the rim, 6.6 px from the middle, moves the mean of a bar of 4.5 px by this
+    rim = 6.6 / 255 / 4.5
+    assert error <= bound + rim
+    assert error >= 0.9 * bound - rim
 
 
 def test_the_same_bits_again_and_in_bands_of_tiles(renderer):

@@ -118,7 +118,8 @@ def test_what_makes_no_lens(make, words):
 
 @pytest.mark.parametrize("lens", [BrownConrady(-0.3, 0.1, p1=0.01), Fisheye(0.1)], ids=lambda lens: lens.kind)
 def test_the_map_knows_every_sample(lens):
-    """Any rectangle of the chart: the boxes of the cells that it meets hold all samples whose rays lie in it."""
+    """Any rectangle of the chart: the boxes of the cells that it meets hold all samples whose rays lie in
+    it."""
     raster = RayRaster(lens, 90, 70, 60.0, 60.0, 45.0, 35.0)
     boxes, (low_x, low_y, scale_x, scale_y, cells) = raster.map
     x, y = raster.chart(raster.rays)

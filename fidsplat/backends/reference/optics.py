@@ -74,8 +74,8 @@ def centers_of(view: View, p: np.ndarray, known: np.ndarray) -> tuple[np.ndarray
 
 
 def anchors_of(view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Coordinates (3, n) about which devices keep the forms of splats whose anchor pixel is (x, y); NaN where it
-    is not known."""
+    """Coordinates (3, n) about which devices keep the forms of splats with the anchor pixel (x, y); NaN where
+    that is not known."""
     if view.raster is None:
         return np.stack([np.ones_like(x), x, y])
     known = (x > 0) & (y > 0)

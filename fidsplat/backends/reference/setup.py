@@ -85,7 +85,8 @@ class Setup:
 def _posed(
     view: View, tangent_u: np.ndarray, tangent_v: np.ndarray, mean: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Unit tangents and centre in the camera frame, and the centre from the eye in the cloud's, (n, 3) each."""
+    """Unit tangents and centre in the camera frame, and the centre from the eye in the cloud's, (n, 3)
+    each."""
     turn = view.rotation.T
     return tangent_u @ turn, tangent_v @ turn, mean @ turn + view.translation, mean - view.eye
 
