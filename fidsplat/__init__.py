@@ -10,6 +10,13 @@ __version__ = "0.1.0"
 _HOME = {
     "SplatCloud": "fidsplat.splats",
     "Camera": "fidsplat.cameras",
+    "BrownConrady": "fidsplat.cameras",
+    "Fisheye": "fidsplat.cameras",
+    "Equirectangular": "fidsplat.cameras",
+    "Orthographic": "fidsplat.cameras",
+    "Shutter": "fidsplat.cameras",
+    "Motion": "fidsplat.cameras",
+    "Trajectory": "fidsplat.cameras",
     "Scene": "fidsplat.scenes",
     "Quality": "fidsplat.quality",
     "Marker": "fidsplat.markers",

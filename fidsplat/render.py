@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import DeviceInfo, Planes, View
+from fidsplat.backends.base import DeviceInfo, Planes
+from fidsplat.backends.exposure import exposed_view
 from fidsplat.backends.registry import open_backend
-from fidsplat.cameras import Camera
+from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.effects import select
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
@@ -18,6 +19,8 @@ from fidsplat.scenes import Scene
 from fidsplat.splats import SplatCloud
 
 _NO_SCENE = Scene(())
+_REST = Motion()
+_INSTANT = Shutter()
 
 
 class Frame(Mapping):
@@ -183,6 +186,8 @@ class Renderer:
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
         background: Iterable[float] | None = None,
+        motion: Motion | None = None,
+        shutter: Shutter | None = None,
     ) -> Frame:
         """Draw one picture.
 
@@ -193,6 +198,8 @@ class Renderer:
             outputs: names of planes; default rgb.
             quality: a Quality or a preset's name; default standard.
             background: (r, g, b) behind the splats; default black.
+            motion: how the camera and groups of splats move; default: they stand still.
+            shutter: when the picture is taken, and how long that takes; default: at time 0, at once.
 
         Raises:
             InputError: no camera, an unknown output or preset, a picture that is too large, a cloud uploaded
@@ -218,8 +225,10 @@ class Renderer:
                 "this cloud was uploaded by another Renderer; upload it with the one that draws it"
             )
         data = resident._data
-        features = select(data, names, chosen)
-        view = View.of(camera, chosen, data.origin, behind)
+        moving = own.motion if motion is None else motion
+        when = own.shutter if shutter is None else shutter
+        view = exposed_view(camera, chosen, data.origin, behind, moving or _REST, when or _INSTANT)
+        features = select(data, names, chosen, camera, bool(view.groups), bool(view.shots))
         return Frame(self.backend.pipeline(features).render(data, view), names)
 
     def render_views(

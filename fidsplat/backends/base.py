@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from fidsplat.cameras import Camera
+from fidsplat.cameras import Camera, Orthographic
+from fidsplat.cameras.raster import RayRaster, raster_of
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
 from fidsplat.splats import SplatCloud
 
+if TYPE_CHECKING:
+    from fidsplat.backends.exposure import Shot
+
+FAR_EYE = 1e9
+"""metres: where the eye of a parallel projection is taken to be"""
 MAX_GRID = 32767
 """Largest side of the sample grid: anchors and rows are kept in 16 bits."""
 
@@ -76,7 +82,8 @@ class View:
     translation: np.ndarray
     """(3,) metres: where the cloud's origin lies in the camera frame"""
     eye: np.ndarray
-    """(3,) metres: the camera's centre relative to the cloud's origin, world axes"""
+    """(3,) metres: the camera's centre relative to the cloud's origin, world axes; far behind it for parallel
+    rays"""
     near: float
     far: float
     log_cut: float
@@ -84,6 +91,28 @@ class View:
     ceiling: float
     stop: float
     background: tuple[float, float, float]
+    raster: RayRaster | None = None
+    """the samples' rays behind a lens; None for a pinhole and for parallel rays"""
+    along_ray: bool = False
+    """whether near, far, sort keys and depths are distances from the camera's centre; else along z"""
+    parallel: bool = False
+    """whether all rays are parallel to z; fx and fy are samples per metre then"""
+    groups: tuple[tuple[int, View], ...] = ()
+    """(label, the view that its splats have), for splats that move by themselves"""
+    shots: tuple[Shot, ...] = ()
+    """the sub-pictures of which this picture is made; none: it is one"""
+
+    def rows(self, top: int, end: int) -> View:
+        """The view of rows of samples [top, end) alone."""
+        if (top, end) == (0, self.height):
+            return self
+        return replace(
+            self,
+            height=end - top,
+            cy=self.cy - top,
+            raster=None if self.raster is None else self.raster.cropped(top, end),
+            groups=tuple((label, view.rows(top, end)) for label, view in self.groups),
+        )
 
     @classmethod
     def of(cls, camera: Camera, quality: Quality, origin: np.ndarray, background) -> View:
@@ -104,6 +133,10 @@ class View:
         rotation = camera.world_to_camera[:3, :3]
         # the difference first, then the rotation: nothing large is ever rotated (numerics B5)
         eye = camera.position - np.asarray(origin, dtype=np.float64)
+        lens, grid = camera.lens, (camera.width * n, camera.height * n)
+        intrinsics = camera.fx * n, camera.fy * n, camera.cx * n, camera.cy * n
+        parallel = isinstance(lens, Orthographic)
+        raster = None if lens is None or parallel else raster_of(lens, *grid, *intrinsics)
         return cls(
             width=camera.width * n,
             height=camera.height * n,
@@ -114,13 +147,17 @@ class View:
             cy=camera.cy * n,
             rotation=rotation,
             translation=-rotation @ eye,
-            eye=eye,
+            # colours that depend on the view see parallel rays come from very far away
+            eye=eye - FAR_EYE * rotation[2] if parallel else eye,
             near=camera.near,
             far=camera.far,
             log_cut=float(np.float32(math.log(quality.alpha_cutoff))),
             ceiling=float(np.float32(quality.opacity_ceiling)),
             stop=float(np.float32(quality.transmittance_stop)),
             background=(float(color[0]), float(color[1]), float(color[2])),
+            raster=raster,
+            along_ray=lens is not None and lens.along_ray,
+            parallel=parallel,
         )
 
 

@@ -40,10 +40,30 @@ class Effect:
     output: Output | None = None
     parts: tuple[str, ...] = ()
     """Names of the parts that it needs."""
+    view_inputs: tuple[str, ...] = ()
+    """Which of `inputs` belong to the view, not to the cloud."""
+    blend_inputs: tuple[str, ...] = ()
+    """Arrays of the view that blending reads for it, in the order of its kernel arguments."""
 
 
 _EFFECTS = (
-    Effect("camera_pinhole", "slot/camera_pinhole.cl"),
+    Effect("camera_pinhole", "slot/camera_pinhole.cl", parts=("perspective",)),
+    Effect("camera_brown_conrady", "slot/camera_brown_conrady.cl", parts=("perspective", "ray_map", "rays")),
+    Effect("camera_fisheye", "slot/camera_fisheye.cl", parts=("ray_map", "rays")),
+    Effect("camera_equirectangular", "slot/camera_equirectangular.cl", parts=("rays",)),
+    Effect("camera_orthographic", "slot/camera_orthographic.cl", record_lanes=4),
+    Effect("perspective", "slot/perspective.cl"),
+    Effect("ray_map", "slot/ray_map.cl", inputs=("ray_map",), view_inputs=("ray_map",)),
+    Effect(
+        "rays",
+        "slot/rays.cl",
+        record_lanes=6,
+        inputs=("rays",),
+        view_inputs=("rays",),
+        blend_inputs=("rays",),
+    ),
+    Effect("motion_groups", "slot/motion_groups.cl", inputs=("labels", "moving"), view_inputs=("moving",)),
+    Effect("shutter_exposure", "slot/shutter_exposure.cl"),
     Effect("color_rgb", "slot/color_rgb.cl", inputs=("colors",)),
     Effect("color_sh", "slot/color_sh.cl", inputs=("sh",)),
     Effect("lowpass_none", "slot/lowpass_none.cl"),
@@ -56,6 +76,7 @@ _EFFECTS = (
         "slot/compose_planes.cl",
         record_lanes=1,
         inputs=("planes", "plane_keys"),
+        view_inputs=("plane_keys",),
         parts=("ray_depth",),
     ),
     Effect("ray_depth", "slot/ray_depth.cl", record_lanes=3),

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
+from fidsplat.cameras import Camera
 from fidsplat.effects.catalogue import CATALOGUE, Effect, Output
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
@@ -32,7 +33,8 @@ class FeatureSet:
     """
 
     slots: tuple[str, ...]
-    """One effect per kind, in the fixed order camera, color, lowpass, stop, compose."""
+    """One effect per kind, in the fixed order camera, color, lowpass, stop, compose; then motion and shutter,
+    if any."""
     taps: tuple[str, ...]
     """Sorted names of the planes beside rgb."""
     sh_degree: int
@@ -66,8 +68,17 @@ class Traits(Protocol):
         ...
 
 
-def select(cloud: Traits, outputs: Iterable[str], quality: Quality) -> FeatureSet:
-    """The features that a cloud, outputs and quality call for.
+def select(
+    cloud: Traits,
+    outputs: Iterable[str],
+    quality: Quality,
+    camera: Camera | None = None,
+    moving: bool = False,
+    exposed: bool = False,
+) -> FeatureSet:
+    """The features that a cloud, outputs, quality and camera (None: a pinhole) call for.
+
+    moving: groups of splats move by themselves. exposed: the picture is made of several poses.
 
     Raises:
         InputError: an output that nobody declares.
@@ -82,11 +93,13 @@ def select(cloud: Traits, outputs: Iterable[str], quality: Quality) -> FeatureSe
             raise InputError(f"unknown output {name!r}{hint}; known: {', '.join(OUTPUTS)}")
     return FeatureSet(
         slots=(
-            "camera_pinhole",
+            f"camera_{camera.lens.kind if camera is not None and camera.lens else 'pinhole'}",
             "color_rgb" if cloud.sh_degree < 0 else "color_sh",
             f"lowpass_{quality.lowpass}",
             f"stop_{quality.stop_rule}",
             "compose_planes" if cloud.has_planes and quality.coplanar == "blend" else "compose_ordered",
+            *(("motion_groups",) if moving else ()),
+            *(("shutter_exposure",) if exposed else ()),
         ),
         taps=tuple(sorted(wanted - {"rgb"})),
         sh_degree=max(cloud.sh_degree, 0),

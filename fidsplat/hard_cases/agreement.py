@@ -79,7 +79,7 @@ class Difference:
 def truth_of(picture: Picture, pixels: tuple[np.ndarray, np.ndarray] | None = None) -> dict[str, np.ndarray]:
     """The reference's planes with `alpha` and `certificate`: whole, or (k, ...) at pixels (rows, columns)."""
     judge = ReferenceBackend()
-    features = select(picture.cloud, (*picture.outputs, "alpha"), picture.quality)
+    features = select(picture.cloud, (*picture.outputs, "alpha"), picture.quality, picture.camera)
     view = View.of(picture.camera, picture.quality, picture.cloud.origin, picture.background)
     pipeline, resident = judge.pipeline(features), judge.upload(picture.cloud)
     if pixels is not None:

@@ -8,6 +8,8 @@ from fidsplat.files import atomic_write
 from fidsplat.formats import save_ply
 from fidsplat.quality import PRESETS, Quality
 from fidsplat.rotations import matrix_to_quaternion
+from fidsplat.scenes.lens import lens_table
+from fidsplat.scenes.moving import keyframe_tables, shutter_table
 from fidsplat.scenes.read import IMAGE
 from fidsplat.scenes.scene import PlacedMarker, Scene
 
@@ -27,6 +29,13 @@ def write_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
         save_ply(cloud, file.parent / name)
         splats.append({"file": name})
     parts = [] if scene.camera is None else [_table("[camera]", _camera(scene))]
+    lens = None if scene.camera is None else lens_table(scene.camera)
+    parts += [] if lens is None else [_table(f"[camera.{lens[0]}]", lens[1])]
+    if scene.shutter is not None:
+        parts.append(_table("[camera.shutter]", shutter_table(scene.shutter)))
+    if scene.camera_motion is not None:
+        frames = keyframe_tables(scene.camera_motion, "the camera", camera=True)
+        parts += [_table("[[camera.motion]]", frame) for frame in frames]
     parts += [_table("[[splats]]", table) for table in splats]
     parts += [_table("[[markers]]", table) for table in markers]
     parts.append(_table("[render]", render))
@@ -44,7 +53,9 @@ def _camera(scene: Scene) -> dict:
     camera = scene.camera
     assert camera is not None
     keys = ("width", "height", "fx", "fy", "cx", "cy", "near", "far")
-    return {key: getattr(camera, key) for key in keys} | {"world_to_camera": camera.world_to_camera.tolist()}
+    table = {key: getattr(camera, key) for key in keys}
+    # a camera that moves has its poses in the keyframes
+    return table if scene.camera_motion else table | {"world_to_camera": camera.world_to_camera.tolist()}
 
 
 def _marker(placed: PlacedMarker, folder: Path) -> dict:
@@ -52,6 +63,7 @@ def _marker(placed: PlacedMarker, folder: Path) -> dict:
     spec = marker.spec
     if spec.startswith(IMAGE):
         spec = IMAGE + os.path.relpath(spec.removeprefix(IMAGE), folder)
+    motion = {} if placed.motion is None else {"motion": keyframe_tables(placed.motion, marker.spec)}
     return {
         "spec": spec,
         "size": float(marker.size),
@@ -59,6 +71,7 @@ def _marker(placed: PlacedMarker, folder: Path) -> dict:
         "quaternion": matrix_to_quaternion(placed.pose[:3, :3]).tolist(),
         "mixture": marker.mixture,
         "quiet_zone": int(marker.quiet_zone),
+        **motion,
     }
 
 
@@ -88,6 +101,8 @@ def _value(value) -> str:
         return _string(value)
     if isinstance(value, list):
         return f"[{', '.join(map(_value, value))}]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {_value(part)}" for key, part in value.items()) + "}"
     return repr(value)  # int and finite float are written alike in Python and TOML, and so is inf
 
 

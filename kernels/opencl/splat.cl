@@ -25,6 +25,7 @@ typedef struct {
     vfloat d;               // denominator
     vfloat q;               // n_u^2 + n_v^2
     vint inside;            // the ray meets the splat's plane within R and beyond the near plane
+//@@ crossing
 } Crossing;
 
 // Affine forms at a row: `*_x` are the parts that do not change along the tile's rows.
@@ -39,6 +40,7 @@ static inline Crossing cross_row(const Splat *s, vfloat nu_x, vfloat nv_x, vfloa
     return c;
 }
 
+//@@ cross_functions
 // Opacity (the alpha of the paper) of a fragment at half squared distance rho / 2
 static inline vfloat fragment_opacity(const Splat *s, vfloat half_rho, float ceiling) {
     return fmin(exp(s->log_opacity - half_rho), (vfloat)ceiling);

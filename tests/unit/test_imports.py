@@ -98,16 +98,19 @@ def within_any(names, package) -> bool:
     return any(within(name, (package,)) for name in names)
 
 
+# modules of the wing that every backend may import
+SHARED = ("base", "registry", "planes", "exposure")
+
+
 def test_backends_do_not_import_each_other():
     for module, path in MODULES.items():
         parts = module.split(".")
-        if parts[0] != "backends" or len(parts) < 2 or parts[1] in ("__init__", "base", "registry", "planes"):
+        if parts[0] != "backends" or len(parts) < 2 or parts[1] in ("__init__", *SHARED):
             continue
         others = {
             name
             for name in imported(path)
-            if name.startswith("fidsplat.backends.")
-            and name.split(".")[2] not in ("base", "registry", "planes", parts[1])
+            if name.startswith("fidsplat.backends.") and name.split(".")[2] not in (*SHARED, parts[1])
         }
         assert {name for name in others if name.removeprefix("fidsplat.") in MODULES} == set(), module
 

@@ -12,6 +12,7 @@ import pyopencl as cl
 
 from fidsplat.backends.base import View
 from fidsplat.backends.opencl.assemble import DeviceShape, Source
+from fidsplat.backends.opencl.exposed_run import ExposedRun
 from fidsplat.backends.opencl.memory import Resident
 from fidsplat.backends.opencl.plan import Plan, plan_of
 from fidsplat.backends.opencl.run import Run
@@ -86,7 +87,7 @@ class OpenCLPipeline:
             shape = replace(self.shape, lists="ordered")
             return self.backend.pipeline(self.features, shape).render(resident, view)
         try:
-            run = Run(self, resident, view, plan)
+            run = (ExposedRun if view.shots else Run)(self, resident, view, plan)
             return OpenCLPlanes(run, run.draw())
         except cl.Error as error:
             raise DeviceError(f"{self.backend.info.title} failed while drawing: {error}") from error
@@ -95,6 +96,8 @@ class OpenCLPipeline:
         pixels = view.width * view.height
         planes = 4 + sum(planes for effect in self.features.effects for planes in effect.planes)
         channels = sum(output.channels for output in self.features.outputs)
+        if view.shots:
+            planes *= 2  # the picture's own beside those of a shot
         fixed = 4 * pixels * planes + 4 * pixels // view.samples**2 * channels + resident.device_bytes
         backend, record = self.backend, self.source.record_bytes
         budget, largest = backend.memory_budget, backend.device.max_mem_alloc_size

@@ -49,8 +49,15 @@ class Run:
         for first, end in self.lists.bands():
             self._blend(first, end, raw_planes)
             if end == self.tiles:
-                outputs = self._resolve(raw_planes)
+                outputs = self.resolve(raw_planes)
         return outputs
+
+    def samples(self) -> list[cl.Buffer]:
+        """All stages but the last: the sample planes, raw first."""
+        planes = self._sample_planes()
+        for first, end in self.lists.bands():
+            self._blend(first, end, planes)
+        return planes
 
     # stages
 
@@ -82,10 +89,12 @@ class Run:
             np.float32(view.ceiling),
             np.float32(view.stop),
             np.float32(1.0 / view.samples**2),
-            *sample_planes,
+            sample_planes[0],
+            *(self.held[name] for effect in self.pipeline.features.effects for name in effect.blend_inputs),
+            *sample_planes[1:],
         )
 
-    def _resolve(self, raw_planes: list[cl.Buffer]) -> dict[str, tuple[Output, cl.Buffer]]:
+    def resolve(self, raw_planes: list[cl.Buffer]) -> dict[str, tuple[Output, cl.Buffer]]:
         view, features = self.view, self.pipeline.features
         height, width = view.height // view.samples, view.width // view.samples
         outputs = {
@@ -154,9 +163,21 @@ class Run:
     def put_view(self, row: int, end: int) -> None:
         """The uniforms of the projection, for rows of samples [row, end)."""
         view = self.view
-        tail = [view.fx, view.fy, view.cx, view.cy, view.near, view.far, view.log_cut]
-        tail += [view.width, view.height, 1.0 / view.samples**2, row, end]
-        parts = [view.rotation.ravel(), view.translation, view.eye, tail]
-        self.put("view", np.concatenate(parts).astype(self.pipeline.real))
+        if view.raster is not None:
+            self.held |= self.backend.ray_buffers.of(view.raster, self.rows, self.stride)
+        views = np.array([_uniforms(each, row, end) for each in (view, *(of for _, of in view.groups))])
+        self.put("view", views.astype(self.pipeline.real))
+        if view.groups:
+            head = [len(view.groups), views.shape[1]]
+            self.put("moving", np.array([*head, *(label for label, _ in view.groups)], np.int32))
         if self.resident.planes is not None:
             self.put("plane_keys", self.resident.planes.keys(view))
+
+
+def _uniforms(view: View, row: int, end: int) -> np.ndarray:
+    """The buffer `view` (prelude.cl) for rows of samples [row, end)."""
+    tail = [view.fx, view.fy, view.cx, view.cy, view.near, view.far, view.log_cut]
+    tail += [view.width, view.height, 1.0 / view.samples**2, row, end]
+    if view.raster is not None:
+        tail += view.raster.uniforms
+    return np.concatenate([view.rotation.ravel(), view.translation, view.eye, tail])

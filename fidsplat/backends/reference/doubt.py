@@ -15,9 +15,10 @@ import numpy as np
 
 from fidsplat.backends.base import View
 from fidsplat.backends.reference.fragments import Fragments, shifted
+from fidsplat.backends.reference.optics import ROUND
 from fidsplat.backends.reference.setup import Setup
 
-_ROUND = 4 * 2.0**-24  # of a form, relative to its terms: its coefficients' rounding, and its sums'
+_ROUND = ROUND
 _WEIGHT = 2 * _ROUND  # relative, of half rho and of an opacity: a division, two products, exp
 _STOP = 5e-5  # relative, of a transmittance at a threshold
 
@@ -45,22 +46,25 @@ class Span:
 
 def span_of(s: Setup, view: View, f: Fragments) -> Span:
     """The span of fragments whose forms are computed in float32."""
+    terms = [s.forms[:, :, c] for c in range(3)]
     e_u, e_v, e_d = (
-        _ROUND * (np.abs(form) + f.dx * np.abs(s.forms[1, :, c]) + f.dy * np.abs(s.forms[2, :, c]))
-        for c, form in enumerate((f.n_u, f.n_v, f.d))
+        _rounding(s, f, form, term) for form, term in zip((f.n_u, f.n_v, f.d), terms, strict=True)
     )
+    # one rounding where it is the splat's; a form of its own for parallel rays
+    e_dz = _ROUND * f.dz if s.depth_forms is None else _rounding(s, f, f.dz, s.depth_forms)
     d_low, d_high = f.d - e_d, f.d + e_d
     q_low = np.maximum(np.abs(f.n_u) - e_u, 0) ** 2 + np.maximum(np.abs(f.n_v) - e_v, 0) ** 2
     q_high = (np.abs(f.n_u) + e_u) ** 2 + (np.abs(f.n_v) + e_v) ** 2
     slack = _ROUND * (np.abs(s.log_opacity) + s.half_r2)  # the squared radius is a difference of float32
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        may = (d_high > 0) & (d_low * view.near <= s.z_numerator * (1 + _ROUND))
-        must = (d_low > 0) & (d_high * view.near <= s.z_numerator * (1 - _ROUND))
+        may = (d_high > 0) & (d_low * view.near <= f.dz + e_dz)
+        must = (d_low > 0) & (d_high * view.near <= f.dz - e_dz)
         nearest, furthest = q_low / (2 * d_high**2), q_high / (2 * d_low**2)
         nearest = np.where(may & (nearest <= s.half_r2 + slack), nearest, np.inf)
         furthest = np.where(must & (furthest <= s.half_r2 - slack), furthest, np.inf)
-        z_low = np.where(d_high > 0, s.z_numerator / d_high, np.inf)
-        z_high = np.where(d_low > 0, s.z_numerator / d_low, np.inf)
+        near_dz, far_dz = (f.dz, f.dz) if s.depth_forms is None else (f.dz - e_dz, f.dz + e_dz)
+        z_low = np.where(d_high > 0, near_dz / np.where(near_dz < 0, d_low, d_high), np.inf)
+        z_high = np.where(d_low > 0, far_dz / np.where(far_dz < 0, d_high, d_low), np.inf)
     if s.screen:
         away, off = np.sqrt(f.offset), _ROUND * (1 + f.dx + f.dy)
         dot_low, dot_high = np.maximum(away - off, 0) ** 2, (away + off) ** 2
@@ -75,6 +79,14 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
     missed = d_high <= 0
     z_low, z_high = np.where(missed, s.pz, z_low), np.where(missed, s.pz, z_high)
     return Span.of(low, high, z_low, z_high)
+
+
+def _rounding(s: Setup, f: Fragments, form: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """What rounding may change (k, n) in forms (k, n) with factors (3, n)."""
+    total = np.abs(form)
+    for away, term in zip(f.away, terms, strict=True):
+        total = total + away * np.abs(term)
+    return s.round * total
 
 
 def of_color(s: Setup, view: View, span: Span, before: np.ndarray, moved: np.ndarray) -> np.ndarray:

@@ -21,6 +21,7 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
     t, doubt = samples["t"].mean(1), samples["certificate"]
     out = {"rgb": samples["rgb"].mean(1) + t[:, None] * np.asarray(view.background)}
     out["certificate"] = doubt.mean(1)
+    doubt = samples.get("certificate_planes", doubt)  # the other planes show one shot
     if "alpha" in features.taps:
         out["alpha"] = 1 - t
     if "depth" in features.taps:
