@@ -2,9 +2,9 @@
 
     python benchmarks/effects.py [NAME ...] --scene r1m_1080p --repeats 5 [--device opencl] [--json]
 
-Medians of the wall time of one frame (the queue is drained before and after); base and base + effect are drawn
-in turns, so that what else the machine does falls on both. The base is drawn twice, under two names: how far
-their ratio is from 1 is the noise.
+Medians of the wall time of one frame (the queue is drained before and after); base and base + effect are
+drawn in turns, so that what else the machine does falls on both. The base is drawn twice, under two names:
+how far their ratio is from 1 is the noise.
 """
 
 from __future__ import annotations
