@@ -177,7 +177,7 @@ class Fisheye:
         """Image coordinates (n, 2) of points (n, 3); NaN where they are not seen."""
         across = np.hypot(points[:, 0], points[:, 1])
         angle = np.arctan2(across, points[:, 2])
-        seen = np.asarray(angle <= self.limit) & ((across > 0) | (points[:, 2] > 0))
+        seen = np.asarray(angle <= self.limit) & np.asarray((across > 0) | (points[:, 2] > 0))
         a, b = _scaled(points[:, 0], points[:, 1], across, self.distance(angle))
         return np.where(seen[:, None], np.stack([a, b], 1), np.nan)
 
@@ -219,7 +219,7 @@ class Equirectangular:
         """Image coordinates (n, 2), radians, of points (n, 3); NaN for the camera's centre."""
         x, y, z = points.T
         image = np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))], 1)
-        return np.where(points.any(1)[:, None], image, np.nan)
+        return np.where(np.any(points != 0, axis=1)[:, None], image, np.nan)
 
     def rays(self, image: np.ndarray) -> np.ndarray:
         """Unit directions (n, 3) of image coordinates (n, 2); NaN beyond the sphere."""

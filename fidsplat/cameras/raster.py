@@ -7,7 +7,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from fidsplat.cameras.lenses import Fisheye, Lens
+from fidsplat.cameras.lenses import Fisheye, RayLens
 
 CELLS = 512
 """most cells of the finest map along an axis"""
@@ -19,7 +19,7 @@ _EMPTY = np.array([32767, -1, 32767, -1], np.int16)
 class RayRaster:
     """The sample grid of one lens, whatever the pose; sizes, fx, fy, cx, cy in samples."""
 
-    lens: Lens
+    lens: RayLens
     width: int
     height: int
     fx: float
@@ -110,6 +110,8 @@ class RayRaster:
 
 
 @lru_cache(maxsize=4)
-def raster_of(lens: Lens, width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> RayRaster:
+def raster_of(
+    lens: RayLens, width: int, height: int, fx: float, fy: float, cx: float, cy: float
+) -> RayRaster:
     """The raster of these numbers; the last few are kept, for pictures from many poses."""
     return RayRaster(lens, width, height, fx, fy, cx, cy)

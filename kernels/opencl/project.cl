@@ -11,6 +11,7 @@
 // Regular polygon around the R-sigma circle, clipped against the near plane and projected: the bounds of a disk that
 // crosses it (numerics A1 iii). Returns false if nothing is left.
 #define POLYGON 16
+//@@ polygon
 static inline bool clipped_box(real3_ tu, real3_ tv, real3_ tw, real radius, real near, real *box) {
     real around = radius / cos(REAL(3.14159265358979323846) / POLYGON);
     box[0] = box[2] = INFINITY;

@@ -4,18 +4,18 @@
 // Box [samples] of the polygon around the disk.
 static inline Bounds cone_bounds(global const real *view, real3_ a, real3_ b, real3_ p, real radius, real longitude,
                                  real latitude) {
-    real pi = REAL(3.14159265358979323846), around = radius / cos(pi / POLYGON), widest = 0;
+    real pi = REAL(3.14159265358979323846), around = radius / POLYGON_INNER, widest = 0, cu = around, cv = 0;
     bool known = true;
     for (int k = 0; k < POLYGON; k++) {
-        real angle = 2 * pi * k / POLYGON, cu = around * cos(angle), cv = around * sin(angle);
         real3_ corner = {p.x + cu * a.x + cv * b.x, p.y + cu * a.y + cv * b.y, p.z + cu * a.z + cv * b.z};
         real3_ aside = cross3(p, corner);
         real along = dot3(p, corner);
         known = known && along > 0;
-        widest = fmax(widest, sqrt(dot3(aside, aside)) / along);
+        widest = fmax(widest, dot3(aside, aside) / (along * along));
+        next_corner(&cu, &cv);
     }
     // room for the rounding of rays and of the per-sample test
-    real cone = known ? atan(widest) * REAL(1.0002) + REAL(1e-6) : pi;
+    real cone = known ? atan(sqrt(widest)) * REAL(1.0002) + REAL(1e-6) : pi;
     real low = latitude - cone, high = latitude + cone, across = pi;
     if (low > -pi / 2 && high < pi / 2) {
         across = asin(fmin(sin(cone) / cos(latitude), REAL(1.0))) * REAL(1.0002) + REAL(1e-6);

@@ -18,7 +18,7 @@ static inline bool lens_image(global const real *view, real3_ p, real *image_x, 
 // The disk's part of the chart: the corners of a polygon around it, and the sagitta of the arcs between them. Everything
 // where an arc may be a long one or the disk may hold the pole of the chart, the direction -z.
 static inline void chart_box(real3_ a, real3_ b, real3_ p, real radius, real away, real *box) {
-    real around = radius / cos(REAL(3.14159265358979323846) / POLYGON);
+    real around = radius / POLYGON_INNER;
     box[0] = box[2] = INFINITY;
     box[1] = box[3] = -INFINITY;
     real3_ u = {a.x * around, a.y * around, a.z * around}, v = {b.x * around, b.y * around, b.z * around};
@@ -26,13 +26,14 @@ static inline void chart_box(real3_ a, real3_ b, real3_ p, real radius, real awa
     real sphere = sqrt(fmax(dot3(u, u), dot3(v, v))) * REAL(1.000001);
     real x0 = 0, y0 = 0, longest = 0;
     bool known = sphere < away && (p.z > 0 || p.x * p.x + p.y * p.y > sphere * sphere);
+    real cu = 1, cv = 0;
     for (int k = 0; k <= POLYGON && known; k++) {
-        real angle = REAL(6.28318530717958647692) * k / POLYGON, cu = cos(angle), cv = sin(angle);
         real3_ corner = {p.x + cu * u.x + cv * v.x, p.y + cu * u.y + cv * v.y, p.z + cu * u.z + cv * v.z};
         real below = sqrt(dot3(corner, corner)) + corner.z;
         real x1 = corner.x / below, y1 = corner.y / below;
         if (k > 0) longest = fmax(longest, (x1 - x0) * (x1 - x0) + (y1 - y0) * (y1 - y0));
         x0 = x1, y0 = y1;
+        next_corner(&cu, &cv);
         box[0] = fmin(box[0], x1);
         box[1] = fmax(box[1], x1);
         box[2] = fmin(box[2], y1);

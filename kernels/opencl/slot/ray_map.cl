@@ -15,7 +15,7 @@ static inline Bounds mapped_bounds(global const real *numbers, global const shor
         int i0 = min((int)fmax(from_x, REAL(0.0)), last), i1 = min((int)fmin(to_x, cells), last);
         int j0 = min((int)fmax(from_y, REAL(0.0)), last), j1 = min((int)fmin(to_y, cells), last);
         int side = last + 1;
-        while (i1 - i0 > 3 || j1 - j0 > 3) {
+        while (i1 - i0 > 5 || j1 - j0 > 5) {
             map += side * side;
             side /= 2;
             i0 /= 2; i1 /= 2; j0 /= 2; j1 /= 2;
