@@ -50,7 +50,14 @@ _EFFECTS = (
     Effect("camera_pinhole", "slot/camera_pinhole.cl", parts=("perspective",)),
     Effect("camera_brown_conrady", "slot/camera_brown_conrady.cl", parts=("perspective", "ray_map", "rays")),
     Effect("camera_fisheye", "slot/camera_fisheye.cl", parts=("polygon", "ray_map", "rays")),
-    Effect("camera_equirectangular", "slot/camera_equirectangular.cl", parts=("polygon", "rays",)),
+    Effect(
+        "camera_equirectangular",
+        "slot/camera_equirectangular.cl",
+        parts=(
+            "polygon",
+            "rays",
+        ),
+    ),
     Effect("camera_orthographic", "slot/camera_orthographic.cl", record_lanes=4),
     Effect("perspective", "slot/perspective.cl"),
     Effect("polygon", "slot/polygon.cl"),
