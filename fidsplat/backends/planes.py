@@ -46,6 +46,8 @@ class PlaneTable:
         np.maximum.at(high, which, centers)
         np.maximum.at(self._sigma, which, spread)
         self._center, self._half = (low + high) / 2, (high - low) / 2
+        # a box reaches its corners whatever the cut-off
+        self._least_radius = 0.0 if cloud.boxes is None else math.sqrt(2.0)
 
     def keys(self, view: View) -> np.ndarray:
         """(p,) float32, all different: a plane's nearest depth less its splats' diameter [m].
@@ -53,7 +55,7 @@ class PlaneTable:
         Whatever lies before the plane at some pixel, with its centre at most a diameter nearer than the
         plane, arrives after it and can be placed before it; so can what lies behind.
         """
-        radius = math.sqrt(-2 * view.log_cut)
+        radius = max(math.sqrt(-2 * view.log_cut), self._least_radius)
         half = self._half + radius * self._sigma
         along = self._axes @ view.rotation[2]  # (p, 3): depth per metre along each axis
         depth = np.einsum("pk,pk->p", along, self._center) + view.translation[2]

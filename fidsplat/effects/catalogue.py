@@ -1,8 +1,8 @@
 """Every effect: its kernel file and what it adds to the records, buffers and outputs.
 
-A slot is filled by exactly one effect of its kind (camera, color, lowpass, stop, compose); taps are extra
-planes, any number of them; parts are what several of them share. The sections of an effect's kernel file say
-where its text goes (kernels/README.md).
+A slot is filled by exactly one effect of its kind (camera, color, lowpass, stop, compose, footprint); taps
+are extra planes, any number of them; parts are what several of them share. The sections of an effect's kernel
+file say where its text goes (kernels/README.md).
 """
 
 from __future__ import annotations
@@ -56,6 +56,12 @@ _EFFECTS = (
         inputs=("planes", "plane_keys"),
         parts=("ray_depth",),
     ),
+    Effect("footprint_gaussian", "slot/footprint_gaussian.cl"),
+    Effect("footprint_box", "slot/footprint_box.cl", parts=("box_edges",)),
+    Effect(
+        "footprint_mixed", "slot/footprint_mixed.cl", record_lanes=1, inputs=("boxes",), parts=("box_edges",)
+    ),
+    Effect("box_edges", "slot/box_edges.cl", record_lanes=4),
     Effect("ray_depth", "slot/ray_depth.cl", record_lanes=3),
     Effect("alpha", "tap/alpha.cl", output=Output("alpha", 1, "float32")),
     Effect("depth", "tap/depth.cl", planes=(2,), output=Output("depth", 1, "float32"), parts=("ray_depth",)),

@@ -28,7 +28,7 @@ class FeatureSet:
     """
 
     slots: tuple[str, ...]
-    """One effect per kind, in the fixed order camera, color, lowpass, stop, compose."""
+    """One effect per kind, in the fixed order camera, color, lowpass, stop, compose, footprint."""
     taps: tuple[str, ...]
     """Sorted names of the planes beside rgb."""
     sh_degree: int
@@ -60,6 +60,11 @@ class Traits(Protocol):
         """Whether splats are printed on planes."""
         ...
 
+    @property
+    def footprint(self) -> str:
+        """`gaussian`, `box`, or `mixed` where there are splats of both kinds."""
+        ...
+
 
 def select(cloud: Traits, outputs: Iterable[str], quality: Quality) -> FeatureSet:
     """The features that a cloud, outputs and quality call for.
@@ -79,9 +84,11 @@ def select(cloud: Traits, outputs: Iterable[str], quality: Quality) -> FeatureSe
         slots=(
             "camera_pinhole",
             "color_rgb" if cloud.sh_degree < 0 else "color_sh",
-            f"lowpass_{quality.lowpass}",
+            # boxes are filtered by their own footprint
+            "lowpass_none" if cloud.footprint == "box" else f"lowpass_{quality.lowpass}",
             f"stop_{quality.stop_rule}",
             "compose_planes" if cloud.has_planes and quality.coplanar == "blend" else "compose_ordered",
+            f"footprint_{cloud.footprint}",
         ),
         taps=tuple(sorted(wanted - {"rgb"})),
         sh_degree=max(cloud.sh_degree, 0),

@@ -44,6 +44,7 @@ static inline real3_ rotate_to_camera(global const real *view, real3_ v) {
 
 //@@ camera
 //@@ functions
+//@@ footprint_here
 
 kernel void project(
     uint count,
@@ -92,6 +93,7 @@ kernel void project(
     // depth range of the disk (numerics A3)
     real radius = sqrt(REAL(2.0) * half_r2);
     real reach = radius * sqrt(a.z * a.z + b.z * b.z);
+//@@ footprint_reach
     if (!(pz + reach >= near) || !(pz - reach <= view[VIEW_FAR])) return;
 
     real3_ row_x = {a.x, b.x, p.x}, row_y = {a.y, b.y, p.y}, tw = {a.z, b.z, p.z};
@@ -112,6 +114,7 @@ kernel void project(
         center_x = pz >= near ? tu.z / pz : bounds.ex;
         center_y = pz >= near ? tv.z / pz : bounds.ey;
     }
+//@@ footprint_bounds
 //@@ bounds_make
     int width = (int)view[VIEW_WIDTH], height = (int)view[VIEW_HEIGHT];
     int y0, y1;

@@ -81,6 +81,7 @@ class Resident:
         self.origin = cloud.origin
         self.sh_degree = cloud.sh_degree if cloud.sh_degree > 0 else -1
         self.has_planes = cloud.planes is not None
+        self.footprint = cloud.footprint
         self.planes = PlaneTable(cloud) if self.has_planes else None
         self._arrays = {
             "means": cloud.means,
@@ -91,6 +92,8 @@ class Resident:
         }
         if self.planes is not None:
             self._arrays["planes"] = self.planes.index
+        if cloud.boxes is not None:
+            self._arrays["boxes"] = cloud.boxes.astype(np.int32)
         if cloud.colors is not None:
             self._arrays["colors"] = cloud.colors
         elif cloud.sh is not None:  # always: a cloud has one of the two

@@ -83,6 +83,7 @@ class ReferenceCloud:
         self.origin = cloud.origin
         self.sh_degree = cloud.sh_degree
         self.has_planes = cloud.planes is not None
+        self.footprint = cloud.footprint
 
 
 @dataclass

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fidsplat.backends.base import View
-from fidsplat.backends.reference.fragments import Fragments, shifted
+from fidsplat.backends.reference.fragments import Fragments, cover, shifted
 from fidsplat.backends.reference.setup import Setup
 
 _ROUND = 4 * 2.0**-24  # of a form, relative to its terms: its coefficients' rounding, and its sums'
@@ -69,6 +69,16 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
     low = np.exp(s.log_opacity - furthest * (1 + _WEIGHT)) * (1 - _WEIGHT)
     high = np.exp(s.log_opacity - nearest * (1 - _WEIGHT)) * (1 + _WEIGHT)
     low, high = np.minimum(low, view.ceiling), np.minimum(high, view.ceiling)
+    if s.box.any():
+        # of an edge's distance: its two forms', one of them multiplied once more, and the sum's
+        off = np.stack(
+            [(e_d + 1.5 * e) * edge[None] for e, edge in zip((e_u, e_u, e_v, e_v), s.edges, strict=True)]
+        )
+        whole = np.minimum(np.exp(s.log_opacity), view.ceiling)
+        least = whole * cover(s.edges, f.n_u, f.n_v, f.d, -off - _ROUND) * (1 - _WEIGHT)
+        most = whole * cover(s.edges, f.n_u, f.n_v, f.d, off + _ROUND) * (1 + _WEIGHT)
+        low = np.where(s.box, np.where(must, least, 0.0), low)
+        high = np.where(s.box, np.where(may, most, 0.0), high)
     # no ray to the plane: the centre's depth
     z_low = np.where(d_low > 0, np.clip(z_low, s.pz - s.reach, s.pz + s.reach), s.pz - s.reach)
     z_high = np.clip(z_high, s.pz - s.reach, s.pz + s.reach)
@@ -99,6 +109,13 @@ def of_layer_color(thin: np.ndarray, thick: np.ndarray) -> np.ndarray:
     slope = np.exp(-least) + np.minimum(1.0, others / np.maximum(least, 1e-9)) / np.maximum(least, 1.0)
     moved = np.minimum(1.0, slope * (thick - thin)).sum(1, keepdims=True)
     return np.where((thick > 0).sum(1, keepdims=True) > 1, moved, 0.0)
+
+
+def of_box_color(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """The same (k, 1) of a layer of n boxes whose opacities lie between `low` and `high` (k, n): its colour
+    times its opacity is their sum, and where they cover more than all, their mean.
+    """
+    return np.where((high > 0).sum(1, keepdims=True) > 1, (high - low).sum(1, keepdims=True), 0.0)
 
 
 def of_layer_depth(

@@ -97,18 +97,21 @@ def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Laid:
     """The layer (k, 1) of the splats (indices) of a plane."""
     alpha, z = f.alpha[:, splats], f.z[:, splats]
     low, high = span.low[:, splats], span.high[:, splats]
-    tau = optical_depth(alpha)
+    boxes = bool(s.box[splats[0]])  # a plane has one footprint
+    tau = alpha if boxes else optical_depth(alpha)
     total = tau.sum(1, keepdims=True)
     share = tau / np.where(total > 0, total, 1)
     # 1 - opacity is rounded too
     thin, thick = optical_depth(low - 2.0**-23), np.where(high > 0, optical_depth(high + 2.0**-23), 0.0)
+    if boxes:
+        thin, thick = low, high
     heaviest = np.argmax(tau, axis=1)[:, None]
     labels = s.labels[splats]
     label = labels[heaviest]
     other = (labels != label) & (high > 0) & (thick >= np.take_along_axis(thin, heaviest, 1))
     z_low, z_high = doubt.of_layer_depth(span.z_low[:, splats], span.z_high[:, splats], share, thin, thick)
     depth = np.where(total > 0, (share * z).sum(1, keepdims=True), (z_low + z_high) / 2)
-    covered = (1 - (1 - each).prod(1, keepdims=True) for each in (alpha, low, high))
+    covered = (_covered(each, boxes) for each in (alpha, low, high))
     opacity, least, most = covered
     return Laid(
         opacity,
@@ -117,10 +120,17 @@ def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Laid:
         (share @ s.colors[splats])[:, None],
         (share @ s.normal[splats])[:, None],
         label,
-        doubt.of_layer_color(thin, thick),
+        doubt.of_box_color(low, high) if boxes else doubt.of_layer_color(thin, thick),
         other.any(1, keepdims=True),
         np.zeros(len(alpha)),
     )
+
+
+def _covered(opacity: np.ndarray, boxes: bool) -> np.ndarray:
+    """Opacity (k, 1) of a layer: boxes lie side by side, Gaussians over one another."""
+    if boxes:
+        return np.minimum(opacity.sum(1, keepdims=True), 1.0)
+    return 1 - (1 - opacity).prod(1, keepdims=True)
 
 
 def _side_by_side(parts: list[Laid]) -> Laid:

@@ -35,6 +35,8 @@ class Setup:
             log_opacity = np.log(cloud.opacities.astype(np.float64))
         half_r2 = log_opacity - view.log_cut
         reach = np.sqrt(np.maximum(2 * half_r2, 0)) * np.hypot(a[:, 2], b[:, 2])
+        box = np.zeros(len(cloud), bool) if cloud.boxes is None else cloud.boxes
+        reach = np.where(box, np.abs(a[:, 2]) + np.abs(b[:, 2]), reach)
         drawn = (half_r2 > 0) & (p[:, 2] + reach >= view.near) & (p[:, 2] - reach <= view.far)
         order = np.flatnonzero(drawn)
         order = order[np.argsort(self.key[order], kind="stable")]
@@ -58,18 +60,29 @@ class Setup:
         """(3, n, 3): constant, per x, per y; of n_u, n_v, D"""
         self.forms[:, :, 2] *= sign
 
-        self.dot = self.pz >= view.near  # the low-pass dot belongs to the centre
+        self.box = box[order]
+        self.edges = _edges(self.forms)
+
+        ahead = self.pz >= view.near
+        self.dot = ahead & ~self.box  # the low-pass dot belongs to the centre of a Gaussian
         with np.errstate(divide="ignore", invalid="ignore"):
             self.center_x = np.where(self.dot, tu[:, 2] / self.pz, np.inf)
             self.center_y = np.where(self.dot, tv[:, 2] / self.pz, np.inf)
+            middle_x, middle_y = tu[:, 2] / self.pz, tv[:, 2] / self.pz
         # devices keep the forms about the pixel nearest to the centre; unknown here where that is behind
-        self.anchor_x = _anchor(self.center_x, self.dot, view.width)
-        self.anchor_y = _anchor(self.center_y, self.dot, view.height)
+        self.anchor_x = _anchor(middle_x, ahead, view.width)
+        self.anchor_y = _anchor(middle_y, ahead, view.height)
         self.colors = _colors(cloud, order, mean - view.eye)
         self.normal = normal * np.where(height > 0, -1.0, 1.0)[:, None]
         self.screen = "lowpass_screen" in features.slots
         self.exclusive = "stop_exclusive" in features.slots
         self.planes = None if planes is None else planes[order]
+
+
+def _edges(forms: np.ndarray) -> np.ndarray:
+    """1 / |gradient| (4, n) of the forms D + n_u, D - n_u, D + n_v, D - n_v: a box's edges, in samples."""
+    sides = [forms[1:, :, 2] + sign * forms[1:, :, axis] for axis in (0, 1) for sign in (1, -1)]
+    return 1 / np.maximum(np.stack([np.hypot(*side) for side in sides]), 1e-300)
 
 
 def _anchor(center: np.ndarray, known: np.ndarray, size: int) -> np.ndarray:
