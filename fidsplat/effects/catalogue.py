@@ -45,6 +45,7 @@ _EFFECTS = (
     Effect("color_rgb", "slot/color_rgb.cl", inputs=("colors",)),
     Effect("color_sh", "slot/color_sh.cl", inputs=("sh",)),
     Effect("lowpass_none", "slot/lowpass_none.cl"),
+    Effect("lowpass_pixel", "slot/lowpass_pixel.cl", parts=("lowpass_none",)),
     Effect("lowpass_screen", "slot/lowpass_screen.cl", record_lanes=2, bounds_lanes=3),
     Effect("stop_inclusive", "slot/stop_inclusive.cl"),
     Effect("stop_exclusive", "slot/stop_exclusive.cl"),

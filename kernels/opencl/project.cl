@@ -89,6 +89,7 @@ kernel void project(
     real su = fmax(scale_u, SMALLEST_SCALE), sv = fmax(scale_v, SMALLEST_SCALE);
     a.x *= su; a.y *= su; a.z *= su;
     b.x *= sv; b.y *= sv; b.z *= sv;
+//@@ lowpass_make
 
     // depth range of the disk (numerics A3)
     real radius = sqrt(REAL(2.0) * half_r2);

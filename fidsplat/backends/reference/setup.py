@@ -26,16 +26,23 @@ class Setup:
         a, b = unit_a * scale[:, :1], unit_b * scale[:, 1:]
         p = mean @ rotation.T + view.translation
         self.key = p[:, 2].astype(np.float32)
+        with np.errstate(divide="ignore"):
+            log_opacity = np.log(cloud.opacities.astype(np.float64))
+        box = np.zeros(len(cloud), bool) if cloud.boxes is None else cloud.boxes
+        area = scale.prod(axis=1)
+        if "lowpass_pixel" in features.slots:
+            filtered = ~box & (p[:, 2] >= view.near)
+            a, b, grown = _filtered(a, b, p, view, filtered)
+            area = area * grown
+            with np.errstate(divide="ignore"):
+                log_opacity = log_opacity - np.log(grown)
         planes = None
         if "compose_planes" in features.slots:
             table = PlaneTable(cloud)
             planes = table.index
             self.key = np.where(planes < 0, self.key, np.append(table.keys(view), 0)[planes])
-        with np.errstate(divide="ignore"):
-            log_opacity = np.log(cloud.opacities.astype(np.float64))
         half_r2 = log_opacity - view.log_cut
         reach = np.sqrt(np.maximum(2 * half_r2, 0)) * np.hypot(a[:, 2], b[:, 2])
-        box = np.zeros(len(cloud), bool) if cloud.boxes is None else cloud.boxes
         reach = np.where(box, np.abs(a[:, 2]) + np.abs(b[:, 2]), reach)
         drawn = (half_r2 > 0) & (p[:, 2] + reach >= view.near) & (p[:, 2] - reach <= view.far)
         order = np.flatnonzero(drawn)
@@ -43,7 +50,7 @@ class Setup:
         self.order = order
 
         normal = np.cross(unit_a, unit_b)[order]
-        a, b, p, mean, scale = a[order], b[order], p[order], mean[order], scale[order]
+        a, b, p, mean, area = a[order], b[order], p[order], mean[order], area[order]
         self.log_opacity, self.half_r2, self.reach = log_opacity[order], half_r2[order], reach[order]
         self.labels = cloud.labels[order]
         self.pz = p[:, 2]
@@ -55,7 +62,7 @@ class Setup:
         height = np.einsum("ij,ij->i", normal, p)
         edge_on = np.abs(height) <= 1e-13 * np.linalg.norm(p, axis=1)
         sign = np.where(edge_on, 0.0, np.sign(height))
-        self.z_numerator = view.fx * view.fy * scale.prod(axis=1) * np.abs(height * sign)
+        self.z_numerator = view.fx * view.fy * area * np.abs(height * sign)
         self.forms = np.stack([np.cross(tu, tv), np.cross(tv, tw), np.cross(tw, tu)])
         """(3, n, 3): constant, per x, per y; of n_u, n_v, D"""
         self.forms[:, :, 2] *= sign
@@ -77,6 +84,34 @@ class Setup:
         self.screen = "lowpass_screen" in features.slots
         self.exclusive = "stop_exclusive" in features.slots
         self.planes = None if planes is None else planes[order]
+
+
+def _filtered(
+    a: np.ndarray, b: np.ndarray, p: np.ndarray, view: View, chosen: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Scaled tangents (n, 3) after the low-pass `pixel`, and the factor (n,) by which areas grow.
+
+    chosen (n,) bool: the others stay as they are. The covariance of the filter in (u, v) is
+    (G^T G)^-1 / 4 with G the derivative of the sample's position by (u, v) at the centre.
+    """
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        z = p[:, 2]
+        columns = [
+            np.stack([view.fx * (t[:, 0] - p[:, 0] / z * t[:, 2]), view.fy * (t[:, 1] - p[:, 1] / z * t[:, 2])])
+            / z
+            for t in (a, b)
+        ]
+        turned = columns[0][0] * columns[1][1] - columns[1][0] * columns[0][1]
+        m11, m12, m22 = ((columns[i] * columns[j]).sum(0) for i, j in ((0, 0), (0, 1), (1, 1)))
+        variance = 0.25
+        c11, c12 = 1 + variance * m22 / turned**2, -variance * m12 / turned**2
+        grown = np.sqrt(1 + variance * (m11 + m22 + variance) / turned**2)
+        l11 = np.sqrt(c11)
+        grown, wide_a = np.where(chosen, grown, 1.0), l11[:, None] * a + (c12 / l11)[:, None] * b
+        wide_b = (grown / l11)[:, None] * b
+    # edge-on splats grow without limit and are not drawn
+    chosen = (chosen & np.isfinite(grown))[:, None]
+    return np.where(chosen, wide_a, a), np.where(chosen, wide_b, b), grown
 
 
 def _edges(forms: np.ndarray) -> np.ndarray:
