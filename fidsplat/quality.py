@@ -56,6 +56,10 @@ class Quality:
     samples: int = 1
     """n: each pixel is the mean of n x n samples on a regular grid, 1 to 8."""
 
+    first_hit: float = 0.1
+    """Opacity at which the outputs depth_first and distance_first see a surface, (0, 1): the first fragment
+    or layer behind which the transmittance is at most 1 less this."""
+
     setup_precision: str = "float64"
     """Arithmetic of the per-splat set-up. `float32` is also what a device without float64 uses."""
 
@@ -77,6 +81,7 @@ class Quality:
         within("alpha_cutoff", 0.0, 1.0, True, True)
         within("transmittance_stop", 0.0, 1.0, False, True)
         within("opacity_ceiling", 0.0, 1.0, True, False)
+        within("first_hit", 0.0, 1.0, True, True)
         for name, known in (
             ("stop_rule", STOP_RULES),
             ("lowpass", LOWPASS),

@@ -23,9 +23,10 @@ class Frame(Mapping):
     """A finished picture: a mapping from an output's name to a read-only NumPy array, copied from the
     device on first use.
 
-    Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median` (h, w) metres along z,
-    0 where nothing was drawn; `normal` (h, w, 3) unit, camera frame, towards the camera; `label` (h, w)
-    int32, -1 where nothing was drawn.
+    Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median`, `depth_first` (h, w)
+    metres along z, `distance`, `distance_median`, `distance_first` metres along the ray, 0 where nothing was
+    drawn; `normal` (h, w, 3) unit, camera frame, towards the camera, `normal_world` the same in the world's
+    axes; `label`, `splat_id` (h, w) int32, -1 where nothing was drawn; `blended` (h, w) int32.
     """
 
     def __init__(self, planes: Planes, outputs: tuple[str, ...]) -> None:

@@ -70,6 +70,18 @@ class View:
     ceiling: float
     stop: float
     background: tuple[float, float, float]
+    first_light: float
+    """transmittance that is left behind a first hit"""
+
+    def uniform(self, name: str) -> tuple[float, ...]:
+        """Numbers that an effect asks for (`Effect.blend_uniforms`): in the order of its kernel arguments."""
+        match name:
+            case "ray":
+                return self.fx, self.fy, self.cx, self.cy
+            case "rotation":
+                return tuple(self.rotation.ravel().tolist())
+            case _:
+                return (getattr(self, name),)
 
     @classmethod
     def of(cls, camera: Camera, quality: Quality, origin: np.ndarray, background) -> View:
@@ -107,6 +119,7 @@ class View:
             ceiling=float(np.float32(quality.opacity_ceiling)),
             stop=float(np.float32(quality.transmittance_stop)),
             background=(float(color[0]), float(color[1]), float(color[2])),
+            first_light=float(np.float32(1 - quality.first_hit)),
         )
 
 

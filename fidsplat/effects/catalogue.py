@@ -37,7 +37,11 @@ class Effect:
     """Sample planes in each buffer between blending and resolving, in the order of its kernel arguments."""
     output: Output | None = None
     parts: tuple[str, ...] = ()
-    """Names of the parts that it needs."""
+    """Names of the effects that it needs: parts, or taps whose planes it reads."""
+    blend_uniforms: tuple[str, ...] = ()
+    """Numbers of the view (`View.uniform`) that blending needs for it; they stand before its planes."""
+    resolve_uniforms: tuple[str, ...] = ()
+    """The same for resolving."""
 
 
 _EFFECTS = (
@@ -82,6 +86,40 @@ _EFFECTS = (
         planes=(1, 1),
         output=Output("label", 1, "int32"),
     ),
+    Effect("ray_length", "slot/ray_length.cl", resolve_uniforms=("ray",)),
+    Effect(
+        "depth_first",
+        "tap/depth_first.cl",
+        planes=(1,),
+        output=Output("depth_first", 1, "float32"),
+        parts=("ray_depth",),
+        blend_uniforms=("first_light",),
+    ),
+    *(
+        Effect(
+            f"distance{kind}",
+            f"tap/distance{kind}.cl",
+            output=Output(f"distance{kind}", 1, "float32"),
+            parts=(f"depth{kind}", "ray_length"),
+        )
+        for kind in ("", "_median", "_first")
+    ),
+    Effect(
+        "normal_world",
+        "tap/normal_world.cl",
+        output=Output("normal_world", 3, "float32"),
+        parts=("normal",),
+        resolve_uniforms=("rotation",),
+    ),
+    Effect(
+        "splat_id",
+        "tap/splat_id.cl",
+        record_lanes=1,
+        inputs=("splat_ids",),
+        planes=(1, 1),
+        output=Output("splat_id", 1, "int32"),
+    ),
+    Effect("blended", "tap/blended.cl", planes=(1,), output=Output("blended", 1, "int32")),
 )
 
 CATALOGUE: dict[str, Effect] = {effect.name: effect for effect in _EFFECTS}

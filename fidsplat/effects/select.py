@@ -38,13 +38,30 @@ class FeatureSet:
     @cached_property
     def effects(self) -> tuple[Effect, ...]:
         """All effects in the order in which their text is put together: slots, parts, taps."""
-        parts = sorted({part for name in (*self.slots, *self.taps) for part in CATALOGUE[name].parts})
-        return tuple(CATALOGUE[name] for name in (*self.slots, *parts, *self.taps))
+        parts = _parts_of((*self.slots, *self.taps))
+        taps = [tap for tap in self.taps if tap not in parts]
+        return tuple(CATALOGUE[name] for name in (*self.slots, *parts, *taps))
+
+    @cached_property
+    def names(self) -> frozenset[str]:
+        """Names of all effects."""
+        return frozenset(effect.name for effect in self.effects)
 
     @cached_property
     def outputs(self) -> tuple[Output, ...]:
-        """Finished planes, rgb first."""
-        return (RGB, *(OUTPUTS[tap] for tap in self.taps))
+        """Finished planes, rgb first; with those that other taps are made from."""
+        return (RGB, *(effect.output for effect in self.effects if effect.output))
+
+
+def _parts_of(names: Iterable[str]) -> list[str]:
+    """What effects need, and what that needs, sorted."""
+    parts: set[str] = set()
+    todo = list(names)
+    while todo:
+        fresh = set(CATALOGUE[todo.pop()].parts) - parts
+        parts |= fresh
+        todo += fresh
+    return sorted(parts)
 
 
 class Traits(Protocol):

@@ -30,8 +30,15 @@ TOLERANCE = {
     "alpha": COLOR_TOLERANCE,
     "depth": DEPTH_TOLERANCE,
     "depth_median": 0.0,
+    "depth_first": 0.0,
+    "distance": DEPTH_TOLERANCE,
+    "distance_median": 0.0,
+    "distance_first": 0.0,
     "normal": COLOR_TOLERANCE,
+    "normal_world": COLOR_TOLERANCE,
     "label": 0.0,
+    "splat_id": 0.0,
+    "blended": 0.0,
 }
 """What each output may be wrong beyond its certificate."""
 RARE = 1e-3
@@ -99,16 +106,18 @@ def compare(planes: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], o
         error = np.abs(plane - want)
         if error.ndim > risk.ndim:
             error = error.max(-1)
-        if name in ("depth_median", "label"):
-            error = error > (DEPTH_TOLERANCE * want if name == "depth_median" else 0)
+        if TOLERANCE[name] == 0:
+            error = error > (
+                DEPTH_TOLERANCE * want if name.startswith("d") else truth.get(f"{name}_doubt", 0)
+            )
             worst = float(error.mean())
-            beyond = float((error & ~truth[f"{name}_may_flip"]).mean())
+            beyond = float((error & ~truth.get(f"{name}_may_flip", np.zeros(error.shape, bool))).mean())
         else:
             if name in ("rgb", "alpha"):
                 certified = risk * brightest
             else:  # where next to nothing is drawn, its depth and normal mean nothing
                 certified = np.where(covered, truth[f"certificate_{name}"], np.inf)
-            size = np.maximum(want, 1e-30) if name == "depth" else 1.0
+            size = np.maximum(want, 1e-30) if name in ("depth", "distance") else 1.0
             worst = float((error / size).max(initial=0.0))
             beyond = float(((error - certified) / size).max(initial=0.0))
         excess, finite = beyond - TOLERANCE[name], bool(np.isfinite(plane).all())

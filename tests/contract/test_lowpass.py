@@ -32,8 +32,8 @@ def test_boxes_are_left_to_their_own_filter(renderer):
 
 @pytest.mark.parametrize("spread_px", [0.01, 0.1, 0.5, 2.0])
 def test_light_does_not_depend_on_where_a_splat_lies_between_pixels(renderer, spread_px):
-    """The sum of alpha over the picture is the splat's own, 2 pi opacity s_u s_v, at any shift: to 3 % of sigma 0.5
-    px, and what the cut-off takes.
+    """The sum of alpha over the picture is the splat's own, 2 pi opacity s_u s_v, at any shift: to 3 % of
+    sigma 0.5 px, and what the cut-off takes.
     """
     sums = []
     generator = np.random.default_rng(0)
@@ -47,11 +47,16 @@ def test_light_does_not_depend_on_where_a_splat_lies_between_pixels(renderer, sp
 
 
 def test_the_screen_filter_keeps_no_light(renderer):
-    """Why there is another: a splat of a hundredth of a pixel is drawn as a dot of 0.7 px, some 5000 times too bright."""
+    """Why there is another: a splat of a hundredth of a pixel is drawn as a dot of 0.7 px, some 5000 times
+    too bright."""
     cloud = fs.SplatCloud([(0, 0, 1)], [(1, 0, 0, 0)], [(1e-4, 1e-4)], [0.9], colors=[(1, 1, 1)])
     camera = fs.Camera.pinhole(40, 40, 100.0, 100.0, 20.2, 20.4)
     light = {
-        name: float(renderer.render(cloud, camera, "alpha", fs.Quality(lowpass=name, alpha_cutoff=1e-9))["alpha"].sum())
+        name: float(
+            renderer.render(cloud, camera, "alpha", fs.Quality(lowpass=name, alpha_cutoff=1e-9))[
+                "alpha"
+            ].sum()
+        )
         for name in ("screen", "pixel")
     }
     assert light["screen"] == pytest.approx(math.pi * 0.9, rel=0.05)

@@ -124,6 +124,9 @@ class Resident:
 
     def part(self, name: str, first: int, end: int) -> cl.Buffer:
         """The array of splats [first, end)."""
+        if name == "splat_ids" and name not in self._arrays:
+            # made when a picture first asks for it
+            self._arrays[name] = np.arange(self.count, dtype=np.int32)
         if self.streamed:
             piece = np.ascontiguousarray(self._arrays[name][first:end])
             buffer = self._backend.pool.scratch(f"chunk of {name}", piece.nbytes)

@@ -82,8 +82,20 @@ class Run:
             np.float32(view.ceiling),
             np.float32(view.stop),
             np.float32(1.0 / view.samples**2),
-            *sample_planes,
+            *self._blend_args(sample_planes),
         )
+
+    def _blend_args(self, sample_planes: list[cl.Buffer]) -> list:
+        """raw, then each effect's uniforms and planes."""
+        planes = iter(sample_planes)
+        args: list = [next(planes)]
+        for effect in self.pipeline.features.effects:
+            args += self._uniforms(effect.blend_uniforms)
+            args += [next(planes) for _ in effect.planes]
+        return args
+
+    def _uniforms(self, names: tuple[str, ...]) -> list[np.float32]:
+        return [np.float32(number) for name in names for number in self.view.uniform(name)]
 
     def _resolve(self, raw_planes: list[cl.Buffer]) -> dict[str, tuple[Output, cl.Buffer]]:
         view, features = self.view, self.pipeline.features
@@ -94,6 +106,7 @@ class Run:
         }
         extra, rest = [], iter(raw_planes[1:])
         for effect in features.effects:
+            extra += self._uniforms(effect.resolve_uniforms)
             extra += [next(rest) for _ in effect.planes]
             if effect.output:
                 extra.append(outputs[effect.output.name][1])

@@ -142,5 +142,5 @@ class ReferencePipeline:
                 -1, n * n, *blocks[0][name].shape[1:]
             )
             for name in blocks[0]
-        }
+        } | {"x": x.reshape(-1, n * n), "y": y.reshape(-1, n * n)}
         return resolve(samples, view, self.features)

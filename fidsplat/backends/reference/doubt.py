@@ -207,6 +207,29 @@ def of_median(span: Span) -> np.ndarray:
     return np.asarray((may & ~sure).any(1))
 
 
+def of_first(span: Span, light: float) -> np.ndarray:
+    """Whether another fragment (k,) may be the first behind which no more than `light` is left."""
+    high, low = span.high, span.low
+    may = (high > 0) & (span.front_low * (1 - high) * (1 - _STOP) <= light)
+    sure = (low > 0) & (span.front_high * (1 - low) * (1 + _STOP) <= light)
+    return first_column(may, 0) != first_column(sure, 0)
+
+
+def of_count(
+    span: Span, count: np.ndarray, doubt: np.ndarray, stop: float, reordered: np.ndarray
+) -> np.ndarray:
+    """By how much (k,) the number of splats blended may differ. count, doubt (k, m): in each thing that is
+    laid."""
+    may, must = span.high > 0, span.low > 0
+    off = np.where(may, doubt + np.where(must, 0, count), 0)
+    # from where the light may have reached the stop to where it must have, whatever comes may be drawn or not
+    open_to = (span.front_high >= stop * (1 - _STOP)) & (
+        span.front_low * (1 - span.high) <= stop * (1 + _STOP)
+    )
+    off = np.where(may & open_to & (stop > 0), count + doubt, off)
+    return np.where(reordered, np.inf, off.sum(1))
+
+
 def of_label(span: Span, labels: np.ndarray, label: np.ndarray) -> np.ndarray:
     """Whether a fragment of another label (k,), or none at all, may be the heaviest."""
     own = labels == label[:, None]

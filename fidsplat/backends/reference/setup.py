@@ -97,7 +97,9 @@ def _filtered(
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         z = p[:, 2]
         columns = [
-            np.stack([view.fx * (t[:, 0] - p[:, 0] / z * t[:, 2]), view.fy * (t[:, 1] - p[:, 1] / z * t[:, 2])])
+            np.stack(
+                [view.fx * (t[:, 0] - p[:, 0] / z * t[:, 2]), view.fy * (t[:, 1] - p[:, 1] / z * t[:, 2])]
+            )
             / z
             for t in (a, b)
         ]
