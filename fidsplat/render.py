@@ -14,7 +14,9 @@ from fidsplat.effects import select
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
 from fidsplat.scenes import Scene
+from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
+from fidsplat.surroundings import Fog, Gradient, Panorama, background_of
 
 _NO_SCENE = Scene(())
 
@@ -112,17 +114,21 @@ class Renderer:
         camera: Camera | None = None,
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
-        background: Iterable[float] | None = None,
+        background: Iterable[float] | Gradient | Panorama | None = None,
+        sensor: Sensor | None = None,
+        fog: Fog | None = None,
     ) -> Frame:
         """Draw one picture.
 
         Args:
-            scene: what to draw. A Scene's own camera, outputs, quality and background are used where the
-                arguments are left out.
+            scene: what to draw. A Scene's own camera, outputs, quality, background, sensor and fog are used
+                where the arguments are left out.
             camera: needed unless the scene has one.
             outputs: names of planes; default rgb.
             quality: a Quality or a preset's name; default standard.
-            background: (r, g, b) behind the splats; default black.
+            background: (r, g, b), a Gradient or a Panorama behind the splats; default black.
+            sensor: what becomes of rgb on its way out; default nothing.
+            fog: between the camera and what it sees; default none.
 
         Raises:
             InputError: no camera, an unknown output or preset, a picture that is too large, a cloud uploaded
@@ -140,7 +146,11 @@ class Renderer:
         if not names:
             raise InputError("outputs is empty; name at least one, e.g. 'rgb'")
         chosen = Quality.of(own.quality if quality is None else quality)
-        behind = own.background if background is None else tuple(background)
+        behind = background_of(own.background if background is None else background)
+        sensor, fog = sensor or own.sensor, fog or own.fog
+        for value, kind in ((sensor, Sensor), (fog, Fog)):
+            if value is not None and not isinstance(value, kind):
+                raise InputError(f"{kind.__name__.lower()} is {value!r}; it must be a {kind.__name__}")
 
         resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
         if resident._renderer is not self:
@@ -148,8 +158,8 @@ class Renderer:
                 "this cloud was uploaded by another Renderer; upload it with the one that draws it"
             )
         data = resident._data
-        features = select(data, names, chosen)
-        view = View.of(camera, chosen, data.origin, behind)
+        features = select(data, names, chosen, sensor, fog, behind)
+        view = View.of(camera, chosen, data.origin, behind, sensor, fog)
         return Frame(self.backend.pipeline(features).render(data, view), names)
 
     def render_views(
@@ -158,7 +168,9 @@ class Renderer:
         cameras: Iterable[Camera],
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
-        background: Iterable[float] | None = None,
+        background: Iterable[float] | Gradient | Panorama | None = None,
+        sensor: Sensor | None = None,
+        fog: Fog | None = None,
     ) -> Iterator[Frame]:
         """Draw one cloud from many cameras, one Frame for each, in their order.
 
@@ -169,10 +181,11 @@ class Renderer:
         chosen = own.quality if quality is None else quality
         names = own.outputs if outputs is None else outputs
         behind = own.background if background is None else background
+        sensor, fog = sensor or own.sensor, fog or own.fog
         resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
         waiting: Frame | None = None
         for camera in cameras:
-            frame = self.render(resident, camera, names, chosen, behind)
+            frame = self.render(resident, camera, names, chosen, behind, sensor, fog)
             if waiting is not None:
                 yield waiting
             waiting = frame

@@ -77,7 +77,8 @@ Examples:
             frame = renderer.render(scene, outputs=names, quality=self.quality)
             planes = {name: frame[name] for name in frame.outputs}
         seconds = time.perf_counter() - begun
-        files = [file for name, plane in planes.items() for file in save_plane(name, plane, name_of)]
+        bits = None if scene.sensor is None else scene.sensor.bits
+        files = [file for name, plane in planes.items() for file in save_plane(name, plane, name_of, bits)]
         if self.json:
             print_json(
                 {

@@ -1,8 +1,8 @@
 """Every effect: its kernel file and what it adds to the records, buffers and outputs.
 
-A slot is filled by exactly one effect of its kind (camera, color, lowpass, stop, compose, footprint); taps
-are extra planes, any number of them; parts are what several of them share. The sections of an effect's kernel
-file say where its text goes (kernels/README.md).
+A slot is filled by exactly one effect of its kind (camera, color, lowpass, stop, compose, footprint,
+background); taps are extra planes, any number of them; parts are what several of them share. The sections of
+an effect's kernel file say where its text goes (kernels/README.md).
 """
 
 from __future__ import annotations
@@ -41,7 +41,9 @@ class Effect:
     blend_uniforms: tuple[str, ...] = ()
     """Numbers of the view (`View.uniform`) that blending needs for it; they stand before its planes."""
     resolve_uniforms: tuple[str, ...] = ()
-    """The same for resolving."""
+    """The same for resolving; they stand before its arrays."""
+    resolve_arrays: tuple[str, ...] = ()
+    """Arrays of the view (`View.array`) that resolving needs for it; they stand before its planes."""
 
 
 _EFFECTS = (
@@ -86,7 +88,45 @@ _EFFECTS = (
         planes=(1, 1),
         output=Output("label", 1, "int32"),
     ),
-    Effect("ray_length", "slot/ray_length.cl", resolve_uniforms=("ray",)),
+    Effect("background_constant", "slot/background_constant.cl"),
+    Effect(
+        "background_gradient",
+        "slot/background_gradient.cl",
+        parts=("world_ray",),
+        resolve_uniforms=("gradient",),
+    ),
+    Effect(
+        "background_panorama",
+        "slot/background_panorama.cl",
+        parts=("world_ray",),
+        resolve_uniforms=("panorama_size",),
+        resolve_arrays=("panorama",),
+    ),
+    Effect("ray", "slot/ray.cl", resolve_uniforms=("ray",)),
+    Effect("turn", "slot/turn.cl", resolve_uniforms=("rotation",)),
+    Effect("ray_length", "slot/ray_length.cl"),
+    Effect("sample_length", "slot/sample_length.cl", parts=("ray", "ray_length")),
+    Effect("world_ray", "slot/world_ray.cl", parts=("ray", "turn")),
+    Effect(
+        "fog",
+        "tap/fog.cl",
+        planes=(1,),
+        parts=("ray_depth", "ray_length"),
+        blend_uniforms=("fog_density", "ray"),
+    ),
+    Effect("exposure", "post/exposure.cl", resolve_uniforms=("exposure",)),
+    Effect("vignetting", "post/vignetting.cl", resolve_uniforms=("vignette_center", "vignetting")),
+    Effect("noise", "post/noise.cl", resolve_uniforms=("noise",)),
+    Effect("gain", "post/gain.cl", resolve_uniforms=("gain",)),
+    Effect("response_gamma", "post/response_gamma.cl", resolve_uniforms=("inverse_gamma",)),
+    Effect("response_srgb", "post/response_srgb.cl"),
+    Effect(
+        "response_table",
+        "post/response_table.cl",
+        resolve_uniforms=("response_count",),
+        resolve_arrays=("response",),
+    ),
+    Effect("quantise", "post/quantise.cl", resolve_uniforms=("quantise_steps",)),
     Effect(
         "depth_first",
         "tap/depth_first.cl",
@@ -100,7 +140,7 @@ _EFFECTS = (
             f"distance{kind}",
             f"tap/distance{kind}.cl",
             output=Output(f"distance{kind}", 1, "float32"),
-            parts=(f"depth{kind}", "ray_length"),
+            parts=(f"depth{kind}", "sample_length"),
         )
         for kind in ("", "_median", "_first")
     ),
@@ -108,8 +148,7 @@ _EFFECTS = (
         "normal_world",
         "tap/normal_world.cl",
         output=Output("normal_world", 3, "float32"),
-        parts=("normal",),
-        resolve_uniforms=("rotation",),
+        parts=("normal", "turn"),
     ),
     Effect(
         "splat_id",

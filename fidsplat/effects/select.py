@@ -11,6 +11,8 @@ from typing import Protocol
 from fidsplat.effects.catalogue import CATALOGUE, Effect, Output
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
+from fidsplat.sensor import Sensor
+from fidsplat.surroundings import Background, Fog, Gradient
 
 RGB = Output("rgb", 3, "float32")
 OUTPUTS: dict[str, Output] = {
@@ -28,19 +30,22 @@ class FeatureSet:
     """
 
     slots: tuple[str, ...]
-    """One effect per kind, in the fixed order camera, color, lowpass, stop, compose, footprint."""
+    """One effect per kind, in the fixed order camera, color, lowpass, stop, compose, footprint,
+    background."""
     taps: tuple[str, ...]
     """Sorted names of the planes beside rgb."""
     sh_degree: int
     samples: int
     setup_precision: str
+    posts: tuple[str, ...] = ()
+    """What changes rgb on its way out, in its order: fog, the steps of the sensor."""
 
     @cached_property
     def effects(self) -> tuple[Effect, ...]:
-        """All effects in the order in which their text is put together: slots, parts, taps."""
-        parts = _parts_of((*self.slots, *self.taps))
+        """All effects in the order in which their text is put together: slots, parts, taps, posts."""
+        parts = _parts_of((*self.slots, *self.taps, *self.posts))
         taps = [tap for tap in self.taps if tap not in parts]
-        return tuple(CATALOGUE[name] for name in (*self.slots, *parts, *taps))
+        return tuple(CATALOGUE[name] for name in (*self.slots, *parts, *taps, *self.posts))
 
     @cached_property
     def names(self) -> frozenset[str]:
@@ -83,8 +88,16 @@ class Traits(Protocol):
         ...
 
 
-def select(cloud: Traits, outputs: Iterable[str], quality: Quality) -> FeatureSet:
-    """The features that a cloud, outputs and quality call for.
+def select(
+    cloud: Traits,
+    outputs: Iterable[str],
+    quality: Quality,
+    sensor: Sensor | None = None,
+    fog: Fog | None = None,
+    background: Background = (0.0, 0.0, 0.0),
+) -> FeatureSet:
+    """The features that a cloud, outputs, quality and so on call for. Values that mean nothing call for
+    nothing.
 
     Raises:
         InputError: an output that nobody declares.
@@ -97,6 +110,7 @@ def select(cloud: Traits, outputs: Iterable[str], quality: Quality) -> FeatureSe
             near = difflib.get_close_matches(str(name), OUTPUTS, 1)
             hint = f" (did you mean {near[0]!r}?)" if near else ""
             raise InputError(f"unknown output {name!r}{hint}; known: {', '.join(OUTPUTS)}")
+    foggy = fog is not None and fog.density > 0
     return FeatureSet(
         slots=(
             "camera_pinhole",
@@ -106,9 +120,18 @@ def select(cloud: Traits, outputs: Iterable[str], quality: Quality) -> FeatureSe
             f"stop_{quality.stop_rule}",
             "compose_planes" if cloud.has_planes and quality.coplanar == "blend" else "compose_ordered",
             f"footprint_{cloud.footprint}",
+            f"background_{_behind(background, foggy)}",
         ),
         taps=tuple(sorted(wanted - {"rgb"})),
         sh_degree=max(cloud.sh_degree, 0),
         samples=quality.samples,
         setup_precision=quality.setup_precision,
+        posts=(*(("fog",) if foggy else ()), *(() if sensor is None else sensor.steps)),
     )
+
+
+def _behind(background: Background, foggy: bool) -> str:
+    # behind everything fog is all there is
+    if foggy or isinstance(background, tuple):
+        return "constant"
+    return "gradient" if isinstance(background, Gradient) else "panorama"

@@ -19,7 +19,9 @@ from fidsplat.cameras import Camera
 from fidsplat.effects import select
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer
+from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
+from fidsplat.surroundings import Background, Fog
 
 ALL_OUTPUTS = ("rgb", "alpha", "depth", "depth_median", "normal", "label")
 COLOR_TOLERANCE = 2e-5
@@ -54,7 +56,9 @@ class Picture:
     camera: Camera
     quality: Quality = field(default_factory=Quality)
     outputs: tuple[str, ...] = ("rgb", "alpha")
-    background: tuple[float, float, float] = (0.1, 0.2, 0.3)
+    background: Background = (0.1, 0.2, 0.3)
+    sensor: Sensor | None = None
+    fog: Fog | None = None
 
 
 @dataclass(frozen=True)
@@ -86,8 +90,11 @@ class Difference:
 def truth_of(picture: Picture, pixels: tuple[np.ndarray, np.ndarray] | None = None) -> dict[str, np.ndarray]:
     """The reference's planes with `alpha` and `certificate`: whole, or (k, ...) at pixels (rows, columns)."""
     judge = ReferenceBackend()
-    features = select(picture.cloud, (*picture.outputs, "alpha"), picture.quality)
-    view = View.of(picture.camera, picture.quality, picture.cloud.origin, picture.background)
+    around = picture.sensor, picture.fog
+    features = select(
+        picture.cloud, (*picture.outputs, "alpha"), picture.quality, *around, picture.background
+    )
+    view = View.of(picture.camera, picture.quality, picture.cloud.origin, picture.background, *around)
     pipeline, resident = judge.pipeline(features), judge.upload(picture.cloud)
     if pixels is not None:
         return pipeline.pixels(resident, view, *pixels)
@@ -115,6 +122,8 @@ def compare(planes: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], o
         else:
             if name in ("rgb", "alpha"):
                 certified = risk * brightest
+                if name == "rgb":
+                    certified = truth.get("certificate_rgb", certified)
             else:  # where next to nothing is drawn, its depth and normal mean nothing
                 certified = np.where(covered, truth[f"certificate_{name}"], np.inf)
             size = np.maximum(want, 1e-30) if name in ("depth", "distance") else 1.0
@@ -133,5 +142,7 @@ def judge(renderer: Renderer, picture: Picture) -> list[Difference]:
         outputs=picture.outputs,
         quality=picture.quality,
         background=picture.background,
+        sensor=picture.sensor,
+        fog=picture.fog,
     )
     return compare(frame, truth_of(picture), picture.outputs)

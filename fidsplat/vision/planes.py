@@ -16,12 +16,15 @@ from fidsplat.vision.paint import (
 )
 
 
-def save_plane(name: str, plane: np.ndarray, name_of: Callable[[str, str], Path]) -> list[Path]:
+def save_plane(
+    name: str, plane: np.ndarray, name_of: Callable[[str, str], Path], bits: int | None = None
+) -> list[Path]:
     """Write one plane and return the files.
 
     Args:
         name: "rgb", "depth", ...
         plane: (h, w) or (h, w, 3).
+        bits: 16 writes rgb as a 16-bit PNG.
         name_of: gives the file for a plane's name and a suffix such as ".png" or "-turbo.png".
     """
     if name.startswith(("depth", "distance")):
@@ -36,6 +39,9 @@ def save_plane(name: str, plane: np.ndarray, name_of: Callable[[str, str], Path]
             _write_array(name_of(name, ".npy"), plane),
             write_png(name_of(name, ".png"), picture(plane)),
         ]
+    if name == "rgb" and bits == 16:
+        deep = np.rint(np.clip(np.nan_to_num(plane, nan=0.0), 0, 1) * 65535).astype(np.uint16)
+        return [write_png(name_of(name, ".png"), deep)]
     is_normal = name in ("normal", "normal_world")
     return [write_png(name_of(name, ".png"), normal_picture(plane) if is_normal else plane)]
 

@@ -13,7 +13,7 @@ import fidsplat
 PACKAGE = Path(fidsplat.__file__).parent
 
 BASE = {"errors", "files", "rotations"}
-PLAIN = BASE | {"splats", "harmonics", "cameras", "quality"}
+PLAIN = BASE | {"splats", "harmonics", "cameras", "quality", "sensor", "surroundings"}
 # wing: what of fidsplat it may import, at the top or inside a function
 MAY_IMPORT = {
     "errors": set(),
@@ -21,6 +21,8 @@ MAY_IMPORT = {
     "rotations": BASE,
     "harmonics": BASE,
     "quality": BASE,
+    "sensor": BASE,
+    "surroundings": BASE | {"vision.images"},
     "kernel_files": BASE,
     "defects": BASE,
     "splats": BASE | {"harmonics", "defects"},

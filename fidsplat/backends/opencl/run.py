@@ -94,8 +94,9 @@ class Run:
             args += [next(planes) for _ in effect.planes]
         return args
 
-    def _uniforms(self, names: tuple[str, ...]) -> list[np.float32]:
-        return [np.float32(number) for name in names for number in self.view.uniform(name)]
+    def _uniforms(self, names: tuple[str, ...]) -> list[np.generic]:
+        numbers = [number for name in names for number in self.view.uniform(name)]
+        return [number if isinstance(number, np.generic) else np.float32(number) for number in numbers]
 
     def _resolve(self, raw_planes: list[cl.Buffer]) -> dict[str, tuple[Output, cl.Buffer]]:
         view, features = self.view, self.pipeline.features
@@ -107,6 +108,7 @@ class Run:
         extra, rest = [], iter(raw_planes[1:])
         for effect in features.effects:
             extra += self._uniforms(effect.resolve_uniforms)
+            extra += [self.put(name, self.view.array(name)) for name in effect.resolve_arrays]
             extra += [next(rest) for _ in effect.planes]
             if effect.output:
                 extra.append(outputs[effect.output.name][1])

@@ -27,6 +27,14 @@ def composite(
         "t": final,
         "certificate": doubt.of_color(s, view, span, before, laid.moved) + laid.reordered,
     }
+    if "fog" in features.posts:
+        reach = -view.fog_density * ray_lengths(x, y, view)[:, None]
+        left = np.exp(reach * z)
+        out["rgb"] = _sum(weight * left, laid.colors)
+        out["fogged"] = (weight * (1 - left)).sum(1)
+        with np.errstate(invalid="ignore"):
+            moved = np.abs(np.exp(reach * np.maximum(span.z_low, 0)) - np.exp(reach * span.z_high))
+        out["certificate"] += (weight * moved).sum(1)
     drawn = live & (alpha > 0)
     uncertain = laid.reordered > 0
     if {"depth", "depth_median", "depth_first"} & features.names:
@@ -63,6 +71,11 @@ def composite(
         out["blended"] = np.where(drawn, laid.count, 0).sum(1)
         out["blended_doubt"] = doubt.of_count(span, laid.count, laid.count_doubt, view.stop, uncertain)
     return out
+
+
+def ray_lengths(x: np.ndarray, y: np.ndarray, view: View) -> np.ndarray:
+    """Length of the rays through samples at grid positions x, y, per metre of depth."""
+    return np.sqrt(1 + ((x - view.cx) / view.fx) ** 2 + ((y - view.cy) / view.fy) ** 2)
 
 
 def _sum(weight: np.ndarray, values: np.ndarray) -> np.ndarray:

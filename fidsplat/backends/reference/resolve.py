@@ -7,6 +7,8 @@ import math
 import numpy as np
 
 from fidsplat.backends.base import View
+from fidsplat.backends.reference.blend import ray_lengths
+from fidsplat.backends.reference.post import background_at, developed
 from fidsplat.effects import FeatureSet
 
 _ROUND = 1e-6  # relative, of a sum of weights
@@ -20,12 +22,23 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
     `blended_doubt` splats. samples: with `x`, `y`, positions on the sample grid.
     """
     t, doubt = samples["t"].mean(1), samples["certificate"]
-    out = {"rgb": samples["rgb"].mean(1) + t[:, None] * np.asarray(view.background)}
-    out["certificate"] = doubt.mean(1)
+    center_x, center_y = samples["x"].mean(1), samples["y"].mean(1)
+    behind, behind_doubt = background_at(view, center_x, center_y)
+    out = {"rgb": samples["rgb"].mean(1) + t[:, None] * behind, "certificate": doubt.mean(1)}
+    if "fogged" in samples:
+        out["rgb"] += samples["fogged"].mean(1)[:, None] * behind
+    if features.posts or view.surroundings is not None:
+        steps = tuple(step for step in features.posts if step != "fog")
+        brightest = max(
+            1.0, float(np.abs(out["rgb"]).max(initial=1.0)), float(np.abs(behind).max(initial=0.0))
+        )
+        unsure = out["certificate"] * brightest + t * behind_doubt
+        columns, rows = (np.floor(center / view.samples).astype(int) for center in (center_x, center_y))
+        out["rgb"], out["certificate_rgb"] = developed(out["rgb"], unsure, steps, view, columns, rows)
     if "alpha" in features.names:
         out["alpha"] = 1 - t
     # of the ray through each sample, per metre of depth
-    length = _ray_lengths(samples["x"], samples["y"], view)
+    length = ray_lengths(samples["x"], samples["y"], view)
     if "depth" in features.names:
         weight = samples["weight"].sum(1)
         out["depth"] = _ratio(samples["depth"].sum(1), weight, 0.0)
@@ -66,10 +79,6 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
         out["blended"] = samples["blended"].max(1)
         out["blended_doubt"] = samples["blended_doubt"].max(1)
     return out
-
-
-def _ray_lengths(x: np.ndarray, y: np.ndarray, view: View) -> np.ndarray:
-    return np.sqrt(1 + ((x - view.cx) / view.fx) ** 2 + ((y - view.cy) / view.fy) ** 2)
 
 
 def _median(values: np.ndarray) -> np.ndarray:

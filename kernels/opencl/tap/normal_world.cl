@@ -1,7 +1,5 @@
 // normal_world (h, w, 3): the normal in the axes of the world.
 //@ resolve_args
-    , float turn_00, float turn_01, float turn_02, float turn_10, float turn_11, float turn_12, float turn_20, float turn_21
-    , float turn_22                              // world to camera rotation
     , global float *restrict normal_world_out
 //@ resolve_end
     normal_world_out[3 * out] = normal_scale * FMA(turn_00, normal_x, FMA(turn_10, normal_y, turn_20 * normal_z));
