@@ -10,6 +10,8 @@ from fidsplat.backends.base import FAR_EYE, View
 from fidsplat.cameras import Camera
 from fidsplat.cameras.motion import Motion, Shutter
 from fidsplat.quality import Quality
+from fidsplat.sensor import Sensor
+from fidsplat.surroundings import Background, Fog
 
 
 @dataclass(frozen=True)
@@ -32,9 +34,11 @@ def exposed_view(
     camera: Camera,
     quality: Quality,
     origin: np.ndarray,
-    background,
+    background: Background,
     motion: Motion,
     shutter: Shutter,
+    sensor: Sensor | None = None,
+    fog: Fog | None = None,
 ) -> View:
     """The view of a picture under a shutter: with `shots` if it takes more than one pose, else just at its
     time.
@@ -48,7 +52,7 @@ def exposed_view(
         pose = motion.camera_at(time)
         # the position follows from the pose
         now = camera if pose is None else replace(camera, world_to_camera=pose, position=None)
-        view = View.of(now, quality, origin, background)
+        view = View.of(now, quality, origin, background, sensor, fog)
         return replace(view, groups=tuple((k, _moved(view, m, origin)) for k, m in motion.groups_at(time)))
 
     whole = at(shutter.time)

@@ -47,6 +47,8 @@ class PlaneTable:
         np.maximum.at(high, which, centers)
         np.maximum.at(self._sigma, which, spread)
         self._center, self._half = (low + high) / 2, (high - low) / 2
+        # a box reaches its corners whatever the cut-off
+        self._least_radius = 0.0 if cloud.boxes is None else math.sqrt(2.0)
 
     def keys(self, view: View) -> np.ndarray:
         """(p,) float32, all different: a plane's nearest depth less its splats' diameter [m]. Depth is what
@@ -66,7 +68,7 @@ class PlaneTable:
         return keys
 
     def _keys(self, view: View) -> np.ndarray:
-        radius = math.sqrt(-2 * view.log_cut)
+        radius = max(math.sqrt(-2 * view.log_cut), self._least_radius)
         half = self._half + radius * self._sigma
         if view.along_ray:
             aside = np.abs(self._axes @ view.eye - self._center) - half

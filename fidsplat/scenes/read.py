@@ -11,6 +11,7 @@ from fidsplat.cameras import Camera, look_at_matrix
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
 from fidsplat.rotations import rigid_matrix
+from fidsplat.scenes.imaging import read_background, read_fog, read_sensor
 from fidsplat.scenes.lens import TABLES, read_focal_lengths, read_lens
 from fidsplat.scenes.moving import POSE, read_keyframes, read_shutter
 from fidsplat.scenes.scene import PlacedMarker, Scene
@@ -18,7 +19,7 @@ from fidsplat.scenes.table import Table
 from fidsplat.splats import SplatCloud
 
 MAX_BYTES = 16 * 2**20
-TOP = ("camera", "splats", "markers", "render")
+TOP = ("camera", "splats", "markers", "render", "sensor", "fog", "background")
 CAMERA = ("width", "height", "fov_x_deg", "fx", "fy", "cx", "cy")
 CAMERA += ("position", "look_at", "up", "world_to_camera", "near", "far", *TABLES, "shutter", "motion")
 CAMERA_POSE = ("position", "look_at", "up", "world_to_camera")
@@ -43,16 +44,20 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
         else None
     )
     render = top.table("render", RENDER)
+    if "background" in top and "background" in render:
+        raise render.error("background", "and the table [background] exclude each other")
     return Scene(
         clouds=tuple(_splats(table, file.parent) for table in top.tables("splats", SPLATS)),
         camera=camera,
         markers=tuple(_marker(table, file.parent) for table in top.tables("markers", MARKERS)),
-        background=render.numbers("background", 3, (0.0, 0.0, 0.0)),
+        background=read_background(top, file.parent) or render.numbers("background", 3, (0.0, 0.0, 0.0)),
         outputs=render.texts("outputs", ("rgb",)),
         quality=_quality(render),
         device=render.text("device", None),
         shutter=read_shutter(table),
         camera_motion=keyframes,
+        sensor=read_sensor(top),
+        fog=read_fog(top),
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -14,7 +13,9 @@ import numpy as np
 from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.errors import InputError
 from fidsplat.rotations import check_similarity
+from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
+from fidsplat.surroundings import Background, Fog, background_of
 
 if TYPE_CHECKING:
     from fidsplat.cameras.motion import Pose
@@ -60,8 +61,8 @@ class Scene:
     camera: Camera | None = None
     markers: tuple[PlacedMarker, ...] = ()
     """marker i has the label i + 1, whatever label it came with"""
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """RGB in display space"""
+    background: Background = (0.0, 0.0, 0.0)
+    """RGB in display space, a Gradient or a Panorama"""
     outputs: tuple[str, ...] = ("rgb",)
     """names of the planes that are rendered"""
     quality: Quality | str | None = None
@@ -72,6 +73,10 @@ class Scene:
     """when the picture is taken, and how long that takes; None: at time 0, at once"""
     camera_motion: Pose | None = None
     """world_to_camera at a time in seconds; None: the camera stands still"""
+    sensor: Sensor | None = None
+    """what becomes of rgb on its way out"""
+    fog: Fog | None = None
+    """between the camera and what it sees"""
 
     def __post_init__(self) -> None:
         put = object.__setattr__
@@ -82,13 +87,10 @@ class Scene:
             raise InputError(f"shutter must be a Shutter, not {self.shutter!r}")
         if not isinstance(self.camera, Camera | None):
             raise InputError(f"camera must be a Camera, not {self.camera!r}")
-        try:
-            background = tuple(float(value) for value in self.background)
-        except (TypeError, ValueError):
-            background = ()
-        if len(background) != 3 or not all(map(math.isfinite, background)):
-            raise InputError(f"background must be three finite numbers, not {self.background!r}")
-        put(self, "background", background)
+        put(self, "background", background_of(self.background))
+        for name, kind in (("sensor", Sensor), ("fog", Fog)):
+            if not isinstance(getattr(self, name), kind | None):
+                raise InputError(f"{name} must be a {kind.__name__}, not {getattr(self, name)!r}")
         outputs = (self.outputs,) if isinstance(self.outputs, str) else tuple(self.outputs)
         if not outputs or not all(isinstance(name, str) for name in outputs):
             raise InputError(f"outputs must be one or more names, not {self.outputs!r}")

@@ -8,6 +8,7 @@ from fidsplat.files import atomic_write
 from fidsplat.formats import save_ply
 from fidsplat.quality import PRESETS, Quality
 from fidsplat.rotations import matrix_to_quaternion
+from fidsplat.scenes.imaging import imaging_tables
 from fidsplat.scenes.lens import lens_table
 from fidsplat.scenes.moving import keyframe_tables, shutter_table
 from fidsplat.scenes.read import IMAGE
@@ -22,6 +23,7 @@ def write_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
     """
     file = Path(path)
     render = _render(scene)
+    around = imaging_tables(scene, file.parent)
     markers = [_marker(placed, file.parent) for placed in scene.markers]
     splats = []
     for i, cloud in enumerate(scene.clouds):
@@ -38,6 +40,7 @@ def write_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
         parts += [_table("[[camera.motion]]", frame) for frame in frames]
     parts += [_table("[[splats]]", table) for table in splats]
     parts += [_table("[[markers]]", table) for table in markers]
+    parts += [_table(f"[{name}]", table) for name, table in around.items()]
     parts.append(_table("[render]", render))
     try:
         content = "\n".join(parts).encode("utf-8")
@@ -76,7 +79,9 @@ def _marker(placed: PlacedMarker, folder: Path) -> dict:
 
 
 def _render(scene: Scene) -> dict:
-    table: dict = {"outputs": list(scene.outputs), "background": list(scene.background)}
+    table: dict = {"outputs": list(scene.outputs)}
+    if isinstance(scene.background, tuple):
+        table["background"] = list(scene.background)
     if isinstance(scene.quality, Quality):
         plain = scene.quality.with_(samples=1)
         names = [name for name, preset in PRESETS.items() if preset.with_(samples=1) == plain]

@@ -45,6 +45,7 @@ static inline real3_ rotate_to_camera(global const real *view, real3_ v) {
 
 //@@ camera
 //@@ functions
+//@@ footprint_here
 
 kernel void project(
     uint count,
@@ -92,15 +93,18 @@ kernel void project(
     real su = fmax(scale_u, SMALLEST_SCALE), sv = fmax(scale_v, SMALLEST_SCALE);
     a.x *= su; a.y *= su; a.z *= su;
     b.x *= sv; b.y *= sv; b.z *= sv;
+//@@ lowpass_make
 
     // depth range of the disk (numerics A3)
     real radius = sqrt(REAL(2.0) * half_r2);
     real reach = radius * sqrt(a.z * a.z + b.z * b.z);
 //@@ camera_reach
+//@@ footprint_reach
     if (!(pz + reach >= near) || !(pz - reach <= view[VIEW_FAR])) return;
 
 //@@ camera_bounds
 //@@ camera_box
+//@@ footprint_bounds
 //@@ bounds_make
     int width = (int)view[VIEW_WIDTH], height = (int)view[VIEW_HEIGHT];
     int y0, y1;

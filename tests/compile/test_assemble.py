@@ -25,6 +25,7 @@ class Cloud:
 
     sh_degree: int = -1
     has_planes: bool = False
+    footprint: str = "gaussian"
 
 
 COLORS = Cloud()
@@ -39,6 +40,7 @@ def test_base_text_names_no_effect_that_was_not_asked_for():
         "lowpass_none",
         "stop_inclusive",
         "compose_ordered",
+        "footprint_gaussian",
     }
     of_layers = ("planes", "plane_keys", "layer", "Layer", "open", "waiting", "ink")
     for name in (*absent, *TAPS, "sh", "finished", *of_layers):
@@ -55,8 +57,9 @@ def test_a_tap_brings_its_text_and_nothing_else(tap):
     for line in base_lines:
         if not line.startswith("#define RECORD_BYTES"):
             assert line in remaining, f"{tap} removed or moved: {line}"
+    needed = {tap, *CATALOGUE[tap].parts}
     others = [
-        other for other in TAPS if other != tap and not other.startswith(tap) and not tap.startswith(other)
+        other for other in TAPS if not any(other.startswith(own) or own.startswith(other) for own in needed)
     ]
     assert not any(re.search(rf"\b{other}_(out|raw)", with_tap.text) for other in others)
 
@@ -73,6 +76,21 @@ def test_only_splats_on_planes_bring_layers(taps):
         assert re.search(rf"\b{word}\b", layered) or (word == "label_tau" and "label" not in taps), word
     assert in_order == plain
     assert layered.count("float z_numerator;") == 1
+
+
+def test_only_a_scene_of_both_footprints_pays_for_the_choice():
+    texts = {
+        kind: assemble(
+            select(Cloud(has_planes=True, footprint=kind), ("depth", "label"), fs.Quality()), SHAPE
+        )
+        for kind in ("gaussian", "box", "mixed")
+    }
+    assert "IS_BOX" not in texts["gaussian"].text
+    assert "boxes" not in texts["box"].text
+    assert "#define IS_BOX(s) true" in texts["box"].text
+    assert "boxes[i]" in texts["mixed"].text
+    sizes = [texts[kind].record_bytes for kind in texts]
+    assert sizes == sorted(sizes)
 
 
 def test_an_effect_added_to_the_catalogue_leaves_other_texts_as_they_were(monkeypatch):

@@ -13,7 +13,7 @@ import fidsplat
 PACKAGE = Path(fidsplat.__file__).parent
 
 BASE = {"errors", "files", "rotations"}
-PLAIN = BASE | {"splats", "harmonics", "cameras", "quality"}
+PLAIN = BASE | {"splats", "harmonics", "cameras", "quality", "sensor", "surroundings"}
 # wing: what of fidsplat it may import, at the top or inside a function
 MAY_IMPORT = {
     "errors": set(),
@@ -21,8 +21,11 @@ MAY_IMPORT = {
     "rotations": BASE,
     "harmonics": BASE,
     "quality": BASE,
+    "sensor": BASE,
+    "surroundings": BASE | {"vision.images"},
     "kernel_files": BASE,
-    "splats": BASE | {"harmonics"},
+    "defects": BASE,
+    "splats": BASE | {"harmonics", "defects"},
     "cameras": BASE,
     "vision": BASE | {"cameras"},
     "formats": BASE | {"splats", "harmonics", "cameras"},

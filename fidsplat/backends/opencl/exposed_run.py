@@ -29,14 +29,15 @@ class ExposedRun(Run):
     def draw(self) -> dict[str, tuple[Output, cl.Buffer]]:
         """All stages of all shots; returns the outputs by name."""
         plane = self.rows * self.stride
-        counts = [4, *(planes for effect in self.pipeline.features.effects for planes in effect.planes)]
+        effects = self.pipeline.features.effects
+        kinds = [(4, True), *((planes, effect.averaged) for effect in effects for planes in effect.planes)]
         # names that no shot's own planes have
-        whole = [self.take(f"exposed {k}", 4 * plane * count) for k, count in enumerate(counts)]
+        whole = [self.take(f"exposed {k}", 4 * plane * count) for k, (count, _) in enumerate(kinds)]
         for shot in self.view.shots:
             run = Run(self.pipeline, self.resident, shot.view, self.plan)
             planes = run.samples()
             self.events += run.events
-            self._gather(run, shot, planes, whole, counts)
+            self._gather(run, shot, planes, whole, kinds)
             for name, value in run.stats().items():
                 self._counts[name] = max(self._counts[name], value)
             self.uploads += run.uploads
@@ -44,17 +45,23 @@ class ExposedRun(Run):
         return self.resolve(whole)
 
     def _gather(
-        self, run: Run, shot: Shot, planes: list[cl.Buffer], whole: list[cl.Buffer], counts: list[int]
+        self,
+        run: Run,
+        shot: Shot,
+        planes: list[cl.Buffer],
+        whole: list[cl.Buffer],
+        kinds: list[tuple[int, bool]],
     ) -> None:
-        """Adds a shot's samples to the picture's."""
+        """Adds a shot's samples to the picture's. kinds: of each buffer its planes, and whether they are
+        averaged."""
         size = (np.int32(shot.view.width), np.int32(shot.view.height))
         strides = (np.int32(run.stride), np.uint32(run.rows * run.stride))
         strides += (np.int32(self.stride), np.uint32(self.rows * self.stride), np.int32(shot.top))
         items = (-(-shot.view.width // 16) * 16, -(-shot.view.height // 4) * 4)
         mean = (np.float32(shot.weight), np.int32(shot.first))
-        launch, queue = self.pipeline.launch, self.queue
-        event = launch(queue, "expose", items, (16, 4), (*size, *strides, *mean, planes[0], whole[0]))
-        self.events.append(("expose", event))
-        for k in range(1, len(planes)) if shot.middle else ():
-            args = (*size, *strides, np.int32(counts[k]), planes[k], whole[k])
-            self.events.append(("expose", launch(queue, "expose_planes", items, (16, 4), args)))
+        for (count, averaged), mine, every in zip(kinds, planes, whole, strict=True):
+            if averaged or shot.middle:
+                kernel, how = ("expose", mean) if averaged else ("expose_planes", ())
+                args = (*size, *strides, np.int32(count), *how, mine, every)
+                event = self.pipeline.launch(self.queue, kernel, items, (16, 4), args)
+                self.events.append(("expose", event))

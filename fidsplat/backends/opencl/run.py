@@ -89,10 +89,22 @@ class Run:
             np.float32(view.ceiling),
             np.float32(view.stop),
             np.float32(1.0 / view.samples**2),
-            sample_planes[0],
-            *(self.held[name] for effect in self.pipeline.features.effects for name in effect.blend_inputs),
-            *sample_planes[1:],
+            *self._blend_args(sample_planes),
         )
+
+    def _blend_args(self, sample_planes: list[cl.Buffer]) -> list:
+        """raw, then each effect's uniforms, arrays of the view and planes."""
+        planes = iter(sample_planes)
+        args: list = [next(planes)]
+        for effect in self.pipeline.features.effects:
+            args += self._uniforms(effect.blend_uniforms)
+            args += [self.held[name] for name in effect.blend_inputs]
+            args += [next(planes) for _ in effect.planes]
+        return args
+
+    def _uniforms(self, names: tuple[str, ...]) -> list[np.generic]:
+        numbers = [number for name in names for number in self.view.uniform(name)]
+        return [number if isinstance(number, np.generic) else np.float32(number) for number in numbers]
 
     def resolve(self, raw_planes: list[cl.Buffer]) -> dict[str, tuple[Output, cl.Buffer]]:
         view, features = self.view, self.pipeline.features
@@ -103,6 +115,8 @@ class Run:
         }
         extra, rest = [], iter(raw_planes[1:])
         for effect in features.effects:
+            extra += self._uniforms(effect.resolve_uniforms)
+            extra += [self.put(name, self.view.array(name)) for name in effect.resolve_arrays]
             extra += [next(rest) for _ in effect.planes]
             if effect.output:
                 extra.append(outputs[effect.output.name][1])

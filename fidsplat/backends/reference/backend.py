@@ -83,6 +83,7 @@ class ReferenceCloud:
         self.origin = cloud.origin
         self.sh_degree = cloud.sh_degree
         self.has_planes = cloud.planes is not None
+        self.footprint = cloud.footprint
 
 
 @dataclass
@@ -132,6 +133,7 @@ class ReferencePipeline:
         x = (np.asarray(columns)[:, None] * n + sub_columns.ravel() + 0.5).ravel()
         flat = self._exposed(resident, view, x, y) if view.shots else self._samples(resident, view, x, y)
         samples = {name: values.reshape(-1, n * n, *values.shape[1:]) for name, values in flat.items()}
+        samples |= {"x": x.reshape(-1, n * n), "y": y.reshape(-1, n * n)}
         return resolve(samples, view, self.features)
 
     def _samples(
@@ -149,8 +151,8 @@ class ReferencePipeline:
     def _exposed(
         self, resident: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray
     ) -> dict[str, np.ndarray]:
-        """The same of a picture of several shots: the mean of colours and transmittances, all else from the
-        middle one; `certificate_planes` is that one's certificate."""
+        """The same of a picture of several shots: the mean of colours, fog and transmittances, all else from
+        the middle one; `certificate_planes` is that one's certificate."""
         out: dict[str, np.ndarray] = {}
         for shot in view.shots:
             mine = (y > shot.top) & (y < shot.top + shot.view.height)
@@ -158,7 +160,7 @@ class ReferencePipeline:
             seen["certificate_planes"] = seen["certificate"]
             for name, values in seen.items():
                 plane = out.setdefault(name, np.zeros((len(x), *values.shape[1:]), values.dtype))
-                if name in ("rgb", "t", "certificate"):
+                if name in ("rgb", "t", "fogged", "certificate"):
                     plane[mine] += shot.weight * values
                 elif shot.middle:
                     plane[mine] = values

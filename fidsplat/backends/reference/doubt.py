@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fidsplat.backends.base import View
-from fidsplat.backends.reference.fragments import Fragments, shifted
+from fidsplat.backends.reference.fragments import Fragments, cover, shifted
 from fidsplat.backends.reference.optics import ROUND
 from fidsplat.backends.reference.setup import Setup
 
@@ -73,6 +73,16 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
     low = np.exp(s.log_opacity - furthest * (1 + _WEIGHT)) * (1 - _WEIGHT)
     high = np.exp(s.log_opacity - nearest * (1 - _WEIGHT)) * (1 + _WEIGHT)
     low, high = np.minimum(low, view.ceiling), np.minimum(high, view.ceiling)
+    if s.box.any():
+        # of an edge's distance: its two forms', one of them multiplied once more, and the sum's
+        off = np.stack(
+            [(e_d + 1.5 * e) * edge[None] for e, edge in zip((e_u, e_u, e_v, e_v), s.edges, strict=True)]
+        )
+        whole = np.minimum(np.exp(s.log_opacity), view.ceiling)
+        least = whole * cover(s.edges, f.n_u, f.n_v, f.d, -off - _ROUND) * (1 - _WEIGHT)
+        most = whole * cover(s.edges, f.n_u, f.n_v, f.d, off + _ROUND) * (1 + _WEIGHT)
+        low = np.where(s.box, np.where(must, least, 0.0), low)
+        high = np.where(s.box, np.where(may, most, 0.0), high)
     # no ray to the plane: the centre's depth
     z_low = np.where(d_low > 0, np.clip(z_low, s.pz - s.reach, s.pz + s.reach), s.pz - s.reach)
     z_high = np.clip(z_high, s.pz - s.reach, s.pz + s.reach)
@@ -111,6 +121,13 @@ def of_layer_color(thin: np.ndarray, thick: np.ndarray) -> np.ndarray:
     slope = np.exp(-least) + np.minimum(1.0, others / np.maximum(least, 1e-9)) / np.maximum(least, 1.0)
     moved = np.minimum(1.0, slope * (thick - thin)).sum(1, keepdims=True)
     return np.where((thick > 0).sum(1, keepdims=True) > 1, moved, 0.0)
+
+
+def of_box_color(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """The same (k, 1) of a layer of n boxes whose opacities lie between `low` and `high` (k, n): its colour
+    times its opacity is their sum, and where they cover more than all, their mean.
+    """
+    return np.where((high > 0).sum(1, keepdims=True) > 1, (high - low).sum(1, keepdims=True), 0.0)
 
 
 def of_layer_depth(
@@ -200,6 +217,29 @@ def of_median(span: Span) -> np.ndarray:
     may = (span.high > 0) & (span.front_high > 0.5 * (1 - _STOP))
     sure = (span.low > 0) & (span.front_low > 0.5 * (1 + _STOP))
     return np.asarray((may & ~sure).any(1))
+
+
+def of_first(span: Span, light: float) -> np.ndarray:
+    """Whether another fragment (k,) may be the first behind which no more than `light` is left."""
+    high, low = span.high, span.low
+    may = (high > 0) & (span.front_low * (1 - high) * (1 - _STOP) <= light)
+    sure = (low > 0) & (span.front_high * (1 - low) * (1 + _STOP) <= light)
+    return first_column(may, 0) != first_column(sure, 0)
+
+
+def of_count(
+    span: Span, count: np.ndarray, doubt: np.ndarray, stop: float, reordered: np.ndarray
+) -> np.ndarray:
+    """By how much (k,) the number of splats blended may differ. count, doubt (k, m): in each thing that is
+    laid."""
+    may, must = span.high > 0, span.low > 0
+    off = np.where(may, doubt + np.where(must, 0, count), 0)
+    # from where the light may have reached the stop to where it must have, whatever comes may be drawn or not
+    open_to = (span.front_high >= stop * (1 - _STOP)) & (
+        span.front_low * (1 - span.high) <= stop * (1 + _STOP)
+    )
+    off = np.where(may & open_to & (stop > 0), count + doubt, off)
+    return np.where(reordered, np.inf, off.sum(1))
 
 
 def of_label(span: Span, labels: np.ndarray, label: np.ndarray) -> np.ndarray:

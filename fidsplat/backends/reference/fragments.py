@@ -52,10 +52,29 @@ def fragments_of(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Fragment
         z = dz / d
     if s.screen:
         half_rho = np.minimum(half_rho, np.where(offset <= s.half_r2, offset, np.inf))
-    z = np.where(d > 0, np.clip(z, s.pz - s.reach, s.pz + s.reach), s.pz)
     alpha = np.minimum(np.exp(s.log_opacity - half_rho), view.ceiling)
+    if s.box.any():
+        visible = (d > 0) & (d * view.near <= dz)
+        whole = np.minimum(np.exp(s.log_opacity), view.ceiling)
+        alpha = np.where(s.box, np.where(visible, whole * cover(s.edges, n_u, n_v, d, 0.0), 0.0), alpha)
+    z = np.where(d > 0, np.clip(z, s.pz - s.reach, s.pz + s.reach), s.pz)
     dx, dy, away = np.abs(x - s.anchor_x), np.abs(y - s.anchor_y), away_of(view, samples, s.anchors)
     return Fragments(dx, dy, away, n_u, n_v, d, dz, offset, alpha, z)
+
+
+def cover(edges: np.ndarray, n_u: np.ndarray, n_v: np.ndarray, d: np.ndarray, shift) -> np.ndarray:
+    """What boxes cover of samples (k, n), 0 to 1, every edge moved outwards by `shift` (broadcast to (4, k,
+    n)).
+
+    `shift` is in samples, or one array for each of the edges.
+    """
+    shift = np.broadcast_to(shift, (4, *d.shape))
+
+    def ramp(form: np.ndarray, edge: int) -> np.ndarray:
+        return np.clip(0.5 + form * edges[edge] + shift[edge], 0, 1)
+
+    along_u = np.maximum(ramp(d + n_u, 0) + ramp(d - n_u, 1) - 1, 0)
+    return along_u * np.maximum(ramp(d + n_v, 2) + ramp(d - n_v, 3) - 1, 0)
 
 
 def optical_depth(alpha: np.ndarray) -> np.ndarray:

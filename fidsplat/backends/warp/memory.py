@@ -74,9 +74,11 @@ class Resident:
         origin: np.ndarray,
         sh_degree: int,
         planes: PlaneTable | None = None,
+        footprint: str = "gaussian",
     ) -> None:
         self.arrays, self.count, self.origin = arrays, count, origin
         self.sh_degree, self.planes, self.has_planes = sh_degree, planes, planes is not None
+        self.footprint = footprint
 
     @property
     def nbytes(self) -> int:

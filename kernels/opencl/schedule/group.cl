@@ -39,6 +39,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
     Pixel pixels[ROWS];
     for (int row = 0; row < ROWS; row++) pixel_start(&pixels[row]);
 //@@ group_start
+//@@ pixels_start
 
     uint base = starts[band_first], start = starts[tile] - base, end = starts[tile + 1] - base;
     for (uint batch = start; batch < end; batch += STAGED) {

@@ -22,6 +22,7 @@ kernel void blend(
     Pixel pixels[TILE_H];
     for (int row = 0; row < TILE_H; row++) pixel_start(&pixels[row]);
 //@@ lanes_start
+//@@ pixels_start
     // rows that still let light through; those below the picture never do
     int rows = min(height - y0, TILE_H);
     uint alive = rows == 32 ? 0xFFFFFFFFu : (1u << rows) - 1u;
