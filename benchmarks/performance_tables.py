@@ -4,9 +4,9 @@
     python benchmarks/performance_tables.py benchmarks/results/*.json* --into docs/performance.md
 
 Takes what `fidsplat bench --json`, benchmarks/peers, benchmarks/first_frame.py --json,
-benchmarks/listing_ways.py --json and benchmarks/growth.py write, in any mixture. Without --into the tables
-are printed. With it, each replaces what stands in that page between `<!-- begin NAME -->` and
-`<!-- end NAME -->`; a table for which nothing was measured is left alone.
+benchmarks/listing_ways.py --json, benchmarks/large_scenes.py --json and benchmarks/growth.py write, in any
+mixture. Without --into the tables are printed. With it, each replaces what stands in that page between
+`<!-- begin NAME -->` and `<!-- end NAME -->`; a table for which nothing was measured is left alone.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from fidsplat.files import atomic_write
 
 
 def load(files: Iterable[Path]) -> dict[str, list[dict]]:
-    """Records by kind: `frames`, `peers` (a peer and the fidsplat beside it), `first`, `ways`, `growth`."""
-    found: dict[str, list[dict]] = {"frames": [], "peers": [], "first": [], "ways": [], "growth": []}
+    """Records by kind; of `peers`, a fidsplat's is followed by the peer's."""
+    kinds = ("frames", "peers", "first", "ways", "large", "growth")
+    found: dict[str, list[dict]] = {kind: [] for kind in kinds}
     for file in files:
         text = file.read_text("utf-8")
         if file.suffix == ".jsonl":
@@ -32,7 +33,8 @@ def load(files: Iterable[Path]) -> dict[str, list[dict]]:
             continue
         content = json.loads(text)
         if isinstance(content, list):
-            found["ways" if "way" in content[0] else "first"] += content
+            kind = "ways" if "way" in content[0] else "large" if "millions" in content[0] else "first"
+            found[kind] += content
             continue
         results = [record for record in content["results"] if record.get("frame_ms")]
         with_peer = any(record["renderer"] != "fidsplat" for record in results)
@@ -72,10 +74,10 @@ def frames(records: dict[str, list[dict]]) -> str:
         rows.append(
             (
                 record["scene"],
-                record["title"],
+                f"{record['device']}: {record['title']}",
                 f"{ms(record['frame_ms'])} ({ms(low)} to {ms(high)})",
                 times(record, "frame"),
-                f"{record['splats_per_second'] / 1e6:.3g} M",
+                f"{record['splats_per_second'] / 1e6:.{0 if record['splats_per_second'] > 1e8 else 2}f} M",
                 "-" if memory is None else f"{memory / 2**30:.3g} GiB",
                 record["date"],
             )
@@ -92,7 +94,7 @@ def stages(records: dict[str, list[dict]]) -> str:
             f"{ms(record['stages_ms'][name])} ({times(record, name)})" if name in record["stages_ms"] else "-"
             for name in names
         )
-        rows.append((record["scene"], record["title"], *cells))
+        rows.append((record["scene"], f"{record['device']}: {record['title']}", *cells))
     return table(("scene", "device", *names), rows)
 
 
@@ -151,6 +153,32 @@ def ways(records: dict[str, list[dict]]) -> str:
     return table(("scene", "device", "lists", "sort", "bin", "both, ms", "date"), rows)
 
 
+def large(records: dict[str, list[dict]]) -> str:
+    """Tens of millions of splats."""
+    rows = []
+    for record in records["large"]:
+        held = (f"{record[name] / 2**30:.3g} GiB" for name in ("device_bytes", "peak_bytes"))
+        seconds = (f"{record[name]:.3g}" for name in ("first_s", "next_s"))
+        facts = ("yes" if record["chunks"] else "no", f"{record['visible']:,}", f"{record['pairs']:,}")
+        budget = "" if record["budget_gib"] is None else f", budget {record['budget_gib']:g} GiB"
+        rows.append(
+            (f"{record['millions']} M", record["device"] + budget, *seconds, *held, *facts, record["date"])
+        )
+    heads = (
+        "splats",
+        "device",
+        "first, s",
+        "next, s",
+        "device memory",
+        "process",
+        "chunks",
+        "visible",
+        "pairs",
+        "date",
+    )
+    return table(heads, rows)
+
+
 def growth(records: dict[str, list[dict]]) -> str:
     """Exponents of the growth curves."""
     drawn = records["growth"]
@@ -170,6 +198,7 @@ TABLES: dict[str, Callable[[dict[str, list[dict]]], str]] = {
     "peers": peers,
     "first": first,
     "ways": ways,
+    "large": large,
     "growth": growth,
 }
 

@@ -25,6 +25,7 @@ tables, growth = script("performance_tables"), script("growth")
 RECORD = {
     "scene": "tag",
     "renderer": "fidsplat",
+    "device": "d",
     "title": "a CPU",
     "date": "2026-11-21",
     "width": 640,
@@ -43,6 +44,7 @@ RECORD = {
 }
 PEER = RECORD | {
     "renderer": "Peer 1",
+    "device": "d",
     "title": "2 threads",
     "frame_ms": 1234.0,
     "times_ours": 1000.0,
@@ -61,7 +63,13 @@ FIRST = {
 @pytest.fixture
 def files(tmp_path):
     """One of each kind."""
-    failed = {"scene": "r20m_4k", "renderer": "fidsplat", "title": "a CPU", "error": "no memory"}
+    failed = {
+        "scene": "r20m_4k",
+        "renderer": "fidsplat",
+        "device": "d",
+        "title": "a CPU",
+        "error": "no memory",
+    }
     kinds = {
         "bench.json": {"results": [RECORD, failed]},
         "peer.json": {"results": [RECORD | {"frame_ms": 1.2}, PEER]},
@@ -73,6 +81,7 @@ def files(tmp_path):
         "frame_ms": 9.0,
         "stages_ms": {"blend": 9.0},
         "series": "splats",
+        "device": "d",
         "title": "a CPU",
         "error": None,
     }
@@ -93,9 +102,9 @@ def test_each_kind_of_figures_becomes_its_table(files):
     assert rows(made["counts"]) == ["| tag | 640 x 480 | 691 | 690 | 202,902 |"]
     assert rows(made["rates"]) == ["| a CPU | 45 GB/s | 250 G/s | 12.5 G/s | 50 G/s |"]
     assert rows(made["frames"]) == [
-        "| tag | a CPU | 1.23 (1.1 to 1.5) | 12.2 | 0.56 M | 1 GiB | 2026-11-21 |"
+        "| tag | d: a CPU | 1.23 (1.1 to 1.5) | 12.2 | 0.56 M | 1 GiB | 2026-11-21 |"
     ]
-    assert rows(made["stages"]) == ["| tag | a CPU | 0.25 (-) | 0.75 (15.5) |"]
+    assert rows(made["stages"]) == ["| tag | d: a CPU | 0.25 (-) | 0.75 (15.5) |"]
     assert rows(made["peers"]) == [
         "| tag | Peer 1, 2 threads | 1234 | a CPU: 1.2 | 1e+03 | 39.7 dB | 2026-11-21 |"
     ]
