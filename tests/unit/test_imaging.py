@@ -97,6 +97,16 @@ def test_a_scene_file_keeps_them(tmp_path):
     assert (fs.Scene.load(tmp_path / "a.toml").sensor, fs.Scene.load(tmp_path / "a.toml").fog) == (None, None)
 
 
+def test_a_scene_file_keeps_the_low_pass_and_the_first_hit(tmp_path):
+    quality = fs.Quality.named("fast").with_(lowpass="pixel", first_hit=0.4, samples=2)
+    fs.Scene(quality=quality).save(tmp_path / "a.toml")
+    assert fs.Scene.load(tmp_path / "a.toml").quality == quality
+    text = (tmp_path / "a.toml").read_text()
+    (tmp_path / "a.toml").write_text(text.replace('"pixel"', '"pixels"'))
+    with pytest.raises(fs.InputError, match=r"render.lowpass: quality: lowpass is 'pixels'"):
+        fs.Scene.load(tmp_path / "a.toml")
+
+
 def test_a_panorama_of_no_file_cannot_be_written(tmp_path):
     with pytest.raises(fs.InputError, match="came from no file"):
         fs.Scene(background=fs.Panorama(np.zeros((4, 8, 3)))).save(tmp_path / "a.toml")
