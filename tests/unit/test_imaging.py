@@ -1,6 +1,7 @@
 """Sensors, fog and backgrounds: values, scene files, and what is wrong with them."""
 
 import math
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -149,3 +150,11 @@ def test_the_command_writes_as_many_bits_as_the_sensor_has(tmp_path, bits):
     scene = fs.Scene.load(path)
     rgb = fs.Renderer("reference").render(scene)["rgb"]
     assert np.array_equal(image[:, :, ::-1], np.rint(rgb * (2**bits - 1)))
+
+
+@pytest.mark.parametrize("name", ["boxes", "fog", "sensor", "background", "lowpass", "outputs"])
+def test_the_examples_are_drawn(name, renderer):
+    file = Path(__file__).resolve().parents[2] / "examples" / f"{name}.toml"
+    frame = renderer.render(fs.Scene.load(file))
+    assert frame["rgb"].shape == (400, 640, 3)
+    assert frame["rgb"].std() > 0.05
