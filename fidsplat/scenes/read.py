@@ -25,7 +25,7 @@ CAMERA += ("position", "look_at", "up", "world_to_camera", "near", "far", *TABLE
 CAMERA_POSE = ("position", "look_at", "up", "world_to_camera")
 SPLATS = ("file", "position", "quaternion", "scale")
 MARKERS = ("spec", "size", "position", "quaternion", "mixture", "quiet_zone", "motion")
-RENDER = ("outputs", "background", "quality", "samples", "device")
+RENDER = ("outputs", "background", "quality", "samples", "lowpass", "first_hit", "device")
 IMAGE = "image:"
 
 
@@ -155,7 +155,9 @@ def _quality(table: Table) -> Quality | str | None:
     name = table.text("quality", None)
     with table.at("quality"):
         quality = Quality.of(name)
-    if "samples" not in table:
-        return name
-    with table.at("samples"):
-        return quality.with_(samples=table.whole("samples"))
+    readers = {"samples": table.whole, "lowpass": table.text, "first_hit": table.number}
+    given = [key for key in readers if key in table]
+    for key in given:
+        with table.at(key):
+            quality = quality.with_(**{key: readers[key](key)})
+    return quality if given else name

@@ -83,13 +83,16 @@ def _render(scene: Scene) -> dict:
     if isinstance(scene.background, tuple):
         table["background"] = list(scene.background)
     if isinstance(scene.quality, Quality):
-        plain = scene.quality.with_(samples=1)
-        names = [name for name, preset in PRESETS.items() if preset.with_(samples=1) == plain]
+        own = {key: getattr(scene.quality, key) for key in ("samples", "lowpass", "first_hit")}
+        names = [name for name, preset in PRESETS.items() if preset.with_(**own) == scene.quality]
         if not names:
             raise InputError(
-                "a scene file holds a preset's name and samples; this Quality differs from every preset"
+                f"a scene file holds a preset's name and {', '.join(own)}; this Quality differs in more from "
+                "every preset"
             )
-        table |= {"quality": names[0], "samples": scene.quality.samples}
+        plain = PRESETS[names[0]]
+        changed = {key: value for key, value in own.items() if value != getattr(plain, key)}
+        table |= {"quality": names[0], **changed}
     elif scene.quality is not None:
         table["quality"] = scene.quality
     if scene.device is not None:

@@ -17,6 +17,7 @@ from fidsplat.effects import catalogue as catalogue_module
 SHAPE = DeviceShape("lanes", "ordered", 16, 16, 16, 8, 11, 1, True)
 TAPS = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
+DIGESTS = ["8aae1f4da97510b8", "fadf58fb233f2382"]
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,51 @@ def test_text_does_not_depend_on_numbers():
 
 def test_features_are_the_same_whatever_the_order_of_outputs():
     assert select(Cloud(2), ["rgb", "label", "depth"], PLAIN) == select(Cloud(2), ("depth", "label"), PLAIN)
+
+
+def test_the_base_is_what_it_was():
+    """A change of the stages themselves records new digests here; an effect must not."""
+    group = DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, 1024, True)
+    digests = [assemble(select(COLORS, ("rgb",), PLAIN), shape).digest[:16] for shape in (SHAPE, group)]
+    assert digests == DIGESTS
+
+
+POSTS = {
+    "fog": {"fog": fs.Fog(0.1)},
+    "gradient": {"background": fs.Gradient((1, 1, 1), (0, 0, 0))},
+    "panorama": {"background": fs.Panorama(np.zeros((4, 8, 3)))},
+    "sensor": {"sensor": fs.Sensor(2, (0.1,), 1000, 3, 4, 0.5, "srgb", 8)},
+    "gamma": {"sensor": fs.Sensor(response=2.2)},
+    "table": {"sensor": fs.Sensor(response=(0, 0.9, 1))},
+    "pixel": {"quality": fs.Quality(lowpass="pixel")},
+    "mixed": {},
+    "everything": {
+        "fog": fs.Fog(0.1),
+        "sensor": fs.Sensor(2, (0.1,), 1000, 3, 4, 0.5, "srgb", 8),
+        "quality": fs.Quality(lowpass="pixel", samples=2),
+    },
+}
+
+
+@pytest.mark.parametrize("name", POSTS)
+@pytest.mark.parametrize("outputs", [("rgb",), ("rgb", *TAPS)], ids=["rgb", "all"])
+def test_effects_compile_and_run_with_every_output_and_none(renderer, name, outputs):
+    cloud = random_splats(20, seed=1, depth=(1, 4)).with_planes(np.arange(20) // 2 - 1)
+    if name in ("mixed", "everything"):
+        cloud = cloud.with_boxes(np.arange(20) // 2 % 2 == 0)
+    camera = fs.Camera.pinhole(20, 12, 20.0, 20.0, 10.0, 6.0)
+    frame = renderer.render(cloud, camera, outputs=outputs, **POSTS[name])
+    assert all(np.isfinite(frame[each]).all() for each in frame)
+
+
+@pytest.mark.parametrize("left_out", TAPS)
+def test_all_outputs_but_one_compile_and_run(renderer, left_out):
+    cloud = random_splats(20, seed=1, depth=(1, 4))
+    camera = fs.Camera.pinhole(20, 12, 20.0, 20.0, 10.0, 6.0)
+    names = [tap for tap in TAPS if tap != left_out]
+    frame = renderer.render(cloud, camera, outputs=names, quality=PLAIN)
+    assert set(frame) == set(names)
+    assert all(np.isfinite(frame[each]).all() for each in frame)
 
 
 def test_pipelines_are_compiled_once(renderer):

@@ -185,6 +185,33 @@ def test_the_sensor_leaves_the_other_outputs_alone(renderer):
     assert not np.array_equal(plain["rgb"], seen["rgb"])
 
 
+@pytest.mark.parametrize("mixture", ["fitted", "exact"])
+def test_a_tag_is_found_where_it_is_in_fog_and_noise(renderer, mixture):
+    """Position error under 1 % of the distance: the pictures are for robots that localise."""
+    from fidsplat.vision.detect import detect
+    from fidsplat.vision.images import to_uint8
+    from fidsplat.vision.pose import marker_pose, pose_error
+
+    pose = np.eye(4)
+    pose[:3, :3] = [[0.9, 0, 0.43588989], [0, 1, 0], [-0.43588989, 0, 0.9]]
+    pose[:3, 3] = (0.1, -0.05, 1.5)
+    made = fs.marker("apriltag:36h11:5", size=0.3, mixture=mixture)
+    camera = fs.Camera.pinhole(480, 360, 420.0, 420.0, 240.0, 180.0)
+    sensor = fs.Sensor(0.9, (-0.4,), 3000, 10, 3, 1.0, "srgb", 8)
+    scene = fs.Scene(
+        markers=[fs.scenes.PlacedMarker(made, pose)],
+        camera=camera,
+        background=fs.Gradient((0.3, 0.4, 0.6), (0.3, 0.25, 0.2)),
+        sensor=sensor,
+    )
+    for fog in (None, fs.Fog(0.3, (0.5, 0.5, 0.5))):
+        rgb = renderer.render(scene, quality=fs.Quality(lowpass="none", samples=2), fog=fog)["rgb"]
+        (found,) = detect(to_uint8(rgb), families=["36h11"], qr=False)
+        error, _ = pose_error(marker_pose(found.corners, 0.3, camera), pose)
+        assert found.id == 5
+        assert error < 0.01 * np.linalg.norm(pose[:3, 3])
+
+
 def test_a_view_needs_no_sensor():
     view = View.of(CAMERA, fs.Quality(), np.zeros(3), (0, 0, 0))
     assert view.sensor.steps == ()

@@ -1,6 +1,7 @@
 """Sensors, fog and backgrounds: values, scene files, and what is wrong with them."""
 
 import math
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -97,6 +98,16 @@ def test_a_scene_file_keeps_them(tmp_path):
     assert (fs.Scene.load(tmp_path / "a.toml").sensor, fs.Scene.load(tmp_path / "a.toml").fog) == (None, None)
 
 
+def test_a_scene_file_keeps_the_low_pass_and_the_first_hit(tmp_path):
+    quality = fs.Quality.named("fast").with_(lowpass="pixel", first_hit=0.4, samples=2)
+    fs.Scene(quality=quality).save(tmp_path / "a.toml")
+    assert fs.Scene.load(tmp_path / "a.toml").quality == quality
+    text = (tmp_path / "a.toml").read_text()
+    (tmp_path / "a.toml").write_text(text.replace('"pixel"', '"pixels"'))
+    with pytest.raises(fs.InputError, match=r"render.lowpass: quality: lowpass is 'pixels'"):
+        fs.Scene.load(tmp_path / "a.toml")
+
+
 def test_a_panorama_of_no_file_cannot_be_written(tmp_path):
     with pytest.raises(fs.InputError, match="came from no file"):
         fs.Scene(background=fs.Panorama(np.zeros((4, 8, 3)))).save(tmp_path / "a.toml")
@@ -139,3 +150,11 @@ def test_the_command_writes_as_many_bits_as_the_sensor_has(tmp_path, bits):
     scene = fs.Scene.load(path)
     rgb = fs.Renderer("reference").render(scene)["rgb"]
     assert np.array_equal(image[:, :, ::-1], np.rint(rgb * (2**bits - 1)))
+
+
+@pytest.mark.parametrize("name", ["boxes", "fog", "sensor", "background", "lowpass", "outputs"])
+def test_the_examples_are_drawn(name, renderer):
+    file = Path(__file__).resolve().parents[2] / "examples" / f"{name}.toml"
+    frame = renderer.render(fs.Scene.load(file))
+    assert frame["rgb"].shape == (400, 640, 3)
+    assert frame["rgb"].std() > 0.05

@@ -9,16 +9,16 @@
 // edges lie along the samples' rows the coverage is the exact area.
 //@ record
     float edge_u0, edge_u1, edge_v0, edge_v1;   // 1 / |grad| of the forms D + n_u, D - n_u, D + n_v, D - n_v
-//@ crossing
+//@ footprint_crossing
     vfloat cover;           // share of the sample that a box covers
-//@ crossing_functions
+//@ footprint_functions
 #define SQRT_2 1.41421356237309504880f
 static inline vfloat between(vfloat d, vfloat n, float edge_0, float edge_1) {
     vfloat above = clamp(FMA(FMA((vfloat)SQRT_2, n, d), (vfloat)edge_0, (vfloat)0.5f), (vfloat)0.0f, (vfloat)1.0f);
     vfloat below = clamp(FMA(FMA((vfloat)-SQRT_2, n, d), (vfloat)edge_1, (vfloat)0.5f), (vfloat)0.0f, (vfloat)1.0f);
     return fmax(above + below - 1.0f, (vfloat)0.0f);
 }
-//@ crossed
+//@ footprint_cross
     if (IS_BOX(s)) {
         c.cover = between(c.d, nu, s->edge_u0, s->edge_u1) * between(c.d, nv, s->edge_v0, s->edge_v1);
         c.inside = VMASK(c.cover > 0.0f) & VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);
