@@ -25,6 +25,7 @@ typedef struct {
     vfloat d;               // denominator
     vfloat q;               // n_u^2 + n_v^2
     vint inside;            // the ray meets the splat's plane within R and beyond the near plane
+//@@ crossing
 //@@ footprint_crossing
 } Crossing;
 

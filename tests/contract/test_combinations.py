@@ -15,7 +15,9 @@ from fidsplat.hard_cases.agreement import Picture, compare, judge
 
 SIZE = (41, 29)
 CLOUD = random_splats(120, 21, depth=(0.5, 5.0), scale=(0.02, 0.4))
-BOXES = replace(CLOUD, boxes=np.arange(len(CLOUD)) % 2 == 0)
+BOXES = fs.SplatCloud.concatenate(
+    [random_splats(60, 22, depth=(0.5, 5.0), scale=(0.02, 0.4)).with_boxes(), CLOUD]
+)
 PANORAMA = fs.Panorama(np.random.default_rng(5).random((8, 16, 3)).astype(np.float32))
 SKY = fs.Gradient((0.2, 0.4, 0.9), (0.4, 0.3, 0.1))
 FOG = fs.Fog(0.2, (0.6, 0.65, 0.7))
