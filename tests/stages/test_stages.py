@@ -229,6 +229,27 @@ def test_lists_that_outgrow_their_buffers_are_made_again(backend):
         assert np.array_equal(again.read(name), wanted[name]), name
 
 
+@pytest.mark.parametrize("spare", [1, 0, -1])
+def test_room_for_exactly_the_pairs_of_a_picture(backend, spare):
+    """Lists are made again if and only if there is no room for all of them."""
+    cloud, quality = random_splats(3000, seed=5, scale=(1e-3, 0.5)), fs.Quality()
+    groups = listing(backend, "tiled")
+    features, view = select(cloud, ALL_OUTPUTS, quality), View.of(CAMERA, quality, cloud.origin, (0, 0, 0))
+    drawn = []
+    for room in (None, spare):
+        own = type(backend)(backend.device)  # with buffers of its own
+        if room is not None:
+            pairs = drawn[0].stats["pairs"] + room
+            own.pool.scratch("lists", 4 * pairs)
+            own.pool.scratch("pairs", 8 * pairs)
+        drawn.append(own.pipeline(features, groups).render(own.upload(cloud), view))
+        grown = own.pool.size("pairs") > 8 * (drawn[0].stats["pairs"] + spare)
+        assert room is None or grown == (spare < 0)
+    assert drawn[0].stats == drawn[1].stats
+    for name in ALL_OUTPUTS:
+        assert np.array_equal(drawn[0].read(name), drawn[1].read(name)), name
+
+
 def test_a_list_longer_than_local_memory_is_sorted(backend):
     """tiles.cl sorts 2048 pairs at once in local memory, longer lists in global memory as well."""
     cloud = random_splats(11000, seed=8, depth=(1.0, 9.0), scale=(0.2, 0.3), across=0.1)

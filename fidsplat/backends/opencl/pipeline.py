@@ -107,10 +107,15 @@ class OpenCLPipeline:
             raise
 
     def _plan(self, resident: Resident, view: View) -> Plan:
-        pixels = view.width * view.height
+        shape = self.shape
+        tiles = -(-view.width // shape.tile_width) * -(-view.height // shape.tile_height)
+        # tables, places and tallies of tiles: much, if a GPU draws a large picture in chunks
+        fixed = 4 * tiles * (shape.chunks + 2 if shape.lists == "ordered" else 3)
+        pixels = view.width * view.height // view.samples**2
         planes = 4 + sum(planes for effect in self.features.effects for planes in effect.planes)
         channels = sum(output.channels for output in self.features.outputs)
-        fixed = 4 * pixels * planes + 4 * pixels // view.samples**2 * channels + resident.device_bytes
+        fixed += 4 * tiles * shape.tile_width * shape.tile_height * planes  # whole tiles
+        fixed += 4 * pixels * channels + resident.device_bytes
         backend, record = self.backend, self.source.record_bytes
         budget, largest = backend.memory_budget, backend.device.max_mem_alloc_size
         upload = resident.bytes_per_splat if resident.streamed else 0
