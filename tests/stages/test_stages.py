@@ -132,6 +132,22 @@ def test_culled_splats_change_nothing(backend):
     assert np.array_equal(traced(backend, fewer, fs.Quality())[0]["rgb"], trace["rgb"])
 
 
+@pytest.mark.parametrize("lists", ["ordered", "tiled"])
+def test_splats_between_the_samples_are_culled(backend, lists):
+    """Without a low-pass a splat that is smaller than a sample mostly meets no ray; it costs no list."""
+    shape = listing(backend, lists)
+    if not hasattr(shape, "lists"):
+        pytest.skip("reads the records of the OpenCL backend")
+    cloud = random_splats(20000, seed=3, scale=(1e-5, 3e-4))
+    trace, _ = traced(backend, cloud, fs.Quality(lowpass="none"), shape=shape)
+    kept = np.flatnonzero(trace["keys"] != CULLED)
+    y0, y1, x0, x1 = trace["records"][kept].view(np.int16)[:, 30:34].T  # of Splat, kernels/opencl/splat.cl
+    assert len(kept) > 5
+    assert (x0 < x1).all()
+    assert (y0 < y1).all()
+    assert trace["rgb"].any()
+
+
 def test_tile_size_leaves_every_bit_as_it_was(backend):
     """numerics A4 and A5: one test that finds every bug of the bounds."""
     cloud = random_splats(300, seed=3)
