@@ -268,19 +268,31 @@ class Renderer:
         """Draw one cloud from many cameras, one Frame for each, in their order.
 
         The cloud is uploaded once, kernels and buffers are used again, and on a device that works beside the
-        host the next picture is under way while the caller has the last. Arguments and errors: as `render`.
+        host the next picture is under way while the caller has the last. Arguments and errors: as `render`;
+        an error comes after the pictures of the cameras before it.
         """
         own = scene if isinstance(scene, Scene) else _NO_SCENE
         chosen = own.quality if quality is None else quality
         names = own.outputs if outputs is None else outputs
-        behind = own.background if background is None else background
+        names = names if isinstance(names, str) else tuple(names)
+        behind = background_of(own.background if background is None else background)
         sensor, fog = sensor or own.sensor, fog or own.fog
         resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
         waiting: Frame | None = None
-        for camera in cameras:
-            frame = self.render(resident, camera, names, chosen, behind, sensor=sensor, fog=fog)
+        failure: Exception | None = None
+        rest = iter(cameras)
+        while True:
+            try:
+                frame = self.render(resident, next(rest), names, chosen, behind, sensor=sensor, fog=fog)
+            except StopIteration:
+                break
+            except Exception as error:
+                failure = error
+                break
             if waiting is not None:
                 yield waiting
             waiting = frame
         if waiting is not None:
             yield waiting
+        if failure is not None:
+            raise failure

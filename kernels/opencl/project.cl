@@ -111,8 +111,9 @@ kernel void project(
     bounds_rows(&bounds, height, &y0, &y1);
     float x0, x1;
     bounds_span(&bounds, (float)y0 + 0.5f, (float)y1 - 0.5f, &x0, &x1);
-    // written so that a NaN is culled (numerics E1)
-    if (!(y0 < y1 && ceil(x0 - 0.5f) <= (float)(width - 1) && floor(x1 - 0.5f) >= 0.0f)) return;
+    // also what lies between two columns of samples; written so that a NaN is culled (numerics E1)
+    float first = ceil(x0 - 0.5f), last = floor(x1 - 0.5f);
+    if (!(y0 < y1 && first <= (float)(width - 1) && last >= 0.0f && first <= last)) return;
 
     if (y1 <= (int)view[VIEW_BAND] || y0 >= (int)view[VIEW_BAND_END]) {
         keys[i] = OUTSIDE;

@@ -1,5 +1,8 @@
 """A memory budget changes how a picture is drawn, never what it shows."""
 
+import sys
+import weakref
+
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, random_splats
@@ -132,3 +135,85 @@ def test_pictures_of_many_sizes_leave_no_heap_of_buffers(opencl):
         own.render(some, fs.Camera.look_at(64, 32, 1.0, (0, 0, -0.1), (0, 0, 3)))
         held.append(own.backend.pool.memory_bytes)
     assert max(held) <= held[0]
+
+
+def test_a_pool_keeps_to_the_budget_whatever_was_drawn_before(opencl):
+    """Pictures at once and in chunks, few and many planes: what one kind has left does not count against
+    the next."""
+    budget = 16 * 2**20
+    own = fs.Renderer(opencl.device.name, memory_budget=budget)
+    for count, outputs in ((70000, ("rgb",)), (400000, ALL_OUTPUTS), (100000, ("rgb",)), (400000, ("rgb",))):
+        crowd = random_splats(count, seed=6, scale=(1e-4, 1e-2))
+        resident = own.upload(crowd)
+        wanted = opencl.render(crowd, CAMERA, outputs)
+        frame = own.render(resident, CAMERA, outputs)
+        assert all(np.array_equal(frame[name], wanted[name]) for name in outputs)
+        assert own.backend.pool.memory_bytes + resident.memory_bytes <= budget, count
+
+
+def test_neither_frames_nor_kernels_keep_a_cloud(opencl):
+    """Not its buffers, and not the host's arrays that a CPU reads."""
+    some = random_splats(100, seed=7)
+    array, before = some.means, sys.getrefcount(some.means)
+    resident = opencl.upload(some)
+    data = weakref.ref(resident._data)
+    frame = opencl.render(resident, CAMERA)
+    del resident
+    assert data() is None
+    del some
+    assert sys.getrefcount(array) <= before
+    assert frame["rgb"].any()
+    assert frame.stats["splats"] == 100
+
+
+def test_kernels_see_new_buffers_at_old_addresses(opencl):
+    """Arguments are kept from picture to picture, buffers are not: each cloud is drawn, not the last one."""
+    wanted = [random_splats(50, seed=seed) for seed in range(6)]
+    first = [opencl.render(cloud, CAMERA)["rgb"] for cloud in wanted]
+    for _ in range(3):
+        for cloud, picture in zip(wanted, first, strict=True):
+            assert np.array_equal(opencl.render(cloud, CAMERA)["rgb"], picture)
+    assert len({picture.tobytes() for picture in first}) == 6
+
+
+def test_a_leased_buffer_has_the_size_that_was_asked_for(opencl):
+    pool = fs.Renderer(opencl.device.name).backend.pool
+    pool.give_back([("plane", pool.fresh("plane", 64)), ("plane", pool.fresh("plane", 64))])
+    assert pool.lease("plane", 4096).size == 4096
+    kept = pool.fresh("plane", 4096)
+    pool.give_back([("plane", kept)])
+    assert pool.lease("plane", 4096) is kept
+
+
+def test_a_plane_that_cannot_be_read_is_an_error_of_the_device(opencl):
+    frame = opencl.render(random_splats(10, seed=8), CAMERA)
+    output, _ = frame._planes._outputs["rgb"]
+    frame._planes._outputs["rgb"] = output, opencl.backend.pool.fresh("too small", 16)
+    with pytest.raises(fs.DeviceError, match="failed while drawing rgb"):
+        frame["rgb"]
+
+
+def views_until(failing):
+    """Two good cameras, then `failing`."""
+    for x in (-0.5, 0.5):
+        yield fs.Camera.look_at(40, 30, 1.0, (x, 0.0, -0.1), (0.0, 0.0, 3.0))
+    yield failing()
+
+
+@pytest.mark.parametrize("error", [fs.InputError, KeyError])
+def test_views_before_an_error_are_given(renderer, error):
+    """Whether the next camera cannot be had or cannot be drawn."""
+
+    def failing():
+        if error is KeyError:
+            raise KeyError("no more")
+        return "no camera"
+
+    names = (name for name in ("rgb", "alpha"))  # walked once, used for every view
+    frames = renderer.render_views(
+        random_splats(30, seed=4), views_until(failing), names, background=iter((0, 1, 0))
+    )
+    seen = [next(frames), next(frames)]
+    with pytest.raises(error):
+        next(frames)
+    assert [frame["alpha"].shape for frame in seen] == [(30, 40)] * 2

@@ -132,6 +132,22 @@ def test_culled_splats_change_nothing(backend):
     assert np.array_equal(traced(backend, fewer, fs.Quality())[0]["rgb"], trace["rgb"])
 
 
+@pytest.mark.parametrize("lists", ["ordered", "tiled"])
+def test_splats_between_the_samples_are_culled(backend, lists):
+    """Without a low-pass a splat that is smaller than a sample mostly meets no ray; it costs no list."""
+    shape = listing(backend, lists)
+    if not hasattr(shape, "lists"):
+        pytest.skip("reads the records of the OpenCL backend")
+    cloud = random_splats(20000, seed=3, scale=(1e-5, 3e-4))
+    trace, _ = traced(backend, cloud, fs.Quality(lowpass="none"), shape=shape)
+    kept = np.flatnonzero(trace["keys"] != CULLED)
+    y0, y1, x0, x1 = trace["records"][kept].view(np.int16)[:, 30:34].T  # of Splat, kernels/opencl/splat.cl
+    assert len(kept) > 5
+    assert (x0 < x1).all()
+    assert (y0 < y1).all()
+    assert trace["rgb"].any()
+
+
 def test_tile_size_leaves_every_bit_as_it_was(backend):
     """numerics A4 and A5: one test that finds every bug of the bounds."""
     cloud = random_splats(300, seed=3)
@@ -227,6 +243,27 @@ def test_lists_that_outgrow_their_buffers_are_made_again(backend):
     assert again.stats["pairs"] > 1e5
     for name in ALL_OUTPUTS:
         assert np.array_equal(again.read(name), wanted[name]), name
+
+
+@pytest.mark.parametrize("spare", [1, 0, -1])
+def test_room_for_exactly_the_pairs_of_a_picture(backend, spare):
+    """Lists are made again if and only if there is no room for all of them."""
+    cloud, quality = random_splats(3000, seed=5, scale=(1e-3, 0.5)), fs.Quality()
+    groups = listing(backend, "tiled")
+    features, view = select(cloud, ALL_OUTPUTS, quality), View.of(CAMERA, quality, cloud.origin, (0, 0, 0))
+    drawn = []
+    for room in (None, spare):
+        own = type(backend)(backend.device)  # with buffers of its own
+        if room is not None:
+            pairs = drawn[0].stats["pairs"] + room
+            own.pool.scratch("lists", 4 * pairs)
+            own.pool.scratch("pairs", 8 * pairs)
+        drawn.append(own.pipeline(features, groups).render(own.upload(cloud), view))
+        grown = own.pool.size("pairs") > 8 * (drawn[0].stats["pairs"] + spare)
+        assert room is None or grown == (spare < 0)
+    assert drawn[0].stats == drawn[1].stats
+    for name in ALL_OUTPUTS:
+        assert np.array_equal(drawn[0].read(name), drawn[1].read(name)), name
 
 
 def test_a_list_longer_than_local_memory_is_sorted(backend):

@@ -8,7 +8,7 @@ in local memory: few launches, all of them wide. docs/performance.md has both on
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -70,9 +70,10 @@ class OrderedLists(Lists):
         self._stats: dict[str, int] = {}
         self._count = run.resident.count
 
-    def stats(self) -> dict[str, int]:
-        """splats, visible, pairs."""
-        return self._stats
+    def stats(self) -> Callable[[], dict[str, int]]:
+        """To be asked for after the last band, and called when splats, visible and pairs are wanted."""
+        stats = self._stats
+        return lambda: dict(stats)
 
     def bands(self) -> Iterator[tuple[int, int]]:
         """Projects and sorts; yields ranges of tiles (first, end), each when its lists are on the device."""
@@ -239,10 +240,17 @@ class TiledLists(Lists):
         # work-groups that share out the splats of many tiles
         self._big_groups = 4 * run.backend.device.max_compute_units
 
-    def stats(self) -> dict[str, int]:
-        """splats, visible, pairs."""
-        visible = int(self.run.read("tallies", np.uint32, (_TALLIES,))[_VISIBLE])
-        return {"splats": self.run.resident.count, "visible": visible, "pairs": self._pairs}
+    def stats(self) -> Callable[[], dict[str, int]]:
+        """To be asked for after the last band, and called when splats, visible and pairs are wanted."""
+        queue, tallies = self.run.queue, self.run.held["tallies"]
+        splats, pairs = self.run.resident.count, self._pairs
+
+        def read() -> dict[str, int]:
+            words = np.empty(_TALLIES, np.uint32)
+            cl.enqueue_copy(queue, words, tallies)
+            return {"splats": splats, "visible": int(words[_VISIBLE]), "pairs": pairs}
+
+        return read
 
     def bands(self) -> Iterator[tuple[int, int]]:
         """Projects; yields ranges of tiles (first, end), each when its lists are on the device."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +20,10 @@ if TYPE_CHECKING:
 _LEAST = 16  # bytes; OpenCL has no empty buffers
 
 
+class DeviceBuffer(cl.Buffer):
+    """A buffer that can be referred to weakly: to remember it is not to keep it."""
+
+
 class BufferPool:
     """Scratch buffers by name, kept from frame to frame and replaced only when one is too small."""
 
@@ -34,10 +39,13 @@ class BufferPool:
 
     def lease(self, name: str, size: int) -> cl.Buffer:
         """A buffer for somebody who gives it back (`give_back`) when it is not needed any more."""
-        spare = self._spare.get(name)
-        if spare and spare[0].size != max(size, _LEAST):
-            spare.clear()  # of pictures of another size
-        return spare.pop() if spare else self.fresh(name, size)
+        # taken before it is looked at: planes that die meanwhile may give back others
+        spare = self._spare.get(name, [])
+        while spare:
+            buffer = spare.pop()
+            if buffer.size == max(size, _LEAST):
+                return buffer  # else it was of a picture of another size
+        return self.fresh(name, size)
 
     def give_back(self, buffers: list[tuple[str, cl.Buffer]]) -> None:
         """Keeps one or two leased buffers of a name for the next picture of the same size."""
@@ -51,6 +59,13 @@ class BufferPool:
         """What the scratch buffers hold, and leased ones that were given back."""
         spare = (buffer for buffers in self._spare.values() for buffer in buffers)
         return sum(buffer.size for buffer in (*self._buffers.values(), *spare))
+
+    def shrink(self, size: int, kept: Collection[cl.Buffer]) -> None:
+        """Lets go of what is not among `kept`, if the pool holds more than `size` bytes."""
+        if self.memory_bytes > size:
+            self._spare.clear()
+            keep = set(map(id, kept))
+            self._buffers = {name: held for name, held in self._buffers.items() if id(held) in keep}
 
     def scratch(self, name: str, size: int) -> cl.Buffer:
         """A buffer of at least `size` bytes whose content is undefined."""
@@ -73,7 +88,7 @@ class BufferPool:
                 f"most {limit / 2**20:.0f} MiB; use fewer splats or a smaller picture"
             )
         try:
-            return cl.Buffer(self._context, cl.mem_flags.READ_WRITE, max(size, _LEAST))
+            return DeviceBuffer(self._context, cl.mem_flags.READ_WRITE, max(size, _LEAST))
         except cl.Error as error:
             raise DeviceError(f"no memory for {name} ({size / 2**20:.0f} MiB): {error}") from error
 
@@ -119,9 +134,12 @@ class Resident:
             total > backend.memory_budget // 2 or widest > device.max_mem_alloc_size
         )
         if not self._shared and not self.streamed:
-            for name in self._arrays.keys() - {"labels"}:
-                self._whole(name)
-            backend.queue.finish()
+            try:
+                for name in self._arrays.keys() - {"labels"}:
+                    self._whole(name)
+                backend.queue.finish()
+            except cl.Error as error:
+                raise DeviceError(f"{backend.info.title} failed while taking the cloud: {error}") from error
 
     @property
     def bytes_per_splat(self) -> int:
@@ -156,7 +174,8 @@ class Resident:
             if array.size == 0:
                 buffer = self._backend.pool.fresh(f"the cloud's {name}", 16)
             elif self._shared:
-                buffer = cl.Buffer(self._backend.context, flags.READ_ONLY | flags.USE_HOST_PTR, hostbuf=array)
+                flags = flags.READ_ONLY | flags.USE_HOST_PTR
+                buffer = DeviceBuffer(self._backend.context, flags, hostbuf=array)
             else:
                 buffer = self._backend.pool.fresh(f"the cloud's {name}", array.nbytes)
                 cl.enqueue_copy(self._backend.queue, buffer, array)

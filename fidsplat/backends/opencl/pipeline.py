@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ import pyopencl as cl
 from fidsplat.backends.base import View
 from fidsplat.backends.opencl.assemble import DeviceShape, Source
 from fidsplat.backends.opencl.exposed_run import ExposedRun
-from fidsplat.backends.opencl.memory import Resident
+from fidsplat.backends.opencl.memory import DeviceBuffer, Resident
 from fidsplat.backends.opencl.plan import Plan, plan_of
 from fidsplat.backends.opencl.run import Run
 from fidsplat.effects import FeatureSet
@@ -31,16 +32,26 @@ class OpenCLPlanes:
     """
 
     def __init__(self, run: Run, outputs: dict[str, tuple[Output, cl.Buffer]]) -> None:
-        self._queue, self._outputs, self._events, self._stats = run.queue, outputs, run.events, run.stats
+        # not the run itself, which holds the cloud and all scratch buffers
+        self._queue, self._outputs, self._events = run.queue, outputs, run.events
+        self._stats, self._title = run.stats, run.backend.info.title
         self._uploads = run.uploads  # kept until the device has read them
         self._size = (run.view.height // run.view.samples, run.view.width // run.view.samples)
         weakref.finalize(self, run.pool.give_back, run.leased)
 
     def read(self, name: str) -> np.ndarray:
+        """The plane on the host; waits for the device.
+
+        Raises:
+            DeviceError: the device has failed, in this or while it was drawing.
+        """
         output, buffer = self._outputs[name]
         shape = self._size if output.channels == 1 else (*self._size, output.channels)
         plane = np.empty(shape, output.dtype)
-        cl.enqueue_copy(self._queue, plane, buffer)
+        try:
+            cl.enqueue_copy(self._queue, plane, buffer)
+        except cl.Error as error:
+            raise DeviceError(f"{self._title} failed while drawing {name}: {error}") from error
         return plane
 
     @property
@@ -89,16 +100,25 @@ class OpenCLPipeline:
         try:
             run = (ExposedRun if view.shots else Run)(self, resident, view, plan)
             return OpenCLPlanes(run, run.draw())
-        except cl.Error as error:
-            raise DeviceError(f"{self.backend.info.title} failed while drawing: {error}") from error
+        except BaseException as error:
+            with suppress(cl.Error):
+                self.backend.queue.finish()  # a CPU may be reading the arrays of a cloud that nobody keeps
+            if isinstance(error, cl.Error):
+                raise DeviceError(f"{self.backend.info.title} failed while drawing: {error}") from error
+            raise
 
     def _plan(self, resident: Resident, view: View) -> Plan:
-        pixels = view.width * view.height
+        shape = self.shape
+        tiles = -(-view.width // shape.tile_width) * -(-view.height // shape.tile_height)
+        # tables, places and tallies of tiles: much, if a GPU draws a large picture in chunks
+        fixed = 4 * tiles * (shape.chunks + 2 if shape.lists == "ordered" else 3)
+        pixels = view.width * view.height // view.samples**2
         planes = 4 + sum(planes for effect in self.features.effects for planes in effect.planes)
         channels = sum(output.channels for output in self.features.outputs)
         if view.shots:
             planes *= 2  # the picture's own beside those of a shot
-        fixed = 4 * pixels * planes + 4 * pixels // view.samples**2 * channels + resident.device_bytes
+        fixed += 4 * tiles * shape.tile_width * shape.tile_height * planes  # whole tiles
+        fixed += 4 * pixels * channels + resident.device_bytes
         backend, record = self.backend, self.source.record_bytes
         budget, largest = backend.memory_budget, backend.device.max_mem_alloc_size
         upload = resident.bytes_per_splat if resident.streamed else 0
@@ -107,12 +127,14 @@ class OpenCLPipeline:
     def launch(self, queue: cl.CommandQueue, name: str, size: tuple, group: tuple, args: tuple) -> cl.Event:
         """Launch a kernel, setting only those arguments that have changed since its last launch: from picture
         to picture hardly any do, and setting them takes the host longer than a small stage takes a GPU.
+        Buffers are remembered weakly, so that a cloud or a picture that nobody has any more is let go.
         """
         kernel, bound = self._kernels[name], self._bound.pop(name, (None,) * len(args))
-        for index, (new, old) in enumerate(zip(args, bound, strict=True)):
+        known = tuple(_remembered(argument) for argument in args)
+        for index, (new, old) in enumerate(zip(known, bound, strict=True)):
             if new is not old and (type(new) is not type(old) or new != old):
-                kernel.set_arg(index, new)
-        self._bound[name] = args
+                kernel.set_arg(index, args[index])
+        self._bound[name] = known
         return cl.enqueue_nd_range_kernel(queue, kernel, size, group)
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
@@ -134,3 +156,10 @@ class OpenCLPipeline:
             "raw": run.read("raw", np.float32, (4, run.rows, run.stride)),
             **{output.name: planes.read(output.name) for output in self.features.outputs},
         }
+
+
+def _remembered(argument: object) -> object:
+    """What tells a kernel's argument from all others, without keeping a buffer."""
+    if isinstance(argument, DeviceBuffer):
+        return weakref.ref(argument)  # of one that is gone: equal to no other
+    return object() if isinstance(argument, cl.MemoryObject) else argument  # part of a buffer: made anew

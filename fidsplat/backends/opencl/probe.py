@@ -86,6 +86,9 @@ class _PoisonedPool(BufferPool):
     def scratch(self, name: str, size: int) -> cl.Buffer:
         return self._filled(super().scratch(name, size))
 
+    def lease(self, name: str, size: int) -> cl.Buffer:
+        return self._filled(super().lease(name, size))
+
     def fresh(self, name: str, size: int) -> cl.Buffer:
         return self._filled(super().fresh(name, size))
 

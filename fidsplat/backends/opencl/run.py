@@ -39,24 +39,20 @@ class Run:
         self.uploads: list[cl.Event] = []
         self.held: dict[str, cl.Buffer] = {}
         self.leased: list[tuple[str, cl.Buffer]] = []
-        self.lists = LISTS["chunked" if plan.chunk else self.shape.lists](self)
-        self.stats: Callable[[], dict[str, int]] = self.lists.stats
+        self.stats: Callable[[], dict[str, int]] = dict
 
     def draw(self) -> dict[str, tuple[Output, cl.Buffer]]:
         """All stages; returns the outputs by name."""
-        raw_planes = self._sample_planes()
-        outputs = {}
-        for first, end in self.lists.bands():
-            self._blend(first, end, raw_planes)
-            if end == self.tiles:
-                outputs = self.resolve(raw_planes)
-        return outputs
+        return self.resolve(self.samples())
 
     def samples(self) -> list[cl.Buffer]:
         """All stages but the last: the sample planes, raw first."""
         planes = self._sample_planes()
-        for first, end in self.lists.bands():
+        # not an attribute: in a cycle, all that this picture holds would wait for the garbage collector
+        lists = LISTS["chunked" if self.plan.chunk else self.shape.lists](self)
+        for first, end in lists.bands():
             self._blend(first, end, planes)
+        self.stats = lists.stats()
         return planes
 
     # stages
@@ -138,6 +134,11 @@ class Run:
 
     def take(self, name: str, size: int) -> cl.Buffer:
         """A scratch buffer that this picture calls `name`."""
+        if size > self.pool.size(name):
+            self.held.pop(name, None)
+            # what pictures of another kind have left must not count against this one
+            own = self.resident.device_bytes + sum(buffer.size for _, buffer in self.leased)
+            self.pool.shrink(self.backend.memory_budget - own - size, self.held.values())
         self.held[name] = buffer = self.pool.scratch(name, size)
         return buffer
 
