@@ -87,8 +87,8 @@ def _render(scene: Scene) -> dict:
         names = [name for name, preset in PRESETS.items() if preset.with_(**own) == scene.quality]
         if not names:
             raise InputError(
-                f"a scene file holds a preset's name and {', '.join(own)}; this Quality differs in more from "
-                "every preset"
+                f"a scene file holds a preset's name and {', '.join(own)}; in the rest this Quality "
+                "differs from every preset"
             )
         plain = PRESETS[names[0]]
         changed = {key: value for key, value in own.items() if value != getattr(plain, key)}
