@@ -10,26 +10,16 @@ import warp as wp
 from .bounds import Bounds, make_bounds
 from .common import STRICT, View, lowest, store_line
 from .pixel import make_pixel
-from .staging import BLOCK_W, STAGED
+from .staging import BLOCK_H, BLOCK_W, STAGED
 
 NONE, ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 
 
-def strip_of(effects: tuple[str, ...]) -> int:
-    """Samples in a row that one GPU thread draws: two share the reading of a record. Pending layers leave no
-    registers for that.
-    """
-    return 1 if "compose_planes" in effects else 2
-
-
+MIN = {True: 1, False: 1}
 @cache
-def make_blend(effects: tuple[str, ...], on_gpu: bool):
-    """The kernel for these effects of splats and samples."""
-    strip = strip_of(effects)
-    several = strip == 2
-    lanes = BLOCK_W // strip  # of a warp, in a row of samples
-    block_h = 32 // lanes
-    parts = make_pixel(effects, block_h)
+def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
+    """The kernel for these effects of splats and samples; threads: of a block on a GPU, as a tile has samples."""
+    parts = make_pixel(effects)
     pool, stage, touched = parts.staging.pool, parts.staging.stage, parts.staging.touched
     load_staged = parts.load_staged
     Pixel = parts.Pixel
@@ -67,7 +57,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool):
             raw_label[at] = p.label
             raw_label_weight[at] = p.label_weight
 
-    @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+    @wp.kernel(module="unique", module_options=STRICT, enable_backward=False, launch_bounds=(threads, MIN["compose_planes" in effects] if threads == 256 else 1))
     def blend_gpu(
         band_first: int,  # tile of block 0
         view: View,
@@ -84,59 +74,43 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool):
         raw_label_weight: wp.array(dtype=wp.float32),
     ):
         thread = wp.tid()
-        threads = view.tile_w * view.tile_h / strip
         tile = band_first + thread / threads
         item = thread % threads
         # a warp draws a block, so that a splat that misses it costs it nothing
         block, lane = item / 32, item % 32
         across = view.tile_w / BLOCK_W
         left = (tile % view.tiles_x) * view.tile_w + (block % across) * BLOCK_W
-        top = (tile / view.tiles_x) * view.tile_h + (block / across) * block_h
-        x0 = left + (lane % lanes) * strip
-        y0 = top + lane / lanes
-        p0, p1 = start(), start()
-        # what lies beyond the picture is finished from the start
-        if y0 >= view.height or x0 >= view.width:
-            p0.t = 0.0
-        if y0 >= view.height or x0 + 1 >= view.width or wp.static(not several):
-            p1.t = 0.0
+        top = (tile / view.tiles_x) * view.tile_h + (block / across) * BLOCK_H
+        x0 = left + lane % BLOCK_W
+        y0 = top + lane / BLOCK_W
+        p = start()
+        if x0 >= view.width or y0 >= view.height:
+            p.t = 0.0  # what lies beyond the picture is finished from the start
         records = pool()
         k = starts[tile]
         end = starts[tile + 1]
         while k < end:
             length = wp.min(end - k, STAGED)
-            if not stage(records, lines, lists, k, length, unfinished(p0, view) or unfinished(p1, view)):
+            if not stage(records, lines, lists, k, length, unfinished(p, view)):
                 break
             word = int(0)
             while 32 * word < length:
-                bits = touched(
-                    records, word, length, left, top, unfinished(p0, view) or unfinished(p1, view)
-                )
+                bits = touched(records, word, length, left, top, unfinished(p, view))
                 while bits != NONE:
                     which = 32 * word + lowest(bits)
                     bits = bits & (bits - ONE)
                     s = load_staged(records, lines, lists, k, which, view)
                     index = lists[k + which]
-                    x = float(x0) - s.d[3]
-                    y = float(y0) - s.c[0]
-                    u, v, d = row_of(s.u, y), row_of(s.v, y), row_of(s.d, y)
-                    if unfinished(p0, view):
-                        c0 = cross(s, u, v, d, x, y, view)
-                        if c0.drawn:
-                            p0 = blend_one(p0, s, c0, index, lines, labels, planes, view)
-                    if wp.static(several):
-                        if unfinished(p1, view):
-                            c1 = cross(s, u, v, d, x + 1.0, y, view)
-                            if c1.drawn:
-                                p1 = blend_one(p1, s, c1, index, lines, labels, planes, view)
+                    if unfinished(p, view):
+                        y = float(y0) - s.c[0]
+                        u, v, d = row_of(s.u, y), row_of(s.v, y), row_of(s.d, y)
+                        c = cross(s, u, v, d, float(x0) - s.d[3], y, view)
+                        if c.drawn:
+                            p = blend_one(p, s, c, index, lines, labels, planes, view)
                 word += 1
             k += length
         at = y0 * view.tiles_x * view.tile_w + x0
-        store(finish(p0, view), at, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
-        if wp.static(several):
-            store(
-                finish(p1, view), at + 1, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight
-            )
+        store(finish(p, view), at, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def blend_cpu(

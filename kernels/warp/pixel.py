@@ -34,14 +34,14 @@ DARKEST = wp.constant(wp.float32(2.0**-24))
 
 
 @cache
-def make_pixel(effects: tuple[str, ...], block_h: int) -> SimpleNamespace:
+def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     """The state of a sample, what it reads of a splat, and what is done with them: Pixel, Splat; load, start,
-    row, cross, unfinished, blend, finish; and what brings splats to a GPU block whose warps draw blocks of
-    block_h rows: staging, load_staged.
+    row, cross, unfinished, blend, finish; and what brings splats to the threads of a GPU block:
+    staging, load_staged.
     """
     layout = Layout(effects)
     each = layout.lines
-    staging = make_staging(layout, block_h)
+    staging = make_staging(layout)
     staged_line = staging.line
     screen, exclusive, ray_depth, depth, median, normal, label = (
         name in effects

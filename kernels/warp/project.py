@@ -23,11 +23,10 @@ from .records import Layout
 
 # [m]; nobody sees the difference, and what is divided by it stays above float32's denormals (numerics B6)
 SMALLEST_SCALE = wp.constant(wp.float32(1e-20))
+BLOCK = 128
+"""threads of a block on a GPU"""
+LIMITS = (BLOCK, 6)  # so many blocks at once: at most 80 registers, of 108 that it would take
 NONE, BITS = wp.constant(wp.uint32(0)), wp.constant(wp.uint64(32))
-
-
-import os
-LB = tuple(map(int, os.environ.get("LB", "128,4").split(",")))
 
 
 @cache
@@ -141,7 +140,7 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
             tip,
         )
 
-    @wp.kernel(module="unique", module_options=STRICT, enable_backward=False, launch_bounds=LB)
+    @wp.kernel(module="unique", module_options=STRICT, enable_backward=False, launch_bounds=LIMITS)
     def project(
         first: int,  # splat of thread 0
         view: View,

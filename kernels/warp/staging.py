@@ -14,8 +14,8 @@ from .records import Layout
 
 STAGED = 128
 """splats of a batch, a multiple of 32"""
-BLOCK_W = 8
-"""samples across, of the block that a warp draws"""
+BLOCK_W, BLOCK_H = 8, 4
+"""samples that the 32 threads of a warp draw, one each"""
 
 
 _POOL = """
@@ -74,10 +74,10 @@ def _with(text: str, numbers: dict[str, int]) -> str:
     return re.sub("|".join(numbers), lambda name: str(numbers[name[0]]), text)
 
 
-def make_staging(layout: Layout, block_h: int) -> SimpleNamespace:
-    """pool, stage, touched, line: in this order, for each batch. A warp draws BLOCK_W x block_h samples."""
+def make_staging(layout: Layout) -> SimpleNamespace:
+    """pool; then, for each batch, stage, touched, line. For records of this layout."""
     numbers = {"SPLATS": STAGED, "LINES": layout.lines, "BOX": layout.names.index("columns")}
-    numbers |= {"BLOCK_W": BLOCK_W, "BLOCK_H": block_h}
+    numbers |= {"BLOCK_W": BLOCK_W, "BLOCK_H": BLOCK_H}
 
     @wp.func_native(_with(_POOL, numbers))
     def pool() -> wp.uint64:

@@ -35,9 +35,6 @@ _RECORD = ("lowpass_screen", "ray_depth", "normal", "compose_planes")
 _SAMPLE = (*_RECORD, "stop_exclusive", "depth", "depth_median", "label")
 
 
-PROJECT_BLOCK = 128
-"""threads; smaller than others, since it takes many registers"""
-
 # in the order of the kernel's arguments
 _OUTPUTS = ("rgb", "alpha", "depth", "depth_median", "normal", "label")
 # of a View, by the names that the kernels have for them too
@@ -89,7 +86,6 @@ class WarpPipeline:
                 "use an OpenCL device for it"
             )
         self.backend, self.features, self.shape = backend, features, shape
-        area = shape.tile_width * shape.tile_height
         record = tuple(name for name in _RECORD if name in names)
         sample = tuple(name for name in _SAMPLE if name in names)
         terms = (features.sh_degree + 1) ** 2 if "color_sh" in names else 0
@@ -99,11 +95,14 @@ class WarpPipeline:
             self.project = runtime.kernels("project").make_project(
                 record, terms, features.setup_precision, shape.schedule == "tiles"
             )
+            self.project_block = runtime.kernels("project").BLOCK
             self.lists = runtime.kernels("lists").make_lists(screen)
             self.sort = runtime.kernels("lists")
-            self.blend, self.state = runtime.kernels("blend").make_blend(sample, shape.schedule == "group")
-            self.block_dim = area // runtime.kernels("blend").strip_of(sample)
+            self.block_dim = shape.tile_width * shape.tile_height
             """threads that draw a tile on a GPU"""
+            self.blend, self.state = runtime.kernels("blend").make_blend(
+                sample, shape.schedule == "group", self.block_dim
+            )
             self.resolve = runtime.kernels("resolve").make_resolve(features.taps, features.samples)
             common = [self.sort.compact, self.sort.gather, self.sort.find_starts, self.sort.sum_up]
             for kernel in (self.project, self.lists.emit, self.blend, self.resolve, *common):
@@ -111,7 +110,7 @@ class WarpPipeline:
 
     def _compile(self, kernel: Any) -> None:
         # here rather than at the first launch: several threads launch it
-        block = {self.blend: self.block_dim, self.project: PROJECT_BLOCK}.get(kernel, BLOCK)
+        block = {self.blend: self.block_dim, self.project: self.project_block}.get(kernel, BLOCK)
         if not self.backend.device.is_cuda:
             block = 1
         try:
@@ -221,7 +220,7 @@ class _Run:
         cloud = [self.resident.arrays[name] for name in ("means", "quats", "scales", "opacities", "colors")]
         cloud += self._planes()
         records = [self.held["lines"], self.held["bounds"], self._take("windows", n, wp.uint64)]
-        self.launcher.launch(self.pipeline.project, n, self.u, *cloud, *records, keys, counts, drawn, block=PROJECT_BLOCK)
+        self.launcher.launch(self.pipeline.project, n, self.u, *cloud, *records, keys, counts, drawn, block=self.pipeline.project_block)
         wp.utils.array_scan(drawn, places, inclusive=True)
         wp.utils.array_scan(counts, ends, inclusive=True)
         totals = self._take("totals", 2, wp.int64)
