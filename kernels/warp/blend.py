@@ -1,5 +1,5 @@
-"""Tiles from their lists: a block of threads per tile on a GPU; on a CPU a thread per tile that walks each
-splat's box within it.
+"""Tiles from their lists: on a GPU a block of threads per tile, a sample per thread, records staged in shared
+memory; on a CPU a thread per tile that walks each splat's box within it.
 The same functions see every sample, so both take the same decisions.
 """
 
@@ -15,10 +15,11 @@ from .staging import BLOCK_H, BLOCK_W, STAGED
 NONE, ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 
 
-MIN = {True: 1, False: 1}
 @cache
 def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
-    """The kernel for these effects of splats and samples; threads: of a block on a GPU, as a tile has samples."""
+    """The kernel for these effects of splats and samples; threads: of a block on a GPU, one for each of a
+    tile's samples.
+    """
     parts = make_pixel(effects)
     pool, stage, touched = parts.staging.pool, parts.staging.stage, parts.staging.touched
     load_staged = parts.load_staged
@@ -57,7 +58,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
             raw_label[at] = p.label
             raw_label_weight[at] = p.label_weight
 
-    @wp.kernel(module="unique", module_options=STRICT, enable_backward=False, launch_bounds=(threads, MIN["compose_planes" in effects] if threads == 256 else 1))
+    @wp.kernel(module="unique", module_options=STRICT, enable_backward=False, launch_bounds=threads)
     def blend_gpu(
         band_first: int,  # tile of block 0
         view: View,

@@ -153,7 +153,9 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
         plane_keys: wp.array(dtype=wp.float32),  # (planes) depth at which a plane's splats are sorted in [m]
         lines: wp.array(dtype=wp.vec4),  # (n lines_each) out: records of splats that are drawn
         bounds: wp.array(dtype=Bounds),  # (n) out: as `every_bounds` says
-        windows: wp.array(dtype=wp.uint64),  # (n) out: bits of the tiles, below the window's first tile; 0: more
+        windows: wp.array(
+            dtype=wp.uint64
+        ),  # (n) out: bits of the tiles, below the window's first tile; 0: more
         keys: wp.array(dtype=wp.uint32),  # (n) out: depth key, or CULLED
         counts: wp.array(dtype=wp.int64),  # (n) out: tiles that the splat can touch
         drawn: wp.array(dtype=wp.int32),  # (n) out: 1 or 0

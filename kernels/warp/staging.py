@@ -1,7 +1,6 @@
 """Records of a batch of splats in a GPU block's shared memory, and which of them can touch a warp's samples.
 
-Warp's own tiles would serve, but not with 16-byte reads, votes or ballots, so these few functions are CUDA.
-On the CPU, where a
+Warp's own tiles have no 16-byte reads, votes or ballots, so these few functions are CUDA. On the CPU, where a
 block is one thread, they read the records where they lie and let every splat through.
 """
 
@@ -12,8 +11,8 @@ import warp as wp
 
 from .records import Layout
 
-STAGED = 128
-"""splats of a batch, a multiple of 32"""
+STAGED = 256
+"""splats of a batch, a multiple of 32; larger ones gain nothing"""
 BLOCK_W, BLOCK_H = 8, 4
 """samples that the 32 threads of a warp draw, one each"""
 
@@ -93,15 +92,15 @@ def make_staging(layout: Layout) -> SimpleNamespace:
         length: int,
         open: bool,
     ) -> bool:
-        """Brings the records of lists[first : first + length], at most STAGED; false, for all of the block, if
-        nobody is open.
+        """Brings the records of lists[first : first + length], at most STAGED; false, for the whole block, if
+        nobody in it is open.
         """
         ...
 
     @wp.func_native(_with(_TOUCHED, numbers))
     def touched(pool: wp.uint64, word: int, length: int, left: int, top: int, open: bool) -> wp.uint32:
-        """Bits of those of the staged splats 32 word to 32 word + 31 that can touch the warp's block at (left,
-        top); none if nobody in the warp is open.
+        """Bits of those of the staged splats 32 word to 32 word + 31 that can touch the warp's samples, whose
+        first is (left, top); none if nobody in the warp is open.
         """
         ...
 

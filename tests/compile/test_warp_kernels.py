@@ -16,12 +16,14 @@ def made(name, *arguments):
     return kernel(*arguments) if arguments else kernel
 
 
-def compiled(kernel, folder, block=256):
-    """Source text, without comments, that NVRTC compiled for a GPU of 2020."""
+def compiled(kernel, folder, block=256, assembly=False):
+    """Source text, without comments, that NVRTC compiled for a GPU of 2020; or the PTX that it made of it."""
     kernel.module.options["block_dim"] = block
     with runtime.quiet():
         wp.compile_aot_module(kernel.module, arch=80, module_dir=folder, use_ptx=True)
-    assert list(folder.glob("*.ptx"))
+    (result,) = folder.glob("*.ptx")
+    if assembly:
+        return result.read_text()
     (source,) = folder.glob("*.cu")
     return re.sub(r"//[^\n]*", "", source.read_text())
 
@@ -70,6 +72,17 @@ def test_the_base_text_has_nothing_of_absent_effects(tmp_path):
     everything = compiled(made("blend.make_blend", ALL, True, 256)[0], tmp_path / "all")
     for name in ("depth_weight", "depth_median", "label_weight", "Layer", "thickest", "ink"):
         assert re.search(rf"\b{name}", everything), name
+
+
+def test_records_move_as_whole_lines(tmp_path):
+    """Field by field, each store would touch 32 records of a warp."""
+    project = compiled(
+        made("project.make_project", RECORD, 0, "float64", False), tmp_path / "project", 128, assembly=True
+    )
+    assert project.count("st.global.v4") == 7
+    blend = compiled(made("blend.make_blend", RECORD, True, 256)[0], tmp_path / "blend", assembly=True)
+    assert blend.count("ld.shared.v4") >= 5
+    assert "vote.sync.ballot" in blend
 
 
 def test_a_record_grows_by_what_is_asked_for():

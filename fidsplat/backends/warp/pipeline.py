@@ -42,8 +42,8 @@ _UNIFORMS = (
     *("fx", "fy", "cx", "cy", "near", "far", "width", "height", "samples"),
     *("log_cut", "ceiling", "stop"),
 )
-# bytes: of one splat's bounds; of its window, keys, counts, drawn, places, sums; of one that is drawn, in sort and
-# lists; of a sample in all planes; of a pair with the scratch of its sort
+# bytes: of one splat's bounds; of its window, keys, counts, drawn, places, sums; of one that is drawn, in
+# sort and lists; of a sample in all planes; of a pair with the scratch of its sort
 _BOUNDS, _PROJECTED, _VISIBLE, _SAMPLE_BYTES, _PAIR = 44, 36, 40, 60, 24
 
 
@@ -220,7 +220,17 @@ class _Run:
         cloud = [self.resident.arrays[name] for name in ("means", "quats", "scales", "opacities", "colors")]
         cloud += self._planes()
         records = [self.held["lines"], self.held["bounds"], self._take("windows", n, wp.uint64)]
-        self.launcher.launch(self.pipeline.project, n, self.u, *cloud, *records, keys, counts, drawn, block=self.pipeline.project_block)
+        self.launcher.launch(
+            self.pipeline.project,
+            n,
+            self.u,
+            *cloud,
+            *records,
+            keys,
+            counts,
+            drawn,
+            block=self.pipeline.project_block,
+        )
         wp.utils.array_scan(drawn, places, inclusive=True)
         wp.utils.array_scan(counts, ends, inclusive=True)
         totals = self._take("totals", 2, wp.int64)
