@@ -41,7 +41,8 @@ def listing(backend, lists, side=16):
 
 def footprint(cloud, view, index, dot=True):
     """Samples (rows, columns) whose ray meets splat `index` within its radius and beyond the near plane, or
-    that lie in its low-pass dot, if `dot`: float64, by the definition (a 3 x 3 system for each ray, no homography)."""
+    (`dot`) that lie in its low-pass dot: float64, by the definition (a 3 x 3 system for each ray, no
+    homography)."""
     w, x, y, z = cloud.quats[index].astype(float) / np.linalg.norm(cloud.quats[index].astype(float))
     rotation = np.array(
         [
