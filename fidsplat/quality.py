@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 
 from fidsplat.errors import InputError
 
-LOWPASS = ("screen", "none")
+LOWPASS = ("screen", "pixel", "none")
 STOP_RULES = ("inclusive", "exclusive")
 COPLANAR = ("blend", "order")
 SETUP_PRECISIONS = ("float64", "float32")
@@ -43,7 +43,10 @@ class Quality:
 
     lowpass: str = "screen"
     """`screen`: the object-space low-pass of 2DGS (a Gaussian of sigma 0.707 px around the projected centre,
-    the larger of the two weights wins). `none`: the exact splat; use it with several samples per pixel."""
+    the larger of the two weights wins); for scenes that were trained with it, as 2DGS scenes are. `pixel`:
+    each splat convolved in its plane with a Gaussian of a sample's footprint (sigma 0.5 samples), its opacity
+    scaled by the ratio of the areas, so that it conserves energy; for splats far below a pixel. `none`: the
+    exact splat; for markers of Gaussians, with several samples per pixel. Boxes filter themselves."""
 
     coplanar: str = "blend"
     """Splats that are printed on one plane (markers). `blend`: one layer whose colour does not depend on
@@ -52,6 +55,10 @@ class Quality:
 
     samples: int = 1
     """n: each pixel is the mean of n x n samples on a regular grid, 1 to 8."""
+
+    first_hit: float = 0.1
+    """Opacity at which the outputs depth_first and distance_first see a surface, (0, 1): the first fragment
+    or layer behind which the transmittance is at most 1 less this."""
 
     setup_precision: str = "float64"
     """Arithmetic of the per-splat set-up. `float32` is also what a device without float64 uses."""
@@ -74,6 +81,7 @@ class Quality:
         within("alpha_cutoff", 0.0, 1.0, True, True)
         within("transmittance_stop", 0.0, 1.0, False, True)
         within("opacity_ceiling", 0.0, 1.0, True, False)
+        within("first_hit", 0.0, 1.0, True, True)
         for name, known in (
             ("stop_rule", STOP_RULES),
             ("lowpass", LOWPASS),

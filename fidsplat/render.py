@@ -8,25 +8,31 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import DeviceInfo, Planes, View
+from fidsplat.backends.base import DeviceInfo, Planes
+from fidsplat.backends.exposure import exposed_view
 from fidsplat.backends.registry import open_backend
-from fidsplat.cameras import Camera
+from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.effects import select
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
 from fidsplat.scenes import Scene
+from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
+from fidsplat.surroundings import Fog, Gradient, Panorama, background_of
 
 _NO_SCENE = Scene(())
+_REST = Motion()
+_INSTANT = Shutter()
 
 
 class Frame(Mapping):
     """A finished picture: a mapping from an output's name to a read-only NumPy array, copied from the
     device on first use.
 
-    Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median` (h, w) metres along z,
-    0 where nothing was drawn; `normal` (h, w, 3) unit, camera frame, towards the camera; `label` (h, w)
-    int32, -1 where nothing was drawn.
+    Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median`, `depth_first` (h, w)
+    metres along z, `distance`, `distance_median`, `distance_first` metres along the ray, 0 where nothing was
+    drawn; `normal` (h, w, 3) unit, camera frame, towards the camera, `normal_world` the same in the world's
+    axes; `label`, `splat_id` (h, w) int32, -1 where nothing was drawn; `blended` (h, w) int32.
     """
 
     def __init__(self, planes: Planes, outputs: tuple[str, ...]) -> None:
@@ -182,17 +188,25 @@ class Renderer:
         camera: Camera | None = None,
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
-        background: Iterable[float] | None = None,
+        background: Iterable[float] | Gradient | Panorama | None = None,
+        motion: Motion | None = None,
+        shutter: Shutter | None = None,
+        sensor: Sensor | None = None,
+        fog: Fog | None = None,
     ) -> Frame:
         """Draw one picture.
 
         Args:
-            scene: what to draw. A Scene's own camera, outputs, quality and background are used where the
-                arguments are left out.
+            scene: what to draw. A Scene's own camera, outputs, quality, background, sensor and fog are used
+                where the arguments are left out.
             camera: needed unless the scene has one.
             outputs: names of planes; default rgb.
             quality: a Quality or a preset's name; default standard.
-            background: (r, g, b) behind the splats; default black.
+            background: (r, g, b), a Gradient or a Panorama behind the splats; default black.
+            motion: how the camera and groups of splats move; default: they stand still.
+            shutter: when the picture is taken, and how long that takes; default: at time 0, at once.
+            sensor: what becomes of rgb on its way out; default nothing.
+            fog: between the camera and what it sees; default none.
 
         Raises:
             InputError: no camera, an unknown output or preset, a picture that is too large, a cloud uploaded
@@ -210,7 +224,11 @@ class Renderer:
         if not names:
             raise InputError("outputs is empty; name at least one, e.g. 'rgb'")
         chosen = Quality.of(own.quality if quality is None else quality)
-        behind = own.background if background is None else tuple(background)
+        behind = background_of(own.background if background is None else background)
+        sensor, fog = sensor or own.sensor, fog or own.fog
+        for value, kind in ((sensor, Sensor), (fog, Fog)):
+            if value is not None and not isinstance(value, kind):
+                raise InputError(f"{kind.__name__.lower()} is {value!r}; it must be a {kind.__name__}")
 
         resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
         if resident._renderer is not self:
@@ -218,8 +236,23 @@ class Renderer:
                 "this cloud was uploaded by another Renderer; upload it with the one that draws it"
             )
         data = resident._data
-        features = select(data, names, chosen)
-        view = View.of(camera, chosen, data.origin, behind)
+        moving = own.motion if motion is None else motion
+        when = own.shutter if shutter is None else shutter
+        view = exposed_view(
+            camera, chosen, data.origin, behind, moving or _REST, when or _INSTANT, sensor, fog
+        )
+        features = select(
+            data,
+            names,
+            chosen,
+            camera,
+            bool(view.groups),
+            bool(view.shots),
+            view.turns,
+            sensor=sensor,
+            fog=fog,
+            background=behind,
+        )
         return Frame(self.backend.pipeline(features).render(data, view), names)
 
     def render_views(
@@ -228,7 +261,9 @@ class Renderer:
         cameras: Iterable[Camera],
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
-        background: Iterable[float] | None = None,
+        background: Iterable[float] | Gradient | Panorama | None = None,
+        sensor: Sensor | None = None,
+        fog: Fog | None = None,
     ) -> Iterator[Frame]:
         """Draw one cloud from many cameras, one Frame for each, in their order.
 
@@ -240,14 +275,15 @@ class Renderer:
         chosen = own.quality if quality is None else quality
         names = own.outputs if outputs is None else outputs
         names = names if isinstance(names, str) else tuple(names)
-        behind = tuple(own.background if background is None else background)
+        behind = background_of(own.background if background is None else background)
+        sensor, fog = sensor or own.sensor, fog or own.fog
         resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
         waiting: Frame | None = None
         failure: Exception | None = None
         rest = iter(cameras)
         while True:
             try:
-                frame = self.render(resident, next(rest), names, chosen, behind)
+                frame = self.render(resident, next(rest), names, chosen, behind, sensor=sensor, fog=fog)
             except StopIteration:
                 break
             except Exception as error:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fidsplat.defects import LARGEST, drop_report, find_defects, rows_beyond, square_of
 from fidsplat.errors import InputError
 from fidsplat.harmonics import C0, MAX_DEGREE, rotation_of_coefficients, sh_basis
 from fidsplat.rotations import (
@@ -18,8 +19,6 @@ from fidsplat.rotations import (
 __all__ = ["SplatCloud", "sh_basis"]
 
 _F32 = np.dtype(np.float32)
-LARGEST = 1e15
-"""metres, or units of colour: with anything larger, products of single precision would overflow on devices"""
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -45,6 +44,9 @@ class SplatCloud:
     planes: np.ndarray | None = None
     """(n,) int32, or None: splats with the same id >= 0 are printed on one plane, where their order means
     nothing (`with_planes`); -1 for splats of no plane"""
+    boxes: np.ndarray | None = None
+    """(n,) bool, or None if all are False: True for a box, whose opacity is the same all over |u|, |v| <= 1
+    and whose ``scales`` are half sides (`with_boxes`); False for a Gaussian"""
     dropped: dict[str, int] = field(default_factory=dict)
     """reason -> number of splats left out when this cloud was made; empty when nothing was"""
 
@@ -92,19 +94,19 @@ class SplatCloud:
         new_labels = _labels(labels, n)
 
         single = {name: _single(array) for name, array in {"means": given, **arrays}.items()}
-        keep, dropped = _find_defects(single)
+        keep, dropped = find_defects(single)
         if keep is not None:
             single = {name: array[keep] for name, array in single.items()}
             given = single["means"] if given.dtype == _F32 else given[keep]
             new_labels = new_labels[keep]
-            warnings.warn(_drop_report(dropped, n, source), stacklevel=2)
+            warnings.warn(drop_report(dropped, n, source), stacklevel=2)
         single["quats"] = _unit(single["quats"])
         if origin is not None:
             new_origin = _check_origin(origin)
         else:  # after the defects, so that a splat that is left out has no say in it
             single["means"], new_origin = _choose_origin(given, single["means"], single["scales"])
         self._set(
-            **{"colors": None, "sh": None, "planes": None, **single},
+            **{"colors": None, "sh": None, "planes": None, "boxes": None, **single},
             labels=new_labels,
             origin=new_origin,
             dropped=dropped,
@@ -139,6 +141,13 @@ class SplatCloud:
     def has_planes(self) -> bool:
         """Whether some splats are printed on planes."""
         return self.planes is not None
+
+    @property
+    def footprint(self) -> str:
+        """`gaussian`, `box`, or `mixed` where there are splats of both kinds."""
+        if self.boxes is None:
+            return "gaussian"
+        return "box" if self.boxes.all() else "mixed"
 
     @staticmethod
     def empty() -> "SplatCloud":
@@ -184,7 +193,7 @@ class SplatCloud:
         if sh is not None and sh.shape[1] > 1:
             sh = rotation_of_coefficients(self.sh_degree, rotation).astype(_F32) @ sh
         scales = _single(self.scales * scale)
-        within = all(_rows_beyond(array, LARGEST) is None for array in (means, scales))
+        within = all(rows_beyond(array, LARGEST) is None for array in (means, scales))
         if not (within and (scales > 0).all()):
             raise InputError(
                 f"the transform takes splats out of range (its scale is {scale:g}): means and scales may be "
@@ -202,7 +211,23 @@ class SplatCloud:
         ids = _labels(planes, len(self), "planes")
         if (ids < -1).any():
             raise InputError(f"planes must be ids of at least 0, or -1 for none, not {int(ids.min())}")
+        _check_one_footprint(ids, self.boxes)
         return self._replaced(planes=ids if (ids >= 0).any() else None)
+
+    def with_boxes(self, boxes=True) -> "SplatCloud":
+        """The same splats with box footprints where ``boxes``, one bool or (n,) bools, is True.
+
+        A box is a rectangle of even opacity: its scales are half sides in metres, its edges are filtered by
+        the pixel. On a plane (`with_planes`) boxes lie side by side: what they cover of a pixel adds up, so
+        those of a partition, their sides parallel, leave no seam. Raises InputError for anything but bools,
+        and for a plane of both kinds.
+        """
+        mask = np.asarray(boxes)
+        if mask.dtype != bool or mask.shape not in ((), (len(self),)):
+            raise InputError(f"boxes must be one bool or have the shape ({len(self)},) and the type bool")
+        mask = np.full(len(self), mask) if mask.ndim == 0 else mask.copy()
+        _check_one_footprint(self.planes, mask)
+        return self._replaced(boxes=mask if mask.any() else None)
 
     @staticmethod
     def concatenate(clouds: Sequence["SplatCloud"]) -> "SplatCloud":
@@ -236,8 +261,12 @@ class SplatCloud:
             colors, sh = np.concatenate([cloud.colors for cloud in filled if cloud.colors is not None]), None
         else:
             colors, sh = None, np.concatenate([_sh_of_degree(cloud, degree) for cloud in filled])
-        planes = _joined_planes(filled)
-        return first._replaced(**joined, planes=planes, colors=colors, sh=sh, dropped=dropped)
+        planes, boxes = _joined_planes(filled), None
+        if any(cloud.boxes is not None for cloud in filled):
+            boxes = np.concatenate(
+                [np.zeros(len(cloud), bool) if cloud.boxes is None else cloud.boxes for cloud in filled]
+            )
+        return first._replaced(**joined, planes=planes, boxes=boxes, colors=colors, sh=sh, dropped=dropped)
 
 
 def _numbers(name: str, value) -> np.ndarray:
@@ -269,6 +298,17 @@ def _joined_planes(clouds: Sequence[SplatCloud]) -> np.ndarray | None:
         joined.append(np.where(ids >= 0, ids + first_free, -1).astype(np.int32))
         first_free = max(first_free, int(joined[-1].max()) + 1)
     return np.concatenate(joined)
+
+
+def _check_one_footprint(planes: np.ndarray | None, boxes: np.ndarray | None) -> None:
+    if planes is None or boxes is None:
+        return
+    both = np.intersect1d(planes[(planes >= 0) & boxes], planes[~boxes])
+    if len(both):
+        raise InputError(
+            f"plane {both[0]} has boxes and Gaussians, whose coverage follows different rules; "
+            "give each kind a plane"
+        )
 
 
 def _labels(labels, n: int, name: str = "labels") -> np.ndarray:
@@ -329,64 +369,18 @@ def _choose_origin(
     return _single(means - origin), origin
 
 
-def _rows_beyond(array: np.ndarray, limit: float) -> np.ndarray | None:
-    """Which rows hold a value that is not finite or beyond +-limit; None, at no cost in memory, if none."""
-    with np.errstate(invalid="ignore"):
-        if not array.size or (array.min() >= -limit and array.max() <= limit):  # false where there is a NaN
-            return None
-        good = array <= limit
-        good &= array >= -limit
-    return ~np.asarray(good.all(axis=tuple(range(1, array.ndim))))
-
-
-def _find_defects(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, dict[str, int]]:
-    """(mask of the rows to keep, or None for all; reason -> count), each row under its first reason."""
-    bad: np.ndarray | None = None
-    dropped: dict[str, int] = {}
-    s, o = arrays["scales"], arrays["opacities"]
-    finite = float(np.finfo(_F32).max)
-    beyond = {n: _rows_beyond(array, finite if n == "quats" else LARGEST) for n, array in arrays.items()}
-    beyond = {name: rows for name, rows in beyond.items() if rows is not None}
-    defects = [(f"{name} not finite", _rows_beyond(arrays[name], finite)) for name in beyond]
-    defects += [(f"{name} beyond {LARGEST:g}", rows) for name, rows in beyond.items()]
-    with np.errstate(over="ignore", invalid="ignore"):
-        defects += [
-            ("zero quaternion", _square(arrays["quats"]) < 1e-30),
-            ("scale not above 0", (s <= 0).any(axis=1)),
-            ("opacity outside [0, 1]", (o < 0) | (o > 1)),
-        ]
-    for reason, rows in defects:
-        if rows is None or not rows.any():
-            continue
-        fresh = rows if bad is None else rows & ~bad
-        bad = rows if bad is None else rows | bad
-        if fresh.any():
-            dropped[reason] = int(fresh.sum())
-    return (None if bad is None else ~bad), dropped
-
-
-def _drop_report(dropped: dict[str, int], n: int, source) -> str:
-    parts = ", ".join(f"{reason}: {count}" for reason, count in dropped.items())
-    start = "" if source is None else f"{source}: "
-    return f"{start}{sum(dropped.values())} of {n} splats left out ({parts})"
-
-
 def _unit(quats: np.ndarray) -> np.ndarray:
     """Quaternions of length 1. Those that are so to float32 rounding keep their bits: twice is the same as
     once."""
     unit = quats  # only a cloud's own array can be written to
     for start in range(0, len(quats), 4096):  # so that millions of them need no copy in float64
         part = slice(start, start + 4096)
-        square = _square(quats[part])
+        square = square_of(quats[part])
         off = np.abs(square - 1.0) > 2.4e-7
         if off.any():
             unit = unit if unit.flags.writeable else unit.copy()
             unit[part][off] = quats[part][off] / np.sqrt(square[off])[:, None]
     return unit
-
-
-def _square(quats: np.ndarray) -> np.ndarray:
-    return np.einsum("ij,ij->i", quats, quats, dtype=np.float64)
 
 
 def _sh_of_degree(cloud: SplatCloud, degree: int) -> np.ndarray:

@@ -35,6 +35,7 @@ class PlaneTable:
         self.index = np.full(len(cloud), -1, np.int32)
         self.index[on_plane] = which
         turns = quaternion_to_matrix(cloud.quats[on_plane])
+        self._labels = cloud.labels[on_plane[first]]
         self._axes = np.swapaxes(turns[first], 1, 2)  # (p, 3, 3): rows are unit axes
         axes = self._axes[which]
         centers = np.einsum("nkj,nj->nk", axes, cloud.means[on_plane].astype(np.float64))
@@ -46,22 +47,34 @@ class PlaneTable:
         np.maximum.at(high, which, centers)
         np.maximum.at(self._sigma, which, spread)
         self._center, self._half = (low + high) / 2, (high - low) / 2
+        # a box reaches its corners whatever the cut-off
+        self._least_radius = 0.0 if cloud.boxes is None else math.sqrt(2.0)
 
     def keys(self, view: View) -> np.ndarray:
-        """(p,) float32, all different: a plane's nearest depth less its splats' diameter [m].
+        """(p,) float32, all different: a plane's nearest depth less its splats' diameter [m]. Depth is what
+        the view means by it: along z, or the distance from the camera's centre.
 
         Whatever lies before the plane at some pixel, with its centre at most a diameter nearer than the
         plane, arrives after it and can be placed before it; so can what lies behind.
         """
-        radius = math.sqrt(-2 * view.log_cut)
-        half = self._half + radius * self._sigma
-        along = self._axes @ view.rotation[2]  # (p, 3): depth per metre along each axis
-        depth = np.einsum("pk,pk->p", along, self._center) + view.translation[2]
-        nearest = depth - (np.abs(along) * half).sum(1)
-        keys = (nearest - 2 * np.linalg.norm(half, axis=1)).astype(np.float32)
+        keys = self._keys(view)
+        for label, own in view.groups:
+            keys = np.where(self._labels == label, self._keys(own), keys)
         # of equal keys the index decides, and shuffled splats of two planes would mix
         order = np.argsort(keys, kind="stable")
         for before, here in pairwise(order):
             if keys[here] <= keys[before]:
                 keys[here] = np.nextafter(keys[before], np.float32(np.inf))
         return keys
+
+    def _keys(self, view: View) -> np.ndarray:
+        radius = max(math.sqrt(-2 * view.log_cut), self._least_radius)
+        half = self._half + radius * self._sigma
+        if view.along_ray:
+            aside = np.abs(self._axes @ view.eye - self._center) - half
+            nearest = np.linalg.norm(np.maximum(aside, 0.0), axis=1)
+        else:
+            along = self._axes @ view.rotation[2]  # (p, 3): depth per metre along each axis
+            depth = np.einsum("pk,pk->p", along, self._center) + view.translation[2]
+            nearest = depth - (np.abs(along) * half).sum(1)
+        return (nearest - 2 * np.linalg.norm(half, axis=1)).astype(np.float32)

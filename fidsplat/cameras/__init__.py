@@ -1,5 +1,20 @@
 """Cameras: plain data, float64, OpenCV axes (x right, y down, z forward)."""
 
-from fidsplat.cameras.pinhole import Camera, focal_length, look_at_matrix
+from fidsplat.cameras.lenses import BrownConrady, Equirectangular, Fisheye, Lens, Orthographic
+from fidsplat.cameras.motion import Motion, Shutter, Trajectory
+from fidsplat.cameras.pinhole import Camera, fisheye_focal_length, focal_length, look_at_matrix
 
-__all__ = ["Camera", "focal_length", "look_at_matrix"]
+__all__ = [
+    "BrownConrady",
+    "Camera",
+    "Equirectangular",
+    "Fisheye",
+    "Lens",
+    "Motion",
+    "Orthographic",
+    "Shutter",
+    "Trajectory",
+    "fisheye_focal_length",
+    "focal_length",
+    "look_at_matrix",
+]

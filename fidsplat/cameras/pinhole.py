@@ -1,4 +1,4 @@
-"""The pinhole camera."""
+"""The camera: a pinhole, or one with a lens."""
 
 import math
 import operator
@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fidsplat.cameras.lenses import Equirectangular, Fisheye, Lens, Orthographic
 from fidsplat.errors import InputError
 from fidsplat.rotations import check_similarity
 
@@ -15,10 +16,11 @@ MAX_SIZE = 32767
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Pinhole camera. A point (X, Y, Z) of the camera frame falls on x = fx X / Z + cx, y = fy Y / Z + cy.
+    """A camera. Without a lens it is a pinhole: a point (X, Y, Z) of the camera frame falls on
+    x = fx X / Z + cx, y = fy Y / Z + cy. A lens says what stands there for X / Z and Y / Z.
 
     Pixel (row i, column j) has its centre at x = j + 0.5, y = i + 0.5. Raises InputError for values that
-    make no camera.
+    make no camera, among them a distortion that leaves less than half of the picture with a ray.
     """
 
     width: int
@@ -36,13 +38,17 @@ class Camera:
     world_to_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
     """(4, 4) float64, rigid, read-only"""
     near: float = 0.01
-    """metres along z, above 0; no part of a splat that is nearer is drawn"""
+    """metres along z (along the ray for a fisheye or panorama), above 0; no part of a splat that is nearer is
+    drawn"""
     far: float = math.inf
-    """metres along z, above near; a splat that lies wholly beyond it is not drawn"""
+    """metres, likewise, above near; a splat that lies wholly beyond it is not drawn"""
 
     position: np.ndarray = None  # type: ignore[assignment]
     """(3,) float64, centre of projection in the world, metres, read-only. By default it follows from
     world_to_camera, which far from the origin has rounded it; a camera made from its position keeps it"""
+
+    lens: Lens | None = None
+    """None, or a lens whose coefficients are all 0: a pinhole"""
 
     def __post_init__(self) -> None:
         put = object.__setattr__
@@ -74,17 +80,67 @@ class Camera:
         for name, array in (("world_to_camera", matrix), ("position", position)):
             array.flags.writeable = False
             put(self, name, array)
+        if self.lens is not None:
+            self._check_lens()
+
+    def _check_lens(self) -> None:
+        lens = self.lens
+        if not isinstance(lens, Lens):
+            raise InputError(f"camera lens is {lens!r}; it must be BrownConrady, Fisheye, ... or None")
+        if lens.does_nothing:
+            object.__setattr__(self, "lens", None)
+        elif not isinstance(lens, Orthographic):
+            y, x = np.mgrid[0.5 : self.height : self.height / 24, 0.5 : self.width : self.width / 32]
+            seen = np.isfinite(self.rays(np.stack([x.ravel(), y.ravel()], 1))[:, 0]).mean()
+            if seen == 0 or (seen < 0.5 and lens.kind == "brown_conrady"):
+                raise InputError(
+                    f"camera distortion cannot be inverted in {100 * (1 - seen):.0f} % of the picture: it "
+                    "turns back before its edge; check the coefficients and the focal length (pixels)"
+                )
 
     @staticmethod
     def pinhole(
-        width, height, fx, fy, cx, cy, world_to_camera=None, near=0.01, far=math.inf, position=None
+        width, height, fx, fy, cx, cy, world_to_camera=None, near=0.01, far=math.inf, position=None, lens=None
     ) -> "Camera":
         """A camera from its intrinsics (pixels) and its pose (4, 4), the identity when left out.
 
-        position (3,): the exact centre of projection, where the pose was made from one.
+        position (3,): the exact centre of projection, where the pose was made from one. lens: a distortion.
         """
         pose = np.eye(4) if world_to_camera is None else world_to_camera
-        return Camera(width, height, fx, fy, cx, cy, pose, near, far, position)  # type: ignore[arg-type]
+        return Camera(width, height, fx, fy, cx, cy, pose, near, far, position, lens)  # type: ignore[arg-type]
+
+    @staticmethod
+    def fisheye(
+        width, height, fov_x, world_to_camera=None, coefficients=(0.0, 0.0, 0.0, 0.0), near=0.01, far=math.inf
+    ) -> "Camera":
+        """A Kannala-Brandt fisheye whose middle row sees ``fov_x`` radians, at most 200 degrees.
+
+        coefficients: k1 to k4 as `cv2.fisheye` has them. Calibrated intrinsics go through
+        `Camera.pinhole(..., lens=Fisheye(...))`.
+        """
+        lens, width = Fisheye(*coefficients), _size("width", width)
+        f = fisheye_focal_length(width, fov_x, lens)
+        pose = np.eye(4) if world_to_camera is None else world_to_camera
+        return Camera(width, height, f, f, width / 2, height / 2, pose, near, far, lens=lens)
+
+    @staticmethod
+    def equirectangular(width, height, world_to_camera=None, near=0.01, far=math.inf) -> "Camera":
+        """A panorama of the whole sphere: the middle looks along z, the edges along -z, the top along -y."""
+        width, height = _size("width", width), _size("height", height)
+        pose = np.eye(4) if world_to_camera is None else world_to_camera
+        fx, fy = width / (2 * math.pi), height / math.pi
+        return Camera(width, height, fx, fy, width / 2, height / 2, pose, near, far, lens=Equirectangular())
+
+    @staticmethod
+    def orthographic(width, height, metres_wide, world_to_camera=None, near=0.01, far=math.inf) -> "Camera":
+        """A camera of parallel rays whose picture is ``metres_wide`` metres across, with square pixels."""
+        width, height = _size("width", width), _size("height", height)
+        across = _number("metres_wide", metres_wide)
+        if not 0 < across < math.inf:
+            raise InputError(f"camera metres_wide must be above 0 and finite, not {metres_wide!r}")
+        pose = np.eye(4) if world_to_camera is None else world_to_camera
+        f = width / across
+        return Camera(width, height, f, f, width / 2, height / 2, pose, near, far, lens=Orthographic())
 
     @staticmethod
     def look_at(
@@ -106,13 +162,46 @@ class Camera:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def project(self, points) -> np.ndarray:
-        """Pixel coordinates (n, 2) float64 of world points (n, 3), NaN where the depth is not above 0."""
+        """Pixel coordinates (n, 2) float64 of world points (n, 3), NaN where they cannot be seen: the depth
+        is not above 0, or they lie outside the lens."""
         world = np.asarray(points, dtype=np.float64)
         if world.ndim != 2 or world.shape[1] != 3:
             raise InputError(f"points must have the shape (n, 3), but the shape is {world.shape}")
-        x, y, z = ((world - self.position) @ self.world_to_camera[:3, :3].T).T
+        seen = (world - self.position) @ self.world_to_camera[:3, :3].T
+        if self.lens is not None:
+            return self.lens.image(seen) * (self.fx, self.fy) + (self.cx, self.cy)
+        x, y, z = seen.T
         z = np.where(z > 0, z, np.nan)
         return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=1)
+
+    def rays(self, pixels) -> np.ndarray:
+        """Directions (n, 3) float64 in the camera frame of pixel coordinates (n, 2), NaN where nothing is
+        seen.
+
+        Scaled to Z = 1, or to unit length for a fisheye or panorama. Raises InputError for an orthographic
+        camera, whose rays differ by where they start.
+        """
+        image = (np.asarray(pixels, np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
+        if self.lens is None:
+            return np.concatenate([image, np.ones((len(image), 1))], 1)
+        if isinstance(self.lens, Orthographic):
+            raise InputError("the rays of an orthographic camera are parallel to z; it has no directions")
+        return self.lens.rays(image)
+
+
+def fisheye_focal_length(width: int, fov_x: float, lens: Fisheye) -> float:
+    """Focal length in pixels of a fisheye ``width`` pixels wide that sees ``fov_x`` radians from side to
+    side.
+
+    Raises InputError when fov_x is not above 0 (1e-9), or beyond what the lens sees.
+    """
+    angle = _number("fov_x", fov_x)
+    if not 1e-9 < angle <= 2 * lens.limit + 1e-12:
+        raise InputError(
+            f"camera fov_x of this fisheye must lie between 0 and {math.degrees(2 * lens.limit):.4g} "
+            f"degrees, not {math.degrees(angle):.6g}"
+        )
+    return width / 2 / float(lens.distance(angle / 2))
 
 
 def focal_length(width: int, fov_x: float) -> float:

@@ -24,6 +24,9 @@ SPEC is one of
   qr-vN-L:TEXT         version N, error level L M Q H   qr-v22-L:TEXT
   image:FILE           any one-bit picture              image:logo.png
 
+The mixture exact draws every rectangle as one box with sharp edges. A PLY file has no boxes: -o then writes
+the Gaussians of fitted, and says so.
+
 Examples:
   fidsplat marker apriltag:36h11:5 --size 0.16 -o tag.ply
   fidsplat marker "qr:hello" --mixture paper --json"""
@@ -34,7 +37,7 @@ Examples:
         float, option("M", "edge of the code in metres, its quiet zone not counted (default: 1)")
     ] = 1.0
     mixture: Annotated[
-        str, option("NAME", "how rectangles become splats: fitted or paper (default: fitted)")
+        str, option("NAME", "how rectangles become splats: fitted, paper or exact (default: fitted)")
     ] = "fitted"
     native_2dgs: Annotated[
         bool,
@@ -52,7 +55,8 @@ Examples:
             raise InputError(f"splats are written as PLY: name {file.with_suffix('.ply')}, not {file}")
         made = fs.marker(self.spec, size=self.size, mixture=self.mixture)
         if file is not None:
-            fs.save_ply(made.cloud, file, native_2dgs=self.native_2dgs)
+            fs.save_ply(made.gaussians, file, native_2dgs=self.native_2dgs)
+        written = "fitted" if made.mixture == "exact" else made.mixture
         dark = sum(1 for rectangle in made.rectangles if rectangle.dark)
         facts = {
             "spec": made.spec,
@@ -67,6 +71,7 @@ Examples:
             "splats": len(made.cloud),
             "seconds": made.seconds,
             "mixture": made.mixture,
+            "written": None if file is None else {"mixture": written, "splats": len(made.gaussians)},
             "size_m": made.size,
             "module_m": made.module,
             "file": str(file) if file else None,
@@ -84,5 +89,7 @@ Examples:
         ]
         if file is not None:
             rows.append(("written", file))
+        if file is not None and made.mixture == "exact":
+            rows.append(("", f"as {len(made.gaussians)} Gaussians (fitted): a PLY file has no boxes"))
         print_table(console(False), made.spec, ("", ""), rows)
         return 0

@@ -26,7 +26,14 @@ class Render:
 A splat file without a scene is seen from -z, as large as fits a picture of 1280 x 720.
 OUT.png names the colour picture; other planes stand beside it as OUT-depth.png and so on. Any other OUT is a
 folder for rgb.png, depth.png and so on. Depth comes as .npy (metres), .png (16-bit millimetres) and
--turbo.png (colours); labels as .npy and .png (colours).
+-turbo.png (colours); labels, ids and counts as .npy and .png (colours).
+
+Planes:
+  rgb alpha label splat_id            splat_id: index of the heaviest splat; label: its label
+  depth depth_median depth_first      metres along z; first: where the opacity reaches the quality's first_hit
+  distance distance_median distance_first            the same along the ray
+  normal normal_world                 towards the camera, in its axes or the world's
+  blended                             number of splats that made the pixel
 
 Examples:
   fidsplat render scene.toml
@@ -39,7 +46,7 @@ Examples:
     ] = None
     outputs: Annotated[
         str | None,
-        option("A,B,...", "planes: rgb alpha depth depth_median normal label (default: the scene's, or rgb)"),
+        option("A,B,...", "planes, named above (default: the scene's, or rgb)"),
     ] = None
     device: Annotated[
         str | None,
@@ -71,7 +78,8 @@ Examples:
             frame = renderer.render(scene, outputs=names, quality=self.quality)
             planes = {name: frame[name] for name in frame.outputs}
         seconds = time.perf_counter() - begun
-        files = [file for name, plane in planes.items() for file in save_plane(name, plane, name_of)]
+        bits = None if scene.sensor is None else scene.sensor.bits
+        files = [file for name, plane in planes.items() for file in save_plane(name, plane, name_of, bits)]
         if self.json:
             print_json(
                 {

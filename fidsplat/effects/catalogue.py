@@ -1,8 +1,8 @@
 """Every effect: its kernel file and what it adds to the records, buffers and outputs.
 
-A slot is filled by exactly one effect of its kind (camera, color, lowpass, stop, compose); taps are extra
-planes, any number of them; parts are what several of them share. The sections of an effect's kernel file say
-where its text goes (kernels/README.md).
+A slot is filled by exactly one effect of its kind (camera, color, lowpass, stop, compose, footprint,
+background); taps are extra planes, any number of them; parts are what several of them share. The sections of
+an effect's kernel file say where its text goes (kernels/README.md).
 """
 
 from __future__ import annotations
@@ -39,14 +39,48 @@ class Effect:
     """Sample planes in each buffer between blending and resolving, in the order of its kernel arguments."""
     output: Output | None = None
     parts: tuple[str, ...] = ()
-    """Names of the parts that it needs."""
+    """Names of the effects that it needs: parts, or taps whose planes it reads."""
+    view_inputs: tuple[str, ...] = ()
+    """Which of `inputs` belong to the view, not to the cloud."""
+    blend_inputs: tuple[str, ...] = ()
+    """Arrays of the view that blending reads for it, in the order of its kernel arguments."""
+    blend_uniforms: tuple[str, ...] = ()
+    """Numbers of the view (`View.uniform`) that blending needs for it; they stand before its planes."""
+    resolve_uniforms: tuple[str, ...] = ()
+    """The same for resolving; they stand before its arrays."""
+    resolve_arrays: tuple[str, ...] = ()
+    """Arrays of the view (`View.array`) that resolving needs for it; they stand before its planes."""
+    averaged: bool = False
+    """Whether its planes are light: the mean of what several shots leave, not one shot's."""
 
 
 _EFFECTS = (
-    Effect("camera_pinhole", "slot/camera_pinhole.cl"),
+    Effect("camera_pinhole", "slot/camera_pinhole.cl", parts=("perspective",)),
+    Effect("camera_brown_conrady", "slot/camera_brown_conrady.cl", parts=("perspective", "ray_map", "rays")),
+    Effect("camera_fisheye", "slot/camera_fisheye.cl", parts=("polygon", "ray_map", "rays")),
+    Effect(
+        "camera_equirectangular",
+        "slot/camera_equirectangular.cl",
+        parts=("polygon", "rays"),
+    ),
+    Effect("camera_orthographic", "slot/camera_orthographic.cl", record_lanes=4),
+    Effect("perspective", "slot/perspective.cl"),
+    Effect("polygon", "slot/polygon.cl"),
+    Effect("ray_map", "slot/ray_map.cl", inputs=("ray_map",), view_inputs=("ray_map",)),
+    Effect(
+        "rays",
+        "slot/rays.cl",
+        record_lanes=6,
+        inputs=("rays",),
+        view_inputs=("rays",),
+        blend_inputs=("rays",),
+    ),
+    Effect("motion_groups", "slot/motion_groups.cl", inputs=("labels", "moving"), view_inputs=("moving",)),
+    Effect("shutter_exposure", "slot/shutter_exposure.cl"),
     Effect("color_rgb", "slot/color_rgb.cl", inputs=("colors",)),
     Effect("color_sh", "slot/color_sh.cl", inputs=("sh",)),
     Effect("lowpass_none", "slot/lowpass_none.cl"),
+    Effect("lowpass_pixel", "slot/lowpass_pixel.cl", parts=("lowpass_none",)),
     Effect("lowpass_screen", "slot/lowpass_screen.cl", record_lanes=2, bounds_lanes=3),
     Effect("stop_inclusive", "slot/stop_inclusive.cl"),
     Effect("stop_exclusive", "slot/stop_exclusive.cl"),
@@ -56,8 +90,15 @@ _EFFECTS = (
         "slot/compose_planes.cl",
         record_lanes=1,
         inputs=("planes", "plane_keys"),
+        view_inputs=("plane_keys",),
         parts=("ray_depth",),
     ),
+    Effect("footprint_gaussian", "slot/footprint_gaussian.cl"),
+    Effect("footprint_box", "slot/footprint_box.cl", parts=("box_edges",)),
+    Effect(
+        "footprint_mixed", "slot/footprint_mixed.cl", record_lanes=1, inputs=("boxes",), parts=("box_edges",)
+    ),
+    Effect("box_edges", "slot/box_edges.cl", record_lanes=4),
     Effect("ray_depth", "slot/ray_depth.cl", record_lanes=3),
     Effect("alpha", "tap/alpha.cl", output=Output("alpha", 1, "float32")),
     Effect("depth", "tap/depth.cl", planes=(2,), output=Output("depth", 1, "float32"), parts=("ray_depth",)),
@@ -83,6 +124,78 @@ _EFFECTS = (
         planes=(1,),
         output=Output("overdraw", 1, "int32", public=False),
     ),
+    Effect("background_constant", "slot/background_constant.cl"),
+    Effect(
+        "background_gradient",
+        "slot/background_gradient.cl",
+        parts=("world_ray",),
+        resolve_uniforms=("gradient",),
+    ),
+    Effect(
+        "background_panorama",
+        "slot/background_panorama.cl",
+        parts=("world_ray",),
+        resolve_uniforms=("panorama_size",),
+        resolve_arrays=("panorama",),
+    ),
+    Effect("ray", "slot/ray.cl", resolve_uniforms=("ray",)),
+    Effect("turn", "slot/turn.cl", resolve_uniforms=("rotation",)),
+    Effect("ray_length", "slot/ray_length.cl"),
+    Effect("sample_length", "slot/sample_length.cl", parts=("ray", "ray_length")),
+    Effect("world_ray", "slot/world_ray.cl", parts=("ray", "turn")),
+    Effect(
+        "fog",
+        "tap/fog.cl",
+        planes=(1,),
+        parts=("ray_depth", "ray_length"),
+        blend_uniforms=("fog_density", "ray"),
+        averaged=True,
+    ),
+    Effect("exposure", "post/exposure.cl", resolve_uniforms=("exposure",)),
+    Effect("vignetting", "post/vignetting.cl", resolve_uniforms=("vignette_center", "vignetting")),
+    Effect("noise", "post/noise.cl", resolve_uniforms=("noise",)),
+    Effect("gain", "post/gain.cl", resolve_uniforms=("gain",)),
+    Effect("response_gamma", "post/response_gamma.cl", resolve_uniforms=("inverse_gamma",)),
+    Effect("response_srgb", "post/response_srgb.cl"),
+    Effect(
+        "response_table",
+        "post/response_table.cl",
+        resolve_uniforms=("response_count",),
+        resolve_arrays=("response",),
+    ),
+    Effect("quantise", "post/quantise.cl", resolve_uniforms=("quantise_steps",)),
+    Effect(
+        "depth_first",
+        "tap/depth_first.cl",
+        planes=(1,),
+        output=Output("depth_first", 1, "float32"),
+        parts=("ray_depth",),
+        blend_uniforms=("first_light",),
+    ),
+    *(
+        Effect(
+            f"distance{kind}",
+            f"tap/distance{kind}.cl",
+            output=Output(f"distance{kind}", 1, "float32"),
+            parts=(f"depth{kind}", "sample_length"),
+        )
+        for kind in ("", "_median", "_first")
+    ),
+    Effect(
+        "normal_world",
+        "tap/normal_world.cl",
+        output=Output("normal_world", 3, "float32"),
+        parts=("normal", "turn"),
+    ),
+    Effect(
+        "splat_id",
+        "tap/splat_id.cl",
+        record_lanes=1,
+        inputs=("splat_ids",),
+        planes=(1, 1),
+        output=Output("splat_id", 1, "int32"),
+    ),
+    Effect("blended", "tap/blended.cl", planes=(1,), output=Output("blended", 1, "int32")),
 )
 
 CATALOGUE: dict[str, Effect] = {effect.name: effect for effect in _EFFECTS}

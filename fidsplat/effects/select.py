@@ -8,9 +8,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
+from fidsplat.cameras import Camera
 from fidsplat.effects.catalogue import CATALOGUE, Effect, Output
+from fidsplat.effects.together import refuse_strangers
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
+from fidsplat.sensor import Sensor
+from fidsplat.surroundings import Background, Fog, Gradient
 
 RGB = Output("rgb", 3, "float32")
 OUTPUTS: dict[str, Output] = {
@@ -32,24 +36,43 @@ class FeatureSet:
     """
 
     slots: tuple[str, ...]
-    """One effect per kind, in the fixed order camera, color, lowpass, stop, compose."""
+    """One effect per kind, in the fixed order camera, color, lowpass, stop, compose, footprint, background;
+    then motion and shutter, if any."""
     taps: tuple[str, ...]
     """Sorted names of the planes beside rgb."""
     sh_degree: int
     samples: int
     setup_precision: str
+    posts: tuple[str, ...] = ()
+    """What changes rgb on its way out, in its order: fog, the steps of the sensor."""
 
     @cached_property
     def effects(self) -> tuple[Effect, ...]:
-        """All effects in the order in which their text is put together: slots, parts, taps."""
-        parts = sorted({part for name in (*self.slots, *self.taps) for part in CATALOGUE[name].parts})
-        return tuple(CATALOGUE[name] for name in (*self.slots, *parts, *self.taps))
+        """All effects in the order in which their text is put together: slots, parts, taps, posts."""
+        parts = _parts_of((*self.slots, *self.taps, *self.posts))
+        taps = [tap for tap in self.taps if tap not in parts]
+        return tuple(CATALOGUE[name] for name in (*self.slots, *parts, *taps, *self.posts))
+
+    @cached_property
+    def names(self) -> frozenset[str]:
+        """Names of all effects."""
+        return frozenset(effect.name for effect in self.effects)
 
     @cached_property
     def outputs(self) -> tuple[Output, ...]:
-        """Finished planes, rgb first."""
-        planes = (CATALOGUE[tap].output for tap in self.taps)
-        return (RGB, *(plane for plane in planes if plane is not None))
+        """Finished planes, rgb first; with those that other taps are made from."""
+        return (RGB, *(effect.output for effect in self.effects if effect.output))
+
+
+def _parts_of(names: Iterable[str]) -> list[str]:
+    """What effects need, and what that needs, sorted."""
+    parts: set[str] = set()
+    todo = list(names)
+    while todo:
+        fresh = set(CATALOGUE[todo.pop()].parts) - parts
+        parts |= fresh
+        todo += fresh
+    return sorted(parts)
 
 
 class Traits(Protocol):
@@ -65,12 +88,33 @@ class Traits(Protocol):
         """Whether splats are printed on planes."""
         ...
 
+    @property
+    def footprint(self) -> str:
+        """`gaussian`, `box`, or `mixed` where there are splats of both kinds."""
+        ...
 
-def select(cloud: Traits, outputs: Iterable[str], quality: Quality) -> FeatureSet:
-    """The features that a cloud, outputs and quality call for.
+
+def select(
+    cloud: Traits,
+    outputs: Iterable[str],
+    quality: Quality,
+    camera: Camera | None = None,
+    moving: bool = False,
+    exposed: bool = False,
+    turning: bool = False,
+    *,
+    sensor: Sensor | None = None,
+    fog: Fog | None = None,
+    background: Background = (0.0, 0.0, 0.0),
+) -> FeatureSet:
+    """The features that a cloud, outputs, quality, camera (None: a pinhole) and so on call for. Values that
+    mean nothing call for nothing.
+
+    moving: groups of splats move by themselves. exposed: the picture is made of several poses. turning: these
+    look in different directions.
 
     Raises:
-        InputError: an output that nobody declares.
+        InputError: an output that nobody declares, or two effects that do not go together.
     """
     if isinstance(outputs, str):
         outputs = (outputs,)
@@ -80,16 +124,33 @@ def select(cloud: Traits, outputs: Iterable[str], quality: Quality) -> FeatureSe
             near = difflib.get_close_matches(str(name), OUTPUTS, 1)
             hint = f" (did you mean {near[0]!r}?)" if near else ""
             raise InputError(f"unknown output {name!r}{hint}; known: {', '.join(OUTPUTS)}")
+    foggy = fog is not None and fog.density > 0
+    behind = _behind(background, foggy)
+    lowpass = "none" if cloud.footprint == "box" else quality.lowpass
+    refuse_strangers(cloud.footprint, lowpass, wanted, foggy, behind, camera, turning)
     return FeatureSet(
         slots=(
-            "camera_pinhole",
+            f"camera_{camera.lens.kind if camera is not None and camera.lens else 'pinhole'}",
             "color_rgb" if cloud.sh_degree < 0 else "color_sh",
-            f"lowpass_{quality.lowpass}",
+            # boxes are filtered by their own footprint
+            f"lowpass_{lowpass}",
             f"stop_{quality.stop_rule}",
             "compose_planes" if cloud.has_planes and quality.coplanar == "blend" else "compose_ordered",
+            f"footprint_{cloud.footprint}",
+            f"background_{behind}",
+            *(("motion_groups",) if moving else ()),
+            *(("shutter_exposure",) if exposed else ()),
         ),
         taps=tuple(sorted(wanted - {"rgb"})),
         sh_degree=max(cloud.sh_degree, 0),
         samples=quality.samples,
         setup_precision=quality.setup_precision,
+        posts=(*(("fog",) if foggy else ()), *(() if sensor is None else sensor.steps)),
     )
+
+
+def _behind(background: Background, foggy: bool) -> str:
+    # behind everything fog is all there is
+    if foggy or isinstance(background, tuple):
+        return "constant"
+    return "gradient" if isinstance(background, Gradient) else "panorama"

@@ -4,6 +4,7 @@ import os
 
 import numpy as np
 
+from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
 from fidsplat.formats.ply import ORIGIN_COMMENT, PADDED_LOG_SCALE
 from fidsplat.harmonics import C0
@@ -22,8 +23,14 @@ def save_ply(cloud: SplatCloud, path: str | os.PathLike[str], native_2dgs: bool 
     int property plane when the cloud has planes. An origin other than 0 is kept in a comment, and x, y, z are
     relative to it.
 
-    Raises InputError when the file cannot be written; an older file of that name is then left as it was.
+    Raises InputError when the file cannot be written, or when the cloud has boxes, which the format does not;
+    an older file of that name is then left as it was.
     """
+    if cloud.boxes is not None:
+        raise InputError(
+            f"{int(cloud.boxes.sum())} of {len(cloud)} splats are boxes, which a PLY file cannot hold; write "
+            "the marker's Gaussians instead (Marker.gaussians), or make it with mixture='fitted'"
+        )
     rest = 0 if cloud.sh is None else 3 * (cloud.sh.shape[1] - 1)
     names = [
         *"xyz",

@@ -19,7 +19,9 @@ from fidsplat.cameras import Camera
 from fidsplat.effects import select
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer
+from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
+from fidsplat.surroundings import Background, Fog
 
 ALL_OUTPUTS = ("rgb", "alpha", "depth", "depth_median", "normal", "label")
 COLOR_TOLERANCE = 2e-5
@@ -30,8 +32,15 @@ TOLERANCE = {
     "alpha": COLOR_TOLERANCE,
     "depth": DEPTH_TOLERANCE,
     "depth_median": 0.0,
+    "depth_first": 0.0,
+    "distance": DEPTH_TOLERANCE,
+    "distance_median": 0.0,
+    "distance_first": 0.0,
     "normal": COLOR_TOLERANCE,
+    "normal_world": COLOR_TOLERANCE,
     "label": 0.0,
+    "splat_id": 0.0,
+    "blended": 0.0,
 }
 """What each output may be wrong beyond its certificate."""
 RARE = 1e-3
@@ -47,7 +56,9 @@ class Picture:
     camera: Camera
     quality: Quality = field(default_factory=Quality)
     outputs: tuple[str, ...] = ("rgb", "alpha")
-    background: tuple[float, float, float] = (0.1, 0.2, 0.3)
+    background: Background = (0.1, 0.2, 0.3)
+    sensor: Sensor | None = None
+    fog: Fog | None = None
 
 
 @dataclass(frozen=True)
@@ -79,8 +90,10 @@ class Difference:
 def truth_of(picture: Picture, pixels: tuple[np.ndarray, np.ndarray] | None = None) -> dict[str, np.ndarray]:
     """The reference's planes with `alpha` and `certificate`: whole, or (k, ...) at pixels (rows, columns)."""
     judge = ReferenceBackend()
-    features = select(picture.cloud, (*picture.outputs, "alpha"), picture.quality)
-    view = View.of(picture.camera, picture.quality, picture.cloud.origin, picture.background)
+    around = {"sensor": picture.sensor, "fog": picture.fog, "background": picture.background}
+    outputs = (*picture.outputs, "alpha")
+    features = select(picture.cloud, outputs, picture.quality, picture.camera, **around)
+    view = View.of(picture.camera, picture.quality, picture.cloud.origin, **around)
     pipeline, resident = judge.pipeline(features), judge.upload(picture.cloud)
     if pixels is not None:
         return pipeline.pixels(resident, view, *pixels)
@@ -99,16 +112,20 @@ def compare(planes: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], o
         error = np.abs(plane - want)
         if error.ndim > risk.ndim:
             error = error.max(-1)
-        if name in ("depth_median", "label"):
-            error = error > (DEPTH_TOLERANCE * want if name == "depth_median" else 0)
+        if TOLERANCE[name] == 0:
+            error = error > (
+                DEPTH_TOLERANCE * want if name.startswith("d") else truth.get(f"{name}_doubt", 0)
+            )
             worst = float(error.mean())
-            beyond = float((error & ~truth[f"{name}_may_flip"]).mean())
+            beyond = float((error & ~truth.get(f"{name}_may_flip", np.zeros(error.shape, bool))).mean())
         else:
             if name in ("rgb", "alpha"):
                 certified = risk * brightest
+                if name == "rgb":
+                    certified = truth.get("certificate_rgb", certified)
             else:  # where next to nothing is drawn, its depth and normal mean nothing
                 certified = np.where(covered, truth[f"certificate_{name}"], np.inf)
-            size = np.maximum(want, 1e-30) if name == "depth" else 1.0
+            size = np.maximum(want, 1e-30) if name in ("depth", "distance") else 1.0
             worst = float((error / size).max(initial=0.0))
             beyond = float(((error - certified) / size).max(initial=0.0))
         excess, finite = beyond - TOLERANCE[name], bool(np.isfinite(plane).all())
@@ -124,5 +141,7 @@ def judge(renderer: Renderer, picture: Picture) -> list[Difference]:
         outputs=picture.outputs,
         quality=picture.quality,
         background=picture.background,
+        sensor=picture.sensor,
+        fog=picture.fog,
     )
     return compare(frame, truth_of(picture), picture.outputs)

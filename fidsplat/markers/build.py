@@ -29,7 +29,7 @@ from fidsplat.splats import SplatCloud
 if TYPE_CHECKING:
     from shapely import Polygon
 
-MIXTURES = ("fitted", "paper")
+MIXTURES = ("fitted", "paper", "exact")
 MAX_MODULES = 4096
 """Longest edge of a grid with its quiet zone."""
 
@@ -65,7 +65,7 @@ class Marker:
     size: float
     """metres, the code's edge; its width where it is not square"""
     mixture: str
-    """"fitted" or "paper\""""
+    """"fitted", "paper" or "exact\""""
     grid: np.ndarray = field(repr=False)
     """(H, W) uint8, the code with its quiet zone"""
     boxes: np.ndarray = field(repr=False)
@@ -90,6 +90,13 @@ class Marker:
     def module(self) -> float:
         """Metres per module."""
         return self.size / self.bits.shape[1]
+
+    @cached_property
+    def gaussians(self) -> SplatCloud:
+        """Splats that every renderer can draw: ``cloud``, or the mixture `fitted` in place of `exact`."""
+        if self.mixture != "exact":
+            return self.cloud
+        return _gaussians(self.grid, self.boxes, fitted_templates(), fitted_growth(), self.module)
 
     @cached_property
     def rectangles(self) -> list[Rectangle]:
@@ -128,7 +135,8 @@ def marker(
     Args:
         spec: apriltag:36h11:5, aruco:4x4_50:7, qr:TEXT, qr-v22-L:TEXT or image:FILE.png.
         size: metres, edge of the code itself, quiet zone not counted (an image's width).
-        mixture: "fitted" (default) or "paper".
+        mixture: "fitted" (default), "paper", or "exact": one box for each rectangle, which only this renderer
+            draws (`SplatCloud.with_boxes`, `Marker.gaussians`).
         quiet_zone: modules of white around it; default 1 for AprilTag and ArUco, 4 for QR, 0 for images.
         levels, density, duplicates: of the mixture `paper` only, see `paper_template`; default 4, 3, False.
         growth: modules, 0 to 1, by which a rectangle reaches into its own colour beyond a side that is wholly
@@ -140,7 +148,10 @@ def marker(
     """
     start = time.perf_counter()
     parsed = parse_spec(spec)
-    templates, growth = _mixture(mixture, levels, density, duplicates, growth)
+    exact = mixture == "exact"
+    templates, growth = _mixture("fitted" if exact else mixture, levels, density, duplicates, growth)
+    if exact and growth != fitted_growth():
+        raise InputError("growth: the boxes of mixture='exact' meet without seams; leave it out")
     _check_size(size)
     parsed, bits = bits_of(parsed)
     quiet = QUIET_ZONE[parsed.kind] if quiet_zone is None else quiet_zone
@@ -154,7 +165,8 @@ def marker(
     grid = np.pad(bits, quiet)
     labels, components = label_components(grid)
     boxes = partition(grid)
-    cloud = _cloud(grid, boxes, templates, growth, size / bits.shape[1])
+    module = size / bits.shape[1]
+    cloud = _boxes(grid, boxes, module) if exact else _gaussians(grid, boxes, templates, growth, module)
     for array in (bits, grid, boxes, labels):
         array.flags.writeable = False
     return Marker(
@@ -201,23 +213,46 @@ def _check_size(size: float) -> None:
         raise InputError(f"the marker's size is {size!r}; it must be a length from 1e-9 to 1e9 metres")
 
 
-def _cloud(
+def _boxes(grid: np.ndarray, boxes: np.ndarray, module: float) -> SplatCloud:
+    """One box for each rectangle."""
+    corners = boxes.astype(np.float64)
+    middle, half = (corners[:, :2] + corners[:, 2:]) / 2, (corners[:, 2:] - corners[:, :2]) / 2
+    return _printed(
+        grid, boxes, np.arange(len(boxes)), middle, half, np.ones(len(boxes)), module
+    ).with_boxes()
+
+
+def _gaussians(
     grid: np.ndarray, boxes: np.ndarray, templates: tuple[Template, ...], growth: float, module: float
 ) -> SplatCloud:
     width, height = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
     gaussians, owner = place(grow(grid, boxes, growth), width / height, templates)
+    return _printed(grid, boxes, owner, gaussians[:, :2], gaussians[:, 2:4], gaussians[:, 4], module)
+
+
+def _printed(
+    grid: np.ndarray,
+    boxes: np.ndarray,
+    owner: np.ndarray,
+    places: np.ndarray,
+    scales: np.ndarray,
+    opacities: np.ndarray,
+    module: float,
+) -> SplatCloud:
+    """Splats of rectangles ``owner`` (n,) in their colours, at places (n, 2) with scales (n, 2) in
+    modules."""
     n = len(owner)
     means = np.zeros((n, 3), np.float32)
-    means[:, 0] = (gaussians[:, 0] - grid.shape[1] / 2) * module
-    means[:, 1] = (gaussians[:, 1] - grid.shape[0] / 2) * module
+    means[:, 0] = (places[:, 0] - grid.shape[1] / 2) * module
+    means[:, 1] = (places[:, 1] - grid.shape[0] / 2) * module
     quats = np.zeros((n, 4), np.float32)
     quats[:, 0] = 1
     light = 1 - grid[boxes[:, 1], boxes[:, 0]].astype(np.float32)
     cloud = SplatCloud(
         means,
         quats,
-        (gaussians[:, 2:4] * module).astype(np.float32),
-        gaussians[:, 4].astype(np.float32),
+        (scales * module).astype(np.float32),
+        opacities.astype(np.float32),
         colors=np.broadcast_to(light[owner, None], (n, 3)),
     )
     # one sheet of paper: where its splats meet, their order means nothing

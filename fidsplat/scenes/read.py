@@ -5,21 +5,27 @@ import os
 import tomllib
 from pathlib import Path
 
-from fidsplat.cameras import Camera, focal_length, look_at_matrix
+import numpy as np
+
+from fidsplat.cameras import Camera, look_at_matrix
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
 from fidsplat.rotations import rigid_matrix
+from fidsplat.scenes.imaging import read_background, read_fog, read_sensor
+from fidsplat.scenes.lens import TABLES, read_focal_lengths, read_lens
+from fidsplat.scenes.moving import POSE, read_keyframes, read_shutter
 from fidsplat.scenes.scene import PlacedMarker, Scene
 from fidsplat.scenes.table import Table
 from fidsplat.splats import SplatCloud
 
 MAX_BYTES = 16 * 2**20
-TOP = ("camera", "splats", "markers", "render")
+TOP = ("camera", "splats", "markers", "render", "sensor", "fog", "background")
 CAMERA = ("width", "height", "fov_x_deg", "fx", "fy", "cx", "cy")
-CAMERA += ("position", "look_at", "up", "world_to_camera", "near", "far")
+CAMERA += ("position", "look_at", "up", "world_to_camera", "near", "far", *TABLES, "shutter", "motion")
+CAMERA_POSE = ("position", "look_at", "up", "world_to_camera")
 SPLATS = ("file", "position", "quaternion", "scale")
-MARKERS = ("spec", "size", "position", "quaternion", "mixture", "quiet_zone")
-RENDER = ("outputs", "background", "quality", "samples", "device")
+MARKERS = ("spec", "size", "position", "quaternion", "mixture", "quiet_zone", "motion")
+RENDER = ("outputs", "background", "quality", "samples", "lowpass", "first_hit", "device")
 IMAGE = "image:"
 
 
@@ -30,16 +36,28 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
     """
     file = Path(path)
     top = Table(_parse(file), str(file), "", TOP)
-    camera = _camera(top.table("camera", CAMERA)) if "camera" in top else None
+    table = top.table("camera", CAMERA)
+    keyframes = read_keyframes(table, ("time", *CAMERA_POSE), lambda frame: _camera_pose(frame)[0])
+    camera = (
+        _camera(table, None if keyframes is None else np.asarray(keyframes.poses[0]))
+        if "camera" in top
+        else None
+    )
     render = top.table("render", RENDER)
+    if "background" in top and "background" in render:
+        raise render.error("background", "and the table [background] exclude each other")
     return Scene(
         clouds=tuple(_splats(table, file.parent) for table in top.tables("splats", SPLATS)),
         camera=camera,
         markers=tuple(_marker(table, file.parent) for table in top.tables("markers", MARKERS)),
-        background=render.numbers("background", 3, (0.0, 0.0, 0.0)),
+        background=read_background(top, file.parent) or render.numbers("background", 3, (0.0, 0.0, 0.0)),
         outputs=render.texts("outputs", ("rgb",)),
         quality=_quality(render),
         device=render.text("device", None),
+        shutter=read_shutter(table),
+        camera_motion=keyframes,
+        sensor=read_sensor(top),
+        fog=read_fog(top),
     )
 
 
@@ -61,35 +79,36 @@ def _parse(file: Path) -> dict:
         raise InputError(f"{file} is not a scene file in TOML: {error}") from None
 
 
-def _camera(table: Table) -> Camera:
+def _camera(table: Table, first: np.ndarray | None) -> Camera:
+    """The camera of a table; first: its pose where it moves."""
     width, height = table.whole("width"), table.whole("height")
     near, far = table.number("near", 0.01), table.number("far", math.inf, infinite=True)
-    if "fov_x_deg" in table:
-        for key in ("fx", "fy"):
-            if key in table:
-                raise table.error(key, "and fov_x_deg exclude each other")
-        degrees = table.number("fov_x_deg")
-        with table.at("fov_x_deg"):
-            fx = fy = focal_length(width, math.radians(degrees))
-    elif "fx" in table or "fy" in table:
-        fx, fy = table.number("fx"), table.number("fy")
-    else:
-        raise table.error("fov_x_deg", "is missing (or fx and fy)")
+    lens = read_lens(table)
+    fx, fy = read_focal_lengths(table, width, height, lens)
     cx, cy = table.number("cx", width / 2), table.number("cy", height / 2)
-    position = None
+    if first is None:
+        pose, position = _camera_pose(table)
+    else:
+        for key in CAMERA_POSE:
+            if key in table:
+                raise table.error(key, "and motion exclude each other; give the pose in the keyframes")
+        pose, position = first, None
+    with table.at():
+        return Camera.pinhole(width, height, fx, fy, cx, cy, pose, near, far, position, lens)
+
+
+def _camera_pose(table: Table):
+    """world_to_camera (4, 4), and the position if that is given."""
     if "world_to_camera" in table:
         for key in ("position", "look_at", "up"):
             if key in table:
                 raise table.error(key, "and world_to_camera exclude each other")
-        pose = table.matrix("world_to_camera")
-    else:
-        if "position" not in table:
-            raise table.error("position", "is missing (position and look_at, or world_to_camera)")
-        position, look_at = table.numbers("position", 3), table.numbers("look_at", 3)
-        with table.at("look_at"):
-            pose = look_at_matrix(position, look_at, table.numbers("up", 3, (0.0, -1.0, 0.0)))
-    with table.at():
-        return Camera.pinhole(width, height, fx, fy, cx, cy, pose, near, far, position)
+        return np.array(table.matrix("world_to_camera")), None
+    if "position" not in table:
+        raise table.error("position", "is missing (position and look_at, or world_to_camera)")
+    position, look_at = table.numbers("position", 3), table.numbers("look_at", 3)
+    with table.at("look_at"):
+        return look_at_matrix(position, look_at, table.numbers("up", 3, (0.0, -1.0, 0.0))), position
 
 
 def _pose(table: Table, scale: float = 1.0):
@@ -120,21 +139,25 @@ def _marker(table: Table, folder: Path) -> PlacedMarker:
         raise table.error("size", f"must be above 0 metres, not {size!r}")
     if spec.startswith(IMAGE):
         spec = IMAGE + str(folder / spec.removeprefix(IMAGE))
-    pose = _pose(table)
+    pose, motion = _pose(table), read_keyframes(table, POSE, _pose)
     quiet_zone, mixture = table.whole("quiet_zone", None), table.text("mixture", "fitted")
     if quiet_zone is not None and quiet_zone < 0:
         raise table.error("quiet_zone", f"must be 0 or more modules, not {quiet_zone}")
     from fidsplat.markers import marker  # late: it brings shapely and networkx
 
     with table.at():
-        return PlacedMarker(marker(spec, size=size, mixture=mixture, quiet_zone=quiet_zone), pose)
+        return PlacedMarker(
+            marker(spec, size=size, mixture=mixture, quiet_zone=quiet_zone), pose, motion=motion
+        )
 
 
 def _quality(table: Table) -> Quality | str | None:
     name = table.text("quality", None)
     with table.at("quality"):
         quality = Quality.of(name)
-    if "samples" not in table:
-        return name
-    with table.at("samples"):
-        return quality.with_(samples=table.whole("samples"))
+    readers = {"samples": table.whole, "lowpass": table.text, "first_hit": table.number}
+    given = [key for key in readers if key in table]
+    for key in given:
+        with table.at(key):
+            quality = quality.with_(**{key: readers[key](key)})
+    return quality if given else name

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fidsplat.cameras import Camera
+from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.errors import InputError
 from fidsplat.rotations import check_similarity
+from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
+from fidsplat.surroundings import Background, Fog, background_of
 
 if TYPE_CHECKING:
+    from fidsplat.cameras.motion import Pose
     from fidsplat.markers import Marker
     from fidsplat.quality import Quality
 
@@ -30,6 +32,8 @@ class PlacedMarker:
     """(4, 4) float64, world_from_marker, rigid, read-only"""
     label: int = 1
     """label of its splats; a Scene numbers its markers 1, 2, ..."""
+    motion: Pose | None = None
+    """its pose at a time in seconds; None: it stays at `pose`"""
 
     def __post_init__(self) -> None:
         check_similarity(self.pose, "a marker's pose", rigid=True)
@@ -57,33 +61,50 @@ class Scene:
     camera: Camera | None = None
     markers: tuple[PlacedMarker, ...] = ()
     """marker i has the label i + 1, whatever label it came with"""
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """RGB in display space"""
+    background: Background = (0.0, 0.0, 0.0)
+    """RGB in display space, a Gradient or a Panorama"""
     outputs: tuple[str, ...] = ("rgb",)
     """names of the planes that are rendered"""
     quality: Quality | str | None = None
     """a Quality, a preset's name, or None for the default"""
     device: str | None = None
     """a device's name, or None for the default"""
+    shutter: Shutter | None = None
+    """when the picture is taken, and how long that takes; None: at time 0, at once"""
+    camera_motion: Pose | None = None
+    """world_to_camera at a time in seconds; None: the camera stands still"""
+    sensor: Sensor | None = None
+    """what becomes of rgb on its way out"""
+    fog: Fog | None = None
+    """between the camera and what it sees"""
 
     def __post_init__(self) -> None:
         put = object.__setattr__
         put(self, "clouds", _all_of(self.clouds, SplatCloud, "clouds"))
         placed = _all_of(self.markers, PlacedMarker, "markers")
         put(self, "markers", tuple(replace(marker, label=i + 1) for i, marker in enumerate(placed)))
+        if not isinstance(self.shutter, Shutter | None):
+            raise InputError(f"shutter must be a Shutter, not {self.shutter!r}")
         if not isinstance(self.camera, Camera | None):
             raise InputError(f"camera must be a Camera, not {self.camera!r}")
-        try:
-            background = tuple(float(value) for value in self.background)
-        except (TypeError, ValueError):
-            background = ()
-        if len(background) != 3 or not all(map(math.isfinite, background)):
-            raise InputError(f"background must be three finite numbers, not {self.background!r}")
-        put(self, "background", background)
+        put(self, "background", background_of(self.background))
+        for name, kind in (("sensor", Sensor), ("fog", Fog)):
+            if not isinstance(getattr(self, name), kind | None):
+                raise InputError(f"{name} must be a {kind.__name__}, not {getattr(self, name)!r}")
         outputs = (self.outputs,) if isinstance(self.outputs, str) else tuple(self.outputs)
         if not outputs or not all(isinstance(name, str) for name in outputs):
             raise InputError(f"outputs must be one or more names, not {self.outputs!r}")
         put(self, "outputs", outputs)
+
+    @property
+    def motion(self) -> Motion:
+        """What moves: the camera, and markers by their labels (and whatever else has these labels)."""
+        groups = {
+            marker.label: partial(_moved_from, marker.pose, marker.motion)
+            for marker in self.markers
+            if marker.motion is not None
+        }
+        return Motion(self.camera_motion, groups)
 
     def cloud(self) -> SplatCloud:
         """All splats in one cloud: the clouds' in their order with their own labels, then each marker's."""
@@ -110,6 +131,11 @@ class Scene:
         from fidsplat.scenes.write import write_scene
 
         write_scene(self, path)
+
+
+def _moved_from(start: np.ndarray, motion: Pose, time: float) -> np.ndarray:
+    """The motion of the world that takes a marker from its pose to where it is then."""
+    return np.asarray(motion(time), np.float64) @ np.linalg.inv(start)
 
 
 def _all_of(values: Iterable, kind: type, name: str) -> tuple:

@@ -94,6 +94,19 @@ class Table:
             return value
         return self._vector(key, value, count)
 
+    def any_numbers(self, key: str, default: Any = _MISSING) -> Any:
+        """A tuple of finite floats, however many, or the default."""
+        value = self._get(key, default)
+        if key not in self._values:
+            return value
+        if not isinstance(value, list):
+            raise self.error(key, f"must be a list of numbers, not {_kind(value)}")
+        return self._vector(key, value, len(value))
+
+    def kind(self, key: str) -> type | None:
+        """The Python type of a value; None where there is none."""
+        return type(self._values[key]) if key in self._values else None
+
     def matrix(self, key: str) -> list[tuple[float, ...]]:
         """Four rows of four finite floats."""
         value = self._get(key, _MISSING)

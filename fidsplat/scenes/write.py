@@ -8,6 +8,9 @@ from fidsplat.files import atomic_write
 from fidsplat.formats import save_ply
 from fidsplat.quality import PRESETS, Quality
 from fidsplat.rotations import matrix_to_quaternion
+from fidsplat.scenes.imaging import imaging_tables
+from fidsplat.scenes.lens import lens_table
+from fidsplat.scenes.moving import keyframe_tables, shutter_table
 from fidsplat.scenes.read import IMAGE
 from fidsplat.scenes.scene import PlacedMarker, Scene
 
@@ -20,6 +23,7 @@ def write_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
     """
     file = Path(path)
     render = _render(scene)
+    around = imaging_tables(scene, file.parent)
     markers = [_marker(placed, file.parent) for placed in scene.markers]
     splats = []
     for i, cloud in enumerate(scene.clouds):
@@ -27,8 +31,16 @@ def write_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
         save_ply(cloud, file.parent / name)
         splats.append({"file": name})
     parts = [] if scene.camera is None else [_table("[camera]", _camera(scene))]
+    lens = None if scene.camera is None else lens_table(scene.camera)
+    parts += [] if lens is None else [_table(f"[camera.{lens[0]}]", lens[1])]
+    if scene.shutter is not None:
+        parts.append(_table("[camera.shutter]", shutter_table(scene.shutter)))
+    if scene.camera_motion is not None:
+        frames = keyframe_tables(scene.camera_motion, "the camera", camera=True)
+        parts += [_table("[[camera.motion]]", frame) for frame in frames]
     parts += [_table("[[splats]]", table) for table in splats]
     parts += [_table("[[markers]]", table) for table in markers]
+    parts += [_table(f"[{name}]", table) for name, table in around.items()]
     parts.append(_table("[render]", render))
     try:
         content = "\n".join(parts).encode("utf-8")
@@ -44,7 +56,9 @@ def _camera(scene: Scene) -> dict:
     camera = scene.camera
     assert camera is not None
     keys = ("width", "height", "fx", "fy", "cx", "cy", "near", "far")
-    return {key: getattr(camera, key) for key in keys} | {"world_to_camera": camera.world_to_camera.tolist()}
+    table = {key: getattr(camera, key) for key in keys}
+    # a camera that moves has its poses in the keyframes
+    return table if scene.camera_motion else table | {"world_to_camera": camera.world_to_camera.tolist()}
 
 
 def _marker(placed: PlacedMarker, folder: Path) -> dict:
@@ -52,6 +66,7 @@ def _marker(placed: PlacedMarker, folder: Path) -> dict:
     spec = marker.spec
     if spec.startswith(IMAGE):
         spec = IMAGE + os.path.relpath(spec.removeprefix(IMAGE), folder)
+    motion = {} if placed.motion is None else {"motion": keyframe_tables(placed.motion, marker.spec)}
     return {
         "spec": spec,
         "size": float(marker.size),
@@ -59,19 +74,25 @@ def _marker(placed: PlacedMarker, folder: Path) -> dict:
         "quaternion": matrix_to_quaternion(placed.pose[:3, :3]).tolist(),
         "mixture": marker.mixture,
         "quiet_zone": int(marker.quiet_zone),
+        **motion,
     }
 
 
 def _render(scene: Scene) -> dict:
-    table: dict = {"outputs": list(scene.outputs), "background": list(scene.background)}
+    table: dict = {"outputs": list(scene.outputs)}
+    if isinstance(scene.background, tuple):
+        table["background"] = list(scene.background)
     if isinstance(scene.quality, Quality):
-        plain = scene.quality.with_(samples=1)
-        names = [name for name, preset in PRESETS.items() if preset.with_(samples=1) == plain]
+        own = {key: getattr(scene.quality, key) for key in ("samples", "lowpass", "first_hit")}
+        names = [name for name, preset in PRESETS.items() if preset.with_(**own) == scene.quality]
         if not names:
             raise InputError(
-                "a scene file holds a preset's name and samples; this Quality differs from every preset"
+                f"a scene file holds a preset's name and {', '.join(own)}; this Quality differs in more from "
+                "every preset"
             )
-        table |= {"quality": names[0], "samples": scene.quality.samples}
+        plain = PRESETS[names[0]]
+        changed = {key: value for key, value in own.items() if value != getattr(plain, key)}
+        table |= {"quality": names[0], **changed}
     elif scene.quality is not None:
         table["quality"] = scene.quality
     if scene.device is not None:
@@ -88,6 +109,8 @@ def _value(value) -> str:
         return _string(value)
     if isinstance(value, list):
         return f"[{', '.join(map(_value, value))}]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {_value(part)}" for key, part in value.items()) + "}"
     return repr(value)  # int and finite float are written alike in Python and TOML, and so is inf
 
 

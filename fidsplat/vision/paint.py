@@ -36,12 +36,17 @@ def normal_picture(normal: np.ndarray) -> np.ndarray:
 
 
 def label_picture(label: np.ndarray) -> np.ndarray:
-    """Labels (h, w): black for -1, grey for 0 and a colour of its own for each other one."""
-    colours = np.zeros((*label.shape, 3), np.uint8)
-    for value in np.unique(label):
-        if value >= 0:
-            colours[label == value] = _BACKGROUND if value == 0 else _colour(int(value))
-    return colours
+    """Labels or ids (h, w): black for -1, grey for 0 and a colour of its own for each other one."""
+    values, which = np.unique(label, return_inverse=True)
+    colours = _colours(values)
+    colours[values < 0], colours[values == 0] = 0, _BACKGROUND
+    return colours[which.reshape(label.shape)]
+
+
+def count_picture(count: np.ndarray) -> np.ndarray:
+    """Counts (h, w) in the turbo colours from 0 (dark blue) to the greatest (red)."""
+    share = count / max(int(count.max(initial=0)), 1)
+    return cv2.applyColorMap(np.rint(share * 255).astype(np.uint8), cv2.COLORMAP_TURBO)[:, :, ::-1]
 
 
 def outlined(image: np.ndarray, corners: np.ndarray, text: str = "", thickness: int = 2) -> np.ndarray:
@@ -102,8 +107,8 @@ def contact_sheet(rows: list[list[tuple[str, np.ndarray]]], width: int = 384, ga
     return sheet
 
 
-def _colour(value: int) -> tuple[int, int, int]:
+def _colours(values: np.ndarray) -> np.ndarray:
     # turning by the golden angle keeps neighbouring labels far apart on the colour circle
-    hue = (value - 1) * 137.508 % 360 / 2
-    pixel = np.array([[[hue, 200, 255]]]).astype(np.uint8)
-    return tuple(int(c) for c in cv2.cvtColor(pixel, cv2.COLOR_HSV2RGB)[0, 0])  # type: ignore[return-value]
+    hue = (values - 1.0) * 137.508 % 360 / 2
+    pixels = np.stack([hue, np.full(hue.shape, 200.0), np.full(hue.shape, 255.0)], -1).astype(np.uint8)
+    return cv2.cvtColor(pixels[None], cv2.COLOR_HSV2RGB)[0]

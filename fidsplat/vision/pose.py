@@ -20,23 +20,42 @@ def marker_pose(corners: np.ndarray, size: float, camera: Camera) -> np.ndarray:
     Args:
         corners: (4, 2) pixels, TL, TR, BR, BL as printed.
         size: edge of the code in metres.
-        camera: its intrinsics are used, not its pose.
+        camera: its intrinsics and lens are used, not its pose.
+
+    Raises:
+        InputError: an orthographic camera, in which nothing tells how far a marker is.
     """
     half = size / 2
     square = np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]], np.float64)
-    seen = np.ascontiguousarray(corners, np.float64)
-    count, turns, moves, _ = cv2.solvePnPGeneric(
-        square, seen, camera.matrix, None, flags=cv2.SOLVEPNP_IPPE_SQUARE
-    )
+    seen, matrix, turned = np.ascontiguousarray(corners, np.float64), camera.matrix, np.eye(4)
+    if camera.lens is not None:
+        seen, matrix, turned = _flattened(seen, camera)
+    if not np.isfinite(seen).all():
+        return np.full((4, 4), np.nan)
+    count, turns, moves, _ = cv2.solvePnPGeneric(square, seen, matrix, None, flags=cv2.SOLVEPNP_IPPE_SQUARE)
     best, least = np.full((4, 4), np.nan), math.inf
     for turn, move in zip(turns[:count], moves[:count], strict=True):
-        turn, move = cv2.solvePnPRefineLM(square, seen, camera.matrix, None, turn, move)
-        drawn, _ = cv2.projectPoints(square, turn, move, camera.matrix, None)
+        turn, move = cv2.solvePnPRefineLM(square, seen, matrix, None, turn, move)
+        drawn, _ = cv2.projectPoints(square, turn, move, matrix, None)
         error = float(np.linalg.norm(drawn.reshape(4, 2) - seen))
         if error < least and move[2, 0] > 0:
             least, best = error, np.eye(4)
             best[:3, :3], best[:3, 3] = cv2.Rodrigues(turn)[0], move[:, 0]
-    return best @ _FLIP
+    return turned @ best @ _FLIP
+
+
+def _flattened(corners: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corners as a pinhole sees them that looks at their middle; its matrix; camera_from_pinhole (4, 4)."""
+    rays = camera.rays(corners)
+    axis = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).sum(0)
+    axis /= np.linalg.norm(axis)
+    side = np.cross([0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [0.0, 0.0, 1.0], axis)
+    side /= np.linalg.norm(side)
+    turned = np.eye(4)
+    turned[:3, :3] = np.stack([side, np.cross(axis, side), axis], axis=1)
+    flat = rays @ turned[:3, :3]
+    matrix = np.diag([camera.fx, camera.fx, 1.0])
+    return np.ascontiguousarray(camera.fx * flat[:, :2] / flat[:, 2:]), matrix, turned
 
 
 def pose_error(estimate: np.ndarray, truth: np.ndarray) -> tuple[float, float]:

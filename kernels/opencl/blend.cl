@@ -66,6 +66,7 @@ static inline void pixel_blend(Pixel *pixel, const Splat *s, Crossing c, vint ma
                                const BlendConstants *constants) {
     vfloat inverse_d = 1.0f / c.d;
     vfloat opacity = fragment_opacity(s, fragment_half_rho(c, inverse_d, screen), constants->ceiling);
+//@@ footprint_opacity
     const Seen seen = see(s, c, inverse_d);
 //@@ compose
 }

@@ -11,6 +11,7 @@
 // Regular polygon around the R-sigma circle, clipped against the near plane and projected: the bounds of a disk that
 // crosses it (numerics A1 iii). Returns false if nothing is left.
 #define POLYGON 16
+//@@ polygon
 static inline bool clipped_box(real3_ tu, real3_ tv, real3_ tw, real radius, real near, real *box) {
     real around = radius / cos(REAL(3.14159265358979323846) / POLYGON);
     box[0] = box[2] = INFINITY;
@@ -44,6 +45,7 @@ static inline real3_ rotate_to_camera(global const real *view, real3_ v) {
 
 //@@ camera
 //@@ functions
+//@@ footprint_here
 
 kernel void project(
     uint count,
@@ -64,6 +66,7 @@ kernel void project(
     uint i = get_global_id(0);
     if (i >= count) return;
     keys[i] = CULLED;
+//@@ splat_view
 
     float log_opacity = (float)log((real)opacities[i]);
     float half_r2 = log_opacity - (float)view[VIEW_LOG_CUT];
@@ -80,38 +83,28 @@ kernel void project(
     real3_ p = rotate_to_camera(view, mean);
     p.x += view[VIEW_T]; p.y += view[VIEW_T + 1]; p.z += view[VIEW_T + 2];
     real pz = p.z, near = view[VIEW_NEAR];
+//@@ camera_depth
     real3_ facet = cross3(a, b);        // unit normal
     real offset = dot3(facet, p);       // of the plane from the camera's centre
+//@@ camera_offset
     float scale_u = scales[2 * i], scale_v = scales[2 * i + 1];
     // before fmax, which would make a number of a NaN (numerics E1)
     if (!(scale_u >= 0.0f && scale_u < INFINITY && scale_v >= 0.0f && scale_v < INFINITY)) return;
     real su = fmax(scale_u, SMALLEST_SCALE), sv = fmax(scale_v, SMALLEST_SCALE);
     a.x *= su; a.y *= su; a.z *= su;
     b.x *= sv; b.y *= sv; b.z *= sv;
+//@@ lowpass_make
 
     // depth range of the disk (numerics A3)
     real radius = sqrt(REAL(2.0) * half_r2);
     real reach = radius * sqrt(a.z * a.z + b.z * b.z);
+//@@ camera_reach
+//@@ footprint_reach
     if (!(pz + reach >= near) || !(pz - reach <= view[VIEW_FAR])) return;
 
-    real3_ row_x = {a.x, b.x, p.x}, row_y = {a.y, b.y, p.y}, tw = {a.z, b.z, p.z};
-    real3_ tu = image_row(view[VIEW_FX], view[VIEW_CX], row_x, tw);
-    real3_ tv = image_row(view[VIEW_FY], view[VIEW_CY], row_y, tw);
-    real center_x, center_y;
-    Bounds bounds;
-    if (pz - reach >= near) {
-        center_x = tu.z / pz;
-        center_y = tv.z / pz;
-        real3_ cu = image_row(view[VIEW_FX], view[VIEW_CX] - center_x, row_x, tw);
-        real3_ cv = image_row(view[VIEW_FY], view[VIEW_CY] - center_y, row_y, tw);
-        bounds = ellipse_bounds(cu, cv, tw, center_x, center_y, radius * radius);
-    } else {
-        real box[4];
-        if (!clipped_box(tu, tv, tw, radius, near, box)) return;
-        bounds = box_bounds(box[0], box[1], box[2], box[3]);
-        center_x = pz >= near ? tu.z / pz : bounds.ex;
-        center_y = pz >= near ? tv.z / pz : bounds.ey;
-    }
+//@@ camera_bounds
+//@@ camera_box
+//@@ footprint_bounds
 //@@ bounds_make
     int width = (int)view[VIEW_WIDTH], height = (int)view[VIEW_HEIGHT];
     int y0, y1;
@@ -131,11 +124,9 @@ kernel void project(
     int anchor_i = (int)clamp(floor((float)center_x), 0.0f, (float)(width - 1));
     int anchor_j = (int)clamp(floor((float)center_y), 0.0f, (float)(height - 1));
     real anchor_x = anchor_i + REAL(0.5), anchor_y = anchor_j + REAL(0.5);
-    tu = image_row(view[VIEW_FX], view[VIEW_CX] - anchor_x, row_x, tw);
-    tv = image_row(view[VIEW_FY], view[VIEW_CY] - anchor_y, row_y, tw);
-    real3_ k0 = cross3(tu, tv), kx = cross3(tv, tw), ky = cross3(tw, tu);   // (n_u, n_v, D): constant, per x, per y
-    real determinant = view[VIEW_FX] * view[VIEW_FY] * su * sv * offset;   // of M: exact where tw . k0 cancels
+//@@ camera_forms
     real steepest = fmax(fmax(fabs(kx.x), fabs(ky.x)), fmax(fabs(kx.y), fabs(ky.y)));
+//@@ camera_steepest
     if (!(steepest > 0 && steepest < (real)INFINITY)) return;
     real scale = (determinant < 0 ? -1 : 1) / steepest;
     real n_scale = scale * REAL(0.70710678118654752440);   // so that q / D^2 is rho / 2
@@ -143,6 +134,7 @@ kernel void project(
     // Edge-on within rounding: the plane has no visible side, only the low-pass may draw the splat (numerics B2). Asked
     // of the plane alone, so that neither the splat's size nor the focal length has a say.
     real facing = fabs(offset) > (SETUP_FP64 ? REAL(1e-13) : REAL(1e-6)) * sqrt(dot3(p, p)) ? scale : 0;
+//@@ camera_facing
     real z_numerator = determinant * facing;                               // depth = z_numerator / D
 
     Splat record;

@@ -29,3 +29,4 @@ kernel void resolve(
     rgb[3 * out + 2] = FMA(t, background_b, b * mean);
 //@@ resolve_end
 }
+//@@ kernels

@@ -25,7 +25,12 @@ typedef struct {
     vfloat d;               // denominator
     vfloat q;               // n_u^2 + n_v^2
     vint inside;            // the ray meets the splat's plane within R and beyond the near plane
+//@@ crossing
+//@@ footprint_crossing
 } Crossing;
+
+//@@ footprint
+//@@ footprint_functions
 
 // Affine forms at a row: `*_x` are the parts that do not change along the tile's rows.
 static inline Crossing cross_row(const Splat *s, vfloat nu_x, vfloat nv_x, vfloat d_x, float y, float half_r2) {
@@ -36,9 +41,11 @@ static inline Crossing cross_row(const Splat *s, vfloat nu_x, vfloat nv_x, vfloa
     c.q = FMA(nu, nu, nv * nv);
     // product form: no division, and no special value of D (numerics B2)
     c.inside = VMASK(c.q <= half_r2 * (c.d * c.d)) & VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);
+//@@ footprint_cross
     return c;
 }
 
+//@@ cross_functions
 // Opacity (the alpha of the paper) of a fragment at half squared distance rho / 2
 static inline vfloat fragment_opacity(const Splat *s, vfloat half_rho, float ceiling) {
     return fmin(exp(s->log_opacity - half_rho), (vfloat)ceiling);

@@ -17,6 +17,7 @@ from fidsplat.effects import catalogue as catalogue_module
 SHAPE = DeviceShape("lanes", "ordered", 16, 16, 16, 8, 11, 1, True)
 TAPS = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
+DIGESTS = ["8aae1f4da97510b8", "fadf58fb233f2382"]
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class Cloud:
 
     sh_degree: int = -1
     has_planes: bool = False
+    footprint: str = "gaussian"
 
 
 COLORS = Cloud()
@@ -39,6 +41,7 @@ def test_base_text_names_no_effect_that_was_not_asked_for():
         "lowpass_none",
         "stop_inclusive",
         "compose_ordered",
+        "footprint_gaussian",
     }
     of_layers = ("planes", "plane_keys", "layer", "Layer", "open", "waiting", "ink")
     for name in (*absent, *TAPS, "sh", "finished", *of_layers):
@@ -55,8 +58,9 @@ def test_a_tap_brings_its_text_and_nothing_else(tap):
     for line in base_lines:
         if not line.startswith("#define RECORD_BYTES"):
             assert line in remaining, f"{tap} removed or moved: {line}"
+    needed = {tap, *CATALOGUE[tap].parts}
     others = [
-        other for other in TAPS if other != tap and not other.startswith(tap) and not tap.startswith(other)
+        other for other in TAPS if not any(other.startswith(own) or own.startswith(other) for own in needed)
     ]
     assert not any(re.search(rf"\b{other}_(out|raw)", with_tap.text) for other in others)
 
@@ -73,6 +77,21 @@ def test_only_splats_on_planes_bring_layers(taps):
         assert re.search(rf"\b{word}\b", layered) or (word == "label_tau" and "label" not in taps), word
     assert in_order == plain
     assert layered.count("float z_numerator;") == 1
+
+
+def test_only_a_scene_of_both_footprints_pays_for_the_choice():
+    texts = {
+        kind: assemble(
+            select(Cloud(has_planes=True, footprint=kind), ("depth", "label"), fs.Quality()), SHAPE
+        )
+        for kind in ("gaussian", "box", "mixed")
+    }
+    assert "IS_BOX" not in texts["gaussian"].text
+    assert "boxes" not in texts["box"].text
+    assert "#define IS_BOX(s) true" in texts["box"].text
+    assert "boxes[i]" in texts["mixed"].text
+    sizes = [texts[kind].record_bytes for kind in texts]
+    assert sizes == sorted(sizes)
 
 
 def test_an_effect_added_to_the_catalogue_leaves_other_texts_as_they_were(monkeypatch):
@@ -109,6 +128,51 @@ def test_text_does_not_depend_on_numbers():
 
 def test_features_are_the_same_whatever_the_order_of_outputs():
     assert select(Cloud(2), ["rgb", "label", "depth"], PLAIN) == select(Cloud(2), ("depth", "label"), PLAIN)
+
+
+def test_the_base_is_what_it_was():
+    """A change of the stages themselves records new digests here; an effect must not."""
+    group = DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, 1024, True)
+    digests = [assemble(select(COLORS, ("rgb",), PLAIN), shape).digest[:16] for shape in (SHAPE, group)]
+    assert digests == DIGESTS
+
+
+POSTS = {
+    "fog": {"fog": fs.Fog(0.1)},
+    "gradient": {"background": fs.Gradient((1, 1, 1), (0, 0, 0))},
+    "panorama": {"background": fs.Panorama(np.zeros((4, 8, 3)))},
+    "sensor": {"sensor": fs.Sensor(2, (0.1,), 1000, 3, 4, 0.5, "srgb", 8)},
+    "gamma": {"sensor": fs.Sensor(response=2.2)},
+    "table": {"sensor": fs.Sensor(response=(0, 0.9, 1))},
+    "pixel": {"quality": fs.Quality(lowpass="pixel")},
+    "mixed": {},
+    "everything": {
+        "fog": fs.Fog(0.1),
+        "sensor": fs.Sensor(2, (0.1,), 1000, 3, 4, 0.5, "srgb", 8),
+        "quality": fs.Quality(lowpass="pixel", samples=2),
+    },
+}
+
+
+@pytest.mark.parametrize("name", POSTS)
+@pytest.mark.parametrize("outputs", [("rgb",), ("rgb", *TAPS)], ids=["rgb", "all"])
+def test_effects_compile_and_run_with_every_output_and_none(renderer, name, outputs):
+    cloud = random_splats(20, seed=1, depth=(1, 4)).with_planes(np.arange(20) // 2 - 1)
+    if name in ("mixed", "everything"):
+        cloud = cloud.with_boxes(np.arange(20) // 2 % 2 == 0)
+    camera = fs.Camera.pinhole(20, 12, 20.0, 20.0, 10.0, 6.0)
+    frame = renderer.render(cloud, camera, outputs=outputs, **POSTS[name])
+    assert all(np.isfinite(frame[each]).all() for each in frame)
+
+
+@pytest.mark.parametrize("left_out", TAPS)
+def test_all_outputs_but_one_compile_and_run(renderer, left_out):
+    cloud = random_splats(20, seed=1, depth=(1, 4))
+    camera = fs.Camera.pinhole(20, 12, 20.0, 20.0, 10.0, 6.0)
+    names = [tap for tap in TAPS if tap != left_out]
+    frame = renderer.render(cloud, camera, outputs=names, quality=PLAIN)
+    assert set(frame) == set(names)
+    assert all(np.isfinite(frame[each]).all() for each in frame)
 
 
 def test_pipelines_are_compiled_once(renderer):

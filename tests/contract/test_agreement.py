@@ -50,7 +50,9 @@ def test_splats_much_smaller_than_a_pixel(renderer):
     assert_agrees(renderer, random_splats(500, seed=7, depth=(1, 6), scale=(1e-6, 1e-2)), CAMERA)
 
 
-@pytest.mark.parametrize(("lowpass", "samples"), [("none", 1), ("none", 3), ("screen", 2)])
+@pytest.mark.parametrize(
+    ("lowpass", "samples"), [("none", 1), ("none", 3), ("screen", 2), ("pixel", 1), ("pixel", 2)]
+)
 def test_lowpass_and_samples(renderer, lowpass, samples):
     quality = fs.Quality(lowpass=lowpass, samples=samples)
     assert_agrees(renderer, random_splats(100, seed=5), CAMERA, quality=quality)

@@ -72,13 +72,15 @@ def test_a_scene_is_drawn_and_read_back(scene, tmp_path, capsys):
 
 
 def test_every_plane_is_a_file(scene, tmp_path, capsys):
-    words = "rgb,alpha,depth,depth_median,normal,label"
+    words = "rgb,alpha,depth,depth_median,distance_first,normal,normal_world,label,splat_id,blended"
     assert main(["render", scene, "-o", "frames", "--outputs", words, "--json"]) == 0
     assert sorted(said(capsys)["files"]) == sorted(f"frames/{name}" for name in names(tmp_path / "frames"))
     assert names(tmp_path / "frames") == {
         *("rgb.png", "alpha.png", "normal.png", "label.png", "label.npy"),
         *("depth.png", "depth.npy", "depth-turbo.png"),
         *("depth_median.png", "depth_median.npy", "depth_median-turbo.png"),
+        *("distance_first.png", "distance_first.npy", "distance_first-turbo.png", "normal_world.png"),
+        *("splat_id.png", "splat_id.npy", "blended.png", "blended.npy"),
     }
     depth = np.load("frames/depth.npy")
     assert depth.shape == (120, 160)

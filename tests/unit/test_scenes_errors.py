@@ -56,7 +56,7 @@ CHANGES = [
     ("background", "colour", "unknown key render.colour; did you mean"),
     ("[render]", "[rendering]", "unknown table rendering; did you mean render?"),
     ("[[splats]]", "[[splat]]", "unknown key splat; did you mean splats?"),
-    ("[camera]", "[camera.distortion]\nk1 = 0.1\n[camera]", "unknown table camera.distortion; did you mean"),
+    ("[camera]", "[camera.distorsion]\nk1 = 0.1\n[camera]", "unknown table camera.distorsion; did you mean"),
     ("width = 64\n", "", "camera.width is missing"),
     ("fov_x_deg = 60.0\n", "", "camera.fov_x_deg is missing (or fx and fy)"),
     ("fov_x_deg = 60.0\n", "fx = 60.0\n", "camera.fy is missing"),

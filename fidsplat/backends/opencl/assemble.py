@@ -93,6 +93,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     stages = ["prelude", "math", "splat", "bounds", "project", *_LISTS[shape.lists], "blend"]
     stages = [f"{stage}.cl" for stage in (*stages, f"schedule/{shape.schedule}", "resolve")]
     body = "\n".join(_HOOK.sub(fill, kernel_text(stage)) for stage in stages)
+    stages += [f"schedule/{schedule}.cl" for schedule in ("lanes", "group")]
     known = {hook for file in {*stages, *(one.file for one in CATALOGUE.values())} for hook in _hooks(file)}
     for file, section in zip(files, sections, strict=True):
         if unknown := set(section) - known:

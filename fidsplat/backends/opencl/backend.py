@@ -17,6 +17,7 @@ from fidsplat.backends.opencl.floor import measure_rates
 from fidsplat.backends.opencl.memory import BufferPool, Resident
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.plan import PAIR
+from fidsplat.backends.opencl.ray_buffers import RayBuffers
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
@@ -67,6 +68,7 @@ class OpenCLBackend:
         self.side_queue = cl.CommandQueue(self.context)
         """for what the host reads while the stages run"""
         self.pool = BufferPool(self.context, device)
+        self.ray_buffers = RayBuffers(self)
         self.limit_memory(self.info.memory_bytes * 9 // 10)
         self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
 

@@ -51,11 +51,11 @@ class Lists:
         keys, windows = run.take("keys", KEYS * count), run.take("windows", WINDOWS * count)
         if count == 0:
             return
-        inputs = [name for effect in run.pipeline.features.effects for name in effect.inputs]
+        effects = run.pipeline.features.effects
+        inputs = [(name, name in effect.view_inputs) for effect in effects for name in effect.inputs]
         arrays = [run.resident.part(name, first, end) for name in ("means", "quats", "scales", "opacities")]
-        # the keys of planes are the view's, all else is the cloud's
         extra = [
-            run.held[name] if name == "plane_keys" else run.resident.part(name, first, end) for name in inputs
+            run.held[name] if of_view else run.resident.part(name, first, end) for name, of_view in inputs
         ]
         big = (run.held["tallies"], self.big, run.held["big"], run.held["big bounds"])
         args = (np.uint32(count), run.held["view"], *arrays, splats, keys, windows, *big)

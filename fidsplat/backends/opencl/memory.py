@@ -107,6 +107,7 @@ class Resident:
         self.origin = cloud.origin
         self.sh_degree = cloud.sh_degree if cloud.sh_degree > 0 else -1
         self.has_planes = cloud.planes is not None
+        self.footprint = cloud.footprint
         self.planes = PlaneTable(cloud) if self.has_planes else None
         self._arrays = {
             "means": cloud.means,
@@ -117,6 +118,8 @@ class Resident:
         }
         if self.planes is not None:
             self._arrays["planes"] = self.planes.index
+        if cloud.boxes is not None:
+            self._arrays["boxes"] = cloud.boxes.astype(np.int32)
         if cloud.colors is not None:
             self._arrays["colors"] = cloud.colors
         elif cloud.sh is not None:  # always: a cloud has one of the two
@@ -150,6 +153,9 @@ class Resident:
 
     def part(self, name: str, first: int, end: int) -> cl.Buffer:
         """The array of splats [first, end)."""
+        if name == "splat_ids" and name not in self._arrays:
+            # made when a picture first asks for it
+            self._arrays[name] = np.arange(self.count, dtype=np.int32)
         if self.streamed:
             piece = np.ascontiguousarray(self._arrays[name][first:end])
             buffer = self._backend.pool.scratch(f"chunk of {name}", piece.nbytes)

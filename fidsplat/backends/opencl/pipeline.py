@@ -13,6 +13,7 @@ import pyopencl as cl
 
 from fidsplat.backends.base import View
 from fidsplat.backends.opencl.assemble import DeviceShape, Source
+from fidsplat.backends.opencl.exposed_run import ExposedRun
 from fidsplat.backends.opencl.memory import DeviceBuffer, Resident
 from fidsplat.backends.opencl.plan import Plan, plan_of
 from fidsplat.backends.opencl.run import Run
@@ -97,7 +98,7 @@ class OpenCLPipeline:
             shape = replace(self.shape, lists="ordered")
             return self.backend.pipeline(self.features, shape).render(resident, view)
         try:
-            run = Run(self, resident, view, plan)
+            run = (ExposedRun if view.shots else Run)(self, resident, view, plan)
             return OpenCLPlanes(run, run.draw())
         except BaseException as error:
             with suppress(cl.Error):
@@ -114,6 +115,8 @@ class OpenCLPipeline:
         pixels = view.width * view.height // view.samples**2
         planes = 4 + sum(planes for effect in self.features.effects for planes in effect.planes)
         channels = sum(output.channels for output in self.features.outputs)
+        if view.shots:
+            planes *= 2  # the picture's own beside those of a shot
         fixed += 4 * tiles * shape.tile_width * shape.tile_height * planes  # whole tiles
         fixed += 4 * pixels * channels + resident.device_bytes
         backend, record = self.backend, self.source.record_bytes

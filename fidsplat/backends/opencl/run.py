@@ -43,16 +43,17 @@ class Run:
 
     def draw(self) -> dict[str, tuple[Output, cl.Buffer]]:
         """All stages; returns the outputs by name."""
-        raw_planes = self._sample_planes()
-        outputs = {}
+        return self.resolve(self.samples())
+
+    def samples(self) -> list[cl.Buffer]:
+        """All stages but the last: the sample planes, raw first."""
+        planes = self._sample_planes()
         # not an attribute: in a cycle, all that this picture holds would wait for the garbage collector
         lists = LISTS["chunked" if self.plan.chunk else self.shape.lists](self)
         for first, end in lists.bands():
-            self._blend(first, end, raw_planes)
-            if end == self.tiles:
-                outputs = self._resolve(raw_planes)
+            self._blend(first, end, planes)
         self.stats = lists.stats()
-        return outputs
+        return planes
 
     # stages
 
@@ -84,10 +85,24 @@ class Run:
             np.float32(view.ceiling),
             np.float32(view.stop),
             np.float32(1.0 / view.samples**2),
-            *sample_planes,
+            *self._blend_args(sample_planes),
         )
 
-    def _resolve(self, raw_planes: list[cl.Buffer]) -> dict[str, tuple[Output, cl.Buffer]]:
+    def _blend_args(self, sample_planes: list[cl.Buffer]) -> list:
+        """raw, then each effect's uniforms, arrays of the view and planes."""
+        planes = iter(sample_planes)
+        args: list = [next(planes)]
+        for effect in self.pipeline.features.effects:
+            args += self._uniforms(effect.blend_uniforms)
+            args += [self.held[name] for name in effect.blend_inputs]
+            args += [next(planes) for _ in effect.planes]
+        return args
+
+    def _uniforms(self, names: tuple[str, ...]) -> list[np.generic]:
+        numbers = [number for name in names for number in self.view.uniform(name)]
+        return [number if isinstance(number, np.generic) else np.float32(number) for number in numbers]
+
+    def resolve(self, raw_planes: list[cl.Buffer]) -> dict[str, tuple[Output, cl.Buffer]]:
         view, features = self.view, self.pipeline.features
         height, width = view.height // view.samples, view.width // view.samples
         outputs = {
@@ -96,6 +111,8 @@ class Run:
         }
         extra, rest = [], iter(raw_planes[1:])
         for effect in features.effects:
+            extra += self._uniforms(effect.resolve_uniforms)
+            extra += [self.put(name, self.view.array(name)) for name in effect.resolve_arrays]
             extra += [next(rest) for _ in effect.planes]
             if effect.output:
                 extra.append(outputs[effect.output.name][1])
@@ -161,9 +178,21 @@ class Run:
     def put_view(self, row: int, end: int) -> None:
         """The uniforms of the projection, for rows of samples [row, end)."""
         view = self.view
-        tail = [view.fx, view.fy, view.cx, view.cy, view.near, view.far, view.log_cut]
-        tail += [view.width, view.height, 1.0 / view.samples**2, row, end]
-        parts = [view.rotation.ravel(), view.translation, view.eye, tail]
-        self.put("view", np.concatenate(parts).astype(self.pipeline.real))
+        if view.raster is not None:
+            self.held |= self.backend.ray_buffers.of(view.raster, self.rows, self.stride)
+        views = np.array([_uniforms(each, row, end) for each in (view, *(of for _, of in view.groups))])
+        self.put("view", views.astype(self.pipeline.real))
+        if view.groups:
+            head = [len(view.groups), views.shape[1]]
+            self.put("moving", np.array([*head, *(label for label, _ in view.groups)], np.int32))
         if self.resident.planes is not None:
             self.put("plane_keys", self.resident.planes.keys(view))
+
+
+def _uniforms(view: View, row: int, end: int) -> np.ndarray:
+    """The buffer `view` (prelude.cl) for rows of samples [row, end)."""
+    tail = [view.fx, view.fy, view.cx, view.cy, view.near, view.far, view.log_cut]
+    tail += [view.width, view.height, 1.0 / view.samples**2, row, end]
+    if view.raster is not None:
+        tail += view.raster.uniforms
+    return np.concatenate([view.rotation.ravel(), view.translation, view.eye, tail])

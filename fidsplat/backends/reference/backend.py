@@ -83,6 +83,7 @@ class ReferenceCloud:
         self.origin = cloud.origin
         self.sh_degree = cloud.sh_degree
         self.has_planes = cloud.planes is not None
+        self.footprint = cloud.footprint
 
 
 @dataclass
@@ -126,20 +127,41 @@ class ReferencePipeline:
         """Planes at pixels (row, column), each (k,) or (k, 3) float64; `certificate` (k,) beside those asked
         for.
         """
-        splats = Setup(resident.cloud, view, self.features)
         n = view.samples
         sub_rows, sub_columns = np.mgrid[0:n, 0:n]
         y = (np.asarray(rows)[:, None] * n + sub_rows.ravel() + 0.5).ravel()
         x = (np.asarray(columns)[:, None] * n + sub_columns.ravel() + 0.5).ravel()
+        flat = self._exposed(resident, view, x, y) if view.shots else self._samples(resident, view, x, y)
+        samples = {name: values.reshape(-1, n * n, *values.shape[1:]) for name, values in flat.items()}
+        samples |= {"x": x.reshape(-1, n * n), "y": y.reshape(-1, n * n)}
+        return resolve(samples, view, self.features)
+
+    def _samples(
+        self, resident: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """What blending leaves (k, ...) at grid positions x, y (k,)."""
+        splats = Setup(resident.cloud, view, self.features)
         step = max(1, _BLOCK // max(1, len(splats.order)))
         blocks = [
             composite(splats, view, self.features, x[k : k + step], y[k : k + step])
-            for k in range(0, len(x), step)
+            for k in range(0, max(len(x), 1), step)
         ]
-        samples = {
-            name: np.concatenate([block[name] for block in blocks]).reshape(
-                -1, n * n, *blocks[0][name].shape[1:]
-            )
-            for name in blocks[0]
-        }
-        return resolve(samples, view, self.features)
+        return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+
+    def _exposed(
+        self, resident: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """The same of a picture of several shots: the mean of colours, fog and transmittances, all else from
+        the middle one; `certificate_planes` is that one's certificate."""
+        out: dict[str, np.ndarray] = {}
+        for shot in view.shots:
+            mine = (y > shot.top) & (y < shot.top + shot.view.height)
+            seen = self._samples(resident, shot.view, x[mine], y[mine] - shot.top)
+            seen["certificate_planes"] = seen["certificate"]
+            for name, values in seen.items():
+                plane = out.setdefault(name, np.zeros((len(x), *values.shape[1:]), values.dtype))
+                if name in ("rgb", "t", "fogged", "certificate"):
+                    plane[mine] += shot.weight * values
+                elif shot.middle:
+                    plane[mine] = values
+        return out

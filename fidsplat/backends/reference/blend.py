@@ -27,8 +27,17 @@ def composite(
         "t": final,
         "certificate": doubt.of_color(s, view, span, before, laid.moved) + laid.reordered,
     }
+    if "fog" in features.posts:
+        reach = -view.fog_density * ray_lengths(x, y, view)[:, None]
+        left = np.exp(reach * z)
+        out["rgb"] = _sum(weight * left, laid.colors)
+        out["fogged"] = (weight * (1 - left)).sum(1)
+        with np.errstate(invalid="ignore"):
+            moved = np.abs(np.exp(reach * np.maximum(span.z_low, 0)) - np.exp(reach * span.z_high))
+        out["certificate"] += (weight * moved).sum(1)
     drawn = live & (alpha > 0)
-    if {"depth", "depth_median"} & set(features.taps):
+    uncertain = laid.reordered > 0
+    if {"depth", "depth_median", "depth_first"} & features.names:
         out["weight"] = weight.sum(1)
         out["depth"] = (weight * z).sum(1)
         out |= doubt.of_depth(span, weight, z)
@@ -38,20 +47,37 @@ def composite(
         out["depth_median_may_flip"] = (
             doubt.of_median(span)
             | (_pick(span.z_high - span.z_low, last, seen, 0.0) > 1e-5 * out["depth_median"])
-            | (laid.reordered > 0)
+            | uncertain
         )
-    if "normal" in features.taps:
+        first = drawn & (before * (1 - alpha) <= view.first_light)
+        out["depth_first"] = _pick(z, _first(first), np.asarray(first.any(1)), 0.0)
+        out["depth_first_may_flip"] = doubt.of_first(span, view.first_light) | uncertain
+        out["depth_first_may_flip"] |= (
+            _pick(span.z_high - span.z_low, _first(first), np.asarray(first.any(1)), 0.0)
+            > 1e-5 * out["depth_first"]
+        )
+    if "normal" in features.names:
         out["normal"] = _sum(weight, laid.normal)
-    if "label" in features.taps:
+    ids = {"label": laid.labels, "splat_id": laid.ids}
+    flips = {"label": laid.label_may_flip, "splat_id": laid.id_may_flip}
+    for name in sorted(ids.keys() & features.names):
         heaviest = _first(weight)
-        out["label_weight"] = _pick(weight, heaviest, np.asarray(drawn.any(1)), 0.0)
-        out["label"] = _pick(laid.labels, heaviest, out["label_weight"] > 0, -1)
-        out["label_may_flip"] = (
-            doubt.of_label(span, laid.labels, out["label"])
-            | laid.label_may_flip.any(1)
-            | (laid.reordered > 0)
-        )
+        out["heaviest"] = _pick(weight, heaviest, np.asarray(drawn.any(1)), 0.0)
+        out[name] = _pick(ids[name], heaviest, out["heaviest"] > 0, -1)
+        out[f"{name}_may_flip"] = doubt.of_label(span, ids[name], out[name]) | flips[name].any(1) | uncertain
+    if "splat_id" in features.names and len(s.order):
+        out["splat_id"] = np.where(out["splat_id"] >= 0, s.order[out["splat_id"].astype(int)], -1)
+    if "blended" in features.names:
+        out["blended"] = np.where(drawn, laid.count, 0).sum(1)
+        out["blended_doubt"] = doubt.of_count(span, laid.count, laid.count_doubt, view.stop, uncertain)
     return out
+
+
+def ray_lengths(x: np.ndarray, y: np.ndarray, view: View) -> np.ndarray:
+    """Length of the rays through samples at grid positions x, y, per metre of depth."""
+    if view.along_ray or view.parallel:
+        return np.ones_like(x)
+    return np.sqrt(1 + ((x - view.cx) / view.fx) ** 2 + ((y - view.cy) / view.fy) ** 2)
 
 
 def _sum(weight: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -14,10 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from fidsplat.backends.base import View
-from fidsplat.backends.reference.fragments import Fragments, shifted
+from fidsplat.backends.reference.fragments import Fragments, cover, shifted
+from fidsplat.backends.reference.optics import ROUND
 from fidsplat.backends.reference.setup import Setup
 
-_ROUND = 4 * 2.0**-24  # of a form, relative to its terms: its coefficients' rounding, and its sums'
+_ROUND = ROUND
 _WEIGHT = 2 * _ROUND  # relative, of half rho and of an opacity: a division, two products, exp
 _STOP = 5e-5  # relative, of a transmittance at a threshold
 
@@ -45,22 +46,25 @@ class Span:
 
 def span_of(s: Setup, view: View, f: Fragments) -> Span:
     """The span of fragments whose forms are computed in float32."""
+    terms = [s.forms[:, :, c] for c in range(3)]
     e_u, e_v, e_d = (
-        _ROUND * (np.abs(form) + f.dx * np.abs(s.forms[1, :, c]) + f.dy * np.abs(s.forms[2, :, c]))
-        for c, form in enumerate((f.n_u, f.n_v, f.d))
+        _rounding(s, f, form, term) for form, term in zip((f.n_u, f.n_v, f.d), terms, strict=True)
     )
+    # one rounding where it is the splat's; a form of its own for parallel rays
+    e_dz = _ROUND * f.dz if s.depth_forms is None else _rounding(s, f, f.dz, s.depth_forms)
     d_low, d_high = f.d - e_d, f.d + e_d
     q_low = np.maximum(np.abs(f.n_u) - e_u, 0) ** 2 + np.maximum(np.abs(f.n_v) - e_v, 0) ** 2
     q_high = (np.abs(f.n_u) + e_u) ** 2 + (np.abs(f.n_v) + e_v) ** 2
     slack = _ROUND * (np.abs(s.log_opacity) + s.half_r2)  # the squared radius is a difference of float32
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        may = (d_high > 0) & (d_low * view.near <= s.z_numerator * (1 + _ROUND))
-        must = (d_low > 0) & (d_high * view.near <= s.z_numerator * (1 - _ROUND))
+        may = (d_high > 0) & (d_low * view.near <= f.dz + e_dz)
+        must = (d_low > 0) & (d_high * view.near <= f.dz - e_dz)
         nearest, furthest = q_low / (2 * d_high**2), q_high / (2 * d_low**2)
         nearest = np.where(may & (nearest <= s.half_r2 + slack), nearest, np.inf)
         furthest = np.where(must & (furthest <= s.half_r2 - slack), furthest, np.inf)
-        z_low = np.where(d_high > 0, s.z_numerator / d_high, np.inf)
-        z_high = np.where(d_low > 0, s.z_numerator / d_low, np.inf)
+        near_dz, far_dz = (f.dz, f.dz) if s.depth_forms is None else (f.dz - e_dz, f.dz + e_dz)
+        z_low = np.where(d_high > 0, near_dz / np.where(near_dz < 0, d_low, d_high), np.inf)
+        z_high = np.where(d_low > 0, far_dz / np.where(far_dz < 0, d_high, d_low), np.inf)
     if s.screen:
         away, off = np.sqrt(f.offset), _ROUND * (1 + f.dx + f.dy)
         dot_low, dot_high = np.maximum(away - off, 0) ** 2, (away + off) ** 2
@@ -69,12 +73,30 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
     low = np.exp(s.log_opacity - furthest * (1 + _WEIGHT)) * (1 - _WEIGHT)
     high = np.exp(s.log_opacity - nearest * (1 - _WEIGHT)) * (1 + _WEIGHT)
     low, high = np.minimum(low, view.ceiling), np.minimum(high, view.ceiling)
+    if s.box.any():
+        # of an edge's distance: its two forms', one of them multiplied once more, and the sum's
+        off = np.stack(
+            [(e_d + 1.5 * e) * edge[None] for e, edge in zip((e_u, e_u, e_v, e_v), s.edges, strict=True)]
+        )
+        whole = np.minimum(np.exp(s.log_opacity), view.ceiling)
+        least = whole * cover(s.edges, f.n_u, f.n_v, f.d, -off - _ROUND) * (1 - _WEIGHT)
+        most = whole * cover(s.edges, f.n_u, f.n_v, f.d, off + _ROUND) * (1 + _WEIGHT)
+        low = np.where(s.box, np.where(must, least, 0.0), low)
+        high = np.where(s.box, np.where(may, most, 0.0), high)
     # no ray to the plane: the centre's depth
     z_low = np.where(d_low > 0, np.clip(z_low, s.pz - s.reach, s.pz + s.reach), s.pz - s.reach)
     z_high = np.clip(z_high, s.pz - s.reach, s.pz + s.reach)
     missed = d_high <= 0
     z_low, z_high = np.where(missed, s.pz, z_low), np.where(missed, s.pz, z_high)
     return Span.of(low, high, z_low, z_high)
+
+
+def _rounding(s: Setup, f: Fragments, form: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """What rounding may change (k, n) in forms (k, n) with factors (3, n)."""
+    total = np.abs(form)
+    for away, term in zip(f.away, terms, strict=True):
+        total = total + away * np.abs(term)
+    return s.round * total
 
 
 def of_color(s: Setup, view: View, span: Span, before: np.ndarray, moved: np.ndarray) -> np.ndarray:
@@ -99,6 +121,13 @@ def of_layer_color(thin: np.ndarray, thick: np.ndarray) -> np.ndarray:
     slope = np.exp(-least) + np.minimum(1.0, others / np.maximum(least, 1e-9)) / np.maximum(least, 1.0)
     moved = np.minimum(1.0, slope * (thick - thin)).sum(1, keepdims=True)
     return np.where((thick > 0).sum(1, keepdims=True) > 1, moved, 0.0)
+
+
+def of_box_color(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """The same (k, 1) of a layer of n boxes whose opacities lie between `low` and `high` (k, n): its colour
+    times its opacity is their sum, and where they cover more than all, their mean.
+    """
+    return np.where((high > 0).sum(1, keepdims=True) > 1, (high - low).sum(1, keepdims=True), 0.0)
 
 
 def of_layer_depth(
@@ -188,6 +217,29 @@ def of_median(span: Span) -> np.ndarray:
     may = (span.high > 0) & (span.front_high > 0.5 * (1 - _STOP))
     sure = (span.low > 0) & (span.front_low > 0.5 * (1 + _STOP))
     return np.asarray((may & ~sure).any(1))
+
+
+def of_first(span: Span, light: float) -> np.ndarray:
+    """Whether another fragment (k,) may be the first behind which no more than `light` is left."""
+    high, low = span.high, span.low
+    may = (high > 0) & (span.front_low * (1 - high) * (1 - _STOP) <= light)
+    sure = (low > 0) & (span.front_high * (1 - low) * (1 + _STOP) <= light)
+    return first_column(may, 0) != first_column(sure, 0)
+
+
+def of_count(
+    span: Span, count: np.ndarray, doubt: np.ndarray, stop: float, reordered: np.ndarray
+) -> np.ndarray:
+    """By how much (k,) the number of splats blended may differ. count, doubt (k, m): in each thing that is
+    laid."""
+    may, must = span.high > 0, span.low > 0
+    off = np.where(may, doubt + np.where(must, 0, count), 0)
+    # from where the light may have reached the stop to where it must have, whatever comes may be drawn or not
+    open_to = (span.front_high >= stop * (1 - _STOP)) & (
+        span.front_low * (1 - span.high) <= stop * (1 + _STOP)
+    )
+    off = np.where(may & open_to & (stop > 0), count + doubt, off)
+    return np.where(reordered, np.inf, off.sum(1))
 
 
 def of_label(span: Span, labels: np.ndarray, label: np.ndarray) -> np.ndarray:

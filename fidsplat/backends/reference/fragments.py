@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fidsplat.backends.base import View
+from fidsplat.backends.reference.optics import away_of, samples_of
 from fidsplat.backends.reference.setup import Setup
 
 DARKEST = 24 * math.log(2)
@@ -21,30 +22,59 @@ class Fragments:
     dx: np.ndarray
     """distance from the anchor, samples"""
     dy: np.ndarray
+    away: np.ndarray
+    """(3, k, n) at most how far from the anchor, in each coordinate of the samples"""
     n_u: np.ndarray
     n_v: np.ndarray
     d: np.ndarray
+    dz: np.ndarray
+    """d times the depth; (n,) unless rays are parallel"""
     offset: np.ndarray
-    """squared distance from the projected centre, pixels"""
+    """squared distance from the projected centre, pixels; infinite where the sample sees nothing"""
     alpha: np.ndarray
     z: np.ndarray
 
 
 def fragments_of(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Fragments:
     """The fragments of samples (k,) at grid positions x, y."""
-    x, y = x[:, None], y[:, None]
-    n_u, n_v, d = (s.forms[0, :, c] + x * s.forms[1, :, c] + y * s.forms[2, :, c] for c in range(3))
+    samples = samples_of(view, x, y)
+    x, y, (c0, c1, c2) = samples.x, samples.y, samples.coordinates
+    n_u, n_v, d = (c0 * s.forms[0, :, c] + c1 * s.forms[1, :, c] + c2 * s.forms[2, :, c] for c in range(3))
+    dz = s.z_numerator
+    if s.depth_forms is not None:
+        dz = c0 * s.depth_forms[0] + c1 * s.depth_forms[1] + c2 * s.depth_forms[2]
     q = n_u * n_u + n_v * n_v
-    inside = (q <= 2 * s.half_r2 * d * d) & (d > 0) & (d * view.near <= s.z_numerator)
+    inside = (q <= 2 * s.half_r2 * d * d) & (d > 0) & (d * view.near <= dz)
     offset = ((x - s.center_x) ** 2 + (y - s.center_y) ** 2) / view.samples**2
+    offset = np.where(samples.seen, offset, np.inf)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         half_rho = np.where(inside, q / (2 * d * d), np.inf)
-        z = s.z_numerator / d
+        z = dz / d
     if s.screen:
         half_rho = np.minimum(half_rho, np.where(offset <= s.half_r2, offset, np.inf))
-    z = np.where(d > 0, np.clip(z, s.pz - s.reach, s.pz + s.reach), s.pz)
     alpha = np.minimum(np.exp(s.log_opacity - half_rho), view.ceiling)
-    return Fragments(np.abs(x - s.anchor_x), np.abs(y - s.anchor_y), n_u, n_v, d, offset, alpha, z)
+    if s.box.any():
+        visible = (d > 0) & (d * view.near <= dz)
+        whole = np.minimum(np.exp(s.log_opacity), view.ceiling)
+        alpha = np.where(s.box, np.where(visible, whole * cover(s.edges, n_u, n_v, d, 0.0), 0.0), alpha)
+    z = np.where(d > 0, np.clip(z, s.pz - s.reach, s.pz + s.reach), s.pz)
+    dx, dy, away = np.abs(x - s.anchor_x), np.abs(y - s.anchor_y), away_of(view, samples, s.anchors)
+    return Fragments(dx, dy, away, n_u, n_v, d, dz, offset, alpha, z)
+
+
+def cover(edges: np.ndarray, n_u: np.ndarray, n_v: np.ndarray, d: np.ndarray, shift) -> np.ndarray:
+    """What boxes cover of samples (k, n), 0 to 1, every edge moved outwards by `shift` (broadcast to (4, k,
+    n)).
+
+    `shift` is in samples, or one array for each of the edges.
+    """
+    shift = np.broadcast_to(shift, (4, *d.shape))
+
+    def ramp(form: np.ndarray, edge: int) -> np.ndarray:
+        return np.clip(0.5 + form * edges[edge] + shift[edge], 0, 1)
+
+    along_u = np.maximum(ramp(d + n_u, 0) + ramp(d - n_u, 1) - 1, 0)
+    return along_u * np.maximum(ramp(d + n_v, 2) + ramp(d - n_v, 3) - 1, 0)
 
 
 def optical_depth(alpha: np.ndarray) -> np.ndarray:

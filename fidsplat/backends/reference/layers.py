@@ -29,10 +29,17 @@ class Laid:
     """(m, 3) or (k, m, 3), as normal"""
     normal: np.ndarray
     labels: np.ndarray
+    ids: np.ndarray
+    """places in the depth order of the splats that stand for the layers"""
+    count: np.ndarray
+    """splats that are blended in each"""
+    count_doubt: np.ndarray
+    """how many more or less they may be, if it is drawn at all"""
     moved: np.ndarray
     """what may change in a layer's mean colour, per unit of light in front of it"""
     label_may_flip: np.ndarray
     """bool: whether another label may be the layer's"""
+    id_may_flip: np.ndarray
     reordered: np.ndarray
     """(k,) what may change in colour because things may be laid in another order"""
 
@@ -44,18 +51,46 @@ class Laid:
 
         s = self.span
         span = Span.of(of(s.low), of(s.high), of(s.z_low), of(s.z_high))
-        parts = (self.alpha, self.z, self.colors, self.normal, self.labels, self.moved, self.label_may_flip)
-        alpha, z, colors, normal, labels, moved, flips = map(of, parts)
-        return Laid(alpha, z, span, colors, normal, labels, moved, flips, self.reordered)
+        return Laid(
+            span=span, reordered=self.reordered, **{name: of(getattr(self, name)) for name in _COLUMNS}
+        )
+
+
+_COLUMNS = (
+    "alpha",
+    "z",
+    "colors",
+    "normal",
+    "labels",
+    "ids",
+    "count",
+    "count_doubt",
+    "moved",
+    "label_may_flip",
+    "id_may_flip",
+)
+"""fields of Laid that have a value for each of the m things"""
 
 
 def in_order(s: Setup, f: Fragments, span: Span) -> Laid:
     """Every fragment by itself, in the depth order of the splats."""
     shape = f.alpha.shape
     nothing = np.zeros(shape)
-    labels = np.broadcast_to(s.labels, shape)
-    certain = np.zeros(len(f.alpha))
-    return Laid(f.alpha, f.z, span, s.colors, s.normal, labels, nothing, nothing > 0, certain)
+    return Laid(
+        alpha=f.alpha,
+        z=f.z,
+        span=span,
+        colors=s.colors,
+        normal=s.normal,
+        labels=np.broadcast_to(s.labels, shape),
+        ids=np.broadcast_to(np.arange(shape[1]), shape),
+        count=nothing + 1,
+        count_doubt=nothing,
+        moved=nothing,
+        label_may_flip=nothing > 0,
+        id_may_flip=nothing > 0,
+        reordered=np.zeros(len(f.alpha)),
+    )
 
 
 def in_layers(s: Setup, f: Fragments, span: Span, planes: np.ndarray) -> Laid:
@@ -81,15 +116,21 @@ def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Laid:
     k, m = len(f.alpha), len(splats)
     nothing = np.zeros((k, m))
     return Laid(
-        f.alpha[:, splats],
-        f.z[:, splats],
-        Span.of(span.low[:, splats], span.high[:, splats], span.z_low[:, splats], span.z_high[:, splats]),
-        np.broadcast_to(s.colors[splats], (k, m, 3)),
-        np.broadcast_to(s.normal[splats], (k, m, 3)),
-        np.broadcast_to(s.labels[splats], (k, m)),
-        nothing,
-        nothing > 0,
-        np.zeros(k),
+        alpha=f.alpha[:, splats],
+        z=f.z[:, splats],
+        span=Span.of(
+            span.low[:, splats], span.high[:, splats], span.z_low[:, splats], span.z_high[:, splats]
+        ),
+        colors=np.broadcast_to(s.colors[splats], (k, m, 3)),
+        normal=np.broadcast_to(s.normal[splats], (k, m, 3)),
+        labels=np.broadcast_to(s.labels[splats], (k, m)),
+        ids=np.broadcast_to(splats, (k, m)),
+        count=nothing + 1,
+        count_doubt=nothing,
+        moved=nothing,
+        label_may_flip=nothing > 0,
+        id_may_flip=nothing > 0,
+        reordered=np.zeros(k),
     )
 
 
@@ -97,42 +138,58 @@ def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Laid:
     """The layer (k, 1) of the splats (indices) of a plane."""
     alpha, z = f.alpha[:, splats], f.z[:, splats]
     low, high = span.low[:, splats], span.high[:, splats]
-    tau = optical_depth(alpha)
+    boxes = bool(s.box[splats[0]])  # a plane has one footprint
+    tau = alpha if boxes else optical_depth(alpha)
     total = tau.sum(1, keepdims=True)
     share = tau / np.where(total > 0, total, 1)
     # 1 - opacity is rounded too
     thin, thick = optical_depth(low - 2.0**-23), np.where(high > 0, optical_depth(high + 2.0**-23), 0.0)
+    if boxes:
+        thin, thick = low, high
     heaviest = np.argmax(tau, axis=1)[:, None]
     labels = s.labels[splats]
     label = labels[heaviest]
-    other = (labels != label) & (high > 0) & (thick >= np.take_along_axis(thin, heaviest, 1))
+    as_heavy = (high > 0) & (thick >= np.take_along_axis(thin, heaviest, 1))
+    drawn = alpha > 0
     z_low, z_high = doubt.of_layer_depth(span.z_low[:, splats], span.z_high[:, splats], share, thin, thick)
     depth = np.where(total > 0, (share * z).sum(1, keepdims=True), (z_low + z_high) / 2)
-    covered = (1 - (1 - each).prod(1, keepdims=True) for each in (alpha, low, high))
+    covered = (_covered(each, boxes) for each in (alpha, low, high))
     opacity, least, most = covered
     return Laid(
-        opacity,
-        depth,
-        Span.of(least, most, z_low, z_high),
-        (share @ s.colors[splats])[:, None],
-        (share @ s.normal[splats])[:, None],
-        label,
-        doubt.of_layer_color(thin, thick),
-        other.any(1, keepdims=True),
-        np.zeros(len(alpha)),
+        alpha=opacity,
+        z=depth,
+        span=Span.of(least, most, z_low, z_high),
+        colors=(share @ s.colors[splats])[:, None],
+        normal=(share @ s.normal[splats])[:, None],
+        labels=label,
+        ids=splats[heaviest],
+        count=drawn.sum(1, keepdims=True),
+        count_doubt=((low > 0) != (high > 0)).sum(1, keepdims=True),
+        moved=doubt.of_box_color(low, high) if boxes else doubt.of_layer_color(thin, thick),
+        label_may_flip=(as_heavy & (labels != label)).any(1, keepdims=True),
+        id_may_flip=as_heavy.sum(1, keepdims=True) > 1,
+        reordered=np.zeros(len(alpha)),
     )
+
+
+def _covered(opacity: np.ndarray, boxes: bool) -> np.ndarray:
+    """Opacity (k, 1) of a layer: boxes lie side by side, Gaussians over one another."""
+    if boxes:
+        return np.minimum(opacity.sum(1, keepdims=True), 1.0)
+    return 1 - (1 - opacity).prod(1, keepdims=True)
 
 
 def _side_by_side(parts: list[Laid]) -> Laid:
     def joined(name: str) -> np.ndarray:
         return np.concatenate([getattr(part, name) for part in parts], axis=1)
 
-    names = ("alpha", "z", "colors", "normal", "labels", "moved", "label_may_flip")
     spans = (
         np.concatenate([getattr(part.span, name) for part in parts], axis=1)
         for name in ("low", "high", "z_low", "z_high")
     )
-    return Laid(span=Span.of(*spans), reordered=parts[0].reordered, **{name: joined(name) for name in names})
+    return Laid(
+        span=Span.of(*spans), reordered=parts[0].reordered, **{name: joined(name) for name in _COLUMNS}
+    )
 
 
 def _places(columns: Laid, is_layer: np.ndarray) -> np.ndarray:

@@ -7,6 +7,8 @@ import math
 import numpy as np
 
 from fidsplat.backends.base import View
+from fidsplat.backends.reference.blend import ray_lengths
+from fidsplat.backends.reference.post import background_at, developed
 from fidsplat.effects import FeatureSet
 
 _ROUND = 1e-6  # relative, of a sum of weights
@@ -15,44 +17,83 @@ _ROUND = 1e-6  # relative, of a sum of weights
 def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) -> dict[str, np.ndarray]:
     """Planes of pixels (k, ...) from their samples (k, n * n, ...), and their certificates.
 
-    `certificate`: colour per unit of colour, and alpha; `certificate_depth` metres; `certificate_normal`
-    difference of unit vectors; `depth_median_may_flip`, `label_may_flip` bool.
+    `certificate`: colour per unit of colour, and alpha; `certificate_depth`, `certificate_distance` metres;
+    `certificate_normal` difference of unit vectors; `depth_median_may_flip`, `label_may_flip` and so on bool;
+    `blended_doubt` splats. samples: with `x`, `y`, positions on the sample grid.
     """
     t, doubt = samples["t"].mean(1), samples["certificate"]
-    out = {"rgb": samples["rgb"].mean(1) + t[:, None] * np.asarray(view.background)}
-    out["certificate"] = doubt.mean(1)
-    if "alpha" in features.taps:
+    center_x, center_y = samples["x"].mean(1), samples["y"].mean(1)
+    behind, behind_doubt = background_at(view, center_x, center_y)
+    out = {"rgb": samples["rgb"].mean(1) + t[:, None] * behind, "certificate": doubt.mean(1)}
+    if "fogged" in samples:
+        out["rgb"] += samples["fogged"].mean(1)[:, None] * behind
+    if features.posts or view.surroundings is not None:
+        steps = tuple(step for step in features.posts if step != "fog")
+        brightest = max(
+            1.0, float(np.abs(out["rgb"]).max(initial=1.0)), float(np.abs(behind).max(initial=0.0))
+        )
+        unsure = out["certificate"] * brightest + t * behind_doubt
+        columns, rows = (np.floor(center / view.samples).astype(int) for center in (center_x, center_y))
+        out["rgb"], out["certificate_rgb"] = developed(out["rgb"], unsure, steps, view, columns, rows)
+    doubt = samples.get("certificate_planes", doubt)  # the other planes show one shot
+    if "alpha" in features.names:
         out["alpha"] = 1 - t
-    if "depth" in features.taps:
+    # of the ray through each sample, per metre of depth
+    length = ray_lengths(samples["x"], samples["y"], view)
+    if "depth" in features.names:
         weight = samples["weight"].sum(1)
         out["depth"] = _ratio(samples["depth"].sum(1), weight, 0.0)
+        out["distance"] = _ratio((samples["depth"] * length).sum(1), weight, 0.0)
         # light that moves from the nearest to the furthest fragment, in a mean over at least `least`
         spread = samples["furthest"].max(1) - samples["nearest"].min(1)
         moved = doubt.sum(1) * np.where(doubt.sum(1) > 0, np.maximum(spread, 0), 0)
         least = weight - doubt.sum(1)
         out["certificate_depth"] = _ratio(moved + samples["depth_moved"].sum(1), least, math.inf)
-    if "depth_median" in features.taps:
-        medians = np.sort(np.where(samples["depth_median"] > 0, samples["depth_median"], math.inf), axis=1)
-        hits = np.isfinite(medians).sum(1)
-        middle = np.take_along_axis(medians, np.maximum((hits - 1) // 2, 0)[:, None], 1)[:, 0]
-        out["depth_median"] = np.where(hits > 0, middle, 0.0)
-        out["depth_median_may_flip"] = samples["depth_median_may_flip"].any(1)
-    if "normal" in features.taps:
+        # samples whose rays differ in length share out what moves, too
+        spread = (samples["furthest"] * length).max(1) - (samples["nearest"] * length).min(1)
+        moved = doubt.sum(1) * np.where(doubt.sum(1) > 0, np.maximum(spread, 0), 0)
+        moved += (samples["depth_moved"] * length).sum(1)
+        out["certificate_distance"] = _ratio(moved, least, math.inf)
+    for name, along in (("depth_median", "distance_median"), ("depth_first", "distance_first")):
+        if name in features.names:
+            place = _median if name == "depth_median" else _nearest
+            out[name], out[along] = place(samples[name]), place(samples[name] * length)
+            out[f"{name}_may_flip"] = out[f"{along}_may_flip"] = samples[f"{name}_may_flip"].any(1)
+    if "normal" in features.names:
         total = samples["normal"].sum(1)
         length = np.linalg.norm(total, axis=1)
         out["normal"] = total / np.where(length > 0, length, 1)[:, None]
+        out["normal_world"] = out["normal"] @ view.rotation
         moved = 2 * doubt.sum(1) + _ROUND * (1 - samples["t"]).sum(1)
         out["certificate_normal"] = _ratio(moved, length - doubt.sum(1), math.inf)
-    if "label" in features.taps:
-        heaviest = np.argmax(samples["label_weight"], axis=1)
-        weights = np.sort(samples["label_weight"], axis=1)
-        out["label"] = np.take_along_axis(samples["label"], heaviest[:, None], 1)[:, 0].astype(np.int32)
+        out["certificate_normal_world"] = out["certificate_normal"]
+    for name in sorted({"label", "splat_id"} & features.names):
+        heaviest = np.argmax(samples["heaviest"], axis=1)
+        weights = np.sort(samples["heaviest"], axis=1)
+        out[name] = np.take_along_axis(samples[name], heaviest[:, None], 1)[:, 0].astype(np.int32)
         # of samples that weigh the same the first wins, by rounding
-        close = (samples["label_weight"] >= weights[:, -1:] * (1 - 5e-5) - doubt) & (
-            samples["label"] != out["label"][:, None]
+        close = (samples["heaviest"] >= weights[:, -1:] * (1 - 5e-5) - doubt) & (
+            samples[name] != out[name][:, None]
         )
-        out["label_may_flip"] = samples["label_may_flip"].any(1) | (close & (weights[:, -1:] > 0)).any(1)
+        out[f"{name}_may_flip"] = samples[f"{name}_may_flip"].any(1) | (close & (weights[:, -1:] > 0)).any(1)
+    if "blended" in features.names:
+        out["blended"] = samples["blended"].max(1)
+        out["blended_doubt"] = samples["blended_doubt"].max(1)
     return out
+
+
+def _median(values: np.ndarray) -> np.ndarray:
+    """The lower median (k,) of those of (k, n) above 0; 0 where there is none."""
+    medians = np.sort(np.where(values > 0, values, math.inf), axis=1)
+    hits = np.isfinite(medians).sum(1)
+    middle = np.take_along_axis(medians, np.maximum((hits - 1) // 2, 0)[:, None], 1)[:, 0]
+    return np.where(hits > 0, middle, 0.0)
+
+
+def _nearest(values: np.ndarray) -> np.ndarray:
+    """The smallest (k,) of those of (k, n) above 0; 0 where there is none."""
+    nearest = np.where(values > 0, values, math.inf).min(1)
+    return np.where(np.isfinite(nearest), nearest, 0.0)
 
 
 def _ratio(above: np.ndarray, below: np.ndarray, otherwise: float) -> np.ndarray:

@@ -6,6 +6,7 @@ import numpy as np
 
 from fidsplat.backends.base import View
 from fidsplat.backends.planes import PlaneTable
+from fidsplat.backends.reference import optics
 from fidsplat.effects import FeatureSet
 from fidsplat.splats import SplatCloud, sh_basis
 
@@ -21,55 +22,123 @@ class Setup:
         tangent_v = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], 1)
         mean, scale = cloud.means.astype(np.float64), cloud.scales.astype(np.float64)
         scale = np.maximum(scale, np.float32(1e-20))  # as the kernels' SMALLEST_SCALE
-        rotation = view.rotation
-        unit_a, unit_b = tangent_u @ rotation.T, tangent_v @ rotation.T
+        unit_a, unit_b, p, outward = _posed(view, tangent_u, tangent_v, mean)
+        for label, own in view.groups:
+            mine = (cloud.labels == label)[:, None]
+            moved = _posed(own, tangent_u, tangent_v, mean)
+            unit_a, unit_b, p, outward = (
+                np.where(mine, there, here)
+                for there, here in zip(moved, (unit_a, unit_b, p, outward), strict=True)
+            )
         a, b = unit_a * scale[:, :1], unit_b * scale[:, 1:]
-        p = mean @ rotation.T + view.translation
-        self.key = p[:, 2].astype(np.float32)
+        depth = np.linalg.norm(p, axis=1) if view.along_ray else p[:, 2]
+        self.key = depth.astype(np.float32)
+        with np.errstate(divide="ignore"):
+            log_opacity = np.log(cloud.opacities.astype(np.float64))
+        box = np.zeros(len(cloud), bool) if cloud.boxes is None else cloud.boxes
+        area = scale.prod(axis=1)
+        if "lowpass_pixel" in features.slots:
+            filtered = ~box & (p[:, 2] >= view.near)
+            a, b, grown = _filtered(a, b, p, view, filtered)
+            area = area * grown
+            with np.errstate(divide="ignore"):
+                log_opacity = log_opacity - np.log(grown)
         planes = None
         if "compose_planes" in features.slots:
             table = PlaneTable(cloud)
             planes = table.index
             self.key = np.where(planes < 0, self.key, np.append(table.keys(view), 0)[planes])
-        with np.errstate(divide="ignore"):
-            log_opacity = np.log(cloud.opacities.astype(np.float64))
         half_r2 = log_opacity - view.log_cut
-        reach = np.sqrt(np.maximum(2 * half_r2, 0)) * np.hypot(a[:, 2], b[:, 2])
-        drawn = (half_r2 > 0) & (p[:, 2] + reach >= view.near) & (p[:, 2] - reach <= view.far)
+        reach = np.hypot(a[:, 2], b[:, 2])
+        if view.along_ray:
+            reach = np.maximum(np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1))
+        reach = np.sqrt(np.maximum(2 * half_r2, 0)) * reach
+        reach = np.where(box, np.abs(a[:, 2]) + np.abs(b[:, 2]), reach)
+        drawn = (half_r2 > 0) & (depth + reach >= view.near) & (depth - reach <= view.far)
         order = np.flatnonzero(drawn)
         order = order[np.argsort(self.key[order], kind="stable")]
         self.order = order
 
         normal = np.cross(unit_a, unit_b)[order]
-        a, b, p, mean, scale = a[order], b[order], p[order], mean[order], scale[order]
+        a, b, p, area = a[order], b[order], p[order], area[order]
         self.log_opacity, self.half_r2, self.reach = log_opacity[order], half_r2[order], reach[order]
         self.labels = cloud.labels[order]
-        self.pz = p[:, 2]
-        rows = np.stack([a, b, p], axis=2)  # (n, xyz, uv1)
-        tw = rows[:, 2]
-        tu = view.fx * rows[:, 0] + view.cx * tw
-        tv = view.fy * rows[:, 1] + view.cy * tw
+        self.pz = depth[order]
         # the plane's height above the camera's centre decides its side, and whether it is edge-on
-        height = np.einsum("ij,ij->i", normal, p)
-        edge_on = np.abs(height) <= 1e-13 * np.linalg.norm(p, axis=1)
+        height = normal[:, 2] if view.parallel else np.einsum("ij,ij->i", normal, p)
+        edge_on = np.abs(height) <= 1e-13 * (1.0 if view.parallel else np.linalg.norm(p, axis=1))
         sign = np.where(edge_on, 0.0, np.sign(height))
-        self.z_numerator = view.fx * view.fy * scale.prod(axis=1) * np.abs(height * sign)
-        self.forms = np.stack([np.cross(tu, tv), np.cross(tv, tw), np.cross(tw, tu)])
-        """(3, n, 3): constant, per x, per y; of n_u, n_v, D"""
+        self.forms, depth_forms, size = optics.forms_of(view, a, b, p)
+        """(3, n, 3): factors of a sample's coordinates in n_u, n_v, D"""
         self.forms[:, :, 2] *= sign
+        self.depth_forms = depth_forms * sign if view.parallel else None
+        """(3, n): those in D times the depth, for parallel rays; for others that is `z_numerator` (n,)"""
+        self.z_numerator = size * area * np.abs(height * sign)
 
-        self.dot = self.pz >= view.near  # the low-pass dot belongs to the centre
-        with np.errstate(divide="ignore", invalid="ignore"):
-            self.center_x = np.where(self.dot, tu[:, 2] / self.pz, np.inf)
-            self.center_y = np.where(self.dot, tv[:, 2] / self.pz, np.inf)
+        self.box = box[order]
+        self.edges = _edges(self.forms)
+
+        ahead = self.pz >= view.near
+        middle_x, middle_y = optics.centers_of(view, p, ahead)
+        ahead &= np.isfinite(middle_x)
+        self.dot = ahead & ~self.box  # the low-pass dot belongs to the centre of a Gaussian
+        self.center_x, self.center_y = (np.where(self.dot, at, np.inf) for at in (middle_x, middle_y))
         # devices keep the forms about the pixel nearest to the centre; unknown here where that is behind
-        self.anchor_x = _anchor(self.center_x, self.dot, view.width)
-        self.anchor_y = _anchor(self.center_y, self.dot, view.height)
-        self.colors = _colors(cloud, order, mean - view.eye)
+        self.anchor_x = _anchor(middle_x, ahead, view.width)
+        self.anchor_y = _anchor(middle_y, ahead, view.height)
+        self.anchors = optics.anchors_of(view, self.anchor_x, self.anchor_y)
+        self.round = optics.ROUND if view.raster is None else optics.ROUND_OF_RAYS
+        """of a form in float32, relative to its terms"""
+        self.colors = _colors(cloud, order, outward[order])
         self.normal = normal * np.where(height > 0, -1.0, 1.0)[:, None]
         self.screen = "lowpass_screen" in features.slots
         self.exclusive = "stop_exclusive" in features.slots
         self.planes = None if planes is None else planes[order]
+
+
+def _posed(
+    view: View, tangent_u: np.ndarray, tangent_v: np.ndarray, mean: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """Unit tangents and centre in the camera frame, and the centre from the eye in the cloud's, (n, 3)
+    each."""
+    turn = view.rotation.T
+    return tangent_u @ turn, tangent_v @ turn, mean @ turn + view.translation, mean - view.eye
+
+
+def _filtered(
+    a: np.ndarray, b: np.ndarray, p: np.ndarray, view: View, chosen: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Scaled tangents (n, 3) after the low-pass `pixel`, and the factor (n,) by which areas grow.
+
+    chosen (n,) bool: the others stay as they are. The covariance of the filter in (u, v) is
+    (G^T G)^-1 / 4 with G the derivative of the sample's position by (u, v) at the centre.
+    """
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        z = p[:, 2]
+        columns = [
+            np.stack(
+                [view.fx * (t[:, 0] - p[:, 0] / z * t[:, 2]), view.fy * (t[:, 1] - p[:, 1] / z * t[:, 2])]
+            )
+            / z
+            for t in (a, b)
+        ]
+        turned = columns[0][0] * columns[1][1] - columns[1][0] * columns[0][1]
+        m11, m12, m22 = ((columns[i] * columns[j]).sum(0) for i, j in ((0, 0), (0, 1), (1, 1)))
+        variance = 0.25
+        c11, c12 = 1 + variance * m22 / turned**2, -variance * m12 / turned**2
+        grown = np.sqrt(1 + variance * (m11 + m22 + variance) / turned**2)
+        l11 = np.sqrt(c11)
+        grown, wide_a = np.where(chosen, grown, 1.0), l11[:, None] * a + (c12 / l11)[:, None] * b
+        wide_b = (grown / l11)[:, None] * b
+    # edge-on splats grow without limit and are not drawn
+    chosen = (chosen & np.isfinite(grown))[:, None]
+    return np.where(chosen, wide_a, a), np.where(chosen, wide_b, b), grown
+
+
+def _edges(forms: np.ndarray) -> np.ndarray:
+    """1 / |gradient| (4, n) of the forms D + n_u, D - n_u, D + n_v, D - n_v: a box's edges, in samples."""
+    sides = [forms[1:, :, 2] + sign * forms[1:, :, axis] for axis in (0, 1) for sign in (1, -1)]
+    return 1 / np.maximum(np.stack([np.hypot(*side) for side in sides]), 1e-300)
 
 
 def _anchor(center: np.ndarray, known: np.ndarray, size: int) -> np.ndarray:

@@ -74,9 +74,11 @@ class Resident:
         origin: np.ndarray,
         sh_degree: int,
         planes: PlaneTable | None = None,
+        footprint: str = "gaussian",
     ) -> None:
         self.arrays, self.count, self.origin = arrays, count, origin
         self.sh_degree, self.planes, self.has_planes = sh_degree, planes, planes is not None
+        self.footprint = footprint
 
     @property
     def nbytes(self) -> int:
@@ -104,7 +106,7 @@ class Resident:
             arrays["planes"] = planes.index
         device = {name: _uploaded(name, array, pool) for name, array in arrays.items()}
         degree = cloud.sh_degree if cloud.sh_degree > 0 else -1
-        return cls(device, len(cloud), cloud.origin, degree, planes)
+        return cls(device, len(cloud), cloud.origin, degree, planes, cloud.footprint)
 
     @classmethod
     def around(cls, given: Mapping[str, Any], origin: np.ndarray, pool: ArrayPool) -> Resident:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 KNOWN = frozenset(
     {"camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen", "stop_inclusive"}
     | {"stop_exclusive", "compose_ordered", "compose_planes", "ray_depth"}
+    | {"perspective", "footprint_gaussian", "background_constant"}
     | {"alpha", "depth", "depth_median", "normal", "label"}
 )
 """effects that kernels/warp has"""

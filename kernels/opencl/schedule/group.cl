@@ -38,6 +38,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
 
     Pixel pixels[ROWS];
     for (int row = 0; row < ROWS; row++) pixel_start(&pixels[row]);
+//@@ group_start
+//@@ pixels_start
 
     uint base = starts[band_first], start = starts[tile] - base, end = starts[tile + 1] - base;
     for (uint batch = start; batch < end; batch += STAGED) {
@@ -77,8 +79,10 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
                     if (!pixel_unfinished(&pixels[row], &constants)) continue;
                     float y = (float)(py + row - s.ay);
                     Crossing c = cross_row(&s, nu_x, nv_x, d_x, y, half_r2);
+//@@ cross
                     float screen;
                     int mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
+//@@ mask
                     if (VANY(mask)) pixel_blend(&pixels[row], &s, c, mask, screen, &constants);
                 }
             }

@@ -21,6 +21,8 @@ kernel void blend(
 
     Pixel pixels[TILE_H];
     for (int row = 0; row < TILE_H; row++) pixel_start(&pixels[row]);
+//@@ lanes_start
+//@@ pixels_start
     // rows that still let light through; those below the picture never do
     int rows = min(height - y0, TILE_H);
     uint alive = rows == 32 ? 0xFFFFFFFFu : (1u << rows) - 1u;
@@ -40,8 +42,10 @@ kernel void blend(
             if (!(alive >> row & 1u)) continue;
             float y = (float)(y0 + row - s.ay);
             Crossing c = cross_row(&s, nu_x, nv_x, d_x, y, half_r2);
+//@@ cross
             vfloat screen;
             vint mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
+//@@ mask
             if (!VANY(mask)) continue;
             pixel_blend(&pixels[row], &s, c, mask, screen, &constants);
             if (!VANY(pixel_unfinished(&pixels[row], &constants))) alive &= ~(1u << row);

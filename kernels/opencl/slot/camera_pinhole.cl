@@ -1,8 +1,6 @@
-// Pinhole camera, OpenCV axes: row of M for an image axis, relative to an anchor coordinate on that axis, is
-// focal * axis_row + (principal - anchor) * z_row.
-//@ camera
-static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ z_row) {
-    real3_ row = {focal * axis_row.x + offset * z_row.x, focal * axis_row.y + offset * z_row.y,
-                  focal * axis_row.z + offset * z_row.z};
-    return row;
-}
+// Pinhole camera, OpenCV axes.
+//@ camera_forms
+    tu = image_row(view[VIEW_FX], view[VIEW_CX] - anchor_x, row_x, tw);
+    tv = image_row(view[VIEW_FY], view[VIEW_CY] - anchor_y, row_y, tw);
+    real3_ k0 = cross3(tu, tv), kx = cross3(tv, tw), ky = cross3(tw, tu);   // (n_u, n_v, D): constant, per x, per y
+    real determinant = view[VIEW_FX] * view[VIEW_FY] * su * sv * offset;   // of M: exact where tw . k0 cancels

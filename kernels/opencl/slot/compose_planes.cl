@@ -50,9 +50,11 @@ static inline void layer_gather(Layer *layer, const Splat *s, const Seen *seen, 
     opacity = VSELECT((vfloat)0.0f, opacity, mask);
     // an opaque fragment has the optical depth at which float32 leaves no light
     vfloat tau = -log(fmax(1.0f - opacity, (vfloat)0x1p-24f));
+//@@ footprint_tau
     layer->plane = VSELECT(layer->plane, (vint)s->plane, mask);
     layer->opacity = FMA(opacity, 1.0f - layer->opacity, layer->opacity);
     layer->ink += tau;
+//@@ footprint_gather
     vfloat share = VSELECT((vfloat)0.0f, tau / layer->ink, VMASK(tau > 0.0f));
     layer->mean.r = FMA(share, seen->r - layer->mean.r, layer->mean.r);
     layer->mean.g = FMA(share, seen->g - layer->mean.g, layer->mean.g);

@@ -9,6 +9,7 @@
         bounds.px = (float)center_x;
         bounds.py = (float)center_y;
         bounds.pr = pz >= near ? sqrt(half_r2 / (float)view[VIEW_FILTER]) * (1.0f + BOUNDS_PAD_RELATIVE) + BOUNDS_PAD : -1.0f;
+//@@ footprint_dot_bounds
 //@ bounds_span
     float dot_low = fmax(y0 - b->py, -b->pr), dot_high = fmin(y1 - b->py, b->pr);
     if (dot_low <= dot_high) {
@@ -25,6 +26,7 @@
 //@ project
         record.fx = pz >= near ? (float)(center_x - anchor_x) : 1e18f;
         record.fy = pz >= near ? (float)(center_y - anchor_y) : 1e18f;
+//@@ footprint_dot
 //@ fragment_mask
 static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, float y, float half_r2, float filter,
                                  vfloat *screen) {

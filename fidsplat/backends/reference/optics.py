@@ -1,0 +1,92 @@
+"""How the reference's samples look into the scene: the forms of a splat for each kind of camera.
+
+A sample has three coordinates, in which the numerators n_u, n_v and the denominator D of a splat are linear:
+1, x, y for a pinhole or parallel rays, and X, Y, Z of the sample's float32 ray behind a lens.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fidsplat.backends.base import View
+
+ROUND = 4 * 2.0**-24
+"""of a form, relative to its terms: its coefficients' rounding, and its sums'"""
+ROUND_OF_RAYS = 6 * 2.0**-24
+"""the same with one more term, and with the rounding of the distance from the anchor"""
+
+
+@dataclass
+class Samples:
+    """k samples: positions x, y (k, 1) on the grid and coordinates (3, k, 1)."""
+
+    x: np.ndarray
+    y: np.ndarray
+    coordinates: np.ndarray
+    """0 where nothing is seen"""
+    seen: np.ndarray
+    """(k, 1) bool"""
+
+
+def samples_of(view: View, x: np.ndarray, y: np.ndarray) -> Samples:
+    """The samples at grid positions x, y (k,)."""
+    if view.raster is None:
+        one = np.ones_like(x)
+        return Samples(x[:, None], y[:, None], np.stack([one, x, y])[:, :, None], one[:, None] > 0)
+    rays = view.raster.rays[y.astype(int), x.astype(int)].astype(np.float64)
+    seen = np.isfinite(rays[:, :1])
+    coordinates = np.where(seen, rays, 0.0).T[:, :, None]
+    return Samples(x[:, None], y[:, None], coordinates, seen)
+
+
+def forms_of(view: View, a: np.ndarray, b: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Forms of splats with scaled tangents a, b and centres p (n, 3), camera frame.
+
+    Returns:
+        (3, n, 3) factors of the coordinates in n_u, n_v, D; (3, n) those in D times the depth, for parallel
+        rays; and what the volume of a, b, p is multiplied by to give D times the depth, for others.
+    """
+    if view.raster is not None:
+        forms = np.stack([np.cross(b, p), np.cross(p, a), np.cross(a, b)], axis=2)
+        return np.moveaxis(forms, 1, 0), np.zeros((3, len(p))), 1.0
+    rows = np.stack([a, b, p], axis=2)  # (n, xyz, uv1)
+    tw = np.broadcast_to([0.0, 0.0, 1.0], rows[:, 2].shape) if view.parallel else rows[:, 2]
+    tu = view.fx * rows[:, 0] + view.cx * tw
+    tv = view.fy * rows[:, 1] + view.cy * tw
+    forms = np.stack([np.cross(tu, tv), np.cross(tv, tw), np.cross(tw, tu)])
+    return forms, np.einsum("inc,nc->in", forms, rows[:, 2]), view.fx * view.fy
+
+
+def centers_of(view: View, p: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the centres p (n, 3) fall [samples]; infinite where that is not `known` or the lens does not see
+    it."""
+    if view.raster is not None or view.parallel:
+        image = p[:, :2] if view.raster is None else view.raster.lens.image(p)
+        x, y = (image * (view.fx, view.fy) + (view.cx, view.cy)).T
+        known = known & np.isfinite(x)
+    else:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x = (view.fx * p[:, 0] + view.cx * p[:, 2]) / p[:, 2]
+            y = (view.fy * p[:, 1] + view.cy * p[:, 2]) / p[:, 2]
+    return np.where(known, x, np.inf), np.where(known, y, np.inf)
+
+
+def anchors_of(view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Coordinates (3, n) about which devices keep the forms of splats with the anchor pixel (x, y); NaN where
+    that is not known."""
+    if view.raster is None:
+        return np.stack([np.ones_like(x), x, y])
+    known = (x > 0) & (y > 0)
+    rays = view.raster.rays[np.where(known, y, 0).astype(int), np.where(known, x, 0).astype(int)]
+    return np.where(known[:, None], rays, np.nan).T.astype(np.float64)
+
+
+def away_of(view: View, samples: Samples, anchors: np.ndarray) -> np.ndarray:
+    """At most how far (3, k, n) samples are from the anchors, in each coordinate."""
+    away = np.abs(samples.coordinates - anchors[:, None, :])
+    if view.raster is not None:
+        furthest = np.nanmax(np.abs(view.raster.rays), axis=(0, 1), initial=1.0)[:, None, None]
+        away = np.where(np.isnan(away), np.abs(samples.coordinates) + furthest, away)
+    return np.where(samples.seen, away, 0.0)

@@ -1,0 +1,274 @@
+"""Lenses: how directions of the camera frame fall on the picture where that is not a pinhole's way.
+
+A lens maps a point (X, Y, Z) of the camera frame to image coordinates (a, b) without unit or in radians or
+metres; the pixel is x = fx a + cx, y = fy b + cy. Conventions and coefficients are OpenCV's.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import ClassVar, TypeAlias
+
+import numpy as np
+
+from fidsplat.errors import InputError
+
+FISHEYE_LIMIT = math.radians(100)
+"""a fisheye sees no further from its axis: 200 degrees in all"""
+_STEPS = 4096  # of the tables from which Newton's iteration starts
+_ITERATIONS = 12
+
+
+@dataclass(frozen=True)
+class BrownConrady:
+    """Radial (k1 to k6), tangential (p1, p2) and thin-prism (s1 to s4) distortion of a perspective picture,
+    as `cv2.projectPoints` has them. All 0 is a pinhole.
+
+    Directions beyond the first fold of the radial part are not seen. Raises InputError for a coefficient
+    that is not finite.
+    """
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    s1: float = 0.0
+    s2: float = 0.0
+    s3: float = 0.0
+    s4: float = 0.0
+
+    kind: ClassVar[str] = "brown_conrady"
+    along_ray: ClassVar[bool] = False
+    """whether depths are distances along the ray; else they are along z"""
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+    @classmethod
+    def opencv(cls, coefficients) -> BrownConrady:
+        """From OpenCV's distCoeffs: 4, 5, 8 or 12 numbers (k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4).
+
+        Raises:
+            InputError: another count (a tilted sensor's 14 are not offered).
+        """
+        order = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
+        values = np.ravel(coefficients).tolist()
+        if len(values) not in (4, 5, 8, 12):
+            raise InputError(f"distortion has {len(values)} coefficients; OpenCV's orders have 4, 5, 8 or 12")
+        return cls(**dict(zip(order, values, strict=False)))
+
+    @property
+    def does_nothing(self) -> bool:
+        """Whether it is a pinhole."""
+        return not any(getattr(self, field.name) for field in fields(self))
+
+    @cached_property
+    def fold(self) -> float:
+        """tan of the angle from the axis at which the radial part turns back; inf if it never does."""
+        above = np.polynomial.Polynomial([1, self.k1, self.k2, self.k3])
+        below = np.polynomial.Polynomial([1, self.k4, self.k5, self.k6])
+        q = np.polynomial.Polynomial([0, 2])
+        slope = (above + q * above.deriv()) * below - q * above * below.deriv()
+        return math.sqrt(min(_first_root(slope), _first_root(below)))
+
+    def _distorted(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Image coordinates and their derivatives (a, b, a_x, a_y, b_x, b_y)."""
+        q = x * x + y * y
+        above = 1 + q * (self.k1 + q * (self.k2 + q * self.k3))
+        below = 1 + q * (self.k4 + q * (self.k5 + q * self.k6))
+        slope_above = self.k1 + q * (2 * self.k2 + q * 3 * self.k3)
+        slope_below = self.k4 + q * (2 * self.k5 + q * 3 * self.k6)
+        radial = above / below
+        slope = 2 * (slope_above - radial * slope_below) / below  # d radial / d x is this times x
+        a = x * radial + 2 * self.p1 * x * y + self.p2 * (q + 2 * x * x) + q * (self.s1 + q * self.s2)
+        b = y * radial + self.p1 * (q + 2 * y * y) + 2 * self.p2 * x * y + q * (self.s3 + q * self.s4)
+        prism_a, prism_b = 2 * (self.s1 + 2 * q * self.s2), 2 * (self.s3 + 2 * q * self.s4)
+        a_x = radial + x * x * slope + 2 * self.p1 * y + 6 * self.p2 * x + x * prism_a
+        a_y = x * y * slope + 2 * self.p1 * x + 2 * self.p2 * y + y * prism_a
+        b_x = x * y * slope + 2 * self.p1 * x + 2 * self.p2 * y + x * prism_b
+        b_y = radial + y * y * slope + 6 * self.p1 * y + 2 * self.p2 * x + y * prism_b
+        return a, b, a_x, a_y, b_x, b_y
+
+    def image(self, points: np.ndarray) -> np.ndarray:
+        """Image coordinates (n, 2) of points (n, 3); NaN behind the camera and beyond the fold."""
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
+            a, b = self._distorted(x, y)[:2]
+            seen = (points[:, 2] > 0) & (np.hypot(x, y) < self.fold) & np.isfinite(a) & np.isfinite(b)
+        return np.where(seen[:, None], np.stack([a, b], 1), np.nan)
+
+    def rays(self, image: np.ndarray) -> np.ndarray:
+        """Directions (n, 3) = (X / Z, Y / Z, 1) of image coordinates (n, 2); NaN where nothing is seen."""
+        a, b = image.T
+        distance = np.hypot(a, b)
+        x, y = _scaled(a, b, distance, self._undistorted(distance))
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            for _ in range(_ITERATIONS):
+                here_a, here_b, a_x, a_y, b_x, b_y = self._distorted(x, y)
+                off_a, off_b = here_a - a, here_b - b
+                area = a_x * b_y - a_y * b_x
+                x, y = x - (b_y * off_a - a_y * off_b) / area, y - (a_x * off_b - b_x * off_a) / area
+                if not np.nanmax(np.abs(off_a) + np.abs(off_b), initial=0.0) > 1e-13:
+                    break
+            here_a, here_b, a_x, a_y, b_x, b_y = self._distorted(x, y)
+            seen = (np.abs(here_a - a) + np.abs(here_b - b) < 1e-9 * (1 + distance)) & (a_x * b_y > a_y * b_x)
+            seen &= np.hypot(x, y) < self.fold
+        return np.where(seen[:, None], np.stack([x, y, np.ones_like(x)], 1), np.nan)
+
+    def _undistorted(self, distance: np.ndarray) -> np.ndarray:
+        """tan of the angles at which the radial part alone has these distances from the middle."""
+        symmetric = BrownConrady(self.k1, self.k2, self.k3, self.k4, self.k5, self.k6)
+
+        def radial(tangent: np.ndarray) -> np.ndarray:
+            return symmetric._distorted(tangent, np.zeros(1))[0]
+
+        furthest = float(np.max(distance, initial=0.0))
+        top = min(1.0, self.fold)
+        while top < self.fold and top < 1e4 and radial(np.array([top]))[0] < furthest:
+            top = min(2 * top, self.fold)
+        tangents = np.linspace(0, top * (1 - 1e-9), _STEPS)
+        return np.interp(distance, radial(tangents), tangents)
+
+    @property
+    def uniforms(self) -> tuple[float, ...]:
+        """What the kernels take: k1 to k6, p1, p2, s1 to s4, and the square of the fold."""
+        return (*(getattr(self, field.name) for field in fields(self)), min(self.fold**2, 1e30))
+
+
+@dataclass(frozen=True)
+class Fisheye:
+    """Kannala-Brandt fisheye as `cv2.fisheye` has it: a ray at the angle t from the axis falls at the
+    distance t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) from the middle. All 0 is the equidistant lens.
+
+    Sees up to 100 degrees from the axis, or less where that polynomial turns back. Raises InputError for a
+    coefficient that is not finite.
+    """
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+
+    kind: ClassVar[str] = "fisheye"
+    along_ray: ClassVar[bool] = True
+    does_nothing: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+    @cached_property
+    def limit(self) -> float:
+        """Largest angle from the axis that is seen, radians."""
+        slope = np.polynomial.Polynomial([1, 3 * self.k1, 5 * self.k2, 7 * self.k3, 9 * self.k4])
+        return min(math.sqrt(_first_root(slope)), FISHEYE_LIMIT)
+
+    def distance(self, angle):
+        """Distance from the middle of a ray at that angle (radians) from the axis."""
+        q = angle * angle
+        return angle * (1 + q * (self.k1 + q * (self.k2 + q * (self.k3 + q * self.k4))))
+
+    def image(self, points: np.ndarray) -> np.ndarray:
+        """Image coordinates (n, 2) of points (n, 3); NaN where they are not seen."""
+        across = np.hypot(points[:, 0], points[:, 1])
+        angle = np.arctan2(across, points[:, 2])
+        seen = np.asarray(angle <= self.limit) & np.asarray((across > 0) | (points[:, 2] > 0))
+        a, b = _scaled(points[:, 0], points[:, 1], across, self.distance(angle))
+        return np.where(seen[:, None], np.stack([a, b], 1), np.nan)
+
+    def rays(self, image: np.ndarray) -> np.ndarray:
+        """Unit directions (n, 3) of image coordinates (n, 2); NaN where nothing is seen."""
+        a, b = image.T
+        distance = np.hypot(a, b)
+        angles = np.linspace(0, self.limit, _STEPS)
+        angle = np.interp(distance, self.distance(angles), angles)
+        for _ in range(_ITERATIONS):
+            q = angle * angle
+            slope = 1 + q * (3 * self.k1 + q * (5 * self.k2 + q * (7 * self.k3 + q * 9 * self.k4)))
+            off = self.distance(angle) - distance
+            with np.errstate(divide="ignore", invalid="ignore"):
+                step = np.where(slope > 1e-12, off / slope, 0.0)
+            angle = np.clip(angle - step, 0.0, self.limit)
+            if not np.abs(step).max(initial=0.0) > 1e-14:
+                break
+        x, y = _scaled(a, b, distance, np.sin(angle))
+        seen = distance <= self.distance(self.limit)
+        return np.where(seen[:, None], np.stack([x, y, np.cos(angle)], 1), np.nan)
+
+    @property
+    def uniforms(self) -> tuple[float, ...]:
+        """What the kernels take: k1 to k4 and the limit."""
+        return (self.k1, self.k2, self.k3, self.k4, self.limit)
+
+
+@dataclass(frozen=True)
+class Equirectangular:
+    """A panorama: a = longitude atan2(X, Z) from -pi to pi, b = latitude from -pi/2 (up, -y) to pi/2."""
+
+    kind: ClassVar[str] = "equirectangular"
+    along_ray: ClassVar[bool] = True
+    does_nothing: ClassVar[bool] = False
+    uniforms: ClassVar[tuple[float, ...]] = ()
+
+    def image(self, points: np.ndarray) -> np.ndarray:
+        """Image coordinates (n, 2), radians, of points (n, 3); NaN for the camera's centre."""
+        x, y, z = points.T
+        image = np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))], 1)
+        return np.where(np.any(points != 0, axis=1)[:, None], image, np.nan)
+
+    def rays(self, image: np.ndarray) -> np.ndarray:
+        """Unit directions (n, 3) of image coordinates (n, 2); NaN beyond the sphere."""
+        a, b = image.T
+        seen = (np.abs(a) <= math.pi) & (np.abs(b) <= math.pi / 2)
+        rays = np.stack([np.sin(a) * np.cos(b), np.sin(b), np.cos(a) * np.cos(b)], 1)
+        return np.where(seen[:, None], rays, np.nan)
+
+
+@dataclass(frozen=True)
+class Orthographic:
+    """Parallel rays along z: a = X, b = Y in metres, so fx and fy are pixels per metre."""
+
+    kind: ClassVar[str] = "orthographic"
+    along_ray: ClassVar[bool] = False
+    does_nothing: ClassVar[bool] = False
+    uniforms: ClassVar[tuple[float, ...]] = ()
+
+    def image(self, points: np.ndarray) -> np.ndarray:
+        """Image coordinates (n, 2), metres, of points (n, 3); NaN behind the camera."""
+        return np.where(points[:, 2:] > 0, points[:, :2], np.nan)
+
+
+RayLens: TypeAlias = BrownConrady | Fisheye | Equirectangular
+"""lenses whose rays start at one point"""
+Lens: TypeAlias = RayLens | Orthographic
+
+
+def _check(lens) -> None:
+    for field in fields(lens):
+        value = getattr(lens, field.name)
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, (int, float, np.number))
+            or not np.isfinite(value)
+        ):
+            raise InputError(f"lens coefficient {field.name} must be a finite number, not {value!r}")
+        object.__setattr__(lens, field.name, float(value))
+
+
+def _first_root(polynomial: np.polynomial.Polynomial) -> float:
+    """Smallest root above 0; inf if there is none."""
+    coefficients = np.trim_zeros(polynomial.coef, "b")
+    roots = np.polynomial.Polynomial(coefficients).roots() if len(coefficients) > 1 else np.empty(0)
+    real = roots.real[(np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots))) & (roots.real > 0)]
+    return float(real.min()) if len(real) else math.inf
+
+
+def _scaled(a: np.ndarray, b: np.ndarray, length: np.ndarray, wanted: np.ndarray):
+    """(a, b) with another length; 0 stays 0."""
+    factor = wanted / np.where(length > 0, length, 1.0)
+    return a * factor, b * factor

@@ -1,0 +1,179 @@
+"""Shutters, and poses as functions of time."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import TypeAlias
+
+import numpy as np
+
+from fidsplat.errors import InputError
+from fidsplat.rotations import check_similarity, matrix_to_quaternion
+
+MAX_SUB_POSES = 1024
+
+Pose: TypeAlias = Callable[[float], np.ndarray]
+"""(4, 4) rigid matrix at a time in seconds"""
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """When the rows of a picture are exposed. All 0 is the instant global shutter.
+
+    The middle row's exposure has its middle at `time`. Row i of h is exposed
+    `readout` * ((i + 1/2) / h - 1/2) seconds later. Raises InputError for a value out of range.
+    """
+
+    time: float = 0.0
+    """seconds, on the clock of the poses"""
+    exposure: float = 0.0
+    """seconds that each row is exposed; the picture is the mean of `sub_poses` pictures"""
+    sub_poses: int = 8
+    """n: one pose in the middle of each n-th of the exposure"""
+    readout: float = 0.0
+    """seconds from the first row's exposure to the last's (rolling shutter)"""
+    rows_per_band: int = 8
+    """rows that share their poses, those of the band's middle row. What crosses v pixels during the readout
+    of h rows is off by at most v (rows_per_band - 1) / (2 h) pixels; 1 is exact, and slow"""
+
+    def __post_init__(self) -> None:
+        for name in ("time", "exposure", "readout"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+                raise InputError(f"shutter {name} must be a finite number of seconds, not {value!r}")
+            if name != "time" and value < 0:
+                raise InputError(f"shutter {name} must be 0 or more seconds, not {value!r}")
+        for name, most in (("sub_poses", MAX_SUB_POSES), ("rows_per_band", math.inf)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
+                limit = f"1 to {MAX_SUB_POSES}" if name == "sub_poses" else "1 or more"
+                raise InputError(f"shutter {name} must be a whole number, {limit}, not {value!r}")
+
+    def bands(self, height: int) -> list[tuple[int, int, float]]:
+        """(first row, end row, time of its exposure's middle) of the bands of a picture of `height` rows."""
+        rows = self.rows_per_band if self.readout > 0 else height
+        cuts = [*range(0, height, rows), height]
+        return [
+            (top, end, self.time + self.readout * ((top + end) / 2 / height - 0.5))
+            for top, end in itertools.pairwise(cuts)
+        ]
+
+    def times(self, middle: float) -> list[float]:
+        """The times of the sub-poses of an exposure with its middle there."""
+        n = self.sub_poses if self.exposure > 0 else 1
+        return [middle + self.exposure * ((k + 0.5) / n - 0.5) for k in range(n)]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A pose between keyframes: the screw motion from one to the next (a geodesic of SE(3)), at rest before
+    the first and after the last. Call it with a time in seconds.
+
+    Raises InputError for times that do not increase and poses that are not rigid.
+    """
+
+    times: Sequence[float]
+    """(k,) seconds, increasing"""
+    poses: np.ndarray
+    """(k, 4, 4) rigid"""
+
+    def __post_init__(self) -> None:
+        times = np.array(self.times, np.float64)
+        if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+            raise InputError("the times of a trajectory must be one or more finite, increasing numbers")
+        if len(self.poses) != len(times):
+            raise InputError(f"a trajectory has {len(times)} times but {len(self.poses)} poses")
+        for k, pose in enumerate(self.poses):
+            check_similarity(pose, f"pose {k} of a trajectory", rigid=True)
+        poses = np.array(self.poses, np.float64)
+        times.flags.writeable = poses.flags.writeable = False
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "poses", poses)
+
+    def __call__(self, time: float) -> np.ndarray:
+        """(4, 4) float64."""
+        times = np.asarray(self.times)
+        after = int(np.searchsorted(times, time, side="right"))
+        if after == 0 or after == len(times):
+            return self.poses[min(after, len(times) - 1)]
+        share = (time - times[after - 1]) / (times[after] - times[after - 1])
+        return between(self.poses[after - 1], self.poses[after], float(share))
+
+
+def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
+    """The rigid pose (4, 4) that share of the way along the screw motion from one to another."""
+    turn = start[:3, :3].T @ end[:3, :3]
+    move = start[:3, :3].T @ (end[:3, 3] - start[:3, 3])
+    axis = _rotation_vector(turn)
+    # the velocity whose integral over the whole turn is `move`
+    velocity = np.linalg.solve(_integral(axis), move)
+    part = np.eye(4)
+    part[:3, :3] = _turned(axis * share)
+    part[:3, 3] = _integral(axis * share) @ (velocity * share)
+    return start @ part
+
+
+def _skew(axis: np.ndarray) -> np.ndarray:
+    x, y, z = axis
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def _rotation_vector(turn: np.ndarray) -> np.ndarray:
+    """Axis times angle (0 to pi) of a rotation matrix."""
+    w, *xyz = matrix_to_quaternion(turn)
+    length = np.linalg.norm(xyz)
+    return np.array(xyz) * (2 * math.atan2(length, w) / length if length > 0 else 2.0)
+
+
+def _turned(axis: np.ndarray) -> np.ndarray:
+    """The rotation matrix of axis times angle."""
+    angle, skew = float(np.linalg.norm(axis)), _skew(axis)
+    half = np.sinc(angle / 2 / math.pi)
+    return np.eye(3) + np.sinc(angle / math.pi) * skew + half * half / 2 * skew @ skew
+
+
+def _integral(axis: np.ndarray) -> np.ndarray:
+    """The integral over s in [0, 1] of the rotations by s times the axis."""
+    angle, skew = float(np.linalg.norm(axis)), _skew(axis)
+    half = np.sinc(angle / 2 / math.pi)
+    third = 1 / 6 - angle**2 / 120 if angle < 1e-3 else (1 - np.sinc(angle / math.pi)) / angle**2
+    return np.eye(3) + half * half / 2 * skew + third * skew @ skew
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What moves: poses as functions of the time in seconds, `Trajectory` or any callable."""
+
+    camera: Pose | None = None
+    """world_to_camera; None: it stands where it is"""
+    groups: Mapping[int, Pose] = field(default_factory=dict)
+    """label of splats: the rigid motion of the world that they make from where their cloud has them"""
+
+    def __post_init__(self) -> None:
+        if self.camera is not None and not callable(self.camera):
+            raise InputError(
+                f"motion of the camera is {self.camera!r}; it must be a Trajectory or a function"
+            )
+        if not isinstance(self.groups, Mapping) or not all(map(callable, self.groups.values())):
+            raise InputError("motion of groups must be {label: Trajectory or function of the time}")
+        object.__setattr__(self, "groups", MappingProxyType(dict(self.groups)))
+
+    def camera_at(self, time: float) -> np.ndarray | None:
+        """world_to_camera (4, 4) then; None if it does not move."""
+        return None if self.camera is None else _checked(self.camera(time), "the camera", time)
+
+    def groups_at(self, time: float) -> list[tuple[int, np.ndarray]]:
+        """(label, motion (4, 4)) then, of each group."""
+        return [
+            (label, _checked(pose(time), f"the splats of label {label}", time))
+            for label, pose in sorted(self.groups.items())
+        ]
+
+
+def _checked(matrix, who: str, time: float) -> np.ndarray:
+    check_similarity(matrix, f"the pose of {who} at {time:g} s", rigid=True)
+    return np.asarray(matrix, np.float64)

@@ -1,0 +1,117 @@
+"""The rays of a picture's samples, and where on the picture directions fall: what devices read of a lens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from fidsplat.cameras.lenses import Fisheye, RayLens
+
+CELLS = 512
+"""most cells of the finest map along an axis"""
+_ROWS = 1 << 18  # samples whose rays are computed at once
+_EMPTY = np.array([32767, -1, 32767, -1], np.int16)
+
+
+@dataclass(frozen=True, eq=False)
+class RayRaster:
+    """The sample grid of one lens, whatever the pose; sizes, fx, fy, cx, cy in samples."""
+
+    lens: RayLens
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    whole: RayRaster | None = None
+    """the raster of which this one is a few rows"""
+    top: int = 0
+    """which row of it the first one is"""
+
+    def cropped(self, top: int, end: int) -> RayRaster:
+        """Rows [top, end); they share the map of the whole."""
+        return RayRaster(
+            self.lens, self.width, end - top, self.fx, self.fy, self.cx, self.cy - top, self, top
+        )
+
+    @cached_property
+    def rays(self) -> np.ndarray:
+        """(h, w, 3) float32: the direction of each sample's ray, with Z = 1 or of unit length; NaN where
+        nothing is seen. The picture is that of these rounded rays, on every device and in the reference."""
+        if self.whole is not None:
+            return self.whole.rays[self.top : self.top + self.height]
+        rays = np.empty((self.height, self.width, 3), np.float32)
+        step = max(1, _ROWS // self.width)
+        a = (np.arange(self.width) + 0.5 - self.cx) / self.fx
+        for top in range(0, self.height, step):
+            b = (np.arange(top, min(top + step, self.height)) + 0.5 - self.cy) / self.fy
+            image = np.stack(np.broadcast_arrays(a[None, :], b[:, None]), 2).reshape(-1, 2)
+            rays[top : top + step] = self.lens.rays(image).reshape(len(b), self.width, 3)
+        rays.flags.writeable = False
+        return rays
+
+    def chart(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Coordinates in which the kernels enclose a splat: those of the ideal pinhole picture [samples], or,
+        for a fisheye, the stereographic ones (X, Y) / (|ray| + Z)."""
+        x, y, z = np.moveaxis(rays.astype(np.float64), -1, 0)
+        if isinstance(self.lens, Fisheye):
+            below = z + np.sqrt(x * x + y * y + z * z)
+            return x / below, y / below
+        return self.fx * x / z + self.cx, self.fy * y / z + self.cy
+
+    @cached_property
+    def map(self) -> tuple[np.ndarray, np.ndarray]:
+        """Which samples' rays lie in each cell of the chart.
+
+        Returns:
+            boxes (cells^2 + (cells / 2)^2 + ... + 1, 4) int16: first and last column, first and last row of
+            the samples in a cell (last < first: none), for grids of cells, cells / 2, ..., 1 cells a side,
+            row by row; and (low_x, low_y, cells per unit along x, along y, cells).
+        """
+        if self.whole is not None:
+            return self.whole.map
+        rows, columns = np.nonzero(np.isfinite(self.rays[..., 0]))
+        cells = 1
+        while 2 * cells <= min(CELLS, max(self.width, self.height) // 2):
+            cells *= 2
+        x, y = self.chart(self.rays[rows, columns])
+        low = np.array([x.min(), y.min()])
+        # the furthest sample lies in the last cell, not beyond it
+        scale = cells * (1 - 1e-9) / np.maximum(np.array([x.max(), y.max()]) - low, 1e-12)
+        cell = np.minimum((y - low[1]) * scale[1], cells - 1).astype(np.int64) * cells
+        cell += np.minimum((x - low[0]) * scale[0], cells - 1).astype(np.int64)
+        boxes = np.tile(_EMPTY, (cells * cells, 1))
+        for k, (ufunc, values) in enumerate(
+            [(np.minimum, columns), (np.maximum, columns), (np.minimum, rows), (np.maximum, rows)]
+        ):
+            ufunc.at(boxes[:, k], cell, values.astype(np.int16))
+        levels, size = [boxes], cells
+        while size > 1:
+            fine = levels[-1].reshape(size // 2, 2, size // 2, 2, 4)
+            coarse = np.empty((size // 2, size // 2, 4), np.int16)
+            coarse[..., ::2] = fine[..., ::2].min((1, 3))
+            coarse[..., 1::2] = fine[..., 1::2].max((1, 3))
+            size //= 2
+            levels.append(coarse.reshape(-1, 4))
+        return np.concatenate(levels), np.array([*low, *scale, cells])
+
+    @property
+    def uniforms(self) -> tuple[float, ...]:
+        """Numbers that the kernels take: the lens's, then the map's and the first row."""
+        if self.lens.kind == "equirectangular":
+            return self.lens.uniforms
+        low_x, low_y, *rest = map(float, self.map[1])
+        if not isinstance(self.lens, Fisheye):
+            low_y -= self.top  # the chart counts rows as the picture does
+        return (*self.lens.uniforms, low_x, low_y, *rest, float(self.top))
+
+
+@lru_cache(maxsize=4)
+def raster_of(
+    lens: RayLens, width: int, height: int, fx: float, fy: float, cx: float, cy: float
+) -> RayRaster:
+    """The raster of these numbers; the last few are kept, for pictures from many poses."""
+    return RayRaster(lens, width, height, fx, fy, cx, cy)

@@ -1,0 +1,85 @@
+"""Lenses in scene files: the tables of [camera] that switch one on."""
+
+import math
+from dataclasses import fields
+
+from fidsplat.cameras import (
+    BrownConrady,
+    Camera,
+    Equirectangular,
+    Fisheye,
+    Lens,
+    Orthographic,
+    fisheye_focal_length,
+    focal_length,
+)
+from fidsplat.scenes.table import Table
+
+DISTORTION = tuple(field.name for field in fields(BrownConrady))
+FISHEYE = tuple(field.name for field in fields(Fisheye))
+ORTHOGRAPHIC = ("metres_wide",)
+TABLES = ("distortion", "fisheye", "equirectangular", "orthographic")
+_NAME = {BrownConrady: "distortion", Fisheye: "fisheye"}
+
+
+def read_lens(camera: Table) -> Lens | None:
+    """The lens of a [camera] table; None for a pinhole. Raises InputError for two lenses."""
+    named = [name for name in TABLES if name in camera]
+    if len(named) > 1:
+        raise camera.error(named[1], f"and {named[0]} exclude each other")
+    if not named:
+        return None
+    if named[0] in ("distortion", "fisheye"):
+        kind, known = (BrownConrady, DISTORTION) if named[0] == "distortion" else (Fisheye, FISHEYE)
+        table = camera.table(named[0], known)
+        return kind(**{name: table.number(name, 0.0) for name in known})
+    if named[0] == "equirectangular":
+        camera.table("equirectangular", ("",))
+        return Equirectangular()
+    camera.table("orthographic", ORTHOGRAPHIC)
+    return Orthographic()
+
+
+def read_focal_lengths(camera: Table, width: int, height: int, lens: Lens | None) -> tuple[float, float]:
+    """fx and fy of a [camera] table: pixels, per radian for a fisheye or panorama, per metre for parallel
+    rays."""
+    if isinstance(lens, Orthographic):
+        table = camera.table("orthographic", ORTHOGRAPHIC)
+        if "metres_wide" in table:
+            wide = table.number("metres_wide")
+            if not wide > 0:
+                raise table.error("metres_wide", f"must be above 0, not {wide!r}")
+            return width / wide, width / wide
+    if isinstance(lens, Equirectangular) and "fx" not in camera and "fy" not in camera:
+        if "fov_x_deg" in camera:
+            raise camera.error(
+                "fov_x_deg", "and equirectangular exclude each other: it sees the whole sphere"
+            )
+        return width / (2 * math.pi), height / math.pi
+    if "fov_x_deg" in camera:
+        for key in ("fx", "fy"):
+            if key in camera:
+                raise camera.error(key, "and fov_x_deg exclude each other")
+        if isinstance(lens, Orthographic):
+            raise camera.error("fov_x_deg", "and orthographic exclude each other; give metres_wide there")
+        angle = math.radians(camera.number("fov_x_deg"))
+        with camera.at("fov_x_deg"):
+            fisheye = isinstance(lens, Fisheye)
+            f = fisheye_focal_length(width, angle, lens) if fisheye else focal_length(width, angle)
+        return f, f
+    if "fx" in camera or "fy" in camera:
+        return camera.number("fx"), camera.number("fy")
+    if isinstance(lens, Orthographic):
+        raise camera.error("orthographic.metres_wide", "is missing (or fx and fy in pixels per metre)")
+    raise camera.error("fov_x_deg", "is missing (or fx and fy)")
+
+
+def lens_table(camera: Camera) -> tuple[str, dict[str, float]] | None:
+    """The name and content of the table that a camera's lens is written as; None for a pinhole."""
+    lens = camera.lens
+    if lens is None:
+        return None
+    if isinstance(lens, BrownConrady | Fisheye):
+        values = {field.name: getattr(lens, field.name) for field in fields(lens)}
+        return _NAME[type(lens)], {name: value for name, value in values.items() if value}
+    return lens.kind, {}

@@ -1,0 +1,117 @@
+"""What lies around and between the splats: fog, and what is seen behind everything; plain data."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fidsplat.errors import InputError
+
+MAX_PANORAMA = 16384
+"""pixels along a side"""
+
+
+@dataclass(frozen=True)
+class Fog:
+    """Fog of even density: of what is seen at distance r, exp(-density r) is left, the rest is the fog's
+    colour.
+
+    It is also all that is seen behind the splats. Raises InputError for a density that is no number of at
+    least 0, or a colour that is not three finite numbers.
+    """
+
+    density: float
+    """1 / metres"""
+    color: tuple[float, float, float] = (0.7, 0.7, 0.7)
+    """RGB"""
+
+    def __post_init__(self) -> None:
+        ok = isinstance(self.density, (int, float)) and not isinstance(self.density, bool)
+        if not (ok and 0 <= self.density < math.inf):
+            raise InputError(
+                f"fog: density is {self.density!r}; it must be a number of at least 0 (1 / metres)"
+            )
+        object.__setattr__(self, "color", three_numbers("fog: color", self.color))
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """A background between two colours, by the sine of the ray's height above the horizon.
+
+    Raises InputError for a colour or direction that is not three finite numbers, or a direction of length 0.
+    """
+
+    top: tuple[float, float, float]
+    """RGB straight up"""
+    bottom: tuple[float, float, float]
+    """RGB straight down"""
+    up: tuple[float, float, float] = (0.0, -1.0, 0.0)
+    """world direction, of any length"""
+
+    def __post_init__(self) -> None:
+        for name in ("top", "bottom", "up"):
+            object.__setattr__(self, name, three_numbers(f"background: {name}", getattr(self, name)))
+        if not any(self.up):
+            raise InputError(f"background: up is {self.up!r}; it must be a direction, e.g. (0, -1, 0)")
+
+
+@dataclass(frozen=True, eq=False)
+class Panorama:
+    """An equirectangular picture of the world as background: its middle column lies towards +z, to the right
+    of it is +x, its top row is -y.
+
+    Raises InputError for anything but an (h, w, 3) array of finite numbers with 2 to 16384 pixels a side.
+    """
+
+    image: np.ndarray
+    """(h, w, 3) float32 RGB, read-only; uint8 is taken as 255ths"""
+    file: str | None = None
+    """where it came from"""
+
+    def __post_init__(self) -> None:
+        given = np.asarray(self.image)
+        if given.ndim != 3 or given.shape[2] != 3 or given.dtype.kind not in "fiu":
+            raise InputError(
+                f"background: a panorama must be (h, w, 3) numbers, not {given.shape} {given.dtype}"
+            )
+        if not 2 <= min(given.shape[:2]) <= max(given.shape[:2]) <= MAX_PANORAMA:
+            height, width = given.shape[:2]
+            raise InputError(
+                f"background: a panorama of {width} x {height} pixels; 2 to {MAX_PANORAMA} a side can be used"
+            )
+        image = np.array(given, np.float32) / np.float32(255 if given.dtype == np.uint8 else 1)
+        if not np.isfinite(image).all():
+            raise InputError("background: the panorama holds numbers that are not finite")
+        image.flags.writeable = False
+        object.__setattr__(self, "image", image)
+
+    @staticmethod
+    def load(path) -> Panorama:
+        """From a picture file. Raises InputError when it cannot be read."""
+        from fidsplat.vision.images import read_image
+
+        return Panorama(read_image(path), str(path))
+
+
+Background = tuple[float, float, float] | Gradient | Panorama
+
+
+def background_of(value: Any) -> Background:
+    """A background as it is, or three numbers as a colour. Raises InputError for anything else."""
+    if isinstance(value, (Gradient, Panorama)):
+        return value
+    return three_numbers("background", value)
+
+
+def three_numbers(name: str, value: Any) -> tuple[float, float, float]:
+    """Three finite floats. Raises InputError, with the name, for anything else."""
+    try:
+        numbers = tuple(float(number) for number in value)
+    except (TypeError, ValueError):
+        numbers = ()
+    if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
+        raise InputError(f"{name} must be three finite numbers, not {value!r}")
+    return numbers  # type: ignore[return-value]

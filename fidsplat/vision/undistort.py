@@ -1,0 +1,56 @@
+"""Pictures that were taken through a lens, as a pinhole would have taken them."""
+
+import math
+
+import cv2
+import numpy as np
+
+from fidsplat.cameras import Camera, focal_length, look_at_matrix
+from fidsplat.errors import InputError
+
+MAX_FIELD = math.radians(150)
+
+
+def pinhole_towards(camera: Camera, target, width: int, height: int, fov_x: float) -> Camera:
+    """A pinhole at the camera's place whose middle sees `target` (3,), metres; fov_x in radians, up to 150
+    degrees.
+
+    Raises:
+        InputError: fov_x out of range, or the target is where the camera is.
+    """
+    if not 0 < fov_x <= MAX_FIELD:
+        raise InputError(
+            f"fov_x is {math.degrees(fov_x):.6g} degrees; a flat picture has more than 0 and up to 150"
+        )
+    # the camera's own down is down, unless it looks that way
+    down, along = camera.world_to_camera[1, :3], np.asarray(target, np.float64) - camera.position
+    if np.linalg.norm(np.cross(down, along)) < 1e-3 * np.linalg.norm(along):
+        down = camera.world_to_camera[2, :3]
+    f = focal_length(width, fov_x)
+    pose = look_at_matrix(camera.position, target, -down)
+    return Camera.pinhole(width, height, f, f, width / 2, height / 2, pose, position=camera.position)
+
+
+def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
+    """What a pinhole at the same place sees in a picture, by bilinear interpolation; 0 where the lens sees
+    nothing.
+
+    Args:
+        image: (h, w) or (h, w, 3) of uint8 or float32, taken by `camera`.
+        pinhole: its pose may turn, so that a flat picture shows what lies at the side of a fisheye's.
+
+    Raises:
+        InputError: the picture has another size than the camera's, or the pinhole stands elsewhere.
+    """
+    if image.shape[:2] != (camera.height, camera.width):
+        raise InputError(
+            f"the picture has {image.shape[1]} x {image.shape[0]} pixels, but its camera {camera.width} x "
+            f"{camera.height}"
+        )
+    if not np.allclose(pinhole.position, camera.position, rtol=0, atol=1e-9):
+        raise InputError("undistort: the pinhole camera must stand where the picture was taken")
+    y, x = np.mgrid[0.5 : pinhole.height, 0.5 : pinhole.width]
+    rays = pinhole.rays(np.stack([x.ravel(), y.ravel()], 1)) @ pinhole.world_to_camera[:3, :3]
+    at = camera.project(camera.position + rays).astype(np.float32) - np.float32(0.5)
+    at = np.nan_to_num(at, nan=-1e4).reshape(pinhole.height, pinhole.width, 2)
+    return cv2.remap(np.ascontiguousarray(image), at[..., 0], at[..., 1], cv2.INTER_LINEAR)

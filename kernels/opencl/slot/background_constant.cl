@@ -1,0 +1,1 @@
+// One colour behind everything: the background that resolving is given.

@@ -1,0 +1,37 @@
+// Panorama: x is the longitude atan2(X, Z), y the latitude. Depths are distances along the ray. A splat is enclosed by a cone
+// about its centre's direction; one that reaches a pole or the edge of longitudes is listed in whole rows.
+//@ camera
+// Box [samples] of the polygon around the disk.
+static inline Bounds cone_bounds(global const real *view, real3_ a, real3_ b, real3_ p, real radius, real longitude,
+                                 real latitude) {
+    real pi = REAL(3.14159265358979323846), around = radius / POLYGON_INNER, widest = 0, cu = around, cv = 0;
+    bool known = true;
+    for (int k = 0; k < POLYGON; k++) {
+        real3_ corner = {p.x + cu * a.x + cv * b.x, p.y + cu * a.y + cv * b.y, p.z + cu * a.z + cv * b.z};
+        real3_ aside = cross3(p, corner);
+        real along = dot3(p, corner);
+        known = known && along > 0;
+        widest = fmax(widest, dot3(aside, aside) / (along * along));
+        next_corner(&cu, &cv);
+    }
+    // room for the rounding of rays and of the per-sample test
+    real cone = known ? atan(sqrt(widest)) * REAL(1.0002) + REAL(1e-6) : pi;
+    real low = latitude - cone, high = latitude + cone, across = pi;
+    if (low > -pi / 2 && high < pi / 2) {
+        across = asin(fmin(sin(cone) / cos(latitude), REAL(1.0))) * REAL(1.0002) + REAL(1e-6);
+        if (longitude - across < -pi || longitude + across > pi) across = pi;
+    }
+    bool round = across >= pi;
+    real west = round ? -pi : longitude - across, east = round ? pi : longitude + across;
+    return box_bounds(view[VIEW_FX] * west + view[VIEW_CX], view[VIEW_FX] * east + view[VIEW_CX],
+                      view[VIEW_FY] * low + view[VIEW_CY], view[VIEW_FY] * high + view[VIEW_CY]);
+}
+//@ camera_depth
+    pz = sqrt(dot3(p, p));
+//@ camera_reach
+    reach = radius * sqrt(fmax(dot3(a, a), dot3(b, b)));
+//@ camera_bounds
+    real longitude = atan2(p.x, p.z), latitude = atan2(p.y, sqrt(p.x * p.x + p.z * p.z));
+    Bounds bounds = cone_bounds(view, a, b, p, radius, longitude, latitude);
+    real center_x = view[VIEW_FX] * longitude + view[VIEW_CX], center_y = view[VIEW_FY] * latitude + view[VIEW_CY];
+    if (!(pz >= near)) center_x = center_y = NAN;   // no dot of a low-pass

@@ -1,0 +1,44 @@
+// Parallel rays along z: x = fx X + cx, so the projection's last row is (0, 0, 1) instead of the depths. D is constant, and
+// the depth of a fragment is its own affine form of the pixel, times D.
+//@ record
+    float z0, zx, zy;       // depth times D = z0 + zx x + zy y
+    float z_near;
+//@ crossing
+    vfloat z;               // depth times d
+//@ camera
+static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ z_row) {
+    real3_ row = {focal * axis_row.x + offset * z_row.x, focal * axis_row.y + offset * z_row.y,
+                  focal * axis_row.z + offset * z_row.z};
+    return row;
+}
+//@ camera_offset
+    offset = facet.z;       // which side is seen: the camera is infinitely far away
+//@ camera_bounds
+    real3_ row_x = {a.x, b.x, p.x}, row_y = {a.y, b.y, p.y}, tw = {0, 0, 1};
+    real3_ tu = image_row(view[VIEW_FX], view[VIEW_CX], row_x, tw);
+    real3_ tv = image_row(view[VIEW_FY], view[VIEW_CY], row_y, tw);
+    real center_x = tu.z, center_y = tv.z;
+    real3_ cu = image_row(view[VIEW_FX], view[VIEW_CX] - center_x, row_x, tw);
+    real3_ cv = image_row(view[VIEW_FY], view[VIEW_CY] - center_y, row_y, tw);
+    Bounds bounds = ellipse_bounds(cu, cv, tw, center_x, center_y, radius * radius);
+//@ camera_forms
+    tu = image_row(view[VIEW_FX], view[VIEW_CX] - anchor_x, row_x, tw);
+    tv = image_row(view[VIEW_FY], view[VIEW_CY] - anchor_y, row_y, tw);
+    real3_ k0 = cross3(tu, tv), kx = cross3(tv, tw), ky = cross3(tw, tu);   // (n_u, n_v, D): constant, per x, per y
+    real determinant = view[VIEW_FX] * view[VIEW_FY] * su * sv * offset;
+    k0.z = determinant;
+//@ camera_facing
+    facing = fabs(offset) > (SETUP_FP64 ? REAL(1e-13) : REAL(1e-6)) ? scale : 0;
+//@ project
+    record.z0 = (float)((a.z * k0.x + b.z * k0.y + pz * k0.z) * facing);
+    record.zx = (float)((a.z * kx.x + b.z * kx.y) * facing);
+    record.zy = (float)((a.z * ky.x + b.z * ky.y) * facing);
+    record.d_near = INFINITY;
+    record.z_near = (float)near;
+//@ cross
+    c.z = FMA((vfloat)s.zy, (vfloat)y, FMA((vfloat)s.zx, x, (vfloat)s.z0));
+    c.inside &= VMASK(c.z >= s.z_near * c.d);
+//@ camera_see
+    seen.z = VSELECT((vfloat)s->z_center,
+                     clamp(c.z * inverse_d, (vfloat)(s->z_center - s->z_reach), (vfloat)(s->z_center + s->z_reach)),
+                     VMASK(c.d > 0.0f));

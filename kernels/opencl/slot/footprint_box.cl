@@ -1,0 +1,5 @@
+// Every splat is a box (slot/box_edges.cl).
+//@ footprint
+#define IS_BOX(s) true
+//@ footprint_here
+#define BOX_HERE true

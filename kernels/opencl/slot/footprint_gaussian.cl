@@ -1,0 +1,1 @@
+// Every splat is a Gaussian, as 2DGS has them.

@@ -1,0 +1,40 @@
+// Fog of even density: of what is seen at distance r along the ray exp(-density r) is left, the rest is the fog's colour. Exact for
+// each fragment and layer, as each is laid with its own distance. Behind everything is fog alone: its colour is the background.
+//@ state
+    vfloat fog_slope;       // -density, per metre of depth
+    vfloat fogged;          // sum of weights times what the fog hides
+//@ start
+    pixel->fogged = 0.0f;
+//@ pixels_start
+    for (int row = 0; row < (int)(sizeof(pixels) / sizeof(pixels[0])); row++)
+        for (int lane = 0; lane < LANES; lane++) {
+#if LANES == 1
+            int fog_x = px, fog_y = py + row;
+            pixels[row].fog_slope
+#else
+            int fog_x = x0 + lane, fog_y = y0 + row;
+            ((float *)&pixels[row].fog_slope)[lane]
+#endif
+                = -fog_density * ray_length((float)fog_x + 0.5f, (float)fog_y + 0.5f, fog_fx, fog_fy, fog_cx, fog_cy);
+        }
+//@ lay
+    vfloat hidden = weight * (1.0f - exp(pixel->fog_slope * seen->z));
+    pixel->r = FMA(-hidden, seen->r, pixel->r);
+    pixel->g = FMA(-hidden, seen->g, pixel->g);
+    pixel->b = FMA(-hidden, seen->b, pixel->b);
+    pixel->fogged += hidden;
+//@ blend_args
+    , float fog_density, float fog_fx, float fog_fy, float fog_cx, float fog_cy, global float *restrict fog_raw
+//@ store
+        VSTORE(pixel->fogged, fog_raw + at);
+//@ resolve_args
+    , global const float *restrict fog_raw
+//@ resolve_start
+    float fogged = 0;
+//@ resolve_sample
+            fogged += fog_raw[at];
+//@ resolve_end
+    fogged *= mean;
+    rgb[3 * out] = FMA(fogged, background_r, rgb[3 * out]);
+    rgb[3 * out + 1] = FMA(fogged, background_g, rgb[3 * out + 1]);
+    rgb[3 * out + 2] = FMA(fogged, background_b, rgb[3 * out + 2]);

@@ -1,0 +1,120 @@
+"""Lenses and shutters are in the kernels of the pictures that call for them, and in no others."""
+
+import re
+from itertools import product
+
+import numpy as np
+import pytest
+from agreement import random_splats
+from test_assemble import COLORS, PLAIN, SHAPE, Cloud
+
+import fidsplat as fs
+from fidsplat.backends.opencl.assemble import DeviceShape, assemble
+from fidsplat.effects import CATALOGUE, select
+
+GROUP = DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, 1024, True)
+TAPS = ("alpha", "depth", "depth_median", "label", "normal")
+CAMERAS = {
+    "pinhole": fs.Camera.pinhole(33, 21, 30.0, 30.0, 16.0, 10.0),
+    "brown_conrady": fs.Camera.pinhole(33, 21, 30.0, 30.0, 16.0, 10.0, lens=fs.BrownConrady(-0.1)),
+    "fisheye": fs.Camera.fisheye(33, 21, 3.0),
+    "equirectangular": fs.Camera.equirectangular(33, 21),
+    "orthographic": fs.Camera.orthographic(33, 21, 4.0),
+}
+
+# of the texts as they were before there were lenses; a change here changes what every plain picture runs
+BEFORE_LENSES = {
+    ("lanes", ("rgb",)): "7030c5caf3100cc0ab5dab62ddea94e625243c17f853e3b37d4c836a5e80a73c",
+    ("lanes", TAPS): "fa7cc409c9d590e7eace23a7f51bea983eba5d17cdc2a7ad4511e01461645e3a",
+    ("group", ("rgb",)): "703a893aebc95baba4a4a9a0417df64bef4d449b3bf4b908f8efe31e5215ee94",
+    ("group", TAPS): "a40bada96633b676396fa927e6e417a73a395878e28ee4874fb30b4beeef56c9",
+}
+
+
+@pytest.mark.parametrize(("schedule", "taps"), BEFORE_LENSES, ids=str)
+def test_plain_pictures_have_the_text_that_they_had_before_there_were_lenses(schedule, taps):
+    shape = SHAPE if schedule == "lanes" else GROUP
+    text = assemble(select(Cloud(2, True), taps, fs.Quality()), shape)
+    assert text.digest == BEFORE_LENSES[schedule, taps]
+
+
+def test_numbers_of_a_lens_are_not_in_its_text():
+    cameras = [
+        fs.Camera.pinhole(64, 48, f, f, 30.0, 20.0, lens=fs.BrownConrady(k))
+        for f, k in ((50, 0.1), (60, -0.1))
+    ]
+    features = [select(COLORS, ("rgb",), PLAIN, camera) for camera in cameras]
+    assert features[0] == features[1]
+
+
+def test_values_that_mean_nothing_call_for_nothing(renderer):
+    nothing = fs.Camera.pinhole(33, 21, 30.0, 30.0, 16.0, 10.0, lens=fs.BrownConrady())
+    assert select(COLORS, ("rgb",), PLAIN, nothing) == select(COLORS, ("rgb",), PLAIN)
+    # a shutter that needs no time is no shutter, and a motion without one is where it is then
+    cloud = random_splats(10, seed=1, depth=(1, 4))
+    before = set(renderer.backend._pipelines)
+    motion = fs.Motion(lambda time: CAMERAS["pinhole"].world_to_camera)
+    renderer.render(cloud, nothing, quality=PLAIN, motion=motion, shutter=fs.Shutter(time=0.5, sub_poses=9))
+    added = set(renderer.backend._pipelines) - before
+    assert not any("shutter" in slot or "motion" in slot for features, _ in added for slot in features.slots)
+
+
+@pytest.mark.parametrize("kind", CAMERAS)
+def test_a_lens_brings_its_own_text_alone(kind):
+    text = assemble(select(COLORS, ("rgb",), PLAIN, CAMERAS[kind]), SHAPE).text
+    words = {
+        "brown_conrady": ("LENS_FOLD",),
+        "fisheye": ("chart_box", "LENS_LIMIT"),
+        "equirectangular": ("cone_bounds",),
+        "orthographic": ("z_near",),
+    }
+    for other, theirs in words.items():
+        for word in theirs:
+            assert bool(re.search(rf"\b{word}\b", text)) == (other == kind), word
+    assert bool(re.search(r"\brays\b", text)) == (kind not in ("pinhole", "orthographic"))
+    assert not re.search(r"\b(expose|moving)\b", text)
+
+
+def test_what_lenses_take():
+    """Bytes of a record and words of bounds; the base's are those of test_assemble."""
+
+    def record(kind):
+        return assemble(select(COLORS, ("rgb",), PLAIN, CAMERAS[kind]), SHAPE).record_bytes
+
+    assert {kind: record(kind) for kind in CAMERAS} == {
+        "pinhole": 80,
+        "brown_conrady": 96,
+        "fisheye": 96,
+        "equirectangular": 96,
+        "orthographic": 96,
+    }
+    assert not any(
+        CATALOGUE[name].record_lanes for name in ("shutter_exposure", "motion_groups", "ray_map", "polygon")
+    )
+
+
+@pytest.mark.parametrize(("kind", "exposed"), list(product(CAMERAS, (False, True))))
+def test_every_lens_builds_with_everything(renderer, kind, exposed):
+    """All outputs, layers, colours that depend on the view, moving groups; with and without a shutter."""
+    cloud = random_splats(20, seed=1, depth=(1, 4), sh_degree=1).with_planes(np.repeat([-1, 0], 10))
+    shutter = fs.Shutter(exposure=0.1 if exposed else 0.0, sub_poses=2)
+    motion = fs.Motion(None, {1: lambda time: np.eye(4)})
+    frame = renderer.render(cloud, CAMERAS[kind], ("rgb", *TAPS), None, motion=motion, shutter=shutter)
+    assert all(np.isfinite(frame[name]).all() for name in frame)
+
+
+def test_the_other_schedule_draws_the_same_picture(renderer):
+    """The kernels of GPUs on whatever device this is, through every lens."""
+    from fidsplat.backends.exposure import exposed_view
+
+    cloud = random_splats(60, seed=3, depth=(-2, 4))
+    backend = renderer.backend
+    shape = DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, 256, backend.shape.fast_fma)
+    for camera in CAMERAS.values():
+        view = exposed_view(camera, fs.Quality(), cloud.origin, (0, 0, 0), fs.Motion(), fs.Shutter())
+        features = select(cloud, ("rgb", "depth"), fs.Quality(), camera)
+        resident = backend.upload(cloud)
+        one = backend.pipeline(features).render(resident, view)
+        other = backend.pipeline(features, shape).render(resident, view)
+        for name in ("rgb", "depth"):
+            np.testing.assert_allclose(other.read(name), one.read(name), atol=1e-6, rtol=1e-6)

@@ -1,0 +1,164 @@
+"""Combinations of effects: those that are right, against the reference, and those that are refused."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from agreement import random_splats
+
+import fidsplat as fs
+from fidsplat.backends.exposure import exposed_view
+from fidsplat.backends.reference import ReferenceBackend
+from fidsplat.effects import select
+from fidsplat.hard_cases.agreement import Picture, compare, judge
+
+SIZE = (41, 29)
+CLOUD = random_splats(120, 21, depth=(0.5, 5.0), scale=(0.02, 0.4))
+BOXES = fs.SplatCloud.concatenate(
+    [random_splats(60, 22, depth=(0.5, 5.0), scale=(0.02, 0.4)).with_boxes(), CLOUD]
+)
+PANORAMA = fs.Panorama(np.random.default_rng(5).random((8, 16, 3)).astype(np.float32))
+SKY = fs.Gradient((0.2, 0.4, 0.9), (0.4, 0.3, 0.1))
+FOG = fs.Fog(0.2, (0.6, 0.65, 0.7))
+SENSOR = fs.Sensor(exposure=1.5, vignetting=(-0.4, 0.0, 0.1), response="srgb")
+PLAIN = fs.Camera.pinhole(*SIZE, 40.0, 40.0, 20.0, 14.0)
+CAMERAS = {
+    "distortion": fs.Camera.pinhole(*SIZE, 40.0, 40.0, 20.0, 14.0, lens=fs.BrownConrady(-0.2, 0.05)),
+    "fisheye": fs.Camera.fisheye(*SIZE, math.radians(170)),
+    "panorama": fs.Camera.equirectangular(*SIZE),
+    "parallel": fs.Camera.orthographic(*SIZE, 4.0),
+}
+DISTANCES = {name: camera for name, camera in CAMERAS.items() if name != "distortion"}
+OUTPUTS = ("depth_first", "normal_world", "splat_id", "blended")
+BLUR = fs.Shutter(exposure=0.4, sub_poses=3)
+ROLLING = fs.Shutter(time=0.1, exposure=0.2, sub_poses=2, readout=0.4, rows_per_band=8)
+
+
+def sliding(time):
+    """A camera that moves to the right and does not turn."""
+    pose = np.eye(4)
+    pose[0, 3] = -0.5 * time
+    return pose
+
+
+def turning(time):
+    """A camera that turns about its z axis."""
+    pose, angle = np.eye(4), 0.6 * time
+    pose[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+    return pose
+
+
+def assert_agrees(renderer, **picture):
+    differences = judge(renderer, Picture(**{"cloud": CLOUD, **picture}))
+    assert all(difference.agrees for difference in differences), differences
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_outputs_and_sensors_behind_every_lens(renderer, camera):
+    assert_agrees(renderer, camera=camera, outputs=("rgb", *OUTPUTS), sensor=SENSOR)
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+@pytest.mark.parametrize("camera", DISTANCES.values(), ids=DISTANCES)
+def test_fog_and_distances_behind_lenses(renderer, camera, samples):
+    outputs = ("rgb", "distance", "distance_median", "distance_first")
+    quality = fs.Quality(samples=samples)
+    assert_agrees(renderer, camera=camera, outputs=outputs, quality=quality, fog=FOG)
+
+
+@pytest.mark.parametrize("name", DISTANCES)
+def test_distances_are_depths_where_depths_are_along_the_ray(renderer, name):
+    frame = renderer.render(CLOUD, DISTANCES[name], ("depth", "distance"))
+    assert frame["depth"].max() > 0.5
+    assert np.array_equal(frame["depth"], frame["distance"])
+
+
+@pytest.mark.parametrize("shutter", [BLUR, ROLLING], ids=["blur", "rolling"])
+@pytest.mark.parametrize("around", ["fog", "sky", "panorama", "boxes", "pixel"])
+def test_effects_of_the_picture_under_a_shutter(renderer, around, shutter):
+    cloud = BOXES if around == "boxes" else CLOUD
+    pose = sliding if around in ("sky", "panorama") else turning
+    quality = fs.Quality(lowpass="pixel" if around == "pixel" else "screen")
+    behind = {"sky": SKY, "panorama": PANORAMA}.get(around, (0.1, 0.2, 0.3))
+    fog = FOG if around == "fog" else None
+    motion = fs.Motion(pose, {0: sliding})
+    outputs = ("rgb", "alpha", "distance", "splat_id")
+    frame = renderer.render(
+        cloud, PLAIN, outputs, quality, behind, motion=motion, shutter=shutter, sensor=SENSOR, fog=fog
+    )
+    view = exposed_view(PLAIN, quality, cloud.origin, behind, motion, shutter, SENSOR, fog)
+    features = select(
+        cloud, outputs, quality, PLAIN, True, True, view.turns, sensor=SENSOR, fog=fog, background=behind
+    )
+    reference = ReferenceBackend()
+    truth = reference.pipeline(features).render(reference.upload(cloud), view).planes
+    differences = compare(frame, truth, outputs)
+    assert all(difference.agrees for difference in differences), differences
+
+
+def test_fog_is_averaged_over_the_poses_of_a_shutter(renderer):
+    """What fog hides of a wall that only one of two sub-poses sees counts half."""
+    wall = fs.SplatCloud([[0, 0, 2]], [[1, 0, 0, 0]], [[50, 50]], [1.0], colors=[[0, 0, 0]])
+
+    def away(time):
+        pose = np.eye(4)
+        pose[2, 3] = 0.0 if time < 0 else 1e6
+        return pose
+
+    def middle(**when):
+        camera = replace(PLAIN, far=100.0)
+        motion = {} if not when else {"motion": fs.Motion(away), "shutter": fs.Shutter(**when)}
+        return renderer.render(wall, camera, fog=FOG, **motion)["rgb"][14, 20].astype(float)
+
+    near, none, both = middle(), np.array(FOG.color), middle(exposure=1.0, sub_poses=2)
+    assert (near < none - 0.1).all()
+    assert np.allclose(both, (near + none) / 2, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize(
+    ("what", "how"),
+    [
+        ("boxes", {"scene": BOXES}),
+        ("low-pass 'pixel'", {"quality": fs.Quality(lowpass="pixel")}),
+        ("background gradient", {"background": SKY}),
+        ("background panorama", {"background": PANORAMA}),
+    ],
+    ids=["boxes", "pixel", "gradient", "panorama"],
+)
+def test_what_only_a_pinhole_can_is_refused_behind_lenses(renderer, name, what, how):
+    camera = CAMERAS[name]
+    with pytest.raises(fs.InputError, match=what) as caught:
+        renderer.render(how.get("scene", CLOUD), camera, **{k: v for k, v in how.items() if k != "scene"})
+    assert camera.lens.kind in str(caught.value)
+    assert "pinhole" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("what", "how"),
+    [
+        ("fog", {"fog": FOG}),
+        ("distance", {"outputs": ("distance",)}),
+        ("distance_median", {"outputs": ("distance_median",)}),
+        ("distance_first", {"outputs": ("rgb", "distance_first")}),
+    ],
+)
+def test_distances_behind_a_distortion_are_refused(renderer, what, how):
+    with pytest.raises(fs.InputError, match=f"{what} needs.*brown_conrady.*fisheye"):
+        renderer.render(CLOUD, CAMERAS["distortion"], **how)
+
+
+@pytest.mark.parametrize(
+    ("what", "how"),
+    [
+        ("normal_world", {"outputs": ("normal_world",)}),
+        ("background gradient", {"background": SKY}),
+        ("background panorama", {"background": PANORAMA}),
+    ],
+)
+def test_directions_of_the_world_are_refused_to_a_camera_that_turns(renderer, what, how):
+    with pytest.raises(fs.InputError, match=f"{what} cannot.*turns"):
+        renderer.render(CLOUD, PLAIN, motion=fs.Motion(turning), shutter=BLUR, **how)
+    # at one time there is one direction
+    renderer.render(CLOUD, PLAIN, motion=fs.Motion(turning), shutter=fs.Shutter(time=0.3), **how)

@@ -1,0 +1,155 @@
+"""Pictures through lenses against the reference, which sees every splat at every pixel: what bounds lose
+shows."""
+
+import math
+
+import numpy as np
+import pytest
+from agreement import assert_agrees, random_splats, reference_pixels
+from test_agreement import coplanar_cloud
+
+import fidsplat as fs
+from fidsplat.cameras import BrownConrady, Fisheye
+
+POSE = fs.Camera.look_at(64, 48, 1.0, (0.3, 0.2, -0.1), (0.1, 0.0, 3.0)).world_to_camera
+
+
+def seen_through(lens, width=75, height=62, f=50.0):
+    return fs.Camera.pinhole(width, height, f, 1.02 * f, 0.47 * width, 0.52 * height, POSE, lens=lens)
+
+
+CAMERAS = {
+    "distortion": seen_through(BrownConrady(-0.3, 0.1, 0.0, 0.01, p1=0.01, p2=-0.005, s1=0.01, s4=-0.01)),
+    "pincushion": seen_through(BrownConrady(0.4, 0.1)),
+    # the corners lie beyond the fold
+    "fold": seen_through(BrownConrady(-0.35)),
+    "fisheye 200": fs.Camera.fisheye(70, 66, math.radians(200), POSE),
+    "fisheye": seen_through(Fisheye(0.1, -0.05, 0.01), f=35.0),
+    "panorama": fs.Camera.equirectangular(110, 55, POSE),
+    "parallel": fs.Camera.orthographic(75, 62, 4.0, POSE),
+}
+each_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+
+
+@each_camera
+@pytest.mark.parametrize("seed", [0, 1])
+def test_splats_all_around_the_camera(renderer, camera, seed):
+    assert_agrees(renderer, random_splats(200, seed, depth=(-5.0, 6.0)), camera)
+
+
+@each_camera
+def test_small_splats_of_all_shapes(renderer, camera):
+    """Needles included; each at most a few pixels wide, where a bound that is too tight loses most."""
+    cloud = random_splats(600, 4, depth=(-4.0, 4.0), scale=(1e-4, 0.2), across=4.0)
+    assert_agrees(renderer, cloud, camera, quality=fs.Quality(lowpass="none"))
+
+
+@each_camera
+def test_splats_much_larger_than_the_picture(renderer, camera):
+    assert_agrees(renderer, random_splats(80, 5, depth=(-4.0, 4.0), scale=(0.1, 30.0)), camera)
+
+
+@each_camera
+@pytest.mark.parametrize("samples", [1, 2])
+def test_layers(renderer, camera, samples):
+    assert_agrees(renderer, coplanar_cloud(1), camera, quality=fs.Quality(samples=samples))
+
+
+@pytest.mark.parametrize("name", ["distortion", "fisheye", "panorama", "parallel"])
+def test_colours_that_depend_on_the_view(renderer, name):
+    cloud = random_splats(100, 11, depth=(1, 6), scale=(0.02, 0.4), sh_degree=3)
+    assert_agrees(renderer, cloud, CAMERAS[name], outputs=("rgb",))
+
+
+@pytest.mark.parametrize("name", ["fisheye 200", "panorama"])
+def test_splats_that_cross_the_rim_seam_and_poles(renderer, name):
+    """Splats centred within a few degrees of where the picture ends, or of its poles and seam."""
+    generator = np.random.default_rng(7)
+    polar = np.concatenate([np.radians(generator.uniform(92, 110, 150)), generator.uniform(3.0, math.pi, 50)])
+    around = generator.uniform(0, 2 * math.pi, 200)
+    around[:50] = generator.choice([0, math.pi / 2, math.pi, 3 * math.pi / 2], 50)
+    directions = np.stack(
+        [np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], axis=1
+    )
+    seen = directions * generator.uniform(0.5, 4.0, (200, 1))
+    camera = CAMERAS[name]
+    means = (seen - POSE[:3, 3]) @ POSE[:3, :3]
+    poles = random_splats(60, 8, depth=(-0.05, 0.05), scale=(0.05, 0.5), across=0.05)
+    rim = fs.SplatCloud(
+        means,
+        generator.normal(size=(200, 4)),
+        np.exp(generator.uniform(math.log(1e-3), 0, (200, 2))),
+        generator.uniform(0.1, 1, 200),
+        colors=generator.uniform(0, 1, (200, 3)),
+    )
+    above = poles.transformed(fs_move(camera.position + POSE[:3, :3].T @ [0, -1.5, 0]))
+    assert_agrees(renderer, fs.SplatCloud.concatenate([rim, above]), camera)
+
+
+def fs_move(position):
+    matrix = np.eye(4)
+    matrix[:3, 3] = position
+    return matrix
+
+
+def test_outside_the_lens_is_background(renderer):
+    camera = CAMERAS["fisheye 200"]
+    frame = renderer.render(
+        random_splats(100, 3, scale=(1.0, 9.0)),
+        camera,
+        outputs=("rgb", "alpha", "label"),
+        background=(0.2, 0.4, 0.6),
+    )
+    x, y = np.meshgrid(np.arange(70) + 0.5 - 35, np.arange(66) + 0.5 - 33)
+    outside = np.hypot(x, y) > 35.01
+    assert outside.any()
+    assert (frame["rgb"][outside] == np.float32([0.2, 0.4, 0.6])).all()
+    assert (frame["alpha"][outside] == 0).all()
+    assert (frame["label"][outside] == -1).all()
+    assert frame["alpha"][~outside].max() > 0.5
+
+
+def test_a_slight_distortion_is_nearly_a_pinhole(renderer):
+    cloud = random_splats(200, 1, depth=(0.5, 6.0), scale=(0.02, 0.3))
+    plain, bent = seen_through(None), seen_through(BrownConrady(k1=1e-7))
+    assert bent.lens is not None
+    outputs = ("rgb", "depth", "normal")
+    a, b = (renderer.render(cloud, camera, outputs) for camera in (plain, bent))
+    for name in ("rgb", "normal"):
+        assert np.quantile(np.abs(a[name] - b[name]), 0.999) < 1e-3
+    assert np.quantile(np.abs(a["depth"] - b["depth"]), 0.999) < 1e-2
+
+
+def test_depths_of_a_fisheye_are_distances(renderer):
+    """A wall at z = 2: the distance grows as 1 / cos; along z with parallel rays it is 2."""
+    wall = fs.SplatCloud([[0, 0, 2]], [[1, 0, 0, 0]], [[50, 50]], [1.0], colors=[[1, 1, 1]])
+    fisheye = fs.Camera.fisheye(101, 101, math.radians(120))
+    depth = renderer.render(wall, fisheye, "depth")["depth"]
+    angles = np.radians((np.arange(101) + 0.5 - 50.5) * 120 / 101)
+    np.testing.assert_allclose(depth[50], 2 / np.cos(angles), rtol=1e-5)
+    parallel = fs.Camera.orthographic(64, 48, 4.0)
+    np.testing.assert_allclose(renderer.render(wall, parallel, "depth")["depth"], 2, rtol=1e-5)
+
+
+def test_bands_and_both_schedules_give_the_same_bits(renderer):
+    cloud, camera = random_splats(300, 2, depth=(-4.0, 5.0)), CAMERAS["fisheye"]
+    first = renderer.render(cloud, camera)["rgb"]
+    assert (renderer.render(cloud, camera)["rgb"] == first).all()
+    backend = renderer.backend
+    held = backend.pair_budget
+    backend.pair_budget = 50
+    try:
+        assert (renderer.render(cloud, camera)["rgb"] == first).all()
+    finally:
+        backend.pair_budget = held
+
+
+@pytest.mark.parametrize("name", ["distortion", "fisheye", "panorama", "parallel"])
+def test_lenses_in_single_precision(renderer, name):
+    """The set-up of devices without float64, held as the pinhole's is: to a tenth of an 8-bit step."""
+    cloud = random_splats(200, 0, depth=(0.5, 6.0))
+    frame = renderer.render(cloud, CAMERAS[name], quality="fast")
+    truth = reference_pixels(cloud, CAMERAS[name], ("rgb",), "fast")
+    excess = np.abs(frame["rgb"] - truth["rgb"]).max(2) - truth["certificate"]
+    assert np.quantile(excess, 0.999) < 0.1 / 255
+    assert excess.max() < 2.0 / 255

@@ -1,0 +1,106 @@
+"""Every output on every device against the reference, and what the outputs have to do with each other."""
+
+import math
+
+import numpy as np
+import pytest
+from agreement import assert_agrees, random_splats
+
+import fidsplat as fs
+from fidsplat.effects import OUTPUTS
+
+CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.3, -0.2, -0.1), (0.0, 0.1, 3.0))
+ALL = tuple(OUTPUTS)
+KINDS = ("", "_median", "_first")
+
+
+@pytest.mark.parametrize(("seed", "quality"), [(0, "standard"), (1, "reference"), (2, "gsplat")])
+def test_outputs_of_splats_around_the_camera(renderer, seed, quality):
+    assert_agrees(renderer, random_splats(150, seed), CAMERA, ALL, quality)
+
+
+@pytest.mark.parametrize("samples", [2, 3])
+def test_outputs_of_several_samples(renderer, samples):
+    cloud = random_splats(100, 5, depth=(0.5, 5.0))
+    assert_agrees(renderer, cloud, CAMERA, ALL, fs.Quality(samples=samples, first_hit=0.6))
+
+
+@pytest.mark.parametrize("mixture", ["fitted", "exact"])
+def test_outputs_of_layers(renderer, mixture):
+    tag = fs.marker("aruco:4x4_50:7", size=1.0, mixture=mixture).cloud
+    pose = np.eye(4)
+    pose[:3, :3] = [[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]]
+    pose[:3, 3] = (0.1, 0, 2.2)
+    around = random_splats(40, seed=3, depth=(1.2, 3.5), scale=(0.02, 0.2), across=0.8)
+    scene = fs.SplatCloud.concatenate([tag.transformed(pose), around])
+    assert_agrees(renderer, scene, CAMERA, ALL)
+
+
+def test_an_output_alone_is_what_it_is_among_all(renderer):
+    cloud = random_splats(150, 4)
+    together = renderer.render(cloud, CAMERA, ALL)
+    for name in ALL:
+        assert np.array_equal(renderer.render(cloud, CAMERA, name)[name], together[name]), name
+
+
+def test_distances_are_depths_along_the_ray(renderer):
+    """At one sample per pixel each is its depth times the length of the pixel's ray."""
+    frame = renderer.render(random_splats(150, 6), CAMERA, ALL)
+    rows, columns = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width] + 0.5
+    length = np.sqrt(1 + ((columns - CAMERA.cx) / CAMERA.fx) ** 2 + ((rows - CAMERA.cy) / CAMERA.fy) ** 2)
+    for kind in KINDS:
+        assert frame[f"distance{kind}"] == pytest.approx(frame[f"depth{kind}"] * length, rel=1e-6)
+        assert (frame[f"depth{kind}"] > 0).any()
+
+
+def test_normals_in_the_world_are_the_cameras_turned(renderer):
+    frame = renderer.render(random_splats(150, 6), CAMERA, ("normal", "normal_world"))
+    turned = frame["normal"] @ CAMERA.world_to_camera[:3, :3]
+    assert frame["normal_world"] == pytest.approx(turned, abs=1e-6)
+    wall = fs.SplatCloud([(0, 0, 3)], [(1, 0, 0, 0)], [(9, 9)], [1.0], colors=[(1, 1, 1)])
+    normals = renderer.render(wall, CAMERA, "normal_world")["normal_world"]
+    assert normals[30, 40] == pytest.approx([0, 0, -1], abs=1e-6)
+
+
+def layers_of(opacities, first=2.0):
+    """Wide splats one metre behind the other."""
+    n = len(opacities)
+    means = np.column_stack([np.zeros((n, 2)), first + np.arange(n)])
+    return fs.SplatCloud(
+        means, np.tile([1.0, 0, 0, 0], (n, 1)), np.full((n, 2), 50.0), opacities, colors=np.ones((n, 3))
+    )
+
+
+@pytest.mark.parametrize(("first_hit", "depth"), [(0.15, 2), (0.25, 3), (0.4, 4), (0.6, 0)])
+def test_the_first_hit_is_where_the_opacity_reaches_the_threshold(renderer, first_hit, depth):
+    """Three layers of opacity 0.2 cover 0.2, 0.36 and 0.488."""
+    camera = fs.Camera.pinhole(5, 5, 50.0, 50.0, 2.5, 2.5)
+    quality = fs.Quality(first_hit=first_hit)
+    frame = renderer.render(layers_of([0.2, 0.2, 0.2]), camera, ("depth_first", "blended"), quality)
+    assert frame["depth_first"][2, 2] == pytest.approx(depth, rel=1e-6)
+    assert frame["blended"][2, 2] == 3
+
+
+def test_an_opaque_layer_ends_the_count(renderer):
+    camera = fs.Camera.pinhole(5, 5, 50.0, 50.0, 2.5, 2.5)
+    frame = renderer.render(layers_of([0.2, 1.0, 0.2, 0.2]), camera, ("blended", "splat_id"))
+    assert (frame["blended"][2, 2], frame["splat_id"][2, 2]) == (2, 1)
+    assert frame["blended"].dtype == frame["splat_id"].dtype == np.int32
+
+
+def test_splat_ids_are_indices_of_the_cloud_in_chunks_too(renderer):
+    cloud = random_splats(3000, 8, depth=(1.0, 6.0), scale=(1e-3, 0.3))
+    whole = renderer.render(cloud, CAMERA, ("splat_id", "label"))
+    ids = whole["splat_id"]
+    assert ids.max() > 2000
+    seen = ids >= 0
+    assert np.array_equal(cloud.labels[ids[seen]], whole["label"][seen])
+    budget = 1_000_000
+    small = fs.Renderer(renderer.device.name, memory_budget=budget)
+    assert np.array_equal(small.render(cloud, CAMERA, "splat_id")["splat_id"], ids)
+
+
+@pytest.mark.parametrize("value", [0, 1, -0.1, math.nan])
+def test_thresholds_that_no_surface_has_are_refused(value):
+    with pytest.raises(fs.InputError, match="first_hit"):
+        fs.Quality(first_hit=value)

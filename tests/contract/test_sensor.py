@@ -1,0 +1,217 @@
+"""Fog, backgrounds and the steps of the sensor: every device against the reference, and what each
+promises."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from agreement import random_splats
+
+import fidsplat as fs
+from fidsplat.backends.base import View
+from fidsplat.backends.reference.post import variates
+from fidsplat.hard_cases.agreement import Picture, judge
+
+CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.3, -0.2, -0.1), (0.0, 0.1, 3.0))
+CLOUD = random_splats(120, 3)
+GREY = (0.4, 0.4, 0.4)
+NOISY = fs.Sensor(full_well=5000, read_noise=12, seed=7)
+EMPTY = fs.SplatCloud.empty()
+
+
+def panorama(width=40, height=20):
+    return fs.Panorama(np.random.default_rng(1).uniform(0, 1, (height, width, 3)))
+
+
+SENSORS = {
+    "exposure": fs.Sensor(exposure=1.7),
+    "vignetting": fs.Sensor(vignetting=(-0.3, -0.1, 0.02)),
+    "noise": NOISY,
+    "gain": fs.Sensor(gain=0.4),
+    "gamma": fs.Sensor(response=2.2),
+    "srgb": fs.Sensor(response="srgb"),
+    "table": fs.Sensor(response=(0.0, 0.7, 0.9, 0.95)),
+    "bits": fs.Sensor(bits=8),
+    "all": replace(NOISY, exposure=1.3, vignetting=(-0.4,), gain=1.5, response="srgb", bits=16),
+}
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_steps_of_the_sensor(renderer, name):
+    agree(renderer, Picture(CLOUD, CAMERA, sensor=SENSORS[name]))
+
+
+@pytest.mark.parametrize("name", ["all", "vignetting"])
+def test_the_sensor_sees_pixels_not_samples(renderer, name):
+    agree(renderer, Picture(CLOUD, CAMERA, fs.Quality(samples=2), sensor=SENSORS[name]))
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+@pytest.mark.parametrize("density", [0.05, 1.0, 30.0])
+def test_fog(renderer, density, samples):
+    tag = fs.marker("aruco:4x4_50:7", size=1.0).cloud.transformed(np.diag([1, 1, 1, 1.0]) + shift(0, 0, 2))
+    fog = fs.Fog(density, (0.6, 0.7, 0.8))
+    for cloud in (CLOUD, fs.SplatCloud.concatenate([tag, random_splats(30, 4)])):
+        agree(
+            renderer, Picture(cloud, CAMERA, fs.Quality(samples=samples), ("rgb", "alpha", "depth"), fog=fog)
+        )
+
+
+@pytest.mark.parametrize("samples", [1, 3])
+@pytest.mark.parametrize(
+    "background", [fs.Gradient((0.2, 0.4, 0.9), (0.3, 0.2, 0.1), (0.1, -2, 0.3)), panorama()]
+)
+def test_backgrounds(renderer, background, samples):
+    for target in ((0.0, 0.1, 3.0), (0.0, 0.1, -3.0), (0.3, -9.0, 0.0)):
+        camera = fs.Camera.look_at(81, 59, 1.4, (0.3, -0.2, -0.1), target, up=(0.1, -1, 0.2))
+        agree(renderer, Picture(CLOUD, camera, fs.Quality(samples=samples), background=background))
+
+
+def agree(renderer, picture):
+    differences = judge(renderer, picture)
+    assert all(difference.agrees for difference in differences), differences
+
+
+def shift(x, y, z):
+    matrix = np.zeros((4, 4))
+    matrix[:3, 3] = x, y, z
+    return matrix
+
+
+def test_a_wall_fades_by_its_distance_along_the_ray(renderer):
+    wall = fs.SplatCloud([(0, 0, 4)], [(1, 0, 0, 0)], [(500, 500)], [1.0], colors=[(1, 1, 1)])
+    camera = fs.Camera.pinhole(61, 41, 30.0, 30.0, 30.5, 20.5)
+    color = np.array([0.2, 0.3, 0.4])
+    frame = renderer.render(wall, camera, ("rgb", "distance", "alpha"), fog=fs.Fog(0.1, tuple(color)))
+    left = np.exp(-0.1 * frame["distance"][..., None]) * frame["alpha"][..., None]
+    assert frame["rgb"] == pytest.approx(left + (1 - left) * color, abs=1e-5)
+    nothing = renderer.render(EMPTY, camera, fog=fs.Fog(0.1, tuple(color)), background=(1, 0, 0))
+    assert nothing["rgb"] == pytest.approx(np.broadcast_to(color, (41, 61, 3)))
+
+
+def test_the_middle_of_a_panorama_lies_ahead(renderer):
+    """One bright column and row: +z is in the middle, +x to the right of it, -y on top."""
+    image = np.zeros((90, 180, 3))
+    image[:, 135, 0] = 1  # +x
+    image[:, 90, 1] = 1  # +z
+    image[20, :, 2] = 1  # above
+    around = fs.Panorama(image)
+    camera = fs.Camera.pinhole(101, 101, 50.0, 50.0, 50.5, 50.5)  # looks along +z, 90 degrees wide
+    rgb = renderer.render(EMPTY, camera, background=around)["rgb"]
+    assert rgb[50].argmax(0)[1] in (50, 51)
+    right = fs.Camera.look_at(101, 101, math.radians(90), (0, 0, 0), (1, 0, 0))
+    assert renderer.render(EMPTY, right, background=around)["rgb"][50].argmax(0)[0] in (50, 51)
+    up = fs.Camera.look_at(101, 101, math.radians(90), (0, 0, 0), (0, -1, 0.3))
+    assert renderer.render(EMPTY, up, background=around)["rgb"][..., 2].max() > 0.3
+    assert rgb[60:, :, 2].max() == 0
+
+
+def test_noise_has_the_variance_of_its_electrons(renderer):
+    """Light v: variance v / full well + (read noise / full well)^2, to the standard error of 3 x 200 x 200
+    samples."""
+    camera = fs.Camera.pinhole(200, 200, 100.0, 100.0, 100.0, 100.0)
+    for light in (0.0, 0.1, 0.8):
+        rgb = renderer.render(EMPTY, camera, background=(light,) * 3, sensor=NOISY)["rgb"].astype(float)
+        variance = light / 5000 + (12 / 5000) ** 2
+        count = rgb.size
+        assert abs(rgb.mean() - light) < 4 * math.sqrt(variance / count)
+        assert rgb.var() == pytest.approx(variance, rel=4 * math.sqrt(2 / count))
+        neighbours = np.corrcoef(rgb[:, :-1].ravel(), rgb[:, 1:].ravel())[0, 1]
+        channels = np.corrcoef(rgb[..., 0].ravel(), rgb[..., 1].ravel())[0, 1]
+        assert max(abs(neighbours), abs(channels)) < 4 / math.sqrt(count / 3)
+
+
+def test_noise_is_the_same_on_every_run_and_device_and_other_for_another_seed(renderer):
+    camera = fs.Camera.pinhole(64, 48, 60.0, 60.0, 32.0, 24.0)
+
+    def noise(seed):
+        # read noise alone, a power of two: the variates themselves
+        sensor = fs.Sensor(full_well=2.0**100, read_noise=2.0**100, seed=seed)
+        return renderer.render(EMPTY, camera, sensor=sensor)["rgb"]
+
+    first = noise(5)
+    assert np.array_equal(first, noise(5))
+    rows, columns = (grid.ravel() for grid in np.mgrid[0:48, 0:64])
+    assert np.array_equal(first.reshape(-1, 3), variates(columns, rows, 5).astype(np.float32))
+    other = noise(6)
+    assert abs(np.corrcoef(first.ravel(), other.ravel())[0, 1]) < 0.05
+
+
+def test_curves_at_their_own_points(renderer):
+    camera = fs.Camera.pinhole(3, 3, 3.0, 3.0, 1.5, 1.5)
+
+    def value(light, **sensor):
+        return float(
+            renderer.render(EMPTY, camera, background=(light,) * 3, sensor=fs.Sensor(**sensor))["rgb"][
+                1, 1, 0
+            ]
+        )
+
+    assert value(0.5, response="srgb") == pytest.approx(0.735357, abs=1e-5)
+    assert value(0.001, response="srgb") == pytest.approx(0.01292, abs=1e-6)
+    assert value(0.25, response=2.0) == pytest.approx(0.5, abs=1e-6)
+    assert value(0.25, response=(0, 0.5, 1, 1, 1)) == pytest.approx(0.5, abs=1e-6)
+    assert value(9.0, response="srgb") == pytest.approx(1)
+    assert value(9.0, response=(0.2, 1)) == 1
+    assert value(0.3, exposure=2, gain=1.5) == pytest.approx(0.9, abs=1e-6)
+    assert value(0.301, bits=8) == np.float32(77) / np.float32(255)
+    assert value(-3.0, bits=16) == 0
+
+
+def test_values_that_mean_nothing_select_nothing(renderer):
+    from fidsplat.effects import select
+
+    nothing = [
+        fs.Sensor(seed=5, response=1.0, vignetting=(0, 0.0)),
+        fs.Sensor(response=(0, 0.25, 0.5, 0.75, 1)),
+        None,
+    ]
+    plain = select(CLOUD, ("rgb",), fs.Quality())
+    for sensor in nothing:
+        assert (
+            select(CLOUD, ("rgb",), fs.Quality(), sensor=sensor, fog=fs.Fog(0.0), background=(1, 2, 3))
+            == plain
+        )
+    assert select(CLOUD, ("rgb",), fs.Quality(), sensor=NOISY) != plain
+
+
+def test_the_sensor_leaves_the_other_outputs_alone(renderer):
+    names = ("rgb", "alpha", "depth", "normal", "label")
+    plain = renderer.render(CLOUD, CAMERA, names)
+    seen = renderer.render(CLOUD, CAMERA, names, sensor=SENSORS["all"], fog=fs.Fog(0.3), background=GREY)
+    for name in names[1:]:
+        assert np.array_equal(plain[name], seen[name]), name
+    assert not np.array_equal(plain["rgb"], seen["rgb"])
+
+
+@pytest.mark.parametrize("mixture", ["fitted", "exact"])
+def test_a_tag_is_found_where_it_is_in_fog_and_noise(renderer, mixture):
+    """Position error under 1 % of the distance: the pictures are for robots that localise."""
+    from fidsplat.vision.detect import detect
+    from fidsplat.vision.images import to_uint8
+    from fidsplat.vision.pose import marker_pose, pose_error
+
+    pose = np.eye(4)
+    pose[:3, :3] = [[0.9, 0, 0.43588989], [0, 1, 0], [-0.43588989, 0, 0.9]]
+    pose[:3, 3] = (0.1, -0.05, 1.5)
+    made = fs.marker("apriltag:36h11:5", size=0.3, mixture=mixture)
+    camera = fs.Camera.pinhole(480, 360, 420.0, 420.0, 240.0, 180.0)
+    sensor = fs.Sensor(0.9, (-0.4,), 3000, 10, 3, 1.0, "srgb", 8)
+    scene = fs.Scene(
+        markers=[fs.scenes.PlacedMarker(made, pose)],
+        camera=camera,
+        background=fs.Gradient((0.3, 0.4, 0.6), (0.3, 0.25, 0.2)),
+        sensor=sensor,
+    )
+    for fog in (None, fs.Fog(0.3, (0.5, 0.5, 0.5))):
+        rgb = renderer.render(scene, quality=fs.Quality(lowpass="none", samples=2), fog=fog)["rgb"]
+        (found,) = detect(to_uint8(rgb), families=["36h11"], qr=False)
+        error, _ = pose_error(marker_pose(found.corners, 0.3, camera), pose)
+        assert found.id == 5
+        assert error < 0.01 * np.linalg.norm(pose[:3, 3])
+
+
+def test_a_view_needs_no_sensor():
+    view = View.of(CAMERA, fs.Quality(), np.zeros(3), (0, 0, 0))
+    assert view.sensor.steps == ()

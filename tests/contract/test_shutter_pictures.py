@@ -1,0 +1,176 @@
+"""Motion blur, rolling shutter and moving groups, against the reference and against pictures of single
+poses."""
+
+import math
+
+import numpy as np
+import pytest
+from agreement import random_splats
+from test_agreement import coplanar_cloud
+
+import fidsplat as fs
+from fidsplat.backends.exposure import exposed_view
+from fidsplat.backends.reference import ReferenceBackend
+from fidsplat.effects import select
+from fidsplat.hard_cases.agreement import ALL_OUTPUTS, compare
+from fidsplat.quality import Quality
+
+SIZE = (61, 45)
+BACKGROUND = (0.1, 0.2, 0.3)
+
+
+def pose_at(time):
+    """A camera that turns and moves on."""
+    angle = 0.4 * time
+    return fs.Camera.look_at(
+        *SIZE, 1.0, (0.5 * time, -0.2 * time, -0.5), (3 * math.sin(angle), 0.1, 3 * math.cos(angle))
+    ).world_to_camera
+
+
+def turned(time):
+    """A group that turns about (0, 0, 3) and moves to the right."""
+    angle = 0.8 * time
+    matrix = np.eye(4)
+    matrix[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+    matrix[0, 3] = 0.6 * time
+    return matrix
+
+
+CAMERAS = {
+    "pinhole": fs.Camera.pinhole(*SIZE, 50.0, 50.0, 30.0, 22.0),
+    "distortion": fs.Camera.pinhole(*SIZE, 50.0, 50.0, 30.0, 22.0, lens=fs.BrownConrady(-0.2, 0.05, p1=0.01)),
+    "fisheye": fs.Camera.fisheye(*SIZE, math.radians(190)),
+    "panorama": fs.Camera.equirectangular(*SIZE),
+    "parallel": fs.Camera.orthographic(*SIZE, 4.0),
+}
+SHUTTERS = {
+    "blur": fs.Shutter(exposure=0.3, sub_poses=5),
+    "rolling": fs.Shutter(readout=0.5, rows_per_band=7),
+    "both": fs.Shutter(time=0.2, exposure=0.2, sub_poses=2, readout=0.4, rows_per_band=16),
+    "instant": fs.Shutter(time=0.4),
+}
+MOTION = fs.Motion(pose_at, {3: turned, 5: lambda time: turned(-time)})
+
+
+def truth(cloud, camera, quality, outputs, motion, shutter):
+    view = exposed_view(camera, quality, cloud.origin, BACKGROUND, motion, shutter)
+    features = select(cloud, (*outputs, "alpha"), quality, camera, bool(view.groups), bool(view.shots))
+    judge = ReferenceBackend()
+    return judge.pipeline(features).render(judge.upload(cloud), view).planes
+
+
+def assert_exposed(renderer, cloud, camera, motion, shutter, quality=None, outputs=ALL_OUTPUTS):
+    quality = Quality.of(quality)
+    frame = renderer.render(cloud, camera, outputs, quality, BACKGROUND, motion, shutter)
+    differences = compare(frame, truth(cloud, camera, quality, outputs, motion, shutter), outputs)
+    assert all(difference.agrees for difference in differences), differences
+    return frame
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+@pytest.mark.parametrize("shutter", SHUTTERS.values(), ids=SHUTTERS)
+def test_shutters_before_every_lens(renderer, camera, shutter):
+    cloud = random_splats(150, 3, depth=(-2.0, 5.0), scale=(0.01, 0.5))
+    assert_exposed(renderer, cloud, camera, MOTION, shutter)
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_moving_layers(renderer, samples):
+    cloud = coplanar_cloud(1)
+    labels = np.where(cloud.planes < 0, 0, cloud.planes + 3)
+    motion = fs.Motion(None, {3: turned, 4: lambda time: turned(-time)})
+    shutter = fs.Shutter(exposure=0.5, sub_poses=3)
+    camera = CAMERAS["pinhole"]
+    assert_exposed(renderer, cloud.with_labels(labels), camera, motion, shutter, Quality(samples=samples))
+
+
+def test_colours_that_depend_on_the_view_turn_with_their_group(renderer):
+    cloud = random_splats(100, 4, depth=(1, 5), scale=(0.05, 0.3), sh_degree=3)
+    assert_exposed(renderer, cloud, CAMERAS["pinhole"], MOTION, SHUTTERS["both"], outputs=("rgb",))
+
+
+def test_a_moved_group_is_the_transformed_cloud(renderer):
+    still, moving = (
+        random_splats(100, seed, depth=(1, 5), scale=(0.02, 0.3), sh_degree=2) for seed in (1, 2)
+    )
+    together = fs.SplatCloud.concatenate([still.with_labels(0), moving.with_labels(1)])
+    motion, time = fs.Motion(None, {1: turned}), 0.7
+    frame = renderer.render(together, CAMERAS["pinhole"], motion=motion, shutter=fs.Shutter(time=time))
+    moved = fs.SplatCloud.concatenate([still.with_labels(0), moving.with_labels(1).transformed(turned(time))])
+    plain = renderer.render(moved, CAMERAS["pinhole"])
+    error = np.abs(frame["rgb"] - plain["rgb"]).max(2)
+    assert np.quantile(error, 0.99) < 1e-4
+
+
+def test_blur_is_the_mean_of_its_poses(renderer):
+    cloud, camera = random_splats(100, 5, depth=(1, 5), scale=(0.02, 0.3)), CAMERAS["pinhole"]
+    shutter = fs.Shutter(time=0.1, exposure=0.4, sub_poses=4)
+    frame = renderer.render(cloud, camera, ("rgb", "alpha", "depth"), None, BACKGROUND, MOTION, shutter)
+    single = [
+        renderer.render(
+            cloud, camera, ("rgb", "alpha", "depth"), None, BACKGROUND, MOTION, fs.Shutter(time=0.1 + t)
+        )
+        for t in (-0.15, -0.05, 0.05, 0.15)
+    ]
+    for name in ("rgb", "alpha"):
+        np.testing.assert_allclose(frame[name], np.mean([one[name] for one in single], 0), atol=1e-6)
+    assert (frame["depth"] == single[2]["depth"]).all()
+
+
+def test_a_rolling_shutter_takes_each_row_at_its_own_time(renderer):
+    cloud, camera = random_splats(100, 6, depth=(1, 5), scale=(0.02, 0.3)), CAMERAS["pinhole"]
+    shutter = fs.Shutter(readout=0.8, rows_per_band=1)
+    frame = renderer.render(cloud, camera, motion=MOTION, shutter=shutter)
+    for row in (0, 17, 44):
+        time = 0.8 * ((row + 0.5) / SIZE[1] - 0.5)
+        single = renderer.render(cloud, camera, motion=MOTION, shutter=fs.Shutter(time=time))
+        np.testing.assert_allclose(frame["rgb"][row], single["rgb"][row], atol=2e-5)
+
+
+@pytest.mark.parametrize("rows", [1, 4, 15])
+def test_bands_are_off_by_at_most_their_stated_bound(renderer, rows):
+    """A bar that crosses the picture while it is read out: its middle in each row, and where the time puts
+    it."""
+    height, speed, readout = 60, 40.0, 1.0
+    camera = fs.Camera.pinhole(80, height, 100.0, 100.0, 40.0, 30.0)
+
+    def across(time):
+        matrix = np.eye(4)
+        matrix[0, 3] = speed * time * 2.0 / 100.0  # at z = 2, `speed` pixels a second
+        return matrix
+
+    bar = fs.SplatCloud([[0, 0, 2.0]], [[1, 0, 0, 0]], [[0.04, 5.0]], [0.9], colors=[[1, 1, 1]], labels=1)
+    frame = renderer.render(
+        bar,
+        camera,
+        motion=fs.Motion(None, {1: across}),
+        shutter=fs.Shutter(readout=readout, rows_per_band=rows),
+    )
+    light = frame["rgb"][..., 0].astype(float)
+    middle = (light * (np.arange(80) + 0.5)).sum(1) / light.sum(1)
+    want = 40 + speed * readout * ((np.arange(height) + 0.5) / height - 0.5)
+    bound = speed * readout * (rows - 1) / (2 * height)
+    error = np.abs(middle - want).max()
+    # one sample of 1/255 at the rim, 6.6 px from the middle, moves the mean of a bar of 4.5 px by this
+    rim = 6.6 / 255 / 4.5
+    assert error <= bound + rim
+    assert error >= 0.9 * bound - rim
+
+
+def test_the_same_bits_again_and_in_bands_of_tiles(renderer):
+    cloud, camera = random_splats(200, 7, depth=(-1, 5)), CAMERAS["fisheye"]
+
+    def draw():
+        frame = renderer.render(
+            cloud, camera, ("rgb", "depth", "label"), motion=MOTION, shutter=SHUTTERS["both"]
+        )
+        return [frame[name] for name in frame]
+
+    first = draw()
+    assert all((a == b).all() for a, b in zip(first, draw(), strict=True))
+    held = renderer.backend.pair_budget
+    renderer.backend.pair_budget = 60
+    try:
+        assert all((a == b).all() for a, b in zip(first, draw(), strict=True))
+    finally:
+        renderer.backend.pair_budget = held

@@ -1,0 +1,160 @@
+"""Sensors, fog and backgrounds: values, scene files, and what is wrong with them."""
+
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.cli import main
+from fidsplat.vision.images import write_png
+
+SCENE = """[camera]
+width = 24
+height = 16
+fov_x_deg = 60.0
+position = [0.0, 0.0, -1.0]
+look_at = [0.0, 0.0, 0.0]
+
+[[markers]]
+spec = "apriltag:36h11:5"
+size = 0.3
+"""
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"exposure": -1}, "exposure is -1; it must be a number of at least 0"),
+        ({"gain": math.nan}, "gain is nan"),
+        ({"full_well": 0}, "full_well is 0; it must be a number of electrons above 0"),
+        ({"read_noise": 3}, "means nothing without full_well"),
+        ({"seed": 1.5}, "seed is 1.5; it must be a whole number"),
+        ({"seed": 2**32}, "seed is 4294967296"),
+        ({"bits": 12}, "bits is 12; known: 8, 16"),
+        ({"vignetting": (1, 2, 3, 4)}, "vignetting is .*0 to 3 finite numbers"),
+        ({"vignetting": 0.5}, "vignetting is 0.5"),
+        ({"response": "log"}, "response is 'log'; known: linear, srgb"),
+        ({"response": 0.0}, "a gamma must be above 0"),
+        ({"response": (1,)}, "2 to 65536 finite numbers"),
+        ({"response": (0, math.inf)}, "finite numbers"),
+    ],
+)
+def test_sensors_that_cannot_be(values, words):
+    with pytest.raises(fs.InputError, match=words):
+        fs.Sensor(**values)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: fs.Fog(-0.1), "density is -0.1"),
+        (lambda: fs.Fog(0.1, (1, 2)), "fog: color"),
+        (lambda: fs.Gradient((0, 0, 0), (1, 1, math.nan)), "background: bottom"),
+        (lambda: fs.Gradient((0, 0, 0), (1, 1, 1), (0, 0, 0)), "must be a direction"),
+        (lambda: fs.Panorama(np.zeros((4, 4))), r"must be \(h, w, 3\)"),
+        (lambda: fs.Panorama(np.zeros((1, 4, 3))), "4 x 1 pixels"),
+        (lambda: fs.Panorama(np.full((4, 4, 3), np.nan)), "not finite"),
+        (lambda: fs.Panorama.load("nowhere.png"), "nowhere.png"),
+        (lambda: fs.Scene(fog=0.2), "fog must be a Fog"),
+        (lambda: fs.Scene(sensor="srgb"), "sensor must be a Sensor"),
+        (lambda: fs.Scene(background="sky.png"), "background must be three"),
+    ],
+)
+def test_surroundings_that_cannot_be(make, words):
+    with pytest.raises(fs.InputError, match=words):
+        make()
+
+
+def test_steps_come_in_the_order_of_the_light():
+    whole = fs.Sensor(2, (0.1,), 1000, 3, 4, 0.5, 2.2, 8)
+    assert whole.steps == ("exposure", "vignetting", "noise", "gain", "response_gamma", "quantise")
+    assert fs.Sensor().steps == ()
+
+
+def test_a_scene_file_keeps_them(tmp_path):
+    write_png(tmp_path / "sky.png", np.random.default_rng(0).uniform(0, 1, (8, 16, 3)))
+    sensor = fs.Sensor(1.5, (-0.2, 0.1), 9000, 4.5, 11, 2.0, (0.0, 0.6, 1.0), 16)
+    for background in (
+        fs.Gradient((0, 0.1, 1), (0.2, 0.2, 0.2)),
+        fs.Panorama.load(tmp_path / "sky.png"),
+        (0.1, 0.2, 0.3),
+    ):
+        fs.Scene(sensor=sensor, fog=fs.Fog(0.2, (0.5, 0.6, 0.7)), background=background).save(
+            tmp_path / "a.toml"
+        )
+        read = fs.Scene.load(tmp_path / "a.toml")
+        assert (read.sensor, read.fog) == (sensor, fs.Fog(0.2, (0.5, 0.6, 0.7)))
+        if isinstance(background, fs.Panorama):
+            assert np.array_equal(read.background.image, background.image)
+        else:
+            assert read.background == background
+    for response in ("srgb", 1.8):
+        fs.Scene(sensor=fs.Sensor(response=response)).save(tmp_path / "a.toml")
+        assert fs.Scene.load(tmp_path / "a.toml").sensor == fs.Sensor(response=response)
+    fs.Scene().save(tmp_path / "a.toml")
+    assert (fs.Scene.load(tmp_path / "a.toml").sensor, fs.Scene.load(tmp_path / "a.toml").fog) == (None, None)
+
+
+def test_a_scene_file_keeps_the_low_pass_and_the_first_hit(tmp_path):
+    quality = fs.Quality.named("fast").with_(lowpass="pixel", first_hit=0.4, samples=2)
+    fs.Scene(quality=quality).save(tmp_path / "a.toml")
+    assert fs.Scene.load(tmp_path / "a.toml").quality == quality
+    text = (tmp_path / "a.toml").read_text()
+    (tmp_path / "a.toml").write_text(text.replace('"pixel"', '"pixels"'))
+    with pytest.raises(fs.InputError, match=r"render.lowpass: quality: lowpass is 'pixels'"):
+        fs.Scene.load(tmp_path / "a.toml")
+
+
+def test_a_panorama_of_no_file_cannot_be_written(tmp_path):
+    with pytest.raises(fs.InputError, match="came from no file"):
+        fs.Scene(background=fs.Panorama(np.zeros((4, 8, 3)))).save(tmp_path / "a.toml")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("tables", "words"),
+    [
+        ("[sensor]\nexposre = 2.0", "sensor.exposre; did you mean exposure"),
+        ("[sensor]\nexposure = -2.0", "sensor: sensor: exposure is -2.0"),
+        ("[sensor]\nresponse = true", "sensor.response must be a number"),
+        ("[sensor]\nvignetting = 0.1", "sensor.vignetting must be a list of numbers"),
+        ("[fog]\ncolor = [1, 1, 1]", "fog.density is missing"),
+        ("[background]\ntop = [1, 1, 1]", "background.bottom is missing"),
+        ('[background]\nimage = "no.png"', "background.image: .*no.png"),
+        ('[background]\nimage = "no.png"\ntop = [1, 1, 1]', "background.top and image exclude"),
+        (
+            "[background]\ntop = [1, 1, 1]\nbottom = [0, 0, 0]\n[render]\nbackground = [0, 0, 0]",
+            "exclude each other",
+        ),
+    ],
+)
+def test_tables_that_say_something_wrong(tmp_path, tables, words):
+    path = tmp_path / "scene.toml"
+    path.write_text(SCENE + tables)
+    with pytest.raises(fs.InputError, match=words) as caught:
+        fs.Scene.load(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_the_command_writes_as_many_bits_as_the_sensor_has(tmp_path, bits):
+    path = tmp_path / "scene.toml"
+    path.write_text(SCENE + f"[sensor]\nexposure = 0.5\nbits = {bits}\n")
+    assert main(["render", str(path), "-o", str(tmp_path / "out.png"), "--device", "reference"]) == 0
+    image = cv2.imread(str(tmp_path / "out.png"), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    assert image.dtype == (np.uint8 if bits == 8 else np.uint16)
+    scene = fs.Scene.load(path)
+    rgb = fs.Renderer("reference").render(scene)["rgb"]
+    assert np.array_equal(image[:, :, ::-1], np.rint(rgb * (2**bits - 1)))
+
+
+@pytest.mark.parametrize("name", ["boxes", "fog", "sensor", "background", "lowpass", "outputs"])
+def test_the_examples_are_drawn(name, renderer):
+    file = Path(__file__).resolve().parents[2] / "examples" / f"{name}.toml"
+    frame = renderer.render(fs.Scene.load(file))
+    assert frame["rgb"].shape == (400, 640, 3)
+    assert frame["rgb"].std() > 0.05

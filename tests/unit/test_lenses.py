@@ -1,0 +1,203 @@
+"""Lenses: OpenCV's projections, their inverses, what is not seen, scene files."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.cameras import BrownConrady, Equirectangular, Fisheye, Orthographic
+from fidsplat.cameras.raster import RayRaster
+
+ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")
+COEFFICIENTS = [
+    [-0.28, 0.07, 0.0, 0.0],
+    [-0.3, 0.1, 1e-3, -2e-3, 0.01],
+    [0.2, 0.02, -1e-3, 5e-4, -0.003, 0.11, 0.02, 0.001],
+    [-0.25, 0.05, 2e-3, 1e-3, 0.002, 0.01, 0.0, 0.003, 1e-3, -2e-3, 5e-4, 1e-3],
+]
+POSE = fs.Camera.look_at(64, 48, 1.0, (0.3, -0.2, -1.0), (0.1, 0.0, 3.0)).world_to_camera
+
+
+def points_before(seed, spread=0.6):
+    generator = np.random.default_rng(seed)
+    depth = generator.uniform(0.5, 5, 400)
+    return np.stack([*(generator.uniform(-spread, spread, (2, 400)) * depth), depth], 1)
+
+
+@pytest.mark.parametrize("coefficients", COEFFICIENTS, ids=len)
+def test_distortion_is_that_of_opencv(coefficients):
+    camera = fs.Camera.pinhole(
+        640, 480, 500.0, 510.0, 315.0, 250.0, POSE, lens=BrownConrady.opencv(coefficients)
+    )
+    seen = points_before(1)
+    world = (seen - POSE[:3, 3]) @ POSE[:3, :3]
+    turn, move = cv2.Rodrigues(POSE[:3, :3])[0], POSE[:3, 3].copy()
+    want = cv2.projectPoints(world[:, None], turn, move, camera.matrix, np.array(coefficients))[0][:, 0]
+    np.testing.assert_allclose(camera.project(world), want, atol=1e-9)
+    np.testing.assert_allclose(camera.rays(want), seen / seen[:, 2:], atol=1e-9)
+
+
+@pytest.mark.parametrize("coefficients", [(0, 0, 0, 0), (0.05, -0.01, 0.003, -0.001), (-0.03, 0.004, 0, 0)])
+def test_fisheye_is_that_of_opencv(coefficients):
+    camera = fs.Camera.pinhole(640, 600, 200.0, 210.0, 315.0, 250.0, lens=Fisheye(*coefficients))
+    # OpenCV divides by Z, so it goes no further than 90 degrees
+    seen = points_before(2, spread=3.0)
+    zero, matrix = np.zeros(3), camera.matrix
+    want = cv2.fisheye.projectPoints(seen[:, None], zero, zero, matrix, np.array(coefficients, float))[0][
+        :, 0
+    ]
+    np.testing.assert_allclose(camera.project(seen), want, atol=1e-9)
+    np.testing.assert_allclose(
+        camera.rays(want), seen / np.linalg.norm(seen, axis=1, keepdims=True), atol=1e-9
+    )
+
+
+def test_a_fisheye_sees_behind_itself_up_to_200_degrees():
+    camera = fs.Camera.fisheye(200, 200, math.radians(200))
+    angles = np.radians([80.0, 95.0, 99.9, 100.1, 140.0, 180.0])
+    points = np.stack([np.sin(angles), 0 * angles, np.cos(angles)], 1)
+    x = camera.project(points)[:, 0]
+    np.testing.assert_allclose(x[:3], 100 + np.degrees(angles[:3]), rtol=1e-12)
+    assert np.isnan(x[3:]).all()
+    assert np.isnan(camera.rays([[1.0, 1.0], [100.0, 250.0]])).all()
+
+
+def test_a_panorama():
+    camera = fs.Camera.equirectangular(400, 200)
+    points = [[0, 0, 2], [2, 0, 0], [-3, 0, 0], [0, -1, 0], [0, 1, 1], [1e-9, 0, -1]]
+    want = [[200, 100], [300, 100], [100, 100], [200, 0], [200, 150], [400, 100]]
+    np.testing.assert_allclose(camera.project(points), want, atol=1e-6)
+    directions = np.array(points) / np.linalg.norm(points, axis=1, keepdims=True)
+    np.testing.assert_allclose(camera.rays(camera.project(points)), directions, atol=1e-12)
+    assert np.isnan(camera.rays([[-0.1, 100], [200, 200.1]])).all()
+    assert np.isnan(camera.project([[0.0, 0.0, 0.0]])).all()
+
+
+def test_parallel_rays():
+    camera = fs.Camera.orthographic(400, 200, 8.0)
+    np.testing.assert_allclose(camera.project([[1, 2, 5], [1, 2, 50]]), [[250, 200], [250, 200]])
+    assert np.isnan(camera.project([[0, 0, -1]])).all()
+    with pytest.raises(fs.InputError, match="no directions"):
+        camera.rays([[0, 0]])
+
+
+def test_beyond_the_fold_nothing_is_seen():
+    lens = BrownConrady(k1=-0.35)
+    assert lens.fold == pytest.approx(math.sqrt(1 / (3 * 0.35)))
+    camera = fs.Camera.pinhole(80, 60, 52.0, 52.0, 40.0, 30.0, lens=lens)
+    radius = 52 * lens.fold * (1 - 0.35 * lens.fold**2)
+    assert not np.isnan(camera.rays([[40 + radius - 1e-3, 30]])).any()
+    assert np.isnan(camera.rays([[40 + radius + 1e-3, 30]])).all()
+    # the polynomial comes back to the picture there; the lens does not
+    assert np.isnan(camera.project([[1.5, 0, 1]])).all()
+    assert BrownConrady(k1=0.2, k4=-0.1).fold == pytest.approx(math.sqrt(10), rel=0.5)
+
+
+def test_a_lens_that_does_nothing_is_none():
+    assert fs.Camera.pinhole(64, 48, 50, 50, 32, 24, lens=BrownConrady()).lens is None
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: BrownConrady(k1=math.nan), "k1 must be a finite number"),
+        (lambda: Fisheye(k2="a"), "k2 must be a finite number"),
+        (lambda: BrownConrady.opencv([1, 2, 3]), "3 coefficients.*4, 5, 8 or 12"),
+        (lambda: fs.Camera.pinhole(64, 48, 20, 20, 32, 24, lens=BrownConrady(k1=-0.5)), "cannot be inverted"),
+        (lambda: fs.Camera.pinhole(64, 48, 20, 20, 32, 24, lens="fisheye"), "lens is 'fisheye'"),
+        (lambda: fs.Camera.fisheye(64, 48, math.radians(201)), "between 0 and 200 degrees"),
+        (lambda: fs.Camera.orthographic(64, 48, 0.0), "metres_wide must be above 0"),
+    ],
+)
+def test_what_makes_no_lens(make, words):
+    with pytest.raises(fs.InputError, match=words):
+        make()
+
+
+@pytest.mark.parametrize("lens", [BrownConrady(-0.3, 0.1, p1=0.01), Fisheye(0.1)], ids=lambda lens: lens.kind)
+def test_the_map_knows_every_sample(lens):
+    """Any rectangle of the chart: the boxes of the cells that it meets hold all samples whose rays lie in
+    it."""
+    raster = RayRaster(lens, 90, 70, 60.0, 60.0, 45.0, 35.0)
+    boxes, (low_x, low_y, scale_x, scale_y, cells) = raster.map
+    x, y = raster.chart(raster.rays)
+    generator, first = np.random.default_rng(3), 0
+    size = int(cells)
+    while size >= 1:
+        grid = boxes[first : first + size * size].reshape(size, size, 4)
+        step = size / cells
+        for _ in range(50):
+            left, right = np.sort(generator.uniform(0, size, 2))
+            top, bottom = np.sort(generator.uniform(0, size, 2))
+            inside = (x >= low_x + left / scale_x / step) & (x <= low_x + right / scale_x / step)
+            inside &= (y >= low_y + top / scale_y / step) & (y <= low_y + bottom / scale_y / step)
+            rows, columns = np.nonzero(inside)
+            if not len(rows):
+                continue
+            met = grid[int(top) : int(bottom) + 1, int(left) : int(right) + 1].reshape(-1, 4)
+            assert (met[:, 0].min(), met[:, 2].min()) <= (columns.min(), rows.min())
+            assert met[:, 0].min() <= columns.min()
+            assert met[:, 1].max() >= columns.max()
+            assert met[:, 2].min() <= rows.min()
+            assert met[:, 3].max() >= rows.max()
+        first += size * size
+        size //= 2
+    assert first == len(boxes)
+
+
+LENSES = [
+    BrownConrady(-0.3, 0.1, 0.01, p1=1e-3, s4=1e-4),
+    Fisheye(0.01, -0.002),
+    Equirectangular(),
+    Orthographic(),
+]
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.kind)
+def test_scene_files_keep_lenses(tmp_path, lens):
+    camera = fs.Camera.pinhole(64, 48, 40.0, 41.0, 30.0, 25.0, POSE, lens=lens)
+    fs.Scene([], camera=camera).save(tmp_path / "scene.toml")
+    again = fs.Scene.load(tmp_path / "scene.toml").camera
+    assert again.lens == lens
+    assert (again.fx, again.fy, again.cx, again.cy) == (40.0, 41.0, 30.0, 25.0)
+
+
+HEAD = "[camera]\nwidth = 64\nheight = 48\nposition = [0, 0, -1]\nlook_at = [0, 0, 0]\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "fx"),
+    [
+        ("fov_x_deg = 90\n[camera.distortion]\nk1 = -0.1\n", 32.0),
+        ("fov_x_deg = 180\n[camera.fisheye]\n", 64 / math.pi),
+        ("[camera.equirectangular]\n", 32 / math.pi),
+        ("[camera.orthographic]\nmetres_wide = 16.0\n", 4.0),
+    ],
+)
+def test_scene_files_switch_lenses_on(tmp_path, text, fx):
+    (tmp_path / "scene.toml").write_text(HEAD + text)
+    camera = fs.Scene.load(tmp_path / "scene.toml").camera
+    assert camera.lens is not None
+    assert camera.fx == pytest.approx(fx)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("fov_x_deg = 90\n[camera.distortion]\nk7 = 1.0\n", r"camera.distortion.k7; did you mean k"),
+        ("fov_x_deg = 90\n[camera.distortion]\n[camera.fisheye]\n", "fisheye and distortion exclude"),
+        ("fov_x_deg = 90\n[camera.equirectangular]\n", "fov_x_deg and equirectangular exclude"),
+        ("fov_x_deg = 90\n[camera.orthographic]\n", "fov_x_deg and orthographic exclude"),
+        ("[camera.orthographic]\n", "metres_wide is missing"),
+        ("[camera.orthographic]\nmetres_wide = -1\n", "metres_wide must be above 0"),
+        ("[camera.equirectangular]\nradius = 1\n", "unknown key camera.equirectangular.radius"),
+        ("fov_x_deg = 210\n[camera.fisheye]\n", "fov_x_deg: camera fov_x of this fisheye"),
+        ("fov_x_deg = 120\n[camera.distortion]\nk1 = -2.0\n", "cannot be inverted in"),
+    ],
+)
+def test_lenses_that_scene_files_cannot_have(tmp_path, text, words):
+    (tmp_path / "scene.toml").write_text(HEAD + text)
+    with pytest.raises(fs.InputError, match=words):
+        fs.Scene.load(tmp_path / "scene.toml")

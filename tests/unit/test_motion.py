@@ -1,0 +1,156 @@
+"""Poses as functions of time, shutters, and how scene files say them."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.cameras.motion import between
+from fidsplat.rotations import quaternion_to_matrix
+
+
+def random_pose(generator, angle=None):
+    pose = np.eye(4)
+    axis = generator.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    half = (generator.uniform(0, math.pi) if angle is None else angle) / 2
+    pose[:3, :3] = quaternion_to_matrix(np.array([math.cos(half), *(math.sin(half) * axis)]))
+    pose[:3, 3] = generator.uniform(-5, 5, 3)
+    return pose
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.5, 2.0, 3.1])
+def test_between_two_poses_is_one_screw_motion(angle):
+    """Equal steps are the same motion again, whichever end one starts from."""
+    generator = np.random.default_rng(1)
+    start = random_pose(generator)
+    end = start @ random_pose(generator, angle)
+    steps = [between(start, end, k / 4) for k in range(5)]
+    np.testing.assert_allclose(steps[0], start, atol=1e-12)
+    np.testing.assert_allclose(steps[4], end, atol=1e-9)
+    first = np.linalg.inv(steps[0]) @ steps[1]
+    for a, b in itertools.pairwise(steps):
+        np.testing.assert_allclose(np.linalg.inv(a) @ b, first, atol=1e-9)
+    np.testing.assert_allclose(between(end, start, 0.25), steps[3], atol=1e-8)
+    inverse = between(np.linalg.inv(start), np.linalg.inv(end), 0.25)
+    np.testing.assert_allclose(np.linalg.inv(inverse), steps[1], atol=1e-8)
+
+
+def test_a_trajectory_rests_before_and_after():
+    generator = np.random.default_rng(2)
+    poses = [random_pose(generator) for _ in range(3)]
+    path = fs.Trajectory([0.0, 1.0, 3.0], poses)
+    assert (path(-5.0) == poses[0]).all()
+    assert (path(9.0) == poses[2]).all()
+    np.testing.assert_allclose(path(1.0), poses[1], atol=1e-12)
+    np.testing.assert_allclose(path(2.5), between(poses[1], poses[2], 0.75), atol=1e-12)
+
+
+def test_when_rows_are_exposed():
+    shutter = fs.Shutter(time=2.0, exposure=0.4, sub_poses=4, readout=1.0, rows_per_band=4)
+    bands = shutter.bands(10)
+    assert [(top, end) for top, end, _ in bands] == [(0, 4), (4, 8), (8, 10)]
+    assert [time for *_, time in bands] == pytest.approx([1.7, 2.1, 2.4])
+    assert shutter.times(2.0) == pytest.approx([1.85, 1.95, 2.05, 2.15])
+    assert fs.Shutter(time=3.0).bands(10) == [(0, 10, 3.0)]
+    assert fs.Shutter().times(1.0) == [1.0]
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: fs.Shutter(exposure=-1.0), "exposure must be 0 or more seconds, not -1.0"),
+        (lambda: fs.Shutter(readout=-1e-3), "readout must be 0 or more"),
+        (lambda: fs.Shutter(time=math.nan), "time must be a finite number"),
+        (lambda: fs.Shutter(sub_poses=0), "sub_poses must be a whole number, 1 to 1024, not 0"),
+        (lambda: fs.Shutter(rows_per_band=0.5), "rows_per_band must be a whole number, 1 or more"),
+        (lambda: fs.Trajectory([0, 0], [np.eye(4)] * 2), "increasing"),
+        (lambda: fs.Trajectory([0], [np.eye(4)] * 2), "1 times but 2 poses"),
+        (lambda: fs.Trajectory([0], [2 * np.eye(4)]), "pose 0 of a trajectory"),
+        (lambda: fs.Motion(camera=np.eye(4)), "Trajectory or a function"),
+        (lambda: fs.Motion(groups={1: np.eye(4)}), "Trajectory or function"),
+        (lambda: fs.Motion(groups={1: lambda t: np.zeros((4, 4))}).groups_at(0), "label 1 at 0 s"),
+    ],
+)
+def test_what_cannot_move_so(make, words):
+    with pytest.raises(fs.InputError, match=words):
+        make()
+
+
+SCENE = """
+[camera]
+width = 64
+height = 48
+fov_x_deg = 60.0
+
+[camera.shutter]
+exposure_ms = 10.0
+sub_poses = 4
+readout_ms = 20.0
+
+[[camera.motion]]
+time = 0.0
+position = [0, 0, -1]
+look_at = [0, 0, 0]
+
+[[camera.motion]]
+time = 0.5
+position = [0.5, 0, -1]
+look_at = [0, 0, 0]
+
+[[markers]]
+spec = "aruco:4x4_50:7"
+size = 0.2
+motion = [{time = 0.0, position = [0, 0, 0]}, {time = 1.0, position = [1, 0, 0], quaternion = [0, 0, 0, 1]}]
+"""
+
+
+def test_scene_files_say_what_moves(tmp_path):
+    (tmp_path / "a.toml").write_text(SCENE)
+    first = fs.Scene.load(tmp_path / "a.toml")
+    first.save(tmp_path / "b.toml")
+    for scene in (first, fs.Scene.load(tmp_path / "b.toml")):
+        assert scene.shutter == fs.Shutter(exposure=0.01, sub_poses=4, readout=0.02)
+        np.testing.assert_allclose(scene.camera.position, [0, 0, -1], atol=1e-12)
+        position = np.linalg.inv(scene.motion.camera_at(0.5))[:3, 3]
+        np.testing.assert_allclose(position, [0.5, 0, -1], atol=1e-12)
+        ((label, moved),) = scene.motion.groups_at(1.0)
+        assert label == 1
+        np.testing.assert_allclose(moved @ [0.1, 0, 0, 1], [0.9, 0, 0, 1], atol=1e-12)
+
+
+def test_a_marker_moves_from_where_it_is_drawn(tmp_path):
+    """Its own pose is where its splats lie in the cloud; the motion takes it from there."""
+    text = SCENE.replace("size = 0.2", "size = 0.2\nposition = [0.0, 3.0, 0.0]")
+    (tmp_path / "a.toml").write_text(text)
+    scene = fs.Scene.load(tmp_path / "a.toml")
+    corner = np.append(scene.markers[0].corners[0], 1)
+    ((_, moved),) = scene.motion.groups_at(0.0)
+    np.testing.assert_allclose((moved @ corner)[:3], [-0.1, -0.1, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("exposure_ms = 10.0", "exposure_ms = -1.0", "camera.shutter: shutter exposure must be 0 or more"),
+        ("exposure_ms", "exposure", "camera.shutter.exposure; did you mean exposure_ms"),
+        ("time = 0.5", "time = 0.0", r"camera.motion\[1\].time must be above"),
+        ("time = 1.0", "time = -1.0", r"markers\[0\].motion\[1\].time must be above"),
+        ("fov_x_deg = 60.0", "fov_x_deg = 60.0\nposition = [0, 0, 0]", "position and motion exclude"),
+        ("[[camera.motion]]\ntime = 0.0\n", "[[camera.motion]]\n", r"camera.motion\[0\].time is missing"),
+    ],
+)
+def test_motions_that_scene_files_cannot_have(tmp_path, old, new, words):
+    assert old in SCENE
+    (tmp_path / "a.toml").write_text(SCENE.replace(old, new, 1))
+    with pytest.raises(fs.InputError, match=words):
+        fs.Scene.load(tmp_path / "a.toml")
+
+
+def test_functions_cannot_be_saved(tmp_path):
+    camera = fs.Camera.pinhole(64, 48, 50, 50, 32, 24)
+    scene = fs.Scene([], camera=camera, camera_motion=lambda time: np.eye(4))
+    with pytest.raises(fs.InputError, match="motion of the camera is a function"):
+        scene.save(tmp_path / "a.toml")
