@@ -1,5 +1,5 @@
-"""Tiles from their lists: a block of threads per tile on a GPU; on a CPU a thread per tile that walks each
-splat's box within it.
+"""Tiles from their lists: on a GPU a block of threads per tile, a sample per thread, records staged in shared
+memory; on a CPU a thread per tile that walks each splat's box within it.
 The same functions see every sample, so both take the same decisions.
 """
 
@@ -8,23 +8,21 @@ from functools import cache
 import warp as wp
 
 from .bounds import Bounds, make_bounds
-from .common import STRICT, View
+from .common import STRICT, View, lowest, store_line
 from .pixel import make_pixel
+from .staging import BLOCK_H, BLOCK_W, STAGED
 
-
-def strip_of(effects: tuple[str, ...]) -> int:
-    """Samples in a row that one GPU thread draws: four share the reading of a record. Pending layers leave no
-    registers for that.
-    """
-    return 1 if "compose_planes" in effects else 4
+NONE, ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 
 
 @cache
-def make_blend(effects: tuple[str, ...], on_gpu: bool):
-    """The kernel for these effects of splats and samples."""
+def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
+    """The kernel for these effects of splats and samples; threads: of a block on a GPU, one for each of a
+    tile's samples.
+    """
     parts = make_pixel(effects)
-    strip = strip_of(effects)
-    several = strip == 4
+    pool, stage, touched = parts.staging.pool, parts.staging.stage, parts.staging.touched
+    load_staged = parts.load_staged
     Pixel = parts.Pixel
     limits = make_bounds("lowpass_screen" in effects)
     depth, median, normal, label = (name in effects for name in ("depth", "depth_median", "normal", "label"))
@@ -49,7 +47,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool):
         raw_label: wp.array(dtype=wp.int32),
         raw_label_weight: wp.array(dtype=wp.float32),
     ):
-        raw[at] = wp.vec4(p.r, p.g, p.b, p.t)
+        store_line(raw, at, wp.vec4(p.r, p.g, p.b, p.t))
         if wp.static(depth):
             raw_depth[at] = wp.vec2(p.depth, p.depth_weight)
         if wp.static(median):
@@ -60,7 +58,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool):
             raw_label[at] = p.label
             raw_label_weight[at] = p.label_weight
 
-    @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+    @wp.kernel(module="unique", module_options=STRICT, enable_backward=False, launch_bounds=threads)
     def blend_gpu(
         band_first: int,  # tile of block 0
         view: View,
@@ -77,64 +75,43 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool):
         raw_label_weight: wp.array(dtype=wp.float32),
     ):
         thread = wp.tid()
-        across = view.tile_w / strip
-        threads = across * view.tile_h
         tile = band_first + thread / threads
         item = thread % threads
-        x0 = (tile % view.tiles_x) * view.tile_w + (item % across) * strip
-        y0 = (tile / view.tiles_x) * view.tile_h + item / across
-        p0, p1, p2, p3 = start(), start(), start(), start()
-        # what lies beyond the picture is finished from the start
-        below = y0 >= view.height
-        if below or x0 >= view.width:
-            p0.t = 0.0
-        if below or x0 + 1 >= view.width:
-            p1.t = 0.0
-        if below or x0 + 2 >= view.width:
-            p2.t = 0.0
-        if below or x0 + 3 >= view.width:
-            p3.t = 0.0
+        # a warp draws a block, so that a splat that misses it costs it nothing
+        block, lane = item / 32, item % 32
+        across = view.tile_w / BLOCK_W
+        left = (tile % view.tiles_x) * view.tile_w + (block % across) * BLOCK_W
+        top = (tile / view.tiles_x) * view.tile_h + (block / across) * BLOCK_H
+        x0 = left + lane % BLOCK_W
+        y0 = top + lane / BLOCK_W
+        p = start()
+        if x0 >= view.width or y0 >= view.height:
+            p.t = 0.0  # what lies beyond the picture is finished from the start
+        records = pool()
         k = starts[tile]
         end = starts[tile + 1]
         while k < end:
-            index = lists[k]
-            k += 1
-            s = load(lines, index, view)
-            x = float(x0) - s.d[3]
-            y = float(y0) - s.c[0]
-            u, v, d = row_of(s.u, y), row_of(s.v, y), row_of(s.d, y)
-            open0 = unfinished(p0, view)
-            if wp.static(several):
-                open1, open2, open3 = unfinished(p1, view), unfinished(p2, view), unfinished(p3, view)
-                if not (open0 or open1 or open2 or open3):
-                    break
-                c1 = cross(s, u, v, d, x + 1.0, y, view)
-                c2 = cross(s, u, v, d, x + 2.0, y, view)
-                c3 = cross(s, u, v, d, x + 3.0, y, view)
-                if c1.drawn and open1:
-                    p1 = blend_one(p1, s, c1, index, lines, labels, planes, view)
-                if c2.drawn and open2:
-                    p2 = blend_one(p2, s, c2, index, lines, labels, planes, view)
-                if c3.drawn and open3:
-                    p3 = blend_one(p3, s, c3, index, lines, labels, planes, view)
-            else:
-                if not open0:
-                    break
-            c0 = cross(s, u, v, d, x, y, view)
-            if c0.drawn and open0:
-                p0 = blend_one(p0, s, c0, index, lines, labels, planes, view)
+            length = wp.min(end - k, STAGED)
+            if not stage(records, lines, lists, k, length, unfinished(p, view)):
+                break
+            word = int(0)
+            while 32 * word < length:
+                bits = touched(records, word, length, left, top, unfinished(p, view))
+                while bits != NONE:
+                    which = 32 * word + lowest(bits)
+                    bits = bits & (bits - ONE)
+                    s = load_staged(records, lines, lists, k, which, view)
+                    index = lists[k + which]
+                    if unfinished(p, view):
+                        y = float(y0) - s.c[0]
+                        u, v, d = row_of(s.u, y), row_of(s.v, y), row_of(s.d, y)
+                        c = cross(s, u, v, d, float(x0) - s.d[3], y, view)
+                        if c.drawn:
+                            p = blend_one(p, s, c, index, lines, labels, planes, view)
+                word += 1
+            k += length
         at = y0 * view.tiles_x * view.tile_w + x0
-        store(finish(p0, view), at, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
-        if wp.static(several):
-            store(
-                finish(p1, view), at + 1, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight
-            )
-            store(
-                finish(p2, view), at + 2, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight
-            )
-            store(
-                finish(p3, view), at + 3, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight
-            )
+        store(finish(p, view), at, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def blend_cpu(

@@ -1,5 +1,5 @@
 """What part of the picture a splat can touch: its ellipse, or a box where the disk crosses the near plane,
-and the low-pass dot.
+and the low-pass dot. Of most splats a window says which tiles these are: 8 x 4 tiles as bits.
 
 Everything here is conservative; the test of each sample decides.
 """
@@ -14,6 +14,8 @@ from .common import View, fma, to_sample
 # room for the rounding of the fields and of the per-sample test: samples, and relative
 PAD = wp.constant(0.02)
 PAD_RELATIVE = wp.constant(2e-4)
+WINDOW_W = 8
+WINDOW_H = 4
 
 
 @wp.struct
@@ -63,6 +65,18 @@ def ellipse_bounds(x: float, y: float, half_x: float, half_y: float, shear: floa
     b.inverse_hy2 = 1.0 / (b.half_y * b.half_y)
     b.dot_r = -1.0
     return b
+
+
+@wp.func
+def ones(count: int) -> wp.uint32:
+    """The lowest bits, 1 to 31 of them."""
+    return (wp.uint32(1) << wp.uint32(count)) - wp.uint32(1)
+
+
+@wp.func
+def window_tile(corner: int, bit: int, view: View) -> int:
+    """The tile of a bit of the window with its first tile at `corner`."""
+    return corner + bit / WINDOW_W * view.tiles_x + bit % WINDOW_W
 
 
 @cache
@@ -130,4 +144,23 @@ def make_bounds(screen: bool) -> SimpleNamespace:
             return 0, 0
         return first / view.tile_w, (end + view.tile_w - 1) / view.tile_w
 
-    return SimpleNamespace(rows=rows, span=span, tile_rows=tile_rows, tile_span=tile_span)
+    @wp.func
+    def window_bits(b: Bounds, left: int, columns: int, top: int, height: int, view: View) -> wp.uint32:
+        """Tiles that can be touched of those from column `left` and row `top` on, of a splat that touches no
+        others. 0 if they are more than a window has.
+        """
+        bits = wp.uint32(0)
+        if columns <= WINDOW_W and height <= WINDOW_H:
+            for row in range(height):
+                first, end = left, left + columns
+                if height > 1:  # else the columns are those of the row
+                    first, end = tile_span(b, top + row, view)
+                    # a chord between two rows of samples may be wider than those at the rows
+                    first, end = wp.max(first, left), wp.min(end, left + columns)
+                if first < end:
+                    bits = bits | (ones(end - first) << wp.uint32(row * WINDOW_W + first - left))
+        return bits
+
+    return SimpleNamespace(
+        rows=rows, span=span, tile_rows=tile_rows, tile_span=tile_span, window_bits=window_bits
+    )

@@ -28,6 +28,9 @@ class View:
     cy: wp.float64
     near: wp.float64
     far: wp.float64
+    per_fx: wp.float64  # 1 / fx, as those below: to divide takes longer
+    per_fy: wp.float64
+    per_near: wp.float64
     width: int
     height: int
     tile_w: int
@@ -63,6 +66,19 @@ def line_of(lines: wp.array(dtype=wp.vec4), at: int) -> wp.vec4:
     ...
 
 
+# One 16-byte store, likewise: four would each touch a warp's 32 records.
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    reinterpret_cast<float4*>(lines.data)[at] = make_float4(value[0], value[1], value[2], value[3]);
+#else
+    lines.data[at] = value;
+#endif
+""")
+def store_line(lines: wp.array(dtype=wp.vec4), at: int, value: wp.vec4):
+    """lines[at] = value."""
+    ...
+
+
 @wp.func
 def sortable(x: float) -> wp.uint32:
     """Bits of a float in an order that unsigned comparison keeps, negative values and zeros included
@@ -72,6 +88,36 @@ def sortable(x: float) -> wp.uint32:
     if (bits & _SIGN) != _NONE:
         return ~bits
     return bits | _SIGN
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __popc(bits);
+#else
+    return __builtin_popcount(bits);
+#endif
+""")
+def population(bits: wp.uint32) -> int:
+    """How many bits are set."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __ffs(bits) - 1;
+#else
+    return __builtin_ctz(bits);
+#endif
+""")
+def lowest(bits: wp.uint32) -> int:
+    """Number of the lowest bit that is set; there must be one."""
+    ...
+
+
+@wp.func
+def as_bits(low: int, high: int) -> float:
+    """Two numbers from 0 to 65535 in the bits of a float."""
+    return wp.cast((wp.uint32(high) << wp.uint32(16)) | wp.uint32(low), wp.float32)
 
 
 @wp.func

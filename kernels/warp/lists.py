@@ -11,8 +11,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .bounds import Bounds, make_bounds
-from .common import STRICT, View
+from .bounds import Bounds, make_bounds, window_tile
+from .common import STRICT, View, lowest
+
+NONE, ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 
 
 @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
@@ -66,6 +68,12 @@ def sum_up(
     totals[1] = ends[count - 1]
 
 
+@wp.func
+def window_of(window: wp.uint64):
+    """Its first tile, and the bits of the splat's tiles: none if its bounds must be asked."""
+    return int(window >> wp.uint64(32)), wp.uint32(window & wp.uint64(0xFFFFFFFF))
+
+
 @cache
 def make_lists(screen: bool) -> SimpleNamespace:
     """count, histogram and emit, with or without the low-pass dot in the bounds."""
@@ -82,16 +90,23 @@ def make_lists(screen: bool) -> SimpleNamespace:
         first: int,
         view: View,
         order: wp.array(dtype=wp.int32),
+        windows: wp.array(dtype=wp.uint64),
         bounds: wp.array(dtype=Bounds),
         totals: wp.array(dtype=wp.int32),  # out: length of each tile's list; sums of integers have no order
     ):
-        b = bounds[order[wp.tid() + first]]
-        row, end = limits.tile_rows(b, view)
-        while row < end:
-            left, right = limits.tile_span(b, row, view)
-            for column in range(left, right):
-                wp.atomic_add(totals, row * view.tiles_x + column, 1)
-            row += 1
+        index = order[wp.tid() + first]
+        corner, bits = window_of(windows[index])
+        if bits == NONE:
+            b = bounds[index]
+            row, end = limits.tile_rows(b, view)
+            while row < end:
+                left, right = limits.tile_span(b, row, view)
+                for column in range(left, right):
+                    wp.atomic_add(totals, row * view.tiles_x + column, 1)
+                row += 1
+        while bits != NONE:
+            wp.atomic_add(totals, window_tile(corner, lowest(bits), view), 1)
+            bits = bits & (bits - ONE)
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def count(
@@ -100,17 +115,26 @@ def make_lists(screen: bool) -> SimpleNamespace:
         band_first: int,
         band_end: int,
         order: wp.array(dtype=wp.int32),
+        windows: wp.array(dtype=wp.uint64),
         bounds: wp.array(dtype=Bounds),
         lengths: wp.array(dtype=wp.int64),  # out: pairs of each splat in the band, in depth order
     ):
         k = wp.tid() + first
-        b = bounds[order[k]]
-        row, end = limits.tile_rows(b, view)
+        index = order[k]
+        corner, bits = window_of(windows[index])
         total = int(0)
-        while row < end:
-            left, right = band_span(b, row, view, band_first, band_end)
-            total += wp.max(right - left, 0)
-            row += 1
+        if bits == NONE:
+            b = bounds[index]
+            row, end = limits.tile_rows(b, view)
+            while row < end:
+                left, right = band_span(b, row, view, band_first, band_end)
+                total += wp.max(right - left, 0)
+                row += 1
+        while bits != NONE:
+            tile = window_tile(corner, lowest(bits), view)
+            bits = bits & (bits - ONE)
+            if tile >= band_first and tile < band_end:
+                total += 1
         lengths[k] = wp.int64(total)
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
@@ -120,6 +144,7 @@ def make_lists(screen: bool) -> SimpleNamespace:
         band_first: int,
         band_end: int,
         order: wp.array(dtype=wp.int32),
+        windows: wp.array(dtype=wp.uint64),
         bounds: wp.array(dtype=Bounds),
         ends: wp.array(dtype=wp.int64),  # inclusive sums of lengths
         lengths: wp.array(dtype=wp.int64),
@@ -128,15 +153,24 @@ def make_lists(screen: bool) -> SimpleNamespace:
     ):
         k = wp.tid() + first
         index = order[k]
-        b = bounds[index]
         place = int(ends[k] - lengths[k])
-        row, end = limits.tile_rows(b, view)
-        while row < end:
-            left, right = band_span(b, row, view, band_first, band_end)
-            for tile in range(left, right):
+        corner, bits = window_of(windows[index])
+        if bits == NONE:
+            b = bounds[index]
+            row, end = limits.tile_rows(b, view)
+            while row < end:
+                left, right = band_span(b, row, view, band_first, band_end)
+                for tile in range(left, right):
+                    tiles[place] = tile
+                    lists[place] = index
+                    place += 1
+                row += 1
+        while bits != NONE:
+            tile = window_tile(corner, lowest(bits), view)
+            bits = bits & (bits - ONE)
+            if tile >= band_first and tile < band_end:
                 tiles[place] = tile
                 lists[place] = index
                 place += 1
-            row += 1
 
     return SimpleNamespace(histogram=histogram, count=count, emit=emit)

@@ -16,6 +16,7 @@ import warp as wp
 
 from .common import View, fma, line_of
 from .records import Layout
+from .staging import make_staging
 
 _STATE = {
     "stop_exclusive": {"finished": wp.int32},
@@ -35,10 +36,13 @@ DARKEST = wp.constant(wp.float32(2.0**-24))
 @cache
 def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     """The state of a sample, what it reads of a splat, and what is done with them: Pixel, Splat; load, start,
-    row, cross, unfinished, blend, finish.
+    row, cross, unfinished, blend, finish; and what brings splats to the threads of a GPU block:
+    staging, load_staged.
     """
     layout = Layout(effects)
     each = layout.lines
+    staging = make_staging(layout)
+    staged_line = staging.line
     screen, exclusive, ray_depth, depth, median, normal, label = (
         name in effects
         for name in (
@@ -82,7 +86,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     fields |= {"open": Layer, "waiting": Layer} if layers else {}
     Pixel = _struct("Pixel", "What a sample keeps.", fields)
     dot_line, dot_lane = layout.place("dot_x")
-    dot_y_line, dot_y_lane = layout.place("dot_y")
+    dot_y_lane = layout.place("dot_y")[1]  # of the same line
     z_line, z_lane = layout.place("z_numerator")
     zc_line, zc_lane = layout.place("z_center")
     zr_line, zr_lane = layout.place("z_reach")
@@ -99,8 +103,30 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         s.d = line_of(lines, at + 2)
         s.c = line_of(lines, at + 3)
         if wp.static(screen):
-            s.dot_x = line_of(lines, at + dot_line)[dot_lane]
-            s.dot_y = line_of(lines, at + dot_y_line)[dot_y_lane]
+            dot = line_of(lines, at + dot_line)
+            s.dot_x = dot[dot_lane]
+            s.dot_y = dot[dot_y_lane]
+        s.half_r2 = s.u[3] - view.log_cut
+        return s
+
+    @wp.func
+    def load_staged(
+        pool: wp.uint64,
+        lines: wp.array(dtype=wp.vec4),
+        lists: wp.array(dtype=wp.int32),
+        first: int,
+        which: int,
+        view: View,
+    ):
+        s = Splat()
+        s.u = staged_line(pool, lines, lists, first, which, 0)
+        s.v = staged_line(pool, lines, lists, first, which, 1)
+        s.d = staged_line(pool, lines, lists, first, which, 2)
+        s.c = staged_line(pool, lines, lists, first, which, 3)
+        if wp.static(screen):
+            dot = staged_line(pool, lines, lists, first, which, dot_line)
+            s.dot_x = dot[dot_lane]
+            s.dot_y = dot[dot_y_lane]
         s.half_r2 = s.u[3] - view.log_cut
         return s
 
@@ -351,6 +377,8 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         Pixel=Pixel,
         Splat=Splat,
         load=load,
+        load_staged=load_staged,
+        staging=staging,
         start=start,
         row=row,
         cross=cross,

@@ -18,16 +18,22 @@ import warp as wp
 
 from .bounds import PAD, PAD_RELATIVE, Bounds, box_bounds, ellipse_bounds, make_bounds
 from .color import make_color
-from .common import CULLED, STRICT, View, sortable
+from .common import CULLED, STRICT, View, as_bits, population, sortable, store_line
 from .records import Layout
 
 # [m]; nobody sees the difference, and what is divided by it stays above float32's denormals (numerics B6)
 SMALLEST_SCALE = wp.constant(wp.float32(1e-20))
+BLOCK = 128
+"""threads of a block on a GPU"""
+LIMITS = (BLOCK, 6)  # so many blocks at once: at most 80 registers, of 108 that it would take
+NONE, BITS = wp.constant(wp.uint32(0)), wp.constant(wp.uint64(32))
 
 
 @cache
-def make_project(effects: tuple[str, ...], sh_terms: int, precision: str):
-    """The kernel for these record effects; sh_terms: coefficients per colour, 0 for plain colours."""
+def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_bounds: bool):
+    """The kernel for these record effects; sh_terms: coefficients per colour, 0 for plain colours;
+    every_bounds: bounds are written of all that is drawn, not only of splats that touch more than a window.
+    """
     layout = Layout(effects)
     lines_each = layout.lines
     has_normal, has_depth, screen, layers = (
@@ -107,34 +113,34 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str):
         """
         fx, fy = real(view.fx), real(view.fy)
         px, py = p[0] / p[2], p[1] / p[2]
-        r2 = radius * radius
         x = vec2(fx * (a[0] - px * a[2]), fx * (b[0] - px * b[2]))
         y = vec2(fy * (a[1] - py * a[2]), fy * (b[1] - py * b[2]))
         z = vec2(a[2], b[2])
-        g = (p[2] - reach) * (p[2] + reach)
-        mx = -r2 * wp.dot(x, z) / g
-        my = -r2 * wp.dot(y, z) / g
-        qxx = wp.max(mx * mx + r2 * wp.dot(x, x) / g, zero)
-        qyy = wp.max(my * my + r2 * wp.dot(y, y) / g, zero)
-        qxy = mx * my + r2 * wp.dot(x, y) / g
-        half_x, half_y = wp.sqrt(qxx), wp.sqrt(qyy)
-        shear, tip = zero, zero
+        h = radius * radius / ((p[2] - reach) * (p[2] + reach))
+        mx = -h * wp.dot(x, z)
+        my = -h * wp.dot(y, z)
+        qxx = wp.max(mx * mx + h * wp.dot(x, x), zero)
+        qyy = wp.max(my * my + h * wp.dot(y, y), zero)
+        qxy = mx * my + h * wp.dot(x, y)
+        shear = zero
         if qyy > zero:
             shear = qxy / qyy
-        if half_x > zero:
-            tip = qxy / half_x
-        across = wp.sqrt(wp.max(qxx - qxy * shear, zero))
+        # the pad has room for float32's rounding
+        half_x = wp.sqrt(float(qxx))
+        tip = float(0.0)
+        if half_x > 0.0:
+            tip = float(qxy) / half_x
         return ellipse_bounds(
             float(fx * px + real(view.cx) + mx),
             float(fy * py + real(view.cy) + my),
-            float(half_x),
-            float(half_y),
+            half_x,
+            wp.sqrt(float(qyy)),
             float(shear),
-            float(across),
-            float(tip),
+            wp.sqrt(float(wp.max(qxx - qxy * shear, zero))),
+            tip,
         )
 
-    @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+    @wp.kernel(module="unique", module_options=STRICT, enable_backward=False, launch_bounds=LIMITS)
     def project(
         first: int,  # splat of thread 0
         view: View,
@@ -146,7 +152,10 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str):
         planes: wp.array(dtype=wp.int32),  # (n) index of the splat's plane; -1: none
         plane_keys: wp.array(dtype=wp.float32),  # (planes) depth at which a plane's splats are sorted in [m]
         lines: wp.array(dtype=wp.vec4),  # (n lines_each) out: records of splats that are drawn
-        bounds: wp.array(dtype=Bounds),  # (n) out
+        bounds: wp.array(dtype=Bounds),  # (n) out: as `every_bounds` says
+        windows: wp.array(
+            dtype=wp.uint64
+        ),  # (n) out: bits of the tiles, below the window's first tile; 0: more
         keys: wp.array(dtype=wp.uint32),  # (n) out: depth key, or CULLED
         counts: wp.array(dtype=wp.int64),  # (n) out: tiles that the splat can touch
         drawn: wp.array(dtype=wp.int32),  # (n) out: 1 or 0
@@ -187,6 +196,7 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str):
 
         # where it can be seen
         fx, fy, cx, cy = real(view.fx), real(view.fy), real(view.cx), real(view.cy)
+        per_fx, per_fy = real(view.per_fx), real(view.per_fy)
         in_front = p[2] >= near
         center_x, center_y = zero, zero
         box = Bounds()
@@ -205,12 +215,20 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str):
                 box.dot_x = float(center_x)
                 box.dot_y = float(center_y)
                 box.dot_r = wp.sqrt(half_r2 / view.per_pixel) * (1.0 + PAD_RELATIVE) + PAD
-        tiles = int(0)
-        row, rows_end = limits.tile_rows(box, view)
-        while row < rows_end:
-            left, right = limits.tile_span(box, row, view)
-            tiles += right - left
-            row += 1
+        row_first, row_end = limits.rows(box, view.height)
+        first_column, end_column = limits.span(box, row_first, row_end, view.width)
+        if row_first >= row_end or first_column >= end_column:
+            return
+        left = first_column / view.tile_w
+        columns = (end_column - 1) / view.tile_w - left + 1
+        top = row_first / view.tile_h
+        tile_rows = (row_end - 1) / view.tile_h - top + 1
+        bits = limits.window_bits(box, left, columns, top, tile_rows, view)
+        tiles = population(bits)
+        if tiles == 0:
+            for row in range(top, top + tile_rows):
+                begin, end = limits.tile_span(box, row, view)
+                tiles += end - begin
         if tiles == 0:
             return
 
@@ -221,10 +239,10 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str):
         anchor_y = real(ay) + half
         normal = wp.cross(tangent_u, tangent_v)
         height = wp.dot(normal, p)  # of the camera's centre above the plane, with its side
-        ray = vec3((anchor_x - cx) / fx, (anchor_y - cy) / fy, one)
-        form_u = wp.cross(tangent_v, p) / su
-        form_v = wp.cross(p, tangent_u) / sv
-        nux, nuy, nvx, nvy = form_u[0] / fx, form_u[1] / fy, form_v[0] / fx, form_v[1] / fy
+        ray = vec3((anchor_x - cx) * per_fx, (anchor_y - cy) * per_fy, one)
+        form_u = wp.cross(tangent_v, p) * (one / su)
+        form_v = wp.cross(p, tangent_u) * (one / sv)
+        nux, nuy, nvx, nvy = form_u[0] * per_fx, form_u[1] * per_fy, form_v[0] * per_fx, form_v[1] * per_fy
         steepest = wp.max(wp.max(wp.abs(nux), wp.abs(nuy)), wp.max(wp.abs(nvx), wp.abs(nvy)))
         if not (steepest > zero and steepest < real(wp.inf)):
             return
@@ -237,7 +255,7 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str):
         scale = wp.where(height < zero, -one, one) / steepest
         n_scale = scale * sqrt_half
         # edge-on within rounding: no ray meets the plane, only the low-pass dot is drawn (numerics B2)
-        facing = wp.where(wp.abs(height) > edge_on * wp.length(p), scale, zero)
+        facing = wp.where(height * height > edge_on * edge_on * wp.dot(p, p), scale, zero)
 
         rgb = color_of(i, colors, mean - vec3(view.eye))
         if not (wp.isfinite(rgb[0]) and wp.isfinite(rgb[1]) and wp.isfinite(rgb[2])):
@@ -251,15 +269,17 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str):
         record[4] = float(nv0 * n_scale)
         record[5] = float(nvx * n_scale)
         record[6] = float(nvy * n_scale)
-        record[7] = float(height * facing / near)
+        record[7] = float(height * facing * real(view.per_near))
         record[8] = float(wp.dot(normal, ray) * facing)
-        record[9] = float(normal[0] / fx * facing)
-        record[10] = float(normal[1] / fy * facing)
+        record[9] = float(normal[0] * per_fx * facing)
+        record[10] = float(normal[1] * per_fy * facing)
         record[11] = ax
         record[12] = ay
         record[13] = rgb[0]
         record[14] = rgb[1]
         record[15] = rgb[2]
+        record[16] = as_bits(first_column, end_column)
+        record[17] = as_bits(row_first, row_end)
         if wp.static(screen):
             # far away if there is none
             record[at_dot] = wp.where(in_front, float(center_x - anchor_x), 1.0e18)
@@ -276,8 +296,13 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str):
             record[at_normal + 2] = float(normal[2] * towards)
         for line in range(wp.static(lines_each)):
             k = 4 * line
-            lines[i * lines_each + line] = wp.vec4(record[k], record[k + 1], record[k + 2], record[k + 3])
-        bounds[i] = box
+            store_line(
+                lines, i * lines_each + line, wp.vec4(record[k], record[k + 1], record[k + 2], record[k + 3])
+            )
+        if wp.static(every_bounds) or bits == NONE:
+            bounds[i] = box
+        corner = wp.uint64(top * view.tiles_x + left)
+        windows[i] = (corner << BITS) | wp.uint64(bits)
         depth = float(p[2])
         if wp.static(layers):
             if planes[i] >= 0:

@@ -17,6 +17,8 @@ _BASE = (
     "r",
     "g",
     "b",
+    "columns",
+    "rows",
 )
 _EXTRA = {
     "lowpass_screen": ("dot_x", "dot_y"),
@@ -31,7 +33,7 @@ class Layout:
     nu0 + nux x + nuy y is n_u, likewise n_v and D, with x, y in samples from the centre of the anchor sample
     (ax, ay); D is at
     most d_near beyond the near plane. dot_x, dot_y: projected centre from the anchor's; z_numerator / D is
-    the depth.
+    the depth. columns and rows hold first and end, 16 bits each, of the box of samples that it can touch.
     """
 
     def __init__(self, effects: tuple[str, ...]) -> None:

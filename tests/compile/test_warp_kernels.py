@@ -16,12 +16,14 @@ def made(name, *arguments):
     return kernel(*arguments) if arguments else kernel
 
 
-def compiled(kernel, folder, block=256):
-    """Source text, without comments, that NVRTC compiled for a GPU of 2020."""
+def compiled(kernel, folder, block=256, assembly=False):
+    """Source text, without comments, that NVRTC compiled for a GPU of 2020; or the PTX that it made of it."""
     kernel.module.options["block_dim"] = block
     with runtime.quiet():
         wp.compile_aot_module(kernel.module, arch=80, module_dir=folder, use_ptx=True)
-    assert list(folder.glob("*.ptx"))
+    (result,) = folder.glob("*.ptx")
+    if assembly:
+        return result.read_text()
     (source,) = folder.glob("*.cu")
     return re.sub(r"//[^\n]*", "", source.read_text())
 
@@ -34,10 +36,10 @@ def started():
 @pytest.mark.parametrize(
     "kernel",
     [
-        lambda: made("project.make_project", RECORD, 16, "float64"),
-        lambda: made("project.make_project", (), 0, "float32"),
-        lambda: made("blend.make_blend", ALL, True)[0],
-        lambda: made("blend.make_blend", ("lowpass_screen", "stop_exclusive"), True)[0],
+        lambda: made("project.make_project", RECORD, 16, "float64", False),
+        lambda: made("project.make_project", (), 0, "float32", True),
+        lambda: made("blend.make_blend", ALL, True, 256)[0],
+        lambda: made("blend.make_blend", ("lowpass_screen", "stop_exclusive"), True, 256)[0],
         lambda: made("resolve.make_resolve", ("alpha", "depth", "depth_median", "label", "normal"), 3),
         lambda: made("lists.make_lists", True).emit,
         lambda: made("lists.make_lists", True).count,
@@ -55,7 +57,7 @@ def test_the_kernels_compile_for_cuda(kernel, tmp_path):
 
 
 def test_the_base_text_has_nothing_of_absent_effects(tmp_path):
-    text = compiled(made("blend.make_blend", (), True)[0], tmp_path, 64)
+    text = compiled(made("blend.make_blend", (), True, 256)[0], tmp_path)
     for name in (
         "depth_weight",
         "depth_median",
@@ -67,20 +69,31 @@ def test_the_base_text_has_nothing_of_absent_effects(tmp_path):
         "ink",
     ):
         assert not re.search(rf"\b{name}", text), name
-    everything = compiled(made("blend.make_blend", ALL, True)[0], tmp_path / "all")
+    everything = compiled(made("blend.make_blend", ALL, True, 256)[0], tmp_path / "all")
     for name in ("depth_weight", "depth_median", "label_weight", "Layer", "thickest", "ink"):
         assert re.search(rf"\b{name}", everything), name
 
 
+def test_records_move_as_whole_lines(tmp_path):
+    """Field by field, each store would touch 32 records of a warp."""
+    project = compiled(
+        made("project.make_project", RECORD, 0, "float64", False), tmp_path / "project", 128, assembly=True
+    )
+    assert project.count("st.global.v4") == 7
+    blend = compiled(made("blend.make_blend", RECORD, True, 256)[0], tmp_path / "blend", assembly=True)
+    assert blend.count("ld.shared.v4") >= 5
+    assert "vote.sync.ballot" in blend
+
+
 def test_a_record_grows_by_what_is_asked_for():
     layout = runtime.kernels("records").Layout
-    assert layout(()).lines == 4
+    assert layout(()).lines == 5
     assert layout(("lowpass_screen",)).names[-2:] == ["dot_x", "dot_y"]
-    assert layout(RECORD).lines == 6
-    assert layout(RECORD).place("nz") == (5, 3)
+    assert layout(RECORD).lines == 7
+    assert layout(RECORD).place("nz") == (6, 1)
     assert layout(()).place("nz") == (0, 0)
 
 
 def test_a_factory_makes_one_kernel_of_a_set():
-    assert made("project.make_project", (), 0, "float64") is made("project.make_project", (), 0, "float64")
-    assert made("blend.make_blend", (), True) is not made("blend.make_blend", (), False)
+    assert made("blend.make_blend", (), True, 64) is made("blend.make_blend", (), True, 64)
+    assert made("blend.make_blend", (), True, 64) is not made("blend.make_blend", (), False, 64)

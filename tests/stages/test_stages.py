@@ -39,9 +39,10 @@ def listing(backend, lists, side=16):
     return replace(group_shape(backend.shape, side), lists=lists)
 
 
-def footprint(cloud, view, index):
+def footprint(cloud, view, index, dot=True):
     """Samples (rows, columns) whose ray meets splat `index` within its radius and beyond the near plane, or
-    that lie in its low-pass dot: float64, by the definition (a 3 x 3 system for each ray, no homography)."""
+    (`dot`) that lie in its low-pass dot: float64, by the definition (a 3 x 3 system for each ray, no
+    homography)."""
     w, x, y, z = cloud.quats[index].astype(float) / np.linalg.norm(cloud.quats[index].astype(float))
     rotation = np.array(
         [
@@ -60,7 +61,7 @@ def footprint(cloud, view, index):
     half_r2 = np.log(float(cloud.opacities[index])) - view.log_cut
     inside = (solution[..., :2] ** 2).sum(-1) <= 2 * half_r2 * (1 - 1e-6)
     inside &= solution[..., 2] >= view.near
-    if center[2] >= view.near:
+    if dot and center[2] >= view.near:
         px, py = view.fx * center[0] / center[2] + view.cx, view.fy * center[1] / center[2] + view.cy
         inside |= (columns - px) ** 2 + (rows - py) ** 2 <= half_r2 * (1 - 1e-6)
     return np.nonzero(inside)
@@ -166,6 +167,29 @@ def test_tile_size_leaves_every_bit_as_it_was(backend):
         trace, _ = traced(backend, cloud, quality, ALL_OUTPUTS, other)
         for name in ALL_OUTPUTS:
             assert np.array_equal(trace[name], base[name]), f"{name} differs with {other}"
+
+
+@pytest.mark.parametrize("lowpass", ["screen", "none"])
+def test_the_box_of_a_record_holds_all_that_the_splat_touches(backend, lowpass):
+    """What a block of a GPU passes over, it must not have needed."""
+    quality = fs.Quality(lowpass=lowpass)
+    cloud = random_splats(200, seed=5, scale=(1e-3, 5.0))
+    features = select(cloud, ("rgb",), quality)
+    view = View.of(CAMERA, quality, cloud.origin, (0, 0, 0))
+    pipeline = backend.pipeline(features)
+    if not hasattr(pipeline, "layout"):
+        pytest.skip("not Warp's records")
+    trace = pipeline.trace(backend.upload(cloud), view)
+    names = pipeline.layout.names
+    boxes = trace["records"].view(np.uint32)[:, [names.index("columns"), names.index("rows")]]
+    first, end = boxes & 0xFFFF, boxes >> 16
+    seen = 0
+    for index in np.flatnonzero(trace["keys"] != CULLED):
+        rows, columns = footprint(cloud, view, index, dot=lowpass == "screen")
+        for axis, places in enumerate((columns, rows)):
+            assert np.all((places >= first[index, axis]) & (places < end[index, axis])), index
+        seen += len(rows)
+    assert seen > 1000
 
 
 def test_layers_are_the_same_in_every_tile_size_and_schedule(backend, renderer):

@@ -11,6 +11,8 @@ from fidsplat.backends.warp import runtime
 if TYPE_CHECKING:
     from fidsplat.backends.warp.backend import WarpBackend
 
+BLOCK = 256
+"""threads of a block on a GPU, where nothing else is said"""
 _SMALLEST = 2048
 """threads of a kernel below which a piece of a CPU launch is not worth its call"""
 
@@ -22,7 +24,7 @@ class Commands:
         self._wp, self._device = runtime.load(), device
         self._held: dict[tuple[Any, int], tuple[Any, list[Any], list[int]]] = {}
 
-    def launch(self, kernel: Any, count: int, args: list[Any], block: int = 256) -> None:
+    def launch(self, kernel: Any, count: int, args: list[Any], block: int = BLOCK) -> None:
         """`count` threads of a kernel, in blocks of `block` on a GPU."""
         held = self._held.get((kernel, block))
         if held is None:
@@ -51,10 +53,10 @@ class Launcher:
         """into which a CPU launch is cut, so that threads share uneven work"""
         self._marks: list[tuple[str | None, Any]] = []
 
-    def launch(self, kernel: Any, count: int, *args: Any) -> None:
+    def launch(self, kernel: Any, count: int, *args: Any, block: int = BLOCK) -> None:
         """`count` threads of a kernel whose first argument is the number of thread 0."""
         if self._workers is None:
-            self._commands.launch(kernel, count, [0, *args])
+            self._commands.launch(kernel, count, [0, *args], block)
             return
         pieces = min(self.pieces, -(-count // _SMALLEST))
         cuts = [count * k // pieces for k in range(pieces + 1)]

@@ -15,7 +15,7 @@ import numpy as np
 
 from fidsplat.backends.base import View
 from fidsplat.backends.warp import runtime
-from fidsplat.backends.warp.launch import Launcher
+from fidsplat.backends.warp.launch import BLOCK, Launcher
 from fidsplat.backends.warp.memory import Resident
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.catalogue import Output
@@ -43,9 +43,9 @@ _UNIFORMS = (
     *("fx", "fy", "cx", "cy", "near", "far", "width", "height", "samples"),
     *("log_cut", "ceiling", "stop"),
 )
-# bytes: of one splat's bounds; of its keys, counts, drawn, places, sums; of one that is drawn, in sort and
-# lists; of a sample in all planes; of a pair with the scratch of its sort
-_BOUNDS, _PROJECTED, _VISIBLE, _SAMPLE_BYTES, _PAIR = 44, 28, 40, 60, 24
+# bytes: of one splat's bounds; of its window, keys, counts, drawn, places, sums; of one that is drawn, in
+# sort and lists; of a sample in all planes; of a pair with the scratch of its sort
+_BOUNDS, _PROJECTED, _VISIBLE, _SAMPLE_BYTES, _PAIR = 44, 36, 40, 60, 24
 
 
 class WarpPlanes:
@@ -87,19 +87,23 @@ class WarpPipeline:
                 "use an OpenCL device for it"
             )
         self.backend, self.features, self.shape = backend, features, shape
-        area = shape.tile_width * shape.tile_height
         record = tuple(name for name in _RECORD if name in names)
         sample = tuple(name for name in _SAMPLE if name in names)
         terms = (features.sh_degree + 1) ** 2 if "color_sh" in names else 0
         screen = "lowpass_screen" in names
         with runtime.quiet():
             self.layout = runtime.kernels("records").Layout(record)
-            self.project = runtime.kernels("project").make_project(record, terms, features.setup_precision)
+            self.project = runtime.kernels("project").make_project(
+                record, terms, features.setup_precision, shape.schedule == "tiles"
+            )
+            self.project_block = runtime.kernels("project").BLOCK
             self.lists = runtime.kernels("lists").make_lists(screen)
             self.sort = runtime.kernels("lists")
-            self.blend, self.state = runtime.kernels("blend").make_blend(sample, shape.schedule == "group")
-            self.block_dim = area // runtime.kernels("blend").strip_of(sample)
+            self.block_dim = shape.tile_width * shape.tile_height
             """threads that draw a tile on a GPU"""
+            self.blend, self.state = runtime.kernels("blend").make_blend(
+                sample, shape.schedule == "group", self.block_dim
+            )
             self.resolve = runtime.kernels("resolve").make_resolve(features.taps, features.samples)
             common = [self.sort.compact, self.sort.gather, self.sort.find_starts, self.sort.sum_up]
             for kernel in (self.project, self.lists.emit, self.blend, self.resolve, *common):
@@ -107,9 +111,9 @@ class WarpPipeline:
 
     def _compile(self, kernel: Any) -> None:
         # here rather than at the first launch: several threads launch it
-        block = 256 if self.backend.device.is_cuda else 1
-        if kernel is self.blend and self.backend.device.is_cuda:
-            block = self.block_dim
+        block = {self.blend: self.block_dim, self.project: self.project_block}.get(kernel, BLOCK)
+        if not self.backend.device.is_cuda:
+            block = 1
         try:
             loaded = kernel.module.load(self.backend.device, block)
         except Exception as error:
@@ -216,8 +220,18 @@ class _Run:
         ends = self._exact("ends by index", n, wp.int64)
         cloud = [self.resident.arrays[name] for name in ("means", "quats", "scales", "opacities", "colors")]
         cloud += self._planes()
-        records = [self.held["lines"], self.held["bounds"], keys, counts, drawn]
-        self.launch(self.pipeline.project, n, self.u, *cloud, *records)
+        records = [self.held["lines"], self.held["bounds"], self._take("windows", n, wp.uint64)]
+        self.launcher.launch(
+            self.pipeline.project,
+            n,
+            self.u,
+            *cloud,
+            *records,
+            keys,
+            counts,
+            drawn,
+            block=self.pipeline.project_block,
+        )
         wp.utils.array_scan(drawn, places, inclusive=True)
         wp.utils.array_scan(counts, ends, inclusive=True)
         totals = self._take("totals", 2, wp.int64)
@@ -258,7 +272,7 @@ class _Run:
         totals.zero_()
         self.pipeline.load_banding()
         # in one piece: on the CPU its sums are plain additions
-        args = (0, self.u, self.held["order"], self.held["bounds"], totals)
+        args = (0, self.u, self.held["order"], self.held["windows"], self.held["bounds"], totals)
         self.launcher.once(self.pipeline.lists.histogram, visible, *args)
         ends = np.cumsum(totals.numpy()[: self.tiles], dtype=np.int64)
         first, done = 0, 0
@@ -297,10 +311,10 @@ class _Run:
             if whole:
                 self.launch(self.pipeline.sort.gather, visible, held["order"], held["counts"], lengths)
             else:
-                band = (first, end, held["order"], held["bounds"], lengths)
+                band = (first, end, held["order"], held["windows"], held["bounds"], lengths)
                 self.launch(self.pipeline.lists.count, visible, self.u, *band)
             wp.utils.array_scan(lengths, ends, inclusive=True)
-            band = (first, end, held["order"], held["bounds"], ends, lengths, tiles, lists)
+            band = (first, end, held["order"], held["windows"], held["bounds"], ends, lengths, tiles, lists)
             self.launch(self.pipeline.lists.emit, visible, self.u, *band)
             wp.utils.radix_sort_pairs(tiles, lists, pairs, 0, max(self.tiles - 1, 1).bit_length())
         self.launch(self.pipeline.sort.find_starts, end - first + 1, pairs, first, tiles, held["starts"])
@@ -365,6 +379,7 @@ class _Run:
     def _uniforms(self, tiles_x: int, tiles_y: int) -> Any:
         view, shape, wp = self.view, self.pipeline.shape, self.wp
         u = runtime.kernels("common").View()
+        u.per_fx, u.per_fy, u.per_near = 1.0 / view.fx, 1.0 / view.fy, 1.0 / view.near
         u.rotation = wp.mat33d(*view.rotation.ravel().tolist())
         u.translation, u.eye = wp.vec3d(*view.translation.tolist()), wp.vec3d(*view.eye.tolist())
         for name in _UNIFORMS:
