@@ -7,7 +7,15 @@ import fidsplat as fs
 USABLE = [info for info in fs.devices() if info.usable and info.name != "reference"]
 
 
-@pytest.fixture(scope="session", params=[info.name for info in USABLE])
+def pytest_generate_tests(metafunc):
+    """A module may name the one BACKEND that has the effects that it is about."""
+    if "renderer" in metafunc.fixturenames:
+        backend = getattr(metafunc.module, "BACKEND", "")
+        names = [info.name for info in USABLE if info.name.startswith(backend)]
+        metafunc.parametrize("renderer", names, indirect=True, scope="session")
+
+
+@pytest.fixture(scope="session")
 def renderer(request):
     return fs.Renderer(request.param)
 

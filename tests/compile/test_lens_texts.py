@@ -12,6 +12,8 @@ import fidsplat as fs
 from fidsplat.backends.opencl.assemble import DeviceShape, assemble
 from fidsplat.effects import CATALOGUE, select
 
+BACKEND = "opencl"
+
 GROUP = DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, 1024, True)
 TAPS = ("alpha", "depth", "depth_median", "label", "normal")
 CAMERAS = {

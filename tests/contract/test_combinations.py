@@ -13,6 +13,8 @@ from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import Picture, compare, judge
 
+BACKEND = "opencl"
+
 SIZE = (41, 29)
 CLOUD = random_splats(120, 21, depth=(0.5, 5.0), scale=(0.02, 0.4))
 BOXES = fs.SplatCloud.concatenate(
@@ -32,6 +34,7 @@ CAMERAS = {
 DISTANCES = {name: camera for name, camera in CAMERAS.items() if name != "distortion"}
 OUTPUTS = ("depth_first", "normal_world", "splat_id", "blended")
 BLUR = fs.Shutter(exposure=0.4, sub_poses=3)
+WARP = next((info.name for info in fs.devices() if info.usable and info.name.startswith("warp")), None)
 ROLLING = fs.Shutter(time=0.1, exposure=0.2, sub_poses=2, readout=0.4, rows_per_band=8)
 
 
@@ -162,3 +165,18 @@ def test_directions_of_the_world_are_refused_to_a_camera_that_turns(renderer, wh
         renderer.render(CLOUD, PLAIN, motion=fs.Motion(turning), shutter=BLUR, **how)
     # at one time there is one direction
     renderer.render(CLOUD, PLAIN, motion=fs.Motion(turning), shutter=fs.Shutter(time=0.3), **how)
+
+
+@pytest.mark.skipif(WARP is None, reason="no Warp device here")
+@pytest.mark.parametrize(
+    ("lacking", "how"),
+    [
+        ("camera_fisheye", {"camera": CAMERAS["fisheye"]}),
+        ("fog", {"fog": FOG}),
+        ("footprint_box", {"scene": CLOUD.with_boxes()}),
+        ("shutter_exposure", {"motion": fs.Motion(turning), "shutter": BLUR}),
+    ],
+)
+def test_warp_names_what_it_lacks(lacking, how):
+    with pytest.raises(fs.DeviceError, match=f"warp.*{lacking}.*OpenCL"):
+        fs.Renderer(WARP).render(**{"scene": CLOUD, "camera": PLAIN, **how})

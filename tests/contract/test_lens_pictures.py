@@ -11,6 +11,8 @@ from test_agreement import coplanar_cloud
 import fidsplat as fs
 from fidsplat.cameras import BrownConrady, Fisheye
 
+BACKEND = "opencl"
+
 POSE = fs.Camera.look_at(64, 48, 1.0, (0.3, 0.2, -0.1), (0.1, 0.0, 3.0)).world_to_camera
 
 

@@ -13,6 +13,8 @@ from fidsplat.backends.base import View
 from fidsplat.backends.reference.post import variates
 from fidsplat.hard_cases.agreement import Picture, judge
 
+BACKEND = "opencl"
+
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.3, -0.2, -0.1), (0.0, 0.1, 3.0))
 CLOUD = random_splats(120, 3)
 GREY = (0.4, 0.4, 0.4)
