@@ -9,7 +9,8 @@ USABLE = [info for info in fs.devices() if info.usable and info.name != "referen
 
 def pytest_generate_tests(metafunc):
     """A module may name the one BACKEND that has the effects that it is about."""
-    if "renderer" in metafunc.fixturenames:
+    # some modules have a fixture of their own
+    if "renderer" in metafunc.fixturenames and not hasattr(metafunc.module, "renderer"):
         backend = getattr(metafunc.module, "BACKEND", "")
         names = [info.name for info in USABLE if info.name.startswith(backend)]
         metafunc.parametrize("renderer", names, indirect=True, scope="session")

@@ -14,6 +14,8 @@ from fidsplat.backends.opencl.assemble import DeviceShape, assemble
 from fidsplat.effects import CATALOGUE, OUTPUTS, Effect, Output, select
 from fidsplat.effects import catalogue as catalogue_module
 
+BACKEND = "opencl"
+
 SHAPE = DeviceShape("lanes", "ordered", 16, 16, 16, 8, 11, 1, True)
 TAPS = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
