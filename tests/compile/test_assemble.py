@@ -19,7 +19,7 @@ BACKEND = "opencl"
 SHAPE = DeviceShape("lanes", "ordered", 16, 16, 16, 8, 11, 1, True)
 TAPS = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
-DIGESTS = ["8aae1f4da97510b8", "fadf58fb233f2382"]
+DIGESTS = ["7e5cd8014c58b172", "5f4406292140b1fd"]
 
 
 @dataclass(frozen=True)

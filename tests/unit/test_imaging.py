@@ -11,6 +11,8 @@ import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.vision.images import write_png
 
+BACKEND = "opencl"
+
 SCENE = """[camera]
 width = 24
 height = 16
