@@ -34,6 +34,7 @@ def small(renderer, mebibytes, cloud=None):
             cloud.planes,
         )
         budget += sum(array.nbytes for array in arrays if array is not None)
+        budget += 3 << 19  # tables of the ordered lists, which have many pieces there
     return fs.Renderer(renderer.device.name, memory_budget=budget)
 
 

@@ -157,7 +157,8 @@ def test_curves_at_their_own_points(renderer):
     assert value(9.0, response="srgb") == pytest.approx(1)
     assert value(9.0, response=(0.2, 1)) == 1
     assert value(0.3, exposure=2, gain=1.5) == pytest.approx(0.9, abs=1e-6)
-    assert value(0.301, bits=8) == np.float32(77) / np.float32(255)
+    # a device's division may round otherwise
+    assert value(0.301, bits=8) == pytest.approx(77 / 255, abs=6e-8)
     assert value(-3.0, bits=16) == 0
 
 
