@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
+from typing import Any
 
 import cv2
 import numpy as np
@@ -68,7 +69,8 @@ def _pupil(grey: np.ndarray, target: Target) -> Attempt:
         detector = idle.pop()  # one picture at a time: the library keeps scratch memory in it
     except IndexError:
         detector = _pupil_detector("tag" + target.family)
-    read = any(tag.tag_id == target.id for tag in detector.detect(grey))
+    found: Any = detector.detect(grey)  # its annotation says one, it is a list
+    read = any(tag.tag_id == target.id for tag in found)
     idle.append(detector)
     return Attempt(read, read)
 
