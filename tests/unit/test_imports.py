@@ -54,7 +54,13 @@ HOME_OF = {
 }
 HEAVY = ("pyopencl", "warp", "shapely", "networkx", "segno", "cv2", "zxingcpp", "tyro", "rich")
 
-MODULES = {".".join(p.relative_to(PACKAGE).with_suffix("").parts): p for p in PACKAGE.rglob("*.py")}
+# A wheel carries the kernels inside the package (`_kernels`), a checkout beside it; Warp's are Python files of
+# another house, which fidsplat loads by path and which import each other by relative names.
+MODULES = {
+    ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path
+    for path in PACKAGE.rglob("*.py")
+    if path.relative_to(PACKAGE).parts[0] != "_kernels"
+}
 
 
 def imported(path: Path) -> set[str]:
