@@ -248,7 +248,6 @@ class Renderer:
             camera,
             bool(view.groups),
             bool(view.shots),
-            view.turns,
             sensor=sensor,
             fog=fog,
             background=behind,

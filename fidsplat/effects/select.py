@@ -10,7 +10,6 @@ from typing import Protocol
 
 from fidsplat.cameras import Camera
 from fidsplat.effects.catalogue import CATALOGUE, Effect, Output
-from fidsplat.effects.together import refuse_strangers
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
 from fidsplat.sensor import Sensor
@@ -68,8 +67,12 @@ def _parts_of(names: Iterable[str]) -> list[str]:
     """What effects need, and what that needs, sorted."""
     parts: set[str] = set()
     todo = list(names)
+    cameras = [name for name in todo if name.startswith("camera_")]
     while todo:
-        fresh = set(CATALOGUE[todo.pop()].parts) - parts
+        needed = CATALOGUE[todo.pop()].parts
+        for camera in cameras:
+            needed = [CATALOGUE[part].behind.get(camera, part) for part in needed]
+        fresh = set(needed) - parts
         parts |= fresh
         todo += fresh
     return sorted(parts)
@@ -101,7 +104,6 @@ def select(
     camera: Camera | None = None,
     moving: bool = False,
     exposed: bool = False,
-    turning: bool = False,
     *,
     sensor: Sensor | None = None,
     fog: Fog | None = None,
@@ -110,11 +112,10 @@ def select(
     """The features that a cloud, outputs, quality, camera (None: a pinhole) and so on call for. Values that
     mean nothing call for nothing.
 
-    moving: groups of splats move by themselves. exposed: the picture is made of several poses. turning: these
-    look in different directions.
+    moving: groups of splats move by themselves. exposed: the picture is made of several poses.
 
     Raises:
-        InputError: an output that nobody declares, or two effects that do not go together.
+        InputError: an output that nobody declares.
     """
     if isinstance(outputs, str):
         outputs = (outputs,)
@@ -125,9 +126,7 @@ def select(
             hint = f" (did you mean {near[0]!r}?)" if near else ""
             raise InputError(f"unknown output {name!r}{hint}; known: {', '.join(OUTPUTS)}")
     foggy = fog is not None and fog.density > 0
-    behind = _behind(background, foggy)
     lowpass = "none" if cloud.footprint == "box" else quality.lowpass
-    refuse_strangers(cloud.footprint, lowpass, wanted, foggy, behind, camera, turning)
     return FeatureSet(
         slots=(
             f"camera_{camera.lens.kind if camera is not None and camera.lens else 'pinhole'}",
@@ -137,7 +136,7 @@ def select(
             f"stop_{quality.stop_rule}",
             "compose_planes" if cloud.has_planes and quality.coplanar == "blend" else "compose_ordered",
             f"footprint_{cloud.footprint}",
-            f"background_{behind}",
+            f"background_{_behind(background, foggy)}",
             *(("motion_groups",) if moving else ()),
             *(("shutter_exposure",) if exposed else ()),
         ),

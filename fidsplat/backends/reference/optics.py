@@ -41,6 +41,25 @@ def samples_of(view: View, x: np.ndarray, y: np.ndarray) -> Samples:
     return Samples(x[:, None], y[:, None], coordinates, seen)
 
 
+def rays_of(view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directions (k, 3) in the camera frame of the rays through samples at grid positions x, y (k,), along z 1 or
+    of unit length; and whether there is one (k,)."""
+    if view.raster is not None:
+        rays = view.raster.rays[y.astype(int), x.astype(int)].astype(np.float64)
+        return rays, np.isfinite(rays[:, 0])
+    one = np.ones_like(x)
+    across = (0 * x, 0 * y) if view.parallel else ((x - view.cx) / view.fx, (y - view.cy) / view.fy)
+    return np.stack([*across, one], 1), one > 0
+
+
+def ray_lengths(x: np.ndarray, y: np.ndarray, view: View) -> np.ndarray:
+    """Length (k,) of the rays through samples at grid positions x, y, per metre of depth; 1 where there is none."""
+    if view.along_ray or view.parallel:
+        return np.ones_like(x)
+    rays, seen = rays_of(view, x.ravel(), y.ravel())
+    return np.where(seen, np.linalg.norm(rays, axis=1), 1.0).reshape(x.shape)
+
+
 def forms_of(view: View, a: np.ndarray, b: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Forms of splats with scaled tangents a, b and centres p (n, 3), camera frame.
 

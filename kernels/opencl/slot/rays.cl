@@ -56,5 +56,12 @@ static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfl
 #define RAY(k) own_rays[k][row]
 //@ cross
     c = cross_ray(&s, RAY(0), RAY(1), RAY(2), half_r2);
+//@ backdrop_args
+    , global const float *restrict rays
+//@ backdrop_ray
+    ray_x = rays[at];
+    ray_y = rays[plane + at];
+    ray_z = rays[2 * (size_t)plane + at];
+    if (!(ray_x == ray_x)) return;           // nothing is seen there
 //@ mask
     mask &= VMASK(c.d == c.d);               // the low-pass draws nothing where there is no ray
