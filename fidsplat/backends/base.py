@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 
 from fidsplat.cameras import Camera, Orthographic
+from fidsplat.cameras.lenses import Lens
 from fidsplat.cameras.raster import RayRaster, raster_of
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import InputError
@@ -111,6 +112,13 @@ class View:
     """(label, the view that its splats have), for splats that move by themselves"""
     shots: tuple[Shot, ...] = ()
     """the sub-pictures of which this picture is made; none: it is one"""
+
+    @property
+    def lens(self) -> Lens | None:
+        """What stands before a pinhole; None for a pinhole."""
+        if self.raster is not None:
+            return self.raster.lens
+        return Orthographic() if self.parallel else None
 
     @property
     def turns(self) -> bool:

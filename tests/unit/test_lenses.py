@@ -201,3 +201,27 @@ def test_lenses_that_scene_files_cannot_have(tmp_path, text, words):
     (tmp_path / "scene.toml").write_text(HEAD + text)
     with pytest.raises(fs.InputError, match=words):
         fs.Scene.load(tmp_path / "scene.toml")
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [*(BrownConrady.opencv(each) for each in COEFFICIENTS), Fisheye(0.05, -0.01, 0.003, -0.001), Fisheye()]
+    + [Equirectangular(), Orthographic()],
+    ids=lambda lens: lens.kind,
+)
+def test_derivatives_are_those_of_the_image(lens):
+    points, step = points_before(5), 1e-5
+    if lens.along_ray:
+        points = np.concatenate([points, points * (1, 1, -0.05), [(0, 0, 2.0)]])
+    shifts = step * np.eye(3)
+    want = np.stack([lens.image(points + s) - lens.image(points - s) for s in shifts], 2) / (2 * step)
+    seen = np.isfinite(want).all((1, 2))
+    assert seen.mean() > 0.6
+    np.testing.assert_allclose(lens.derivative(points)[seen], want[seen], atol=2e-6, rtol=1e-6)
+
+
+def test_a_panorama_has_derivatives_at_its_poles():
+    poles = np.array([(0, 3.0, 0), (0, -3.0, 0), (1e-9, 3.0, -1e-9)])
+    slopes = Equirectangular().derivative(poles)
+    assert np.isfinite(slopes).all()
+    assert (np.linalg.matrix_rank(slopes, tol=1e-9) == 2).all()

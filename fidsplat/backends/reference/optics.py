@@ -92,6 +92,20 @@ def centers_of(view: View, p: np.ndarray, known: np.ndarray) -> tuple[np.ndarray
     return np.where(known, x, np.inf), np.where(known, y, np.inf)
 
 
+def derivatives_of(view: View, p: np.ndarray) -> np.ndarray:
+    """Of the places where points p (n, 3) fall [samples] by their coordinates, (n, 2, 3); NaN where a lens does not
+    see them."""
+    if view.lens is None:
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            x, y, ahead = p[:, 0] / p[:, 2], p[:, 1] / p[:, 2], 1 / p[:, 2]
+            none = np.zeros_like(x)
+            slopes = np.stack([ahead, none, -x * ahead, none, ahead, -y * ahead], 1).reshape(-1, 2, 3)
+    else:
+        seen = np.isfinite(view.lens.image(p)[:, 0])[:, None, None]
+        slopes = np.where(seen, view.lens.derivative(p), np.nan)
+    return slopes * np.array([[view.fx], [view.fy]])
+
+
 def anchors_of(view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Coordinates (3, n) about which devices keep the forms of splats with the anchor pixel (x, y); NaN where
     that is not known."""

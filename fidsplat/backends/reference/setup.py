@@ -38,7 +38,7 @@ class Setup:
         box = np.zeros(len(cloud), bool) if cloud.boxes is None else cloud.boxes
         area = scale.prod(axis=1)
         if "lowpass_pixel" in features.slots:
-            filtered = ~box & (p[:, 2] >= view.near)
+            filtered = ~box & (depth >= view.near)
             a, b, grown = _filtered(a, b, p, view, filtered)
             area = area * grown
             with np.errstate(divide="ignore"):
@@ -110,18 +110,13 @@ def _filtered(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Scaled tangents (n, 3) after the low-pass `pixel`, and the factor (n,) by which areas grow.
 
-    chosen (n,) bool: the others stay as they are. The covariance of the filter in (u, v) is
+    chosen (n,) bool: the others stay as they are, and those whose centre a lens does not see. The covariance of the filter in (u, v) is
     (G^T G)^-1 / 4 with G the derivative of the sample's position by (u, v) at the centre.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        z = p[:, 2]
-        columns = [
-            np.stack(
-                [view.fx * (t[:, 0] - p[:, 0] / z * t[:, 2]), view.fy * (t[:, 1] - p[:, 1] / z * t[:, 2])]
-            )
-            / z
-            for t in (a, b)
-        ]
+        slopes = optics.derivatives_of(view, p)
+        chosen = chosen & np.isfinite(slopes).all((1, 2))
+        columns = [np.einsum("nij,nj->in", slopes, t) for t in (a, b)]
         turned = columns[0][0] * columns[1][1] - columns[1][0] * columns[0][1]
         m11, m12, m22 = ((columns[i] * columns[j]).sum(0) for i, j in ((0, 0), (0, 1), (1, 1)))
         variance = 0.25
