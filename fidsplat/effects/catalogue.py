@@ -63,6 +63,7 @@ class Effect:
     """By the name of a camera slot: the part that takes this part's place there."""
 
 
+_OWN_RAYS = ("camera_brown_conrady", "camera_fisheye", "camera_equirectangular")
 _EFFECTS = (
     Effect("camera_pinhole", "slot/camera_pinhole.cl", parts=("perspective",)),
     Effect("camera_brown_conrady", "slot/camera_brown_conrady.cl", parts=("perspective", "ray_map", "rays")),
@@ -108,7 +109,22 @@ _EFFECTS = (
     Effect(
         "footprint_mixed", "slot/footprint_mixed.cl", record_lanes=1, inputs=("boxes",), parts=("box_edges",)
     ),
-    Effect("box_edges", "slot/box_edges.cl", record_lanes=4),
+    Effect("box_cover", "slot/box_cover.cl"),
+    Effect(
+        "box_edges",
+        "slot/box_edges.cl",
+        record_lanes=4,
+        parts=("box_cover",),
+        behind=dict.fromkeys(_OWN_RAYS, "rays_box"),
+    ),
+    Effect(
+        "rays_box",
+        "slot/rays_box.cl",
+        inputs=("ray_step",),
+        view_inputs=("ray_step",),
+        blend_inputs=("ray_slopes",),
+        parts=("box_cover",),
+    ),
     Effect("ray_depth", "slot/ray_depth.cl", record_lanes=3),
     Effect("alpha", "tap/alpha.cl", output=Output("alpha", 1, "float32")),
     Effect("depth", "tap/depth.cl", planes=(2,), output=Output("depth", 1, "float32"), parts=("ray_depth",)),

@@ -198,7 +198,8 @@ class Run:
         """The uniforms of the projection, for rows of samples [row, end)."""
         view = self.view
         if view.raster is not None:
-            self.held |= self.backend.ray_buffers.of(view.raster, self.rows, self.stride)
+            slopes = "rays_box" in self.pipeline.features.names
+            self.held |= self.backend.ray_buffers.of(view.raster, self.rows, self.stride, slopes)
         views = np.array([_uniforms(each, row, end) for each in (view, *(of for _, of in view.groups))])
         self.put("view", views.astype(self.pipeline.real))
         if view.groups:

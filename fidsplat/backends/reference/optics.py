@@ -106,6 +106,29 @@ def derivatives_of(view: View, p: np.ndarray) -> np.ndarray:
     return slopes * np.array([[view.fx], [view.fy]])
 
 
+def edges_of(
+    view: View, forms: np.ndarray, x: np.ndarray, y: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The edges of boxes with `forms` (3, n, 3), at samples (k,) on the grid.
+
+    Returns:
+        1 / |gradient| of D + n_u, D - n_u, D + n_v, D - n_v by the sample's position, (4, n) or, where each sample has a ray of
+        its own, (4, k, n); and what the gradients' terms come to, relative to them (0 where devices have them from their set-up).
+    """
+    sides = [(axis, sign) for axis in (0, 1) for sign in (1, -1)]
+    if view.raster is None:
+        steep = [np.hypot(*(forms[1:, :, 2] + sign * forms[1:, :, axis])) for axis, sign in sides]
+        return 1 / np.maximum(np.stack(steep), 1e-300), np.zeros((4, 1))
+    slopes = np.nan_to_num(view.raster.slopes[y.astype(int), x.astype(int)].astype(np.float64))  # (k, 2, 3)
+    edges, terms = [], []
+    for axis, sign in sides:
+        form = forms[:, :, 2] + sign * forms[:, :, axis]
+        edges.append(1 / np.maximum(np.hypot(*np.einsum("kic,cn->ikn", slopes, form)), 1e-300))
+        parts = np.abs(forms[:, :, 2]) + np.abs(forms[:, :, axis])
+        terms.append(np.hypot(*np.einsum("kic,cn->ikn", np.abs(slopes), parts)))
+    return np.stack(edges), np.stack(terms) * np.stack(edges)
+
+
 def anchors_of(view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Coordinates (3, n) about which devices keep the forms of splats with the anchor pixel (x, y); NaN where
     that is not known."""

@@ -49,11 +49,12 @@ class Setup:
             planes = table.index
             self.key = np.where(planes < 0, self.key, np.append(table.keys(view), 0)[planes])
         half_r2 = log_opacity - view.log_cut
-        reach = np.hypot(a[:, 2], b[:, 2])
         if view.along_ray:
-            reach = np.maximum(np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1))
-        reach = np.sqrt(np.maximum(2 * half_r2, 0)) * reach
-        reach = np.where(box, np.abs(a[:, 2]) + np.abs(b[:, 2]), reach)
+            long_a, long_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
+            reach, box_reach = np.maximum(long_a, long_b), long_a + long_b
+        else:
+            reach, box_reach = np.hypot(a[:, 2], b[:, 2]), np.abs(a[:, 2]) + np.abs(b[:, 2])
+        reach = np.where(box, box_reach, np.sqrt(np.maximum(2 * half_r2, 0)) * reach)
         drawn = (half_r2 > 0) & (depth + reach >= view.near) & (depth - reach <= view.far)
         order = np.flatnonzero(drawn)
         order = order[np.argsort(self.key[order], kind="stable")]
@@ -76,7 +77,6 @@ class Setup:
         self.z_numerator = size * area * np.abs(height * sign)
 
         self.box = box[order]
-        self.edges = _edges(self.forms)
 
         ahead = self.pz >= view.near
         middle_x, middle_y = optics.centers_of(view, p, ahead)
@@ -128,12 +128,6 @@ def _filtered(
     # edge-on splats grow without limit and are not drawn
     chosen = (chosen & np.isfinite(grown))[:, None]
     return np.where(chosen, wide_a, a), np.where(chosen, wide_b, b), grown
-
-
-def _edges(forms: np.ndarray) -> np.ndarray:
-    """1 / |gradient| (4, n) of the forms D + n_u, D - n_u, D + n_v, D - n_v: a box's edges, in samples."""
-    sides = [forms[1:, :, 2] + sign * forms[1:, :, axis] for axis in (0, 1) for sign in (1, -1)]
-    return 1 / np.maximum(np.stack([np.hypot(*side) for side in sides]), 1e-300)
 
 
 def _anchor(center: np.ndarray, known: np.ndarray, size: int) -> np.ndarray:

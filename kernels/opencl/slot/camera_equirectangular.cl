@@ -45,3 +45,5 @@ static inline Bounds cone_bounds(global const real *view, real3_ a, real3_ b, re
         gx.y = across * (around_z * b.x - around_x * b.z);
         gy.x = up * (flat * a.y - sink * (around_x * a.x + around_z * a.z));
         gy.y = up * (flat * b.y - sink * (around_x * b.x + around_z * b.z));
+//@ camera_box_reach
+        reach = su + sv;

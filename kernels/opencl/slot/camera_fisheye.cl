@@ -72,3 +72,5 @@ static inline void chart_box(real3_ a, real3_ b, real3_ p, real radius, real awa
         gy.x = view[VIEW_FY] * (sine * out_u + cosine * round_u);
         gy.y = view[VIEW_FY] * (sine * out_v + cosine * round_v);
         filtered = angle <= view[LENS_LIMIT];
+//@ camera_box_reach
+        reach = su + sv;

@@ -45,3 +45,5 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
 //@ camera_derivative
         gx.x = view[VIEW_FX] * a.x; gx.y = view[VIEW_FX] * b.x;
         gy.x = view[VIEW_FY] * a.y; gy.y = view[VIEW_FY] * b.y;
+//@ camera_box_near
+        d_near = INFINITY;                   // depths have a form of their own
