@@ -29,7 +29,7 @@ MAY_IMPORT = {
     "cameras": BASE,
     "vision": BASE | {"cameras"},
     "formats": BASE | {"splats", "harmonics", "cameras"},
-    "markers": BASE | {"splats", "vision.dictionaries", "vision.images"},
+    "markers": BASE | {"splats", "quality", "vision.dictionaries", "vision.images"},
     "scenes": PLAIN | {"markers", "formats"},
     "effects": PLAIN | {"scenes"},
     "backends": PLAIN | {"scenes", "effects", "kernel_files"},
