@@ -29,12 +29,13 @@ MAY_IMPORT = {
     "cameras": BASE,
     "vision": BASE | {"cameras"},
     "formats": BASE | {"splats", "harmonics", "cameras"},
-    "markers": BASE | {"splats", "vision.dictionaries", "vision.images"},
+    "markers": BASE | {"splats", "quality", "vision.dictionaries", "vision.images"},
     "scenes": PLAIN | {"markers", "formats"},
     "effects": PLAIN | {"scenes"},
     "backends": PLAIN | {"scenes", "effects", "kernel_files"},
     "hard_cases": PLAIN | {"scenes", "effects", "backends", "render", "vision", "kernel_files"},
     "render": PLAIN | {"scenes", "effects", "backends"},
+    "accuracy": PLAIN | {"scenes", "render", "backends"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__"}
 
