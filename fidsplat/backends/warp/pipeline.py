@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 KNOWN = frozenset(
     {"camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen", "stop_inclusive"}
-    | {"stop_exclusive", "compose_ordered", "compose_planes", "ray_depth"}
-    | {"perspective", "footprint_gaussian", "background_constant"}
+    | {"stop_exclusive", "compose_ordered", "compose_planes", "ray_depth", "sh_terms"}
+    | {"arithmetic_precise", "perspective", "footprint_gaussian", "background_constant"}
     | {"alpha", "depth", "depth_median", "normal", "label"}
 )
 """effects that kernels/warp has"""
