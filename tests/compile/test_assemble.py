@@ -46,7 +46,7 @@ def test_base_text_names_no_effect_that_was_not_asked_for():
         "footprint_gaussian",
         "arithmetic_precise",
     }
-    of_knobs = ("half", "fast_exp", "native_exp", "KEY_BITS", "wide", "WIDE")
+    of_knobs = ("vload_half", "colors_half", "fast_exp", "native_exp", "KEY_BITS", "wide", "WIDE")
     of_layers = ("planes", "plane_keys", "layer", "Layer", "open", "waiting", "ink")
     for name in (*absent, *TAPS, "sh", "finished", *of_layers, *of_knobs):
         assert not re.search(rf"\b{name}(_|\b)", text), name
