@@ -5,10 +5,13 @@ import re
 import pytest
 
 from fidsplat.backends.warp import runtime
+from fidsplat.effects import OUTPUTS
 
 wp = pytest.importorskip("warp")
-ALL = ("lowpass_screen", "ray_depth", "normal", "compose_planes", "depth", "depth_median", "label")
-RECORD = ALL[:4]
+RECORD = ("lowpass_screen", "ray_depth", "normal", "compose_planes")
+TAPS = ("depth", "depth_median", "depth_first", "heaviest", "blended", "fog")
+ALL = (*RECORD, *TAPS)
+OF_SAMPLES = ("depth_weight", "depth_median", "depth_first", "heaviest", "blended", "fog_slope", "fogged")
 
 
 def made(name, *arguments):
@@ -28,6 +31,13 @@ def compiled(kernel, folder, block=256, assembly=False):
     return re.sub(r"//[^\n]*", "", source.read_text())
 
 
+def resolving(behind, samples):
+    """The kernel for all outputs."""
+    planes = tuple(made("planes.of_samples", ALL).items())
+    integers = tuple(output.name for output in OUTPUTS.values() if output.dtype == "int32")
+    return made("resolve.make_resolve", tuple(OUTPUTS), integers, planes, behind, samples)
+
+
 @pytest.fixture(autouse=True)
 def started():
     runtime.load()
@@ -40,7 +50,7 @@ def started():
         lambda: made("project.make_project", (), 0, "float32", True),
         lambda: made("blend.make_blend", ALL, True, 256)[0],
         lambda: made("blend.make_blend", ("lowpass_screen", "stop_exclusive"), True, 256)[0],
-        lambda: made("resolve.make_resolve", ("alpha", "depth", "depth_median", "label", "normal"), 3),
+        lambda: resolving("constant", 3),
         lambda: made("lists.make_lists", True).emit,
         lambda: made("lists.make_lists", True).count,
         lambda: made("lists.make_lists", False).histogram,
@@ -58,19 +68,10 @@ def test_the_kernels_compile_for_cuda(kernel, tmp_path):
 
 def test_the_base_text_has_nothing_of_absent_effects(tmp_path):
     text = compiled(made("blend.make_blend", (), True, 256)[0], tmp_path)
-    for name in (
-        "depth_weight",
-        "depth_median",
-        "label_weight",
-        "finished",
-        "dot_x",
-        "Layer",
-        "thickest",
-        "ink",
-    ):
+    for name in (*OF_SAMPLES, "finished", "dot_x", "Layer", "thickest", "ink"):
         assert not re.search(rf"\b{name}", text), name
     everything = compiled(made("blend.make_blend", ALL, True, 256)[0], tmp_path / "all")
-    for name in ("depth_weight", "depth_median", "label_weight", "Layer", "thickest", "ink"):
+    for name in (*OF_SAMPLES, "Layer", "thickest", "ink"):
         assert re.search(rf"\b{name}", everything), name
 
 
