@@ -44,7 +44,7 @@ class View:
     stop: float
     first_light: float  # transmittance that is left behind a first hit
     fog_density: float  # 1 / metres
-    ray: wp.vec4  # a sample's ray is ((column - [2]) [0], (row - [3]) [1], 1); 0: depths are distances already
+    ray: wp.vec4  # a sample's ray is ((column - [2]) [0], (row - [3]) [1], 1); 0 where depths are distances
 
 
 def struct_of(name: str, words: str, fields: dict):

@@ -48,6 +48,7 @@ def started():
     [
         lambda: made("project.make_project", RECORD, 16, "float64", False),
         lambda: made("project.make_project", (), 0, "float32", True),
+        lambda: made("project.make_project", ("lowpass_pixel",), 0, "float64", False),
         lambda: made("blend.make_blend", ALL, True, 256)[0],
         lambda: made("blend.make_blend", ("lowpass_screen", "stop_exclusive"), True, 256)[0],
         lambda: resolving("constant", 3),
@@ -58,7 +59,16 @@ def started():
         lambda: made("lists.find_starts"),
     ],
     ids=[
-        *("project", "project-float32", "blend-all", "blend-exclusive", "resolve", "emit", "count"),
+        *(
+            "project",
+            "project-float32",
+            "project-filtered",
+            "blend-all",
+            "blend-exclusive",
+            "resolve",
+            "emit",
+            "count",
+        ),
         *("histogram", "compact", "starts"),
     ],
 )

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from fidsplat.backends.warp.backend import WarpBackend, WarpShape
 
 KNOWN = frozenset(
-    {"camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen", "stop_inclusive"}
-    | {"stop_exclusive", "compose_ordered", "compose_planes", "ray_depth"}
+    {"camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen", "lowpass_pixel"}
+    | {"stop_inclusive", "stop_exclusive", "compose_ordered", "compose_planes", "ray_depth"}
     | {"perspective", "footprint_gaussian", "background_constant"}
     | {"ray", "ray_length", "sample_length", "turn", "world_ray"}
     | {"alpha", "depth", "depth_median", "depth_first", "distance", "distance_median", "distance_first"}
@@ -35,6 +35,7 @@ KNOWN = frozenset(
 """effects that kernels/warp has"""
 # of these depend on an effect: a stage is compiled once for all feature sets that mean the same to it
 _RECORD = ("lowpass_screen", "ray_depth", "normal", "compose_planes")
+_PROJECT = (*_RECORD, "lowpass_pixel")
 _SAMPLE = (*_RECORD, "stop_exclusive", "depth", "depth_median", "depth_first", "heaviest", "blended", "fog")
 
 
@@ -96,7 +97,10 @@ class WarpPipeline:
         with runtime.quiet():
             self.layout = runtime.kernels("records").Layout(record)
             self.project = runtime.kernels("project").make_project(
-                record, terms, features.setup_precision, shape.schedule == "tiles"
+                tuple(name for name in _PROJECT if name in names),
+                terms,
+                features.setup_precision,
+                shape.schedule == "tiles",
             )
             self.project_block = runtime.kernels("project").BLOCK
             self.lists = runtime.kernels("lists").make_lists(screen)
