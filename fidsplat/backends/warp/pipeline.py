@@ -27,14 +27,15 @@ if TYPE_CHECKING:
 KNOWN = frozenset(
     {"camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen", "lowpass_pixel"}
     | {"stop_inclusive", "stop_exclusive", "compose_ordered", "compose_planes", "ray_depth"}
-    | {"perspective", "footprint_gaussian", "background_constant"}
+    | {"perspective", "footprint_gaussian", "footprint_box", "footprint_mixed", "box_edges"}
+    | {"background_constant"}
     | {"ray", "ray_length", "sample_length", "turn", "world_ray"}
     | {"alpha", "depth", "depth_median", "depth_first", "distance", "distance_median", "distance_first"}
     | {"normal", "normal_world", "label", "splat_id", "blended"}
 )
 """effects that kernels/warp has"""
 # of these depend on an effect: a stage is compiled once for all feature sets that mean the same to it
-_RECORD = ("lowpass_screen", "ray_depth", "normal", "compose_planes")
+_RECORD = ("lowpass_screen", "ray_depth", "normal", "compose_planes", "footprint_box", "footprint_mixed")
 _PROJECT = (*_RECORD, "lowpass_pixel")
 _SAMPLE = (*_RECORD, "stop_exclusive", "depth", "depth_median", "depth_first", "heaviest", "blended", "fog")
 
@@ -110,15 +111,15 @@ class WarpPipeline:
             self.blend, self.state = runtime.kernels("blend").make_blend(
                 sample, shape.schedule == "group", self.block_dim
             )
-            planes, surroundings = runtime.kernels("planes"), runtime.kernels("surroundings")
+            planes = runtime.kernels("planes")
             self.sample_planes = planes.of_samples(sample)
             """type of an element of each"""
             finished = tuple(output.name for output in features.outputs)
             integers = tuple(output.name for output in features.outputs if output.dtype == "int32")
             self.samples_type = planes.make_samples(tuple(self.sample_planes.items()))
             self.outputs_type = planes.make_outputs(finished, integers)
-            behind = next((kind for kind in surroundings.KINDS if f"background_{kind}" in names), "constant")
-            self.around_type = surroundings.make_surroundings(behind).Around
+            behind = "constant"
+            self.around_type = runtime.kernels("surroundings").make_surroundings(behind).Around
             self.resolve = runtime.kernels("resolve").make_resolve(
                 finished, integers, tuple(self.sample_planes.items()), behind, features.samples
             )
@@ -237,6 +238,7 @@ class _Run:
         ends = self._exact("ends by index", n, wp.int64)
         cloud = [self.resident.arrays[name] for name in ("means", "quats", "scales", "opacities", "colors")]
         cloud += self._planes()
+        cloud.append(self.resident.arrays.get("boxes", drawn))  # of one kind of splats: never read
         records = [self.held["lines"], self.held["bounds"], self._take("windows", n, wp.uint64)]
         self.launcher.launch(
             self.pipeline.project,
@@ -371,15 +373,12 @@ class _Run:
             array = self.pool.fresh(output.name, height * width * output.channels, dtype)
             outputs[output.name] = output, array
             setattr(finished, output.name, array)
+        around = self.pipeline.around_type()
+        around.color = wp.vec3(*view.background)
         if "label" in outputs:
             finished.labels = self.resident.arrays["labels"]
-        self.launch(self.pipeline.resolve, height * width, self.u, width, self._around(), samples, finished)
+        self.launch(self.pipeline.resolve, height * width, self.u, width, around, samples, finished)
         return outputs, (height, width)
-
-    def _around(self) -> Any:
-        around, view, wp = self.pipeline.around_type(), self.view, self.wp
-        around.color = wp.vec3(*view.background)
-        return around
 
     # helpers
 
