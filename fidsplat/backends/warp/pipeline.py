@@ -15,6 +15,7 @@ import numpy as np
 
 from fidsplat.backends.base import View
 from fidsplat.backends.warp import runtime
+from fidsplat.backends.warp.around import Surroundings
 from fidsplat.backends.warp.launch import BLOCK, Launcher
 from fidsplat.backends.warp.memory import Resident
 from fidsplat.effects import FeatureSet
@@ -28,7 +29,7 @@ KNOWN = frozenset(
     {"camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen", "lowpass_pixel"}
     | {"stop_inclusive", "stop_exclusive", "compose_ordered", "compose_planes", "ray_depth"}
     | {"perspective", "footprint_gaussian", "footprint_box", "footprint_mixed", "box_edges"}
-    | {"background_constant"}
+    | {"background_constant", "background_gradient", "background_panorama", "fog"}
     | {"ray", "ray_length", "sample_length", "turn", "world_ray"}
     | {"alpha", "depth", "depth_median", "depth_first", "distance", "distance_median", "distance_first"}
     | {"normal", "normal_world", "label", "splat_id", "blended"}
@@ -118,8 +119,9 @@ class WarpPipeline:
             integers = tuple(output.name for output in features.outputs if output.dtype == "int32")
             self.samples_type = planes.make_samples(tuple(self.sample_planes.items()))
             self.outputs_type = planes.make_outputs(finished, integers)
-            behind = "constant"
-            self.around_type = runtime.kernels("surroundings").make_surroundings(behind).Around
+            kinds = runtime.kernels("surroundings").KINDS
+            behind = next((kind for kind in kinds if f"background_{kind}" in names), "constant")
+            self.surroundings = Surroundings(backend, behind)
             self.resolve = runtime.kernels("resolve").make_resolve(
                 finished, integers, tuple(self.sample_planes.items()), behind, features.samples
             )
@@ -373,8 +375,7 @@ class _Run:
             array = self.pool.fresh(output.name, height * width * output.channels, dtype)
             outputs[output.name] = output, array
             setattr(finished, output.name, array)
-        around = self.pipeline.around_type()
-        around.color = wp.vec3(*view.background)
+        around = self.pipeline.surroundings.of(view)
         if "label" in outputs:
             finished.labels = self.resident.arrays["labels"]
         self.launch(self.pipeline.resolve, height * width, self.u, width, around, samples, finished)
