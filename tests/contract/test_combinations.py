@@ -131,8 +131,6 @@ def test_backgrounds_behind_every_lens(renderer, camera, behind, samples):
     ("lacking", "how"),
     [
         ("camera_fisheye", {"camera": CAMERAS["fisheye"]}),
-        ("fog", {"fog": FOG}),
-        ("footprint_box", {"scene": CLOUD.with_boxes()}),
         ("shutter_exposure", {"motion": fs.Motion(turning), "shutter": BLUR}),
     ],
 )

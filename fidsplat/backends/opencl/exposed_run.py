@@ -40,7 +40,7 @@ class ExposedRun(Run):
         for shot in self.view.shots:
             run = Run(self.pipeline, self.resident, shot.view, self.plan)
             run.held |= around
-            planes = run.samples()
+            *_, planes = run.filled()
             self.events += run.events
             self._gather(run, shot, planes, whole, kinds)
             for name, value in run.stats().items():
@@ -49,7 +49,9 @@ class ExposedRun(Run):
             self.pool.give_back(run.leased)
         if self.view.raster is not None and any(effect.resolve_inputs for effect in effects):
             self.held |= self.backend.ray_buffers.of(self.view.raster, self.rows, self.stride)
-        return self.resolve(whole)
+        outputs = self.outputs()
+        self.resolve(whole, outputs)
+        return outputs
 
     def _gather(
         self,

@@ -11,7 +11,7 @@
 //@ footprint_crossing
     vfloat cover;           // share of the sample that a box covers
 //@ footprint_functions
-#define SQRT_2 1.41421356237309504880f   // the numerators hold sqrt(1/2)
+#define SQRT_2 WIDE(1.41421356237309504880)   // the numerators hold sqrt(1/2)
 //@ footprint_reach
     if (BOX_HERE) {
         radius = REAL(1.41421356237309504880);

@@ -1,9 +1,9 @@
 // Edges of boxes (slot/box_cover.cl) where forms are affine in the sample: straight lines, whose distances in samples need
 // one number for each edge of a splat.
 //@ record
-    float edge_u0, edge_u1, edge_v0, edge_v1;   // 1 / |grad| of the forms D + n_u, D - n_u, D + n_v, D - n_v
+    wide edge_u0, edge_u1, edge_v0, edge_v1;   // 1 / |grad| of the forms D + n_u, D - n_u, D + n_v, D - n_v
 //@ footprint_functions
-static inline vfloat between(vfloat d, vfloat n, float edge_0, float edge_1) {
+static inline vfloat between(vfloat d, vfloat n, wide edge_0, wide edge_1) {
     vfloat above = clamp(FMA(FMA((vfloat)SQRT_2, n, d), (vfloat)edge_0, (vfloat)0.5f), (vfloat)0.0f, (vfloat)1.0f);
     vfloat below = clamp(FMA(FMA((vfloat)-SQRT_2, n, d), (vfloat)edge_1, (vfloat)0.5f), (vfloat)0.0f, (vfloat)1.0f);
     return fmax(above + below - 1.0f, (vfloat)0.0f);
@@ -82,7 +82,7 @@ static inline bool box_touches(real3_ k0, real3_ kx, real3_ ky, real facing, rea
     }
 //@ project
     real edge_line[3];
-    record.edge_u0 = (float)box_edge(k0, kx, ky, scale, scale, false, edge_line);
-    record.edge_u1 = (float)box_edge(k0, kx, ky, scale, -scale, false, edge_line);
-    record.edge_v0 = (float)box_edge(k0, kx, ky, scale, scale, true, edge_line);
-    record.edge_v1 = (float)box_edge(k0, kx, ky, scale, -scale, true, edge_line);
+    record.edge_u0 = (wide)box_edge(k0, kx, ky, scale, scale, false, edge_line);
+    record.edge_u1 = (wide)box_edge(k0, kx, ky, scale, -scale, false, edge_line);
+    record.edge_v0 = (wide)box_edge(k0, kx, ky, scale, scale, true, edge_line);
+    record.edge_v1 = (wide)box_edge(k0, kx, ky, scale, -scale, true, edge_line);
