@@ -61,7 +61,9 @@ def small(rows: list[list[tuple[str, np.ndarray]]], width: int) -> np.ndarray:
 def examples(renderer: fs.Renderer, out: Path) -> None:
     """The scene files whose picture stands beside them in docs/effects.md."""
     folder = ROOT / "examples"
-    files = sorted([*folder.glob("lens-*.toml"), *folder.glob("shutter-*.toml")])
+    files = sorted(
+        file for name in ("lens-*", "shutter-*", "together") for file in folder.glob(f"{name}.toml")
+    )
     for file in track(files, "examples", console=Console(stderr=True)):
         write_png(out / f"effect-{file.stem}.png", renderer.render(fs.Scene.load(file))["rgb"])
 

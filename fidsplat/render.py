@@ -261,20 +261,25 @@ class Renderer:
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
         background: Iterable[float] | Gradient | Panorama | None = None,
+        motion: Motion | None = None,
+        shutter: Shutter | None = None,
         sensor: Sensor | None = None,
         fog: Fog | None = None,
     ) -> Iterator[Frame]:
         """Draw one cloud from many cameras, one Frame for each, in their order.
 
         The cloud is uploaded once, kernels and buffers are used again, and on a device that works beside the
-        host the next picture is under way while the caller has the last. Arguments and errors: as `render`;
-        an error comes after the pictures of the cameras before it.
+        host the next picture is under way while the caller has the last. Arguments and errors: as `render`
+        (a motion of the camera takes the place of each camera's pose); an error comes after the pictures of
+        the cameras before it.
         """
         own = scene if isinstance(scene, Scene) else _NO_SCENE
         chosen = own.quality if quality is None else quality
         names = own.outputs if outputs is None else outputs
         names = names if isinstance(names, str) else tuple(names)
         behind = background_of(own.background if background is None else background)
+        motion = own.motion if motion is None else motion
+        shutter = own.shutter if shutter is None else shutter
         sensor, fog = sensor or own.sensor, fog or own.fog
         resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
         waiting: Frame | None = None
@@ -282,7 +287,7 @@ class Renderer:
         rest = iter(cameras)
         while True:
             try:
-                frame = self.render(resident, next(rest), names, chosen, behind, sensor=sensor, fog=fog)
+                frame = self.render(resident, next(rest), names, chosen, behind, motion, shutter, sensor, fog)
             except StopIteration:
                 break
             except Exception as error:

@@ -37,7 +37,8 @@ def sliding(time: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Switch:
-    """One effect. Of a `kind` a picture has one at most; fog is a background, since nothing else is seen behind it."""
+    """One effect. Of a `kind` a picture has one at most; fog is a background, since nothing else is seen
+    behind it."""
 
     kind: str
     camera: fs.Camera | None = None
@@ -106,8 +107,8 @@ def goes(names: Iterable[str]) -> bool:
 
 
 def everything(lens: str | None) -> tuple[str, ...]:
-    """All effects behind that lens (None: a pinhole); of those that exclude each other one, another for each lens. None is coarse, so
-    that pictures are compared closely."""
+    """All effects behind that lens (None: a pinhole); of those that exclude each other one, another for each
+    lens. None is coarse, so that pictures are compared closely."""
     kinds: dict[str, list[str]] = {}
     for name, switch in SWITCHES.items():
         kinds.setdefault(switch.kind, []).append(name)

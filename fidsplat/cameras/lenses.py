@@ -197,9 +197,7 @@ class Fisheye:
             around = np.where(across > 0, self.distance(angle) / across, 1 / z)
         by_radius = outward * np.stack([z * cos, z * sin, -across])
         by_turn = around * np.stack([-sin, cos, 0 * z])
-        return np.moveaxis(
-            np.stack([cos * by_radius - sin * by_turn, sin * by_radius + cos * by_turn]), 2, 0
-        )
+        return np.moveaxis(np.stack([cos * by_radius - sin * by_turn, sin * by_radius + cos * by_turn]), 2, 0)
 
     def image(self, points: np.ndarray) -> np.ndarray:
         """Image coordinates (n, 2) of points (n, 3); NaN where they are not seen."""
@@ -249,8 +247,8 @@ class Equirectangular:
         return np.where(np.any(points != 0, axis=1)[:, None], image, np.nan)
 
     def derivative(self, points: np.ndarray) -> np.ndarray:
-        """Of the image coordinates by X, Y, Z, (n, 2, 3), at points (n, 3). At a pole, where the longitude jumps, that
-        of a point 1e-6 rad away from it towards z."""
+        """Of the image coordinates by X, Y, Z, (n, 2, 3), at points (n, 3). At a pole, where the longitude
+        jumps, that of a point 1e-6 rad away from it towards z."""
         x, y, z = points.T
         far = np.linalg.norm(points, axis=1)
         polar = np.hypot(x, z) < 1e-6 * far

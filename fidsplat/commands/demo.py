@@ -22,6 +22,7 @@ that is wholly visible is not found within 1 % of its distance.
 
 Examples:
   fidsplat demo
+  fidsplat demo --mixture exact --out sharp
   fidsplat demo --out pictures --json"""
 
     out: Annotated[
@@ -30,6 +31,9 @@ Examples:
     device: Annotated[
         str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")
     ] = None
+    mixture: Annotated[
+        str, option("NAME", "of the markers: fitted, paper or exact, as `fidsplat marker` (default: fitted)")
+    ] = "fitted"
     json: Json = False
 
     def run(self) -> int:
@@ -37,7 +41,7 @@ Examples:
 
         where = console(self.json)
         with where.status("starting") as status:
-            result = run_demo(self.out, self.device, status.update)
+            result = run_demo(self.out, self.device, status.update, self.mixture)
         if self.json:
             print_json(result.as_dict())
         else:

@@ -35,10 +35,14 @@ Planes:
   normal normal_world                 towards the camera, in its axes or the world's
   blended                             number of splats that made the pixel
 
+Lenses, shutters and motion, fog, backgrounds, sensors and boxes are tables of a scene file
+(docs/scene-files.md); they go together.
+
 Examples:
   fidsplat render scene.toml
   fidsplat render scene.toml -o frames --outputs rgb,depth,normal,label
-  fidsplat render tag.ply -o tag.png --device reference --quality gsplat"""
+  fidsplat render tag.ply -o tag.png --device reference --quality gsplat
+  fidsplat render tag.ply --lowpass pixel --samples 3"""
 
     source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply", "what to draw")]
     out: Annotated[
@@ -56,6 +60,12 @@ Examples:
         str | None,
         option("Q", "standard fast reference gsplat surfel (default: the scene's, or standard)"),
     ] = None
+    samples: Annotated[
+        int | None, option("N", "N x N samples per pixel (default: the scene's, or the quality's)")
+    ] = None
+    lowpass: Annotated[
+        str | None, option("NAME", "screen, pixel or none (default: the scene's, or the quality's)")
+    ] = None
     json: Json = False
 
     def run(self) -> int:
@@ -66,16 +76,19 @@ Examples:
 
         names = None if self.outputs is None else tuple(n.strip() for n in self.outputs.split(","))
         # what is wrong with the words is said before anything is read or opened
-        select(fs.SplatCloud.empty(), names or (), Quality.of(self.quality))
+        asked = {"samples": self.samples, "lowpass": self.lowpass}
+        asked = {name: value for name, value in asked.items() if value is not None}
+        select(fs.SplatCloud.empty(), names or (), Quality.of(self.quality).with_(**asked))
         name_of = _names(self.out, Path(self.source))
         where = console(self.json)
         with where.status("reading"):
             scene = _load(self.source)
         with where.status("opening the device"):
             renderer = fs.Renderer(self.device or scene.device)
+        quality = Quality.of(scene.quality if self.quality is None else self.quality).with_(**asked)
         begun = time.perf_counter()
         with where.status("drawing"):
-            frame = renderer.render(scene, outputs=names, quality=self.quality)
+            frame = renderer.render(scene, outputs=names, quality=quality)
             planes = {name: frame[name] for name in frame.outputs}
         seconds = time.perf_counter() - begun
         bits = None if scene.sensor is None else scene.sensor.bits

@@ -96,7 +96,10 @@ class DemoResult:
 
 
 def run_demo(
-    out: str | Path, device: str | None = None, tell: Callable[[str], None] = lambda text: None
+    out: str | Path,
+    device: str | None = None,
+    tell: Callable[[str], None] = lambda text: None,
+    mixture: str = "fitted",
 ) -> DemoResult:
     """Run the demo and write its pictures, its scene and its figures into the folder ``out``.
 
@@ -104,20 +107,22 @@ def run_demo(
         out: made when it is missing; files of an earlier run are overwritten.
         device: as for `Renderer`.
         tell: called with what is being done, for a progress display.
+        mixture: of the markers. Those of `exact` stand in scene.ply as `fitted`: a PLY file has no boxes.
 
-    Raises InputError when the folder cannot be written, DeviceError when the device cannot be used.
+    Raises InputError when the folder cannot be written or there is no such mixture, DeviceError when the
+    device cannot be used.
     """
     begun = time.perf_counter()
     folder = writable_folder(out)
     tell("making three markers and their scene")
-    scene = demo_scene()
+    scene = demo_scene(mixture=mixture)
     tell("opening the device")
     renderer = Renderer(device)
     resident = renderer.upload(scene)
     files = [folder / "scene.toml", folder / "scene.ply"]
     scene.save(files[0])
     files += sorted(folder.glob("scene-splats-*.ply"))
-    save_ply(scene.cloud(), files[1])
+    save_ply((scene if mixture != "exact" else demo_scene()).cloud(), files[1])
 
     sightings, strangers, frame_ms, visible, sheet = [], [], {}, {}, []
     for view, camera in demo_views().items():

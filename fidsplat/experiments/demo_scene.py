@@ -28,11 +28,13 @@ SIGNS = (
 OUTPUTS = ("rgb", "depth", "normal", "label")
 
 
-def demo_scene(seed: int = 0) -> Scene:
+def demo_scene(seed: int = 0, mixture: str = "fitted") -> Scene:
     """Signs, ground, wall and plants: about ten thousand background splats, label 0, and the splats of the
-    signs."""
+    signs, of that mixture."""
     random = np.random.default_rng(seed)
-    placed = tuple(PlacedMarker(marker(spec, size=size), _at(place)) for spec, size, place in SIGNS)
+    placed = tuple(
+        PlacedMarker(marker(spec, size=size, mixture=mixture), _at(place)) for spec, size, place in SIGNS
+    )
     parts = [
         _ground(random),
         _wall(random),

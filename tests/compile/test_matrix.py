@@ -1,7 +1,8 @@
-"""The compile matrix: each effect alone, all, all but one, all pairs; their texts, and pictures against the reference.
+"""The compile matrix: each effect alone, all, all but one, all pairs; their texts, and pictures against the
+reference.
 
-Texts are put together for all pairs; kernels are built, and pictures compared, for a sample of them, or for all of them with
-FIDSPLAT_ALL_PAIRS=1 in the environment."""
+Texts are put together for all pairs; kernels are built, and pictures compared, for a sample of them, or for
+all of them with FIDSPLAT_ALL_PAIRS=1 in the environment."""
 
 import os
 import re

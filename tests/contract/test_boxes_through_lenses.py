@@ -61,9 +61,10 @@ LARGE = {
 
 @pytest.mark.parametrize("camera", LARGE.values(), ids=LARGE)
 def test_a_small_box_is_listed_for_few_tiles(renderer, camera):
-    """No more than 1.2 times those of a Gaussian of three standard deviations, while it is not seen edge-on."""
+    """No more than 1.2 times those of a Gaussian of three standard deviations, while it is not seen
+    edge-on."""
     cloud = random_splats(300, 2, depth=(0.8, 4.0), scale=(0.01, 0.04), across=0.8)
-    turns = np.random.default_rng(1).uniform(-0.15, 0.15, (300, 4)) + (1, 0, 0, 0)
+    turns = np.random.default_rng(1).uniform(-0.15, 0.15, (300, 4)) + np.array([1, 0, 0, 0])
     cloud = fs.SplatCloud(cloud.means, turns, cloud.scales, np.ones(300), colors=cloud.colors)
     boxes = renderer.render(cloud.with_boxes(), camera, quality=EXACT)
     disks = renderer.render(cloud, camera, quality=EXACT)
@@ -76,25 +77,27 @@ def seen_from(camera, tilt, distance, spin=20.0):
     a, b = math.radians(tilt), math.radians(spin)
     target = np.array((0.11, 0.07, 0.0))
     away = np.array([math.sin(a) * math.cos(b), math.sin(a) * math.sin(b), -math.cos(a)])
-    pose = fs.Camera.look_at(64, 48, 1.0, target + distance * away, target + (0.1 * distance, 0, 0))
+    pose = fs.Camera.look_at(64, 48, 1.0, target + distance * away, target + 0.1 * distance * np.eye(3)[0])
     return replace(camera, world_to_camera=pose.world_to_camera, position=None)
 
 
 def widened(camera):
-    """Samples (h, w) that see ten times as wide as others do: the last ones before the fold of a distortion."""
+    """Samples (h, w) that see ten times as wide as others do: the last ones before the fold of a
+    distortion."""
     if camera.lens.kind == "orthographic":
         return np.zeros((camera.height, camera.width), bool)
-    raster = raster_of(
-        camera.lens, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
-    )
+    raster = raster_of(camera.lens, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
     width = np.linalg.norm(raster.slopes, axis=(2, 3))
     return width > 10 * np.nanmedian(width)
 
 
 @each_camera
-@pytest.mark.parametrize(("tilt", "distance"), [(0, 0.1), (60, 0.1), (0, 0.7), (40, 0.7), (75, 0.7), (40, 8.0)])
+@pytest.mark.parametrize(
+    ("tilt", "distance"), [(0, 0.1), (60, 0.1), (0, 0.7), (40, 0.7), (75, 0.7), (40, 8.0)]
+)
 def test_boxes_of_a_sheet_add_up_to_it(renderer, camera, tilt, distance):
-    """A sheet cut at random covers what one box of its size covers in every pixel, and a white one is as white."""
+    """A sheet cut at random covers what one box of its size covers in every pixel, and a white one is as
+    white."""
     corners = np.array(cut((9, 9), np.random.default_rng(7)), float)
     half = (corners[:, 2:] - corners[:, :2]) / 2
     middle = (corners[:, :2] + corners[:, 2:]) / 2 - 4.5
@@ -114,9 +117,12 @@ def test_boxes_of_a_sheet_add_up_to_it(renderer, camera, tilt, distance):
 @each_camera
 @pytest.mark.parametrize("size", [0.004, 0.2])
 def test_light_is_that_of_the_image(renderer, camera, size):
-    """The opacities that a tilted box adds to a picture sum up to the area of its image, below a pixel and above it."""
+    """The opacities that a tilted box adds to a picture sum up to the area of its image, below a pixel and
+    above it."""
     turn = [math.cos(0.35), math.sin(0.35), 0.2, 0.1]
-    box = fs.SplatCloud([(0.1, 0.1, 0.1)], [turn], [(size, 1.5 * size)], [1.0], colors=[(1, 1, 1)]).with_boxes()
+    box = fs.SplatCloud(
+        [(0.1, 0.1, 0.1)], [turn], [(size, 1.5 * size)], [1.0], colors=[(1, 1, 1)]
+    ).with_boxes()
     looking = seen_from(camera, 10, 2.0)
     edge = np.linspace(-1, 1, 50)
     around = [(edge, -1 + 0 * edge), (1 + 0 * edge, edge), (-edge, 1 + 0 * edge), (-1 + 0 * edge, -edge)]

@@ -90,9 +90,7 @@ def test_effects_of_the_picture_under_a_shutter(renderer, around, shutter):
         cloud, PLAIN, outputs, quality, behind, motion=motion, shutter=shutter, sensor=SENSOR, fog=fog
     )
     view = exposed_view(PLAIN, quality, cloud.origin, behind, motion, shutter, SENSOR, fog)
-    features = select(
-        cloud, outputs, quality, PLAIN, True, True, sensor=SENSOR, fog=fog, background=behind
-    )
+    features = select(cloud, outputs, quality, PLAIN, True, True, sensor=SENSOR, fog=fog, background=behind)
     reference = ReferenceBackend()
     truth = reference.pipeline(features).render(reference.upload(cloud), view).planes
     differences = compare(frame, truth, outputs)
@@ -123,7 +121,9 @@ def test_fog_is_averaged_over_the_poses_of_a_shutter(renderer):
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 def test_backgrounds_behind_every_lens(renderer, camera, behind, samples):
     quality = fs.Quality(samples=samples)
-    assert_agrees(renderer, camera=camera, background=behind, quality=quality, outputs=("rgb", "normal_world"))
+    assert_agrees(
+        renderer, camera=camera, background=behind, quality=quality, outputs=("rgb", "normal_world")
+    )
 
 
 @pytest.mark.skipif(WARP is None, reason="no Warp device here")

@@ -13,7 +13,13 @@ CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 PIXEL = fs.Quality(lowpass="pixel")
 LENSES = {
     "distortion": fs.Camera.pinhole(
-        75, 62, 50.0, 51.0, 35.0, 32.0, lens=fs.BrownConrady(-0.3, 0.1, 0.0, 0.01, p1=0.01, p2=-0.005, s1=0.01)
+        75,
+        62,
+        50.0,
+        51.0,
+        35.0,
+        32.0,
+        lens=fs.BrownConrady(-0.3, 0.1, 0.0, 0.01, p1=0.01, p2=-0.005, s1=0.01),
     ),
     "fisheye": fs.Camera.fisheye(70, 66, math.radians(200), coefficients=(0.02, -0.004, 0.001, 0.0)),
     "panorama": fs.Camera.equirectangular(110, 55),
@@ -43,15 +49,16 @@ def test_splats_of_every_size_through_every_lens(renderer, camera, scale):
 
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
 def test_a_lens_keeps_the_light_of_a_splat(renderer, camera):
-    """The sum of alpha over the picture is 2 pi opacity times the area of the image of the one-sigma square of a splat
-    far below a pixel; the area from a finite parallelogram."""
+    """The sum of alpha over the picture is 2 pi opacity times the area of the image of the one-sigma square
+    of a splat far below a pixel; the area from a finite parallelogram."""
     generator = np.random.default_rng(2)
     # seen by every lens here, off its axis
     mean = np.array([0.5, -0.35, 1.5])
     cloud = fs.SplatCloud([mean], [generator.normal(size=4)], [(3e-4, 5e-4)], [0.9], colors=[(1, 1, 1)])
     axes = quaternion_to_matrix(cloud.quats)[0, :, :2] * cloud.scales[0]
     u, v = (
-        (camera.project([mean + axis]) - camera.project([mean - axis]))[0] / 2 for axis in axes.T.astype(float)
+        (camera.project([mean + axis]) - camera.project([mean - axis]))[0] / 2
+        for axis in axes.T.astype(float)
     )
     want = 2 * math.pi * 0.9 * abs(u[0] * v[1] - u[1] * v[0])
     quality = PIXEL.with_(alpha_cutoff=1e-9)

@@ -119,6 +119,20 @@ def test_blur_is_the_mean_of_its_poses(renderer):
     assert (frame["depth"] == single[2]["depth"]).all()
 
 
+def test_many_views_share_a_motion_and_a_shutter(renderer):
+    cloud, outputs = random_splats(60, 5, depth=(1, 5), scale=(0.02, 0.3)), ("rgb", "depth")
+    cameras = [CAMERAS["pinhole"], CAMERAS["distortion"]]
+    motion, shutter = fs.Motion(None, {3: turned}), SHUTTERS["both"]
+    views = renderer.render_views(cloud, cameras, outputs, motion=motion, shutter=shutter)
+    scene = fs.Scene([cloud], shutter=shutter, camera_motion=pose_at)
+    of_scene = renderer.render_views(scene, cameras, outputs)
+    for camera, frame, moved in zip(cameras, views, of_scene, strict=True):
+        single = renderer.render(cloud, camera, outputs, motion=motion, shutter=shutter)
+        assert all(np.array_equal(frame[name], single[name]) for name in outputs)
+        single = renderer.render(scene, camera, outputs)
+        assert all(np.array_equal(moved[name], single[name]) for name in outputs)
+
+
 def test_a_rolling_shutter_takes_each_row_at_its_own_time(renderer):
     cloud, camera = random_splats(100, 6, depth=(1, 5), scale=(0.02, 0.3)), CAMERAS["pinhole"]
     shutter = fs.Shutter(readout=0.8, rows_per_band=1)

@@ -61,6 +61,15 @@ def test_a_marker_that_is_missed_fails_the_demo(tmp_path, capsys, monkeypatch):
     assert "aruco:4x4_50:7 in 'hidden'" not in out
 
 
+def test_the_markers_of_the_demo_may_be_boxes(scene, tmp_path, capsys):
+    sharp = demo_scene(mixture="exact")
+    assert sharp.cloud().footprint == "mixed"
+    assert [p.marker.spec for p in sharp.markers] == [p.marker.spec for p in scene.markers]
+    assert len(sharp.cloud()) < len(scene.cloud())
+    assert main(["demo", "--out", str(tmp_path), "--mixture", "sharp"]) == 2
+    assert "sharp" in capsys.readouterr().err
+
+
 def test_the_scene_is_the_same_every_time(scene):
     again = demo_scene().cloud()
     one = scene.cloud()

@@ -205,8 +205,10 @@ def test_lenses_that_scene_files_cannot_have(tmp_path, text, words):
 
 @pytest.mark.parametrize(
     "lens",
-    [*(BrownConrady.opencv(each) for each in COEFFICIENTS), Fisheye(0.05, -0.01, 0.003, -0.001), Fisheye()]
-    + [Equirectangular(), Orthographic()],
+    [
+        *(BrownConrady.opencv(each) for each in COEFFICIENTS),
+        *(Fisheye(0.05, -0.01, 0.003, -0.001), Fisheye(), Equirectangular(), Orthographic()),
+    ],
     ids=lambda lens: lens.kind,
 )
 def test_derivatives_are_those_of_the_image(lens):
@@ -228,7 +230,9 @@ def test_a_panorama_has_derivatives_at_its_poles():
 
 
 @pytest.mark.parametrize(
-    "lens", [BrownConrady(-0.2, 0.05, p1=0.01), Fisheye(0.05, -0.01), Equirectangular()], ids=lambda lens: lens.kind
+    "lens",
+    [BrownConrady(-0.2, 0.05, p1=0.01), Fisheye(0.05, -0.01), Equirectangular()],
+    ids=lambda lens: lens.kind,
 )
 def test_slopes_of_a_raster_are_the_differences_of_its_rays(lens):
     """A step of a tenth of a sample in either direction turns a ray by that much of its slope."""

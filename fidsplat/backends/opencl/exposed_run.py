@@ -35,7 +35,9 @@ class ExposedRun(Run):
         whole = [self.take(f"exposed {k}", 4 * plane * count) for k, (count, _) in enumerate(kinds)]
         # what is around is the same for all shots
         around = {
-            name: self.put(name, self.view.array(name)) for effect in effects for name in effect.backdrop_arrays
+            name: self.put(name, self.view.array(name))
+            for effect in effects
+            for name in effect.backdrop_arrays
         }
         for shot in self.view.shots:
             run = Run(self.pipeline, self.resident, shot.view, self.plan)

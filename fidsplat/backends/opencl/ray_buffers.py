@@ -24,7 +24,8 @@ class RayBuffers:
         )
 
     def of(self, raster: RayRaster, rows: int, columns: int, slopes: bool = False) -> dict[str, cl.Buffer]:
-        """Buffers by name, for a sample grid that is padded to rows x columns. slopes: with those that boxes need."""
+        """Buffers by name, for a sample grid that is padded to rows x columns. slopes: with those that boxes
+        need."""
         sizes = self._held.setdefault(raster, {})
         if (rows, columns) not in sizes:
             sizes[rows, columns] = {"rays": self._planes("rays", raster.rays, rows, columns)}
@@ -34,7 +35,7 @@ class RayBuffers:
         if slopes and "ray_slopes" not in held:
             flat = raster.slopes.reshape(raster.height, raster.width, 6)
             held["ray_slopes"] = self._planes("ray_slopes", flat, rows, columns)
-            held["ray_step"] = self._put("ray_step", np.float32([raster.step]))
+            held["ray_step"] = self._put("ray_step", np.array([raster.step], np.float32))
         return held
 
     def _planes(self, name: str, array: np.ndarray, rows: int, columns: int) -> cl.Buffer:

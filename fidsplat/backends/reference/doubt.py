@@ -74,7 +74,8 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
     high = np.exp(s.log_opacity - nearest * (1 - _WEIGHT)) * (1 + _WEIGHT)
     low, high = np.minimum(low, view.ceiling), np.minimum(high, view.ceiling)
     if s.box.any():
-        # of an edge's distance: its two forms', one of them multiplied once more, the sum's, and near it the gradient's
+        # of an edge's distance: its two forms', one of them multiplied once more, the sum's, and near it the
+        # gradient's
         off = np.stack(
             [
                 (e_d + 1.5 * e) * edge + _ROUND * terms

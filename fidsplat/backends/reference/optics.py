@@ -42,8 +42,8 @@ def samples_of(view: View, x: np.ndarray, y: np.ndarray) -> Samples:
 
 
 def rays_of(view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Directions (k, 3) in the camera frame of the rays through samples at grid positions x, y (k,), along z 1 or
-    of unit length; and whether there is one (k,)."""
+    """Directions (k, 3) in the camera frame of the rays through samples at grid positions x, y (k,), along z
+    1 or of unit length; and whether there is one (k,)."""
     if view.raster is not None:
         rays = view.raster.rays[y.astype(int), x.astype(int)].astype(np.float64)
         return rays, np.isfinite(rays[:, 0])
@@ -53,7 +53,8 @@ def rays_of(view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def ray_lengths(x: np.ndarray, y: np.ndarray, view: View) -> np.ndarray:
-    """Length (k,) of the rays through samples at grid positions x, y, per metre of depth; 1 where there is none."""
+    """Length (k,) of the rays through samples at grid positions x, y, per metre of depth; 1 where there is
+    none."""
     if view.along_ray or view.parallel:
         return np.ones_like(x)
     rays, seen = rays_of(view, x.ravel(), y.ravel())
@@ -93,8 +94,8 @@ def centers_of(view: View, p: np.ndarray, known: np.ndarray) -> tuple[np.ndarray
 
 
 def derivatives_of(view: View, p: np.ndarray) -> np.ndarray:
-    """Of the places where points p (n, 3) fall [samples] by their coordinates, (n, 2, 3); NaN where a lens does not
-    see them."""
+    """Of the places where points p (n, 3) fall [samples] by their coordinates, (n, 2, 3); NaN where a lens
+    does not see them."""
     if view.lens is None:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             x, y, ahead = p[:, 0] / p[:, 2], p[:, 1] / p[:, 2], 1 / p[:, 2]
@@ -106,14 +107,13 @@ def derivatives_of(view: View, p: np.ndarray) -> np.ndarray:
     return slopes * np.array([[view.fx], [view.fy]])
 
 
-def edges_of(
-    view: View, forms: np.ndarray, x: np.ndarray, y: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def edges_of(view: View, forms: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The edges of boxes with `forms` (3, n, 3), at samples (k,) on the grid.
 
     Returns:
-        1 / |gradient| of D + n_u, D - n_u, D + n_v, D - n_v by the sample's position, (4, n) or, where each sample has a ray of
-        its own, (4, k, n); and what the gradients' terms come to, relative to them (0 where devices have them from their set-up).
+        1 / |gradient| of D + n_u, D - n_u, D + n_v, D - n_v by the sample's position, (4, n) or, where each
+        sample has a ray of its own, (4, k, n); and what the gradients' terms come to, relative to them (0
+        where devices have them from their set-up).
     """
     sides = [(axis, sign) for axis in (0, 1) for sign in (1, -1)]
     if view.raster is None:

@@ -13,8 +13,8 @@ _ROUND = 2e-6
 
 
 def background_at(view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colours (k, 3) that samples at x, y (k,) on the grid see behind everything, 0 where they see nothing, and
-    what float32 may change in them (k,)."""
+    """Colours (k, 3) that samples at x, y (k,) on the grid see behind everything, 0 where they see nothing,
+    and what float32 may change in them (k,)."""
     around = view.surroundings
     assert around is not None
     rays, seen = rays_of(view, x, y)
@@ -22,7 +22,10 @@ def background_at(view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray,
     if isinstance(around, Gradient):
         up = np.array(around.up) / np.linalg.norm(around.up)
         share = np.clip(0.5 + 0.5 * (rays @ up) / np.linalg.norm(rays, axis=1), 0, 1)[:, None]
-        colors, doubt = np.add(around.bottom, share * np.subtract(around.top, around.bottom)), np.zeros(len(x))
+        colors, doubt = (
+            np.add(around.bottom, share * np.subtract(around.top, around.bottom)),
+            np.zeros(len(x)),
+        )
     else:
         colors, doubt = _panorama_at(around, rays)
     return np.where(seen[:, None], colors, 0.0), np.where(seen, doubt, 0.0)

@@ -114,8 +114,9 @@ def _filtered(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Scaled tangents (n, 3) after the low-pass `pixel`, and the factor (n,) by which areas grow.
 
-    chosen (n,) bool: the others stay as they are, and those whose centre a lens does not see. The covariance of the filter in (u, v) is
-    (G^T G)^-1 / 4 with G the derivative of the sample's position by (u, v) at the centre.
+    chosen (n,) bool: the others stay as they are, and those whose centre a lens does not see. The covariance
+    of the filter in (u, v) is (G^T G)^-1 / 4 with G the derivative of the sample's position by (u, v) at the
+    centre.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         slopes = optics.derivatives_of(view, p)

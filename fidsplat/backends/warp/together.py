@@ -8,7 +8,8 @@ from fidsplat.errors import DeviceError
 
 _LENSES = ("camera_brown_conrady", "camera_fisheye", "camera_equirectangular", "camera_orthographic")
 _SKIES = ("background_gradient", "background_panorama")
-# boxes before a lens with rays of its own, and a distortion's distances, have names of their own (rays_box, ...)
+# boxes before a lens with rays of its own, and a distortion's distances, have names of their own (rays_box,
+# ...)
 _APART = (
     (_LENSES, ("lowpass_pixel", *_SKIES)),
     (("camera_orthographic",), ("footprint_box", "footprint_mixed")),
@@ -16,7 +17,8 @@ _APART = (
 
 
 def refuse_strangers(names: Collection[str], turns: bool = False) -> None:
-    """Refuse effects that the kernels would draw wrongly together; turns: the camera turns during an exposure.
+    """Refuse effects that the kernels would draw wrongly together; turns: the camera turns during an
+    exposure.
 
     Raises:
         DeviceError: it names both.
@@ -28,6 +30,6 @@ def refuse_strangers(names: Collection[str], turns: bool = False) -> None:
     asked = [name for name in ("normal_world", *_SKIES) if name in names]
     if turns and asked:
         raise DeviceError(
-            f"warp does not draw {', '.join(asked)} for a camera that turns while the picture is taken yet; use "
-            "an OpenCL device for it"
+            f"warp does not draw {', '.join(asked)} for a camera that turns while the picture is taken yet; "
+            "use an OpenCL device for it"
         )
