@@ -1,5 +1,8 @@
 """The knobs: their ranges, what goes together, and where they come from."""
 
+import json
+from importlib.resources import files
+
 import numpy as np
 import pytest
 
@@ -7,6 +10,7 @@ import fidsplat as fs
 from fidsplat.markers.mixture import fitted_templates
 from fidsplat.quality import TEMPLATE_SIZES
 
+TEMPLATES = files("fidsplat.markers").joinpath("templates.json")
 WRONG = {
     "arithmetic": "quick",
     "blend_precision": "float16",
@@ -86,6 +90,11 @@ def test_shipped_templates_are_those_that_quality_knows():
     counts = [len(one.cloud) for one in made.values()]
     assert counts == sorted(counts)
     assert len(made[1].cloud) == len(made[1].boxes)
+
+
+def test_larger_templates_are_better_ones():
+    reached = [entry["fit_db"] for entry in json.loads(TEMPLATES.read_text("utf-8"))["sets"]]
+    assert reached == sorted(reached)
 
 
 def test_a_marker_takes_from_a_quality_what_it_does_not_say():
