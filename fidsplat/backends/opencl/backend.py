@@ -102,6 +102,11 @@ class OpenCLBackend:
         if not self.info.float64 and features.setup_precision != "float32":
             features = replace(features, setup_precision="float32")
         key = (features, shape or shape_for(features, self.shape))
+        if key[1].blend_items > self.device.max_work_group_size:
+            raise DeviceError(
+                f"{self.info.title} has work-groups of at most {self.device.max_work_group_size}, and "
+                f"tile_size={features.tile_size} needs {key[1].blend_items}; use smaller tiles"
+            )
         if key not in self._pipelines:
             source = assemble(*key)
             program = self.build(source.text)
