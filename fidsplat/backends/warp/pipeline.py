@@ -8,7 +8,7 @@ the same bits.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy as np
 from fidsplat.backends.base import View
 from fidsplat.backends.warp import runtime
 from fidsplat.backends.warp.around import Surroundings
+from fidsplat.backends.warp.finished import WarpPlanes
 from fidsplat.backends.warp.launch import BLOCK, Launcher
 from fidsplat.backends.warp.memory import Resident
 from fidsplat.effects import FeatureSet
@@ -49,33 +50,6 @@ _UNIFORMS = (
 # bytes: of one splat's bounds; of its window, keys, counts, drawn, places, sums; of one that is drawn, in
 # sort and lists; of a pair with the scratch of its sort
 _BOUNDS, _PROJECTED, _VISIBLE, _PAIR = 44, 36, 40, 24
-
-
-class WarpPlanes:
-    """Finished planes on the device."""
-
-    def __init__(
-        self,
-        outputs: dict[str, tuple[Output, Any]],
-        size: tuple[int, int],
-        launcher: Launcher,
-        stats: dict[str, int],
-    ) -> None:
-        self._outputs, self._size, self._launcher = outputs, size, launcher
-        self.stats: Mapping[str, int] = stats
-
-    def device_array(self, name: str) -> Any:
-        """The plane as a wp.array (h, w) or (h, w, 3) on the device; no copy."""
-        output, array = self._outputs[name]
-        return array.reshape(self._size if output.channels == 1 else (*self._size, output.channels))
-
-    def read(self, name: str) -> np.ndarray:
-        # a CPU array's numpy() is its own memory, which device_array gives away
-        return np.array(self.device_array(name).numpy())
-
-    @property
-    def timings(self) -> dict[str, float]:
-        return self._launcher.timings()
 
 
 class WarpPipeline:
