@@ -215,7 +215,7 @@ class _Run:
         ends = self._exact("ends by index", n, wp.int64)
         cloud = [self.resident.arrays[name] for name in ("means", "quats", "scales", "opacities", "colors")]
         cloud += self._planes()
-        cloud.append(self.resident.arrays.get("boxes", drawn))  # of one kind of splats: never read
+        cloud.append(self.resident.arrays.get("boxes", drawn))  # not read where all are of one kind
         records = [self.held["lines"], self.held["bounds"], self._take("windows", n, wp.uint64)]
         self.launcher.launch(
             self.pipeline.project,
@@ -292,6 +292,7 @@ class _Run:
         fixed += self.grid[0] * self.grid[1] * sample
         pixel = sum(4 * output.channels for output in self.pipeline.features.outputs)
         fixed += self.view.width * self.view.height // self.view.samples**2 * pixel
+        fixed += self.pipeline.surroundings.nbytes(self.view)
         room = (budget - fixed) // _PAIR
         if room < 1:
             raise DeviceError(
@@ -331,7 +332,7 @@ class _Run:
         """Draws the tiles of one band."""
         pipeline, held = self.pipeline, self.held
         lists = held["starts"], held["lists"]
-        planes = self.resident.arrays.get("planes", held["lists"])  # of no splats: never read
+        planes = self.resident.arrays.get("planes", held["lists"])  # not read where there are none
         args = (self.u, held["lines"], planes, *lists, samples)
         area = pipeline.shape.tile_width * pipeline.shape.tile_height
         if pipeline.shape.schedule == "group":
