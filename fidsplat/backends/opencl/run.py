@@ -89,10 +89,7 @@ class Run:
             np.uint32(first),
             np.int32(view.width),
             np.int32(view.height),
-            np.float32(view.log_cut),
-            np.float32(view.ceiling),
-            np.float32(view.stop),
-            np.float32(1.0 / view.samples**2),
+            *map(self.pipeline.wide, (view.log_cut, view.ceiling, view.stop, 1.0 / view.samples**2)),
             *self._blend_args(sample_planes),
         )
 
