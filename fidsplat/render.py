@@ -244,7 +244,6 @@ class Renderer:
             camera,
             moving=bool(view.groups),
             exposed=bool(view.shots),
-            turning=view.turns,
             sensor=sensor,
             fog=fog,
             background=behind,
