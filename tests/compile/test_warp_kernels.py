@@ -9,6 +9,7 @@ from fidsplat.backends.warp import runtime
 wp = pytest.importorskip("warp")
 ALL = ("lowpass_screen", "ray_depth", "normal", "compose_planes", "depth", "depth_median", "label")
 RECORD = ALL[:4]
+STEPS = ("exposure", "vignetting", "noise", "gain", "response_srgb", "response_table", "quantise")
 
 
 def made(name, *arguments):
@@ -41,6 +42,7 @@ def started():
         lambda: made("blend.make_blend", ALL, True, 256)[0],
         lambda: made("blend.make_blend", ("lowpass_screen", "stop_exclusive"), True, 256)[0],
         lambda: made("resolve.make_resolve", ("alpha", "depth", "depth_median", "label", "normal"), 3),
+        lambda: made("sensor.make_develop", STEPS)[0],
         lambda: made("lists.make_lists", True).emit,
         lambda: made("lists.make_lists", True).count,
         lambda: made("lists.make_lists", False).histogram,
@@ -48,8 +50,8 @@ def started():
         lambda: made("lists.find_starts"),
     ],
     ids=[
-        *("project", "project-float32", "blend-all", "blend-exclusive", "resolve", "emit", "count"),
-        *("histogram", "compact", "starts"),
+        *("project", "project-float32", "blend-all", "blend-exclusive", "resolve", "sensor", "emit"),
+        *("count", "histogram", "compact", "starts"),
     ],
 )
 def test_the_kernels_compile_for_cuda(kernel, tmp_path):

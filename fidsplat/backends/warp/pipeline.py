@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fidsplat.backends.base import View
-from fidsplat.backends.warp import runtime
+from fidsplat.backends.warp import runtime, sensor
 from fidsplat.backends.warp.launch import BLOCK, Launcher
 from fidsplat.backends.warp.memory import Resident
 from fidsplat.effects import FeatureSet
@@ -29,6 +29,7 @@ KNOWN = frozenset(
     | {"stop_exclusive", "compose_ordered", "compose_planes", "ray_depth"}
     | {"perspective", "footprint_gaussian", "background_constant"}
     | {"alpha", "depth", "depth_median", "normal", "label"}
+    | sensor.STEPS
 )
 """effects that kernels/warp has"""
 # of these depend on an effect: a stage is compiled once for all feature sets that mean the same to it
@@ -106,6 +107,9 @@ class WarpPipeline:
             )
             self.resolve = runtime.kernels("resolve").make_resolve(features.taps, features.samples)
             common = [self.sort.compact, self.sort.gather, self.sort.find_starts, self.sort.sum_up]
+            self.sensor = sensor.Development.of(features.posts)
+            if self.sensor:
+                common.append(self.sensor.kernel)
             for kernel in (self.project, self.lists.emit, self.blend, self.resolve, *common):
                 self._compile(kernel)
 
@@ -364,6 +368,9 @@ class _Run:
             for name in _OUTPUTS
         ]
         self.launch(self.pipeline.resolve, height * width, self.u, width, *samples, *arrays)
+        if self.pipeline.sensor:
+            args = self.pipeline.sensor.arguments(view, self.pool)
+            self.launch(self.pipeline.sensor.kernel, height * width, *args, width, outputs["rgb"][1])
         return outputs, (height, width)
 
     # helpers
