@@ -19,6 +19,7 @@ import warp as wp
 from .bounds import PAD, PAD_RELATIVE, Bounds, box_bounds, ellipse_bounds, make_bounds
 from .color import make_color
 from .common import CULLED, STRICT, View, as_bits, population, sortable, store_line
+from .motion import make_motion
 from .records import Layout
 
 # [m]; nobody sees the difference, and what is divided by it stays above float32's denormals (numerics B6)
@@ -46,6 +47,9 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
     edge_on = real(1e-13 if precision == "float64" else 1e-6)
     one, two, half, zero = real(1.0), real(2.0), real(0.5), real(0.0)
     limits, color_of = make_bounds(screen), make_color(sh_terms, real)
+    moves = "motion_groups" in effects
+    motion = make_motion(moves)
+    Moving = motion.Moving
     word = {name: layout.names.index(name) for name in layout.names}
     first_extra = {name: word.get(name, 0) for name in ("dot_x", "z_numerator", "nx")}
     at_dot, at_depth, at_normal = first_extra["dot_x"], first_extra["z_numerator"], first_extra["nx"]
@@ -144,6 +148,7 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
     def project(
         first: int,  # splat of thread 0
         view: View,
+        moving: Moving,
         means: wp.array(dtype=wp.vec3),  # (n) [m], relative to the cloud's origin
         quats: wp.array(dtype=wp.vec4),  # (n) w x y z
         scales: wp.array(dtype=wp.vec2),  # (n) [m]
@@ -179,12 +184,17 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
         q = quats[i]
         w, x, y, z = real(q[0]), real(q[1]), real(q[2]), real(q[3])
         s = two / (w * w + x * x + y * y + z * z)
-        turn = mat33(view.rotation)
+        turn, shift, eye = mat33(view.rotation), vec3(view.translation), vec3(view.eye)
+        if wp.static(moves):
+            group = motion.group_of(moving, i)
+            if group >= 0:
+                own = moving.poses[group]
+                turn, shift, eye = mat33(own.rotation), vec3(own.translation), vec3(own.eye)
         tangent_u = turn * vec3(one - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y))
         tangent_v = turn * vec3(s * (x * y - w * z), one - s * (x * x + z * z), s * (y * z + w * x))
         center = means[i]
         mean = vec3(real(center[0]), real(center[1]), real(center[2]))
-        p = turn * mean + vec3(view.translation)
+        p = turn * mean + shift
         a = tangent_u * su
         b = tangent_v * sv
 
@@ -257,7 +267,7 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
         # edge-on within rounding: no ray meets the plane, only the low-pass dot is drawn (numerics B2)
         facing = wp.where(height * height > edge_on * edge_on * wp.dot(p, p), scale, zero)
 
-        rgb = color_of(i, colors, mean - vec3(view.eye))
+        rgb = color_of(i, colors, mean - eye)
         if not (wp.isfinite(rgb[0]) and wp.isfinite(rgb[1]) and wp.isfinite(rgb[2])):
             return
 

@@ -38,7 +38,7 @@ def started():
     "kernel",
     [
         lambda: made("project.make_project", RECORD, 16, "float64", False),
-        lambda: made("project.make_project", (), 0, "float32", True),
+        lambda: made("project.make_project", (*RECORD, "motion_groups"), 0, "float32", True),
         lambda: made("blend.make_blend", ALL, True, 256)[0],
         lambda: made("blend.make_blend", ("lowpass_screen", "stop_exclusive"), True, 256)[0],
         lambda: made("resolve.make_resolve", ("alpha", "depth", "depth_median", "label", "normal"), 3),

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fidsplat.backends.base import View
-from fidsplat.backends.warp import runtime, sensor
+from fidsplat.backends.warp import motion, runtime, sensor
 from fidsplat.backends.warp.launch import BLOCK, Launcher
 from fidsplat.backends.warp.memory import Resident
 from fidsplat.effects import FeatureSet
@@ -30,10 +30,12 @@ KNOWN = frozenset(
     | {"perspective", "footprint_gaussian", "background_constant"}
     | {"alpha", "depth", "depth_median", "normal", "label"}
     | sensor.STEPS
+    | {"motion_groups"}
 )
 """effects that kernels/warp has"""
 # of these depend on an effect: a stage is compiled once for all feature sets that mean the same to it
 _RECORD = ("lowpass_screen", "ray_depth", "normal", "compose_planes")
+_PROJECTED_ONLY = ("motion_groups",)
 _SAMPLE = (*_RECORD, "stop_exclusive", "depth", "depth_median", "label")
 
 
@@ -94,8 +96,9 @@ class WarpPipeline:
         screen = "lowpass_screen" in names
         with runtime.quiet():
             self.layout = runtime.kernels("records").Layout(record)
+            own = tuple(name for name in _PROJECTED_ONLY if name in names)
             self.project = runtime.kernels("project").make_project(
-                record, terms, features.setup_precision, shape.schedule == "tiles"
+                (*record, *own), terms, features.setup_precision, shape.schedule == "tiles"
             )
             self.project_block = runtime.kernels("project").BLOCK
             self.lists = runtime.kernels("lists").make_lists(screen)
@@ -229,6 +232,7 @@ class _Run:
             self.pipeline.project,
             n,
             self.u,
+            motion.moving(self.resident, self.view, self.pool),
             *cloud,
             *records,
             keys,
