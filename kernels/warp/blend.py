@@ -9,6 +9,7 @@ import warp as wp
 
 from .bounds import Bounds, make_bounds
 from .common import STRICT, View, lowest, store_line
+from .lens import make_rays
 from .pixel import make_pixel
 from .staging import BLOCK_H, BLOCK_W, STAGED
 
@@ -34,7 +35,9 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
         parts.unfinished,
         parts.blend,
     )
-    finish = parts.finish
+    finish, cross_ray = parts.finish, parts.cross_ray
+    bent = "rays" in effects
+    Rays = make_rays(bent)
 
     @wp.func
     def store(
@@ -62,6 +65,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
     def blend_gpu(
         band_first: int,  # tile of block 0
         view: View,
+        rays: Rays,
         lines: wp.array(dtype=wp.vec4),
         labels: wp.array(dtype=wp.int32),
         planes: wp.array(dtype=wp.int32),
@@ -87,6 +91,10 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
         p = start()
         if x0 >= view.width or y0 >= view.height:
             p.t = 0.0  # what lies beyond the picture is finished from the start
+        if wp.static(bent):
+            ray = wp.vec3()
+            if p.t > 0.0:
+                ray = rays.rays[y0 * view.width + x0]
         records = pool()
         k = starts[tile]
         end = starts[tile + 1]
@@ -103,9 +111,11 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
                     s = load_staged(records, lines, lists, k, which, view)
                     index = lists[k + which]
                     if unfinished(p, view):
-                        y = float(y0) - s.c[0]
-                        u, v, d = row_of(s.u, y), row_of(s.v, y), row_of(s.d, y)
-                        c = cross(s, u, v, d, float(x0) - s.d[3], y, view)
+                        x, y = float(x0) - s.d[3], float(y0) - s.c[0]
+                        if wp.static(bent):
+                            c = cross_ray(s, ray, x, y, view)
+                        else:
+                            c = cross(s, row_of(s.u, y), row_of(s.v, y), row_of(s.d, y), x, y, view)
                         if c.drawn:
                             p = blend_one(p, s, c, index, lines, labels, planes, view)
                 word += 1
@@ -117,6 +127,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
     def blend_cpu(
         band_first: int,  # tile of thread 0
         view: View,
+        rays: Rays,
         lines: wp.array(dtype=wp.vec4),
         labels: wp.array(dtype=wp.int32),
         planes: wp.array(dtype=wp.int32),
@@ -157,7 +168,11 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
                 y = float(row) - s.c[0]
                 u, v, d = row_of(s.u, y), row_of(s.v, y), row_of(s.d, y)
                 for column in range(left, right):
-                    c = cross(s, u, v, d, float(column) - s.d[3], y, view)
+                    x = float(column) - s.d[3]
+                    if wp.static(bent):
+                        c = cross_ray(s, rays.rays[row * view.width + column], x, y, view)
+                    else:
+                        c = cross(s, u, v, d, x, y, view)
                     if c.drawn:
                         at = state_first + (row - y0) * view.tile_w + column - x0
                         p = state[at]

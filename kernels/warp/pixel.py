@@ -55,14 +55,20 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             "label",
         )
     )
+    bent, parallel = "rays" in effects, "camera_orthographic" in effects
     # u: nu0, nux, nuy, log opacity; v: nv0, nvx, nvy, D at the near plane; d: d0, dx, dy, ax; c: ay, r, g, b
     splat = {"u": wp.vec4, "v": wp.vec4, "d": wp.vec4, "c": wp.vec4, "half_r2": wp.float32}
     splat |= {"dot_x": wp.float32, "dot_y": wp.float32} if screen else {}
+    # w: factors of the ray's Z; origin: the anchor's ray
+    splat |= {"w": wp.vec3, "origin": wp.vec3} if bent else {}
+    # plane_z0, plane_zx, plane_zy, plane_near
+    splat |= {"plane": wp.vec4} if parallel else {}
     Splat = _struct("Splat", "What of a record each sample needs.", splat)
     # q / d^2 is rho / 2; inside: the ray meets the disk within R and beyond the near plane
     crossing = {"d": wp.float32, "q": wp.float32, "inside": wp.bool, "drawn": wp.bool}
     # screen: squared distance from the projected centre in pixels, which is rho / 2 of the low-pass
     crossing |= {"screen": wp.float32} if screen else {}
+    crossing |= {"z": wp.float32} if parallel else {}  # d times the depth
     Crossing = _struct("Crossing", "Where the ray of a sample meets a splat.", crossing)
     layers = "compose_planes" in effects
     seen = {"rgb": wp.vec3}
@@ -93,6 +99,10 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     nx_line, nx_lane = layout.place("nx")
     ny_line, ny_lane = layout.place("ny")
     nz_line, nz_lane = layout.place("nz")
+    (w0, w0_lane), (w1, w1_lane), (w2, w2_lane) = (layout.place(name) for name in ("nuz", "nvz", "dz"))
+    (o0, o0_lane), (o1, o1_lane), (o2, o2_lane) = (layout.place(f"ray_{axis}") for axis in "xyz")
+    plane_places = [layout.place(f"plane_{name}") for name in ("z0", "zx", "zy", "near")]
+    (p0, p0_lane), (p1, p1_lane), (p2, p2_lane), (p3, p3_lane) = plane_places
 
     @wp.func
     def load(lines: wp.array(dtype=wp.vec4), index: int, view: View):
@@ -106,8 +116,38 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             dot = line_of(lines, at + dot_line)
             s.dot_x = dot[dot_lane]
             s.dot_y = dot[dot_y_lane]
+        if wp.static(bent):
+            s.w = wp.vec3(
+                line_of(lines, at + w0)[w0_lane],
+                line_of(lines, at + w1)[w1_lane],
+                line_of(lines, at + w2)[w2_lane],
+            )
+            s.origin = wp.vec3(
+                line_of(lines, at + o0)[o0_lane],
+                line_of(lines, at + o1)[o1_lane],
+                line_of(lines, at + o2)[o2_lane],
+            )
+        if wp.static(parallel):
+            s.plane = wp.vec4(
+                line_of(lines, at + p0)[p0_lane],
+                line_of(lines, at + p1)[p1_lane],
+                line_of(lines, at + p2)[p2_lane],
+                line_of(lines, at + p3)[p3_lane],
+            )
         s.half_r2 = s.u[3] - view.log_cut
         return s
+
+    @wp.func
+    def staged(
+        pool: wp.uint64,
+        lines: wp.array(dtype=wp.vec4),
+        lists: wp.array(dtype=wp.int32),
+        first: int,
+        which: int,
+        line: int,
+        lane: int,
+    ) -> float:
+        return staged_line(pool, lines, lists, first, which, line)[lane]
 
     @wp.func
     def load_staged(
@@ -127,6 +167,24 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             dot = staged_line(pool, lines, lists, first, which, dot_line)
             s.dot_x = dot[dot_lane]
             s.dot_y = dot[dot_y_lane]
+        if wp.static(bent):
+            s.w = wp.vec3(
+                staged(pool, lines, lists, first, which, w0, w0_lane),
+                staged(pool, lines, lists, first, which, w1, w1_lane),
+                staged(pool, lines, lists, first, which, w2, w2_lane),
+            )
+            s.origin = wp.vec3(
+                staged(pool, lines, lists, first, which, o0, o0_lane),
+                staged(pool, lines, lists, first, which, o1, o1_lane),
+                staged(pool, lines, lists, first, which, o2, o2_lane),
+            )
+        if wp.static(parallel):
+            s.plane = wp.vec4(
+                staged(pool, lines, lists, first, which, p0, p0_lane),
+                staged(pool, lines, lists, first, which, p1, p1_lane),
+                staged(pool, lines, lists, first, which, p2, p2_lane),
+                staged(pool, lines, lists, first, which, p3, p3_lane),
+            )
         s.half_r2 = s.u[3] - view.log_cut
         return s
 
@@ -155,13 +213,29 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     @wp.func
     def cross(s: Splat, row_u: float, row_v: float, row_d: float, x: float, y: float, view: View):
         """x, y: the sample from the anchor; row_*: `row` of the three forms at y."""
+        return meet(s, fma(s.u[1], x, row_u), fma(s.v[1], x, row_v), fma(s.d[1], x, row_d), x, y, view)
+
+    @wp.func
+    def cross_ray(s: Splat, ray: wp.vec3, x: float, y: float, view: View):
+        """The same for the sample that has this ray."""
+        r = ray - s.origin
+        nu = fma(s.w[0], r[2], fma(s.u[1], r[0], fma(s.u[2], r[1], s.u[0])))
+        nv = fma(s.w[1], r[2], fma(s.v[1], r[0], fma(s.v[2], r[1], s.v[0])))
+        d = fma(s.w[2], r[2], fma(s.d[1], r[0], fma(s.d[2], r[1], s.d[0])))
+        c = meet(s, nu, nv, d, x, y, view)
+        c.drawn = c.drawn and d == d  # nothing is seen without a ray
+        return c
+
+    @wp.func
+    def meet(s: Splat, nu: float, nv: float, d: float, x: float, y: float, view: View):
         c = Crossing()
-        nu = fma(s.u[1], x, row_u)
-        nv = fma(s.v[1], x, row_v)
-        c.d = fma(s.d[1], x, row_d)
+        c.d = d
         c.q = fma(nu, nu, nv * nv)
         # product form: no division, no special value of D (numerics B2)
         c.inside = c.q <= s.half_r2 * (c.d * c.d) and c.d > 0.0 and c.d <= s.v[3]
+        if wp.static(parallel):
+            c.z = fma(s.plane[2], y, fma(s.plane[1], x, s.plane[0]))
+            c.inside = c.inside and c.z >= s.plane[3] * c.d
         c.drawn = c.inside
         if wp.static(screen):
             ex = x - s.dot_x
@@ -196,6 +270,8 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         center = line_of(lines, at + zc_line)[zc_lane]
         reach = line_of(lines, at + zr_line)[zr_lane]
         if c.d > 0.0:
+            if wp.static(parallel):
+                return wp.clamp(c.z * inverse_d, center - reach, center + reach)
             met = line_of(lines, at + z_line)[z_lane] * inverse_d
             return wp.clamp(met, center - reach, center + reach)
         return center
@@ -382,6 +458,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         start=start,
         row=row,
         cross=cross,
+        cross_ray=cross_ray,
         unfinished=unfinished,
         blend=blend,
         finish=finish,

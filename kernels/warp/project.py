@@ -19,6 +19,7 @@ import warp as wp
 from .bounds import PAD, PAD_RELATIVE, Bounds, box_bounds, ellipse_bounds, make_bounds
 from .color import make_color
 from .common import CULLED, STRICT, View, as_bits, population, sortable, store_line
+from .lens import LENSES, make_lens, make_optics
 from .motion import make_motion
 from .records import Layout
 
@@ -50,9 +51,16 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
     moves = "motion_groups" in effects
     motion = make_motion(moves)
     Moving = motion.Moving
+    camera = next((name for name in effects if name in LENSES), None)
+    parallel = "camera_orthographic" in effects
+    ray_depths = camera in ("camera_fisheye", "camera_equirectangular")  # distances, not along z
+    mapped, bent = camera == "camera_brown_conrady", camera is not None
+    optics = make_optics(camera, real) if camera else None
+    Lens = make_lens(camera)
     word = {name: layout.names.index(name) for name in layout.names}
-    first_extra = {name: word.get(name, 0) for name in ("dot_x", "z_numerator", "nx")}
+    first_extra = {name: word.get(name, 0) for name in ("dot_x", "z_numerator", "nx", "nuz", "plane_z0")}
     at_dot, at_depth, at_normal = first_extra["dot_x"], first_extra["z_numerator"], first_extra["nx"]
+    at_ray, at_plane = first_extra["nuz"], first_extra["plane_z0"]
 
     @wp.func
     def extremes(a: real, b: real, p: real, depth: vec3, radius: real, near: real):
@@ -126,6 +134,18 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
         qxx = wp.max(mx * mx + h * wp.dot(x, x), zero)
         qyy = wp.max(my * my + h * wp.dot(y, y), zero)
         qxy = mx * my + h * wp.dot(x, y)
+        return conic(fx * px + real(view.cx) + mx, fy * py + real(view.cy) + my, qxx, qyy, qxy)
+
+    @wp.func
+    def parallel_ellipse(a: vec3, b: vec3, x: real, y: real, radius: real, view: View):
+        """Image of a disk around (x, y) along parallel rays."""
+        fx, fy = real(view.fx), real(view.fy)
+        across, down = vec2(fx * a[0], fx * b[0]) * radius, vec2(fy * a[1], fy * b[1]) * radius
+        return conic(x, y, wp.dot(across, across), wp.dot(down, down), wp.dot(across, down))
+
+    @wp.func
+    def conic(x: real, y: real, qxx: real, qyy: real, qxy: real):
+        """The ellipse around (x, y) that reaches sqrt(qxx) along x and sqrt(qyy) along y."""
         shear = zero
         if qyy > zero:
             shear = qxy / qyy
@@ -135,8 +155,8 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
         if half_x > 0.0:
             tip = float(qxy) / half_x
         return ellipse_bounds(
-            float(fx * px + real(view.cx) + mx),
-            float(fy * py + real(view.cy) + my),
+            float(x),
+            float(y),
             half_x,
             wp.sqrt(float(qyy)),
             float(shear),
@@ -149,6 +169,7 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
         first: int,  # splat of thread 0
         view: View,
         moving: Moving,
+        lens: Lens,
         means: wp.array(dtype=wp.vec3),  # (n) [m], relative to the cloud's origin
         quats: wp.array(dtype=wp.vec4),  # (n) w x y z
         scales: wp.array(dtype=wp.vec2),  # (n) [m]
@@ -200,26 +221,45 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
 
         near = real(view.near)
         radius = wp.sqrt(two * real(half_r2))
+        depth = p[2]
         reach = radius * wp.sqrt(a[2] * a[2] + b[2] * b[2])  # half of the disk's depth range (numerics A3)
-        if not (p[2] + reach >= near and p[2] - reach <= real(view.far)):
+        if wp.static(ray_depths):
+            depth = wp.length(p)
+            reach = radius * wp.sqrt(wp.max(wp.dot(a, a), wp.dot(b, b)))
+        if not (depth + reach >= near and depth - reach <= real(view.far)):
             return
 
         # where it can be seen
         fx, fy, cx, cy = real(view.fx), real(view.fy), real(view.cx), real(view.cy)
         per_fx, per_fy = real(view.per_fx), real(view.per_fy)
-        in_front = p[2] >= near
+        in_front = depth >= near  # or, of a lens, whether it is known where the centre falls
         center_x, center_y = zero, zero
         box = Bounds()
-        if in_front:
-            center_x = fx * (p[0] / p[2]) + cx
-            center_y = fy * (p[1] / p[2]) + cy
-        if p[2] - reach >= near:
-            box = ellipse(a, b, p, radius, reach, view)
+        if wp.static(parallel):
+            center_x = fx * p[0] + cx
+            center_y = fy * p[1] + cy
+            box = parallel_ellipse(a, b, center_x, center_y, radius, view)
+        elif wp.static(ray_depths):
+            box = optics.enclose(a, b, p, radius, view, lens)
         else:
-            box = clipped(a, b, p, radius, reach, view)
-        if not in_front:
-            center_x = real(box.x)
-            center_y = real(box.y)
+            if in_front:
+                center_x = fx * (p[0] / p[2]) + cx
+                center_y = fy * (p[1] / p[2]) + cy
+            if p[2] - reach >= near:
+                box = ellipse(a, b, p, radius, reach, view)
+            else:
+                box = clipped(a, b, p, radius, reach, view)
+        if wp.static(mapped):
+            x0, x1 = real(box.x - box.half_x), real(box.x + box.half_x)
+            y0, y1 = real(box.y - box.half_y), real(box.y + box.half_y)
+            box = optics.mapped(x0, x1, y0, y1, lens)
+        if wp.static(bent):
+            if in_front:
+                center_x, center_y, in_front = optics.image(p, view, lens)
+        if wp.static(not parallel):
+            if not in_front:
+                center_x = real(box.x)
+                center_y = real(box.y)
         if wp.static(screen):
             if in_front:
                 box.dot_x = float(center_x)
@@ -252,20 +292,36 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
         ray = vec3((anchor_x - cx) * per_fx, (anchor_y - cy) * per_fy, one)
         form_u = wp.cross(tangent_v, p) * (one / su)
         form_v = wp.cross(p, tangent_u) * (one / sv)
+        if wp.static(parallel):
+            # the same far away, per metre of distance: D is n_z
+            height = normal[2]
+            form_u = vec3(tangent_v[1], -tangent_v[0], zero) * (one / su)
+            form_v = vec3(-tangent_u[1], tangent_u[0], zero) * (one / sv)
+        if wp.static(bent):
+            # forms of a ray, not of a sample
+            anchor = optics.anchor(int(ax), int(ay), p, view, lens)
+            ray = vec3(real(anchor[0]), real(anchor[1]), real(anchor[2]))
+            per_fx, per_fy = one, one
         nux, nuy, nvx, nvy = form_u[0] * per_fx, form_u[1] * per_fy, form_v[0] * per_fx, form_v[1] * per_fy
         steepest = wp.max(wp.max(wp.abs(nux), wp.abs(nuy)), wp.max(wp.abs(nvx), wp.abs(nvy)))
+        if wp.static(bent):
+            steepest = wp.max(steepest, wp.max(wp.abs(form_u[2]), wp.abs(form_v[2])))
         if not (steepest > zero and steepest < real(wp.inf)):
             return
         nu0 = wp.dot(form_u, ray)
         nv0 = wp.dot(form_v, ray)
-        if in_front:
-            # both vanish at the projected centre
-            nu0 = nux * (anchor_x - center_x) + nuy * (anchor_y - center_y)
-            nv0 = nvx * (anchor_x - center_x) + nvy * (anchor_y - center_y)
+        if wp.static(not bent):
+            if wp.static(parallel) or in_front:
+                # both vanish at the projected centre
+                nu0 = nux * (anchor_x - center_x) + nuy * (anchor_y - center_y)
+                nv0 = nvx * (anchor_x - center_x) + nvy * (anchor_y - center_y)
         scale = wp.where(height < zero, -one, one) / steepest
         n_scale = scale * sqrt_half
         # edge-on within rounding: no ray meets the plane, only the low-pass dot is drawn (numerics B2)
-        facing = wp.where(height * height > edge_on * edge_on * wp.dot(p, p), scale, zero)
+        away2 = wp.dot(p, p)
+        if wp.static(parallel):
+            away2 = one
+        facing = wp.where(height * height > edge_on * edge_on * away2, scale, zero)
 
         rgb = color_of(i, colors, mean - eye)
         if not (wp.isfinite(rgb[0]) and wp.isfinite(rgb[1]) and wp.isfinite(rgb[2])):
@@ -294,9 +350,27 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
             # far away if there is none
             record[at_dot] = wp.where(in_front, float(center_x - anchor_x), 1.0e18)
             record[at_dot + 1] = wp.where(in_front, float(center_y - anchor_y), 1.0e18)
+        if wp.static(parallel):
+            # D times the depth, which is p_z - (n_x X + n_y Y) / n_z at (X, Y) from the centre [m]
+            off_x, off_y = (anchor_x - center_x) * per_fx, (anchor_y - center_y) * per_fy
+            record[7] = wp.inf
+            record[8] = float(normal[2] * facing)
+            record[9] = 0.0
+            record[10] = 0.0
+            record[at_plane] = float((normal[2] * p[2] - normal[0] * off_x - normal[1] * off_y) * facing)
+            record[at_plane + 1] = float(-normal[0] * per_fx * facing)
+            record[at_plane + 2] = float(-normal[1] * per_fy * facing)
+            record[at_plane + 3] = float(near)
+        if wp.static(bent):
+            record[at_ray] = float(form_u[2] * n_scale)
+            record[at_ray + 1] = float(form_v[2] * n_scale)
+            record[at_ray + 2] = float(normal[2] * facing)
+            record[at_ray + 3] = anchor[0]
+            record[at_ray + 4] = anchor[1]
+            record[at_ray + 5] = anchor[2]
         if wp.static(has_depth):
             record[at_depth] = float(height * facing)
-            record[at_depth + 1] = float(p[2])
+            record[at_depth + 1] = float(depth)
             record[at_depth + 2] = float(reach)
         if wp.static(has_normal):
             # the camera is on one side of the whole plane, so the sign is the splat's (numerics B7)
@@ -313,11 +387,11 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
             bounds[i] = box
         corner = wp.uint64(top * view.tiles_x + left)
         windows[i] = (corner << BITS) | wp.uint64(bits)
-        depth = float(p[2])
+        key = float(depth)
         if wp.static(layers):
             if planes[i] >= 0:
-                depth = plane_keys[planes[i]]
-        keys[i] = sortable(depth)
+                key = plane_keys[planes[i]]
+        keys[i] = sortable(key)
         counts[i] = wp.int64(tiles)
         drawn[i] = 1
 

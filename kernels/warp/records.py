@@ -22,6 +22,8 @@ _BASE = (
 )
 _EXTRA = {
     "lowpass_screen": ("dot_x", "dot_y"),
+    "rays": ("nuz", "nvz", "dz", "ray_x", "ray_y", "ray_z"),
+    "camera_orthographic": ("plane_z0", "plane_zx", "plane_zy", "plane_near"),
     "ray_depth": ("z_numerator", "z_center", "z_reach"),
     "normal": ("nx", "ny", "nz"),
 }
@@ -34,6 +36,8 @@ class Layout:
     (ax, ay); D is at
     most d_near beyond the near plane. dot_x, dot_y: projected centre from the anchor's; z_numerator / D is
     the depth. columns and rows hold first and end, 16 bits each, of the box of samples that it can touch.
+    Behind a lens x, y, z are a sample's ray from the anchor's (ray_x, ray_y, ray_z). For parallel rays
+    plane_z0 + plane_zx x + plane_zy y is D times the depth, which is at least plane_near.
     """
 
     def __init__(self, effects: tuple[str, ...]) -> None:

@@ -1,4 +1,4 @@
-"""What a sensor makes of the light of each pixel: exposure, vignetting, noise, gain, response, whole steps."""
+"""What a sensor makes of each pixel's light: exposure, vignetting, noise, gain, response, whole steps."""
 
 from functools import cache
 

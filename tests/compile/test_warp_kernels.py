@@ -9,6 +9,10 @@ from fidsplat.backends.warp import runtime
 wp = pytest.importorskip("warp")
 ALL = ("lowpass_screen", "ray_depth", "normal", "compose_planes", "depth", "depth_median", "label")
 RECORD = ALL[:4]
+LENSES = [
+    ("camera_orthographic", "lowpass_screen", "normal"),
+    *((f"camera_{name}", "rays", *RECORD) for name in ("brown_conrady", "fisheye", "equirectangular")),
+]
 STEPS = ("exposure", "vignetting", "noise", "gain", "response_srgb", "response_table", "quantise")
 
 
@@ -39,7 +43,10 @@ def started():
     [
         lambda: made("project.make_project", RECORD, 16, "float64", False),
         lambda: made("project.make_project", (*RECORD, "motion_groups"), 0, "float32", True),
+        *(lambda camera=name: made("project.make_project", camera, 0, "float64", False) for name in LENSES),
         lambda: made("blend.make_blend", ALL, True, 256)[0],
+        lambda: made("blend.make_blend", ("rays", *ALL), True, 256)[0],
+        lambda: made("blend.make_blend", ("camera_orthographic", *ALL), True, 256)[0],
         lambda: made("blend.make_blend", ("lowpass_screen", "stop_exclusive"), True, 256)[0],
         lambda: made("resolve.make_resolve", ("alpha", "depth", "depth_median", "label", "normal"), 3),
         lambda: made("sensor.make_develop", STEPS)[0],
@@ -50,7 +57,8 @@ def started():
         lambda: made("lists.find_starts"),
     ],
     ids=[
-        *("project", "project-float32", "blend-all", "blend-exclusive", "resolve", "sensor", "emit"),
+        *("project", "project-float32", *(names[0] for names in LENSES), "blend-all", "blend-rays"),
+        *("blend-parallel", "blend-exclusive", "resolve", "sensor", "emit"),
         *("count", "histogram", "compact", "starts"),
     ],
 )
@@ -69,6 +77,8 @@ def test_the_base_text_has_nothing_of_absent_effects(tmp_path):
         "Layer",
         "thickest",
         "ink",
+        "cross_ray",
+        "origin",
     ):
         assert not re.search(rf"\b{name}", text), name
     everything = compiled(made("blend.make_blend", ALL, True, 256)[0], tmp_path / "all")

@@ -20,12 +20,12 @@ def moving(resident: Resident, view: View, pool: ArrayPool) -> Any:
     if not view.groups:
         return held
     labels = np.array([label for label, _ in view.groups], np.int32)
-    poses = np.zeros(len(labels), kernels.Pose.numpy_dtype())
-    for pose, (_, own) in zip(poses, view.groups, strict=True):
-        pose["rotation"], pose["translation"], pose["eye"] = own.rotation, own.translation, own.eye
+    poses = [(own.rotation, own.translation, own.eye) for _, own in view.groups]
     held.labels = resident.arrays["labels"]
     held.groups = pool.exact("groups", len(labels), wp.int32)
     held.poses = pool.exact("poses", len(labels), kernels.Pose)
     wp.copy(held.groups, wp.array(labels, dtype=wp.int32, device="cpu"))
-    wp.copy(held.poses, wp.array(poses, dtype=kernels.Pose, device="cpu"))
+    wp.copy(
+        held.poses, wp.array(np.array(poses, kernels.Pose.numpy_dtype()), dtype=kernels.Pose, device="cpu")
+    )
     return held

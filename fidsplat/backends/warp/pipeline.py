@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fidsplat.backends.base import View
-from fidsplat.backends.warp import motion, runtime, sensor
+from fidsplat.backends.warp import lens, motion, runtime, sensor
 from fidsplat.backends.warp.launch import BLOCK, Launcher
 from fidsplat.backends.warp.memory import Resident
 from fidsplat.effects import FeatureSet
@@ -30,12 +30,16 @@ KNOWN = frozenset(
     | {"perspective", "footprint_gaussian", "background_constant"}
     | {"alpha", "depth", "depth_median", "normal", "label"}
     | sensor.STEPS
-    | {"motion_groups"}
+    | lens.EFFECTS
+    | {"motion_groups", "camera_orthographic"}
 )
 """effects that kernels/warp has"""
 # of these depend on an effect: a stage is compiled once for all feature sets that mean the same to it
-_RECORD = ("lowpass_screen", "ray_depth", "normal", "compose_planes")
-_PROJECTED_ONLY = ("motion_groups",)
+_RECORD = ("lowpass_screen", "rays", "camera_orthographic", "ray_depth", "normal", "compose_planes")
+_PROJECTED_ONLY = (
+    *("motion_groups", "camera_brown_conrady", "camera_fisheye"),
+    "camera_equirectangular",
+)
 _SAMPLE = (*_RECORD, "stop_exclusive", "depth", "depth_median", "label")
 
 
@@ -195,6 +199,7 @@ class _Run:
         self.grid = tiles_y * shape.tile_height, tiles_x * shape.tile_width
         self.held: dict[str, Any] = {}
         self.u = self._uniforms(tiles_x, tiles_y)
+        self.lens, self.rays = self.backend.lens_arrays.of(view, self.pool)
         self._take("starts", self.tiles + 1, self.wp.int32)
         self._take("lists", 1, self.wp.int32)
         self._take("order", 1, self.wp.int32)
@@ -233,6 +238,7 @@ class _Run:
             n,
             self.u,
             motion.moving(self.resident, self.view, self.pool),
+            self.lens,
             *cloud,
             *records,
             keys,
@@ -300,6 +306,7 @@ class _Run:
         each = 16 * self.pipeline.layout.lines + _BOUNDS + _PROJECTED
         fixed = resident.nbytes + each * resident.count + _VISIBLE * visible
         fixed += self.grid[0] * self.grid[1] * (_SAMPLE_BYTES + 4 * len(self.pipeline.features.taps))
+        fixed += self.backend.lens_arrays.nbytes(self.view)
         room = (budget - fixed) // _PAIR
         if room < 1:
             raise DeviceError(
@@ -345,7 +352,7 @@ class _Run:
         """Draws the tiles of one band."""
         pipeline, held = self.pipeline, self.held
         splats = (self.resident.arrays["labels"], self.resident.arrays.get("planes", samples[4]))
-        args = (self.u, held["lines"], *splats, held["starts"], held["lists"], *samples)
+        args = (self.u, self.rays, held["lines"], *splats, held["starts"], held["lists"], *samples)
         area = pipeline.shape.tile_width * pipeline.shape.tile_height
         if pipeline.shape.schedule == "group":
             count = (end - first) * pipeline.block_dim
