@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .bounds import box_bounds
-from .common import View
+from .common import View, struct_of
 
 COEFFICIENTS = {
     "camera_brown_conrady": wp.types.vector(12, wp.float64),  # k1 to k6, p1, p2, s1 to s4
@@ -23,16 +23,12 @@ seen
 LENSES = (*COEFFICIENTS, "camera_equirectangular")
 
 
-def _struct(name: str, words: str, fields: dict):
-    return wp.struct(type(name, (), {"__annotations__": fields, "__doc__": words, "__module__": __name__}))
-
-
 @cache
 def make_rays(given: bool):
     """The struct of what a sample reads: nothing, if all rays follow from the view."""
     # X, Y, Z along the rows of samples; NaN where nothing is seen
     fields = {"rays": wp.array(dtype=wp.vec3)}
-    return _struct("Rays", "The samples' rays.", fields if given else {})
+    return struct_of("Rays", "The samples' rays.", fields if given else {})
 
 
 @cache
@@ -50,7 +46,7 @@ def make_lens(camera: str | None):
             "per_unit": wp.vec2d,  # cells
             "top": wp.int32,  # row of the map's picture that is the first of this one
         }
-    return _struct("Lens", "What the projection reads of a lens.", fields if camera else {})
+    return struct_of("Lens", "What the projection reads of a lens.", fields if camera else {})
 
 
 @cache

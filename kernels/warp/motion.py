@@ -5,6 +5,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from .common import struct_of
+
 
 @wp.struct
 class Pose:
@@ -25,8 +27,7 @@ def make_motion(moves: bool) -> SimpleNamespace:
         "groups": wp.array(dtype=wp.int32),  # (groups) their labels
         "poses": wp.array(dtype=Pose),  # (groups)
     }
-    annotations = {"__annotations__": fields if moves else {}, "__module__": __name__}
-    Moving = wp.struct(type("Moving", (), {**annotations, "__doc__": "What moves, and how."}))
+    Moving = struct_of("Moving", "What moves, and how.", fields if moves else {})
 
     @wp.func
     def group_of(moving: Moving, i: int) -> int:

@@ -20,6 +20,7 @@ from .bounds import PAD, PAD_RELATIVE, Bounds, box_bounds, ellipse_bounds, make_
 from .color import make_color
 from .common import CULLED, STRICT, View, as_bits, population, sortable, store_line
 from .lens import LENSES, make_lens, make_optics
+from .lowpass import make_filter
 from .motion import make_motion
 from .records import Layout
 
@@ -38,8 +39,9 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
     """
     layout = Layout(effects)
     lines_each = layout.lines
-    has_normal, has_depth, screen, layers = (
-        name in effects for name in ("normal", "ray_depth", "lowpass_screen", "compose_planes")
+    has_normal, has_depth, screen, filtered, layers = (
+        name in effects
+        for name in ("normal", "ray_depth", "lowpass_screen", "lowpass_pixel", "compose_planes")
     )
     real = wp.float64 if precision == "float64" else wp.float32
     vec2, vec3, mat33 = wp.types.vector(2, real), wp.types.vector(3, real), wp.types.matrix((3, 3), real)
@@ -47,7 +49,7 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
     sqrt_half = real(math.sqrt(0.5))
     edge_on = real(1e-13 if precision == "float64" else 1e-6)
     one, two, half, zero = real(1.0), real(2.0), real(0.5), real(0.0)
-    limits, color_of = make_bounds(screen), make_color(sh_terms, real)
+    limits, color_of, widened = make_bounds(screen), make_color(sh_terms, real), make_filter(real)
     moves = "motion_groups" in effects
     motion = make_motion(moves)
     Moving = motion.Moving
@@ -220,6 +222,18 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
         b = tangent_v * sv
 
         near = real(view.near)
+        if wp.static(filtered):
+            if p[2] >= near:
+                wide = widened(a, b, p, view)
+                log_opacity -= float(wp.log(wide[3]))
+                half_r2 = log_opacity - view.log_cut
+                if not (half_r2 > 0.0):
+                    return  # edge-on too: infinitely thin, infinitely faint
+                a = wide[0] * a + wide[1] * b
+                b = wide[2] * b
+                su *= wide[0]
+                sv *= wide[2]
+                tangent_u = a / su  # of unit area with tangent_v, whose direction stays
         radius = wp.sqrt(two * real(half_r2))
         depth = p[2]
         reach = radius * wp.sqrt(a[2] * a[2] + b[2] * b[2])  # half of the disk's depth range (numerics A3)

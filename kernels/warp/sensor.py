@@ -4,7 +4,7 @@ from functools import cache
 
 import warp as wp
 
-from .common import STRICT, fma
+from .common import STRICT, fma, struct_of
 
 NUMBERS = {
     "exposure": {"exposure": wp.float32},
@@ -62,8 +62,7 @@ def make_develop(steps: tuple[str, ...]):
     need.
     """
     fields = {name: kind for step in steps for name, kind in NUMBERS[step].items()}
-    annotations = {"__annotations__": fields, "__doc__": "What the steps need.", "__module__": __name__}
-    Settings = wp.struct(type("Settings", (), annotations))
+    Settings = struct_of("Settings", "What the steps need.", fields)
     exposed, vignetted, noisy, amplified, gamma, srgb, table, quantised = (name in steps for name in NUMBERS)
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)

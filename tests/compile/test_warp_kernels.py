@@ -5,10 +5,13 @@ import re
 import pytest
 
 from fidsplat.backends.warp import runtime
+from fidsplat.effects import OUTPUTS
 
 wp = pytest.importorskip("warp")
-ALL = ("lowpass_screen", "ray_depth", "normal", "compose_planes", "depth", "depth_median", "label")
-RECORD = ALL[:4]
+RECORD = ("lowpass_screen", "ray_depth", "normal", "compose_planes")
+TAPS = ("depth", "depth_median", "depth_first", "heaviest", "blended", "fog")
+ALL = (*RECORD, *TAPS)
+OF_SAMPLES = ("depth_weight", "depth_median", "depth_first", "heaviest", "blended", "fog_slope", "fogged")
 LENSES = [
     ("camera_orthographic", "lowpass_screen", "normal"),
     *((f"camera_{name}", "rays", *RECORD) for name in ("brown_conrady", "fisheye", "equirectangular")),
@@ -33,6 +36,13 @@ def compiled(kernel, folder, block=256, assembly=False):
     return re.sub(r"//[^\n]*", "", source.read_text())
 
 
+def resolving(behind, samples):
+    """The kernel for all outputs."""
+    planes = tuple(made("planes.of_samples", ALL).items())
+    integers = tuple(output.name for output in OUTPUTS.values() if output.dtype == "int32")
+    return made("resolve.make_resolve", tuple(OUTPUTS), integers, planes, behind, samples)
+
+
 @pytest.fixture(autouse=True)
 def started():
     runtime.load()
@@ -44,11 +54,12 @@ def started():
         lambda: made("project.make_project", RECORD, 16, "float64", False),
         lambda: made("project.make_project", (*RECORD, "motion_groups"), 0, "float32", True),
         *(lambda camera=name: made("project.make_project", camera, 0, "float64", False) for name in LENSES),
+        lambda: made("project.make_project", ("lowpass_pixel",), 0, "float64", False),
         lambda: made("blend.make_blend", ALL, True, 256)[0],
         lambda: made("blend.make_blend", ("rays", *ALL), True, 256)[0],
         lambda: made("blend.make_blend", ("camera_orthographic", *ALL), True, 256)[0],
         lambda: made("blend.make_blend", ("lowpass_screen", "stop_exclusive"), True, 256)[0],
-        lambda: made("resolve.make_resolve", ("alpha", "depth", "depth_median", "label", "normal"), 3),
+        lambda: resolving("constant", 3),
         lambda: made("sensor.make_develop", STEPS)[0],
         lambda: made("lists.make_lists", True).emit,
         lambda: made("lists.make_lists", True).count,
@@ -57,8 +68,8 @@ def started():
         lambda: made("lists.find_starts"),
     ],
     ids=[
-        *("project", "project-float32", *(names[0] for names in LENSES), "blend-all", "blend-rays"),
-        *("blend-parallel", "blend-exclusive", "resolve", "sensor", "emit"),
+        *("project", "project-float32", *(names[0] for names in LENSES), "project-filtered", "blend-all"),
+        *("blend-rays", "blend-parallel", "blend-exclusive", "resolve", "sensor", "emit"),
         *("count", "histogram", "compact", "starts"),
     ],
 )
@@ -68,21 +79,10 @@ def test_the_kernels_compile_for_cuda(kernel, tmp_path):
 
 def test_the_base_text_has_nothing_of_absent_effects(tmp_path):
     text = compiled(made("blend.make_blend", (), True, 256)[0], tmp_path)
-    for name in (
-        "depth_weight",
-        "depth_median",
-        "label_weight",
-        "finished",
-        "dot_x",
-        "Layer",
-        "thickest",
-        "ink",
-        "cross_ray",
-        "origin",
-    ):
+    for name in (*OF_SAMPLES, "finished", "dot_x", "Layer", "thickest", "ink", "cross_ray", "origin"):
         assert not re.search(rf"\b{name}", text), name
     everything = compiled(made("blend.make_blend", ALL, True, 256)[0], tmp_path / "all")
-    for name in ("depth_weight", "depth_median", "label_weight", "Layer", "thickest", "ink"):
+    for name in (*OF_SAMPLES, "Layer", "thickest", "ink"):
         assert re.search(rf"\b{name}", everything), name
 
 

@@ -25,10 +25,12 @@ if TYPE_CHECKING:
     from fidsplat.backends.warp.backend import WarpBackend, WarpShape
 
 KNOWN = frozenset(
-    {"camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen", "stop_inclusive"}
-    | {"stop_exclusive", "compose_ordered", "compose_planes", "ray_depth"}
+    {"camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen", "lowpass_pixel"}
+    | {"stop_inclusive", "stop_exclusive", "compose_ordered", "compose_planes", "ray_depth"}
     | {"perspective", "footprint_gaussian", "background_constant"}
-    | {"alpha", "depth", "depth_median", "normal", "label"}
+    | {"ray", "ray_length", "sample_length", "turn", "world_ray"}
+    | {"alpha", "depth", "depth_median", "depth_first", "distance", "distance_median", "distance_first"}
+    | {"normal", "normal_world", "label", "splat_id", "blended"}
     | sensor.STEPS
     | lens.EFFECTS
     | {"motion_groups", "camera_orthographic"}
@@ -36,23 +38,21 @@ KNOWN = frozenset(
 """effects that kernels/warp has"""
 # of these depend on an effect: a stage is compiled once for all feature sets that mean the same to it
 _RECORD = ("lowpass_screen", "rays", "camera_orthographic", "ray_depth", "normal", "compose_planes")
-_PROJECTED_ONLY = (
-    *("motion_groups", "camera_brown_conrady", "camera_fisheye"),
-    "camera_equirectangular",
+_PROJECT = (
+    *(*_RECORD, "lowpass_pixel", "motion_groups"),
+    *("camera_brown_conrady", "camera_fisheye", "camera_equirectangular"),
 )
-_SAMPLE = (*_RECORD, "stop_exclusive", "depth", "depth_median", "label")
+_SAMPLE = (*_RECORD, "stop_exclusive", "depth", "depth_median", "depth_first", "heaviest", "blended", "fog")
 
 
-# in the order of the kernel's arguments
-_OUTPUTS = ("rgb", "alpha", "depth", "depth_median", "normal", "label")
 # of a View, by the names that the kernels have for them too
 _UNIFORMS = (
     *("fx", "fy", "cx", "cy", "near", "far", "width", "height", "samples"),
-    *("log_cut", "ceiling", "stop"),
+    *("log_cut", "ceiling", "stop", "first_light", "fog_density"),
 )
 # bytes: of one splat's bounds; of its window, keys, counts, drawn, places, sums; of one that is drawn, in
-# sort and lists; of a sample in all planes; of a pair with the scratch of its sort
-_BOUNDS, _PROJECTED, _VISIBLE, _SAMPLE_BYTES, _PAIR = 44, 36, 40, 60, 24
+# sort and lists; of a pair with the scratch of its sort
+_BOUNDS, _PROJECTED, _VISIBLE, _PAIR = 44, 36, 40, 24
 
 
 class WarpPlanes:
@@ -94,15 +94,19 @@ class WarpPipeline:
                 "use an OpenCL device for it"
             )
         self.backend, self.features, self.shape = backend, features, shape
+        if names & {"label", "splat_id"}:
+            names |= {"heaviest"}  # both are the same splat's
         record = tuple(name for name in _RECORD if name in names)
         sample = tuple(name for name in _SAMPLE if name in names)
         terms = (features.sh_degree + 1) ** 2 if "color_sh" in names else 0
         screen = "lowpass_screen" in names
         with runtime.quiet():
             self.layout = runtime.kernels("records").Layout(record)
-            own = tuple(name for name in _PROJECTED_ONLY if name in names)
             self.project = runtime.kernels("project").make_project(
-                (*record, *own), terms, features.setup_precision, shape.schedule == "tiles"
+                tuple(name for name in _PROJECT if name in names),
+                terms,
+                features.setup_precision,
+                shape.schedule == "tiles",
             )
             self.project_block = runtime.kernels("project").BLOCK
             self.lists = runtime.kernels("lists").make_lists(screen)
@@ -112,7 +116,18 @@ class WarpPipeline:
             self.blend, self.state = runtime.kernels("blend").make_blend(
                 sample, shape.schedule == "group", self.block_dim
             )
-            self.resolve = runtime.kernels("resolve").make_resolve(features.taps, features.samples)
+            planes, surroundings = runtime.kernels("planes"), runtime.kernels("surroundings")
+            self.sample_planes = planes.of_samples(sample)
+            """type of an element of each"""
+            finished = tuple(output.name for output in features.outputs)
+            integers = tuple(output.name for output in features.outputs if output.dtype == "int32")
+            self.samples_type = planes.make_samples(tuple(self.sample_planes.items()))
+            self.outputs_type = planes.make_outputs(finished, integers)
+            behind = next((kind for kind in surroundings.KINDS if f"background_{kind}" in names), "constant")
+            self.around_type = surroundings.make_surroundings(behind).Around
+            self.resolve = runtime.kernels("resolve").make_resolve(
+                finished, integers, tuple(self.sample_planes.items()), behind, features.samples
+            )
             common = [self.sort.compact, self.sort.gather, self.sort.find_starts, self.sort.sum_up]
             self.sensor = sensor.Development.of(features.posts)
             if self.sensor:
@@ -160,7 +175,7 @@ class WarpPipeline:
         run = self._drawn(resident, view)
         stats = run.planes.stats
         rows, stride = run.grid
-        raw = run.held["raw"].numpy()[: rows * stride]
+        raw = run.held["raw color"].numpy()[: rows * stride]
         return {
             "keys": run.held["keys"].numpy()[: resident.count].copy(),
             "order": run.held["order"].numpy()[: stats["visible"]].astype(np.uint32),
@@ -305,7 +320,10 @@ class _Run:
         # as `_project`, `_sort`, `_list`, `_samples` and `_resolve` take them; the sorts have as much again
         each = 16 * self.pipeline.layout.lines + _BOUNDS + _PROJECTED
         fixed = resident.nbytes + each * resident.count + _VISIBLE * visible
-        fixed += self.grid[0] * self.grid[1] * (_SAMPLE_BYTES + 4 * len(self.pipeline.features.taps))
+        sample = sum(map(self.wp.types.type_size_in_bytes, self.pipeline.sample_planes.values()))
+        fixed += self.grid[0] * self.grid[1] * sample
+        pixel = sum(4 * output.channels for output in self.pipeline.features.outputs)
+        fixed += self.view.width * self.view.height // self.view.samples**2 * pixel
         fixed += self.backend.lens_arrays.nbytes(self.view)
         room = (budget - fixed) // _PAIR
         if room < 1:
@@ -334,25 +352,20 @@ class _Run:
             wp.utils.radix_sort_pairs(tiles, lists, pairs, 0, max(self.tiles - 1, 1).bit_length())
         self.launch(self.pipeline.sort.find_starts, end - first + 1, pairs, first, tiles, held["starts"])
 
-    def _samples(self) -> list[Any]:
-        """Planes that blending fills: raw, depth, median, normal, label, the label's weight."""
-        wp, taps = self.wp, self.pipeline.features.taps
+    def _samples(self) -> Any:
+        """Planes that blending fills, as one struct."""
+        samples = self.pipeline.samples_type()
         size = self.grid[0] * self.grid[1]
-        wanted = [
-            ("raw", wp.vec4, True),
-            ("raw depth", wp.vec2, "depth" in taps),
-            ("raw median", wp.float32, "depth_median" in taps),
-            ("raw normal", wp.vec3, "normal" in taps),
-            ("raw label", wp.int32, "label" in taps),
-            ("raw label weight", wp.float32, "label" in taps),
-        ]
-        return [self._take(name, size if asked else 1, dtype) for name, dtype, asked in wanted]
+        for name, dtype in self.pipeline.sample_planes.items():
+            setattr(samples, name, self._take(f"raw {name}", size, dtype))
+        return samples
 
-    def _blend(self, first: int, end: int, samples: list[Any]) -> None:
+    def _blend(self, first: int, end: int, samples: Any) -> None:
         """Draws the tiles of one band."""
         pipeline, held = self.pipeline, self.held
-        splats = (self.resident.arrays["labels"], self.resident.arrays.get("planes", samples[4]))
-        args = (self.u, self.rays, held["lines"], *splats, held["starts"], held["lists"], *samples)
+        lists = held["starts"], held["lists"]
+        planes = self.resident.arrays.get("planes", held["lists"])  # of no splats: never read
+        args = (self.u, self.rays, held["lines"], planes, *lists, samples)
         area = pipeline.shape.tile_width * pipeline.shape.tile_height
         if pipeline.shape.schedule == "group":
             count = (end - first) * pipeline.block_dim
@@ -361,28 +374,28 @@ class _Run:
         state = self._take("state", self.launcher.pieces * area, pipeline.state)
         self.launcher.tiles(pipeline.blend, first, end, area, *args, held["bounds"], state)
 
-    def _resolve(self, samples: list[Any]) -> tuple[dict[str, tuple[Output, Any]], tuple[int, int]]:
-        view, features, wp = self.view, self.pipeline.features, self.wp
+    def _resolve(self, samples: Any) -> tuple[dict[str, tuple[Output, Any]], tuple[int, int]]:
+        view, wp = self.view, self.wp
         height, width = view.height // view.samples, view.width // view.samples
-        outputs = {}
-        for output in features.outputs:
+        outputs, finished = {}, self.pipeline.outputs_type()
+        for output in self.pipeline.features.outputs:
             dtype = wp.int32 if output.dtype == "int32" else wp.float32
             # asked for anew: the caller keeps them
-            outputs[output.name] = (
-                output,
-                self.pool.fresh(output.name, height * width * output.channels, dtype),
-            )
-        arrays = [
-            outputs[name][1]
-            if name in outputs
-            else self._take(f"no {name}", 1, wp.int32 if name == "label" else wp.float32)
-            for name in _OUTPUTS
-        ]
-        self.launch(self.pipeline.resolve, height * width, self.u, width, *samples, *arrays)
+            array = self.pool.fresh(output.name, height * width * output.channels, dtype)
+            outputs[output.name] = output, array
+            setattr(finished, output.name, array)
+        if "label" in outputs:
+            finished.labels = self.resident.arrays["labels"]
+        self.launch(self.pipeline.resolve, height * width, self.u, width, self._around(), samples, finished)
         if self.pipeline.sensor:
             args = self.pipeline.sensor.arguments(view, self.pool)
             self.launch(self.pipeline.sensor.kernel, height * width, *args, width, outputs["rgb"][1])
         return outputs, (height, width)
+
+    def _around(self) -> Any:
+        around, view, wp = self.pipeline.around_type(), self.view, self.wp
+        around.color = wp.vec3(*view.background)
+        return around
 
     # helpers
 
@@ -404,5 +417,6 @@ class _Run:
             setattr(u, name, getattr(view, name))
         u.tile_w, u.tile_h, u.tiles_x, u.tiles_y = shape.tile_width, shape.tile_height, tiles_x, tiles_y
         u.per_pixel = 1.0 / view.samples**2
-        u.background = wp.vec3(*view.background)
+        fx, fy, cx, cy = view.uniform("ray")
+        u.ray = wp.vec4(1 / fx, 1 / fy, cx, cy)
         return u
