@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fidsplat.backends.base import View
-from fidsplat.backends.warp import lens, motion, runtime, sensor
+from fidsplat.backends.warp import exposure, lens, motion, runtime, sensor
 from fidsplat.backends.warp.launch import BLOCK, Launcher
 from fidsplat.backends.warp.memory import Resident
 from fidsplat.effects import FeatureSet
@@ -33,7 +33,7 @@ KNOWN = frozenset(
     | {"normal", "normal_world", "label", "splat_id", "blended"}
     | sensor.STEPS
     | lens.EFFECTS
-    | {"motion_groups", "camera_orthographic"}
+    | {"motion_groups", "shutter_exposure", "camera_orthographic"}
 )
 """effects that kernels/warp has"""
 # of these depend on an effect: a stage is compiled once for all feature sets that mean the same to it
@@ -132,6 +132,9 @@ class WarpPipeline:
             self.sensor = sensor.Development.of(features.posts)
             if self.sensor:
                 common.append(self.sensor.kernel)
+            self.expose = exposure.kernels_of(self.sample_planes) if "shutter_exposure" in names else {}
+            """by the name of a plane of samples"""
+            common += self.expose.values()
             for kernel in (self.project, self.lists.emit, self.blend, self.resolve, *common):
                 self._compile(kernel)
 
@@ -193,7 +196,9 @@ class WarpPipeline:
         wp = runtime.load()
         try:
             with wp.ScopedDevice(self.backend.device):
-                return _Run(self, resident, view)
+                run = _Run(self, resident, view, Launcher(self.backend))
+                run.draw()
+                return run
         except RuntimeError as error:
             if isinstance(error, DeviceError):
                 raise
@@ -203,26 +208,50 @@ class WarpPipeline:
 class _Run:
     """One picture: the stages in order, each a method."""
 
-    def __init__(self, pipeline: WarpPipeline, resident: Resident, view: View) -> None:
+    def __init__(
+        self, pipeline: WarpPipeline, resident: Resident, view: View, launcher: Launcher, beside: int = 0
+    ) -> None:
+        """beside: bytes on the device that belong to the picture of which this one is a part."""
         self.pipeline, self.resident, self.view = pipeline, resident, view
         self.backend, self.pool, shape = pipeline.backend, pipeline.backend.pool, pipeline.shape
         self.wp = runtime.load()
-        self.launcher = Launcher(self.backend)
-        self.launch = self.launcher.launch
+        self.launcher, self.launch, self.beside = launcher, launcher.launch, beside
         tiles_x, tiles_y = -(-view.width // shape.tile_width), -(-view.height // shape.tile_height)
         self.tiles = tiles_x * tiles_y
         self.grid = tiles_y * shape.tile_height, tiles_x * shape.tile_width
         self.held: dict[str, Any] = {}
         self.u = self._uniforms(tiles_x, tiles_y)
-        self.lens, self.rays = self.backend.lens_arrays.of(view, self.pool)
+        self.stats: dict[str, int] = {"splats": resident.count, "visible": 0, "pairs": 0}
+
+    def draw(self) -> None:
+        """All stages; `planes` are the finished ones."""
+        samples = self._exposed() if self.view.shots else self._drawn()
+        self.launcher.stage("resolve")
+        outputs, size = self._resolve(samples)
+        self.launcher.stage(None)
+        self.planes = WarpPlanes(outputs, size, self.launcher, self.stats)
+
+    def _exposed(self) -> Any:
+        """All stages but the last of each shot, and what their samples are together."""
+        whole = self._samples("exposed")
+        for shot in self.view.shots:
+            run = _Run(self.pipeline, self.resident, shot.view, self.launcher, self._planes_bytes())
+            samples = run._drawn()
+            self.launcher.stage("expose")
+            exposure.gather(self.pipeline, self.launcher, shot, samples, whole, self.grid[1])
+            self.stats = {name: max(value, run.stats[name]) for name, value in self.stats.items()}
+        return whole
+
+    def _drawn(self) -> Any:
+        """All stages but the last; planes of samples."""
         self._take("starts", self.tiles + 1, self.wp.int32)
         self._take("lists", 1, self.wp.int32)
         self._take("order", 1, self.wp.int32)
-        self._take("bounds", resident.count, runtime.kernels("bounds").Bounds)
-        self._take("lines", resident.count * pipeline.layout.lines, self.wp.vec4)
-
+        self._take("bounds", self.resident.count, runtime.kernels("bounds").Bounds)
+        self._take("lines", self.resident.count * self.pipeline.layout.lines, self.wp.vec4)
         self.launcher.stage("project")
-        visible, pairs = self._project() if resident.count else (0, 0)
+        self.lens, self.rays = self.backend.lens_arrays.of(self.view, self.pool)
+        visible, pairs = self._project() if self.resident.count else (0, 0)
         self.launcher.stage("sort")
         if pairs:
             self._sort(visible)
@@ -232,11 +261,8 @@ class _Run:
             self._list(visible, first, end, listed, whole=listed == pairs)
             self.launcher.stage("blend")
             self._blend(first, end, samples)
-        self.launcher.stage("resolve")
-        outputs, size = self._resolve(samples)
-        self.launcher.stage(None)
-        stats = {"splats": resident.count, "visible": visible, "pairs": pairs}
-        self.planes = WarpPlanes(outputs, size, self.launcher, stats)
+        self.stats |= {"visible": visible, "pairs": pairs}
+        return samples
 
     # stages
 
@@ -320,10 +346,7 @@ class _Run:
         # as `_project`, `_sort`, `_list`, `_samples` and `_resolve` take them; the sorts have as much again
         each = 16 * self.pipeline.layout.lines + _BOUNDS + _PROJECTED
         fixed = resident.nbytes + each * resident.count + _VISIBLE * visible
-        sample = sum(map(self.wp.types.type_size_in_bytes, self.pipeline.sample_planes.values()))
-        fixed += self.grid[0] * self.grid[1] * sample
-        pixel = sum(4 * output.channels for output in self.pipeline.features.outputs)
-        fixed += self.view.width * self.view.height // self.view.samples**2 * pixel
+        fixed += self._planes_bytes() + self.beside
         fixed += self.backend.lens_arrays.nbytes(self.view)
         room = (budget - fixed) // _PAIR
         if room < 1:
@@ -333,6 +356,13 @@ class _Run:
                 "or use an OpenCL device, which draws a cloud in chunks"
             )
         return room
+
+    def _planes_bytes(self) -> int:
+        """What planes of samples and of pixels take."""
+        sample = sum(map(self.wp.types.type_size_in_bytes, self.pipeline.sample_planes.values()))
+        pixel = sum(4 * output.channels for output in self.pipeline.features.outputs)
+        pixels = self.view.width * self.view.height // self.view.samples**2
+        return self.grid[0] * self.grid[1] * sample + pixels * pixel
 
     def _list(self, visible: int, first: int, end: int, pairs: int, whole: bool) -> None:
         """The lists of the tiles of one band, each in depth order."""
@@ -352,12 +382,12 @@ class _Run:
             wp.utils.radix_sort_pairs(tiles, lists, pairs, 0, max(self.tiles - 1, 1).bit_length())
         self.launch(self.pipeline.sort.find_starts, end - first + 1, pairs, first, tiles, held["starts"])
 
-    def _samples(self) -> Any:
-        """Planes that blending fills, as one struct."""
+    def _samples(self, kind: str = "raw") -> Any:
+        """Planes that blending fills, as one struct; those of another kind are others."""
         samples = self.pipeline.samples_type()
         size = self.grid[0] * self.grid[1]
         for name, dtype in self.pipeline.sample_planes.items():
-            setattr(samples, name, self._take(f"raw {name}", size, dtype))
+            setattr(samples, name, self._take(f"{kind} {name}", size, dtype))
         return samples
 
     def _blend(self, first: int, end: int, samples: Any) -> None:
