@@ -170,5 +170,5 @@ def test_directions_of_the_world_are_refused_to_a_camera_that_turns(renderer, wh
 @pytest.mark.skipif(WARP is None, reason="no Warp device here")
 def test_warp_names_what_it_lacks():
     features = replace(select(CLOUD, ("rgb",), fs.Quality(), PLAIN), taps=("overdraw",))
-    with pytest.raises(fs.DeviceError, match="warp.*no overdraw; use an OpenCL device"):
+    with pytest.raises(fs.DeviceError, match=r"warp.*no overdraw; use an OpenCL device"):
         fs.Renderer(WARP).backend.pipeline(features)
