@@ -9,19 +9,16 @@ docs/markers.md.
 from __future__ import annotations
 
 import json
-import operator
 from functools import cache
 from importlib.resources import files
 from typing import NamedTuple
 
 import numpy as np
 
-from fidsplat.errors import InputError
+from fidsplat.quality import MAX_DENSITY, MAX_LEVELS, MarkerQuality, whole_number
 
 GAMMA = 3.0
 """The paper's cut-off: a Gaussian ends at 3 standard deviations."""
-
-MAX_LEVELS, MAX_DENSITY = 8, 100
 
 
 class Template(NamedTuple):
@@ -70,27 +67,18 @@ def paper_template(levels: int = 4, density: int = 3, duplicates: bool = False) 
     return np.concatenate(rows)
 
 
-def whole_number(name: str, value: int, low: int, high: int) -> int:
-    """The value as an int. Raises InputError unless it is a whole number within the range."""
-    try:
-        number = operator.index(value)
-    except TypeError:
-        number = None
-    if number is None or not low <= number <= high:
-        raise InputError(f"{name} is {value!r}; it must be a whole number from {low} to {high}")
-    return number
-
-
 @cache
-def _fitted() -> tuple[tuple[Template, ...], float]:
+def _fitted() -> tuple[dict[int, tuple[Template, ...]], float]:
     data = json.loads(files("fidsplat.markers").joinpath("templates.json").read_text("utf-8"))
-    templates = []
-    for entry in data["templates"]:
-        gaussians = np.array([mirror for row in entry["quadrant"] for mirror in _mirrors(row)])
-        gaussians.flags.writeable = False
-        limit = entry["max_aspect"]
-        templates.append(Template(np.inf if limit is None else limit, gaussians))
-    return tuple(templates), data["growth"]
+    sets = {entry["size"]: tuple(map(_template, entry["templates"])) for entry in data["sets"]}
+    return sets, data["growth"]
+
+
+def _template(entry: dict) -> Template:
+    gaussians = np.array([mirror for row in entry["quadrant"] for mirror in _mirrors(row)])
+    gaussians.flags.writeable = False
+    limit = entry["max_aspect"]
+    return Template(np.inf if limit is None else limit, gaussians)
 
 
 def _mirrors(row: list[float]) -> list[list[float]]:
@@ -99,9 +87,10 @@ def _mirrors(row: list[float]) -> list[list[float]]:
     return [[sx * x, sy * y, *rest] for sy in ((1, -1) if y else (1,)) for sx in ((1, -1) if x else (1,))]
 
 
-def fitted_templates() -> tuple[Template, ...]:
-    """The shipped templates in rising order of aspect ratio; the last has no limit."""
-    return _fitted()[0]
+def fitted_templates(size: int = MarkerQuality.template) -> tuple[Template, ...]:
+    """The shipped templates of a size (`TEMPLATE_SIZES`) in rising order of aspect ratio; the last has no
+    limit."""
+    return _fitted()[0][size]
 
 
 def fitted_growth() -> float:

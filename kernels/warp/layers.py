@@ -19,9 +19,9 @@ DARKEST = wp.constant(wp.float32(2.0**-24))
 
 
 def make_layer(Seen, effects: tuple[str, ...]) -> SimpleNamespace:
-    """Layer, and what is known of it: gather; nothing, depth, shown."""
+    """Layer, and what is known of it: gather, gather_box; nothing, depth, shown."""
     normal, heaviest, blended = (name in effects for name in ("normal", "heaviest", "blended"))
-    # `mean` holds sums over the layer's fragments, each times its optical depth
+    # `mean` holds sums over the layer's fragments, each times its optical depth; of boxes, times its opacity
     fields = {"plane": wp.int32, "opacity": wp.float32, "ink": wp.float32, "mean": Seen}
     fields |= {"thickest": wp.float32} if heaviest else {}
     Layer = struct_of("Layer", "What a sample sees of one plane; plane -1: nothing.", fields)
@@ -49,13 +49,26 @@ def make_layer(Seen, effects: tuple[str, ...]) -> SimpleNamespace:
     @wp.func
     def gather(layer: Layer, plane: int, seen: Seen, opacity: float):
         """The layer with one more fragment: optical depths -ln(1 - opacity) add up."""
-        after = layer
         tau = opacity + 0.5 * opacity * opacity  # of a faint one, which 1 - opacity would blur
         if opacity > FAINT:
             # an opaque fragment has the optical depth at which float32 leaves no light
             tau = -wp.log(wp.max(1.0 - opacity, DARKEST))
-        after.plane = plane
+        after = mixed_in(layer, plane, seen, tau)
         after.opacity = fma(opacity, 1.0 - layer.opacity, layer.opacity)
+        return after
+
+    @wp.func
+    def gather_box(layer: Layer, plane: int, seen: Seen, opacity: float):
+        """The layer with one more box: they lie side by side, so what they cover adds up."""
+        after = mixed_in(layer, plane, seen, opacity)
+        after.opacity = wp.min(after.ink, 1.0)
+        return after
+
+    @wp.func
+    def mixed_in(layer: Layer, plane: int, seen: Seen, tau: float):
+        """The layer with more ink, tau, that shows `seen`."""
+        after = layer
+        after.plane = plane
         after.ink = layer.ink + tau
         mean = layer.mean
         mean.rgb = layer.mean.rgb + tau * seen.rgb
@@ -71,7 +84,9 @@ def make_layer(Seen, effects: tuple[str, ...]) -> SimpleNamespace:
         after.mean = mean
         return after
 
-    return SimpleNamespace(Layer=Layer, nothing=nothing, depth=depth, shown=shown, gather=gather)
+    return SimpleNamespace(
+        Layer=Layer, nothing=nothing, depth=depth, shown=shown, gather=gather, gather_box=gather_box
+    )
 
 
 def make_laying(layer: SimpleNamespace, Pixel, lay) -> SimpleNamespace:

@@ -9,9 +9,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from .boxes import between
 from .common import View, fma, line_of, struct_of
 from .layers import make_layer, make_laying
-from .records import Layout
+from .records import BOXES, Layout
 from .staging import make_staging
 from .surroundings import ray_length
 
@@ -46,9 +47,11 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         for name in ("depth", "depth_median", "depth_first", "normal", "heaviest", "blended", "fog")
     )
     bent, parallel = "rays" in effects, "camera_orthographic" in effects
+    boxes, all_boxes = any(name in effects for name in BOXES), "footprint_box" in effects
     # u: nu0, nux, nuy, log opacity; v: nv0, nvx, nvy, D at the near plane; d: d0, dx, dy, ax; c: ay, r, g, b
     splat = {"u": wp.vec4, "v": wp.vec4, "d": wp.vec4, "c": wp.vec4, "half_r2": wp.float32}
     splat |= {"dot_x": wp.float32, "dot_y": wp.float32} if screen else {}
+    splat |= {"edges": wp.vec4} if boxes else {}
     # w: factors of the ray's Z; origin: the anchor's ray
     splat |= {"w": wp.vec3, "origin": wp.vec3} if bent else {}
     # plane_z0, plane_zx, plane_zy, plane_near
@@ -59,6 +62,8 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     # screen: squared distance from the projected centre in pixels, which is rho / 2 of the low-pass
     crossing |= {"screen": wp.float32} if screen else {}
     crossing |= {"z": wp.float32} if parallel else {}  # d times the depth
+    # cover: share of the sample that a box covers
+    crossing |= {"cover": wp.float32} if boxes else {}
     Crossing = struct_of("Crossing", "Where the ray of a sample meets a splat.", crossing)
     seen = {"rgb": wp.vec3}
     seen |= {"z": wp.float32} if ray_depth else {}
@@ -76,6 +81,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     Pixel = struct_of("Pixel", "What a sample keeps.", fields)
     dot_line, dot_lane = layout.place("dot_x")
     dot_y_lane = layout.place("dot_y")[1]  # of the same line
+    edge_line = layout.place("edge_u0")[0]
     z_line, z_lane = layout.place("z_numerator")
     zc_line, zc_lane = layout.place("z_center")
     zr_line, zr_lane = layout.place("z_reach")
@@ -99,6 +105,8 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             dot = line_of(lines, at + dot_line)
             s.dot_x = dot[dot_lane]
             s.dot_y = dot[dot_y_lane]
+        if wp.static(boxes):
+            s.edges = line_of(lines, at + edge_line)
         if wp.static(bent):
             s.w = wp.vec3(
                 line_of(lines, at + w0)[w0_lane],
@@ -150,6 +158,8 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             dot = staged_line(pool, lines, lists, first, which, dot_line)
             s.dot_x = dot[dot_lane]
             s.dot_y = dot[dot_y_lane]
+        if wp.static(boxes):
+            s.edges = staged_line(pool, lines, lists, first, which, edge_line)
         if wp.static(bent):
             s.w = wp.vec3(
                 staged(pool, lines, lists, first, which, w0, w0_lane),
@@ -191,6 +201,10 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         return fma(form[2], y, form[0])
 
     @wp.func
+    def is_box(s: Splat) -> bool:
+        return s.edges[0] > 0.0
+
+    @wp.func
     def cross(s: Splat, row_u: float, row_v: float, row_d: float, x: float, y: float, view: View):
         """x, y: the sample from the anchor; row_*: `row` of the three forms at y."""
         return meet(s, fma(s.u[1], x, row_u), fma(s.v[1], x, row_v), fma(s.d[1], x, row_d), x, y, view)
@@ -210,12 +224,19 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     def meet(s: Splat, nu: float, nv: float, d: float, x: float, y: float, view: View):
         c = Crossing()
         c.d = d
-        c.q = fma(nu, nu, nv * nv)
-        # product form: no division, no special value of D (numerics B2)
-        c.inside = c.q <= s.half_r2 * (c.d * c.d) and c.d > 0.0 and c.d <= s.v[3]
+        ahead = c.d > 0.0 and c.d <= s.v[3]
         if wp.static(parallel):
             c.z = fma(s.plane[2], y, fma(s.plane[1], x, s.plane[0]))
-            c.inside = c.inside and c.z >= s.plane[3] * c.d
+            ahead = ahead and c.z >= s.plane[3] * c.d
+        if wp.static(not all_boxes):
+            c.q = fma(nu, nu, nv * nv)
+            # product form: no division, no special value of D (numerics B2)
+            c.inside = c.q <= s.half_r2 * (c.d * c.d) and ahead
+        if wp.static(boxes):
+            if is_box(s):
+                across = between(c.d, nu, wp.vec2(s.edges[0], s.edges[1]))
+                c.cover = across * between(c.d, nv, wp.vec2(s.edges[2], s.edges[3]))
+                c.inside = c.cover > 0.0 and ahead
         c.drawn = c.inside
         if wp.static(screen):
             ex = x - s.dot_x
@@ -233,6 +254,9 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
 
     @wp.func
     def opacity_of(s: Splat, c: Crossing, inverse_d: float, view: View) -> float:
+        if wp.static(boxes):
+            if is_box(s):
+                return wp.min(wp.exp(s.u[3]), view.ceiling) * c.cover
         half_rho = c.q * inverse_d * inverse_d
         if wp.static(screen):
             if c.inside:
@@ -351,6 +375,10 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
                 return lay(p, seen, opacity, view)
             if p.open.plane >= 0 and p.open.plane != plane:
                 p = gathered.begin(p, view)
+            if wp.static(boxes):
+                if is_box(s):
+                    p.open = layer.gather_box(p.open, plane, seen, opacity)
+                    return p
             p.open = layer.gather(p.open, plane, seen, opacity)
             return p
         else:

@@ -11,6 +11,9 @@ wp = pytest.importorskip("warp")
 RECORD = ("lowpass_screen", "ray_depth", "normal", "compose_planes")
 TAPS = ("depth", "depth_median", "depth_first", "heaviest", "blended", "fog")
 ALL = (*RECORD, *TAPS)
+MIXED = (*RECORD, "footprint_mixed", *TAPS)
+OF_BOXES = ("edges", "cover")
+FILTERS = ("make_boxes", "make_filter")
 OF_SAMPLES = ("depth_weight", "depth_median", "depth_first", "heaviest", "blended", "fog_slope", "fogged")
 LENSES = [
     ("camera_orthographic", "lowpass_screen", "normal"),
@@ -55,12 +58,21 @@ def started():
         lambda: made("project.make_project", (*RECORD, "motion_groups"), 0, "float32", True),
         *(lambda camera=name: made("project.make_project", camera, 0, "float64", False) for name in LENSES),
         lambda: made("project.make_project", ("lowpass_pixel",), 0, "float64", False),
+        lambda: made(
+            "project.make_project", (*RECORD, "footprint_mixed", "lowpass_pixel"), 0, "float64", False
+        ),
+        lambda: made("project.make_project", ("footprint_box",), 0, "float32", False),
         lambda: made("blend.make_blend", ALL, True, 256)[0],
+        lambda: made("blend.make_blend", MIXED, True, 256)[0],
+        lambda: made("blend.make_blend", ("footprint_box",), True, 256)[0],
         lambda: made("blend.make_blend", ("rays", *ALL), True, 256)[0],
         lambda: made("blend.make_blend", ("camera_orthographic", *ALL), True, 256)[0],
         lambda: made("blend.make_blend", ("lowpass_screen", "stop_exclusive"), True, 256)[0],
         lambda: resolving("constant", 3),
+        lambda: resolving("gradient", 1),
+        lambda: resolving("panorama", 1),
         lambda: made("sensor.make_develop", STEPS)[0],
+        lambda: made("shutter.make_expose", wp.vec4),
         lambda: made("lists.make_lists", True).emit,
         lambda: made("lists.make_lists", True).count,
         lambda: made("lists.make_lists", False).histogram,
@@ -68,9 +80,10 @@ def started():
         lambda: made("lists.find_starts"),
     ],
     ids=[
-        *("project", "project-float32", *(names[0] for names in LENSES), "project-filtered", "blend-all"),
-        *("blend-rays", "blend-parallel", "blend-exclusive", "resolve", "sensor", "emit"),
-        *("count", "histogram", "compact", "starts"),
+        *("project", "project-float32", *(names[0] for names in LENSES), "project-filtered"),
+        *("project-mixed", "project-boxes", "blend-all", "blend-mixed", "blend-boxes", "blend-rays"),
+        *("blend-parallel", "blend-exclusive", "resolve", "resolve-gradient", "resolve-panorama"),
+        *("sensor", "expose", "emit", "count", "histogram", "compact", "starts"),
     ],
 )
 def test_the_kernels_compile_for_cuda(kernel, tmp_path):
@@ -79,10 +92,20 @@ def test_the_kernels_compile_for_cuda(kernel, tmp_path):
 
 def test_the_base_text_has_nothing_of_absent_effects(tmp_path):
     text = compiled(made("blend.make_blend", (), True, 256)[0], tmp_path)
-    for name in (*OF_SAMPLES, "finished", "dot_x", "Layer", "thickest", "ink", "cross_ray", "origin"):
+    absent = (*OF_SAMPLES, *OF_BOXES, "finished", "dot_x", "Layer", "thickest", "ink", "cross_ray", "origin")
+    for name in absent:
         assert not re.search(rf"\b{name}", text), name
-    everything = compiled(made("blend.make_blend", ALL, True, 256)[0], tmp_path / "all")
-    for name in (*OF_SAMPLES, "Layer", "thickest", "ink"):
+    project = compiled(made("project.make_project", (), 0, "float64", False), tmp_path / "project", 128)
+    for name in FILTERS:
+        assert name not in project, name
+    everything = compiled(made("blend.make_blend", MIXED, True, 256)[0], tmp_path / "all")
+    project = compiled(
+        made("project.make_project", (*RECORD, "footprint_mixed", "lowpass_pixel"), 0, "float64", False),
+        tmp_path / "mixed",
+        128,
+    )
+    assert all(name in project for name in FILTERS)
+    for name in (*OF_SAMPLES, *OF_BOXES, "Layer", "thickest", "ink"):
         assert re.search(rf"\b{name}", everything), name
 
 
@@ -104,6 +127,8 @@ def test_a_record_grows_by_what_is_asked_for():
     assert layout(RECORD).lines == 7
     assert layout(RECORD).place("nz") == (6, 1)
     assert layout(()).place("nz") == (0, 0)
+    assert layout(("lowpass_screen", "footprint_mixed")).lines == 6
+    assert layout(("footprint_box",)).place("edge_u0") == (4, 0), "a line of their own"
 
 
 def test_a_factory_makes_one_kernel_of_a_set():

@@ -13,8 +13,6 @@ from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import Picture, compare, judge
 
-BACKEND = "opencl"
-
 SIZE = (41, 29)
 CLOUD = random_splats(120, 21, depth=(0.5, 5.0), scale=(0.02, 0.4))
 BOXES = fs.SplatCloud.concatenate(

@@ -26,8 +26,6 @@ def test_tilted_to_edge_on(renderer, tilt):
 
 
 def test_boxes_are_left_to_their_own_filter(renderer):
-    if renderer.device.name.startswith("warp"):
-        pytest.skip("Warp has no boxes (docs/backends.md)")
     mixed = random_splats(60, seed=4, depth=(0.5, 6.0)).with_boxes(np.arange(60) % 2 == 0)
     assert_agrees(renderer, mixed, CAMERA, quality=PIXEL)
 

@@ -27,8 +27,6 @@ def test_outputs_of_several_samples(renderer, samples):
 
 @pytest.mark.parametrize("mixture", ["fitted", "exact"])
 def test_outputs_of_layers(renderer, mixture):
-    if mixture == "exact" and renderer.device.name.startswith("warp"):
-        pytest.skip("Warp has no boxes (docs/backends.md)")
     tag = fs.marker("aruco:4x4_50:7", size=1.0, mixture=mixture).cloud
     pose = np.eye(4)
     pose[:3, :3] = [[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]]

@@ -13,21 +13,11 @@ from fidsplat.backends.base import View
 from fidsplat.backends.reference.post import variates
 from fidsplat.hard_cases.agreement import Picture, judge
 
-SURROUNDINGS = ("fog", "wall", "background", "panorama", "leaves_the_other")
-"""in the names of tests that need fog, or a background that is not one colour"""
-
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.3, -0.2, -0.1), (0.0, 0.1, 3.0))
 CLOUD = random_splats(120, 3)
 GREY = (0.4, 0.4, 0.4)
 NOISY = fs.Sensor(full_well=5000, read_noise=12, seed=7)
 EMPTY = fs.SplatCloud.empty()
-
-
-@pytest.fixture(autouse=True)
-def surroundings(request):
-    name = request.node.name
-    if "[warp" in name and any(word in name for word in SURROUNDINGS):
-        pytest.skip("Warp has no fog and no backgrounds but one colour (docs/backends.md)")
 
 
 def panorama(width=40, height=20):

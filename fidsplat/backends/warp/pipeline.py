@@ -15,6 +15,7 @@ import numpy as np
 
 from fidsplat.backends.base import View
 from fidsplat.backends.warp import exposure, lens, motion, runtime, sensor
+from fidsplat.backends.warp.around import Surroundings
 from fidsplat.backends.warp.launch import BLOCK, Launcher
 from fidsplat.backends.warp.memory import Resident
 from fidsplat.effects import FeatureSet
@@ -27,7 +28,9 @@ if TYPE_CHECKING:
 KNOWN = frozenset(
     {"camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen", "lowpass_pixel"}
     | {"stop_inclusive", "stop_exclusive", "compose_ordered", "compose_planes", "ray_depth"}
-    | {"perspective", "footprint_gaussian", "background_constant"}
+    | {"sh_terms", "arithmetic_precise", "keys_short"}
+    | {"perspective", "footprint_gaussian", "footprint_box", "footprint_mixed", "box_edges"}
+    | {"background_constant", "background_gradient", "background_panorama", "fog"}
     | {"ray", "ray_length", "sample_length", "turn", "world_ray"}
     | {"alpha", "depth", "depth_median", "depth_first", "distance", "distance_median", "distance_first"}
     | {"normal", "normal_world", "label", "splat_id", "blended"}
@@ -37,7 +40,10 @@ KNOWN = frozenset(
 )
 """effects that kernels/warp has"""
 # of these depend on an effect: a stage is compiled once for all feature sets that mean the same to it
-_RECORD = ("lowpass_screen", "rays", "camera_orthographic", "ray_depth", "normal", "compose_planes")
+_RECORD = (
+    *("lowpass_screen", "rays", "camera_orthographic", "ray_depth", "normal", "compose_planes"),
+    *("footprint_box", "footprint_mixed"),
+)
 _PROJECT = (
     *(*_RECORD, "lowpass_pixel", "motion_groups"),
     *("camera_brown_conrady", "camera_fisheye", "camera_equirectangular"),
@@ -116,15 +122,16 @@ class WarpPipeline:
             self.blend, self.state = runtime.kernels("blend").make_blend(
                 sample, shape.schedule == "group", self.block_dim
             )
-            planes, surroundings = runtime.kernels("planes"), runtime.kernels("surroundings")
+            planes = runtime.kernels("planes")
             self.sample_planes = planes.of_samples(sample)
             """type of an element of each"""
             finished = tuple(output.name for output in features.outputs)
             integers = tuple(output.name for output in features.outputs if output.dtype == "int32")
             self.samples_type = planes.make_samples(tuple(self.sample_planes.items()))
             self.outputs_type = planes.make_outputs(finished, integers)
-            behind = next((kind for kind in surroundings.KINDS if f"background_{kind}" in names), "constant")
-            self.around_type = surroundings.make_surroundings(behind).Around
+            kinds = runtime.kernels("surroundings").KINDS
+            behind = next((kind for kind in kinds if f"background_{kind}" in names), "constant")
+            self.surroundings = Surroundings(backend, behind)
             self.resolve = runtime.kernels("resolve").make_resolve(
                 finished, integers, tuple(self.sample_planes.items()), behind, features.samples
             )
@@ -273,6 +280,7 @@ class _Run:
         ends = self._exact("ends by index", n, wp.int64)
         cloud = [self.resident.arrays[name] for name in ("means", "quats", "scales", "opacities", "colors")]
         cloud += self._planes()
+        cloud.append(self.resident.arrays.get("boxes", drawn))  # of one kind of splats: never read
         records = [self.held["lines"], self.held["bounds"], self._take("windows", n, wp.uint64)]
         self.launcher.launch(
             self.pipeline.project,
@@ -311,7 +319,8 @@ class _Run:
         keys = self._take("sorted keys", 2 * visible, wp.uint32)
         order = self._take("order", 2 * visible, wp.int32)
         given = (self.held[name] for name in ("keys", "drawn", "places"))
-        self.launch(self.pipeline.sort.compact, self.resident.count, *given, keys, order)
+        leading = wp.uint32(-1 << (32 - self.pipeline.features.depth_key_bits) & 0xFFFFFFFF)
+        self.launch(self.pipeline.sort.compact, self.resident.count, *given, leading, keys, order)
         wp.utils.radix_sort_pairs(keys, order, visible)
 
     def _bands(self, visible: int, pairs: int) -> Iterator[tuple[int, int, int]]:
@@ -414,18 +423,14 @@ class _Run:
             array = self.pool.fresh(output.name, height * width * output.channels, dtype)
             outputs[output.name] = output, array
             setattr(finished, output.name, array)
+        around = self.pipeline.surroundings.of(view)
         if "label" in outputs:
             finished.labels = self.resident.arrays["labels"]
-        self.launch(self.pipeline.resolve, height * width, self.u, width, self._around(), samples, finished)
+        self.launch(self.pipeline.resolve, height * width, self.u, width, around, samples, finished)
         if self.pipeline.sensor:
             args = self.pipeline.sensor.arguments(view, self.pool)
             self.launch(self.pipeline.sensor.kernel, height * width, *args, width, outputs["rgb"][1])
         return outputs, (height, width)
-
-    def _around(self) -> Any:
-        around, view, wp = self.pipeline.around_type(), self.view, self.wp
-        around.color = wp.vec3(*view.background)
-        return around
 
     # helpers
 
