@@ -52,8 +52,8 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     splat = {"u": wp.vec4, "v": wp.vec4, "d": wp.vec4, "c": wp.vec4, "half_r2": wp.float32}
     splat |= {"dot_x": wp.float32, "dot_y": wp.float32} if screen else {}
     splat |= {"edges": wp.vec4} if boxes else {}
-    # w: factors of the ray's Z; origin: the anchor's ray
-    splat |= {"w": wp.vec3, "origin": wp.vec3} if bent else {}
+    # w: factors of the ray's Z, then the anchor's X; origin: the anchor's ray
+    splat |= {"w": wp.vec4, "origin": wp.vec3} if bent else {}
     # plane_z0, plane_zx, plane_zy, plane_near
     splat |= {"plane": wp.vec4} if parallel else {}
     Splat = struct_of("Splat", "What of a record each sample needs.", splat)
@@ -88,10 +88,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     nx_line, nx_lane = layout.place("nx")
     ny_line, ny_lane = layout.place("ny")
     nz_line, nz_lane = layout.place("nz")
-    (w0, w0_lane), (w1, w1_lane), (w2, w2_lane) = (layout.place(name) for name in ("nuz", "nvz", "dz"))
-    (o0, o0_lane), (o1, o1_lane), (o2, o2_lane) = (layout.place(f"ray_{axis}") for axis in "xyz")
-    plane_places = [layout.place(f"plane_{name}") for name in ("z0", "zx", "zy", "near")]
-    (p0, p0_lane), (p1, p1_lane), (p2, p2_lane), (p3, p3_lane) = plane_places
+    ray_line, plane_line = layout.place("nuz")[0], layout.place("plane_z0")[0]
 
     @wp.func
     def load(lines: wp.array(dtype=wp.vec4), index: int, view: View):
@@ -108,37 +105,13 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         if wp.static(boxes):
             s.edges = line_of(lines, at + edge_line)
         if wp.static(bent):
-            s.w = wp.vec3(
-                line_of(lines, at + w0)[w0_lane],
-                line_of(lines, at + w1)[w1_lane],
-                line_of(lines, at + w2)[w2_lane],
-            )
-            s.origin = wp.vec3(
-                line_of(lines, at + o0)[o0_lane],
-                line_of(lines, at + o1)[o1_lane],
-                line_of(lines, at + o2)[o2_lane],
-            )
+            s.w = line_of(lines, at + ray_line)
+            rest = line_of(lines, at + ray_line + 1)
+            s.origin = wp.vec3(s.w[3], rest[0], rest[1])
         if wp.static(parallel):
-            s.plane = wp.vec4(
-                line_of(lines, at + p0)[p0_lane],
-                line_of(lines, at + p1)[p1_lane],
-                line_of(lines, at + p2)[p2_lane],
-                line_of(lines, at + p3)[p3_lane],
-            )
+            s.plane = line_of(lines, at + plane_line)
         s.half_r2 = s.u[3] - view.log_cut
         return s
-
-    @wp.func
-    def staged(
-        pool: wp.uint64,
-        lines: wp.array(dtype=wp.vec4),
-        lists: wp.array(dtype=wp.int32),
-        first: int,
-        which: int,
-        line: int,
-        lane: int,
-    ) -> float:
-        return staged_line(pool, lines, lists, first, which, line)[lane]
 
     @wp.func
     def load_staged(
@@ -161,23 +134,11 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         if wp.static(boxes):
             s.edges = staged_line(pool, lines, lists, first, which, edge_line)
         if wp.static(bent):
-            s.w = wp.vec3(
-                staged(pool, lines, lists, first, which, w0, w0_lane),
-                staged(pool, lines, lists, first, which, w1, w1_lane),
-                staged(pool, lines, lists, first, which, w2, w2_lane),
-            )
-            s.origin = wp.vec3(
-                staged(pool, lines, lists, first, which, o0, o0_lane),
-                staged(pool, lines, lists, first, which, o1, o1_lane),
-                staged(pool, lines, lists, first, which, o2, o2_lane),
-            )
+            s.w = staged_line(pool, lines, lists, first, which, ray_line)
+            rest = staged_line(pool, lines, lists, first, which, ray_line + 1)
+            s.origin = wp.vec3(s.w[3], rest[0], rest[1])
         if wp.static(parallel):
-            s.plane = wp.vec4(
-                staged(pool, lines, lists, first, which, p0, p0_lane),
-                staged(pool, lines, lists, first, which, p1, p1_lane),
-                staged(pool, lines, lists, first, which, p2, p2_lane),
-                staged(pool, lines, lists, first, which, p3, p3_lane),
-            )
+            s.plane = staged_line(pool, lines, lists, first, which, plane_line)
         s.half_r2 = s.u[3] - view.log_cut
         return s
 
