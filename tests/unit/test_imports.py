@@ -35,6 +35,7 @@ MAY_IMPORT = {
     "backends": PLAIN | {"scenes", "effects", "kernel_files"},
     "hard_cases": PLAIN | {"scenes", "effects", "backends", "render", "vision", "kernel_files"},
     "render": PLAIN | {"scenes", "effects", "backends"},
+    "accuracy": PLAIN | {"scenes", "render", "backends"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__"}
 

@@ -1,0 +1,117 @@
+"""How wrong a picture is: its error against the same definition drawn at full precision.
+
+What a picture is (low-pass, samples per pixel, how coplanar splats are laid) is its definition; constants
+that leave something out of it (cut-off, stop, ceiling) and the arithmetic decide how accurate it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fidsplat.backends.reference.backend import ReferencePlanes
+from fidsplat.cameras import Camera
+from fidsplat.errors import InputError
+from fidsplat.quality import Quality
+from fidsplat.render import Renderer, ResidentCloud
+from fidsplat.scenes import Scene
+from fidsplat.splats import SplatCloud
+
+TRUTH_CUTOFF = 1e-8
+"""alpha below which the truth leaves a contribution out: a thousand such layers hide 1e-5"""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Differences between two planes, over all their values."""
+
+    maximum: float
+    """largest absolute difference"""
+    p999: float
+    """99.9th percentile of the absolute differences"""
+    rmse: float
+    """root of the mean squared difference"""
+    psnr: float
+    """dB against a peak of 1; infinite where the planes are equal"""
+
+
+def errors(picture: ArrayLike, truth: ArrayLike) -> Errors:
+    """The error of a plane, worked out in float64.
+
+    Args:
+        picture: any shape, e.g. (h, w, 3) or (h, w).
+        truth: the same shape.
+
+    Raises:
+        InputError: the shapes differ, there are no values, or one is not finite.
+    """
+    seen, want = np.asarray(picture, np.float64), np.asarray(truth, np.float64)
+    if seen.shape != want.shape:
+        raise InputError(f"a picture of shape {seen.shape} cannot be compared with one of shape {want.shape}")
+    if seen.size == 0:
+        raise InputError(f"a picture of shape {seen.shape} has no values to compare")
+    for name, plane in (("picture", seen), ("truth", want)):
+        bad = plane.size - int(np.isfinite(plane).sum())
+        if bad:
+            raise InputError(
+                f"{bad} of {plane.size} values of the {name} are not finite; they have no error to measure"
+            )
+    off = np.abs(seen - want)
+    mean_square = float(np.mean(off**2))
+    return Errors(
+        maximum=float(off.max()),
+        p999=float(np.quantile(off, 0.999)),
+        rmse=mean_square**0.5,
+        psnr=float(-10 * np.log10(mean_square)) if mean_square > 0 else float("inf"),
+    )
+
+
+def full_precision(like: Quality, renderer: Renderer) -> Quality:
+    """The quality that draws the same definition with nothing left out, in the best arithmetic of the device.
+
+    Low-pass, samples, coplanar and first_hit are those of `like`. OpenCL blends in float64 where the device
+    has it; else the arithmetic is the device's own, with the set-up in float64 if the device has that.
+    """
+    best = like.with_(
+        alpha_cutoff=TRUTH_CUTOFF,
+        transmittance_stop=0.0,
+        opacity_ceiling=1.0,
+        stop_rule="inclusive",
+        setup_precision="float64",
+    )
+    known = any(field.name == "blend_precision" for field in fields(Quality))
+    doubles = renderer.device.float64 and renderer.device.name.startswith("opencl")
+    return best.with_(blend_precision="float64") if doubles and known else best
+
+
+def truth(
+    renderer: Renderer,
+    scene: Scene | SplatCloud | ResidentCloud,
+    camera: Camera | None = None,
+    like: Quality | str | None = None,
+    output: str = "rgb",
+    **around,
+) -> np.ndarray:
+    """The picture of the same definition as `like`, drawn by `renderer` at full precision (`full_precision`).
+
+    Args:
+        renderer: who draws; "reference" gives float64 planes, other devices what they give, as float64.
+        scene: as `Renderer.render`.
+        camera: as `Renderer.render`.
+        like: whose definition; default standard.
+        output: the plane.
+        around: background, motion, shutter, sensor, fog, as `Renderer.render`.
+
+    Returns:
+        float64, of the shape of the plane: (h, w, 3) for rgb.
+
+    Raises:
+        InputError, DeviceError: as `Renderer.render`.
+    """
+    quality = full_precision(Quality.of(like), renderer)
+    frame = renderer.render(scene, camera, (output,), quality, **around)
+    if isinstance(frame._planes, ReferencePlanes):  # float32 is made of its planes when they are read
+        return frame._planes.planes[output]
+    return np.asarray(frame[output], np.float64)

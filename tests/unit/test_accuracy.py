@@ -1,0 +1,77 @@
+"""Errors between pictures, and the picture of the same definition at full precision."""
+
+import numpy as np
+import pytest
+from agreement import random_splats, reference_pixels
+
+import fidsplat as fs
+from fidsplat.accuracy import Errors, errors, full_precision, truth
+from fidsplat.errors import InputError
+from fidsplat.hard_cases.agreement import compare
+
+CAMERA = fs.Camera.pinhole(24, 17, 20.0, 20.0, 12.0, 8.5)
+
+
+def test_errors_of_known_differences():
+    want = np.zeros((10, 100), np.float32)
+    seen = want.copy()
+    seen[3, 5], seen[4, 4] = 0.25, -0.5
+    found = errors(seen, want)
+    assert found.maximum == 0.5
+    assert found.p999 == pytest.approx(np.quantile(np.abs(seen), 0.999))
+    assert found.rmse == pytest.approx(np.sqrt((0.25**2 + 0.5**2) / 1000))
+    assert found.psnr == pytest.approx(-20 * np.log10(found.rmse))
+
+
+def test_equal_pictures_have_no_error():
+    assert errors(np.ones((2, 3)), np.ones((2, 3))) == Errors(0.0, 0.0, 0.0, float("inf"))
+
+
+def test_differences_are_not_rounded_to_float32():
+    assert errors(np.float64([1.0 + 1e-12]), np.float64([1.0])).maximum == pytest.approx(1e-12, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("picture", "want", "message"),
+    [
+        (np.zeros((2, 3)), np.zeros((3, 2)), r"\(2, 3\).*\(3, 2\)"),
+        (np.zeros((0, 3)), np.zeros((0, 3)), "no values"),
+        (np.array([1.0, np.nan]), np.zeros(2), "1 of 2 values of the picture"),
+        (np.zeros(2), np.array([np.inf, np.nan]), "2 of 2 values of the truth"),
+    ],
+)
+def test_what_cannot_be_compared(picture, want, message):
+    with pytest.raises(InputError, match=message):
+        errors(picture, want)
+
+
+def test_truth_keeps_the_definition_and_leaves_nothing_out():
+    like = fs.Quality(
+        samples=2,
+        lowpass="pixel",
+        alpha_cutoff=0.1,
+        opacity_ceiling=0.9,
+        coplanar="order",
+        stop_rule="exclusive",
+    )
+    best = full_precision(like, fs.Renderer("reference"))
+    assert (best.samples, best.lowpass, best.coplanar) == (2, "pixel", "order")
+    assert best.alpha_cutoff <= 1e-6
+    assert (best.transmittance_stop, best.opacity_ceiling, best.stop_rule) == (0.0, 1.0, "inclusive")
+
+
+def test_truth_of_a_device_is_that_of_the_reference(renderer):
+    cloud = random_splats(60, seed=3, depth=(1.0, 6.0), scale=(0.05, 1.0))
+    best = full_precision(fs.Quality(), fs.Renderer("reference"))
+    judge = reference_pixels(cloud, CAMERA, ("rgb",), best)
+    ours = truth(renderer, cloud, CAMERA)
+    assert ours.dtype == np.float64
+    assert ours.shape == (17, 24, 3)
+    (difference,) = compare({"rgb": ours}, judge, ("rgb",))
+    assert difference.agrees, difference
+
+
+def test_the_reference_gives_its_float64():
+    cloud = random_splats(20, seed=1, depth=(1.0, 6.0))
+    plane = truth(fs.Renderer("reference"), cloud, CAMERA, background=(0.1, 0.2, 0.3))
+    assert (plane != plane.astype(np.float32)).any()
