@@ -55,8 +55,8 @@ HOME_OF = {
 }
 HEAVY = ("pyopencl", "warp", "shapely", "networkx", "segno", "cv2", "zxingcpp", "tyro", "rich")
 
-# A wheel carries the kernels inside the package (`_kernels`), a checkout beside it; Warp's are Python files of
-# another house, which fidsplat loads by path and which import each other by relative names.
+# A wheel carries the kernels inside the package (`_kernels`), a checkout beside it; Warp's are Python files
+# of another house, which fidsplat loads by path and which import each other by relative names.
 MODULES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path
     for path in PACKAGE.rglob("*.py")
