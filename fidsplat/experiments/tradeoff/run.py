@@ -116,14 +116,16 @@ def all_parts(names: tuple[str, ...], knobs: tuple[str, ...], quick: bool) -> li
     found: list[tuple[int, dict]] = []
     for name in chosen:
         marked = scenes.is_marker(name)
+        every = name not in scenes.FEW_KNOBS and not (marked and quick)
         for view in scenes.views_of(name):
             defined: set[tuple] = set()
-            for point in points.points(turned, marked, quick, name not in scenes.FEW_KNOBS):
+            for point in points.points(turned, marked, quick, every):
                 if name == "r1m_1080p" and point.quality.samples > 2:
                     continue  # 18 million samples: minutes on a CPU for what the smaller scene shows too
                 tier = 0 if point.knob in _EARLY else 2
                 found.append((tier, {"what": POINT, "scene": view, **point.key(), "quick": quick}))
-                definition = tuple(getattr(point.quality, knob) for knob in DEFINITION)
+                rule = point.quality.coplanar if marked else BASE.coplanar  # only markers have planes
+                definition = (point.quality.lowpass, point.quality.samples, rule)
                 if point.knob != MARKER_KNOB and definition not in defined:
                     defined.add(definition)
                     found.append((tier + 1, _truth_part(view, definition)))
