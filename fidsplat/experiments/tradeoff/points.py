@@ -1,4 +1,5 @@
-"""The settings that are measured: each knob alone over a ladder, presets, useful combinations."""
+"""The settings that are measured: each knob over a ladder, constants of others in an exact picture, presets,
+useful combinations."""
 
 from __future__ import annotations
 
@@ -22,6 +23,8 @@ from fidsplat.quality import (
 BASE = Quality(alpha_cutoff=1 / 255, transmittance_stop=1e-4)
 """what every other setting is measured beside, turn by turn: the cut-off and the stop that other systems
 share, and our rules; pinned, so that presets may change"""
+EXACT = Quality(alpha_cutoff=1e-6, transmittance_stop=0.0)
+"""what leaves nothing out that float32 can show; a constant put into this alone shows the error it makes"""
 SHARP = {"lowpass": "none", "samples": 3}
 """for markers: exact splats, the mean of 3 x 3 samples"""
 
@@ -63,8 +66,23 @@ _QUICK_MARKERS = (MarkerQuality("paper"), MarkerQuality("exact"))
 _COMBINED_CUTOFFS, _COMBINED_STOPS = (1e-4, 1 / 2048, 1 / 1024, 1 / 512, 1 / 255), (1e-4, 1e-3, 1 / 512)
 _FAST = {"arithmetic": "fast", "setup_precision": "float32"}
 
-PRESETS_KNOB, TOGETHER, MARKER_KNOB = "preset", "together", "marker"
-KNOBS = (PRESETS_KNOB, *_LADDERS, MARKER_KNOB, TOGETHER)
+_ALONE: tuple[dict[str, Any], ...] = (
+    {"alpha_cutoff": 1 / 255},
+    {"alpha_cutoff": math.exp(-4.5)},
+    {"transmittance_stop": 1e-4},
+    {"transmittance_stop": 1 / 256},
+    {"opacity_ceiling": 0.99},
+    {"stop_rule": "exclusive", "transmittance_stop": 1e-4, "coplanar": "order"},
+    {"lowpass": "none"},
+    {"depth_key_bits": 16},
+    {"color_precision": "float16"},
+    {"setup_precision": "float32"},
+    {"arithmetic": "fast"},
+)
+"""constants that are put into `EXACT`, one at a time"""
+
+PRESETS_KNOB, ALONE, TOGETHER, MARKER_KNOB = "preset", "alone", "together", "marker"
+KNOBS = (PRESETS_KNOB, ALONE, *_LADDERS, MARKER_KNOB, TOGETHER)
 """what --knobs takes"""
 
 
@@ -112,6 +130,9 @@ def points(
     if PRESETS_KNOB in chosen:
         # surfel has the same constants as gsplat
         found += [Point(PRESETS_KNOB, name, PRESETS[name]) for name in PRESETS if name != "surfel"]
+    if ALONE in chosen and not on_marker:
+        found.append(Point(ALONE, "exact", EXACT))
+        found += [alone(changes) for changes in (_ALONE[:6] if quick else _ALONE)]
     if MARKER_KNOB in chosen and on_marker:
         found += _marker_points(quick)
     for knob, (values, kinds) in _LADDERS.items() if every_ladder else ():
@@ -144,6 +165,12 @@ def marker_words(knobs: MarkerQuality) -> str:
     else:
         words = f"fitted {knobs.template}" if knobs.mixture == "fitted" else knobs.mixture
     return words if knobs.growth is None else f"{words} growth {knobs.growth:g}"
+
+
+def alone(changes: dict[str, Any]) -> Point:
+    """A constant in the setting that is exact otherwise."""
+    knob, value = next(iter(changes.items()))
+    return Point(ALONE, f"{knob} {value_words(value)}", EXACT.with_(**changes))
 
 
 def _turned(knob: str, value: Any) -> Point:

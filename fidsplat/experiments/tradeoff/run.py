@@ -15,7 +15,7 @@ from fidsplat.errors import FidsplatError
 from fidsplat.experiments.records import Records, run_facts
 from fidsplat.experiments.tradeoff import decoding, points, scenes
 from fidsplat.experiments.tradeoff.judging import check_truth, judge_picture
-from fidsplat.experiments.tradeoff.points import BASE, MARKER_KNOB, PRESETS_KNOB
+from fidsplat.experiments.tradeoff.points import ALONE, BASE, MARKER_KNOB, PRESETS_KNOB
 from fidsplat.experiments.tradeoff.table import DEFINITION, Table
 from fidsplat.experiments.tradeoff.timing import FULL, QUICK, time_point
 from fidsplat.files import writable_folder
@@ -28,7 +28,7 @@ NAME = "tradeoff"
 FILE = f"{NAME}.jsonl"
 POINT, DECODE, TRUTH = "point", "decode", "truth"
 IDEAL = "ideal"
-_EARLY = ("base", PRESETS_KNOB, "alpha_cutoff", "transmittance_stop", MARKER_KNOB)
+_EARLY = ("base", PRESETS_KNOB, ALONE, "alpha_cutoff", "transmittance_stop", MARKER_KNOB)
 _BATCH = 16
 """parts at most whose pictures wait to be looked at"""
 
@@ -96,7 +96,10 @@ def planned(settings: Settings) -> Iterator[Plan]:
     renderer = Renderer(settings.device)
     device = f"{renderer.device.title}, {renderer.device.version}"
     versions = reader_versions() | metric_versions() | {"pyopencl": version("pyopencl")}
-    facts = run_facts(NAME, device, scenes.SEED, versions) | {"kind": renderer.device.kind}
+    facts = run_facts(NAME, device, scenes.SEED, versions) | {
+        "kind": renderer.device.kind,
+        "title": renderer.device.title,
+    }
     records = Records(settings.out / FILE, facts, settings.anew)
     pool = ThreadPoolExecutor(settings.workers)
     try:

@@ -6,7 +6,7 @@ import math
 
 from fidsplat.experiments.document import Document
 from fidsplat.experiments.figures import NOTHING
-from fidsplat.experiments.tradeoff.points import PRESETS_KNOB
+from fidsplat.experiments.tradeoff.points import ALONE, PRESETS_KNOB
 from fidsplat.experiments.tradeoff.report import verdicts
 from fidsplat.experiments.tradeoff.report.results import Measured, Results
 from fidsplat.experiments.tradeoff.report.wording import listed, number, percent
@@ -40,13 +40,14 @@ def report_reading(document: Document, results: Results) -> None:
     for title, settings in groups.items():
         document.text(f"{title}: {listed([_words(results, setting) for setting in settings])}.")
     document.text(f"**Worth turning** for accuracy: {listed(_bargains(results, scenes, found))}.")
+    noises = ", ".join(f"{scene} {verdicts.noise(results.base(scene)):.1%}" for scene in scenes)
     meanings = "; ".join(f"{name}: {meaning}" for name, meaning in verdicts.MEANINGS.items())
     document.text(
         "A setting stands in one of the first lists when it is that on some scene and makes no difference on "
-        f"the others ({meanings}). A time differs when its median does by {verdicts.TIME_CHANGES:.0%} and "
-        "both quartiles of the pairs' ratios lie on that side; an error when it does by a factor of "
-        f"{verdicts.ERROR_CHANGES}. Worth turning are those that buy accuracy on every scene, first those "
-        "whose error falls most for the time."
+        f"the others ({meanings}). A time differs when both quartiles of the pairs' ratios lie on one side of 1 "
+        f"and the median does by more than the base beside itself ({noises}); an error when it does by a "
+        f"factor of {verdicts.ERROR_CHANGES}. Worth turning are those that buy accuracy on every scene, first "
+        "those whose error falls most for the time."
     )
     rows = [
         (_words(results, setting), *(by_scene.get(scene, NOTHING) for scene in scenes))
@@ -61,7 +62,7 @@ def _verdicts(results: Results, scenes: list[str]) -> dict[tuple[str, str], dict
     for setting in results.settings():
         for scene in scenes:
             point = results.at(scene, *setting)
-            if point is not None and point.same_picture and point.knob != "base":
+            if point is not None and point.same_picture and point.knob not in ("base", ALONE):
                 found.setdefault(setting, {})[scene] = verdicts.verdict(point, results.base(scene))
     return found
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from fidsplat.errors import InputError
 from fidsplat.experiments.angles import largest, parse_tilts
 from fidsplat.experiments.records import key_of, read_lines
-from fidsplat.experiments.tradeoff.points import BASE, KNOBS, PRESETS_KNOB
+from fidsplat.experiments.tradeoff.points import ALONE, BASE, KNOBS, MARKER_KNOB, PRESETS_KNOB, TOGETHER
 from fidsplat.experiments.tradeoff.run import DECODE, IDEAL, POINT, TRUTH
 from fidsplat.experiments.tradeoff.scenes import MARKERS, NAMES, views_of
 
@@ -31,7 +31,9 @@ class Measured:
     @property
     def words(self) -> str:
         """The setting in words."""
-        if self.knob in ("base", PRESETS_KNOB, "together", "marker"):
+        if self.knob == ALONE:
+            return self.value if self.value == "exact" else f"exact but for {self.value}"
+        if self.knob in ("base", PRESETS_KNOB, TOGETHER, MARKER_KNOB):
             return self.value
         return f"{self.knob} {self.value}"
 

@@ -9,7 +9,7 @@ from fidsplat.experiments.tradeoff.report.results import Measured, Results
 INVISIBLE = 1 / 512
 """half a step of 8 bits"""
 TIME_CHANGES = 0.02
-"""share by which the median must differ, besides both quartiles lying on that side"""
+"""share by which the median must differ at least, besides both quartiles lying on that side"""
 ERROR_CHANGES = 1.1
 """factor"""
 _TINY = 1e-6
@@ -46,15 +46,21 @@ def verdict(point: Measured, base: Measured) -> str:
     signs = {_sign(point.result[name], base.result[name]) for name in ("maximum", "rmse")}
     if {-1, 1} <= signs:
         return MIXED
-    return _BY_SIGNS[time_sign(point), next((sign for sign in signs if sign), 0)]
+    return _BY_SIGNS[time_sign(point, noise(base)), next((sign for sign in signs if sign), 0)]
 
 
-def time_sign(point: Measured) -> int:
-    """-1 for a setting that is faster than the base, 1 for a slower one, 0 where the noise hides it."""
+def noise(base: Measured) -> float:
+    """The share by which times differ on a scene for no reason: that of the base drawn beside itself."""
+    return max(TIME_CHANGES, *(abs(quartile - 1) for quartile in base.result["ratio_quartiles"]))
+
+
+def time_sign(point: Measured, least: float) -> int:
+    """-1 for a setting that is faster than the base, 1 for a slower one, 0 where the noise `least` hides
+    it."""
     low, high = point.result["ratio_quartiles"]
-    if point.ratio < 1 - TIME_CHANGES and high < 1:
+    if point.ratio < 1 - least and high < 1:
         return -1
-    return int(point.ratio > 1 + TIME_CHANGES and low > 1)
+    return int(point.ratio > 1 + least and low > 1)
 
 
 def _sign(error: float, other: float) -> int:
