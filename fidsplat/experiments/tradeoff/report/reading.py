@@ -44,10 +44,10 @@ def report_reading(document: Document, results: Results) -> None:
     meanings = "; ".join(f"{name}: {meaning}" for name, meaning in verdicts.MEANINGS.items())
     document.text(
         "A setting stands in one of the first lists when it is that on some scene and makes no difference on "
-        f"the others ({meanings}). A time differs when both quartiles of the pairs' ratios lie on one side of 1 "
-        f"and the median does by more than the base beside itself ({noises}); an error when it does by a "
-        f"factor of {verdicts.ERROR_CHANGES}. Worth turning are those that buy accuracy on every scene, first "
-        "those whose error falls most for the time."
+        f"the others ({meanings}). A time differs when both quartiles of the pairs' ratios lie on one side "
+        f"of 1 and the median does by more than the base beside itself ({noises}); an error when it does by "
+        f"a factor of {verdicts.ERROR_CHANGES}. Worth turning are those that buy accuracy on every scene, "
+        "first those whose error falls most for the time."
     )
     rows = [
         (_words(results, setting), *(by_scene.get(scene, NOTHING) for scene in scenes))
