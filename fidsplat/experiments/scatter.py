@@ -80,7 +80,7 @@ def scatter_chart(
 
 
 class _Scale:
-    """Values to pixels, with ticks at 1, 2 and 5 (or 1) times powers of ten, or at equal steps."""
+    """Values to pixels, with ticks at a few multiples of powers of ten, or at equal steps."""
 
     def __init__(self, values: Sequence[float], logarithmic: bool, start: float, stop: float) -> None:
         self._start, self._stop, self._logarithmic = start, stop, logarithmic
@@ -88,7 +88,8 @@ class _Scale:
         if logarithmic:
             if low <= 0:
                 raise ValueError("a logarithmic scale has no place for values at or below 0")
-            steps = (1, 2, 5) if high / low < 300 else (1,)
+            spread = high / low
+            steps = (1, 1.5, 2, 3, 5, 7) if spread < 10 else (1, 2, 5) if spread < 300 else (1,)
             powers = range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 2)
             every = [step * 10.0**power for power in powers for step in steps]
         else:

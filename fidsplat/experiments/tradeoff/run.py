@@ -94,12 +94,10 @@ def planned(settings: Settings) -> Iterator[Plan]:
     work = all_parts(settings.scenes, settings.knobs, settings.quick)
     writable_folder(settings.out)
     renderer = Renderer(settings.device)
-    device = f"{renderer.device.title}, {renderer.device.version}"
+    info = renderer.device
     versions = reader_versions() | metric_versions() | {"pyopencl": version("pyopencl")}
-    facts = run_facts(NAME, device, scenes.SEED, versions) | {
-        "kind": renderer.device.kind,
-        "title": renderer.device.title,
-    }
+    facts = run_facts(NAME, f"{info.title}, {info.version}", scenes.SEED, versions)
+    facts |= {"kind": info.kind, "title": info.title}
     records = Records(settings.out / FILE, facts, settings.anew)
     pool = ThreadPoolExecutor(settings.workers)
     try:

@@ -87,7 +87,7 @@ def _device(document: Document, results: Results, name: str) -> dict[str, str]:
     for scene in plotted:
         file = f"pareto-{scene.replace('@', '-')}-{name}.svg"
         charts[file] = pareto_chart(results, scene)
-        document.picture(file, f"Time against error, {scene}, {results.device}")
+        document.picture(file, f"Time against error, {scene}, {results.title}")
     if plain:
         document.heading("Every setting", 3)
         document.text("Time beside the base, largest error and RMSE.")
@@ -159,7 +159,7 @@ def _provenance(document: Document, devices: Sequence[Results]) -> None:
             definition = f"{key['lowpass']}, {key['samples']} x {key['samples']}, {key['coplanar']}"
             checks.append(
                 (
-                    results.device,
+                    results.title,
                     key["scene"],
                     definition,
                     found["blend_precision"],

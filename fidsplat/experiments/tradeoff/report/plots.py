@@ -31,7 +31,7 @@ def pareto_chart(results: Results, scene: str) -> str:
     line = [Dot(ms * point.ratio, _error(point, False)) for point in front(points)] if not marked else []
     error = "RMSE from the ideal texture" if marked else "largest error against float64"
     return scatter_chart(
-        f"{scene} on {results.device}", Axis("ms per frame", True), Axis(error, True), series, line
+        f"{scene} on {results.title}", Axis("ms per frame", True), Axis(error, True), series, line
     )
 
 
@@ -61,8 +61,8 @@ def marker_charts(results: Results) -> Iterator[tuple[str, str, str]]:
                 tilts.setdefault(name, []).append(Dot(each, angle, point.words if name == "qr10" else ""))
     across = Axis("Gaussians per rectangle", True)
     if decibels:
-        title = f"PSNR from the ideal texture at {PLOTTED_TILT} degrees, {results.device}"
+        title = f"PSNR from the ideal texture at {PLOTTED_TILT} degrees, {results.title}"
         yield "psnr", title, scatter_chart(title, across, Axis("dB"), decibels)
     if tilts:
-        title = f"Tilt up to which a marker is read, {results.device}"
+        title = f"Tilt up to which a marker is read, {results.title}"
         yield "angle", title, scatter_chart(title, across, Axis("degrees"), tilts)

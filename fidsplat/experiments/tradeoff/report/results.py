@@ -65,12 +65,13 @@ class Results:
     """Lines of one device.
 
     Args:
-        device: its title and driver.
+        device: its title and driver; `title` is without the driver.
         lines: of `tradeoff.jsonl`; of several about the same part the first counts.
     """
 
     def __init__(self, device: str, lines: Sequence[dict]) -> None:
         self.device, self.lines = device, lines
+        self.title = lines[0]["run"].get("title", device)
         self.kind = lines[0]["run"].get("kind", "")
         self.points: dict[tuple[str, str, str], Measured] = {}
         self.refused: dict[str, str] = {}
