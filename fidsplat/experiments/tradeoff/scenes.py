@@ -20,8 +20,8 @@ RANDOM = ("r100k_720p", "r1m_1080p")
 HARD = "hard"
 MARKERS = {"apriltag": "apriltag", "qr2": "small", "qr5": "medium", "qr10": "large", "qr22": "huge"}
 """name -> the category of the paper that marker 0 is taken of"""
-FEW_KNOBS = ("qr2", "qr5", "qr22")
-"""markers that show how they are made; what the other knobs do to markers the others show"""
+FEW_KNOBS = ("apriltag", "qr2", "qr5", "qr22")
+"""markers that show how they are made; what every other knob does to markers qr10 shows"""
 NAMES = (*RANDOM, HARD, *MARKERS)
 QUICK_NAMES = ("r100k_720p", HARD, "apriltag", "qr10")
 TILTS = (0, 60, 80)

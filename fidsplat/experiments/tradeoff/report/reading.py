@@ -62,7 +62,9 @@ def _verdicts(results: Results, scenes: list[str]) -> dict[tuple[str, str], dict
     for setting in results.settings():
         for scene in scenes:
             point = results.at(scene, *setting)
-            if point is not None and point.same_picture and point.knob not in ("base", ALONE):
+            if point is None or not point.same_picture or point.knob in ("base", ALONE):
+                continue
+            if point.quality != results.base(scene).quality:  # a preset may be the base itself
                 found.setdefault(setting, {})[scene] = verdicts.verdict(point, results.base(scene))
     return found
 
@@ -99,7 +101,7 @@ def report_goals(document: Document, results: Results) -> None:
         gsplat = results.at(scene, *GSPLAT)
         if gsplat is None:
             continue
-        ours = [p for p in results.of(scene) if p.same_picture and (p.knob, p.value) != GSPLAT]
+        ours = [p for p in results.of(scene) if p.same_picture and p.quality != gsplat.quality]
         as_good = [p for p in ours if p.maximum <= gsplat.maximum]
         as_fast = [p for p in ours if p.ratio <= gsplat.ratio * _EQUAL_TIME]
         quickest = min(as_good, key=lambda p: p.ratio, default=None)
