@@ -29,7 +29,7 @@ def hard_scene(seed: int = 0) -> tuple[SplatCloud, Camera]:
     40 stacks of layers of 0.98 to 1 before a lamp, which a ceiling of 0.99 and a dropped last layer let shine
     through. edge-on: tilts of 89 to 89.9999 degrees. tiny: 0.01 to 0.5 px. pages: layers 0.1 mm apart
     at 5 m, in no order of the file. needles: 1000 to 30,000 times as long as wide. near: strips of ground
-    that begin behind the camera. All of it lies at `PLACE`, half a million metres and more from the origin.
+    that begin behind the camera. All of it lies 4.5 million metres from the origin.
     """
     generator = np.random.default_rng(seed)
     parts = [
