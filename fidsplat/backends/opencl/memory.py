@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -133,13 +133,7 @@ class Resident:
         self.streamed = not self._shared and (
             total > backend.memory_budget // 2 or widest > device.max_mem_alloc_size
         )
-        if not self._shared and not self.streamed:
-            try:
-                for name in self._arrays.keys() - {"labels", "colors", "sh"}:
-                    self._whole(name)
-                backend.queue.finish()
-            except cl.Error as error:
-                raise DeviceError(f"{backend.info.title} failed while taking the cloud: {error}") from error
+        self.settle(sorted(self._arrays.keys() - {"labels", "colors", "sh"}))
 
     @property
     def bytes_per_splat(self) -> int:
@@ -151,27 +145,49 @@ class Resident:
         """Bytes that the cloud holds on the device; a CPU's are the host's."""
         return 0 if self._shared else sum(buffer.size for buffer in self._buffers.values())
 
+    def settle(self, names: Iterable[str]) -> None:
+        """Copies these arrays to the device if it is to hold the cloud, so that a picture's plan knows of
+        them.
+
+        Raises:
+            DeviceError: the device fails or lacks memory.
+        """
+        fresh = [name for name in names if name not in self._buffers]
+        if self._shared or self.streamed or not fresh:
+            return
+        try:
+            for name in fresh:
+                self._whole(name)
+            self._backend.queue.finish()
+        except cl.Error as error:
+            title = self._backend.info.title
+            raise DeviceError(f"{title} failed while taking the cloud: {error}") from error
+
     def part(self, name: str, first: int, end: int) -> cl.Buffer:
         """The array of splats [first, end)."""
-        if name == "splat_ids" and name not in self._arrays:
-            # made when a picture first asks for it
-            self._arrays[name] = np.arange(self.count, dtype=np.int32)
-        if name.endswith("_half") and name not in self._arrays:
-            self._arrays[name] = halves(self._arrays[name.removesuffix("_half")])
         if self.streamed:
-            piece = np.ascontiguousarray(self._arrays[name][first:end])
+            piece = np.ascontiguousarray(self._array(name)[first:end])
             buffer = self._backend.pool.scratch(f"chunk of {name}", piece.nbytes)
             cl.enqueue_copy(self._backend.queue, buffer, piece)
             return buffer
         whole = self._whole(name)
         if end - first == self.count:
             return whole
-        row = self._arrays[name].nbytes // self.count
+        row = self._array(name).nbytes // self.count
         return whole.get_sub_region(first * row, (end - first) * row)
+
+    def _array(self, name: str) -> np.ndarray:
+        """The array on the host; ids and halves are made when a picture first asks for them."""
+        if name not in self._arrays:
+            if name == "splat_ids":
+                self._arrays[name] = np.arange(self.count, dtype=np.int32)
+            else:
+                self._arrays[name] = halves(self._arrays[name.removesuffix("_half")])
+        return self._arrays[name]
 
     def _whole(self, name: str) -> cl.Buffer:
         if name not in self._buffers:
-            array = np.ascontiguousarray(self._arrays[name])
+            array = np.ascontiguousarray(self._array(name))
             flags = cl.mem_flags
             if array.size == 0:
                 buffer = self._backend.pool.fresh(f"the cloud's {name}", 16)

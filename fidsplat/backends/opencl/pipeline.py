@@ -93,6 +93,8 @@ class OpenCLPipeline:
         Raises:
             DeviceError: the device runs out of memory or fails.
         """
+        effects = self.features.effects
+        resident.settle(name for one in effects for name in one.inputs if name not in one.view_inputs)
         plan = self._plan(resident, view)
         if plan.chunk and self.shape.lists != "ordered":
             # one way of drawing in chunks is enough: where memory is short, sorting takes the least time
