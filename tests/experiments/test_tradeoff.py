@@ -10,7 +10,7 @@ from fidsplat.cli import main
 from fidsplat.experiments.records import read_lines
 from fidsplat.experiments.tradeoff import judging, run
 from fidsplat.experiments.tradeoff.hard import CELLS, cell_window, hard_scene
-from fidsplat.experiments.tradeoff.points import ALONE, BASE, EXACT, KNOBS, decode_points, points
+from fidsplat.experiments.tradeoff.points import ALONE, BASE, EXACT, KNOBS, decode_points, points, quality_of
 from fidsplat.experiments.tradeoff.scenes import NAMES, TradeScene, make, scene_names
 from fidsplat.experiments.tradeoff.table import Table
 from fidsplat.experiments.tradeoff.timing import QUICK, time_point
@@ -70,7 +70,9 @@ def test_parts_are_all_different_and_the_telling_ones_come_first():
     assert {part["scene"].partition("@")[0] for part in full} == set(NAMES)
     knobs = [part.get("knob") for part in full]
     assert knobs.index("tile_size") > max(i for i, knob in enumerate(knobs) if knob == "alpha_cutoff")
-    again = [run.quality_of(part["quality"]) for part in full if part.get("quality")]
+    for point in points(KNOBS, True):
+        assert quality_of(json.loads(json.dumps(point.key()))["quality"]) == point.quality
+    again = [quality_of(part["quality"]) for part in full if part.get("quality") is not None]
     assert BASE in again
     assert EXACT in again
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from fidsplat.errors import InputError
@@ -97,8 +97,24 @@ class Point:
     quality: Quality
 
     def key(self) -> dict:
-        """For the key of a result: the setting with every knob, so that a default that moves is seen."""
-        return {"knob": self.knob, "value": self.value, "quality": asdict(self.quality)}
+        """For the key of a result: the setting by what it changes in the base."""
+        changes = _changes(asdict(self.quality), asdict(BASE))
+        return {"knob": self.knob, "value": self.value, "quality": changes}
+
+
+def quality_of(changes: dict) -> Quality:
+    """The setting of a key's `quality`."""
+    marker = replace(BASE.marker, **changes.get("marker", {}))
+    return BASE.with_(**changes | {"marker": marker})
+
+
+def _changes(values: dict, others: dict) -> dict:
+    """What differs of nested values, and to what."""
+    return {
+        name: _changes(value, others[name]) if isinstance(value, dict) else value
+        for name, value in values.items()
+        if value != others[name]
+    }
 
 
 def knob_names(words: Iterable[str]) -> tuple[str, ...]:

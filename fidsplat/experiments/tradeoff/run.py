@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from fidsplat.accuracy import TRUTH_CUTOFF
 from fidsplat.errors import FidsplatError
@@ -19,7 +20,6 @@ from fidsplat.experiments.tradeoff.points import ALONE, BASE, MARKER_KNOB, PRESE
 from fidsplat.experiments.tradeoff.table import DEFINITION, Table
 from fidsplat.experiments.tradeoff.timing import FULL, QUICK, time_point
 from fidsplat.files import writable_folder
-from fidsplat.quality import MarkerQuality, Quality
 from fidsplat.render import Renderer
 from fidsplat.vision.metrics import metric_versions
 from fidsplat.vision.readers import reader_versions
@@ -73,7 +73,7 @@ class Plan:
             batch = left[first : first + size]
             looks = [self.begin(part) for part in batch]
             for part, result in zip(batch, self.pool.map(lambda look: look(), looks), strict=True):
-                yield self.records.append(part, result)
+                yield self.records.append(part, _rounded(result))
 
     def begin(self, part: dict) -> Callable[[], dict]:
         """Do the device's share of a part; what is returned does the host's. What a device refuses to draw
@@ -142,15 +142,19 @@ def _truth_part(view: str, definition: tuple) -> dict:
     return {"what": TRUTH, "scene": view, **dict(zip(DEFINITION, definition, strict=True))}
 
 
-def quality_of(values: dict) -> Quality:
-    """The setting of a key."""
-    return Quality(**{**values, "marker": MarkerQuality(**values["marker"])})
+def _rounded(value: Any) -> Any:
+    """Numbers to six digits: no measurement has more, and lines stay short."""
+    if isinstance(value, dict):
+        return {name: _rounded(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_rounded(item) for item in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def _begin(table: Table, part: dict, quick: bool) -> Callable[[], dict]:
     view = part["scene"]
     if part["what"] == DECODE:
-        quality = None if part["quality"] is None else quality_of(part["quality"])
+        quality = None if part["quality"] is None else points.quality_of(part["quality"])
         return decoding.scan(table, view, quality, part["tilts"])
     if part["what"] == TRUTH:
         asked = BASE.with_(**{name: part[name] for name in DEFINITION})
@@ -158,7 +162,7 @@ def _begin(table: Table, part: dict, quick: bool) -> Callable[[], dict]:
         scene = table.scene(view, asked.marker).scene
         facts = {"blend_precision": full.blend_precision, "alpha_cutoff": TRUTH_CUTOFF}
         return lambda: facts | check_truth(truth, scene, full)
-    quality = quality_of(part["quality"])
+    quality = points.quality_of(part["quality"])
     frame, times = time_point(table, view, quality, QUICK if quick else FULL)
     picture, truth = frame["rgb"], table.truth(view, quality)
     scene = table.scene(view, quality.marker).scene

@@ -91,5 +91,4 @@ def made_marker(name: str, knobs: MarkerQuality) -> Marker:
     spec = CATEGORIES[MARKERS[name]].spec(0, SEED)
     plain = marker(spec)
     module = PROTOCOL.module(plain.grid.shape[0])
-    options = {"levels": knobs.levels, "density": knobs.density} if knobs.mixture == "paper" else {}
-    return marker(spec, module * plain.bits.shape[1], knobs.mixture, growth=knobs.growth, **options)
+    return marker(spec, module * plain.bits.shape[1], quality=knobs)

@@ -10,7 +10,7 @@ from pathlib import Path
 from fidsplat.errors import InputError
 from fidsplat.experiments.angles import largest, parse_tilts
 from fidsplat.experiments.records import key_of, read_lines
-from fidsplat.experiments.tradeoff.points import ALONE, BASE, KNOBS, MARKER_KNOB, PRESETS_KNOB, TOGETHER
+from fidsplat.experiments.tradeoff.points import ALONE, KNOBS, MARKER_KNOB, PRESETS_KNOB, TOGETHER
 from fidsplat.experiments.tradeoff.run import DECODE, IDEAL, POINT, TRUTH
 from fidsplat.experiments.tradeoff.scenes import MARKERS, NAMES, views_of
 
@@ -26,6 +26,7 @@ class Measured:
     knob: str
     value: str
     quality: dict
+    """what it changes in the base"""
     result: dict
 
     @property
@@ -58,7 +59,7 @@ class Measured:
         """Whether its definition is the base's, so that errors may be compared."""
         # without coplanar splats their rule defines nothing
         knobs = DEFINES if self.scene.partition("@")[0] in MARKERS else DEFINES[:2]
-        return all(self.quality[knob] == getattr(BASE, knob) for knob in knobs)
+        return not any(knob in self.quality for knob in knobs)
 
 
 class Results:
