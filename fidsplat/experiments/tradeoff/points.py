@@ -31,7 +31,7 @@ SHARP = {"lowpass": "none", "samples": 3}
 # knob -> (its values, in which kinds of scenes: r random and hard, m markers)
 _LADDERS: dict[str, tuple[tuple[Any, ...], str]] = {
     "alpha_cutoff": (
-        (1e-6, 1e-5, 1e-4, 1 / 2048, 1 / 1024, 1 / 512, 2 / 255, math.exp(-4.5), 4 / 255),
+        (1e-6, 1e-5, 1e-4, 1 / 4096, 1 / 2048, 1 / 1024, 1 / 512, 2 / 255, math.exp(-4.5), 4 / 255),
         "rm",
     ),
     "transmittance_stop": ((0.0, 1e-6, 1e-5, 1e-3, 1 / 512, 1 / 256, 1e-2), "rm"),
@@ -63,7 +63,7 @@ _MARKER_LADDER = (
     MarkerQuality("exact"),
 )
 _QUICK_MARKERS = (MarkerQuality("paper"), MarkerQuality("exact"))
-_COMBINED_CUTOFFS, _COMBINED_STOPS = (1e-4, 1 / 2048, 1 / 1024, 1 / 512, 1 / 255), (1e-4, 1e-3, 1 / 512)
+_COMBINED_CUTOFFS, _COMBINED_STOPS = (1e-4, 1 / 4096, 1 / 2048, 1 / 1024, 1 / 255), (1e-4, 1e-3, 1 / 512)
 _FAST = {"arithmetic": "fast", "setup_precision": "float32"}
 
 _ALONE: tuple[dict[str, Any], ...] = (
@@ -80,6 +80,13 @@ _ALONE: tuple[dict[str, Any], ...] = (
     {"arithmetic": "fast"},
 )
 """constants that are put into `EXACT`, one at a time"""
+
+_FRACTIONS = {
+    above / below: f"{above}/{below}"
+    for above, below in (
+        (1, 255), (2, 255), (4, 255), (1, 256), (1, 512), (1, 1024), (1, 2048), (1, 4096),
+    )
+}  # fmt: skip
 
 PRESETS_KNOB, ALONE, TOGETHER, MARKER_KNOB = "preset", "alone", "together", "marker"
 KNOBS = (PRESETS_KNOB, ALONE, *_LADDERS, MARKER_KNOB, TOGETHER)
@@ -198,9 +205,8 @@ def _turned(knob: str, value: Any) -> Point:
 
 def value_words(value: Any) -> str:
     """A knob's value; fractions that systems write as such stay such."""
-    for above, below in ((1, 512), (1, 256), (1, 1024), (1, 2048), (1, 255), (2, 255), (4, 255)):
-        if isinstance(value, float) and value == above / below:
-            return f"{above}/{below}"
+    if value in _FRACTIONS:
+        return _FRACTIONS[value]
     if value == math.exp(-4.5):
         return "3 sigma"  # where an opaque splat has fallen to that
     return f"{value:g}" if isinstance(value, float) else str(value)
