@@ -8,6 +8,7 @@ from __future__ import annotations
 import difflib
 import math
 import operator
+from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 from numbers import Real
 from typing import Any
@@ -25,7 +26,7 @@ DEPTH_KEY_BITS = (16, 24, 32)
 TILE_SIZES = (8, 16, 32)
 MAX_SAMPLES = 8
 MIXTURES = ("fitted", "paper", "exact")
-TEMPLATE_SIZES = (25,)
+TEMPLATE_SIZES = (1, 5, 9, 13, 25)
 """Gaussians of a rectangle in the templates that are shipped (fidsplat/markers/templates.json)"""
 MAX_LEVELS, MAX_DENSITY = 8, 100
 
@@ -73,7 +74,8 @@ class MarkerQuality:
     and rounds what lies behind. None: what the mixture was made with (0.4 for fitted, 0 for paper)."""
 
     template: int = 25
-    """Of `fitted`: Gaussians of a rectangle up to an aspect ratio of 8 (`TEMPLATE_SIZES`)."""
+    """Of `fitted`: Gaussians of a rectangle up to an aspect ratio of 8, one of `TEMPLATE_SIZES`: 1, 5, 9, 13
+    or 25. Fewer are drawn faster and leave edges blurred and corners round."""
 
     def __post_init__(self) -> None:
         _one_of("marker quality: mixture", self.mixture, MIXTURES)
@@ -212,26 +214,84 @@ class Quality:
         """The preset of that name: standard, fast, reference, gsplat or surfel."""
         if name in PRESETS:
             return PRESETS[name]
-        near = difflib.get_close_matches(str(name), PRESETS, 1)
-        hint = f" (did you mean {near[0]!r}?)" if near else ""
-        raise InputError(f"unknown quality {name!r}{hint}; known: {', '.join(PRESETS)}")
+        raise InputError(f"unknown quality {name!r}{_hint(name, PRESETS)}; known: {', '.join(PRESETS)}")
 
     @classmethod
     def of(cls, quality: Quality | str | None) -> Quality:
-        """A `Quality` from itself, from a preset's name, or the default from None."""
+        """A `Quality` from itself, from text, or the default from None.
+
+        Text is a preset's name, knobs as key=value, or both: "fast", "alpha_cutoff=1e-3",
+        "fast,samples=2,marker.template=9". Without a name the knobs are changed in standard.
+
+        Raises:
+            InputError: an unknown preset or knob, or a value that it cannot have.
+        """
         if quality is None:
             return PRESETS["standard"]
         if isinstance(quality, cls):
             return quality
-        return cls.named(quality)  # type: ignore[arg-type]
+        if not isinstance(quality, str):
+            raise InputError(f"quality is {quality!r}; it must be an fs.Quality or text")
+        first, *rest = (part.strip() for part in quality.split(","))
+        chosen = PRESETS["standard"] if "=" in first else cls.named(first)
+        changes: dict[str, Any] = {}
+        for part in [first, *rest] if "=" in first else rest:
+            name, equals, value = (piece.strip() for piece in part.partition("="))
+            if not equals:
+                raise InputError(f"quality: {part!r} must be a knob as key=value, e.g. alpha_cutoff=1e-3")
+            if name.startswith("marker."):
+                own = name.removeprefix("marker.")
+                changes.setdefault("marker", {})[own] = _read(MarkerQuality, own, value)
+            else:
+                changes[name] = _read(cls, name, value)
+        return chosen.with_(**changes)
 
     def with_(self, **changes) -> Quality:
-        """A copy with some knobs changed; an unknown knob is an error that names the known ones."""
-        known = [f.name for f in fields(self)]
+        """A copy with some knobs changed; an unknown knob is an error that names the known ones.
+
+        marker: a `MarkerQuality`, or a dict of those of its knobs that change.
+        """
         for name in changes:
-            if name not in known:
-                raise InputError(f"quality has no knob {name!r}; known: {', '.join(known)}")
+            _check_known(Quality, name)
+        marker = changes.get("marker")
+        if isinstance(marker, dict):
+            for name in marker:
+                _check_known(MarkerQuality, name)
+            changes["marker"] = replace(self.marker, **marker)
         return replace(self, **changes)
+
+
+def knobs(kind: type[Quality] | type[MarkerQuality]) -> dict[str, str]:
+    """Type of every knob that is a single value, as it is written: `float`, `int | None` ..."""
+    return {knob.name: str(knob.type) for knob in fields(kind) if knob.name != "marker"}
+
+
+def _check_known(kind: type[Quality] | type[MarkerQuality], name: str) -> None:
+    known = [knob.name for knob in fields(kind)]
+    if name not in known:
+        whose = "marker quality" if kind is MarkerQuality else "quality"
+        raise InputError(f"{whose} has no knob {name!r}{_hint(name, known)}; known: {', '.join(known)}")
+
+
+def _hint(name: Any, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(str(name), known, 1)
+    return f" (did you mean {near[0]!r}?)" if near else ""
+
+
+def _read(kind: type[Quality] | type[MarkerQuality], name: str, text: str) -> Any:
+    """A knob's value from text."""
+    if name == "marker":
+        raise InputError("quality: marker has knobs of its own; write e.g. marker.template=9")
+    _check_known(kind, name)
+    wanted = knobs(kind)[name]
+    if wanted.endswith("| None") and text.lower() == "none":
+        return None
+    convert = {"float": float, "int": int, "str": str}[wanted.split()[0]]
+    try:
+        return convert(text)
+    except ValueError:
+        what = "a whole number" if convert is int else "a number"
+        raise InputError(f"quality: {name} is {text!r}; it must be {what}") from None
 
 
 # gsplat: gsplat 1.5/1.6 `rasterization_2dgs`; surfel: the 2DGS authors' diff-surfel-rasterization.

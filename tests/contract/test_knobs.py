@@ -94,6 +94,16 @@ def test_half_colors_end_at_the_largest_half(opencl):
     assert opencl.render(cloud, CAMERA, quality=HALF)["rgb"].max() == pytest.approx(65504, rel=1e-2)
 
 
+def test_a_device_holds_halves_instead_of_floats(opencl):
+    cloud = random_splats(100, seed=11, depth=(1, 6), scale=(0.02, 0.4), sh_degree=2)
+    resident = opencl.upload(cloud)
+    resident._data._shared = False  # a CPU reads the host's arrays; make it copy them
+    frame = opencl.render(resident, CAMERA, quality=HALF)
+    assert np.array_equal(frame["rgb"], opencl.render(cloud, CAMERA, quality=HALF)["rgb"])
+    means, quats, scales, opacities, coefficients = 3, 4, 2, 1, 9 * 3
+    assert resident.memory_bytes == 100 * (4 * (means + quats + scales + opacities) + 2 * coefficients)
+
+
 @pytest.mark.parametrize("bits", [16, 24])
 def test_short_keys_order_as_the_reference_does(renderer, bits):
     quality = fs.Quality(depth_key_bits=bits)

@@ -163,20 +163,19 @@ class Resident:
 
     def part(self, name: str, first: int, end: int) -> cl.Buffer:
         """The array of splats [first, end)."""
-        array = self._array(name)
         if self.streamed:
-            piece = np.ascontiguousarray(array[first:end])
+            piece = np.ascontiguousarray(self._array(name)[first:end])
             buffer = self._backend.pool.scratch(f"chunk of {name}", piece.nbytes)
             cl.enqueue_copy(self._backend.queue, buffer, piece)
             return buffer
         whole = self._whole(name)
         if end - first == self.count:
             return whole
-        row = array.nbytes // self.count
+        row = self._array(name).nbytes // self.count
         return whole.get_sub_region(first * row, (end - first) * row)
 
     def _array(self, name: str) -> np.ndarray:
-        """One of the cloud's arrays, or one that is made of it when a picture first asks for it."""
+        """The array on the host; ids and halves are made when a picture first asks for them."""
         if name not in self._arrays:
             if name == "splat_ids":
                 self._arrays[name] = np.arange(self.count, dtype=np.int32)
@@ -186,7 +185,7 @@ class Resident:
 
     def _whole(self, name: str) -> cl.Buffer:
         if name not in self._buffers:
-            array = np.ascontiguousarray(self._arrays[name])
+            array = np.ascontiguousarray(self._array(name))
             flags = cl.mem_flags
             if array.size == 0:
                 buffer = self._backend.pool.fresh(f"the cloud's {name}", 16)
