@@ -157,14 +157,10 @@ class Renderer:
         """Splats in arrays that are on the device already: drawn where they lie, without a copy.
 
         Shapes and units are those of SplatCloud, float32 (labels int32): wp.array, or what gives DLPack
-        (torch,
-        CuPy, JAX); NumPy arrays are copied. What is in the arrays when a picture is drawn is what it shows,
-        so a
-        simulation may move the splats between pictures. Quaternions need no unit length; a splat that cannot
-        be drawn
-        (a value that is not finite, a scale below 0) is left out of the picture without a word. `origin`
-        (3,): world
-        position of the means' zero.
+        (torch, CuPy, JAX); NumPy arrays are copied. What is in the arrays when a picture is drawn is what it
+        shows, so a simulation may move the splats between pictures. Quaternions need no unit length; a splat
+        that cannot be drawn (a value that is not finite, a scale below 0) is left out of the picture without
+        a word. `origin` (3,): world position of the means' zero.
 
         Raises:
             InputError: the backend takes no arrays, or one has the wrong shape, type or device.
@@ -201,7 +197,7 @@ class Renderer:
                 where the arguments are left out.
             camera: needed unless the scene has one.
             outputs: names of planes; default rgb.
-            quality: a Quality or a preset's name; default standard.
+            quality: a Quality, or text such as "fast" or "fast,samples=2" (`Quality.of`); default standard.
             background: (r, g, b), a Gradient or a Panorama behind the splats; default black.
             motion: how the camera and groups of splats move; default: they stand still.
             shutter: when the picture is taken, and how long that takes; default: at time 0, at once.
@@ -246,8 +242,8 @@ class Renderer:
             names,
             chosen,
             camera,
-            bool(view.groups),
-            bool(view.shots),
+            moving=bool(view.groups),
+            exposed=bool(view.shots),
             sensor=sensor,
             fog=fog,
             background=behind,

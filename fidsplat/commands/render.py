@@ -1,6 +1,8 @@
 """`fidsplat render`."""
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
@@ -8,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import tyro
 
 from fidsplat.commands.output import Json, console, option, print_json, print_table
-from fidsplat.errors import InputError
+from fidsplat.errors import FidsplatError, InputError
 from fidsplat.files import writable_folder
 
 if TYPE_CHECKING:
@@ -35,14 +37,18 @@ Planes:
   normal normal_world                 towards the camera, in its axes or the world's
   blended                             number of splats that made the pixel
 
+Quality: standard fast reference gsplat surfel; any knob of fs.Quality may follow, or stand alone and change
+standard: fast,samples=2,alpha_cutoff=1e-3. Markers of a scene file that do not say how they are made take
+marker.mixture, marker.levels, marker.density, marker.growth and marker.template from it.
+
 Lenses, shutters and motion, fog, backgrounds, sensors and boxes are tables of a scene file
 (docs/scene-files.md); they go together.
 
 Examples:
   fidsplat render scene.toml
+  fidsplat render scene.toml --quality standard,alpha_cutoff=1e-3,tile_size=8
   fidsplat render scene.toml -o frames --outputs rgb,depth,normal,label
-  fidsplat render tag.ply -o tag.png --device reference --quality gsplat
-  fidsplat render tag.ply --lowpass pixel --samples 3"""
+  fidsplat render tag.ply -o tag.png --device reference --quality gsplat"""
 
     source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply", "what to draw")]
     out: Annotated[
@@ -58,13 +64,7 @@ Examples:
     ] = None
     quality: Annotated[
         str | None,
-        option("Q", "standard fast reference gsplat surfel (default: the scene's, or standard)"),
-    ] = None
-    samples: Annotated[
-        int | None, option("N", "N x N samples per pixel (default: the scene's, or the quality's)")
-    ] = None
-    lowpass: Annotated[
-        str | None, option("NAME", "screen, pixel or none (default: the scene's, or the quality's)")
+        option("Q", "a preset, knobs as key=value, or both, as below (default: the scene's, or standard)"),
     ] = None
     json: Json = False
 
@@ -76,19 +76,19 @@ Examples:
 
         names = None if self.outputs is None else tuple(n.strip() for n in self.outputs.split(","))
         # what is wrong with the words is said before anything is read or opened
-        asked = {"samples": self.samples, "lowpass": self.lowpass}
-        asked = {name: value for name, value in asked.items() if value is not None}
-        select(fs.SplatCloud.empty(), names or (), Quality.of(self.quality).with_(**asked))
+        select(fs.SplatCloud.empty(), names or (), Quality.of(self.quality))
         name_of = _names(self.out, Path(self.source))
         where = console(self.json)
         with where.status("reading"):
-            scene = _load(self.source)
-        with where.status("opening the device"):
+            scene = _load(self.source, self.quality)
+        with _named(self.source, "render.outputs", names is None):
+            select(fs.SplatCloud.empty(), scene.outputs, Quality.of(None))
+        of_scene = _named(self.source, "render.device", self.device is None)
+        with where.status("opening the device"), of_scene:
             renderer = fs.Renderer(self.device or scene.device)
-        quality = Quality.of(scene.quality if self.quality is None else self.quality).with_(**asked)
         begun = time.perf_counter()
         with where.status("drawing"):
-            frame = renderer.render(scene, outputs=names, quality=quality)
+            frame = renderer.render(scene, outputs=names, quality=self.quality)
             planes = {name: frame[name] for name in frame.outputs}
         seconds = time.perf_counter() - begun
         bits = None if scene.sensor is None else scene.sensor.bits
@@ -117,6 +117,17 @@ Examples:
         return 0
 
 
+@contextmanager
+def _named(source: str, key: str, of_scene: bool) -> Iterator[None]:
+    """Puts the scene file and its key before an error about what stands there, if that is what is used."""
+    try:
+        yield
+    except FidsplatError as error:
+        if of_scene and Path(source).suffix.lower() == ".toml":
+            raise type(error)(f"{source}: {key}: {error}") from error
+        raise
+
+
 def _names(out: str | None, source: Path):
     """A function from a plane's name and a suffix to the file that it goes to, in a folder known to be
     writable."""
@@ -136,13 +147,13 @@ def _names(out: str | None, source: Path):
     return lambda plane, suffix: file / f"{plane}{suffix}"
 
 
-def _load(source: str) -> "Scene":
+def _load(source: str, quality: str | None) -> "Scene":
     import fidsplat as fs
     from fidsplat.commands.framing import framing_camera
 
     suffix = Path(source).suffix.lower()
     if suffix == ".toml":
-        scene = fs.Scene.load(source)
+        scene = fs.Scene.load(source, quality)
         if scene.camera is None:
             raise InputError(
                 f"{source} has no [camera] table; add one with width, height, fov_x_deg, position, look_at"

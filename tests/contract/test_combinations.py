@@ -13,8 +13,6 @@ from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import Picture, compare, judge
 
-BACKEND = "opencl"
-
 SIZE = (41, 29)
 CLOUD = random_splats(120, 21, depth=(0.5, 5.0), scale=(0.02, 0.4))
 BOXES = fs.SplatCloud.concatenate(
@@ -127,13 +125,7 @@ def test_backgrounds_behind_every_lens(renderer, camera, behind, samples):
 
 
 @pytest.mark.skipif(WARP is None, reason="no Warp device here")
-@pytest.mark.parametrize(
-    ("lacking", "how"),
-    [
-        ("camera_fisheye", {"camera": CAMERAS["fisheye"]}),
-        ("shutter_exposure", {"motion": fs.Motion(turning), "shutter": BLUR}),
-    ],
-)
-def test_warp_names_what_it_lacks(lacking, how):
-    with pytest.raises(fs.DeviceError, match=f"warp.*{lacking}.*OpenCL"):
-        fs.Renderer(WARP).render(**{"scene": CLOUD, "camera": PLAIN, **how})
+def test_warp_names_what_it_lacks():
+    features = replace(select(CLOUD, ("rgb",), fs.Quality(), PLAIN), taps=("overdraw",))
+    with pytest.raises(fs.DeviceError, match=r"warp.*no overdraw; use an OpenCL device"):
+        fs.Renderer(WARP).backend.pipeline(features)

@@ -141,6 +141,7 @@ def test_nothing_to_draw_is_the_background(scene, tmp_path):
         (["--device", "opencl:nosuchthing"], 2, "nosuchthing"),
         (["--device", "vulkan"], 2, "vulkan"),
         (["--quality", "standrad"], 2, "standard"),
+        (["--quality", "fast,alpha_cutof=1e-3"], 2, "did you mean 'alpha_cutoff'"),
         (["--outputs", ""], 2, "output"),
     ],
 )
@@ -160,6 +161,8 @@ def test_what_cannot_be_drawn(scene, words, status, says, capsys):
         (("36h11:5", "36h11:5000"), "586"),
         (("size = 0.25", "size = 0.0"), "size"),
         (("[camera]", "[camra]"), "camera"),
+        (("background", 'outputs = ["dpth"]\nbackground'), "scene.toml: render.outputs: unknown output"),
+        (("background", 'device = "vulkan"\nbackground'), "scene.toml: render.device: unknown device"),
     ],
 )
 def test_scene_files_that_are_wrong(scene, tmp_path, change, says, capsys):
@@ -199,15 +202,3 @@ def test_the_frame_leaves_strays_out_only_when_there_are_many():
     few = fs.SplatCloud(means[:5], many.quats[:5], many.scales[:5], np.ones(5), colors=np.zeros((5, 3)))
     inside = framing_camera(few).project(means[:5])
     assert ((inside > 0) & (inside < (1280, 720))).all()
-
-
-def test_samples_and_low_pass_of_the_command_line_stand_before_the_scene(scene, tmp_path, capsys):
-    assert main(["render", scene, "-o", "wide.png"]) == 0
-    assert main(["render", scene, "-o", "fine.png", "--samples", "3", "--lowpass", "pixel"]) == 0
-    loaded = fs.Scene.load(scene)
-    want = fs.Renderer().render(loaded, quality=fs.Quality(lowpass="pixel", samples=3))["rgb"]
-    fine = read_image("fine.png").astype(int)
-    assert np.abs(fine - 255 * want.clip(0, 1)).max() <= 0.51
-    assert not np.array_equal(fine, read_image("wide.png"))
-    assert main(["render", scene, "--lowpass", "soft"]) == 2
-    assert "soft" in capsys.readouterr().err

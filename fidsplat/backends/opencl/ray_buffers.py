@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
@@ -42,6 +43,13 @@ class RayBuffers:
         planes = np.full((array.shape[2], rows, columns), np.nan, np.float32)
         planes[:, : array.shape[0], : array.shape[1]] = np.moveaxis(array, 2, 0)
         return self._put(name, planes)
+
+    @staticmethod
+    def bytes_of(rasters: Collection[RayRaster], tile_height: int, columns: int) -> int:
+        """What the buffers of the rasters of one picture take, for grids that are padded to whole tiles."""
+        rows = sum(-(-raster.height // tile_height) * tile_height for raster in rasters)
+        one = next(iter(rasters))
+        return 12 * rows * columns + (one.map[0].nbytes if one.lens.kind != "equirectangular" else 0)
 
     def _map(self, raster: RayRaster) -> cl.Buffer:
         maps = self._held.setdefault(raster, {}).setdefault((0, 0), {})
