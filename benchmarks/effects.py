@@ -1,10 +1,12 @@
-"""What effects cost: a standard random scene without and with each, in turns, splats resident.
+"""What each effect costs: a standard random scene without and with it, in turns, splats resident.
 
-    python benchmarks/effects.py [NAME ...] --scene r1m_1080p --repeats 5 [--device opencl] [--json]
+    python benchmarks/effects.py [NAME ...] [--scene r1m_1080p] [--device opencl] [--repeats 5] [--json]
 
-Medians of the wall time of one frame (the queue is drained before and after); base and base + effect are
-drawn in turns, so that what else the machine does falls on both. The base is drawn twice, under two names:
-how far their ratio is from 1 is the noise.
+Every frame with an effect is followed by one without, the picture left on the device, the queue drained
+before and after each, so that what else the machine does falls on both. The price is the median of the ratios
+of the two times less 1; the quartiles of the ratios say how far to trust it, and so does the row "base
+again", whose two times are of the same thing. Boxes have the places, turns and scales of the scene's
+Gaussians and cover less of the picture.
 """
 
 from __future__ import annotations
@@ -15,7 +17,6 @@ import math
 import statistics
 import sys
 import time
-from collections.abc import Callable
 from datetime import date
 
 import numpy as np
@@ -24,16 +25,21 @@ from rich.progress import track
 from rich.table import Table
 
 import fidsplat as fs
+from fidsplat.effects import OUTPUTS
 from fidsplat.experiments.scenes import SCENES, load_scene
 
-
-def with_lens(lens, narrower: float = 1.0) -> Callable[[fs.Camera], dict]:
-    """The base camera with a lens."""
-    return lambda base: {
-        "camera": fs.Camera.pinhole(
-            base.width, base.height, narrower * base.fx, narrower * base.fy, base.cx, base.cy, lens=lens
-        )
-    }
+TABLE = tuple(np.linspace(0, 1, 64) ** 0.5)
+SENSORS = {
+    "exposure": fs.Sensor(exposure=1.3),
+    "vignetting": fs.Sensor(vignetting=(-0.3, 0.05)),
+    "noise": fs.Sensor(full_well=12000, read_noise=8),
+    "gain": fs.Sensor(gain=1.5),
+    "response gamma": fs.Sensor(response=2.2),
+    "response srgb": fs.Sensor(response="srgb"),
+    "response table": fs.Sensor(response=TABLE),
+    "8 bits": fs.Sensor(bits=8),
+    "whole sensor": fs.Sensor(1.3, (-0.3, 0.05), 12000, 8, 1, 1.5, "srgb", 8),
+}
 
 
 def turning(time: float) -> np.ndarray:
@@ -49,86 +55,149 @@ def moved(time: float) -> np.ndarray:
     return matrix
 
 
-TURN, GROUP = fs.Motion(turning), fs.Motion(None, {1: moved})
-EFFECTS: dict[str, Callable[[fs.Camera], dict]] = {
-    "base again": lambda base: {},
-    "distortion": with_lens(fs.BrownConrady(-0.28, 0.07, p1=1e-3)),
-    # the same field of view across the middle row
-    "fisheye": with_lens(fs.Fisheye(0.01), math.tan(math.radians(30)) / math.radians(30)),
-    "panorama": lambda base: {"camera": fs.Camera.equirectangular(base.width, base.height)},
-    "parallel rays": lambda base: {"camera": fs.Camera.orthographic(base.width, base.height, 9.2)},
-    "moving group": lambda base: {"motion": GROUP, "shutter": fs.Shutter(time=0.1)},
-    "blur, 8 poses": lambda base: {"motion": TURN, "shutter": fs.Shutter(exposure=0.02)},
-    "rolling, bands of 8 rows": lambda base: {"motion": TURN, "shutter": fs.Shutter(readout=0.02)},
-    "rolling, bands of 64 rows": lambda base: {
-        "motion": TURN,
-        "shutter": fs.Shutter(readout=0.02, rows_per_band=64),
-    },
-}
+def lenses(base: fs.Camera) -> dict[str, dict]:
+    """The base camera with each lens."""
+
+    def through(lens, narrower: float = 1.0) -> dict:
+        focal = narrower * base.fx, narrower * base.fy
+        camera = fs.Camera.pinhole(base.width, base.height, *focal, base.cx, base.cy, lens=lens)
+        return {"camera": camera}
+
+    return {
+        "distortion": through(fs.BrownConrady(-0.28, 0.07, p1=1e-3)),
+        # the same field of view across the middle row
+        "fisheye": through(fs.Fisheye(0.01), math.tan(math.radians(30)) / math.radians(30)),
+        "panorama": {"camera": fs.Camera.equirectangular(base.width, base.height)},
+        "parallel rays": {"camera": fs.Camera.orthographic(base.width, base.height, 9.2)},
+    }
 
 
-def measure(names: list[str], scene: str, device: str, repeats: int) -> list[dict]:
-    """Times of the base and of each effect, milliseconds."""
-    renderer = fs.Renderer(device)
-    cloud, camera = load_scene(scene)
-    # every tenth splat moves where groups do
-    resident = renderer.upload(cloud.with_labels((np.arange(len(cloud)) % 10 == 0).astype(np.int32)))
+def shutters() -> dict[str, dict]:
+    """What moves, and pictures that take time."""
+    turn = fs.Motion(turning)
+    return {
+        # every tenth splat
+        "moving group": {"motion": fs.Motion(None, {1: moved}), "shutter": fs.Shutter(time=0.1)},
+        "blur, 8 poses": {"motion": turn, "shutter": fs.Shutter(exposure=0.02)},
+        "rolling, bands of 64 rows": {
+            "motion": turn,
+            "shutter": fs.Shutter(readout=0.02, rows_per_band=64),
+        },
+        "rolling, bands of 8 rows": {"motion": turn, "shutter": fs.Shutter(readout=0.02)},
+    }
 
-    def wall(options: dict) -> float:
-        start = time.perf_counter()
-        renderer.render(resident, options.get("camera", camera), **_rest(options)).timings  # noqa: B018 (waits)
-        return (time.perf_counter() - start) * 1e3
 
+def effects(base: fs.Camera) -> dict[str, dict]:
+    """Name of an effect -> what differs from the base in the call of `Renderer.render`; `cloud`: see
+    `changed`."""
+    sky = np.random.default_rng(0).uniform(0, 1, (512, 1024, 3)).astype(np.float32)
+    return {
+        "base again": {},
+        **lenses(base),
+        **shutters(),
+        "lowpass none": {"quality": fs.Quality(lowpass="none")},
+        "lowpass pixel": {"quality": fs.Quality(lowpass="pixel")},
+        "2 x 2 samples": {"quality": fs.Quality(samples=2)},
+        "boxes": {"cloud": "box"},
+        "1 box in 100": {"cloud": "mixed"},
+        **{f"SH degree {degree}": {"cloud": degree} for degree in (1, 2, 3)},
+        **{f"output {name}": {"outputs": ("rgb", name)} for name in OUTPUTS if name != "rgb"},
+        "fog": {"fog": fs.Fog(0.05)},
+        "background gradient": {"background": fs.Gradient((0.2, 0.4, 0.9), (0.3, 0.3, 0.2))},
+        "background panorama": {"background": fs.Panorama(sky)},
+        **{name: {"sensor": sensor} for name, sensor in SENSORS.items()},
+    }
+
+
+def changed(cloud: fs.SplatCloud, what: str | int) -> fs.SplatCloud:
+    """The scene's cloud with another footprint, or with SH of a degree."""
+    if what == "box":
+        return cloud.with_boxes()
+    if what == "mixed":
+        return cloud.with_boxes(np.arange(len(cloud)) % 100 == 0)
+    count = (int(what) + 1) ** 2
+    sh = np.random.default_rng(1).normal(0, 0.2, (len(cloud), count, 3)).astype(np.float32)
+    return fs.SplatCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, sh=sh)
+
+
+def milliseconds(renderer: fs.Renderer, resident, call: dict) -> float:
+    """Wall time of one frame."""
+    start = time.perf_counter()
+    frame = renderer.render(resident, **call)
+    _ = frame.timings  # waits for the device
+    return (time.perf_counter() - start) * 1e3
+
+
+def measure(options: argparse.Namespace) -> list[dict]:
+    """One row for each effect."""
+    renderer = fs.Renderer(options.device)
+    cloud, camera = load_scene(options.scene)
+    cloud = cloud.with_labels((np.arange(len(cloud)) % 10 == 0).astype(np.int32))
+    plain = renderer.upload(cloud)
+    known = effects(camera)
     rows = []
-    for name in track(names, description=scene, console=Console(stderr=True)):
-        options = EFFECTS[name](camera)
-        wall({}), wall(options)
-        pairs = [(wall({}), wall(options)) for _ in range(repeats)]
-        base, effect = (statistics.median(times) for times in zip(*pairs, strict=True))
-        ratio = statistics.median(b / a for a, b in pairs)
+    for name in track(options.names or list(known), "effects", console=Console(stderr=True)):
+        call = {"camera": camera, **known[name]}
+        what = call.pop("cloud", None)
+        resident = plain if what is None else renderer.upload(changed(cloud, what))
+        for _ in range(2):
+            milliseconds(renderer, resident, call), milliseconds(renderer, plain, {"camera": camera})
+        pairs = [
+            (milliseconds(renderer, resident, call), milliseconds(renderer, plain, {"camera": camera}))
+            for _ in range(options.repeats)
+        ]
+        ratios = [mine / base for mine, base in pairs]
+        quartiles = statistics.quantiles(ratios, n=4)
         rows.append(
-            {"effect": name, "base_ms": base, "effect_ms": effect, "price_percent": 100 * (ratio - 1)}
+            {
+                "effect": name,
+                "base_ms": statistics.median(base for _, base in pairs),
+                "effect_ms": statistics.median(mine for mine, _ in pairs),
+                "price_percent": (statistics.median(ratios) - 1) * 100,
+                "quartiles_percent": [(quartiles[0] - 1) * 100, (quartiles[2] - 1) * 100],
+            }
         )
     about = {
-        "scene": scene,
+        "scene": options.scene,
         "device": f"{renderer.device.title} ({renderer.device.platform})",
         "driver": renderer.device.version,
         "date": date.today().isoformat(),
-        "repeats": repeats,
+        "repeats": options.repeats,
     }
     return [about | row for row in rows]
-
-
-def _rest(options: dict) -> dict:
-    return {key: value for key, value in options.items() if key != "camera"}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("names", nargs="*", default=list(EFFECTS), choices=[*EFFECTS, []], metavar="NAME")
-    parser.add_argument("--scene", default="r1m_1080p", choices=SCENES)
+    known = list(effects(fs.Camera.pinhole(8, 8, 8, 8, 4, 4)))
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"default all of: {', '.join(known)}")
+    parser.add_argument("--scene", default="r1m_1080p", choices=list(SCENES))
     parser.add_argument("--device", default="opencl")
-    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--repeats", type=int, default=5, help="2 or more")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    rows = measure(list(options.names), options.scene, options.device, max(options.repeats, 1))
+    if unknown := set(options.names) - set(known):
+        parser.error(f"no effect is called {', '.join(sorted(unknown))}; there are: {', '.join(known)}")
+    options.repeats = max(options.repeats, 2)
+    rows = measure(options)
     if options.json:
         json.dump(rows, sys.stdout, indent=1)
         print()
         return
-    table = Table(
-        "effect", "base [ms]", "with it [ms]", "price", title=f"{options.scene}, {rows[0]['device']}"
-    )
+    title = "{scene}, {device}, {driver}, {date}, {repeats} pairs".format(**rows[0])
+    table = Table("effect", "base [ms]", "with it [ms]", "price", "quartiles", title=title)
     for row in rows:
+        low, high = row["quartiles_percent"]
         table.add_row(
             row["effect"],
-            f"{row['base_ms']:.0f}",
-            f"{row['effect_ms']:.0f}",
+            f"{row['base_ms']:.2f}",
+            f"{row['effect_ms']:.2f}",
             f"{row['price_percent']:+.0f} %",
+            f"{low:+.0f} to {high:+.0f} %",
         )
-    Console().print(table)
+    Console(width=130).print(table)
 
 
 if __name__ == "__main__":

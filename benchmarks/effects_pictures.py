@@ -1,4 +1,4 @@
-"""Makes the pictures of docs/effects.md that show footprints, outputs, sensor, fog and backgrounds.
+"""Makes the pictures of docs/effects.md, and the sheet of all effects in the README.
 
 python benchmarks/effects_pictures.py [--device opencl] [--out docs/images]
 """
@@ -7,15 +7,24 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
+from rich.console import Console
+from rich.progress import track
 
 import fidsplat as fs
 from fidsplat.scenes import PlacedMarker
 from fidsplat.vision.images import to_uint8, write_png
 from fidsplat.vision.paint import contact_sheet, count_picture, depth_picture, label_picture, normal_picture
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "examples"))
+from make_data import globe, sky  # noqa: E402
 
 WIDTH, HEIGHT = 320, 200
 PAINT = {"depth": depth_picture, "distance": depth_picture, "normal": normal_picture}
@@ -44,18 +53,90 @@ def room(mixture: str) -> fs.Scene:
     return fs.Scene([ground], camera, tags, background=(0.55, 0.7, 0.9))
 
 
-def sky() -> fs.Panorama:
-    """A panorama with clouds, made of a few waves."""
-    v, u = np.mgrid[0:256, 0:512] / [[[256]], [[512]]]
-    waves = sum(np.sin(2 * np.pi * (k * u + 3 * v * k) + k * k) / k for k in (3, 5, 8, 13, 21)) / 2
-    cloud = np.clip(waves + 0.3, 0, 1)[..., None] * np.clip(1.6 - 3 * v, 0, 1)[..., None]
-    blue = np.array([0.35, 0.55, 0.9]) * (1 - v[..., None]) + 0.75 * v[..., None]
-    return fs.Panorama(blue * (1 - cloud) + cloud)
-
-
 def small(rows: list[list[tuple[str, np.ndarray]]], width: int) -> np.ndarray:
     """A sheet with 5 bits per channel: pages should load fast."""
     return contact_sheet(rows, width=width) // 8 * 8
+
+
+def examples(renderer: fs.Renderer, out: Path) -> None:
+    """The scene files whose picture stands beside them in docs/effects.md."""
+    folder = ROOT / "examples"
+    files = sorted([*folder.glob("lens-*.toml"), *folder.glob("shutter-*.toml")])
+    for file in track(files, "examples", console=Console(stderr=True)):
+        write_png(out / f"effect-{file.stem}.png", renderer.render(fs.Scene.load(file))["rgb"])
+
+
+def turned(degrees: float) -> Callable[[float], np.ndarray]:
+    """The room's camera, turning by so many degrees a second."""
+
+    def pose(time: float) -> np.ndarray:
+        angle = math.radians(degrees) * time
+        target = (0.1 + 5.4 * math.sin(angle), 0.1, -0.4 + 5.4 * math.cos(angle))
+        return fs.Camera.look_at(8, 8, 1, (0.1, -0.5, -0.4), target).world_to_camera
+
+    return pose
+
+
+def shining(degree: int) -> fs.Scene:
+    """The globe with its spherical harmonics up to a degree."""
+    camera = fs.Camera.look_at(WIDTH, HEIGHT, math.radians(40), (0.9, -0.9, -1.6), (0, 0, 0))
+    return fs.Scene([globe(degree)], camera, background=(0.5, 0.5, 0.5))
+
+
+def dense() -> fs.Scene:
+    """A QR code of version 10 at 2.5 pixels per module."""
+    marker = PlacedMarker(fs.marker("qr-v10-L:fidsplat", size=1.0))
+    camera = fs.Camera.look_at(WIDTH, HEIGHT, math.radians(45), (0.3, -0.2, -2.6), (0, 0, 0))
+    return fs.Scene([], camera, [marker], background=(0.5, 0.5, 0.5))
+
+
+def all_effects(renderer: fs.Renderer) -> list[tuple[str, np.ndarray]]:
+    """A titled picture of each effect, all of one shape."""
+    gaussians, boxes = room("fitted"), room("exact")
+    camera = boxes.camera
+    assert camera is not None
+
+    def through(lens=None, **focal) -> fs.Camera:
+        return replace(camera, lens=lens, **focal)
+
+    def seen(scene: fs.Scene = boxes, **call) -> np.ndarray:
+        return to_uint8(renderer.render(scene, **call)["rgb"])
+
+    def plane(name: str) -> np.ndarray:
+        return PAINT[name](renderer.render(boxes, outputs=("rgb", name))[name])
+
+    code = dense()
+    round_ = fs.Camera.equirectangular(WIDTH, HEIGHT, world_to_camera=camera.world_to_camera)
+    wide = fs.Camera.orthographic(WIDTH, HEIGHT, 4.0, world_to_camera=camera.world_to_camera)
+    turn = fs.Motion(turned(150))
+    panels = {
+        "pinhole, mixture fitted": lambda: seen(gaussians),
+        "boxes (mixture exact)": seen,
+        "Brown-Conrady": lambda: seen(gaussians, camera=through(fs.BrownConrady(-0.28, 0.07))),
+        "fisheye": lambda: seen(gaussians, camera=through(fs.Fisheye(), fx=130.0, fy=130.0)),
+        "panorama": lambda: seen(gaussians, camera=round_),
+        "parallel rays": lambda: seen(gaussians, camera=wide),
+        "motion blur": lambda: seen(motion=turn, shutter=fs.Shutter(exposure=0.03, sub_poses=16)),
+        "rolling shutter": lambda: seen(motion=turn, shutter=fs.Shutter(readout=0.1, rows_per_band=4)),
+        "both": lambda: seen(motion=turn, shutter=fs.Shutter(exposure=0.03, readout=0.1, sub_poses=24)),
+        "QR 10, low-pass screen": lambda: seen(code),
+        "low-pass pixel": lambda: seen(code, quality=fs.Quality(lowpass="pixel")),
+        "none, 3 x 3 samples": lambda: seen(code, quality=fs.Quality(lowpass="none", samples=3)),
+        "plain colour": lambda: seen(shining(0)),
+        "SH degree 3": lambda: seen(shining(3)),
+        "depth": lambda: plane("depth"),
+        "normal": lambda: plane("normal"),
+        "label": lambda: plane("label"),
+        "splat_id": lambda: plane("splat_id"),
+        "blended": lambda: plane("blended"),
+        "fog": lambda: seen(fog=fs.Fog(0.15, (0.75, 0.78, 0.8))),
+        "gradient": lambda: seen(background=fs.Gradient((0.1, 0.25, 0.7), (1.0, 0.95, 0.85))),
+        "image behind": lambda: seen(background=fs.Panorama(sky())),
+        "vignetting": lambda: seen(sensor=fs.Sensor(vignetting=(-0.6,))),
+        "noise": lambda: seen(sensor=fs.Sensor(full_well=200, read_noise=6)),
+        "response curve": lambda: seen(sensor=fs.Sensor(exposure=0.5, response="srgb")),
+    }
+    return [(name, draw()) for name, draw in track(panels.items(), "effects", console=Console(stderr=True))]
 
 
 def main() -> None:
@@ -63,9 +144,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--device", default="opencl")
-    parser.add_argument(
-        "--out", type=Path, default=Path(__file__).resolve().parent.parent / "docs" / "images"
-    )
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "images")
     options = parser.parse_args()
     renderer = fs.Renderer(options.device)
     scene, exact = room("fitted"), room("exact")
@@ -91,11 +170,16 @@ def main() -> None:
         ("plain", picture(exact)),
         ("fog 0.15 / m", picture(exact, fog=fs.Fog(0.15, (0.75, 0.78, 0.8)))),
         ("gradient", picture(exact, background=fs.Gradient((0.1, 0.25, 0.7), (1.0, 0.95, 0.85)))),
-        ("panorama", picture(exact, background=sky())),
+        ("panorama", picture(exact, background=fs.Panorama(sky()))),
         ("vignetting -0.6", picture(exact, sensor=fs.Sensor(vignetting=(-0.6,)))),
         ("noise, 200 electrons", picture(exact, sensor=fs.Sensor(full_well=200, read_noise=6))),
     ]
     write_png(options.out / "effect-sensor.png", small([seen[:3], seen[3:]], 140))
+
+    examples(renderer, options.out)
+    panels = all_effects(renderer)
+    sheet = contact_sheet([panels[k : k + 5] for k in range(0, len(panels), 5)], width=WIDTH)
+    cv2.imwrite(str(options.out / "effects.jpg"), sheet[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ _HOME = {
     "Motion": "fidsplat.cameras",
     "Trajectory": "fidsplat.cameras",
     "Scene": "fidsplat.scenes",
+    "MarkerQuality": "fidsplat.quality",
     "Quality": "fidsplat.quality",
     "Sensor": "fidsplat.sensor",
     "Fog": "fidsplat.surroundings",

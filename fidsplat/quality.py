@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import difflib
 import math
-from dataclasses import dataclass, fields, replace
+import operator
+from dataclasses import dataclass, field, fields, replace
+from numbers import Real
+from typing import Any
 
 from fidsplat.errors import InputError
 
@@ -15,7 +18,71 @@ LOWPASS = ("screen", "pixel", "none")
 STOP_RULES = ("inclusive", "exclusive")
 COPLANAR = ("blend", "order")
 SETUP_PRECISIONS = ("float64", "float32")
+ARITHMETIC = ("precise", "fast")
+BLEND_PRECISIONS = ("float32", "float64")
+COLOR_PRECISIONS = ("float32", "float16")
+DEPTH_KEY_BITS = (16, 24, 32)
+TILE_SIZES = (8, 16, 32)
 MAX_SAMPLES = 8
+MIXTURES = ("fitted", "paper", "exact")
+TEMPLATE_SIZES = (25,)
+"""Gaussians of a rectangle in the templates that are shipped (fidsplat/markers/templates.json)"""
+MAX_LEVELS, MAX_DENSITY = 8, 100
+
+
+def whole_number(name: str, value: Any, low: int, high: int) -> int:
+    """The value as an int. Raises InputError unless it is a whole number within the range."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or isinstance(value, bool) or not low <= number <= high:
+        raise InputError(f"{name} is {value!r}; it must be a whole number from {low} to {high}")
+    return number
+
+
+def _one_of(what: str, value: Any, known: tuple) -> None:
+    if isinstance(value, (bool, float)) or value not in known:
+        raise InputError(f"{what} is {value!r}; known: {', '.join(map(str, known))}")
+
+
+@dataclass(frozen=True)
+class MarkerQuality:
+    """Knobs of making a marker of splats: how its rectangles become Gaussians.
+
+    More Gaussians follow sharp edges better and cost time in every picture. `fs.marker` takes these where it
+    is not told otherwise, and so do the markers of scene files and `fidsplat marker`.
+
+    Raises:
+        InputError: a value lies outside its range; the message names the range.
+    """
+
+    mixture: str = "fitted"
+    """`fitted`: templates optimised for whole markers. `paper`: the construction of the paper's section 3.2.
+    `exact`: one box per rectangle, with edges that the pixel filters."""
+
+    levels: int = 4
+    """Of `paper`: L, 1 to 8; 2^(L+2) - 7 Gaussians a rectangle at density 1, edges blurred over 2^-L half
+    widths."""
+
+    density: int = 3
+    """Of `paper`: copies of all levels but the last, 1 to 100: opaque insides against more to blend."""
+
+    growth: float | None = None
+    """Modules, 0 to 1, by which a rectangle reaches into its own colour across shared sides: closes seams,
+    and rounds what lies behind. None: what the mixture was made with (0.4 for fitted, 0 for paper)."""
+
+    template: int = 25
+    """Of `fitted`: Gaussians of a rectangle up to an aspect ratio of 8 (`TEMPLATE_SIZES`)."""
+
+    def __post_init__(self) -> None:
+        _one_of("marker quality: mixture", self.mixture, MIXTURES)
+        whole_number("marker quality: levels", self.levels, 1, MAX_LEVELS)
+        whole_number("marker quality: density", self.density, 1, MAX_DENSITY)
+        _one_of("marker quality: template", self.template, TEMPLATE_SIZES)
+        growth = self.growth
+        if growth is not None and not (isinstance(growth, Real) and 0 <= growth <= 1):
+            raise InputError(f"marker quality: growth is {growth!r}; it must lie from 0 to 1 module")
 
 
 @dataclass(frozen=True)
@@ -63,6 +130,30 @@ class Quality:
     setup_precision: str = "float64"
     """Arithmetic of the per-splat set-up. `float32` is also what a device without float64 uses."""
 
+    arithmetic: str = "precise"
+    """Exponentials and divisions of blending. `precise`: those of the device's library, within 2 or 3 units
+    of the last place. `fast`: shorter ones."""
+
+    blend_precision: str = "float32"
+    """Arithmetic of each fragment: crossing, weight and blending. `float64`: a device's truth picture, many
+    times slower; needs float64 in the device and in the set-up."""
+
+    color_precision: str = "float32"
+    """How a cloud's colours and spherical harmonics are held. `float16`: half the memory and traffic for 11
+    bits, a relative error up to 2^-11 (5e-4)."""
+
+    depth_key_bits: int = 32
+    """Leading bits of the depth's float32 by which splats are sorted, 16, 24 or 32: sign, exponent, and then
+    7, 15 or 23 bits of mantissa, so that depths within 1/128, 1/32768 or 1/8388608 of each other tie and keep
+    the cloud's order. Fewer sort faster on CPUs. Clouds with layers of coplanar splats always have all 32."""
+
+    tile_size: int | None = None
+    """Edge in samples of the tiles in which pictures are drawn, 8, 16 or 32; None: the device's own. CPUs
+    draw tiles as high as this and at most as wide as their vectors. The same bits; time alone changes."""
+
+    marker: MarkerQuality = field(default_factory=MarkerQuality)
+    """How markers become splats."""
+
     def __post_init__(self) -> None:
         def within(name: str, low: float, high: float, low_open: bool, high_open: bool) -> None:
             value = getattr(self, name)
@@ -87,9 +178,25 @@ class Quality:
             ("lowpass", LOWPASS),
             ("coplanar", COPLANAR),
             ("setup_precision", SETUP_PRECISIONS),
+            ("arithmetic", ARITHMETIC),
+            ("blend_precision", BLEND_PRECISIONS),
+            ("color_precision", COLOR_PRECISIONS),
+            ("depth_key_bits", DEPTH_KEY_BITS),
+            ("tile_size", (None, *TILE_SIZES)),
         ):
-            if getattr(self, name) not in known:
-                raise InputError(f"quality: {name} is {getattr(self, name)!r}; known: {', '.join(known)}")
+            _one_of(f"quality: {name}", getattr(self, name), known)
+        if not isinstance(self.marker, MarkerQuality):
+            raise InputError(f"quality: marker is {self.marker!r}; it must be an fs.MarkerQuality(...)")
+        if self.blend_precision == "float64" and self.setup_precision != "float64":
+            raise InputError(
+                "quality: blend_precision='float64' means nothing after a set-up in float32; use "
+                "setup_precision='float64' with it"
+            )
+        if self.blend_precision == "float64" and self.arithmetic != "precise":
+            raise InputError(
+                "quality: arithmetic='fast' is for float32; use arithmetic='precise' with "
+                "blend_precision='float64'"
+            )
         if self.stop_rule == "exclusive" and self.coplanar == "blend":
             raise InputError(
                 "quality: the exclusive stop drops single fragments, which coplanar='blend' does not have; "

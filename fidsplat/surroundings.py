@@ -103,6 +103,11 @@ def background_of(value: Any) -> Background:
     """A background as it is, or three numbers as a colour. Raises InputError for anything else."""
     if isinstance(value, (Gradient, Panorama)):
         return value
+    if isinstance(value, np.ndarray) and value.ndim > 1:
+        raise InputError(
+            f"background is an array of shape {value.shape}; give three numbers, or a picture as "
+            "fs.Panorama(array)"
+        )
     return three_numbers("background", value)
 
 

@@ -116,6 +116,10 @@ def select(
     Raises:
         InputError: an output that nobody declares, or two effects that do not go together.
     """
+    for name in ("arithmetic", "blend_precision", "color_precision", "depth_key_bits", "tile_size"):
+        default, value = getattr(Quality(), name), getattr(quality, name)
+        if value != default:
+            raise InputError(f"quality: no device draws with {name}={value!r} yet; leave it at {default!r}")
     if isinstance(outputs, str):
         outputs = (outputs,)
     wanted = set(outputs)

@@ -18,18 +18,17 @@ from fidsplat.markers.mixture import (
     fitted_templates,
     paper_template,
     place,
-    whole_number,
 )
 from fidsplat.markers.partition import partition
 from fidsplat.markers.regions import label_components, polygons
 from fidsplat.markers.seams import grow
 from fidsplat.markers.spec import QUIET_ZONE, bits_of, parse_spec
+from fidsplat.quality import MIXTURES, whole_number
 from fidsplat.splats import SplatCloud
 
 if TYPE_CHECKING:
     from shapely import Polygon
 
-MIXTURES = ("fitted", "paper", "exact")
 MAX_MODULES = 4096
 """Longest edge of a grid with its quiet zone."""
 

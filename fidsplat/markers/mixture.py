@@ -9,19 +9,16 @@ docs/markers.md.
 from __future__ import annotations
 
 import json
-import operator
 from functools import cache
 from importlib.resources import files
 from typing import NamedTuple
 
 import numpy as np
 
-from fidsplat.errors import InputError
+from fidsplat.quality import MAX_DENSITY, MAX_LEVELS, whole_number
 
 GAMMA = 3.0
 """The paper's cut-off: a Gaussian ends at 3 standard deviations."""
-
-MAX_LEVELS, MAX_DENSITY = 8, 100
 
 
 class Template(NamedTuple):
@@ -68,17 +65,6 @@ def paper_template(levels: int = 4, density: int = 3, duplicates: bool = False) 
         ]
         rows += [np.array(mirrored)] * (density if level < levels - 1 else 1)
     return np.concatenate(rows)
-
-
-def whole_number(name: str, value: int, low: int, high: int) -> int:
-    """The value as an int. Raises InputError unless it is a whole number within the range."""
-    try:
-        number = operator.index(value)
-    except TypeError:
-        number = None
-    if number is None or not low <= number <= high:
-        raise InputError(f"{name} is {value!r}; it must be a whole number from {low} to {high}")
-    return number
 
 
 @cache

@@ -29,7 +29,7 @@ MAY_IMPORT = {
     "cameras": BASE,
     "vision": BASE | {"cameras"},
     "formats": BASE | {"splats", "harmonics", "cameras"},
-    "markers": BASE | {"splats", "vision.dictionaries", "vision.images"},
+    "markers": BASE | {"splats", "quality", "vision.dictionaries", "vision.images"},
     "scenes": PLAIN | {"markers", "formats"},
     "effects": PLAIN | {"scenes"},
     "backends": PLAIN | {"scenes", "effects", "kernel_files"},
@@ -55,8 +55,8 @@ HOME_OF = {
 }
 HEAVY = ("pyopencl", "warp", "shapely", "networkx", "segno", "cv2", "zxingcpp", "tyro", "rich")
 
-# A wheel carries the kernels inside the package (`_kernels`), a checkout beside it; Warp's are Python files of
-# another house, which fidsplat loads by path and which import each other by relative names.
+# A wheel carries the kernels inside the package (`_kernels`), a checkout beside it; Warp's are Python files
+# of another house, which fidsplat loads by path and which import each other by relative names.
 MODULES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path
     for path in PACKAGE.rglob("*.py")

@@ -1,0 +1,54 @@
+"""Makes the files that some examples read: a sky and a globe whose colours depend on the view.
+
+python examples/make_data.py [FOLDER]        default: examples/data, beside this file
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import fidsplat as fs
+from fidsplat.vision.images import write_png
+
+
+def sky() -> np.ndarray:
+    """A panorama with clouds, made of a few waves: (256, 512, 3), 0 to 1."""
+    v, u = np.mgrid[0:256, 0:512] / [[[256]], [[512]]]
+    waves = sum(np.sin(2 * np.pi * (k * u + 3 * v * k) + k * k) / k for k in (3, 5, 8, 13, 21)) / 2
+    cloud = np.clip(waves + 0.3, 0, 1)[..., None] * np.clip(1.6 - 3 * v, 0, 1)[..., None]
+    blue = np.array([0.35, 0.55, 0.9]) * (1 - v[..., None]) + 0.75 * v[..., None]
+    return (blue * (1 - cloud) + cloud).astype(np.float32)
+
+
+def globe(degree: int = 3) -> fs.SplatCloud:
+    """A sphere of radius 0.5 m around the origin that shines from above: spherical harmonics up to a
+    degree."""
+    n = 1500
+    z = 1 - (2 * np.arange(n) + 1) / n
+    turn = np.pi * (1 + 5**0.5) * np.arange(n)
+    normals = np.column_stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z])
+    # the quaternion that turns (0, 0, 1) to the normal
+    quats = np.column_stack([1 + z, -normals[:, 1], normals[:, 0], np.zeros(n)])
+    sh = np.zeros((n, (degree + 1) ** 2, 3), np.float32)
+    shade = 0.5 + 0.35 * np.sin(7 * turn)[:, None] * [0.2, 0.6, 1.0]
+    sh[:, 0] = (shade - 0.5) / 0.2820948
+    shine = np.random.default_rng(0).normal(0, 0.5, sh.shape[1])
+    # each degree falls off as its square, so that what a degree adds is seen and does not drown the rest
+    weights = np.concatenate([np.full(2 * k + 1, 1 / max(k, 1) ** 1.5) for k in range(degree + 1)])
+    sh[:, 1:] = (shine * weights)[1:, None]
+    return fs.SplatCloud(0.5 * normals, quats, np.full((n, 2), 0.025), np.full(n, 0.95), sh=sh)
+
+
+def main() -> None:
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).resolve().parent / "data"
+    folder.mkdir(parents=True, exist_ok=True)
+    print(write_png(folder / "sky.png", sky()))
+    fs.save_ply(globe(), folder / "globe.ply")
+    print(folder / "globe.ply")
+
+
+if __name__ == "__main__":
+    main()
