@@ -6,13 +6,14 @@ that leave something out of it (cut-off, stop, ceiling) and the arithmetic decid
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fidsplat.backends.reference.backend import ReferencePlanes
 from fidsplat.cameras import Camera
+from fidsplat.effects import select
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer, ResidentCloud
@@ -81,9 +82,19 @@ def full_precision(like: Quality, renderer: Renderer) -> Quality:
         stop_rule="inclusive",
         setup_precision="float64",
     )
-    known = any(field.name == "blend_precision" for field in fields(Quality))
-    doubles = renderer.device.float64 and renderer.device.name.startswith("opencl")
-    return best.with_(blend_precision="float64") if doubles and known else best
+    doubles = best.with_(blend_precision="float64")
+    return doubles if _draws(renderer, doubles) else best
+
+
+def _draws(renderer: Renderer, quality: Quality) -> bool:
+    """Whether this renderer draws in float64 what `quality` says; the reference always does, unasked."""
+    if not (renderer.device.float64 and renderer.device.name.startswith("opencl")):
+        return False
+    try:
+        select(SplatCloud.empty(), ("rgb",), quality)
+    except InputError:
+        return False
+    return True
 
 
 def truth(

@@ -35,7 +35,8 @@ MAY_IMPORT = {
     "backends": PLAIN | {"scenes", "effects", "kernel_files"},
     "hard_cases": PLAIN | {"scenes", "effects", "backends", "render", "vision", "kernel_files"},
     "render": PLAIN | {"scenes", "effects", "backends"},
-    "accuracy": PLAIN | {"scenes", "render", "backends"},
+    "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
+    "budget": PLAIN | {"scenes", "render", "accuracy", "kernel_files"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__"}
 
