@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from fidsplat.backends.reference.backend import ReferencePlanes
 from fidsplat.cameras import Camera
 from fidsplat.effects import select
-from fidsplat.errors import InputError
+from fidsplat.errors import DeviceError, InputError
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer, ResidentCloud
 from fidsplat.scenes import Scene
@@ -82,19 +82,35 @@ def full_precision(like: Quality, renderer: Renderer) -> Quality:
         stop_rule="inclusive",
         setup_precision="float64",
     )
-    doubles = best.with_(blend_precision="float64")
-    return doubles if _draws(renderer, doubles) else best
+    if renderer.device.name != "reference" and draws_float64(renderer):
+        return best.with_(blend_precision="float64")
+    return best
 
 
-def _draws(renderer: Renderer, quality: Quality) -> bool:
-    """Whether this renderer draws in float64 what `quality` says; the reference always does, unasked."""
+def draws_float64(renderer: Renderer) -> bool:
+    """Whether its pictures at full precision are float64 throughout: the reference's, and those of OpenCL on
+    a device with float64."""
+    if renderer.device.name == "reference":
+        return True
     if not (renderer.device.float64 and renderer.device.name.startswith("opencl")):
         return False
     try:
-        select(SplatCloud.empty(), ("rgb",), quality)
+        select(SplatCloud.empty(), ("rgb",), Quality(blend_precision="float64"))
     except InputError:
         return False
     return True
+
+
+def judge_for(renderer: Renderer) -> Renderer:
+    """Who draws the truth for a renderer's pictures: itself if it can in float64, else OpenCL on this
+    machine's processor if that is there and can, else itself."""
+    if draws_float64(renderer):
+        return renderer
+    try:
+        processor = Renderer("opencl:cpu")
+    except DeviceError:
+        return renderer
+    return processor if draws_float64(processor) else renderer
 
 
 def truth(
