@@ -67,16 +67,10 @@ class Measurement:
 
     def rows(self) -> list[dict]:
         """As table.json has them, the cheapest first."""
-        rows = [
-            vars(
-                Setting(
-                    knobs, *(round_up(x) for x in (off.min(), np.median(off), off.max())), cost=round(cost, 3)
-                )
-            )
-            for knobs, off, cost in zip(
-                self.settings, self.errors.T, self.costs.round(3).tolist(), strict=True
-            )
-        ]
+        rows = []
+        for knobs, off, cost in zip(self.settings, self.errors.T, self.costs.tolist(), strict=True):
+            sizes = (round_up(size) for size in (off.min(), np.median(off), off.max()))
+            rows.append(vars(Setting(knobs, *sizes, cost=round(cost, 3))))
         return sorted(rows, key=lambda row: row["cost"])
 
 
@@ -107,6 +101,7 @@ def main() -> int:
         found = all_errors(renderer, scenes, truths, settings)
         return Measurement(settings, found, all_costs(renderer, settings, args.repeats))
 
+    grid = [{"alpha_cutoff": cut, "transmittance_stop": stop} for cut in CUTOFFS for stop in STOPS]
     plain = measure(grid)
     plain = plain.of(plain.front())
     say(f"{len(plain.settings)} of {len(grid)} are on the front")

@@ -96,8 +96,8 @@ class Calibration:
         return 1e3 * (time.perf_counter() - begun)
 
     def times(self, qualities: Iterable[Quality], repeats: int = REPEATS) -> list[Times]:
-        """Times of qualities that this device draws; frames take turns, so that what disturbs one disturbs all.
-        A frame of each goes before those that count."""
+        """Times of qualities that this device draws. Frames take turns, so that what disturbs one disturbs
+        all; one of each goes before those that count."""
         several = list(qualities)
         self._tell(f"timing {len(several)} settings")
         taken = [[self.time(quality) for quality in several] for _ in range(repeats + 1)][1:]

@@ -121,8 +121,8 @@ def _from_table(error: float, settings: tuple[Setting, ...], base: Quality, rend
             return Choice(setting.of(base), setting.promised, None, None, "table", name, setting.knobs)
     best = min(setting.promised for setting in settings)
     raise InputError(
-        f"no setting promises an error of {error:g} for any scene on {renderer.device.name}; the best promises "
-        f"{best:.2g}: allow that, or give camera=... and cloud=... to measure what yours needs"
+        f"no setting promises an error of {error:g} for any scene on {renderer.device.name}: the best is "
+        f"{best:.2g}; allow that, or give camera=... and cloud=... to measure yours"
     )
 
 
@@ -147,7 +147,7 @@ def _measured(search: Search, error: float | None, ms: float | None) -> Choice:
         found = search.cheapest_within(error)
         if ms is not None and found.times.late > ms:
             raise InputError(
-                f"an error of {error:g} takes {found.times.late:.3g} ms a frame on {search.device}, more than "
+                f"an error of {error:g} takes {found.times.late:.3g} ms a frame on {search.device}, not "
                 f"{ms:g}; {_best_in(search, ms)}"
             )
     times, setting = found.times, found.setting

@@ -25,9 +25,9 @@ FREE: dict[str, Any] = {
     "color_precision": "float32",
     "depth_key_bits": 32,
 }
-"""The knobs that a budget turns, and where they stand unless a setting says otherwise. Of the other knobs those
-that only make a picture wrong are off (opacity ceiling, exclusive stop); the rest are its definition, or, as
-tile_size, cost no accuracy: they stay as the base quality has them."""
+"""The knobs that a budget turns, and where they stand unless a setting says otherwise. Of the other knobs
+those that only make a picture wrong are off (opacity ceiling, exclusive stop); the rest are its definition,
+or, as tile_size, cost no accuracy: they stay as the base quality has them."""
 
 
 @dataclass(frozen=True)
