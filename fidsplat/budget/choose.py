@@ -38,6 +38,11 @@ class Choice:
     knobs: dict[str, Any]
     """where it differs from the settings that a budget starts from (`table.FREE`)"""
 
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON: all but the quality itself, and what it takes to make it again."""
+        keys = ("error", "ms", "ms_late", "source", "device", "knobs")
+        return {key: getattr(self, key) for key in keys}
+
     @property
     def summary(self) -> str:
         """One line for people."""
@@ -65,9 +70,9 @@ def choose(
     Raises:
         InputError: as `Quality.within`. DeviceError: the device cannot be used or fails.
     """
-    definition = Quality.of(base)
-    _check(error, ms)
+    check_bounds(error, ms)
     own = cloud if isinstance(cloud, Scene) else Scene(())
+    definition = Quality.of(own.quality if base is None else base)
     camera = camera or own.camera
     for name, given in (("cloud", cloud), ("camera", camera)):
         if given is None and (ms is not None or cloud is not None or camera is not None):
@@ -80,8 +85,8 @@ def choose(
         assert error is not None
         return _from_table(error, settings, definition, renderer)
     for name in ("background", "motion", "shutter", "fog"):
-        if around.get(name) is None and isinstance(cloud, Scene):
-            around[name] = getattr(cloud, name)
+        if around.get(name) is None:
+            around[name] = getattr(own, name)
     splats = cloud.cloud() if isinstance(cloud, Scene) else cloud
     info = renderer.device
     key = store.digest(
@@ -102,21 +107,20 @@ def choose(
     return choice
 
 
-def _check(error: float | None, ms: float | None) -> None:
-    """Raises InputError for bounds that are no numbers; those that nothing can keep are for later."""
+def check_bounds(error: float | None, ms: float | None) -> None:
+    """Raises InputError for bounds that are no numbers. Those that nothing can keep are told from the others
+    by measuring what is possible."""
     if error is None and ms is None:
         raise InputError("a budget of nothing: give error=1e-3, or ms=20 with camera=... and cloud=...")
     for name, value, example in (("error", error, "1e-3"), ("ms", ms, "20")):
         number = isinstance(value, (int, float)) and not isinstance(value, bool)
         if value is not None and not (number and math.isfinite(value)):
-            raise InputError(
-                f"{name} is {value!r}; it must be a finite number above 0, e.g. {name}={example}"
-            )
+            raise InputError(f"{name} is {value!r}; it must be a finite number, e.g. {name}={example}")
 
 
 def _from_table(error: float, settings: tuple[Setting, ...], base: Quality, renderer: Renderer) -> Choice:
     for setting in settings:
-        if setting.promised <= error:
+        if setting.promised <= error and _drawn(setting, base, renderer):
             name = renderer.device.name
             return Choice(setting.of(base), setting.promised, None, None, "table", name, setting.knobs)
     best = min(setting.promised for setting in settings)
@@ -126,6 +130,18 @@ def _from_table(error: float, settings: tuple[Setting, ...], base: Quality, rend
     )
 
 
+def _drawn(setting: Setting, base: Quality, renderer: Renderer) -> bool:
+    """Whether the device has the setting's knobs; numbers alone every device has."""
+    if setting.knobs.keys() <= {"alpha_cutoff", "transmittance_stop"}:
+        return True
+    pixel = Camera.pinhole(1, 1, 1.0, 1.0, 0.5, 0.5)
+    try:
+        renderer.render(SplatCloud.empty(), pixel, quality=setting.of(base))
+    except InputError:
+        return False
+    return True
+
+
 def _kept(key: str | None, base: Quality, device: str) -> Choice | None:
     """The answer of before, if there is one that can still be understood."""
     kept = store.load(key)
@@ -133,8 +149,8 @@ def _kept(key: str | None, base: Quality, device: str) -> Choice | None:
         if kept is None:
             return None
         setting = Setting(kept["knobs"], 0, 0, 0, 0)
-        numbers = [float(kept[name]) for name in ("error", "ms", "ms_late")]
-        return Choice(setting.of(base), *numbers, "kept", device, setting.knobs)
+        error, ms, late = (float(kept[name]) for name in ("error", "ms", "ms_late"))
+        return Choice(setting.of(base), error, ms, late, "kept", device, setting.knobs)
     except (KeyError, TypeError, ValueError, AttributeError):
         return None
 
