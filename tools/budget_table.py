@@ -7,8 +7,8 @@ over random scenes and what they cost.
 Each scene of `fidsplat/budget/random_scenes.py` is drawn with every setting and held against the same
 definition at full precision: by the float64 reference, or by the device itself with --device-truth. Costs are
 medians of frames of the scenes of TIMED, drawn in turn. In a second round the settings on the front of error
-and cost are drawn with every set of MODIFIERS; what is on that front then is kept. Knobs that the device does
-not have are left out. What the file says of another kind of device stays.
+and cost are drawn with every set of MODIFIERS, and FINEST beside them; what is on that front then is kept.
+Knobs that the device does not have are left out. What the file says of another kind of device stays.
 """
 
 from __future__ import annotations
@@ -39,7 +39,10 @@ MODIFIERS = (
     {"depth_key_bits": 16},
     {"setup_precision": "float32", "arithmetic": "fast"},
     {"setup_precision": "float32", "arithmetic": "fast", "color_precision": "float16", "depth_key_bits": 24},
-    {"blend_precision": "float64"},
+)
+FINEST = (
+    {"alpha_cutoff": 1e-8, "transmittance_stop": 0.0},
+    {"alpha_cutoff": 1e-8, "transmittance_stop": 0.0, "blend_precision": "float64"},
 )
 TIMED = ((100_000, 0.03, 1280, 720), (20_000, 0.15, 640, 480))
 """splats, median scale in metres, width, height: many small splats, and few large ones"""
@@ -106,7 +109,9 @@ def main() -> int:
     plain = plain.of(plain.front())
     say(f"{len(plain.settings)} of {len(grid)} are on the front")
     modifiers = [more for more in MODIFIERS if draws(renderer, scenes[0], more)]
-    both = measure(plain.settings + [knobs | more for knobs in plain.settings for more in modifiers])
+    finest = [knobs for knobs in FINEST if draws(renderer, scenes[0], knobs)]
+    combined = [knobs | more for knobs in plain.settings for more in modifiers]
+    both = measure(plain.settings + combined + finest)
     final = both.of(both.front())
     say(f"{len(final.settings)} of {len(both.settings)} are kept")
 

@@ -19,6 +19,10 @@ from fidsplat.splats import SplatCloud
 
 REPEATS = 9
 """frames of each quality that are timed, in turn with those of the others"""
+FEWEST = 3
+PATIENCE_MS = 10_000.0
+"""what timing several qualities may take in all; where it would take longer, fewer frames are timed, but
+`FEWEST` of each"""
 FLOAT32_DOUBT = 1e-5
 """what a truth drawn in float32 may be off: several times the largest error in table.json of such pictures"""
 
@@ -100,5 +104,7 @@ class Calibration:
         all; one of each goes before those that count."""
         several = list(qualities)
         self._tell(f"timing {len(several)} settings")
-        taken = [[self.time(quality) for quality in several] for _ in range(repeats + 1)][1:]
+        first = sum(self.time(quality) for quality in several)
+        repeats = max(FEWEST, min(repeats, int(PATIENCE_MS / first)))
+        taken = [[self.time(quality) for quality in several] for _ in range(repeats)]
         return [Times.of([row[k] for row in taken]) for k in range(len(several))]

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from fidsplat.budget.calibrate import Calibration, Times
+from fidsplat.budget.calibrate import FEWEST, Calibration, Times
 from fidsplat.budget.table import Setting
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
@@ -14,6 +15,10 @@ ENOUGH = 4
 """settings that are timed together before one is taken"""
 TOO_LONG = 1.5
 """times of the allowed time: a setting whose first frame takes longer is timed no further"""
+SHORT = 0.5
+"""times of the allowed time: settings that should take less by the table are tried last"""
+LUCK = 4.0
+"""how many times better than in proportion to the table a setting may do in this scene"""
 
 
 @dataclass(frozen=True)
@@ -40,11 +45,18 @@ class Search:
         Raises:
             InputError: none is; it says which error is the least.
         """
-        hits = []
-        # what has not come near the error in any scene of the table is not tried
-        for setting, measured in self._measured(s for s in self._settings if s.least <= error):
-            if measured <= error:
-                hits.append((setting, measured))
+        hits: list[tuple[Setting, float]] = []
+        missed: tuple[Setting, float] | None = None
+        for setting in self._settings:
+            # what has not come near the error in any scene of the table is not tried, nor what is hardly
+            # better than the last that missed it
+            if setting.least > error or (missed and not _much_better(setting, *missed)):
+                continue
+            for _, measured in self._measured([setting]):
+                if measured <= error:
+                    hits.append((setting, measured))
+                else:
+                    missed = setting, error / measured
             if len(hits) == ENOUGH:
                 break
         if hits:
@@ -62,22 +74,15 @@ class Search:
         Raises:
             InputError: none does; it says how long the fastest takes.
         """
-        likely, late = [], 0
-        for setting, measured in self._measured(self._settings):
-            if self.calibration.time(setting.of(self.calibration.base)) <= TOO_LONG * ms:
-                likely.append((setting, measured))
-            else:
-                late += 1
-            if late == ENOUGH:
-                break
-        likely.sort(key=lambda pair: pair[1])
         seen: list[Found] = []
-        for start in range(0, len(likely), ENOUGH):
-            batch = self._timed(likely[start : start + ENOUGH])
-            for found in batch:
-                if found.times.late <= ms:
-                    return found
-            seen += batch
+        start = self._start(ms)
+        for group in (self._settings[start:], self._settings[:start]):
+            likely = self._likely(group, ms)
+            for at in range(0, len(likely), ENOUGH):
+                seen += self._timed(likely[at : at + ENOUGH])
+                in_time = [found for found in seen if found.times.late <= ms]
+                if in_time:
+                    return min(in_time, key=lambda found: found.error)
         if not seen:
             first = self._measured(self._settings)
             seen = self._timed([pair for pair, _ in zip(first, range(ENOUGH), strict=False)])
@@ -86,6 +91,27 @@ class Search:
             f"no setting draws this scene in {ms:g} ms on {self.device}; the fastest takes "
             f"{best.times.late:.3g} ms, with an error of {best.error:.2g}"
         )
+
+    def _start(self, ms: float) -> int:
+        """Which setting to begin with: the first that should take more than a `SHORT` part of the time."""
+        usual = min(self._settings, key=lambda setting: abs(math.log(setting.cost)))
+        (taken,) = self.calibration.times([usual.of(self.calibration.base)], FEWEST)
+        costs = [setting.cost * taken.median / usual.cost for setting in self._settings]
+        start = next((k for k, cost in enumerate(costs) if cost >= SHORT * ms), len(costs))
+        return max(0, min(start, len(costs) - 2 * ENOUGH))
+
+    def _likely(self, group: Iterable[Setting], ms: float) -> list[tuple[Setting, float]]:
+        """Of settings, the cheapest first, those whose first frame is not much too late; the most accurate
+        first."""
+        likely, late = [], 0
+        for setting, measured in self._measured(group):
+            if self.calibration.time(setting.of(self.calibration.base)) <= TOO_LONG * ms:
+                likely.append((setting, measured))
+            else:
+                late += 1
+            if late == ENOUGH:
+                break
+        return sorted(likely, key=lambda pair: pair[1])
 
     def _measured(self, settings: Iterable[Setting]):
         """Those that the device draws, with their errors, as they are asked for."""
@@ -101,3 +127,10 @@ class Search:
             Found(setting, quality, measured, taken)
             for (setting, measured), quality, taken in zip(pairs, qualities, times, strict=True)
         ]
+
+
+def _much_better(setting: Setting, missed: Setting, wanted: float) -> bool:
+    """Whether a setting can have `wanted` times the error of one that missed: by the table's median, which
+    the cut-off decides, or by its largest error, which the stop does."""
+    enough = LUCK * wanted
+    return setting.median <= enough * missed.median or setting.most <= enough * missed.most
