@@ -1,7 +1,9 @@
 """Optimise the templates of the mixture `fitted` and write fidsplat/markers/templates.json.
 
-    python tools/fit_templates.py [-o FILE] [--starts N] [--rounds N]
+    python tools/fit_templates.py [-o FILE] [--sizes N ...] [--starts N] [--rounds N]
 
+A size is the number of Gaussians of a rectangle that is not long; those that are not named stay in the file
+as they are.
 Needs scipy (extra `dev`); takes some minutes on one core; the same numbers on every run of one set of library
 versions. Two stages, both L-BFGS-B on analytic gradients, symmetric under mirrors by construction:
 
@@ -36,13 +38,18 @@ from fidsplat.markers.seams import grow
 GROWTH = 0.4  # modules; measured together with the templates, see docs/markers.md
 THINNEST = 0.025  # least sigma in half widths: thinner lines alias between the samples of a pixel
 LONGEST = {"c": 0.42, "x": 0.42, "y": 0.42, "q": 0.25}  # largest sigma: longer lines show as hairs at corners
+FEW, LONGEST_OF_FEW = 13, 0.8  # below so many Gaussians they must be wide, hairs or not
 CUT = 1 / 255
-# largest aspect ratio, aspect ratio of stage 1, and, beside the one in the middle: pairs on the long axis,
-# pairs on the short axis, fours
-CLASSES = (
-    (8.0, 1.0, (4, 4, 2)),
-    (None, 10.0, (5, 5, 3)),
-)
+# largest aspect ratio, aspect ratio of stage 1
+CLASSES = ((8.0, 1.0), (None, 10.0))
+# of each class, beside the one in the middle: pairs on the long axis, pairs on the short axis, fours
+COUNTS = {
+    1: ((0, 0, 0), (0, 0, 0)),
+    5: ((1, 1, 0), (1, 1, 0)),
+    9: ((1, 1, 1), (2, 1, 1)),
+    13: ((2, 2, 1), (3, 2, 1)),
+    25: ((4, 4, 2), (5, 5, 3)),
+}
 BACKGROUNDS = (0.0, 0.5, 1.0)
 ORDERS = {"layer": 2.0, "0": 1.0, "130": 1.0}  # weights; an angle sorts the centres along that direction
 
@@ -55,6 +62,7 @@ class Symmetric:
     def __init__(self, counts: list[tuple[int, int, int]]) -> None:
         parameter, signs, longest, self.first, self.quadrant = [], [], [], [0], [0]
         m = 0
+        few = 1 + 2 * counts[0][0] + 2 * counts[0][1] + 4 * counts[0][2] < FEW
         for long, short, fours in counts:
             for kind, number in (("c", 1), ("x", long), ("y", short), ("q", fours)):
                 for _ in range(number):
@@ -62,7 +70,7 @@ class Symmetric:
                     ys = (1, -1) if kind in "yq" else (0,)
                     signs += [(sx, sy) for sy in ys for sx in xs]
                     parameter += [m] * (len(xs) * len(ys))
-                    longest.append(LONGEST[kind])
+                    longest.append(LONGEST_OF_FEW if few else LONGEST[kind])
                     m += 1
             self.first.append(len(parameter))
             self.quadrant.append(m)
@@ -162,7 +170,7 @@ class Layout:
         boxes = partition(self.grid)
         grown = grow(self.grid, boxes, GROWTH)
         w, h = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
-        limits = [np.inf if limit is None else limit for limit, *_ in CLASSES]
+        limits = [np.inf if limit is None else limit for limit, _ in CLASSES]
         kind = np.searchsorted(limits, np.maximum(w, h) / np.minimum(w, h) - 1e-9)
         first = np.array(self.model.first)
         n = np.diff(first)[kind]
@@ -294,10 +302,10 @@ def training_grids() -> list[tuple[np.ndarray, float]]:
     return [*tags, (code(20, 901)[:20, :20], 12.0), (code(100, 902)[14:30, 14:30], 12.0)]
 
 
-def fit_together(raw: np.ndarray, model: Symmetric, rounds: int) -> np.ndarray:
-    thinnest = np.concatenate(
-        [np.tile([THINNEST / aspect, THINNEST], (1 + sum(counts), 1)) for _, aspect, counts in CLASSES]
-    )
+def fit_together(raw: np.ndarray, model: Symmetric, rounds: int) -> tuple[np.ndarray, float]:
+    """Raw parameters of all classes after stage 2, and what they reach there in dB."""
+    aspects = np.repeat([aspect for _, aspect in CLASSES], np.diff(model.quadrant))
+    thinnest = np.column_stack([THINNEST / aspects, np.full(len(aspects), THINNEST)])
     layouts = [Layout(grid, model, per, seed) for seed, (grid, per) in enumerate(training_grids())]
 
     def function(v: np.ndarray):
@@ -308,12 +316,31 @@ def fit_together(raw: np.ndarray, model: Symmetric, rounds: int) -> np.ndarray:
         g = model.gradient(slots, sum(part[1] for part in parts))
         return scale * sum(part[0] for part in parts), scale * g.ravel()
 
+    reached = 0.0
     for number in range(rounds):
         for layout in layouts:
             layout.freeze(model.slots(raw))
         raw, error = minimise(function, raw, thinnest, model.longest, 15)
-        print(f"round {number + 1}: {-10 * np.log10(error / 100):.3f} dB", flush=True)
-    return raw
+        reached = float(-10 * np.log10(error / 100))
+        print(f"round {number + 1}: {reached:.3f} dB", flush=True)
+    return raw, reached
+
+
+def fit(size: int, starts: int, rounds: int) -> dict:
+    """The templates of a size, as the file holds them."""
+    model = Symmetric(list(COUNTS[size]))
+    raw = np.concatenate(
+        [fit_alone(aspect, counts, starts) for (_, aspect), counts in zip(CLASSES, COUNTS[size], strict=True)]
+    )
+    print(f"size {size}: stage 1 done", flush=True)
+    raw, reached = fit_together(raw, model, rounds)
+    templates = []
+    for (limit, _), a, b in zip(CLASSES, model.quadrant[:-1], model.quadrant[1:], strict=True):
+        slots = np.column_stack([raw[a:b, :2], np.exp(raw[a:b, 2:4]), raw[a:b, 4]])
+        signs = [np.abs(model.signs[model.parameter == i][0]) for i in range(a, b)]
+        slots[:, :2] *= signs
+        templates.append({"max_aspect": limit, "quadrant": np.round(slots, 4).tolist()})
+    return {"size": size, "fit_db": round(reached, 2), "templates": templates}
 
 
 def main() -> None:
@@ -322,27 +349,24 @@ def main() -> None:
     )
     default = Path(__file__).resolve().parents[1] / "fidsplat" / "markers" / "templates.json"
     parser.add_argument("-o", "--out", type=Path, default=default)
+    parser.add_argument("--sizes", type=int, nargs="+", choices=COUNTS, default=list(COUNTS))
     parser.add_argument("--starts", type=int, default=24, help="random starts per class in stage 1")
     parser.add_argument("--rounds", type=int, default=12, help="rounds of 15 iterations in stage 2")
     options = parser.parse_args()
 
     start = time.perf_counter()
-    model = Symmetric([counts for *_, counts in CLASSES])
-    raw = np.concatenate([fit_alone(aspect, counts, options.starts) for _, aspect, counts in CLASSES])
-    print(f"stage 1 done after {time.perf_counter() - start:.0f} s", flush=True)
-    raw = fit_together(raw, model, options.rounds)
-    templates = []
-    for (limit, *_), a, b in zip(CLASSES, model.quadrant[:-1], model.quadrant[1:], strict=True):
-        slots = np.column_stack([raw[a:b, :2], np.exp(raw[a:b, 2:4]), raw[a:b, 4]])
-        signs = [np.abs(model.signs[model.parameter == i][0]) for i in range(a, b)]
-        slots[:, :2] *= signs
-        templates.append({"max_aspect": limit, "quadrant": np.round(slots, 4).tolist()})
+    known = json.loads(options.out.read_text("utf-8"))["sets"] if options.out.exists() else []
+    sets = {entry["size"]: entry for entry in known}
+    sets |= {size: fit(size, options.starts, options.rounds) for size in options.sizes}
     about = (
-        "made by tools/fit_templates.py; rows: x, y, sigma_x, sigma_y, opacity in half sizes, long side first"
+        "made by tools/fit_templates.py; rows: x, y, sigma_x, sigma_y, opacity in half sizes, long side first; "
+        "fit_db: against the ideal texture of the markers that it was fitted on"
     )
-    text = json.dumps({"about": about, "growth": GROWTH, "templates": templates})
+    text = json.dumps({"about": about, "growth": GROWTH, "sets": [sets[size] for size in sorted(sets)]})
     text = (
-        text.replace(' {"max', '\n  {"max')
+        text.replace(' {"size', '\n {"size')
+        .replace('[{"size', '[\n {"size')
+        .replace(' {"max', '\n  {"max')
         .replace('[{"max', '[\n  {"max')
         .replace("[[", "[\n    [")
         .replace("], [", "],\n    [")

@@ -30,6 +30,8 @@ class Effect:
     """Path below kernels/<dialect>/."""
     record_lanes: int = 0
     """32-bit words that it adds to the record of a visible splat."""
+    record_whole: bool = False
+    """Whether these are integers: other words are wider where fragments are computed in double."""
     bounds_lanes: int = 0
     """32-bit words that it adds to the bounds of a visible splat."""
     inputs: tuple[str, ...] = ()
@@ -78,7 +80,10 @@ _EFFECTS = (
     Effect("motion_groups", "slot/motion_groups.cl", inputs=("labels", "moving"), view_inputs=("moving",)),
     Effect("shutter_exposure", "slot/shutter_exposure.cl"),
     Effect("color_rgb", "slot/color_rgb.cl", inputs=("colors",)),
-    Effect("color_sh", "slot/color_sh.cl", inputs=("sh",)),
+    Effect("color_rgb_half", "slot/color_rgb_half.cl", inputs=("colors_half",)),
+    Effect("color_sh", "slot/color_sh.cl", inputs=("sh",), parts=("sh_terms",)),
+    Effect("color_sh_half", "slot/color_sh_half.cl", inputs=("sh_half",), parts=("sh_terms",)),
+    Effect("sh_terms", "slot/sh_terms.cl"),
     Effect("lowpass_none", "slot/lowpass_none.cl"),
     Effect("lowpass_pixel", "slot/lowpass_pixel.cl", parts=("lowpass_none",)),
     Effect("lowpass_screen", "slot/lowpass_screen.cl", record_lanes=2, bounds_lanes=3),
@@ -89,6 +94,7 @@ _EFFECTS = (
         "compose_planes",
         "slot/compose_planes.cl",
         record_lanes=1,
+        record_whole=True,
         inputs=("planes", "plane_keys"),
         view_inputs=("plane_keys",),
         parts=("ray_depth",),
@@ -96,7 +102,12 @@ _EFFECTS = (
     Effect("footprint_gaussian", "slot/footprint_gaussian.cl"),
     Effect("footprint_box", "slot/footprint_box.cl", parts=("box_edges",)),
     Effect(
-        "footprint_mixed", "slot/footprint_mixed.cl", record_lanes=1, inputs=("boxes",), parts=("box_edges",)
+        "footprint_mixed",
+        "slot/footprint_mixed.cl",
+        record_lanes=1,
+        record_whole=True,
+        inputs=("boxes",),
+        parts=("box_edges",),
     ),
     Effect("box_edges", "slot/box_edges.cl", record_lanes=4),
     Effect("ray_depth", "slot/ray_depth.cl", record_lanes=3),
@@ -114,6 +125,7 @@ _EFFECTS = (
         "label",
         "tap/label.cl",
         record_lanes=1,
+        record_whole=True,
         inputs=("labels",),
         planes=(1, 1),
         output=Output("label", 1, "int32"),
@@ -124,6 +136,10 @@ _EFFECTS = (
         planes=(1,),
         output=Output("overdraw", 1, "int32", public=False),
     ),
+    Effect("arithmetic_precise", "slot/arithmetic_precise.cl"),
+    Effect("arithmetic_fast", "slot/arithmetic_fast.cl"),
+    Effect("blend_double", "slot/blend_double.cl"),
+    Effect("keys_short", "slot/keys_short.cl"),
     Effect("background_constant", "slot/background_constant.cl"),
     Effect(
         "background_gradient",
@@ -191,6 +207,7 @@ _EFFECTS = (
         "splat_id",
         "tap/splat_id.cl",
         record_lanes=1,
+        record_whole=True,
         inputs=("splat_ids",),
         planes=(1, 1),
         output=Output("splat_id", 1, "int32"),

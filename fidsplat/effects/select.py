@@ -36,8 +36,8 @@ class FeatureSet:
     """
 
     slots: tuple[str, ...]
-    """One effect per kind, in the fixed order camera, color, lowpass, stop, compose, footprint, background;
-    then motion and shutter, if any."""
+    """One effect per kind, in the fixed order camera, color, lowpass, stop, compose, footprint, background,
+    arithmetic; then motion, shutter, double blending and short keys, if any."""
     taps: tuple[str, ...]
     """Sorted names of the planes beside rgb."""
     sh_degree: int
@@ -45,6 +45,9 @@ class FeatureSet:
     setup_precision: str
     posts: tuple[str, ...] = ()
     """What changes rgb on its way out, in its order: fog, the steps of the sensor."""
+    depth_key_bits: int = 32
+    tile_size: int | None = None
+    """samples; None: the device's own"""
 
     @cached_property
     def effects(self) -> tuple[Effect, ...]:
@@ -116,10 +119,6 @@ def select(
     Raises:
         InputError: an output that nobody declares, or two effects that do not go together.
     """
-    for name in ("arithmetic", "blend_precision", "color_precision", "depth_key_bits", "tile_size"):
-        default, value = getattr(Quality(), name), getattr(quality, name)
-        if value != default:
-            raise InputError(f"quality: no device draws with {name}={value!r} yet; leave it at {default!r}")
     if isinstance(outputs, str):
         outputs = (outputs,)
     wanted = set(outputs)
@@ -131,25 +130,35 @@ def select(
     foggy = fog is not None and fog.density > 0
     behind = _behind(background, foggy)
     lowpass = "none" if cloud.footprint == "box" else quality.lowpass
-    refuse_strangers(cloud.footprint, lowpass, wanted, foggy, behind, camera, turning)
+    precision = quality.blend_precision
+    refuse_strangers(cloud.footprint, lowpass, wanted, foggy, behind, camera, turning, precision)
+    layered = cloud.has_planes and quality.coplanar == "blend"
+    # the splats of a plane arrive together because no other has their key
+    key_bits = 32 if layered else quality.depth_key_bits
+    color = "color_rgb" if cloud.sh_degree < 0 else "color_sh"
     return FeatureSet(
         slots=(
             f"camera_{camera.lens.kind if camera is not None and camera.lens else 'pinhole'}",
-            "color_rgb" if cloud.sh_degree < 0 else "color_sh",
+            f"{color}_half" if quality.color_precision == "float16" else color,
             # boxes are filtered by their own footprint
             f"lowpass_{lowpass}",
             f"stop_{quality.stop_rule}",
-            "compose_planes" if cloud.has_planes and quality.coplanar == "blend" else "compose_ordered",
+            "compose_planes" if layered else "compose_ordered",
             f"footprint_{cloud.footprint}",
             f"background_{behind}",
+            f"arithmetic_{quality.arithmetic}",
             *(("motion_groups",) if moving else ()),
             *(("shutter_exposure",) if exposed else ()),
+            *(("blend_double",) if precision == "float64" else ()),
+            *(("keys_short",) if key_bits < 32 else ()),
         ),
         taps=tuple(sorted(wanted - {"rgb"})),
         sh_degree=max(cloud.sh_degree, 0),
         samples=quality.samples,
         setup_precision=quality.setup_precision,
         posts=(*(("fog",) if foggy else ()), *(() if sensor is None else sensor.steps)),
+        depth_key_bits=key_bits,
+        tile_size=quality.tile_size,
     )
 
 

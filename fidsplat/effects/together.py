@@ -18,6 +18,7 @@ def refuse_strangers(
     background: str,
     camera: Camera | None,
     turning: bool,
+    blend_precision: str,
 ) -> None:
     """Refuse what one effect cannot do under another. Names are those of select.py's slots and outputs.
 
@@ -25,6 +26,12 @@ def refuse_strangers(
         InputError: it names both effects and what would do.
     """
     lens = camera.lens.kind if camera is not None and camera.lens else None
+    if blend_precision == "float64" and (lens not in (None, "orthographic") or foggy):
+        what = "the fog's" if foggy else f"a {lens} lens's"
+        raise InputError(
+            f"blend_precision='float64' would promise too much: {what} rays are held in float32; take "
+            "blend_precision='float32', or a pinhole without fog"
+        )
     if lens is not None:
         pinhole = f"draw with a pinhole (Camera.pinhole without a lens) instead of the {lens} lens"
         if footprint != "gaussian":

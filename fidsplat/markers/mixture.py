@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fidsplat.quality import MAX_DENSITY, MAX_LEVELS, whole_number
+from fidsplat.quality import MAX_DENSITY, MAX_LEVELS, MarkerQuality, whole_number
 
 GAMMA = 3.0
 """The paper's cut-off: a Gaussian ends at 3 standard deviations."""
@@ -68,15 +68,17 @@ def paper_template(levels: int = 4, density: int = 3, duplicates: bool = False) 
 
 
 @cache
-def _fitted() -> tuple[tuple[Template, ...], float]:
+def _fitted() -> tuple[dict[int, tuple[Template, ...]], float]:
     data = json.loads(files("fidsplat.markers").joinpath("templates.json").read_text("utf-8"))
-    templates = []
-    for entry in data["templates"]:
-        gaussians = np.array([mirror for row in entry["quadrant"] for mirror in _mirrors(row)])
-        gaussians.flags.writeable = False
-        limit = entry["max_aspect"]
-        templates.append(Template(np.inf if limit is None else limit, gaussians))
-    return tuple(templates), data["growth"]
+    sets = {entry["size"]: tuple(map(_template, entry["templates"])) for entry in data["sets"]}
+    return sets, data["growth"]
+
+
+def _template(entry: dict) -> Template:
+    gaussians = np.array([mirror for row in entry["quadrant"] for mirror in _mirrors(row)])
+    gaussians.flags.writeable = False
+    limit = entry["max_aspect"]
+    return Template(np.inf if limit is None else limit, gaussians)
 
 
 def _mirrors(row: list[float]) -> list[list[float]]:
@@ -85,9 +87,10 @@ def _mirrors(row: list[float]) -> list[list[float]]:
     return [[sx * x, sy * y, *rest] for sy in ((1, -1) if y else (1,)) for sx in ((1, -1) if x else (1,))]
 
 
-def fitted_templates() -> tuple[Template, ...]:
-    """The shipped templates in rising order of aspect ratio; the last has no limit."""
-    return _fitted()[0]
+def fitted_templates(size: int = MarkerQuality.template) -> tuple[Template, ...]:
+    """The shipped templates of a size (`TEMPLATE_SIZES`) in rising order of aspect ratio; the last has no
+    limit."""
+    return _fitted()[0][size]
 
 
 def fitted_growth() -> float:

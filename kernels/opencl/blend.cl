@@ -14,7 +14,7 @@ typedef struct {
 } Pixel;
 
 typedef struct {            // uniforms of the blend stage
-    float log_cut, ceiling, stop, filter;
+    wide log_cut, ceiling, stop, filter;
 } BlendConstants;
 
 static inline void pixel_start(Pixel *pixel) {
@@ -64,7 +64,7 @@ static inline void pixel_finish(Pixel *pixel, const BlendConstants *constants) {
 // Draws the fragment where `mask` is set.
 static inline void pixel_blend(Pixel *pixel, const Splat *s, Crossing c, vint mask, vfloat screen,
                                const BlendConstants *constants) {
-    vfloat inverse_d = 1.0f / c.d;
+//@@ reciprocal
     vfloat opacity = fragment_opacity(s, fragment_half_rho(c, inverse_d, screen), constants->ceiling);
 //@@ footprint_opacity
     const Seen seen = see(s, c, inverse_d);

@@ -1,10 +1,11 @@
-// Vectors of LANES pixels, and the few functions whose spelling depends on LANES.
+// Vectors of LANES pixels, and the few functions whose spelling depends on LANES. `wide` is what fragments are computed in:
+// the host prints float, or double for the effect blend_double, which has one lane; WIDE(1.5) is a constant of that type.
 
 #define GLUE_(a, b) a##b
 #define GLUE(a, b) GLUE_(a, b)
 
 #if LANES == 1
-typedef float vfloat;
+typedef wide vfloat;
 typedef int vint;
 #define VSELECT(no, yes, mask) ((mask) ? (yes) : (no))
 #define VANY(mask) (mask)
@@ -35,6 +36,7 @@ typedef GLUE(int, LANES) vint;
 #else
 #define FMA(a, b, c) ((a) * (b) + (c))
 #endif
+//@@ arithmetic
 
 typedef struct { real x, y, z; } real3_;
 

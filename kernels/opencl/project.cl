@@ -68,8 +68,8 @@ kernel void project(
     keys[i] = CULLED;
 //@@ splat_view
 
-    float log_opacity = (float)log((real)opacities[i]);
-    float half_r2 = log_opacity - (float)view[VIEW_LOG_CUT];
+    wide log_opacity = (wide)log((real)opacities[i]);
+    wide half_r2 = log_opacity - (wide)view[VIEW_LOG_CUT];
     if (!(half_r2 > 0.0f)) return;
 
     // columns of the splat's rotation, from the quaternion as it is (no unit length assumed)
@@ -138,10 +138,10 @@ kernel void project(
     real z_numerator = determinant * facing;                               // depth = z_numerator / D
 
     Splat record;
-    record.nu0 = (float)(k0.x * n_scale); record.nux = (float)(kx.x * n_scale); record.nuy = (float)(ky.x * n_scale);
-    record.nv0 = (float)(k0.y * n_scale); record.nvx = (float)(kx.y * n_scale); record.nvy = (float)(ky.y * n_scale);
-    record.d0 = (float)(k0.z * facing); record.dx = (float)(kx.z * facing); record.dy = (float)(ky.z * facing);
-    record.d_near = (float)(z_numerator / near);
+    record.nu0 = (wide)(k0.x * n_scale); record.nux = (wide)(kx.x * n_scale); record.nuy = (wide)(ky.x * n_scale);
+    record.nv0 = (wide)(k0.y * n_scale); record.nvx = (wide)(kx.y * n_scale); record.nvy = (wide)(ky.y * n_scale);
+    record.d0 = (wide)(k0.z * facing); record.dx = (wide)(kx.z * facing); record.dy = (wide)(ky.z * facing);
+    record.d_near = (wide)(z_numerator / near);
     record.log_opacity = log_opacity;
     record.ax = (short)anchor_i;
     record.ay = (short)anchor_j;
@@ -166,4 +166,5 @@ kernel void project(
     float key = (float)pz;
 //@@ key
     keys[i] = sortable(key);
+//@@ key_bits
 }

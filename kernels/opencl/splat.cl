@@ -7,12 +7,12 @@
 // front of the camera, and sqrt(1/2) in the numerators, so that (n_u^2 + n_v^2) / D^2 is rho / 2.
 
 typedef struct __attribute__((aligned(16))) {   // whole vectors of 16 bytes are read and written
-    float nu0, nux, nuy;    // n_u = nu0 + nux x + nuy y
-    float nv0, nvx, nvy;
-    float d0, dx, dy;       // D
-    float d_near;           // D at depth `near`: a fragment is in front of the near plane if D <= d_near
-    float log_opacity;
-    float r, g, b;
+    wide nu0, nux, nuy;     // n_u = nu0 + nux x + nuy y
+    wide nv0, nvx, nvy;
+    wide d0, dx, dy;       // D
+    wide d_near;           // D at depth `near`: a fragment is in front of the near plane if D <= d_near
+    wide log_opacity;
+    wide r, g, b;
     short ax, ay;           // anchor pixel
     short y0, y1;           // rows [y0, y1) that the splat can touch
     short x0, x1;           // columns [x0, x1)
@@ -33,7 +33,7 @@ typedef struct {
 //@@ footprint_functions
 
 // Affine forms at a row: `*_x` are the parts that do not change along the tile's rows.
-static inline Crossing cross_row(const Splat *s, vfloat nu_x, vfloat nv_x, vfloat d_x, float y, float half_r2) {
+static inline Crossing cross_row(const Splat *s, vfloat nu_x, vfloat nv_x, vfloat d_x, wide y, wide half_r2) {
     Crossing c;
     vfloat nu = FMA((vfloat)s->nuy, (vfloat)y, nu_x);
     vfloat nv = FMA((vfloat)s->nvy, (vfloat)y, nv_x);
@@ -47,6 +47,6 @@ static inline Crossing cross_row(const Splat *s, vfloat nu_x, vfloat nv_x, vfloa
 
 //@@ cross_functions
 // Opacity (the alpha of the paper) of a fragment at half squared distance rho / 2
-static inline vfloat fragment_opacity(const Splat *s, vfloat half_rho, float ceiling) {
-    return fmin(exp(s->log_opacity - half_rho), (vfloat)ceiling);
+static inline vfloat fragment_opacity(const Splat *s, vfloat half_rho, wide ceiling) {
+//@@ opacity
 }

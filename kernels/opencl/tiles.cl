@@ -18,11 +18,16 @@ static inline ulong scan_group(local ulong *partial, uint item, ulong mine, ulon
     return exclusive;
 }
 
+// places in the buffer `counts`, which the host reads while later stages run: number of big splats, of pairs (64 bits)
+enum { COUNT_BIG = 0, COUNT_PAIRS = 1 };
+
 // Index space: one work-group of SCAN_ITEMS.
-// Reads: tallies. Writes: starts[tiles + 1] modulo 2^32, cursors[tiles] (the same); tallies' number of pairs in 64 bits.
+// Reads: tallies. Writes: starts[tiles + 1] modulo 2^32, cursors[tiles] (the same), counts; zeroes tallies' number of
+// visible splats.
 // If there are more pairs than `capacity` (and that is not 2^32 - 1), all lists are made empty.
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
-    uint tiles, uint capacity, global uint *restrict tallies, global uint *restrict starts, global uint *restrict cursors
+    uint tiles, uint capacity, global uint *restrict tallies, global uint *restrict starts, global uint *restrict cursors,
+    global uint *restrict counts
 ) {
     local ulong partial[SCAN_ITEMS];
     uint item = get_local_id(0);
@@ -41,8 +46,9 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
     if (item == 0) {
         starts[tiles] = (uint)running;
         tallies[TALLY_VISIBLE] = 0;   // emit adds them up
-        tallies[TALLY_PAIRS] = (uint)running;
-        tallies[TALLY_PAIRS + 1] = (uint)(running >> 32);
+        counts[COUNT_BIG] = tallies[TALLY_BIG];
+        counts[COUNT_PAIRS] = (uint)running;
+        counts[COUNT_PAIRS + 1] = (uint)(running >> 32);
     }
     if (capacity != 0xFFFFFFFFu && running > capacity) {
         barrier(CLK_GLOBAL_MEM_FENCE);
@@ -54,24 +60,37 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
 // shares the tiles.
 #define WALK_ITEMS 256
 
+// The rows of tiles that a big splat may touch. Counts and lists both come from this, so they agree.
+typedef struct { int top, cells, tiles_x; } Walk;
+
+static inline Walk walk_of(const Bounds *b, int width, int height) {
+    int y0, y1;
+    bounds_rows(b, height, &y0, &y1);
+    Walk walk = {y0 / TILE_H, 0, (width + TILE_W - 1) / TILE_W};
+    walk.cells = ((y1 - 1) / TILE_H - walk.top + 1) * walk.tiles_x;
+    return walk;
+}
+
+// The tile of one cell of these rows; -1 if the splat cannot touch it.
+static inline int walk_tile(const Walk *walk, int cell, const Bounds *b, int width, int height) {
+    int row = walk->top + cell / walk->tiles_x, column = cell % walk->tiles_x;
+    TileSpan span = tile_span(b, row, width, height);
+    return column >= span.first && column <= span.last ? row * walk->tiles_x + column : -1;
+}
+
 // Adds the tiles of big splats to the tallies.
 // Index space: any number of work-groups; each takes every so many-th splat.
 // Reads: tallies' number of big splats, big_bounds.
-
 kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void tally_big(
     int width, int height, uint big_capacity, global const Bounds *restrict big_bounds, global uint *restrict tallies
 ) {
-    int tiles_x = (width + TILE_W - 1) / TILE_W;
     uint count = min(tallies[TALLY_BIG], big_capacity);
     for (uint k = get_group_id(0); k < count; k += get_num_groups(0)) {
-        Bounds b = big_bounds[k];
-        int y0, y1;
-        bounds_rows(&b, height, &y0, &y1);
-        int top = y0 / TILE_H, rows = (y1 - 1) / TILE_H - top + 1;
-        for (int cell = get_local_id(0); cell < rows * tiles_x; cell += WALK_ITEMS) {
-            int row = top + cell / tiles_x, column = cell % tiles_x;
-            TileSpan span = tile_span(&b, row, width, height);
-            if (column >= span.first && column <= span.last) atomic_inc(tallies + TALLIES + row * tiles_x + column);
+        const Bounds b = big_bounds[k];
+        const Walk walk = walk_of(&b, width, height);
+        for (int cell = get_local_id(0); cell < walk.cells; cell += WALK_ITEMS) {
+            int tile = walk_tile(&walk, cell, &b, width, height);
+            if (tile >= 0) atomic_inc(tallies + TALLIES + tile);
         }
     }
 }
@@ -104,17 +123,11 @@ kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void emit(
     uint item = get_local_id(0), big_count = min(tallies[TALLY_BIG], big_capacity);
     if (get_group_id(0) >= splat_groups) {
         for (uint k = get_group_id(0) - splat_groups; k < big_count; k += get_num_groups(0) - splat_groups) {
-            Bounds b = big_bounds[k];
+            const Bounds b = big_bounds[k];
+            const Walk walk = walk_of(&b, width, height);
             uint splat = big[k], key = keys[splat];
-            int y0, y1;
-            bounds_rows(&b, height, &y0, &y1);
-            int top = y0 / TILE_H, rows = (y1 - 1) / TILE_H - top + 1;
-            for (int cell = item; cell < rows * band.tiles_x; cell += WALK_ITEMS) {
-                int row = top + cell / band.tiles_x, column = cell % band.tiles_x;
-                TileSpan span = tile_span(&b, row, width, height);
-                if (column >= span.first && column <= span.last)
-                    emit_pair(row * band.tiles_x + column, &band, key, splat, cursors, pairs);
-            }
+            for (int cell = item; cell < walk.cells; cell += WALK_ITEMS)
+                emit_pair(walk_tile(&walk, cell, &b, width, height), &band, key, splat, cursors, pairs);
         }
         return;   // the whole group
     }
@@ -146,35 +159,20 @@ static inline void comparator(uint t, uint stride, bool mirrored, uint *i, uint 
     *j = mirrored ? *i + 2 * (stride - inside) - 1 : *i + stride;
 }
 
-static inline void local_step(local ulong *items, uint length, uint comparators, uint stride, bool mirrored) {
-    for (uint t = get_local_id(0); t < comparators; t += SORT_ITEMS) {
-        uint i, j;
-        comparator(t, stride, mirrored, &i, &j);
-        if (j < length) {
-            ulong a = items[i], b = items[j];
-            if (a > b) {
-                items[i] = b;
-                items[j] = a;
-            }
-        }
-    }
-    barrier(CLK_LOCAL_MEM_FENCE);
-}
-
-static inline void global_step(global ulong *items, uint length, uint comparators, uint stride, bool mirrored) {
-    for (uint t = get_local_id(0); t < comparators; t += SORT_ITEMS) {
-        uint i, j;
-        comparator(t, stride, mirrored, &i, &j);
-        if (j < length) {
-            ulong a = items[i], b = items[j];
-            if (a > b) {
-                items[i] = b;
-                items[j] = a;
-            }
-        }
-    }
-    barrier(CLK_GLOBAL_MEM_FENCE);
-}
+// One step of the network on `items`, which lie where `fence` says.
+#define SORT_STEP(items, length, comparators, stride, mirrored, fence)                      \
+    for (uint t = get_local_id(0); t < (comparators); t += SORT_ITEMS) {                    \
+        uint i, j;                                                                          \
+        comparator(t, stride, mirrored, &i, &j);                                            \
+        if (j < (length)) {                                                                 \
+            ulong a = (items)[i], b = (items)[j];                                           \
+            if (a > b) {                                                                    \
+                (items)[i] = b;                                                             \
+                (items)[j] = a;                                                             \
+            }                                                                               \
+        }                                                                                   \
+    }                                                                                       \
+    barrier(fence)
 
 kernel __attribute__((reqd_work_group_size(SORT_ITEMS, 1, 1))) void sort_tiles(
     int band_first, global const uint *restrict starts, global ulong *restrict pairs, global uint *restrict lists
@@ -188,33 +186,22 @@ kernel __attribute__((reqd_work_group_size(SORT_ITEMS, 1, 1))) void sort_tiles(
 
     // blocks that fit local memory: all of a short list
     uint block = min(padded, (uint)SORT_LOCAL);
-    for (uint from = 0; from < length; from += block) {
-        uint here = min(length - from, block);
-        for (uint k = item; k < here; k += SORT_ITEMS) items[k] = list[from + k];
-        barrier(CLK_LOCAL_MEM_FENCE);
-        for (uint size = 2; size <= block; size *= 2)
-            for (uint stride = size / 2; stride > 0; stride /= 2)
-                local_step(items, here, block / 2, stride, stride == size / 2);
-        if (length <= SORT_LOCAL) {
-            for (uint k = item; k < here; k += SORT_ITEMS) lists[start + k] = (uint)items[k];
-        } else {
-            for (uint k = item; k < here; k += SORT_ITEMS) list[from + k] = items[k];
-            barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
+    for (uint size = block; size <= padded; size *= 2) {
+        bool whole = size == block;   // all stages of each block; later what a wider stage leaves to do within them
+        for (uint stride = size / 2; stride >= SORT_LOCAL; stride /= 2) {
+            SORT_STEP(list, length, padded / 2, stride, stride == size / 2, CLK_GLOBAL_MEM_FENCE);
         }
-    }
-    // longer ones: wide steps in global memory, the rest of each stage in blocks again
-    for (uint size = 2 * SORT_LOCAL; size <= padded; size *= 2) {
-        for (uint stride = size / 2; stride >= SORT_LOCAL; stride /= 2)
-            global_step(list, length, padded / 2, stride, stride == size / 2);
-        for (uint from = 0; from < length; from += SORT_LOCAL) {
-            uint here = min(length - from, (uint)SORT_LOCAL);
+        for (uint from = 0; from < length; from += block) {
+            uint here = min(length - from, block);
             for (uint k = item; k < here; k += SORT_ITEMS) items[k] = list[from + k];
             barrier(CLK_LOCAL_MEM_FENCE);
-            for (uint stride = SORT_LOCAL / 2; stride > 0; stride /= 2)
-                local_step(items, here, SORT_LOCAL / 2, stride, false);
+            for (uint stage = whole ? 2 : block; stage <= block; stage *= 2)
+                for (uint stride = stage / 2; stride > 0; stride /= 2) {
+                    SORT_STEP(items, here, block / 2, stride, whole && stride == stage / 2, CLK_LOCAL_MEM_FENCE);
+                }
             for (uint k = item; k < here; k += SORT_ITEMS) {
-                list[from + k] = items[k];
-                if (size == padded) lists[start + k + from] = (uint)items[k];
+                if (size == padded) lists[start + from + k] = (uint)items[k];
+                else list[from + k] = items[k];
             }
             barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
         }

@@ -28,8 +28,8 @@ CAMERAS = {
 BEFORE_LENSES = {
     ("lanes", ("rgb",)): "087ca7624e96be538f740ecbc034838e45fea9ae94ab13685fe60e31b514f454",
     ("lanes", TAPS): "e78531380a46b124b5164bc9f762341b4f35df751b33e7b6ae7f1c428bd94c0f",
-    ("group", ("rgb",)): "ee9c1734fdeca7b49617789f6ee0cfaed837810c5ada902221f08a025ea6ba9f",
-    ("group", TAPS): "86873a7e56fad0bb96c78d8c4682591b36dc32e0f1c496bdfac42c6648c01765",
+    ("group", ("rgb",)): "e50af68eb1c79007f5a18c4c515f6af2a74fae840222feb1c222708114958290",
+    ("group", TAPS): "c14d3f275dbc10fe790722a5b56592dd5a5de517297a74821ef89fbb174905d8",
 }
 
 

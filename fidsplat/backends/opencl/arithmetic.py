@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.opencl.assemble import kernel_text
+from fidsplat.backends.opencl.assemble import kernel_text, with_scalars
 from fidsplat.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def run_arithmetic(
     lanes = backend.shape.lanes
     defines = {"LANES": lanes, "FAST_FMA": 0, "SETUP_FP64": int(backend.info.float64)}
     text = "".join(f"#define {name} {value}\n" for name, value in defines.items())
-    program = backend.build(text + "".join(map(kernel_text, _FILES)))
+    program = backend.build(with_scalars(text + "".join(map(kernel_text, _FILES))))
     kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
     n = len(exponents)
     single = [array.astype(np.float32) for array in (exponents, shares, above, below)]

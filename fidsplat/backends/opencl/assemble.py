@@ -12,11 +12,11 @@ import re
 from dataclasses import dataclass
 from functools import cache
 
-from fidsplat.effects import CATALOGUE, FeatureSet
+from fidsplat.effects import CATALOGUE, Effect, FeatureSet
 from fidsplat.errors import DeviceError
 from fidsplat.kernel_files import kernels_folder
 
-BASE_RECORD_BYTES = 68
+BASE_RECORD_LANES, BASE_RECORD_SHORTS = 14, 6
 RECORD_ALIGNMENT = 16
 BASE_BOUNDS_BYTES = 32
 _LISTS = {"ordered": ("scan", "sort", "bin", "pack"), "tiled": ("tiles",)}
@@ -24,6 +24,8 @@ _HOOK = re.compile(r"^[ \t]*//@@ (\w+)[ \t]*\n", re.MULTILINE)
 _SECTION = re.compile(r"^//@ (\w+)[ \t]*\n", re.MULTILINE)
 _COMMENT = re.compile(r"[ \t]*//[^\n]*")
 _BLANK = re.compile(r"\n\s*\n+")
+_WIDE_CONSTANT = re.compile(r"\bWIDE\(([^()]+)\)")
+_WIDE = re.compile(r"\bwide\b")
 
 
 @dataclass(frozen=True)
@@ -65,8 +67,8 @@ class Source:
 def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     """The source text of all stages for these features on a device of this shape."""
     effects = features.effects
-    record_bytes = BASE_RECORD_BYTES + 4 * sum(effect.record_lanes for effect in effects)
-    record_bytes += -record_bytes % RECORD_ALIGNMENT
+    double = "blend_double" in features.names
+    record_bytes = _record_bytes(effects, 8 if double else 4)
     bounds_bytes = BASE_BOUNDS_BYTES + 4 * sum(effect.bounds_lanes for effect in effects)
     defines = {
         "CHUNKS": shape.chunks,
@@ -80,8 +82,10 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         "TILE_H": shape.tile_height,
         "TILE_W": shape.tile_width,
     }
-    if features.sh_degree > 0 or "color_sh" in features.slots:
+    if features.sh_degree > 0 or "sh_terms" in features.names:
         defines["SH_DEGREE"] = features.sh_degree
+    if "keys_short" in features.names:
+        defines["KEY_BITS"] = features.depth_key_bits
     files = [effect.file for effect in effects]
     if shape.lists == "tiled":
         files.append("list/tiled.cl")
@@ -99,8 +103,24 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         if unknown := set(section) - known:
             raise DeviceError(f"kernel file {file} fills hooks that no file has: {sorted(unknown)}")
     text = "".join(f"#define {name} {value}\n" for name, value in sorted(defines.items()))
-    text += _BLANK.sub("\n", _COMMENT.sub("", body))
+    text += _BLANK.sub("\n", with_scalars(_COMMENT.sub("", body), double))
     return Source(text, hashlib.sha256(text.encode()).hexdigest(), record_bytes, bounds_bytes)
+
+
+def with_scalars(text: str, double: bool = False) -> str:
+    """Kernel text in which the type `wide` and its constants are those of C."""
+    text = _WIDE_CONSTANT.sub(r"\1" if double else r"\1f", text)
+    return _WIDE.sub("double" if double else "float", text)
+
+
+def _record_bytes(effects: tuple[Effect, ...], scalar: int) -> int:
+    """Size of the C struct `Splat` whose numbers take `scalar` bytes."""
+    size = scalar * BASE_RECORD_LANES + 2 * BASE_RECORD_SHORTS
+    for effect in effects:
+        if effect.record_lanes:
+            each = 4 if effect.record_whole else scalar
+            size += -size % each + each * effect.record_lanes
+    return size + -size % RECORD_ALIGNMENT
 
 
 @cache

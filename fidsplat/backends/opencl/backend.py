@@ -18,6 +18,7 @@ from fidsplat.backends.opencl.memory import BufferPool, Resident
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.plan import PAIR
 from fidsplat.backends.opencl.ray_buffers import RayBuffers
+from fidsplat.backends.opencl.shapes import shape_for
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
@@ -90,11 +91,17 @@ class OpenCLBackend:
         """The stages compiled for these features; `shape` replaces the device's own build constants (tests).
 
         Raises:
-            DeviceError: the compiler refuses; its log is in the message.
+            DeviceError: the compiler refuses; its log is in the message. Or the device has no float64 for
+                blending.
         """
+        if not self.info.float64 and "blend_double" in features.names:
+            raise DeviceError(
+                f"{self.info.title} has no float64 (cl_khr_fp64) for blend_precision='float64'; use "
+                "blend_precision='float32', or another device"
+            )
         if not self.info.float64 and features.setup_precision != "float32":
             features = replace(features, setup_precision="float32")
-        key = (features, shape or self.shape)
+        key = (features, shape or shape_for(features, self.shape))
         if key not in self._pipelines:
             source = assemble(*key)
             program = self.build(source.text)

@@ -35,14 +35,16 @@ class ExposedRun(Run):
         whole = [self.take(f"exposed {k}", 4 * plane * count) for k, (count, _) in enumerate(kinds)]
         for shot in self.view.shots:
             run = Run(self.pipeline, self.resident, shot.view, self.plan)
-            planes = run.samples()
+            *_, planes = run.filled()
             self.events += run.events
             self._gather(run, shot, planes, whole, kinds)
             for name, value in run.stats().items():
                 self._counts[name] = max(self._counts[name], value)
             self.uploads += run.uploads
             self.pool.give_back(run.leased)
-        return self.resolve(whole)
+        outputs = self.outputs()
+        self.resolve(whole, outputs)
+        return outputs
 
     def _gather(
         self,

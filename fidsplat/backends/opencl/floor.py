@@ -9,7 +9,7 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.base import Rates
-from fidsplat.backends.opencl.assemble import kernel_text
+from fidsplat.backends.opencl.assemble import kernel_text, with_scalars
 from fidsplat.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def measure_rates(backend: OpenCLBackend) -> Rates:
         "SETUP_FP64": int(backend.info.float64),
     }
     text = "".join(f"#define {name} {value}\n" for name, value in defines.items())
-    program = backend.build(text + "".join(map(kernel_text, _FILES)))
+    program = backend.build(with_scalars(text + "".join(map(kernel_text, _FILES))))
     kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
     try:
         return Rates(

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 # words of the buffer `tallies`, as in prelude.cl
 _VISIBLE, _PAIRS, _ALL, _BIG, _TALLIES = 0, 2, 4, 6, 8
+# words of the buffer `counts`, as in tiles.cl: big splats, pairs (two words)
+_COUNTS = 3
 
 
 class Lists:
@@ -110,10 +112,11 @@ class OrderedLists(Lists):
         table = run.take("sort table", 4 * bins * self.shape.chunks)
         keys, order, tallies = run.held["keys"], run.take("order 0", 4 * count), run.held["tallies"]
         length = np.array([count, 0], np.uint32)
+        least = 32 - run.pipeline.features.depth_key_bits  # the bits below are 0
         run.uploads.append(
             cl.enqueue_copy(run.queue, tallies, length, dst_offset=4 * _ALL, is_blocking=False)
         )
-        for number, shift in enumerate(range(0, 32, self.shape.radix_bits)):
+        for number, shift in enumerate(range(least, 32, self.shape.radix_bits)):
             slot = np.uint32(_ALL if number == 0 else _VISIBLE)
             keys_out = run.take(f"sorted keys {number % 2}", 4 * count)
             order_out = run.take(f"order {(number + 1) % 2}", 4 * count)
@@ -262,12 +265,11 @@ class TiledLists(Lists):
         if capacity:
             self._list(0, run.tiles, capacity, True)
             yield 0, run.tiles
-        words = self._read(counted)
-        while words[_BIG] > self.big:
-            self._project(int(words[_BIG]))
+        big, self._pairs = self._read(counted)
+        while big > self.big:
+            self._project(big)
             counted, capacity = self._starts(0), 0
-            words = self._read(counted)
-        self._pairs = int(words[_PAIRS]) | int(words[_PAIRS + 1]) << 32
+            big, self._pairs = self._read(counted)
         if self._pairs > capacity or not capacity:
             yield from self._again()
 
@@ -297,7 +299,9 @@ class TiledLists(Lists):
         run, items = self.run, self.run.shape.scan_items
         starts = run.take("starts", 4 * (run.tiles + 1))
         cursors = run.take("cursors", 4 * run.tiles)
-        args = (np.uint32(run.tiles), np.uint32(capacity), run.held["tallies"], starts, cursors)
+        # what the host reads has a buffer of its own: `emit` adds to the tallies meanwhile
+        counts = run.take("counts", 4 * _COUNTS)
+        args = (np.uint32(run.tiles), np.uint32(capacity), run.held["tallies"], starts, cursors, counts)
         return run.launch("bin", "tile_starts", items, items, *args)
 
     def _list(self, first: int, end: int, capacity: int, first_band: bool) -> None:
@@ -314,13 +318,13 @@ class TiledLists(Lists):
         sort = (np.int32(first), held["starts"], pairs, lists)
         run.launch("sort", "sort_tiles", (end - first) * items, items, *sort)
 
-    def _read(self, counted: cl.Event) -> np.ndarray:
-        """The tallies' head as it was when `counted` had ended, while later stages run."""
-        words = np.empty(_TALLIES, np.uint32)
+    def _read(self, counted: cl.Event) -> tuple[int, int]:
+        """Numbers of big splats and of pairs as `counted` has left them, while later stages run."""
+        words = np.empty(_COUNTS, np.uint32)
         self.run.queue.flush()
         side = self.run.backend.side_queue
-        cl.enqueue_copy(side, words, self.run.held["tallies"], wait_for=[counted])
-        return words
+        cl.enqueue_copy(side, words, self.run.held["counts"], wait_for=[counted])
+        return int(words[0]), int(words[1]) | int(words[2]) << 32
 
 
 LISTS = {"ordered": OrderedLists, "chunked": ChunkedLists, "tiled": TiledLists}

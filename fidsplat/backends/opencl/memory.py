@@ -10,7 +10,7 @@ import pyopencl as cl
 
 from fidsplat.backends.planes import PlaneTable
 from fidsplat.errors import DeviceError
-from fidsplat.harmonics import C0
+from fidsplat.harmonics import C0, halves
 from fidsplat.splats import SplatCloud
 
 if TYPE_CHECKING:
@@ -96,9 +96,9 @@ class BufferPool:
 class Resident:
     """A SplatCloud on the device. SH of degree 0 does not depend on the view and becomes plain colours.
 
-    A CPU reads the cloud's own arrays, without a copy. On other devices they are copied when a picture first
-    asks for them, or, where they would take more than half of the memory budget, a chunk at a time for
-    every picture (`streamed`).
+    A CPU reads the cloud's own arrays, without a copy. On other devices they are copied, labels and colours
+    when a picture first asks for them (in the precision that it wants), or, where they would take more than
+    half of the memory budget, a chunk at a time for every picture (`streamed`).
     """
 
     def __init__(self, backend: OpenCLBackend, cloud: SplatCloud) -> None:
@@ -135,7 +135,7 @@ class Resident:
         )
         if not self._shared and not self.streamed:
             try:
-                for name in self._arrays.keys() - {"labels"}:
+                for name in self._arrays.keys() - {"labels", "colors", "sh"}:
                     self._whole(name)
                 backend.queue.finish()
             except cl.Error as error:
@@ -156,6 +156,8 @@ class Resident:
         if name == "splat_ids" and name not in self._arrays:
             # made when a picture first asks for it
             self._arrays[name] = np.arange(self.count, dtype=np.int32)
+        if name.endswith("_half") and name not in self._arrays:
+            self._arrays[name] = halves(self._arrays[name.removesuffix("_half")])
         if self.streamed:
             piece = np.ascontiguousarray(self._arrays[name][first:end])
             buffer = self._backend.pool.scratch(f"chunk of {name}", piece.nbytes)

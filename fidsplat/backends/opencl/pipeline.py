@@ -85,6 +85,7 @@ class OpenCLPipeline:
         self._kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
         self._bound: dict[str, tuple] = {}
         self.real = np.float64 if features.setup_precision == "float64" else np.float32
+        self.wide = np.float64 if "blend_double" in features.names else np.float32
 
     def render(self, resident: Resident, view: View) -> OpenCLPlanes:
         """Draw one picture.

@@ -50,20 +50,17 @@ def scan(pipeline: OpenCLPipeline, lengths: np.ndarray) -> tuple[np.ndarray, int
     """
     backend, items = pipeline.backend, (pipeline.shape.scan_items,)
     count, starts = np.uint32(len(lengths)), buffer_of(backend, np.empty(len(lengths) + 1, np.uint32))
+    sums = buffer_of(backend, np.zeros(8, np.uint32))
     if pipeline.shape.lists == "tiled":
         tallies = buffer_of(backend, np.concatenate([np.zeros(8, np.uint32), lengths]))
         cursors = buffer_of(backend, lengths)
-        args, kernel, place = (count, np.uint32(2**32 - 1), tallies, starts, cursors), "tile_starts", 2
+        args, kernel, place = (count, np.uint32(2**32 - 1), tallies, starts, cursors, sums), "tile_starts", 1
     else:
-        tallies = buffer_of(backend, np.zeros(8, np.uint32))
-        args, kernel, place = (
-            (count, buffer_of(backend, lengths), starts, tallies, np.uint32(4)),
-            "scan_bins",
-            4,
-        )
+        totals = buffer_of(backend, lengths)
+        args, kernel, place = (count, totals, starts, sums, np.uint32(4)), "scan_bins", 4
     pipeline.launch(backend.queue, kernel, items, items, args)
     places = contents(backend, starts).view(np.uint32)
-    words = contents(backend, tallies).view(np.uint32)
+    words = contents(backend, sums).view(np.uint32)
     return places, int(words[place]) | int(words[place + 1]) << 32
 
 

@@ -7,7 +7,7 @@ same bits.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,17 +43,25 @@ class Run:
 
     def draw(self) -> dict[str, tuple[Output, cl.Buffer]]:
         """All stages; returns the outputs by name."""
-        return self.resolve(self.samples())
+        outputs = self.outputs()
+        for planes in self.filled():
+            self.resolve(planes, outputs)
+        return outputs
 
-    def samples(self) -> list[cl.Buffer]:
-        """All stages but the last: the sample planes, raw first."""
+    def filled(self) -> Iterator[list[cl.Buffer]]:
+        """All stages but the last: yields the sample planes, raw first, when all tiles are blended.
+
+        Where lists were made before the host knew their length it may do so twice: what is launched then is
+        under way while the host waits, and what comes last counts.
+        """
         planes = self._sample_planes()
         # not an attribute: in a cycle, all that this picture holds would wait for the garbage collector
         lists = LISTS["chunked" if self.plan.chunk else self.shape.lists](self)
         for first, end in lists.bands():
             self._blend(first, end, planes)
+            if end == self.tiles:
+                yield planes
         self.stats = lists.stats()
-        return planes
 
     # stages
 
@@ -81,10 +89,7 @@ class Run:
             np.uint32(first),
             np.int32(view.width),
             np.int32(view.height),
-            np.float32(view.log_cut),
-            np.float32(view.ceiling),
-            np.float32(view.stop),
-            np.float32(1.0 / view.samples**2),
+            *map(self.pipeline.wide, (view.log_cut, view.ceiling, view.stop, 1.0 / view.samples**2)),
             *self._blend_args(sample_planes),
         )
 
@@ -102,13 +107,18 @@ class Run:
         numbers = [number for name in names for number in self.view.uniform(name)]
         return [number if isinstance(number, np.generic) else np.float32(number) for number in numbers]
 
-    def resolve(self, raw_planes: list[cl.Buffer]) -> dict[str, tuple[Output, cl.Buffer]]:
+    def outputs(self) -> dict[str, tuple[Output, cl.Buffer]]:
+        """Room for the finished planes, by name."""
+        pixels = (self.view.height // self.view.samples) * (self.view.width // self.view.samples)
+        return {
+            output.name: (output, self.lease(output.name, 4 * pixels * output.channels))
+            for output in self.pipeline.features.outputs
+        }
+
+    def resolve(self, raw_planes: list[cl.Buffer], outputs: dict[str, tuple[Output, cl.Buffer]]) -> None:
+        """The last stage: pixels from samples."""
         view, features = self.view, self.pipeline.features
         height, width = view.height // view.samples, view.width // view.samples
-        outputs = {
-            output.name: (output, self.lease(output.name, 4 * height * width * output.channels))
-            for output in features.outputs
-        }
         extra, rest = [], iter(raw_planes[1:])
         for effect in features.effects:
             extra += self._uniforms(effect.resolve_uniforms)
@@ -121,7 +131,6 @@ class Run:
         args = (*fixed, *background, raw_planes[0], outputs["rgb"][1], *extra)
         size = (-(-width // 16) * 16, -(-height // 4) * 4)
         self.events.append(("resolve", self.pipeline.launch(self.queue, "resolve", size, (16, 4), args)))
-        return outputs
 
     # what the stages and the lists share
 

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 KNOWN = frozenset(
     {"camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen", "stop_inclusive"}
-    | {"stop_exclusive", "compose_ordered", "compose_planes", "ray_depth"}
-    | {"perspective", "footprint_gaussian", "background_constant"}
+    | {"stop_exclusive", "compose_ordered", "compose_planes", "ray_depth", "sh_terms"}
+    | {"arithmetic_precise", "keys_short", "perspective", "footprint_gaussian", "background_constant"}
     | {"alpha", "depth", "depth_median", "normal", "label"}
 )
 """effects that kernels/warp has"""
@@ -256,7 +256,8 @@ class _Run:
         keys = self._take("sorted keys", 2 * visible, wp.uint32)
         order = self._take("order", 2 * visible, wp.int32)
         given = (self.held[name] for name in ("keys", "drawn", "places"))
-        self.launch(self.pipeline.sort.compact, self.resident.count, *given, keys, order)
+        leading = wp.uint32(-1 << (32 - self.pipeline.features.depth_key_bits) & 0xFFFFFFFF)
+        self.launch(self.pipeline.sort.compact, self.resident.count, *given, leading, keys, order)
         wp.utils.radix_sort_pairs(keys, order, visible)
 
     def _bands(self, visible: int, pairs: int) -> Iterator[tuple[int, int, int]]:

@@ -21,7 +21,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
     global const uint *restrict starts,
     uint band_first,                         // the first tile of this launch; lists begin with its list
     int width, int height,
-    float log_cut, float ceiling, float stop, float filter,
+    wide log_cut, wide ceiling, wide stop, wide filter,
     global float *restrict raw
 //@@ blend_args
 ) {
@@ -72,15 +72,15 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
                 for (int part = 0; part < RECORD_BYTES / 16; part++)
                     copy.words[part] = staged[word * 32 + 31 - clz(bits & -bits)].words[part];
                 const Splat s = copy.splat;
-                float half_r2 = s.log_opacity - constants.log_cut;
-                float x = (float)(px - s.ax);
-                float nu_x = FMA(s.nux, x, s.nu0), nv_x = FMA(s.nvx, x, s.nv0), d_x = FMA(s.dx, x, s.d0);
+                wide half_r2 = s.log_opacity - constants.log_cut;
+                wide x = (wide)(px - s.ax);
+                wide nu_x = FMA(s.nux, x, s.nu0), nv_x = FMA(s.nvx, x, s.nv0), d_x = FMA(s.dx, x, s.d0);
                 for (int row = 0; row < ROWS; row++) {
                     if (!pixel_unfinished(&pixels[row], &constants)) continue;
-                    float y = (float)(py + row - s.ay);
+                    wide y = (wide)(py + row - s.ay);
                     Crossing c = cross_row(&s, nu_x, nv_x, d_x, y, half_r2);
 //@@ cross
-                    float screen;
+                    wide screen;
                     int mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
 //@@ mask
                     if (VANY(mask)) pixel_blend(&pixels[row], &s, c, mask, screen, &constants);

@@ -10,7 +10,7 @@ kernel void blend(
     global const uint *restrict starts,
     uint band_first,                         // the first tile of this launch; lists begin with its list
     int width, int height,
-    float log_cut, float ceiling, float stop, float filter,
+    wide log_cut, wide ceiling, wide stop, wide filter,
     global float *restrict raw
 //@@ blend_args
 ) {
@@ -32,7 +32,7 @@ kernel void blend(
         FETCH_AHEAD(splats + lists[min(k + AHEAD_SPLATS, end - 1)]);
         FETCH_AHEAD((global const char *)(splats + lists[min(k + AHEAD_SPLATS, end - 1)]) + 64);
         const Splat s = splats[lists[k]];
-        float half_r2 = s.log_opacity - constants.log_cut;
+        wide half_r2 = s.log_opacity - constants.log_cut;
         int first = max(s.y0 - y0, 0), last = min(s.y1 - y0, TILE_H);
         vfloat x = (vfloat)(float)(x0 - s.ax) + VLANE;
         vfloat nu_x = FMA((vfloat)s.nux, x, (vfloat)s.nu0);
@@ -40,7 +40,7 @@ kernel void blend(
         vfloat d_x = FMA((vfloat)s.dx, x, (vfloat)s.d0);
         for (int row = first; row < last; row++) {
             if (!(alive >> row & 1u)) continue;
-            float y = (float)(y0 + row - s.ay);
+            wide y = (wide)(y0 + row - s.ay);
             Crossing c = cross_row(&s, nu_x, nv_x, d_x, y, half_r2);
 //@@ cross
             vfloat screen;

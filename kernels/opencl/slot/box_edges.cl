@@ -8,12 +8,12 @@
 // sides add up to that of the rectangle, at corners, T-junctions, under perspective, and below the size of a sample. Where the
 // edges lie along the samples' rows the coverage is the exact area.
 //@ record
-    float edge_u0, edge_u1, edge_v0, edge_v1;   // 1 / |grad| of the forms D + n_u, D - n_u, D + n_v, D - n_v
+    wide edge_u0, edge_u1, edge_v0, edge_v1;   // 1 / |grad| of the forms D + n_u, D - n_u, D + n_v, D - n_v
 //@ footprint_crossing
     vfloat cover;           // share of the sample that a box covers
 //@ footprint_functions
-#define SQRT_2 1.41421356237309504880f
-static inline vfloat between(vfloat d, vfloat n, float edge_0, float edge_1) {
+#define SQRT_2 WIDE(1.41421356237309504880)
+static inline vfloat between(vfloat d, vfloat n, wide edge_0, wide edge_1) {
     vfloat above = clamp(FMA(FMA((vfloat)SQRT_2, n, d), (vfloat)edge_0, (vfloat)0.5f), (vfloat)0.0f, (vfloat)1.0f);
     vfloat below = clamp(FMA(FMA((vfloat)-SQRT_2, n, d), (vfloat)edge_1, (vfloat)0.5f), (vfloat)0.0f, (vfloat)1.0f);
     return fmax(above + below - 1.0f, (vfloat)0.0f);
@@ -100,10 +100,10 @@ static inline bool box_touches(real3_ k0, real3_ kx, real3_ ky, real facing, rea
         if (BOX_HERE) record.fx = record.fy = 1e18f;
 //@ project
     real edge_line[3];
-    record.edge_u0 = (float)box_edge(k0, kx, ky, scale, scale, false, edge_line);
-    record.edge_u1 = (float)box_edge(k0, kx, ky, scale, -scale, false, edge_line);
-    record.edge_v0 = (float)box_edge(k0, kx, ky, scale, scale, true, edge_line);
-    record.edge_v1 = (float)box_edge(k0, kx, ky, scale, -scale, true, edge_line);
+    record.edge_u0 = (wide)box_edge(k0, kx, ky, scale, scale, false, edge_line);
+    record.edge_u1 = (wide)box_edge(k0, kx, ky, scale, -scale, false, edge_line);
+    record.edge_v0 = (wide)box_edge(k0, kx, ky, scale, scale, true, edge_line);
+    record.edge_v1 = (wide)box_edge(k0, kx, ky, scale, -scale, true, edge_line);
 //@ footprint_opacity
     if (IS_BOX(s)) opacity = fmin(exp(s->log_opacity), constants->ceiling) * c.cover;
 //@ footprint_tau

@@ -1,8 +1,8 @@
 // Parallel rays along z: x = fx X + cx, so the projection's last row is (0, 0, 1) instead of the depths. D is constant, and
 // the depth of a fragment is its own affine form of the pixel, times D.
 //@ record
-    float z0, zx, zy;       // depth times D = z0 + zx x + zy y
-    float z_near;
+    wide z0, zx, zy;        // depth times D = z0 + zx x + zy y
+    wide z_near;
 //@ crossing
     vfloat z;               // depth times d
 //@ camera
@@ -30,11 +30,11 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
 //@ camera_facing
     facing = fabs(offset) > (SETUP_FP64 ? REAL(1e-13) : REAL(1e-6)) ? scale : 0;
 //@ project
-    record.z0 = (float)((a.z * k0.x + b.z * k0.y + pz * k0.z) * facing);
-    record.zx = (float)((a.z * kx.x + b.z * kx.y) * facing);
-    record.zy = (float)((a.z * ky.x + b.z * ky.y) * facing);
+    record.z0 = (wide)((a.z * k0.x + b.z * k0.y + pz * k0.z) * facing);
+    record.zx = (wide)((a.z * kx.x + b.z * kx.y) * facing);
+    record.zy = (wide)((a.z * ky.x + b.z * ky.y) * facing);
     record.d_near = INFINITY;
-    record.z_near = (float)near;
+    record.z_near = (wide)near;
 //@ cross
     c.z = FMA((vfloat)s.zy, (vfloat)y, FMA((vfloat)s.zx, x, (vfloat)s.z0));
     c.inside &= VMASK(c.z >= s.z_near * c.d);

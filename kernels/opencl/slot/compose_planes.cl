@@ -49,7 +49,7 @@ static inline void layer_pick(Layer *layer, const Layer *other, vint mask) {
 static inline void layer_gather(Layer *layer, const Splat *s, const Seen *seen, vfloat opacity, vint mask) {
     opacity = VSELECT((vfloat)0.0f, opacity, mask);
     // an opaque fragment has the optical depth at which float32 leaves no light
-    vfloat tau = -log(fmax(1.0f - opacity, (vfloat)0x1p-24f));
+//@@ layer_tau
 //@@ footprint_tau
     layer->plane = VSELECT(layer->plane, (vint)s->plane, mask);
     layer->opacity = FMA(opacity, 1.0f - layer->opacity, layer->opacity);

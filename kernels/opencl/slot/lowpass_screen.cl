@@ -2,7 +2,7 @@
 // the distance in pixels from the projected centre (numerics A6). The dot belongs to the centre: it is drawn if the centre
 // lies beyond the near plane, whatever the ray through the pixel does (numerics B2).
 //@ record
-    float fx, fy;           // projected centre relative to the anchor's centre; far away if it is not drawn
+    wide fx, fy;            // projected centre relative to the anchor's centre; far away if it is not drawn
 //@ bounds
     float px, py, pr;       // the filter's support: centre and radius [samples]; radius < 0: none
 //@ bounds_make
@@ -24,14 +24,14 @@
         high = fmax(high, b->py + b->pr);
     }
 //@ project
-        record.fx = pz >= near ? (float)(center_x - anchor_x) : 1e18f;
-        record.fy = pz >= near ? (float)(center_y - anchor_y) : 1e18f;
+        record.fx = pz >= near ? (wide)(center_x - anchor_x) : 1e18f;
+        record.fy = pz >= near ? (wide)(center_y - anchor_y) : 1e18f;
 //@@ footprint_dot
 //@ fragment_mask
-static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, float y, float half_r2, float filter,
+static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, wide y, wide half_r2, wide filter,
                                  vfloat *screen) {
     vfloat ex = x - s->fx;
-    float ey = y - s->fy;
+    wide ey = y - s->fy;
     *screen = FMA(ex, ex, (vfloat)(ey * ey)) * filter;
     return c.inside | VMASK(*screen <= half_r2);
 }

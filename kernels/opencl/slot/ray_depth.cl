@@ -2,12 +2,12 @@
 // depth range of the R-sigma disk; in the low-pass dot of a splat whose plane the ray misses, the centre's depth
 // (numerics B2, B4).
 //@ record
-    float z_numerator;      // depth = z_numerator / D
-    float z_center, z_reach;
+    wide z_numerator;       // depth = z_numerator / D
+    wide z_center, z_reach;
 //@ project
-    record.z_numerator = (float)z_numerator;
-    record.z_center = (float)pz;
-    record.z_reach = (float)reach;
+    record.z_numerator = (wide)z_numerator;
+    record.z_center = (wide)pz;
+    record.z_reach = (wide)reach;
 //@ seen
     vfloat z;
 //@ see

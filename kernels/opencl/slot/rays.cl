@@ -3,8 +3,8 @@
 // at the depth det[a b p] / D in units of r's length: along z if rays have Z = 1, else along the ray. The forms are kept
 // relative to the ray of the sample nearest to the centre, so that nothing cancels (numerics B1).
 //@ record
-    float nuz, nvz, dz;     // n_u = nu0 + nux X + nuy Y + nuz Z, likewise n_v and D
-    float ray_x, ray_y, ray_z;   // X, Y, Z are relative to this ray
+    wide nuz, nvz, dz;      // n_u = nu0 + nux X + nuy Y + nuz Z, likewise n_v and D
+    wide ray_x, ray_y, ray_z;    // X, Y, Z are relative to this ray
 //@ cross_functions
 static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfloat ray_z, float half_r2) {
     vfloat x = ray_x - s->ray_x, y = ray_y - s->ray_y, z = ray_z - s->ray_z;
@@ -37,9 +37,9 @@ static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfl
 //@ camera_steepest
     steepest = fmax(steepest, fmax(fabs(kz.x), fabs(kz.y)));
 //@ project
-    record.nuz = (float)(kz.x * n_scale);
-    record.nvz = (float)(kz.y * n_scale);
-    record.dz = (float)(kz.z * facing);
+    record.nuz = (wide)(kz.x * n_scale);
+    record.nvz = (wide)(kz.y * n_scale);
+    record.dz = (wide)(kz.z * facing);
     record.ray_x = anchor_ray[0];
     record.ray_y = anchor_ray[1];
     record.ray_z = anchor_ray[2];

@@ -1,13 +1,13 @@
 // normal (h, w, 3): unit normal in the camera frame, towards the camera, of the mean of the splats' normals by weight; 0 where
 // nothing was drawn.
 //@ record
-    float nx, ny, nz;
+    wide nx, ny, nz;
 //@ project
     // the camera is on one side of the whole plane, so the sign is the splat's (numerics B7)
     real towards = offset > 0 ? -1 : 1;
-    record.nx = (float)(facet.x * towards);
-    record.ny = (float)(facet.y * towards);
-    record.nz = (float)(facet.z * towards);
+    record.nx = (wide)(facet.x * towards);
+    record.ny = (wide)(facet.y * towards);
+    record.nz = (wide)(facet.z * towards);
 //@ state
     vfloat normal_x, normal_y, normal_z;
 //@ start
