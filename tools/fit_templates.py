@@ -359,8 +359,8 @@ def main() -> None:
     sets = {entry["size"]: entry for entry in known}
     sets |= {size: fit(size, options.starts, options.rounds) for size in options.sizes}
     about = (
-        "made by tools/fit_templates.py; rows: x, y, sigma_x, sigma_y, opacity in half sizes, long side first; "
-        "fit_db: against the ideal texture of the markers that it was fitted on"
+        "made by tools/fit_templates.py; rows: x, y, sigma_x, sigma_y, opacity in half sizes, long side "
+        "first; fit_db: against the ideal texture of the markers that it was fitted on"
     )
     text = json.dumps({"about": about, "growth": GROWTH, "sets": [sets[size] for size in sorted(sets)]})
     text = (

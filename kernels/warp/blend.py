@@ -10,6 +10,7 @@ import warp as wp
 from .bounds import Bounds, make_bounds
 from .common import STRICT, View, lowest, store_line
 from .pixel import make_pixel
+from .planes import make_samples, of_samples
 from .staging import BLOCK_H, BLOCK_W, STAGED
 
 NONE, ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
@@ -25,7 +26,11 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
     load_staged = parts.load_staged
     Pixel = parts.Pixel
     limits = make_bounds("lowpass_screen" in effects)
-    depth, median, normal, label = (name in effects for name in ("depth", "depth_median", "normal", "label"))
+    Samples = make_samples(tuple(of_samples(effects).items()))
+    depth, median, first, normal, heaviest, blended, fog = (
+        name in effects
+        for name in ("depth", "depth_median", "depth_first", "normal", "heaviest", "blended", "fog")
+    )
     load, start, row_of, cross, unfinished, blend_one = (
         parts.load,
         parts.start,
@@ -37,42 +42,33 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
     finish = parts.finish
 
     @wp.func
-    def store(
-        p: Pixel,
-        at: int,
-        raw: wp.array(dtype=wp.vec4),
-        raw_depth: wp.array(dtype=wp.vec2),
-        raw_median: wp.array(dtype=wp.float32),
-        raw_normal: wp.array(dtype=wp.vec3),
-        raw_label: wp.array(dtype=wp.int32),
-        raw_label_weight: wp.array(dtype=wp.float32),
-    ):
-        store_line(raw, at, wp.vec4(p.r, p.g, p.b, p.t))
+    def store(p: Pixel, at: int, samples: Samples):
+        store_line(samples.color, at, wp.vec4(p.r, p.g, p.b, p.t))
         if wp.static(depth):
-            raw_depth[at] = wp.vec2(p.depth, p.depth_weight)
+            samples.depth[at] = wp.vec2(p.depth, p.depth_weight)
         if wp.static(median):
-            raw_median[at] = p.depth_median
+            samples.depth_median[at] = p.depth_median
+        if wp.static(first):
+            samples.depth_first[at] = p.depth_first
         if wp.static(normal):
-            raw_normal[at] = p.normal
-        if wp.static(label):
-            raw_label[at] = p.label
-            raw_label_weight[at] = p.label_weight
+            samples.normal[at] = p.normal
+        if wp.static(heaviest):
+            samples.heaviest[at] = p.heaviest
+            samples.weight[at] = p.weight
+        if wp.static(blended):
+            samples.blended[at] = p.blended
+        if wp.static(fog):
+            samples.fogged[at] = p.fogged
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False, launch_bounds=threads)
     def blend_gpu(
         band_first: int,  # tile of block 0
         view: View,
         lines: wp.array(dtype=wp.vec4),
-        labels: wp.array(dtype=wp.int32),
         planes: wp.array(dtype=wp.int32),
         starts: wp.array(dtype=wp.int32),
         lists: wp.array(dtype=wp.int32),
-        raw: wp.array(dtype=wp.vec4),  # out, as all below: r, g, b, transmittance
-        raw_depth: wp.array(dtype=wp.vec2),  # sum w z, sum w
-        raw_median: wp.array(dtype=wp.float32),
-        raw_normal: wp.array(dtype=wp.vec3),
-        raw_label: wp.array(dtype=wp.int32),
-        raw_label_weight: wp.array(dtype=wp.float32),
+        samples: Samples,  # out
     ):
         thread = wp.tid()
         tile = band_first + thread / threads
@@ -84,7 +80,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
         top = (tile / view.tiles_x) * view.tile_h + (block / across) * BLOCK_H
         x0 = left + lane % BLOCK_W
         y0 = top + lane / BLOCK_W
-        p = start()
+        p = start(x0, y0, view)
         if x0 >= view.width or y0 >= view.height:
             p.t = 0.0  # what lies beyond the picture is finished from the start
         records = pool()
@@ -107,27 +103,21 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
                         u, v, d = row_of(s.u, y), row_of(s.v, y), row_of(s.d, y)
                         c = cross(s, u, v, d, float(x0) - s.d[3], y, view)
                         if c.drawn:
-                            p = blend_one(p, s, c, index, lines, labels, planes, view)
+                            p = blend_one(p, s, c, index, lines, planes, view)
                 word += 1
             k += length
         at = y0 * view.tiles_x * view.tile_w + x0
-        store(finish(p, view), at, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight)
+        store(finish(p, view), at, samples)
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def blend_cpu(
         band_first: int,  # tile of thread 0
         view: View,
         lines: wp.array(dtype=wp.vec4),
-        labels: wp.array(dtype=wp.int32),
         planes: wp.array(dtype=wp.int32),
         starts: wp.array(dtype=wp.int32),
         lists: wp.array(dtype=wp.int32),
-        raw: wp.array(dtype=wp.vec4),
-        raw_depth: wp.array(dtype=wp.vec2),
-        raw_median: wp.array(dtype=wp.float32),
-        raw_normal: wp.array(dtype=wp.vec3),
-        raw_label: wp.array(dtype=wp.int32),
-        raw_label_weight: wp.array(dtype=wp.float32),
+        samples: Samples,  # out
         bounds: wp.array(dtype=Bounds),
         state: wp.array(
             dtype=Pixel
@@ -138,7 +128,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
         x0 = (tile % view.tiles_x) * view.tile_w
         y0 = (tile / view.tiles_x) * view.tile_h
         for k in range(view.tile_w * view.tile_h):
-            state[state_first + k] = start()
+            state[state_first + k] = start(x0 + k % view.tile_w, y0 + k / view.tile_w, view)
         x_end = wp.min(x0 + view.tile_w, view.width)
         y_end = wp.min(y0 + view.tile_h, view.height)
         alive = (x_end - x0) * (y_end - y0)
@@ -162,7 +152,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
                         at = state_first + (row - y0) * view.tile_w + column - x0
                         p = state[at]
                         if unfinished(p, view):
-                            p = blend_one(p, s, c, index, lines, labels, planes, view)
+                            p = blend_one(p, s, c, index, lines, planes, view)
                             if not unfinished(p, view):
                                 alive -= 1
                             state[at] = p
@@ -171,8 +161,6 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
             for column in range(view.tile_w):
                 p = state[state_first + row * view.tile_w + column]
                 at = (y0 + row) * stride + x0 + column
-                store(
-                    finish(p, view), at, raw, raw_depth, raw_median, raw_normal, raw_label, raw_label_weight
-                )
+                store(finish(p, view), at, samples)
 
     return (blend_gpu if on_gpu else blend_cpu), Pixel

@@ -42,7 +42,14 @@ class View:
     log_cut: float
     ceiling: float
     stop: float
-    background: wp.vec3
+    first_light: float  # transmittance that is left behind a first hit
+    fog_density: float  # 1 / metres
+    ray: wp.vec4  # a sample's ray is ((column - [2]) [0], (row - [3]) [1], 1); 0 where depths are distances
+
+
+def struct_of(name: str, words: str, fields: dict):
+    """A struct with these fields, name: type."""
+    return wp.struct(type(name, (), {"__annotations__": fields, "__doc__": words, "__module__": __name__}))
 
 
 @wp.func_native("return fmaf(a, b, c);")

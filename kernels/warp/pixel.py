@@ -1,12 +1,7 @@
 """One sample: its fragments, and what it keeps of them. Front to back, C = sum_k c_k alpha_k prod_{j<k} (1 -
 alpha_j).
 
-Splats of one plane are one layer at a sample (docs/rendering.md, coplanar splats): its colour and depth are
-means of its fragments
-by optical depth. They arrive together, before anything that the layer is compared with; it is laid before the
-first fragment of
-no plane that lies behind it there, or at the end. Two layers may be pending; when a third begins the nearer
-of them is laid.
+Splats of one plane are laid together (layers.py).
 """
 
 from functools import cache
@@ -14,23 +9,24 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .common import View, fma, line_of
-from .records import Layout
+from .boxes import between
+from .common import View, fma, line_of, struct_of
+from .layers import make_layer, make_laying
+from .records import BOXES, Layout
 from .staging import make_staging
+from .surroundings import ray_length
 
 _STATE = {
     "stop_exclusive": {"finished": wp.int32},
     "depth": {"depth": wp.float32, "depth_weight": wp.float32},
     "depth_median": {"depth_median": wp.float32},
+    "depth_first": {"depth_first": wp.float32},
     "normal": {"normal": wp.vec3},
-    "label": {"label_weight": wp.float32, "label": wp.int32},
+    "heaviest": {"weight": wp.float32, "heaviest": wp.int32},
+    "blended": {"blended": wp.int32},
+    # fog_slope: -density, per metre of depth; fogged: sum of weights times what the fog hides
+    "fog": {"fog_slope": wp.float32, "fogged": wp.float32},
 }
-
-
-FAINT = wp.constant(1e-3)
-"""below it the optical depth of an opacity a is a + a^2 / 2, to 3 parts in 10^7"""
-DARKEST = wp.constant(wp.float32(2.0**-24))
-"""transmittance of an opaque fragment, whose optical depth would be infinite"""
 
 
 @cache
@@ -43,50 +39,43 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     each = layout.lines
     staging = make_staging(layout)
     staged_line = staging.line
-    screen, exclusive, ray_depth, depth, median, normal, label = (
-        name in effects
-        for name in (
-            "lowpass_screen",
-            "stop_exclusive",
-            "ray_depth",
-            "depth",
-            "depth_median",
-            "normal",
-            "label",
-        )
+    screen, exclusive, ray_depth, layers = (
+        name in effects for name in ("lowpass_screen", "stop_exclusive", "ray_depth", "compose_planes")
     )
+    depth, median, first, normal, heaviest, blended, fog = (
+        name in effects
+        for name in ("depth", "depth_median", "depth_first", "normal", "heaviest", "blended", "fog")
+    )
+    boxes, all_boxes = any(name in effects for name in BOXES), "footprint_box" in effects
     # u: nu0, nux, nuy, log opacity; v: nv0, nvx, nvy, D at the near plane; d: d0, dx, dy, ax; c: ay, r, g, b
     splat = {"u": wp.vec4, "v": wp.vec4, "d": wp.vec4, "c": wp.vec4, "half_r2": wp.float32}
     splat |= {"dot_x": wp.float32, "dot_y": wp.float32} if screen else {}
-    Splat = _struct("Splat", "What of a record each sample needs.", splat)
+    splat |= {"edges": wp.vec4} if boxes else {}
+    Splat = struct_of("Splat", "What of a record each sample needs.", splat)
     # q / d^2 is rho / 2; inside: the ray meets the disk within R and beyond the near plane
     crossing = {"d": wp.float32, "q": wp.float32, "inside": wp.bool, "drawn": wp.bool}
     # screen: squared distance from the projected centre in pixels, which is rho / 2 of the low-pass
     crossing |= {"screen": wp.float32} if screen else {}
-    Crossing = _struct("Crossing", "Where the ray of a sample meets a splat.", crossing)
-    layers = "compose_planes" in effects
+    # cover: share of the sample that a box covers
+    crossing |= {"cover": wp.float32} if boxes else {}
+    Crossing = struct_of("Crossing", "Where the ray of a sample meets a splat.", crossing)
     seen = {"rgb": wp.vec3}
     seen |= {"z": wp.float32} if ray_depth else {}
     seen |= {"normal": wp.vec3} if normal else {}
-    seen |= {"label": wp.int32} if label else {}
-    Seen = _struct("Seen", "What shows where something is drawn.", seen)
-    # `mean` holds sums over the layer's fragments, each times its optical depth
-    layer = {
-        "plane": wp.int32,
-        "opacity": wp.float32,
-        "ink": wp.float32,
-        "mean": Seen,
-        "thickest": wp.float32,
-    }
-    Layer = _struct("Layer", "What a sample sees of one plane; plane -1: nothing.", layer)
+    # index of the splat, a layer's of the one of greatest optical depth; number of splats
+    seen |= {"heaviest": wp.int32} if heaviest else {}
+    seen |= {"blended": wp.int32} if blended else {}
+    Seen = struct_of("Seen", "What shows where something is drawn.", seen)
     fields = {"t": wp.float32, "r": wp.float32, "g": wp.float32, "b": wp.float32}
     for effect in effects:
         fields |= _STATE.get(effect, {})
+    layer = make_layer(Seen, effects) if layers else None
     # pending: the layer that still gathers, and one that arrived before it
-    fields |= {"open": Layer, "waiting": Layer} if layers else {}
-    Pixel = _struct("Pixel", "What a sample keeps.", fields)
+    fields |= {"open": layer.Layer, "waiting": layer.Layer} if layer else {}
+    Pixel = struct_of("Pixel", "What a sample keeps.", fields)
     dot_line, dot_lane = layout.place("dot_x")
     dot_y_lane = layout.place("dot_y")[1]  # of the same line
+    edge_line = layout.place("edge_u0")[0]
     z_line, z_lane = layout.place("z_numerator")
     zc_line, zc_lane = layout.place("z_center")
     zr_line, zr_lane = layout.place("z_reach")
@@ -106,6 +95,8 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             dot = line_of(lines, at + dot_line)
             s.dot_x = dot[dot_lane]
             s.dot_y = dot[dot_y_lane]
+        if wp.static(boxes):
+            s.edges = line_of(lines, at + edge_line)
         s.half_r2 = s.u[3] - view.log_cut
         return s
 
@@ -127,24 +118,23 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             dot = staged_line(pool, lines, lists, first, which, dot_line)
             s.dot_x = dot[dot_lane]
             s.dot_y = dot[dot_y_lane]
+        if wp.static(boxes):
+            s.edges = staged_line(pool, lines, lists, first, which, edge_line)
         s.half_r2 = s.u[3] - view.log_cut
         return s
 
     @wp.func
-    def no_layer():
-        layer = Layer()
-        layer.plane = -1
-        return layer
-
-    @wp.func
-    def start():
+    def start(x: int, y: int, view: View):
+        """The state of a sample before anything is drawn."""
         p = Pixel()
         p.t = 1.0
-        if wp.static(label):
-            p.label = -1
+        if wp.static(heaviest):
+            p.heaviest = -1
         if wp.static(layers):
-            p.open = no_layer()
-            p.waiting = no_layer()
+            p.open.plane = -1
+            p.waiting.plane = -1
+        if wp.static(fog):
+            p.fog_slope = -view.fog_density * ray_length(float(x) + 0.5, float(y) + 0.5, view)
         return p
 
     @wp.func
@@ -153,15 +143,26 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         return fma(form[2], y, form[0])
 
     @wp.func
+    def is_box(s: Splat) -> bool:
+        return s.edges[0] > 0.0
+
+    @wp.func
     def cross(s: Splat, row_u: float, row_v: float, row_d: float, x: float, y: float, view: View):
         """x, y: the sample from the anchor; row_*: `row` of the three forms at y."""
         c = Crossing()
         nu = fma(s.u[1], x, row_u)
         nv = fma(s.v[1], x, row_v)
         c.d = fma(s.d[1], x, row_d)
-        c.q = fma(nu, nu, nv * nv)
-        # product form: no division, no special value of D (numerics B2)
-        c.inside = c.q <= s.half_r2 * (c.d * c.d) and c.d > 0.0 and c.d <= s.v[3]
+        ahead = c.d > 0.0 and c.d <= s.v[3]
+        if wp.static(not all_boxes):
+            c.q = fma(nu, nu, nv * nv)
+            # product form: no division, no special value of D (numerics B2)
+            c.inside = c.q <= s.half_r2 * (c.d * c.d) and ahead
+        if wp.static(boxes):
+            if is_box(s):
+                across = between(c.d, nu, wp.vec2(s.edges[0], s.edges[1]))
+                c.cover = across * between(c.d, nv, wp.vec2(s.edges[2], s.edges[3]))
+                c.inside = c.cover > 0.0 and ahead
         c.drawn = c.inside
         if wp.static(screen):
             ex = x - s.dot_x
@@ -179,6 +180,9 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
 
     @wp.func
     def opacity_of(s: Splat, c: Crossing, inverse_d: float, view: View) -> float:
+        if wp.static(boxes):
+            if is_box(s):
+                return wp.min(wp.exp(s.u[3]), view.ceiling) * c.cover
         half_rho = c.q * inverse_d * inverse_d
         if wp.static(screen):
             if c.inside:
@@ -216,7 +220,6 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         inverse_d: float,
         index: int,
         lines: wp.array(dtype=wp.vec4),
-        labels: wp.array(dtype=wp.int32),
     ):
         """What a fragment shows."""
         seen = Seen()
@@ -225,8 +228,10 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             seen.z = depth_of(lines, index, c, inverse_d)
         if wp.static(normal):
             seen.normal = normal_of(lines, index)
-        if wp.static(label):
-            seen.label = labels[index]
+        if wp.static(heaviest):
+            seen.heaviest = index
+        if wp.static(blended):
+            seen.blended = 1
         return seen
 
     @wp.func
@@ -241,99 +246,34 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
                 p.finished = 1
                 return p
         weight = p.t * opacity
-        p.r = fma(weight, seen.rgb[0], p.r)
-        p.g = fma(weight, seen.rgb[1], p.g)
-        p.b = fma(weight, seen.rgb[2], p.b)
+        shown = weight
+        if wp.static(fog):
+            shown = weight * wp.exp(p.fog_slope * seen.z)
+            p.fogged += weight - shown
+        p.r = fma(shown, seen.rgb[0], p.r)
+        p.g = fma(shown, seen.rgb[1], p.g)
+        p.b = fma(shown, seen.rgb[2], p.b)
         if wp.static(depth):
             p.depth = fma(weight, seen.z, p.depth)
             p.depth_weight += weight
         if wp.static(median):
             if p.t > 0.5:
                 p.depth_median = seen.z
+        if wp.static(first):
+            if p.depth_first == 0.0 and p.t - weight <= view.first_light:
+                p.depth_first = seen.z
         if wp.static(normal):
             p.normal += weight * seen.normal
-        if wp.static(label):
-            if weight > p.label_weight:
-                p.label_weight = weight
-                p.label = seen.label
+        if wp.static(heaviest):
+            if weight > p.weight:
+                p.weight = weight
+                p.heaviest = seen.heaviest
+        if wp.static(blended):
+            p.blended += seen.blended
         p.t = p.t - weight
         return p
 
-    @wp.func
-    def depth_of_layer(layer: Layer) -> float:
-        return layer.mean.z / layer.ink
-
-    @wp.func
-    def lay_layer(pixel: Pixel, layer: Layer, view: View):
-        """The pixel with a layer laid as one thing."""
-        seen = layer.mean
-        seen.rgb = layer.mean.rgb / layer.ink
-        seen.z = depth_of_layer(layer)
-        if wp.static(normal):
-            seen.normal = layer.mean.normal / layer.ink
-        return lay(pixel, seen, layer.opacity, view)
-
-    @wp.func
-    def lay_before(pixel: Pixel, z: float, view: View):
-        """The pixel with its pending layers laid that lie before depth z, the nearer first."""
-        p = pixel
-        for turn in range(2):
-            has_open = bool(False)
-            has_waiting = bool(False)
-            if p.open.plane >= 0:
-                has_open = depth_of_layer(p.open) < z
-            if p.waiting.plane >= 0:
-                has_waiting = depth_of_layer(p.waiting) < z
-            if has_open and has_waiting:
-                # of equals the one that arrived first
-                if depth_of_layer(p.open) < depth_of_layer(p.waiting):
-                    has_waiting = False
-                else:
-                    has_open = False
-            if has_waiting:
-                p = lay_layer(p, p.waiting, view)
-                p.waiting = no_layer()
-            if has_open:
-                p = lay_layer(p, p.open, view)
-                p.open = no_layer()
-        return p
-
-    @wp.func
-    def begin(pixel: Pixel, view: View):
-        """The pixel with no open layer: it waits, and of two that would wait the nearer is laid."""
-        p = pixel
-        if p.waiting.plane >= 0:
-            if depth_of_layer(p.open) < depth_of_layer(p.waiting):
-                p = lay_layer(p, p.open, view)
-                p.open = no_layer()
-                return p
-            p = lay_layer(p, p.waiting, view)
-        p.waiting = p.open
-        p.open = no_layer()
-        return p
-
-    @wp.func
-    def gather(layer: Layer, plane: int, seen: Seen, opacity: float):
-        """The layer with one more fragment: optical depths -ln(1 - opacity) add up."""
-        after = layer
-        tau = opacity + 0.5 * opacity * opacity  # of a faint one, which 1 - opacity would blur
-        if opacity > FAINT:
-            # an opaque fragment has the optical depth at which float32 leaves no light
-            tau = -wp.log(wp.max(1.0 - opacity, DARKEST))
-        after.plane = plane
-        after.opacity = fma(opacity, 1.0 - layer.opacity, layer.opacity)
-        after.ink = layer.ink + tau
-        mean = layer.mean
-        mean.rgb = layer.mean.rgb + tau * seen.rgb
-        mean.z = fma(tau, seen.z, layer.mean.z)
-        if wp.static(normal):
-            mean.normal = layer.mean.normal + tau * seen.normal
-        if wp.static(label):
-            if tau > layer.thickest:
-                after.thickest = tau
-                mean.label = seen.label
-        after.mean = mean
-        return after
+    gathered = make_laying(layer, Pixel, lay) if layer else None
 
     @wp.func
     def blend(
@@ -342,25 +282,28 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         c: Crossing,
         index: int,
         lines: wp.array(dtype=wp.vec4),
-        labels: wp.array(dtype=wp.int32),
         planes: wp.array(dtype=wp.int32),
         view: View,
     ):
         """The pixel after a fragment that is drawn, of a pixel that is not finished."""
         inverse_d = 1.0 / c.d
         opacity = opacity_of(s, c, inverse_d, view)
-        seen = see(s, c, inverse_d, index, lines, labels)
+        seen = see(s, c, inverse_d, index, lines)
         if wp.static(layers):
             p = pixel
             if not (opacity > 0.0):
                 return p  # of no optical depth: a mean over it would be 0 / 0
             plane = planes[index]
             if plane < 0:
-                p = lay_before(p, seen.z, view)
+                p = gathered.lay_before(p, seen.z, view)
                 return lay(p, seen, opacity, view)
             if p.open.plane >= 0 and p.open.plane != plane:
-                p = begin(p, view)
-            p.open = gather(p.open, plane, seen, opacity)
+                p = gathered.begin(p, view)
+            if wp.static(boxes):
+                if is_box(s):
+                    p.open = layer.gather_box(p.open, plane, seen, opacity)
+                    return p
+            p.open = layer.gather(p.open, plane, seen, opacity)
             return p
         else:
             return lay(pixel, seen, opacity, view)
@@ -369,7 +312,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     def finish(pixel: Pixel, view: View):
         """The pixel after the last fragment."""
         if wp.static(layers):
-            return lay_before(pixel, float(wp.inf), view)
+            return gathered.lay_before(pixel, float(wp.inf), view)
         else:
             return pixel
 
@@ -386,7 +329,3 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         blend=blend,
         finish=finish,
     )
-
-
-def _struct(name: str, words: str, fields: dict):
-    return wp.struct(type(name, (), {"__annotations__": fields, "__doc__": words, "__module__": __name__}))

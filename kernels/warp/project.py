@@ -17,8 +17,10 @@ from functools import cache
 import warp as wp
 
 from .bounds import PAD, PAD_RELATIVE, Bounds, box_bounds, ellipse_bounds, make_bounds
+from .boxes import make_boxes
 from .color import make_color
 from .common import CULLED, STRICT, View, as_bits, population, sortable, store_line
+from .lowpass import make_filter
 from .records import Layout
 
 # [m]; nobody sees the difference, and what is divided by it stays above float32's denormals (numerics B6)
@@ -36,8 +38,9 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
     """
     layout = Layout(effects)
     lines_each = layout.lines
-    has_normal, has_depth, screen, layers = (
-        name in effects for name in ("normal", "ray_depth", "lowpass_screen", "compose_planes")
+    has_normal, has_depth, screen, filtered, layers = (
+        name in effects
+        for name in ("normal", "ray_depth", "lowpass_screen", "lowpass_pixel", "compose_planes")
     )
     real = wp.float64 if precision == "float64" else wp.float32
     vec2, vec3, mat33 = wp.types.vector(2, real), wp.types.vector(3, real), wp.types.matrix((3, 3), real)
@@ -45,10 +48,14 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
     sqrt_half = real(math.sqrt(0.5))
     edge_on = real(1e-13 if precision == "float64" else 1e-6)
     one, two, half, zero = real(1.0), real(2.0), real(0.5), real(0.0)
-    limits, color_of = make_bounds(screen), make_color(sh_terms, real)
+    all_boxes, mixed = "footprint_box" in effects, "footprint_mixed" in effects
+    boxes_too = all_boxes or mixed
+    of_box = make_boxes(real)
+    limits, color_of, widened = make_bounds(screen), make_color(sh_terms, real), make_filter(real)
     word = {name: layout.names.index(name) for name in layout.names}
-    first_extra = {name: word.get(name, 0) for name in ("dot_x", "z_numerator", "nx")}
+    first_extra = {name: word.get(name, 0) for name in ("dot_x", "z_numerator", "nx", "edge_u0")}
     at_dot, at_depth, at_normal = first_extra["dot_x"], first_extra["z_numerator"], first_extra["nx"]
+    at_edges, at_box = first_extra["edge_u0"], word["columns"]
 
     @wp.func
     def extremes(a: real, b: real, p: real, depth: vec3, radius: real, near: real):
@@ -140,6 +147,13 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
             tip,
         )
 
+    @wp.func
+    def disk(a: vec3, b: vec3, p: vec3, radius: real, reach: real, view: View):
+        """Bounds of a Gaussian's disk."""
+        if p[2] - reach >= real(view.near):
+            return ellipse(a, b, p, radius, reach, view)
+        return clipped(a, b, p, radius, reach, view)
+
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False, launch_bounds=LIMITS)
     def project(
         first: int,  # splat of thread 0
@@ -151,6 +165,7 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
         colors: wp.array(dtype=wp.vec3),  # (n), or (n sh_terms)
         planes: wp.array(dtype=wp.int32),  # (n) index of the splat's plane; -1: none
         plane_keys: wp.array(dtype=wp.float32),  # (planes) depth at which a plane's splats are sorted in [m]
+        boxes: wp.array(dtype=wp.int32),  # (n) 1: a box, of a cloud that has boxes and others
         lines: wp.array(dtype=wp.vec4),  # (n lines_each) out: records of splats that are drawn
         bounds: wp.array(dtype=Bounds),  # (n) out: as `every_bounds` says
         windows: wp.array(
@@ -189,8 +204,30 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
         b = tangent_v * sv
 
         near = real(view.near)
+        if wp.static(boxes_too):
+            boxed = bool(wp.static(all_boxes))
+            if wp.static(mixed):
+                boxed = boxes[i] != 0
+        if wp.static(filtered):
+            widens = p[2] >= near
+            if wp.static(boxes_too):
+                widens = widens and not boxed
+            if widens:
+                wide = widened(a, b, p, view)
+                log_opacity -= float(wp.log(wide[3]))
+                half_r2 = log_opacity - view.log_cut
+                if not (half_r2 > 0.0):
+                    return  # edge-on too: infinitely thin, infinitely faint
+                a = wide[0] * a + wide[1] * b
+                b = wide[2] * b
+                su *= wide[0]
+                sv *= wide[2]
+                tangent_u = a / su  # of unit area with tangent_v, whose direction stays
         radius = wp.sqrt(two * real(half_r2))
         reach = radius * wp.sqrt(a[2] * a[2] + b[2] * b[2])  # half of the disk's depth range (numerics A3)
+        if wp.static(boxes_too):
+            if boxed:
+                reach = wp.abs(a[2]) + wp.abs(b[2])
         if not (p[2] + reach >= near and p[2] - reach <= real(view.far)):
             return
 
@@ -203,10 +240,17 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
         if in_front:
             center_x = fx * (p[0] / p[2]) + cx
             center_y = fy * (p[1] / p[2]) + cy
-        if p[2] - reach >= near:
-            box = ellipse(a, b, p, radius, reach, view)
+        if wp.static(boxes_too):
+            if boxed:
+                area = of_box.extent(tangent_u, tangent_v, p, su, sv, p[2] - reach >= near, view)
+                if not (area[0] <= area[1]):
+                    return
+                box = box_bounds(float(area[0]), float(area[1]), float(area[2]), float(area[3]))
+            else:
+                if wp.static(mixed):
+                    box = disk(a, b, p, radius, reach, view)
         else:
-            box = clipped(a, b, p, radius, reach, view)
+            box = disk(a, b, p, radius, reach, view)
         if not in_front:
             center_x = real(box.x)
             center_y = real(box.y)
@@ -215,6 +259,9 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
                 box.dot_x = float(center_x)
                 box.dot_y = float(center_y)
                 box.dot_r = wp.sqrt(half_r2 / view.per_pixel) * (1.0 + PAD_RELATIVE) + PAD
+            if wp.static(boxes_too):
+                if boxed:
+                    box.dot_r = -1.0
         row_first, row_end = limits.rows(box, view.height)
         first_column, end_column = limits.span(box, row_first, row_end, view.width)
         if row_first >= row_end or first_column >= end_column:
@@ -278,12 +325,24 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
         record[13] = rgb[0]
         record[14] = rgb[1]
         record[15] = rgb[2]
-        record[16] = as_bits(first_column, end_column)
-        record[17] = as_bits(row_first, row_end)
+        record[at_box] = as_bits(first_column, end_column)
+        record[at_box + 1] = as_bits(row_first, row_end)
+        if wp.static(boxes_too):
+            if boxed:
+                of_d = vec2(normal[0] * per_fx, normal[1] * per_fy)
+                of_u = of_box.edges(of_d, vec2(nux, nuy), scale)
+                of_v = of_box.edges(of_d, vec2(nvx, nvy), scale)
+                record[at_edges] = of_u[0]
+                record[at_edges + 1] = of_u[1]
+                record[at_edges + 2] = of_v[0]
+                record[at_edges + 3] = of_v[1]
         if wp.static(screen):
             # far away if there is none
             record[at_dot] = wp.where(in_front, float(center_x - anchor_x), 1.0e18)
             record[at_dot + 1] = wp.where(in_front, float(center_y - anchor_y), 1.0e18)
+            if wp.static(boxes_too):
+                if boxed:
+                    record[at_dot] = 1.0e18
         if wp.static(has_depth):
             record[at_depth] = float(height * facing)
             record[at_depth + 1] = float(p[2])

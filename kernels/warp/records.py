@@ -1,6 +1,6 @@
 """Where each number of a visible splat's record lies."""
 
-_BASE = (
+_FORMS = (
     "nu0",
     "nux",
     "nuy",
@@ -17,9 +17,11 @@ _BASE = (
     "r",
     "g",
     "b",
-    "columns",
-    "rows",
 )
+# 1 / |gradient| of D + n_u, D - n_u, D + n_v, D - n_v; all 0: no box
+_EDGES = ("edge_u0", "edge_u1", "edge_v0", "edge_v1")
+BOXES = ("footprint_box", "footprint_mixed")
+"""effects with boxes"""
 _EXTRA = {
     "lowpass_screen": ("dot_x", "dot_y"),
     "ray_depth": ("z_numerator", "z_center", "z_reach"),
@@ -37,7 +39,10 @@ class Layout:
     """
 
     def __init__(self, effects: tuple[str, ...]) -> None:
-        self.names = [*_BASE, *(name for effect in effects for name in _EXTRA.get(effect, ()))]
+        # edges before the rest: they fill a line
+        edges = _EDGES if any(name in effects for name in BOXES) else ()
+        extra = (name for effect in effects for name in _EXTRA.get(effect, ()))
+        self.names = [*_FORMS, *edges, "columns", "rows", *extra]
         self.lines = -(-len(self.names) // 4)
 
     def place(self, name: str) -> tuple[int, int]:

@@ -1,88 +1,167 @@
-"""Pixels from their samples: means, the median of medians, the label of the largest weight."""
+"""Pixels from their samples: means, the median of medians, the nearest hit, the splat of largest weight."""
 
 from functools import cache
 
 import warp as wp
 
 from .common import STRICT, View, fma
+from .planes import make_outputs, make_samples
+from .surroundings import make_surroundings, ray_length, to_world
 
 
 @cache
-def make_resolve(taps: tuple[str, ...], samples: int):
-    """The kernel for these planes and samples x samples per pixel."""
-    alpha, depth, median, normal, label = (
-        name in taps for name in ("alpha", "depth", "depth_median", "normal", "label")
+def make_resolve(
+    outputs: tuple[str, ...],
+    integers: tuple[str, ...],
+    planes: tuple[tuple[str, type], ...],
+    behind: str,
+    samples: int,
+):
+    """The kernel for these outputs, of which some are integers, from these planes of samples, with such a
+    background and samples x samples per pixel; its structs Samples, Outputs, Around.
+    """
+    Samples, Outputs = make_samples(planes), make_outputs(outputs, integers)
+    around_us = make_surroundings(behind)
+    Around, color_behind = around_us.Around, around_us.behind
+    has = {name for name, _ in planes}
+    depth, median, first, normal, heaviest, blended, fog = (
+        name in has
+        for name in ("depth", "depth_median", "depth_first", "normal", "heaviest", "blended", "fogged")
     )
+    alpha, label, splat_id, normal_world, distance, distance_median, distance_first = (
+        name in outputs
+        for name in (
+            *("alpha", "label", "splat_id", "normal_world"),
+            *("distance", "distance_median", "distance_first"),
+        )
+    )
+    lengths = distance or distance_median or distance_first
     n = samples
     mean = 1.0 / (n * n)
     several = wp.types.vector(n * n, wp.float32)
 
+    @wp.func
+    def sorted_in(values: several, count: int, value: float):
+        """`count` values in order and one more."""
+        after = values
+        place = count
+        while place > 0 and after[wp.max(place - 1, 0)] > value:
+            after[place] = after[place - 1]
+            place -= 1
+        after[place] = value
+        return after
+
+    @wp.func
+    def middle_of(values: several, count: int) -> float:
+        """The lower median of `count` values in order; 0 of none."""
+        if count > 0:
+            return values[(count - 1) / 2]
+        return 0.0
+
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def resolve(
-        first: int,  # pixel of thread 0
+        first_pixel: int,  # of thread 0
         view: View,
         width: int,  # of the picture
-        raw: wp.array(dtype=wp.vec4),
-        raw_depth: wp.array(dtype=wp.vec2),
-        raw_median: wp.array(dtype=wp.float32),
-        raw_normal: wp.array(dtype=wp.vec3),
-        raw_label: wp.array(dtype=wp.int32),
-        raw_label_weight: wp.array(dtype=wp.float32),
-        rgb_out: wp.array(dtype=wp.float32),  # (h w 3)
-        alpha_out: wp.array(dtype=wp.float32),  # (h w), as those below
-        depth_out: wp.array(dtype=wp.float32),
-        median_out: wp.array(dtype=wp.float32),
-        normal_out: wp.array(dtype=wp.float32),  # (h w 3)
-        label_out: wp.array(dtype=wp.int32),
+        around: Around,
+        samples: Samples,
+        out: Outputs,
     ):
-        out = wp.tid() + first
-        x = (out % width) * n
-        y = (out / width) * n
+        pixel = wp.tid() + first_pixel
+        x = (pixel % width) * n
+        y = (pixel / width) * n
         stride = view.tiles_x * view.tile_w
         total = wp.vec4()
+        fogged = float(0.0)
         z = wp.vec2()
-        facing = wp.vec3()
+        along = float(0.0)
         medians = several()
+        medians_along = several()
         hits = int(0)
-        heaviest = float(0.0)
-        name = int(-1)
+        nearest = float(wp.inf)
+        nearest_along = float(wp.inf)
+        facing = wp.vec3()
+        weight = float(0.0)
+        which = int(-1)
+        count = int(0)
         for sample in range(wp.static(n * n)):
-            at = (y + sample / n) * stride + x + sample % n
-            total += raw[at]
+            column = x + sample % n
+            row = y + sample / n
+            at = row * stride + column
+            total += samples.color[at]
+            length = float(1.0)
+            if wp.static(lengths):
+                length = ray_length(float(column) + 0.5, float(row) + 0.5, view)
+            if wp.static(fog):
+                fogged += samples.fogged[at]
             if wp.static(depth):
-                z += raw_depth[at]
+                here = samples.depth[at]
+                z += here
+                if wp.static(distance):
+                    along = fma(here[0], length, along)
             if wp.static(median):
-                here = raw_median[at]
-                if here > 0.0:
-                    place = hits
-                    while place > 0 and medians[wp.max(place - 1, 0)] > here:
-                        medians[place] = medians[place - 1]
-                        place -= 1
-                    medians[place] = here
+                half = samples.depth_median[at]
+                if half > 0.0:
+                    medians = sorted_in(medians, hits, half)
+                    if wp.static(distance_median):
+                        medians_along = sorted_in(medians_along, hits, half * length)
                     hits += 1
+            if wp.static(first):
+                hit = samples.depth_first[at]
+                if hit > 0.0:
+                    nearest = wp.min(nearest, hit)
+                    if wp.static(distance_first):
+                        nearest_along = wp.min(nearest_along, hit * length)
             if wp.static(normal):
-                facing += raw_normal[at]
-            if wp.static(label):
-                if raw_label_weight[at] > heaviest:
-                    heaviest = raw_label_weight[at]
-                    name = raw_label[at]
+                facing += samples.normal[at]
+            if wp.static(heaviest):
+                if samples.weight[at] > weight:
+                    weight = samples.weight[at]
+                    which = samples.heaviest[at]
+            if wp.static(blended):
+                count = wp.max(count, samples.blended[at])
         t = total[3] * mean
+        # fog is of one colour with what lies behind everything
+        left = t
+        if wp.static(fog):
+            left += fogged * mean
+        middle = 0.5 * float(n)
+        background = color_behind(around, float(x) + middle, float(y) + middle, view)
         for channel in range(3):
-            rgb_out[3 * out + channel] = fma(t, view.background[channel], total[channel] * mean)
+            out.rgb[3 * pixel + channel] = fma(left, background[channel], total[channel] * mean)
         if wp.static(alpha):
-            alpha_out[out] = 1.0 - t
+            out.alpha[pixel] = 1.0 - t
         if wp.static(depth):
-            depth_out[out] = wp.where(z[1] > 0.0, z[0] / z[1], 0.0)
+            out.depth[pixel] = wp.where(z[1] > 0.0, z[0] / z[1], 0.0)
+            if wp.static(distance):
+                out.distance[pixel] = wp.where(z[1] > 0.0, along / z[1], 0.0)
         if wp.static(median):
-            middle = float(0.0)
-            if hits > 0:
-                middle = medians[(hits - 1) / 2]
-            median_out[out] = middle
+            out.depth_median[pixel] = middle_of(medians, hits)
+            if wp.static(distance_median):
+                out.distance_median[pixel] = middle_of(medians_along, hits)
+        if wp.static(first):
+            out.depth_first[pixel] = wp.where(nearest < wp.inf, nearest, 0.0)
+            if wp.static(distance_first):
+                out.distance_first[pixel] = wp.where(nearest_along < wp.inf, nearest_along, 0.0)
         if wp.static(normal):
-            length = wp.length(facing)
+            length_of_sum = wp.length(facing)
+            unit = wp.vec3()
+            if length_of_sum > 0.0:
+                unit = facing / length_of_sum
             for channel in range(3):
-                normal_out[3 * out + channel] = wp.where(length > 0.0, facing[channel] / length, 0.0)
+                out.normal[3 * pixel + channel] = unit[channel]
+            if wp.static(normal_world):
+                turned = to_world(unit, view)
+                for channel in range(3):
+                    out.normal_world[3 * pixel + channel] = turned[channel]
+        if wp.static(splat_id):
+            out.splat_id[pixel] = which
         if wp.static(label):
-            label_out[out] = name
+            name = int(-1)
+            if which >= 0:
+                name = out.labels[which]
+            out.label[pixel] = name
+        if wp.static(blended):
+            out.blended[pixel] = count
 
     return resolve

@@ -5,10 +5,16 @@ import re
 import pytest
 
 from fidsplat.backends.warp import runtime
+from fidsplat.effects import OUTPUTS
 
 wp = pytest.importorskip("warp")
-ALL = ("lowpass_screen", "ray_depth", "normal", "compose_planes", "depth", "depth_median", "label")
-RECORD = ALL[:4]
+RECORD = ("lowpass_screen", "ray_depth", "normal", "compose_planes")
+TAPS = ("depth", "depth_median", "depth_first", "heaviest", "blended", "fog")
+ALL = (*RECORD, *TAPS)
+MIXED = (*RECORD, "footprint_mixed", *TAPS)
+OF_BOXES = ("edges", "cover")
+FILTERS = ("make_boxes", "make_filter")
+OF_SAMPLES = ("depth_weight", "depth_median", "depth_first", "heaviest", "blended", "fog_slope", "fogged")
 
 
 def made(name, *arguments):
@@ -28,6 +34,13 @@ def compiled(kernel, folder, block=256, assembly=False):
     return re.sub(r"//[^\n]*", "", source.read_text())
 
 
+def resolving(behind, samples):
+    """The kernel for all outputs."""
+    planes = tuple(made("planes.of_samples", ALL).items())
+    integers = tuple(output.name for output in OUTPUTS.values() if output.dtype == "int32")
+    return made("resolve.make_resolve", tuple(OUTPUTS), integers, planes, behind, samples)
+
+
 @pytest.fixture(autouse=True)
 def started():
     runtime.load()
@@ -38,9 +51,18 @@ def started():
     [
         lambda: made("project.make_project", RECORD, 16, "float64", False),
         lambda: made("project.make_project", (), 0, "float32", True),
+        lambda: made("project.make_project", ("lowpass_pixel",), 0, "float64", False),
+        lambda: made(
+            "project.make_project", (*RECORD, "footprint_mixed", "lowpass_pixel"), 0, "float64", False
+        ),
+        lambda: made("project.make_project", ("footprint_box",), 0, "float32", False),
         lambda: made("blend.make_blend", ALL, True, 256)[0],
+        lambda: made("blend.make_blend", MIXED, True, 256)[0],
+        lambda: made("blend.make_blend", ("footprint_box",), True, 256)[0],
         lambda: made("blend.make_blend", ("lowpass_screen", "stop_exclusive"), True, 256)[0],
-        lambda: made("resolve.make_resolve", ("alpha", "depth", "depth_median", "label", "normal"), 3),
+        lambda: resolving("constant", 3),
+        lambda: resolving("gradient", 1),
+        lambda: resolving("panorama", 1),
         lambda: made("lists.make_lists", True).emit,
         lambda: made("lists.make_lists", True).count,
         lambda: made("lists.make_lists", False).histogram,
@@ -48,7 +70,22 @@ def started():
         lambda: made("lists.find_starts"),
     ],
     ids=[
-        *("project", "project-float32", "blend-all", "blend-exclusive", "resolve", "emit", "count"),
+        *(
+            "project",
+            "project-float32",
+            "project-filtered",
+            "project-mixed",
+            "project-boxes",
+            "blend-all",
+            "blend-mixed",
+            "blend-boxes",
+            "blend-exclusive",
+            "resolve",
+            "resolve-gradient",
+            "resolve-panorama",
+            "emit",
+            "count",
+        ),
         *("histogram", "compact", "starts"),
     ],
 )
@@ -58,19 +95,19 @@ def test_the_kernels_compile_for_cuda(kernel, tmp_path):
 
 def test_the_base_text_has_nothing_of_absent_effects(tmp_path):
     text = compiled(made("blend.make_blend", (), True, 256)[0], tmp_path)
-    for name in (
-        "depth_weight",
-        "depth_median",
-        "label_weight",
-        "finished",
-        "dot_x",
-        "Layer",
-        "thickest",
-        "ink",
-    ):
+    for name in (*OF_SAMPLES, *OF_BOXES, "finished", "dot_x", "Layer", "thickest", "ink"):
         assert not re.search(rf"\b{name}", text), name
-    everything = compiled(made("blend.make_blend", ALL, True, 256)[0], tmp_path / "all")
-    for name in ("depth_weight", "depth_median", "label_weight", "Layer", "thickest", "ink"):
+    project = compiled(made("project.make_project", (), 0, "float64", False), tmp_path / "project", 128)
+    for name in FILTERS:
+        assert name not in project, name
+    everything = compiled(made("blend.make_blend", MIXED, True, 256)[0], tmp_path / "all")
+    project = compiled(
+        made("project.make_project", (*RECORD, "footprint_mixed", "lowpass_pixel"), 0, "float64", False),
+        tmp_path / "mixed",
+        128,
+    )
+    assert all(name in project for name in FILTERS)
+    for name in (*OF_SAMPLES, *OF_BOXES, "Layer", "thickest", "ink"):
         assert re.search(rf"\b{name}", everything), name
 
 
@@ -92,6 +129,8 @@ def test_a_record_grows_by_what_is_asked_for():
     assert layout(RECORD).lines == 7
     assert layout(RECORD).place("nz") == (6, 1)
     assert layout(()).place("nz") == (0, 0)
+    assert layout(("lowpass_screen", "footprint_mixed")).lines == 6
+    assert layout(("footprint_box",)).place("edge_u0") == (4, 0), "a line of their own"
 
 
 def test_a_factory_makes_one_kernel_of_a_set():

@@ -54,8 +54,6 @@ def test_splats_much_smaller_than_a_pixel(renderer):
     ("lowpass", "samples"), [("none", 1), ("none", 3), ("screen", 2), ("pixel", 1), ("pixel", 2)]
 )
 def test_lowpass_and_samples(renderer, lowpass, samples):
-    if lowpass == "pixel" and not renderer.device.name.startswith("opencl"):
-        pytest.skip("Warp has no low-pass of this kind (docs/backends.md)")
     quality = fs.Quality(lowpass=lowpass, samples=samples)
     assert_agrees(renderer, random_splats(100, seed=5), CAMERA, quality=quality)
 

@@ -9,8 +9,6 @@ from agreement import assert_agrees, random_splats
 import fidsplat as fs
 from fidsplat.rotations import quaternion_to_matrix
 
-BACKEND = "opencl"
-
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 SMALL = fs.Camera.look_at(81, 59, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 EXACT = fs.Quality(lowpass="none")

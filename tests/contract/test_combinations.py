@@ -172,8 +172,6 @@ def test_directions_of_the_world_are_refused_to_a_camera_that_turns(renderer, wh
     ("lacking", "how"),
     [
         ("camera_fisheye", {"camera": CAMERAS["fisheye"]}),
-        ("fog", {"fog": FOG}),
-        ("footprint_box", {"scene": CLOUD.with_boxes()}),
         ("shutter_exposure", {"motion": fs.Motion(turning), "shutter": BLUR}),
     ],
 )

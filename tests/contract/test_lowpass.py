@@ -8,8 +8,6 @@ from agreement import assert_agrees, random_splats
 
 import fidsplat as fs
 
-BACKEND = "opencl"
-
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 PIXEL = fs.Quality(lowpass="pixel")
 

@@ -9,8 +9,6 @@ from agreement import assert_agrees, random_splats
 import fidsplat as fs
 from fidsplat.effects import OUTPUTS
 
-BACKEND = "opencl"
-
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.3, -0.2, -0.1), (0.0, 0.1, 3.0))
 ALL = tuple(OUTPUTS)
 KINDS = ("", "_median", "_first")

@@ -88,8 +88,6 @@ def test_every_method_puts_the_marker_where_the_ideal_has_it(renderer):
     camera = protocol.camera(35.0)
     ideal = painter.open(IDEAL, "small-0", spec, module)(camera)
     for name in method_names()[1:]:
-        if name.startswith("exact") and not renderer.device.name.startswith("opencl"):
-            continue  # Warp has no boxes (docs/backends.md)
         picture = painter.open(name, "small-0", spec, module)(camera)
         assert picture.shape == ideal.shape
         match = psnr(picture, ideal)

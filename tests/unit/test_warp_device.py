@@ -282,7 +282,7 @@ def test_a_memory_budget_draws_in_bands_with_the_same_bits():
     cloud = random_splats(300, seed=5, depth=(0.5, 4.0), scale=(0.05, 1.0))
     view = fs.Camera.look_at(320, 240, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
     wanted = fs.Renderer("warp:cpu").render(cloud, view, ALL_OUTPUTS)
-    own = fs.Renderer("warp:cpu", memory_budget=6_280_000)
+    own = fs.Renderer("warp:cpu", memory_budget=6_894_400)
     frame = own.render(cloud, view, ALL_OUTPUTS)
     assert own.backend.pool._arrays["tile totals", wp.int32].size == 300, "it was drawn in bands"
     assert frame.stats == wanted.stats

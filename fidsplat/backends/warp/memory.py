@@ -104,6 +104,8 @@ class Resident:
         planes = None if cloud.planes is None else PlaneTable(cloud)
         if planes is not None:
             arrays["planes"] = planes.index
+        if cloud.footprint == "mixed" and cloud.boxes is not None:
+            arrays["boxes"] = cloud.boxes.astype(np.int32)
         device = {name: _uploaded(name, array, pool) for name, array in arrays.items()}
         degree = cloud.sh_degree if cloud.sh_degree > 0 else -1
         return cls(device, len(cloud), cloud.origin, degree, planes, cloud.footprint)
@@ -148,6 +150,7 @@ def _dtype(name: str) -> Any:
         "sh": wp.vec3,
         "labels": wp.int32,
         "planes": wp.int32,
+        "boxes": wp.int32,
     }[name]
 
 

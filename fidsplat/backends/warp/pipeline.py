@@ -15,6 +15,7 @@ import numpy as np
 
 from fidsplat.backends.base import View
 from fidsplat.backends.warp import runtime
+from fidsplat.backends.warp.around import Surroundings
 from fidsplat.backends.warp.launch import BLOCK, Launcher
 from fidsplat.backends.warp.memory import Resident
 from fidsplat.effects import FeatureSet
@@ -25,27 +26,30 @@ if TYPE_CHECKING:
     from fidsplat.backends.warp.backend import WarpBackend, WarpShape
 
 KNOWN = frozenset(
-    {"camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen", "stop_inclusive"}
-    | {"stop_exclusive", "compose_ordered", "compose_planes", "ray_depth", "sh_terms"}
-    | {"arithmetic_precise", "keys_short", "perspective", "footprint_gaussian", "background_constant"}
-    | {"alpha", "depth", "depth_median", "normal", "label"}
+    {"camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen", "lowpass_pixel"}
+    | {"stop_inclusive", "stop_exclusive", "compose_ordered", "compose_planes", "ray_depth"}
+    | {"sh_terms", "arithmetic_precise", "keys_short"}
+    | {"perspective", "footprint_gaussian", "footprint_box", "footprint_mixed", "box_edges"}
+    | {"background_constant", "background_gradient", "background_panorama", "fog"}
+    | {"ray", "ray_length", "sample_length", "turn", "world_ray"}
+    | {"alpha", "depth", "depth_median", "depth_first", "distance", "distance_median", "distance_first"}
+    | {"normal", "normal_world", "label", "splat_id", "blended"}
 )
 """effects that kernels/warp has"""
 # of these depend on an effect: a stage is compiled once for all feature sets that mean the same to it
-_RECORD = ("lowpass_screen", "ray_depth", "normal", "compose_planes")
-_SAMPLE = (*_RECORD, "stop_exclusive", "depth", "depth_median", "label")
+_RECORD = ("lowpass_screen", "ray_depth", "normal", "compose_planes", "footprint_box", "footprint_mixed")
+_PROJECT = (*_RECORD, "lowpass_pixel")
+_SAMPLE = (*_RECORD, "stop_exclusive", "depth", "depth_median", "depth_first", "heaviest", "blended", "fog")
 
 
-# in the order of the kernel's arguments
-_OUTPUTS = ("rgb", "alpha", "depth", "depth_median", "normal", "label")
 # of a View, by the names that the kernels have for them too
 _UNIFORMS = (
     *("fx", "fy", "cx", "cy", "near", "far", "width", "height", "samples"),
-    *("log_cut", "ceiling", "stop"),
+    *("log_cut", "ceiling", "stop", "first_light", "fog_density"),
 )
 # bytes: of one splat's bounds; of its window, keys, counts, drawn, places, sums; of one that is drawn, in
-# sort and lists; of a sample in all planes; of a pair with the scratch of its sort
-_BOUNDS, _PROJECTED, _VISIBLE, _SAMPLE_BYTES, _PAIR = 44, 36, 40, 60, 24
+# sort and lists; of a pair with the scratch of its sort
+_BOUNDS, _PROJECTED, _VISIBLE, _PAIR = 44, 36, 40, 24
 
 
 class WarpPlanes:
@@ -87,6 +91,8 @@ class WarpPipeline:
                 "use an OpenCL device for it"
             )
         self.backend, self.features, self.shape = backend, features, shape
+        if names & {"label", "splat_id"}:
+            names |= {"heaviest"}  # both are the same splat's
         record = tuple(name for name in _RECORD if name in names)
         sample = tuple(name for name in _SAMPLE if name in names)
         terms = (features.sh_degree + 1) ** 2 if "color_sh" in names else 0
@@ -94,7 +100,10 @@ class WarpPipeline:
         with runtime.quiet():
             self.layout = runtime.kernels("records").Layout(record)
             self.project = runtime.kernels("project").make_project(
-                record, terms, features.setup_precision, shape.schedule == "tiles"
+                tuple(name for name in _PROJECT if name in names),
+                terms,
+                features.setup_precision,
+                shape.schedule == "tiles",
             )
             self.project_block = runtime.kernels("project").BLOCK
             self.lists = runtime.kernels("lists").make_lists(screen)
@@ -104,7 +113,19 @@ class WarpPipeline:
             self.blend, self.state = runtime.kernels("blend").make_blend(
                 sample, shape.schedule == "group", self.block_dim
             )
-            self.resolve = runtime.kernels("resolve").make_resolve(features.taps, features.samples)
+            planes = runtime.kernels("planes")
+            self.sample_planes = planes.of_samples(sample)
+            """type of an element of each"""
+            finished = tuple(output.name for output in features.outputs)
+            integers = tuple(output.name for output in features.outputs if output.dtype == "int32")
+            self.samples_type = planes.make_samples(tuple(self.sample_planes.items()))
+            self.outputs_type = planes.make_outputs(finished, integers)
+            kinds = runtime.kernels("surroundings").KINDS
+            behind = next((kind for kind in kinds if f"background_{kind}" in names), "constant")
+            self.surroundings = Surroundings(backend, behind)
+            self.resolve = runtime.kernels("resolve").make_resolve(
+                finished, integers, tuple(self.sample_planes.items()), behind, features.samples
+            )
             common = [self.sort.compact, self.sort.gather, self.sort.find_starts, self.sort.sum_up]
             for kernel in (self.project, self.lists.emit, self.blend, self.resolve, *common):
                 self._compile(kernel)
@@ -149,7 +170,7 @@ class WarpPipeline:
         run = self._drawn(resident, view)
         stats = run.planes.stats
         rows, stride = run.grid
-        raw = run.held["raw"].numpy()[: rows * stride]
+        raw = run.held["raw color"].numpy()[: rows * stride]
         return {
             "keys": run.held["keys"].numpy()[: resident.count].copy(),
             "order": run.held["order"].numpy()[: stats["visible"]].astype(np.uint32),
@@ -220,6 +241,7 @@ class _Run:
         ends = self._exact("ends by index", n, wp.int64)
         cloud = [self.resident.arrays[name] for name in ("means", "quats", "scales", "opacities", "colors")]
         cloud += self._planes()
+        cloud.append(self.resident.arrays.get("boxes", drawn))  # of one kind of splats: never read
         records = [self.held["lines"], self.held["bounds"], self._take("windows", n, wp.uint64)]
         self.launcher.launch(
             self.pipeline.project,
@@ -292,7 +314,10 @@ class _Run:
         # as `_project`, `_sort`, `_list`, `_samples` and `_resolve` take them; the sorts have as much again
         each = 16 * self.pipeline.layout.lines + _BOUNDS + _PROJECTED
         fixed = resident.nbytes + each * resident.count + _VISIBLE * visible
-        fixed += self.grid[0] * self.grid[1] * (_SAMPLE_BYTES + 4 * len(self.pipeline.features.taps))
+        sample = sum(map(self.wp.types.type_size_in_bytes, self.pipeline.sample_planes.values()))
+        fixed += self.grid[0] * self.grid[1] * sample
+        pixel = sum(4 * output.channels for output in self.pipeline.features.outputs)
+        fixed += self.view.width * self.view.height // self.view.samples**2 * pixel
         room = (budget - fixed) // _PAIR
         if room < 1:
             raise DeviceError(
@@ -320,25 +345,20 @@ class _Run:
             wp.utils.radix_sort_pairs(tiles, lists, pairs, 0, max(self.tiles - 1, 1).bit_length())
         self.launch(self.pipeline.sort.find_starts, end - first + 1, pairs, first, tiles, held["starts"])
 
-    def _samples(self) -> list[Any]:
-        """Planes that blending fills: raw, depth, median, normal, label, the label's weight."""
-        wp, taps = self.wp, self.pipeline.features.taps
+    def _samples(self) -> Any:
+        """Planes that blending fills, as one struct."""
+        samples = self.pipeline.samples_type()
         size = self.grid[0] * self.grid[1]
-        wanted = [
-            ("raw", wp.vec4, True),
-            ("raw depth", wp.vec2, "depth" in taps),
-            ("raw median", wp.float32, "depth_median" in taps),
-            ("raw normal", wp.vec3, "normal" in taps),
-            ("raw label", wp.int32, "label" in taps),
-            ("raw label weight", wp.float32, "label" in taps),
-        ]
-        return [self._take(name, size if asked else 1, dtype) for name, dtype, asked in wanted]
+        for name, dtype in self.pipeline.sample_planes.items():
+            setattr(samples, name, self._take(f"raw {name}", size, dtype))
+        return samples
 
-    def _blend(self, first: int, end: int, samples: list[Any]) -> None:
+    def _blend(self, first: int, end: int, samples: Any) -> None:
         """Draws the tiles of one band."""
         pipeline, held = self.pipeline, self.held
-        splats = (self.resident.arrays["labels"], self.resident.arrays.get("planes", samples[4]))
-        args = (self.u, held["lines"], *splats, held["starts"], held["lists"], *samples)
+        lists = held["starts"], held["lists"]
+        planes = self.resident.arrays.get("planes", held["lists"])  # of no splats: never read
+        args = (self.u, held["lines"], planes, *lists, samples)
         area = pipeline.shape.tile_width * pipeline.shape.tile_height
         if pipeline.shape.schedule == "group":
             count = (end - first) * pipeline.block_dim
@@ -347,24 +367,20 @@ class _Run:
         state = self._take("state", self.launcher.pieces * area, pipeline.state)
         self.launcher.tiles(pipeline.blend, first, end, area, *args, held["bounds"], state)
 
-    def _resolve(self, samples: list[Any]) -> tuple[dict[str, tuple[Output, Any]], tuple[int, int]]:
-        view, features, wp = self.view, self.pipeline.features, self.wp
+    def _resolve(self, samples: Any) -> tuple[dict[str, tuple[Output, Any]], tuple[int, int]]:
+        view, wp = self.view, self.wp
         height, width = view.height // view.samples, view.width // view.samples
-        outputs = {}
-        for output in features.outputs:
+        outputs, finished = {}, self.pipeline.outputs_type()
+        for output in self.pipeline.features.outputs:
             dtype = wp.int32 if output.dtype == "int32" else wp.float32
             # asked for anew: the caller keeps them
-            outputs[output.name] = (
-                output,
-                self.pool.fresh(output.name, height * width * output.channels, dtype),
-            )
-        arrays = [
-            outputs[name][1]
-            if name in outputs
-            else self._take(f"no {name}", 1, wp.int32 if name == "label" else wp.float32)
-            for name in _OUTPUTS
-        ]
-        self.launch(self.pipeline.resolve, height * width, self.u, width, *samples, *arrays)
+            array = self.pool.fresh(output.name, height * width * output.channels, dtype)
+            outputs[output.name] = output, array
+            setattr(finished, output.name, array)
+        around = self.pipeline.surroundings.of(view)
+        if "label" in outputs:
+            finished.labels = self.resident.arrays["labels"]
+        self.launch(self.pipeline.resolve, height * width, self.u, width, around, samples, finished)
         return outputs, (height, width)
 
     # helpers
@@ -387,5 +403,6 @@ class _Run:
             setattr(u, name, getattr(view, name))
         u.tile_w, u.tile_h, u.tiles_x, u.tiles_y = shape.tile_width, shape.tile_height, tiles_x, tiles_y
         u.per_pixel = 1.0 / view.samples**2
-        u.background = wp.vec3(*view.background)
+        fx, fy, cx, cy = view.uniform("ray")
+        u.ray = wp.vec4(1 / fx, 1 / fy, cx, cy)
         return u

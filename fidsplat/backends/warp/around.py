@@ -1,0 +1,53 @@
+"""What lies behind the splats, as the kernels want it (kernels/warp/surroundings.py)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from fidsplat.backends.base import View
+from fidsplat.backends.warp import runtime
+from fidsplat.errors import DeviceError
+from fidsplat.surroundings import Gradient, Panorama
+
+if TYPE_CHECKING:
+    from fidsplat.backends.warp.backend import WarpBackend
+
+
+class Surroundings:
+    """Fills the struct of one kind of background; the last panorama stays on the device."""
+
+    def __init__(self, backend: WarpBackend, kind: str) -> None:
+        self._backend = backend
+        self._type = runtime.kernels("surroundings").make_surroundings(kind).Around
+        self._panorama: tuple[Panorama | None, Any] = None, None
+
+    def of(self, view: View) -> Any:
+        """The struct for this view.
+
+        Raises:
+            DeviceError: there is no room for the panorama.
+        """
+        wp = runtime.load()
+        around, behind = self._type(), view.surroundings
+        if isinstance(behind, Gradient):
+            numbers = view.uniform("gradient")
+            around.top, around.bottom, around.up = (wp.vec3(*numbers[k : k + 3]) for k in (0, 3, 6))
+        elif isinstance(behind, Panorama):
+            around.image = self._uploaded(behind)
+        else:
+            around.color = wp.vec3(*view.background)
+        return around
+
+    def _uploaded(self, panorama: Panorama) -> Any:
+        wp, (held, array) = runtime.load(), self._panorama
+        if held is not panorama:
+            image = panorama.image
+            try:
+                array = wp.array(image, dtype=wp.vec3, device=self._backend.device)
+            except (RuntimeError, MemoryError) as error:
+                raise DeviceError(
+                    f"the panorama needs {image.nbytes / 2**20:.0f} MiB, which {self._backend.info.name} has "
+                    "not; use a smaller one"
+                ) from error
+            self._panorama = panorama, array
+        return array

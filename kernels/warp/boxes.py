@@ -1,0 +1,137 @@
+"""Boxes: rectangles |u| <= 1, |v| <= 1 of a splat's plane, whose edges the sample filters (docs/effects.md).
+
+The image of an edge is a straight line, and D + n_u, D - n_u, D + n_v, D - n_v are affine in the sample: over
+their gradients they are the sample's distances from the four edges, inwards, in samples.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from .common import View, fma
+
+SQRT2 = wp.constant(wp.float32(2.0**0.5))
+LINES = wp.constant(10)
+"""what bounds a box in the picture: its edges, the horizon of its plane, the near plane, the picture"""
+ACUTE = wp.constant(0.1)
+"""sine of an angle below which a corner's tip may lie far away"""
+
+
+@wp.func
+def between(d: float, n: float, edges: wp.vec2) -> float:
+    """Which share of a sample lies between two opposite edges; n: n_u or n_v over sqrt 2, as in a record."""
+    low = wp.clamp(fma(fma(SQRT2, n, d), edges[0], 0.5), 0.0, 1.0)
+    high = wp.clamp(fma(fma(-SQRT2, n, d), edges[1], 0.5), 0.0, 1.0)
+    return wp.max(low + high - 1.0, 0.0)
+
+
+@cache
+def make_boxes(real) -> SimpleNamespace:
+    """edges: what turns a box's forms into distances from its edges; extent: what it can touch."""
+    vec2, vec3, vec4 = (wp.types.vector(n, real) for n in (2, 3, 4))
+    lines_type = wp.types.matrix((int(LINES), 3), real)
+    zero, half, one = real(0.0), real(0.5), real(1.0)
+
+    @wp.func
+    def per_gradient(x: real, y: real) -> real:
+        return one / wp.max(wp.sqrt(x * x + y * y), real(1e-30))
+
+    @wp.func
+    def edges(d: vec2, n: vec2, scale: real) -> wp.vec2:
+        """Of the forms D + n, D - n with these gradients, times a factor: 1 / |gradient|."""
+        per = one / wp.abs(scale)
+        return wp.vec2(
+            float(per * per_gradient(d[0] + n[0], d[1] + n[1])),
+            float(per * per_gradient(d[0] - n[0], d[1] - n[1])),
+        )
+
+    @wp.func
+    def corners(lines: lines_type, clear: bool):
+        """Box x0, x1, y0, y1 around the four corners of a quadrangle with lines 0, 1 opposite to each other
+        and 2, 3; and whether none of its corners is acute.
+        """
+        box = vec4(real(wp.inf), -real(wp.inf), real(wp.inf), -real(wp.inf))
+        blunt = clear
+        corner_count = int(4)
+        for corner in range(corner_count):
+            k = corner / 2
+            j = 2 + corner % 2
+            turn = lines[k, 1] * lines[j, 2] - lines[k, 2] * lines[j, 1]
+            if not (wp.abs(turn) > real(ACUTE)):
+                blunt = False
+            x = (lines[k, 2] * lines[j, 0] - lines[j, 2] * lines[k, 0]) / turn
+            y = (lines[j, 1] * lines[k, 0] - lines[k, 1] * lines[j, 0]) / turn
+            box = grown(box, x, y)
+        return box, blunt
+
+    @wp.func
+    def grown(box: vec4, x: real, y: real) -> vec4:
+        return vec4(wp.min(box[0], x), wp.max(box[1], x), wp.min(box[2], y), wp.max(box[3], y))
+
+    @wp.func
+    def rim(lines: lines_type):
+        """Box around the polygon in which no line's form is below 0: around the part of each line in it."""
+        box = vec4(real(wp.inf), -real(wp.inf), real(wp.inf), -real(wp.inf))
+        count = int(LINES)
+        for k in range(count):
+            gx, gy = lines[k, 1], lines[k, 2]
+            squared = gx * gx + gy * gy
+            if squared > zero:
+                foot_x, foot_y = -lines[k, 0] * gx / squared, -lines[k, 0] * gy / squared
+                low = -real(wp.inf)
+                high = real(wp.inf)
+                for j in range(count):
+                    if j != k:
+                        value = lines[j, 0] + lines[j, 1] * foot_x + lines[j, 2] * foot_y
+                        slope = lines[j, 2] * gx - lines[j, 1] * gy
+                        if slope > zero:
+                            low = wp.max(low, -value / slope)
+                        elif slope < zero:
+                            high = wp.min(high, -value / slope)
+                        elif not (value >= zero):
+                            high = -real(wp.inf)
+                if low <= high:
+                    box = grown(box, foot_x - low * gy, foot_y + low * gx)
+                    box = grown(box, foot_x - high * gy, foot_y + high * gx)
+        return box
+
+    @wp.func
+    def extent(tangent_u: vec3, tangent_v: vec3, p: vec3, su: real, sv: real, clear: bool, view: View):
+        """Box x0, x1, y0, y1 of samples that a box may cover at all: up to half a sample outside its edges.
+        x0 > x1 if there are none. clear: it lies wholly beyond the near plane.
+        """
+        per_fx, per_fy = real(view.per_fx), real(view.per_fy)
+        cx, cy = real(view.cx), real(view.cy)
+        normal = wp.cross(tangent_u, tangent_v)
+        height = wp.dot(normal, p)
+        side = wp.where(height < zero, -one, one)
+        d = normal * side
+        u = wp.cross(tangent_v, p) * (side / su)
+        v = wp.cross(p, tangent_u) * (side / sv)
+        # about the principal point
+        lines = lines_type()
+        edge_count = int(4)
+        for k in range(edge_count):
+            turn = wp.where(k % 2 == 0, one, -one)
+            form = d + turn * wp.where(k < 2, u, v)
+            x, y = form[0] * per_fx, form[1] * per_fy
+            per = per_gradient(x, y)
+            lines[k, 0] = form[2] * per + half
+            lines[k, 1] = x * per
+            lines[k, 2] = y * per
+        box, blunt = corners(lines, clear)
+        if not blunt:
+            for k in range(2):
+                turn = wp.where(k == 0, one, -one)
+                lines[4 + k, 0] = turn * d[2] + wp.where(k == 0, zero, wp.abs(height) * real(view.per_near))
+                lines[4 + k, 1] = turn * d[0] * per_fx
+                lines[4 + k, 2] = turn * d[1] * per_fy
+                lines[6 + k, 0] = one + wp.where(k == 0, cx, real(view.width) - cx)
+                lines[6 + k, 1] = turn
+                lines[8 + k, 0] = one + wp.where(k == 0, cy, real(view.height) - cy)
+                lines[8 + k, 2] = turn
+            box = rim(lines)
+        return vec4(box[0] + cx, box[1] + cx, box[2] + cy, box[3] + cy)
+
+    return SimpleNamespace(edges=edges, extent=extent)

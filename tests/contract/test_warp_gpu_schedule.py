@@ -1,0 +1,51 @@
+"""Warp's schedule for GPUs, wherever Warp runs, with the effects of samples and pixels: against the
+reference, as its own schedule is by the other tests."""
+
+import numpy as np
+import pytest
+from agreement import random_splats
+
+import fidsplat as fs
+from fidsplat.backends.base import View
+from fidsplat.effects import OUTPUTS, select
+from fidsplat.hard_cases.agreement import Picture, compare, truth_of
+from fidsplat.hard_cases.invariance import other_schedule
+
+BACKEND = "warp"
+
+CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.3, -0.2, -0.1), (0.0, 0.1, 3.0))
+EVERYTHING = tuple(OUTPUTS)
+AROUND = random_splats(90, seed=3, depth=(-0.5, 5.0))
+
+
+def scene_of_layers():
+    """A marker of boxes, one of Gaussians, and splats and boxes of no plane."""
+    pose = np.eye(4)
+    pose[:3, :3] = [[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]]
+    pose[:3, 3] = (0.1, 0, 2.2)
+    exact = fs.marker("aruco:4x4_50:7", size=0.8, mixture="exact").cloud.transformed(pose)
+    pose[:3, 3] = (-0.4, 0.1, 2.5)
+    fitted = fs.marker("aruco:4x4_50:7", size=0.8).cloud.transformed(pose)
+    return fs.SplatCloud.concatenate([exact, fitted, AROUND.with_boxes(np.arange(90) % 3 == 0)])
+
+
+PICTURES = {
+    "layers": lambda: Picture(scene_of_layers(), CAMERA, outputs=EVERYTHING, fog=fs.Fog(0.3)),
+    "boxes": lambda: Picture(AROUND.with_boxes(), CAMERA, outputs=("rgb", "depth_first", "blended")),
+    "pixel": lambda: Picture(
+        AROUND, CAMERA, fs.Quality(lowpass="pixel", samples=2), background=fs.Gradient((0, 0, 1), (1, 0, 0))
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_the_schedule_of_gpus_agrees_with_the_reference(renderer, name):
+    picture = PICTURES[name]()
+    backend, cloud, behind = renderer.backend, picture.cloud, picture.background
+    features = select(cloud, picture.outputs, picture.quality, fog=picture.fog, background=behind)
+    view = View.of(CAMERA, picture.quality, cloud.origin, behind, fog=picture.fog)
+    planes = backend.pipeline(features, other_schedule(renderer)).render(backend.upload(cloud), view)
+    drawn = {output: planes.read(output) for output in picture.outputs}
+    differences = compare(drawn, truth_of(picture), picture.outputs)
+    assert all(difference.agrees for difference in differences), differences
+    assert drawn["rgb"].std() > 0.05
