@@ -19,6 +19,7 @@ from fidsplat.quality import Quality
 from fidsplat.render import Renderer, ResidentCloud
 from fidsplat.scenes import Scene
 from fidsplat.splats import SplatCloud
+from fidsplat.surroundings import Fog
 
 TRUTH_CUTOFF = 1e-8
 """alpha below which the truth leaves a contribution out: a thousand such layers hide 1e-5"""
@@ -69,11 +70,14 @@ def errors(picture: ArrayLike, truth: ArrayLike) -> Errors:
     )
 
 
-def full_precision(like: Quality, renderer: Renderer) -> Quality:
+def full_precision(
+    like: Quality, renderer: Renderer, camera: Camera | None = None, fog: Fog | None = None
+) -> Quality:
     """The quality that draws the same definition with nothing left out, in the best arithmetic of the device.
 
-    Low-pass, samples, coplanar and first_hit are those of `like`. OpenCL blends in float64 where the device
-    has it; else the arithmetic is the device's own, with the set-up in float64 if the device has that.
+    Low-pass, samples, coplanar and first_hit are those of `like`. OpenCL blends in float64 where that can be
+    (`draws_float64`); else the arithmetic is the device's own, with the set-up in float64 if the device has
+    that.
     """
     best = like.with_(
         alpha_cutoff=TRUTH_CUTOFF,
@@ -81,36 +85,38 @@ def full_precision(like: Quality, renderer: Renderer) -> Quality:
         opacity_ceiling=1.0,
         stop_rule="inclusive",
         setup_precision="float64",
+        arithmetic="precise",
+        color_precision="float32",
+        depth_key_bits=32,
     )
-    if renderer.device.name != "reference" and draws_float64(renderer):
+    if renderer.device.name != "reference" and draws_float64(renderer, camera, fog):
         return best.with_(blend_precision="float64")
     return best
 
 
-def draws_float64(renderer: Renderer) -> bool:
+def draws_float64(renderer: Renderer, camera: Camera | None = None, fog: Fog | None = None) -> bool:
     """Whether its pictures at full precision are float64 throughout: the reference's, and those of OpenCL on
-    a device with float64."""
-    if renderer.device.name == "reference":
-        return True
-    if not (renderer.device.float64 and renderer.device.name.startswith("opencl")):
-        return False
+    a device with float64, but for lenses and fog, whose rays are float32."""
+    family = renderer.device.name.partition(":")[0]
+    if family != "opencl" or not renderer.device.float64:
+        return family == "reference"
     try:
-        select(SplatCloud.empty(), ("rgb",), Quality(blend_precision="float64"))
+        select(SplatCloud.empty(), ("rgb",), Quality(blend_precision="float64"), camera, fog=fog)
     except InputError:
         return False
     return True
 
 
-def judge_for(renderer: Renderer) -> Renderer:
+def judge_for(renderer: Renderer, camera: Camera | None = None, fog: Fog | None = None) -> Renderer:
     """Who draws the truth for a renderer's pictures: itself if it can in float64, else OpenCL on this
     machine's processor if that is there and can, else itself."""
-    if draws_float64(renderer):
+    if draws_float64(renderer, camera, fog):
         return renderer
     try:
         processor = Renderer("opencl:cpu")
     except DeviceError:
         return renderer
-    return processor if draws_float64(processor) else renderer
+    return processor if draws_float64(processor, camera, fog) else renderer
 
 
 def truth(
@@ -137,7 +143,9 @@ def truth(
     Raises:
         InputError, DeviceError: as `Renderer.render`.
     """
-    quality = full_precision(Quality.of(like), renderer)
+    own = scene if isinstance(scene, Scene) else Scene()
+    seen_from, fog = camera or own.camera, around.get("fog") or own.fog
+    quality = full_precision(Quality.of(like), renderer, seen_from, fog)
     frame = renderer.render(scene, camera, (output,), quality, **around)
     if isinstance(frame._planes, ReferencePlanes):  # float32 is made of its planes when they are read
         return frame._planes.planes[output]

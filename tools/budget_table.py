@@ -5,7 +5,7 @@ over random scenes and what they cost.
     python tools/budget_table.py --device opencl:nvidia     adds the settings of GPUs
 
 Each scene of `fidsplat/budget/random_scenes.py` is drawn with every setting and held against the same
-definition at full precision: by the float64 reference, or by the device itself with --device-truth. Costs are
+definition at full precision, which the device draws in float64 (`fidsplat.accuracy.judge_for`). Costs are
 medians of frames of the scenes of TIMED, drawn in turn. In a second round the settings on the front of error
 and cost are drawn with every set of MODIFIERS, and FINEST beside them; what is on that front then is kept.
 Knobs that the device does not have are left out. What the file says of another kind of device stays.
@@ -22,7 +22,7 @@ from datetime import date
 import numpy as np
 
 import fidsplat as fs
-from fidsplat.accuracy import errors, truth
+from fidsplat.accuracy import errors, judge_for, truth
 from fidsplat.budget.random_scenes import random_scene
 from fidsplat.budget.table import FILE, Setting
 from fidsplat.errors import InputError
@@ -44,7 +44,7 @@ FINEST = (
     {"alpha_cutoff": 1e-8, "transmittance_stop": 0.0},
     {"alpha_cutoff": 1e-8, "transmittance_stop": 0.0, "blend_precision": "float64"},
 )
-TIMED = ((100_000, 0.03, 1280, 720), (20_000, 0.15, 640, 480))
+TIMED = ((25_000, 0.05, 640, 360), (5_000, 0.2, 320, 240))
 """splats, median scale in metres, width, height: many small splats, and few large ones"""
 SLACK = 1.03
 """times and errors this close are one: timings are noisy"""
@@ -87,11 +87,10 @@ def main() -> int:
     parser.add_argument("--device", default="opencl:pocl")
     parser.add_argument("--scenes", type=int, default=400)
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--device-truth", action="store_true", help="truths by the device, not the reference")
     parser.add_argument("--out", default=str(FILE))
     args = parser.parse_args()
     renderer = fs.Renderer(args.device)
-    judge = renderer if args.device_truth else fs.Renderer("reference")
+    judge = judge_for(renderer)
 
     say(f"truths of {args.scenes} scenes by {judge.device.name}")
     scenes = [random_scene(seed) for seed in range(args.scenes)]

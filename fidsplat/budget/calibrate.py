@@ -71,10 +71,11 @@ class Calibration:
     def _truth(self) -> tuple[np.ndarray, float]:
         """The picture (h, w, 3), and how far it may be off itself."""
         self._tell("drawing the picture at full precision")
-        judge = judge_for(self.renderer)
+        about = self._camera, self._around.get("fog")
+        judge = judge_for(self.renderer, *about)
         scene = self._resident if judge is self.renderer else self._cloud
         picture = truth(judge, scene, self._camera, self.base, **self._around)
-        return picture, 0.0 if draws_float64(judge) else FLOAT32_DOUBT
+        return picture, 0.0 if draws_float64(judge, *about) else FLOAT32_DOUBT
 
     def error(self, quality: Quality) -> float | None:
         """Largest absolute error of rgb against the truth; None for a quality that this device does not draw.
