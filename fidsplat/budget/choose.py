@@ -131,8 +131,8 @@ def _from_table(error: float, settings: tuple[Setting, ...], base: Quality, rend
 
 
 def _drawn(setting: Setting, base: Quality, renderer: Renderer) -> bool:
-    """Whether the device has the setting's knobs; numbers alone every device has."""
-    if setting.knobs.keys() <= {"alpha_cutoff", "transmittance_stop"}:
+    """Whether the device has the setting's knobs."""
+    if setting.everywhere:
         return True
     pixel = Camera.pinhole(1, 1, 1.0, 1.0, 0.5, 0.5)
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -83,10 +84,13 @@ class Search:
                 in_time = [found for found in seen if found.times.late <= ms]
                 if in_time:
                     return min(in_time, key=lambda found: found.error)
-        if not seen:
-            first = self._measured(self._settings)
-            seen = self._timed([pair for pair, _ in zip(first, range(ENOUGH), strict=False)])
-        best = min(seen, key=lambda found: found.times.late)
+        # a second look at what was the fastest: on a busy machine the first may have been unlucky
+        pairs = [(found.setting, found.error) for found in sorted(seen, key=_late)]
+        if not pairs:
+            pairs = list(itertools.islice(self._measured(self._settings), ENOUGH))
+        best = min(self._timed(pairs[:ENOUGH]), key=_late)
+        if best.times.late <= ms:
+            return best
         raise InputError(
             f"no setting draws this scene in {ms:g} ms on {self.device}; the fastest takes "
             f"{best.times.late:.3g} ms, with an error of {best.error:.2g}"
@@ -94,7 +98,10 @@ class Search:
 
     def _start(self, ms: float) -> int:
         """Which setting to begin with: the first that should take more than a `SHORT` part of the time."""
-        usual = min(self._settings, key=lambda setting: abs(math.log(setting.cost)))
+        usual = min(
+            (setting for setting in self._settings if setting.everywhere),
+            key=lambda setting: abs(math.log(setting.cost)),
+        )
         (taken,) = self.calibration.times([usual.of(self.calibration.base)], FEWEST)
         costs = [setting.cost * taken.median / usual.cost for setting in self._settings]
         start = next((k for k, cost in enumerate(costs) if cost >= SHORT * ms), len(costs))
@@ -127,6 +134,10 @@ class Search:
             Found(setting, quality, measured, taken)
             for (setting, measured), quality, taken in zip(pairs, qualities, times, strict=True)
         ]
+
+
+def _late(found: Found) -> float:
+    return found.times.late
 
 
 def _much_better(setting: Setting, missed: Setting, wanted: float) -> bool:

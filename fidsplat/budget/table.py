@@ -50,6 +50,11 @@ class Setting:
         return base.with_(**(FREE | {"opacity_ceiling": 1.0, "stop_rule": "inclusive"} | self.knobs))
 
     @property
+    def everywhere(self) -> bool:
+        """Whether every device draws it: it differs in numbers alone."""
+        return self.knobs.keys() <= {"alpha_cutoff", "transmittance_stop"}
+
+    @property
     def promised(self) -> float:
         """The error that is promised for a scene that nobody has measured."""
         return MARGIN * self.most
