@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
-from fidsplat import __version__
 from fidsplat.budget import store, table
 from fidsplat.budget.calibrate import Calibration
 from fidsplat.budget.search import Search
@@ -89,14 +89,8 @@ def choose(
             around[name] = getattr(own, name)
     splats = cloud.cloud() if isinstance(cloud, Scene) else cloud
     info = renderer.device
-    key = store.digest(
-        (__version__, table.version(), info.name, info.title, info.platform, info.version),
-        (error, ms),
-        definition,
-        camera,
-        splats,
-        around,
-    )
+    drawn_by = (info.name, info.title, info.platform, info.version, store.versions())
+    key = store.digest(drawn_by, (error, ms), definition, camera, splats, around)
     kept = _kept(key, definition, info.name)
     if kept is not None:
         return kept
@@ -113,8 +107,8 @@ def check_bounds(error: float | None, ms: float | None) -> None:
     if error is None and ms is None:
         raise InputError("a budget of nothing: give error=1e-3, or ms=20 with camera=... and cloud=...")
     for name, value, example in (("error", error, "1e-3"), ("ms", ms, "20")):
-        number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        if value is not None and not (number and math.isfinite(value)):
+        number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+        if value is not None and not number:
             raise InputError(f"{name} is {value!r}; it must be a finite number, e.g. {name}={example}")
 
 
@@ -123,7 +117,8 @@ def _from_table(error: float, settings: tuple[Setting, ...], base: Quality, rend
         if setting.promised <= error and _drawn(setting, base, renderer):
             name = renderer.device.name
             return Choice(setting.of(base), setting.promised, None, None, "table", name, setting.knobs)
-    best = min(setting.promised for setting in settings)
+    finest = sorted(settings, key=lambda setting: setting.promised)
+    best = next(setting.promised for setting in finest if _drawn(setting, base, renderer))
     raise InputError(
         f"no setting promises an error of {error:g} for any scene on {renderer.device.name}: the best is "
         f"{best:.2g}; allow that, or give camera=... and cloud=... to measure yours"

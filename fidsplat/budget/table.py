@@ -73,5 +73,5 @@ def load(kind: str) -> tuple[Setting, ...]:
 
 
 def version() -> str:
-    """When and by what the table was made: part of the key of what is kept."""
+    """When and by what the table was made, as text."""
     return json.dumps(json.loads(FILE.read_text("utf-8"))["made"], sort_keys=True)
