@@ -24,6 +24,11 @@ from fidsplat.surroundings import Fog
 TRUTH_CUTOFF = 1e-8
 """alpha below which the truth leaves a contribution out: a thousand such layers hide 1e-5"""
 
+FLOAT32_OUTPUT = 1e-7
+"""what a truth of colours up to 1 is off that a device hands out in float32"""
+FLOAT32_TRUTH = 1e-5
+"""what one is off that is drawn in float32: more than any picture at full precision in budget/table.json"""
+
 
 @dataclass(frozen=True)
 class Errors:
@@ -105,6 +110,13 @@ def draws_float64(renderer: Renderer, camera: Camera | None = None, fog: Fog | N
     except InputError:
         return False
     return True
+
+
+def doubt(judge: Renderer, camera: Camera | None = None, fog: Fog | None = None) -> float:
+    """What the truth may be off itself that a renderer draws."""
+    if judge.device.name == "reference":
+        return 0.0
+    return FLOAT32_OUTPUT if draws_float64(judge, camera, fog) else FLOAT32_TRUTH
 
 
 def judge_for(renderer: Renderer, camera: Camera | None = None, fog: Fog | None = None) -> Renderer:

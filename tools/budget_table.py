@@ -6,9 +6,10 @@ over random scenes and what they cost.
 
 Each scene of `fidsplat/budget/random_scenes.py` is drawn with every setting and held against the same
 definition at full precision, which the device draws in float64 (`fidsplat.accuracy.judge_for`). Costs are
-medians of frames of the scenes of TIMED, drawn in turn. In a second round the settings on the front of error
-and cost are drawn with every set of MODIFIERS, and FINEST beside them; what is on that front then is kept.
-Knobs that the device does not have are left out. What the file says of another kind of device stays.
+medians of frames of the scenes of TIMED, drawn in turn; on CPUs those of the processor's time. In a second
+round the settings on the front of error and cost are drawn with every set of MODIFIERS, and FINEST beside
+them; what is on that front then is kept. Knobs that the device does not have are left out. What the file
+says of another kind of device stays.
 """
 
 from __future__ import annotations
@@ -22,21 +23,19 @@ from datetime import date
 import numpy as np
 
 import fidsplat as fs
-from fidsplat.accuracy import errors, judge_for, truth
+from fidsplat.accuracy import doubt, errors, judge_for, truth
 from fidsplat.budget.random_scenes import random_scene
 from fidsplat.budget.table import FILE, Setting
 from fidsplat.errors import InputError
 from fidsplat.experiments.scenes import random_cloud, standard_camera
 from fidsplat.files import atomic_write
 
-CUTOFFS = (0.06, 0.03, 0.015, 2 / 255, 1 / 255, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 1e-7)
-STOPS = (0.05, 0.015, 4e-3, 1e-3, 1e-4, 1e-5, 1e-6)
+CUTOFFS = (0.03, 0.015, 2 / 255, 1 / 255, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 1e-7)
+STOPS = (0.05, 0.015, 4e-3, 1e-3, 1e-4, 1e-6)
 MODIFIERS = (
     {"setup_precision": "float32"},
     {"arithmetic": "fast"},
     {"color_precision": "float16"},
-    {"depth_key_bits": 24},
-    {"depth_key_bits": 16},
     {"setup_precision": "float32", "arithmetic": "fast"},
     {"setup_precision": "float32", "arithmetic": "fast", "color_precision": "float16", "depth_key_bits": 24},
 )
@@ -46,7 +45,7 @@ FINEST = (
 )
 TIMED = ((25_000, 0.05, 640, 360), (5_000, 0.2, 320, 240))
 """splats, median scale in metres, width, height: many small splats, and few large ones"""
-SLACK = 1.03
+SLACK = 1.02
 """times and errors this close are one: timings are noisy"""
 
 
@@ -72,7 +71,7 @@ class Measurement:
         """As table.json has them, the cheapest first."""
         rows = []
         for knobs, off, cost in zip(self.settings, self.errors.T, self.costs.tolist(), strict=True):
-            sizes = (round_up(size) for size in (off.min(), np.median(off), off.max()))
+            sizes = (round_up(size) for size in (np.quantile(off, 0.05), np.median(off), off.max()))
             rows.append(vars(Setting(knobs, *sizes, cost=round(cost, 3))))
         return sorted(rows, key=lambda row: row["cost"])
 
@@ -151,11 +150,12 @@ def all_errors(renderer: fs.Renderer, scenes, truths, settings: list[dict]) -> n
     """Largest absolute error of rgb (scenes, settings)."""
     qualities = [quality(knobs) for knobs in settings]
     found = np.empty((len(scenes), len(settings)))
+    off = doubt(judge_for(renderer))
     for k, (scene, want) in enumerate(zip(scenes, truths, strict=True)):
         resident = renderer.upload(scene.cloud)
         for j, each in enumerate(qualities):
             frame = renderer.render(resident, scene.camera, quality=each, background=scene.background)
-            found[k, j] = errors(frame["rgb"], want).maximum
+            found[k, j] = errors(frame["rgb"], want).maximum + off
         say(f"errors: {k + 1} of {len(scenes)} scenes, {len(settings)} settings", end="\r")
     say("")
     return found
@@ -164,16 +164,18 @@ def all_errors(renderer: fs.Renderer, scenes, truths, settings: list[dict]) -> n
 def all_costs(renderer: fs.Renderer, settings: list[dict], repeats: int) -> np.ndarray:
     """Time of a frame over that of the settings' base (settings,): the mean over the timed scenes."""
     qualities = [quality({}), *(quality(knobs) for knobs in settings)]
+    # a processor's own time does not hang on what else runs there
+    clock = time.process_time if renderer.device.kind == "cpu" else time.perf_counter
     ratios = []
     for count, scale, width, height in TIMED:
         resident, camera = renderer.upload(random_cloud(count, scale)), standard_camera(width, height)
         taken = np.empty((repeats + 1, len(qualities)))
         for k in range(repeats + 1):
             for j, each in enumerate(qualities):
-                begun = time.perf_counter()
+                begun = clock()
                 frame = renderer.render(resident, camera, quality=each)
                 assert frame.timings is not None  # waits for the device
-                taken[k, j] = time.perf_counter() - begun
+                taken[k, j] = clock() - begun
             say(f"times: {k} of {repeats} rounds, {count:,} splats", end="\r")
         middle = np.median(taken[1:], 0)
         ratios.append(middle[1:] / middle[0])

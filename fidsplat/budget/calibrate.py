@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.accuracy import draws_float64, errors, judge_for, truth
+from fidsplat.accuracy import doubt, errors, judge_for, truth
 from fidsplat.cameras import Camera
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
@@ -23,8 +23,6 @@ FEWEST = 3
 PATIENCE_MS = 10_000.0
 """what timing several qualities may take in all; where it would take longer, fewer frames are timed, but
 `FEWEST` of each"""
-FLOAT32_DOUBT = 1e-5
-"""what a truth drawn in float32 may be off: several times the largest error in table.json of such pictures"""
 
 
 @dataclass(frozen=True)
@@ -75,22 +73,22 @@ class Calibration:
         judge = judge_for(self.renderer, *about)
         scene = self._resident if judge is self.renderer else self._cloud
         picture = truth(judge, scene, self._camera, self.base, **self._around)
-        return picture, 0.0 if draws_float64(judge, *about) else FLOAT32_DOUBT
+        return picture, doubt(judge, *about)
 
     def error(self, quality: Quality) -> float | None:
         """Largest absolute error of rgb against the truth; None for a quality that this device does not draw.
 
-        Where no float64 truth can be drawn it has `FLOAT32_DOUBT` added.
+        What the truth may be off itself is added.
         """
         if quality not in self._errors:
-            want, doubt = self._truth  # first, so that what is wrong with the scene itself is said
+            want, off = self._truth  # first, so that what is wrong with the scene itself is said
             self._tell(f"measuring errors ({len(self._errors) + 1} settings so far)")
             try:
                 frame = self.renderer.render(self._resident, self._camera, ("rgb",), quality, **self._around)
             except InputError:
                 self._errors[quality] = None
             else:
-                self._errors[quality] = errors(frame["rgb"], want).maximum + doubt
+                self._errors[quality] = errors(frame["rgb"], want).maximum + off
         return self._errors[quality]
 
     def time(self, quality: Quality) -> float:

@@ -49,9 +49,9 @@ class Search:
         hits: list[tuple[Setting, float]] = []
         missed: tuple[Setting, float] | None = None
         for setting in self._settings:
-            # what has not come near the error in any scene of the table is not tried, nor what is hardly
-            # better than the last that missed it
-            if setting.least > error or (missed and not _much_better(setting, *missed)):
+            # what does not come near the error in the easiest scenes is not tried, nor what is hardly better
+            # than the last that missed it
+            if setting.easy > LUCK * error or (missed and not _much_better(setting, *missed)):
                 continue
             for _, measured in self._measured([setting]):
                 if measured <= error:

@@ -36,14 +36,14 @@ class Setting:
 
     knobs: dict[str, Any]
     """those of `FREE` that differ from it"""
-    least: float
-    """the smallest of the largest errors of the pictures of the table's scenes"""
+    easy: float
+    """the largest error of a picture, in the easiest twentieth of the table's scenes"""
     median: float
-    """of them"""
+    """the same, in the median scene"""
     most: float
-    """the largest of them"""
+    """and in the hardest"""
     cost: float
-    """time of a frame, in that of the setting without any knobs"""
+    """time of a frame, in that of the setting without any knobs (on CPUs the processor's time)"""
 
     def of(self, base: Quality) -> Quality:
         """The quality with the definition of `base` and the accuracy of this setting."""
