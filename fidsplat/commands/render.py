@@ -1,6 +1,8 @@
 """`fidsplat render`."""
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
@@ -8,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import tyro
 
 from fidsplat.commands.output import Json, console, option, print_json, print_table
-from fidsplat.errors import InputError
+from fidsplat.errors import FidsplatError, InputError
 from fidsplat.files import writable_folder
 
 if TYPE_CHECKING:
@@ -85,7 +87,10 @@ Examples:
         where = console(self.json)
         with where.status("reading"):
             scene = _load(self.source)
-        with where.status("opening the device"):
+        with _named(self.source, "render.outputs", names is None):
+            select(fs.SplatCloud.empty(), scene.outputs, Quality.of(None))
+        of_scene = _named(self.source, "render.device", self.device is None)
+        with where.status("opening the device"), of_scene:
             renderer = fs.Renderer(self.device or scene.device)
         choice = None
         if budget:
@@ -132,6 +137,17 @@ Examples:
         for file in files:
             where.print(str(file), markup=False, soft_wrap=True)
         return 0
+
+
+@contextmanager
+def _named(source: str, key: str, of_scene: bool) -> Iterator[None]:
+    """Puts the scene file and its key before an error about what stands there, if that is what is used."""
+    try:
+        yield
+    except FidsplatError as error:
+        if of_scene and Path(source).suffix.lower() == ".toml":
+            raise type(error)(f"{source}: {key}: {error}") from error
+        raise
 
 
 def _names(out: str | None, source: Path):

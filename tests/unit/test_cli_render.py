@@ -187,6 +187,8 @@ def test_what_cannot_be_drawn(scene, words, status, says, capsys):
         (("36h11:5", "36h11:5000"), "586"),
         (("size = 0.25", "size = 0.0"), "size"),
         (("[camera]", "[camra]"), "camera"),
+        (("background", 'outputs = ["dpth"]\nbackground'), "scene.toml: render.outputs: unknown output"),
+        (("background", 'device = "vulkan"\nbackground'), "scene.toml: render.device: unknown device"),
     ],
 )
 def test_scene_files_that_are_wrong(scene, tmp_path, change, says, capsys):

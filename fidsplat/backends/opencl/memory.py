@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Hashable, Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 
 _LEAST = 16  # bytes; OpenCL has no empty buffers
+_ID = 4  # bytes of a splat's index, of which there is no array before a picture asks for it
 
 
 class DeviceBuffer(cl.Buffer):
@@ -32,6 +33,7 @@ class BufferPool:
         self._device = device
         self._buffers: dict[str, cl.Buffer] = {}
         self._spare: dict[str, list[cl.Buffer]] = {}
+        self._kind: Hashable = None
 
     def size(self, name: str) -> int:
         """Bytes of the scratch buffer of that name; 0 if there is none yet."""
@@ -60,12 +62,13 @@ class BufferPool:
         spare = (buffer for buffers in self._spare.values() for buffer in buffers)
         return sum(buffer.size for buffer in (*self._buffers.values(), *spare))
 
-    def shrink(self, size: int, kept: Collection[cl.Buffer]) -> None:
-        """Lets go of what is not among `kept`, if the pool holds more than `size` bytes."""
-        if self.memory_bytes > size:
+    def make_way(self, kind: Hashable, size: int) -> None:
+        """Before a picture: lets go of what pictures of another kind have left, if that is more than `size`
+        bytes. Pictures of one kind take buffers of the same sizes."""
+        if kind != self._kind and self.memory_bytes > size:
             self._spare.clear()
-            keep = set(map(id, kept))
-            self._buffers = {name: held for name, held in self._buffers.items() if id(held) in keep}
+            self._buffers.clear()
+        self._kind = kind
 
     def scratch(self, name: str, size: int) -> cl.Buffer:
         """A buffer of at least `size` bytes whose content is undefined."""
@@ -126,7 +129,7 @@ class Resident:
             degree_0 = np.maximum(np.float32(C0) * cloud.sh[:, 0, :] + np.float32(0.5), 0)
             self._arrays |= {"sh": cloud.sh} if self.sh_degree > 0 else {"colors": degree_0}
         self._buffers: dict[str, cl.Buffer] = {}
-        total = self.count * self.bytes_per_splat
+        total = self.count * self._bytes_of(self._arrays)
         widest = max(array.nbytes for array in self._arrays.values())
         device = backend.device
         self._shared = backend.info.kind == "cpu" and bool(device.host_unified_memory)
@@ -141,10 +144,19 @@ class Resident:
             except cl.Error as error:
                 raise DeviceError(f"{backend.info.title} failed while taking the cloud: {error}") from error
 
-    @property
-    def bytes_per_splat(self) -> int:
-        """Bytes of a splat in all arrays of the cloud."""
-        return sum(array.nbytes // max(self.count, 1) for array in self._arrays.values())
+    def _bytes_of(self, names: Iterable[str]) -> int:
+        """Bytes of a splat in these arrays."""
+        arrays = self._arrays
+        return sum(arrays[k].nbytes // max(self.count, 1) if k in arrays else _ID for k in names)
+
+    def bytes_for(self, names: Iterable[str]) -> tuple[int, int]:
+        """What a picture that asks for these arrays makes of the cloud: bytes that stay on the device, and
+        bytes per splat that each picture copies there."""
+        if self._shared:
+            return 0, 0
+        if self.streamed:
+            return 0, self._bytes_of(names)
+        return self.count * self._bytes_of({*names, *self._buffers}), 0
 
     @property
     def device_bytes(self) -> int:

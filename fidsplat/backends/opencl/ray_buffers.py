@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
@@ -33,6 +34,13 @@ class RayBuffers:
             if raster.lens.kind != "equirectangular":
                 sizes[rows, columns]["ray_map"] = self._map(raster.whole or raster)
         return sizes[rows, columns]
+
+    @staticmethod
+    def bytes_of(rasters: Collection[RayRaster], tile_height: int, columns: int) -> int:
+        """What the buffers of the rasters of one picture take, for grids that are padded to whole tiles."""
+        rows = sum(-(-raster.height // tile_height) * tile_height for raster in rasters)
+        one = next(iter(rasters))
+        return 12 * rows * columns + (one.map[0].nbytes if one.lens.kind != "equirectangular" else 0)
 
     def _map(self, raster: RayRaster) -> cl.Buffer:
         maps = self._held.setdefault(raster, {}).setdefault((0, 0), {})

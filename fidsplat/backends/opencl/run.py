@@ -143,11 +143,6 @@ class Run:
 
     def take(self, name: str, size: int) -> cl.Buffer:
         """A scratch buffer that this picture calls `name`."""
-        if size > self.pool.size(name):
-            self.held.pop(name, None)
-            # what pictures of another kind have left must not count against this one
-            own = self.resident.device_bytes + sum(buffer.size for _, buffer in self.leased)
-            self.pool.shrink(self.backend.memory_budget - own - size, self.held.values())
         self.held[name] = buffer = self.pool.scratch(name, size)
         return buffer
 

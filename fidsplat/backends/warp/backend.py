@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from fidsplat.backends.warp.pipeline import WarpPipeline
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
+from fidsplat.surroundings import Panorama
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,8 @@ class WarpBackend:
         # Warp runs a CPU launch on the thread that calls it, without the interpreter's lock
         self.workers = None if device.is_cuda else ThreadPoolExecutor(self.threads, "fidsplat-warp")
         self.commands = Commands(device)
+        self.panoramas: WeakKeyDictionary[Panorama, Any] = WeakKeyDictionary()
+        """on the device, each as long as it is somewhere else"""
         self._pipelines: dict[tuple[FeatureSet, WarpShape], WarpPipeline] = {}
 
     def limit_memory(self, budget: int) -> None:

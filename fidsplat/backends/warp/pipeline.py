@@ -8,7 +8,7 @@ the same bits.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy as np
 from fidsplat.backends.base import View
 from fidsplat.backends.warp import runtime
 from fidsplat.backends.warp.around import Surroundings
+from fidsplat.backends.warp.finished import WarpPlanes
 from fidsplat.backends.warp.launch import BLOCK, Launcher
 from fidsplat.backends.warp.memory import Resident
 from fidsplat.effects import FeatureSet
@@ -50,33 +51,6 @@ _UNIFORMS = (
 # bytes: of one splat's bounds; of its window, keys, counts, drawn, places, sums; of one that is drawn, in
 # sort and lists; of a pair with the scratch of its sort
 _BOUNDS, _PROJECTED, _VISIBLE, _PAIR = 44, 36, 40, 24
-
-
-class WarpPlanes:
-    """Finished planes on the device."""
-
-    def __init__(
-        self,
-        outputs: dict[str, tuple[Output, Any]],
-        size: tuple[int, int],
-        launcher: Launcher,
-        stats: dict[str, int],
-    ) -> None:
-        self._outputs, self._size, self._launcher = outputs, size, launcher
-        self.stats: Mapping[str, int] = stats
-
-    def device_array(self, name: str) -> Any:
-        """The plane as a wp.array (h, w) or (h, w, 3) on the device; no copy."""
-        output, array = self._outputs[name]
-        return array.reshape(self._size if output.channels == 1 else (*self._size, output.channels))
-
-    def read(self, name: str) -> np.ndarray:
-        # a CPU array's numpy() is its own memory, which device_array gives away
-        return np.array(self.device_array(name).numpy())
-
-    @property
-    def timings(self) -> dict[str, float]:
-        return self._launcher.timings()
 
 
 class WarpPipeline:
@@ -241,7 +215,7 @@ class _Run:
         ends = self._exact("ends by index", n, wp.int64)
         cloud = [self.resident.arrays[name] for name in ("means", "quats", "scales", "opacities", "colors")]
         cloud += self._planes()
-        cloud.append(self.resident.arrays.get("boxes", drawn))  # of one kind of splats: never read
+        cloud.append(self.resident.arrays.get("boxes", drawn))  # not read where all are of one kind
         records = [self.held["lines"], self.held["bounds"], self._take("windows", n, wp.uint64)]
         self.launcher.launch(
             self.pipeline.project,
@@ -318,6 +292,7 @@ class _Run:
         fixed += self.grid[0] * self.grid[1] * sample
         pixel = sum(4 * output.channels for output in self.pipeline.features.outputs)
         fixed += self.view.width * self.view.height // self.view.samples**2 * pixel
+        fixed += self.pipeline.surroundings.nbytes(self.view)
         room = (budget - fixed) // _PAIR
         if room < 1:
             raise DeviceError(
@@ -357,7 +332,7 @@ class _Run:
         """Draws the tiles of one band."""
         pipeline, held = self.pipeline, self.held
         lists = held["starts"], held["lists"]
-        planes = self.resident.arrays.get("planes", held["lists"])  # of no splats: never read
+        planes = self.resident.arrays.get("planes", held["lists"])  # not read where there are none
         args = (self.u, held["lines"], planes, *lists, samples)
         area = pipeline.shape.tile_width * pipeline.shape.tile_height
         if pipeline.shape.schedule == "group":
