@@ -138,11 +138,12 @@ class Combination:
 
     def features(self, *more: str) -> FeatureSet:
         """What it calls for, and more outputs."""
-        moving, exposed = bool(self.motion.groups), self.shutter.exposure > 0 or self.shutter.readout > 0
         around = {"sensor": self.sensor, "fog": self.fog, "background": self.background}
-        return select(
-            self.cloud, (*self.outputs, *more), self.quality, self.camera, moving, exposed, **around
-        )
+        around |= {
+            "moving": bool(self.motion.groups),
+            "exposed": self.shutter.exposure > 0 or self.shutter.readout > 0,
+        }
+        return select(self.cloud, (*self.outputs, *more), self.quality, self.camera, **around)
 
 
 def combination(names: Iterable[str]) -> Combination:

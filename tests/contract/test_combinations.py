@@ -55,6 +55,15 @@ def assert_agrees(renderer, **picture):
     assert all(difference.agrees for difference in differences), differences
 
 
+def refused(renderer, **picture):
+    """Whether this is Warp, which says then that it does not draw these together yet."""
+    if not renderer.device.name.startswith("warp"):
+        return False
+    with pytest.raises(fs.DeviceError, match=r"warp.*use an OpenCL device for it"):
+        renderer.render(CLOUD, **picture)
+    return True
+
+
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 def test_outputs_and_sensors_behind_every_lens(renderer, camera):
     assert_agrees(renderer, camera=camera, outputs=("rgb", *OUTPUTS), sensor=SENSOR)
@@ -65,7 +74,9 @@ def test_outputs_and_sensors_behind_every_lens(renderer, camera):
 def test_fog_and_distances_behind_lenses(renderer, camera, samples):
     outputs = ("rgb", "distance", "distance_median", "distance_first")
     quality = fs.Quality(samples=samples)
-    assert_agrees(renderer, camera=camera, outputs=outputs, quality=quality, fog=FOG)
+    picture = {"camera": camera, "outputs": outputs, "quality": quality, "fog": FOG}
+    if camera is not CAMERAS["distortion"] or not refused(renderer, **picture):
+        assert_agrees(renderer, **picture)
 
 
 @pytest.mark.parametrize("name", ALONG)
@@ -84,11 +95,18 @@ def test_effects_of_the_picture_under_a_shutter(renderer, around, shutter):
     fog = FOG if around == "fog" else None
     motion = fs.Motion(turning, {0: sliding})
     outputs = ("rgb", "alpha", "distance", "splat_id", "normal_world")
+    moved = {"camera": PLAIN, "motion": motion, "shutter": shutter}
+    if refused(renderer, outputs=outputs, **moved):
+        outputs = outputs[:-1]
+        if around in ("sky", "panorama"):
+            assert refused(renderer, background=behind, **moved)
+            return
     frame = renderer.render(
         cloud, PLAIN, outputs, quality, behind, motion=motion, shutter=shutter, sensor=SENSOR, fog=fog
     )
     view = exposed_view(PLAIN, quality, cloud.origin, behind, motion, shutter, SENSOR, fog)
-    features = select(cloud, outputs, quality, PLAIN, True, True, sensor=SENSOR, fog=fog, background=behind)
+    around_us = {"moving": True, "exposed": True, "sensor": SENSOR, "fog": fog, "background": behind}
+    features = select(cloud, outputs, quality, PLAIN, **around_us)
     reference = ReferenceBackend()
     truth = reference.pipeline(features).render(reference.upload(cloud), view).planes
     differences = compare(frame, truth, outputs)
@@ -119,9 +137,9 @@ def test_fog_is_averaged_over_the_poses_of_a_shutter(renderer):
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 def test_backgrounds_behind_every_lens(renderer, camera, behind, samples):
     quality = fs.Quality(samples=samples)
-    assert_agrees(
-        renderer, camera=camera, background=behind, quality=quality, outputs=("rgb", "normal_world")
-    )
+    picture = {"camera": camera, "background": behind, "quality": quality}
+    if not refused(renderer, **picture):
+        assert_agrees(renderer, **picture, outputs=("rgb", "normal_world"))
 
 
 @pytest.mark.skipif(WARP is None, reason="no Warp device here")

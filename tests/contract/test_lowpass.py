@@ -40,10 +40,21 @@ def test_tilted_to_edge_on(renderer, tilt):
     assert_agrees(renderer, cloud, fs.Camera.pinhole(60, 60, 50.0, 50.0, 30.0, 30.0), quality=PIXEL)
 
 
+def refused(renderer, cloud, camera):
+    """Whether this is Warp, which says then that it has no such low-pass before a lens yet."""
+    if not renderer.device.name.startswith("warp"):
+        return False
+    with pytest.raises(fs.DeviceError, match=r"warp does not draw camera_.* with lowpass_pixel yet"):
+        renderer.render(cloud, camera, quality=PIXEL)
+    return True
+
+
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
 @pytest.mark.parametrize("scale", [(1e-6, 1e-2), (1e-3, 2.0)], ids=["small", "any"])
 def test_splats_of_every_size_through_every_lens(renderer, camera, scale):
     cloud = random_splats(200, seed=8, depth=(-4.0, 5.0), scale=scale)
+    if refused(renderer, cloud, camera):
+        return
     assert_agrees(renderer, cloud, camera, quality=PIXEL)
 
 
@@ -61,6 +72,8 @@ def test_a_lens_keeps_the_light_of_a_splat(renderer, camera):
         for axis in axes.T.astype(float)
     )
     want = 2 * math.pi * 0.9 * abs(u[0] * v[1] - u[1] * v[0])
+    if refused(renderer, cloud, camera):
+        return
     quality = PIXEL.with_(alpha_cutoff=1e-9)
     light = float(renderer.render(cloud, camera, "alpha", quality)["alpha"].sum())
     assert light == pytest.approx(want, rel=0.032)

@@ -45,11 +45,12 @@ class RayBuffers:
         return self._put(name, planes)
 
     @staticmethod
-    def bytes_of(rasters: Collection[RayRaster], tile_height: int, columns: int) -> int:
+    def bytes_of(rasters: Collection[RayRaster], tile_height: int, columns: int, slopes: bool) -> int:
         """What the buffers of the rasters of one picture take, for grids that are padded to whole tiles."""
         rows = sum(-(-raster.height // tile_height) * tile_height for raster in rasters)
         one = next(iter(rasters))
-        return 12 * rows * columns + (one.map[0].nbytes if one.lens.kind != "equirectangular" else 0)
+        table = one.map[0].nbytes if one.lens.kind != "equirectangular" else 0
+        return (36 if slopes else 12) * rows * columns + table
 
     def _map(self, raster: RayRaster) -> cl.Buffer:
         maps = self._held.setdefault(raster, {}).setdefault((0, 0), {})
