@@ -183,7 +183,9 @@ PICTURES = {
         "camera": fs.Camera.pinhole(161, 117, 150.0, 150.0, 80.0, 60.0, lens=fs.BrownConrady(-0.1)),
         "motion": fs.Motion(lambda time: np.eye(4)),
         "shutter": fs.Shutter(readout=0.1, exposure=0.05, sub_poses=2),
+        "outputs": ("rgb", "distance"),
     },
+    "boxes": {"camera": fs.Camera.fisheye(161, 117, 2.5), "background": fs.Gradient((1, 1, 1), (0, 0, 0))},
 }
 
 
@@ -198,11 +200,14 @@ def test_a_plan_counts_all_that_a_picture_takes(opencl, monkeypatch, machine, me
     monkeypatch.setattr(pool, "fresh", lambda what, size: taken.append((what, size)) or fresh(what, size))
     monkeypatch.setattr(pool, "make_way", lambda kind, way: planned.append(way) or make_way(kind, way))
     some = random_splats(60000, seed=3, depth=(1.0, 6.0), scale=(1e-3, 1e-2), sh_degree=1)
+    if name == "boxes":
+        some = some.with_boxes()
     own.render(some, **{"camera": CAMERA, **PICTURES[name]})["rgb"]
     largest = {}
     for what, size in taken:
         # a lens's rays are many buffers of one name, the others replace one another
-        largest[what] = largest.get(what, 0) + size if what == "rays" else max(largest.get(what, 0), size)
+        more = largest.get(what, 0) + size if what in ("rays", "ray_slopes") else size
+        largest[what] = max(largest.get(what, 0), more)
     assert ("packed splats" in largest) == (mebibytes == 7)
     assert sum(largest.values()) <= mebibytes * 2**20 - planned[-1] <= mebibytes * 2**20
 

@@ -135,6 +135,8 @@ class OpenCLPipeline:
         fixed += sum(view.array(name).nbytes for names in arrays for name in names)
         if view.raster is not None:
             rasters = {shot.view.raster for shot in view.shots if shot.view.raster} or {view.raster}
+            if any(effect.resolve_inputs for effect in effects):
+                rasters.add(view.raster)  # resolving reads that of the whole picture
             columns, slopes = tiles_x * shape.tile_width, "rays_box" in self.features.names
             fixed += RayBuffers.bytes_of(rasters, shape.tile_height, columns, slopes)
         backend, record = self.backend, self.source.record_bytes
