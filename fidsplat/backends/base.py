@@ -300,6 +300,10 @@ class Measurable(Protocol):
         """Device memory that scratch buffers hold; clouds and finished planes are not among them."""
         ...
 
+    def release_scratch(self) -> None:
+        """Let go of them, so that the next picture shows what it needs."""
+        ...
+
     def rates(self) -> Rates:
         """What the device can do at best; measured anew at each call."""
         ...

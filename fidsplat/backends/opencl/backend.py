@@ -120,6 +120,10 @@ class OpenCLBackend:
         """Device memory that scratch buffers hold, and finished planes that nobody has any more."""
         return self.pool.memory_bytes
 
+    def release_scratch(self) -> None:
+        """Lets go of the scratch buffers; the next picture takes what it needs."""
+        self.pool.shrink(0, ())
+
     def rates(self) -> Rates:
         """What the device can do at best; measured anew at each call."""
         return measure_rates(self)
