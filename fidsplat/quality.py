@@ -11,9 +11,16 @@ import operator
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 from numbers import Real
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fidsplat.errors import InputError
+
+if TYPE_CHECKING:
+    from fidsplat.cameras import Camera, Motion, Shutter
+    from fidsplat.render import Renderer
+    from fidsplat.scenes import Scene
+    from fidsplat.splats import SplatCloud
+    from fidsplat.surroundings import Background, Fog
 
 LOWPASS = ("screen", "pixel", "none")
 STOP_RULES = ("inclusive", "exclusive")
@@ -96,19 +103,21 @@ class Quality:
     """
 
     alpha_cutoff: float = 1.0 / 255.0
-    """Contributions below this alpha are not drawn, (0, 1). It sets each splat's radius:
+    """Alpha, in (0, 1), default 1/255: contributions below it are not drawn. It sets each splat's radius:
     R^2 = 2 ln(opacity / cutoff), the same R in bounds and in the per-pixel test. Lower costs area, higher
     bites haze (research: 100 layers of alpha 0.0039 lose 32 % opacity at 1/255)."""
 
     transmittance_stop: float = 1e-4
-    """A pixel is finished once its transmittance is at or below this, [0, 1). 0 never stops."""
+    """Transmittance, in [0, 1), default 1e-4: a pixel is finished once its own is at or below this, and what
+    lies behind changes it by that much at most. Higher saves the splats behind opaque ones; 0 never stops."""
 
     stop_rule: str = "inclusive"
     """`inclusive`: the fragment that reaches the stop is still drawn. `exclusive` (gsplat, 2DGS authors): it
     is dropped, which leaks up to 1 % of the background through opaque splats; kept for parity only."""
 
     opacity_ceiling: float = 1.0
-    """Upper bound of one fragment's alpha, (0, 1]. gsplat and the 2DGS authors use 0.99."""
+    """Alpha, in (0, 1], default 1: upper bound of one fragment's. gsplat and the 2DGS authors use 0.99, which
+    keeps their gradients finite and lets 1 % of the background through; it saves no time."""
 
     lowpass: str = "screen"
     """`screen`: the object-space low-pass of 2DGS (a Gaussian of sigma 0.707 px around the projected centre,
@@ -123,18 +132,20 @@ class Quality:
     splats, which flips as the camera turns."""
 
     samples: int = 1
-    """n: each pixel is the mean of n x n samples on a regular grid, 1 to 8."""
+    """n, 1 to 8, default 1: each pixel is the mean of n x n samples on a regular grid. More smooth edges, and
+    cost n^2 times the blending."""
 
     first_hit: float = 0.1
     """Opacity at which the outputs depth_first and distance_first see a surface, (0, 1): the first fragment
     or layer behind which the transmittance is at most 1 less this."""
 
     setup_precision: str = "float64"
-    """Arithmetic of the per-splat set-up. `float32` is also what a device without float64 uses."""
+    """Arithmetic of the per-splat set-up. `float32` is also what a device without float64 uses; it moves
+    small and grazing splats (docs/numerics.md), and saves time on devices whose float64 is slow."""
 
     arithmetic: str = "precise"
     """Exponentials and divisions of blending. `precise`: those of the device's library, within 2 or 3 units
-    of the last place. `fast`: shorter ones."""
+    of the last place. `fast`: shorter ones, by which colours move by less than 1e-5."""
 
     blend_precision: str = "float32"
     """Arithmetic of each fragment: crossing, weight and blending. `float64`: a device's truth picture, many
@@ -146,8 +157,8 @@ class Quality:
 
     depth_key_bits: int = 32
     """Leading bits of the depth's float32 by which splats are sorted, 16, 24 or 32: sign, exponent, and then
-    7, 15 or 23 bits of mantissa, so that depths within 1/128, 1/32768 or 1/8388608 of each other tie and keep
-    the cloud's order. Fewer sort faster on CPUs. Clouds with layers of coplanar splats always have all 32."""
+    7, 15 or 23 bits of mantissa. Depths that agree in them (to 1/128, 1/32768 or 1/8388608 at best) tie and
+    keep the cloud's order. Fewer sort faster on CPUs. Where planes are layers there are always all 32."""
 
     tile_size: int | None = None
     """Edge in samples of the tiles in which pictures are drawn, 8, 16 or 32; None: the device's own. CPUs
@@ -245,6 +256,51 @@ class Quality:
             else:
                 changes[name] = _read(cls, name, value)
         return chosen.with_(**changes)
+
+    @classmethod
+    def within(
+        cls,
+        error: float | None = None,
+        ms: float | None = None,
+        *,
+        camera: Camera | None = None,
+        cloud: Scene | SplatCloud | None = None,
+        device: str | Renderer | None = None,
+        base: Quality | str | None = None,
+        background: Background | None = None,
+        motion: Motion | None = None,
+        shutter: Shutter | None = None,
+        fog: Fog | None = None,
+    ) -> Quality:
+        """The cheapest quality that keeps an error, or the most accurate one that keeps a time.
+
+        The error is the largest absolute difference of rgb, over all pixels and channels and before any
+        sensor, from the same definition at full precision in float64 (`fidsplat.accuracy.truth`). The
+        definition (low-pass, samples, coplanar, marker) is that of `base`.
+
+        With the error alone the answer comes from a table of errors over random scenes. With a camera and a
+        cloud it is measured: on this device, in that scene, from there. What was measured is kept in the
+        user's cache folder. docs/budget.md says how often each promise was kept.
+
+        Args:
+            error: largest error allowed.
+            ms: milliseconds that nine frames of ten may take, with the splats on the device and the picture
+                left there; needs camera and cloud.
+            camera: from where it is measured; not needed for a Scene that has one.
+            cloud: splats, or a Scene, whose background, fog and motion count too.
+            device: a device's name or a Renderer; by default that of `Renderer()`.
+            base: whose definition; default the Scene's quality, or standard.
+            background: as `Renderer.render`, with motion, shutter and fog.
+
+        Raises:
+            InputError: no bound, one that is no finite number, or one that nothing keeps; the message says
+                what the best possible is.
+            DeviceError: the device cannot be used or fails.
+        """
+        from fidsplat.budget import choose  # late: a budget is measured by drawing, with all that this takes
+
+        around = {"background": background, "motion": motion, "shutter": shutter, "fog": fog}
+        return choose(error, ms, camera, cloud, device, base, **around).quality
 
     def with_(self, **changes) -> Quality:
         """A copy with some knobs changed; an unknown knob is an error that names the known ones.

@@ -157,14 +157,10 @@ class Renderer:
         """Splats in arrays that are on the device already: drawn where they lie, without a copy.
 
         Shapes and units are those of SplatCloud, float32 (labels int32): wp.array, or what gives DLPack
-        (torch,
-        CuPy, JAX); NumPy arrays are copied. What is in the arrays when a picture is drawn is what it shows,
-        so a
-        simulation may move the splats between pictures. Quaternions need no unit length; a splat that cannot
-        be drawn
-        (a value that is not finite, a scale below 0) is left out of the picture without a word. `origin`
-        (3,): world
-        position of the means' zero.
+        (torch, CuPy, JAX); NumPy arrays are copied. What is in the arrays when a picture is drawn is what it
+        shows, so a simulation may move the splats between pictures. Quaternions need no unit length; a splat
+        that cannot be drawn (a value that is not finite, a scale below 0) is left out of the picture without
+        a word. `origin` (3,): world position of the means' zero.
 
         Raises:
             InputError: the backend takes no arrays, or one has the wrong shape, type or device.
@@ -246,9 +242,8 @@ class Renderer:
             names,
             chosen,
             camera,
-            bool(view.groups),
-            bool(view.shots),
-            view.turns,
+            moving=bool(view.groups),
+            exposed=bool(view.shots),
             sensor=sensor,
             fog=fog,
             background=behind,

@@ -13,6 +13,9 @@ from fidsplat.rotations import check_similarity
 MAX_SIZE = 32767
 """largest width and height in pixels: pixel numbers fit 16 bits on every device"""
 
+FOCAL_LENGTHS = 1e-6, 1e18
+"""least and most, pixels: beyond them the forms of a splat leave the range of float32, and it is lost"""
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -28,9 +31,9 @@ class Camera:
     height: int
     """pixels, 1 to 32767"""
     fx: float
-    """pixels, above 0"""
+    """pixels, 1e-6 to 1e18"""
     fy: float
-    """pixels, above 0"""
+    """pixels, 1e-6 to 1e18"""
     cx: float
     """pixels, anywhere; width / 2 is the middle"""
     cy: float
@@ -56,9 +59,15 @@ class Camera:
             put(self, name, _size(name, getattr(self, name)))
         for name in ("fx", "fy", "cx", "cy", "near", "far"):
             put(self, name, _number(name, getattr(self, name)))
-        for name in ("fx", "fy", "near"):
-            if not (0 < getattr(self, name) < math.inf):
-                raise InputError(f"camera {name} must be above 0 and finite, not {getattr(self, name)!r}")
+        if not (0 < self.near < math.inf):
+            raise InputError(f"camera near must be above 0 and finite, not {self.near!r}")
+        least, most = FOCAL_LENGTHS
+        for name in ("fx", "fy"):
+            if not least <= getattr(self, name) <= most:
+                raise InputError(
+                    f"camera {name} must lie between {least:g} and {most:g} pixels, not "
+                    f"{getattr(self, name)!r}; it is half the width / tan(half the field of view)"
+                )
         for name in ("cx", "cy"):
             if not math.isfinite(getattr(self, name)):
                 raise InputError(f"camera {name} must be finite, not {getattr(self, name)!r}")

@@ -1,6 +1,8 @@
 """`fidsplat render`."""
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
@@ -8,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import tyro
 
 from fidsplat.commands.output import Json, console, option, print_json, print_table
-from fidsplat.errors import InputError
+from fidsplat.errors import FidsplatError, InputError
 from fidsplat.files import writable_folder
 
 if TYPE_CHECKING:
@@ -43,7 +45,9 @@ Examples:
   fidsplat render scene.toml
   fidsplat render scene.toml --quality standard,alpha_cutoff=1e-3,tile_size=8
   fidsplat render scene.toml -o frames --outputs rgb,depth,normal,label
-  fidsplat render tag.ply -o tag.png --device reference --quality gsplat"""
+  fidsplat render tag.ply -o tag.png --device reference --quality gsplat
+  fidsplat render scene.toml --max-error 1e-3        measures first, and keeps what it found for the next time
+  fidsplat render scene.toml --max-ms 20"""
 
     source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply", "what to draw")]
     out: Annotated[
@@ -61,10 +65,19 @@ Examples:
         str | None,
         option("Q", "a preset, knobs as key=value, or both, as below (default: the scene's, or standard)"),
     ] = None
+    max_error: Annotated[
+        float | None,
+        option("E", "draw with the cheapest quality whose largest error of rgb is at most E, e.g. 1e-3"),
+    ] = None
+    max_ms: Annotated[
+        float | None,
+        option("T", "draw with the most accurate quality that takes at most T milliseconds a frame"),
+    ] = None
     json: Json = False
 
     def run(self) -> int:
         import fidsplat as fs
+        from fidsplat.budget import check_bounds, choose
         from fidsplat.effects import select
         from fidsplat.quality import Quality
         from fidsplat.vision.planes import save_plane
@@ -72,15 +85,34 @@ Examples:
         names = None if self.outputs is None else tuple(n.strip() for n in self.outputs.split(","))
         # what is wrong with the words is said before anything is read or opened
         select(fs.SplatCloud.empty(), names or (), Quality.of(self.quality))
+        budget = self.max_error is not None or self.max_ms is not None
+        if budget:
+            check_bounds(self.max_error, self.max_ms)
         name_of = _names(self.out, Path(self.source))
         where = console(self.json)
         with where.status("reading"):
             scene = _load(self.source, self.quality)
-        with where.status("opening the device"):
+        with _named(self.source, "render.outputs", names is None):
+            select(fs.SplatCloud.empty(), scene.outputs, Quality.of(None))
+        of_scene = _named(self.source, "render.device", self.device is None)
+        with where.status("opening the device"), of_scene:
             renderer = fs.Renderer(self.device or scene.device)
+        choice = None
+        if budget:
+            with where.status("measuring") as status:
+                choice = choose(
+                    self.max_error,
+                    self.max_ms,
+                    cloud=scene,
+                    device=renderer,
+                    base=self.quality,
+                    tell=status.update,
+                )
         begun = time.perf_counter()
         with where.status("drawing"):
-            frame = renderer.render(scene, outputs=names, quality=self.quality)
+            frame = renderer.render(
+                scene, outputs=names, quality=self.quality if choice is None else choice.quality
+            )
             planes = {name: frame[name] for name in frame.outputs}
         seconds = time.perf_counter() - begun
         bits = None if scene.sensor is None else scene.sensor.bits
@@ -93,6 +125,7 @@ Examples:
                     "width": scene.camera.width if scene.camera else None,
                     "height": scene.camera.height if scene.camera else None,
                     "outputs": list(frame.outputs),
+                    "chosen": None if choice is None else choice.as_dict(),
                     "stats": dict(frame.stats),
                     "timings_ms": dict(frame.timings),
                     "seconds": seconds,
@@ -104,9 +137,22 @@ Examples:
         rows += [(what, f"{count:,}") for what, count in frame.stats.items()]
         rows += [("with compilation and transfer", f"{seconds:.2f} s")]
         print_table(where, f"{self.source} on {renderer.device.title}", ("", ""), rows)
+        if choice is not None:
+            where.print(f"chosen: {choice.summary}", markup=False, soft_wrap=True)
         for file in files:
             where.print(str(file), markup=False, soft_wrap=True)
         return 0
+
+
+@contextmanager
+def _named(source: str, key: str, of_scene: bool) -> Iterator[None]:
+    """Puts the scene file and its key before an error about what stands there, if that is what is used."""
+    try:
+        yield
+    except FidsplatError as error:
+        if of_scene and Path(source).suffix.lower() == ".toml":
+            raise type(error)(f"{source}: {key}: {error}") from error
+        raise
 
 
 def _names(out: str | None, source: Path):

@@ -157,7 +157,7 @@ def marker(
     start = time.perf_counter()
     parsed = parse_spec(spec)
     given = {"levels": levels, "density": density, "growth": growth, "template": template}
-    chosen = _chosen(quality or MarkerQuality(), mixture, duplicates, given)
+    chosen = _chosen(MarkerQuality() if quality is None else quality, mixture, duplicates, given)
     exact = chosen.mixture == "exact"
     templates, growth = _mixture(chosen, bool(duplicates))
     _check_size(size)
@@ -201,6 +201,10 @@ def _chosen(
     quality: MarkerQuality, mixture: str | None, duplicates: bool | None, given: dict[str, Any]
 ) -> MarkerQuality:
     """The knobs, with those that are given (not None) in place of the others."""
+    if not isinstance(quality, MarkerQuality):
+        raise InputError(
+            f"quality is {quality!r}; it must be an fs.MarkerQuality, e.g. fs.Quality(...).marker"
+        )
     name = quality.mixture if mixture is None else mixture
     if name not in MIXTURES:
         raise InputError(f"unknown mixture {name!r}; known: {', '.join(MIXTURES)}")

@@ -7,6 +7,7 @@ import pytest
 from agreement import ALL_OUTPUTS, assert_agrees, compare, random_splats, reference_pixels
 
 import fidsplat as fs
+from fidsplat.cameras.pinhole import FOCAL_LENGTHS
 from fidsplat.experiments.scenes import load_scene
 
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
@@ -97,6 +98,13 @@ def test_markers_at_five_tilts(renderer, spec, tilt):
 def test_principal_point_outside_the_picture_and_odd_sizes(renderer):
     camera = fs.Camera.pinhole(53, 31, 60.0, 75.0, -20.5, 44.25)
     assert_agrees(renderer, random_splats(300, seed=2, depth=(0.5, 5), scale=(0.01, 0.5)), camera)
+
+
+@pytest.mark.parametrize("focal", FOCAL_LENGTHS)
+def test_the_least_and_the_longest_focal_lengths(renderer, focal):
+    """What Camera lets pass is drawn as it should be: splats that fill the sphere, or the pixel."""
+    camera = fs.Camera.pinhole(41, 31, focal, focal, 20.0, 15.0)
+    assert_agrees(renderer, random_splats(60, seed=3, depth=(2, 4), scale=(0.05, 0.8)), camera)
 
 
 def test_a_hundred_thousand_splats_at_720p(renderer):

@@ -77,6 +77,16 @@ def test_fast_arithmetic_stays_within_the_usual_tolerance(opencl, cloud):
     assert 0 < np.abs(exact - fast).max() <= 1e-5
 
 
+def test_fast_exponentials_do_not_run_over(opencl):
+    """At this cut-off the faintest fragments lie below the smallest normal float32."""
+    faint = {"alpha_cutoff": 1e-42, "transmittance_stop": 0.0}
+    exact, fast = (
+        opencl.render(AROUND, CAMERA, ALL_OUTPUTS, quality.with_(**faint)) for quality in (fs.Quality(), FAST)
+    )
+    for name in ("rgb", "alpha", "normal"):
+        assert np.abs(exact[name] - fast[name]).max() <= 1e-5
+
+
 @pytest.mark.parametrize("degree", [None, 0, 2])
 def test_half_colors_are_the_reference_s_rounded_ones(opencl, degree):
     cloud = random_splats(200, seed=11, depth=(1, 6), scale=(0.02, 0.4), sh_degree=degree)

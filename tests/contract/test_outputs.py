@@ -95,9 +95,13 @@ def test_splat_ids_are_indices_of_the_cloud_in_chunks_too(renderer):
     assert ids.max() > 2000
     seen = ids >= 0
     assert np.array_equal(cloud.labels[ids[seen]], whole["label"][seen])
-    budget = 1_000_000
+    # a GPU's tables for drawing in chunks take more
+    budget = 1_000_000 if renderer.device.kind == "cpu" else 3_000_000
     small = fs.Renderer(renderer.device.name, memory_budget=budget)
-    assert np.array_equal(small.render(cloud, CAMERA, "splat_id")["splat_id"], ids)
+    resident = small.upload(cloud)
+    resident._data._shared, resident._data.streamed = False, True
+    assert np.array_equal(small.render(resident, CAMERA, "splat_id")["splat_id"], ids)
+    assert "packed splats" in small.backend.pool._buffers
 
 
 @pytest.mark.parametrize("value", [0, 1, -0.1, math.nan])

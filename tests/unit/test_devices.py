@@ -1,6 +1,7 @@
 """Names of devices, and the repair of PoCL's target processor."""
 
 import ctypes
+from types import SimpleNamespace
 
 import pytest
 
@@ -36,6 +37,37 @@ def test_unknown_devices_are_named(name, words):
         fs.Renderer(name)
     assert all(word in str(caught.value) for word in words)
     assert caught.value.exit_status == 2
+
+
+def test_devices_of_one_name_are_numbered(monkeypatch):
+    """Two PoCLs in one process, or two cards of one platform: each can be typed."""
+    from fidsplat.backends.opencl import backend
+
+    def card(platform, name, available=True):
+        return SimpleNamespace(
+            platform=SimpleNamespace(name=platform), name=name, vendor="", type=0, available=available
+        )
+
+    pocl = "Portable Computing Language"
+    found = [card(pocl, "a"), card("NVIDIA CUDA", "b"), card(pocl, "c"), card("NVIDIA CUDA", "d")]
+    found.append(card("NVIDIA CUDA", "e"))
+    monkeypatch.setattr(backend, "_all_devices", lambda: iter(found))
+    monkeypatch.setattr(backend, "_why_unusable", lambda device: "" if device.available else "broken")
+    monkeypatch.setattr(backend, "OpenCLBackend", lambda device: device.name)
+    wanted = {"pocl": "a", "nvidia": "b", "pocl-2": "c", "nvidia-2": "d", "NVIDIA-3 ": "e"}
+    assert list(backend._named_devices()) == [
+        *("opencl:pocl", "opencl:nvidia", "opencl:pocl-2", "opencl:nvidia-2", "opencl:nvidia-3")
+    ]
+    assert {name: backend.open_device(name) for name in wanted} == wanted
+    assert [backend._name_of(device) for device in found] == list(backend._named_devices())
+    with pytest.raises(UnknownDeviceError, match="opencl:nvidia-3: e"):
+        backend.open_device("nvidia-4")
+    # without a number the first that works; with one just that
+    found[0] = card(pocl, "a", available=False)
+    assert backend.open_device("pocl") == "c"
+    found[0], found[2] = card(pocl, "a"), card(pocl, "c", available=False)
+    with pytest.raises(fs.DeviceError, match="broken"):
+        backend.open_device("pocl-2")
 
 
 def test_no_platform_says_how_to_get_one(monkeypatch):

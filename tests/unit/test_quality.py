@@ -107,3 +107,5 @@ def test_a_marker_takes_from_a_quality_what_it_does_not_say():
     assert fs.marker("apriltag:36h11:5", mixture="exact", quality=quality).mixture == "exact"
     with pytest.raises(fs.InputError, match="levels and density"):
         fs.marker("apriltag:36h11:5", mixture="paper", template=9)
+    with pytest.raises(fs.InputError, match="MarkerQuality"):
+        fs.marker("apriltag:36h11:5", quality=fs.Quality())  # type: ignore[arg-type]

@@ -1,5 +1,6 @@
 """The Warp backend: its devices, what it says when it is missing, arrays that are shared without a copy."""
 
+import gc
 import re
 import subprocess
 import sys
@@ -97,6 +98,21 @@ def test_what_warp_lacks_stands_in_its_page():
     assert set(CATALOGUE) >= KNOWN
     for name in set(CATALOGUE) - KNOWN:
         assert f"`{name}`" in page, name
+
+
+def test_a_panorama_is_on_the_device_once_and_as_long_as_it_is_used(renderer):
+    held, before = renderer.backend.panoramas, len(renderer.backend.panoramas)
+    sky = fs.Panorama(np.random.default_rng(1).uniform(0, 1, (8, 16, 3)))
+    first, second = (renderer.render(CLOUD, CAMERA, names, background=sky) for names in ("rgb", "alpha"))
+    assert len(held) == before + 1
+    assert held[sky].shape == (8, 16)
+    again = fs.Panorama(1 - sky.image)
+    assert not np.array_equal(renderer.render(CLOUD, CAMERA, background=again)["rgb"], first["rgb"])
+    assert np.array_equal(renderer.render(CLOUD, CAMERA, background=sky)["rgb"], first["rgb"])
+    assert second["alpha"].any()
+    del sky, again
+    gc.collect()
+    assert len(held) == before
 
 
 def test_the_environment_names_the_default(monkeypatch):

@@ -31,23 +31,25 @@ _NO_PLATFORM = (
 
 def devices() -> list[DeviceInfo]:
     """Every OpenCL device here, usable or not. An empty list if there is no platform."""
-    return [_describe(device) for device in _all_devices()]
+    return [_describe(device, name) for name, device in _named_devices().items()]
 
 
 def open_device(selector: str = "") -> OpenCLBackend:
-    """The best usable device (GPU before CPU), or the first whose platform, name or vendor contains
-    `selector`.
+    """The best usable device (GPU before CPU) of those whose platform, name or vendor contains `selector`, or
+    the one that `devices` lists as opencl:`selector` where that ends with a number.
 
     Raises:
         DeviceError: no OpenCL at all, or none of the devices can be used.
         UnknownDeviceError: nothing matches the selector.
     """
-    found = list(_all_devices())
+    found = _named_devices()
     if not found:
         raise DeviceError(_NO_PLATFORM)
-    matching = [device for device in found if _matches(device, selector)]
+    wanted = selector.strip().lower()
+    numbered = found.get(f"opencl:{wanted}") if wanted[-1:].isdigit() else None
+    matching = [numbered] if numbered else [device for device in found.values() if _matches(device, wanted)]
     if not matching:
-        known = "; ".join(f"{device.platform.name}: {device.name}" for device in found)
+        known = "; ".join(f"{name}: {device.name}" for name, device in found.items())
         raise UnknownDeviceError(f"no OpenCL device matches {selector!r}; there are: {known}")
     usable = [device for device in matching if not _why_unusable(device)]
     if not usable:
@@ -60,7 +62,7 @@ class OpenCLBackend:
     """An open OpenCL device with its queue, buffer pool and compiled pipelines."""
 
     def __init__(self, device: cl.Device) -> None:
-        self.info = _describe(device)
+        self.info = _describe(device, _name_of(device))
         self.device = device
         self.target = _target(device)
         self.shape = _shape(device)
@@ -102,6 +104,11 @@ class OpenCLBackend:
         if not self.info.float64 and features.setup_precision != "float32":
             features = replace(features, setup_precision="float32")
         key = (features, shape or shape_for(features, self.shape))
+        if key[1].blend_items > self.device.max_work_group_size:
+            raise DeviceError(
+                f"{self.info.title} has work-groups of at most {self.device.max_work_group_size}, and "
+                f"tile_size={features.tile_size} needs {key[1].blend_items}; use smaller tiles"
+            )
         if key not in self._pipelines:
             source = assemble(*key)
             program = self.build(source.text)
@@ -159,13 +166,30 @@ def _all_devices() -> Iterator[cl.Device]:
             continue
 
 
+def _named_devices() -> dict[str, cl.Device]:
+    """Devices by what to type for them; of several with the platform's name the later ones have a number."""
+    named: dict[str, cl.Device] = {}
+    for device in _all_devices():
+        platform = device.platform.name
+        short = "pocl" if "Portable Computing Language" in platform else platform.split()[0].lower()
+        name, number = f"opencl:{short}", 1
+        while name in named:
+            number += 1
+            name = f"opencl:{short}-{number}"
+        named[name] = device
+    return named
+
+
+def _name_of(device: cl.Device) -> str:
+    return next(name for name, known in _named_devices().items() if known == device)
+
+
 def _matches(device: cl.Device, selector: str) -> bool:
     aliases = {"pocl": "portable computing language"}
-    wanted = selector.strip().lower()
     named = f"{device.platform.name} {device.name} {device.vendor}".lower()
-    if wanted in ("cpu", "gpu"):
-        return bool(device.type & getattr(cl.device_type, wanted.upper()))
-    return wanted in named or aliases.get(wanted, "\0") in named
+    if selector in ("cpu", "gpu"):
+        return bool(device.type & getattr(cl.device_type, selector.upper()))
+    return selector in named or aliases.get(selector, "\0") in named
 
 
 def _why_unusable(device: cl.Device) -> str:
@@ -190,17 +214,14 @@ def _target(device: cl.Device) -> str:
     return device.version
 
 
-def _describe(device: cl.Device) -> DeviceInfo:
+def _describe(device: cl.Device, name: str) -> DeviceInfo:
     why = _why_unusable(device)
     kind = (
         "gpu" if device.type & cl.device_type.GPU else "cpu" if device.type & cl.device_type.CPU else "other"
     )
-    short = (
-        "pocl" if "Portable Computing Language" in device.platform.name else device.platform.name.split()[0]
-    )
     float64 = "cl_khr_fp64" in device.extensions
     return DeviceInfo(
-        name=f"opencl:{short.lower()}",
+        name=name,
         title=device.name.strip(),
         platform=device.platform.name.strip(),
         version=device.version.strip(),

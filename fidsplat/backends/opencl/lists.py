@@ -15,11 +15,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.opencl.plan import KEYS, WINDOWS
+from fidsplat.backends.opencl.plan import BIG, KEYS, WINDOWS
 from fidsplat.errors import DeviceError
 
 if TYPE_CHECKING:
     from fidsplat.backends.opencl.run import Run
+
+SPLAT_ARRAYS = ("means", "quats", "scales", "opacities")
+"""what of a cloud every picture reads"""
 
 # words of the buffer `tallies`, as in prelude.cl
 _VISIBLE, _PAIRS, _ALL, _BIG, _TALLIES = 0, 2, 4, 6, 8
@@ -39,7 +42,7 @@ class Lists:
     def make_room(self, words: int, needed: int = 0) -> None:
         """Zeroes `words` words of the tallies; takes room for at least `needed` big splats."""
         run = self.run
-        room = max(needed * 5 // 4, run.pool.size("big") // 4, 4096)
+        room = max(needed * 5 // 4, run.pool.size("big") // 4, BIG)
         self.big = np.uint32(room)
         tallies = run.lease("tallies", 4 * words)
         run.take("big", 4 * room)
@@ -55,7 +58,7 @@ class Lists:
             return
         effects = run.pipeline.features.effects
         inputs = [(name, name in effect.view_inputs) for effect in effects for name in effect.inputs]
-        arrays = [run.resident.part(name, first, end) for name in ("means", "quats", "scales", "opacities")]
+        arrays = [run.resident.part(name, first, end) for name in SPLAT_ARRAYS]
         extra = [
             run.held[name] if of_view else run.resident.part(name, first, end) for name, of_view in inputs
         ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Hashable, Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,6 +32,7 @@ class BufferPool:
         self._device = device
         self._buffers: dict[str, cl.Buffer] = {}
         self._spare: dict[str, list[cl.Buffer]] = {}
+        self._kind: Hashable = None
 
     def size(self, name: str) -> int:
         """Bytes of the scratch buffer of that name; 0 if there is none yet."""
@@ -60,12 +61,13 @@ class BufferPool:
         spare = (buffer for buffers in self._spare.values() for buffer in buffers)
         return sum(buffer.size for buffer in (*self._buffers.values(), *spare))
 
-    def shrink(self, size: int, kept: Collection[cl.Buffer]) -> None:
-        """Lets go of what is not among `kept`, if the pool holds more than `size` bytes."""
-        if self.memory_bytes > size:
+    def make_way(self, kind: Hashable, size: int) -> None:
+        """Before a picture: lets go of what pictures of another kind have left, if that is more than `size`
+        bytes. Pictures of one kind take buffers of the same sizes."""
+        if kind != self._kind and self.memory_bytes > size:
             self._spare.clear()
-            keep = set(map(id, kept))
-            self._buffers = {name: held for name, held in self._buffers.items() if id(held) in keep}
+            self._buffers.clear()
+        self._kind = kind
 
     def scratch(self, name: str, size: int) -> cl.Buffer:
         """A buffer of at least `size` bytes whose content is undefined."""
@@ -126,42 +128,38 @@ class Resident:
             degree_0 = np.maximum(np.float32(C0) * cloud.sh[:, 0, :] + np.float32(0.5), 0)
             self._arrays |= {"sh": cloud.sh} if self.sh_degree > 0 else {"colors": degree_0}
         self._buffers: dict[str, cl.Buffer] = {}
-        total = self.count * self.bytes_per_splat
+        total = self.count * self._bytes_of(self._arrays)
         widest = max(array.nbytes for array in self._arrays.values())
         device = backend.device
         self._shared = backend.info.kind == "cpu" and bool(device.host_unified_memory)
         self.streamed = not self._shared and (
             total > backend.memory_budget // 2 or widest > device.max_mem_alloc_size
         )
-        self.settle(sorted(self._arrays.keys() - {"labels", "colors", "sh"}))
+        if not self._shared and not self.streamed:
+            try:
+                for name in self._arrays.keys() - {"labels", "colors", "sh"}:
+                    self._whole(name)
+                backend.queue.finish()
+            except cl.Error as error:
+                raise DeviceError(f"{backend.info.title} failed while taking the cloud: {error}") from error
 
-    @property
-    def bytes_per_splat(self) -> int:
-        """Bytes of a splat in all arrays of the cloud."""
-        return sum(array.nbytes // max(self.count, 1) for array in self._arrays.values())
+    def _bytes_of(self, names: Iterable[str]) -> int:
+        """Bytes of a splat in these arrays."""
+        return sum(self._array(name).nbytes // max(self.count, 1) for name in names)
+
+    def bytes_for(self, names: Iterable[str]) -> tuple[int, int]:
+        """What a picture that asks for these arrays makes of the cloud: bytes that stay on the device, and
+        bytes per splat that each picture copies there."""
+        if self._shared:
+            return 0, 0
+        if self.streamed:
+            return 0, self._bytes_of(names)
+        return self.count * self._bytes_of({*names, *self._buffers}), 0
 
     @property
     def device_bytes(self) -> int:
         """Bytes that the cloud holds on the device; a CPU's are the host's."""
         return 0 if self._shared else sum(buffer.size for buffer in self._buffers.values())
-
-    def settle(self, names: Iterable[str]) -> None:
-        """Copies these arrays to the device if it is to hold the cloud, so that a picture's plan knows of
-        them.
-
-        Raises:
-            DeviceError: the device fails or lacks memory.
-        """
-        fresh = [name for name in names if name not in self._buffers]
-        if self._shared or self.streamed or not fresh:
-            return
-        try:
-            for name in fresh:
-                self._whole(name)
-            self._backend.queue.finish()
-        except cl.Error as error:
-            title = self._backend.info.title
-            raise DeviceError(f"{title} failed while taking the cloud: {error}") from error
 
     def part(self, name: str, first: int, end: int) -> cl.Buffer:
         """The array of splats [first, end)."""

@@ -14,8 +14,10 @@ import pyopencl as cl
 from fidsplat.backends.base import View
 from fidsplat.backends.opencl.assemble import DeviceShape, Source
 from fidsplat.backends.opencl.exposed_run import ExposedRun
+from fidsplat.backends.opencl.lists import SPLAT_ARRAYS
 from fidsplat.backends.opencl.memory import DeviceBuffer, Resident
-from fidsplat.backends.opencl.plan import Plan, plan_of
+from fidsplat.backends.opencl.plan import BIG, SMALL, Plan, plan_of, table_bytes
+from fidsplat.backends.opencl.ray_buffers import RayBuffers
 from fidsplat.backends.opencl.run import Run
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.catalogue import Output
@@ -84,6 +86,10 @@ class OpenCLPipeline:
         self.backend = backend
         self._kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
         self._bound: dict[str, tuple] = {}
+        taken = [
+            name for effect in features.effects for name in effect.inputs if name not in effect.view_inputs
+        ]
+        self._cloud_arrays = {*SPLAT_ARRAYS, *taken}
         self.real = np.float64 if features.setup_precision == "float64" else np.float32
         self.wide = np.float64 if "blend_double" in features.names else np.float32
 
@@ -93,13 +99,15 @@ class OpenCLPipeline:
         Raises:
             DeviceError: the device runs out of memory or fails.
         """
-        effects = self.features.effects
-        resident.settle(name for one in effects for name in one.inputs if name not in one.view_inputs)
         plan = self._plan(resident, view)
         if plan.chunk and self.shape.lists != "ordered":
             # one way of drawing in chunks is enough: where memory is short, sorting takes the least time
             shape = replace(self.shape, lists="ordered")
             return self.backend.pipeline(self.features, shape).render(resident, view)
+        backend = self.backend
+        way = backend.memory_budget - plan.held
+        # what this picture takes anew is planned for; that of its own kind is there already
+        backend.pool.make_way((self, view.width, view.height, resident.count, plan), way)
         try:
             run = (ExposedRun if view.shots else Run)(self, resident, view, plan)
             return OpenCLPlanes(run, run.draw())
@@ -111,21 +119,25 @@ class OpenCLPipeline:
             raise
 
     def _plan(self, resident: Resident, view: View) -> Plan:
-        shape = self.shape
-        tiles = -(-view.width // shape.tile_width) * -(-view.height // shape.tile_height)
-        # tables, places and tallies of tiles: much, if a GPU draws a large picture in chunks
-        fixed = 4 * tiles * (shape.chunks + 2 if shape.lists == "ordered" else 3)
-        pixels = view.width * view.height // view.samples**2
-        planes = 4 + sum(planes for effect in self.features.effects for planes in effect.planes)
-        channels = sum(output.channels for output in self.features.outputs)
+        shape, effects = self.shape, self.features.effects
+        tiles_x = -(-view.width // shape.tile_width)
+        tiles = tiles_x * -(-view.height // shape.tile_height)
+        stays, upload = resident.bytes_for(self._cloud_arrays)
+        fixed = stays + SMALL + table_bytes(shape.lists, tiles, shape.chunks, shape.radix_bits)
+        fixed += BIG * (4 + self.source.bounds_bytes)
+        planes = 4 + sum(planes for effect in effects for planes in effect.planes)
         if view.shots:
             planes *= 2  # the picture's own beside those of a shot
         fixed += 4 * tiles * shape.tile_width * shape.tile_height * planes  # whole tiles
-        fixed += 4 * pixels * channels + resident.device_bytes
+        pixels = view.width * view.height // view.samples**2
+        fixed += 4 * pixels * sum(output.channels for output in self.features.outputs)
+        fixed += sum(view.array(name).nbytes for effect in effects for name in effect.resolve_arrays)
+        if view.raster is not None:
+            rasters = {shot.view.raster for shot in view.shots if shot.view.raster} or {view.raster}
+            fixed += RayBuffers.bytes_of(rasters, shape.tile_height, tiles_x * shape.tile_width)
         backend, record = self.backend, self.source.record_bytes
         budget, largest = backend.memory_budget, backend.device.max_mem_alloc_size
-        upload = resident.bytes_per_splat if resident.streamed else 0
-        return plan_of(resident.count, record, upload, fixed, self.shape.lists, budget, largest)
+        return plan_of(resident.count, record, upload, fixed, shape.lists, budget, largest)
 
     def launch(self, queue: cl.CommandQueue, name: str, size: tuple, group: tuple, args: tuple) -> cl.Event:
         """Launch a kernel, setting only those arguments that have changed since its last launch: from picture
@@ -147,7 +159,7 @@ class OpenCLPipeline:
         (n, words) float32 (undefined for culled splats); raw (4, rows, columns) float32: r, g, b,
         transmittance of the padded sample grid; and the finished outputs by name.
         """
-        run = Run(self, resident, view, Plan(0, resident.count))
+        run = Run(self, resident, view, Plan(0, resident.count, 0))
         planes = OpenCLPlanes(run, run.draw())
         stats = planes.stats
         words = self.source.record_bytes // 4

@@ -13,6 +13,10 @@ _LEAST = 1 << 10
 
 KEYS, WINDOWS, SORTED, PAIR = 4, 8, 16, {"ordered": 4, "tiled": 12}
 """bytes per splat of sort keys, of tile windows, and of keys and indices being sorted; bytes per pair"""
+BIG = 1 << 12
+"""big splats for which there is room at first"""
+SMALL = 1 << 14
+"""bytes for all that is small: uniforms, counts, groups that move"""
 
 
 @dataclass(frozen=True)
@@ -23,6 +27,16 @@ class Plan:
     """splats that are projected at once; 0: all, without packing those that are seen"""
     capacity: int
     """splats of one band that are kept, if in chunks"""
+    held: int
+    """bytes that all of it takes at most, the cloud included; more only if more than `BIG` splats are big"""
+
+
+def table_bytes(lists: str, tiles: int, chunks: int, radix_bits: int) -> int:
+    """What listing takes beside splats and pairs: tables, places and tallies."""
+    if lists == "tiled":
+        return 4 * 3 * tiles
+    bins = 1 << radix_bits
+    return 4 * ((tiles + bins) * (chunks + 2) + 3 * chunks)
 
 
 def plan_of(
@@ -33,7 +47,7 @@ def plan_of(
     Args:
         record_bytes: of a splat's record.
         upload_bytes: per splat, where the cloud itself does not stay on the device; else 0.
-        fixed_bytes: sample planes, outputs, and the cloud if it stays.
+        fixed_bytes: sample planes, outputs, tables, and the cloud if it stays.
         budget: bytes that everything may take together. largest: bytes that one buffer may take.
 
     Raises:
@@ -43,7 +57,7 @@ def plan_of(
     pairs = budget // 8
     fits = not upload_bytes and fixed_bytes + direct + pairs <= budget
     if fits and count * record_bytes <= largest:
-        return Plan(0, count)
+        return Plan(0, count, fixed_bytes + direct + pairs)
     free = budget - fixed_bytes - pairs
     each = record_bytes + KEYS + WINDOWS
     chunk = CHUNK
@@ -56,4 +70,5 @@ def plan_of(
             f"a memory budget of {budget / 2**20:.0f} MiB is too small: the picture and the cloud alone take "
             f"{fixed_bytes / 2**20:.0f} MiB; raise memory_budget, or draw a smaller picture or fewer outputs"
         )
-    return Plan(chunk, capacity)
+    held = fixed_bytes + pairs + chunk * (each + upload_bytes) + capacity * (each + SORTED)
+    return Plan(chunk, capacity, held)

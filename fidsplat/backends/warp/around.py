@@ -14,12 +14,11 @@ if TYPE_CHECKING:
 
 
 class Surroundings:
-    """Fills the struct of one kind of background; the last panorama stays on the device."""
+    """Fills the struct of one kind of background. A panorama stays on the device as long as it lives."""
 
     def __init__(self, backend: WarpBackend, kind: str) -> None:
         self._backend = backend
         self._type = runtime.kernels("surroundings").make_surroundings(kind).Around
-        self._panorama: tuple[Panorama | None, Any] = None, None
 
     def of(self, view: View) -> Any:
         """The struct for this view.
@@ -38,16 +37,19 @@ class Surroundings:
             around.color = wp.vec3(*view.background)
         return around
 
+    def nbytes(self, view: View) -> int:
+        """Bytes that it takes on the device."""
+        return view.surroundings.image.nbytes if isinstance(view.surroundings, Panorama) else 0
+
     def _uploaded(self, panorama: Panorama) -> Any:
-        wp, (held, array) = runtime.load(), self._panorama
-        if held is not panorama:
+        wp, held = runtime.load(), self._backend.panoramas
+        if panorama not in held:
             image = panorama.image
             try:
-                array = wp.array(image, dtype=wp.vec3, device=self._backend.device)
+                held[panorama] = wp.array(image, dtype=wp.vec3, device=self._backend.device)
             except (RuntimeError, MemoryError) as error:
                 raise DeviceError(
                     f"the panorama needs {image.nbytes / 2**20:.0f} MiB, which {self._backend.info.name} has "
                     "not; use a smaller one"
                 ) from error
-            self._panorama = panorama, array
-        return array
+        return held[panorama]

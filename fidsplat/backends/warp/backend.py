@@ -7,17 +7,20 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from fidsplat.backends.base import DeviceInfo
 from fidsplat.backends.warp import runtime
 from fidsplat.backends.warp.launch import Commands
+from fidsplat.backends.warp.lens import LensArrays
 from fidsplat.backends.warp.memory import ArrayPool, Resident
 from fidsplat.backends.warp.pipeline import WarpPipeline
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
+from fidsplat.surroundings import Panorama
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,7 @@ class WarpBackend:
         self.device = device
         self.shape = WarpShape("group" if device.is_cuda else "tiles", 16, 16)
         self.pool = ArrayPool(device)
+        self.lens_arrays = LensArrays()
         self.pair_budget = 2**30 - 1
         """Most pairs of splats and tiles that are listed at once; tests make it small."""
         self.memory_budget = self.info.memory_bytes // 10 * 9
@@ -77,6 +81,8 @@ class WarpBackend:
         # Warp runs a CPU launch on the thread that calls it, without the interpreter's lock
         self.workers = None if device.is_cuda else ThreadPoolExecutor(self.threads, "fidsplat-warp")
         self.commands = Commands(device)
+        self.panoramas: WeakKeyDictionary[Panorama, Any] = WeakKeyDictionary()
+        """on the device, each as long as it is somewhere else"""
         self._pipelines: dict[tuple[FeatureSet, WarpShape], WarpPipeline] = {}
 
     def limit_memory(self, budget: int) -> None:
