@@ -131,12 +131,10 @@ class OpenCLPipeline:
         fixed += 4 * tiles * shape.tile_width * shape.tile_height * planes  # whole tiles
         pixels = view.width * view.height // view.samples**2
         fixed += 4 * pixels * sum(output.channels for output in self.features.outputs)
-        arrays = [(*effect.resolve_arrays, *effect.backdrop_arrays) for effect in effects]
-        fixed += sum(view.array(name).nbytes for names in arrays for name in names)
+        arrays = (name for effect in effects for name in (*effect.resolve_arrays, *effect.backdrop_arrays))
+        fixed += sum(view.array(name).nbytes for name in arrays)
         if view.raster is not None:
-            rasters = {shot.view.raster for shot in view.shots if shot.view.raster} or {view.raster}
-            if any(effect.resolve_inputs for effect in effects):
-                rasters.add(view.raster)  # resolving reads that of the whole picture
+            rasters = {view.raster, *(shot.view.raster for shot in view.shots if shot.view.raster)}
             columns, slopes = tiles_x * shape.tile_width, "rays_box" in self.features.names
             fixed += RayBuffers.bytes_of(rasters, shape.tile_height, columns, slopes)
         backend, record = self.backend, self.source.record_bytes

@@ -25,8 +25,7 @@ class RayBuffers:
         )
 
     def of(self, raster: RayRaster, rows: int, columns: int, slopes: bool = False) -> dict[str, cl.Buffer]:
-        """Buffers by name, for a sample grid that is padded to rows x columns. slopes: with those that boxes
-        need."""
+        """Buffers by name, for a sample grid that is padded to rows x columns. slopes: those of boxes too."""
         sizes = self._held.setdefault(raster, {})
         if (rows, columns) not in sizes:
             sizes[rows, columns] = {"rays": self._planes("rays", raster.rays, rows, columns)}
@@ -36,7 +35,7 @@ class RayBuffers:
         if slopes and "ray_slopes" not in held:
             flat = raster.slopes.reshape(raster.height, raster.width, 6)
             held["ray_slopes"] = self._planes("ray_slopes", flat, rows, columns)
-            held["ray_step"] = self._put("ray_step", np.array([raster.step], np.float32))
+            held["ray_step"] = self._put("ray_step", np.float32([raster.step]))
         return held
 
     def _planes(self, name: str, array: np.ndarray, rows: int, columns: int) -> cl.Buffer:
@@ -49,8 +48,8 @@ class RayBuffers:
         """What the buffers of the rasters of one picture take, for grids that are padded to whole tiles."""
         rows = sum(-(-raster.height // tile_height) * tile_height for raster in rasters)
         one = next(iter(rasters))
-        table = one.map[0].nbytes if one.lens.kind != "equirectangular" else 0
-        return (36 if slopes else 12) * rows * columns + table
+        each = 36 if slopes else 12
+        return each * rows * columns + (one.map[0].nbytes if one.lens.kind != "equirectangular" else 0)
 
     def _map(self, raster: RayRaster) -> cl.Buffer:
         maps = self._held.setdefault(raster, {}).setdefault((0, 0), {})
