@@ -35,7 +35,7 @@ class RayBuffers:
         if slopes and "ray_slopes" not in held:
             flat = raster.slopes.reshape(raster.height, raster.width, 6)
             held["ray_slopes"] = self._planes("ray_slopes", flat, rows, columns)
-            held["ray_step"] = self._put("ray_step", np.float32([raster.step]))
+            held["ray_step"] = self._put("ray_step", np.array([raster.step], np.float32))
         return held
 
     def _planes(self, name: str, array: np.ndarray, rows: int, columns: int) -> cl.Buffer:
