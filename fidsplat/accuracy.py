@@ -6,21 +6,28 @@ that leave something out of it (cut-off, stop, ceiling) and the arithmetic decid
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fidsplat.backends.reference.backend import ReferencePlanes
 from fidsplat.cameras import Camera
-from fidsplat.errors import InputError
+from fidsplat.effects import select
+from fidsplat.errors import DeviceError, InputError
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer, ResidentCloud
 from fidsplat.scenes import Scene
 from fidsplat.splats import SplatCloud
+from fidsplat.surroundings import Fog
 
 TRUTH_CUTOFF = 1e-8
 """alpha below which the truth leaves a contribution out: a thousand such layers hide 1e-5"""
+
+FLOAT32_OUTPUT = 1e-7
+"""what a truth of colours up to 1 is off that a device hands out in float32"""
+FLOAT32_TRUTH = 1e-5
+"""what one is off that is drawn in float32: more than any picture at full precision in budget/table.json"""
 
 
 @dataclass(frozen=True)
@@ -68,11 +75,14 @@ def errors(picture: ArrayLike, truth: ArrayLike) -> Errors:
     )
 
 
-def full_precision(like: Quality, renderer: Renderer) -> Quality:
+def full_precision(
+    like: Quality, renderer: Renderer, camera: Camera | None = None, fog: Fog | None = None
+) -> Quality:
     """The quality that draws the same definition with nothing left out, in the best arithmetic of the device.
 
-    Low-pass, samples, coplanar and first_hit are those of `like`. OpenCL blends in float64 where the device
-    has it; else the arithmetic is the device's own, with the set-up in float64 if the device has that.
+    Low-pass, samples, coplanar and first_hit are those of `like`. OpenCL blends in float64 where that can be
+    (`draws_float64`); else the arithmetic is the device's own, with the set-up in float64 if the device has
+    that.
     """
     best = like.with_(
         alpha_cutoff=TRUTH_CUTOFF,
@@ -80,10 +90,45 @@ def full_precision(like: Quality, renderer: Renderer) -> Quality:
         opacity_ceiling=1.0,
         stop_rule="inclusive",
         setup_precision="float64",
+        arithmetic="precise",
+        color_precision="float32",
+        depth_key_bits=32,
     )
-    known = any(field.name == "blend_precision" for field in fields(Quality))
-    doubles = renderer.device.float64 and renderer.device.name.startswith("opencl")
-    return best.with_(blend_precision="float64") if doubles and known else best
+    if renderer.device.name != "reference" and draws_float64(renderer, camera, fog):
+        return best.with_(blend_precision="float64")
+    return best
+
+
+def draws_float64(renderer: Renderer, camera: Camera | None = None, fog: Fog | None = None) -> bool:
+    """Whether its pictures at full precision are float64 throughout: the reference's, and those of OpenCL on
+    a device with float64, but for lenses and fog, whose rays are float32."""
+    family = renderer.device.name.partition(":")[0]
+    if family != "opencl" or not renderer.device.float64:
+        return family == "reference"
+    try:
+        select(SplatCloud.empty(), ("rgb",), Quality(blend_precision="float64"), camera, fog=fog)
+    except InputError:
+        return False
+    return True
+
+
+def doubt(judge: Renderer, camera: Camera | None = None, fog: Fog | None = None) -> float:
+    """What the truth may be off itself that a renderer draws."""
+    if judge.device.name == "reference":
+        return 0.0
+    return FLOAT32_OUTPUT if draws_float64(judge, camera, fog) else FLOAT32_TRUTH
+
+
+def judge_for(renderer: Renderer, camera: Camera | None = None, fog: Fog | None = None) -> Renderer:
+    """Who draws the truth for a renderer's pictures: itself if it can in float64, else OpenCL on this
+    machine's processor if that is there and can, else itself."""
+    if draws_float64(renderer, camera, fog):
+        return renderer
+    try:
+        processor = Renderer("opencl:cpu")
+    except DeviceError:
+        return renderer
+    return processor if draws_float64(processor, camera, fog) else renderer
 
 
 def truth(
@@ -110,7 +155,9 @@ def truth(
     Raises:
         InputError, DeviceError: as `Renderer.render`.
     """
-    quality = full_precision(Quality.of(like), renderer)
+    own = scene if isinstance(scene, Scene) else Scene()
+    seen_from, fog = camera or own.camera, around.get("fog") or own.fog
+    quality = full_precision(Quality.of(like), renderer, seen_from, fog)
     frame = renderer.render(scene, camera, (output,), quality, **around)
     if isinstance(frame._planes, ReferencePlanes):  # float32 is made of its planes when they are read
         return frame._planes.planes[output]

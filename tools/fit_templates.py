@@ -49,6 +49,7 @@ COUNTS = {
     9: ((1, 1, 1), (2, 1, 1)),
     13: ((2, 2, 1), (3, 2, 1)),
     25: ((4, 4, 2), (5, 5, 3)),
+    41: ((6, 6, 4), (7, 7, 5)),
 }
 BACKGROUNDS = (0.0, 0.5, 1.0)
 ORDERS = {"layer": 2.0, "0": 1.0, "130": 1.0}  # weights; an angle sorts the centres along that direction

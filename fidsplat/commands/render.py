@@ -37,10 +37,17 @@ Planes:
   normal normal_world                 towards the camera, in its axes or the world's
   blended                             number of splats that made the pixel
 
+Quality: standard fast reference gsplat surfel; any knob of fs.Quality may follow, or stand alone and change
+standard: fast,samples=2,alpha_cutoff=1e-3. Markers of a scene file that do not say how they are made take
+marker.mixture, marker.levels, marker.density, marker.growth and marker.template from it.
+
 Examples:
   fidsplat render scene.toml
+  fidsplat render scene.toml --quality standard,alpha_cutoff=1e-3,tile_size=8
   fidsplat render scene.toml -o frames --outputs rgb,depth,normal,label
-  fidsplat render tag.ply -o tag.png --device reference --quality gsplat"""
+  fidsplat render tag.ply -o tag.png --device reference --quality gsplat
+  fidsplat render scene.toml --max-error 1e-3        measures first, and keeps what it found for the next time
+  fidsplat render scene.toml --max-ms 20"""
 
     source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply", "what to draw")]
     out: Annotated[
@@ -56,12 +63,21 @@ Examples:
     ] = None
     quality: Annotated[
         str | None,
-        option("Q", "standard fast reference gsplat surfel (default: the scene's, or standard)"),
+        option("Q", "a preset, knobs as key=value, or both, as below (default: the scene's, or standard)"),
+    ] = None
+    max_error: Annotated[
+        float | None,
+        option("E", "draw with the cheapest quality whose largest error of rgb is at most E, e.g. 1e-3"),
+    ] = None
+    max_ms: Annotated[
+        float | None,
+        option("T", "draw with the most accurate quality that takes at most T milliseconds a frame"),
     ] = None
     json: Json = False
 
     def run(self) -> int:
         import fidsplat as fs
+        from fidsplat.budget import check_bounds, choose
         from fidsplat.effects import select
         from fidsplat.quality import Quality
         from fidsplat.vision.planes import save_plane
@@ -69,18 +85,34 @@ Examples:
         names = None if self.outputs is None else tuple(n.strip() for n in self.outputs.split(","))
         # what is wrong with the words is said before anything is read or opened
         select(fs.SplatCloud.empty(), names or (), Quality.of(self.quality))
+        budget = self.max_error is not None or self.max_ms is not None
+        if budget:
+            check_bounds(self.max_error, self.max_ms)
         name_of = _names(self.out, Path(self.source))
         where = console(self.json)
         with where.status("reading"):
-            scene = _load(self.source)
+            scene = _load(self.source, self.quality)
         with _named(self.source, "render.outputs", names is None):
             select(fs.SplatCloud.empty(), scene.outputs, Quality.of(None))
         of_scene = _named(self.source, "render.device", self.device is None)
         with where.status("opening the device"), of_scene:
             renderer = fs.Renderer(self.device or scene.device)
+        choice = None
+        if budget:
+            with where.status("measuring") as status:
+                choice = choose(
+                    self.max_error,
+                    self.max_ms,
+                    cloud=scene,
+                    device=renderer,
+                    base=self.quality,
+                    tell=status.update,
+                )
         begun = time.perf_counter()
         with where.status("drawing"):
-            frame = renderer.render(scene, outputs=names, quality=self.quality)
+            frame = renderer.render(
+                scene, outputs=names, quality=self.quality if choice is None else choice.quality
+            )
             planes = {name: frame[name] for name in frame.outputs}
         seconds = time.perf_counter() - begun
         bits = None if scene.sensor is None else scene.sensor.bits
@@ -93,6 +125,7 @@ Examples:
                     "width": scene.camera.width if scene.camera else None,
                     "height": scene.camera.height if scene.camera else None,
                     "outputs": list(frame.outputs),
+                    "chosen": None if choice is None else choice.as_dict(),
                     "stats": dict(frame.stats),
                     "timings_ms": dict(frame.timings),
                     "seconds": seconds,
@@ -104,6 +137,8 @@ Examples:
         rows += [(what, f"{count:,}") for what, count in frame.stats.items()]
         rows += [("with compilation and transfer", f"{seconds:.2f} s")]
         print_table(where, f"{self.source} on {renderer.device.title}", ("", ""), rows)
+        if choice is not None:
+            where.print(f"chosen: {choice.summary}", markup=False, soft_wrap=True)
         for file in files:
             where.print(str(file), markup=False, soft_wrap=True)
         return 0
@@ -139,13 +174,13 @@ def _names(out: str | None, source: Path):
     return lambda plane, suffix: file / f"{plane}{suffix}"
 
 
-def _load(source: str) -> "Scene":
+def _load(source: str, quality: str | None) -> "Scene":
     import fidsplat as fs
     from fidsplat.commands.framing import framing_camera
 
     suffix = Path(source).suffix.lower()
     if suffix == ".toml":
-        scene = fs.Scene.load(source)
+        scene = fs.Scene.load(source, quality)
         if scene.camera is None:
             raise InputError(
                 f"{source} has no [camera] table; add one with width, height, fov_x_deg, position, look_at"

@@ -77,6 +77,16 @@ def test_fast_arithmetic_stays_within_the_usual_tolerance(opencl, cloud):
     assert 0 < np.abs(exact - fast).max() <= 1e-5
 
 
+def test_fast_exponentials_do_not_run_over(opencl):
+    """At this cut-off the faintest fragments lie below the smallest normal float32."""
+    faint = {"alpha_cutoff": 1e-42, "transmittance_stop": 0.0}
+    exact, fast = (
+        opencl.render(AROUND, CAMERA, ALL_OUTPUTS, quality.with_(**faint)) for quality in (fs.Quality(), FAST)
+    )
+    for name in ("rgb", "alpha", "normal"):
+        assert np.abs(exact[name] - fast[name]).max() <= 1e-5
+
+
 @pytest.mark.parametrize("degree", [None, 0, 2])
 def test_half_colors_are_the_reference_s_rounded_ones(opencl, degree):
     cloud = random_splats(200, seed=11, depth=(1, 6), scale=(0.02, 0.4), sh_degree=degree)
@@ -92,6 +102,16 @@ def test_half_colors_are_the_reference_s_rounded_ones(opencl, degree):
 def test_half_colors_end_at_the_largest_half(opencl):
     cloud = fs.SplatCloud([[0, 0, 2]], [[1, 0, 0, 0]], [[1, 1]], [1.0], colors=[[1e6, 1.0, 0.0]])
     assert opencl.render(cloud, CAMERA, quality=HALF)["rgb"].max() == pytest.approx(65504, rel=1e-2)
+
+
+def test_a_device_holds_halves_instead_of_floats(opencl):
+    cloud = random_splats(100, seed=11, depth=(1, 6), scale=(0.02, 0.4), sh_degree=2)
+    resident = opencl.upload(cloud)
+    resident._data._shared = False  # a CPU reads the host's arrays; make it copy them
+    frame = opencl.render(resident, CAMERA, quality=HALF)
+    assert np.array_equal(frame["rgb"], opencl.render(cloud, CAMERA, quality=HALF)["rgb"])
+    means, quats, scales, opacities, coefficients = 3, 4, 2, 1, 9 * 3
+    assert resident.memory_bytes == 100 * (4 * (means + quats + scales + opacities) + 2 * coefficients)
 
 
 @pytest.mark.parametrize("bits", [16, 24])

@@ -1,5 +1,7 @@
 """Errors between pictures, and the picture of the same definition at full precision."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from agreement import random_splats, reference_pixels
@@ -69,6 +71,17 @@ def test_truth_of_a_device_is_that_of_the_reference(renderer):
     assert ours.shape == (17, 24, 3)
     (difference,) = compare({"rgb": ours}, judge, ("rgb",))
     assert difference.agrees, difference
+
+
+def test_rays_of_lenses_and_fog_are_float32():
+    """They have a truth all the same."""
+    renderer, cloud = fs.Renderer("opencl"), random_splats(20, seed=1, depth=(1.0, 6.0))
+    lens = replace(CAMERA, lens=fs.Fisheye())
+    fog = fs.Fog(0.2)
+    assert full_precision(fs.Quality(), renderer).blend_precision == "float64"
+    assert full_precision(fs.Quality(), renderer, fog=fog).blend_precision == "float32"
+    picture = truth(renderer, cloud, lens, fog=fog)
+    assert errors(picture, truth(fs.Renderer("reference"), cloud, lens, fog=fog)).maximum < 1e-4
 
 
 def test_the_reference_gives_its_float64():

@@ -48,6 +48,33 @@ def names(folder) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
+def test_a_budget_is_measured_and_told(scene, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("fidsplat.budget.store.folder", lambda: tmp_path / "cache")
+    words = ["render", scene, "--max-error", "1e-3", "--max-ms", "60000"]
+    assert main([*words, "--json"]) == 0
+    chosen = said(capsys)["chosen"]
+    assert 0 < chosen["error"] <= 1e-3
+    assert 0 < chosen["ms"] <= chosen["ms_late"] <= 60000
+    assert chosen["source"] == "measured"
+    assert fs.Quality().with_(**chosen["knobs"])
+    assert main(words) == 0
+    told = capsys.readouterr().out
+    assert "chosen: alpha_cutoff" in told
+    assert "measured error" in told
+    assert main(["render", scene, "--json"]) == 0
+    assert said(capsys)["chosen"] is None
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [(["--max-error", "nan"], "error is nan"), (["--max-error", "1e-12"], "the least is")],
+)
+def test_a_budget_that_cannot_be(scene, tmp_path, capsys, monkeypatch, words, message):
+    monkeypatch.setattr("fidsplat.budget.store.folder", lambda: tmp_path / "cache")
+    assert main(["render", scene, *words]) == 2
+    assert message in capsys.readouterr().err
+
+
 def test_a_scene_is_drawn_and_read_back(scene, tmp_path, capsys):
     assert main(["render", scene, "--json"]) == 0
     facts = said(capsys)
@@ -141,6 +168,7 @@ def test_nothing_to_draw_is_the_background(scene, tmp_path):
         (["--device", "opencl:nosuchthing"], 2, "nosuchthing"),
         (["--device", "vulkan"], 2, "vulkan"),
         (["--quality", "standrad"], 2, "standard"),
+        (["--quality", "fast,alpha_cutof=1e-3"], 2, "did you mean 'alpha_cutoff'"),
         (["--outputs", ""], 2, "output"),
     ],
 )

@@ -20,7 +20,9 @@ MAY_IMPORT = {
     "files": BASE,
     "rotations": BASE,
     "harmonics": BASE,
-    "quality": BASE,
+    # a budget is measured by drawing: `Quality.within` loads what draws when it is called, and its arguments
+    # have the types of those (test_a_quality_loads_nothing_that_draws)
+    "quality": BASE | {"budget", "cameras", "render", "scenes", "splats", "surroundings"},
     "sensor": BASE,
     "surroundings": BASE | {"vision.images"},
     "kernel_files": BASE,
@@ -35,7 +37,8 @@ MAY_IMPORT = {
     "backends": PLAIN | {"scenes", "effects", "kernel_files"},
     "hard_cases": PLAIN | {"scenes", "effects", "backends", "render", "vision", "kernel_files"},
     "render": PLAIN | {"scenes", "effects", "backends"},
-    "accuracy": PLAIN | {"scenes", "render", "backends"},
+    "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
+    "budget": PLAIN | {"scenes", "render", "accuracy", "kernel_files"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__"}
 
@@ -142,6 +145,11 @@ def test_import_fidsplat_is_light():
         assert loaded == "[]"
         seconds.append(float(time))
     print(f"import fidsplat: {min(seconds):.3f} s, the best of {len(seconds)} (wanted: below 0.25 s)")
+
+
+def test_a_quality_loads_nothing_that_draws():
+    out = fresh("import sys, fidsplat.quality; print([m for m in sys.modules if m.startswith('fidsplat.')])")
+    assert out == "['fidsplat.errors', 'fidsplat.quality']"
 
 
 def test_plain_data_and_the_renderer_open_no_heavy_package():

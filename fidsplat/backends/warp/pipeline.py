@@ -13,6 +13,7 @@ from fidsplat.backends.warp.finished import WarpPlanes
 from fidsplat.backends.warp.launch import BLOCK, Launcher
 from fidsplat.backends.warp.memory import Resident
 from fidsplat.backends.warp.run import Run
+from fidsplat.backends.warp.together import refuse_strangers
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError
 
@@ -23,7 +24,7 @@ KNOWN = frozenset(
     {"camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen", "lowpass_pixel"}
     | {"stop_inclusive", "stop_exclusive", "compose_ordered", "compose_planes", "ray_depth"}
     | {"sh_terms", "arithmetic_precise", "keys_short"}
-    | {"perspective", "footprint_gaussian", "footprint_box", "footprint_mixed", "box_edges"}
+    | {"perspective", "footprint_gaussian", "footprint_box", "footprint_mixed", "box_edges", "box_cover"}
     | {"background_constant", "background_gradient", "background_panorama", "fog"}
     | {"ray", "ray_length", "sample_length", "turn", "world_ray"}
     | {"alpha", "depth", "depth_median", "depth_first", "distance", "distance_median", "distance_first"}
@@ -56,6 +57,8 @@ class WarpPipeline:
                 f"{backend.info.name} ({backend.info.platform}) has no {', '.join(lacking)}; "
                 "use an OpenCL device for it"
             )
+        refuse_strangers(names)
+        self._names = features.names
         self.backend, self.features, self.shape = backend, features, shape
         if names & {"label", "splat_id"}:
             names |= {"heaviest"}  # both are the same splat's
@@ -126,8 +129,9 @@ class WarpPipeline:
         """Draw one picture.
 
         Raises:
-            DeviceError: the device runs out of memory or fails.
+            DeviceError: the device runs out of memory or fails, or lacks what the view asks for.
         """
+        refuse_strangers(self._names, view.turns)
         return self._drawn(resident, view).planes
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:

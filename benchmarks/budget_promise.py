@@ -1,0 +1,201 @@
+"""How often `fs.Quality.within` keeps what it promises, on scenes that its table was not made of.
+
+    python benchmarks/budget_promise.py [--device opencl:pocl] [--scenes 200] [-o FILE.json]
+
+Errors: random scenes with held-out seeds, each with every bound of BOUNDS, against the float64 reference.
+`table` is the setting that the table gives for the bound; `measured` the one that was calibrated on the scene
+and camera; `elsewhere` the same from another camera (turned by 5 degrees, moved by a tenth of the distance);
+`crossing` the table's setting in scenes whose loose splats cross a printed plane. Times: budgets of TIMES
+times what the standard quality takes in each scene; then FRAMES frames are drawn, and those in time counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, field, replace
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+import fidsplat as fs
+from fidsplat.accuracy import errors, truth
+from fidsplat.budget import choose
+from fidsplat.budget.random_scenes import HELD_OUT, RandomScene, random_scene
+from fidsplat.errors import InputError
+from fidsplat.experiments.bench.catalogue import BENCH_SCENES
+from fidsplat.files import atomic_write
+
+BOUNDS = (1e-2, 1e-3, 1e-4)
+TIMED = ("tag", "r100k_720p", "r1m_1080p")
+TIMES = (0.5, 0.8, 1.0, 1.5, 3.0)
+FRAMES = 30
+
+
+@dataclass
+class Kept:
+    """How often a bound was kept."""
+
+    worst: list[float] = field(default_factory=list)
+    """error of each scene over the bound"""
+    refused: int = 0
+    """scenes of which nothing was promised"""
+
+    def as_dict(self) -> dict:
+        kept = sum(ratio <= 1 for ratio in self.worst)
+        return {
+            "promises": len(self.worst),
+            "kept": kept,
+            "refused": self.refused,
+            "worst_over_bound": max(self.worst, default=math.nan),
+            "median_over_bound": float(np.median(self.worst)) if self.worst else math.nan,
+        }
+
+
+def moved(scene: RandomScene) -> RandomScene:
+    """The scene from another camera."""
+    camera, (c, s) = scene.camera, (math.cos(math.radians(5)), math.sin(math.radians(5)))
+    pose = np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1.0]])
+    pose[0, 3] = 0.1 * float(np.median(scene.cloud.means[:, 2]))
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    return replace(
+        scene, camera=fs.Camera.pinhole(camera.width, camera.height, *intrinsics, pose, near=camera.near)
+    )
+
+
+def errors_kept(renderer: fs.Renderer, count: int, measured: int, where: Console) -> list[dict]:
+    """A row for each way of asking and each bound: of `count` scenes, and of the first `measured` of them."""
+    judge = fs.Renderer("reference")
+    ways = ("table", "crossing", "measured", "elsewhere")
+    kept = {(way, bound): Kept() for way in ways for bound in BOUNDS}
+    table = {bound: fs.Quality.within(error=bound, device=renderer) for bound in BOUNDS}
+
+    def hold(way: str, bound: float, scene: RandomScene, quality: fs.Quality, want: np.ndarray) -> None:
+        frame = renderer.render(scene.cloud, scene.camera, quality=quality, background=scene.background)
+        kept[way, bound].worst.append(errors(frame["rgb"], want).maximum / bound)
+
+    def truth_of(scene: RandomScene) -> np.ndarray:
+        return truth(judge, scene.cloud, scene.camera, background=scene.background)
+
+    for k in track(range(count), "errors", console=where):
+        scene = random_scene(HELD_OUT + k)
+        want = truth_of(scene)
+        for bound, quality in table.items():
+            hold("table", bound, scene, quality, want)
+        if k >= measured:
+            continue
+        crossing, elsewhere = random_scene(HELD_OUT + k, crossing=True), moved(scene)
+        mixed, there = truth_of(crossing), truth_of(elsewhere)
+        for bound, quality in table.items():
+            hold("crossing", bound, crossing, quality, mixed)
+            place = {"camera": scene.camera, "cloud": scene.cloud, "background": scene.background}
+            try:
+                own = fs.Quality.within(error=bound, device=renderer, **place)
+            except InputError:
+                kept["measured", bound].refused += 1
+                continue
+            hold("measured", bound, scene, own, want)
+            hold("elsewhere", bound, elsewhere, own, there)
+    return [{"way": way, "error": bound, **found.as_dict()} for (way, bound), found in kept.items()]
+
+
+def times_kept(renderer: fs.Renderer, names: list[str], where: Console) -> list[dict]:
+    """A row for each scene and budget."""
+    rows = []
+    for name in names:
+        cloud, camera = BENCH_SCENES[name].make()
+        resident = renderer.upload(cloud)
+        usual = float(np.median(frame_times(renderer, resident, camera, fs.Quality(), 10)))
+        for times in track(TIMES, f"times, {name}", console=where):
+            ms = times * usual
+            row = {"scene": name, "standard_ms": usual, "budget_ms": ms}
+            begun = time.perf_counter()
+            try:
+                found = choose(ms=ms, camera=camera, cloud=cloud, device=renderer)
+            except InputError as error:
+                rows.append(row | {"refused": str(error)})
+                continue
+            calibration = time.perf_counter() - begun
+            taken = frame_times(renderer, resident, camera, found.quality, FRAMES)
+            rows.append(
+                row
+                | {
+                    "calibration_s": calibration,
+                    "chosen": found.knobs,
+                    "error": found.error,
+                    "frames": FRAMES,
+                    "in_time": int((taken <= ms).sum()),
+                    "median_ms": float(np.median(taken)),
+                    "p90_ms": float(np.quantile(taken, 0.9)),
+                }
+            )
+    return rows
+
+
+def frame_times(renderer: fs.Renderer, resident, camera, quality, count: int) -> np.ndarray:
+    """Milliseconds of frames (count,), after one that does not count."""
+    taken = []
+    for _ in range(count + 1):
+        begun = time.perf_counter()
+        frame = renderer.render(resident, camera, quality=quality)
+        assert frame.timings is not None  # waits for the device
+        taken.append(1e3 * (time.perf_counter() - begun))
+    return np.array(taken[1:])
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--device", default=None)
+    parser.add_argument("--scenes", type=int, default=200)
+    parser.add_argument("--measured", type=int, default=60, help="scenes that are calibrated too")
+    parser.add_argument("--timed", default=",".join(TIMED), help="bench scenes, or nothing")
+    parser.add_argument("-o", "--out", type=Path)
+    args = parser.parse_args()
+    where = Console(stderr=True)
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["XDG_CACHE_HOME"] = folder  # nothing that was measured before counts
+        renderer = fs.Renderer(args.device)
+        found = {
+            "device": renderer.device.title,
+            "driver": renderer.device.version,
+            "date": date.today().isoformat(),
+            "fidsplat": fs.__version__,
+            "scenes": args.scenes,
+            "errors": errors_kept(renderer, args.scenes, args.measured, where),
+            "times": times_kept(renderer, [name for name in args.timed.split(",") if name], where),
+        }
+    table = Table("way", "error", "kept", "refused", "worst / bound", "median / bound", box=None)
+    for row in found["errors"]:
+        ratios = (f"{row[f'{which}_over_bound']:.3g}" for which in ("worst", "median"))
+        share = f"{row['kept']} of {row['promises']}"
+        table.add_row(row["way"], f"{row['error']:g}", share, str(row["refused"]), *ratios)
+    where.print(table)
+    table = Table("scene", "budget ms", "error", "median ms", "in time", "calibrated in s", box=None)
+    for row in found["times"]:
+        if "refused" in row:
+            table.add_row(row["scene"], f"{row['budget_ms']:.1f}", row["refused"])
+        else:
+            numbers = (
+                f"{row['error']:.2g}",
+                f"{row['median_ms']:.1f}",
+                f"{row['in_time']} of {row['frames']}",
+            )
+            table.add_row(row["scene"], f"{row['budget_ms']:.1f}", *numbers, f"{row['calibration_s']:.1f}")
+    where.print(table)
+    if args.out:
+        with atomic_write(args.out) as stream:
+            stream.write((json.dumps(found, indent=1) + "\n").encode())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,77 @@
+"""The settings that a budget chooses among, with what each was measured to give (table.json, made by
+tools/budget_table.py)."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from fidsplat.quality import Quality
+
+FILE = Path(__file__).with_name("table.json")
+MARGIN = 1.5
+"""how many times below the bound the largest error of a setting over the table's scenes must lie: the largest
+over other scenes is a little larger"""
+
+FREE: dict[str, Any] = {
+    "alpha_cutoff": 1.0 / 255.0,
+    "transmittance_stop": 1e-4,
+    "setup_precision": "float64",
+    "arithmetic": "precise",
+    "blend_precision": "float32",
+    "color_precision": "float32",
+    "depth_key_bits": 32,
+}
+"""The knobs that a budget turns, and where they stand unless a setting says otherwise. Of the other knobs
+those that only make a picture wrong are off (opacity ceiling, exclusive stop); the rest are its definition,
+or, as tile_size, cost no accuracy: they stay as the base quality has them."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One choice of the knobs, and what it was measured to give."""
+
+    knobs: dict[str, Any]
+    """those of `FREE` that differ from it"""
+    easy: float
+    """the largest error of a picture, in the easiest twentieth of the table's scenes"""
+    median: float
+    """the same, in the median scene"""
+    most: float
+    """and in the hardest"""
+    cost: float
+    """time of a frame, in that of the setting without any knobs (on CPUs the processor's time)"""
+
+    def of(self, base: Quality) -> Quality:
+        """The quality with the definition of `base` and the accuracy of this setting."""
+        return base.with_(**(FREE | {"opacity_ceiling": 1.0, "stop_rule": "inclusive"} | self.knobs))
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether every device draws it: it differs in numbers alone."""
+        return self.knobs.keys() <= {"alpha_cutoff", "transmittance_stop"}
+
+    @property
+    def promised(self) -> float:
+        """The error that is promised for a scene that nobody has measured."""
+        return MARGIN * self.most
+
+
+@cache
+def load(kind: str) -> tuple[Setting, ...]:
+    """The settings for a kind of device (cpu, gpu), the cheapest first.
+
+    A kind for which nothing has been measured has the settings of CPUs: the errors are those of float32
+    everywhere, and costs rank alike.
+    """
+    classes = json.loads(FILE.read_text("utf-8"))["classes"]
+    rows = classes.get(kind, classes["cpu"])["settings"]
+    return tuple(sorted((Setting(**row) for row in rows), key=lambda setting: setting.cost))
+
+
+def version() -> str:
+    """When and by what the table was made, as text."""
+    return json.dumps(json.loads(FILE.read_text("utf-8"))["made"], sort_keys=True)

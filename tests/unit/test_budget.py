@@ -1,0 +1,217 @@
+"""`Quality.within`: what it promises is kept, on scenes that its table has never seen."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.accuracy import errors, truth
+from fidsplat.budget import calibrate, choose, store, table
+from fidsplat.budget.random_scenes import HELD_OUT, random_scene
+from fidsplat.errors import InputError
+
+BACKEND = "opencl"
+BOUNDS = (1e-2, 1e-3, 1e-4)
+HELD_OUT_SCENES = 16
+SMALL = fs.Camera.pinhole(2, 2, 1.0, 1.0, 1.0, 1.0)
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    """What is kept is kept here, not in the user's folder."""
+    monkeypatch.setattr(store, "folder", lambda: tmp_path / "cache")
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return random_scene(HELD_OUT + 1)
+
+
+@pytest.fixture(scope="module")
+def held_out(judge):
+    """Scenes that no table is made of, with their truths."""
+    scenes = [random_scene(HELD_OUT + k) for k in range(HELD_OUT_SCENES)]
+    return [(s, truth(judge, s.cloud, s.camera, background=s.background)) for s in scenes]
+
+
+def error_of(renderer, scene, quality, want):
+    frame = renderer.render(scene.cloud, scene.camera, quality=quality, background=scene.background)
+    return errors(frame["rgb"], want).maximum
+
+
+def within(renderer, scene, error=None, ms=None, **more):
+    return choose(error, ms, scene.camera, scene.cloud, renderer, background=scene.background, **more)
+
+
+# the table
+
+
+def test_the_table_is_a_ladder():
+    settings = table.load("cpu")
+    assert [s.cost for s in settings] == sorted(s.cost for s in settings)
+    assert all(0 < s.easy <= s.median <= s.most for s in settings)
+    assert all(isinstance(s.of(fs.Quality()), fs.Quality) for s in settings)
+    assert table.load("a kind that nobody measured") == settings
+
+
+@pytest.mark.parametrize("error", BOUNDS)
+def test_the_table_keeps_its_promise(renderer, held_out, error):
+    """The long form, 200 scenes, is benchmarks/budget_promise.py; docs/budget.md has what it gave."""
+    quality = fs.Quality.within(error=error, device=renderer)
+    found = [error_of(renderer, scene, quality, want) for scene, want in held_out]
+    assert max(found) <= error, found
+
+
+def test_less_error_is_never_cheaper(renderer):
+    cost = {json.dumps(s.knobs): s.cost for s in table.load(renderer.device.kind)}
+    chosen = [choose(error, device=renderer) for error in (0.3, *BOUNDS)]
+    costs = [cost[json.dumps(choice.knobs)] for choice in chosen]
+    assert costs == sorted(costs)
+    assert costs[0] < costs[-1]
+
+
+def test_the_definition_stays():
+    base = fs.Quality(lowpass="pixel", samples=3, coplanar="order", first_hit=0.3, tile_size=8)
+    kept = ("lowpass", "samples", "coplanar", "first_hit", "tile_size", "marker")
+    for setting in table.load("cpu"):
+        assert all(getattr(setting.of(base), name) == getattr(base, name) for name in kept)
+        parity = setting.of(fs.Quality.named("gsplat"))
+        assert (parity.opacity_ceiling, parity.stop_rule, parity.coplanar) == (1.0, "inclusive", "order")
+
+
+# calibration
+
+
+def test_a_measured_error_is_the_error(renderer, held_out):
+    for scene, want in held_out[:6]:
+        for bound in BOUNDS:
+            choice = within(renderer, scene, bound)
+            found = error_of(renderer, scene, choice.quality, want)
+            assert found <= bound
+            assert choice.error == pytest.approx(found, abs=1e-6)  # the device's truth is rounded to float32
+            assert choice.source == "measured"
+
+
+def test_measuring_finds_what_is_cheaper_than_the_table(renderer, held_out):
+    """Most scenes need less than the worst of the table does."""
+    cutoff = fs.Quality.within(error=1e-3, device=renderer).alpha_cutoff
+    own = [within(renderer, scene, 1e-3).quality.alpha_cutoff for scene, _ in held_out[:6]]
+    assert np.median(own) > cutoff
+
+
+def test_the_answer_is_kept_and_a_broken_file_is_made_anew(renderer, scene, monkeypatch):
+    first = within(renderer, scene, 1e-3)
+    (file,) = store.folder().iterdir()
+    with monkeypatch.context() as patch:
+        patch.setattr(calibrate.Calibration, "error", lambda *_: pytest.fail("it was measured again"))
+        again = within(renderer, scene, 1e-3)
+    assert dataclasses.replace(again, source="measured") == first
+    for broken in (b"", b"{", b"[1]", b'{"knobs": {"alpha_cutoff": 7}, "error": 0, "ms": 0, "ms_late": 0}'):
+        file.write_bytes(broken)
+        assert within(renderer, scene, 1e-3).source == "measured"
+        assert json.loads(file.read_bytes())["knobs"]
+
+
+def test_what_is_kept_is_for_one_question(renderer, scene):
+    within(renderer, scene, 1e-3)
+    within(renderer, scene, 1e-2)
+    within(renderer, scene, 1e-3, base="reference")
+    choose(1e-3, camera=scene.camera, cloud=scene.cloud, device=renderer, background=(0.2, 0.2, 0.2))
+    within(renderer, random_scene(HELD_OUT + 2), 1e-3)
+    moved = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, cx=scene.camera.cx + 1))
+    within(renderer, moved, 1e-3)
+    assert len(list(store.folder().iterdir())) == 6
+
+
+def test_a_folder_that_cannot_be_written_is_no_obstacle(renderer, scene, tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setattr(store, "folder", lambda: tmp_path / "file" / "cache")
+    assert within(renderer, scene, 1e-2).source == "measured"
+
+
+def test_functions_have_no_key():
+    assert store.digest(1, lambda: 2) is None
+    assert store.digest(1, (2.0, None)) != store.digest(1, (2.0, 0))
+
+
+def test_a_scene_says_the_rest_itself(renderer, held_out):
+    scene, want = held_out[3]
+    rest = {"camera": scene.camera, "background": scene.background, "quality": fs.Quality(first_hit=0.2)}
+    whole = fs.Scene([scene.cloud], **rest)
+    quality = fs.Quality.within(error=1e-3, cloud=whole, device=renderer)
+    assert quality.first_hit == 0.2
+    assert errors(renderer.render(whole, quality=quality)["rgb"], want).maximum <= 1e-3
+
+
+# times: a clock that knows what each setting costs, so that nothing hangs on how busy the machine is
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Frames take ten milliseconds a decade of the cut-off."""
+    monkeypatch.setattr(
+        calibrate.Calibration, "time", lambda self, quality: -10 * float(np.log10(quality.alpha_cutoff))
+    )
+
+
+def test_the_most_accurate_in_time(renderer, scene, clock):
+    choice = within(renderer, scene, ms=31)
+    cutoffs = {s.of(fs.Quality()).alpha_cutoff for s in table.load(renderer.device.kind)}
+    assert choice.quality.alpha_cutoff == min(cutoff for cutoff in cutoffs if -10 * np.log10(cutoff) <= 31)
+    assert choice.ms == choice.ms_late == pytest.approx(-10 * np.log10(choice.quality.alpha_cutoff))
+    assert within(renderer, scene, ms=45).error < choice.error
+
+
+def test_error_and_time_together(renderer, scene, clock):
+    choice = within(renderer, scene, 1e-2, 100)
+    assert choice.error <= 1e-2
+    with pytest.raises(InputError, match=r"an error of 0\.0001 takes \d+.*; the least error in that"):
+        within(renderer, scene, 1e-4, 25)
+
+
+@pytest.mark.parametrize("ms", [0, -3, 1e-6])
+def test_a_time_that_nothing_keeps(renderer, scene, clock, ms):
+    with pytest.raises(InputError, match=r"the fastest takes [\d.]+ ms, with an error of"):
+        within(renderer, scene, ms=ms)
+
+
+def test_frames_are_really_timed(renderer, scene):
+    choice = within(renderer, scene, ms=10_000)
+    assert 0 < choice.ms <= choice.ms_late <= 10_000
+    assert choice.error < 1e-4
+
+
+# what cannot be
+
+
+@pytest.mark.parametrize("error", [0, -1e-3, 1e-9])
+def test_an_error_that_nothing_keeps(renderer, scene, error):
+    with pytest.raises(InputError, match=r"the best is \d"):
+        fs.Quality.within(error=error, device=renderer)
+    with pytest.raises(InputError, match=r"the least is \d.*allow \d"):
+        within(renderer, scene, error)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({}, "a budget of nothing"),
+        ({"error": float("nan")}, "error is nan"),
+        ({"error": "small"}, "error is 'small'"),
+        ({"error": True}, "error is True"),
+        ({"ms": float("inf")}, "ms is inf"),
+        ({"ms": 5}, "needs a cloud"),
+        ({"error": 1e-3, "cloud": fs.SplatCloud.empty()}, "needs a camera"),
+        ({"error": 1e-3, "camera": fs.Camera.pinhole(2, 2, 1.0, 1.0, 1.0, 1.0)}, "needs a cloud"),
+        (
+            {"error": 1e-3, "cloud": 7, "camera": fs.Camera.pinhole(2, 2, 1.0, 1.0, 1.0, 1.0)},
+            "cloud is a int",
+        ),
+        ({"error": 1e-3, "base": "best"}, "unknown quality"),
+    ],
+)
+def test_what_makes_no_budget(words, message):
+    with pytest.raises(InputError, match=message):
+        fs.Quality.within(**words)

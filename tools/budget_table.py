@@ -1,0 +1,187 @@
+"""Makes fidsplat/budget/table.json: the settings that `fs.Quality.within` chooses among, with their errors
+over random scenes and what they cost.
+
+    python tools/budget_table.py --device opencl:pocl       about 10 minutes on two cores
+    python tools/budget_table.py --device opencl:nvidia     adds the settings of GPUs
+
+Each scene of `fidsplat/budget/random_scenes.py` is drawn with every setting and held against the same
+definition at full precision, which the device draws in float64 (`fidsplat.accuracy.judge_for`). Costs are
+medians of frames of the scenes of TIMED, drawn in turn; on CPUs those of the processor's time. In a second
+round the settings on the front of error and cost are drawn with every set of MODIFIERS, and FINEST beside
+them; what is on that front then is kept. Knobs that the device does not have are left out. What the file
+says of another kind of device stays.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from datetime import date
+
+import numpy as np
+
+import fidsplat as fs
+from fidsplat.accuracy import doubt, errors, judge_for, truth
+from fidsplat.budget.random_scenes import random_scene
+from fidsplat.budget.table import FILE, Setting
+from fidsplat.errors import InputError
+from fidsplat.experiments.scenes import random_cloud, standard_camera
+from fidsplat.files import atomic_write
+
+CUTOFFS = (0.03, 0.015, 2 / 255, 1 / 255, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 1e-7)
+STOPS = (0.05, 0.015, 4e-3, 1e-3, 1e-4, 1e-6)
+MODIFIERS = (
+    {"setup_precision": "float32"},
+    {"arithmetic": "fast"},
+    {"color_precision": "float16"},
+    {"setup_precision": "float32", "arithmetic": "fast"},
+    {"setup_precision": "float32", "arithmetic": "fast", "color_precision": "float16", "depth_key_bits": 24},
+)
+FINEST = (
+    {"alpha_cutoff": 1e-8, "transmittance_stop": 0.0},
+    {"alpha_cutoff": 1e-8, "transmittance_stop": 0.0, "blend_precision": "float64"},
+)
+TIMED = ((25_000, 0.05, 640, 360), (5_000, 0.2, 320, 240))
+"""splats, median scale in metres, width, height: many small splats, and few large ones"""
+SLACK = 1.02
+"""times and errors this close are one: timings are noisy"""
+
+
+class Measurement:
+    """Settings as knobs, with errors (scenes, settings) and costs (settings,)."""
+
+    def __init__(self, settings: list[dict], errors_: np.ndarray, costs: np.ndarray) -> None:
+        self.settings, self.errors, self.costs = settings, errors_, costs
+
+    def front(self) -> list[int]:
+        """Settings that no other equals or betters in cost, in median and in largest error, but for SLACK."""
+        what = np.log([self.costs, np.median(self.errors, 0), self.errors.max(0)]).T  # (settings, 3)
+        total, slack = what.sum(1), np.log(SLACK)
+        return [
+            k for k in range(len(what)) if not ((what <= what[k] + slack).all(1) & (total < total[k])).any()
+        ]
+
+    def of(self, chosen: list[int]) -> Measurement:
+        """The chosen settings alone."""
+        return Measurement([self.settings[k] for k in chosen], self.errors[:, chosen], self.costs[chosen])
+
+    def rows(self) -> list[dict]:
+        """As table.json has them, the cheapest first."""
+        rows = []
+        for knobs, off, cost in zip(self.settings, self.errors.T, self.costs.tolist(), strict=True):
+            sizes = (round_up(size) for size in (np.quantile(off, 0.05), np.median(off), off.max()))
+            rows.append(vars(Setting(knobs, *sizes, cost=round(cost, 3))))
+        return sorted(rows, key=lambda row: row["cost"])
+
+
+def round_up(value: float) -> float:
+    """To three digits."""
+    return float(f"{value * 1.0005:.3g}")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--device", default="opencl:pocl")
+    parser.add_argument("--scenes", type=int, default=400)
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--out", default=str(FILE))
+    args = parser.parse_args()
+    renderer = fs.Renderer(args.device)
+    judge = judge_for(renderer)
+
+    say(f"truths of {args.scenes} scenes by {judge.device.name}")
+    scenes = [random_scene(seed) for seed in range(args.scenes)]
+    truths = []
+    for k, scene in enumerate(scenes):
+        truths.append(truth(judge, scene.cloud, scene.camera, background=scene.background))
+        say(f"truths: {k + 1} of {args.scenes}", end="\r")
+
+    def measure(settings: list[dict]) -> Measurement:
+        found = all_errors(renderer, scenes, truths, settings)
+        return Measurement(settings, found, all_costs(renderer, settings, args.repeats))
+
+    grid = [{"alpha_cutoff": cut, "transmittance_stop": stop} for cut in CUTOFFS for stop in STOPS]
+    plain = measure(grid)
+    plain = plain.of(plain.front())
+    say(f"{len(plain.settings)} of {len(grid)} are on the front")
+    modifiers = [more for more in MODIFIERS if draws(renderer, scenes[0], more)]
+    finest = [knobs for knobs in FINEST if draws(renderer, scenes[0], knobs)]
+    combined = [knobs | more for knobs in plain.settings for more in modifiers]
+    both = measure(plain.settings + combined + finest)
+    final = both.of(both.front())
+    say(f"{len(final.settings)} of {len(both.settings)} are kept")
+
+    out = json.loads(FILE.read_text("utf-8")) if FILE.exists() else {"made": {}, "classes": {}}
+    info = renderer.device
+    out["classes"][info.kind] = {"settings": final.rows()}
+    out["made"][info.kind] = {
+        "device": info.title,
+        "driver": info.version,
+        "date": date.today().isoformat(),
+        "scenes": args.scenes,
+        "truth": judge.device.name,
+        "fidsplat": fs.__version__,
+    }
+    with atomic_write(args.out) as stream:
+        stream.write((json.dumps(out, indent=1) + "\n").encode())
+    return 0
+
+
+def say(text: str, end: str = "\n") -> None:
+    print(text, file=sys.stderr, end=end, flush=True)
+
+
+def quality(knobs: dict) -> fs.Quality:
+    return Setting(knobs, 0, 0, 0, 0).of(fs.Quality())
+
+
+def draws(renderer: fs.Renderer, scene, knobs: dict) -> bool:
+    try:
+        renderer.render(scene.cloud, scene.camera, quality=quality(knobs))
+    except InputError as error:
+        say(f"left out: {error}")
+        return False
+    return True
+
+
+def all_errors(renderer: fs.Renderer, scenes, truths, settings: list[dict]) -> np.ndarray:
+    """Largest absolute error of rgb (scenes, settings)."""
+    qualities = [quality(knobs) for knobs in settings]
+    found = np.empty((len(scenes), len(settings)))
+    off = doubt(judge_for(renderer))
+    for k, (scene, want) in enumerate(zip(scenes, truths, strict=True)):
+        resident = renderer.upload(scene.cloud)
+        for j, each in enumerate(qualities):
+            frame = renderer.render(resident, scene.camera, quality=each, background=scene.background)
+            found[k, j] = errors(frame["rgb"], want).maximum + off
+        say(f"errors: {k + 1} of {len(scenes)} scenes, {len(settings)} settings", end="\r")
+    say("")
+    return found
+
+
+def all_costs(renderer: fs.Renderer, settings: list[dict], repeats: int) -> np.ndarray:
+    """Time of a frame over that of the settings' base (settings,): the mean over the timed scenes."""
+    qualities = [quality({}), *(quality(knobs) for knobs in settings)]
+    # a processor's own time does not hang on what else runs there
+    clock = time.process_time if renderer.device.kind == "cpu" else time.perf_counter
+    ratios = []
+    for count, scale, width, height in TIMED:
+        resident, camera = renderer.upload(random_cloud(count, scale)), standard_camera(width, height)
+        taken = np.empty((repeats + 1, len(qualities)))
+        for k in range(repeats + 1):
+            for j, each in enumerate(qualities):
+                begun = clock()
+                frame = renderer.render(resident, camera, quality=each)
+                assert frame.timings is not None  # waits for the device
+                taken[k, j] = clock() - begun
+            say(f"times: {k} of {repeats} rounds, {count:,} splats", end="\r")
+        middle = np.median(taken[1:], 0)
+        ratios.append(middle[1:] / middle[0])
+        say("")
+    return np.mean(ratios, 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
