@@ -33,7 +33,7 @@ DEPTH_KEY_BITS = (16, 24, 32)
 TILE_SIZES = (8, 16, 32)
 MAX_SAMPLES = 8
 MIXTURES = ("fitted", "paper", "exact")
-TEMPLATE_SIZES = (1, 5, 9, 13, 25)
+TEMPLATE_SIZES = (1, 5, 9, 13, 25, 41)
 """Gaussians of a rectangle in the templates that are shipped (fidsplat/markers/templates.json)"""
 MAX_LEVELS, MAX_DENSITY = 8, 100
 
@@ -81,8 +81,8 @@ class MarkerQuality:
     and rounds what lies behind. None: what the mixture was made with (0.4 for fitted, 0 for paper)."""
 
     template: int = 25
-    """Of `fitted`: Gaussians of a rectangle up to an aspect ratio of 8, one of `TEMPLATE_SIZES`: 1, 5, 9, 13
-    or 25. Fewer are drawn faster and leave edges blurred and corners round."""
+    """Of `fitted`: Gaussians of a rectangle up to an aspect ratio of 8, one of `TEMPLATE_SIZES`: 1, 5, 9,
+    13, 25 or 41. Fewer are drawn faster and leave edges blurred and corners round."""
 
     def __post_init__(self) -> None:
         _one_of("marker quality: mixture", self.mixture, MIXTURES)

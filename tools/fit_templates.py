@@ -339,7 +339,8 @@ def fit(size: int, starts: int, rounds: int) -> dict:
     for (limit, _), a, b in zip(CLASSES, model.quadrant[:-1], model.quadrant[1:], strict=True):
         slots = np.column_stack([raw[a:b, :2], np.exp(raw[a:b, 2:4]), raw[a:b, 4]])
         signs = [np.abs(model.signs[model.parameter == i][0]) for i in range(a, b)]
-        slots[:, :2] *= signs
+        # what stands for twins keeps off the axis between them
+        slots[:, :2] = np.maximum(slots[:, :2], 1e-4) * signs
         templates.append({"max_aspect": limit, "quadrant": np.round(slots, 4).tolist()})
     return {"size": size, "fit_db": round(reached, 2), "templates": templates}
 

@@ -28,8 +28,8 @@ The mixture exact draws every rectangle as one box with sharp edges. A PLY file 
 the Gaussians of fitted, and says so.
 
 Knobs of the mixtures (fs.MarkerQuality) are part of a quality: marker.levels (1 to 8) and marker.density (1
-to 100) of paper, marker.template of fitted (Gaussians of a rectangle: 1, 5, 9, 13 or 25), marker.growth
-(modules).
+to 100) of paper, marker.template of fitted (Gaussians of a rectangle: 1, 5, 9, 13, 25 or 41), and
+marker.growth (modules).
 
 Examples:
   fidsplat marker apriltag:36h11:5 --size 0.16 -o tag.ply

@@ -6,7 +6,7 @@ from agreement import ALL_OUTPUTS, assert_agrees, random_splats, reference_pixel
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
-from fidsplat.effects import select
+from fidsplat.effects import OUTPUTS, select
 
 CAMERA = fs.Camera.look_at(83, 61, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 AROUND = random_splats(200, seed=1)
@@ -64,6 +64,16 @@ def test_double_is_nearer_to_the_truth_than_float32(opencl):
         for quality in (DOUBLE, fs.Quality())
     ]
     assert errors[0] < 0.2 * errors[1]
+
+
+def test_double_has_every_output_and_footprint(opencl):
+    """In one record, whose size the compiler checks."""
+    if not opencl.device.float64:
+        pytest.skip("the device has no float64")
+    cloud = coplanar_cloud(1)
+    cloud = cloud.with_boxes(cloud.planes == 0)
+    camera = fs.Camera.orthographic(41, 30, 4.0)
+    assert_agrees(opencl, cloud, camera, tuple(OUTPUTS), DOUBLE)
 
 
 @pytest.mark.parametrize("cloud", [AROUND, coplanar_cloud(1)], ids=["around", "planes"])

@@ -25,7 +25,7 @@ class RayBuffers:
         )
 
     def of(self, raster: RayRaster, rows: int, columns: int, slopes: bool = False) -> dict[str, cl.Buffer]:
-        """Buffers by name, for a sample grid that is padded to rows x columns. slopes: with those that boxes need."""
+        """Buffers by name, for a sample grid that is padded to rows x columns. slopes: those of boxes too."""
         sizes = self._held.setdefault(raster, {})
         if (rows, columns) not in sizes:
             sizes[rows, columns] = {"rays": self._planes("rays", raster.rays, rows, columns)}
@@ -44,11 +44,12 @@ class RayBuffers:
         return self._put(name, planes)
 
     @staticmethod
-    def bytes_of(rasters: Collection[RayRaster], tile_height: int, columns: int) -> int:
+    def bytes_of(rasters: Collection[RayRaster], tile_height: int, columns: int, slopes: bool) -> int:
         """What the buffers of the rasters of one picture take, for grids that are padded to whole tiles."""
         rows = sum(-(-raster.height // tile_height) * tile_height for raster in rasters)
         one = next(iter(rasters))
-        return 12 * rows * columns + (one.map[0].nbytes if one.lens.kind != "equirectangular" else 0)
+        each = 36 if slopes else 12
+        return each * rows * columns + (one.map[0].nbytes if one.lens.kind != "equirectangular" else 0)
 
     def _map(self, raster: RayRaster) -> cl.Buffer:
         maps = self._held.setdefault(raster, {}).setdefault((0, 0), {})

@@ -64,7 +64,8 @@ _MARKER_LADDER = (
 )
 _QUICK_MARKERS = (MarkerQuality("paper"), MarkerQuality("exact"))
 _COMBINED_CUTOFFS, _COMBINED_STOPS = (1e-4, 1 / 4096, 1 / 2048, 1 / 1024, 1 / 255), (1e-4, 1e-3, 1 / 512)
-_FAST = {"arithmetic": "fast", "setup_precision": "float32"}
+_FAST, _FASTEST = {"arithmetic": "fast"}, {"arithmetic": "fast", "setup_precision": "float32"}
+_FASTEST_STOP = 1e-3
 
 _ALONE: tuple[dict[str, Any], ...] = (
     {"alpha_cutoff": 1 / 255},
@@ -223,12 +224,14 @@ def _marker_points(quick: bool) -> Iterator[Point]:
 
 
 def _together(quick: bool) -> Iterator[Point]:
-    """Cut-off and stop together, each in precise and in fast arithmetic."""
-    for fast in ({}, _FAST):
-        for cutoff in _COMBINED_CUTOFFS[::2] if quick else _COMBINED_CUTOFFS:
-            for stop in _COMBINED_STOPS[1:2] if quick else _COMBINED_STOPS:
-                if not fast and (cutoff == BASE.alpha_cutoff or stop == BASE.transmittance_stop):
+    """Cut-off and stop together, in precise and in fast arithmetic, and some with a float32 set-up too."""
+    cutoffs = _COMBINED_CUTOFFS[1::2] if quick else _COMBINED_CUTOFFS
+    for more, words in (({}, ""), (_FAST, ", fast"), (_FASTEST, ", fast, float32 set-up")):
+        stops = (_FASTEST_STOP,) if quick or more is _FASTEST else _COMBINED_STOPS
+        for cutoff in cutoffs:
+            for stop in stops:
+                if not more and (cutoff == BASE.alpha_cutoff or stop == BASE.transmittance_stop):
                     continue  # that is one knob alone
-                words = f"cutoff {value_words(cutoff)}, stop {value_words(stop)}" + (", fast" if fast else "")
-                changes = {"alpha_cutoff": cutoff, "transmittance_stop": stop, **fast}
-                yield Point(TOGETHER, words, BASE.with_(**changes))
+                changes = {"alpha_cutoff": cutoff, "transmittance_stop": stop, **more}
+                value = f"cutoff {value_words(cutoff)}, stop {value_words(stop)}{words}"
+                yield Point(TOGETHER, value, BASE.with_(**changes))
