@@ -1,12 +1,11 @@
 """Combinations of effects: those that are right, against the reference, and those that are refused."""
 
 import math
-from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from agreement import random_splats
+from agreement import random_splats, unless_warp
 
 import fidsplat as fs
 from fidsplat.backends.exposure import exposed_view
@@ -49,13 +48,6 @@ def turning(time):
     pose, angle = np.eye(4), 0.6 * time
     pose[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
     return pose
-
-
-def unless_warp(renderer, refuses):
-    """Around a picture that Warp refuses by name (docs/backends.md) if `refuses`, and OpenCL draws."""
-    if refuses and renderer.device.name.startswith("warp"):
-        return pytest.raises(fs.DeviceError, match="use an OpenCL device")
-    return nullcontext()
 
 
 def assert_agrees(renderer, **picture):
