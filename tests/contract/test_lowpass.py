@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from agreement import assert_agrees, random_splats
+from agreement import assert_agrees, random_splats, unless_warp
 
 import fidsplat as fs
 from fidsplat.rotations import quaternion_to_matrix
@@ -40,28 +40,18 @@ def test_tilted_to_edge_on(renderer, tilt):
     assert_agrees(renderer, cloud, fs.Camera.pinhole(60, 60, 50.0, 50.0, 30.0, 30.0), quality=PIXEL)
 
 
-def refused(renderer, cloud, camera):
-    """Whether this is Warp, which says then that it has no such low-pass before a lens yet."""
-    if not renderer.device.name.startswith("warp"):
-        return False
-    with pytest.raises(fs.DeviceError, match=r"warp does not draw camera_.* with lowpass_pixel yet"):
-        renderer.render(cloud, camera, quality=PIXEL)
-    return True
-
-
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
 @pytest.mark.parametrize("scale", [(1e-6, 1e-2), (1e-3, 2.0)], ids=["small", "any"])
 def test_splats_of_every_size_through_every_lens(renderer, camera, scale):
     cloud = random_splats(200, seed=8, depth=(-4.0, 5.0), scale=scale)
-    if refused(renderer, cloud, camera):
-        return
-    assert_agrees(renderer, cloud, camera, quality=PIXEL)
+    with unless_warp(renderer, True):
+        assert_agrees(renderer, cloud, camera, quality=PIXEL)
 
 
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
 def test_a_lens_keeps_the_light_of_a_splat(renderer, camera):
-    """The sum of alpha over the picture is 2 pi opacity times the area of the image of the one-sigma square
-    of a splat far below a pixel; the area from a finite parallelogram."""
+    """The sum of alpha over the picture is 2 pi opacity times the area of the image of the one-sigma square of a splat
+    far below a pixel; the area from a finite parallelogram."""
     generator = np.random.default_rng(2)
     # seen by every lens here, off its axis
     mean = np.array([0.5, -0.35, 1.5])
@@ -72,11 +62,10 @@ def test_a_lens_keeps_the_light_of_a_splat(renderer, camera):
         for axis in axes.T.astype(float)
     )
     want = 2 * math.pi * 0.9 * abs(u[0] * v[1] - u[1] * v[0])
-    if refused(renderer, cloud, camera):
-        return
     quality = PIXEL.with_(alpha_cutoff=1e-9)
-    light = float(renderer.render(cloud, camera, "alpha", quality)["alpha"].sum())
-    assert light == pytest.approx(want, rel=0.032)
+    with unless_warp(renderer, True):
+        light = float(renderer.render(cloud, camera, "alpha", quality)["alpha"].sum())
+        assert light == pytest.approx(want, rel=0.032)
 
 
 def test_boxes_are_left_to_their_own_filter(renderer):
