@@ -1,6 +1,7 @@
 """What markers cost and how well they show: counts, seconds and PSNR of both mixtures.
 
-    python benchmarks/marker_quality.py [--device opencl] [--edge-px 480] [--repeats 7] [--json]
+    python benchmarks/marker_quality.py [--device opencl] [--mixtures NAME ...] [--edge-px 480] [--repeats 7]
+        [--json]
 
 AprilTag 36h11 id 0, and QR codes in byte mode at level L of seeded random strings of 20, 100, 250 and 1000
 characters (versions 2, 5, 10 and 22), seen frontally at 800 x 800, the code's edge `--edge-px` pixels long,
@@ -30,6 +31,7 @@ from rich.table import Table
 
 import fidsplat as fs
 from fidsplat.markers import Marker, marker
+from fidsplat.quality import TEMPLATE_SIZES
 
 PICTURE = 800
 FINE = 12
@@ -38,6 +40,7 @@ MIXTURES = {
     "paper": {"mixture": "paper", "levels": 4, "density": 3},
     "paper, grown": {"mixture": "paper", "levels": 4, "density": 3, "growth": 0.4},
     "fitted": {"mixture": "fitted"},
+    **{f"fitted, {size}": {"mixture": "fitted", "template": size} for size in TEMPLATE_SIZES if size != 25},
 }
 VIEWS = {"layer": ("blend", 0.0), "order": ("order", 0.0), "tilted 30": ("order", 30.0)}
 
@@ -105,7 +108,12 @@ def run(options: argparse.Namespace) -> list[dict]:
     renderer = fs.Renderer(options.device)
     ideals: dict = {}
     rows = []
-    work = [(c, s, m, k) for c, s in categories(options.seed).items() for m, k in MIXTURES.items()]
+    work = [
+        (c, s, m, k)
+        for c, s in categories(options.seed).items()
+        for m, k in MIXTURES.items()
+        if m in options.mixtures
+    ]
     for category, spec, mixture, kwargs in track(work, "markers", console=Console(stderr=True)):
         made = marker(spec, **kwargs)
         seconds = [marker(spec, **kwargs).seconds for _ in range(options.repeats)]
@@ -130,6 +138,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--device", default="opencl")
+    parser.add_argument("--mixtures", nargs="+", choices=MIXTURES, default=list(MIXTURES))
     parser.add_argument(
         "--edge-px", type=float, default=480.0, help="edge of the code in pixels (430 or more)"
     )
@@ -157,7 +166,7 @@ def main() -> None:
             f"{row['splats'] / (dark + light):.1f}",
             f"{row['seconds']:.4f}",
             *(f"{value:.2f}" for value in row["psnr_db"].values()),
-            end_section=row["mixture"] == list(MIXTURES)[-1],
+            end_section=row["mixture"] == options.mixtures[-1],
         )
     Console().print(table)
 

@@ -24,6 +24,7 @@ Examples:
   fidsplat render scene.toml -o picture.png         draw a scene
   fidsplat detect picture.png --scene scene.toml    read it back, with poses
   fidsplat bench                                    what a frame costs here
+  fidsplat tradeoff --quick                         what accuracy costs in time
 
 `fidsplat COMMAND --help` explains a command. --debug, anywhere, shows where an error arose."""
 
@@ -75,7 +76,7 @@ def _parse(words: list[str]):
     while words and words[0] in known:
         kind, about, program = known[words[0]], known[words[0]].HELP, f"{program} {words[0]}"
         known, words = getattr(kind, "PARTS", {}), words[1:]
-    if known:  # a group, and no word that leads on
+    if known and not hasattr(kind, "run"):  # a group, and no word that leads on
         kind = _any_of(known)
     said = io.StringIO()
     try:

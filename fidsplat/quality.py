@@ -8,6 +8,7 @@ from __future__ import annotations
 import difflib
 import math
 import operator
+from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 from numbers import Real
 from typing import TYPE_CHECKING, Any
@@ -32,7 +33,7 @@ DEPTH_KEY_BITS = (16, 24, 32)
 TILE_SIZES = (8, 16, 32)
 MAX_SAMPLES = 8
 MIXTURES = ("fitted", "paper", "exact")
-TEMPLATE_SIZES = (25,)
+TEMPLATE_SIZES = (1, 5, 9, 13, 25, 41)
 """Gaussians of a rectangle in the templates that are shipped (fidsplat/markers/templates.json)"""
 MAX_LEVELS, MAX_DENSITY = 8, 100
 
@@ -80,7 +81,8 @@ class MarkerQuality:
     and rounds what lies behind. None: what the mixture was made with (0.4 for fitted, 0 for paper)."""
 
     template: int = 25
-    """Of `fitted`: Gaussians of a rectangle up to an aspect ratio of 8 (`TEMPLATE_SIZES`)."""
+    """Of `fitted`: Gaussians of a rectangle up to an aspect ratio of 8, one of `TEMPLATE_SIZES`: 1, 5, 9,
+    13, 25 or 41. Fewer are drawn faster and leave edges blurred and corners round."""
 
     def __post_init__(self) -> None:
         _one_of("marker quality: mixture", self.mixture, MIXTURES)
@@ -101,19 +103,21 @@ class Quality:
     """
 
     alpha_cutoff: float = 1.0 / 255.0
-    """Contributions below this alpha are not drawn, (0, 1). It sets each splat's radius:
+    """Alpha, in (0, 1), default 1/255: contributions below it are not drawn. It sets each splat's radius:
     R^2 = 2 ln(opacity / cutoff), the same R in bounds and in the per-pixel test. Lower costs area, higher
     bites haze (research: 100 layers of alpha 0.0039 lose 32 % opacity at 1/255)."""
 
     transmittance_stop: float = 1e-4
-    """A pixel is finished once its transmittance is at or below this, [0, 1). 0 never stops."""
+    """Transmittance, in [0, 1), default 1e-4: a pixel is finished once its own is at or below this, and what
+    lies behind changes it by that much at most. Higher saves the splats behind opaque ones; 0 never stops."""
 
     stop_rule: str = "inclusive"
     """`inclusive`: the fragment that reaches the stop is still drawn. `exclusive` (gsplat, 2DGS authors): it
     is dropped, which leaks up to 1 % of the background through opaque splats; kept for parity only."""
 
     opacity_ceiling: float = 1.0
-    """Upper bound of one fragment's alpha, (0, 1]. gsplat and the 2DGS authors use 0.99."""
+    """Alpha, in (0, 1], default 1: upper bound of one fragment's. gsplat and the 2DGS authors use 0.99, which
+    keeps their gradients finite and lets 1 % of the background through; it saves no time."""
 
     lowpass: str = "screen"
     """`screen`: the object-space low-pass of 2DGS (a Gaussian of sigma 0.707 px around the projected centre,
@@ -128,18 +132,20 @@ class Quality:
     splats, which flips as the camera turns."""
 
     samples: int = 1
-    """n: each pixel is the mean of n x n samples on a regular grid, 1 to 8."""
+    """n, 1 to 8, default 1: each pixel is the mean of n x n samples on a regular grid. More smooth edges, and
+    cost n^2 times the blending."""
 
     first_hit: float = 0.1
     """Opacity at which the outputs depth_first and distance_first see a surface, (0, 1): the first fragment
     or layer behind which the transmittance is at most 1 less this."""
 
     setup_precision: str = "float64"
-    """Arithmetic of the per-splat set-up. `float32` is also what a device without float64 uses."""
+    """Arithmetic of the per-splat set-up. `float32` is also what a device without float64 uses; it moves
+    small and grazing splats (docs/numerics.md), and saves time on devices whose float64 is slow."""
 
     arithmetic: str = "precise"
     """Exponentials and divisions of blending. `precise`: those of the device's library, within 2 or 3 units
-    of the last place. `fast`: shorter ones."""
+    of the last place. `fast`: shorter ones, by which colours move by less than 1e-5."""
 
     blend_precision: str = "float32"
     """Arithmetic of each fragment: crossing, weight and blending. `float64`: a device's truth picture, many
@@ -151,8 +157,8 @@ class Quality:
 
     depth_key_bits: int = 32
     """Leading bits of the depth's float32 by which splats are sorted, 16, 24 or 32: sign, exponent, and then
-    7, 15 or 23 bits of mantissa, so that depths within 1/128, 1/32768 or 1/8388608 of each other tie and keep
-    the cloud's order. Fewer sort faster on CPUs. Clouds with layers of coplanar splats always have all 32."""
+    7, 15 or 23 bits of mantissa. Depths that agree in them (to 1/128, 1/32768 or 1/8388608 at best) tie and
+    keep the cloud's order. Fewer sort faster on CPUs. Where planes are layers there are always all 32."""
 
     tile_size: int | None = None
     """Edge in samples of the tiles in which pictures are drawn, 8, 16 or 32; None: the device's own. CPUs
@@ -219,18 +225,37 @@ class Quality:
         """The preset of that name: standard, fast, reference, gsplat or surfel."""
         if name in PRESETS:
             return PRESETS[name]
-        near = difflib.get_close_matches(str(name), PRESETS, 1)
-        hint = f" (did you mean {near[0]!r}?)" if near else ""
-        raise InputError(f"unknown quality {name!r}{hint}; known: {', '.join(PRESETS)}")
+        raise InputError(f"unknown quality {name!r}{_hint(name, PRESETS)}; known: {', '.join(PRESETS)}")
 
     @classmethod
     def of(cls, quality: Quality | str | None) -> Quality:
-        """A `Quality` from itself, from a preset's name, or the default from None."""
+        """A `Quality` from itself, from text, or the default from None.
+
+        Text is a preset's name, knobs as key=value, or both: "fast", "alpha_cutoff=1e-3",
+        "fast,samples=2,marker.template=9". Without a name the knobs are changed in standard.
+
+        Raises:
+            InputError: an unknown preset or knob, or a value that it cannot have.
+        """
         if quality is None:
             return PRESETS["standard"]
         if isinstance(quality, cls):
             return quality
-        return cls.named(quality)  # type: ignore[arg-type]
+        if not isinstance(quality, str):
+            raise InputError(f"quality is {quality!r}; it must be an fs.Quality or text")
+        first, *rest = (part.strip() for part in quality.split(","))
+        chosen = PRESETS["standard"] if "=" in first else cls.named(first)
+        changes: dict[str, Any] = {}
+        for part in [first, *rest] if "=" in first else rest:
+            name, equals, value = (piece.strip() for piece in part.partition("="))
+            if not equals:
+                raise InputError(f"quality: {part!r} must be a knob as key=value, e.g. alpha_cutoff=1e-3")
+            if name.startswith("marker."):
+                own = name.removeprefix("marker.")
+                changes.setdefault("marker", {})[own] = _read(MarkerQuality, own, value)
+            else:
+                changes[name] = _read(cls, name, value)
+        return chosen.with_(**changes)
 
     @classmethod
     def within(
@@ -278,12 +303,51 @@ class Quality:
         return choose(error, ms, camera, cloud, device, base, **around).quality
 
     def with_(self, **changes) -> Quality:
-        """A copy with some knobs changed; an unknown knob is an error that names the known ones."""
-        known = [f.name for f in fields(self)]
+        """A copy with some knobs changed; an unknown knob is an error that names the known ones.
+
+        marker: a `MarkerQuality`, or a dict of those of its knobs that change.
+        """
         for name in changes:
-            if name not in known:
-                raise InputError(f"quality has no knob {name!r}; known: {', '.join(known)}")
+            _check_known(Quality, name)
+        marker = changes.get("marker")
+        if isinstance(marker, dict):
+            for name in marker:
+                _check_known(MarkerQuality, name)
+            changes["marker"] = replace(self.marker, **marker)
         return replace(self, **changes)
+
+
+def knobs(kind: type[Quality] | type[MarkerQuality]) -> dict[str, str]:
+    """Type of every knob that is a single value, as it is written: `float`, `int | None` ..."""
+    return {knob.name: str(knob.type) for knob in fields(kind) if knob.name != "marker"}
+
+
+def _check_known(kind: type[Quality] | type[MarkerQuality], name: str) -> None:
+    known = [knob.name for knob in fields(kind)]
+    if name not in known:
+        whose = "marker quality" if kind is MarkerQuality else "quality"
+        raise InputError(f"{whose} has no knob {name!r}{_hint(name, known)}; known: {', '.join(known)}")
+
+
+def _hint(name: Any, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(str(name), known, 1)
+    return f" (did you mean {near[0]!r}?)" if near else ""
+
+
+def _read(kind: type[Quality] | type[MarkerQuality], name: str, text: str) -> Any:
+    """A knob's value from text."""
+    if name == "marker":
+        raise InputError("quality: marker has knobs of its own; write e.g. marker.template=9")
+    _check_known(kind, name)
+    wanted = knobs(kind)[name]
+    if wanted.endswith("| None") and text.lower() == "none":
+        return None
+    convert = {"float": float, "int": int, "str": str}[wanted.split()[0]]
+    try:
+        return convert(text)
+    except ValueError:
+        what = "a whole number" if convert is int else "a number"
+        raise InputError(f"quality: {name} is {text!r}; it must be {what}") from None
 
 
 # gsplat: gsplat 1.5/1.6 `rasterization_2dgs`; surfel: the 2DGS authors' diff-surfel-rasterization.

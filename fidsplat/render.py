@@ -197,7 +197,7 @@ class Renderer:
                 where the arguments are left out.
             camera: needed unless the scene has one.
             outputs: names of planes; default rgb.
-            quality: a Quality or a preset's name; default standard.
+            quality: a Quality, or text such as "fast" or "fast,samples=2" (`Quality.of`); default standard.
             background: (r, g, b), a Gradient or a Panorama behind the splats; default black.
             motion: how the camera and groups of splats move; default: they stand still.
             shutter: when the picture is taken, and how long that takes; default: at time 0, at once.
@@ -244,7 +244,6 @@ class Renderer:
             camera,
             moving=bool(view.groups),
             exposed=bool(view.shots),
-            turning=view.turns,
             sensor=sensor,
             fog=fog,
             background=behind,

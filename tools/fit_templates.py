@@ -49,6 +49,7 @@ COUNTS = {
     9: ((1, 1, 1), (2, 1, 1)),
     13: ((2, 2, 1), (3, 2, 1)),
     25: ((4, 4, 2), (5, 5, 3)),
+    41: ((6, 6, 4), (7, 7, 5)),
 }
 BACKGROUNDS = (0.0, 0.5, 1.0)
 ORDERS = {"layer": 2.0, "0": 1.0, "130": 1.0}  # weights; an angle sorts the centres along that direction
@@ -338,7 +339,8 @@ def fit(size: int, starts: int, rounds: int) -> dict:
     for (limit, _), a, b in zip(CLASSES, model.quadrant[:-1], model.quadrant[1:], strict=True):
         slots = np.column_stack([raw[a:b, :2], np.exp(raw[a:b, 2:4]), raw[a:b, 4]])
         signs = [np.abs(model.signs[model.parameter == i][0]) for i in range(a, b)]
-        slots[:, :2] *= signs
+        # what stands for twins keeps off the axis between them
+        slots[:, :2] = np.maximum(slots[:, :2], 1e-4) * signs
         templates.append({"max_aspect": limit, "quadrant": np.round(slots, 4).tolist()})
     return {"size": size, "fit_db": round(reached, 2), "templates": templates}
 

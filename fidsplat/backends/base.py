@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 
 from fidsplat.cameras import Camera, Orthographic
+from fidsplat.cameras.lenses import Lens
 from fidsplat.cameras.raster import RayRaster, raster_of
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import InputError
@@ -113,9 +114,26 @@ class View:
     """the sub-pictures of which this picture is made; none: it is one"""
 
     @property
+    def lens(self) -> Lens | None:
+        """What stands before a pinhole; None for a pinhole."""
+        if self.raster is not None:
+            return self.raster.lens
+        return Orthographic() if self.parallel else None
+
+    @property
     def turns(self) -> bool:
         """Whether its shots look in different directions."""
         return any(not np.array_equal(shot.view.rotation, self.rotation) for shot in self.shots)
+
+    @property
+    def turns_of_rows(self) -> np.ndarray:
+        """(h, 3, 3) world to camera, for each row of pixels that of the pose which normals show there."""
+        turns = np.tile(self.rotation, (self.height // self.samples, 1, 1))
+        for shot in self.shots:
+            if shot.middle:
+                top = shot.top // self.samples
+                turns[top : top + shot.view.height // self.samples] = shot.view.rotation
+        return turns
 
     def rows(self, top: int, end: int) -> View:
         """The view of rows of samples [top, end) alone."""
@@ -156,7 +174,9 @@ class View:
                 return self.sensor.uniform(name)
 
     def array(self, name: str) -> np.ndarray:
-        """A float32 array that an effect asks for (`Effect.resolve_arrays`)."""
+        """A float32 array that an effect asks for (`Effect.resolve_arrays`, `Effect.backdrop_arrays`)."""
+        if name == "turns":
+            return self.turns_of_rows.astype(np.float32)
         if name == "panorama" and isinstance(self.surroundings, Panorama):
             return self.surroundings.image
         return np.asarray(self.sensor.response, np.float32)
@@ -278,6 +298,10 @@ class Measurable(Protocol):
     @property
     def memory_bytes(self) -> int:
         """Device memory that scratch buffers hold; clouds and finished planes are not among them."""
+        ...
+
+    def release_scratch(self) -> None:
+        """Let go of them, so that the next picture shows what it needs."""
         ...
 
     def rates(self) -> Rates:

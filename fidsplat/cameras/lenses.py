@@ -103,6 +103,14 @@ class BrownConrady:
             seen = (points[:, 2] > 0) & (np.hypot(x, y) < self.fold) & np.isfinite(a) & np.isfinite(b)
         return np.where(seen[:, None], np.stack([a, b], 1), np.nan)
 
+    def derivative(self, points: np.ndarray) -> np.ndarray:
+        """Of the image coordinates by X, Y, Z, (n, 2, 3), at points (n, 3) that are seen."""
+        z = points[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            x, y = points[:, 0] / z, points[:, 1] / z
+            by_x, by_y = np.array(self._distorted(x, y)[2:]).reshape(2, 2, -1).swapaxes(0, 1) / z
+            return np.moveaxis(np.stack([by_x, by_y, -(x * by_x + y * by_y)]), (0, 1, 2), (2, 1, 0))
+
     def rays(self, image: np.ndarray) -> np.ndarray:
         """Directions (n, 3) = (X / Z, Y / Z, 1) of image coordinates (n, 2); NaN where nothing is seen."""
         a, b = image.T
@@ -173,6 +181,24 @@ class Fisheye:
         q = angle * angle
         return angle * (1 + q * (self.k1 + q * (self.k2 + q * (self.k3 + q * self.k4))))
 
+    def _slope(self, angle):
+        """Derivative of the distance by the angle."""
+        q = angle * angle
+        return 1 + q * (3 * self.k1 + q * (5 * self.k2 + q * (7 * self.k3 + q * 9 * self.k4)))
+
+    def derivative(self, points: np.ndarray) -> np.ndarray:
+        """Of the image coordinates by X, Y, Z, (n, 2, 3), at points (n, 3) that are seen."""
+        x, y, z = points.T
+        across = np.hypot(x, y)
+        angle = np.arctan2(across, z)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            cos, sin = np.where(across > 0, x / across, 1.0), np.where(across > 0, y / across, 0.0)
+            outward = self._slope(angle) / (across**2 + z**2)
+            around = np.where(across > 0, self.distance(angle) / across, 1 / z)
+        by_radius = outward * np.stack([z * cos, z * sin, -across])
+        by_turn = around * np.stack([-sin, cos, 0 * z])
+        return np.moveaxis(np.stack([cos * by_radius - sin * by_turn, sin * by_radius + cos * by_turn]), 2, 0)
+
     def image(self, points: np.ndarray) -> np.ndarray:
         """Image coordinates (n, 2) of points (n, 3); NaN where they are not seen."""
         across = np.hypot(points[:, 0], points[:, 1])
@@ -188,8 +214,7 @@ class Fisheye:
         angles = np.linspace(0, self.limit, _STEPS)
         angle = np.interp(distance, self.distance(angles), angles)
         for _ in range(_ITERATIONS):
-            q = angle * angle
-            slope = 1 + q * (3 * self.k1 + q * (5 * self.k2 + q * (7 * self.k3 + q * 9 * self.k4)))
+            slope = self._slope(angle)
             off = self.distance(angle) - distance
             with np.errstate(divide="ignore", invalid="ignore"):
                 step = np.where(slope > 1e-12, off / slope, 0.0)
@@ -221,6 +246,19 @@ class Equirectangular:
         image = np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))], 1)
         return np.where(np.any(points != 0, axis=1)[:, None], image, np.nan)
 
+    def derivative(self, points: np.ndarray) -> np.ndarray:
+        """Of the image coordinates by X, Y, Z, (n, 2, 3), at points (n, 3). At a pole, where the longitude jumps, that
+        of a point 1e-6 rad away from it towards z."""
+        x, y, z = points.T
+        far = np.linalg.norm(points, axis=1)
+        polar = np.hypot(x, z) < 1e-6 * far
+        x, z = np.where(polar, 0.0, x), np.where(polar, 1e-6 * far, z)
+        flat = np.hypot(x, z)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            longitude = np.stack([z, 0 * y, -x]) / flat**2
+            latitude = np.stack([-x * y / flat, flat, -z * y / flat]) / far**2
+        return np.moveaxis(np.stack([longitude, latitude]), 2, 0)
+
     def rays(self, image: np.ndarray) -> np.ndarray:
         """Unit directions (n, 3) of image coordinates (n, 2); NaN beyond the sphere."""
         a, b = image.T
@@ -241,6 +279,10 @@ class Orthographic:
     def image(self, points: np.ndarray) -> np.ndarray:
         """Image coordinates (n, 2), metres, of points (n, 3); NaN behind the camera."""
         return np.where(points[:, 2:] > 0, points[:, :2], np.nan)
+
+    def derivative(self, points: np.ndarray) -> np.ndarray:
+        """Of the image coordinates by X, Y, Z, (n, 2, 3), at points (n, 3)."""
+        return np.tile(np.eye(2, 3), (len(points), 1, 1))
 
 
 RayLens: TypeAlias = BrownConrady | Fisheye | Equirectangular

@@ -53,6 +53,37 @@ class RayRaster:
         rays.flags.writeable = False
         return rays
 
+    @cached_property
+    def slopes(self) -> np.ndarray:
+        """(h, w, 2, 3) float32: derivatives of the rays by x and by y, per sample; NaN where nothing is seen."""
+        if self.whole is not None:
+            return self.whole.slopes[self.top : self.top + self.height]
+        slopes = np.empty((self.height, self.width, 2, 3), np.float32)
+        step = max(1, _ROWS // self.width)
+        for top in range(0, self.height, step):
+            rays = self.rays[top : top + step].reshape(-1, 3).astype(np.float64)
+            by_ray = self.lens.derivative(rays) * np.array([[self.fx], [self.fy]])
+            if not self.lens.along_ray:
+                by_ray[:, :, 2] = 0.0  # rays have Z = 1, and so have those beside them
+            # the inverse among the rays beside this one: J^T (J J^T)^-1
+            xx, yy, xy = ((by_ray[:, i] * by_ray[:, j]).sum(1)[:, None] for i, j in ((0, 0), (1, 1), (0, 1)))
+            with np.errstate(divide="ignore", invalid="ignore"):
+                along_x = (yy * by_ray[:, 0] - xy * by_ray[:, 1]) / (xx * yy - xy * xy)
+                along_y = (xx * by_ray[:, 1] - xy * by_ray[:, 0]) / (xx * yy - xy * xy)
+            slopes[top : top + step] = np.stack([along_x, along_y], 1).reshape(-1, self.width, 2, 3)
+        slopes.flags.writeable = False
+        return slopes
+
+    @cached_property
+    def step(self) -> float:
+        """The largest length of a ray's derivative in any direction of the picture, rounded up."""
+        if self.whole is not None:
+            return self.whole.step
+        along_x, along_y = np.moveaxis(self.slopes, 2, 0)
+        xx, yy, xy = ((a * b).sum(2) for a, b in ((along_x, along_x), (along_y, along_y), (along_x, along_y)))
+        squared = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
+        return float(np.sqrt(np.nanmax(squared))) * 1.00001
+
     def chart(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Coordinates in which the kernels enclose a splat: those of the ideal pinhole picture [samples], or,
         for a fisheye, the stereographic ones (X, Y) / (|ray| + Z)."""

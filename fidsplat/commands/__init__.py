@@ -1,6 +1,6 @@
 """One module for each command: a dataclass of its options, whose ``run`` does the work and returns the exit
 status. Its docstring is the line in the list of commands, its HELP what `fidsplat COMMAND --help` says.
-A group of commands has PARTS instead: its commands by the word that follows.
+A group of commands has PARTS instead, or as well: its commands by the word that follows.
 
 Nothing heavy is imported before ``run``, so that help and errors come at once.
 """
@@ -13,6 +13,7 @@ from fidsplat.commands.devices import Devices
 from fidsplat.commands.experiment import Experiment
 from fidsplat.commands.marker import Marker
 from fidsplat.commands.render import Render
+from fidsplat.commands.tradeoff import Tradeoff
 from fidsplat.commands.warm import Warm
 
 COMMANDS = {
@@ -23,6 +24,7 @@ COMMANDS = {
     "detect": Detect,
     "check": Check,
     "bench": Bench,
+    "tradeoff": Tradeoff,
     "warm": Warm,
     "experiment": Experiment,
 }

@@ -27,8 +27,13 @@ SPEC is one of
 The mixture exact draws every rectangle as one box with sharp edges. A PLY file has no boxes: -o then writes
 the Gaussians of fitted, and says so.
 
+Knobs of the mixtures (fs.MarkerQuality) are part of a quality: marker.levels (1 to 8) and marker.density (1
+to 100) of paper, marker.template of fitted (Gaussians of a rectangle: 1, 5, 9, 13, 25 or 41), and
+marker.growth (modules).
+
 Examples:
   fidsplat marker apriltag:36h11:5 --size 0.16 -o tag.ply
+  fidsplat marker qr:hello --quality marker.template=9
   fidsplat marker "qr:hello" --mixture paper --json"""
 
     spec: Annotated[tyro.conf.Positional[str], option("SPEC", "what to make, as above")]
@@ -37,8 +42,11 @@ Examples:
         float, option("M", "edge of the code in metres, its quiet zone not counted (default: 1)")
     ] = 1.0
     mixture: Annotated[
-        str, option("NAME", "how rectangles become splats: fitted, paper or exact (default: fitted)")
-    ] = "fitted"
+        str | None, option("NAME", "how rectangles become splats: fitted, paper or exact (default: fitted)")
+    ] = None
+    quality: Annotated[
+        str | None, option("Q", "as `fidsplat render` takes it; what it says of markers, as above, holds")
+    ] = None
     native_2dgs: Annotated[
         bool,
         tyro.conf.arg(help="leave the third scale out of the file, as 2DGS does", help_behavior_hint=""),
@@ -53,7 +61,8 @@ Examples:
         file = writable_file(self.out) if self.out is not None else None
         if file is not None and file.suffix.lower() != ".ply":
             raise InputError(f"splats are written as PLY: name {file.with_suffix('.ply')}, not {file}")
-        made = fs.marker(self.spec, size=self.size, mixture=self.mixture)
+        quality = fs.Quality.of(self.quality).marker
+        made = fs.marker(self.spec, size=self.size, mixture=self.mixture, quality=quality)
         if file is not None:
             fs.save_ply(made.gaussians, file, native_2dgs=self.native_2dgs)
         written = "fitted" if made.mixture == "exact" else made.mixture

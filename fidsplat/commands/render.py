@@ -37,8 +37,13 @@ Planes:
   normal normal_world                 towards the camera, in its axes or the world's
   blended                             number of splats that made the pixel
 
+Quality: standard fast reference gsplat surfel; any knob of fs.Quality may follow, or stand alone and change
+standard: fast,samples=2,alpha_cutoff=1e-3. Markers of a scene file that do not say how they are made take
+marker.mixture, marker.levels, marker.density, marker.growth and marker.template from it.
+
 Examples:
   fidsplat render scene.toml
+  fidsplat render scene.toml --quality standard,alpha_cutoff=1e-3,tile_size=8
   fidsplat render scene.toml -o frames --outputs rgb,depth,normal,label
   fidsplat render tag.ply -o tag.png --device reference --quality gsplat
   fidsplat render scene.toml --max-error 1e-3        measures first, and keeps what it found for the next time
@@ -58,7 +63,7 @@ Examples:
     ] = None
     quality: Annotated[
         str | None,
-        option("Q", "standard fast reference gsplat surfel (default: the scene's, or standard)"),
+        option("Q", "a preset, knobs as key=value, or both, as below (default: the scene's, or standard)"),
     ] = None
     max_error: Annotated[
         float | None,
@@ -86,7 +91,7 @@ Examples:
         name_of = _names(self.out, Path(self.source))
         where = console(self.json)
         with where.status("reading"):
-            scene = _load(self.source)
+            scene = _load(self.source, self.quality)
         with _named(self.source, "render.outputs", names is None):
             select(fs.SplatCloud.empty(), scene.outputs, Quality.of(None))
         of_scene = _named(self.source, "render.device", self.device is None)
@@ -169,13 +174,13 @@ def _names(out: str | None, source: Path):
     return lambda plane, suffix: file / f"{plane}{suffix}"
 
 
-def _load(source: str) -> "Scene":
+def _load(source: str, quality: str | None) -> "Scene":
     import fidsplat as fs
     from fidsplat.commands.framing import framing_camera
 
     suffix = Path(source).suffix.lower()
     if suffix == ".toml":
-        scene = fs.Scene.load(source)
+        scene = fs.Scene.load(source, quality)
         if scene.camera is None:
             raise InputError(
                 f"{source} has no [camera] table; add one with width, height, fov_x_deg, position, look_at"

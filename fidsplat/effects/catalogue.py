@@ -7,7 +7,8 @@ an effect's kernel file say where its text goes (kernels/README.md).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
@@ -52,10 +53,19 @@ class Effect:
     """The same for resolving; they stand before its arrays."""
     resolve_arrays: tuple[str, ...] = ()
     """Arrays of the view (`View.array`) that resolving needs for it; they stand before its planes."""
+    resolve_inputs: tuple[str, ...] = ()
+    """The same of those that are on the device already."""
+    backdrop_uniforms: tuple[str, ...] = ()
+    """As `resolve_uniforms`, for what is seen behind everything (slot/world_ray.cl); then its arrays."""
+    backdrop_arrays: tuple[str, ...] = ()
+    backdrop_inputs: tuple[str, ...] = ()
     averaged: bool = False
     """Whether its planes are light: the mean of what several shots leave, not one shot's."""
+    behind: Mapping[str, str] = field(default_factory=dict, hash=False)
+    """By the name of a camera slot: the part that takes this part's place there."""
 
 
+_OWN_RAYS = ("camera_brown_conrady", "camera_fisheye", "camera_equirectangular")
 _EFFECTS = (
     Effect("camera_pinhole", "slot/camera_pinhole.cl", parts=("perspective",)),
     Effect("camera_brown_conrady", "slot/camera_brown_conrady.cl", parts=("perspective", "ray_map", "rays")),
@@ -76,6 +86,7 @@ _EFFECTS = (
         inputs=("rays",),
         view_inputs=("rays",),
         blend_inputs=("rays",),
+        backdrop_inputs=("rays",),
     ),
     Effect("motion_groups", "slot/motion_groups.cl", inputs=("labels", "moving"), view_inputs=("moving",)),
     Effect("shutter_exposure", "slot/shutter_exposure.cl"),
@@ -109,7 +120,22 @@ _EFFECTS = (
         inputs=("boxes",),
         parts=("box_edges",),
     ),
-    Effect("box_edges", "slot/box_edges.cl", record_lanes=4),
+    Effect("box_cover", "slot/box_cover.cl"),
+    Effect(
+        "box_edges",
+        "slot/box_edges.cl",
+        record_lanes=4,
+        parts=("box_cover",),
+        behind=dict.fromkeys(_OWN_RAYS, "rays_box"),
+    ),
+    Effect(
+        "rays_box",
+        "slot/rays_box.cl",
+        inputs=("ray_step",),
+        view_inputs=("ray_step",),
+        blend_inputs=("ray_slopes",),
+        parts=("box_cover",),
+    ),
     Effect("ray_depth", "slot/ray_depth.cl", record_lanes=3),
     Effect("alpha", "tap/alpha.cl", output=Output("alpha", 1, "float32")),
     Effect("depth", "tap/depth.cl", planes=(2,), output=Output("depth", 1, "float32"), parts=("ray_depth",)),
@@ -145,20 +171,33 @@ _EFFECTS = (
         "background_gradient",
         "slot/background_gradient.cl",
         parts=("world_ray",),
-        resolve_uniforms=("gradient",),
+        backdrop_uniforms=("gradient",),
     ),
     Effect(
         "background_panorama",
         "slot/background_panorama.cl",
         parts=("world_ray",),
-        resolve_uniforms=("panorama_size",),
-        resolve_arrays=("panorama",),
+        backdrop_uniforms=("panorama_size",),
+        backdrop_arrays=("panorama",),
     ),
     Effect("ray", "slot/ray.cl", resolve_uniforms=("ray",)),
-    Effect("turn", "slot/turn.cl", resolve_uniforms=("rotation",)),
-    Effect("ray_length", "slot/ray_length.cl"),
-    Effect("sample_length", "slot/sample_length.cl", parts=("ray", "ray_length")),
-    Effect("world_ray", "slot/world_ray.cl", parts=("ray", "turn")),
+    Effect("turn", "slot/turn.cl", resolve_arrays=("turns",)),
+    # rays of fisheyes and panoramas have a length of 1
+    Effect("ray_length", "slot/ray_length.cl", behind={"camera_brown_conrady": "rays_length"}),
+    Effect("rays_length", "slot/rays_length.cl"),
+    Effect(
+        "sample_length",
+        "slot/sample_length.cl",
+        parts=("ray", "ray_length"),
+        behind={"camera_brown_conrady": "rays_sample_length"},
+    ),
+    Effect(
+        "rays_sample_length",
+        "slot/rays_sample_length.cl",
+        parts=("rays_length",),
+        resolve_inputs=("rays",),
+    ),
+    Effect("world_ray", "slot/world_ray.cl"),
     Effect(
         "fog",
         "tap/fog.cl",

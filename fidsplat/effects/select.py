@@ -71,8 +71,12 @@ def _parts_of(names: Iterable[str]) -> list[str]:
     """What effects need, and what that needs, sorted."""
     parts: set[str] = set()
     todo = list(names)
+    cameras = [name for name in todo if name.startswith("camera_")]
     while todo:
-        fresh = set(CATALOGUE[todo.pop()].parts) - parts
+        needed = CATALOGUE[todo.pop()].parts
+        for camera in cameras:
+            needed = [CATALOGUE[part].behind.get(camera, part) for part in needed]
+        fresh = set(needed) - parts
         parts |= fresh
         todo += fresh
     return sorted(parts)
@@ -105,7 +109,6 @@ def select(
     *,
     moving: bool = False,
     exposed: bool = False,
-    turning: bool = False,
     sensor: Sensor | None = None,
     fog: Fog | None = None,
     background: Background = (0.0, 0.0, 0.0),
@@ -113,8 +116,7 @@ def select(
     """The features that a cloud, outputs, quality, camera (None: a pinhole) and so on call for. Values that
     mean nothing call for nothing.
 
-    moving: groups of splats move by themselves. exposed: the picture is made of several poses. turning: these
-    look in different directions.
+    moving: groups of splats move by themselves. exposed: the picture is made of several poses.
 
     Raises:
         InputError: an output that nobody declares, or two effects that do not go together.
@@ -128,10 +130,9 @@ def select(
             hint = f" (did you mean {near[0]!r}?)" if near else ""
             raise InputError(f"unknown output {name!r}{hint}; known: {', '.join(OUTPUTS)}")
     foggy = fog is not None and fog.density > 0
-    behind = _behind(background, foggy)
     lowpass = "none" if cloud.footprint == "box" else quality.lowpass
     precision = quality.blend_precision
-    refuse_strangers(cloud.footprint, lowpass, wanted, foggy, behind, camera, turning, precision)
+    refuse_strangers(foggy, camera, precision)
     layered = cloud.has_planes and quality.coplanar == "blend"
     # the splats of a plane arrive together because no other has their key
     key_bits = 32 if layered else quality.depth_key_bits
@@ -145,7 +146,7 @@ def select(
             f"stop_{quality.stop_rule}",
             "compose_planes" if layered else "compose_ordered",
             f"footprint_{cloud.footprint}",
-            f"background_{behind}",
+            f"background_{_behind(background, foggy)}",
             f"arithmetic_{quality.arithmetic}",
             *(("motion_groups",) if moving else ()),
             *(("shutter_exposure",) if exposed else ()),

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-_COLOURS = ("#777777", "#d1495b", "#edae49", "#00798c", "#30638e", "#7b4f9d", "#2e8b57", "#c26a2d", "#1f2d3d")
+COLOURS = ("#777777", "#d1495b", "#edae49", "#00798c", "#30638e", "#7b4f9d", "#2e8b57", "#c26a2d", "#1f2d3d")
 _WIDTH, _HEIGHT = 900, 360
 _LEFT, _RIGHT, _BOTTOM = 62, 16, 34
 _ROW = 16  # of the legend
@@ -44,7 +44,7 @@ def bar_chart(
     ticks = _powers(bars) if logarithmic else _steps(bars)
     low, high = ticks[0], ticks[-1]
 
-    legend, rows = _legend(list(series))
+    names, rows = legend(list(series))
     top = 44 + _ROW * rows
 
     def place(value: float) -> float:
@@ -54,23 +54,23 @@ def bar_chart(
             share = (max(value, low) - low) / (high - low)
         return _HEIGHT - _BOTTOM - share * (_HEIGHT - top - _BOTTOM)
 
-    parts = [_text(_WIDTH / 2, 18, title, "middle", 15), _text(8, top - 8, axis, "start", 11), *legend]
+    parts = [text(_WIDTH / 2, 18, title, "middle", 15), text(8, top - 8, axis, "start", 11), *names]
     for tick in ticks:
         y = place(tick)
         parts.append(f'<path d="M{_LEFT} {y:.1f}H{_WIDTH - _RIGHT}" stroke="#ddd"/>')
-        parts.append(_text(_LEFT - 6, y + 4, f"{tick:,.10g}", "end", 11))
+        parts.append(text(_LEFT - 6, y + 4, f"{tick:,.10g}", "end", 11))
     wide = (_WIDTH - _LEFT - _RIGHT) / len(groups)
     thick = 0.84 * wide / len(series)
     for g, group in enumerate(groups):
         x0 = _LEFT + g * wide
-        parts.append(_text(x0 + wide / 2, _HEIGHT - 12, group, "middle", 12))
+        parts.append(text(x0 + wide / 2, _HEIGHT - 12, group, "middle", 12))
         for s, row in enumerate(series.values()):
             bar = row[g]
             if bar is None:
                 continue
             x, y = x0 + 0.08 * wide + s * thick, place(bar.value)
             floor = _HEIGHT - _BOTTOM - y
-            colour = _COLOURS[s % len(_COLOURS)]
+            colour = COLOURS[s % len(COLOURS)]
             size = f'width="{0.92 * thick:.1f}" height="{floor:.1f}"'
             parts.append(f'<rect x="{x:.1f}" y="{y:.1f}" {size} fill="{colour}"/>')
             if bar.spread > 0:
@@ -83,7 +83,7 @@ def bar_chart(
     )
 
 
-def _legend(names: list[str]) -> tuple[list[str], int]:
+def legend(names: list[str]) -> tuple[list[str], int]:
     """Squares and names in as many rows as they need; the number of rows."""
     parts, x, rows = [], float(_LEFT), 1
     for s, name in enumerate(names):
@@ -91,8 +91,8 @@ def _legend(names: list[str]) -> tuple[list[str], int]:
         if x + length > _WIDTH and x > _LEFT:
             x, rows = float(_LEFT), rows + 1
         y = 10 + _ROW * rows
-        square = f'width="10" height="10" fill="{_COLOURS[s % len(_COLOURS)]}"'
-        parts += [f'<rect x="{x:.0f}" y="{y}" {square}/>', _text(x + 14, y + 9, name, "start", 11)]
+        square = f'width="10" height="10" fill="{COLOURS[s % len(COLOURS)]}"'
+        parts += [f'<rect x="{x:.0f}" y="{y}" {square}/>', text(x + 14, y + 9, name, "start", 11)]
         x += length
     return parts, rows
 
@@ -112,7 +112,8 @@ def _powers(bars: list[Bar]) -> list[float]:
     return [10.0**k for k in range(first, max(last, first + 1) + 1)]
 
 
-def _text(x: float, y: float, text: str, anchor: str, size: int) -> str:
+def text(x: float, y: float, words: str, anchor: str, size: int) -> str:
+    """Words at a place, as SVG."""
     return (
-        f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-size="{size}">{html.escape(text)}</text>'
+        f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-size="{size}">{html.escape(words)}</text>'
     )

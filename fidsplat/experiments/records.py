@@ -27,7 +27,7 @@ def run_facts(experiment: str, device: str | None, seed: int, extra: dict[str, s
     """What a run's numbers depend on, for every line.
 
     Args:
-        experiment: name of its module in this folder.
+        experiment: name of its module or package in this folder (of a package, what lies at its top).
         device: title and driver of what draws; None when nothing is drawn.
         seed: of texts and views.
         extra: versions of packages, by name.
@@ -74,7 +74,9 @@ def _code_hash(experiment: str) -> str:
     package = Path(__file__).parent.parent
     files = [f for part in _CODE for f in (package / part).rglob("*") if f.suffix in (".py", ".json")]
     files += [f for f in package.glob("*.py") if f.name != "cli.py"]
-    files += [package / "experiments" / f"{name}.py" for name in (*_SHARED, experiment)]
+    files += [package / "experiments" / f"{name}.py" for name in _SHARED]
+    own = package / "experiments" / experiment
+    files += own.glob("*.py") if own.is_dir() else [own.with_suffix(".py")]
     files += kernels_folder().rglob("*.cl")
     found = hashlib.sha256()
     # by name: kernels lie elsewhere in a wheel
@@ -123,18 +125,26 @@ class Records:
         for key, part in zip(keys, parts, strict=True):
             if key in self.done:
                 continue
-            line = {"key": part, "result": measure(part), "run": self.run}
-            with open(self.file, "a", encoding="utf-8") as stream:
-                stream.write(_dump(line))
-                stream.flush()
-                os.fsync(stream.fileno())
-            self.done[key] = line
             count += 1
-            yield count, line
+            yield count, self.append(part, measure(part))
+
+    def append(self, part: dict, result: dict) -> dict:
+        """Keep the result of a part at once; returns its line."""
+        line = {"key": part, "result": result, "run": self.run}
+        with open(self.file, "a", encoding="utf-8") as stream:
+            stream.write(_dump(line))
+            stream.flush()
+            os.fsync(stream.fileno())
+        self.done[_canonical(part)] = line
+        return line
 
     def missing(self, work: Iterable[dict]) -> int:
         """How many parts are not done yet."""
-        return sum(_canonical(part) not in self.done for part in work)
+        return len(self.left(work))
+
+    def left(self, work: Iterable[dict]) -> list[dict]:
+        """The parts that are not done yet, in their order."""
+        return [part for part in work if _canonical(part) not in self.done]
 
 
 def key_of(line: dict) -> str:
@@ -177,7 +187,7 @@ def read_lines(file: Path) -> list[dict]:
                 raise TypeError
         except (ValueError, KeyError, TypeError):
             raise InputError(
-                f"{file}, line {number}: not a result of fidsplat experiment; give another folder with -o"
+                f"{file}, line {number}: not a result of fidsplat; give another folder with -o"
             ) from None
         found.append(value)
     return found

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from numbers import Real
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from fidsplat.markers.partition import partition
 from fidsplat.markers.regions import label_components, polygons
 from fidsplat.markers.seams import grow
 from fidsplat.markers.spec import QUIET_ZONE, bits_of, parse_spec
-from fidsplat.quality import MIXTURES, whole_number
+from fidsplat.quality import MIXTURES, MarkerQuality, whole_number
 from fidsplat.splats import SplatCloud
 
 if TYPE_CHECKING:
@@ -65,6 +65,8 @@ class Marker:
     """metres, the code's edge; its width where it is not square"""
     mixture: str
     """"fitted", "paper" or "exact\""""
+    quality: MarkerQuality
+    """all knobs that it was made with; `growth` is None where the mixture's own was taken"""
     grid: np.ndarray = field(repr=False)
     """(H, W) uint8, the code with its quiet zone"""
     boxes: np.ndarray = field(repr=False)
@@ -95,7 +97,8 @@ class Marker:
         """Splats that every renderer can draw: ``cloud``, or the mixture `fitted` in place of `exact`."""
         if self.mixture != "exact":
             return self.cloud
-        return _gaussians(self.grid, self.boxes, fitted_templates(), fitted_growth(), self.module)
+        templates = fitted_templates(self.quality.template)
+        return _gaussians(self.grid, self.boxes, templates, fitted_growth(), self.module)
 
     @cached_property
     def rectangles(self) -> list[Rectangle]:
@@ -121,13 +124,15 @@ class Marker:
 def marker(
     spec: str,
     size: float = 1.0,
-    mixture: str = "fitted",
+    mixture: str | None = None,
     quiet_zone: int | None = None,
     *,
     levels: int | None = None,
     density: int | None = None,
     duplicates: bool | None = None,
     growth: float | None = None,
+    template: int | None = None,
+    quality: MarkerQuality | None = None,
 ) -> Marker:
     """Make a marker of splats.
 
@@ -138,19 +143,23 @@ def marker(
             draws (`SplatCloud.with_boxes`, `Marker.gaussians`).
         quiet_zone: modules of white around it; default 1 for AprilTag and ArUco, 4 for QR, 0 for images.
         levels, density, duplicates: of the mixture `paper` only, see `paper_template`; default 4, 3, False.
+        template: of the mixtures `fitted` and (for `Marker.gaussians`) `exact` only: Gaussians of a
+            rectangle, 1, 5, 9, 13, 25 or 41; default 25.
         growth: modules, 0 to 1, by which a rectangle reaches into its own colour beyond a side that is wholly
             shared with it, against seams; default what the fitted templates were optimised with, and 0 for
             paper.
+        quality: what mixture, levels, density, growth and template are where they are left out
+            (`Quality.marker`); what does not concern the mixture is let be.
 
     Raises:
         InputError: a value above that cannot be used; the message gives the valid range.
     """
     start = time.perf_counter()
     parsed = parse_spec(spec)
-    exact = mixture == "exact"
-    templates, growth = _mixture("fitted" if exact else mixture, levels, density, duplicates, growth)
-    if exact and growth != fitted_growth():
-        raise InputError("growth: the boxes of mixture='exact' meet without seams; leave it out")
+    given = {"levels": levels, "density": density, "growth": growth, "template": template}
+    chosen = _chosen(MarkerQuality() if quality is None else quality, mixture, duplicates, given)
+    exact = chosen.mixture == "exact"
+    templates, growth = _mixture(chosen, bool(duplicates))
     _check_size(size)
     parsed, bits = bits_of(parsed)
     quiet = QUIET_ZONE[parsed.kind] if quiet_zone is None else quiet_zone
@@ -177,7 +186,8 @@ def marker(
         bits=bits,
         quiet_zone=quiet,
         size=float(size),
-        mixture=mixture,
+        mixture=chosen.mixture,
+        quality=chosen,
         grid=grid,
         boxes=boxes,
         labels=labels,
@@ -187,23 +197,37 @@ def marker(
     )
 
 
-def _mixture(
-    name: str, levels: int | None, density: int | None, duplicates: bool | None, growth: float | None
-) -> tuple[tuple[Template, ...], float]:
-    options = {"levels": levels, "density": density, "duplicates": duplicates}
-    given = {key: value for key, value in options.items() if value is not None}
-    if name == "paper":
-        templates, default = (Template(math.inf, paper_template(**given)),), 0.0
-    elif name == "fitted":
-        if given:
-            raise InputError(f"{', '.join(given)}: only the mixture 'paper' has this; write mixture='paper'")
-        templates, default = fitted_templates(), fitted_growth()
-    else:
+def _chosen(
+    quality: MarkerQuality, mixture: str | None, duplicates: bool | None, given: dict[str, Any]
+) -> MarkerQuality:
+    """The knobs, with those that are given (not None) in place of the others."""
+    if not isinstance(quality, MarkerQuality):
+        raise InputError(
+            f"quality is {quality!r}; it must be an fs.MarkerQuality, e.g. fs.Quality(...).marker"
+        )
+    name = quality.mixture if mixture is None else mixture
+    if name not in MIXTURES:
         raise InputError(f"unknown mixture {name!r}; known: {', '.join(MIXTURES)}")
-    growth = default if growth is None else growth
-    if not (isinstance(growth, Real) and 0 <= growth <= 1):
-        raise InputError(f"growth is {growth!r}; it must lie from 0 to 1 module")
-    return templates, float(growth)
+    given = {key: value for key, value in given.items() if value is not None}
+    of_paper = [key for key in ("levels", "density") if key in given]
+    of_paper += [] if duplicates is None else ["duplicates"]
+    if of_paper and name != "paper":
+        raise InputError(f"{', '.join(of_paper)}: only the mixture 'paper' has this; write mixture='paper'")
+    if "template" in given and name == "paper":
+        raise InputError("template: the mixture 'paper' has levels and density instead")
+    if "growth" in given and name == "exact":
+        raise InputError("growth: the boxes of mixture='exact' meet without seams; leave it out")
+    return replace(quality, mixture=name, **given)
+
+
+def _mixture(quality: MarkerQuality, duplicates: bool) -> tuple[tuple[Template, ...], float]:
+    """Templates and growth; of `exact` those of the Gaussians that stand in for its boxes."""
+    if quality.mixture == "paper":
+        whole = paper_template(quality.levels, quality.density, duplicates)
+        templates, growth = (Template(math.inf, whole),), 0.0
+    else:
+        templates, growth = fitted_templates(quality.template), fitted_growth()
+    return templates, growth if quality.growth is None else float(quality.growth)
 
 
 def _check_size(size: float) -> None:

@@ -9,9 +9,10 @@ import numpy as np
 
 from fidsplat.cameras import Camera, look_at_matrix
 from fidsplat.errors import InputError
-from fidsplat.quality import Quality
+from fidsplat.quality import MarkerQuality, Quality, knobs
 from fidsplat.rotations import rigid_matrix
 from fidsplat.scenes.imaging import read_background, read_fog, read_sensor
+from fidsplat.scenes.knobs import quality_of, read_knobs
 from fidsplat.scenes.lens import TABLES, read_focal_lengths, read_lens
 from fidsplat.scenes.moving import POSE, read_keyframes, read_shutter
 from fidsplat.scenes.scene import PlacedMarker, Scene
@@ -19,18 +20,20 @@ from fidsplat.scenes.table import Table
 from fidsplat.splats import SplatCloud
 
 MAX_BYTES = 16 * 2**20
-TOP = ("camera", "splats", "markers", "render", "sensor", "fog", "background")
+TOP = ("camera", "splats", "markers", "render", "quality", "sensor", "fog", "background")
 CAMERA = ("width", "height", "fov_x_deg", "fx", "fy", "cx", "cy")
 CAMERA += ("position", "look_at", "up", "world_to_camera", "near", "far", *TABLES, "shutter", "motion")
 CAMERA_POSE = ("position", "look_at", "up", "world_to_camera")
 SPLATS = ("file", "position", "quaternion", "scale")
-MARKERS = ("spec", "size", "position", "quaternion", "mixture", "quiet_zone", "motion")
+MARKERS = ("spec", "size", "position", "quaternion", *knobs(MarkerQuality), "quiet_zone", "motion")
 RENDER = ("outputs", "background", "quality", "samples", "lowpass", "first_hit", "device")
 IMAGE = "image:"
 
 
-def read_scene(path: str | os.PathLike[str]) -> Scene:
+def read_scene(path: str | os.PathLike[str], quality: Quality | str | None = None) -> Scene:
     """The scene of a file and of the splat and image files that it names, which are looked for beside it.
+
+    quality: instead of the file's; markers are made with it too.
 
     Raises InputError, naming the file and the key, for whatever is wrong.
     """
@@ -46,13 +49,15 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
     render = top.table("render", RENDER)
     if "background" in top and "background" in render:
         raise render.error("background", "and the table [background] exclude each other")
+    quality = quality_of(top, render) if quality is None else quality
+    made_with = Quality.of(quality).marker
     return Scene(
         clouds=tuple(_splats(table, file.parent) for table in top.tables("splats", SPLATS)),
         camera=camera,
-        markers=tuple(_marker(table, file.parent) for table in top.tables("markers", MARKERS)),
+        markers=tuple(_marker(table, file.parent, made_with) for table in top.tables("markers", MARKERS)),
         background=read_background(top, file.parent) or render.numbers("background", 3, (0.0, 0.0, 0.0)),
         outputs=render.texts("outputs", ("rgb",)),
-        quality=_quality(render),
+        quality=quality,
         device=render.text("device", None),
         shutter=read_shutter(table),
         camera_motion=keyframes,
@@ -133,31 +138,19 @@ def _splats(table: Table, folder: Path) -> SplatCloud:
         return cloud.transformed(pose) if moved else cloud
 
 
-def _marker(table: Table, folder: Path) -> PlacedMarker:
+def _marker(table: Table, folder: Path, quality: MarkerQuality) -> PlacedMarker:
     spec, size = table.text("spec"), table.number("size")
     if not size > 0:
         raise table.error("size", f"must be above 0 metres, not {size!r}")
     if spec.startswith(IMAGE):
         spec = IMAGE + str(folder / spec.removeprefix(IMAGE))
     pose, motion = _pose(table), read_keyframes(table, POSE, _pose)
-    quiet_zone, mixture = table.whole("quiet_zone", None), table.text("mixture", "fitted")
+    quiet_zone = table.whole("quiet_zone", None)
+    own = read_knobs(table, MarkerQuality)
     if quiet_zone is not None and quiet_zone < 0:
         raise table.error("quiet_zone", f"must be 0 or more modules, not {quiet_zone}")
     from fidsplat.markers import marker  # late: it brings shapely and networkx
 
     with table.at():
-        return PlacedMarker(
-            marker(spec, size=size, mixture=mixture, quiet_zone=quiet_zone), pose, motion=motion
-        )
-
-
-def _quality(table: Table) -> Quality | str | None:
-    name = table.text("quality", None)
-    with table.at("quality"):
-        quality = Quality.of(name)
-    readers = {"samples": table.whole, "lowpass": table.text, "first_hit": table.number}
-    given = [key for key in readers if key in table]
-    for key in given:
-        with table.at(key):
-            quality = quality.with_(**{key: readers[key](key)})
-    return quality if given else name
+        made = marker(spec, size=size, quiet_zone=quiet_zone, quality=quality, **own)
+        return PlacedMarker(made, pose, motion=motion)

@@ -66,7 +66,7 @@ class Scene:
     outputs: tuple[str, ...] = ("rgb",)
     """names of the planes that are rendered"""
     quality: Quality | str | None = None
-    """a Quality, a preset's name, or None for the default"""
+    """a Quality, text (`Quality.of`), or None for the default"""
     device: str | None = None
     """a device's name, or None for the default"""
     shutter: Shutter | None = None
@@ -115,18 +115,21 @@ class Scene:
         return SplatCloud.concatenate([*self.clouds, *(marker.cloud() for marker in self.markers)])
 
     @staticmethod
-    def load(path: str | os.PathLike[str]) -> Scene:
-        """Read a scene file (docs/scene-files.md). Raises InputError, naming file and key, for whatever is
-        wrong."""
+    def load(path: str | os.PathLike[str], quality: Quality | str | None = None) -> Scene:
+        """Read a scene file (docs/scene-files.md).
+
+        quality: instead of the file's; its knobs of markers hold for markers that do not say theirs.
+
+        Raises InputError, naming file and key, for whatever is wrong.
+        """
         from fidsplat.scenes.read import read_scene
 
-        return read_scene(path)
+        return read_scene(path, quality)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a scene file, and beside it one PLY file STEM-splats-I.ply for each of ``clouds``.
 
-        Raises InputError when a file cannot be written, or a marker or Quality cannot be said in a scene
-        file.
+        Raises InputError when a file cannot be written, or a marker cannot be said in a scene file.
         """
         from fidsplat.scenes.write import write_scene
 

@@ -6,9 +6,10 @@ from pathlib import Path
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
 from fidsplat.formats import save_ply
-from fidsplat.quality import PRESETS, Quality
+from fidsplat.quality import Quality
 from fidsplat.rotations import matrix_to_quaternion
 from fidsplat.scenes.imaging import imaging_tables
+from fidsplat.scenes.knobs import marker_knobs, quality_tables
 from fidsplat.scenes.lens import lens_table
 from fidsplat.scenes.moving import keyframe_tables, shutter_table
 from fidsplat.scenes.read import IMAGE
@@ -19,12 +20,12 @@ def write_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
     """Write STEM-splats-I.ply for each cloud, then the scene file, so that it never names a file that is
     missing.
 
-    Raises InputError when a file cannot be written, or a marker or Quality cannot be said in a scene file.
+    Raises InputError when a file cannot be written, or a marker cannot be said in a scene file.
     """
     file = Path(path)
-    render = _render(scene)
+    render, qualities = _render(scene)
     around = imaging_tables(scene, file.parent)
-    markers = [_marker(placed, file.parent) for placed in scene.markers]
+    markers = [_marker(placed, file.parent, scene.quality) for placed in scene.markers]
     splats = []
     for i, cloud in enumerate(scene.clouds):
         name = f"{file.stem}-splats-{i}.ply"
@@ -42,6 +43,7 @@ def write_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
     parts += [_table("[[markers]]", table) for table in markers]
     parts += [_table(f"[{name}]", table) for name, table in around.items()]
     parts.append(_table("[render]", render))
+    parts += [_table(f"[{name}]", table) for name, table in qualities.items()]
     try:
         content = "\n".join(parts).encode("utf-8")
     except UnicodeEncodeError as error:
@@ -61,7 +63,7 @@ def _camera(scene: Scene) -> dict:
     return table if scene.camera_motion else table | {"world_to_camera": camera.world_to_camera.tolist()}
 
 
-def _marker(placed: PlacedMarker, folder: Path) -> dict:
+def _marker(placed: PlacedMarker, folder: Path, quality: Quality | str | None) -> dict:
     marker = placed.marker
     spec = marker.spec
     if spec.startswith(IMAGE):
@@ -72,32 +74,21 @@ def _marker(placed: PlacedMarker, folder: Path) -> dict:
         "size": float(marker.size),
         "position": placed.pose[:3, 3].tolist(),
         "quaternion": matrix_to_quaternion(placed.pose[:3, :3]).tolist(),
-        "mixture": marker.mixture,
+        **marker_knobs(marker.quality, quality),
         "quiet_zone": int(marker.quiet_zone),
         **motion,
     }
 
 
-def _render(scene: Scene) -> dict:
+def _render(scene: Scene) -> tuple[dict, dict[str, dict]]:
     table: dict = {"outputs": list(scene.outputs)}
     if isinstance(scene.background, tuple):
         table["background"] = list(scene.background)
-    if isinstance(scene.quality, Quality):
-        own = {key: getattr(scene.quality, key) for key in ("samples", "lowpass", "first_hit")}
-        names = [name for name, preset in PRESETS.items() if preset.with_(**own) == scene.quality]
-        if not names:
-            raise InputError(
-                f"a scene file holds a preset's name and {', '.join(own)}; in the rest this Quality "
-                "differs from every preset"
-            )
-        plain = PRESETS[names[0]]
-        changed = {key: value for key, value in own.items() if value != getattr(plain, key)}
-        table |= {"quality": names[0], **changed}
-    elif scene.quality is not None:
-        table["quality"] = scene.quality
+    own, tables = quality_tables(scene.quality)
+    table |= own
     if scene.device is not None:
         table["device"] = scene.device
-    return table
+    return table, tables
 
 
 def _table(head: str, values: dict) -> str:

@@ -50,9 +50,14 @@ def metric_versions() -> dict[str, str]:
 
 
 def flip(picture: np.ndarray, truth: np.ndarray) -> float:
-    """Mean LDR-FLIP (Andersson et al. 2020) of two (h, w) pictures at 67 pixels per degree, 0 for equal."""
+    """Mean LDR-FLIP (Andersson et al. 2020) of two pictures, (h, w) or (h, w, 3), at 67 pixels per degree, 0
+    for equal."""
     import flip_evaluator  # type: ignore[import-not-found]  # of the extra `experiments`
 
-    a, b = (np.repeat(np.asarray(p, np.float32)[:, :, None], 3, axis=2) for p in (picture, truth))
+    def coloured(values: np.ndarray) -> np.ndarray:
+        values = np.asarray(values, np.float32)
+        return np.ascontiguousarray(values if values.ndim == 3 else np.repeat(values[:, :, None], 3, axis=2))
+
+    a, b = coloured(picture), coloured(truth)
     _, mean, _ = flip_evaluator.evaluate(b, a, "LDR", applyMagma=False, computeMeanError=True)
     return float(mean)

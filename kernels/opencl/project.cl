@@ -102,6 +102,7 @@ kernel void project(
 //@@ footprint_reach
     if (!(pz + reach >= near) || !(pz - reach <= view[VIEW_FAR])) return;
 
+//@@ footprint_spread
 //@@ camera_bounds
 //@@ camera_box
 //@@ footprint_bounds

@@ -9,6 +9,7 @@ import warp as wp
 
 from .bounds import Bounds, make_bounds
 from .common import STRICT, View, lowest, store_line
+from .lens import make_rays
 from .pixel import make_pixel
 from .planes import make_samples, of_samples
 from .staging import BLOCK_H, BLOCK_W, STAGED
@@ -39,7 +40,9 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
         parts.unfinished,
         parts.blend,
     )
-    finish = parts.finish
+    finish, cross_ray = parts.finish, parts.cross_ray
+    bent = "rays" in effects
+    Rays = make_rays(bent)
 
     @wp.func
     def store(p: Pixel, at: int, samples: Samples):
@@ -64,6 +67,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
     def blend_gpu(
         band_first: int,  # tile of block 0
         view: View,
+        rays: Rays,
         lines: wp.array(dtype=wp.vec4),
         planes: wp.array(dtype=wp.int32),
         starts: wp.array(dtype=wp.int32),
@@ -83,6 +87,10 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
         p = start(x0, y0, view)
         if x0 >= view.width or y0 >= view.height:
             p.t = 0.0  # what lies beyond the picture is finished from the start
+        if wp.static(bent):
+            ray = wp.vec3()
+            if p.t > 0.0:
+                ray = rays.rays[y0 * view.width + x0]
         records = pool()
         k = starts[tile]
         end = starts[tile + 1]
@@ -99,9 +107,11 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
                     s = load_staged(records, lines, lists, k, which, view)
                     index = lists[k + which]
                     if unfinished(p, view):
-                        y = float(y0) - s.c[0]
-                        u, v, d = row_of(s.u, y), row_of(s.v, y), row_of(s.d, y)
-                        c = cross(s, u, v, d, float(x0) - s.d[3], y, view)
+                        x, y = float(x0) - s.d[3], float(y0) - s.c[0]
+                        if wp.static(bent):
+                            c = cross_ray(s, ray, x, y, view)
+                        else:
+                            c = cross(s, row_of(s.u, y), row_of(s.v, y), row_of(s.d, y), x, y, view)
                         if c.drawn:
                             p = blend_one(p, s, c, index, lines, planes, view)
                 word += 1
@@ -113,6 +123,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
     def blend_cpu(
         band_first: int,  # tile of thread 0
         view: View,
+        rays: Rays,
         lines: wp.array(dtype=wp.vec4),
         planes: wp.array(dtype=wp.int32),
         starts: wp.array(dtype=wp.int32),
@@ -147,7 +158,11 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
                 y = float(row) - s.c[0]
                 u, v, d = row_of(s.u, y), row_of(s.v, y), row_of(s.d, y)
                 for column in range(left, right):
-                    c = cross(s, u, v, d, float(column) - s.d[3], y, view)
+                    x = float(column) - s.d[3]
+                    if wp.static(bent):
+                        c = cross_ray(s, rays.rays[row * view.width + column], x, y, view)
+                    else:
+                        c = cross(s, u, v, d, x, y, view)
                     if c.drawn:
                         at = state_first + (row - y0) * view.tile_w + column - x0
                         p = state[at]

@@ -46,16 +46,22 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         name in effects
         for name in ("depth", "depth_median", "depth_first", "normal", "heaviest", "blended", "fog")
     )
+    bent, parallel = "rays" in effects, "camera_orthographic" in effects
     boxes, all_boxes = any(name in effects for name in BOXES), "footprint_box" in effects
     # u: nu0, nux, nuy, log opacity; v: nv0, nvx, nvy, D at the near plane; d: d0, dx, dy, ax; c: ay, r, g, b
     splat = {"u": wp.vec4, "v": wp.vec4, "d": wp.vec4, "c": wp.vec4, "half_r2": wp.float32}
     splat |= {"dot_x": wp.float32, "dot_y": wp.float32} if screen else {}
     splat |= {"edges": wp.vec4} if boxes else {}
+    # w: factors of the ray's Z, then the anchor's X; origin: the anchor's ray
+    splat |= {"w": wp.vec4, "origin": wp.vec3} if bent else {}
+    # plane_z0, plane_zx, plane_zy, plane_near
+    splat |= {"plane": wp.vec4} if parallel else {}
     Splat = struct_of("Splat", "What of a record each sample needs.", splat)
     # q / d^2 is rho / 2; inside: the ray meets the disk within R and beyond the near plane
     crossing = {"d": wp.float32, "q": wp.float32, "inside": wp.bool, "drawn": wp.bool}
     # screen: squared distance from the projected centre in pixels, which is rho / 2 of the low-pass
     crossing |= {"screen": wp.float32} if screen else {}
+    crossing |= {"z": wp.float32} if parallel else {}  # d times the depth
     # cover: share of the sample that a box covers
     crossing |= {"cover": wp.float32} if boxes else {}
     Crossing = struct_of("Crossing", "Where the ray of a sample meets a splat.", crossing)
@@ -82,6 +88,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     nx_line, nx_lane = layout.place("nx")
     ny_line, ny_lane = layout.place("ny")
     nz_line, nz_lane = layout.place("nz")
+    ray_line, plane_line = layout.place("nuz")[0], layout.place("plane_z0")[0]
 
     @wp.func
     def load(lines: wp.array(dtype=wp.vec4), index: int, view: View):
@@ -97,6 +104,12 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             s.dot_y = dot[dot_y_lane]
         if wp.static(boxes):
             s.edges = line_of(lines, at + edge_line)
+        if wp.static(bent):
+            s.w = line_of(lines, at + ray_line)
+            rest = line_of(lines, at + ray_line + 1)
+            s.origin = wp.vec3(s.w[3], rest[0], rest[1])
+        if wp.static(parallel):
+            s.plane = line_of(lines, at + plane_line)
         s.half_r2 = s.u[3] - view.log_cut
         return s
 
@@ -120,6 +133,12 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             s.dot_y = dot[dot_y_lane]
         if wp.static(boxes):
             s.edges = staged_line(pool, lines, lists, first, which, edge_line)
+        if wp.static(bent):
+            s.w = staged_line(pool, lines, lists, first, which, ray_line)
+            rest = staged_line(pool, lines, lists, first, which, ray_line + 1)
+            s.origin = wp.vec3(s.w[3], rest[0], rest[1])
+        if wp.static(parallel):
+            s.plane = staged_line(pool, lines, lists, first, which, plane_line)
         s.half_r2 = s.u[3] - view.log_cut
         return s
 
@@ -149,11 +168,27 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     @wp.func
     def cross(s: Splat, row_u: float, row_v: float, row_d: float, x: float, y: float, view: View):
         """x, y: the sample from the anchor; row_*: `row` of the three forms at y."""
+        return meet(s, fma(s.u[1], x, row_u), fma(s.v[1], x, row_v), fma(s.d[1], x, row_d), x, y, view)
+
+    @wp.func
+    def cross_ray(s: Splat, ray: wp.vec3, x: float, y: float, view: View):
+        """The same for the sample that has this ray."""
+        r = ray - s.origin
+        nu = fma(s.w[0], r[2], fma(s.u[1], r[0], fma(s.u[2], r[1], s.u[0])))
+        nv = fma(s.w[1], r[2], fma(s.v[1], r[0], fma(s.v[2], r[1], s.v[0])))
+        d = fma(s.w[2], r[2], fma(s.d[1], r[0], fma(s.d[2], r[1], s.d[0])))
+        c = meet(s, nu, nv, d, x, y, view)
+        c.drawn = c.drawn and d == d  # nothing is seen without a ray
+        return c
+
+    @wp.func
+    def meet(s: Splat, nu: float, nv: float, d: float, x: float, y: float, view: View):
         c = Crossing()
-        nu = fma(s.u[1], x, row_u)
-        nv = fma(s.v[1], x, row_v)
-        c.d = fma(s.d[1], x, row_d)
+        c.d = d
         ahead = c.d > 0.0 and c.d <= s.v[3]
+        if wp.static(parallel):
+            c.z = fma(s.plane[2], y, fma(s.plane[1], x, s.plane[0]))
+            ahead = ahead and c.z >= s.plane[3] * c.d
         if wp.static(not all_boxes):
             c.q = fma(nu, nu, nv * nv)
             # product form: no division, no special value of D (numerics B2)
@@ -200,6 +235,8 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         center = line_of(lines, at + zc_line)[zc_lane]
         reach = line_of(lines, at + zr_line)[zr_lane]
         if c.d > 0.0:
+            if wp.static(parallel):
+                return wp.clamp(c.z * inverse_d, center - reach, center + reach)
             met = line_of(lines, at + z_line)[z_lane] * inverse_d
             return wp.clamp(met, center - reach, center + reach)
         return center
@@ -325,6 +362,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         start=start,
         row=row,
         cross=cross,
+        cross_ray=cross_ray,
         unfinished=unfinished,
         blend=blend,
         finish=finish,

@@ -18,6 +18,8 @@ _SAMPLES = {
     "blended": {"blended": wp.int32},
     "fog": {"fogged": wp.float32},
 }
+LIGHT = frozenset({"color", "fogged"})
+"""planes of samples whose mean is what several poses leave together"""
 
 
 def of_samples(effects: tuple[str, ...]) -> dict[str, type]:

@@ -16,11 +16,14 @@ from functools import cache
 
 import warp as wp
 
-from .bounds import PAD, PAD_RELATIVE, Bounds, box_bounds, ellipse_bounds, make_bounds
+from .bounds import PAD, PAD_RELATIVE, Bounds, box_bounds, make_bounds
 from .boxes import make_boxes
 from .color import make_color
 from .common import CULLED, STRICT, View, as_bits, population, sortable, store_line
+from .disk import make_disk
+from .lens import LENSES, make_lens, make_optics
 from .lowpass import make_filter
+from .motion import make_motion
 from .records import Layout
 
 # [m]; nobody sees the difference, and what is divided by it stays above float32's denormals (numerics B6)
@@ -50,114 +53,30 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
     one, two, half, zero = real(1.0), real(2.0), real(0.5), real(0.0)
     all_boxes, mixed = "footprint_box" in effects, "footprint_mixed" in effects
     boxes_too = all_boxes or mixed
-    of_box = make_boxes(real)
+    of_box, disk = make_boxes(real), make_disk(real)
     limits, color_of, widened = make_bounds(screen), make_color(sh_terms, real), make_filter(real)
+    moves = "motion_groups" in effects
+    motion = make_motion(moves)
+    Moving = motion.Moving
+    camera = next((name for name in effects if name in LENSES), None)
+    parallel = "camera_orthographic" in effects
+    ray_depths = camera in ("camera_fisheye", "camera_equirectangular")  # distances, not along z
+    mapped, bent = camera == "camera_brown_conrady", camera is not None
+    optics = make_optics(camera, real) if camera else None
+    Lens = make_lens(camera)
     word = {name: layout.names.index(name) for name in layout.names}
-    first_extra = {name: word.get(name, 0) for name in ("dot_x", "z_numerator", "nx", "edge_u0")}
+    extras = ("dot_x", "z_numerator", "nx", "edge_u0", "nuz", "plane_z0")
+    first_extra = {name: word.get(name, 0) for name in extras}
     at_dot, at_depth, at_normal = first_extra["dot_x"], first_extra["z_numerator"], first_extra["nx"]
     at_edges, at_box = first_extra["edge_u0"], word["columns"]
-
-    @wp.func
-    def extremes(a: real, b: real, p: real, depth: vec3, radius: real, near: real):
-        """Least and greatest (a u + b v + p) / (depth (u, v, 1)) on the arc u^2 + v^2 = radius^2 beyond
-        `near`.
-
-        The ratio's derivative along the arc vanishes where e cos + f sin = -g.
-        """
-        low = real(wp.inf)
-        high = -real(wp.inf)
-        e = b * depth[2] - p * depth[1]
-        f = p * depth[0] - a * depth[2]
-        g = (b * depth[0] - a * depth[1]) * radius
-        h = wp.sqrt(e * e + f * f)
-        if h > zero:
-            along = -g / h
-            if wp.abs(along) <= one:
-                aside = wp.sqrt(one - along * along)
-                for side in range(2):
-                    s = wp.where(side == 0, aside, -aside)
-                    u = radius * (along * e - s * f) / h
-                    v = radius * (along * f + s * e) / h
-                    z = depth[0] * u + depth[1] * v + depth[2]
-                    if z >= near:
-                        ratio = (a * u + b * v + p) / z
-                        low = wp.min(low, ratio)
-                        high = wp.max(high, ratio)
-        return low, high
-
-    @wp.func
-    def clipped(a: vec3, b: vec3, p: vec3, radius: real, reach: real, view: View):
-        """Box of the part of the disk beyond the near plane: of its arc, and of the chord in which the plane
-        cuts it.
-
-        The part is convex and depth is positive in it, so ratios are largest on its rim (numerics A1 ii).
-        """
-        near = real(view.near)
-        depth = vec3(a[2], b[2], p[2])
-        x0, x1 = extremes(a[0], b[0], p[0], depth, radius, near)
-        y0, y1 = extremes(a[1], b[1], p[1], depth, radius, near)
-        g = a[2] * a[2] + b[2] * b[2]
-        if p[2] - reach < near and g > zero:
-            k = near - p[2]
-            swing = wp.sqrt(wp.max(radius * radius * g - k * k, zero))
-            for side in range(2):
-                s = wp.where(side == 0, swing, -swing)
-                u = (k * a[2] - s * b[2]) / g
-                v = (k * b[2] + s * a[2]) / g
-                x = (a[0] * u + b[0] * v + p[0]) / near
-                y = (a[1] * u + b[1] * v + p[1]) / near
-                x0 = wp.min(x0, x)
-                x1 = wp.max(x1, x)
-                y0 = wp.min(y0, y)
-                y1 = wp.max(y1, y)
-        fx, fy, cx, cy = real(view.fx), real(view.fy), real(view.cx), real(view.cy)
-        return box_bounds(float(x0 * fx + cx), float(x1 * fx + cx), float(y0 * fy + cy), float(y1 * fy + cy))
-
-    @wp.func
-    def ellipse(a: vec3, b: vec3, p: vec3, radius: real, reach: real, view: View):
-        """Image of a disk that lies wholly beyond the near plane, from its dual conic about the projected
-        centre (numerics A4).
-        """
-        fx, fy = real(view.fx), real(view.fy)
-        px, py = p[0] / p[2], p[1] / p[2]
-        x = vec2(fx * (a[0] - px * a[2]), fx * (b[0] - px * b[2]))
-        y = vec2(fy * (a[1] - py * a[2]), fy * (b[1] - py * b[2]))
-        z = vec2(a[2], b[2])
-        h = radius * radius / ((p[2] - reach) * (p[2] + reach))
-        mx = -h * wp.dot(x, z)
-        my = -h * wp.dot(y, z)
-        qxx = wp.max(mx * mx + h * wp.dot(x, x), zero)
-        qyy = wp.max(my * my + h * wp.dot(y, y), zero)
-        qxy = mx * my + h * wp.dot(x, y)
-        shear = zero
-        if qyy > zero:
-            shear = qxy / qyy
-        # the pad has room for float32's rounding
-        half_x = wp.sqrt(float(qxx))
-        tip = float(0.0)
-        if half_x > 0.0:
-            tip = float(qxy) / half_x
-        return ellipse_bounds(
-            float(fx * px + real(view.cx) + mx),
-            float(fy * py + real(view.cy) + my),
-            half_x,
-            wp.sqrt(float(qyy)),
-            float(shear),
-            wp.sqrt(float(wp.max(qxx - qxy * shear, zero))),
-            tip,
-        )
-
-    @wp.func
-    def disk(a: vec3, b: vec3, p: vec3, radius: real, reach: real, view: View):
-        """Bounds of a Gaussian's disk."""
-        if p[2] - reach >= real(view.near):
-            return ellipse(a, b, p, radius, reach, view)
-        return clipped(a, b, p, radius, reach, view)
+    at_ray, at_plane = first_extra["nuz"], first_extra["plane_z0"]
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False, launch_bounds=LIMITS)
     def project(
         first: int,  # splat of thread 0
         view: View,
+        moving: Moving,
+        lens: Lens,
         means: wp.array(dtype=wp.vec3),  # (n) [m], relative to the cloud's origin
         quats: wp.array(dtype=wp.vec4),  # (n) w x y z
         scales: wp.array(dtype=wp.vec2),  # (n) [m]
@@ -194,12 +113,17 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
         q = quats[i]
         w, x, y, z = real(q[0]), real(q[1]), real(q[2]), real(q[3])
         s = two / (w * w + x * x + y * y + z * z)
-        turn = mat33(view.rotation)
+        turn, shift, eye = mat33(view.rotation), vec3(view.translation), vec3(view.eye)
+        if wp.static(moves):
+            group = motion.group_of(moving, i)
+            if group >= 0:
+                own = moving.poses[group]
+                turn, shift, eye = mat33(own.rotation), vec3(own.translation), vec3(own.eye)
         tangent_u = turn * vec3(one - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y))
         tangent_v = turn * vec3(s * (x * y - w * z), one - s * (x * x + z * z), s * (y * z + w * x))
         center = means[i]
         mean = vec3(real(center[0]), real(center[1]), real(center[2]))
-        p = turn * mean + vec3(view.translation)
+        p = turn * mean + shift
         a = tangent_u * su
         b = tangent_v * sv
 
@@ -224,36 +148,55 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
                 sv *= wide[2]
                 tangent_u = a / su  # of unit area with tangent_v, whose direction stays
         radius = wp.sqrt(two * real(half_r2))
+        depth = p[2]
         reach = radius * wp.sqrt(a[2] * a[2] + b[2] * b[2])  # half of the disk's depth range (numerics A3)
         if wp.static(boxes_too):
             if boxed:
                 reach = wp.abs(a[2]) + wp.abs(b[2])
-        if not (p[2] + reach >= near and p[2] - reach <= real(view.far)):
+        if wp.static(ray_depths):
+            depth = wp.length(p)
+            reach = radius * wp.sqrt(wp.max(wp.dot(a, a), wp.dot(b, b)))
+        if not (depth + reach >= near and depth - reach <= real(view.far)):
             return
 
         # where it can be seen
         fx, fy, cx, cy = real(view.fx), real(view.fy), real(view.cx), real(view.cy)
         per_fx, per_fy = real(view.per_fx), real(view.per_fy)
-        in_front = p[2] >= near
+        in_front = depth >= near  # or, of a lens, whether it is known where the centre falls
         center_x, center_y = zero, zero
         box = Bounds()
-        if in_front:
-            center_x = fx * (p[0] / p[2]) + cx
-            center_y = fy * (p[1] / p[2]) + cy
-        if wp.static(boxes_too):
-            if boxed:
-                area = of_box.extent(tangent_u, tangent_v, p, su, sv, p[2] - reach >= near, view)
-                if not (area[0] <= area[1]):
-                    return
-                box = box_bounds(float(area[0]), float(area[1]), float(area[2]), float(area[3]))
-            else:
-                if wp.static(mixed):
-                    box = disk(a, b, p, radius, reach, view)
+        if wp.static(parallel):
+            center_x = fx * p[0] + cx
+            center_y = fy * p[1] + cy
+            box = disk.parallel(a, b, center_x, center_y, radius, view)
+        elif wp.static(ray_depths):
+            box = optics.enclose(a, b, p, radius, view, lens)
         else:
-            box = disk(a, b, p, radius, reach, view)
-        if not in_front:
-            center_x = real(box.x)
-            center_y = real(box.y)
+            if in_front:
+                center_x = fx * (p[0] / p[2]) + cx
+                center_y = fy * (p[1] / p[2]) + cy
+            if wp.static(boxes_too):
+                if boxed:
+                    area = of_box.extent(tangent_u, tangent_v, p, su, sv, p[2] - reach >= near, view)
+                    if not (area[0] <= area[1]):
+                        return
+                    box = box_bounds(float(area[0]), float(area[1]), float(area[2]), float(area[3]))
+                else:
+                    if wp.static(mixed):
+                        box = disk.seen(a, b, p, radius, reach, view)
+            else:
+                box = disk.seen(a, b, p, radius, reach, view)
+        if wp.static(mapped):
+            x0, x1 = real(box.x - box.half_x), real(box.x + box.half_x)
+            y0, y1 = real(box.y - box.half_y), real(box.y + box.half_y)
+            box = optics.mapped(x0, x1, y0, y1, lens)
+        if wp.static(bent):
+            if in_front:
+                center_x, center_y, in_front = optics.image(p, view, lens)
+        if wp.static(not parallel):
+            if not in_front:
+                center_x = real(box.x)
+                center_y = real(box.y)
         if wp.static(screen):
             if in_front:
                 box.dot_x = float(center_x)
@@ -289,22 +232,38 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
         ray = vec3((anchor_x - cx) * per_fx, (anchor_y - cy) * per_fy, one)
         form_u = wp.cross(tangent_v, p) * (one / su)
         form_v = wp.cross(p, tangent_u) * (one / sv)
+        if wp.static(parallel):
+            # the same far away, per metre of distance: D is n_z
+            height = normal[2]
+            form_u = vec3(tangent_v[1], -tangent_v[0], zero) * (one / su)
+            form_v = vec3(-tangent_u[1], tangent_u[0], zero) * (one / sv)
+        if wp.static(bent):
+            # forms of a ray, not of a sample
+            anchor = optics.anchor(int(ax), int(ay), p, view, lens)
+            ray = vec3(real(anchor[0]), real(anchor[1]), real(anchor[2]))
+            per_fx, per_fy = one, one
         nux, nuy, nvx, nvy = form_u[0] * per_fx, form_u[1] * per_fy, form_v[0] * per_fx, form_v[1] * per_fy
         steepest = wp.max(wp.max(wp.abs(nux), wp.abs(nuy)), wp.max(wp.abs(nvx), wp.abs(nvy)))
+        if wp.static(bent):
+            steepest = wp.max(steepest, wp.max(wp.abs(form_u[2]), wp.abs(form_v[2])))
         if not (steepest > zero and steepest < real(wp.inf)):
             return
         nu0 = wp.dot(form_u, ray)
         nv0 = wp.dot(form_v, ray)
-        if in_front:
-            # both vanish at the projected centre
-            nu0 = nux * (anchor_x - center_x) + nuy * (anchor_y - center_y)
-            nv0 = nvx * (anchor_x - center_x) + nvy * (anchor_y - center_y)
+        if wp.static(not bent):
+            if wp.static(parallel) or in_front:
+                # both vanish at the projected centre
+                nu0 = nux * (anchor_x - center_x) + nuy * (anchor_y - center_y)
+                nv0 = nvx * (anchor_x - center_x) + nvy * (anchor_y - center_y)
         scale = wp.where(height < zero, -one, one) / steepest
         n_scale = scale * sqrt_half
         # edge-on within rounding: no ray meets the plane, only the low-pass dot is drawn (numerics B2)
-        facing = wp.where(height * height > edge_on * edge_on * wp.dot(p, p), scale, zero)
+        away2 = wp.dot(p, p)
+        if wp.static(parallel):
+            away2 = one
+        facing = wp.where(height * height > edge_on * edge_on * away2, scale, zero)
 
-        rgb = color_of(i, colors, mean - vec3(view.eye))
+        rgb = color_of(i, colors, mean - eye)
         if not (wp.isfinite(rgb[0]) and wp.isfinite(rgb[1]) and wp.isfinite(rgb[2])):
             return
 
@@ -343,9 +302,27 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
             if wp.static(boxes_too):
                 if boxed:
                     record[at_dot] = 1.0e18
+        if wp.static(parallel):
+            # D times the depth, which is p_z - (n_x X + n_y Y) / n_z at (X, Y) from the centre [m]
+            off_x, off_y = (anchor_x - center_x) * per_fx, (anchor_y - center_y) * per_fy
+            record[7] = wp.inf
+            record[8] = float(normal[2] * facing)
+            record[9] = 0.0
+            record[10] = 0.0
+            record[at_plane] = float((normal[2] * p[2] - normal[0] * off_x - normal[1] * off_y) * facing)
+            record[at_plane + 1] = float(-normal[0] * per_fx * facing)
+            record[at_plane + 2] = float(-normal[1] * per_fy * facing)
+            record[at_plane + 3] = float(near)
+        if wp.static(bent):
+            record[at_ray] = float(form_u[2] * n_scale)
+            record[at_ray + 1] = float(form_v[2] * n_scale)
+            record[at_ray + 2] = float(normal[2] * facing)
+            record[at_ray + 3] = anchor[0]
+            record[at_ray + 4] = anchor[1]
+            record[at_ray + 5] = anchor[2]
         if wp.static(has_depth):
             record[at_depth] = float(height * facing)
-            record[at_depth + 1] = float(p[2])
+            record[at_depth + 1] = float(depth)
             record[at_depth + 2] = float(reach)
         if wp.static(has_normal):
             # the camera is on one side of the whole plane, so the sign is the splat's (numerics B7)
@@ -362,11 +339,11 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
             bounds[i] = box
         corner = wp.uint64(top * view.tiles_x + left)
         windows[i] = (corner << BITS) | wp.uint64(bits)
-        depth = float(p[2])
+        key = float(depth)
         if wp.static(layers):
             if planes[i] >= 0:
-                depth = plane_keys[planes[i]]
-        keys[i] = sortable(depth)
+                key = plane_keys[planes[i]]
+        keys[i] = sortable(key)
         counts[i] = wp.int64(tiles)
         drawn[i] = 1
 

@@ -22,6 +22,12 @@ _FORMS = (
 _EDGES = ("edge_u0", "edge_u1", "edge_v0", "edge_v1")
 BOXES = ("footprint_box", "footprint_mixed")
 """effects with boxes"""
+_WHOLE = {
+    "footprint_box": _EDGES,
+    "footprint_mixed": _EDGES,
+    "camera_orthographic": ("plane_z0", "plane_zx", "plane_zy", "plane_near"),
+    "rays": ("nuz", "nvz", "dz", "ray_x", "ray_y", "ray_z"),
+}
 _EXTRA = {
     "lowpass_screen": ("dot_x", "dot_y"),
     "ray_depth": ("z_numerator", "z_center", "z_reach"),
@@ -36,13 +42,15 @@ class Layout:
     (ax, ay); D is at
     most d_near beyond the near plane. dot_x, dot_y: projected centre from the anchor's; z_numerator / D is
     the depth. columns and rows hold first and end, 16 bits each, of the box of samples that it can touch.
+    Behind a lens x, y, z are a sample's ray from the anchor's (ray_x, ray_y, ray_z). For parallel rays
+    plane_z0 + plane_zx x + plane_zy y is D times the depth, which is at least plane_near.
     """
 
     def __init__(self, effects: tuple[str, ...]) -> None:
-        # edges before the rest: they fill a line
-        edges = _EDGES if any(name in effects for name in BOXES) else ()
+        # before the rest, so that they begin a line
+        whole = (name for effect in effects for name in _WHOLE.get(effect, ()))
         extra = (name for effect in effects for name in _EXTRA.get(effect, ()))
-        self.names = [*_FORMS, *edges, "columns", "rows", *extra]
+        self.names = [*_FORMS, *whole, "columns", "rows", *extra]
         self.lines = -(-len(self.names) // 4)
 
     def place(self, name: str) -> tuple[int, int]:

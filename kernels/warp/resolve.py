@@ -72,6 +72,7 @@ def make_resolve(
         y = (pixel / width) * n
         stride = view.tiles_x * view.tile_w
         total = wp.vec4()
+        backdrop = wp.vec3()
         fogged = float(0.0)
         z = wp.vec2()
         along = float(0.0)
@@ -89,6 +90,10 @@ def make_resolve(
             row = y + sample / n
             at = row * stride + column
             total += samples.color[at]
+            if wp.static(behind != "constant"):
+                backdrop += samples.color[at][3] * color_behind(
+                    around, float(column) + 0.5, float(row) + 0.5, view
+                )
             length = float(1.0)
             if wp.static(lengths):
                 length = ray_length(float(column) + 0.5, float(row) + 0.5, view)
@@ -125,10 +130,13 @@ def make_resolve(
         left = t
         if wp.static(fog):
             left += fogged * mean
-        middle = 0.5 * float(n)
-        background = color_behind(around, float(x) + middle, float(y) + middle, view)
-        for channel in range(3):
-            out.rgb[3 * pixel + channel] = fma(left, background[channel], total[channel] * mean)
+        if wp.static(behind == "constant"):
+            background = color_behind(around, 0.0, 0.0, view)
+            for channel in range(3):
+                out.rgb[3 * pixel + channel] = fma(left, background[channel], total[channel] * mean)
+        else:
+            for channel in range(3):
+                out.rgb[3 * pixel + channel] = (total[channel] + backdrop[channel]) * mean
         if wp.static(alpha):
             out.alpha[pixel] = 1.0 - t
         if wp.static(depth):

@@ -15,6 +15,11 @@ MIXED = (*RECORD, "footprint_mixed", *TAPS)
 OF_BOXES = ("edges", "cover")
 FILTERS = ("make_boxes", "make_filter")
 OF_SAMPLES = ("depth_weight", "depth_median", "depth_first", "heaviest", "blended", "fog_slope", "fogged")
+LENSES = [
+    ("camera_orthographic", "lowpass_screen", "normal"),
+    *((f"camera_{name}", "rays", *RECORD) for name in ("brown_conrady", "fisheye", "equirectangular")),
+]
+STEPS = ("exposure", "vignetting", "noise", "gain", "response_srgb", "response_table", "quantise")
 
 
 def made(name, *arguments):
@@ -50,7 +55,8 @@ def started():
     "kernel",
     [
         lambda: made("project.make_project", RECORD, 16, "float64", False),
-        lambda: made("project.make_project", (), 0, "float32", True),
+        lambda: made("project.make_project", (*RECORD, "motion_groups"), 0, "float32", True),
+        *(lambda camera=name: made("project.make_project", camera, 0, "float64", False) for name in LENSES),
         lambda: made("project.make_project", ("lowpass_pixel",), 0, "float64", False),
         lambda: made(
             "project.make_project", (*RECORD, "footprint_mixed", "lowpass_pixel"), 0, "float64", False
@@ -59,10 +65,14 @@ def started():
         lambda: made("blend.make_blend", ALL, True, 256)[0],
         lambda: made("blend.make_blend", MIXED, True, 256)[0],
         lambda: made("blend.make_blend", ("footprint_box",), True, 256)[0],
+        lambda: made("blend.make_blend", ("rays", *ALL), True, 256)[0],
+        lambda: made("blend.make_blend", ("camera_orthographic", *ALL), True, 256)[0],
         lambda: made("blend.make_blend", ("lowpass_screen", "stop_exclusive"), True, 256)[0],
         lambda: resolving("constant", 3),
         lambda: resolving("gradient", 1),
         lambda: resolving("panorama", 1),
+        lambda: made("sensor.make_develop", STEPS)[0],
+        lambda: made("shutter.make_expose", wp.vec4),
         lambda: made("lists.make_lists", True).emit,
         lambda: made("lists.make_lists", True).count,
         lambda: made("lists.make_lists", False).histogram,
@@ -70,23 +80,10 @@ def started():
         lambda: made("lists.find_starts"),
     ],
     ids=[
-        *(
-            "project",
-            "project-float32",
-            "project-filtered",
-            "project-mixed",
-            "project-boxes",
-            "blend-all",
-            "blend-mixed",
-            "blend-boxes",
-            "blend-exclusive",
-            "resolve",
-            "resolve-gradient",
-            "resolve-panorama",
-            "emit",
-            "count",
-        ),
-        *("histogram", "compact", "starts"),
+        *("project", "project-float32", *(names[0] for names in LENSES), "project-filtered"),
+        *("project-mixed", "project-boxes", "blend-all", "blend-mixed", "blend-boxes", "blend-rays"),
+        *("blend-parallel", "blend-exclusive", "resolve", "resolve-gradient", "resolve-panorama"),
+        *("sensor", "expose", "emit", "count", "histogram", "compact", "starts"),
     ],
 )
 def test_the_kernels_compile_for_cuda(kernel, tmp_path):
@@ -95,7 +92,8 @@ def test_the_kernels_compile_for_cuda(kernel, tmp_path):
 
 def test_the_base_text_has_nothing_of_absent_effects(tmp_path):
     text = compiled(made("blend.make_blend", (), True, 256)[0], tmp_path)
-    for name in (*OF_SAMPLES, *OF_BOXES, "finished", "dot_x", "Layer", "thickest", "ink"):
+    absent = (*OF_SAMPLES, *OF_BOXES, "finished", "dot_x", "Layer", "thickest", "ink", "cross_ray", "origin")
+    for name in absent:
         assert not re.search(rf"\b{name}", text), name
     project = compiled(made("project.make_project", (), 0, "float64", False), tmp_path / "project", 128)
     for name in FILTERS:

@@ -6,7 +6,7 @@ from agreement import ALL_OUTPUTS, assert_agrees, random_splats, reference_pixel
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
-from fidsplat.effects import select
+from fidsplat.effects import OUTPUTS, select
 
 CAMERA = fs.Camera.look_at(83, 61, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 AROUND = random_splats(200, seed=1)
@@ -66,6 +66,16 @@ def test_double_is_nearer_to_the_truth_than_float32(opencl):
     assert errors[0] < 0.2 * errors[1]
 
 
+def test_double_has_every_output_and_footprint(opencl):
+    """In one record, whose size the compiler checks."""
+    if not opencl.device.float64:
+        pytest.skip("the device has no float64")
+    cloud = coplanar_cloud(1)
+    cloud = cloud.with_boxes(cloud.planes == 0)
+    camera = fs.Camera.orthographic(41, 30, 4.0)
+    assert_agrees(opencl, cloud, camera, tuple(OUTPUTS), DOUBLE)
+
+
 @pytest.mark.parametrize("cloud", [AROUND, coplanar_cloud(1)], ids=["around", "planes"])
 def test_fast_arithmetic_stays_within_the_usual_tolerance(opencl, cloud):
     assert_agrees(opencl, cloud, CAMERA, quality=FAST)
@@ -75,6 +85,16 @@ def test_fast_arithmetic_stays_within_the_usual_tolerance(opencl, cloud):
         for quality in (fs.Quality(), FAST)
     )
     assert 0 < np.abs(exact - fast).max() <= 1e-5
+
+
+def test_fast_exponentials_do_not_run_over(opencl):
+    """At this cut-off the faintest fragments lie below the smallest normal float32."""
+    faint = {"alpha_cutoff": 1e-42, "transmittance_stop": 0.0}
+    exact, fast = (
+        opencl.render(AROUND, CAMERA, ALL_OUTPUTS, quality.with_(**faint)) for quality in (fs.Quality(), FAST)
+    )
+    for name in ("rgb", "alpha", "normal"):
+        assert np.abs(exact[name] - fast[name]).max() <= 1e-5
 
 
 @pytest.mark.parametrize("degree", [None, 0, 2])
@@ -92,6 +112,16 @@ def test_half_colors_are_the_reference_s_rounded_ones(opencl, degree):
 def test_half_colors_end_at_the_largest_half(opencl):
     cloud = fs.SplatCloud([[0, 0, 2]], [[1, 0, 0, 0]], [[1, 1]], [1.0], colors=[[1e6, 1.0, 0.0]])
     assert opencl.render(cloud, CAMERA, quality=HALF)["rgb"].max() == pytest.approx(65504, rel=1e-2)
+
+
+def test_a_device_holds_halves_instead_of_floats(opencl):
+    cloud = random_splats(100, seed=11, depth=(1, 6), scale=(0.02, 0.4), sh_degree=2)
+    resident = opencl.upload(cloud)
+    resident._data._shared = False  # a CPU reads the host's arrays; make it copy them
+    frame = opencl.render(resident, CAMERA, quality=HALF)
+    assert np.array_equal(frame["rgb"], opencl.render(cloud, CAMERA, quality=HALF)["rgb"])
+    means, quats, scales, opacities, coefficients = 3, 4, 2, 1, 9 * 3
+    assert resident.memory_bytes == 100 * (4 * (means + quats + scales + opacities) + 2 * coefficients)
 
 
 @pytest.mark.parametrize("bits", [16, 24])

@@ -7,9 +7,24 @@ import pytest
 from agreement import assert_agrees, random_splats
 
 import fidsplat as fs
+from fidsplat.rotations import quaternion_to_matrix
 
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 PIXEL = fs.Quality(lowpass="pixel")
+LENSES = {
+    "distortion": fs.Camera.pinhole(
+        75,
+        62,
+        50.0,
+        51.0,
+        35.0,
+        32.0,
+        lens=fs.BrownConrady(-0.3, 0.1, 0.0, 0.01, p1=0.01, p2=-0.005, s1=0.01),
+    ),
+    "fisheye": fs.Camera.fisheye(70, 66, math.radians(200), coefficients=(0.02, -0.004, 0.001, 0.0)),
+    "panorama": fs.Camera.equirectangular(110, 55),
+    "parallel": fs.Camera.orthographic(75, 62, 4.0),
+}
 
 
 @pytest.mark.parametrize("scale", [(1e-6, 1e-2), (1e-3, 2.0), (1e-3, 50.0)])
@@ -23,6 +38,32 @@ def test_tilted_to_edge_on(renderer, tilt):
     quats = [[math.cos(half), math.sin(half), 0, 0]]
     cloud = fs.SplatCloud([(0, 0, 2)], quats, [(0.2, 0.2)], [0.95], colors=[(1, 0.5, 0.2)])
     assert_agrees(renderer, cloud, fs.Camera.pinhole(60, 60, 50.0, 50.0, 30.0, 30.0), quality=PIXEL)
+
+
+@pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
+@pytest.mark.parametrize("scale", [(1e-6, 1e-2), (1e-3, 2.0)], ids=["small", "any"])
+def test_splats_of_every_size_through_every_lens(renderer, camera, scale):
+    cloud = random_splats(200, seed=8, depth=(-4.0, 5.0), scale=scale)
+    assert_agrees(renderer, cloud, camera, quality=PIXEL)
+
+
+@pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
+def test_a_lens_keeps_the_light_of_a_splat(renderer, camera):
+    """The sum of alpha over the picture is 2 pi opacity times the area of the image of the one-sigma square of a splat
+    far below a pixel; the area from a finite parallelogram."""
+    generator = np.random.default_rng(2)
+    # seen by every lens here, off its axis
+    mean = np.array([0.5, -0.35, 1.5])
+    cloud = fs.SplatCloud([mean], [generator.normal(size=4)], [(3e-4, 5e-4)], [0.9], colors=[(1, 1, 1)])
+    axes = quaternion_to_matrix(cloud.quats)[0, :, :2] * cloud.scales[0]
+    u, v = (
+        (camera.project([mean + axis]) - camera.project([mean - axis]))[0] / 2
+        for axis in axes.T.astype(float)
+    )
+    want = 2 * math.pi * 0.9 * abs(u[0] * v[1] - u[1] * v[0])
+    quality = PIXEL.with_(alpha_cutoff=1e-9)
+    light = float(renderer.render(cloud, camera, "alpha", quality)["alpha"].sum())
+    assert light == pytest.approx(want, rel=0.032)
 
 
 def test_boxes_are_left_to_their_own_filter(renderer):

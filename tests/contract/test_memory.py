@@ -179,6 +179,7 @@ def test_a_pool_keeps_to_the_budget_whatever_was_drawn_before(opencl, machine):
 PICTURES = {
     "plain": {},
     "all": {"outputs": (*ALL_OUTPUTS, "splat_id"), "background": fs.Panorama(np.ones((64, 128, 3)))},
+    "boxes before a lens": {"camera": fs.Camera.fisheye(161, 117, 3.0)},
     "rolling shutter": {
         "camera": fs.Camera.pinhole(161, 117, 150.0, 150.0, 80.0, 60.0, lens=fs.BrownConrady(-0.1)),
         "motion": fs.Motion(lambda time: np.eye(4)),
@@ -198,13 +199,18 @@ def test_a_plan_counts_all_that_a_picture_takes(opencl, monkeypatch, machine, me
     monkeypatch.setattr(pool, "fresh", lambda what, size: taken.append((what, size)) or fresh(what, size))
     monkeypatch.setattr(pool, "make_way", lambda kind, way: planned.append(way) or make_way(kind, way))
     some = random_splats(60000, seed=3, depth=(1.0, 6.0), scale=(1e-3, 1e-2), sh_degree=1)
+    some = some.with_boxes(np.arange(60000) < 30000) if name == "boxes before a lens" else some
     own.render(some, **{"camera": CAMERA, **PICTURES[name]})["rgb"]
     largest = {}
     for what, size in taken:
         # a lens's rays are many buffers of one name, the others replace one another
-        largest[what] = largest.get(what, 0) + size if what == "rays" else max(largest.get(what, 0), size)
+        many = what.startswith("ray")
+        largest[what] = largest.get(what, 0) + size if many else max(largest.get(what, 0), size)
     assert ("packed splats" in largest) == (mebibytes == 7)
-    assert sum(largest.values()) <= mebibytes * 2**20 - planned[-1] <= mebibytes * 2**20
+    budget = mebibytes * 2**20
+    # an eighth is for pairs alone, however few there are
+    rest = sum(size for what, size in largest.items() if what not in ("pairs", "lists"))
+    assert rest <= budget - planned[-1] - budget // 8 <= budget
 
 
 def test_neither_frames_nor_kernels_keep_a_cloud(opencl):

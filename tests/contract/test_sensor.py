@@ -18,15 +18,6 @@ CLOUD = random_splats(120, 3)
 GREY = (0.4, 0.4, 0.4)
 NOISY = fs.Sensor(full_well=5000, read_noise=12, seed=7)
 EMPTY = fs.SplatCloud.empty()
-SURROUNDINGS = ("fog", "wall", "background", "panorama")
-"""in the names of tests that need no step of the sensor"""
-
-
-@pytest.fixture(autouse=True)
-def surroundings(request):
-    name = request.node.name
-    if "[warp" in name and ("noise" in name or not any(word in name for word in SURROUNDINGS)):
-        pytest.skip("Warp has no sensor (docs/backends.md)")
 
 
 def panorama(width=40, height=20):

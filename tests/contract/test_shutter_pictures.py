@@ -15,8 +15,6 @@ from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, compare
 from fidsplat.quality import Quality
 
-BACKEND = "opencl"
-
 SIZE = (61, 45)
 BACKGROUND = (0.1, 0.2, 0.3)
 

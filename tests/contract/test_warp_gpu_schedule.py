@@ -1,9 +1,10 @@
-"""Warp's schedule for GPUs, wherever Warp runs, with the effects of samples and pixels: against the
-reference, as its own schedule is by the other tests."""
+"""Warp's schedule for GPUs, wherever Warp runs, with lenses and the effects of samples and pixels: against
+the reference, as its own schedule is by the other tests."""
 
 import numpy as np
 import pytest
-from agreement import random_splats
+from agreement import ALL_OUTPUTS, random_splats
+from test_lens_pictures import CAMERAS
 
 import fidsplat as fs
 from fidsplat.backends.base import View
@@ -35,6 +36,10 @@ PICTURES = {
     "pixel": lambda: Picture(
         AROUND, CAMERA, fs.Quality(lowpass="pixel", samples=2), background=fs.Gradient((0, 0, 1), (1, 0, 0))
     ),
+    **{
+        name: lambda camera=CAMERAS[name]: Picture(AROUND, camera, outputs=ALL_OUTPUTS)
+        for name in ("distortion", "fisheye 200", "panorama", "parallel")
+    },
 }
 
 
@@ -42,8 +47,10 @@ PICTURES = {
 def test_the_schedule_of_gpus_agrees_with_the_reference(renderer, name):
     picture = PICTURES[name]()
     backend, cloud, behind = renderer.backend, picture.cloud, picture.background
-    features = select(cloud, picture.outputs, picture.quality, fog=picture.fog, background=behind)
-    view = View.of(CAMERA, picture.quality, cloud.origin, behind, fog=picture.fog)
+    features = select(
+        cloud, picture.outputs, picture.quality, picture.camera, fog=picture.fog, background=behind
+    )
+    view = View.of(picture.camera, picture.quality, cloud.origin, behind, fog=picture.fog)
     planes = backend.pipeline(features, other_schedule(renderer)).render(backend.upload(cloud), view)
     drawn = {output: planes.read(output) for output in picture.outputs}
     differences = compare(drawn, truth_of(picture), picture.outputs)

@@ -168,6 +168,7 @@ def test_nothing_to_draw_is_the_background(scene, tmp_path):
         (["--device", "opencl:nosuchthing"], 2, "nosuchthing"),
         (["--device", "vulkan"], 2, "vulkan"),
         (["--quality", "standrad"], 2, "standard"),
+        (["--quality", "fast,alpha_cutof=1e-3"], 2, "did you mean 'alpha_cutoff'"),
         (["--outputs", ""], 2, "output"),
     ],
 )

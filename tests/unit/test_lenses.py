@@ -201,3 +201,51 @@ def test_lenses_that_scene_files_cannot_have(tmp_path, text, words):
     (tmp_path / "scene.toml").write_text(HEAD + text)
     with pytest.raises(fs.InputError, match=words):
         fs.Scene.load(tmp_path / "scene.toml")
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [*(BrownConrady.opencv(each) for each in COEFFICIENTS), Fisheye(0.05, -0.01, 0.003, -0.001), Fisheye()]
+    + [Equirectangular(), Orthographic()],
+    ids=lambda lens: lens.kind,
+)
+def test_derivatives_are_those_of_the_image(lens):
+    points, step = points_before(5), 1e-5
+    if lens.along_ray:
+        points = np.concatenate([points, points * (1, 1, -0.05), [(0, 0, 2.0)]])
+    shifts = step * np.eye(3)
+    want = np.stack([lens.image(points + s) - lens.image(points - s) for s in shifts], 2) / (2 * step)
+    seen = np.isfinite(want).all((1, 2))
+    assert seen.mean() > 0.6
+    np.testing.assert_allclose(lens.derivative(points)[seen], want[seen], atol=2e-6, rtol=1e-6)
+
+
+def test_a_panorama_has_derivatives_at_its_poles():
+    poles = np.array([(0, 3.0, 0), (0, -3.0, 0), (1e-9, 3.0, -1e-9)])
+    slopes = Equirectangular().derivative(poles)
+    assert np.isfinite(slopes).all()
+    assert (np.linalg.matrix_rank(slopes, tol=1e-9) == 2).all()
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [BrownConrady(-0.2, 0.05, p1=0.01), Fisheye(0.05, -0.01), Equirectangular()],
+    ids=lambda lens: lens.kind,
+)
+def test_slopes_of_a_raster_are_the_differences_of_its_rays(lens):
+    """A step of a tenth of a sample in either direction turns a ray by that much of its slope."""
+    size, numbers = (40, 30), (14.0, 13.0, 19.3, 15.2)
+    raster = RayRaster(lens, *size, *numbers)
+    x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
+    places = np.stack([x.ravel(), y.ravel()], 1)
+    slopes = raster.slopes.reshape(-1, 2, 3)
+    assert raster.cropped(10, 20).slopes.tobytes() == raster.slopes[10:20].tobytes()
+    furthest = 0.0
+    for axis, step in enumerate(0.1 * np.eye(2)):
+        image = [(places + sign * step - numbers[2:]) / numbers[:2] for sign in (1, -1)]
+        want = (lens.rays(image[0]) - lens.rays(image[1])) / 0.2
+        seen = np.isfinite(want[:, 0]) & np.isfinite(slopes[:, 0, 0])
+        assert seen.mean() > 0.6
+        np.testing.assert_allclose(slopes[seen, axis], want[seen], atol=3e-5)
+        furthest = max(furthest, np.linalg.norm(want[seen], axis=1).max())
+    assert raster.step > furthest * 0.999

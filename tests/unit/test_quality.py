@@ -1,9 +1,16 @@
 """The knobs: their ranges, what goes together, and where they come from."""
 
+import json
+from importlib.resources import files
+
+import numpy as np
 import pytest
 
 import fidsplat as fs
+from fidsplat.markers.mixture import fitted_templates
+from fidsplat.quality import TEMPLATE_SIZES
 
+TEMPLATES = files("fidsplat.markers").joinpath("templates.json")
 WRONG = {
     "arithmetic": "quick",
     "blend_precision": "float16",
@@ -37,3 +44,68 @@ def test_key_bits_are_whole_numbers(value):
 def test_blending_in_float64_refuses_what_would_undo_it(other):
     with pytest.raises(fs.InputError, match="blend_precision='float64'"):
         fs.Quality(blend_precision="float64", **other)
+
+
+@pytest.mark.parametrize(
+    ("text", "quality"),
+    [
+        ("fast", fs.Quality.named("fast")),
+        ("alpha_cutoff=1e-3", fs.Quality(alpha_cutoff=1e-3)),
+        (" fast , samples = 2 ,tile_size=none", fs.Quality.named("fast").with_(samples=2)),
+        ("tile_size=16,marker.template=9", fs.Quality(tile_size=16, marker=fs.MarkerQuality(template=9))),
+        (
+            "standard,marker.mixture=paper,marker.growth=0.1",
+            fs.Quality(marker=fs.MarkerQuality("paper", growth=0.1)),
+        ),
+    ],
+)
+def test_text_says_a_quality(text, quality):
+    assert fs.Quality.of(text) == quality
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("fats", "did you mean 'fast'"),
+        ("fast,samples", "key=value"),
+        ("fast,samples=two", "whole number"),
+        ("alpha_cutoff=", "must be a number"),
+        ("alpha_cutof=1", "did you mean 'alpha_cutoff'"),
+        ("marker.templat=9", "did you mean 'template'"),
+        ("marker=paper", "marker.template=9"),
+        ("arithmetic=quick", "precise, fast"),
+        ("", "standard"),
+    ],
+)
+def test_text_that_says_none(text, says):
+    with pytest.raises(fs.InputError, match=says):
+        fs.Quality.of(text)
+
+
+def test_shipped_templates_are_those_that_quality_knows():
+    for size in TEMPLATE_SIZES:
+        square = fitted_templates(size)[0].gaussians
+        assert len(square) == size
+    made = {size: fs.marker("apriltag:36h11:5", template=size) for size in TEMPLATE_SIZES}
+    counts = [len(one.cloud) for one in made.values()]
+    assert counts == sorted(counts)
+    assert len(made[1].cloud) == len(made[1].boxes)
+
+
+def test_larger_templates_are_better_ones():
+    reached = [entry["fit_db"] for entry in json.loads(TEMPLATES.read_text("utf-8"))["sets"]]
+    assert reached == sorted(reached)
+
+
+def test_a_marker_takes_from_a_quality_what_it_does_not_say():
+    quality = fs.MarkerQuality("paper", levels=2, density=1, template=9, growth=0.2)
+    by_quality = fs.marker("apriltag:36h11:5", quality=quality)
+    by_itself = fs.marker("apriltag:36h11:5", mixture="paper", levels=2, density=1, growth=0.2)
+    assert np.array_equal(by_quality.cloud.scales, by_itself.cloud.scales)
+    assert fs.marker("apriltag:36h11:5", mixture="fitted", quality=quality).quality.template == 9
+    # what does not concern the mixture is let be; what is asked for is not
+    assert fs.marker("apriltag:36h11:5", mixture="exact", quality=quality).mixture == "exact"
+    with pytest.raises(fs.InputError, match="levels and density"):
+        fs.marker("apriltag:36h11:5", mixture="paper", template=9)
+    with pytest.raises(fs.InputError, match="MarkerQuality"):
+        fs.marker("apriltag:36h11:5", quality=fs.Quality())  # type: ignore[arg-type]

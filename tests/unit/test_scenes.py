@@ -1,6 +1,7 @@
 """Scenes: merging, scene files as the contract shows them, saving and loading again."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -27,12 +28,11 @@ def cloud_of(n=5, seed=0, **changes):
     return fs.SplatCloud(**fields | changes)
 
 
-def fake_marker(spec, size=1.0, mixture="fitted", quiet_zone=None):
+def fake_marker(spec, size=1.0, mixture=None, quiet_zone=None, quality=None, **own):
     """What a scene needs of a marker, without partitioning one: two splats and four corners."""
     if "unknown" in spec:
         raise fs.InputError(f"unknown spec {spec!r}")
-    if mixture not in ("fitted", "paper"):
-        raise fs.InputError(f"unknown mixture {mixture!r}")
+    knobs = replace(quality or fs.MarkerQuality(), **own | ({"mixture": mixture} if mixture else {}))
     cloud = fs.SplatCloud(
         [[-size, 0, 0], [size, 0, 0]],
         [[1, 0, 0, 0]] * 2,
@@ -43,7 +43,13 @@ def fake_marker(spec, size=1.0, mixture="fitted", quiet_zone=None):
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * size / 2
     quiet_zone = 1 if quiet_zone is None else quiet_zone
     return SimpleNamespace(
-        spec=spec, size=size, mixture=mixture, quiet_zone=quiet_zone, cloud=cloud, corners=corners
+        spec=spec,
+        size=size,
+        mixture=knobs.mixture,
+        quality=knobs,
+        quiet_zone=quiet_zone,
+        cloud=cloud,
+        corners=corners,
     )
 
 
@@ -239,11 +245,77 @@ def test_files_of_a_saved_scene(tmp_path):
     assert len(fs.Scene.load(tmp_path / "lab.toml").cloud()) == 7
 
 
-def test_a_quality_between_the_presets_cannot_be_saved(tmp_path):
-    scene = fs.Scene(quality=fs.Quality(alpha_cutoff=0.123))
-    with pytest.raises(fs.InputError, match="differs from every preset"):
-        scene.save(tmp_path / "a.toml")
-    assert not list(tmp_path.iterdir())
+BETWEEN = fs.Quality(
+    alpha_cutoff=0.123,
+    samples=2,
+    tile_size=8,
+    depth_key_bits=24,
+    marker=fs.MarkerQuality("paper", levels=3, growth=0.25),
+)
+
+
+@pytest.mark.parametrize("quality", [BETWEEN, "fast,samples=2,marker.template=9"])
+def test_a_quality_between_the_presets_is_saved_whole(tmp_path, quality):
+    fs.Scene(quality=quality).save(tmp_path / "a.toml")
+    assert fs.Scene.load(tmp_path / "a.toml").quality == quality
+
+
+@pytest.mark.parametrize("quality", [None, BETWEEN])
+@pytest.mark.parametrize(
+    "made",
+    [fs.MarkerQuality(), fs.MarkerQuality(template=9, growth=0.1), fs.MarkerQuality("paper", 2, 1, 0.5)],
+)
+def test_markers_are_saved_as_they_were_made(tmp_path, made, quality):
+    placed = PlacedMarker(fake_marker("qr:a", quality=made))
+    fs.Scene(markers=[placed], quality=quality).save(tmp_path / "a.toml")
+    again = fs.Scene.load(tmp_path / "a.toml").markers[0].marker.quality
+    if made.mixture == "paper":
+        assert replace(again, template=made.template) == made
+    else:
+        assert again.template == made.template
+        assert again.growth in (made.growth, 0.4)  # which the fitted templates were made with
+
+
+def test_knobs_of_a_scene_file(tmp_path):
+    file = tmp_path / "a.toml"
+    file.write_text(
+        """
+        markers = [{spec = "qr:a", size = 1}, {spec = "qr:b", size = 1, template = 5}]
+        [quality]
+        preset = "fast"
+        alpha_cutoff = 1e-3
+        [quality.marker]
+        template = 9
+        """
+    )
+    scene = fs.Scene.load(file)
+    assert scene.quality == fs.Quality.of("fast,alpha_cutoff=1e-3,marker.template=9")
+    assert [placed.marker.quality.template for placed in scene.markers] == [9, 5]
+    other = fs.Scene.load(file, "marker.template=13")
+    assert [placed.marker.quality.template for placed in other.markers] == [13, 5]
+    assert fs.Quality.of(other.quality).alpha_cutoff == 1 / 255
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[quality]\npreset = 'fats'", "quality.preset: unknown quality 'fats'"),
+        ("[quality]\nalpha_cutof = 1", "unknown key quality.alpha_cutof; did you mean alpha_cutoff"),
+        ("[quality]\nalpha_cutoff = 2", "quality: quality: alpha_cutoff is 2"),
+        ("[quality]\ntile_size = 'big'", "quality.tile_size must be a whole number"),
+        ("[quality.marker]\ntemplate = 4", "template is 4; known: 1, 5, 9"),
+        (
+            "[render]\nsamples = 2\n[quality]\npreset = 'fast'",
+            "render.samples and the table [quality] exclude",
+        ),
+        ("markers = [{spec = 'qr:a', size = 1, template = 4}]", "markers[0]: marker quality: template is 4"),
+    ],
+)
+def test_knobs_of_a_scene_file_that_cannot_be(tmp_path, text, says):
+    (tmp_path / "a.toml").write_text(text)
+    with pytest.raises(fs.InputError) as caught:
+        fs.Scene.load(tmp_path / "a.toml")
+    assert says in str(caught.value)
 
 
 def test_text_that_is_no_unicode_cannot_be_saved(tmp_path):

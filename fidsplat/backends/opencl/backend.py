@@ -104,6 +104,11 @@ class OpenCLBackend:
         if not self.info.float64 and features.setup_precision != "float32":
             features = replace(features, setup_precision="float32")
         key = (features, shape or shape_for(features, self.shape))
+        if key[1].blend_items > self.device.max_work_group_size:
+            raise DeviceError(
+                f"{self.info.title} has work-groups of at most {self.device.max_work_group_size}, and "
+                f"tile_size={features.tile_size} needs {key[1].blend_items}; use smaller tiles"
+            )
         if key not in self._pipelines:
             source = assemble(*key)
             program = self.build(source.text)
@@ -114,6 +119,10 @@ class OpenCLBackend:
     def memory_bytes(self) -> int:
         """Device memory that scratch buffers hold, and finished planes that nobody has any more."""
         return self.pool.memory_bytes
+
+    def release_scratch(self) -> None:
+        """Lets go of the scratch buffers; the next picture takes what it needs."""
+        self.pool.shrink(0, ())
 
     def rates(self) -> Rates:
         """What the device can do at best; measured anew at each call."""

@@ -33,8 +33,15 @@ class ExposedRun(Run):
         kinds = [(4, True), *((planes, effect.averaged) for effect in effects for planes in effect.planes)]
         # names that no shot's own planes have
         whole = [self.take(f"exposed {k}", 4 * plane * count) for k, (count, _) in enumerate(kinds)]
+        # what is around is the same for all shots
+        around = {
+            name: self.put(name, self.view.array(name))
+            for effect in effects
+            for name in effect.backdrop_arrays
+        }
         for shot in self.view.shots:
             run = Run(self.pipeline, self.resident, shot.view, self.plan)
+            run.held |= around
             *_, planes = run.filled()
             self.events += run.events
             self._gather(run, shot, planes, whole, kinds)
@@ -42,6 +49,8 @@ class ExposedRun(Run):
                 self._counts[name] = max(self._counts[name], value)
             self.uploads += run.uploads
             self.pool.give_back(run.leased)
+        if self.view.raster is not None and any(effect.resolve_inputs for effect in effects):
+            self.held |= self.backend.ray_buffers.of(self.view.raster, self.rows, self.stride)
         outputs = self.outputs()
         self.resolve(whole, outputs)
         return outputs

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 
 _LEAST = 16  # bytes; OpenCL has no empty buffers
-_ID = 4  # bytes of a splat's index, of which there is no array before a picture asks for it
 
 
 class DeviceBuffer(cl.Buffer):
@@ -146,8 +145,7 @@ class Resident:
 
     def _bytes_of(self, names: Iterable[str]) -> int:
         """Bytes of a splat in these arrays."""
-        arrays = self._arrays
-        return sum(arrays[k].nbytes // max(self.count, 1) if k in arrays else _ID for k in names)
+        return sum(self._array(name).nbytes // max(self.count, 1) for name in names)
 
     def bytes_for(self, names: Iterable[str]) -> tuple[int, int]:
         """What a picture that asks for these arrays makes of the cloud: bytes that stay on the device, and
@@ -165,25 +163,29 @@ class Resident:
 
     def part(self, name: str, first: int, end: int) -> cl.Buffer:
         """The array of splats [first, end)."""
-        if name == "splat_ids" and name not in self._arrays:
-            # made when a picture first asks for it
-            self._arrays[name] = np.arange(self.count, dtype=np.int32)
-        if name.endswith("_half") and name not in self._arrays:
-            self._arrays[name] = halves(self._arrays[name.removesuffix("_half")])
         if self.streamed:
-            piece = np.ascontiguousarray(self._arrays[name][first:end])
+            piece = np.ascontiguousarray(self._array(name)[first:end])
             buffer = self._backend.pool.scratch(f"chunk of {name}", piece.nbytes)
             cl.enqueue_copy(self._backend.queue, buffer, piece)
             return buffer
         whole = self._whole(name)
         if end - first == self.count:
             return whole
-        row = self._arrays[name].nbytes // self.count
+        row = self._array(name).nbytes // self.count
         return whole.get_sub_region(first * row, (end - first) * row)
+
+    def _array(self, name: str) -> np.ndarray:
+        """The array on the host; ids and halves are made when a picture first asks for them."""
+        if name not in self._arrays:
+            if name == "splat_ids":
+                self._arrays[name] = np.arange(self.count, dtype=np.int32)
+            else:
+                self._arrays[name] = halves(self._arrays[name.removesuffix("_half")])
+        return self._arrays[name]
 
     def _whole(self, name: str) -> cl.Buffer:
         if name not in self._buffers:
-            array = np.ascontiguousarray(self._arrays[name])
+            array = np.ascontiguousarray(self._array(name))
             flags = cl.mem_flags
             if array.size == 0:
                 buffer = self._backend.pool.fresh(f"the cloud's {name}", 16)

@@ -131,10 +131,12 @@ class OpenCLPipeline:
         fixed += 4 * tiles * shape.tile_width * shape.tile_height * planes  # whole tiles
         pixels = view.width * view.height // view.samples**2
         fixed += 4 * pixels * sum(output.channels for output in self.features.outputs)
-        fixed += sum(view.array(name).nbytes for effect in effects for name in effect.resolve_arrays)
+        arrays = (name for effect in effects for name in (*effect.resolve_arrays, *effect.backdrop_arrays))
+        fixed += sum(view.array(name).nbytes for name in arrays)
         if view.raster is not None:
-            rasters = {shot.view.raster for shot in view.shots if shot.view.raster} or {view.raster}
-            fixed += RayBuffers.bytes_of(rasters, shape.tile_height, tiles_x * shape.tile_width)
+            rasters = {view.raster, *(shot.view.raster for shot in view.shots if shot.view.raster)}
+            columns, slopes = tiles_x * shape.tile_width, "rays_box" in self.features.names
+            fixed += RayBuffers.bytes_of(rasters, shape.tile_height, columns, slopes)
         backend, record = self.backend, self.source.record_bytes
         budget, largest = backend.memory_budget, backend.device.max_mem_alloc_size
         return plan_of(resident.count, record, upload, fixed, shape.lists, budget, largest)

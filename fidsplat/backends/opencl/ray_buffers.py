@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class RayBuffers:
-    """The buffers `rays` and `ray_map` (kernels/opencl/slot) of the rasters that were drawn last."""
+    """The buffers `rays`, `ray_map` and so on (kernels/opencl/slot) of the rasters that were drawn last."""
 
     def __init__(self, backend: OpenCLBackend) -> None:
         self._backend = backend
@@ -24,23 +24,32 @@ class RayBuffers:
             WeakKeyDictionary()
         )
 
-    def of(self, raster: RayRaster, rows: int, columns: int) -> dict[str, cl.Buffer]:
-        """Buffers by name, for a sample grid that is padded to rows x columns."""
+    def of(self, raster: RayRaster, rows: int, columns: int, slopes: bool = False) -> dict[str, cl.Buffer]:
+        """Buffers by name, for a sample grid that is padded to rows x columns. slopes: those of boxes too."""
         sizes = self._held.setdefault(raster, {})
         if (rows, columns) not in sizes:
-            planes = np.full((3, rows, columns), np.nan, np.float32)
-            planes[:, : raster.height, : raster.width] = np.moveaxis(raster.rays, 2, 0)
-            sizes[rows, columns] = {"rays": self._put("rays", planes)}
+            sizes[rows, columns] = {"rays": self._planes("rays", raster.rays, rows, columns)}
             if raster.lens.kind != "equirectangular":
                 sizes[rows, columns]["ray_map"] = self._map(raster.whole or raster)
-        return sizes[rows, columns]
+        held = sizes[rows, columns]
+        if slopes and "ray_slopes" not in held:
+            flat = raster.slopes.reshape(raster.height, raster.width, 6)
+            held["ray_slopes"] = self._planes("ray_slopes", flat, rows, columns)
+            held["ray_step"] = self._put("ray_step", np.float32([raster.step]))
+        return held
+
+    def _planes(self, name: str, array: np.ndarray, rows: int, columns: int) -> cl.Buffer:
+        planes = np.full((array.shape[2], rows, columns), np.nan, np.float32)
+        planes[:, : array.shape[0], : array.shape[1]] = np.moveaxis(array, 2, 0)
+        return self._put(name, planes)
 
     @staticmethod
-    def bytes_of(rasters: Collection[RayRaster], tile_height: int, columns: int) -> int:
+    def bytes_of(rasters: Collection[RayRaster], tile_height: int, columns: int, slopes: bool) -> int:
         """What the buffers of the rasters of one picture take, for grids that are padded to whole tiles."""
         rows = sum(-(-raster.height // tile_height) * tile_height for raster in rasters)
         one = next(iter(rasters))
-        return 12 * rows * columns + (one.map[0].nbytes if one.lens.kind != "equirectangular" else 0)
+        each = 36 if slopes else 12
+        return each * rows * columns + (one.map[0].nbytes if one.lens.kind != "equirectangular" else 0)
 
     def _map(self, raster: RayRaster) -> cl.Buffer:
         maps = self._held.setdefault(raster, {}).setdefault((0, 0), {})

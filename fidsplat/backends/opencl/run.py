@@ -60,6 +60,8 @@ class Run:
         for first, end in lists.bands():
             self._blend(first, end, planes)
             if end == self.tiles:
+                if "world_ray" in self.pipeline.features.names:
+                    self._backdrop(planes[0])
                 yield planes
         self.stats = lists.stats()
 
@@ -103,6 +105,22 @@ class Run:
             args += [next(planes) for _ in effect.planes]
         return args
 
+    def _backdrop(self, raw: cl.Buffer) -> None:
+        """Adds what the samples see behind everything."""
+        view = self.view
+        size = (np.int32(view.width), np.int32(view.height))
+        strides = (np.int32(self.stride), np.uint32(self.rows * self.stride))
+        args = [*size, *strides, *self._uniforms(("ray", "rotation")), raw]
+        for effect in self.pipeline.features.effects:
+            args += self._uniforms(effect.backdrop_uniforms)
+            for name in effect.backdrop_arrays:
+                args.append(self.held[name] if name in self.held else self.put(name, view.array(name)))
+            args += [self.held[name] for name in effect.backdrop_inputs]
+        items = (-(-view.width // 16) * 16, -(-view.height // 4) * 4)
+        self.events.append(
+            ("resolve", self.pipeline.launch(self.queue, "backdrop", items, (16, 4), tuple(args)))
+        )
+
     def _uniforms(self, names: tuple[str, ...]) -> list[np.generic]:
         numbers = [number for name in names for number in self.view.uniform(name)]
         return [number if isinstance(number, np.generic) else np.float32(number) for number in numbers]
@@ -123,6 +141,7 @@ class Run:
         for effect in features.effects:
             extra += self._uniforms(effect.resolve_uniforms)
             extra += [self.put(name, self.view.array(name)) for name in effect.resolve_arrays]
+            extra += [self.held[name] for name in effect.resolve_inputs]
             extra += [next(rest) for _ in effect.planes]
             if effect.output:
                 extra.append(outputs[effect.output.name][1])
@@ -183,7 +202,8 @@ class Run:
         """The uniforms of the projection, for rows of samples [row, end)."""
         view = self.view
         if view.raster is not None:
-            self.held |= self.backend.ray_buffers.of(view.raster, self.rows, self.stride)
+            slopes = "rays_box" in self.pipeline.features.names
+            self.held |= self.backend.ray_buffers.of(view.raster, self.rows, self.stride, slopes)
         views = np.array([_uniforms(each, row, end) for each in (view, *(of for _, of in view.groups))])
         self.put("view", views.astype(self.pipeline.real))
         if view.groups:

@@ -8,6 +8,8 @@ from fidsplat.backends.base import View
 from fidsplat.backends.reference import doubt
 from fidsplat.backends.reference.fragments import fragments_of, shifted
 from fidsplat.backends.reference.layers import in_layers, in_order
+from fidsplat.backends.reference.optics import ray_lengths
+from fidsplat.backends.reference.post import background_at
 from fidsplat.backends.reference.setup import Setup
 from fidsplat.effects import FeatureSet
 
@@ -35,6 +37,10 @@ def composite(
         with np.errstate(invalid="ignore"):
             moved = np.abs(np.exp(reach * np.maximum(span.z_low, 0)) - np.exp(reach * span.z_high))
         out["certificate"] += (weight * moved).sum(1)
+    if view.surroundings is not None:
+        behind, moved = background_at(view, x, y)
+        out["rgb"] = out["rgb"] + final[:, None] * behind
+        out["behind_doubt"] = final * moved
     drawn = live & (alpha > 0)
     uncertain = laid.reordered > 0
     if {"depth", "depth_median", "depth_first"} & features.names:
@@ -71,13 +77,6 @@ def composite(
         out["blended"] = np.where(drawn, laid.count, 0).sum(1)
         out["blended_doubt"] = doubt.of_count(span, laid.count, laid.count_doubt, view.stop, uncertain)
     return out
-
-
-def ray_lengths(x: np.ndarray, y: np.ndarray, view: View) -> np.ndarray:
-    """Length of the rays through samples at grid positions x, y, per metre of depth."""
-    if view.along_ray or view.parallel:
-        return np.ones_like(x)
-    return np.sqrt(1 + ((x - view.cx) / view.fx) ** 2 + ((y - view.cy) / view.fy) ** 2)
 
 
 def _sum(weight: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -74,13 +74,16 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
     high = np.exp(s.log_opacity - nearest * (1 - _WEIGHT)) * (1 + _WEIGHT)
     low, high = np.minimum(low, view.ceiling), np.minimum(high, view.ceiling)
     if s.box.any():
-        # of an edge's distance: its two forms', one of them multiplied once more, and the sum's
+        # of an edge's distance: its two forms', one of them multiplied once more, the sum's, and near it the gradient's
         off = np.stack(
-            [(e_d + 1.5 * e) * edge[None] for e, edge in zip((e_u, e_u, e_v, e_v), s.edges, strict=True)]
+            [
+                (e_d + 1.5 * e) * edge + _ROUND * terms
+                for e, edge, terms in zip((e_u, e_u, e_v, e_v), f.edges, f.edge_terms, strict=True)
+            ]
         )
         whole = np.minimum(np.exp(s.log_opacity), view.ceiling)
-        least = whole * cover(s.edges, f.n_u, f.n_v, f.d, -off - _ROUND) * (1 - _WEIGHT)
-        most = whole * cover(s.edges, f.n_u, f.n_v, f.d, off + _ROUND) * (1 + _WEIGHT)
+        least = whole * cover(f.edges, f.n_u, f.n_v, f.d, -off - _ROUND) * (1 - _WEIGHT)
+        most = whole * cover(f.edges, f.n_u, f.n_v, f.d, off + _ROUND) * (1 + _WEIGHT)
         low = np.where(s.box, np.where(must, least, 0.0), low)
         high = np.where(s.box, np.where(may, most, 0.0), high)
     # no ray to the plane: the centre's depth

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fidsplat.backends.base import View
-from fidsplat.backends.reference.optics import away_of, samples_of
+from fidsplat.backends.reference.optics import away_of, edges_of, samples_of
 from fidsplat.backends.reference.setup import Setup
 
+_NO_EDGES = np.zeros((4, 0))
 DARKEST = 24 * math.log(2)
 """optical depth at which float32 leaves no light"""
 
@@ -33,11 +34,15 @@ class Fragments:
     """squared distance from the projected centre, pixels; infinite where the sample sees nothing"""
     alpha: np.ndarray
     z: np.ndarray
+    edges: np.ndarray
+    """(4, n) or (4, k, n), and their terms, as `edges_of` has them, if there are boxes"""
+    edge_terms: np.ndarray
 
 
 def fragments_of(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Fragments:
     """The fragments of samples (k,) at grid positions x, y."""
     samples = samples_of(view, x, y)
+    edges, edge_terms = edges_of(view, s.forms, x, y) if s.box.any() else (_NO_EDGES, _NO_EDGES)
     x, y, (c0, c1, c2) = samples.x, samples.y, samples.coordinates
     n_u, n_v, d = (c0 * s.forms[0, :, c] + c1 * s.forms[1, :, c] + c2 * s.forms[2, :, c] for c in range(3))
     dz = s.z_numerator
@@ -56,10 +61,10 @@ def fragments_of(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Fragment
     if s.box.any():
         visible = (d > 0) & (d * view.near <= dz)
         whole = np.minimum(np.exp(s.log_opacity), view.ceiling)
-        alpha = np.where(s.box, np.where(visible, whole * cover(s.edges, n_u, n_v, d, 0.0), 0.0), alpha)
+        alpha = np.where(s.box, np.where(visible, whole * cover(edges, n_u, n_v, d, 0.0), 0.0), alpha)
     z = np.where(d > 0, np.clip(z, s.pz - s.reach, s.pz + s.reach), s.pz)
     dx, dy, away = np.abs(x - s.anchor_x), np.abs(y - s.anchor_y), away_of(view, samples, s.anchors)
-    return Fragments(dx, dy, away, n_u, n_v, d, dz, offset, alpha, z)
+    return Fragments(dx, dy, away, n_u, n_v, d, dz, offset, alpha, z, edges, edge_terms)
 
 
 def cover(edges: np.ndarray, n_u: np.ndarray, n_v: np.ndarray, d: np.ndarray, shift) -> np.ndarray:

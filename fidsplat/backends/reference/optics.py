@@ -41,6 +41,25 @@ def samples_of(view: View, x: np.ndarray, y: np.ndarray) -> Samples:
     return Samples(x[:, None], y[:, None], coordinates, seen)
 
 
+def rays_of(view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directions (k, 3) in the camera frame of the rays through samples at grid positions x, y (k,), along z 1 or
+    of unit length; and whether there is one (k,)."""
+    if view.raster is not None:
+        rays = view.raster.rays[y.astype(int), x.astype(int)].astype(np.float64)
+        return rays, np.isfinite(rays[:, 0])
+    one = np.ones_like(x)
+    across = (0 * x, 0 * y) if view.parallel else ((x - view.cx) / view.fx, (y - view.cy) / view.fy)
+    return np.stack([*across, one], 1), one > 0
+
+
+def ray_lengths(x: np.ndarray, y: np.ndarray, view: View) -> np.ndarray:
+    """Length (k,) of the rays through samples at grid positions x, y, per metre of depth; 1 where there is none."""
+    if view.along_ray or view.parallel:
+        return np.ones_like(x)
+    rays, seen = rays_of(view, x.ravel(), y.ravel())
+    return np.where(seen, np.linalg.norm(rays, axis=1), 1.0).reshape(x.shape)
+
+
 def forms_of(view: View, a: np.ndarray, b: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Forms of splats with scaled tangents a, b and centres p (n, 3), camera frame.
 
@@ -71,6 +90,41 @@ def centers_of(view: View, p: np.ndarray, known: np.ndarray) -> tuple[np.ndarray
             x = (view.fx * p[:, 0] + view.cx * p[:, 2]) / p[:, 2]
             y = (view.fy * p[:, 1] + view.cy * p[:, 2]) / p[:, 2]
     return np.where(known, x, np.inf), np.where(known, y, np.inf)
+
+
+def derivatives_of(view: View, p: np.ndarray) -> np.ndarray:
+    """Of the places where points p (n, 3) fall [samples] by their coordinates, (n, 2, 3); NaN where a lens does not
+    see them."""
+    if view.lens is None:
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            x, y, ahead = p[:, 0] / p[:, 2], p[:, 1] / p[:, 2], 1 / p[:, 2]
+            none = np.zeros_like(x)
+            slopes = np.stack([ahead, none, -x * ahead, none, ahead, -y * ahead], 1).reshape(-1, 2, 3)
+    else:
+        seen = np.isfinite(view.lens.image(p)[:, 0])[:, None, None]
+        slopes = np.where(seen, view.lens.derivative(p), np.nan)
+    return slopes * np.array([[view.fx], [view.fy]])
+
+
+def edges_of(view: View, forms: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The edges of boxes with `forms` (3, n, 3), at samples (k,) on the grid.
+
+    Returns:
+        1 / |gradient| of D + n_u, D - n_u, D + n_v, D - n_v by the sample's position, (4, n) or, where each sample has a ray of
+        its own, (4, k, n); and what the gradients' terms come to, relative to them (0 where devices have them from their set-up).
+    """
+    sides = [(axis, sign) for axis in (0, 1) for sign in (1, -1)]
+    if view.raster is None:
+        steep = [np.hypot(*(forms[1:, :, 2] + sign * forms[1:, :, axis])) for axis, sign in sides]
+        return 1 / np.maximum(np.stack(steep), 1e-300), np.zeros((4, 1))
+    slopes = np.nan_to_num(view.raster.slopes[y.astype(int), x.astype(int)].astype(np.float64))  # (k, 2, 3)
+    edges, terms = [], []
+    for axis, sign in sides:
+        form = forms[:, :, 2] + sign * forms[:, :, axis]
+        edges.append(1 / np.maximum(np.hypot(*np.einsum("kic,cn->ikn", slopes, form)), 1e-300))
+        parts = np.abs(forms[:, :, 2]) + np.abs(forms[:, :, axis])
+        terms.append(np.hypot(*np.einsum("kic,cn->ikn", np.abs(slopes), parts)))
+    return np.stack(edges), np.stack(terms) * np.stack(edges)
 
 
 def anchors_of(view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fidsplat.backends.base import View
+from fidsplat.backends.reference.optics import rays_of
 from fidsplat.surroundings import Gradient, Panorama
 
 _ROUND = 2e-6
@@ -12,17 +13,30 @@ _ROUND = 2e-6
 
 
 def background_at(view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colours (k, 3) behind pixels whose centres lie at x, y (k,) on the sample grid, and what float32 may
-    change in them (k,)."""
+    """Colours (k, 3) that samples at x, y (k,) on the grid see behind everything, 0 where they see nothing, and
+    what float32 may change in them (k,)."""
     around = view.surroundings
-    if around is None:
-        return np.broadcast_to(view.background, (len(x), 3)), np.zeros(len(x))
-    rays = np.stack([(x - view.cx) / view.fx, (y - view.cy) / view.fy, np.ones_like(x)], 1) @ view.rotation
+    assert around is not None
+    rays, seen = rays_of(view, x, y)
+    rays = np.where(seen[:, None], rays, 1.0) @ view.rotation
     if isinstance(around, Gradient):
         up = np.array(around.up) / np.linalg.norm(around.up)
         share = np.clip(0.5 + 0.5 * (rays @ up) / np.linalg.norm(rays, axis=1), 0, 1)[:, None]
-        return np.add(around.bottom, share * np.subtract(around.top, around.bottom)), np.zeros(len(x))
-    return _panorama_at(around, rays)
+        colors, doubt = (
+            np.add(around.bottom, share * np.subtract(around.top, around.bottom)),
+            np.zeros(len(x)),
+        )
+    else:
+        colors, doubt = _panorama_at(around, rays)
+    return np.where(seen[:, None], colors, 0.0), np.where(seen, doubt, 0.0)
+
+
+def brightest(around: Gradient | Panorama | None) -> float:
+    """The largest value that is seen behind everything."""
+    if around is None:
+        return 0.0
+    colors = (around.top, around.bottom) if isinstance(around, Gradient) else around.image
+    return float(np.abs(colors).max())
 
 
 def _panorama_at(panorama: Panorama, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from fidsplat.backends.base import View
-from fidsplat.backends.reference.blend import ray_lengths
-from fidsplat.backends.reference.post import background_at, developed
+from fidsplat.backends.reference.optics import ray_lengths
+from fidsplat.backends.reference.post import brightest, developed
 from fidsplat.effects import FeatureSet
 
 _ROUND = 1e-6  # relative, of a sum of weights
@@ -23,16 +23,15 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
     """
     t, doubt = samples["t"].mean(1), samples["certificate"]
     center_x, center_y = samples["x"].mean(1), samples["y"].mean(1)
-    behind, behind_doubt = background_at(view, center_x, center_y)
-    out = {"rgb": samples["rgb"].mean(1) + t[:, None] * behind, "certificate": doubt.mean(1)}
+    out = {"rgb": samples["rgb"].mean(1) + t[:, None] * view.background, "certificate": doubt.mean(1)}
     if "fogged" in samples:
-        out["rgb"] += samples["fogged"].mean(1)[:, None] * behind
+        out["rgb"] += samples["fogged"].mean(1)[:, None] * view.background
     if features.posts or view.surroundings is not None:
         steps = tuple(step for step in features.posts if step != "fog")
-        brightest = max(
-            1.0, float(np.abs(out["rgb"]).max(initial=1.0)), float(np.abs(behind).max(initial=0.0))
-        )
-        unsure = out["certificate"] * brightest + t * behind_doubt
+        most = max(1.0, float(np.abs(out["rgb"]).max(initial=1.0)), float(np.abs(view.background).max()))
+        unsure = out["certificate"] * max(most, brightest(view.surroundings))
+        if view.surroundings is not None:
+            unsure = unsure + samples["behind_doubt"].mean(1)
         columns, rows = (np.floor(center / view.samples).astype(int) for center in (center_x, center_y))
         out["rgb"], out["certificate_rgb"] = developed(out["rgb"], unsure, steps, view, columns, rows)
     doubt = samples.get("certificate_planes", doubt)  # the other planes show one shot
@@ -63,7 +62,8 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
         total = samples["normal"].sum(1)
         length = np.linalg.norm(total, axis=1)
         out["normal"] = total / np.where(length > 0, length, 1)[:, None]
-        out["normal_world"] = out["normal"] @ view.rotation
+        turns = view.turns_of_rows[np.floor(center_y / view.samples).astype(int)]
+        out["normal_world"] = np.einsum("ki,kij->kj", out["normal"], turns)
         moved = 2 * doubt.sum(1) + _ROUND * (1 - samples["t"]).sum(1)
         out["certificate_normal"] = _ratio(moved, length - doubt.sum(1), math.inf)
         out["certificate_normal_world"] = out["certificate_normal"]

@@ -39,7 +39,7 @@ class Setup:
         box = np.zeros(len(cloud), bool) if cloud.boxes is None else cloud.boxes
         area = scale.prod(axis=1)
         if "lowpass_pixel" in features.slots:
-            filtered = ~box & (p[:, 2] >= view.near)
+            filtered = ~box & (depth >= view.near)
             a, b, grown = _filtered(a, b, p, view, filtered)
             area = area * grown
             with np.errstate(divide="ignore"):
@@ -52,11 +52,12 @@ class Setup:
         if "keys_short" in features.names:
             self.key = _leading(self.key, features.depth_key_bits)
         half_r2 = log_opacity - view.log_cut
-        reach = np.hypot(a[:, 2], b[:, 2])
         if view.along_ray:
-            reach = np.maximum(np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1))
-        reach = np.sqrt(np.maximum(2 * half_r2, 0)) * reach
-        reach = np.where(box, np.abs(a[:, 2]) + np.abs(b[:, 2]), reach)
+            long_a, long_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
+            reach, box_reach = np.maximum(long_a, long_b), long_a + long_b
+        else:
+            reach, box_reach = np.hypot(a[:, 2], b[:, 2]), np.abs(a[:, 2]) + np.abs(b[:, 2])
+        reach = np.where(box, box_reach, np.sqrt(np.maximum(2 * half_r2, 0)) * reach)
         drawn = (half_r2 > 0) & (depth + reach >= view.near) & (depth - reach <= view.far)
         order = np.flatnonzero(drawn)
         order = order[np.argsort(self.key[order], kind="stable")]
@@ -79,7 +80,6 @@ class Setup:
         self.z_numerator = size * area * np.abs(height * sign)
 
         self.box = box[order]
-        self.edges = _edges(self.forms)
 
         ahead = self.pz >= view.near
         middle_x, middle_y = optics.centers_of(view, p, ahead)
@@ -114,18 +114,13 @@ def _filtered(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Scaled tangents (n, 3) after the low-pass `pixel`, and the factor (n,) by which areas grow.
 
-    chosen (n,) bool: the others stay as they are. The covariance of the filter in (u, v) is
+    chosen (n,) bool: the others stay as they are, and those whose centre a lens does not see. The covariance of the filter in (u, v) is
     (G^T G)^-1 / 4 with G the derivative of the sample's position by (u, v) at the centre.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        z = p[:, 2]
-        columns = [
-            np.stack(
-                [view.fx * (t[:, 0] - p[:, 0] / z * t[:, 2]), view.fy * (t[:, 1] - p[:, 1] / z * t[:, 2])]
-            )
-            / z
-            for t in (a, b)
-        ]
+        slopes = optics.derivatives_of(view, p)
+        chosen = chosen & np.isfinite(slopes).all((1, 2))
+        columns = [np.einsum("nij,nj->in", slopes, t) for t in (a, b)]
         turned = columns[0][0] * columns[1][1] - columns[1][0] * columns[0][1]
         m11, m12, m22 = ((columns[i] * columns[j]).sum(0) for i, j in ((0, 0), (0, 1), (1, 1)))
         variance = 0.25
@@ -137,12 +132,6 @@ def _filtered(
     # edge-on splats grow without limit and are not drawn
     chosen = (chosen & np.isfinite(grown))[:, None]
     return np.where(chosen, wide_a, a), np.where(chosen, wide_b, b), grown
-
-
-def _edges(forms: np.ndarray) -> np.ndarray:
-    """1 / |gradient| (4, n) of the forms D + n_u, D - n_u, D + n_v, D - n_v: a box's edges, in samples."""
-    sides = [forms[1:, :, 2] + sign * forms[1:, :, axis] for axis in (0, 1) for sign in (1, -1)]
-    return 1 / np.maximum(np.stack([np.hypot(*side) for side in sides]), 1e-300)
 
 
 def _anchor(center: np.ndarray, known: np.ndarray, size: int) -> np.ndarray:

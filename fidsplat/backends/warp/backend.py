@@ -14,6 +14,7 @@ import numpy as np
 from fidsplat.backends.base import DeviceInfo
 from fidsplat.backends.warp import runtime
 from fidsplat.backends.warp.launch import Commands
+from fidsplat.backends.warp.lens import LensArrays
 from fidsplat.backends.warp.memory import ArrayPool, Resident
 from fidsplat.backends.warp.pipeline import WarpPipeline
 from fidsplat.effects import FeatureSet
@@ -71,6 +72,7 @@ class WarpBackend:
         self.device = device
         self.shape = WarpShape("group" if device.is_cuda else "tiles", 16, 16)
         self.pool = ArrayPool(device)
+        self.lens_arrays = LensArrays()
         self.pair_budget = 2**30 - 1
         """Most pairs of splats and tiles that are listed at once; tests make it small."""
         self.memory_budget = self.info.memory_bytes // 10 * 9

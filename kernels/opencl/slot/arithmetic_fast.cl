@@ -1,7 +1,6 @@
 // Shorter exponentials and logarithms, and on a GPU its own short functions. On CPUs, where `native_*` are the library's
 // functions under another name, they are polynomials: 2^f for |f| <= 1/2 of degree 5, relative error 1.1e-7 before rounding
-// (Lawson's algorithm), and ln m of Cephes; one instruction divides as fast as any substitute. Garbage where an exponential
-// would underflow: nothing is drawn there.
+// (Lawson's algorithm), and ln m of Cephes; one instruction divides as fast as any substitute.
 //@ arithmetic
 #if LANES == 1
 static inline vfloat fast_exp(vfloat x) { return native_exp(x); }
@@ -11,6 +10,7 @@ static inline vfloat fast_reciprocal(vfloat x) { return native_recip(x); }
 static inline vfloat fast_exp(vfloat x) {
     const vfloat log2_e = 1.44269504088896341f;
     const float rounder = 12582912.0f;       // 1.5 * 2^23: the sum's last bits are the whole number
+    x = fmax(x, (vfloat)-87.0f);             // below, the exponent's bits would run over
     vfloat sum = FMA(x, log2_e, (vfloat)rounder);
     vfloat f = FMA(x, log2_e, rounder - sum);
     vfloat p = FMA((vfloat)1.32645783e-3f, f, (vfloat)9.67161916e-3f);

@@ -1,12 +1,11 @@
 // Behind everything a blend of two colours by the sine of the ray's height above the horizon.
-//@ resolve_args
+//@ backdrop_args
     , float sky_r, float sky_g, float sky_b, float ground_r, float ground_g, float ground_b
     , float up_x, float up_y, float up_z
-//@ resolve_start
-//@@ world_ray
+//@ backdrop
     float climb = FMA(world_x, up_x, FMA(world_y, up_y, world_z * up_z))
                    / sqrt(FMA(world_x, world_x, FMA(world_y, world_y, world_z * world_z)));
     float sky_share = clamp(FMA(0.5f, climb, 0.5f), 0.0f, 1.0f);
-    background_r = FMA(sky_share, sky_r - ground_r, ground_r);
-    background_g = FMA(sky_share, sky_g - ground_g, ground_g);
-    background_b = FMA(sky_share, sky_b - ground_b, ground_b);
+    behind[0] = FMA(sky_share, sky_r - ground_r, ground_r);
+    behind[1] = FMA(sky_share, sky_g - ground_g, ground_g);
+    behind[2] = FMA(sky_share, sky_b - ground_b, ground_b);

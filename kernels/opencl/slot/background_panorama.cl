@@ -1,6 +1,6 @@
 // Behind everything an equirectangular picture of the world: its middle column lies towards +z, to the right of it is +x, its
 // top row is -y. Bilinear, around the seam too.
-//@ resolve_args
+//@ backdrop_args
     , int panorama_width, int panorama_height, global const float *restrict panorama
 //@ functions
 static inline float panorama_at(global const float *restrict panorama, int width, int height, int x, int y, int channel) {
@@ -8,23 +8,18 @@ static inline float panorama_at(global const float *restrict panorama, int width
     y = clamp(y, 0, height - 1);
     return panorama[((size_t)y * width + x) * 3 + channel];
 }
-//@ resolve_start
-//@@ world_ray
+//@ backdrop
     float turn_share = FMA(atan2(world_x, world_z), 0.15915494309189535f, 0.5f);
     float fall_share = FMA(atan2(world_y, sqrt(FMA(world_x, world_x, world_z * world_z))), 0.31830988618379067f, 0.5f);
     float panorama_x = FMA(turn_share, (float)panorama_width, -0.5f);
     float panorama_y = FMA(fall_share, (float)panorama_height, -0.5f);
     int left = (int)floor(panorama_x), top = (int)floor(panorama_y);
     float right_share = panorama_x - (float)left, bottom_share = panorama_y - (float)top;
-    float panorama_rgb[3];
     for (int channel = 0; channel < 3; channel++) {
         float corner[4];
         for (int k = 0; k < 4; k++)
             corner[k] = panorama_at(panorama, panorama_width, panorama_height, left + (k & 1), top + (k >> 1), channel);
         float above = FMA(right_share, corner[1] - corner[0], corner[0]);
         float below = FMA(right_share, corner[3] - corner[2], corner[2]);
-        panorama_rgb[channel] = FMA(bottom_share, below - above, above);
+        behind[channel] = FMA(bottom_share, below - above, above);
     }
-    background_r = panorama_rgb[0];
-    background_g = panorama_rgb[1];
-    background_b = panorama_rgb[2];

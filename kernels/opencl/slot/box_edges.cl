@@ -1,18 +1,8 @@
-// Boxes: opaque or evenly translucent rectangles |u| <= 1, |v| <= 1 of a splat's plane, their edges filtered by the
-// sample's own width, so that n samples per pixel sharpen them and none makes them alias.
-//
-// h is a sample's signed distance from the image of an edge, in samples: (D -+ n_u) / |grad(D -+ n_u)|, from the affine
-// forms. A ramp clamp(1/2 + h) over one sample says how much of it lies on the box's side. Between two edges it is
-// the sum of their ramps less 1, and a box covers the product of that along u and v. Ramps belong to edges, not to boxes: the two
-// boxes at an edge have ramps that add up to 1, so the coverages of any partition of a rectangle into boxes with parallel
-// sides add up to that of the rectangle, at corners, T-junctions, under perspective, and below the size of a sample. Where the
-// edges lie along the samples' rows the coverage is the exact area.
+// Edges of boxes (slot/box_cover.cl) where forms are affine in the sample: straight lines, whose distances in samples need
+// one number for each edge of a splat.
 //@ record
     wide edge_u0, edge_u1, edge_v0, edge_v1;   // 1 / |grad| of the forms D + n_u, D - n_u, D + n_v, D - n_v
-//@ footprint_crossing
-    vfloat cover;           // share of the sample that a box covers
 //@ footprint_functions
-#define SQRT_2 WIDE(1.41421356237309504880)
 static inline vfloat between(vfloat d, vfloat n, wide edge_0, wide edge_1) {
     vfloat above = clamp(FMA(FMA((vfloat)SQRT_2, n, d), (vfloat)edge_0, (vfloat)0.5f), (vfloat)0.0f, (vfloat)1.0f);
     vfloat below = clamp(FMA(FMA((vfloat)-SQRT_2, n, d), (vfloat)edge_1, (vfloat)0.5f), (vfloat)0.0f, (vfloat)1.0f);
@@ -79,35 +69,20 @@ static inline bool box_touches(real3_ k0, real3_ kx, real3_ ky, real facing, rea
     }
     return count > 0;
 }
-//@ footprint_reach
-    if (BOX_HERE) {
-        radius = REAL(1.41421356237309504880);
-        reach = fabs(a.z) + fabs(b.z);
-    }
 //@ footprint_bounds
     if (BOX_HERE) {
         real3_ cu = image_row(view[VIEW_FX], view[VIEW_CX] - center_x, row_x, tw);
         real3_ cv = image_row(view[VIEW_FY], view[VIEW_CY] - center_y, row_y, tw);
         real box[4] = {-1 - center_x, view[VIEW_WIDTH] + 1 - center_x, -1 - center_y, view[VIEW_HEIGHT] + 1 - center_y};
         real d_near = fabs(view[VIEW_FX] * view[VIEW_FY] * su * sv * offset) / near;
+//@@ camera_box_near
         real towards_box = offset < 0 ? -1 : 1;
         if (!box_touches(cross3(cu, cv), cross3(cv, tw), cross3(tw, cu), towards_box, d_near, box)) return;
         bounds = box_bounds(center_x + box[0], center_x + box[1], center_y + box[2], center_y + box[3]);
     }
-//@ footprint_dot_bounds
-        if (BOX_HERE) bounds.pr = -1.0f;
-//@ footprint_dot
-        if (BOX_HERE) record.fx = record.fy = 1e18f;
 //@ project
     real edge_line[3];
     record.edge_u0 = (wide)box_edge(k0, kx, ky, scale, scale, false, edge_line);
     record.edge_u1 = (wide)box_edge(k0, kx, ky, scale, -scale, false, edge_line);
     record.edge_v0 = (wide)box_edge(k0, kx, ky, scale, scale, true, edge_line);
     record.edge_v1 = (wide)box_edge(k0, kx, ky, scale, -scale, true, edge_line);
-//@ footprint_opacity
-    if (IS_BOX(s)) opacity = fmin(exp(s->log_opacity), constants->ceiling) * c.cover;
-//@ footprint_tau
-    // what lies side by side adds up: the ink of boxes is the area that they cover, and their colour its mean
-    if (IS_BOX(s)) tau = opacity;
-//@ footprint_gather
-    if (IS_BOX(s)) layer->opacity = fmin(layer->ink, (vfloat)1.0f);

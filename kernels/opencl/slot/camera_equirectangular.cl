@@ -35,3 +35,15 @@ static inline Bounds cone_bounds(global const real *view, real3_ a, real3_ b, re
     Bounds bounds = cone_bounds(view, a, b, p, radius, longitude, latitude);
     real center_x = view[VIEW_FX] * longitude + view[VIEW_CX], center_y = view[VIEW_FY] * latitude + view[VIEW_CY];
     if (!(pz >= near)) center_x = center_y = NAN;   // no dot of a low-pass
+//@ camera_derivative
+        real polar = p.x * p.x + p.z * p.z < REAL(1e-12) * pz * pz ? 1 : 0;   // where the longitude jumps
+        real around_x = polar > 0 ? 0 : p.x, around_z = polar > 0 ? REAL(1e-6) * pz : p.z;
+        real flat = sqrt(around_x * around_x + around_z * around_z);
+        real across = view[VIEW_FX] / (flat * flat), up = view[VIEW_FY] / (pz * pz);
+        real sink = p.y / flat;
+        gx.x = across * (around_z * a.x - around_x * a.z);
+        gx.y = across * (around_z * b.x - around_x * b.z);
+        gy.x = up * (flat * a.y - sink * (around_x * a.x + around_z * a.z));
+        gy.y = up * (flat * b.y - sink * (around_x * b.x + around_z * b.z));
+//@ camera_box_reach
+        reach = su + sv;

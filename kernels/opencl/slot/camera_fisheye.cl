@@ -56,3 +56,21 @@ static inline void chart_box(real3_ a, real3_ b, real3_ p, real radius, real awa
     chart_box(a, b, p, radius, pz, chart);
     Bounds bounds = mapped_bounds(view + LENS_MAP, ray_map, chart[0], chart[1], chart[2], chart[3]);
     if (!(pz >= near && lens_image(view, p, &center_x, &center_y))) center_x = center_y = NAN;   // no dot of a low-pass
+//@ camera_derivative
+        // outwards and around, then turned into the picture's axes
+        real across = sqrt(p.x * p.x + p.y * p.y), angle = atan2(across, p.z), q = angle * angle;
+        real cosine = across > 0 ? p.x / across : 1, sine = across > 0 ? p.y / across : 0;
+        global const real *k = view + LENS;
+        real slope = (1 + q * (3 * k[0] + q * (5 * k[1] + q * (7 * k[2] + q * 9 * k[3])))) / (pz * pz);
+        real distance = angle * (1 + q * (k[0] + q * (k[1] + q * (k[2] + q * k[3]))));
+        real around = across > 0 ? distance / across : 1 / p.z;
+        real out_u = slope * (p.z * (cosine * a.x + sine * a.y) - across * a.z);
+        real out_v = slope * (p.z * (cosine * b.x + sine * b.y) - across * b.z);
+        real round_u = around * (cosine * a.y - sine * a.x), round_v = around * (cosine * b.y - sine * b.x);
+        gx.x = view[VIEW_FX] * (cosine * out_u - sine * round_u);
+        gx.y = view[VIEW_FX] * (cosine * out_v - sine * round_v);
+        gy.x = view[VIEW_FY] * (sine * out_u + cosine * round_u);
+        gy.y = view[VIEW_FY] * (sine * out_v + cosine * round_v);
+        filtered = angle <= view[LENS_LIMIT];
+//@ camera_box_reach
+        reach = su + sv;

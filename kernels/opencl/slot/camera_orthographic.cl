@@ -42,3 +42,8 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
     seen.z = VSELECT((vfloat)s->z_center,
                      clamp(c.z * inverse_d, (vfloat)(s->z_center - s->z_reach), (vfloat)(s->z_center + s->z_reach)),
                      VMASK(c.d > 0.0f));
+//@ camera_derivative
+        gx.x = view[VIEW_FX] * a.x; gx.y = view[VIEW_FX] * b.x;
+        gy.x = view[VIEW_FY] * a.y; gy.y = view[VIEW_FY] * b.y;
+//@ camera_box_near
+        d_near = INFINITY;                   // depths have a form of their own

@@ -2,17 +2,20 @@
 // footprint there, and its opacity falls as its area grows (EWA splatting, Zwicker et al. 2001, carried over to 2DGS). With G the
 // derivative of the sample's position by (u, v) at the centre, the footprint's covariance in (u, v) is s^2 (G^T G)^-1. So the
 // filtered splat is another 2D Gaussian of the same plane, and nothing after the set-up knows of the filter.
+//@ functions
+//@@ camera_derivative_functions
 //@ lowpass_make
 #ifndef BOX_HERE
 #define BOX_HERE false
 #endif
-    if (!BOX_HERE && pz >= near) {
+    bool filtered = !BOX_HERE && pz >= near;
+    real3_ gx = {0, 0, 0}, gy = {0, 0, 0};   // derivatives of the sample's x, y by u, v; z is not used
+    if (filtered) {
+//@@ camera_derivative
+    }
+    if (filtered) {
         // standard deviation in samples: a point spreads over its pixels evenly to 1.5 % per axis wherever it lies between them
         const real variance = REAL(0.25);
-        real ahead = 1 / pz;
-        real3_ in_x = {a.x, b.x, p.x}, in_y = {a.y, b.y, p.y}, in_z = {a.z, b.z, p.z};
-        real3_ gx = image_row(view[VIEW_FX] * ahead, -view[VIEW_FX] * p.x * ahead * ahead, in_x, in_z);
-        real3_ gy = image_row(view[VIEW_FY] * ahead, -view[VIEW_FY] * p.y * ahead * ahead, in_y, in_z);
         real m11 = gx.x * gx.x + gy.x * gy.x, m12 = gx.x * gx.y + gy.x * gy.y, m22 = gx.y * gx.y + gy.y * gy.y;
         real area = gx.x * gy.y - gx.y * gy.x, area2 = area * area;
         real grown = 1 + variance * (m11 + m22 + variance) / area2;      // (area after / area before)^2

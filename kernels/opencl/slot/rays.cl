@@ -6,12 +6,16 @@
     wide nuz, nvz, dz;      // n_u = nu0 + nux X + nuy Y + nuz Z, likewise n_v and D
     wide ray_x, ray_y, ray_z;    // X, Y, Z are relative to this ray
 //@ cross_functions
-static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfloat ray_z, float half_r2) {
+static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfloat ray_z, float half_r2
+//@@ ray_cross_parameters
+) {
     vfloat x = ray_x - s->ray_x, y = ray_y - s->ray_y, z = ray_z - s->ray_z;
     vfloat nu = FMA((vfloat)s->nuz, z, FMA((vfloat)s->nuy, y, FMA((vfloat)s->nux, x, (vfloat)s->nu0)));
     vfloat nv = FMA((vfloat)s->nvz, z, FMA((vfloat)s->nvy, y, FMA((vfloat)s->nvx, x, (vfloat)s->nv0)));
     vfloat d = FMA((vfloat)s->dz, z, FMA((vfloat)s->dy, y, FMA((vfloat)s->dx, x, (vfloat)s->d0)));
-    return cross_row(s, nu, nv, d, 0.0f, half_r2);
+    Crossing c = cross_row(s, nu, nv, d, 0.0f, half_r2);
+//@@ ray_cross
+    return c;
 }
 //@ project_args
     , global const float *restrict rays      // (3, rows, columns) of the padded grid
@@ -55,6 +59,15 @@ static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfl
         for (int k = 0; k < 3; k++) own_rays[k][row] = rays[k * ray_plane + (py + row) * ray_stride + px];
 #define RAY(k) own_rays[k][row]
 //@ cross
-    c = cross_ray(&s, RAY(0), RAY(1), RAY(2), half_r2);
+    c = cross_ray(&s, RAY(0), RAY(1), RAY(2), half_r2
+//@@ ray_cross_arguments
+    );
+//@ backdrop_args
+    , global const float *restrict rays
+//@ backdrop_ray
+    ray_x = rays[at];
+    ray_y = rays[plane + at];
+    ray_z = rays[2 * (size_t)plane + at];
+    if (!(ray_x == ray_x)) return;           // nothing is seen there
 //@ mask
     mask &= VMASK(c.d == c.d);               // the low-pass draws nothing where there is no ray

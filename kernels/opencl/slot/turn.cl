@@ -1,4 +1,5 @@
-// World to camera rotation, for what needs the world's axes when pixels are resolved.
+// World to camera rotation of each row of pixels, for what needs the world's axes when pixels are resolved.
 //@ resolve_args
-    , float turn_00, float turn_01, float turn_02, float turn_10, float turn_11, float turn_12, float turn_20, float turn_21
-    , float turn_22
+    , global const float *restrict turns     // (h, 3, 3)
+//@ resolve_start
+    global const float *turn = turns + 9 * (size_t)y;

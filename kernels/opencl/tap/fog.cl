@@ -15,7 +15,9 @@
             int fog_x = x0 + lane, fog_y = y0 + row;
             ((float *)&pixels[row].fog_slope)[lane]
 #endif
-                = -fog_density * ray_length((float)fog_x + 0.5f, (float)fog_y + 0.5f, fog_fx, fog_fy, fog_cx, fog_cy);
+                = -fog_density *
+//@@ fog_length
+                ;
         }
 //@ lay
     vfloat hidden = weight * (1.0f - exp(pixel->fog_slope * seen->z));

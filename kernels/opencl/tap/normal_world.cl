@@ -2,6 +2,6 @@
 //@ resolve_args
     , global float *restrict normal_world_out
 //@ resolve_end
-    normal_world_out[3 * out] = normal_scale * FMA(turn_00, normal_x, FMA(turn_10, normal_y, turn_20 * normal_z));
-    normal_world_out[3 * out + 1] = normal_scale * FMA(turn_01, normal_x, FMA(turn_11, normal_y, turn_21 * normal_z));
-    normal_world_out[3 * out + 2] = normal_scale * FMA(turn_02, normal_x, FMA(turn_12, normal_y, turn_22 * normal_z));
+    for (int axis = 0; axis < 3; axis++)
+        normal_world_out[3 * out + axis] =
+            normal_scale * FMA(turn[axis], normal_x, FMA(turn[3 + axis], normal_y, turn[6 + axis] * normal_z));

@@ -1,0 +1,134 @@
+"""`fidsplat tradeoff`: what accuracy costs in time, measured; `fidsplat tradeoff report`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+import tyro
+
+from fidsplat.commands.output import Json, console, option, print_json
+from fidsplat.errors import InputError
+
+DEFAULT_FOLDER = "fidsplat-tradeoff"
+
+
+@dataclass
+class TradeoffReport:
+    """Plots, tables and a reading from results of `fidsplat tradeoff`."""
+
+    HELP: ClassVar[
+        str
+    ] = """Write a report from results: what each constant costs, Pareto plots, what is worth turning.
+
+Results of several devices stand side by side; results of the same device in several folders are joined, and
+of a part that was measured twice the first file's stays. All that the text says of the numbers is worked out
+from them. Plots lie in the report's folder, or for FILE.md in a folder of that name.
+
+Examples:
+  fidsplat tradeoff report
+  fidsplat tradeoff report cpu gpu -o docs/accuracy.md"""
+
+    folders: Annotated[
+        tyro.conf.Positional[tuple[str, ...]],
+        option("DIR", f"folders with results, *.jsonl (default: {DEFAULT_FOLDER})"),
+    ] = ()
+    out: Annotated[
+        str | None, option("DIR|FILE.md", "folder or file for the report (default: the first folder)", "-o")
+    ] = None
+    json: Json = False
+
+    def run(self) -> int:
+        from fidsplat.experiments.tradeoff.report.page import write_report
+
+        folders = [Path(folder) for folder in self.folders or (DEFAULT_FOLDER,)]
+        files = write_report(folders, Path(self.out or folders[0]))
+        if self.json:
+            print_json({"files": [str(file) for file in files]})
+        else:
+            console(False).print(f"report in {files[0]}", markup=False, soft_wrap=True)
+        return 0
+
+
+@dataclass
+class Tradeoff:
+    """Measure what accuracy costs in time: every knob alone, then combinations."""
+
+    HELP: ClassVar[
+        str
+    ] = """Measure what each constant of a splat renderer costs in time and buys in accuracy.
+
+Each knob of Quality is turned alone (the constants of gsplat and of the 2DGS authors among its values), then
+several together. A setting draws in turn with the base, frame by frame, and its picture is compared with a
+float64 one that leaves nothing out. Markers are also compared with the ideal printed texture, and tilted
+until nobody reads them. Results are JSON lines, written as they come; a run that was stopped goes on where
+it was. Keep the machine quiet.
+
+  r100k_720p, r1m_1080p            random splats, as in `fidsplat bench`
+  hard                             haze, veils, opaque stacks, edge-on, tiny, needles, near plane, far away
+  apriltag, qr2, qr5, qr10, qr22   markers at 0, 60 and 80 degrees
+
+Examples:
+  fidsplat tradeoff --quick                              a rough picture, under 3 minutes on two cores
+  fidsplat tradeoff -o gpu --device opencl:nvidia        everything
+  fidsplat tradeoff --scenes hard --knobs alpha_cutoff transmittance_stop
+  fidsplat tradeoff report cpu gpu -o docs/accuracy.md   plots and tables from results"""
+    PARTS: ClassVar[dict[str, type]] = {"report": TradeoffReport}
+
+    out: Annotated[
+        str | None,
+        option(
+            "DIR",
+            f"folder for results (default: {DEFAULT_FOLDER}, with --quick {DEFAULT_FOLDER}-quick)",
+            "-o",
+        ),
+    ] = None
+    device: Annotated[
+        str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")
+    ] = None
+    scenes: Annotated[tuple[str, ...], option("NAME...", "scenes (default: all; --quick: four)")] = ()
+    knobs: Annotated[
+        tuple[str, ...],
+        option("NAME...", "knobs of Quality, or preset, marker, together (default: all)"),
+    ] = ()
+    quick: Annotated[
+        bool, tyro.conf.arg(help="few values, few frames, four scenes", help_behavior_hint="")
+    ] = False
+    anew: Annotated[
+        bool, tyro.conf.arg(help="measure again what is in the results' folder", help_behavior_hint="")
+    ] = False
+    json: Json = False
+
+    def run(self) -> int:
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+        from rich.progress import TimeRemainingColumn as Remaining
+
+        from fidsplat.experiments.tradeoff.run import Settings, planned
+        from fidsplat.render import default_device
+
+        folder = Path(self.out or DEFAULT_FOLDER + ("-quick" if self.quick else ""))
+        device = default_device() if self.device is None else self.device
+        if device == "reference":
+            raise InputError("the reference is what others are measured against; give another --device")
+        settings = Settings(folder, device, self.scenes, self.knobs, self.quick, self.anew)
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+        columns = (*columns, TimeElapsedColumn(), Remaining())
+        refused = []
+        with planned(settings) as plan, Progress(*columns, console=console(True)) as bars:
+            bar = bars.add_task("tradeoff", total=len(plan.work), completed=len(plan.work) - plan.left)
+            for line in plan.run():
+                key = line["key"]
+                words = " ".join(str(key[name]) for name in ("scene", "knob", "value") if name in key)
+                bars.update(bar, advance=1, description=words)
+                if "error" in line["result"]:
+                    refused.append(f"{words}: {line['result']['error']}")
+            file = plan.records.file
+        if self.json:
+            print_json({"file": str(file), "parts": len(plan.work), "refused": refused})
+            return 0
+        where = console(False)
+        for words in refused:
+            where.print(f"not measured: {words}", markup=False, soft_wrap=True)
+        where.print(f"{file}; fidsplat tradeoff report {folder}", markup=False, soft_wrap=True)
+        return 0

@@ -1,0 +1,95 @@
+"""What numbers say of a setting: free, bought, a trap. The words of the report follow from here alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from fidsplat.experiments.tradeoff.report.results import Measured, Results
+
+INVISIBLE = 1 / 512
+"""half a step of 8 bits"""
+TIME_CHANGES = 0.02
+"""share by which the median must differ at least, besides both quartiles lying on that side"""
+ERROR_CHANGES = 1.1
+"""factor"""
+_TINY = 1e-6
+"""errors below this are rounding, and equal"""
+
+FREE, BOUGHT, CHEAPER, TRAP, WASTE, FASTER, NOTHING, MIXED = (
+    "free accuracy",
+    "buys accuracy",
+    "buys time",
+    "trap",
+    "waste",
+    "free time",
+    "no difference",
+    "mixed",
+)
+MEANINGS = {
+    FREE: "smaller error, no slower",
+    FASTER: "faster, no larger error",
+    BOUGHT: "smaller error, slower",
+    CHEAPER: "faster, larger error",
+    TRAP: "larger error, no faster",
+    WASTE: "slower, no smaller error",
+    NOTHING: "neither differs",
+    MIXED: "one of largest error and RMSE falls and the other rises",
+}
+_BY_SIGNS = {
+    (0, -1): FREE, (-1, -1): FREE, (1, -1): BOUGHT, (-1, 0): FASTER, (-1, 1): CHEAPER,
+    (0, 1): TRAP, (1, 1): TRAP, (1, 0): WASTE, (0, 0): NOTHING,
+}  # fmt: skip
+
+
+def verdict(point: Measured, base: Measured) -> str:
+    """What a setting with the base's definition is on a scene, beside the base."""
+    signs = {_sign(point.result[name], base.result[name]) for name in ("maximum", "rmse")}
+    if {-1, 1} <= signs:
+        return MIXED
+    return _BY_SIGNS[time_sign(point, noise(base)), next((sign for sign in signs if sign), 0)]
+
+
+def noise(base: Measured) -> float:
+    """The share by which times differ on a scene for no reason: that of the base drawn beside itself."""
+    return max(TIME_CHANGES, *(abs(quartile - 1) for quartile in base.result["ratio_quartiles"]))
+
+
+def time_sign(point: Measured, least: float) -> int:
+    """-1 for a setting that is faster than the base, 1 for a slower one, 0 where the noise `least` hides
+    it."""
+    low, high = point.result["ratio_quartiles"]
+    if point.ratio < 1 - least and high < 1:
+        return -1
+    return int(point.ratio > 1 + least and low > 1)
+
+
+def _sign(error: float, other: float) -> int:
+    error, other = max(error, _TINY), max(other, _TINY)
+    return int(error > other * ERROR_CHANGES) - int(error * ERROR_CHANGES < other)
+
+
+def front(points: Iterable[Measured]) -> list[Measured]:
+    """Those than which none is both as fast and as accurate, from fast to accurate."""
+    found: list[Measured] = []
+    for point in sorted(points, key=lambda p: (p.ratio, p.maximum)):
+        if not found or point.maximum < found[-1].maximum:
+            found.append(point)
+    return found
+
+
+def cheapest_within(results: Results, scenes: Iterable[str], bound: float) -> tuple[Measured, ...] | None:
+    """The setting, measured on all the scenes, whose error is at most the bound on each apart from certified
+    flips and whose product of time ratios is least: what was measured of it, or None."""
+    scenes = list(scenes)
+    best: tuple[float, tuple[Measured, ...]] | None = None
+    for knob, value in results.settings():
+        found = [results.at(scene, knob, value) for scene in scenes]
+        there = tuple(point for point in found if point is not None and point.same_picture)
+        if len(there) < len(scenes) or not there or any(point.sure > bound for point in there):
+            continue
+        cost = 1.0
+        for point in there:
+            cost *= point.ratio
+        if best is None or cost < best[0]:
+            best = cost, there
+    return None if best is None else best[1]

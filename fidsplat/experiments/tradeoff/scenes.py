@@ -1,0 +1,94 @@
+"""The scenes of `fidsplat tradeoff`: random ones, the hard cases, and markers at three tilts."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+
+from fidsplat.cameras import Camera
+from fidsplat.errors import InputError
+from fidsplat.experiments.scenes import load_scene
+from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS
+from fidsplat.experiments.tradeoff.hard import hard_scene
+from fidsplat.markers import Marker, marker
+from fidsplat.quality import MarkerQuality
+from fidsplat.splats import SplatCloud
+
+RANDOM = ("r100k_720p", "r1m_1080p")
+HARD = "hard"
+MARKERS = {"apriltag": "apriltag", "qr2": "small", "qr5": "medium", "qr10": "large", "qr22": "huge"}
+"""name -> the category of the paper that marker 0 is taken of"""
+FEW_KNOBS = ("apriltag", "qr2", "qr5", "qr22")
+"""markers that show how they are made; what every other knob does to markers qr10 shows"""
+NAMES = (*RANDOM, HARD, *MARKERS)
+QUICK_NAMES = ("r100k_720p", HARD, "apriltag", "qr10")
+TILTS = (0, 60, 80)
+"""degrees from the marker's normal"""
+PROTOCOL = PROTOCOLS["fixed-plane"]
+"""how markers are looked at: a plane of 2 x 2 m, 4 m away, in 800 x 800 pixels"""
+GREY = (BACKGROUND, BACKGROUND, BACKGROUND)
+"""beside the plane of a marker"""
+SEED = 0
+
+
+@dataclass(frozen=True)
+class TradeScene:
+    """One picture to be drawn."""
+
+    name: str
+    """`qr10@60` is the marker qr10 at 60 degrees"""
+    cloud: SplatCloud
+    camera: Camera
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    made: Marker | None = None
+    """the marker, in modules of `PROTOCOL`"""
+
+
+def scene_names(words: Iterable[str], quick: bool = False) -> tuple[str, ...]:
+    """Names of scenes from words, each once; none: all of them, or those of a quick run.
+
+    Raises:
+        InputError: a name that no scene has.
+    """
+    names = tuple(dict.fromkeys(words)) or (QUICK_NAMES if quick else NAMES)
+    for name in names:
+        if name not in NAMES:
+            near = difflib.get_close_matches(name, NAMES, 1)
+            hint = f" (did you mean {near[0]!r}?)" if near else ""
+            raise InputError(f"there is no scene {name!r}{hint}; known: {', '.join(NAMES)}")
+    return names
+
+
+def views_of(name: str) -> tuple[str, ...]:
+    """The pictures that belong to a scene's name: itself, or a marker at each tilt."""
+    return tuple(f"{name}@{tilt}" for tilt in TILTS) if name in MARKERS else (name,)
+
+
+def is_marker(view: str) -> bool:
+    """Whether a picture or a scene's name is of a marker."""
+    return view.partition("@")[0] in MARKERS
+
+
+def make(view: str, knobs: MarkerQuality) -> TradeScene:
+    """A picture of `views_of`; knobs: how its marker becomes splats.
+
+    Raises:
+        InputError: there is no such mixture or template.
+    """
+    name, _, tilt = view.partition("@")
+    if name in MARKERS:
+        made = made_marker(name, knobs)
+        return TradeScene(view, made.cloud, PROTOCOL.camera(float(tilt)), GREY, made)
+    cloud, camera = hard_scene(SEED) if name == HARD else load_scene(name, SEED)
+    return TradeScene(view, cloud, camera)
+
+
+@lru_cache(maxsize=32)
+def made_marker(name: str, knobs: MarkerQuality) -> Marker:
+    """The marker of that name on its plane of 2 x 2 m, quiet zone included."""
+    spec = CATEGORIES[MARKERS[name]].spec(0, SEED)
+    plain = marker(spec)
+    module = PROTOCOL.module(plain.grid.shape[0])
+    return marker(spec, module * plain.bits.shape[1], quality=knobs)

@@ -1,0 +1,85 @@
+"""Milliseconds of a setting and of the base, turn by turn, and the memory that it takes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fidsplat.backends.base import Measurable
+from fidsplat.experiments.tradeoff.points import BASE
+from fidsplat.experiments.tradeoff.table import Table
+from fidsplat.quality import Quality
+from fidsplat.render import Frame
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How long is measured: pairs of frames until `seconds` have passed, within limits."""
+
+    least: int = 5
+    most: int = 30
+    seconds: float = 0.3
+
+
+FULL, QUICK = Effort(), Effort(3, 5, 0.2)
+
+
+def time_point(table: Table, view: str, quality: Quality, effort: Effort) -> tuple[Frame, dict]:
+    """Draw a picture at a setting and at the base in turn.
+
+    Splats lie on the device, the picture stays there; a time is from the call until the device is done.
+    Each pair begins with the other one of the two, and neither counts before both have been drawn once.
+
+    Returns the picture, and `ms`, `base_ms` (medians), their quartiles, `ratio` (median of the pairs' ratios,
+    and its quartiles), `repeats`, `stages_ms` by the device's own clock, `memory_bytes` (scratch, cloud and
+    picture; None where the backend cannot tell), `splats`, `pairs`.
+    """
+    backend = table.renderer.backend
+    scene = table.scene(view, quality.marker)
+    if isinstance(backend, Measurable):
+        backend.release_scratch()
+    frame = table.draw(view, quality)
+    stats = dict(frame.stats)
+    memory = None
+    if isinstance(backend, Measurable):
+        picture = 12 * scene.scene.camera.width * scene.scene.camera.height
+        memory = backend.memory_bytes + scene.resident.memory_bytes + picture
+    _ = table.draw(view, BASE).timings
+    own: list[float] = []
+    base: list[float] = []
+    stages: dict[str, list[float]] = {}
+    end = time.perf_counter() + effort.seconds
+    while len(own) < effort.least or (len(own) < effort.most and time.perf_counter() < end):
+        turns = [(quality, own), (BASE, base)]
+        for which, times in turns[:: -1 if len(own) % 2 else 1]:
+            start = time.perf_counter()
+            timings = table.draw(view, which).timings  # waits for the device
+            times.append(1e3 * (time.perf_counter() - start))
+            if times is own:
+                for stage, ms in timings.items():
+                    stages.setdefault(stage, []).append(ms)
+    ms, ms_quartiles = _middle(own)
+    base_ms, base_quartiles = _middle(base)
+    ratio, ratio_quartiles = _middle(np.divide(own, base).tolist())
+    return frame, {
+        "ms": ms,
+        "ms_quartiles": ms_quartiles,
+        "base_ms": base_ms,
+        "base_quartiles": base_quartiles,
+        "ratio": ratio,
+        "ratio_quartiles": ratio_quartiles,
+        "repeats": len(own),
+        "stages_ms": {stage: float(np.median(times)) for stage, times in stages.items()},
+        "memory_bytes": memory,
+        "splats": stats["splats"],
+        "pairs": stats["pairs"],
+    }
+
+
+def _middle(values: Sequence[float]) -> tuple[float, list[float]]:
+    """The median and the two quartiles."""
+    low, middle, high = np.percentile(values, (25, 50, 75))
+    return float(middle), [float(low), float(high)]

@@ -1,0 +1,76 @@
+"""Knobs of quality in scene files: the table [quality], and a few keys of [render]."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fidsplat.quality import PRESETS, MarkerQuality, Quality, knobs
+from fidsplat.scenes.table import Table
+
+_OF_RENDER = ("samples", "lowpass", "first_hit")
+
+
+def read_knobs(table: Table, kind: type[Quality] | type[MarkerQuality]) -> dict[str, Any]:
+    """Those knobs that a table says, in their types; their ranges are checked by whoever takes them."""
+    readers = {"float": table.number, "int": table.whole, "str": table.text}
+    return {name: readers[wanted.split()[0]](name) for name, wanted in knobs(kind).items() if name in table}
+
+
+def quality_of(top: Table, render: Table) -> Quality | str | None:
+    """What a scene file says of quality: the table [quality], or [render]'s preset and those of its keys."""
+    given = [key for key in ("quality", *_OF_RENDER) if key in render]
+    if "quality" in top:
+        if given:
+            raise render.error(given[0], "and the table [quality] exclude each other; say it there")
+        table = top.table("quality", ("preset", *knobs(Quality), "marker"))
+        with table.at("preset"):
+            plain = Quality.named(table.text("preset", "standard"))
+        changes = read_knobs(table, Quality)
+        if "marker" in table:
+            changes["marker"] = read_knobs(table.table("marker", tuple(knobs(MarkerQuality))), MarkerQuality)
+        with table.at():
+            return plain.with_(**changes)
+    text = render.text("quality", None)
+    with render.at("quality"):
+        quality = Quality.of(text)
+    readers = {"samples": render.whole, "lowpass": render.text, "first_hit": render.number}
+    for key in _OF_RENDER:
+        if key in render:
+            with render.at(key):
+                quality = quality.with_(**{key: readers[key](key)})
+    return quality if set(given) - {"quality"} else text
+
+
+def quality_tables(quality: Quality | str | None) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """What [render] says of a quality, and the tables beside it, by name."""
+    if quality is None:
+        return {}, {}
+    if isinstance(quality, str):
+        return {"quality": quality}, {}
+    own = {key: getattr(quality, key) for key in _OF_RENDER}
+    for name, preset in PRESETS.items():
+        if preset.with_(**own) == quality:
+            return {"quality": name} | _changes(quality, preset), {}
+    plain = PRESETS["standard"]
+    tables = {"quality": {"preset": "standard"} | _changes(quality, plain)}
+    if of_markers := _changes(quality.marker, plain.marker):
+        tables["quality.marker"] = of_markers
+    return {}, tables
+
+
+def _changes(given: Quality | MarkerQuality, plain: Quality | MarkerQuality) -> dict[str, Any]:
+    """The knobs in which two differ, as the first has them. None cannot be said, and no preset says more."""
+    pairs = {name: (getattr(given, name), getattr(plain, name)) for name in knobs(type(given))}
+    return {name: value for name, (value, before) in pairs.items() if value != before}
+
+
+def marker_knobs(made: MarkerQuality, scene: Quality | str | None) -> dict[str, Any]:
+    """What a marker's own table says of how it was made, where the scene's quality does not say the same."""
+    changes = _changes(made, Quality.of(scene).marker)
+    if "growth" in changes and made.growth is None:  # the mixture's own, which a file cannot say
+        from fidsplat.markers.mixture import fitted_growth
+
+        changes["growth"] = fitted_growth() if made.mixture == "fitted" else 0.0
+    concern = {"fitted": ("growth", "template"), "paper": ("levels", "density", "growth")}
+    mine = concern.get(made.mixture, ("template",))
+    return {"mixture": made.mixture} | {name: changes[name] for name in mine if name in changes}

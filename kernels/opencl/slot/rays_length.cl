@@ -1,0 +1,9 @@
+// Length of the ray through a sample per unit of depth along z, of the ray that the lens gives it.
+//@ functions
+static inline float length_of_ray(global const float *restrict rays, size_t plane, size_t at) {
+    float x = rays[at], y = rays[plane + at], z = rays[2 * plane + at];
+    float length = sqrt(FMA(x, x, FMA(y, y, z * z)));
+    return length == length ? length : 1.0f;   // where nothing is seen no depth is multiplied by it but 0
+}
+//@ fog_length
+                length_of_ray(rays, ray_plane, (size_t)fog_y * ray_stride + fog_x)

@@ -1,0 +1,231 @@
+"""Lenses whose samples each have a ray of their own, and where such a lens can see a splat.
+
+A map says which samples' rays lie in a cell of the lens's chart, so bounds hold whatever the rays are. The
+chart of a distorted picture is the ideal one, a fisheye's the stereographic one.
+"""
+
+import math
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from .bounds import box_bounds
+from .common import View, struct_of
+
+COEFFICIENTS = {
+    "camera_brown_conrady": wp.types.vector(12, wp.float64),  # k1 to k6, p1, p2, s1 to s4
+    "camera_fisheye": wp.vec4d,  # k1 to k4
+}
+"""lenses that have some, and a map; they stand before the square of the fold, or the largest angle, that is
+seen
+"""
+LENSES = (*COEFFICIENTS, "camera_equirectangular")
+
+
+@cache
+def make_rays(given: bool):
+    """The struct of what a sample reads: nothing, if all rays follow from the view."""
+    # X, Y, Z along the rows of samples; NaN where nothing is seen
+    fields = {"rays": wp.array(dtype=wp.vec3)}
+    return struct_of("Rays", "The samples' rays.", fields if given else {})
+
+
+@cache
+def make_lens(camera: str | None):
+    """The struct of what the projection reads of a lens, or of none."""
+    fields = {"rays": wp.array(dtype=wp.vec3)}
+    if camera in COEFFICIENTS:
+        fields |= {
+            "k": COEFFICIENTS[camera],
+            "limit": wp.float64,
+            # first and last column and row of the samples in each cell; then grids of half as many a side
+            "cells": wp.array(dtype=wp.vec4s),
+            "side": wp.int32,  # cells
+            "low": wp.vec2d,  # corner of the first cell
+            "per_unit": wp.vec2d,  # cells
+            "top": wp.int32,  # row of the map's picture that is the first of this one
+        }
+    return struct_of("Lens", "What the projection reads of a lens.", fields if camera else {})
+
+
+@cache
+def make_optics(camera: str, real) -> SimpleNamespace:
+    """image(p, view, lens): where a point falls, and whether it is seen; anchor(x, y, p, view, lens): the ray
+    about which a splat's forms are kept.
+
+    And for bounds: mapped(x0, x1, y0, y1, lens) of a box of the chart, or
+    enclose(a, b, p, radius, view, lens) of a disk.
+    """
+    Lens = make_lens(camera)
+    vec2, vec3 = wp.types.vector(2, real), wp.types.vector(3, real)
+    zero, half, one, two, pi = real(0.0), real(0.5), real(1.0), real(2.0), real(math.pi)
+    # room for the rounding of rays and of the per-sample test: relative; radians, or of the chart; cells
+    more, pad, room = real(1.0002), real(1e-6), real(0.02)
+
+    @wp.func
+    def cone(a: vec3, b: vec3, p: vec3, radius: real) -> real:
+        """Half of the angle of a cone about p that holds the disk p + u a + v b, u^2 + v^2 <= radius^2; pi if
+        that is a right angle or more.
+
+        |p x c| / (p c) is the tangent of the angle of c: what it is at most, over what it is at least.
+        """
+        across_a, across_b = wp.cross(p, a), wp.cross(p, b)
+        aa, ab, bb = wp.dot(across_a, across_a), wp.dot(across_a, across_b), wp.dot(across_b, across_b)
+        widest = half * (aa + bb + wp.sqrt((aa - bb) * (aa - bb) + real(4.0) * ab * ab))
+        along_a, along_b = wp.dot(p, a), wp.dot(p, b)
+        along = wp.dot(p, p) - radius * wp.sqrt(along_a * along_a + along_b * along_b)
+        if along > zero:
+            return wp.atan2(radius * wp.sqrt(widest), along) * more + pad
+        return pi
+
+    @wp.func
+    def mapped(x0: real, x1: real, y0: real, y1: real, lens: Lens):
+        """Bounds of the samples whose rays lie in [x0, x1] x [y0, y1] of the chart."""
+        side = lens.side
+        end = real(side)
+        low = vec2(
+            (x0 - real(lens.low[0])) * real(lens.per_unit[0]) - room,
+            (y0 - real(lens.low[1])) * real(lens.per_unit[1]) - room,
+        )
+        high = vec2(
+            (x1 - real(lens.low[0])) * real(lens.per_unit[0]) + room,
+            (y1 - real(lens.low[1])) * real(lens.per_unit[1]) + room,
+        )
+        left, right, top, bottom = int(32767), int(-1), int(32767), int(-1)
+        if high[0] >= zero and low[0] <= end and high[1] >= zero and low[1] <= end:
+            i0, i1 = cell(low[0], side), cell(high[0], side)
+            j0, j1 = cell(low[1], side), cell(high[1], side)
+            grid = int(0)
+            # to a grid in which they are few
+            while i1 - i0 >= 6 or j1 - j0 >= 6:
+                grid += side * side
+                side = side / 2
+                i0, i1, j0, j1 = i0 / 2, i1 / 2, j0 / 2, j1 / 2
+            for j in range(j0, j1 + 1):
+                for i in range(i0, i1 + 1):
+                    samples = lens.cells[grid + j * side + i]
+                    left, right = wp.min(left, int(samples[0])), wp.max(right, int(samples[1]))
+                    top, bottom = wp.min(top, int(samples[2])), wp.max(bottom, int(samples[3]))
+        # of none it is inside out, and reaches no sample
+        return box_bounds(
+            float(left) + 0.5, float(right) + 0.5, float(top - lens.top) + 0.5, float(bottom - lens.top) + 0.5
+        )
+
+    @wp.func
+    def cell(x: real, side: int) -> int:
+        return wp.min(int(wp.clamp(x, zero, real(side))), side - 1)
+
+    @wp.func
+    def image_distorted(p: vec3, view: View, lens: Lens):
+        x, y = p[0] / p[2], p[1] / p[2]
+        q = x * x + y * y
+        k1, k2, k3 = real(lens.k[0]), real(lens.k[1]), real(lens.k[2])
+        k4, k5, k6 = real(lens.k[3]), real(lens.k[4]), real(lens.k[5])
+        p1, p2 = real(lens.k[6]), real(lens.k[7])
+        s1, s2, s3, s4 = real(lens.k[8]), real(lens.k[9]), real(lens.k[10]), real(lens.k[11])
+        radial = (one + q * (k1 + q * (k2 + q * k3))) / (one + q * (k4 + q * (k5 + q * k6)))
+        a = x * radial + two * p1 * x * y + p2 * (q + two * x * x) + q * (s1 + q * s2)
+        b = y * radial + two * p2 * x * y + p1 * (q + two * y * y) + q * (s3 + q * s4)
+        return real(view.fx) * a + real(view.cx), real(view.fy) * b + real(view.cy), q < real(lens.limit)
+
+    @wp.func
+    def image_fisheye(p: vec3, view: View, lens: Lens):
+        across = wp.sqrt(p[0] * p[0] + p[1] * p[1])
+        angle = wp.atan2(across, p[2])
+        q = angle * angle
+        k1, k2, k3, k4 = real(lens.k[0]), real(lens.k[1]), real(lens.k[2]), real(lens.k[3])
+        away = angle * (one + q * (k1 + q * (k2 + q * (k3 + q * k4))))
+        x, y = zero, zero
+        if across > zero:
+            x = p[0] / across * away
+            y = p[1] / across * away
+        x = real(view.fx) * x + real(view.cx)
+        y = real(view.fy) * y + real(view.cy)
+        return x, y, angle <= real(lens.limit)
+
+    @wp.func
+    def extremes(above: vec3, below: vec3, radius: real) -> vec2:
+        """Least and greatest (above (u, v, 1)) / (below (u, v, 1)) with u^2 + v^2 <= radius^2, where the
+        divisor is above 0.
+        """
+        middle = above[2] / below[2]
+        slope = vec2(below[0], below[1])
+        x = vec2(above[0], above[1]) - middle * slope
+        reach = radius * wp.length(slope)
+        h = radius * radius / ((below[2] - reach) * (below[2] + reach))
+        m = -h * wp.dot(x, slope)
+        aside = wp.sqrt(m * m + h * wp.dot(x, x))
+        return vec2(middle + m - aside, middle + m + aside)
+
+    @wp.func
+    def enclose_fisheye(a: vec3, b: vec3, p: vec3, radius: real, view: View, lens: Lens):
+        """In the stereographic picture (X, Y) / (|r| + Z), with |r| between the part of r along p and that
+        over the cosine of the cone's angle: between them the quotient is largest and least at either.
+        """
+        away, w = wp.length(p), cone(a, b, p, radius)
+        x0, x1, y0, y1 = real(wp.inf), -real(wp.inf), real(wp.inf), -real(wp.inf)
+        for end in range(2):
+            per_away = wp.where(end == 0, one, one / wp.cos(w)) / away
+            below = vec3(
+                a[2] + per_away * wp.dot(a, p), b[2] + per_away * wp.dot(b, p), p[2] + per_away * away * away
+            )
+            # else it may hold the direction -z, which lies at infinity
+            if (
+                w < real(1.5)
+                and below[2] - radius * wp.sqrt(below[0] * below[0] + below[1] * below[1]) > real(1e-3) * away
+            ):
+                x = extremes(vec3(a[0], b[0], p[0]), below, radius)
+                y = extremes(vec3(a[1], b[1], p[1]), below, radius)
+                x0, x1, y0, y1 = wp.min(x0, x[0]), wp.max(x1, x[1]), wp.min(y0, y[0]), wp.max(y1, y[1])
+            else:
+                x0, x1, y0, y1 = -real(wp.inf), real(wp.inf), -real(wp.inf), real(wp.inf)
+        more_x, more_y = (x1 - x0) * (more - one) + pad, (y1 - y0) * (more - one) + pad
+        return mapped(x0 - more_x, x1 + more_x, y0 - more_y, y1 + more_y, lens)
+
+    @wp.func
+    def image_panorama(p: vec3, view: View, lens: Lens):
+        longitude = wp.atan2(p[0], p[2])
+        latitude = wp.atan2(p[1], wp.sqrt(p[0] * p[0] + p[2] * p[2]))
+        return real(view.fx) * longitude + real(view.cx), real(view.fy) * latitude + real(view.cy), True
+
+    @wp.func
+    def enclose_panorama(a: vec3, b: vec3, p: vec3, radius: real, view: View, lens: Lens):
+        """A cone of half angle w about latitude t reaches asin(sin w / cos t) of longitude to both sides; all
+        around, if it holds a pole or crosses the edge of longitudes.
+        """
+        longitude = wp.atan2(p[0], p[2])
+        latitude = wp.atan2(p[1], wp.sqrt(p[0] * p[0] + p[2] * p[2]))
+        w = cone(a, b, p, radius)
+        west, east = -pi, pi
+        if wp.abs(latitude) + w < half * pi:
+            aside = wp.asin(wp.min(wp.sin(w) / wp.cos(latitude), one)) * more + pad
+            if wp.abs(longitude) + aside < pi:
+                west = longitude - aside
+                east = longitude + aside
+        fx, fy, cx, cy = real(view.fx), real(view.fy), real(view.cx), real(view.cy)
+        return box_bounds(
+            float(fx * west + cx),
+            float(fx * east + cx),
+            float(fy * (latitude - w) + cy),
+            float(fy * (latitude + w) + cy),
+        )
+
+    @wp.func
+    def anchor(column: int, row: int, p: vec3, view: View, lens: Lens) -> wp.vec3:
+        """The ray of that sample; the direction of p where it sees nothing."""
+        ray = lens.rays[row * view.width + column]
+        if ray[0] != ray[0]:
+            away = wp.length(p)
+            ray = wp.vec3(0.0, 0.0, 0.0)
+            if away > zero:
+                ray = wp.vec3(float(p[0] / away), float(p[1] / away), float(p[2] / away))
+        return ray
+
+    image = {
+        "camera_brown_conrady": image_distorted,
+        "camera_fisheye": image_fisheye,
+        "camera_equirectangular": image_panorama,
+    }[camera]
+    enclose = {"camera_fisheye": enclose_fisheye, "camera_equirectangular": enclose_panorama}.get(camera)
+    return SimpleNamespace(Lens=Lens, image=image, anchor=anchor, mapped=mapped, enclose=enclose)

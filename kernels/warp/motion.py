@@ -1,0 +1,40 @@
+"""Splats that move by themselves: their label says in which group, and each group has a pose of its own."""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from .common import struct_of
+
+
+@wp.struct
+class Pose:
+    """What a picture's `View` says of where splats stand, for one group."""
+
+    rotation: wp.mat33d  # to camera
+    translation: wp.vec3d  # where the cloud's origin lies in the camera frame [m]
+    eye: wp.vec3d  # the camera's centre relative to the cloud's origin, axes of the group [m]
+
+
+@cache
+def make_motion(moves: bool) -> SimpleNamespace:
+    """Moving, which holds nothing where nothing moves, and group_of(moving, i): the group of a splat, -1 for
+    none.
+    """
+    fields = {
+        "labels": wp.array(dtype=wp.int32),  # (n)
+        "groups": wp.array(dtype=wp.int32),  # (groups) their labels
+        "poses": wp.array(dtype=Pose),  # (groups)
+    }
+    Moving = struct_of("Moving", "What moves, and how.", fields if moves else {})
+
+    @wp.func
+    def group_of(moving: Moving, i: int) -> int:
+        found = int(-1)
+        for group in range(moving.groups.shape[0]):
+            if moving.groups[group] == moving.labels[i]:
+                found = group
+        return found
+
+    return SimpleNamespace(Moving=Moving, group_of=group_of)

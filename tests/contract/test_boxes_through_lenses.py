@@ -1,0 +1,160 @@
+"""Boxes through lenses: no seam in a sheet of them, bounds that lose nothing, the area of their image."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from agreement import assert_agrees, random_splats, reference_pixels
+from test_boxes import EXACT, boxes_of, cut
+from test_lens_pictures import CAMERAS
+
+import fidsplat as fs
+from fidsplat.backends.exposure import exposed_view
+from fidsplat.backends.opencl.assemble import DeviceShape
+from fidsplat.cameras.raster import raster_of
+from fidsplat.effects import select
+from fidsplat.rotations import quaternion_to_matrix
+
+BACKEND = "opencl"
+
+SEAM = 1e-3
+each_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+
+
+@each_camera
+@pytest.mark.parametrize("seed", [0, 1])
+def test_boxes_all_around_the_camera(renderer, camera, seed):
+    """Bounds lose nothing: the reference asks every sample."""
+    assert_agrees(renderer, random_splats(80, seed, depth=(-5.0, 6.0)).with_boxes(), camera, quality=EXACT)
+
+
+@each_camera
+def test_small_boxes_of_all_shapes(renderer, camera):
+    cloud = random_splats(200, 4, depth=(-4.0, 4.0), scale=(1e-4, 0.2), across=4.0)
+    assert_agrees(renderer, cloud.with_boxes(), camera, quality=EXACT)
+
+
+@each_camera
+def test_boxes_much_larger_than_the_picture(renderer, camera):
+    cloud = random_splats(40, 5, depth=(-4.0, 4.0), scale=(0.1, 30.0))
+    assert_agrees(renderer, cloud.with_boxes(), camera, quality=EXACT)
+
+
+@each_camera
+@pytest.mark.parametrize("samples", [1, 2])
+def test_boxes_and_gaussians_in_layers(renderer, camera, samples):
+    pose = np.eye(4)
+    pose[:3, 3] = (0.1, 0, 2)
+    tag = fs.marker("apriltag:36h11:5", size=0.8, mixture="exact").cloud.transformed(pose)
+    around = random_splats(80, seed=3, depth=(-2.0, 3.5), scale=(0.02, 0.2))
+    mixed = fs.SplatCloud.concatenate([tag, around.with_boxes(np.arange(80) % 3 == 0)])
+    assert_agrees(renderer, mixed, camera, quality=fs.Quality(samples=samples))
+
+
+LARGE = {
+    "distortion": fs.Camera.pinhole(480, 360, 400.0, 400.0, 240.0, 180.0, lens=fs.BrownConrady(-0.2, 0.05)),
+    "fisheye": fs.Camera.fisheye(480, 360, math.radians(150)),
+    "panorama": fs.Camera.equirectangular(480, 240),
+}
+
+
+@pytest.mark.parametrize("camera", LARGE.values(), ids=LARGE)
+def test_a_small_box_is_listed_for_few_tiles(renderer, camera):
+    """No more than 1.2 times those of a Gaussian of three standard deviations, while it is not seen edge-on."""
+    cloud = random_splats(300, 2, depth=(0.8, 4.0), scale=(0.01, 0.04), across=0.8)
+    turns = np.random.default_rng(1).uniform(-0.15, 0.15, (300, 4)) + (1, 0, 0, 0)
+    cloud = fs.SplatCloud(cloud.means, turns, cloud.scales, np.ones(300), colors=cloud.colors)
+    boxes = renderer.render(cloud.with_boxes(), camera, quality=EXACT)
+    disks = renderer.render(cloud, camera, quality=EXACT)
+    assert boxes.stats["visible"] > 50
+    assert boxes.stats["pairs"] < 1.2 * disks.stats["pairs"]
+
+
+def seen_from(camera, tilt, distance, spin=20.0):
+    """The camera before the middle of a sheet 1 m wide at z = 0, off its axis."""
+    a, b = math.radians(tilt), math.radians(spin)
+    target = np.array((0.11, 0.07, 0.0))
+    away = np.array([math.sin(a) * math.cos(b), math.sin(a) * math.sin(b), -math.cos(a)])
+    pose = fs.Camera.look_at(64, 48, 1.0, target + distance * away, target + (0.1 * distance, 0, 0))
+    return replace(camera, world_to_camera=pose.world_to_camera, position=None)
+
+
+def widened(camera):
+    """Samples (h, w) that see ten times as wide as others do: the last ones before the fold of a distortion."""
+    if camera.lens.kind == "orthographic":
+        return np.zeros((camera.height, camera.width), bool)
+    raster = raster_of(camera.lens, camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    width = np.linalg.norm(raster.slopes, axis=(2, 3))
+    return width > 10 * np.nanmedian(width)
+
+
+@each_camera
+@pytest.mark.parametrize(
+    ("tilt", "distance"), [(0, 0.1), (60, 0.1), (0, 0.7), (40, 0.7), (75, 0.7), (40, 8.0)]
+)
+def test_boxes_of_a_sheet_add_up_to_it(renderer, camera, tilt, distance):
+    """A sheet cut at random covers what one box of its size covers in every pixel, and a white one is as white."""
+    corners = np.array(cut((9, 9), np.random.default_rng(7)), float)
+    half = (corners[:, 2:] - corners[:, :2]) / 2
+    middle = (corners[:, :2] + corners[:, 2:]) / 2 - 4.5
+    sheet = boxes_of(middle / 9, half / 9)
+    whole = boxes_of(np.zeros((1, 2)), np.full((1, 2), 0.5))
+    # parallel rays would see the near plane cut the sheet
+    looking = seen_from(camera, tilt, 0.7 if camera.lens.kind == "orthographic" else distance)
+    quality = EXACT.with_(transmittance_stop=0.0)
+    parts, one = (renderer.render(cloud, looking, ("rgb", "alpha"), quality) for cloud in (sheet, whole))
+    assert one["alpha"].max() > 0.3
+    even = ~widened(looking)
+    assert even.mean() > 0.9
+    assert np.abs(parts["alpha"] - one["alpha"])[even].max() < SEAM
+    assert np.abs(parts["rgb"] - parts["alpha"][..., None])[even].max() < SEAM
+
+
+@each_camera
+@pytest.mark.parametrize("size", [0.004, 0.2])
+def test_light_is_that_of_the_image(renderer, camera, size):
+    """The opacities that a tilted box adds to a picture sum up to the area of its image, below a pixel and above it."""
+    turn = [math.cos(0.35), math.sin(0.35), 0.2, 0.1]
+    box = fs.SplatCloud(
+        [(0.1, 0.1, 0.1)], [turn], [(size, 1.5 * size)], [1.0], colors=[(1, 1, 1)]
+    ).with_boxes()
+    looking = seen_from(camera, 10, 2.0)
+    edge = np.linspace(-1, 1, 50)
+    around = [(edge, -1 + 0 * edge), (1 + 0 * edge, edge), (-edge, 1 + 0 * edge), (-1 + 0 * edge, -edge)]
+    outline = np.concatenate([np.stack(side, 1)[:-1] for side in around]) * (size, 1.5 * size)
+    x, y = looking.project(box.means[0] + outline @ quaternion_to_matrix(box.quats)[0, :, :2].T).T
+    area = abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2
+    areas = []
+    grid = np.stack(np.meshgrid(np.arange(8), np.arange(8)), 2).reshape(-1, 2)
+    for shift in (grid + np.random.default_rng(0).uniform(0, 1, (64, 2))) / 8:
+        moved = replace(looking, cx=looking.cx + shift[0], cy=looking.cy + shift[1])
+        areas.append(float(renderer.render(box, moved, "alpha", EXACT)["alpha"].sum()))
+    assert np.mean(areas) == pytest.approx(area, rel=0.03)
+
+
+def test_the_other_schedule_draws_the_same_boxes(renderer):
+    """The kernels of GPUs on whatever device this is."""
+    cloud = random_splats(60, seed=3, depth=(-2, 4))
+    cloud = cloud.with_boxes(np.arange(60) % 2 == 0)
+    backend = renderer.backend
+    shape = DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, 256, backend.shape.fast_fma)
+    for name in ("distortion", "fisheye", "panorama", "parallel"):
+        camera = CAMERAS[name]
+        view = exposed_view(camera, fs.Quality(), cloud.origin, (0, 0, 0), fs.Motion(), fs.Shutter())
+        features = select(cloud, ("rgb", "depth"), fs.Quality(), camera)
+        resident = backend.upload(cloud)
+        one = backend.pipeline(features).render(resident, view)
+        other = backend.pipeline(features, shape).render(resident, view)
+        for plane in ("rgb", "depth"):
+            np.testing.assert_allclose(other.read(plane), one.read(plane), atol=1e-6, rtol=1e-6)
+
+
+def test_boxes_through_lenses_in_single_precision(renderer):
+    """The set-up of devices without float64, held as Gaussians are: to a tenth of an 8-bit step."""
+    cloud = random_splats(100, 0, depth=(0.5, 6.0)).with_boxes()
+    for name in ("distortion", "fisheye", "panorama"):
+        frame = renderer.render(cloud, CAMERAS[name], quality="fast")
+        truth = reference_pixels(cloud, CAMERAS[name], ("rgb",), "fast")
+        excess = np.abs(frame["rgb"] - truth["rgb"]).max(2) - truth["certificate"]
+        assert np.quantile(excess, 0.995) < 0.1 / 255

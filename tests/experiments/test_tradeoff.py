@@ -1,0 +1,252 @@
+"""`fidsplat tradeoff`: what is measured, how it is judged, how a run survives."""
+
+import json
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.cli import main
+from fidsplat.experiments.records import read_lines
+from fidsplat.experiments.tradeoff import judging, run
+from fidsplat.experiments.tradeoff.hard import CELLS, cell_window, hard_scene
+from fidsplat.experiments.tradeoff.points import ALONE, BASE, EXACT, KNOBS, decode_points, points, quality_of
+from fidsplat.experiments.tradeoff.scenes import NAMES, TradeScene, make, scene_names
+from fidsplat.experiments.tradeoff.table import Table
+from fidsplat.experiments.tradeoff.timing import QUICK, time_point
+from fidsplat.hard_cases.clouds import camera, splats
+from fidsplat.quality import MarkerQuality
+
+FACING = (1.0, 0.0, 0.0, 0.0)
+WORDS = ("tradeoff", "--quick", "--scenes", "apriltag", "--knobs", "opacity_ceiling")
+
+
+@pytest.fixture(scope="module")
+def table():
+    return Table(fs.Renderer("opencl"))
+
+
+def faint_rim() -> TradeScene:
+    """One opaque splat on black, facing the camera: its rim is what a cut-off takes."""
+    cloud = splats([[0.0, 0.0, 2.0]], FACING, (0.2, 0.2), 1.0, (1.0, 0.5, 0.25))
+    return TradeScene("rim", cloud, camera(64, 48, 60.0))
+
+
+def drawn(renderer: fs.Renderer, scene: TradeScene, quality: fs.Quality) -> np.ndarray:
+    return renderer.render(scene.cloud, scene.camera, quality=quality, background=scene.background)["rgb"]
+
+
+def test_every_setting_is_one_knob_away_from_the_base():
+    for on_marker in (False, True):
+        for point in points(KNOBS, on_marker):
+            near = EXACT if point.knob == ALONE else BASE
+            turned = {name for name in vars(BASE) if getattr(point.quality, name) != getattr(near, name)}
+            if point.knob in vars(BASE):
+                # the exclusive stop knows no layers; markers are also drawn without a low-pass
+                beside = {"coplanar"} if point.value == "exclusive" else {"lowpass", "samples"}
+                wanted = beside if point.knob == "marker" or "coplanar" in beside else set()
+                assert turned, point
+                assert turned <= {point.knob, *wanted}, point
+            elif point.knob == ALONE and point.value != "exact":
+                assert point.value.split()[0] in turned
+
+
+def test_the_constants_of_other_systems_are_among_the_settings():
+    found = {(point.knob, point.value) for point in points(KNOBS, False)}
+    assert {
+        ("alpha_cutoff", "3 sigma"), ("opacity_ceiling", "0.99"), ("stop_rule", "exclusive"),
+        ("lowpass", "none"), ("depth_key_bits", "16"), ("preset", "gsplat"), (ALONE, "alpha_cutoff 1/255"),
+        (ALONE, "transmittance_stop 0.0001"),
+    } <= found  # fmt: skip
+    assert {point.quality.marker.mixture for point in decode_points(KNOBS)} == {"fitted", "paper", "exact"}
+
+
+def test_parts_are_all_different_and_the_telling_ones_come_first():
+    for quick in (False, True):
+        parts = run.all_parts((), (), quick)
+        assert len({json.dumps(part, sort_keys=True) for part in parts}) == len(parts)
+        assert parts[0]["knob"] == "base"
+    full = run.all_parts((), (), False)
+    assert {part["scene"].partition("@")[0] for part in full} == set(NAMES)
+    knobs = [part.get("knob") for part in full]
+    assert knobs.index("tile_size") > max(i for i, knob in enumerate(knobs) if knob == "alpha_cutoff")
+    for point in points(KNOBS, True):
+        assert quality_of(json.loads(json.dumps(point.key()))["quality"]) == point.quality
+    again = [quality_of(part["quality"]) for part in full if part.get("quality") is not None]
+    assert BASE in again
+    assert EXACT in again
+
+
+def test_the_hard_scene_is_the_same_each_time_and_fills_its_cells(table):
+    (one, camera_), (other, _) = hard_scene(), hard_scene()
+    assert all(
+        np.array_equal(getattr(one, name), getattr(other, name)) for name in ("means", "scales", "quats")
+    )
+    assert len(one) > 5000
+    assert np.linalg.norm(one.origin) > 1e6
+    picture = table.draw("hard", EXACT)["rgb"]
+    assert picture.shape == (camera_.height, camera_.width, 3)
+    for number, name in enumerate(CELLS):
+        assert picture[cell_window(number)].max() > 0.1, name
+    # it hurts what it is to hurt: the haze is lost below 1/255, dropped layers let the lamp through
+    off = np.abs(table.draw("hard", BASE)["rgb"] - picture)
+    assert off[cell_window(CELLS.index("haze"))].max() > 0.1
+    dropped = table.draw("hard", BASE.with_(stop_rule="exclusive", coplanar="order"))["rgb"]
+    assert np.abs(dropped - picture)[cell_window(CELLS.index("opaque"))].max() > 0.5
+
+
+def test_errors_are_those_of_the_cut_off():
+    renderer, scene = fs.Renderer("opencl"), faint_rim()
+    cut = fs.Quality(alpha_cutoff=0.1)
+    exact = np.asarray(drawn(renderer, scene, EXACT), np.float64)
+    result = judging.judge_picture(drawn(renderer, scene, cut), exact, scene, cut)
+    # just outside the radius alpha is just below the cut-off
+    assert 0.09 < result["maximum"] < 0.1
+    assert result["p999"] <= result["maximum"]
+    assert result["rmse"] == pytest.approx(np.sqrt(((drawn(renderer, scene, cut) - exact) ** 2).mean()))
+    assert result["psnr"] == pytest.approx(-20 * np.log10(result["rmse"]))
+    # no pixel's decision hangs on rounding, so certificates take nothing away
+    assert result["maximum_sure"] == pytest.approx(result["maximum"], abs=1e-4)
+    same = judging.judge_picture(exact.astype(np.float32), exact, scene, EXACT)
+    assert same["psnr"] is None or same["psnr"] > 120
+
+
+def test_a_certified_flip_is_no_error():
+    renderer, scene = fs.Renderer("opencl"), faint_rim()
+    quality = fs.Quality(alpha_cutoff=0.1)
+    truth_of = judging.truth_of(
+        judging.Picture(scene.cloud, scene.camera, quality, ("rgb",)),
+        tuple(part.ravel() for part in np.mgrid[0:48, 0:64]),
+    )
+    certificate = truth_of["certificate"].reshape(48, 64)
+    off = np.zeros((48, 64))
+    row, column = np.unravel_index(np.argmax(certificate), off.shape)
+    off[row, column] = certificate[row, column]
+    assert judging.beyond_certificates(off, scene, quality) <= 1e-12
+    # an error that nothing certifies stays
+    off[24, 32] = 0.3
+    assert certificate[24, 32] < 1e-3
+    assert judging.beyond_certificates(off, scene, quality) == pytest.approx(0.3, abs=1e-3)
+    assert drawn(renderer, scene, quality)[24, 32].max() > 0.9
+
+
+def test_many_splats_have_no_certificates(monkeypatch):
+    monkeypatch.setattr(judging, "_PAIRS", 5)
+    assert judging.beyond_certificates(np.zeros((48, 64)), faint_rim(), BASE) is None
+
+
+def test_a_marker_is_held_against_the_printed_texture(table):
+    result = {}
+    for mixture in ("fitted", "exact"):
+        quality = BASE.with_(marker=MarkerQuality(mixture))
+        scene = make("apriltag@60", quality.marker)
+        frame, times = time_point(table, "apriltag@60", quality, QUICK)
+        result[mixture] = times | judging.judge_marker(frame["rgb"], scene)
+    assert result["exact"]["ideal_psnr"] > 50 > result["fitted"]["ideal_psnr"] > 20
+    assert result["exact"]["corners_px"] < 0.1
+    assert result["exact"]["splats"] == result["exact"]["rectangles"]
+    assert result["fitted"]["splats"] > 20 * result["fitted"]["rectangles"]
+    for found in result.values():
+        assert found["repeats"] >= QUICK.least
+        assert found["ms"] > 0
+        assert found["base_ms"] > 0
+        assert found["memory_bytes"] > 0
+        assert found["ratio_quartiles"][0] <= found["ratio"] <= found["ratio_quartiles"][1]
+
+
+def test_memory_is_that_of_the_setting_alone(table):
+    def memory(quality):
+        return time_point(table, "apriltag@0", quality, QUICK)[1]["memory_bytes"]
+
+    small = memory(BASE)
+    assert memory(BASE.with_(samples=3, lowpass="none")) > 2 * small
+    assert memory(BASE) == small
+
+
+def test_a_definition_has_a_truth_of_its_own(table):
+    assert table.truth("apriltag@0", BASE) is table.truth("apriltag@0", BASE.with_(alpha_cutoff=0.01))
+    order = BASE.with_(coplanar="order")
+    assert np.abs(table.truth("apriltag@0", BASE) - table.truth("apriltag@0", order)).max() > 0.1
+    # only coplanar splats have a rule
+    assert table.truth("hard", BASE) is table.truth("hard", order)
+    full = table.full("hard", BASE)
+    found = judging.check_truth(table.truth("hard", BASE), table.scene("hard", BASE.marker).scene, full)
+    assert found["pixels"] == 64
+    assert found["maximum"] < 2e-6
+
+
+def test_an_interrupted_run_goes_on(capsys, tmp_path, monkeypatch):
+    words = [*WORDS, "-o", str(tmp_path), "--json"]
+    real, begun = run._begin, []
+
+    def stopped(table, part, quick):
+        begun.append(part)
+        if len(begun) > 2:
+            raise KeyboardInterrupt
+        return real(table, part, quick)
+
+    monkeypatch.setattr(run, "_begin", stopped)
+    monkeypatch.setattr(run.Settings, "workers", 1)
+    assert main(words) == 130
+    assert "interrupted" in capsys.readouterr().err
+    file = tmp_path / run.FILE
+    first = file.read_text()
+    assert [line["key"] for line in read_lines(file)] == begun[:2]
+
+    monkeypatch.setattr(run, "_begin", real)
+    assert main(words) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told == {"file": str(file), "parts": len(read_lines(file)), "refused": []}
+    assert file.read_text().startswith(first)
+    lines = read_lines(file)
+    assert {line["key"]["what"] for line in lines} == {"point", "decode", "truth"}
+    assert all(line["run"]["device"] and line["run"]["commit"] for line in lines)
+    read = {line["key"]["knob"]: line["result"]["read"] for line in lines if line["key"]["what"] == "decode"}
+    assert read["ideal"].startswith("111")
+    assert read["base"].startswith("111")
+
+    before = file.read_bytes()
+    assert main(words) == 0  # nothing is left to do
+    assert file.read_bytes() == before
+
+
+def test_what_a_device_refuses_is_a_result(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise fs.InputError("no halves here")
+
+    monkeypatch.setattr(run, "_begin", refuse)
+    settings = run.Settings(tmp_path, "opencl", ("apriltag",), ("samples",), quick=True)
+    with run.planned(settings) as plan:
+        lines = list(plan.run())
+    assert lines
+    assert all(line["result"] == {"error": "no halves here"} for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--scenes", "qr11"], "there is no scene 'qr11' (did you mean 'qr10'?)"),
+        (["--knobs", "alpha_cutof"], "there is no knob 'alpha_cutof' (did you mean 'alpha_cutoff'?)"),
+        (["--device", "reference"], "give another --device"),
+        (["report", "nowhere"], "no results in nowhere"),
+    ],
+)
+def test_wrong_words_are_one_line(capsys, tmp_path, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    assert main(["tradeoff", *words]) == 2
+    out, err = capsys.readouterr()
+    assert (out, err.count("\n")) == ("", 1)
+    assert message in err
+
+
+@pytest.mark.parametrize("words", [(), ("report",)])
+def test_help_teaches(capsys, words):
+    assert main(["tradeoff", *words, "--help"]) == 0
+    out = capsys.readouterr().out
+    assert f"usage: {' '.join(('fidsplat tradeoff', *words))}" in out
+    assert "  fidsplat tradeoff report cpu gpu -o docs/accuracy.md" in out
+
+
+def test_names_of_scenes():
+    assert scene_names(()) == NAMES
+    assert scene_names(("hard", "hard")) == ("hard",)
