@@ -95,6 +95,8 @@ def test_splat_ids_are_indices_of_the_cloud_in_chunks_too(renderer):
     assert ids.max() > 2000
     seen = ids >= 0
     assert np.array_equal(cloud.labels[ids[seen]], whole["label"][seen])
+    if not renderer.device.name.startswith("opencl"):
+        return  # Warp draws no cloud in chunks (docs/backends.md)
     # a GPU's tables for drawing in chunks take more
     budget = 1_000_000 if renderer.device.kind == "cpu" else 3_000_000
     small = fs.Renderer(renderer.device.name, memory_budget=budget)

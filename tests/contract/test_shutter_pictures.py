@@ -54,7 +54,8 @@ MOTION = fs.Motion(pose_at, {3: turned, 5: lambda time: turned(-time)})
 
 def truth(cloud, camera, quality, outputs, motion, shutter):
     view = exposed_view(camera, quality, cloud.origin, BACKGROUND, motion, shutter)
-    features = select(cloud, (*outputs, "alpha"), quality, camera, bool(view.groups), bool(view.shots))
+    kinds = {"moving": bool(view.groups), "exposed": bool(view.shots)}
+    features = select(cloud, (*outputs, "alpha"), quality, camera, **kinds)
     judge = ReferenceBackend()
     return judge.pipeline(features).render(judge.upload(cloud), view).planes
 

@@ -122,7 +122,7 @@ def test_a_certified_flip_is_no_error():
     off = np.zeros((48, 64))
     row, column = np.unravel_index(np.argmax(certificate), off.shape)
     off[row, column] = certificate[row, column]
-    assert judging.beyond_certificates(off, scene, quality) <= 1e-12
+    assert judging.beyond_certificates(off, scene, quality) == pytest.approx(0.0, abs=1e-12)
     # an error that nothing certifies stays
     off[24, 32] = 0.3
     assert certificate[24, 32] < 1e-3

@@ -123,13 +123,13 @@ def test_the_front_has_nothing_that_is_beaten():
 def test_the_cheapest_invisible_error_is_the_cheapest_on_all_scenes():
     lines = plain_lines("hard") + plain_lines("r100k_720p")
     chosen = verdicts.cheapest_within(Results("d", lines), ("hard", "r100k_720p"), verdicts.INVISIBLE)
-    assert {point.words for point in chosen} == {"alpha_cutoff 1/1024"}
+    assert {point.words for point in chosen or ()} == {"alpha_cutoff 1/1024"}
     # beyond its certificates the other is invisible too, on one of the scenes
     for each in lines:
         if each["key"]["value"] == "16" and each["key"]["scene"] == "hard":
             each["result"]["maximum_sure"] = 0.001
     chosen = verdicts.cheapest_within(Results("d", lines), ("hard",), verdicts.INVISIBLE)
-    assert {point.words for point in chosen} == {"tile_size 16"}
+    assert {point.words for point in chosen or ()} == {"tile_size 16"}
     assert verdicts.cheapest_within(Results("d", lines), ("hard",), 1e-9) is None
 
 
@@ -231,8 +231,8 @@ def test_a_scatter_chart_puts_more_to_the_right_and_up(logarithmic):
     assert low[1] > middle[1] > high[1]
     if logarithmic:
         assert middle[0] == pytest.approx((low[0] + high[0]) / 2, abs=0.2)
-    words = [node.firstChild.data for node in document.getElementsByTagName("text")]
-    assert {"title <", "a", "b", "low", "high"} <= set(words)
+    for words in ("title &lt;", "a", "b", "low", "high"):
+        assert f">{words}</text>" in text
 
 
 def test_a_scatter_chart_needs_dots_that_its_axes_can_hold():

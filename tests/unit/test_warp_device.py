@@ -307,6 +307,24 @@ def test_a_memory_budget_draws_in_bands_with_the_same_bits():
         fs.Renderer("warp:cpu", memory_budget=2**20).render(cloud, view, ALL_OUTPUTS)
 
 
+def test_a_memory_budget_counts_rays_and_the_planes_of_all_poses():
+    cloud = random_splats(300, seed=5, depth=(0.5, 4.0), scale=(0.05, 1.0))
+    view = fs.Camera.fisheye(320, 240, 2.6)
+    start, end = np.eye(4), np.eye(4)
+    end[0, 3] = 0.5
+    poses = fs.Trajectory([-1.0, 1.0], np.stack([start, end]))
+    exposed = {"motion": fs.Motion(poses), "shutter": fs.Shutter(exposure=0.3, sub_poses=2)}
+    wanted = fs.Renderer("warp:cpu").render(cloud, view, ("rgb", "depth"), **exposed)
+    own = fs.Renderer("warp:cpu", memory_budget=7_400_000)
+    frame = own.render(cloud, view, ("rgb", "depth"), **exposed)
+    assert own.backend.pool._arrays["tile totals", wp.int32].size == 300, "it was drawn in bands"
+    assert all(np.array_equal(frame[name], wanted[name]) for name in ("rgb", "depth"))
+    small = fs.Renderer("warp:cpu", memory_budget=5_500_000)
+    small.render(cloud, view, ("rgb", "depth"))
+    with pytest.raises(fs.DeviceError, match=r"too small .* raise memory_budget"):
+        small.render(cloud, view, ("rgb", "depth"), **exposed)
+
+
 def test_poison_reaches_every_array(renderer, monkeypatch):
     """Hard case E5 would prove nothing if the arrays were clean."""
     from fidsplat.backends.warp import probe

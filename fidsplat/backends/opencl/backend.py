@@ -122,7 +122,7 @@ class OpenCLBackend:
 
     def release_scratch(self) -> None:
         """Lets go of the scratch buffers; the next picture takes what it needs."""
-        self.pool.shrink(0, ())
+        self.pool.clear()
 
     def rates(self) -> Rates:
         """What the device can do at best; measured anew at each call."""

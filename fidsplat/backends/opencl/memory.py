@@ -65,9 +65,13 @@ class BufferPool:
         """Before a picture: lets go of what pictures of another kind have left, if that is more than `size`
         bytes. Pictures of one kind take buffers of the same sizes."""
         if kind != self._kind and self.memory_bytes > size:
-            self._spare.clear()
-            self._buffers.clear()
+            self.clear()
         self._kind = kind
+
+    def clear(self) -> None:
+        """Lets go of all that it holds."""
+        self._spare.clear()
+        self._buffers.clear()
 
     def scratch(self, name: str, size: int) -> cl.Buffer:
         """A buffer of at least `size` bytes whose content is undefined."""
