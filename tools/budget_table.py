@@ -1,7 +1,7 @@
 """Makes fidsplat/budget/table.json: the settings that `fs.Quality.within` chooses among, with their errors
 over random scenes and what they cost.
 
-    python tools/budget_table.py --device opencl:pocl       about 10 minutes on two cores
+    python tools/budget_table.py --device opencl:pocl       about 15 minutes on two busy cores
     python tools/budget_table.py --device opencl:nvidia     adds the settings of GPUs
 
 Each scene of `fidsplat/budget/random_scenes.py` is drawn with every setting and held against the same

@@ -12,7 +12,6 @@ import numpy as np
 
 from fidsplat.accuracy import doubt, errors, judge_for, truth
 from fidsplat.cameras import Camera
-from fidsplat.errors import InputError
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer
 from fidsplat.splats import SplatCloud
@@ -63,7 +62,7 @@ class Calibration:
         self.renderer, self.base = renderer, base
         self._cloud, self._camera, self._around, self._tell = cloud, camera, around, tell
         self._resident = renderer.upload(cloud)
-        self._errors: dict[Quality, float | None] = {}
+        self._errors: dict[Quality, float] = {}
 
     @cached_property
     def _truth(self) -> tuple[np.ndarray, float]:
@@ -75,20 +74,13 @@ class Calibration:
         picture = truth(judge, scene, self._camera, self.base, **self._around)
         return picture, doubt(judge, *about)
 
-    def error(self, quality: Quality) -> float | None:
-        """Largest absolute error of rgb against the truth; None for a quality that this device does not draw.
-
-        What the truth may be off itself is added.
-        """
+    def error(self, quality: Quality) -> float:
+        """Largest absolute error of rgb against the truth. What the truth may be off itself is added."""
         if quality not in self._errors:
-            want, off = self._truth  # first, so that what is wrong with the scene itself is said
+            want, off = self._truth
             self._tell(f"measuring errors ({len(self._errors) + 1} settings so far)")
-            try:
-                frame = self.renderer.render(self._resident, self._camera, ("rgb",), quality, **self._around)
-            except InputError:
-                self._errors[quality] = None
-            else:
-                self._errors[quality] = errors(frame["rgb"], want).maximum + off
+            frame = self.renderer.render(self._resident, self._camera, ("rgb",), quality, **self._around)
+            self._errors[quality] = errors(frame["rgb"], want).maximum + off
         return self._errors[quality]
 
     def time(self, quality: Quality) -> float:

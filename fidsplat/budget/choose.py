@@ -13,7 +13,7 @@ from fidsplat.budget.calibrate import Calibration
 from fidsplat.budget.search import Search
 from fidsplat.budget.table import Setting
 from fidsplat.cameras import Camera
-from fidsplat.errors import InputError
+from fidsplat.errors import DeviceError, InputError
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer, default_device
 from fidsplat.scenes import Scene
@@ -114,9 +114,10 @@ def check_bounds(error: float | None, ms: float | None) -> None:
 
 def _from_table(error: float, settings: tuple[Setting, ...], base: Quality, renderer: Renderer) -> Choice:
     for setting in settings:
-        if setting.promised <= error and _drawn(setting, base, renderer):
+        drawn = _drawn(setting, base, renderer) if setting.promised <= error else None
+        if drawn is not None:
             name = renderer.device.name
-            return Choice(setting.of(base), setting.promised, None, None, "table", name, setting.knobs)
+            return Choice(drawn.of(base), drawn.promised, None, None, "table", name, drawn.knobs)
     finest = sorted(settings, key=lambda setting: setting.promised)
     best = next(setting.promised for setting in finest if _drawn(setting, base, renderer))
     raise InputError(
@@ -125,16 +126,16 @@ def _from_table(error: float, settings: tuple[Setting, ...], base: Quality, rend
     )
 
 
-def _drawn(setting: Setting, base: Quality, renderer: Renderer) -> bool:
-    """Whether the device has the setting's knobs."""
-    if setting.everywhere:
-        return True
+def _drawn(setting: Setting, base: Quality, renderer: Renderer) -> Setting | None:
+    """The setting, or what keeps its promise without the knobs that the device lacks, or None."""
+    if setting == setting.everywhere:
+        return setting
     pixel = Camera.pinhole(1, 1, 1.0, 1.0, 0.5, 0.5)
     try:
         renderer.render(SplatCloud.empty(), pixel, quality=setting.of(base))
-    except InputError:
-        return False
-    return True
+    except (InputError, DeviceError):
+        return None if "blend_precision" in setting.knobs else setting.everywhere
+    return setting
 
 
 def _kept(key: str | None, base: Quality, device: str) -> Choice | None:

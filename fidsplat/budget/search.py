@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from fidsplat.budget.calibrate import FEWEST, Calibration, Times
 from fidsplat.budget.table import Setting
-from fidsplat.errors import InputError
+from fidsplat.errors import DeviceError, InputError
 from fidsplat.quality import Quality
 
 ENOUGH = 4
@@ -53,9 +53,9 @@ class Search:
             # than the last that missed it
             if setting.easy > LUCK * error or (missed and not _much_better(setting, *missed)):
                 continue
-            for _, measured in self._measured([setting]):
+            for drawn, measured in self._measured([setting]):
                 if measured <= error:
-                    hits.append((setting, measured))
+                    hits.append((drawn, measured))
                 else:
                     missed = setting, error / measured
             if len(hits) == ENOUGH:
@@ -63,7 +63,7 @@ class Search:
         if hits:
             return min(self._timed(hits), key=lambda found: found.times.median)
         best = sorted(self._settings, key=lambda setting: setting.median)[:ENOUGH]
-        least = min((measured for _, measured in self._measured(best)), default=float("nan"))
+        least = min(measured for _, measured in self._measured(best))
         raise InputError(
             f"no setting keeps an error of {error:g} for this scene on {self.device}: the least is "
             f"{least:.2g}; allow {least * 1.1:.2g} or more"
@@ -98,10 +98,7 @@ class Search:
 
     def _start(self, ms: float) -> int:
         """Which setting to begin with: the first that should take more than a `SHORT` part of the time."""
-        usual = min(
-            (setting for setting in self._settings if setting.everywhere),
-            key=lambda setting: abs(math.log(setting.cost)),
-        )
+        usual = min(self._settings, key=lambda setting: abs(math.log(setting.cost))).everywhere
         (taken,) = self.calibration.times([usual.of(self.calibration.base)], FEWEST)
         costs = [setting.cost * taken.median / usual.cost for setting in self._settings]
         start = next((k for k, cost in enumerate(costs) if cost >= SHORT * ms), len(costs))
@@ -121,11 +118,16 @@ class Search:
         return sorted(likely, key=lambda pair: pair[1])
 
     def _measured(self, settings: Iterable[Setting]):
-        """Those that the device draws, with their errors, as they are asked for."""
+        """Settings with their errors, as they are asked for; without the knobs that the device lacks."""
         for setting in settings:
-            measured = self.calibration.error(setting.of(self.calibration.base))
-            if measured is not None:
-                yield setting, measured
+            try:
+                measured = self.calibration.error(setting.of(self.calibration.base))
+            except (InputError, DeviceError):
+                if setting == setting.everywhere:
+                    raise
+                setting = setting.everywhere
+                measured = self.calibration.error(setting.of(self.calibration.base))
+            yield setting, measured
 
     def _timed(self, pairs: list[tuple[Setting, float]]) -> list[Found]:
         qualities = [setting.of(self.calibration.base) for setting, _ in pairs]

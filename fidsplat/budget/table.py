@@ -4,7 +4,7 @@ tools/budget_table.py)."""
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,8 @@ FREE: dict[str, Any] = {
 """The knobs that a budget turns, and where they stand unless a setting says otherwise. Of the other knobs
 those that only make a picture wrong are off (opacity ceiling, exclusive stop); the rest are its definition,
 or, as tile_size, cost no accuracy: they stay as the base quality has them."""
+NUMBERS = ("alpha_cutoff", "transmittance_stop")
+"""those of them that every device has"""
 
 
 @dataclass(frozen=True)
@@ -50,9 +52,11 @@ class Setting:
         return base.with_(**(FREE | {"opacity_ceiling": 1.0, "stop_rule": "inclusive"} | self.knobs))
 
     @property
-    def everywhere(self) -> bool:
-        """Whether every device draws it: it differs in numbers alone."""
-        return self.knobs.keys() <= {"alpha_cutoff", "transmittance_stop"}
+    def everywhere(self) -> Setting:
+        """What is drawn instead where a device lacks its other knobs: its numbers alone, no less accurate
+        but for float64 blending."""
+        numbers = {name: value for name, value in self.knobs.items() if name in NUMBERS}
+        return replace(self, knobs=numbers)
 
     @property
     def promised(self) -> float:

@@ -145,6 +145,23 @@ def test_a_scene_says_the_rest_itself(renderer, held_out):
     assert errors(renderer.render(whole, quality=quality)["rgb"], want).maximum <= 1e-3
 
 
+def test_a_device_without_a_knob(renderer, held_out, monkeypatch):
+    """As Warp, which has no fast arithmetic."""
+    draw = fs.Renderer.render
+
+    def lacking(self, cloud, camera=None, outputs=None, quality=None, **more):
+        if fs.Quality.of(quality).arithmetic == "fast":
+            raise fs.DeviceError("no fast arithmetic")
+        return draw(self, cloud, camera, outputs, quality, **more)
+
+    monkeypatch.setattr(fs.Renderer, "render", lacking)
+    scene, want = held_out[2]
+    for choice in (choose(1e-3, device=renderer), within(renderer, scene, 1e-3)):
+        assert error_of(renderer, scene, choice.quality, want) <= 1e-3
+    with pytest.raises(InputError, match="the least is"):
+        within(renderer, scene, 1e-12)
+
+
 # times: a clock that knows what each setting costs, so that nothing hangs on how busy the machine is
 
 
