@@ -50,8 +50,8 @@ def test_splats_of_every_size_through_every_lens(renderer, camera, scale):
 
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
 def test_a_lens_keeps_the_light_of_a_splat(renderer, camera):
-    """The sum of alpha over the picture is 2 pi opacity times the area of the image of the one-sigma square of a splat
-    far below a pixel; the area from a finite parallelogram."""
+    """The sum of alpha over the picture is 2 pi opacity times the area of the image of the one-sigma square
+    of a splat far below a pixel; the area from a finite parallelogram."""
     generator = np.random.default_rng(2)
     # seen by every lens here, off its axis
     mean = np.array([0.5, -0.35, 1.5])
