@@ -10,7 +10,7 @@ from contextlib import contextmanager
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.opencl.assemble import kernel_text
+from fidsplat.backends.opencl.assemble import kernel_text, with_scalars
 from fidsplat.backends.opencl.backend import OpenCLBackend
 from fidsplat.backends.opencl.memory import BufferPool
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
@@ -34,7 +34,8 @@ def evaluate(
         "SETUP_FP64": int(backend.info.float64),
     }
     head = "".join(f"#define {name} {value}\n" for name, value in defines.items())
-    program = backend.build(head + kernel_text("prelude.cl") + kernel_text("math.cl") + text)
+    stages = kernel_text("prelude.cl") + kernel_text("math.cl")
+    program = backend.build(with_scalars(head + stages + text))
     given = [buffer_of(backend, array) for array in inputs]
     made = [np.empty(len(inputs[0]), dtype) for dtype in outputs]
     taken = [buffer_of(backend, array) for array in made]
