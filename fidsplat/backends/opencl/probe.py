@@ -35,7 +35,7 @@ def evaluate(
     }
     head = "".join(f"#define {name} {value}\n" for name, value in defines.items())
     stages = kernel_text("prelude.cl") + kernel_text("math.cl")
-    program = backend.build(with_scalars(head + stages + text))
+    program = backend.build(with_scalars(head + stages) + text)
     given = [buffer_of(backend, array) for array in inputs]
     made = [np.empty(len(inputs[0]), dtype) for dtype in outputs]
     taken = [buffer_of(backend, array) for array in made]
