@@ -45,6 +45,10 @@ class Sensor:
     rounded"""
 
     def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.generic):  # a scene file says Python's own numbers
+                object.__setattr__(self, field.name, value.item())
         for name in ("exposure", "gain", "read_noise"):
             if not (_is_number(getattr(self, name)) and 0 <= getattr(self, name) < math.inf):
                 raise InputError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from types import MappingProxyType
 from typing import TypeAlias
 
@@ -41,6 +41,10 @@ class Shutter:
     of h rows is off by at most v (rows_per_band - 1) / (2 h) pixels; 1 is exact, and slow"""
 
     def __post_init__(self) -> None:
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if isinstance(value, np.generic):  # a scene file says Python's own numbers
+                object.__setattr__(self, each.name, value.item())
         for name in ("time", "exposure", "readout"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):

@@ -103,6 +103,29 @@ def test_a_scene_file_keeps_them(tmp_path):
     assert (fs.Scene.load(tmp_path / "a.toml").sensor, fs.Scene.load(tmp_path / "a.toml").fog) == (None, None)
 
 
+def test_numbers_of_numpy_are_numbers(tmp_path):
+    """They are what a script has that draws many pictures; a file says them as any others."""
+    one = np.float32(1.5)
+    scene = fs.Scene(
+        camera=fs.Camera.pinhole(8, 6, 8.0, 8.0, 4.0, 3.0),
+        sensor=fs.Sensor(one, full_well=np.float64(900), seed=np.int64(7), response=one, bits=np.int32(8)),
+        fog=fs.Fog(np.float64(0.25)),
+        shutter=fs.Shutter(exposure=np.float64(0.25), sub_poses=np.int64(3), rows_per_band=np.int32(2)),
+        quality=fs.Quality(alpha_cutoff=np.float64(0.125)),
+    )
+    scene.save(tmp_path / "a.toml")
+    read = fs.Scene.load(tmp_path / "a.toml")
+    assert (read.sensor, read.fog, read.shutter) == (scene.sensor, scene.fog, scene.shutter)
+    assert read.sensor == fs.Sensor(1.5, full_well=900, seed=7, response=1.5, bits=8)
+    assert read.quality == scene.quality
+
+
+def test_a_panorama_of_whole_numbers_is_a_share_of_its_type():
+    for kind in (np.uint8, np.uint16):
+        image = np.full((2, 4, 3), np.iinfo(kind).max, kind)
+        assert (fs.Panorama(image).image == 1).all()
+
+
 def test_a_scene_file_keeps_the_low_pass_and_the_first_hit(tmp_path):
     quality = fs.Quality.named("fast").with_(lowpass="pixel", first_hit=0.4, samples=2)
     fs.Scene(quality=quality).save(tmp_path / "a.toml")
