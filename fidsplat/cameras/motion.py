@@ -86,11 +86,19 @@ class Trajectory:
     """(k, 4, 4) rigid"""
 
     def __post_init__(self) -> None:
-        times = np.array(self.times, np.float64)
+        try:
+            times = np.array(self.times, np.float64)
+        except (TypeError, ValueError):
+            times = np.empty(0)
         if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-            raise InputError("the times of a trajectory must be one or more finite, increasing numbers")
+            raise InputError(
+                "the times of a trajectory must be one or more finite, increasing numbers of seconds, not "
+                f"{self.times!r}"
+            )
         if len(self.poses) != len(times):
-            raise InputError(f"a trajectory has {len(times)} times but {len(self.poses)} poses")
+            raise InputError(
+                f"a trajectory has {len(times)} times but {len(self.poses)} poses; give one for each time"
+            )
         for k, pose in enumerate(self.poses):
             check_similarity(pose, f"pose {k} of a trajectory", rigid=True)
         poses = np.array(self.poses, np.float64)
@@ -164,6 +172,12 @@ class Motion:
             )
         if not isinstance(self.groups, Mapping) or not all(map(callable, self.groups.values())):
             raise InputError("motion of groups must be {label: Trajectory or function of the time}")
+        for label in self.groups:
+            if isinstance(label, bool) or not isinstance(label, (int, np.integer)):
+                raise InputError(
+                    f"motion of groups: the label {label!r} is no whole number; splats have such "
+                    "(SplatCloud.with_labels)"
+                )
         object.__setattr__(self, "groups", MappingProxyType(dict(self.groups)))
 
     def camera_at(self, time: float) -> np.ndarray | None:

@@ -9,6 +9,7 @@ import pytest
 import fidsplat as fs
 from fidsplat.cameras.motion import between
 from fidsplat.rotations import quaternion_to_matrix
+from fidsplat.scenes import PlacedMarker
 
 
 def random_pose(generator, angle=None):
@@ -71,6 +72,9 @@ def test_when_rows_are_exposed():
         (lambda: fs.Trajectory([0], [2 * np.eye(4)]), "pose 0 of a trajectory"),
         (lambda: fs.Motion(camera=np.eye(4)), "Trajectory or a function"),
         (lambda: fs.Motion(groups={1: np.eye(4)}), "Trajectory or function"),
+        (lambda: fs.Motion(groups={"tag": lambda t: np.eye(4)}), "the label 'tag' is no whole number"),
+        (lambda: fs.Trajectory(["noon"], [np.eye(4)]), r"increasing numbers of seconds, not \['noon'\]"),
+        (lambda: PlacedMarker(None, motion=np.eye(4)), "a marker's motion is .*function of the time"),
         (lambda: fs.Motion(groups={1: lambda t: np.zeros((4, 4))}).groups_at(0), "label 1 at 0 s"),
     ],
 )
