@@ -28,6 +28,7 @@ from rich.table import Table
 
 import fidsplat as fs
 from fidsplat.effects import OUTPUTS
+from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.experiments.scenes import SCENES, load_scene
 
 TABLE = tuple(np.linspace(0, 1, 64) ** 0.5)
@@ -97,9 +98,9 @@ def effects(base: fs.Camera) -> dict[str, dict]:
         "base again": {},
         **lenses(base),
         **shutters(),
-        "lowpass none": {"quality": fs.Quality(lowpass="none")},
-        "lowpass pixel": {"quality": fs.Quality(lowpass="pixel")},
-        "2 x 2 samples": {"quality": fs.Quality(samples=2)},
+        "lowpass none": {"quality": TIMED.with_(lowpass="none")},
+        "lowpass pixel": {"quality": TIMED.with_(lowpass="pixel")},
+        "2 x 2 samples": {"quality": TIMED.with_(samples=2)},
         "boxes": {"cloud": "box"},
         "1 box in 100": {"cloud": "mixed"},
         **{f"SH degree {degree}": {"cloud": degree} for degree in (1, 2, 3)},
@@ -125,7 +126,7 @@ def changed(cloud: fs.SplatCloud, what: str | int) -> fs.SplatCloud:
 def milliseconds(renderer: fs.Renderer, resident, call: dict) -> float:
     """Wall time of one frame."""
     start = time.perf_counter()
-    frame = renderer.render(resident, **call)
+    frame = renderer.render(resident, **{"quality": TIMED, **call})
     _ = frame.timings  # waits for the device
     return (time.perf_counter() - start) * 1e3
 
