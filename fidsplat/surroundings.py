@@ -56,7 +56,7 @@ class Gradient:
     def __post_init__(self) -> None:
         for name in ("top", "bottom", "up"):
             object.__setattr__(self, name, three_numbers(f"background: {name}", getattr(self, name)))
-        if not any(self.up):
+        if not 0 < np.linalg.norm(self.up) < math.inf:
             raise InputError(f"background: up is {self.up!r}; it must be a direction, e.g. (0, -1, 0)")
 
 

@@ -95,10 +95,9 @@ class Trajectory:
                 "the times of a trajectory must be one or more finite, increasing numbers of seconds, not "
                 f"{self.times!r}"
             )
-        if len(self.poses) != len(times):
-            raise InputError(
-                f"a trajectory has {len(times)} times but {len(self.poses)} poses; give one for each time"
-            )
+        count = len(self.poses) if isinstance(self.poses, Sequence | np.ndarray) else 0
+        if count != len(times):
+            raise InputError(f"a trajectory has {len(times)} times but {count} poses; give one for each time")
         for k, pose in enumerate(self.poses):
             check_similarity(pose, f"pose {k} of a trajectory", rigid=True)
         poses = np.array(self.poses, np.float64)

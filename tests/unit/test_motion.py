@@ -69,6 +69,7 @@ def test_when_rows_are_exposed():
         (lambda: fs.Shutter(rows_per_band=0.5), "rows_per_band must be a whole number, 1 or more"),
         (lambda: fs.Trajectory([0, 0], [np.eye(4)] * 2), "increasing"),
         (lambda: fs.Trajectory([0], [np.eye(4)] * 2), "1 times but 2 poses"),
+        (lambda: fs.Trajectory([0], None), "1 times but 0 poses; give one for each"),
         (lambda: fs.Trajectory([0], [2 * np.eye(4)]), "pose 0 of a trajectory"),
         (lambda: fs.Motion(camera=np.eye(4)), "Trajectory or a function"),
         (lambda: fs.Motion(groups={1: np.eye(4)}), "Trajectory or function"),
