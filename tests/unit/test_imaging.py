@@ -35,10 +35,7 @@ size = 0.3
         ({"exposure": -1}, "exposure is -1; it must be a number of at least 0"),
         ({"gain": math.nan}, "gain is nan"),
         ({"full_well": 0.5}, "full_well is 0.5; it must be a number of electrons, 1 or more"),
-        (
-            {"full_well": 9, "read_noise": 10},
-            "read_noise is 10; .* at least 0, at most 9",
-        ),
+        ({"full_well": 9, "read_noise": 10}, "read_noise is 10; .* at least 0, at most 9"),
         ({"gain": 1e30}, r"gain is 1e\+30; it must be a number of at least 0, at most"),
         ({"read_noise": 3}, "means nothing without full_well"),
         ({"seed": 1.5}, "seed is 1.5; it must be a whole number"),
