@@ -1,10 +1,12 @@
 """A scene pays only for what it calls for: the text of the kernels, and what it costs."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
+import pyopencl as cl
 import pytest
 from agreement import random_splats
 
@@ -17,6 +19,7 @@ from fidsplat.effects import catalogue as catalogue_module
 BACKEND = "opencl"
 
 SHAPE = DeviceShape("lanes", "ordered", 16, 16, 16, 8, 11, 1, True)
+GROUP = DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, 1024, True)
 TAPS = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
 DIGESTS = ["7e5cd8014c58b172", "6b929620b4b3627a"]
@@ -104,6 +107,11 @@ def test_an_effect_added_to_the_catalogue_leaves_other_texts_as_they_were(monkey
     monkeypatch.setitem(catalogue_module.CATALOGUE, "dummy", dummy)
     after = {taps: assemble(select(COLORS, taps, PLAIN), SHAPE).digest for taps in combinations(TAPS, 2)}
     assert before == after
+    features = select(COLORS, ("rgb",), PLAIN)
+    base, chosen = assemble(features, SHAPE), assemble(replace(features, taps=("dummy",)), SHAPE)
+    assert chosen.record_bytes == base.record_bytes + 16
+    assert "alpha_out" in chosen.text
+    assert "alpha_out" not in base.text
 
 
 def test_record_sizes_are_what_the_effects_declare():
@@ -136,9 +144,61 @@ def test_features_are_the_same_whatever_the_order_of_outputs():
 
 def test_the_base_is_what_it_was():
     """A change of the stages themselves records new digests here; an effect must not."""
-    group = DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, 1024, True)
-    digests = [assemble(select(COLORS, ("rgb",), PLAIN), shape).digest[:16] for shape in (SHAPE, group)]
+    digests = [assemble(select(COLORS, ("rgb",), PLAIN), shape).digest[:16] for shape in (SHAPE, GROUP)]
     assert digests == DIGESTS
+
+
+# of each kernel of the base: arguments, those of them that are buffers, bytes of local memory
+TAKEN = {
+    "lanes": {
+        "bin_count": (8, 5, 0),
+        "bin_emit": (13, 7, 0),
+        "blend": (11, 4, 0),
+        "pack_count": (3, 2, 0),
+        "pack_move": (8, 7, 0),
+        "project": (14, 12, 0),
+        "resolve": (9, 2, 0),
+        "scan_bins": (5, 3, 16),
+        "scan_chunks": (3, 2, 0),
+        "sort_count": (5, 3, 0),
+        "sort_scatter": (10, 7, 0),
+    },
+    "group": {
+        "blend": (11, 4, 10308),
+        "emit": (17, 8, 4),
+        "project": (14, 12, 0),
+        "resolve": (9, 2, 0),
+        "sort_tiles": (4, 3, 16384),
+        "tally_big": (5, 2, 0),
+        "tile_starts": (6, 4, 8192),
+    },
+}
+
+
+@pytest.mark.parametrize("schedule", ["lanes", "group"])
+def test_what_the_kernels_of_the_base_take(renderer, schedule):
+    """An effect must not change it, nor registers and private memory, which follow from the text."""
+    shape = SHAPE if schedule == "lanes" else GROUP
+    pipeline = renderer.backend.pipeline(select(COLORS, ("rgb",), PLAIN), shape)
+    local = cl.kernel_work_group_info.LOCAL_MEM_SIZE
+    taken = {}
+    for name, kernel in pipeline._kernels.items():
+        head = re.search(rf"void {name}\(([^{{]*?)\)\s*\{{", pipeline.source.text)
+        assert head, name
+        taken[name] = kernel.num_args, len(re.findall(r"\bglobal\b", head[1]))
+        # drivers may pad it
+        staged = kernel.get_work_group_info(local, renderer.backend.device)
+        assert 0 <= staged - TAKEN[schedule][name][2] < 64, name
+    assert taken == {name: numbers[:2] for name, numbers in TAKEN[schedule].items()}
+
+
+def test_the_page_of_the_device_wing_has_every_hook():
+    folder = Path(__file__).resolve().parents[2] / "kernels"
+    page = (folder / "README.md").read_text("utf-8")
+    texts = [file.read_text("utf-8") for file in (folder / "opencl").rglob("*.cl")]
+    hooks = {hook for text in texts for hook in re.findall(r"^[ \t]*//@@ (\w+)", text, re.MULTILINE)}
+    assert len(hooks) > 50
+    assert {hook for hook in hooks if f"`{hook}`" not in page} == set()
 
 
 # what the compile matrix (test_matrix.py) does not have with everything

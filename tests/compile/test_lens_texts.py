@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 import pytest
 from agreement import random_splats
-from test_assemble import COLORS, PLAIN, SHAPE, Cloud
+from test_assemble import COLORS, GROUP, PLAIN, SHAPE, Cloud
 
 import fidsplat as fs
 from fidsplat.backends.opencl.assemble import DeviceShape, assemble
@@ -14,7 +14,6 @@ from fidsplat.effects import CATALOGUE, select
 
 BACKEND = "opencl"
 
-GROUP = DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, 1024, True)
 TAPS = ("alpha", "depth", "depth_median", "label", "normal")
 CAMERAS = {
     "pinhole": fs.Camera.pinhole(33, 21, 30.0, 30.0, 16.0, 10.0),
