@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
+from fidsplat.backends.opencl.memory import Resident
 from fidsplat.cli import main
 from fidsplat.experiments.records import read_lines
 from fidsplat.experiments.tradeoff import judging, run
+from fidsplat.experiments.tradeoff import table as table_module
 from fidsplat.experiments.tradeoff.hard import CELLS, cell_window, hard_scene
 from fidsplat.experiments.tradeoff.points import ALONE, BASE, EXACT, KNOBS, decode_points, points, quality_of
 from fidsplat.experiments.tradeoff.scenes import NAMES, TradeScene, make, scene_names
 from fidsplat.experiments.tradeoff.table import Table
-from fidsplat.experiments.tradeoff.timing import QUICK, time_point
+from fidsplat.experiments.tradeoff.timing import QUICK, memory_of, time_point
 from fidsplat.hard_cases.clouds import camera, splats
 from fidsplat.quality import MarkerQuality
 
@@ -161,6 +163,25 @@ def test_memory_is_that_of_the_setting_alone(table):
     small = memory(BASE)
     assert memory(BASE.with_(samples=3, lowpass="none")) > 2 * small
     assert memory(BASE) == small
+
+
+def test_memory_does_not_hang_on_what_was_drawn_before(table, monkeypatch):
+    """As on a GPU, where a cloud keeps its halves once a picture has asked for them."""
+    held = property(lambda self: sum(buffer.size for buffer in self._buffers.values()))
+    monkeypatch.setattr(Resident, "device_bytes", held)
+    before = memory_of(table, "apriltag@0", BASE)
+    halves = memory_of(table, "apriltag@0", BASE.with_(color_precision="float16"))
+    table.draw("apriltag@0", BASE.with_(color_precision="float16"))
+    assert memory_of(table, "apriltag@0", BASE) == before > halves
+
+
+def test_a_device_without_float64_is_held_against_one_with_it(table, monkeypatch):
+    """As Warp's."""
+    monkeypatch.setattr(table_module, "judge_for", lambda renderer: table.renderer)
+    lacking = fs.Renderer("opencl")
+    monkeypatch.setattr(lacking, "render", lambda *_, **__: pytest.fail("it drew its own truth"))
+    want = table.truth("apriltag@0", BASE)
+    assert np.array_equal(Table(lacking).truth("apriltag@0", BASE), want)
 
 
 def test_a_definition_has_a_truth_of_its_own(table):
