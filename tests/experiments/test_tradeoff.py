@@ -1,5 +1,6 @@
 """`fidsplat tradeoff`: what is measured, how it is judged, how a run survives."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -51,6 +52,11 @@ def test_every_setting_is_one_knob_away_from_the_base():
                 assert turned <= {point.knob, *wanted}, point
             elif point.knob == ALONE and point.value != "exact":
                 assert point.value.split()[0] in turned
+
+
+def test_every_knob_is_turned():
+    # first_hit decides where depth_first is, and nothing of rgb
+    assert {knob.name for knob in dataclasses.fields(fs.Quality)} - set(KNOBS) == {"first_hit"}
 
 
 def test_the_constants_of_other_systems_are_among_the_settings():

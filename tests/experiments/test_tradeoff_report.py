@@ -250,6 +250,12 @@ def test_other_results_are_refused_by_name(tmp_path):
         load([tmp_path / "a"])
 
 
+def test_a_folder_without_results_is_not_passed_over(tmp_path):
+    write(tmp_path / "a", plain_lines("hard"))
+    with pytest.raises(fs.InputError, match=r"no results in .*other"):
+        load([tmp_path / "a", tmp_path / "other"])
+
+
 def test_a_setting_knows_whether_it_draws_another_picture():
     point = Point("coplanar", "order", BASE.with_(coplanar="order"))
     on_hard = Results("d", [line("hard", point, result(1.0, 0.1))]).points["hard", "coplanar", "order"]

@@ -166,7 +166,10 @@ def load(folders: Iterable[Path]) -> list[Results]:
     folders = list(folders)
     by_device: dict[str, dict[str, dict]] = {}
     for folder in folders:
-        for file in sorted(folder.glob("*.jsonl")):
+        files = sorted(folder.glob("*.jsonl"))
+        if not files:
+            raise InputError(f"no results in {folder}; run fidsplat tradeoff -o {folder}, or leave it out")
+        for file in files:
             for line in read_lines(file):
                 try:
                     device, known = line["run"]["device"], line["key"]["what"] in (POINT, DECODE, TRUTH)
