@@ -1,6 +1,7 @@
 """What each effect costs: a standard random scene without and with it, in turns, splats resident.
 
     python benchmarks/effects.py [NAME ...] [--scene r1m_1080p] [--device opencl] [--repeats 5] [--json]
+    python benchmarks/effects.py --table FILE.json [FILE.json ...]       the table of docs/effects.md
 
 Every frame with an effect is followed by one without, the picture left on the device, the queue drained
 before and after each, so that what else the machine does falls on both. The price is the median of the ratios
@@ -18,6 +19,7 @@ import statistics
 import sys
 import time
 from datetime import date
+from pathlib import Path
 
 import numpy as np
 from rich.console import Console
@@ -26,6 +28,7 @@ from rich.table import Table
 
 import fidsplat as fs
 from fidsplat.effects import OUTPUTS
+from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.experiments.scenes import SCENES, load_scene
 
 TABLE = tuple(np.linspace(0, 1, 64) ** 0.5)
@@ -95,9 +98,9 @@ def effects(base: fs.Camera) -> dict[str, dict]:
         "base again": {},
         **lenses(base),
         **shutters(),
-        "lowpass none": {"quality": fs.Quality(lowpass="none")},
-        "lowpass pixel": {"quality": fs.Quality(lowpass="pixel")},
-        "2 x 2 samples": {"quality": fs.Quality(samples=2)},
+        "lowpass none": {"quality": TIMED.with_(lowpass="none")},
+        "lowpass pixel": {"quality": TIMED.with_(lowpass="pixel")},
+        "2 x 2 samples": {"quality": TIMED.with_(samples=2)},
         "boxes": {"cloud": "box"},
         "1 box in 100": {"cloud": "mixed"},
         **{f"SH degree {degree}": {"cloud": degree} for degree in (1, 2, 3)},
@@ -123,7 +126,7 @@ def changed(cloud: fs.SplatCloud, what: str | int) -> fs.SplatCloud:
 def milliseconds(renderer: fs.Renderer, resident, call: dict) -> float:
     """Wall time of one frame."""
     start = time.perf_counter()
-    frame = renderer.render(resident, **call)
+    frame = renderer.render(resident, **{"quality": TIMED, **call})
     _ = frame.timings  # waits for the device
     return (time.perf_counter() - start) * 1e3
 
@@ -167,6 +170,25 @@ def measure(options: argparse.Namespace) -> list[dict]:
     return [about | row for row in rows]
 
 
+def page_table(files: list[str]) -> str:
+    """The results of several devices side by side, in Markdown; each file is what --json prints."""
+    runs = [{row["effect"]: row for row in json.loads(Path(file).read_text("utf-8"))} for file in files]
+    firsts = [next(iter(run.values())) for run in runs]
+    head = "".join(f" {first['device']}, {first['repeats']} pairs | |" for first in firsts)
+    lines = [f"| effect |{head}", "|---|" + "---:|---:|" * len(runs)]
+    for name in runs[0]:
+        cells = [name]
+        for row in (run.get(name) for run in runs):
+            low, high = row["quartiles_percent"] if row else (0, 0)
+            cells += (
+                [f"{row['effect_ms']:.4g} ms", f"{row['price_percent']:+.0f} % ({low:+.0f} to {high:+.0f})"]
+                if row
+                else ["", ""]
+            )
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -177,7 +199,11 @@ def main() -> None:
     parser.add_argument("--device", default="opencl")
     parser.add_argument("--repeats", type=int, default=5, help="2 or more")
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--table", nargs="+", metavar="FILE", help="print results side by side instead")
     options = parser.parse_args()
+    if options.table:
+        print(page_table(options.table))
+        return
     if unknown := set(options.names) - set(known):
         parser.error(f"no effect is called {', '.join(sorted(unknown))}; there are: {', '.join(known)}")
     options.repeats = max(options.repeats, 2)

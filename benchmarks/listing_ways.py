@@ -23,6 +23,7 @@ from rich.table import Table
 import fidsplat as fs
 from fidsplat.backends.base import View
 from fidsplat.effects import select
+from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.experiments.scenes import SCENES, load_scene
 
 WAYS = ("ordered", "tiled")
@@ -30,7 +31,7 @@ WAYS = ("ordered", "tiled")
 
 def measure(renderer: fs.Renderer, name: str, repeats: int) -> list[dict]:
     """Medians of the stages in milliseconds, one row for each way."""
-    backend, quality = renderer.backend, fs.Quality()
+    backend, quality = renderer.backend, TIMED
     cloud, camera = load_scene(name)
     resident = backend.upload(cloud)
     view = View.of(camera, quality, cloud.origin, (0, 0, 0))

@@ -56,7 +56,8 @@ def turning(
     It goes round it and rises with it, and is level with its middle halfway. tilt: degrees about the vertical
     axis halfway; 0 is face to face.
     """
-    quality = Quality(coplanar=coplanar)
+    # the cut-off of other systems: a rim that enters a pixel enters with as much
+    quality = Quality(alpha_cutoff=1 / 255, coplanar=coplanar)
     for number in range(-steps, steps + 1):
         rise = (number + 0.5) * step
         round_it, level = math.radians(tilt) + rise, 1.6 * math.cos(rise)
@@ -105,7 +106,8 @@ def faint_between(opacity: float) -> Picture:
     means = [(0, 0, 2) - 0.1 * along, (0, 0, 2) + 0.1 * along, (0, 0, 2)]
     colors = [(0, 0, 0), (1, 1, 1), (0.5, 0.5, 0.5)]
     cloud = splats(means, turn, 0.15, [0.9, 0.9, opacity], colors).with_planes([0, 0, -1])
-    return Picture(cloud, Camera.pinhole(33, 33, 60.0, 60.0, 16.5, 16.5), Quality(), ("rgb",))
+    quality = Quality(alpha_cutoff=1 / 255)
+    return Picture(cloud, Camera.pinhole(33, 33, 60.0, 60.0, 16.5, 16.5), quality, ("rgb",))
 
 
 def largest_jump(renderer: Renderer, pictures: Iterator[Picture]) -> tuple[float, np.ndarray, np.ndarray]:

@@ -73,7 +73,7 @@ def test_every_touched_tile_has_the_splat_and_few_others_do(backend, seed, scale
     """numerics A1, A3 to A5: nothing is lost, wherever the disk lies; bounds in front are tight."""
     cloud = random_splats(120, seed, scale=scale)
     shape = listing(backend, lists)
-    trace, view = traced(backend, cloud, fs.Quality(), shape=shape)
+    trace, view = traced(backend, cloud, fs.Quality(alpha_cutoff=1 / 255), shape=shape)
     tiles_x = -(-view.width // shape.tile_width)
     listed = [set() for _ in range(len(cloud))]
     for tile in range(len(trace["starts"]) - 1):

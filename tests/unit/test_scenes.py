@@ -293,7 +293,7 @@ def test_knobs_of_a_scene_file(tmp_path):
     assert [placed.marker.quality.template for placed in scene.markers] == [9, 5]
     other = fs.Scene.load(file, "marker.template=13")
     assert [placed.marker.quality.template for placed in other.markers] == [13, 5]
-    assert fs.Quality.of(other.quality).alpha_cutoff == 1 / 255
+    assert fs.Quality.of(other.quality).alpha_cutoff == fs.Quality().alpha_cutoff
 
 
 @pytest.mark.parametrize(

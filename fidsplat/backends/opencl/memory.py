@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyopencl as cl
@@ -21,7 +21,11 @@ _LEAST = 16  # bytes; OpenCL has no empty buffers
 
 
 class DeviceBuffer(cl.Buffer):
-    """A buffer that can be referred to weakly: to remember it is not to keep it."""
+    """A buffer with a token of its own: to remember that is not to keep the buffer."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.token = object()
 
 
 class BufferPool:

@@ -85,7 +85,7 @@ class OpenCLPipeline:
         self.shape = shape
         self.backend = backend
         self._kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
-        self._bound: dict[str, tuple] = {}
+        self._bound: dict[str, list] = {}
         taken = [
             name for effect in features.effects for name in effect.inputs if name not in effect.view_inputs
         ]
@@ -144,14 +144,19 @@ class OpenCLPipeline:
     def launch(self, queue: cl.CommandQueue, name: str, size: tuple, group: tuple, args: tuple) -> cl.Event:
         """Launch a kernel, setting only those arguments that have changed since its last launch: from picture
         to picture hardly any do, and setting them takes the host longer than a small stage takes a GPU.
-        Buffers are remembered weakly, so that a cloud or a picture that nobody has any more is let go.
+        A buffer is remembered by its token, so that a cloud or a picture that nobody has any more is let go.
         """
-        kernel, bound = self._kernels[name], self._bound.pop(name, (None,) * len(args))
-        known = tuple(_remembered(argument) for argument in args)
-        for index, (new, old) in enumerate(zip(known, bound, strict=True)):
-            if new is not old and (type(new) is not type(old) or new != old):
-                kernel.set_arg(index, args[index])
-        self._bound[name] = known
+        kernel, bound = self._kernels[name], self._bound.pop(name, None) or [None] * len(args)
+        for index, argument in enumerate(args):
+            if type(argument) is DeviceBuffer:
+                mark: object = argument.token
+            else:  # part of a buffer is made anew for each launch
+                mark = argument if isinstance(argument, np.generic) else object()
+            old = bound[index]
+            if mark is not old and (type(mark) is not type(old) or mark != old):
+                kernel.set_arg(index, argument)
+                bound[index] = mark
+        self._bound[name] = bound
         return cl.enqueue_nd_range_kernel(queue, kernel, size, group)
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
@@ -173,10 +178,3 @@ class OpenCLPipeline:
             "raw": run.read("raw", np.float32, (4, run.rows, run.stride)),
             **{output.name: planes.read(output.name) for output in self.features.outputs},
         }
-
-
-def _remembered(argument: object) -> object:
-    """What tells a kernel's argument from all others, without keeping a buffer."""
-    if isinstance(argument, DeviceBuffer):
-        return weakref.ref(argument)  # of one that is gone: equal to no other
-    return object() if isinstance(argument, cl.MemoryObject) else argument  # part of a buffer: made anew

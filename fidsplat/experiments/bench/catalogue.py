@@ -14,9 +14,12 @@ from fidsplat.cameras import Camera
 from fidsplat.errors import InputError
 from fidsplat.experiments.scenes import SCENES, load_scene, standard_camera
 from fidsplat.markers import marker
+from fidsplat.quality import Quality
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.splats import SplatCloud
 
+TIMED = Quality(alpha_cutoff=1 / 255, transmittance_stop=1e-4)
+"""how scenes are timed: with the cut-off and the stop that all peers share, so that the work is the same"""
 WALL_COLUMNS, WALL_ROWS = 20, 10
 _WALL_CODES = 10  # different ones; each hangs in as many places
 

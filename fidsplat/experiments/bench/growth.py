@@ -10,10 +10,10 @@ import numpy as np
 
 from fidsplat.backends.base import Rates
 from fidsplat.cameras import Camera
+from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.experiments.bench.measure import WARM_UP, SceneRun
 from fidsplat.experiments.bench.overdraw import overdraw
 from fidsplat.experiments.scenes import random_cloud, standard_camera
-from fidsplat.quality import Quality
 from fidsplat.splats import SplatCloud
 
 MILLION = 1_000_000
@@ -70,7 +70,7 @@ def measure(point: Point, device: str, rates: Rates | None, repeats: int) -> dic
         run.draw(counts=number >= WARM_UP)
     record = run.result.as_dict() | {"series": point.series, "x": point.x}
     if point.series == "overdraw" and "fragments" in record:
-        layers = overdraw(run.renderer, run.resident, camera, Quality(transmittance_stop=0.0))
+        layers = overdraw(run.renderer, run.resident, camera, TIMED.with_(transmittance_stop=0.0))
         record["layers_per_pixel"] = float(layers.mean(dtype=np.float64))
     return record
 

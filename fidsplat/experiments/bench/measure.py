@@ -12,7 +12,7 @@ import numpy as np
 from fidsplat.backends.base import DeviceInfo, Measurable, Rates
 from fidsplat.cameras import Camera
 from fidsplat.errors import FidsplatError
-from fidsplat.experiments.bench.catalogue import BENCH_SCENES
+from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED
 from fidsplat.experiments.bench.model import Counts, floor_ms
 from fidsplat.experiments.bench.overdraw import overdraw
 from fidsplat.render import Frame, Renderer
@@ -158,7 +158,7 @@ class SceneRun:
         try:
             self.resident = self.renderer.upload(cloud)
             start = time.perf_counter()
-            frame = self.renderer.render(self.resident, camera)
+            frame = self.renderer.render(self.resident, camera, quality=TIMED)
             self.picture = frame["rgb"]
             self.result.first_frame_ms = 1e3 * (time.perf_counter() - start)
             self.result.mean_rgb = float(self.picture.mean(dtype=np.float64))
@@ -174,7 +174,7 @@ class SceneRun:
         pixels = result.width * result.height
         result.memory_bytes = backend.memory_bytes + self.resident.memory_bytes + 12 * pixels
         result.counts["fragments"] = int(
-            overdraw(self.renderer, self.resident, self.camera).sum(dtype=np.int64)
+            overdraw(self.renderer, self.resident, self.camera, TIMED).sum(dtype=np.int64)
         )
         further = max(cloud.sh_degree + 1, 1) ** 2 - 1
         counts = Counts(pixels=pixels, sh_coefficients=further, **result.counts)
@@ -186,7 +186,8 @@ class SceneRun:
             return
         try:
             start = time.perf_counter()
-            timings = self.renderer.render(self.resident, self.camera).timings  # waits for the device
+            frame = self.renderer.render(self.resident, self.camera, quality=TIMED)
+            timings = frame.timings  # waits for the device
             took = 1e3 * (time.perf_counter() - start)
         except FidsplatError as error:
             self.result.error = str(error)

@@ -13,16 +13,13 @@ from fidsplat.quality import Quality
 from fidsplat.render import Renderer, ResidentCloud
 
 
-def overdraw(
-    renderer: Renderer, resident: ResidentCloud, camera: Camera, quality: Quality | None = None
-) -> np.ndarray:
+def overdraw(renderer: Renderer, resident: ResidentCloud, camera: Camera, quality: Quality) -> np.ndarray:
     """Fragments that each pixel draws, (h, w) int32, of all its samples together.
 
     Raises:
         FidsplatError: the device fails, or its backend has no such count.
     """
-    chosen = quality or Quality()
     data = resident._data
-    features = replace(select(data, ("rgb",), chosen), taps=("overdraw",))
-    view = View.of(camera, chosen, data.origin, (0.0, 0.0, 0.0))
+    features = replace(select(data, ("rgb",), quality), taps=("overdraw",))
+    view = View.of(camera, quality, data.origin, (0.0, 0.0, 0.0))
     return renderer.backend.pipeline(features).render(data, view).read("overdraw")
