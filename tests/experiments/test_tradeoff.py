@@ -18,7 +18,7 @@ from fidsplat.experiments.tradeoff.scenes import NAMES, TradeScene, make, scene_
 from fidsplat.experiments.tradeoff.table import Table
 from fidsplat.experiments.tradeoff.timing import QUICK, memory_of, time_point
 from fidsplat.hard_cases.clouds import camera, splats
-from fidsplat.quality import MarkerQuality
+from fidsplat.quality import PRESETS, MarkerQuality
 
 FACING = (1.0, 0.0, 0.0, 0.0)
 WORDS = ("tradeoff", "--quick", "--scenes", "apriltag", "--knobs", "opacity_ceiling")
@@ -200,6 +200,12 @@ def test_a_definition_has_a_truth_of_its_own(table):
     found = judging.check_truth(table.truth("hard", BASE), table.scene("hard", BASE.marker).scene, full)
     assert found["pixels"] == 64
     assert found["maximum"] < 2e-6
+
+
+def test_nobody_sees_what_standard_leaves_out(table):
+    """Half a step of 8 bits, on what constants hurt most."""
+    standard = PRESETS["standard"]
+    assert np.abs(table.draw("hard", standard)["rgb"] - table.truth("hard", standard)).max() <= 1 / 512
 
 
 def test_an_interrupted_run_goes_on(capsys, tmp_path, monkeypatch):
