@@ -254,6 +254,13 @@ def test_what_a_device_refuses_is_a_result(tmp_path, monkeypatch):
     assert lines
     assert all(line["result"] == {"error": "no halves here"} for line in lines)
 
+    # it may have been the device that failed: another run tries again
+    monkeypatch.setattr(run, "_begin", lambda *_: lambda: {"maximum": 0.0})
+    for left in (len(lines), 0):
+        with run.planned(settings) as plan:
+            assert plan.left == len(list(plan.run())) == left
+    assert [line["result"] for line in read_lines(tmp_path / run.FILE)] == [{"maximum": 0.0}] * len(lines)
+
 
 @pytest.mark.parametrize(
     ("words", "message"),

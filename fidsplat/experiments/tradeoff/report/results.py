@@ -66,8 +66,8 @@ class Results:
 
     Args:
         device: its title and driver; `title` is without the driver.
-        lines: of `tradeoff.jsonl`; of several about the same part the first counts. A preset that has changed
-            since is left out, but where its setting of today was measured under another name.
+        lines: of `tradeoff.jsonl`, one for each part. A preset that has changed since is left out, but where
+            its setting of today was measured under another name.
     """
 
     def __init__(self, device: str, lines: Sequence[dict]) -> None:
@@ -177,7 +177,9 @@ def load(folders: Iterable[Path]) -> list[Results]:
                     known = False
                 if not known:
                     raise InputError(f"{file} holds no results of fidsplat tradeoff; give folders that do")
-                by_device.setdefault(device, {}).setdefault(key_of(line), line)
+                lines, key = by_device.setdefault(device, {}), key_of(line)
+                if key not in lines or "error" in lines[key]["result"]:
+                    lines[key] = line
     found = [Results(device, list(lines.values())) for device, lines in by_device.items()]
     found = [results for results in found if results.scenes]
     if not found:
