@@ -74,7 +74,7 @@ def main() -> None:
         made, row = markers[mixture], []
         for px in SIZES:
             camera = camera_of(made, px)
-            quality = fs.Quality(lowpass=lowpass, samples=samples)
+            quality = fs.Quality(alpha_cutoff=1 / 255, lowpass=lowpass, samples=samples)
             rgb = renderer.render(made.cloud, camera, quality=quality, background=(GREY,) * 3)["rgb"]
             error = rgb[..., 0] - area_sampled(made, px, camera)
             row.append(f"{-10 * math.log10(float((error * error).mean())):.1f}")

@@ -96,7 +96,7 @@ def measure(renderer: fs.Renderer, made: Marker, edge_px: float, background: flo
         if (made.spec, tilt) not in ideals:
             ideals[made.spec, tilt] = ideal_picture(made, camera, background)
         ideal, counts = ideals[made.spec, tilt]
-        quality = fs.Quality(lowpass="none", samples=3, coplanar=coplanar)
+        quality = fs.Quality(alpha_cutoff=1 / 255, lowpass="none", samples=3, coplanar=coplanar)
         frame = renderer.render(made.cloud, camera, quality=quality, background=(background,) * 3)
         off = frame["rgb"].mean(2)[counts] - ideal[counts]
         found[name] = float(-10 * np.log10(np.mean(off * off)))

@@ -67,7 +67,8 @@ it was. Keep the machine quiet.
 
   r100k_720p, r1m_1080p            random splats, as in `fidsplat bench`
   hard                             haze, veils, opaque stacks, edge-on, tiny, needles, near plane, far away
-  apriltag, qr2, qr5, qr10, qr22   markers at 0, 60 and 80 degrees
+  apriltag, qr2, qr5, qr10, qr22   markers at 0, 60 and 80 degrees: presets and ways of making them; of qr10
+                                   every knob
 
 Examples:
   fidsplat tradeoff --quick                              a rough picture, under 3 minutes on two cores

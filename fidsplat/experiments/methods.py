@@ -17,8 +17,12 @@ from fidsplat.quality import Quality
 from fidsplat.render import Renderer
 
 IDEAL = "ideal"
-FILTERS = {"screen": Quality(), "best": Quality(lowpass="none", samples=3)}
-"""the low-pass of 2DGS, and ours: none, the mean of 3 x 3 samples"""
+_CUT = 1 / 255
+FILTERS = {
+    "screen": Quality(alpha_cutoff=_CUT),
+    "best": Quality(alpha_cutoff=_CUT, lowpass="none", samples=3),
+}
+"""the low-pass of 2DGS, and ours: none, the mean of 3 x 3 samples; with the cut-off of other renderers"""
 # as the paper's authors drew the models that they trained
 _TRAINED_QUALITY = "surfel"
 

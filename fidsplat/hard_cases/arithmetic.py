@@ -28,7 +28,7 @@ BOUNDS = {
     "log64": 3.0,
 }
 FAST = ("native_exp", "native_recip")
-"""Functions of which nothing is promised, and which nothing uses."""
+"""Functions of which nothing is promised, and which only `arithmetic="fast"` uses, on GPUs."""
 
 
 @dataclass(frozen=True)

@@ -1,21 +1,24 @@
 """`fidsplat tradeoff`: what is measured, how it is judged, how a run survives."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 
 import fidsplat as fs
+from fidsplat.backends.opencl.memory import Resident
 from fidsplat.cli import main
 from fidsplat.experiments.records import read_lines
 from fidsplat.experiments.tradeoff import judging, run
+from fidsplat.experiments.tradeoff import table as table_module
 from fidsplat.experiments.tradeoff.hard import CELLS, cell_window, hard_scene
 from fidsplat.experiments.tradeoff.points import ALONE, BASE, EXACT, KNOBS, decode_points, points, quality_of
 from fidsplat.experiments.tradeoff.scenes import NAMES, TradeScene, make, scene_names
 from fidsplat.experiments.tradeoff.table import Table
-from fidsplat.experiments.tradeoff.timing import QUICK, time_point
+from fidsplat.experiments.tradeoff.timing import QUICK, memory_of, time_point
 from fidsplat.hard_cases.clouds import camera, splats
-from fidsplat.quality import MarkerQuality
+from fidsplat.quality import PRESETS, MarkerQuality
 
 FACING = (1.0, 0.0, 0.0, 0.0)
 WORDS = ("tradeoff", "--quick", "--scenes", "apriltag", "--knobs", "opacity_ceiling")
@@ -49,6 +52,11 @@ def test_every_setting_is_one_knob_away_from_the_base():
                 assert turned <= {point.knob, *wanted}, point
             elif point.knob == ALONE and point.value != "exact":
                 assert point.value.split()[0] in turned
+
+
+def test_every_knob_is_turned():
+    # first_hit decides where depth_first is, and nothing of rgb
+    assert {knob.name for knob in dataclasses.fields(fs.Quality)} - set(KNOBS) == {"first_hit"}
 
 
 def test_the_constants_of_other_systems_are_among_the_settings():
@@ -163,6 +171,25 @@ def test_memory_is_that_of_the_setting_alone(table):
     assert memory(BASE) == small
 
 
+def test_memory_does_not_hang_on_what_was_drawn_before(table, monkeypatch):
+    """As on a GPU, where a cloud keeps its halves once a picture has asked for them."""
+    held = property(lambda self: sum(buffer.size for buffer in self._buffers.values()))
+    monkeypatch.setattr(Resident, "device_bytes", held)
+    before = memory_of(table, "apriltag@0", BASE)
+    halves = memory_of(table, "apriltag@0", BASE.with_(color_precision="float16"))
+    table.draw("apriltag@0", BASE.with_(color_precision="float16"))
+    assert memory_of(table, "apriltag@0", BASE) == before > halves
+
+
+def test_a_device_without_float64_is_held_against_one_with_it(table, monkeypatch):
+    """As Warp's."""
+    monkeypatch.setattr(table_module, "judge_for", lambda renderer: table.renderer)
+    lacking = fs.Renderer("opencl")
+    monkeypatch.setattr(lacking, "render", lambda *_, **__: pytest.fail("it drew its own truth"))
+    want = table.truth("apriltag@0", BASE)
+    assert np.array_equal(Table(lacking).truth("apriltag@0", BASE), want)
+
+
 def test_a_definition_has_a_truth_of_its_own(table):
     assert table.truth("apriltag@0", BASE) is table.truth("apriltag@0", BASE.with_(alpha_cutoff=0.01))
     order = BASE.with_(coplanar="order")
@@ -173,6 +200,12 @@ def test_a_definition_has_a_truth_of_its_own(table):
     found = judging.check_truth(table.truth("hard", BASE), table.scene("hard", BASE.marker).scene, full)
     assert found["pixels"] == 64
     assert found["maximum"] < 2e-6
+
+
+def test_nobody_sees_what_standard_leaves_out(table):
+    """Half a step of 8 bits, on what constants hurt most."""
+    standard = PRESETS["standard"]
+    assert np.abs(table.draw("hard", standard)["rgb"] - table.truth("hard", standard)).max() <= 1 / 512
 
 
 def test_an_interrupted_run_goes_on(capsys, tmp_path, monkeypatch):
@@ -220,6 +253,13 @@ def test_what_a_device_refuses_is_a_result(tmp_path, monkeypatch):
         lines = list(plan.run())
     assert lines
     assert all(line["result"] == {"error": "no halves here"} for line in lines)
+
+    # it may have been the device that failed: another run tries again
+    monkeypatch.setattr(run, "_begin", lambda *_: lambda: {"maximum": 0.0})
+    for left in (len(lines), 0):
+        with run.planned(settings) as plan:
+            assert plan.left == len(list(plan.run())) == left
+    assert [line["result"] for line in read_lines(tmp_path / run.FILE)] == [{"maximum": 0.0}] * len(lines)
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,14 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.cli import main
+from fidsplat.experiments.document import Document
 from fidsplat.experiments.scatter import Axis, Dot, scatter_chart
 from fidsplat.experiments.tradeoff.points import ALONE, BASE, EXACT, KNOBS, Point, decode_points, points
 from fidsplat.experiments.tradeoff.report import verdicts
+from fidsplat.experiments.tradeoff.report.plots import pareto_chart
+from fidsplat.experiments.tradeoff.report.reading import report_reading
 from fidsplat.experiments.tradeoff.report.results import Results, load
+from fidsplat.quality import PRESETS
 
 RUN = {
     "device": "A processor, driver 1", "title": "A processor", "kind": "cpu", "machine": "two cores",
@@ -49,6 +53,7 @@ NUMBERS = {
     ("lowpass", "none"): (0.7, 0.5),
     (ALONE, "exact"): (2.0, 1e-6),
     (ALONE, "alpha_cutoff 1/255"): (1.2, 0.019),
+    (ALONE, "opacity_ceiling 0.99"): (2.01, 0.01),
 }
 
 
@@ -153,7 +158,8 @@ def test_the_report_says_what_the_numbers_say(capsys, tmp_path):
     for words in (
         "**Free accuracy**: tile_size 16.",
         "**Free time**: transmittance_stop 1/512.",
-        "**Traps**: gsplat, opacity_ceiling 0.99.",
+        "**Traps**: gsplat; opacity_ceiling 0.99.",
+        "traps: opacity_ceiling 0.99; free time: none; buying time on some scene: alpha_cutoff 1/255;",
         "**Waste**: transmittance_stop 0.",
         "**No difference** on any scene: setup_precision float32.",
         "alpha_cutoff 1/1024 (r100k_720p +25 %, error / 13; hard +25 %, error / 13)",
@@ -168,6 +174,42 @@ def test_the_report_says_what_the_numbers_say(capsys, tmp_path):
         "](accuracy/pareto-hard-gpu.svg)",
     ):
         assert words in text, words
+
+
+def test_what_is_free_on_one_scene_and_bought_on_another_is_worth_turning():
+    lines = plain_lines("r100k_720p") + plain_lines("hard")
+    for each in lines:
+        if (each["key"]["scene"], each["key"]["value"]) == ("hard", "1/1024"):
+            each["result"] |= result(1.0, 0.0015)
+    document = Document("t")
+    report_reading(document, Results("d", lines))
+    assert (
+        "**Worth turning** for accuracy: alpha_cutoff 1/1024 (r100k_720p +25 %, error / 13; hard +0.0 %, "
+        "error / 13); alpha_cutoff 0.0001 ("
+    ) in document.markdown()
+
+
+def test_a_preset_is_what_it_says_today(monkeypatch):
+    found = {(point.knob, point.value): point for point in points(KNOBS, False)}
+    lines = plain_lines("hard")
+    lines.append(line("hard", found["preset", "standard"], result(1.0, 0.02)))
+    assert Results("d", lines).at("hard", "preset", "standard").maximum == 0.02
+    today = BASE.with_(alpha_cutoff=1 / 1024)
+    monkeypatch.setitem(PRESETS, "standard", today)
+    now = Results("d", lines).at("hard", "preset", "standard")
+    assert (now.maximum, now.words) == (0.0015, "standard")  # as measured by another name
+    assert Results("d", lines[-1:]).at("hard", "preset", "standard") is None
+    lines.append(line("hard", Point("preset", "standard", today), result(1.2, 0.0016)))
+    assert Results("d", lines).at("hard", "preset", "standard").maximum == 0.0016
+
+
+def test_no_two_kinds_of_dots_have_one_colour():
+    every = [line("hard", point, result(1.0, 0.02)) for point in points(KNOBS, False)]
+    chart = xml.dom.minidom.parseString(pareto_chart(Results("d", every), "hard"))
+    boxes = chart.getElementsByTagName("rect")
+    colours = [box.getAttribute("fill") for box in boxes if box.getAttribute("width") == "10"]
+    assert len(colours) > 5
+    assert len(set(colours)) == len(colours)
 
 
 def test_of_what_was_measured_twice_the_first_file_counts(tmp_path):
@@ -206,6 +248,12 @@ def test_other_results_are_refused_by_name(tmp_path):
     write(tmp_path / "a", [other])
     with pytest.raises(fs.InputError, match="holds no results of fidsplat tradeoff"):
         load([tmp_path / "a"])
+
+
+def test_a_folder_without_results_is_not_passed_over(tmp_path):
+    write(tmp_path / "a", plain_lines("hard"))
+    with pytest.raises(fs.InputError, match=r"no results in .*other"):
+        load([tmp_path / "a", tmp_path / "other"])
 
 
 def test_a_setting_knows_whether_it_draws_another_picture():

@@ -99,6 +99,8 @@ def planned(settings: Settings) -> Iterator[Plan]:
     facts = run_facts(NAME, f"{info.title}, {info.version}", scenes.SEED, versions)
     facts |= {"kind": info.kind, "title": info.title}
     records = Records(settings.out / FILE, facts, settings.anew)
+    # a device that failed may be there again: what has an error is not done
+    records.done = {key: line for key, line in records.done.items() if "error" not in line["result"]}
     pool = ThreadPoolExecutor(settings.workers)
     try:
         yield Plan(records, work, Table(renderer), pool, settings)

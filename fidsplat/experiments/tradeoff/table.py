@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.accuracy import full_precision, truth
+from fidsplat.accuracy import full_precision, judge_for, truth
 from fidsplat.experiments.tradeoff.points import BASE
 from fidsplat.experiments.tradeoff.scenes import TradeScene, make
 from fidsplat.quality import MarkerQuality, Quality
@@ -30,10 +30,13 @@ class OnDevice:
 
 
 class Table:
-    """Scenes and truths are made when they are first asked for, and the last few are kept."""
+    """Scenes and truths are made when they are first asked for, and the last few are kept.
+
+    Truths are drawn by the renderer itself, or by OpenCL on the processor where it cannot blend in float64.
+    """
 
     def __init__(self, renderer: Renderer) -> None:
-        self.renderer = renderer
+        self.renderer, self._judge = renderer, judge_for(renderer)
         self._scenes: OrderedDict[Hashable, OnDevice] = OrderedDict()
         self._truths: OrderedDict[Hashable, np.ndarray] = OrderedDict()
 
@@ -58,8 +61,9 @@ class Table:
         like = self.definition(view, quality)
 
         def draw() -> np.ndarray:
-            on = self.scene(view, quality.marker)
-            return truth(self.renderer, on.resident, on.scene.camera, like, background=on.scene.background)
+            on, judge = self.scene(view, quality.marker), self._judge
+            what = on.resident if judge is self.renderer else on.scene.cloud
+            return truth(judge, what, on.scene.camera, like, background=on.scene.background)
 
         return _kept(self._truths, (view, like), draw, _TRUTHS)
 
@@ -72,7 +76,7 @@ class Table:
 
     def full(self, view: str, quality: Quality) -> Quality:
         """The setting at which `truth` is drawn."""
-        return full_precision(self.definition(view, quality), self.renderer)
+        return full_precision(self.definition(view, quality), self._judge)
 
 
 def _kept(shelf: OrderedDict[Hashable, Any], key: Hashable, make: Callable[[], Any], most: int) -> Any:

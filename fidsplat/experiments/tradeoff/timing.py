@@ -37,16 +37,9 @@ def time_point(table: Table, view: str, quality: Quality, effort: Effort) -> tup
     and its quartiles), `repeats`, `stages_ms` by the device's own clock, `memory_bytes` (scratch, cloud and
     picture; None where the backend cannot tell), `splats`, `pairs`.
     """
-    backend = table.renderer.backend
-    scene = table.scene(view, quality.marker)
-    if isinstance(backend, Measurable):
-        backend.release_scratch()
+    memory = memory_of(table, view, quality)
     frame = table.draw(view, quality)
     stats = dict(frame.stats)
-    memory = None
-    if isinstance(backend, Measurable):
-        picture = 12 * scene.scene.camera.width * scene.scene.camera.height
-        memory = backend.memory_bytes + scene.resident.memory_bytes + picture
     _ = table.draw(view, BASE).timings
     own: list[float] = []
     base: list[float] = []
@@ -77,6 +70,20 @@ def time_point(table: Table, view: str, quality: Quality, effort: Effort) -> tup
         "splats": stats["splats"],
         "pairs": stats["pairs"],
     }
+
+
+def memory_of(table: Table, view: str, quality: Quality) -> int | None:
+    """Bytes on the device of a picture at a setting: scratch, cloud and picture; None where the backend
+    cannot tell."""
+    backend, scene = table.renderer.backend, table.scene(view, quality.marker).scene
+    if not isinstance(backend, Measurable):
+        return None
+    backend.release_scratch()
+    # a cloud keeps every form of its colours that was ever asked for; this one has been asked for nothing yet
+    resident = table.renderer.upload(scene.cloud)
+    table.renderer.render(resident, scene.camera, ("rgb",), quality, background=scene.background)
+    picture = 12 * scene.camera.width * scene.camera.height
+    return backend.memory_bytes + resident.memory_bytes + picture
 
 
 def _middle(values: Sequence[float]) -> tuple[float, list[float]]:

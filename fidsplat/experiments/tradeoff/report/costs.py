@@ -23,7 +23,7 @@ class Constant:
 
 CONSTANTS = (
     Constant("1/255: nothing fainter is drawn", "alpha_cutoff 1/255"),
-    Constant("3 sigma: an opaque splat ends there", "alpha_cutoff 3 sigma"),
+    Constant("exp(-9/2): an opaque splat ends at 3 sigma, a fainter one sooner", "alpha_cutoff 3 sigma"),
     Constant("1e-4: a pixel is finished", "transmittance_stop 0.0001"),
     Constant("1/256: a pixel is finished", "transmittance_stop 1/256"),
     Constant("0.99: no fragment is more opaque", "opacity_ceiling 0.99"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from fidsplat.experiments.scatter import Axis, Dot, scatter_chart
-from fidsplat.experiments.tradeoff.points import PRESETS_KNOB
+from fidsplat.experiments.tradeoff.points import ALONE, MARKER_KNOB, PRESETS_KNOB, TOGETHER
 from fidsplat.experiments.tradeoff.report.results import Measured, Results
 from fidsplat.experiments.tradeoff.report.verdicts import front
 from fidsplat.experiments.tradeoff.scenes import MARKERS, is_marker
@@ -14,6 +14,17 @@ _LEAST = 1e-7
 """errors below this are drawn there"""
 PLOTTED_TILT = 60
 """degrees at which markers are plotted"""
+_SERIES = {
+    "base": "base",
+    PRESETS_KNOB: "preset",
+    ALONE: "a constant in the exact picture",
+    "alpha_cutoff": "alpha_cutoff",
+    "transmittance_stop": "transmittance_stop",
+    MARKER_KNOB: "marker",
+    TOGETHER: "several knobs",
+}
+_REST = "another knob"
+"""knobs that have a colour of their own, as there are not enough for all, and what the others are called"""
 
 
 def pareto_chart(results: Results, scene: str) -> str:
@@ -25,9 +36,9 @@ def pareto_chart(results: Results, scene: str) -> str:
     best = {id(point) for point in front(points)} if not marked else set()
     series: dict[str, list[Dot]] = {}
     for point in points:
-        named = point.knob in ("base", PRESETS_KNOB) or id(point) in best or point.knob == "marker"
+        named = point.knob in ("base", PRESETS_KNOB) or id(point) in best or point.knob == MARKER_KNOB
         dot = Dot(ms * point.ratio, _error(point, marked), point.words if named else "")
-        series.setdefault(point.knob, []).append(dot)
+        series.setdefault(_SERIES.get(point.knob, _REST), []).append(dot)
     line = [Dot(ms * point.ratio, _error(point, False)) for point in front(points)] if not marked else []
     error = "RMSE from the ideal texture" if marked else "largest error against float64"
     return scatter_chart(
@@ -50,7 +61,7 @@ def marker_charts(results: Results) -> Iterator[tuple[str, str, str]]:
     for name in MARKERS:
         scene = f"{name}@{PLOTTED_TILT}"
         for point in results.of(scene):
-            if point.knob not in ("base", "marker"):
+            if point.knob not in ("base", MARKER_KNOB):
                 continue
             each = point.result["splats"] / point.result["rectangles"]
             if point.result["ideal_psnr"] is not None:

@@ -15,6 +15,7 @@ from fidsplat.experiments.tradeoff.scenes import HARD, is_marker
 GSPLAT = (PRESETS_KNOB, "gsplat")
 _EQUAL_TIME = 1.02
 _MORE_ACCURATE = 10.0
+_BETTER = {verdicts.BOUGHT, verdicts.FREE}
 
 
 def report_reading(document: Document, results: Results) -> None:
@@ -26,12 +27,7 @@ def report_reading(document: Document, results: Results) -> None:
     groups = {
         "**Free accuracy**": [s for s, v in found.items() if _only(v, verdicts.FREE)],
         "**Free time**": [s for s, v in found.items() if _only(v, verdicts.FASTER)],
-        "**Traps**": [
-            s
-            for s, v in found.items()
-            if verdicts.TRAP in v.values()
-            and not {verdicts.CHEAPER, verdicts.BOUGHT, verdicts.FREE, verdicts.FASTER} & set(v.values())
-        ],
+        "**Traps**": [s for s, v in found.items() if _is_trap(v)],
         "**Waste**": [s for s, v in found.items() if _only(v, verdicts.WASTE)],
         "**No difference** on any scene": [
             s for s, v in found.items() if set(v.values()) == {verdicts.NOTHING}
@@ -40,14 +36,18 @@ def report_reading(document: Document, results: Results) -> None:
     for title, settings in groups.items():
         document.text(f"{title}: {listed([_words(results, setting) for setting in settings])}.")
     document.text(f"**Worth turning** for accuracy: {listed(_bargains(results, scenes, found))}.")
+    constants = _constants(results, scenes)
+    if constants:
+        document.text(f"**Constants alone in an exact picture**: {_sorted_out(constants)}.")
     noises = ", ".join(f"{scene} {verdicts.noise(results.base(scene)):.1%}" for scene in scenes)
     meanings = "; ".join(f"{name}: {meaning}" for name, meaning in verdicts.MEANINGS.items())
     document.text(
         "A setting stands in one of the first lists when it is that on some scene and makes no difference on "
-        f"the others ({meanings}). A time differs when both quartiles of the pairs' ratios lie on one side "
-        f"of 1 and the median does by more than the base beside itself ({noises}); an error when it does by "
-        f"a factor of {verdicts.ERROR_CHANGES}. Worth turning are those that buy accuracy on every scene, "
-        "first those whose error falls most for the time."
+        f"the others ({meanings}); a trap is nowhere faster or more accurate. A time differs when both "
+        "quartiles of the pairs' ratios lie on one side of 1 and the median does by more than the base "
+        f"beside itself ({noises}); an error when it does by a factor of {verdicts.ERROR_CHANGES}. Worth "
+        "turning are those that buy accuracy on some scenes and have it free on the others, first those "
+        "whose error falls most for the time."
     )
     rows = [
         (_words(results, setting), *(by_scene.get(scene, NOTHING) for scene in scenes))
@@ -69,6 +69,38 @@ def _verdicts(results: Results, scenes: list[str]) -> dict[tuple[str, str], dict
     return found
 
 
+def _constants(results: Results, scenes: list[str]) -> dict[tuple[str, str], dict[str, str]]:
+    """Setting -> scene -> verdict beside the exact picture, of the constants that were put into it. Beside
+    the base, errors of its cut-off hide what most of them do."""
+    found: dict[tuple[str, str], dict[str, str]] = {}
+    for scene in scenes:
+        exact = results.at(scene, ALONE, "exact")
+        if exact is None:
+            continue
+        for point in results.of(scene):
+            if point.knob == ALONE and point is not exact and point.same_picture:
+                verdict = verdicts.verdict(point, exact, exact.ratio)
+                found.setdefault((ALONE, point.value), {})[scene] = verdict
+    return found
+
+
+def _sorted_out(constants: dict[tuple[str, str], dict[str, str]]) -> str:
+    """What the constants are, in words."""
+    groups = {
+        "traps": [s for s, v in constants.items() if _is_trap(v)],
+        "free time": [s for s, v in constants.items() if _only(v, verdicts.FASTER)],
+        "buying time on some scene": [s for s, v in constants.items() if verdicts.CHEAPER in v.values()],
+        "without a difference": [s for s, v in constants.items() if set(v.values()) == {verdicts.NOTHING}],
+    }
+    values = {name: ", ".join(value for _, value in settings) for name, settings in groups.items()}
+    return "; ".join(f"{name}: {words or 'none'}" for name, words in values.items())
+
+
+def _is_trap(by_scene: dict[str, str]) -> bool:
+    better = {verdicts.CHEAPER, verdicts.BOUGHT, verdicts.FREE, verdicts.FASTER}
+    return verdicts.TRAP in by_scene.values() and not better & set(by_scene.values())
+
+
 def _only(by_scene: dict[str, str], wanted: str) -> bool:
     return wanted in by_scene.values() and set(by_scene.values()) <= {wanted, verdicts.NOTHING}
 
@@ -78,10 +110,10 @@ def _words(results: Results, setting: tuple[str, str]) -> str:
 
 
 def _bargains(results: Results, scenes: list[str], found: dict[tuple[str, str], dict[str, str]]) -> list[str]:
-    """The best few settings that buy accuracy everywhere: what they cost and give on each scene."""
+    """The best few settings that buy accuracy and lose it nowhere: what they cost and give on each scene."""
     ranked = []
     for setting, by_scene in found.items():
-        if set(by_scene.values()) != {verdicts.BOUGHT}:
+        if verdicts.BOUGHT not in by_scene.values() or not set(by_scene.values()) <= _BETTER:
             continue
         gain, cost, words = 0.0, 0.0, []
         for scene in by_scene:
@@ -89,7 +121,8 @@ def _bargains(results: Results, scenes: list[str], found: dict[tuple[str, str], 
             factor = base.maximum / max(point.maximum, 1e-9)
             gain, cost = gain + math.log(factor), cost + math.log(point.ratio)
             words.append(f"{scene} {percent(point.ratio)}, error / {factor:.2g}")
-        ranked.append((gain / cost, f"{_words(results, setting)} ({'; '.join(words)})"))
+        worth = gain / cost if cost > 0 else math.inf
+        ranked.append((worth, f"{_words(results, setting)} ({'; '.join(words)})"))
     return [words for _, words in sorted(ranked, reverse=True)[:5]]
 
 
@@ -109,6 +142,10 @@ def report_goals(document: Document, results: Results) -> None:
         rows.append(_equal_error(scene, gsplat, quickest))
         rows.append(_equal_time(scene, gsplat, best))
     document.table(("scene", "wanted", "found", "by", "reached"), rows)
+    document.text(
+        f"Times within {_EQUAL_TIME - 1:.0%} are equal. What is found is the best of all settings, so that "
+        "between settings as good as each other the luckier time stands here."
+    )
     plain = [scene for scene in results.scenes if not is_marker(scene)]
     choices = {
         "random scenes": [scene for scene in plain if scene != HARD],

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fidsplat.errors import InputError
 from fidsplat.experiments.angles import largest, parse_tilts
 from fidsplat.experiments.records import key_of, read_lines
-from fidsplat.experiments.tradeoff.points import ALONE, KNOBS, MARKER_KNOB, PRESETS_KNOB, TOGETHER
+from fidsplat.experiments.tradeoff.points import ALONE, KNOBS, MARKER_KNOB, PRESETS_KNOB, TOGETHER, Point
 from fidsplat.experiments.tradeoff.run import DECODE, IDEAL, POINT, TRUTH
-from fidsplat.experiments.tradeoff.scenes import MARKERS, NAMES, views_of
-
-DEFINES = ("lowpass", "samples", "coplanar")
-"""knobs that make another picture: their errors are against another truth than the base's"""
+from fidsplat.experiments.tradeoff.scenes import NAMES, is_marker, views_of
+from fidsplat.experiments.tradeoff.table import DEFINITION
+from fidsplat.quality import PRESETS
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ class Measured:
     def same_picture(self) -> bool:
         """Whether its definition is the base's, so that errors may be compared."""
         # without coplanar splats their rule defines nothing
-        knobs = DEFINES if self.scene.partition("@")[0] in MARKERS else DEFINES[:2]
+        knobs = (knob for knob in DEFINITION if knob != "coplanar" or is_marker(self.scene))
         return not any(knob in self.quality for knob in knobs)
 
 
@@ -67,7 +66,8 @@ class Results:
 
     Args:
         device: its title and driver; `title` is without the driver.
-        lines: of `tradeoff.jsonl`; of several about the same part the first counts.
+        lines: of `tradeoff.jsonl`, one for each part. A preset that has changed since is left out, but where
+            its setting of today was measured under another name.
     """
 
     def __init__(self, device: str, lines: Sequence[dict]) -> None:
@@ -78,12 +78,17 @@ class Results:
         self.refused: dict[str, str] = {}
         self.truths: list[dict] = []
         self._scans: dict[tuple[str, str, str], dict] = {}
+        presets: dict[str, None] = {}
         for line in lines:
             key, result = line["key"], line["result"]
             if "error" in result:
                 self.refused.setdefault(f"{key.get('knob', 'truth')} {key.get('value', '')}", result["error"])
             elif key["what"] == POINT:
                 point = Measured(key["scene"], key["knob"], key["value"], key["quality"], result)
+                if point.knob == PRESETS_KNOB:
+                    presets[point.value] = None
+                    if point.quality != _today(point.value):
+                        continue  # the preset has changed since
                 known = self.points.get((point.scene, point.knob, point.value))
                 # of a quick run and a full one the full one counts
                 if known is None or known.result["repeats"] < result["repeats"]:
@@ -96,6 +101,15 @@ class Results:
                     self._scans[where] = line
             elif key["what"] == TRUTH:
                 self.truths.append(line)
+        self._name_presets(presets)
+
+    def _name_presets(self, names: Iterable[str]) -> None:
+        """Give the names of presets to points that have their settings under another name."""
+        for name in names:
+            for point in list(self.points.values()):
+                if point.quality == _today(name):
+                    named = replace(point, knob=PRESETS_KNOB, value=name)
+                    self.points.setdefault((point.scene, PRESETS_KNOB, name), named)
 
     @property
     def scenes(self) -> list[str]:
@@ -138,6 +152,11 @@ class Results:
         return sorted(found, key=lambda pair: order.index(pair[0]))
 
 
+def _today(name: str) -> dict | None:
+    """What a preset changes in the base; None where there is none of that name any more."""
+    return Point(PRESETS_KNOB, name, PRESETS[name]).key()["quality"] if name in PRESETS else None
+
+
 def load(folders: Iterable[Path]) -> list[Results]:
     """The results in folders (every *.jsonl in them), by device, processors first.
 
@@ -147,7 +166,10 @@ def load(folders: Iterable[Path]) -> list[Results]:
     folders = list(folders)
     by_device: dict[str, dict[str, dict]] = {}
     for folder in folders:
-        for file in sorted(folder.glob("*.jsonl")):
+        files = sorted(folder.glob("*.jsonl"))
+        if not files:
+            raise InputError(f"no results in {folder}; run fidsplat tradeoff -o {folder}, or leave it out")
+        for file in files:
             for line in read_lines(file):
                 try:
                     device, known = line["run"]["device"], line["key"]["what"] in (POINT, DECODE, TRUTH)
@@ -155,7 +177,9 @@ def load(folders: Iterable[Path]) -> list[Results]:
                     known = False
                 if not known:
                     raise InputError(f"{file} holds no results of fidsplat tradeoff; give folders that do")
-                by_device.setdefault(device, {}).setdefault(key_of(line), line)
+                lines, key = by_device.setdefault(device, {}), key_of(line)
+                if key not in lines or "error" in lines[key]["result"]:
+                    lines[key] = line
     found = [Results(device, list(lines.values())) for device, lines in by_device.items()]
     found = [results for results in found if results.scenes]
     if not found:

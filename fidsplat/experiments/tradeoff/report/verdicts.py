@@ -41,26 +41,28 @@ _BY_SIGNS = {
 }  # fmt: skip
 
 
-def verdict(point: Measured, base: Measured) -> str:
-    """What a setting with the base's definition is on a scene, beside the base."""
-    signs = {_sign(point.result[name], base.result[name]) for name in ("maximum", "rmse")}
+def verdict(point: Measured, other: Measured, unit: float = 1.0) -> str:
+    """What a setting is on a scene beside another of the same definition: the base, or one whose time is
+    `unit` times the base's."""
+    signs = {_sign(point.result[name], other.result[name]) for name in ("maximum", "rmse")}
     if {-1, 1} <= signs:
         return MIXED
-    return _BY_SIGNS[time_sign(point, noise(base)), next((sign for sign in signs if sign), 0)]
+    return _BY_SIGNS[time_sign(point, noise(other, unit), unit), next((sign for sign in signs if sign), 0)]
 
 
-def noise(base: Measured) -> float:
-    """The share by which times differ on a scene for no reason: that of the base drawn beside itself."""
-    return max(TIME_CHANGES, *(abs(quartile - 1) for quartile in base.result["ratio_quartiles"]))
+def noise(other: Measured, unit: float = 1.0) -> float:
+    """The share by which times differ on a scene for no reason: that of the base drawn beside itself, or that
+    of another setting's own times."""
+    return max(TIME_CHANGES, *(abs(quartile / unit - 1) for quartile in other.result["ratio_quartiles"]))
 
 
-def time_sign(point: Measured, least: float) -> int:
-    """-1 for a setting that is faster than the base, 1 for a slower one, 0 where the noise `least` hides
-    it."""
-    low, high = point.result["ratio_quartiles"]
-    if point.ratio < 1 - least and high < 1:
+def time_sign(point: Measured, least: float, unit: float = 1.0) -> int:
+    """-1 for a setting that is faster than the base (or `unit` times its time), 1 for a slower one, 0 where
+    the noise `least` hides it."""
+    low, high = (quartile / unit for quartile in point.result["ratio_quartiles"])
+    if point.ratio / unit < 1 - least and high < 1:
         return -1
-    return int(point.ratio > 1 + least and low > 1)
+    return int(point.ratio / unit > 1 + least and low > 1)
 
 
 def _sign(error: float, other: float) -> int:

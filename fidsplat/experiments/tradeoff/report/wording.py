@@ -24,5 +24,5 @@ def percent(ratio: float | None) -> str:
 
 
 def listed(words: list[str]) -> str:
-    """Words in a sentence; nothing is "none"."""
-    return ", ".join(words) if words else "none"
+    """Settings in a sentence, whose names may have commas; nothing is "none"."""
+    return "; ".join(words) if words else "none"
