@@ -185,7 +185,7 @@ def test_what_is_free_on_one_scene_and_bought_on_another_is_worth_turning():
     report_reading(document, Results("d", lines))
     assert (
         "**Worth turning** for accuracy: alpha_cutoff 1/1024 (r100k_720p +25 %, error / 13; hard +0.0 %, "
-        "error / 13); alpha_cutoff 0.0001 ("
+        "error / 13); "
     ) in document.markdown()
 
 
