@@ -1,4 +1,4 @@
-"""Makes the pictures of docs/effects.md, and the sheet of all effects in the README.
+"""Makes the pictures of docs/effects.md but the low-passes' (filter_quality.py), and the sheet in the README.
 
 python benchmarks/effects_pictures.py [--device opencl] [--out docs/images]
 """
@@ -177,6 +177,10 @@ def main() -> None:
         ("noise, 200 electrons", picture(exact, sensor=fs.Sensor(full_well=200, read_noise=6))),
     ]
     write_png(options.out / "effect-sensor.png", small([seen[:3], seen[3:]], 140))
+
+    globes = [("plain" if degree == 0 else f"degree {degree}", shining(degree)) for degree in range(4)]
+    colors = [(name, picture(what)) for name, what in globes]
+    write_png(options.out / "effect-color.png", small([colors], 120))
 
     examples(renderer, options.out)
     panels = all_effects(renderer)

@@ -21,7 +21,6 @@ from fidsplat.splats import SplatCloud
 from fidsplat.surroundings import Fog, Gradient, Panorama, background_of
 
 _NO_SCENE = Scene(())
-_REST = Motion()
 _INSTANT = Shutter()
 
 
@@ -221,8 +220,10 @@ class Renderer:
             raise InputError("outputs is empty; name at least one, e.g. 'rgb'")
         chosen = Quality.of(own.quality if quality is None else quality)
         behind = background_of(own.background if background is None else background)
-        sensor, fog = sensor or own.sensor, fog or own.fog
-        for value, kind in ((sensor, Sensor), (fog, Fog)):
+        sensor, fog = (own.sensor if sensor is None else sensor), (own.fog if fog is None else fog)
+        moving = own.motion if motion is None else motion
+        when = (own.shutter or _INSTANT) if shutter is None else shutter
+        for value, kind in ((sensor, Sensor), (fog, Fog), (moving, Motion), (when, Shutter)):
             if value is not None and not isinstance(value, kind):
                 raise InputError(f"{kind.__name__.lower()} is {value!r}; it must be a {kind.__name__}")
 
@@ -232,11 +233,7 @@ class Renderer:
                 "this cloud was uploaded by another Renderer; upload it with the one that draws it"
             )
         data = resident._data
-        moving = own.motion if motion is None else motion
-        when = own.shutter if shutter is None else shutter
-        view = exposed_view(
-            camera, chosen, data.origin, behind, moving or _REST, when or _INSTANT, sensor, fog
-        )
+        view = exposed_view(camera, chosen, data.origin, behind, moving, when, sensor, fog)
         features = select(
             data,
             names,
@@ -276,7 +273,7 @@ class Renderer:
         behind = background_of(own.background if background is None else background)
         motion = own.motion if motion is None else motion
         shutter = own.shutter if shutter is None else shutter
-        sensor, fog = sensor or own.sensor, fog or own.fog
+        sensor, fog = (own.sensor if sensor is None else sensor), (own.fog if fog is None else fog)
         resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
         waiting: Frame | None = None
         failure: Exception | None = None

@@ -12,6 +12,10 @@ from fidsplat.errors import InputError
 
 RESPONSES = ("linear", "srgb")
 BITS = (8, 16)
+GAMMAS = 0.01, 100.0
+"""least and most"""
+LARGEST = 1e15
+"""of factors and of a curve's values: what is made of them stays within float32"""
 
 
 @dataclass(frozen=True)
@@ -29,10 +33,10 @@ class Sensor:
     """up to three numbers a, b, c: light times 1 + a r^2 + b r^4 + c r^6, with r the distance from the
     principal point in halves of the picture's diagonal"""
     full_well: float = math.inf
-    """electrons of the value 1, above 0: n electrons have a shot noise of sqrt(n); infinitely many have
+    """electrons of the value 1, 1 or more: n electrons have a shot noise of sqrt(n); infinitely many have
     none"""
     read_noise: float = 0.0
-    """electrons, standard deviation of each read-out, 0 and above; it needs a finite full_well"""
+    """electrons, standard deviation of each read-out, 0 to full_well, which it needs"""
     seed: int = 0
     """which noise, 0 to 2^32 - 1; the same seed gives the same noise, so change it from picture to picture"""
     gain: float = 1.0
@@ -45,22 +49,27 @@ class Sensor:
     rounded"""
 
     def __post_init__(self) -> None:
-        for name in ("exposure", "gain", "read_noise"):
-            if not (_is_number(getattr(self, name)) and 0 <= getattr(self, name) < math.inf):
-                raise InputError(
-                    f"sensor: {name} is {getattr(self, name)!r}; it must be a number of at least 0"
-                )
-        if not (_is_number(self.full_well) and self.full_well > 0):
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.generic):  # a scene file says Python's own numbers
+                object.__setattr__(self, field.name, value.item())
+        if not (_is_number(self.full_well) and self.full_well >= 1):
             raise InputError(
-                f"sensor: full_well is {self.full_well!r}; it must be a number of electrons above 0"
+                f"sensor: full_well is {self.full_well!r}; it must be a number of electrons, 1 or more"
             )
+        for name, most in (("exposure", LARGEST), ("gain", LARGEST), ("read_noise", self.full_well)):
+            value = getattr(self, name)
+            if not (_is_number(value) and 0 <= value <= most and value < math.inf):
+                raise InputError(
+                    f"sensor: {name} is {value!r}; it must be a number of at least 0, at most {most:g}"
+                )
         if self.read_noise > 0 and math.isinf(self.full_well):
             raise InputError(
                 f"sensor: read_noise is {self.read_noise!r} electrons, which means nothing without full_well"
             )
         if not (isinstance(self.seed, int) and not isinstance(self.seed, bool) and 0 <= self.seed < 2**32):
             raise InputError(f"sensor: seed is {self.seed!r}; it must be a whole number from 0 to 2^32 - 1")
-        if self.bits is not None and self.bits not in BITS:
+        if self.bits is not None and (isinstance(self.bits, float) or self.bits not in BITS):
             raise InputError(f"sensor: bits is {self.bits!r}; known: 8, 16, or none")
         object.__setattr__(self, "vignetting", _numbers("vignetting", self.vignetting, 0, 3))
         if isinstance(self.response, str):
@@ -70,8 +79,11 @@ class Sensor:
                     "or a table"
                 )
         elif _is_number(self.response):
-            if not 0 < self.response < math.inf:  # type: ignore[operator]
-                raise InputError(f"sensor: response is {self.response!r}; a gamma must be above 0")
+            if not GAMMAS[0] <= self.response <= GAMMAS[1]:  # type: ignore[operator]
+                raise InputError(
+                    f"sensor: response is {self.response!r}; a gamma must lie between {GAMMAS[0]:g} and "
+                    f"{GAMMAS[1]:g}"
+                )
         else:
             object.__setattr__(self, "response", _numbers("response", self.response, 2, 65536))
 
@@ -128,6 +140,12 @@ def _numbers(name: str, values: Any, least: int, most: int) -> tuple[float, ...]
         numbers = tuple(float(value) for value in values)
     except (TypeError, ValueError):
         numbers = None
-    if numbers is None or not least <= len(numbers) <= most or not all(map(math.isfinite, numbers)):
-        raise InputError(f"sensor: {name} is {values!r}; it must be {least} to {most} finite numbers")
+    if (
+        numbers is None
+        or not least <= len(numbers) <= most
+        or not all(abs(number) <= LARGEST for number in numbers)
+    ):
+        raise InputError(
+            f"sensor: {name} is {values!r}; it must be {least} to {most} finite numbers, at most {LARGEST:g}"
+        )
     return numbers

@@ -29,6 +29,8 @@ class Fog:
     """RGB"""
 
     def __post_init__(self) -> None:
+        if isinstance(self.density, np.generic):  # a scene file says Python's own numbers
+            object.__setattr__(self, "density", self.density.item())
         ok = isinstance(self.density, (int, float)) and not isinstance(self.density, bool)
         if not (ok and 0 <= self.density < math.inf):
             raise InputError(
@@ -54,7 +56,7 @@ class Gradient:
     def __post_init__(self) -> None:
         for name in ("top", "bottom", "up"):
             object.__setattr__(self, name, three_numbers(f"background: {name}", getattr(self, name)))
-        if not any(self.up):
+        if not 0 < np.linalg.norm(self.up) < math.inf:
             raise InputError(f"background: up is {self.up!r}; it must be a direction, e.g. (0, -1, 0)")
 
 
@@ -67,7 +69,7 @@ class Panorama:
     """
 
     image: np.ndarray
-    """(h, w, 3) float32 RGB, read-only; uint8 is taken as 255ths"""
+    """(h, w, 3) float32 RGB, read-only; uint8 is taken as 255ths, uint16 as 65535ths"""
     file: str | None = None
     """where it came from"""
 
@@ -82,7 +84,8 @@ class Panorama:
             raise InputError(
                 f"background: a panorama of {width} x {height} pixels; 2 to {MAX_PANORAMA} a side can be used"
             )
-        image = np.array(given, np.float32) / np.float32(255 if given.dtype == np.uint8 else 1)
+        whole = np.iinfo(given.dtype).max if given.dtype in (np.uint8, np.uint16) else 1
+        image = np.array(given, np.float32) / np.float32(whole)
         if not np.isfinite(image).all():
             raise InputError("background: the panorama holds numbers that are not finite")
         image.flags.writeable = False

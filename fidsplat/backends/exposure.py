@@ -40,8 +40,8 @@ def exposed_view(
     sensor: Sensor | None = None,
     fog: Fog | None = None,
 ) -> View:
-    """The view of a picture under a shutter: with `shots` if it takes more than one pose, else just at its
-    time.
+    """The view of a picture under a shutter: with `shots` if something moves and it takes more than one pose,
+    else just at its time.
 
     Raises:
         InputError: as View.of; a pose that is not rigid.
@@ -56,7 +56,8 @@ def exposed_view(
         return replace(view, groups=tuple((k, _moved(view, m, origin)) for k, m in motion.groups_at(time)))
 
     whole = at(shutter.time)
-    if len(bands) == 1 and len(shutter.times(0.0)) == 1:
+    still = motion.camera is None and not motion.groups
+    if still or (len(bands) == 1 and len(shutter.times(0.0)) == 1):
         return whole
     shots = []
     for top, end, middle in bands:

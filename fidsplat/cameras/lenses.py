@@ -17,6 +17,8 @@ from fidsplat.errors import InputError
 
 FISHEYE_LIMIT = math.radians(100)
 """a fisheye sees no further from its axis: 200 degrees in all"""
+MAX_COEFFICIENT = 1e12
+"""of a lens, in size: far beyond any that can be inverted, and products of several still are numbers"""
 _STEPS = 4096  # of the tables from which Newton's iteration starts
 _ITERATIONS = 12
 
@@ -296,9 +298,12 @@ def _check(lens) -> None:
         if (
             isinstance(value, bool)
             or not isinstance(value, (int, float, np.number))
-            or not np.isfinite(value)
+            or not abs(value) <= MAX_COEFFICIENT
         ):
-            raise InputError(f"lens coefficient {field.name} must be a finite number, not {value!r}")
+            raise InputError(
+                f"lens coefficient {field.name} must be a finite number, in size at most "
+                f"{MAX_COEFFICIENT:g}, not {value!r}"
+            )
         object.__setattr__(lens, field.name, float(value))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from types import MappingProxyType
 from typing import TypeAlias
 
@@ -41,6 +41,10 @@ class Shutter:
     of h rows is off by at most v (rows_per_band - 1) / (2 h) pixels; 1 is exact, and slow"""
 
     def __post_init__(self) -> None:
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if isinstance(value, np.generic):  # a scene file says Python's own numbers
+                object.__setattr__(self, each.name, value.item())
         for name in ("time", "exposure", "readout"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
@@ -82,11 +86,18 @@ class Trajectory:
     """(k, 4, 4) rigid"""
 
     def __post_init__(self) -> None:
-        times = np.array(self.times, np.float64)
+        try:
+            times = np.array(self.times, np.float64)
+        except (TypeError, ValueError):
+            times = np.empty(0)
         if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-            raise InputError("the times of a trajectory must be one or more finite, increasing numbers")
-        if len(self.poses) != len(times):
-            raise InputError(f"a trajectory has {len(times)} times but {len(self.poses)} poses")
+            raise InputError(
+                "the times of a trajectory must be one or more finite, increasing numbers of seconds, not "
+                f"{self.times!r}"
+            )
+        count = len(self.poses) if isinstance(self.poses, Sequence | np.ndarray) else 0
+        if count != len(times):
+            raise InputError(f"a trajectory has {len(times)} times but {count} poses; give one for each time")
         for k, pose in enumerate(self.poses):
             check_similarity(pose, f"pose {k} of a trajectory", rigid=True)
         poses = np.array(self.poses, np.float64)
@@ -160,6 +171,12 @@ class Motion:
             )
         if not isinstance(self.groups, Mapping) or not all(map(callable, self.groups.values())):
             raise InputError("motion of groups must be {label: Trajectory or function of the time}")
+        for label in self.groups:
+            if isinstance(label, bool) or not isinstance(label, (int, np.integer)):
+                raise InputError(
+                    f"motion of groups: the label {label!r} is no whole number; splats have such "
+                    "(SplatCloud.with_labels)"
+                )
         object.__setattr__(self, "groups", MappingProxyType(dict(self.groups)))
 
     def camera_at(self, time: float) -> np.ndarray | None:

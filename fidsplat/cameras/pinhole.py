@@ -2,11 +2,11 @@
 
 import math
 import operator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
-from fidsplat.cameras.lenses import Equirectangular, Fisheye, Lens, Orthographic
+from fidsplat.cameras.lenses import BrownConrady, Equirectangular, Fisheye, Lens, Orthographic
 from fidsplat.errors import InputError
 from fidsplat.rotations import check_similarity
 
@@ -101,10 +101,18 @@ class Camera:
         elif not isinstance(lens, Orthographic):
             y, x = np.mgrid[0.5 : self.height : self.height / 24, 0.5 : self.width : self.width / 32]
             seen = np.isfinite(self.rays(np.stack([x.ravel(), y.ravel()], 1))[:, 0]).mean()
-            if seen == 0 or (seen < 0.5 and lens.kind == "brown_conrady"):
+            if seen < 0.5 and isinstance(lens, BrownConrady):
+                values = [(each.name, getattr(lens, each.name)) for each in fields(lens)]
+                given = ", ".join(f"{name} = {value:g}" for name, value in values if value)
                 raise InputError(
-                    f"camera distortion cannot be inverted in {100 * (1 - seen):.0f} % of the picture: it "
-                    "turns back before its edge; check the coefficients and the focal length (pixels)"
+                    f"camera distortion ({given}) cannot be inverted in {100 * (1 - seen):.0f} % of the "
+                    "picture: it turns back before its edge; check the coefficients and the focal length "
+                    f"({self.fx:g} pixels)"
+                )
+            if seen == 0:
+                raise InputError(
+                    f"camera lens: the whole picture lies outside what a {lens.kind} lens sees; check fx, fy "
+                    f"({self.fx:g}, {self.fy:g} pixels per radian) and cx, cy ({self.cx:g}, {self.cy:g})"
                 )
 
     @staticmethod
@@ -127,7 +135,10 @@ class Camera:
         coefficients: k1 to k4 as `cv2.fisheye` has them. Calibrated intrinsics go through
         `Camera.pinhole(..., lens=Fisheye(...))`.
         """
-        lens, width = Fisheye(*coefficients), _size("width", width)
+        factors = np.ravel(coefficients).tolist()
+        if len(factors) != 4:
+            raise InputError(f"a fisheye has 4 coefficients, k1 to k4, not {len(factors)}")
+        lens, width = Fisheye(*factors), _size("width", width)
         f = fisheye_focal_length(width, fov_x, lens)
         pose = np.eye(4) if world_to_camera is None else world_to_camera
         return Camera(width, height, f, f, width / 2, height / 2, pose, near, far, lens=lens)

@@ -1,6 +1,6 @@
 """`fidsplat detect`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import tyro
@@ -17,7 +17,8 @@ class Detect:
 
 Prints what they say and the corners of each, in pixels: top left, top right, bottom right, bottom left as
 printed, the centre of the first pixel at (0.5, 0.5). With --scene also where each marker of that scene was
-seen from its camera, and how far that is from the truth.
+seen from its camera, and how far that is from the truth: of a scene that moves, from where things are at its
+shutter's time, when the middle row is exposed.
 
 Examples:
   fidsplat detect photo.jpg
@@ -71,7 +72,8 @@ Examples:
         if scene is not None:
             from fidsplat.experiments.readback import read_back
 
-            readings, strangers = read_back(found, scene.markers, scene.camera)
+            camera, markers = _standing(scene)
+            readings, strangers = read_back(found, markers, camera)
             result["markers"] = [reading.as_dict() for reading in readings]
             result["not_in_scene"] = [code.name for code in strangers]
         if self.json:
@@ -111,6 +113,19 @@ Examples:
                 f"{size[1]}; give the picture that this scene was rendered to"
             )
         return scene
+
+
+def _standing(scene):
+    """The camera and the markers of a scene where they are at its shutter's time."""
+    time = 0.0 if scene.shutter is None else scene.shutter.time
+    pose, camera = scene.motion.camera_at(time), scene.camera
+    if pose is not None:
+        camera = replace(camera, world_to_camera=pose, position=None)
+    markers = [
+        marker if marker.motion is None else replace(marker, pose=marker.motion(time))
+        for marker in scene.markers
+    ]
+    return camera, markers
 
 
 def reading_row(reading) -> tuple[str, ...]:

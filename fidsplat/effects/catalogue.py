@@ -1,8 +1,9 @@
 """Every effect: its kernel file and what it adds to the records, buffers and outputs.
 
 A slot is filled by exactly one effect of its kind (camera, color, lowpass, stop, compose, footprint,
-background); taps are extra planes, any number of them; parts are what several of them share. The sections of
-an effect's kernel file say where its text goes (kernels/README.md).
+background, arithmetic); taps are extra planes and posts steps after blending, any number of them; parts are
+what several of them share. The sections of an effect's kernel file say where its text goes
+(kernels/README.md).
 """
 
 from __future__ import annotations

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class PlacedMarker:
-    """A marker somewhere in the world. Raises InputError when the pose is not rigid."""
+    """A marker somewhere in the world. Raises InputError when the pose is not rigid, or the motion is no
+    function."""
 
     marker: Marker
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -37,6 +38,11 @@ class PlacedMarker:
 
     def __post_init__(self) -> None:
         check_similarity(self.pose, "a marker's pose", rigid=True)
+        if self.motion is not None and not callable(self.motion):
+            raise InputError(
+                f"a marker's motion is a {type(self.motion).__name__}; it must be an fs.Trajectory or a "
+                "function of the time"
+            )
         pose = np.array(self.pose, dtype=np.float64)
         pose.flags.writeable = False
         object.__setattr__(self, "pose", pose)

@@ -3,6 +3,8 @@
 import os
 from pathlib import Path
 
+import numpy as np
+
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
 from fidsplat.formats import save_ply
@@ -102,7 +104,8 @@ def _value(value) -> str:
         return f"[{', '.join(map(_value, value))}]"
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key} = {_value(part)}" for key, part in value.items()) + "}"
-    return repr(value)  # int and finite float are written alike in Python and TOML, and so is inf
+    plain = value.item() if isinstance(value, np.generic) else value
+    return repr(plain)  # int and finite float are written alike in Python and TOML, and so is inf
 
 
 def _string(text: str) -> str:

@@ -57,6 +57,8 @@ def test_values_that_mean_nothing_call_for_nothing(renderer):
     before = set(renderer.backend._pipelines)
     motion = fs.Motion(lambda time: CAMERAS["pinhole"].world_to_camera)
     renderer.render(cloud, nothing, quality=PLAIN, motion=motion, shutter=fs.Shutter(time=0.5, sub_poses=9))
+    # nor is one before which nothing moves
+    renderer.render(cloud, nothing, quality=PLAIN, shutter=fs.Shutter(exposure=0.1, readout=0.2))
     added = set(renderer.backend._pipelines) - before
     assert not any("shutter" in slot or "motion" in slot for features, _ in added for slot in features.slots)
 

@@ -45,13 +45,12 @@ def eight_bits(rgb):
     return np.clip(np.round(np.asarray(rgb) * 255), 0, 255).astype(np.uint8)
 
 
-@pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("turn_deg", [0, 30])
-def test_a_tag_is_found_where_it_is(renderer, name, turn_deg):
+def assert_found(renderer, name, turn, **effects):
+    """After undistortion, where it is to 1 % of the distance."""
     camera, position = CASES[name]
-    placed = tag_at(position, math.radians(turn_deg))
+    placed = tag_at(position, turn)
     scene = fs.Scene([], camera, [placed], background=(0.5, 0.5, 0.5), quality=DENSE)
-    image = eight_bits(renderer.render(scene)["rgb"])
+    image = eight_bits(renderer.render(scene, **effects)["rgb"])
     flat = pinhole_towards(camera, position, 360, 360, math.radians(40))
     (found,) = detect(undistort(image, camera, flat), families=("36h11",), qr=False)
     assert found.id == 5
@@ -59,6 +58,30 @@ def test_a_tag_is_found_where_it_is(renderer, name, turn_deg):
     apart, _ = pose_error(pose, placed.pose)
     print(f"{name}: {100 * apart / np.linalg.norm(position):.2f} % of the distance")
     assert apart < 0.01 * np.linalg.norm(position)
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("turn_deg", [0, 30])
+def test_a_tag_is_found_where_it_is(renderer, name, turn_deg):
+    assert_found(renderer, name, math.radians(turn_deg))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_tag_that_moves_is_found_in_blur_and_noise_through_every_lens(renderer, name):
+    """It turns about the camera by 0.4 rad a second, up to 2 px during the exposure; light falls off, and
+    values have a noise of up to 5 of 255 grey levels."""
+
+    def around(time):
+        return pose_of((0, 0, 0), (math.cos(0.2 * time), 0, math.sin(0.2 * time), 0))
+
+    assert_found(
+        renderer,
+        name,
+        math.radians(15),
+        motion=fs.Motion(None, {1: around}),
+        shutter=fs.Shutter(exposure=0.01, sub_poses=4),
+        sensor=fs.Sensor(vignetting=(-0.3,), full_well=3000, read_noise=10, seed=2),
+    )
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -98,6 +98,34 @@ def test_a_scene_is_drawn_and_read_back(scene, tmp_path, capsys):
     assert "position [mm]" in out
 
 
+def test_what_moves_is_held_against_where_it_is_at_the_shutters_time(scene, tmp_path, capsys):
+    """The camera has passed 0.06 m by then, the tag 0.03 m: far more than the error."""
+    keyframes = """
+[[camera.motion]]
+time = 0.0
+position = [0.0, 0.0, -0.5]
+look_at = [0.0, 0.0, 0.0]
+
+[[camera.motion]]
+time = 1.0
+position = [0.12, 0.0, -0.5]
+look_at = [0.12, 0.0, 0.0]
+"""
+    tag = "motion = [{time = 0.0, position = [0.02, 0.0, 0.1]}, {time = 1.0, position = [0.02, 0.06, 0.1]}]"
+    text = SCENE.replace(
+        "position = [0.0, 0.0, -0.5]\nlook_at = [0.0, 0.0, 0.0]\n", "[camera.shutter]\ntime = 0.5"
+    )
+    text = text.replace("position = [0.02, 0.0, 0.1]\n", f"{tag}\n")
+    (tmp_path / scene).write_text(text + keyframes)
+    assert main(["render", scene]) == 0
+    capsys.readouterr()
+    assert main(["detect", "scene.png", "--scene", scene, "--json"]) == 0
+    (marker,) = said(capsys)["markers"]
+    assert marker["found"]
+    assert marker["position_error_mm"] < 6
+    assert marker["corner_error_px"] < 0.5
+
+
 def test_every_plane_is_a_file(scene, tmp_path, capsys):
     words = "rgb,alpha,depth,depth_median,distance_first,normal,normal_world,label,splat_id,blended"
     assert main(["render", scene, "-o", "frames", "--outputs", words, "--json"]) == 0

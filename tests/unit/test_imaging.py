@@ -34,15 +34,18 @@ size = 0.3
     [
         ({"exposure": -1}, "exposure is -1; it must be a number of at least 0"),
         ({"gain": math.nan}, "gain is nan"),
-        ({"full_well": 0}, "full_well is 0; it must be a number of electrons above 0"),
+        ({"full_well": 0.5}, "full_well is 0.5; it must be a number of electrons, 1 or more"),
+        ({"full_well": 9, "read_noise": 10}, "read_noise is 10; .* at least 0, at most 9"),
+        ({"gain": 1e30}, r"gain is 1e\+30; it must be a number of at least 0, at most"),
         ({"read_noise": 3}, "means nothing without full_well"),
         ({"seed": 1.5}, "seed is 1.5; it must be a whole number"),
         ({"seed": 2**32}, "seed is 4294967296"),
         ({"bits": 12}, "bits is 12; known: 8, 16"),
+        ({"bits": 8.0}, "bits is 8.0; known: 8, 16"),
         ({"vignetting": (1, 2, 3, 4)}, "vignetting is .*0 to 3 finite numbers"),
         ({"vignetting": 0.5}, "vignetting is 0.5"),
         ({"response": "log"}, "response is 'log'; known: linear, srgb"),
-        ({"response": 0.0}, "a gamma must be above 0"),
+        ({"response": 1e-300}, "a gamma must lie between 0.01 and 100"),
         ({"response": (1,)}, "2 to 65536 finite numbers"),
         ({"response": (0, math.inf)}, "finite numbers"),
     ],
@@ -59,6 +62,7 @@ def test_sensors_that_cannot_be(values, words):
         (lambda: fs.Fog(0.1, (1, 2)), "fog: color"),
         (lambda: fs.Gradient((0, 0, 0), (1, 1, math.nan)), "background: bottom"),
         (lambda: fs.Gradient((0, 0, 0), (1, 1, 1), (0, 0, 0)), "must be a direction"),
+        (lambda: fs.Gradient((0, 0, 0), (1, 1, 1), (1e-300, 0, 0)), "must be a direction"),
         (lambda: fs.Panorama(np.zeros((4, 4))), r"must be \(h, w, 3\)"),
         (lambda: fs.Panorama(np.zeros((1, 4, 3))), "4 x 1 pixels"),
         (lambda: fs.Panorama(np.full((4, 4, 3), np.nan)), "not finite"),
@@ -101,6 +105,29 @@ def test_a_scene_file_keeps_them(tmp_path):
         assert fs.Scene.load(tmp_path / "a.toml").sensor == fs.Sensor(response=response)
     fs.Scene().save(tmp_path / "a.toml")
     assert (fs.Scene.load(tmp_path / "a.toml").sensor, fs.Scene.load(tmp_path / "a.toml").fog) == (None, None)
+
+
+def test_numbers_of_numpy_are_numbers(tmp_path):
+    """They are what a script has that draws many pictures; a file says them as any others."""
+    one = np.float32(1.5)
+    scene = fs.Scene(
+        camera=fs.Camera.pinhole(8, 6, 8.0, 8.0, 4.0, 3.0),
+        sensor=fs.Sensor(one, full_well=np.float64(900), seed=np.int64(7), response=one, bits=np.int32(8)),
+        fog=fs.Fog(np.float64(0.25)),
+        shutter=fs.Shutter(exposure=np.float64(0.25), sub_poses=np.int64(3), rows_per_band=np.int32(2)),
+        quality=fs.Quality(alpha_cutoff=np.float64(0.125)),
+    )
+    scene.save(tmp_path / "a.toml")
+    read = fs.Scene.load(tmp_path / "a.toml")
+    assert (read.sensor, read.fog, read.shutter) == (scene.sensor, scene.fog, scene.shutter)
+    assert read.sensor == fs.Sensor(1.5, full_well=900, seed=7, response=1.5, bits=8)
+    assert read.quality == scene.quality
+
+
+def test_a_panorama_of_whole_numbers_is_a_share_of_its_type():
+    for kind in (np.uint8, np.uint16):
+        image = np.full((2, 4, 3), np.iinfo(kind).max, kind)
+        assert (fs.Panorama(image).image == 1).all()
 
 
 def test_a_scene_file_keeps_the_low_pass_and_the_first_hit(tmp_path):

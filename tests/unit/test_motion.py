@@ -9,6 +9,7 @@ import pytest
 import fidsplat as fs
 from fidsplat.cameras.motion import between
 from fidsplat.rotations import quaternion_to_matrix
+from fidsplat.scenes import PlacedMarker
 
 
 def random_pose(generator, angle=None):
@@ -68,9 +69,13 @@ def test_when_rows_are_exposed():
         (lambda: fs.Shutter(rows_per_band=0.5), "rows_per_band must be a whole number, 1 or more"),
         (lambda: fs.Trajectory([0, 0], [np.eye(4)] * 2), "increasing"),
         (lambda: fs.Trajectory([0], [np.eye(4)] * 2), "1 times but 2 poses"),
+        (lambda: fs.Trajectory([0], None), "1 times but 0 poses; give one for each"),
         (lambda: fs.Trajectory([0], [2 * np.eye(4)]), "pose 0 of a trajectory"),
         (lambda: fs.Motion(camera=np.eye(4)), "Trajectory or a function"),
         (lambda: fs.Motion(groups={1: np.eye(4)}), "Trajectory or function"),
+        (lambda: fs.Motion(groups={"tag": lambda t: np.eye(4)}), "the label 'tag' is no whole number"),
+        (lambda: fs.Trajectory(["noon"], [np.eye(4)]), r"increasing numbers of seconds, not \['noon'\]"),
+        (lambda: PlacedMarker(None, motion=np.eye(4)), "a marker's motion is .*function of the time"),
         (lambda: fs.Motion(groups={1: lambda t: np.zeros((4, 4))}).groups_at(0), "label 1 at 0 s"),
     ],
 )
