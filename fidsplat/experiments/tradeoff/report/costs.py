@@ -8,7 +8,7 @@ from fidsplat.experiments.document import Document
 from fidsplat.experiments.figures import NOTHING
 from fidsplat.experiments.tradeoff.points import ALONE
 from fidsplat.experiments.tradeoff.report.results import Measured, Results
-from fidsplat.experiments.tradeoff.report.verdicts import verdict
+from fidsplat.experiments.tradeoff.report.verdicts import noise, verdict
 from fidsplat.experiments.tradeoff.report.wording import fixed, number, percent
 from fidsplat.experiments.tradeoff.scenes import is_marker
 
@@ -88,7 +88,7 @@ def _errors(point: Measured) -> list[str]:
 
 def report_scene(document: Document, results: Results, scene: str) -> None:
     """Everything that was measured on one scene."""
-    base = results.base(scene)
+    base, least = results.base(scene), noise(results, scene)
     rows = []
     for point in results.of(scene):
         found = point.result
@@ -106,7 +106,7 @@ def report_scene(document: Document, results: Results, scene: str) -> None:
                 number(found["rmse"]),
                 fixed(found["psnr"]),
                 number(found["flip"]),
-                verdict(point, base) if point.same_picture else "another picture",
+                verdict(point, base, least) if point.same_picture else "another picture",
             )
         )
     heads = (

@@ -39,15 +39,16 @@ def report_reading(document: Document, results: Results) -> None:
     constants = _constants(results, scenes)
     if constants:
         document.text(f"**Constants alone in an exact picture**: {_sorted_out(constants)}.")
-    noises = ", ".join(f"{scene} {verdicts.noise(results.base(scene)):.1%}" for scene in scenes)
+    noises = ", ".join(f"{scene} {verdicts.noise(results, scene):.1%}" for scene in scenes)
     meanings = "; ".join(f"{name}: {meaning}" for name, meaning in verdicts.MEANINGS.items())
     document.text(
         "A setting stands in one of the first lists when it is that on some scene and makes no difference on "
         f"the others ({meanings}); a trap is nowhere faster or more accurate. A time differs when both "
         "quartiles of the pairs' ratios lie on one side of 1 and the median does by more than the base "
-        f"beside itself ({noises}); an error when it does by a factor of {verdicts.ERROR_CHANGES}. Worth "
-        "turning are those that buy accuracy on some scenes and have it free on the others, first those "
-        "whose error falls most for the time."
+        "beside itself, and than any setting that was measured twice, under two names, beside itself "
+        f"({noises}); an error when it does by a factor of {verdicts.ERROR_CHANGES}. Worth turning are those "
+        "that buy accuracy on some scenes and have it free on the others, first those whose error falls most "
+        "for the time."
     )
     rows = [
         (_words(results, setting), *(by_scene.get(scene, NOTHING) for scene in scenes))
@@ -59,13 +60,15 @@ def report_reading(document: Document, results: Results) -> None:
 def _verdicts(results: Results, scenes: list[str]) -> dict[tuple[str, str], dict[str, str]]:
     """Setting -> scene -> verdict, of what keeps the base's definition."""
     found: dict[tuple[str, str], dict[str, str]] = {}
+    noise = {scene: verdicts.noise(results, scene) for scene in scenes}
     for setting in results.settings():
         for scene in scenes:
             point = results.at(scene, *setting)
             if point is None or not point.same_picture or point.knob in ("base", ALONE):
                 continue
-            if point.quality != results.base(scene).quality:  # a preset may be the base itself
-                found.setdefault(setting, {})[scene] = verdicts.verdict(point, results.base(scene))
+            base = results.base(scene)
+            if point.quality != base.quality:  # a preset may be the base itself
+                found.setdefault(setting, {})[scene] = verdicts.verdict(point, base, noise[scene])
     return found
 
 
@@ -74,12 +77,12 @@ def _constants(results: Results, scenes: list[str]) -> dict[tuple[str, str], dic
     the base, errors of its cut-off hide what most of them do."""
     found: dict[tuple[str, str], dict[str, str]] = {}
     for scene in scenes:
-        exact = results.at(scene, ALONE, "exact")
+        exact, noise = results.at(scene, ALONE, "exact"), verdicts.noise(results, scene)
         if exact is None:
             continue
         for point in results.of(scene):
             if point.knob == ALONE and point is not exact and point.same_picture:
-                verdict = verdicts.verdict(point, exact, exact.ratio)
+                verdict = verdicts.verdict(point, exact, noise, exact.ratio)
                 found.setdefault((ALONE, point.value), {})[scene] = verdict
     return found
 

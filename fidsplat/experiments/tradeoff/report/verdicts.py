@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
 
 from fidsplat.experiments.tradeoff.report.results import Measured, Results
@@ -41,19 +42,23 @@ _BY_SIGNS = {
 }  # fmt: skip
 
 
-def verdict(point: Measured, other: Measured, unit: float = 1.0) -> str:
+def verdict(point: Measured, other: Measured, least: float, unit: float = 1.0) -> str:
     """What a setting is on a scene beside another of the same definition: the base, or one whose time is
-    `unit` times the base's."""
+    `unit` times the base's. least: the scene's `noise`."""
     signs = {_sign(point.result[name], other.result[name]) for name in ("maximum", "rmse")}
     if {-1, 1} <= signs:
         return MIXED
-    return _BY_SIGNS[time_sign(point, noise(other, unit), unit), next((sign for sign in signs if sign), 0)]
+    return _BY_SIGNS[time_sign(point, least, unit), next((sign for sign in signs if sign), 0)]
 
 
-def noise(other: Measured, unit: float = 1.0) -> float:
-    """The share by which times differ on a scene for no reason: that of the base drawn beside itself, or that
-    of another setting's own times."""
-    return max(TIME_CHANGES, *(abs(quartile / unit - 1) for quartile in other.result["ratio_quartiles"]))
+def noise(results: Results, scene: str) -> float:
+    """The share by which times differ on a scene for no reason: that of the base drawn beside itself, and
+    that between settings that were measured twice, under two names."""
+    shares = [abs(quartile - 1) for quartile in results.base(scene).result["ratio_quartiles"]]
+    times: dict[str, list[float]] = {}
+    for point in results.of(scene):
+        times.setdefault(json.dumps(point.quality, sort_keys=True), []).append(point.ratio)
+    return max(TIME_CHANGES, *shares, *(max(same) / min(same) - 1 for same in times.values()))
 
 
 def time_sign(point: Measured, least: float, unit: float = 1.0) -> int:
