@@ -146,7 +146,8 @@ class OpenCLPipeline:
         to picture hardly any do, and setting them takes the host longer than a small stage takes a GPU.
         A buffer is remembered by its token, so that a cloud or a picture that nobody has any more is let go.
         """
-        kernel, bound = self._kernels[name], self._bound.pop(name, None) or [None] * len(args)
+        kernel = self._kernels[name]
+        bound: list[object] = self._bound.pop(name, None) or [None] * len(args)
         for index, argument in enumerate(args):
             if type(argument) is DeviceBuffer:
                 mark: object = argument.token
