@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.hard_cases.agreement import Picture
+from fidsplat.hard_cases.agreement import CATALOGUED, Picture
 from fidsplat.hard_cases.clouds import quaternion, splats, turned
 from fidsplat.hard_cases.invariance import draw
 from fidsplat.quality import Quality
@@ -56,8 +56,7 @@ def turning(
     It goes round it and rises with it, and is level with its middle halfway. tilt: degrees about the vertical
     axis halfway; 0 is face to face.
     """
-    # the cut-off of other systems: a rim that enters a pixel enters with as much
-    quality = Quality(alpha_cutoff=1 / 255, coplanar=coplanar)
+    quality = CATALOGUED.with_(coplanar=coplanar)
     for number in range(-steps, steps + 1):
         rise = (number + 0.5) * step
         round_it, level = math.radians(tilt) + rise, 1.6 * math.cos(rise)
@@ -106,8 +105,7 @@ def faint_between(opacity: float) -> Picture:
     means = [(0, 0, 2) - 0.1 * along, (0, 0, 2) + 0.1 * along, (0, 0, 2)]
     colors = [(0, 0, 0), (1, 1, 1), (0.5, 0.5, 0.5)]
     cloud = splats(means, turn, 0.15, [0.9, 0.9, opacity], colors).with_planes([0, 0, -1])
-    quality = Quality(alpha_cutoff=1 / 255)
-    return Picture(cloud, Camera.pinhole(33, 33, 60.0, 60.0, 16.5, 16.5), quality, ("rgb",))
+    return Picture(cloud, Camera.pinhole(33, 33, 60.0, 60.0, 16.5, 16.5), outputs=("rgb",))
 
 
 def largest_jump(renderer: Renderer, pictures: Iterator[Picture]) -> tuple[float, np.ndarray, np.ndarray]:

@@ -74,7 +74,7 @@ def cut_pictures() -> Iterator[Picture]:
     means = np.column_stack([(grid + 0.5 - (SMALL.cx, SMALL.cy)) / SMALL.fx, np.ones(len(grid))])
     for sizes in ((0.2, 0.2), (1e-4, 1e-4)):
         faint = splats(means, FACING, sizes, near_values(CUT, steps), np.eye(3)[np.arange(len(grid)) % 3])
-        yield Picture(faint, SMALL, Quality(alpha_cutoff=CUT))
+        yield Picture(faint, SMALL)
     haze = stack([0.0039] * 300, step=0.01)
     yield Picture(haze, SMALL, Quality.named("reference"))
     contours = random_splats(150, 21, depth=(1.0, 4.0), scale=(0.05, 0.5), across=1.5)

@@ -10,7 +10,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.effects import select
-from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
+from fidsplat.hard_cases.agreement import ALL_OUTPUTS, CATALOGUED, Picture
 from fidsplat.hard_cases.case import Case, Finding
 from fidsplat.hard_cases.clouds import camera, random_splats, splats, taken, turned
 from fidsplat.hard_cases.invariance import probe_of
@@ -132,7 +132,7 @@ def far_check(renderer: Renderer) -> Iterator[Finding]:
         for x, y in ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, 1)):
             at = [(0.5 + 0.5 * x) * VIEW.width + x * pixels, (0.5 + 0.5 * y) * VIEW.height + y * pixels]
             mean = [[(at[0] - VIEW.cx) / VIEW.fx, (at[1] - VIEW.cy) / VIEW.fy, 1.0]]
-            stats = renderer.render(splats(mean, (1, 0, 0, 0), (1e-6, 1e-6)), VIEW).stats
+            stats = renderer.render(splats(mean, (1, 0, 0, 0), (1e-6, 1e-6)), VIEW, quality=CATALOGUED).stats
             pairs, visible = pairs + stats["pairs"], visible + stats["visible"]
     yield Finding("splats off the picture that are not culled", visible, 0)
     yield Finding("tiles that list them", pairs, 0)

@@ -200,7 +200,8 @@ def test_a_plan_counts_all_that_a_picture_takes(opencl, monkeypatch, machine, me
     monkeypatch.setattr(pool, "make_way", lambda kind, way: planned.append(way) or make_way(kind, way))
     some = random_splats(60000, seed=3, depth=(1.0, 6.0), scale=(1e-3, 1e-2), sh_degree=1)
     some = some.with_boxes(np.arange(60000) < 30000) if name == "boxes before a lens" else some
-    own.render(some, **{"camera": CAMERA, **PICTURES[name]})["rgb"]
+    quality = fs.Quality(alpha_cutoff=1 / 255)
+    own.render(some, **{"camera": CAMERA, "quality": quality, **PICTURES[name]})["rgb"]
     largest = {}
     for what, size in taken:
         # a lens's rays are many buffers of one name, the others replace one another

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.hard_cases.agreement import ALL_OUTPUTS
+from fidsplat.hard_cases.agreement import ALL_OUTPUTS, CATALOGUED
 from fidsplat.hard_cases.clouds import taken
 from fidsplat.hard_cases.group_e import BROKEN, VICTIM, VIEW, broken_fields, crowd, spoilt
 
@@ -121,10 +121,10 @@ def test_minus_zero_is_zero(renderer):
 def test_splats_that_cannot_be_seen_leave_no_trace(renderer):
     """Opacity 0, -0, denormal, and below the cut-off: good splats that are not drawn."""
     cloud = crowd()
-    wanted = renderer.render(without_victim(cloud), VIEW, ALL_OUTPUTS)
+    wanted = renderer.render(without_victim(cloud), VIEW, ALL_OUTPUTS, CATALOGUED)
     for opacity in (0.0, -0.0, 1e-45, 1e-30, 0.0039):
         kept = spoilt(cloud, {"opacities": opacity})
-        frame = renderer.render(kept, VIEW, ALL_OUTPUTS)
+        frame = renderer.render(kept, VIEW, ALL_OUTPUTS, CATALOGUED)
         assert len(kept) == len(cloud)
         assert same_bits(frame, wanted)
         assert frame.stats["visible"] == wanted.stats["visible"]

@@ -107,11 +107,7 @@ def test_certificates_name_what_single_precision_cannot_decide():
     needle = splats([[0.00625, 0.00625, 1]], turned((0, 0, 1), 45), (0.4, 1.25e-6))
     faint = splats([[0.00625, 0.00625, 1]], (1, 0, 0, 0), 0.2, np.float32(1 / 255) * (1 + 1e-6))
     tie = splats([[0, 0, 1], [0, 0, 2]], (1, 0, 0, 0), 50.0, [0.5, 1.0], labels=[1, 2])
-    quality = fs.Quality(alpha_cutoff=1 / 255)
-    doubt = [
-        check.truth_of(Picture(cloud, camera(), quality, outputs=ALL_OUTPUTS))
-        for cloud in (needle, faint, tie)
-    ]
+    doubt = [check.truth_of(Picture(cloud, camera(), outputs=ALL_OUTPUTS)) for cloud in (needle, faint, tie)]
     assert doubt[0]["certificate"].max() > 1e-3
     assert 0.003 < doubt[1]["certificate"].max() < 0.005
     assert doubt[2]["label_may_flip"].any()

@@ -8,6 +8,7 @@ from cases import assert_holds
 import fidsplat as fs
 from fidsplat.hard_cases import group_e
 from fidsplat.hard_cases.agreement import COLOR_TOLERANCE, Picture, truth_of
+from fidsplat.hard_cases.invariance import draw
 
 
 @pytest.mark.parametrize("case", group_e.CASES, ids=lambda case: case.name)
@@ -26,8 +27,8 @@ def test_the_largest_grids_at_a_few_pixels(renderer, width, height):
     camera = group_e.sized(width, height)
     generator = np.random.default_rng(0)
     pixels = generator.integers(0, height, 200), generator.integers(0, width, 200)
-    truth = truth_of(Picture(cloud, camera), pixels)
-    frame = renderer.render(cloud, camera, ("rgb", "alpha"), background=(0.1, 0.2, 0.3))
+    picture = Picture(cloud, camera)
+    truth, frame = truth_of(picture, pixels), draw(renderer, picture)
     for name in ("rgb", "alpha"):
         error = np.abs(frame[name][pixels] - truth[name])
         error = error.max(-1) if error.ndim > 1 else error
