@@ -6,7 +6,7 @@ Errors: random scenes with held-out seeds, each with every bound of BOUNDS, agai
 `table` is the setting that the table gives for the bound; `measured` the one that was calibrated on the scene
 and camera; `elsewhere` the same from another camera (turned by 5 degrees, moved by a tenth of the distance);
 `crossing` the table's setting in scenes whose loose splats cross a printed plane. Times: budgets of TIMES
-times what BASE takes in each scene; then FRAMES frames are drawn, and those in time counted.
+times what TIMED takes in each scene; then FRAMES frames are drawn, and those in time counted.
 """
 
 from __future__ import annotations
@@ -32,12 +32,11 @@ from fidsplat.accuracy import errors, truth
 from fidsplat.budget import choose
 from fidsplat.budget.random_scenes import HELD_OUT, RandomScene, random_scene
 from fidsplat.errors import InputError
-from fidsplat.experiments.bench.catalogue import BENCH_SCENES
+from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED
 from fidsplat.files import atomic_write
 
 BOUNDS = (1e-2, 1e-3, 1e-4)
-BASE = fs.Quality(alpha_cutoff=1 / 255, transmittance_stop=1e-4)
-TIMED = ("tag", "r100k_720p", "r1m_1080p")
+SCENES = ("tag", "r100k_720p", "r1m_1080p")
 TIMES = (0.5, 0.8, 1.0, 1.5, 3.0)
 FRAMES = 30
 
@@ -115,7 +114,7 @@ def times_kept(renderer: fs.Renderer, names: list[str], where: Console) -> list[
     for name in names:
         cloud, camera = BENCH_SCENES[name].make()
         resident = renderer.upload(cloud)
-        usual = float(np.median(frame_times(renderer, resident, camera, BASE, 10)))
+        usual = float(np.median(frame_times(renderer, resident, camera, TIMED, 10)))
         for times in track(TIMES, f"times, {name}", console=where):
             ms = times * usual
             row = {"scene": name, "base_ms": usual, "budget_ms": ms}
@@ -158,7 +157,7 @@ def main() -> int:
     parser.add_argument("--device", default=None)
     parser.add_argument("--scenes", type=int, default=200)
     parser.add_argument("--measured", type=int, default=60, help="scenes that are calibrated too")
-    parser.add_argument("--timed", default=",".join(TIMED), help="bench scenes, or nothing")
+    parser.add_argument("--timed", default=",".join(SCENES), help="bench scenes, or nothing")
     parser.add_argument("-o", "--out", type=Path)
     args = parser.parse_args()
     where = Console(stderr=True)

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from fidsplat.errors import InputError
+from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.quality import (
     COLOR_PRECISIONS,
     DEPTH_KEY_BITS,
@@ -20,7 +21,7 @@ from fidsplat.quality import (
     Quality,
 )
 
-BASE = Quality(alpha_cutoff=1 / 255, transmittance_stop=1e-4)
+BASE = TIMED
 """what every other setting is measured beside, turn by turn: the cut-off and the stop that other systems
 share, and our rules; pinned, so that presets may change"""
 EXACT = Quality(alpha_cutoff=1e-6, transmittance_stop=0.0)
