@@ -72,24 +72,26 @@ def _gaps(angles: Angles) -> Iterator[Target]:
 
 
 def _paper_angles(angles: Angles) -> Iterator[Target]:
-    for category, paper in ANGLES.items():
-        wanted = paper["ours"][1]
-        ceiling = _unbroken(angles, category, IDEAL)
-        beside = "" if ceiling is None else f" (ideal: {ceiling:.1f})"
-        for mixture in ALLOWED_GAP:
-            mean = _unbroken(angles, category, f"{mixture}/best")
-            if mean is not None:
-                yield Target(
-                    f"{mixture}/best, {category}, fixed-module: read without a miss up to, mean",
-                    f">= {wanted} deg (paper)",
-                    f"{mean:.1f} deg{beside}",
-                    mean >= wanted - _SLACK,
-                )
+    """The paper gives the largest angle; what is read without a miss up to it is the stricter question."""
+    for which, words in enumerate(("largest tilt that is read", "read without a miss up to")):
+        for category, paper in ANGLES.items():
+            wanted = paper["ours"][1]
+            ceiling = _decoding(angles, category, IDEAL, which)
+            beside = "" if ceiling is None else f" (ideal: {ceiling:.1f})"
+            for mixture in ALLOWED_GAP:
+                mean = _decoding(angles, category, f"{mixture}/best", which)
+                if mean is not None:
+                    yield Target(
+                        f"{mixture}/best, {category}, fixed-module: {words}, mean",
+                        f">= {wanted} deg (paper)",
+                        f"{mean:.1f} deg{beside}",
+                        mean >= wanted - _SLACK,
+                    )
 
 
-def _unbroken(angles: Angles, category: str, method: str) -> float | None:
+def _decoding(angles: Angles, category: str, method: str, which: int) -> float | None:
     scans = angles.of("fixed-module", category, method, "zxing-tall").values()
-    return statistics.fmean(largest(s.tilts, s.read)[1] or 0.0 for s in scans) if scans else None
+    return statistics.fmean(largest(s.tilts, s.read)[which] or 0.0 for s in scans) if scans else None
 
 
 def _views(views: Views) -> Iterator[Target]:
