@@ -15,6 +15,7 @@ from fidsplat.experiments.report_angles import Angles
 from fidsplat.experiments.report_counts import Counts
 from fidsplat.experiments.report_views import Views
 from fidsplat.experiments.setup import CATEGORIES, PROTOCOLS
+from fidsplat.experiments.views import LINEAR, TRUTHS
 
 ALLOWED_GAP = {"exact": 0.2, "fitted": 1.0}
 """degrees by which reading may end below the ideal texture's"""
@@ -95,18 +96,19 @@ def _decoding(angles: Angles, category: str, method: str, which: int) -> float |
 
 
 def _views(views: Views) -> Iterator[Target]:
-    truths = [t for t in ("exact", "blender-raw", "blender-standard") if t in views.names(0)]
+    truths = [t for t in TRUTHS if t in views.names(0)]
     for truth in truths:
         for category in category_order(views.names(1)):
             ceiling = views.mean(truth, category, IDEAL, "psnr")
-            beside = "" if ceiling is None else f" (a perfect picture: {ceiling:.2f})"
+            beside = "" if ceiling is None else f" (a perfect picture of display values: {ceiling:.2f})"
+            filtered = "light" if truth in LINEAR else "best"
             for metric, least in (("psnr", EXACT_PSNR), ("ssim", EXACT_SSIM)):
-                value = views.mean(truth, category, "exact/best", metric)
+                value = views.mean(truth, category, f"exact/{filtered}", metric)
                 if value is not None:
                     unit = " dB" if metric == "psnr" else ""
                     extra = beside if metric == "psnr" else ""
                     yield Target(
-                        f"exact/best, {category}, {metric} against {truth}",
+                        f"exact/{filtered}, {category}, {metric} against {truth}",
                         f">= {least}{unit}",
                         f"{value:.3f}{unit}{extra}",
                         value >= least,
