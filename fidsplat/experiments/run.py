@@ -22,7 +22,7 @@ from fidsplat.vision.readers import reader_versions
 
 NAMES = (counts.NAME, localisation.NAME, views.NAME, angles.NAME)
 """the experiments that measure, quickest first"""
-QUICK_VIEWS = 2
+QUICK_VIEWS = 1
 
 
 @dataclass(frozen=True)
