@@ -145,9 +145,9 @@ class Quality:
     small and grazing splats (docs/numerics.md), and saves time on devices whose float64 is slow."""
 
     arithmetic: str = "fast"
-    """Exponentials and logarithms of blending in float32. `precise`: the device's library, of which OpenCL
-    promises 3 units of the last place (ulp). `fast`: our own polynomials, the same bits on every device with
-    fused multiply-adds: exponentials within 2.3 ulp, logarithms within 1.1. Colours move by less than 1e-6."""
+    """Exponentials and logarithms of blending. `fast`: our own polynomials, the same bits wherever devices
+    fuse multiply-adds; exponentials within 2.3 units of the last place, logarithms within 1.1. `precise`:
+    the library's, of which OpenCL promises 3; by those colours move by less than 1e-6, and take longer."""
 
     blend_precision: str = "float32"
     """Arithmetic of each fragment: crossing, weight and blending. `float64`: a device's truth picture, many

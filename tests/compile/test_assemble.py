@@ -201,6 +201,11 @@ def test_the_page_of_the_device_wing_has_every_hook():
     assert {hook for hook in hooks if f"`{hook}`" not in page} == set()
 
 
+def test_no_kernel_calls_what_opencl_promises_nothing_of():
+    for file in (Path(__file__).resolve().parents[2] / "kernels" / "opencl").rglob("*.cl"):
+        assert not re.search(r"\b(native|half)_\w+\(", file.read_text("utf-8")), file
+
+
 # what the compile matrix (test_matrix.py) does not have with everything
 KNOBS = {
     "double": {"quality": fs.Quality(blend_precision="float64")},

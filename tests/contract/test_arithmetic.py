@@ -1,4 +1,4 @@
-"""Our own short exponential and logarithm (`Quality.arithmetic`): bounds, bits, and what pictures are like."""
+"""Our own short exponential and logarithm (`Quality.arithmetic`): bounds, bits, pictures."""
 
 from dataclasses import replace
 from importlib import import_module
