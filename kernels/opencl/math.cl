@@ -20,7 +20,15 @@ typedef int vint;
 typedef GLUE(float, LANES) vfloat;
 typedef GLUE(int, LANES) vint;
 #define VSELECT(no, yes, mask) select(no, yes, mask)
+// Whether any lane is set. Clang makes a chain of branches of `any`, a lane each, and one test of its own reduction.
+#if defined(__has_builtin)
+#if __has_builtin(__builtin_reduce_or)
+#define VANY(mask) (__builtin_reduce_or(mask) != 0)
+#endif
+#endif
+#ifndef VANY
 #define VANY(mask) any(mask)
+#endif
 #define VLOAD(p) GLUE(vload, LANES)(0, p)
 #define VSTORE(v, p) GLUE(vstore, LANES)(v, 0, p)
 #define VMASK(condition) (condition)

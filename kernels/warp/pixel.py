@@ -20,7 +20,8 @@ from .surroundings import ray_length
 _STATE = {
     "stop_exclusive": {"finished": wp.int32},
     "depth": {"depth": wp.float32, "depth_weight": wp.float32},
-    "depth_median": {"depth_median": wp.float32},
+    # median_light: left behind the fragment that counted last
+    "depth_median": {"depth_median": wp.float32, "median_light": wp.float32},
     "depth_first": {"depth_first": wp.float32},
     "normal": {"normal": wp.vec3},
     "heaviest": {"weight": wp.float32, "heaviest": wp.int32},
@@ -28,6 +29,9 @@ _STATE = {
     # fog_slope: -density, per metre of depth; fogged: sum of weights times what the fog hides
     "fog": {"fog_slope": wp.float32, "fogged": wp.float32},
 }
+
+LEAST_ALPHA = wp.constant(wp.float32(1.0 / 255.0))
+"""less of a sample than this is nothing to label, depth, median depth and normal"""
 
 
 @cache
@@ -149,6 +153,8 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         """The state of a sample before anything is drawn."""
         p = Pixel()
         p.t = 1.0
+        if wp.static(median):
+            p.median_light = 1.0
         if wp.static(heaviest):
             p.heaviest = -1
         if wp.static(layers):
@@ -296,8 +302,10 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             p.depth = fma(weight, seen.z, p.depth)
             p.depth_weight += weight
         if wp.static(median):
-            if p.t > 0.5:
+            # faint ones count together
+            if p.t > 0.5 and p.median_light - (p.t - weight) >= LEAST_ALPHA:
                 p.depth_median = seen.z
+                p.median_light = p.t - weight
         if wp.static(first):
             if p.depth_first == 0.0 and p.t - weight <= view.first_light:
                 p.depth_first = seen.z
@@ -350,10 +358,18 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     @wp.func
     def finish(pixel: Pixel, view: View):
         """The pixel after the last fragment."""
+        p = pixel
         if wp.static(layers):
-            return gathered.lay_before(pixel, float(wp.inf), view)
-        else:
-            return pixel
+            p = gathered.lay_before(p, float(wp.inf), view)
+        if 1.0 - p.t < LEAST_ALPHA:
+            if wp.static(depth):
+                p.depth = 0.0
+                p.depth_weight = 0.0
+            if wp.static(normal):
+                p.normal = wp.vec3()
+            if wp.static(heaviest):
+                p.weight = 0.0
+        return p
 
     return SimpleNamespace(
         Pixel=Pixel,
