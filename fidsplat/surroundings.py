@@ -85,7 +85,7 @@ class Panorama:
                 f"background: a panorama of {width} x {height} pixels; 2 to {MAX_PANORAMA} a side can be used"
             )
         whole = np.iinfo(given.dtype).max if given.dtype in (np.uint8, np.uint16) else 1
-        image = np.array(given, np.float32) / np.float32(whole)
+        image = np.array(given, np.float32, order="C") / np.float32(whole)
         if not np.isfinite(image).all():
             raise InputError("background: the panorama holds numbers that are not finite")
         image.flags.writeable = False
