@@ -103,7 +103,10 @@ Background = tuple[float, float, float] | Gradient | Panorama
 
 
 def background_of(value: Any) -> Background:
-    """A background as it is, or three numbers as a colour. Raises InputError for anything else."""
+    """A background as it is, or three numbers as a colour, which a gradient between equal colours is too. Raises
+    InputError for anything else."""
+    if isinstance(value, Gradient) and value.top == value.bottom:
+        return value.top
     if isinstance(value, (Gradient, Panorama)):
         return value
     if isinstance(value, np.ndarray) and value.ndim > 1:

@@ -99,8 +99,8 @@ class Scene:
         for number in moving:
             if isinstance(number, bool) or number not in range(len(self.clouds)):
                 raise InputError(
-                    f"cloud_motions: there is no cloud {number!r}; this scene has {len(self.clouds)}, counted "
-                    "from 0"
+                    f"cloud_motions: there is no cloud {number!r}; this scene has {len(self.clouds)}, "
+                    "counted from 0"
                 )
         put(self, "cloud_motions", dict(moving))
         placed = _all_of(self.markers, PlacedMarker, "markers")

@@ -176,6 +176,13 @@ def test_values_that_mean_nothing_select_nothing(renderer):
             == plain
         )
     assert select(CLOUD, ("rgb",), fs.Quality(), sensor=NOISY) != plain
+    grey = fs.Gradient(GREY, GREY, (1, 0, 0))
+    assert select(CLOUD, ("rgb",), fs.Quality(), background=grey) == plain
+    assert select(CLOUD, ("rgb",), fs.Quality(), background=fs.Gradient(GREY, (0, 0, 0))) != plain
+    frames = [renderer.render(CLOUD, CAMERA, background=behind) for behind in (grey, GREY)]
+    assert np.array_equal(frames[0]["rgb"], frames[1]["rgb"])
+    around = fs.Scene([CLOUD], CAMERA, background=grey)
+    assert np.array_equal(renderer.render(around)["rgb"], frames[0]["rgb"])
 
 
 def test_the_sensor_leaves_the_other_outputs_alone(renderer):
