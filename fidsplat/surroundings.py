@@ -93,18 +93,19 @@ class Panorama:
 
     @staticmethod
     def load(path) -> Panorama:
-        """From a picture file. Raises InputError when it cannot be read."""
+        """From a picture file, whole numbers of 8 or 16 bits or floats. Raises InputError when it cannot be
+        read."""
         from fidsplat.vision.images import read_image
 
-        return Panorama(read_image(path), str(path))
+        return Panorama(read_image(path, deep=True), str(path))
 
 
 Background = tuple[float, float, float] | Gradient | Panorama
 
 
 def background_of(value: Any) -> Background:
-    """A background as it is, or three numbers as a colour, which a gradient between equal colours is too. Raises
-    InputError for anything else."""
+    """A background as it is, or three numbers as a colour, which a gradient between equal colours is too.
+    Raises InputError for anything else."""
     if isinstance(value, Gradient) and value.top == value.bottom:
         return value.top
     if isinstance(value, (Gradient, Panorama)):
