@@ -17,7 +17,7 @@ def read_image(path: str | os.PathLike[str], deep: bool = False) -> np.ndarray:
 
     deep: False gives uint8, 16 bits cut to 8; True uint8, uint16 or float32, as the file has it.
 
-    Raises InputError when the file is missing, is no picture that OpenCV reads, or has pixels of another kind.
+    Raises InputError when the file is missing, is no picture that OpenCV reads, or has other pixels.
     """
     image = _decode(path, cv2.IMREAD_COLOR | (cv2.IMREAD_ANYDEPTH if deep else 0))
     if image.dtype not in (np.uint8, np.uint16, np.float32):
