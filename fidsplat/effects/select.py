@@ -14,7 +14,7 @@ from fidsplat.effects.together import refuse_strangers
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
 from fidsplat.sensor import Sensor
-from fidsplat.surroundings import Background, Fog, Gradient
+from fidsplat.surroundings import Background, Fog, Gradient, background_of
 
 RGB = Output("rgb", 3, "float32")
 OUTPUTS: dict[str, Output] = {
@@ -165,7 +165,8 @@ def select(
 
 
 def _behind(background: Background, foggy: bool) -> str:
+    around = background_of(background)
     # behind everything fog is all there is
-    if foggy or isinstance(background, tuple):
+    if foggy or isinstance(around, tuple):
         return "constant"
-    return "gradient" if isinstance(background, Gradient) else "panorama"
+    return "gradient" if isinstance(around, Gradient) else "panorama"

@@ -120,6 +120,7 @@ def test_record_sizes_are_what_the_effects_declare():
 
     # 68 bytes and 4 for each lane that an effect adds, in whole vectors of 16
     assert record(("rgb",)) == record(("alpha",)) == record(("rgb",), degree=3) == 80
+    assert assemble(select(COLORS, ("rgb",), PLAIN), SHAPE).bounds_bytes == 32
     assert record(("rgb",), fs.Quality()) == record(("label",)) == 80
     assert record(("depth",)) == record(("depth", "depth_median")) == record(("normal",)) == 80
     assert record(("depth", "normal")) == record(("depth", "label"), fs.Quality()) == 96
