@@ -12,6 +12,9 @@ typedef int vint;
 #define VLOAD(p) (*(p))
 #define VSTORE(v, p) (*(p) = (v))
 #define VMASK(condition) (-(condition))
+#define VAS_INT(x) as_int(x)
+#define VAS_FLOAT(x) as_float(x)
+#define VFLOAT(i) ((vfloat)(i))
 #define VLANE 0.0f
 #else
 typedef GLUE(float, LANES) vfloat;
@@ -29,6 +32,9 @@ typedef GLUE(int, LANES) vint;
 #define VLOAD(p) GLUE(vload, LANES)(0, p)
 #define VSTORE(v, p) GLUE(vstore, LANES)(v, 0, p)
 #define VMASK(condition) (condition)
+#define VAS_INT(x) GLUE(as_int, LANES)(x)
+#define VAS_FLOAT(x) GLUE(as_float, LANES)(x)
+#define VFLOAT(i) GLUE(convert_float, LANES)(i)
 #if LANES == 16
 #define VLANE ((vfloat)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
 #elif LANES == 8

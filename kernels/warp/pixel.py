@@ -11,6 +11,7 @@ import warp as wp
 
 from .boxes import between
 from .common import View, fma, line_of, struct_of
+from .fast import fast_exp
 from .layers import make_layer, make_laying
 from .records import BOXES, Layout
 from .staging import make_staging
@@ -50,6 +51,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         name in effects
         for name in ("depth", "depth_median", "depth_first", "normal", "heaviest", "blended", "fog")
     )
+    exp = fast_exp if "arithmetic_fast" in effects else wp.exp
     bent, parallel = "rays" in effects, "camera_orthographic" in effects
     boxes, all_boxes = any(name in effects for name in BOXES), "footprint_box" in effects
     # u: nu0, nux, nuy, log opacity; v: nv0, nvx, nvy, D at the near plane; d: d0, dx, dy, ax; c: ay, r, g, b
@@ -230,7 +232,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
                 half_rho = wp.min(half_rho, c.screen)
             else:
                 half_rho = c.screen
-        return wp.min(wp.exp(s.u[3] - half_rho), view.ceiling)
+        return wp.min(exp(s.u[3] - half_rho), view.ceiling)
 
     @wp.func
     def depth_of(lines: wp.array(dtype=wp.vec4), index: int, c: Crossing, inverse_d: float) -> float:
