@@ -31,7 +31,7 @@ LENSES = {
 @pytest.mark.parametrize("place", ["ahead", "near", "aside"])
 def test_the_screen_dot_of_splats_about_as_wide_as_it(renderer, place, samples):
     """Devices may pass over a dot that is never the larger weight, and over no other: splats of 0.5 to 4
-    pixels, tilted at will, in the middle of the view, close to the near plane, and at the edge of the picture.
+    pixels, tilted at will, in the middle of the view, close to the near plane, at the edge of the picture.
     """
     camera = fs.Camera.pinhole(61, 47, 40.0, 40.0, 30.0, 24.0)
     generator = np.random.default_rng(5)
