@@ -147,7 +147,8 @@ def select(
             "compose_planes" if layered else "compose_ordered",
             f"footprint_{cloud.footprint}",
             f"background_{_behind(background, foggy)}",
-            f"arithmetic_{quality.arithmetic}",
+            # short functions are float32's
+            f"arithmetic_{'precise' if precision == 'float64' else quality.arithmetic}",
             *(("motion_groups",) if moving else ()),
             *(("shutter_exposure",) if exposed else ()),
             *(("blend_double",) if precision == "float64" else ()),

@@ -11,6 +11,7 @@ import warp as wp
 
 from .boxes import between
 from .common import View, fma, line_of, struct_of
+from .fast import fast_exp
 from .layers import make_layer, make_laying
 from .records import BOXES, Layout
 from .staging import make_staging
@@ -19,7 +20,8 @@ from .surroundings import ray_length
 _STATE = {
     "stop_exclusive": {"finished": wp.int32},
     "depth": {"depth": wp.float32, "depth_weight": wp.float32},
-    "depth_median": {"depth_median": wp.float32},
+    # median_light: left behind the fragment that counted last
+    "depth_median": {"depth_median": wp.float32, "median_light": wp.float32},
     "depth_first": {"depth_first": wp.float32},
     "normal": {"normal": wp.vec3},
     "heaviest": {"weight": wp.float32, "heaviest": wp.int32},
@@ -27,6 +29,9 @@ _STATE = {
     # fog_slope: -density, per metre of depth; fogged: sum of weights times what the fog hides
     "fog": {"fog_slope": wp.float32, "fogged": wp.float32},
 }
+
+LEAST_ALPHA = wp.constant(wp.float32(1.0 / 255.0))
+"""less of a sample than this is nothing to label, depth, median depth and normal"""
 
 
 @cache
@@ -46,6 +51,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         name in effects
         for name in ("depth", "depth_median", "depth_first", "normal", "heaviest", "blended", "fog")
     )
+    exp = fast_exp if "arithmetic_fast" in effects else wp.exp
     bent, parallel = "rays" in effects, "camera_orthographic" in effects
     boxes, all_boxes = any(name in effects for name in BOXES), "footprint_box" in effects
     # u: nu0, nux, nuy, log opacity; v: nv0, nvx, nvy, D at the near plane; d: d0, dx, dy, ax; c: ay, r, g, b
@@ -147,6 +153,8 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         """The state of a sample before anything is drawn."""
         p = Pixel()
         p.t = 1.0
+        if wp.static(median):
+            p.median_light = 1.0
         if wp.static(heaviest):
             p.heaviest = -1
         if wp.static(layers):
@@ -224,7 +232,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
                 half_rho = wp.min(half_rho, c.screen)
             else:
                 half_rho = c.screen
-        return wp.min(wp.exp(s.u[3] - half_rho), view.ceiling)
+        return wp.min(exp(s.u[3] - half_rho), view.ceiling)
 
     @wp.func
     def depth_of(lines: wp.array(dtype=wp.vec4), index: int, c: Crossing, inverse_d: float) -> float:
@@ -294,8 +302,10 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             p.depth = fma(weight, seen.z, p.depth)
             p.depth_weight += weight
         if wp.static(median):
-            if p.t > 0.5:
+            # faint ones count together
+            if p.t > 0.5 and p.median_light - (p.t - weight) >= LEAST_ALPHA:
                 p.depth_median = seen.z
+                p.median_light = p.t - weight
         if wp.static(first):
             if p.depth_first == 0.0 and p.t - weight <= view.first_light:
                 p.depth_first = seen.z
@@ -348,10 +358,18 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     @wp.func
     def finish(pixel: Pixel, view: View):
         """The pixel after the last fragment."""
+        p = pixel
         if wp.static(layers):
-            return gathered.lay_before(pixel, float(wp.inf), view)
-        else:
-            return pixel
+            p = gathered.lay_before(p, float(wp.inf), view)
+        if 1.0 - p.t < LEAST_ALPHA:
+            if wp.static(depth):
+                p.depth = 0.0
+                p.depth_weight = 0.0
+            if wp.static(normal):
+                p.normal = wp.vec3()
+            if wp.static(heaviest):
+                p.weight = 0.0
+        return p
 
     return SimpleNamespace(
         Pixel=Pixel,

@@ -63,6 +63,7 @@ def started():
         ),
         lambda: made("project.make_project", ("footprint_box",), 0, "float32", False),
         lambda: made("blend.make_blend", ALL, True, 256)[0],
+        lambda: made("blend.make_blend", (*ALL, "arithmetic_fast"), True, 256)[0],
         lambda: made("blend.make_blend", MIXED, True, 256)[0],
         lambda: made("blend.make_blend", ("footprint_box",), True, 256)[0],
         lambda: made("blend.make_blend", ("rays", *ALL), True, 256)[0],
@@ -81,8 +82,15 @@ def started():
     ],
     ids=[
         *("project", "project-float32", *(names[0] for names in LENSES), "project-filtered"),
-        *("project-mixed", "project-boxes", "blend-all", "blend-mixed", "blend-boxes", "blend-rays"),
-        *("blend-parallel", "blend-exclusive", "resolve", "resolve-gradient", "resolve-panorama"),
+        *("project-mixed", "project-boxes", "blend-all", "blend-fast", "blend-mixed", "blend-boxes"),
+        *(
+            "blend-rays",
+            "blend-parallel",
+            "blend-exclusive",
+            "resolve",
+            "resolve-gradient",
+            "resolve-panorama",
+        ),
         *("sensor", "expose", "emit", "count", "histogram", "compact", "starts"),
     ],
 )
