@@ -122,8 +122,9 @@ def planned(names: Iterable[str], settings: Settings) -> Iterator[dict[str, Plan
 
 
 def _records(name: str, settings: Settings, renderer: Renderer | None) -> Records:
-    drawn = renderer is not None and name != counts.NAME
-    device = f"{renderer.device.title}, {renderer.device.version}" if drawn else None
+    device = None
+    if renderer is not None and name != counts.NAME:
+        device = f"{renderer.device.title}, {renderer.device.version}"
     versions = reader_versions() | (metric_versions() if name == views.NAME else {})
     return Records(settings.file(name), run_facts(name, device, settings.seed, versions), settings.anew)
 

@@ -53,7 +53,8 @@ def report_targets(
     document.text(
         f"To be reached by all {MARKERS} markers of a category, at tilts of {FULL_TILTS} and over "
         f"{TEST_VIEWS} views; what was found is of the markers, tilts and views that were measured: "
-        f"{_measured(angles, views)}. The ideal is the same detector's on the ideal texture."
+        f"{_measured(angles, views)}. The ideal is the same detector's on the ideal texture. "
+        f"{sum(target.reached for target in targets)} of {len(targets)} are reached."
     )
     document.table(
         ("target", "wanted", "found", "reached"), [(*t[:3], "yes" if t.reached else "no") for t in targets]

@@ -144,6 +144,9 @@ def test_targets_are_judged(results):
     assert verdict(f"fitted/best, small, {missed}") == ["zxing-tall 1 of 13", "no"]
     assert verdict(f"fitted/best, huge, {missed}") == ["zxing-tall 7 of 7", "no"]
     assert f"tilts of {TILTS}, 2 views" in text
+    verdicts = [row[-1] for row in rows_of(text) if row[-1].strip("| ") in ("yes", "no")]
+    reached = sum("yes" in verdict for verdict in verdicts)
+    assert f"{reached} of {len(verdicts)} are reached." in text
     best = "fitted/best, small, fixed-module: largest tilt that is read, mean"
     assert verdict(best) == ["82.0 deg (ideal: 82.5), mean of 2", "yes"]
     assert verdict("fitted/best above paper/screen, small, PSNR against exact")[-1] == "yes"
