@@ -153,7 +153,7 @@ def check(settings: Settings) -> None:
 
 def _check_trained(settings: Settings) -> None:
     folder = settings.trained
-    if folder is None:
+    if folder is None or settings.ideal_only:
         return
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder; give one with 2dgs-17/small-0.ply and the like")
