@@ -137,8 +137,8 @@ def in_pieces(
     """Cut n rectangles across their longer sides into the fewest equal pieces of at most an aspect ratio.
 
     rectangles: (n, 4) float64 x0, y0, x1, y1. aspect: (n,) width over height, which decides. Returns (m, 4)
-    pieces, (m,) their aspect and (m,) int64 the rectangle that each is of. Templates fade towards their ends, so
-    at a cut pieces reach into each other, `OVERLAP` of their width each.
+    pieces, (m,) their aspect and (m,) int64 the rectangle that each is of. Templates fade towards their ends,
+    so at a cut pieces reach into each other, `OVERLAP` of their width each.
     """
     parts = np.maximum(np.ceil(np.maximum(aspect, 1 / aspect) * (1 - 1e-9) / longest), 1).astype(np.int64)
     owner = np.repeat(np.arange(len(parts)), parts)

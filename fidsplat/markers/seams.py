@@ -3,17 +3,18 @@
 import numpy as np
 
 LONG = 0.6
-"""Along an axis on which a rectangle has L modules it grows by LONG L times as much, if that is more than once."""
+"""Where a rectangle is L modules long it grows by LONG L times as much along that axis, or once if that is
+more."""
 
 
 def grow(grid: np.ndarray, rectangles: np.ndarray, growth: float) -> np.ndarray:
     """Extend rectangles of an (h, w) 0/1 grid across those sides that lie wholly against their own colour.
 
-    rectangles: (n, 4) ints x0, y0, x1, y1 in cells. growth: modules, 0 to 1, for short
-    sides; `LONG` says what longer ones take. Returns (n, 4) float64. A mixture fades towards its edges,
-    so two rectangles of one component leave a seam; where they overlap it closes. Templates are scaled, so long
-    rectangles fade over a long way, and reach accordingly far beneath what lies at their ends. All cells
-    that a rectangle grows into, corners included, are of its colour. Its longer axis comes first.
+    rectangles: (n, 4) ints x0, y0, x1, y1 in cells. growth: modules, 0 to 1, for short ones; `LONG` says
+    what longer ones take. Returns (n, 4) float64. A mixture fades towards its edges, so two rectangles of one
+    component leave a seam; where they overlap it closes. Templates are scaled, so long rectangles fade over a
+    long way, and reach accordingly far beneath what lies at their ends. All cells that a rectangle grows into,
+    corners included, are of its colour. Its longer axis comes first.
     """
     h, w = grid.shape
     padded = np.full((h + 2, w + 2), 2, np.int8)  # 2: outside, nobody's colour

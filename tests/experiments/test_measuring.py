@@ -74,7 +74,7 @@ def test_scans_do_not_hang_on_the_number_of_threads(renderer):
     ("category", "tilts"), [("apriltag", "72:84:6"), ("small", "0:44:22"), ("medium", "0:40:20")]
 )
 def test_fitted_markers_are_read_wherever_the_ideal_is(renderer, pool, category, tilts):
-    """OpenCV's detectors stumble over grey in the quiet zone, which the ends of long rectangles would leave."""
+    """OpenCV's detectors stumble over grey in the quiet zone, which ends of long rectangles would leave."""
     seen = []
     for method in (IDEAL, "fitted/best"):
         part = angles.angles_work([CATEGORIES[category]], ["fixed-plane"], [method], tilts, 1)[0]
