@@ -77,11 +77,12 @@ class MarkerQuality:
     """Of `paper`: copies of all levels but the last, 1 to 100: opaque insides against more to blend."""
 
     growth: float | None = None
-    """Modules, 0 to 1, by which a rectangle reaches into its own colour across shared sides: closes seams,
-    and rounds what lies behind. None: what the mixture was made with (0.4 for fitted, 0 for paper)."""
+    """Modules, 0 to 1, by which a rectangle reaches into its own colour across shared sides (a long one
+    further along its axis): closes seams, and rounds what lies behind. None: what the mixture was made with
+    (0.4 for fitted, 0 for paper)."""
 
     template: int = 25
-    """Of `fitted`: Gaussians of a rectangle up to an aspect ratio of 8, one of `TEMPLATE_SIZES`: 1, 5, 9,
+    """Of `fitted`: Gaussians of a rectangle up to an aspect ratio of 6, one of `TEMPLATE_SIZES`: 1, 5, 9,
     13, 25 or 41. Fewer are drawn faster and leave edges blurred and corners round."""
 
     def __post_init__(self) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from fidsplat.experiments.methods import mixtures, plain_marker
 from fidsplat.experiments.setup import CATEGORIES, Category
 from fidsplat.markers import marker
-from fidsplat.markers.mixture import fitted_templates, paper_template
+from fidsplat.markers.mixture import fitted_templates, paper_template, place
 
 NAME = "counts"
 FULL_REPEATS, QUICK_REPEATS = 15, 3
@@ -75,7 +75,4 @@ def _gaussians(mixture: str, boxes: np.ndarray) -> int | None:
     if mixture != "fitted":
         return None
     sides = boxes[:, 2:] - boxes[:, :2]
-    aspect = sides.max(1) / sides.min(1)
-    templates = fitted_templates()
-    which = np.searchsorted([t.max_aspect for t in templates], aspect)
-    return int(np.array([len(t.gaussians) for t in templates])[which].sum())
+    return len(place(boxes.astype(np.float64), sides[:, 0] / sides[:, 1], fitted_templates())[1])
