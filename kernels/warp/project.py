@@ -25,6 +25,7 @@ from .lens import LENSES, make_lens, make_optics
 from .lowpass import make_filter
 from .motion import make_motion
 from .records import Layout
+from .slopes import make_slopes
 
 # [m]; nobody sees the difference, and what is divided by it stays above float32's denormals (numerics B6)
 SMALLEST_SCALE = wp.constant(wp.float32(1e-20))
@@ -64,6 +65,7 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
     mapped, bent = camera == "camera_brown_conrady", camera is not None
     optics = make_optics(camera, real) if camera else None
     Lens = make_lens(camera)
+    slopes_at = make_slopes("camera_orthographic" if parallel else camera, real)
     word = {name: layout.names.index(name) for name in layout.names}
     extras = ("dot_x", "z_numerator", "nx", "edge_u0", "nuz", "plane_z0")
     first_extra = {name: word.get(name, 0) for name in extras}
@@ -126,6 +128,9 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
         p = turn * mean + shift
         a = tangent_u * su
         b = tangent_v * sv
+        depth = p[2]
+        if wp.static(ray_depths):
+            depth = wp.length(p)
 
         near = real(view.near)
         if wp.static(boxes_too):
@@ -133,11 +138,12 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
             if wp.static(mixed):
                 boxed = boxes[i] != 0
         if wp.static(filtered):
-            widens = p[2] >= near
+            widens = depth >= near
             if wp.static(boxes_too):
                 widens = widens and not boxed
-            if widens:
-                wide = widened(a, b, p, view)
+            by_x, by_y, here = slopes_at(p, view, lens)
+            if widens and here:
+                wide = widened(a, b, by_x, by_y)
                 log_opacity -= float(wp.log(wide[3]))
                 half_r2 = log_opacity - view.log_cut
                 if not (half_r2 > 0.0):
@@ -148,13 +154,11 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
                 sv *= wide[2]
                 tangent_u = a / su  # of unit area with tangent_v, whose direction stays
         radius = wp.sqrt(two * real(half_r2))
-        depth = p[2]
         reach = radius * wp.sqrt(a[2] * a[2] + b[2] * b[2])  # half of the disk's depth range (numerics A3)
         if wp.static(boxes_too):
             if boxed:
                 reach = wp.abs(a[2]) + wp.abs(b[2])
         if wp.static(ray_depths):
-            depth = wp.length(p)
             reach = radius * wp.sqrt(wp.max(wp.dot(a, a), wp.dot(b, b)))
         if not (depth + reach >= near and depth - reach <= real(view.far)):
             return

@@ -56,7 +56,6 @@ def test_the_cpu_is_listed_and_opened_by_its_name():
 @pytest.mark.parametrize(
     ("names", "turns"),
     [
-        ({"camera_fisheye", "lowpass_pixel"}, False),
         ({"camera_orthographic", "footprint_mixed"}, False),
         ({"camera_brown_conrady", "background_panorama"}, False),
         ({"camera_pinhole", "normal_world"}, True),

@@ -11,7 +11,7 @@ _SKIES = ("background_gradient", "background_panorama")
 # boxes before a lens with rays of its own, and a distortion's distances, have names of their own (rays_box,
 # ...)
 _APART = (
-    (_LENSES, ("lowpass_pixel", *_SKIES)),
+    (_LENSES, _SKIES),
     (("camera_orthographic",), ("footprint_box", "footprint_mixed")),
 )
 
