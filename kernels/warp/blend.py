@@ -9,7 +9,6 @@ import warp as wp
 
 from .bounds import Bounds, make_bounds
 from .common import STRICT, View, lowest, store_line
-from .lens import make_rays
 from .pixel import make_pixel
 from .planes import make_samples, of_samples
 from .staging import BLOCK_H, BLOCK_W, STAGED
@@ -42,7 +41,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
     )
     finish, cross_ray = parts.finish, parts.cross_ray
     bent = "rays" in effects
-    Rays = make_rays(bent)
+    Rays = parts.Rays
 
     @wp.func
     def store(p: Pixel, at: int, samples: Samples):
@@ -84,7 +83,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
         top = (tile / view.tiles_x) * view.tile_h + (block / across) * BLOCK_H
         x0 = left + lane % BLOCK_W
         y0 = top + lane / BLOCK_W
-        p = start(x0, y0, view)
+        p = start(x0, y0, rays, view)
         if x0 >= view.width or y0 >= view.height:
             p.t = 0.0  # what lies beyond the picture is finished from the start
         if wp.static(bent):
@@ -139,7 +138,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
         x0 = (tile % view.tiles_x) * view.tile_w
         y0 = (tile / view.tiles_x) * view.tile_h
         for k in range(view.tile_w * view.tile_h):
-            state[state_first + k] = start(x0 + k % view.tile_w, y0 + k / view.tile_w, view)
+            state[state_first + k] = start(x0 + k % view.tile_w, y0 + k / view.tile_w, rays, view)
         x_end = wp.min(x0 + view.tile_w, view.width)
         y_end = wp.min(y0 + view.tile_h, view.height)
         alive = (x_end - x0) * (y_end - y0)

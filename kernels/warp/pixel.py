@@ -13,8 +13,8 @@ from .boxes import between
 from .common import View, fma, line_of, struct_of
 from .layers import make_layer, make_laying
 from .records import BOXES, Layout
+from .sight import make_sight
 from .staging import make_staging
-from .surroundings import ray_length
 
 _STATE = {
     "stop_exclusive": {"finished": wp.int32},
@@ -48,6 +48,8 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     )
     bent, parallel = "rays" in effects, "camera_orthographic" in effects
     boxes, all_boxes = any(name in effects for name in BOXES), "footprint_box" in effects
+    sight = make_sight(bent, "rays_length" in effects)
+    Rays, length_of = sight.Rays, sight.length_of
     # u: nu0, nux, nuy, log opacity; v: nv0, nvx, nvy, D at the near plane; d: d0, dx, dy, ax; c: ay, r, g, b
     splat = {"u": wp.vec4, "v": wp.vec4, "d": wp.vec4, "c": wp.vec4, "half_r2": wp.float32}
     splat |= {"dot_x": wp.float32, "dot_y": wp.float32} if screen else {}
@@ -143,7 +145,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         return s
 
     @wp.func
-    def start(x: int, y: int, view: View):
+    def start(x: int, y: int, rays: Rays, view: View):
         """The state of a sample before anything is drawn."""
         p = Pixel()
         p.t = 1.0
@@ -153,7 +155,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             p.open.plane = -1
             p.waiting.plane = -1
         if wp.static(fog):
-            p.fog_slope = -view.fog_density * ray_length(float(x) + 0.5, float(y) + 0.5, view)
+            p.fog_slope = -view.fog_density * length_of(x, y, rays, view)
         return p
 
     @wp.func
@@ -354,6 +356,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             return pixel
 
     return SimpleNamespace(
+        Rays=Rays,
         Pixel=Pixel,
         Splat=Splat,
         load=load,

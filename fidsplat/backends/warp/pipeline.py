@@ -43,7 +43,17 @@ _PROJECT = (
     *(*_RECORD, "lowpass_pixel", "motion_groups"),
     *("camera_brown_conrady", "camera_fisheye", "camera_equirectangular"),
 )
-_SAMPLE = (*_RECORD, "stop_exclusive", "depth", "depth_median", "depth_first", "heaviest", "blended", "fog")
+_SAMPLE = (
+    *_RECORD,
+    "stop_exclusive",
+    "depth",
+    "depth_median",
+    "depth_first",
+    "heaviest",
+    "blended",
+    "fog",
+    "rays_length",
+)
 
 
 class WarpPipeline:
@@ -58,7 +68,6 @@ class WarpPipeline:
                 "use an OpenCL device for it"
             )
         refuse_strangers(names)
-        self._names = features.names
         self.backend, self.features, self.shape = backend, features, shape
         if names & {"label", "splat_id"}:
             names |= {"heaviest"}  # both are the same splat's
@@ -89,14 +98,16 @@ class WarpPipeline:
             integers = tuple(output.name for output in features.outputs if output.dtype == "int32")
             self.samples_type = planes.make_samples(tuple(self.sample_planes.items()))
             self.outputs_type = planes.make_outputs(finished, integers)
-            kinds = runtime.kernels("surroundings").KINDS
-            behind = next((kind for kind in kinds if f"background_{kind}" in names), "constant")
-            self.surroundings = Surroundings(backend, behind)
+            self.surroundings = Surroundings.among(names, backend)
+            self.stretched = "rays_sample_length" in names
+            """whether a lens gives rays the lengths that resolving needs"""
             self.resolve = runtime.kernels("resolve").make_resolve(
-                finished, integers, tuple(self.sample_planes.items()), behind, features.samples
+                finished, integers, tuple(self.sample_planes.items()), self.stretched, features.samples
             )
             common = [self.sort.compact, self.sort.gather, self.sort.find_starts, self.sort.sum_up]
             self.sensor = sensor.Development.of(features.posts)
+            if self.surroundings:
+                common.append(self.surroundings.kernel)
             if self.sensor:
                 common.append(self.sensor.kernel)
             self.expose = exposure.kernels_of(self.sample_planes) if "shutter_exposure" in names else {}
@@ -129,9 +140,8 @@ class WarpPipeline:
         """Draw one picture.
 
         Raises:
-            DeviceError: the device runs out of memory or fails, or lacks what the view asks for.
+            DeviceError: the device runs out of memory or fails.
         """
-        refuse_strangers(self._names, view.turns)
         return self._drawn(resident, view).planes
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:

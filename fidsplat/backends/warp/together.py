@@ -6,19 +6,12 @@ from collections.abc import Collection
 
 from fidsplat.errors import DeviceError
 
-_LENSES = ("camera_brown_conrady", "camera_fisheye", "camera_equirectangular", "camera_orthographic")
-_SKIES = ("background_gradient", "background_panorama")
-# boxes before a lens with rays of its own, and a distortion's distances, have names of their own (rays_box,
-# ...)
-_APART = (
-    (_LENSES, _SKIES),
-    (("camera_orthographic",), ("footprint_box", "footprint_mixed")),
-)
+# boxes before a lens with rays of its own have a name of their own (rays_box)
+_APART = ((("camera_orthographic",), ("footprint_box", "footprint_mixed")),)
 
 
-def refuse_strangers(names: Collection[str], turns: bool = False) -> None:
-    """Refuse effects that the kernels would draw wrongly together; turns: the camera turns during an
-    exposure.
+def refuse_strangers(names: Collection[str]) -> None:
+    """Refuse effects that the kernels would draw wrongly together.
 
     Raises:
         DeviceError: it names both.
@@ -27,9 +20,3 @@ def refuse_strangers(names: Collection[str], turns: bool = False) -> None:
         both = [name for group in (one, other) for name in group if name in names]
         if any(name in names for name in one) and any(name in names for name in other):
             raise DeviceError(f"warp does not draw {' with '.join(both)} yet; use an OpenCL device for it")
-    asked = [name for name in ("normal_world", *_SKIES) if name in names]
-    if turns and asked:
-        raise DeviceError(
-            f"warp does not draw {', '.join(asked)} for a camera that turns while the picture is taken yet; "
-            "use an OpenCL device for it"
-        )
