@@ -9,6 +9,7 @@ import warp as wp
 
 from .bounds import Bounds, make_bounds
 from .common import STRICT, View, lowest, store_line
+from .lens import SLOPES
 from .pixel import make_pixel
 from .planes import make_samples, of_samples
 from .staging import BLOCK_H, BLOCK_W, STAGED
@@ -39,8 +40,8 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
         parts.unfinished,
         parts.blend,
     )
-    finish, cross_ray = parts.finish, parts.cross_ray
-    bent = "rays" in effects
+    finish, cross_ray, cross_slopes = parts.finish, parts.cross_ray, parts.cross_slopes
+    bent, curved = "rays" in effects, cross_slopes is not None
     Rays = parts.Rays
 
     @wp.func
@@ -90,6 +91,10 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
             ray = wp.vec3()
             if p.t > 0.0:
                 ray = rays.rays[y0 * view.width + x0]
+        if wp.static(curved):
+            slopes = SLOPES()
+            if p.t > 0.0:
+                slopes = rays.slopes[y0 * view.width + x0]
         records = pool()
         k = starts[tile]
         end = starts[tile + 1]
@@ -107,7 +112,9 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
                     index = lists[k + which]
                     if unfinished(p, view):
                         x, y = float(x0) - s.d[3], float(y0) - s.c[0]
-                        if wp.static(bent):
+                        if wp.static(curved):
+                            c = cross_slopes(s, ray, slopes, x, y, view)
+                        elif wp.static(bent):
                             c = cross_ray(s, ray, x, y, view)
                         else:
                             c = cross(s, row_of(s.u, y), row_of(s.v, y), row_of(s.d, y), x, y, view)
@@ -158,8 +165,11 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
                 u, v, d = row_of(s.u, y), row_of(s.v, y), row_of(s.d, y)
                 for column in range(left, right):
                     x = float(column) - s.d[3]
-                    if wp.static(bent):
-                        c = cross_ray(s, rays.rays[row * view.width + column], x, y, view)
+                    seen_at = row * view.width + column
+                    if wp.static(curved):
+                        c = cross_slopes(s, rays.rays[seen_at], rays.slopes[seen_at], x, y, view)
+                    elif wp.static(bent):
+                        c = cross_ray(s, rays.rays[seen_at], x, y, view)
                     else:
                         c = cross(s, u, v, d, x, y, view)
                     if c.drawn:

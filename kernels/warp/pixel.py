@@ -9,24 +9,14 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .boxes import between
+from .boxes import between, between_curves
 from .common import View, fma, line_of, struct_of
 from .layers import make_layer, make_laying
+from .lens import SLOPES
+from .planes import STATE
 from .records import BOXES, Layout
 from .sight import make_sight
 from .staging import make_staging
-
-_STATE = {
-    "stop_exclusive": {"finished": wp.int32},
-    "depth": {"depth": wp.float32, "depth_weight": wp.float32},
-    "depth_median": {"depth_median": wp.float32},
-    "depth_first": {"depth_first": wp.float32},
-    "normal": {"normal": wp.vec3},
-    "heaviest": {"weight": wp.float32, "heaviest": wp.int32},
-    "blended": {"blended": wp.int32},
-    # fog_slope: -density, per metre of depth; fogged: sum of weights times what the fog hides
-    "fog": {"fog_slope": wp.float32, "fogged": wp.float32},
-}
 
 
 @cache
@@ -48,12 +38,14 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     )
     bent, parallel = "rays" in effects, "camera_orthographic" in effects
     boxes, all_boxes = any(name in effects for name in BOXES), "footprint_box" in effects
-    sight = make_sight(bent, "rays_length" in effects)
+    sight = make_sight(bent, "rays_length" in effects, bent and boxes)
     Rays, length_of = sight.Rays, sight.length_of
+    curved, edged = boxes and bent, boxes and not bent
     # u: nu0, nux, nuy, log opacity; v: nv0, nvx, nvy, D at the near plane; d: d0, dx, dy, ax; c: ay, r, g, b
     splat = {"u": wp.vec4, "v": wp.vec4, "d": wp.vec4, "c": wp.vec4, "half_r2": wp.float32}
     splat |= {"dot_x": wp.float32, "dot_y": wp.float32} if screen else {}
-    splat |= {"edges": wp.vec4} if boxes else {}
+    splat |= {"edges": wp.vec4} if edged else {}
+    splat |= {"boxed": wp.float32} if curved and not all_boxes else {}
     # w: factors of the ray's Z, then the anchor's X; origin: the anchor's ray
     splat |= {"w": wp.vec4, "origin": wp.vec3} if bent else {}
     # plane_z0, plane_zx, plane_zy, plane_near
@@ -76,7 +68,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     Seen = struct_of("Seen", "What shows where something is drawn.", seen)
     fields = {"t": wp.float32, "r": wp.float32, "g": wp.float32, "b": wp.float32}
     for effect in effects:
-        fields |= _STATE.get(effect, {})
+        fields |= STATE.get(effect, {})
     layer = make_layer(Seen, effects) if layers else None
     # pending: the layer that still gathers, and one that arrived before it
     fields |= {"open": layer.Layer, "waiting": layer.Layer} if layer else {}
@@ -90,6 +82,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     nx_line, nx_lane = layout.place("nx")
     ny_line, ny_lane = layout.place("ny")
     nz_line, nz_lane = layout.place("nz")
+    boxed_line, boxed_lane = layout.place("boxed")
     ray_line, plane_line = layout.place("nuz")[0], layout.place("plane_z0")[0]
 
     @wp.func
@@ -104,8 +97,10 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             dot = line_of(lines, at + dot_line)
             s.dot_x = dot[dot_lane]
             s.dot_y = dot[dot_y_lane]
-        if wp.static(boxes):
+        if wp.static(edged):
             s.edges = line_of(lines, at + edge_line)
+        if wp.static(curved and not all_boxes):
+            s.boxed = line_of(lines, at + boxed_line)[boxed_lane]
         if wp.static(bent):
             s.w = line_of(lines, at + ray_line)
             rest = line_of(lines, at + ray_line + 1)
@@ -133,8 +128,10 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             dot = staged_line(pool, lines, lists, first, which, dot_line)
             s.dot_x = dot[dot_lane]
             s.dot_y = dot[dot_y_lane]
-        if wp.static(boxes):
+        if wp.static(edged):
             s.edges = staged_line(pool, lines, lists, first, which, edge_line)
+        if wp.static(curved and not all_boxes):
+            s.boxed = staged_line(pool, lines, lists, first, which, boxed_line)[boxed_lane]
         if wp.static(bent):
             s.w = staged_line(pool, lines, lists, first, which, ray_line)
             rest = staged_line(pool, lines, lists, first, which, ray_line + 1)
@@ -165,7 +162,12 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
 
     @wp.func
     def is_box(s: Splat) -> bool:
-        return s.edges[0] > 0.0
+        if wp.static(all_boxes):
+            return True
+        elif wp.static(curved):
+            return s.boxed > 0.0
+        else:
+            return s.edges[0] > 0.0
 
     @wp.func
     def cross(s: Splat, row_u: float, row_v: float, row_d: float, x: float, y: float, view: View):
@@ -173,14 +175,33 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         return meet(s, fma(s.u[1], x, row_u), fma(s.v[1], x, row_v), fma(s.d[1], x, row_d), x, y, view)
 
     @wp.func
+    def forms_of(s: Splat, ray: wp.vec3) -> wp.vec3:
+        """n_u, n_v and D of a ray."""
+        r = ray - s.origin
+        return wp.vec3(
+            fma(s.w[0], r[2], fma(s.u[1], r[0], fma(s.u[2], r[1], s.u[0]))),
+            fma(s.w[1], r[2], fma(s.v[1], r[0], fma(s.v[2], r[1], s.v[0]))),
+            fma(s.w[2], r[2], fma(s.d[1], r[0], fma(s.d[2], r[1], s.d[0]))),
+        )
+
+    @wp.func
     def cross_ray(s: Splat, ray: wp.vec3, x: float, y: float, view: View):
         """The same for the sample that has this ray."""
-        r = ray - s.origin
-        nu = fma(s.w[0], r[2], fma(s.u[1], r[0], fma(s.u[2], r[1], s.u[0])))
-        nv = fma(s.w[1], r[2], fma(s.v[1], r[0], fma(s.v[2], r[1], s.v[0])))
-        d = fma(s.w[2], r[2], fma(s.d[1], r[0], fma(s.d[2], r[1], s.d[0])))
-        c = meet(s, nu, nv, d, x, y, view)
-        c.drawn = c.drawn and d == d  # nothing is seen without a ray
+        n = forms_of(s, ray)
+        c = meet(s, n[0], n[1], n[2], x, y, view)
+        c.drawn = c.drawn and n[2] == n[2]  # nothing is seen without a ray
+        return c
+
+    @wp.func
+    def cross_slopes(s: Splat, ray: wp.vec3, slopes: SLOPES, x: float, y: float, view: View):
+        """The same where there are boxes, with the ray's derivatives."""
+        c = cross_ray(s, ray, x, y, view)
+        if is_box(s):
+            n, of_d = forms_of(s, ray), wp.vec3(s.d[1], s.d[2], s.w[2])
+            across = between_curves(n[2], n[0], of_d, wp.vec3(s.u[1], s.u[2], s.w[0]), slopes)
+            c.cover = across * between_curves(n[2], n[1], of_d, wp.vec3(s.v[1], s.v[2], s.w[1]), slopes)
+            c.inside = c.cover > 0.0 and c.d > 0.0 and c.d <= s.v[3]
+            c.drawn = c.inside
         return c
 
     @wp.func
@@ -195,7 +216,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             c.q = fma(nu, nu, nv * nv)
             # product form: no division, no special value of D (numerics B2)
             c.inside = c.q <= s.half_r2 * (c.d * c.d) and ahead
-        if wp.static(boxes):
+        if wp.static(edged):
             if is_box(s):
                 across = between(c.d, nu, wp.vec2(s.edges[0], s.edges[1]))
                 c.cover = across * between(c.d, nv, wp.vec2(s.edges[2], s.edges[3]))
@@ -366,6 +387,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         row=row,
         cross=cross,
         cross_ray=cross_ray,
+        cross_slopes=cross_slopes if curved else None,
         unfinished=unfinished,
         blend=blend,
         finish=finish,

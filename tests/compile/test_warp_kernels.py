@@ -62,9 +62,13 @@ def started():
             "project.make_project", (*RECORD, "footprint_mixed", "lowpass_pixel"), 0, "float64", False
         ),
         lambda: made("project.make_project", ("footprint_box",), 0, "float32", False),
+        lambda: made("project.make_project", (*LENSES[2], "footprint_mixed"), 0, "float64", False),
+        lambda: made("project.make_project", (*LENSES[0], "footprint_mixed"), 0, "float64", False),
         lambda: made("blend.make_blend", ALL, True, 256)[0],
         lambda: made("blend.make_blend", MIXED, True, 256)[0],
         lambda: made("blend.make_blend", ("footprint_box",), True, 256)[0],
+        lambda: made("blend.make_blend", ("rays", "footprint_box"), True, 256)[0],
+        lambda: made("blend.make_blend", ("rays", *MIXED), True, 256)[0],
         lambda: made("blend.make_blend", ("rays", *ALL, "rays_length"), True, 256)[0],
         lambda: made("blend.make_blend", ("camera_orthographic", *ALL), True, 256)[0],
         lambda: made("blend.make_blend", ("lowpass_screen", "stop_exclusive"), True, 256)[0],
@@ -82,7 +86,8 @@ def started():
     ],
     ids=[
         *("project", "project-float32", *(names[0] for names in LENSES), "project-filtered"),
-        *("project-mixed", "project-boxes", "blend-all", "blend-mixed", "blend-boxes", "blend-rays"),
+        *("project-mixed", "project-boxes", "project-fisheye-mixed", "project-parallel-mixed"),
+        *("blend-all", "blend-mixed", "blend-boxes", "blend-rays-boxes", "blend-rays-mixed", "blend-rays"),
         *("blend-parallel", "blend-exclusive", "resolve", "resolve-stretched"),
         *("backdrop-gradient", "backdrop-panorama"),
         *("sensor", "expose", "emit", "count", "histogram", "compact", "starts"),
@@ -131,6 +136,8 @@ def test_a_record_grows_by_what_is_asked_for():
     assert layout(()).place("nz") == (0, 0)
     assert layout(("lowpass_screen", "footprint_mixed")).lines == 6
     assert layout(("footprint_box",)).place("edge_u0") == (4, 0), "a line of their own"
+    assert layout(("rays", "footprint_box")).names == layout(("rays",)).names, "edges are curves"
+    assert "boxed" in layout(("rays", "footprint_mixed")).names
 
 
 def test_a_factory_makes_one_kernel_of_a_set():

@@ -14,7 +14,7 @@ from fidsplat.cameras.raster import RayRaster
 
 EFFECTS = frozenset(
     {"camera_brown_conrady", "camera_fisheye", "camera_equirectangular", "rays", "ray_map", "polygon"}
-    | {"rays_length", "rays_sample_length"}
+    | {"rays_length", "rays_sample_length", "rays_box"}
 )
 """the lenses, and what the catalogue says that they are made of"""
 
@@ -25,8 +25,9 @@ class LensArrays:
     def __init__(self) -> None:
         self._held: WeakKeyDictionary[RayRaster, dict[str, Any]] = WeakKeyDictionary()
 
-    def rays(self, view: View, pool: ArrayPool, given: bool = True) -> Any:
-        """The struct `Rays` of a view; an empty one if it has no raster, or none is `given`.
+    def rays(self, view: View, pool: ArrayPool, given: bool = True, sloped: bool = False) -> Any:
+        """The struct `Rays` of a view, with derivatives if `sloped`; an empty one if it has no raster, or
+        none is `given`.
 
         Raises:
             DeviceError: the device has no memory for them.
@@ -34,8 +35,14 @@ class LensArrays:
         kernels, raster = runtime.kernels("lens"), view.raster
         if raster is None or not given:
             return kernels.make_rays(False)()
-        rays = kernels.make_rays(True)()
-        rays.rays = self._arrays(raster, pool)["rays"][raster.top * raster.width :]
+        rays, arrays = kernels.make_rays(True, sloped)(), self._arrays(raster, pool)
+        first = raster.top * raster.width
+        rays.rays = arrays["rays"][first:]
+        if sloped:
+            if "slopes" not in arrays:
+                slopes = (raster.whole or raster).slopes.reshape(-1, 2, 3)
+                arrays["slopes"] = _uploaded("ray slopes", slopes, kernels.SLOPES, pool)
+            rays.slopes = arrays["slopes"][first:]
         return rays
 
     def lens(self, view: View, pool: ArrayPool) -> Any:

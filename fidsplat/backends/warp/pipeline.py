@@ -13,7 +13,6 @@ from fidsplat.backends.warp.finished import WarpPlanes
 from fidsplat.backends.warp.launch import BLOCK, Launcher
 from fidsplat.backends.warp.memory import Resident
 from fidsplat.backends.warp.run import Run
-from fidsplat.backends.warp.together import refuse_strangers
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError
 
@@ -67,7 +66,6 @@ class WarpPipeline:
                 f"{backend.info.name} ({backend.info.platform}) has no {', '.join(lacking)}; "
                 "use an OpenCL device for it"
             )
-        refuse_strangers(names)
         self.backend, self.features, self.shape = backend, features, shape
         if names & {"label", "splat_id"}:
             names |= {"heaviest"}  # both are the same splat's
@@ -99,6 +97,8 @@ class WarpPipeline:
             self.samples_type = planes.make_samples(tuple(self.sample_planes.items()))
             self.outputs_type = planes.make_outputs(finished, integers)
             self.surroundings = Surroundings.among(names, backend)
+            self.sloped = "rays_box" in names
+            """whether blending needs the derivatives of a lens's rays"""
             self.stretched = "rays_sample_length" in names
             """whether a lens gives rays the lengths that resolving needs"""
             self.resolve = runtime.kernels("resolve").make_resolve(

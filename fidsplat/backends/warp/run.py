@@ -79,7 +79,7 @@ class Run:
         self._take("lines", self.resident.count * self.pipeline.layout.lines, self.wp.vec4)
         self.launcher.stage("project")
         self.lens = self.backend.lens_arrays.lens(self.view, self.pool)
-        self.rays = self.backend.lens_arrays.rays(self.view, self.pool)
+        self.rays = self.backend.lens_arrays.rays(self.view, self.pool, sloped=self.pipeline.sloped)
         visible, pairs = self._project() if self.resident.count else (0, 0)
         self.launcher.stage("sort")
         if pairs:
@@ -285,6 +285,7 @@ class Run:
             setattr(u, name, getattr(view, name))
         u.tile_w, u.tile_h, u.tiles_x, u.tiles_y = shape.tile_width, shape.tile_height, tiles_x, tiles_y
         u.per_pixel = 1.0 / view.samples**2
+        u.ray_step = view.raster.step if view.raster and self.pipeline.sloped else 0.0
         fx, fy, cx, cy = view.uniform("ray")
         u.ray = wp.vec4(1 / fx, 1 / fy, cx, cy)
         return u
