@@ -94,7 +94,9 @@ class Run:
             # here, as shots may look in different directions
             self.launcher.stage("resolve")
             count, around = self.view.width * self.view.height, self.pipeline.surroundings
-            self.launch(around.kernel, count, self.u, around.of(self.view), self.rays, samples.color)
+            # without the derivatives that blending may have: a struct of another type
+            rays = self.backend.lens_arrays.rays(self.view, self.pool)
+            self.launch(around.kernel, count, self.u, around.of(self.view), rays, samples.color)
         self.stats |= {"visible": visible, "pairs": pairs}
         return samples
 
