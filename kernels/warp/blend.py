@@ -165,11 +165,11 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
                 u, v, d = row_of(s.u, y), row_of(s.v, y), row_of(s.d, y)
                 for column in range(left, right):
                     x = float(column) - s.d[3]
-                    seen_at = row * view.width + column
                     if wp.static(curved):
-                        c = cross_slopes(s, rays.rays[seen_at], rays.slopes[seen_at], x, y, view)
+                        at = row * view.width + column
+                        c = cross_slopes(s, rays.rays[at], rays.slopes[at], x, y, view)
                     elif wp.static(bent):
-                        c = cross_ray(s, rays.rays[seen_at], x, y, view)
+                        c = cross_ray(s, rays.rays[row * view.width + column], x, y, view)
                     else:
                         c = cross(s, u, v, d, x, y, view)
                     if c.drawn:

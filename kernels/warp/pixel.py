@@ -40,7 +40,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     boxes, all_boxes = any(name in effects for name in BOXES), "footprint_box" in effects
     sight = make_sight(bent, "rays_length" in effects, bent and boxes)
     Rays, length_of = sight.Rays, sight.length_of
-    curved, edged = boxes and bent, boxes and not bent
+    curved, edged = boxes and bent, boxes and not bent  # their edges: from each sample's ray, from a record
     # u: nu0, nux, nuy, log opacity; v: nv0, nvx, nvy, D at the near plane; d: d0, dx, dy, ax; c: ay, r, g, b
     splat = {"u": wp.vec4, "v": wp.vec4, "d": wp.vec4, "c": wp.vec4, "half_r2": wp.float32}
     splat |= {"dot_x": wp.float32, "dot_y": wp.float32} if screen else {}

@@ -77,6 +77,16 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
     at_ray, at_plane = first_extra["nuz"], first_extra["plane_z0"]
     at_flag = first_extra["boxed"]
 
+    @wp.func
+    def seen(a: vec3, b: vec3, p: vec3, radius: real, reach: real, x: real, y: real, view: View, lens: Lens):
+        """Bounds of a disk, or of what a lens takes for its picture; x, y: where parallel rays show p."""
+        if wp.static(parallel):
+            return disk.parallel(a, b, x, y, radius, view)
+        elif wp.static(ray_depths):
+            return optics.enclose(a, b, p, radius, view, lens)
+        else:
+            return disk.seen(a, b, p, radius, reach, view)
+
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False, launch_bounds=LIMITS)
     def project(
         first: int,  # splat of thread 0
@@ -145,18 +155,19 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
             widens = depth >= near
             if wp.static(boxes_too):
                 widens = widens and not boxed
-            by_x, by_y, here = slopes_at(p, view, lens)
-            if widens and here:
-                wide = widened(a, b, by_x, by_y)
-                log_opacity -= float(wp.log(wide[3]))
-                half_r2 = log_opacity - view.log_cut
-                if not (half_r2 > 0.0):
-                    return  # edge-on too: infinitely thin, infinitely faint
-                a = wide[0] * a + wide[1] * b
-                b = wide[2] * b
-                su *= wide[0]
-                sv *= wide[2]
-                tangent_u = a / su  # of unit area with tangent_v, whose direction stays
+            if widens:
+                by_x, by_y, here = slopes_at(p, view, lens)
+                if here:
+                    wide = widened(a, b, by_x, by_y)
+                    log_opacity -= float(wp.log(wide[3]))
+                    half_r2 = log_opacity - view.log_cut
+                    if not (half_r2 > 0.0):
+                        return  # edge-on too: infinitely thin, infinitely faint
+                    a = wide[0] * a + wide[1] * b
+                    b = wide[2] * b
+                    su *= wide[0]
+                    sv *= wide[2]
+                    tangent_u = a / su  # of unit area with tangent_v, whose direction stays
         radius = wp.sqrt(two * real(half_r2))
         reach = radius * wp.sqrt(a[2] * a[2] + b[2] * b[2])  # half of the disk's depth range (numerics A3)
         if wp.static(boxes_too):
@@ -183,9 +194,7 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
                 center_x = fx * (p[0] / p[2]) + cx
                 center_y = fy * (p[1] / p[2]) + cy
         box = Bounds()
-        round = bool(wp.static(not boxes_too or bent))
         if wp.static(edged):
-            round = not boxed
             if boxed:
                 area = vec4()
                 if wp.static(parallel):
@@ -195,22 +204,19 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
                 if not (area[0] <= area[1]):
                     return
                 box = box_bounds(float(area[0]), float(area[1]), float(area[2]), float(area[3]))
-        if round:
-            around_a, around_b, around_r, around_z = a, b, radius, reach
-            if wp.static(boxes_too and bent):
-                if boxed:
-                    # the disk around a larger rectangle
-                    sides = of_box.spread(tangent_u, tangent_v, p, su, sv, real(view.ray_step))
-                    around_a = tangent_u * sides[0]
-                    around_b = tangent_v * sides[1]
-                    around_r = sqrt_two
-                    around_z = sqrt_two * wp.length(vec2(around_a[2], around_b[2]))
-            if wp.static(parallel):
-                box = disk.parallel(around_a, around_b, center_x, center_y, around_r, view)
-            elif wp.static(ray_depths):
-                box = optics.enclose(around_a, around_b, p, around_r, view, lens)
-            else:
-                box = disk.seen(around_a, around_b, p, around_r, around_z, view)
+            elif wp.static(mixed):
+                box = seen(a, b, p, radius, reach, center_x, center_y, view, lens)
+        elif wp.static(boxes_too):
+            if boxed:
+                # the disk around a larger rectangle
+                sides = of_box.spread(tangent_u, tangent_v, p, su, sv, real(view.ray_step))
+                side_u, side_v = tangent_u * sides[0], tangent_v * sides[1]
+                range_z = sqrt_two * wp.length(vec2(side_u[2], side_v[2]))
+                box = seen(side_u, side_v, p, sqrt_two, range_z, center_x, center_y, view, lens)
+            elif wp.static(mixed):
+                box = seen(a, b, p, radius, reach, center_x, center_y, view, lens)
+        else:
+            box = seen(a, b, p, radius, reach, center_x, center_y, view, lens)
         if wp.static(mapped):
             x0, x1 = real(box.x - box.half_x), real(box.x + box.half_x)
             y0, y1 = real(box.y - box.half_y), real(box.y + box.half_y)

@@ -43,15 +43,8 @@ _PROJECT = (
     *("camera_brown_conrady", "camera_fisheye", "camera_equirectangular"),
 )
 _SAMPLE = (
-    *_RECORD,
-    "stop_exclusive",
-    "depth",
-    "depth_median",
-    "depth_first",
-    "heaviest",
-    "blended",
-    "fog",
-    "rays_length",
+    *(*_RECORD, "stop_exclusive", "depth", "depth_median", "depth_first"),
+    *("heaviest", "blended", "fog", "rays_length"),
 )
 
 
