@@ -29,9 +29,10 @@ class Frame(Mapping):
     device on first use.
 
     Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median`, `depth_first` (h, w)
-    metres along z, `distance`, `distance_median`, `distance_first` metres along the ray, 0 where nothing was
-    drawn; `normal` (h, w, 3) unit, camera frame, towards the camera, `normal_world` the same in the world's
-    axes; `label`, `splat_id` (h, w) int32, -1 where nothing was drawn; `blended` (h, w) int32.
+    metres along z, `distance`, `distance_median`, `distance_first` metres along the ray; `normal` (h, w, 3)
+    unit, camera frame, towards the camera, `normal_world` the same in the world's axes; `label`, `splat_id`
+    (h, w) int32; `blended` (h, w) int32. Where less than 1/255 is covered, or of first hits less than
+    `Quality.first_hit`, labels and ids are -1, the others of these 0.
     """
 
     def __init__(self, planes: Planes, outputs: tuple[str, ...]) -> None:

@@ -85,7 +85,7 @@ class Panorama:
                 f"background: a panorama of {width} x {height} pixels; 2 to {MAX_PANORAMA} a side can be used"
             )
         whole = np.iinfo(given.dtype).max if given.dtype in (np.uint8, np.uint16) else 1
-        image = np.array(given, np.float32) / np.float32(whole)
+        image = np.array(given, np.float32, order="C") / np.float32(whole)
         if not np.isfinite(image).all():
             raise InputError("background: the panorama holds numbers that are not finite")
         image.flags.writeable = False
@@ -93,17 +93,21 @@ class Panorama:
 
     @staticmethod
     def load(path) -> Panorama:
-        """From a picture file. Raises InputError when it cannot be read."""
+        """From a picture file, whole numbers of 8 or 16 bits or floats. Raises InputError when it cannot be
+        read."""
         from fidsplat.vision.images import read_image
 
-        return Panorama(read_image(path), str(path))
+        return Panorama(read_image(path, deep=True), str(path))
 
 
 Background = tuple[float, float, float] | Gradient | Panorama
 
 
 def background_of(value: Any) -> Background:
-    """A background as it is, or three numbers as a colour. Raises InputError for anything else."""
+    """A background as it is, or three numbers as a colour, which a gradient between equal colours is too.
+    Raises InputError for anything else."""
+    if isinstance(value, Gradient) and value.top == value.bottom:
+        return value.top
     if isinstance(value, (Gradient, Panorama)):
         return value
     if isinstance(value, np.ndarray) and value.ndim > 1:

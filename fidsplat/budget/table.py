@@ -28,7 +28,7 @@ FREE: dict[str, Any] = {
 """The knobs that a budget turns, and where they stand unless a setting says otherwise. Of the other knobs
 those that only make a picture wrong are off (opacity ceiling, exclusive stop); the rest are its definition,
 or, as tile_size, cost no accuracy: they stay as the base quality has them."""
-NUMBERS = ("alpha_cutoff", "transmittance_stop")
+COMMON = ("alpha_cutoff", "transmittance_stop", "arithmetic")
 """those of them that every device has"""
 
 
@@ -53,10 +53,10 @@ class Setting:
 
     @property
     def everywhere(self) -> Setting:
-        """What is drawn instead where a device lacks its other knobs: its numbers alone, no less accurate
+        """What is drawn instead where a device lacks its other knobs: those that all have, no less accurate
         but for float64 blending."""
-        numbers = {name: value for name, value in self.knobs.items() if name in NUMBERS}
-        return replace(self, knobs=numbers)
+        common = {name: value for name, value in self.knobs.items() if name in COMMON}
+        return replace(self, knobs=common)
 
     @property
     def promised(self) -> float:

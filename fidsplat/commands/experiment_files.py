@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
@@ -52,6 +53,7 @@ Examples:
     def run(self) -> int:
         from rich.progress import Progress
 
+        from fidsplat.experiments.blender import check_pictures
         from fidsplat.experiments.dataset import dataset_work, write_scene
         from fidsplat.experiments.setup import MARKERS, chosen_categories
         from fidsplat.experiments.views import TRUTHS
@@ -61,6 +63,8 @@ Examples:
             raise InputError(f"unknown truth {self.truth!r}; known: {', '.join(TRUTHS)}")
         if not 1 <= self.markers <= MARKERS:
             raise InputError(f"--markers is {self.markers}; each category has 1 to {MARKERS}")
+        if self.truth.startswith("blender-"):
+            check_pictures(self.blender, self.truth.removeprefix("blender-"), self.seed)
         folder = writable_folder(self.out)
         work = dataset_work(chosen_categories(self.category), self.markers)
         where = console(self.json)
@@ -130,11 +134,15 @@ Examples:
             return 0
         if not (1 <= self.markers <= MARKERS and self.samples >= 1):
             raise InputError(f"--markers must be 1 to {MARKERS} and --samples at least 1")
+        if self.threads is not None and self.threads < 1:
+            raise InputError(f"--threads is {self.threads}; at least 1 thread draws")
         views = self.view or blender.VIEW_NAMES
         categories = chosen_categories(self.category)
         for view in views:
             blender.ready(view, environment)
         folder, done = Path(self.out), 0
+        for view in views:
+            blender.note_pictures(folder, view, self.seed, self.samples)
         with Progress(console=console(True), transient=True) as bars:
             for view in views:
                 jobs = [
@@ -161,6 +169,9 @@ class Merge:
         str
     ] = """Join results of shards: NAME-1-of-4.jsonl and so on in the folders become NAME.jsonl.
 
+What NAME.jsonl holds beside them stays. Warns of shards that are missing, and where the results are not of
+one device, version or code.
+
 Examples:
   fidsplat experiment merge shards -o results
   fidsplat experiment merge machine-1 machine-2 -o results"""
@@ -172,7 +183,7 @@ Examples:
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.experiments.records import merge
+        from fidsplat.experiments.records import merge, missing_shards
         from fidsplat.experiments.run import NAMES
 
         result = {}
@@ -181,15 +192,23 @@ Examples:
             files += [f for folder in self.folders for f in [Path(folder) / f"{name}.jsonl"] if f.is_file()]
             if files:
                 target = Path(self.out) / f"{name}.jsonl"
-                lines, twice = merge(files, target)
-                result[name] = {"file": str(target), "files": len(files), "lines": lines, "repeated": twice}
+                joined = merge(files, target)
+                facts = {"file": str(target), "files": len(files), "lines": joined.lines}
+                result[name] = facts | {"repeated": joined.repeated, "missing": missing_shards(files)}
+                if result[name]["missing"]:
+                    text = f"{name}: there is no shard {', '.join(result[name]['missing'])}"
+                    warnings.warn(text, stacklevel=2)
+                if joined.differ:
+                    text = f"{name}: results that differ in {' and '.join(joined.differ)} are joined"
+                    warnings.warn(f"{text}; the report lists them", stacklevel=2)
         if not result:
             raise InputError(f"no results of shards in {', '.join(self.folders) or 'no folder'}")
         if self.json:
             print_json(result)
         else:
             for facts in result.values():
-                text = f"{facts['file']}: {facts['lines']} results of {facts['files']} files"
+                again = f", {facts['repeated']} of them repeated" if facts["repeated"] else ""
+                text = f"{facts['file']}: {facts['lines']} results of {facts['files']} files{again}"
                 console(False).print(text, markup=False, soft_wrap=True)
         return 0
 

@@ -129,12 +129,13 @@ def measure(names: tuple[str, ...], settings: Settings, as_json: bool) -> int:
     files: dict[str, str] = {}
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
     columns = (*columns, TimeElapsedColumn(), Remaining())
-    for name in names:
-        with planned(name, settings) as plan, Progress(*columns, console=console(True)) as bars:
-            bar = bars.add_task(name, total=len(plan.work), completed=len(plan.work) - plan.left)
-            for done, line in plan.run():
-                bars.update(bar, completed=done, description=f"{name} {_what(line['key'])}")
-            bars.update(bar, description=name)
+    with planned(names, settings) as plans:
+        for name, plan in plans.items():
+            with Progress(*columns, console=console(True)) as bars:
+                bar = bars.add_task(name, total=len(plan.work), completed=len(plan.work) - plan.left)
+                for done, line in plan.run():
+                    bars.update(bar, completed=done, description=f"{name} {_what(line['key'])}")
+                bars.update(bar, description=name)
             files[name] = str(plan.records.file)
     if as_json:
         print_json({"files": files})

@@ -138,16 +138,24 @@ _EFFECTS = (
         parts=("box_cover",),
     ),
     Effect("ray_depth", "slot/ray_depth.cl", record_lanes=3),
+    Effect("shown", "slot/shown.cl"),
     Effect("alpha", "tap/alpha.cl", output=Output("alpha", 1, "float32")),
-    Effect("depth", "tap/depth.cl", planes=(2,), output=Output("depth", 1, "float32"), parts=("ray_depth",)),
+    Effect("depth", "tap/depth.cl", planes=(2,), output=Output("depth", 1, "float32"), parts=("ray_depth", "shown")),
     Effect(
         "depth_median",
         "tap/depth_median.cl",
         planes=(1,),
         output=Output("depth_median", 1, "float32"),
-        parts=("ray_depth",),
+        parts=("ray_depth", "shown"),
     ),
-    Effect("normal", "tap/normal.cl", record_lanes=3, planes=(3,), output=Output("normal", 3, "float32")),
+    Effect(
+        "normal",
+        "tap/normal.cl",
+        record_lanes=3,
+        planes=(3,),
+        output=Output("normal", 3, "float32"),
+        parts=("shown",),
+    ),
     Effect(
         "label",
         "tap/label.cl",
@@ -156,6 +164,7 @@ _EFFECTS = (
         inputs=("labels",),
         planes=(1, 1),
         output=Output("label", 1, "int32"),
+        parts=("shown",),
     ),
     Effect(
         "overdraw",
@@ -251,6 +260,7 @@ _EFFECTS = (
         inputs=("splat_ids",),
         planes=(1, 1),
         output=Output("splat_id", 1, "int32"),
+        parts=("shown",),
     ),
     Effect("blended", "tap/blended.cl", planes=(1,), output=Output("blended", 1, "int32")),
 )

@@ -14,7 +14,7 @@ from fidsplat.effects.together import refuse_strangers
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
 from fidsplat.sensor import Sensor
-from fidsplat.surroundings import Background, Fog, Gradient
+from fidsplat.surroundings import Background, Fog, Gradient, background_of
 
 RGB = Output("rgb", 3, "float32")
 OUTPUTS: dict[str, Output] = {
@@ -147,7 +147,8 @@ def select(
             "compose_planes" if layered else "compose_ordered",
             f"footprint_{cloud.footprint}",
             f"background_{_behind(background, foggy)}",
-            f"arithmetic_{quality.arithmetic}",
+            # short functions are float32's
+            f"arithmetic_{'precise' if precision == 'float64' else quality.arithmetic}",
             *(("motion_groups",) if moving else ()),
             *(("shutter_exposure",) if exposed else ()),
             *(("blend_double",) if precision == "float64" else ()),
@@ -164,7 +165,8 @@ def select(
 
 
 def _behind(background: Background, foggy: bool) -> str:
+    around = background_of(background)
     # behind everything fog is all there is
-    if foggy or isinstance(background, tuple):
+    if foggy or isinstance(around, tuple):
         return "constant"
-    return "gradient" if isinstance(background, Gradient) else "panorama"
+    return "gradient" if isinstance(around, Gradient) else "panorama"

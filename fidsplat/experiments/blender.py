@@ -23,7 +23,7 @@ from fidsplat.experiments.setup import (
     novel_cameras,
     training_cameras,
 )
-from fidsplat.files import writable_folder
+from fidsplat.files import atomic_write, writable_folder
 
 BPY = "bpy==5.0.1"
 VIEW_NAMES = ("standard", "raw")
@@ -41,6 +41,37 @@ def novel_picture(folder: Path, view: str, category: str, index: int, number: in
 def training_picture(folder: Path, view: str, category: str, index: int, number: int) -> Path:
     """The file of one training view of the densest collection."""
     return folder / view / f"{category}-{index}" / f"view-{number:02d}.png"
+
+
+def check_pictures(folder: Path, view: str, seed: int, samples: int | None = None) -> dict:
+    """What a view's pictures were drawn with, {} where nothing is known.
+
+    Raises InputError when that is another seed or number of samples (None: any).
+    """
+    try:
+        about = json.loads(_note(folder, view).read_text("utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read {_note(folder, view)}: {error}") from error
+    for name, wanted in (("seed", seed), ("samples", samples)):
+        if wanted is not None and about.get(name) != wanted:
+            raise InputError(
+                f"{folder / view} holds pictures of {name} {about.get(name)}, not {wanted}; give another folder"
+            )
+    return about
+
+
+def note_pictures(folder: Path, view: str, seed: int, samples: int) -> None:
+    """Keep what a view's pictures are drawn with. Raises InputError as `check_pictures`."""
+    check_pictures(folder, view, seed, samples)
+    writable_folder(folder / view)
+    with atomic_write(_note(folder, view)) as stream:
+        stream.write(json.dumps({"seed": seed, "samples": samples}).encode())
+
+
+def _note(folder: Path, view: str) -> Path:
+    return folder / view / "drawn-with.json"
 
 
 def default_environment() -> Path:

@@ -68,8 +68,10 @@ def write_scene(part: dict, folder: Path, seed: int, truth: str, blender: Path) 
     spec = category.spec(part["index"], seed)
     about = _about(spec, part, seed, truth)
     note = scene / "marker.json"
-    if note.is_file() and json.loads(note.read_text("utf-8")) == about:
+    if _whole(note, about):
         return scene
+    # a run that is stopped leaves no note on pictures of two kinds
+    note.unlink(missing_ok=True)
     points, colors = _points(spec, f"{seed} points {category.name} {part['index']}")
     sets = (
         (scene, "view", training_cameras(part["views"]), training_picture),
@@ -91,6 +93,13 @@ def write_scene(part: dict, folder: Path, seed: int, truth: str, blender: Path) 
     with atomic_write(note) as stream:
         stream.write(json.dumps(about, indent=1).encode())
     return scene
+
+
+def _whole(note: Path, about: dict) -> bool:
+    try:
+        return json.loads(note.read_text("utf-8")) == about
+    except (FileNotFoundError, ValueError):
+        return False
 
 
 def _about(spec: str, part: dict, seed: int, truth: str) -> dict:

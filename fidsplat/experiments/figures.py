@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Iterable, Sequence
 
 from fidsplat.experiments.charts import Bar
-from fidsplat.experiments.methods import IDEAL, mixtures
+from fidsplat.experiments.methods import FILTERS, IDEAL, mixtures, with_linear_light
 from fidsplat.experiments.setup import CATEGORIES, COLLECTIONS
 
 NOTHING = "-"
@@ -41,7 +41,7 @@ def category_order(names: Iterable[str]) -> list[str]:
 def method_order(names: Iterable[str]) -> list[str]:
     """Those that occur: the ideal, mixtures, trained models."""
     there = set(names)
-    own = [name for m in mixtures() for name in (f"{m}/screen", f"{m}/best")]
+    own = with_linear_light(f"{m}/{filtered}" for m in mixtures() for filtered in FILTERS)
     known = [IDEAL, *own, *(f"2dgs-{n}" for n in COLLECTIONS)]
     return [name for name in known if name in there] + sorted(there - set(known))
 

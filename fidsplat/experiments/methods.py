@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,11 +10,12 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.errors import InputError
-from fidsplat.experiments.plane import plane_picture
+from fidsplat.experiments.plane import from_srgb, plane_picture
 from fidsplat.experiments.setup import BACKGROUND, COLLECTIONS, PLANE
 from fidsplat.markers import Marker, marker
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer
+from fidsplat.sensor import Sensor
 
 IDEAL = "ideal"
 _CUT = 1 / 255
@@ -23,6 +24,8 @@ FILTERS = {
     "best": Quality(alpha_cutoff=_CUT, lowpass="none", samples=3),
 }
 """the low-pass of 2DGS, and ours: none, the mean of 3 x 3 samples; with the cut-off of other renderers"""
+_LIGHT = "light"
+"""the filter "best", blended in linear light and then encoded by the sensor's sRGB curve"""
 # as the paper's authors drew the models that they trained
 _TRAINED_QUALITY = "surfel"
 
@@ -56,6 +59,17 @@ def method_names(chosen: tuple[str, ...] = (), trained: Path | None = None) -> t
     return (IDEAL, *own, *models)
 
 
+def with_linear_light(methods: Iterable[str]) -> list[str]:
+    """The rows, and after each "MIXTURE/best" the same drawn in linear light."""
+    more = ([m, m.replace("/best", f"/{_LIGHT}")] if m.endswith("/best") else [m] for m in methods)
+    return [name for names in more for name in names]
+
+
+def in_linear_light(method: str) -> bool:
+    """Whether a row is drawn in linear light."""
+    return method.endswith(f"/{_LIGHT}")
+
+
 @dataclass(eq=False)
 class Painter:
     """Draws markers by any method.
@@ -71,7 +85,7 @@ class Painter:
         """Get ready to draw a marker.
 
         Args:
-            method: one of `method_names`.
+            method: one of `method_names` or `with_linear_light`.
             name: the marker's, e.g. "small-0".
             spec: the marker's.
             module: metres.
@@ -86,7 +100,8 @@ class Painter:
             raise InputError(f"the method {method} needs a renderer")
         head, _, filtered = method.partition("/")
         if filtered:
-            cloud, quality = marker(spec, module * plain.bits.shape[1], mixture=head).cloud, FILTERS[filtered]
+            cloud = marker(spec, module * plain.bits.shape[1], mixture=head).cloud
+            quality = FILTERS["best" if filtered == _LIGHT else filtered]
         elif self.trained is not None:
             from fidsplat.formats import load_ply
 
@@ -96,9 +111,14 @@ class Painter:
         else:
             raise InputError(f"the method {method} needs a folder of trained models")
         resident = renderer.upload(cloud)
+        linear = in_linear_light(method)
+        ground = from_srgb(BACKGROUND) if linear else BACKGROUND
+        sensor = Sensor(response="srgb") if linear else None
 
         def draw(camera: Camera) -> np.ndarray:
-            frame = renderer.render(resident, camera, quality=quality, background=(BACKGROUND,) * 3)
+            frame = renderer.render(
+                resident, camera, quality=quality, background=(ground,) * 3, sensor=sensor
+            )
             return frame["rgb"].mean(2) if not filtered else frame["rgb"][:, :, 0]
 
         return draw

@@ -125,3 +125,14 @@ def _pieces(begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     who, t = who[order], t[order]
     same = who[1:] == who[:-1]
     return who[:-1][same], t[:-1][same], t[1:][same]
+
+
+def srgb(light: np.ndarray) -> np.ndarray:
+    """Linear light in [0, 1] to display values (IEC 61966-2-1)."""
+    light = np.clip(light, 0.0, 1.0)
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+def from_srgb(value: float) -> float:
+    """A display value to linear light."""
+    return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4

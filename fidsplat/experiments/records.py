@@ -7,11 +7,13 @@ import hashlib
 import json
 import os
 import platform
+import re
 import subprocess
 from collections.abc import Callable, Iterable, Iterator
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
+from typing import NamedTuple
 
 from fidsplat import __version__
 from fidsplat.errors import InputError
@@ -46,8 +48,8 @@ def run_facts(experiment: str, device: str | None, seed: int, extra: dict[str, s
 
 def _differences(old: dict, new: dict) -> list[str]:
     """The facts on which numbers depend and that are not the same. A run that draws nothing has no device."""
-    names = [name for name in ("versions", "code", "seed") if old.get(name) != new[name]]
-    devices = (old.get("device"), new["device"])
+    names = [name for name in ("versions", "code", "seed") if old.get(name) != new.get(name)]
+    devices = (old.get("device"), new.get("device"))
     return names + (["device"] if None not in devices and devices[0] != devices[1] else [])
 
 
@@ -201,24 +203,53 @@ def shard(work: list[dict], text: str | None) -> list[dict]:
     if text is None:
         return work
     first, _, of = text.partition("/")
-    if not (first.isdigit() and of.isdigit() and 1 <= int(first) <= int(of)):
+    if not (first.isdecimal() and of.isdecimal() and 1 <= int(first) <= int(of)):
         raise InputError(f"--shard is {text!r}; write i/n with 1 <= i <= n, e.g. 1/4")
     return work[int(first) - 1 :: int(of)]
 
 
-def merge(files: list[Path], target: Path) -> tuple[int, int]:
-    """Join files of shards into one; returns the numbers of lines, and of parts that more than one file had.
+class Merged(NamedTuple):
+    """What `merge` found."""
 
-    Of such parts the first stays. Raises InputError when a file is missing or none of ours.
+    lines: int
+    repeated: int
+    """parts that more than one file had"""
+    differ: tuple[str, ...]
+    """facts on which numbers depend and that are not the same in all lines"""
+
+
+def merge(files: list[Path], target: Path) -> Merged:
+    """Join files of shards into one; of a part that several have the first stays.
+
+    What the target holds already and the files do not stays in it.
+
+    Raises InputError when a file is missing or none of ours.
     """
-    found: dict[str, dict] = {}
-    twice = 0
     for file in files:
         if not file.is_file():
             raise InputError(f"{file} is not a file; give the .jsonl files of the shards")
+    found: dict[str, dict] = {}
+    twice = 0
+    for file in files:
         for line in read_lines(file):
             twice += key_of(line) in found
             found.setdefault(key_of(line), line)
+    for line in read_lines(target):
+        found.setdefault(key_of(line), line)
+    lines = list(found.values())
+    runs = [line.get("run", {}) for line in lines]
+    # one that draws nothing has no device to differ from
+    first = next((run for run in runs if run.get("device")), runs[0] if runs else {})
+    differ = {name for run in runs for name in _differences(run, first)}
     writable_folder(target.parent)
-    _write(target, found.values())
-    return len(found), twice
+    _write(target, lines)
+    return Merged(len(lines), twice, tuple(sorted(differ)))
+
+
+def missing_shards(files: Iterable[Path]) -> list[str]:
+    """The "i/n" that are not among files named as `--shard i/n` names them."""
+    there: dict[int, set[int]] = {}
+    for file in files:
+        if match := re.fullmatch(r".*-(\d+)-of-(\d+)\.jsonl", file.name):
+            there.setdefault(int(match[2]), set()).add(int(match[1]))
+    return [f"{i}/{n}" for n, found in sorted(there.items()) for i in range(1, n + 1) if i not in found]

@@ -68,7 +68,8 @@ def report_views(document: Document, lines: Sequence[dict]) -> dict[str, str]:
     charts = {}
     for truth in (name for name in TRUTHS if name in views.names(0)):
         document.heading(f"Against {truth}: {TRUTHS[truth]}", 3)
-        methods = [m for m in method_order(views.names(2)) if not m.startswith("2dgs-")]
+        there = {method for t, _, method in views.found if t == truth}
+        methods = [m for m in method_order(there | {IDEAL}) if not m.startswith("2dgs-")]
         rows = []
         categories = category_order(views.names(1))
         for category in categories:
@@ -95,7 +96,8 @@ def report_views(document: Document, lines: Sequence[dict]) -> dict[str, str]:
             "The ideal against exact-linear is what a picture that is perfect in display values loses when "
             "the truth takes its means in linear light, as Blender's 'Standard' view does: the difference "
             "sits on module edges, so it grows with the number of modules. A renderer that blends display "
-            "values, as splat renderers do, comes no closer to such a truth, but by luck."
+            "values, as splat renderers do, comes no closer to such a truth, but by luck. The rows /light "
+            "blend linear light and encode it as the last step (the sensor's response srgb)."
         )
     return charts
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -11,6 +11,7 @@ from pathlib import Path
 
 from fidsplat.errors import InputError
 from fidsplat.experiments import angles, counts, localisation, views
+from fidsplat.experiments.blender import VIEW_NAMES, check_pictures
 from fidsplat.experiments.methods import IDEAL, Painter, method_names
 from fidsplat.experiments.records import Records, run_facts, shard
 from fidsplat.experiments.setup import MARKERS, PROTOCOLS, SEED, TEST_VIEWS, chosen_categories
@@ -22,7 +23,7 @@ from fidsplat.vision.readers import reader_versions
 
 NAMES = (counts.NAME, localisation.NAME, views.NAME, angles.NAME)
 """the experiments that measure, quickest first"""
-QUICK_VIEWS = 2
+QUICK_VIEWS = 1
 
 
 @dataclass(frozen=True)
@@ -94,26 +95,37 @@ class Plan:
 
 
 @contextmanager
-def planned(name: str, settings: Settings) -> Iterator[Plan]:
-    """An experiment with all that it needs, opened for as long as the context lasts.
+def planned(names: Iterable[str], settings: Settings) -> Iterator[dict[str, Plan]]:
+    """Experiments by name with all that they need, opened for as long as the context lasts.
+
+    All are made ready before the first runs: what is wrong with the last is not told after hours.
 
     Raises InputError for settings that cannot be used, DeviceError when the device cannot be opened.
     """
     check(settings)
-    work = shard(_work(name, settings), settings.part)
+    works = {name: shard(_work(name, settings), settings.part) for name in names}
     writable_folder(settings.out)
-    draws = name != counts.NAME and not settings.ideal_only
+    draws = not settings.ideal_only and any(name != counts.NAME for name in works)
     renderer = Renderer(settings.device) if draws else None
-    device = None if renderer is None else f"{renderer.device.title}, {renderer.device.version}"
-    versions = reader_versions() | (metric_versions() if name == views.NAME else {})
-    facts = run_facts(name, device, settings.seed, versions)
-    records = Records(settings.file(name), facts, settings.anew)
+    painter = Painter(renderer, settings.trained)
     pool = ThreadPoolExecutor(settings.workers)
     try:
-        yield Plan(records, work, _measure(name, settings, Painter(renderer, settings.trained), pool))
+        # first, for it reads files: --anew drops nothing for a run that cannot begin
+        measures = {name: _measure(name, settings, painter, pool) for name in works}
+        yield {
+            name: Plan(_records(name, settings, renderer), work, measures[name])
+            for name, work in works.items()
+        }
     finally:
         # an interrupt must not wait for pictures that nobody will look at
         pool.shutdown(cancel_futures=True)
+
+
+def _records(name: str, settings: Settings, renderer: Renderer | None) -> Records:
+    drawn = renderer is not None and name != counts.NAME
+    device = f"{renderer.device.title}, {renderer.device.version}" if drawn else None
+    versions = reader_versions() | (metric_versions() if name == views.NAME else {})
+    return Records(settings.file(name), run_facts(name, device, settings.seed, versions), settings.anew)
 
 
 def check(settings: Settings) -> None:
@@ -130,6 +142,12 @@ def check(settings: Settings) -> None:
         raise InputError(
             f"{settings.trained} is not a folder; give one with 2dgs-17/small-0.ply and the like"
         )
+    if settings.blender is not None and not settings.blender.is_dir():
+        raise InputError(
+            f"{settings.blender} is not a folder; give the one that fidsplat experiment blender wrote"
+        )
+    for view in VIEW_NAMES:
+        check_pictures(settings.blender_folder, view, settings.seed)
     if settings.tilts is not None:
         angles.parse_tilts(settings.tilts)
     method_names(settings.mixtures)

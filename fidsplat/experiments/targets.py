@@ -15,6 +15,7 @@ from fidsplat.experiments.report_angles import Angles
 from fidsplat.experiments.report_counts import Counts
 from fidsplat.experiments.report_views import Views
 from fidsplat.experiments.setup import CATEGORIES, PROTOCOLS
+from fidsplat.experiments.views import LINEAR, TRUTHS
 
 ALLOWED_GAP = {"exact": 0.2, "fitted": 1.0}
 """degrees by which reading may end below the ideal texture's"""
@@ -72,39 +73,42 @@ def _gaps(angles: Angles) -> Iterator[Target]:
 
 
 def _paper_angles(angles: Angles) -> Iterator[Target]:
-    for category, paper in ANGLES.items():
-        wanted = paper["ours"][1]
-        ceiling = _unbroken(angles, category, IDEAL)
-        beside = "" if ceiling is None else f" (ideal: {ceiling:.1f})"
-        for mixture in ALLOWED_GAP:
-            mean = _unbroken(angles, category, f"{mixture}/best")
-            if mean is not None:
-                yield Target(
-                    f"{mixture}/best, {category}, fixed-module: read without a miss up to, mean",
-                    f">= {wanted} deg (paper)",
-                    f"{mean:.1f} deg{beside}",
-                    mean >= wanted - _SLACK,
-                )
+    """The paper gives the largest angle; what is read without a miss up to it is the stricter question."""
+    for which, words in enumerate(("largest tilt that is read", "read without a miss up to")):
+        for category, paper in ANGLES.items():
+            wanted = paper["ours"][1]
+            ceiling = _decoding(angles, category, IDEAL, which)
+            beside = "" if ceiling is None else f" (ideal: {ceiling:.1f})"
+            for mixture in ALLOWED_GAP:
+                mean = _decoding(angles, category, f"{mixture}/best", which)
+                if mean is not None:
+                    yield Target(
+                        f"{mixture}/best, {category}, fixed-module: {words}, mean",
+                        f">= {wanted} deg (paper)",
+                        f"{mean:.1f} deg{beside}",
+                        mean >= wanted - _SLACK,
+                    )
 
 
-def _unbroken(angles: Angles, category: str, method: str) -> float | None:
+def _decoding(angles: Angles, category: str, method: str, which: int) -> float | None:
     scans = angles.of("fixed-module", category, method, "zxing-tall").values()
-    return statistics.fmean(largest(s.tilts, s.read)[1] or 0.0 for s in scans) if scans else None
+    return statistics.fmean(largest(s.tilts, s.read)[which] or 0.0 for s in scans) if scans else None
 
 
 def _views(views: Views) -> Iterator[Target]:
-    truths = [t for t in ("exact", "blender-raw", "blender-standard") if t in views.names(0)]
+    truths = [t for t in TRUTHS if t in views.names(0)]
     for truth in truths:
         for category in category_order(views.names(1)):
             ceiling = views.mean(truth, category, IDEAL, "psnr")
-            beside = "" if ceiling is None else f" (a perfect picture: {ceiling:.2f})"
+            beside = "" if ceiling is None else f" (a perfect picture of display values: {ceiling:.2f})"
+            filtered = "light" if truth in LINEAR else "best"
             for metric, least in (("psnr", EXACT_PSNR), ("ssim", EXACT_SSIM)):
-                value = views.mean(truth, category, "exact/best", metric)
+                value = views.mean(truth, category, f"exact/{filtered}", metric)
                 if value is not None:
                     unit = " dB" if metric == "psnr" else ""
                     extra = beside if metric == "psnr" else ""
                     yield Target(
-                        f"exact/best, {category}, {metric} against {truth}",
+                        f"exact/{filtered}, {category}, {metric} against {truth}",
                         f">= {least}{unit}",
                         f"{value:.3f}{unit}{extra}",
                         value >= least,

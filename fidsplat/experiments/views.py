@@ -11,8 +11,8 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.errors import InputError
 from fidsplat.experiments.blender import VIEW_NAMES, novel_picture
-from fidsplat.experiments.methods import IDEAL, Painter, plain_marker
-from fidsplat.experiments.plane import plane_picture
+from fidsplat.experiments.methods import IDEAL, Painter, in_linear_light, plain_marker, with_linear_light
+from fidsplat.experiments.plane import from_srgb, plane_picture, srgb
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS, TEST_VIEWS, Category, novel_cameras
 from fidsplat.vision.images import read_image, to_uint8
 from fidsplat.vision.metrics import flip, has_flip, psnr, ssim
@@ -24,6 +24,8 @@ TRUTHS = {
     "blender-standard": "Blender, view 'Standard'",
     "blender-raw": "Blender, view 'Raw' on display values",
 }
+LINEAR = ("exact-linear", "blender-standard")
+"""those that take means of linear light: drawing in linear light is compared with these alone"""
 Perceptual = Callable[[np.ndarray, np.ndarray], float]
 
 
@@ -52,7 +54,7 @@ def views_work(
                 for view in VIEW_NAMES
                 if all(novel_picture(blender, view, category.name, index, i).is_file() for i in range(views))
             ]
-            for method in methods:
+            for method in with_linear_light(methods):
                 for truth in truths:
                     part = {
                         "category": category.name,
@@ -63,7 +65,8 @@ def views_work(
                         "flip": has_flip(),
                         "lpips": lpips,
                     }
-                    if not (method == IDEAL and truth == "exact"):  # equal by definition
+                    equal = method == IDEAL and truth == "exact"  # by definition
+                    if not equal and (truth in LINEAR or not in_linear_light(method)):
                         work.append(part)
     return work
 
@@ -120,14 +123,3 @@ def exact_view(spec: str, camera: Camera, linear: bool) -> np.ndarray:
     if not linear:
         return plane_picture(grid, module, camera, background=BACKGROUND)
     return srgb(plane_picture(grid, module, camera, background=from_srgb(BACKGROUND)))
-
-
-def srgb(light: np.ndarray) -> np.ndarray:
-    """Linear light in [0, 1] to display values (IEC 61966-2-1)."""
-    light = np.clip(light, 0.0, 1.0)
-    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-
-
-def from_srgb(value: float) -> float:
-    """A display value to linear light."""
-    return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4

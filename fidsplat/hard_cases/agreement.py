@@ -108,7 +108,6 @@ def truth_of(picture: Picture, pixels: tuple[np.ndarray, np.ndarray] | None = No
 def compare(planes: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], outputs) -> list[Difference]:
     """Planes of a device against those of `truth_of`, for each of `outputs`."""
     risk = truth["certificate"]
-    covered = truth["alpha"] > 1e-3
     brightest = max(1.0, float(np.abs(truth["rgb"]).max(initial=1.0)))
     risky = float((risk > RISKY).mean())
     differences = []
@@ -128,8 +127,8 @@ def compare(planes: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], o
                 certified = risk * brightest
                 if name == "rgb":
                     certified = truth.get("certificate_rgb", certified)
-            else:  # where next to nothing is drawn, its depth and normal mean nothing
-                certified = np.where(covered, truth[f"certificate_{name}"], np.inf)
+            else:
+                certified = truth[f"certificate_{name}"]
             # parallel rays see what lies behind the camera's plane, at negative depths
             size = np.maximum(np.abs(want), 1e-30) if name in ("depth", "distance") else 1.0
             worst = float((error / size).max(initial=0.0))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.cameras import Camera, look_at_matrix
+from fidsplat.cameras import Camera, Trajectory, look_at_matrix
 from fidsplat.errors import InputError
 from fidsplat.quality import MarkerQuality, Quality, knobs
 from fidsplat.rotations import rigid_matrix
@@ -24,7 +24,7 @@ TOP = ("camera", "splats", "markers", "render", "quality", "sensor", "fog", "bac
 CAMERA = ("width", "height", "fov_x_deg", "fx", "fy", "cx", "cy")
 CAMERA += ("position", "look_at", "up", "world_to_camera", "near", "far", *TABLES, "shutter", "motion")
 CAMERA_POSE = ("position", "look_at", "up", "world_to_camera")
-SPLATS = ("file", "position", "quaternion", "scale")
+SPLATS = ("file", "position", "quaternion", "scale", "motion")
 MARKERS = ("spec", "size", "position", "quaternion", *knobs(MarkerQuality), "quiet_zone", "motion")
 RENDER = ("outputs", "background", "quality", "samples", "lowpass", "first_hit", "device")
 IMAGE = "image:"
@@ -51,8 +51,9 @@ def read_scene(path: str | os.PathLike[str], quality: Quality | str | None = Non
         raise render.error("background", "and the table [background] exclude each other")
     quality = quality_of(top, render) if quality is None else quality
     made_with = Quality.of(quality).marker
+    splats = [_splats(table, file.parent) for table in top.tables("splats", SPLATS)]
     return Scene(
-        clouds=tuple(_splats(table, file.parent) for table in top.tables("splats", SPLATS)),
+        clouds=tuple(cloud for cloud, _ in splats),
         camera=camera,
         markers=tuple(_marker(table, file.parent, made_with) for table in top.tables("markers", MARKERS)),
         background=read_background(top, file.parent) or render.numbers("background", 3, (0.0, 0.0, 0.0)),
@@ -63,6 +64,7 @@ def read_scene(path: str | os.PathLike[str], quality: Quality | str | None = Non
         camera_motion=keyframes,
         sensor=read_sensor(top),
         fog=read_fog(top),
+        cloud_motions={i: motion for i, (_, motion) in enumerate(splats) if motion is not None},
     )
 
 
@@ -125,17 +127,20 @@ def _pose(table: Table, scale: float = 1.0):
         return rigid_matrix(position, quaternion, scale)
 
 
-def _splats(table: Table, folder: Path) -> SplatCloud:
+def _splats(table: Table, folder: Path) -> tuple[SplatCloud, Trajectory | None]:
+    """A file's splats where they are put, and how they move from there."""
     from fidsplat.formats import load_ply
 
     name, scale = table.text("file"), table.number("scale", 1.0)
     if not scale > 0:
         raise table.error("scale", f"must be above 0, not {scale!r}")
-    pose = _pose(table, scale)
+    pose, motion = _pose(table, scale), read_keyframes(table, POSE, _pose)
+    if motion is not None:
+        motion = Trajectory(motion.times, motion.poses @ np.linalg.inv(_pose(table)))
     with table.at("file"):
         cloud = load_ply(folder / name)
         moved = any(key in table for key in ("position", "quaternion", "scale"))
-        return cloud.transformed(pose) if moved else cloud
+        return (cloud.transformed(pose) if moved else cloud), motion
 
 
 def _marker(table: Table, folder: Path, quality: MarkerQuality) -> PlacedMarker:

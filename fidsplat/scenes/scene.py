@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
@@ -83,10 +84,25 @@ class Scene:
     """what becomes of rgb on its way out"""
     fog: Fog | None = None
     """between the camera and what it sees"""
+    cloud_motions: Mapping[int, Pose] = field(default_factory=dict)
+    """number of a cloud that moves: the rigid motion of the world, at a time in seconds, that it makes from
+    where it is. Its splats have one label for all, above the markers', that no other splat has"""
 
     def __post_init__(self) -> None:
         put = object.__setattr__
         put(self, "clouds", _all_of(self.clouds, SplatCloud, "clouds"))
+        moving = self.cloud_motions
+        if not isinstance(moving, Mapping) or not all(map(callable, moving.values())):
+            raise InputError(
+                "cloud_motions must be {number of the cloud: fs.Trajectory or function of the time}"
+            )
+        for number in moving:
+            if isinstance(number, bool) or number not in range(len(self.clouds)):
+                raise InputError(
+                    f"cloud_motions: there is no cloud {number!r}; this scene has {len(self.clouds)}, "
+                    "counted from 0"
+                )
+        put(self, "cloud_motions", dict(moving))
         placed = _all_of(self.markers, PlacedMarker, "markers")
         put(self, "markers", tuple(replace(marker, label=i + 1) for i, marker in enumerate(placed)))
         if not isinstance(self.shutter, Shutter | None):
@@ -104,21 +120,37 @@ class Scene:
 
     @property
     def motion(self) -> Motion:
-        """What moves: the camera, and markers by their labels (and whatever else has these labels)."""
+        """What moves: the camera, markers by their labels (and whatever else has these), and clouds."""
         groups = {
             marker.label: partial(_moved_from, marker.pose, marker.motion)
             for marker in self.markers
             if marker.motion is not None
         }
+        groups |= {self._labels[number]: motion for number, motion in self.cloud_motions.items()}
         return Motion(self.camera_motion, groups)
 
     def cloud(self) -> SplatCloud:
-        """All splats in one cloud: the clouds' in their order with their own labels, then each marker's."""
+        """All splats in one cloud: the clouds' in their order, with their own labels if they do not move by
+        themselves, then each marker's."""
         return self._merged
 
     @cached_property
     def _merged(self) -> SplatCloud:
-        return SplatCloud.concatenate([*self.clouds, *(marker.cloud() for marker in self.markers)])
+        labels = self._labels
+        clouds = [
+            cloud.with_labels(labels[i]) if i in labels else cloud for i, cloud in enumerate(self.clouds)
+        ]
+        return SplatCloud.concatenate([*clouds, *(marker.cloud() for marker in self.markers)])
+
+    @cached_property
+    def _labels(self) -> dict[int, int]:
+        """The labels of clouds that move, by their numbers."""
+        still = [cloud.labels for i, cloud in enumerate(self.clouds) if i not in self.cloud_motions]
+        taken = (
+            {int(label) for labels in still for label in np.unique(labels)} if self.cloud_motions else set()
+        )
+        free = (label for label in itertools.count(len(self.markers) + 1) if label not in taken)
+        return dict(zip(sorted(self.cloud_motions), free, strict=False))
 
     @staticmethod
     def load(path: str | os.PathLike[str], quality: Quality | str | None = None) -> Scene:

@@ -28,11 +28,14 @@ def write_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
     render, qualities = _render(scene)
     around = imaging_tables(scene, file.parent)
     markers = [_marker(placed, file.parent, scene.quality) for placed in scene.markers]
+    motions = {
+        i: {"motion": keyframe_tables(motion, f"cloud {i}")} for i, motion in scene.cloud_motions.items()
+    }
     splats = []
     for i, cloud in enumerate(scene.clouds):
         name = f"{file.stem}-splats-{i}.ply"
         save_ply(cloud, file.parent / name)
-        splats.append({"file": name})
+        splats.append({"file": name, **motions.get(i, {})})
     parts = [] if scene.camera is None else [_table("[camera]", _camera(scene))]
     lens = None if scene.camera is None else lens_table(scene.camera)
     parts += [] if lens is None else [_table(f"[camera.{lens[0]}]", lens[1])]

@@ -12,12 +12,17 @@ from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
 
 
-def read_image(path: str | os.PathLike[str]) -> np.ndarray:
-    """Read a picture as (h, w, 3) uint8 RGB. Grey is repeated, 16 bits are cut to 8, alpha is dropped.
+def read_image(path: str | os.PathLike[str], deep: bool = False) -> np.ndarray:
+    """Read a picture as (h, w, 3) RGB. Grey is repeated, alpha is dropped.
 
-    Raises InputError when the file is missing or is no picture that OpenCV reads.
+    deep: False gives uint8, 16 bits cut to 8; True uint8, uint16 or float32, as the file has it.
+
+    Raises InputError when the file is missing, is no picture that OpenCV reads, or has other pixels.
     """
-    return cv2.cvtColor(_decode(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    image = _decode(path, cv2.IMREAD_COLOR | (cv2.IMREAD_ANYDEPTH if deep else 0))
+    if image.dtype not in (np.uint8, np.uint16, np.float32):
+        raise InputError(f"{path} holds {image.dtype} pixels; give 8 or 16 bits, or floats of 32")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def read_bits(path: str | os.PathLike[str]) -> np.ndarray:

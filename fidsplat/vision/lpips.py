@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -41,7 +42,7 @@ def load_lpips(file: Path) -> Callable[[np.ndarray, np.ndarray], float]:
     try:
         with np.load(file, allow_pickle=False) as arrays:
             weights = {name: np.asarray(arrays[name], np.float64) for name in arrays.files}
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
         raise InputError(f"{file} is no .npz file with LPIPS weights: {error}") from error
     for k, (out, into, size) in enumerate(_CHANNELS):
         shapes = {

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
+from itertools import product
 from typing import Any
 
 import cv2
@@ -19,8 +20,10 @@ import zxingcpp
 from fidsplat.errors import InputError
 from fidsplat.vision.dictionaries import predefined
 
-# how much taller the picture is made, one after the other, until zxing-cpp reads the code
+# how much larger the picture is made, and how much taller beside that, until zxing-cpp reads the code: all
+# heights at the picture's own size first, then twice as large
 UNFORESHORTEN = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0)
+ENLARGE = (1.0, 2.0)
 # a quadrilateral is that of the code when it shares more than this part of their union with it
 MIN_OVERLAP = 0.5
 _MARGIN = 16  # pixels kept around what is not background
@@ -94,26 +97,27 @@ def _cv2_qr(grey: np.ndarray, target: Target) -> Attempt:
     return Attempt(read or (quad is not None and _any_over([quad.reshape(4, 2) + 0.5], target)), read)
 
 
-def _zxing(grey: np.ndarray, target: Target, taller: float = 1.0) -> Attempt:
+def _zxing(grey: np.ndarray, target: Target, enlarged: tuple[float, float] = (1.0, 1.0)) -> Attempt:
     """zxing-cpp with its defaults, for QR codes."""
     formats = zxingcpp.BarcodeFormats([zxingcpp.BarcodeFormat.QRCode])
     codes = zxingcpp.read_barcodes(
         grey, formats=formats, text_mode=zxingcpp.TextMode.Plain, return_errors=True
     )
-    quads = (_position(code) / (1.0, taller) for code in codes)
+    quads = (_position(code) / enlarged for code in codes)
     read = any(code.valid and code.text == target.payload for code in codes)
     return Attempt(read or _any_over(quads, target), read)
 
 
 def _zxing_tall(grey: np.ndarray, target: Target) -> Attempt:
-    """zxing-cpp after un-foreshortening: the rows that differ from the background, made taller and taller."""
+    """zxing-cpp after un-foreshortening: the rows that differ from the background, made larger and taller."""
     top, bottom = _content_rows(grey)
     part = np.ascontiguousarray(grey[top:bottom])
     moved = Target(target.kind, target.family, target.id, target.payload, target.corners - (0.0, top))
     found = False
-    for factor in UNFORESHORTEN:
-        tall = cv2.resize(part, None, fx=1.0, fy=factor, interpolation=cv2.INTER_LINEAR)
-        attempt = _zxing(tall, moved, tall.shape[0] / part.shape[0])
+    for across, taller in product(ENLARGE, UNFORESHORTEN):
+        # cubic: modules of one pixel keep their contrast, which linear interpolation takes from them
+        tall = cv2.resize(part, None, fx=across, fy=across * taller, interpolation=cv2.INTER_CUBIC)
+        attempt = _zxing(tall, moved, (across, tall.shape[0] / part.shape[0]))
         found = found or attempt.found
         if attempt.read:
             return attempt

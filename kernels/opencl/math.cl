@@ -12,15 +12,29 @@ typedef int vint;
 #define VLOAD(p) (*(p))
 #define VSTORE(v, p) (*(p) = (v))
 #define VMASK(condition) (-(condition))
+#define VAS_INT(x) as_int(x)
+#define VAS_FLOAT(x) as_float(x)
+#define VFLOAT(i) ((vfloat)(i))
 #define VLANE 0.0f
 #else
 typedef GLUE(float, LANES) vfloat;
 typedef GLUE(int, LANES) vint;
 #define VSELECT(no, yes, mask) select(no, yes, mask)
+// Whether any lane is set. Clang makes a chain of branches of `any`, a lane each, and one test of its own reduction.
+#if defined(__has_builtin)
+#if __has_builtin(__builtin_reduce_or)
+#define VANY(mask) (__builtin_reduce_or(mask) != 0)
+#endif
+#endif
+#ifndef VANY
 #define VANY(mask) any(mask)
+#endif
 #define VLOAD(p) GLUE(vload, LANES)(0, p)
 #define VSTORE(v, p) GLUE(vstore, LANES)(v, 0, p)
 #define VMASK(condition) (condition)
+#define VAS_INT(x) GLUE(as_int, LANES)(x)
+#define VAS_FLOAT(x) GLUE(as_float, LANES)(x)
+#define VFLOAT(i) GLUE(convert_float, LANES)(i)
 #if LANES == 16
 #define VLANE ((vfloat)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
 #elif LANES == 8

@@ -12,6 +12,7 @@ from .common import STRICT, View, lowest, store_line
 from .lens import SLOPES
 from .pixel import make_pixel
 from .planes import make_samples, of_samples
+from .splat import make_splat
 from .staging import BLOCK_H, BLOCK_W, STAGED
 
 NONE, ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
@@ -23,8 +24,9 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
     tile's samples.
     """
     parts = make_pixel(effects)
-    pool, stage, touched = parts.staging.pool, parts.staging.stage, parts.staging.touched
-    load_staged = parts.load_staged
+    splats = make_splat(effects)
+    pool, stage, touched = splats.staging.pool, splats.staging.stage, splats.staging.touched
+    load, load_staged = splats.load, splats.load_staged
     Pixel = parts.Pixel
     limits = make_bounds("lowpass_screen" in effects)
     Samples = make_samples(tuple(of_samples(effects).items()))
@@ -32,8 +34,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
         name in effects
         for name in ("depth", "depth_median", "depth_first", "normal", "heaviest", "blended", "fog")
     )
-    load, start, row_of, cross, unfinished, blend_one = (
-        parts.load,
+    start, row_of, cross, unfinished, blend_one = (
         parts.start,
         parts.row,
         parts.cross,

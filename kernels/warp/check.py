@@ -4,6 +4,7 @@ them."""
 import warp as wp
 
 from .common import STRICT, fma
+from .fast import fast_exp, fast_log
 
 
 @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
@@ -12,7 +13,7 @@ def arithmetic(
     shares: wp.array(dtype=wp.float32),
     above: wp.array(dtype=wp.float32),
     below: wp.array(dtype=wp.float32),
-    out: wp.array(dtype=wp.float32, ndim=2),  # (5, n): exp, log, division, square root, fma
+    out: wp.array(dtype=wp.float32, ndim=2),  # (7, n): exp, log, division, square root, fma, fast exp, log
 ):
     i = wp.tid()
     out[0, i] = wp.exp(exponents[i])
@@ -20,6 +21,8 @@ def arithmetic(
     out[2, i] = above[i] / below[i]
     out[3, i] = wp.sqrt(below[i])
     out[4, i] = fma(above[i], below[i], above[i])
+    out[5, i] = fast_exp(exponents[i])
+    out[6, i] = fast_log(shares[i])
 
 
 @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .common import View, fma, struct_of
+from .fast import fast_log
 
 FAINT = wp.constant(1e-3)
 """below it the optical depth of an opacity a is a + a^2 / 2, to 3 parts in 10^7"""
@@ -21,6 +22,7 @@ DARKEST = wp.constant(wp.float32(2.0**-24))
 def make_layer(Seen, effects: tuple[str, ...]) -> SimpleNamespace:
     """Layer, and what is known of it: gather, gather_box; nothing, depth, shown."""
     normal, heaviest, blended = (name in effects for name in ("normal", "heaviest", "blended"))
+    log = fast_log if "arithmetic_fast" in effects else wp.log
     # `mean` holds sums over the layer's fragments, each times its optical depth; of boxes, times its opacity
     fields = {"plane": wp.int32, "opacity": wp.float32, "ink": wp.float32, "mean": Seen}
     fields |= {"thickest": wp.float32} if heaviest else {}
@@ -52,7 +54,7 @@ def make_layer(Seen, effects: tuple[str, ...]) -> SimpleNamespace:
         tau = opacity + 0.5 * opacity * opacity  # of a faint one, which 1 - opacity would blur
         if opacity > FAINT:
             # an opaque fragment has the optical depth at which float32 leaves no light
-            tau = -wp.log(wp.max(1.0 - opacity, DARKEST))
+            tau = -log(wp.max(1.0 - opacity, DARKEST))
         after = mixed_in(layer, plane, seen, tau)
         after.opacity = fma(opacity, 1.0 - layer.opacity, layer.opacity)
         return after

@@ -11,24 +11,37 @@ import warp as wp
 
 from .boxes import between, between_curves
 from .common import View, fma, line_of, struct_of
+from .fast import fast_exp
 from .layers import make_layer, make_laying
 from .lens import SLOPES
-from .planes import STATE
 from .records import BOXES, Layout
 from .sight import make_sight
-from .staging import make_staging
+from .splat import make_splat
+
+_STATE = {
+    "stop_exclusive": {"finished": wp.int32},
+    "depth": {"depth": wp.float32, "depth_weight": wp.float32},
+    # median_light: left behind the fragment that counted last
+    "depth_median": {"depth_median": wp.float32, "median_light": wp.float32},
+    "depth_first": {"depth_first": wp.float32},
+    "normal": {"normal": wp.vec3},
+    "heaviest": {"weight": wp.float32, "heaviest": wp.int32},
+    "blended": {"blended": wp.int32},
+    # fog_slope: -density, per metre of depth; fogged: sum of weights times what the fog hides
+    "fog": {"fog_slope": wp.float32, "fogged": wp.float32},
+}
+LEAST_ALPHA = wp.constant(wp.float32(1.0 / 255.0))
+"""less of a sample than this is nothing to label, depth, median depth and normal"""
 
 
 @cache
 def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
-    """The state of a sample, what it reads of a splat, and what is done with them: Pixel, Splat; load, start,
-    row, cross, unfinished, blend, finish; and what brings splats to the threads of a GPU block:
-    staging, load_staged.
+    """The state of a sample, and what is done with it: Rays, Pixel; start, row, cross, cross_ray,
+    cross_slopes, unfinished, blend, finish.
     """
+    Splat = make_splat(effects).Splat
     layout = Layout(effects)
     each = layout.lines
-    staging = make_staging(layout)
-    staged_line = staging.line
     screen, exclusive, ray_depth, layers = (
         name in effects for name in ("lowpass_screen", "stop_exclusive", "ray_depth", "compose_planes")
     )
@@ -36,21 +49,12 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         name in effects
         for name in ("depth", "depth_median", "depth_first", "normal", "heaviest", "blended", "fog")
     )
+    exp = fast_exp if "arithmetic_fast" in effects else wp.exp
     bent, parallel = "rays" in effects, "camera_orthographic" in effects
     boxes, all_boxes = any(name in effects for name in BOXES), "footprint_box" in effects
     sight = make_sight(bent, "rays_length" in effects, bent and boxes)
     Rays, length_of = sight.Rays, sight.length_of
     curved, edged = boxes and bent, boxes and not bent  # their edges: from each sample's ray, from a record
-    # u: nu0, nux, nuy, log opacity; v: nv0, nvx, nvy, D at the near plane; d: d0, dx, dy, ax; c: ay, r, g, b
-    splat = {"u": wp.vec4, "v": wp.vec4, "d": wp.vec4, "c": wp.vec4, "half_r2": wp.float32}
-    splat |= {"dot_x": wp.float32, "dot_y": wp.float32} if screen else {}
-    splat |= {"edges": wp.vec4} if edged else {}
-    splat |= {"boxed": wp.float32} if curved and not all_boxes else {}
-    # w: factors of the ray's Z, then the anchor's X; origin: the anchor's ray
-    splat |= {"w": wp.vec4, "origin": wp.vec3} if bent else {}
-    # plane_z0, plane_zx, plane_zy, plane_near
-    splat |= {"plane": wp.vec4} if parallel else {}
-    Splat = struct_of("Splat", "What of a record each sample needs.", splat)
     # q / d^2 is rho / 2; inside: the ray meets the disk within R and beyond the near plane
     crossing = {"d": wp.float32, "q": wp.float32, "inside": wp.bool, "drawn": wp.bool}
     # screen: squared distance from the projected centre in pixels, which is rho / 2 of the low-pass
@@ -68,84 +72,25 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     Seen = struct_of("Seen", "What shows where something is drawn.", seen)
     fields = {"t": wp.float32, "r": wp.float32, "g": wp.float32, "b": wp.float32}
     for effect in effects:
-        fields |= STATE.get(effect, {})
+        fields |= _STATE.get(effect, {})
     layer = make_layer(Seen, effects) if layers else None
     # pending: the layer that still gathers, and one that arrived before it
     fields |= {"open": layer.Layer, "waiting": layer.Layer} if layer else {}
     Pixel = struct_of("Pixel", "What a sample keeps.", fields)
-    dot_line, dot_lane = layout.place("dot_x")
-    dot_y_lane = layout.place("dot_y")[1]  # of the same line
-    edge_line = layout.place("edge_u0")[0]
     z_line, z_lane = layout.place("z_numerator")
     zc_line, zc_lane = layout.place("z_center")
     zr_line, zr_lane = layout.place("z_reach")
     nx_line, nx_lane = layout.place("nx")
     ny_line, ny_lane = layout.place("ny")
     nz_line, nz_lane = layout.place("nz")
-    boxed_line, boxed_lane = layout.place("boxed")
-    ray_line, plane_line = layout.place("nuz")[0], layout.place("plane_z0")[0]
-
-    @wp.func
-    def load(lines: wp.array(dtype=wp.vec4), index: int, view: View):
-        s = Splat()
-        at = index * each
-        s.u = line_of(lines, at)
-        s.v = line_of(lines, at + 1)
-        s.d = line_of(lines, at + 2)
-        s.c = line_of(lines, at + 3)
-        if wp.static(screen):
-            dot = line_of(lines, at + dot_line)
-            s.dot_x = dot[dot_lane]
-            s.dot_y = dot[dot_y_lane]
-        if wp.static(edged):
-            s.edges = line_of(lines, at + edge_line)
-        if wp.static(curved and not all_boxes):
-            s.boxed = line_of(lines, at + boxed_line)[boxed_lane]
-        if wp.static(bent):
-            s.w = line_of(lines, at + ray_line)
-            rest = line_of(lines, at + ray_line + 1)
-            s.origin = wp.vec3(s.w[3], rest[0], rest[1])
-        if wp.static(parallel):
-            s.plane = line_of(lines, at + plane_line)
-        s.half_r2 = s.u[3] - view.log_cut
-        return s
-
-    @wp.func
-    def load_staged(
-        pool: wp.uint64,
-        lines: wp.array(dtype=wp.vec4),
-        lists: wp.array(dtype=wp.int32),
-        first: int,
-        which: int,
-        view: View,
-    ):
-        s = Splat()
-        s.u = staged_line(pool, lines, lists, first, which, 0)
-        s.v = staged_line(pool, lines, lists, first, which, 1)
-        s.d = staged_line(pool, lines, lists, first, which, 2)
-        s.c = staged_line(pool, lines, lists, first, which, 3)
-        if wp.static(screen):
-            dot = staged_line(pool, lines, lists, first, which, dot_line)
-            s.dot_x = dot[dot_lane]
-            s.dot_y = dot[dot_y_lane]
-        if wp.static(edged):
-            s.edges = staged_line(pool, lines, lists, first, which, edge_line)
-        if wp.static(curved and not all_boxes):
-            s.boxed = staged_line(pool, lines, lists, first, which, boxed_line)[boxed_lane]
-        if wp.static(bent):
-            s.w = staged_line(pool, lines, lists, first, which, ray_line)
-            rest = staged_line(pool, lines, lists, first, which, ray_line + 1)
-            s.origin = wp.vec3(s.w[3], rest[0], rest[1])
-        if wp.static(parallel):
-            s.plane = staged_line(pool, lines, lists, first, which, plane_line)
-        s.half_r2 = s.u[3] - view.log_cut
-        return s
 
     @wp.func
     def start(x: int, y: int, rays: Rays, view: View):
         """The state of a sample before anything is drawn."""
         p = Pixel()
         p.t = 1.0
+        if wp.static(median):
+            p.median_light = 1.0
         if wp.static(heaviest):
             p.heaviest = -1
         if wp.static(layers):
@@ -247,7 +192,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
                 half_rho = wp.min(half_rho, c.screen)
             else:
                 half_rho = c.screen
-        return wp.min(wp.exp(s.u[3] - half_rho), view.ceiling)
+        return wp.min(exp(s.u[3] - half_rho), view.ceiling)
 
     @wp.func
     def depth_of(lines: wp.array(dtype=wp.vec4), index: int, c: Crossing, inverse_d: float) -> float:
@@ -317,8 +262,10 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             p.depth = fma(weight, seen.z, p.depth)
             p.depth_weight += weight
         if wp.static(median):
-            if p.t > 0.5:
+            # faint ones count together
+            if p.t > 0.5 and p.median_light - (p.t - weight) >= LEAST_ALPHA:
                 p.depth_median = seen.z
+                p.median_light = p.t - weight
         if wp.static(first):
             if p.depth_first == 0.0 and p.t - weight <= view.first_light:
                 p.depth_first = seen.z
@@ -371,18 +318,22 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     @wp.func
     def finish(pixel: Pixel, view: View):
         """The pixel after the last fragment."""
+        p = pixel
         if wp.static(layers):
-            return gathered.lay_before(pixel, float(wp.inf), view)
-        else:
-            return pixel
+            p = gathered.lay_before(p, float(wp.inf), view)
+        if 1.0 - p.t < LEAST_ALPHA:
+            if wp.static(depth):
+                p.depth = 0.0
+                p.depth_weight = 0.0
+            if wp.static(normal):
+                p.normal = wp.vec3()
+            if wp.static(heaviest):
+                p.weight = 0.0
+        return p
 
     return SimpleNamespace(
         Rays=Rays,
         Pixel=Pixel,
-        Splat=Splat,
-        load=load,
-        load_staged=load_staged,
-        staging=staging,
         start=start,
         row=row,
         cross=cross,

@@ -1,5 +1,5 @@
-"""What a sample keeps while it is blended; planes of samples, which blending leaves for resolving, and planes
-of pixels, which resolving leaves for the user: structs with the fields of the effects that a picture has.
+"""Planes of samples, which blending leaves for resolving, and planes of pixels, which resolving leaves for
+the user: structs of arrays with the fields of the effects that a picture has.
 """
 
 from functools import cache
@@ -8,18 +8,6 @@ import warp as wp
 
 from .common import struct_of
 
-STATE = {
-    "stop_exclusive": {"finished": wp.int32},
-    "depth": {"depth": wp.float32, "depth_weight": wp.float32},
-    "depth_median": {"depth_median": wp.float32},
-    "depth_first": {"depth_first": wp.float32},
-    "normal": {"normal": wp.vec3},
-    "heaviest": {"weight": wp.float32, "heaviest": wp.int32},
-    "blended": {"blended": wp.int32},
-    # fog_slope: -density, per metre of depth; fogged: sum of weights times what the fog hides
-    "fog": {"fog_slope": wp.float32, "fogged": wp.float32},
-}
-"""what a sample keeps while it is blended, by effect"""
 # of a sample: `heaviest` serves labels and splat ids
 _SAMPLES = {
     "depth": {"depth": wp.vec2},  # sum w z, sum w

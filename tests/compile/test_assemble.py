@@ -22,7 +22,7 @@ SHAPE = DeviceShape("lanes", "ordered", 16, 16, 16, 8, 11, 1, True)
 GROUP = DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, 1024, True)
 TAPS = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
-DIGESTS = ["7e5cd8014c58b172", "6b929620b4b3627a"]
+DIGESTS = ["9c907ba55001a9b6", "04793b83405177e4"]
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ def test_base_text_names_no_effect_that_was_not_asked_for():
         "stop_inclusive",
         "compose_ordered",
         "footprint_gaussian",
-        "arithmetic_precise",
+        "arithmetic_fast",
     }
-    of_knobs = ("vload_half", "colors_half", "fast_exp", "native_exp", "KEY_BITS", "wide", "WIDE")
+    of_knobs = ("vload_half", "colors_half", "KEY_BITS", "wide", "WIDE")
     of_layers = ("planes", "plane_keys", "layer", "Layer", "open", "waiting", "ink")
     for name in (*absent, *TAPS, "sh", "finished", *of_layers, *of_knobs):
         assert not re.search(rf"\b{name}(_|\b)", text), name
@@ -120,6 +120,7 @@ def test_record_sizes_are_what_the_effects_declare():
 
     # 68 bytes and 4 for each lane that an effect adds, in whole vectors of 16
     assert record(("rgb",)) == record(("alpha",)) == record(("rgb",), degree=3) == 80
+    assert assemble(select(COLORS, ("rgb",), PLAIN), SHAPE).bounds_bytes == 32
     assert record(("rgb",), fs.Quality()) == record(("label",)) == 80
     assert record(("depth",)) == record(("depth", "depth_median")) == record(("normal",)) == 80
     assert record(("depth", "normal")) == record(("depth", "label"), fs.Quality()) == 96
@@ -128,7 +129,7 @@ def test_record_sizes_are_what_the_effects_declare():
 
 
 def test_a_section_that_no_stage_has_is_refused(monkeypatch):
-    monkeypatch.setattr(assembly, "_sections", lambda path: {"no_such_hook": "x"})
+    monkeypatch.setattr(assembly, "sections_of", lambda path: {"no_such_hook": "x"})
     with pytest.raises(fs.DeviceError, match="no_such_hook"):
         assemble(select(COLORS, ("rgb",), PLAIN), SHAPE)
 
@@ -201,10 +202,15 @@ def test_the_page_of_the_device_wing_has_every_hook():
     assert {hook for hook in hooks if f"`{hook}`" not in page} == set()
 
 
+def test_no_kernel_calls_what_opencl_promises_nothing_of():
+    for file in (Path(__file__).resolve().parents[2] / "kernels" / "opencl").rglob("*.cl"):
+        assert not re.search(r"\b(native|half)_\w+\(", file.read_text("utf-8")), file
+
+
 # what the compile matrix (test_matrix.py) does not have with everything
 KNOBS = {
     "double": {"quality": fs.Quality(blend_precision="float64")},
-    "knobs": {"quality": fs.Quality(arithmetic="fast", color_precision="float16", tile_size=8)},
+    "knobs": {"quality": fs.Quality(arithmetic="precise", color_precision="float16", tile_size=8)},
 }
 
 

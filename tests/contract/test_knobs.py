@@ -12,7 +12,6 @@ CAMERA = fs.Camera.look_at(83, 61, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 AROUND = random_splats(200, seed=1)
 DENSE = random_splats(2000, seed=8, depth=(1.0, 6.0), scale=(1e-3, 0.3))
 DOUBLE = fs.Quality(blend_precision="float64")
-FAST = fs.Quality(arithmetic="fast")
 HALF = fs.Quality(color_precision="float16")
 ROUNDING = 2.0**-24
 """relative, of a float32"""
@@ -76,27 +75,6 @@ def test_double_has_every_output_and_footprint(opencl):
     assert_agrees(opencl, cloud, camera, tuple(OUTPUTS), DOUBLE)
 
 
-@pytest.mark.parametrize("cloud", [AROUND, coplanar_cloud(1)], ids=["around", "planes"])
-def test_fast_arithmetic_stays_within_the_usual_tolerance(opencl, cloud):
-    assert_agrees(opencl, cloud, CAMERA, quality=FAST)
-    # a relative error e of all opacities changes colours by e at most; without a stop no decision hangs on it
-    exact, fast = (
-        opencl.render(cloud, CAMERA, ALL_OUTPUTS, quality.with_(transmittance_stop=0.0))["rgb"]
-        for quality in (fs.Quality(), FAST)
-    )
-    assert 0 < np.abs(exact - fast).max() <= 1e-5
-
-
-def test_fast_exponentials_do_not_run_over(opencl):
-    """At this cut-off the faintest fragments lie below the smallest normal float32."""
-    faint = {"alpha_cutoff": 1e-42, "transmittance_stop": 0.0}
-    exact, fast = (
-        opencl.render(AROUND, CAMERA, ALL_OUTPUTS, quality.with_(**faint)) for quality in (fs.Quality(), FAST)
-    )
-    for name in ("rgb", "alpha", "normal"):
-        assert np.abs(exact[name] - fast[name]).max() <= 1e-5
-
-
 @pytest.mark.parametrize("degree", [None, 0, 2])
 def test_half_colors_are_the_reference_s_rounded_ones(opencl, degree):
     cloud = random_splats(200, seed=11, depth=(1, 6), scale=(0.02, 0.4), sh_degree=degree)
@@ -154,7 +132,7 @@ def test_tiles_change_no_bit(renderer, size):
 
 @pytest.mark.parametrize(
     ("quality", "name"),
-    [(DOUBLE, "blend_double"), (FAST, "arithmetic_fast"), (HALF, "color_rgb_half")],
+    [(DOUBLE, "blend_double"), (HALF, "color_rgb_half")],
 )
 def test_a_device_refuses_by_name_what_it_does_not_do(renderer, quality, name):
     if renderer.device.name.startswith("opencl") and (renderer.device.float64 or name != "blend_double"):

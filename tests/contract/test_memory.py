@@ -5,6 +5,7 @@ import weakref
 from dataclasses import replace
 
 import numpy as np
+import pyopencl as cl
 import pytest
 from agreement import ALL_OUTPUTS, random_splats
 
@@ -212,6 +213,50 @@ def test_a_plan_counts_all_that_a_picture_takes(opencl, monkeypatch, machine, me
     # an eighth is for pairs alone, however few there are
     rest = sum(size for what, size in largest.items() if what not in ("pairs", "lists"))
     assert rest <= budget - planned[-1] - budget // 8 <= budget
+
+
+def test_a_panorama_is_copied_once(opencl, monkeypatch):
+    """As long as it is the one that was drawn last; pictures show theirs, whatever lay there before."""
+    own = fs.Renderer(opencl.device.name)
+    rng = np.random.default_rng(0)
+    one, other = (fs.Panorama(rng.random((33, 70, 3))) for _ in range(2))
+    copied, copy = [], cl.enqueue_copy
+    monkeypatch.setattr(
+        cl, "enqueue_copy", lambda *args, **more: copied.append(args[2]) or copy(*args, **more)
+    )
+    some, shutter = random_splats(20, seed=9), fs.Shutter(exposure=0.1, sub_poses=2)
+
+    def draw(around, **more):
+        copied.clear()
+        rgb = own.render(some, CAMERA, background=around, **more)["rgb"]
+        return rgb, sum(array is around.image for array in copied)
+
+    first, times = draw(one)
+    assert times == 1
+    again, times = draw(one)
+    assert times == 0
+    assert np.array_equal(first, again)
+    _, times = draw(one, motion=fs.Motion(lambda time: np.eye(4)), shutter=shutter)
+    assert times == 0
+    second, times = draw(other)
+    assert times == 1
+    assert not np.array_equal(first, second)
+    again, times = draw(one)
+    assert times == 1
+    assert np.array_equal(first, again)
+    own.backend.release_scratch()
+    again, times = draw(one)
+    assert times == 1
+    assert np.array_equal(first, again)
+
+
+def test_a_panorama_of_any_memory_order_is_the_same(opencl):
+    image = np.random.default_rng(1).random((20, 40, 3))
+    pictures = [
+        opencl.render(fs.SplatCloud.empty(), CAMERA, background=fs.Panorama(each))["rgb"]
+        for each in (image, np.asfortranarray(image), image[:, ::-1][:, ::-1])
+    ]
+    assert all(np.array_equal(pictures[0], other) for other in pictures)
 
 
 def test_neither_frames_nor_kernels_keep_a_cloud(opencl):

@@ -106,6 +106,68 @@ def test_splat_ids_are_indices_of_the_cloud_in_chunks_too(renderer):
     assert "packed splats" in small.backend.pool._buffers
 
 
+TOLD = ("label", "splat_id", "depth", "depth_median", "distance", "distance_median", "normal", "normal_world")
+NOTHING = {"label": -1, "splat_id": -1}
+
+
+def told(frame, name):
+    plane = frame[name] != NOTHING.get(name, 0)
+    return plane.any(-1) if plane.ndim == 3 else plane
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_masks_do_not_grow_with_a_low_cutoff(renderer, samples):
+    """They end where 1/255 is covered, whatever is drawn beyond it for the sake of colours."""
+    splat = fs.SplatCloud([(0.1, 0.1, 3)], [(1, 0, 0, 0)], [(0.2, 0.3)], [0.9], colors=[(1, 1, 1)], labels=7)
+    masks = {}
+    for cutoff in (1 / 255, 1e-3, 1e-5):
+        quality = fs.Quality(alpha_cutoff=cutoff, samples=samples)
+        frame = renderer.render(splat, CAMERA, ("alpha", *TOLD), quality)
+        masks[cutoff] = told(frame, "label")
+        for name in TOLD:
+            assert np.array_equal(told(frame, name), masks[cutoff]), name
+        if samples == 1:
+            assert np.array_equal(masks[cutoff], frame["alpha"] >= np.float32(1 / 255))
+    assert 100 < masks[1e-5].sum() < (frame["alpha"] > 0).sum() - 100
+    assert np.array_equal(masks[1e-5], masks[1e-3])
+    assert np.array_equal(masks[1e-5], masks[1 / 255])
+
+
+@pytest.mark.parametrize(("opacity", "count", "seen"), [(1e-3, 3, False), (1e-3, 5, True), (2e-3, 700, True)])
+def test_haze_is_told_of_once_it_covers_enough(renderer, opacity, count, seen):
+    """However little each layer is; the median lies where half of the light is left, within the layers that
+    count together.
+    """
+    camera = fs.Camera.pinhole(5, 5, 50.0, 50.0, 2.5, 2.5)
+    frame = renderer.render(layers_of([opacity] * count), camera, TOLD)
+    assert {name: bool(told(frame, name)[2, 2]) for name in TOLD} == dict.fromkeys(TOLD, seen)
+    if count > 100:
+        half = math.log(0.5) / math.log(1 - opacity)
+        assert 2 + half - 4 < frame["depth_median"][2, 2] < 2 + half + 1
+
+
+def test_faint_fragments_behind_do_not_move_the_median(renderer):
+    """Of half-transparent things the last that shows is the median, not a rim of 1/1000 far behind it."""
+    camera = fs.Camera.pinhole(5, 5, 50.0, 50.0, 2.5, 2.5)
+    cloud = layers_of([0.2, 0.1, 1e-3, 1e-3])
+    frame = renderer.render(cloud, camera, ("depth_median", "blended"))
+    assert frame["blended"][2, 2] == 4
+    assert frame["depth_median"][2, 2] == pytest.approx(3, rel=1e-6)
+    for seed in range(3):
+        assert_agrees(renderer, faint_splats(seed), CAMERA, ALL)
+
+
+def faint_splats(seed):
+    """Many splats that cover little each, before a few that do not."""
+    cloud = random_splats(300, seed, depth=(1.0, 6.0), scale=(0.05, 1.0))
+    generator = np.random.default_rng(seed)
+    opacities = np.exp(generator.uniform(math.log(1e-4), math.log(0.05), len(cloud))).astype(np.float32)
+    opacities[:10] = 0.7
+    return fs.SplatCloud(
+        cloud.means, cloud.quats, cloud.scales, opacities, colors=cloud.colors, labels=cloud.labels
+    )
+
+
 @pytest.mark.parametrize("value", [0, 1, -0.1, math.nan])
 def test_thresholds_that_no_surface_has_are_refused(value):
     with pytest.raises(fs.InputError, match="first_hit"):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import random_splats
+from ideal_effects import assert_as_good, ideal_picture
 
 import fidsplat as fs
 from fidsplat.backends.base import View
@@ -175,6 +176,13 @@ def test_values_that_mean_nothing_select_nothing(renderer):
             == plain
         )
     assert select(CLOUD, ("rgb",), fs.Quality(), sensor=NOISY) != plain
+    grey = fs.Gradient(GREY, GREY, (1, 0, 0))
+    assert select(CLOUD, ("rgb",), fs.Quality(), background=grey) == plain
+    assert select(CLOUD, ("rgb",), fs.Quality(), background=fs.Gradient(GREY, (0, 0, 0))) != plain
+    frames = [renderer.render(CLOUD, CAMERA, background=behind) for behind in (grey, GREY)]
+    assert np.array_equal(frames[0]["rgb"], frames[1]["rgb"])
+    around = fs.Scene([CLOUD], CAMERA, background=grey)
+    assert np.array_equal(renderer.render(around)["rgb"], frames[0]["rgb"])
 
 
 def test_the_sensor_leaves_the_other_outputs_alone(renderer):
@@ -188,7 +196,7 @@ def test_the_sensor_leaves_the_other_outputs_alone(renderer):
 
 @pytest.mark.parametrize("mixture", ["fitted", "exact"])
 def test_a_tag_is_found_where_it_is_in_fog_and_noise(renderer, mixture):
-    """Position error under 1 % of the distance: the pictures are for robots that localise."""
+    """Position error under 1 % of the distance, as the ideal plane's: the pictures are for robots."""
     from fidsplat.vision.detect import detect
     from fidsplat.vision.images import to_uint8
     from fidsplat.vision.pose import marker_pose, pose_error
@@ -199,18 +207,20 @@ def test_a_tag_is_found_where_it_is_in_fog_and_noise(renderer, mixture):
     made = fs.marker("apriltag:36h11:5", size=0.3, mixture=mixture)
     camera = fs.Camera.pinhole(480, 360, 420.0, 420.0, 240.0, 180.0)
     sensor = fs.Sensor(0.9, (-0.4,), 3000, 10, 3, 1.0, "srgb", 8)
-    scene = fs.Scene(
-        markers=[fs.scenes.PlacedMarker(made, pose)],
-        camera=camera,
-        background=fs.Gradient((0.3, 0.4, 0.6), (0.3, 0.25, 0.2)),
-        sensor=sensor,
-    )
+    around = fs.Gradient((0.3, 0.4, 0.6), (0.3, 0.25, 0.2))
+    placed = fs.scenes.PlacedMarker(made, pose)
+    scene = fs.Scene(markers=[placed], camera=camera, background=around, sensor=sensor)
+    distance = np.linalg.norm(pose[:3, 3])
     for fog in (None, fs.Fog(0.3, (0.5, 0.5, 0.5))):
         rgb = renderer.render(scene, quality=fs.Quality(lowpass="none", samples=2), fog=fog)["rgb"]
-        (found,) = detect(to_uint8(rgb), families=["36h11"], qr=False)
-        error, _ = pose_error(marker_pose(found.corners, 0.3, camera), pose)
-        assert found.id == 5
-        assert error < 0.01 * np.linalg.norm(pose[:3, 3])
+        ideal = ideal_picture(placed, camera, 2, around, sensor=sensor, fog=fog)
+        errors = []
+        for picture in (rgb, ideal):
+            (found,) = detect(to_uint8(picture), families=["36h11"], qr=False)
+            assert found.id == 5
+            errors.append(pose_error(marker_pose(found.corners, 0.3, camera), pose)[0])
+        assert_as_good(*errors, distance)
+        assert errors[1] < 0.01 * distance
 
 
 def test_a_view_needs_no_sensor():

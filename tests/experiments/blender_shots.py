@@ -16,9 +16,8 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.experiments import blender
 from fidsplat.experiments.methods import plain_marker
-from fidsplat.experiments.plane import plane_picture
+from fidsplat.experiments.plane import from_srgb, plane_picture, srgb
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES
-from fidsplat.experiments.views import from_srgb, srgb
 from fidsplat.vision.images import read_image
 from fidsplat.vision.metrics import psnr
 

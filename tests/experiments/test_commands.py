@@ -5,9 +5,11 @@ import json
 import numpy as np
 import pytest
 
+import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.commands.experiment import Experiment
 from fidsplat.experiments import angles
+from fidsplat.experiments.blender import check_pictures, note_pictures
 from fidsplat.experiments.records import read_lines
 from fidsplat.vision.images import write_png
 
@@ -78,7 +80,7 @@ def test_shards_merge_into_what_one_run_gives(capsys, tmp_path):
     )
     assert status == 0
     assert json.loads(out)["angles"] == {
-        "file": str(tmp_path / "both" / "angles.jsonl"), "files": 2, "lines": 2, "repeated": 0,
+        "file": str(tmp_path / "both" / "angles.jsonl"), "files": 2, "lines": 2, "repeated": 0, "missing": [],
     }  # fmt: skip
 
     def found(folder):
@@ -139,6 +141,8 @@ def test_scenes_for_trainers(capsys, tmp_path):
         (["dataset", "--markers", "9"], "--markers is 9"),
         (["blender", "--environment", "nowhere"], "fidsplat experiment blender --install"),
         (["blender", "--samples", "0"], "--samples at least 1"),
+        (["blender", "--threads", "0"], "--threads is 0"),
+        (["views", "--blender", "nowhere"], "nowhere is not a folder; give the one that"),
         (["blender", "--view", "agx"], "unknown view 'agx'"),
         (["merge", "nowhere"], "no results of shards in nowhere"),
         (["report", "nowhere"], "no results in nowhere"),
@@ -157,3 +161,57 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_work(capsys, tmp_pat
     status, _, err = run(capsys, "counts", "-o", tmp_path / "file" / "deeper")
     assert status == 2
     assert "cannot write into the folder" in err
+
+
+def test_what_is_wrong_with_the_last_experiment_is_told_before_the_first(capsys, tmp_path):
+    """Counts are measured first, tilts last: nothing is measured for a run that would fail after hours."""
+    words = ("all", "--quick", *SMALL, "--mixture", "fitted", "-o", tmp_path)
+    old = '{"key": {"tilts": "x"}, "result": {}, "run": {"code": "older"}}\n'
+    (tmp_path / "angles.jsonl").write_text(old)
+    status, _, err = run(capsys, *words)
+    assert status == 2
+    assert "angles.jsonl holds results of another versions and code" in err
+    status, _, err = run(capsys, *words, "--lpips", tmp_path / "no.npz", "--anew")
+    assert status == 2
+    assert "cannot read the LPIPS weights" in err
+    (tmp_path / "cut.npz").write_bytes(b"PK\x03\x04 a download that was cut short")
+    status, _, err = run(capsys, *words, "--lpips", tmp_path / "cut.npz", "--anew")
+    assert status == 2
+    assert "cut.npz is no .npz file with LPIPS weights" in err
+    assert read_lines(tmp_path / "counts.jsonl") == []
+    assert (tmp_path / "angles.jsonl").read_text() == old  # --anew drops nothing for it
+
+
+def test_merge_tells_of_shards_that_are_missing(capsys, tmp_path):
+    words = ("counts", *SMALL, "--shard", "1/3", "-o", tmp_path)
+    assert run(capsys, *words)[0] == 0
+    status, out, err = run(capsys, "merge", tmp_path, "-o", tmp_path / "out")
+    assert status == 0
+    assert "1 results of 1 files" in out
+    assert err == "fidsplat: warning: counts: there is no shard 2/3, 3/3\n"
+
+
+def test_pictures_of_another_seed_are_not_the_truth(capsys, tmp_path):
+    """Blender's pictures are looked for by their names, which do not say their seed."""
+    note_pictures(tmp_path / "b", "raw", 0, 16)
+    for words in (
+        ("views", "--quick", *SMALL, "--blender", tmp_path / "b", "--seed", "1", "-o", tmp_path / "out"),
+        (
+            "dataset",
+            "--truth",
+            "blender-raw",
+            "--blender",
+            tmp_path / "b",
+            "--seed",
+            "1",
+            "-o",
+            tmp_path / "d",
+        ),
+    ):
+        status, _, err = run(capsys, *words)
+        assert status == 2
+        assert "holds pictures of seed 0, not 1" in err
+    with pytest.raises(fs.InputError, match="pictures of samples 16, not 64; give another folder"):
+        note_pictures(tmp_path / "b", "raw", 0, 64)
+    assert check_pictures(tmp_path / "b", "raw", 0) == {"seed": 0, "samples": 16}
+    assert check_pictures(tmp_path / "b", "standard", 3) == {}

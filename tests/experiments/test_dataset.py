@@ -104,6 +104,22 @@ def test_blenders_pictures_become_the_scenes(tmp_path):
     assert read_image(scene / "test" / "images" / "test-19.png")[0, 0].tolist() == [19, 19, 19]
 
 
+def test_a_scene_of_one_truth_that_a_stop_left_with_pictures_of_two_is_drawn_again(tmp_path):
+    part = {"category": "apriltag", "index": 0, "views": 3}
+    scene = write_scene(part, tmp_path / "out", 0, "exact", Path("nowhere"))
+    first = (scene / "images" / "view-00.png").read_bytes()
+    folder = tmp_path / "blender" / "raw" / "apriltag-0"
+    folder.mkdir(parents=True)
+    write_png(folder / "view-00.png", np.zeros((800, 800, 3), np.uint8))
+    with pytest.raises(fs.InputError, match=r"view-01\.png is missing"):  # stopped after one picture
+        write_scene(part, tmp_path / "out", 0, "blender-raw", tmp_path / "blender")
+    write_scene(part, tmp_path / "out", 0, "exact", Path("nowhere"))
+    assert (scene / "images" / "view-00.png").read_bytes() == first
+    (scene / "marker.json").write_text("{")
+    write_scene(part, tmp_path / "out", 0, "exact", Path("nowhere"))
+    assert json.loads((scene / "marker.json").read_text())["truth"] == "exact"
+
+
 def test_there_are_a_hundred_scenes():
     work = dataset_work(CATEGORIES.values())
     assert len({scene_name(part) for part in work}) == 100

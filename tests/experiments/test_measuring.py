@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.experiments import angles, counts, localisation, views
+from fidsplat.experiments import angles, counts, localisation, plane, views
 from fidsplat.experiments.methods import IDEAL, Painter, method_names, mixtures, plain_marker
 from fidsplat.experiments.setup import CATEGORIES, PROTOCOLS, novel_cameras
 from fidsplat.vision.images import to_uint8, write_png
@@ -166,8 +166,8 @@ def test_blenders_pictures_take_part_where_a_marker_has_all_of_them(pool, tmp_pa
 
 def test_the_srgb_curve_and_its_inverse():
     values = np.linspace(0, 1, 101)
-    assert views.srgb(np.array([views.from_srgb(v) for v in values])) == pytest.approx(values, abs=1e-9)
-    assert views.srgb(np.array([0.2]))[0] * 255 == pytest.approx(123.6, abs=0.1)
+    assert plane.srgb(np.array([plane.from_srgb(v) for v in values])) == pytest.approx(values, abs=1e-9)
+    assert plane.srgb(np.array([0.2]))[0] * 255 == pytest.approx(123.6, abs=0.1)
 
 
 def test_counts_of_a_marker_that_one_can_count():

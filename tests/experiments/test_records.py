@@ -2,11 +2,12 @@
 
 import json
 import math
+from pathlib import Path
 
 import pytest
 
 import fidsplat as fs
-from fidsplat.experiments.records import Records, merge, read_lines, run_facts, shard
+from fidsplat.experiments.records import Records, merge, missing_shards, read_lines, run_facts, shard
 
 WORK = [{"category": "small", "index": i} for i in range(5)]
 
@@ -97,7 +98,7 @@ def test_shards_share_the_work():
     assert sorted(p["index"] for part in parts for p in part) == [0, 1, 2, 3, 4]
     assert [len(part) for part in parts] == [2, 2, 1]
     assert shard(WORK, None) == WORK
-    for text in ("0/3", "4/3", "1", "a/b", "1/0", "-1/3", ""):
+    for text in ("0/3", "4/3", "1", "a/b", "1/0", "-1/3", "", "²/3"):
         with pytest.raises(fs.InputError, match="write i/n with 1 <= i <= n"):
             shard(WORK, text)
 
@@ -107,12 +108,34 @@ def test_merge_joins_shards_and_counts_repeats(tmp_path):
     for number, file in enumerate(files):
         list(Records(file, facts()).measure(WORK[2 * number : 2 * number + 3], lambda part: {"by": number}))  # noqa: B023
     target = tmp_path / "out" / "counts.jsonl"
-    assert merge(files, target) == (5, 1)
+    assert merge(files, target) == (5, 1, ())
     lines = {line["key"]["index"]: line["result"]["by"] for line in read_lines(target)}
     assert lines == {0: 0, 1: 0, 2: 0, 3: 1, 4: 1}
-    assert merge([target, *files], target) == (5, 6)
+    assert merge([target, *files], target) == (5, 6, ())
     with pytest.raises(fs.InputError, match="is not a file"):
         merge([tmp_path / "none.jsonl"], target)
+
+
+def test_merging_one_machine_after_the_other_loses_nothing_and_says_what_differs(tmp_path):
+    target = tmp_path / "counts.jsonl"
+    for number, device in enumerate((None, "a device", "another")):
+        file = tmp_path / f"counts-{number + 1}-of-4.jsonl"
+        list(
+            Records(file, facts(device=device)).measure([WORK[0], WORK[number]], lambda part: {"by": number})
+        )  # noqa: B023
+        joined = merge([file], target)
+        assert joined == (number + 1, 0, ("device",) if number == 2 else ())
+    # a shard that was measured anew replaces what was merged of it before
+    assert {line["key"]["index"]: line["result"]["by"] for line in read_lines(target)} == {0: 2, 1: 1, 2: 2}
+    other = tmp_path / "counts-4-of-4.jsonl"
+    list(Records(other, facts(code="0" * 16, seed=1)).measure(WORK[3:], lambda part: {}))
+    assert merge([other], target).differ == ("code", "device", "seed")
+
+
+def test_missing_shards_are_named():
+    files = [Path(f"a/angles-{i}-of-4.jsonl") for i in (1, 4)] + [Path("b/angles-2-of-2.jsonl")]
+    assert missing_shards([*files, Path("angles.jsonl")]) == ["1/2", "2/4", "3/4"]
+    assert missing_shards(files[:2] + [Path(f"b/angles-{i}-of-4.jsonl") for i in (2, 3)]) == []
 
 
 def test_facts_name_what_numbers_hang_on():

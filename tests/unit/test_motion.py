@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from agreement import random_splats
 
 import fidsplat as fs
 from fidsplat.cameras.motion import between
@@ -76,6 +77,8 @@ def test_when_rows_are_exposed():
         (lambda: fs.Motion(groups={"tag": lambda t: np.eye(4)}), "the label 'tag' is no whole number"),
         (lambda: fs.Trajectory(["noon"], [np.eye(4)]), r"increasing numbers of seconds, not \['noon'\]"),
         (lambda: PlacedMarker(None, motion=np.eye(4)), "a marker's motion is .*function of the time"),
+        (lambda: fs.Scene(cloud_motions={0: np.eye(4)}), "cloud_motions must be"),
+        (lambda: fs.Scene(cloud_motions={0: lambda t: np.eye(4)}), "no cloud 0; this scene has 0"),
         (lambda: fs.Motion(groups={1: lambda t: np.zeros((4, 4))}).groups_at(0), "label 1 at 0 s"),
     ],
 )
@@ -154,8 +157,79 @@ def test_motions_that_scene_files_cannot_have(tmp_path, old, new, words):
         fs.Scene.load(tmp_path / "a.toml")
 
 
+SPLATS = """
+[camera]
+width = 40
+height = 30
+fov_x_deg = 60.0
+position = [0, 0, -1]
+look_at = [0, 0, 1]
+
+[camera.shutter]
+time = 0.5
+
+[[splats]]
+file = "still.ply"
+
+[[splats]]
+file = "moving.ply"
+position = [0, 0, 2]
+quaternion = [1, 0.2, 0, 0]
+scale = 0.5
+motion = [
+    {time = 0.0, position = [-1, 0, 2], quaternion = [1, 0, 0, 0.5]},
+    {time = 1.0, position = [1, 0, 2], quaternion = [1, 0, 0, 0.5]},
+]
+
+[[markers]]
+spec = "aruco:4x4_50:7"
+size = 0.2
+position = [0.5, 0.5, 1.0]
+"""
+
+
+@pytest.fixture
+def splats(tmp_path):
+    """A scene file of a still and a moving cloud, which have labels of their own, and a marker."""
+    fs.save_ply(random_splats(20, 1, depth=(1, 3)).with_labels([0, 1, 2, 4] * 5), tmp_path / "still.ply")
+    fs.save_ply(random_splats(30, 2, depth=(-1, 1)).with_labels(1), tmp_path / "moving.ply")
+    (tmp_path / "a.toml").write_text(SPLATS)
+    return fs.Scene.load(tmp_path / "a.toml")
+
+
+def test_splat_files_move_by_themselves(tmp_path, splats):
+    """Each moves from where it is put; as a file that lies where the moving one is then."""
+    splats.save(tmp_path / "b.toml")
+    start = SPLATS.index("motion")
+    there = SPLATS.replace(SPLATS[start : SPLATS.index("]\n\n[[markers]]") + 2], "", 1)
+    there = there.replace(
+        "position = [0, 0, 2]\nquaternion = [1, 0.2, 0, 0]",
+        "quaternion = [1, 0, 0, 0.5]\nposition = [0, 0, 2]",
+    )
+    (tmp_path / "there.toml").write_text(there)
+    expected = fs.Renderer("reference").render(fs.Scene.load(tmp_path / "there.toml"))["rgb"]
+    for scene in (splats, fs.Scene.load(tmp_path / "b.toml")):
+        drawn = fs.Renderer("reference").render(scene)["rgb"]
+        np.testing.assert_allclose(drawn, expected, atol=1e-4)
+        assert scene.cloud().labels[20:].tolist() == [3] * 30 + [1] * (len(scene.cloud()) - 50)
+        assert [label for label, _ in scene.motion.groups_at(0.5)] == [3]
+
+
+def test_a_cloud_that_moves_has_a_label_that_no_other_has(splats):
+    clouds = [*splats.clouds, splats.clouds[1]]
+    scene = fs.Scene(clouds, cloud_motions={1: lambda t: np.eye(4), 2: lambda t: np.eye(4)})
+    assert [set(map(int, part)) for part in np.split(scene.cloud().labels, [20, 50])] == [
+        {0, 1, 2, 4},
+        {3},
+        {5},
+    ]
+
+
 def test_functions_cannot_be_saved(tmp_path):
     camera = fs.Camera.pinhole(64, 48, 50, 50, 32, 24)
     scene = fs.Scene([], camera=camera, camera_motion=lambda time: np.eye(4))
     with pytest.raises(fs.InputError, match="motion of the camera is a function"):
         scene.save(tmp_path / "a.toml")
+    moving = fs.Scene([fs.SplatCloud.empty()], cloud_motions={0: lambda time: np.eye(4)})
+    with pytest.raises(fs.InputError, match="motion of cloud 0 is a function"):
+        moving.save(tmp_path / "a.toml")

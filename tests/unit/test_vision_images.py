@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from fidsplat.errors import InputError
+from fidsplat.surroundings import Panorama
 from fidsplat.vision.images import read_bits, read_image, to_uint8, write_png
 
 
@@ -22,6 +23,29 @@ def test_sixteen_bits_are_kept(tmp_path):
     depth = np.array([[0, 1, 65535], [300, 4000, 2]], np.uint16)
     write_png(tmp_path / "d.png", depth)
     assert np.array_equal(cv2.imread(str(tmp_path / "d.png"), cv2.IMREAD_UNCHANGED), depth)
+
+
+@pytest.mark.parametrize("suffix", ["png", "tiff"])
+@pytest.mark.parametrize("grey", [False, True])
+def test_a_panorama_has_the_depth_of_its_file(tmp_path, suffix, grey):
+    values = np.random.default_rng(0).integers(0, 65536, (6, 8) if grey else (6, 8, 3), dtype=np.uint16)
+    file = tmp_path / f"sky.{suffix}"
+    cv2.imwrite(str(file), values if grey else values[:, :, ::-1])
+    whole = np.broadcast_to(values[:, :, None] if grey else values, (6, 8, 3))
+    np.testing.assert_allclose(Panorama.load(file).image, whole / 65535, atol=1e-7)
+    assert read_image(file).dtype == np.uint8
+
+
+def test_a_panorama_of_floats_keeps_what_is_brighter_than_white(tmp_path):
+    values = np.random.default_rng(0).uniform(0, 30, (6, 8, 3)).astype(np.float32)
+    cv2.imwrite(str(tmp_path / "sky.tiff"), values[:, :, ::-1])
+    assert np.array_equal(Panorama.load(tmp_path / "sky.tiff").image, values)
+
+
+def test_a_panorama_of_other_numbers_is_refused(tmp_path):
+    cv2.imwrite(str(tmp_path / "sky.tiff"), np.zeros((6, 8, 3)))
+    with pytest.raises(InputError, match="float64 pixels; give 8 or 16 bits"):
+        Panorama.load(tmp_path / "sky.tiff")
 
 
 @pytest.mark.parametrize("shape", [(3,), (2, 2, 4), (0, 3, 3)])

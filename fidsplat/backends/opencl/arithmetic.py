@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.opencl.assemble import kernel_text, with_scalars
+from fidsplat.backends.opencl.assemble import kernel_text, sections_of, with_scalars
 from fidsplat.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -27,23 +27,29 @@ def run_arithmetic(
 
     Returns:
         (n,) float32: `exp` of exponents, `log` of shares, `division` above / below, `sqrt` of below, `fma`
-        above * below + above, `native_exp`, `native_recip`; (n,) float64 where the device has it:
-        `division64`, `sqrt64`, `log64`; `denormal` (2,) float32: half of the smallest normal number, and
-        twice that.
+        above * below + above, `fast_exp` of exponents, `fast_log` of shares; (n,) float64 where
+        the device has it: `division64`, `sqrt64`, `log64`; `denormal` (2,) float32: half of the smallest
+        normal number, and twice that.
 
     Raises:
         DeviceError: the device cannot compile or run the kernels.
     """
     lanes = backend.shape.lanes
-    defines = {"LANES": lanes, "FAST_FMA": 0, "SETUP_FP64": int(backend.info.float64)}
+    defines = {
+        "LANES": lanes,
+        "FAST_FMA": int(backend.shape.fast_fma),
+        "SETUP_FP64": int(backend.info.float64),
+    }
     text = "".join(f"#define {name} {value}\n" for name, value in defines.items())
-    program = backend.build(with_scalars(text + "".join(map(kernel_text, _FILES))))
+    text += "".join(map(kernel_text, _FILES))
+    text = text.replace("//@@ arithmetic", sections_of("slot/arithmetic_fast.cl")["arithmetic"])
+    program = backend.build(with_scalars(text))
     kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
     n = len(exponents)
     single = [array.astype(np.float32) for array in (exponents, shares, above, below)]
     try:
         planes = _run(backend, kernels["arithmetic_float"], n // lanes, n, single, 7)
-        names = ("exp", "log", "division", "sqrt", "fma", "native_exp", "native_recip")
+        names = ("exp", "log", "division", "sqrt", "fma", "fast_exp", "fast_log")
         results: dict[str, np.ndarray] = dict(zip(names, planes, strict=True))
         if backend.info.float64:
             planes = _run(backend, kernels["arithmetic_real"], n, n, [above, below], 3)

@@ -89,7 +89,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     files = [effect.file for effect in effects]
     if shape.lists == "tiled":
         files.append("list/tiled.cl")
-    sections = [_sections(file) for file in files]
+    sections = [sections_of(file) for file in files]
 
     def fill(match: re.Match[str]) -> str:
         return "".join(_HOOK.sub(fill, section.get(match[1], "")) for section in sections)
@@ -135,6 +135,7 @@ def _hooks(path: str) -> tuple[str, ...]:
 
 
 @cache
-def _sections(path: str) -> dict[str, str]:
+def sections_of(path: str) -> dict[str, str]:
+    """The sections of an effect's file, by the hook that each fills."""
     pieces = _SECTION.split(kernel_text(path))
     return dict(zip(pieces[1::2], pieces[2::2], strict=True))

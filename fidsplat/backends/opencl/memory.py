@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Hashable, Iterable
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +36,7 @@ class BufferPool:
         self._context = context
         self._device = device
         self._buffers: dict[str, cl.Buffer] = {}
+        self._contents: dict[str, weakref.ref[np.ndarray]] = {}
         self._spare: dict[str, list[cl.Buffer]] = {}
         self._kind: Hashable = None
 
@@ -76,9 +78,21 @@ class BufferPool:
         """Lets go of all that it holds."""
         self._spare.clear()
         self._buffers.clear()
+        self._contents.clear()
+
+    def holding(self, name: str, array: np.ndarray) -> cl.Buffer | None:
+        """The scratch buffer of that name, if what it has still is this array (`now_holds`)."""
+        content = self._contents.get(name)
+        return self._buffers[name] if content is not None and content() is array else None
+
+    def now_holds(self, name: str, array: np.ndarray) -> None:
+        """Remembers that the scratch buffer of that name has this array, if the array stays as it is."""
+        if not array.flags.writeable and array.flags.owndata:
+            self._contents[name] = weakref.ref(array)
 
     def scratch(self, name: str, size: int) -> cl.Buffer:
         """A buffer of at least `size` bytes whose content is undefined."""
+        self._contents.pop(name, None)
         held = self._buffers.get(name)
         if held is None or held.size < size:
             self._buffers.pop(name, None)

@@ -172,9 +172,14 @@ class Run:
         return buffer
 
     def put(self, name: str, array: np.ndarray) -> cl.Buffer:
-        """A scratch buffer with these contents; does not wait."""
+        """A scratch buffer with these contents; does not wait. What the last picture put there and nobody can
+        change (a panorama) is not copied again."""
+        if (held := self.pool.holding(name, array)) is not None:
+            self.held[name] = held
+            return held
         buffer = self.take(name, array.nbytes)
         self.uploads.append(cl.enqueue_copy(self.queue, buffer, array, is_blocking=False))
+        self.pool.now_holds(name, array)
         return buffer
 
     def launch(self, stage: str, kernel: str, items: int, group: int, *args) -> cl.Event:

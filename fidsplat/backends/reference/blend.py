@@ -11,6 +11,7 @@ from fidsplat.backends.reference.layers import in_layers, in_order
 from fidsplat.backends.reference.optics import ray_lengths
 from fidsplat.backends.reference.post import background_at
 from fidsplat.backends.reference.setup import Setup
+from fidsplat.backends.reference.shown import LEAST_ALPHA, median_of
 from fidsplat.effects import FeatureSet
 
 
@@ -29,6 +30,8 @@ def composite(
         "t": final,
         "certificate": doubt.of_color(s, view, span, before, laid.moved) + laid.reordered,
     }
+    out["shown"] = 1 - final >= LEAST_ALPHA
+    out["shown_may_flip"] = np.abs(1 - final - LEAST_ALPHA) <= out["certificate"] + doubt.STOP
     if "fog" in features.posts:
         reach = -view.fog_density * ray_lengths(x, y, view)[:, None]
         left = np.exp(reach * z)
@@ -47,11 +50,10 @@ def composite(
         out["weight"] = weight.sum(1)
         out["depth"] = (weight * z).sum(1)
         out |= doubt.of_depth(span, weight, z)
-        half = drawn & (before > 0.5)
-        last, seen = half.shape[1] - 1 - _first(half[:, ::-1]), np.asarray(half.any(1))
+        last, seen, may_flip = median_of(before, alpha, drawn, span)
         out["depth_median"] = _pick(z, last, seen, 0.0)
         out["depth_median_may_flip"] = (
-            doubt.of_median(span)
+            may_flip
             | (_pick(span.z_high - span.z_low, last, seen, 0.0) > 1e-5 * out["depth_median"])
             | uncertain
         )
@@ -68,9 +70,10 @@ def composite(
     flips = {"label": laid.label_may_flip, "splat_id": laid.id_may_flip}
     for name in sorted(ids.keys() & features.names):
         heaviest = _first(weight)
-        out["heaviest"] = _pick(weight, heaviest, np.asarray(drawn.any(1)), 0.0)
-        out[name] = _pick(ids[name], heaviest, out["heaviest"] > 0, -1)
-        out[f"{name}_may_flip"] = doubt.of_label(span, ids[name], out[name]) | flips[name].any(1) | uncertain
+        out["heaviest"] = _pick(weight, heaviest, out["shown"], 0.0)
+        out[name] = _pick(ids[name], heaviest, out["shown"], -1)
+        flip = doubt.of_label(span, ids[name], out[name]) | flips[name].any(1) | uncertain
+        out[f"{name}_may_flip"] = (flip & out["shown"]) | out["shown_may_flip"]
     if "splat_id" in features.names and len(s.order):
         out["splat_id"] = np.where(out["splat_id"] >= 0, s.order[out["splat_id"].astype(int)], -1)
     if "blended" in features.names:

@@ -20,7 +20,8 @@ from fidsplat.backends.reference.setup import Setup
 
 _ROUND = ROUND
 _WEIGHT = 2 * _ROUND  # relative, of half rho and of an opacity: a division, two products, exp
-_STOP = 5e-5  # relative, of a transmittance at a threshold
+STOP = 5e-5
+"""relative, of a transmittance at a threshold"""
 
 
 @dataclass
@@ -106,8 +107,8 @@ def _rounding(s: Setup, f: Fragments, form: np.ndarray, terms: np.ndarray) -> np
 def of_color(s: Setup, view: View, span: Span, before: np.ndarray, moved: np.ndarray) -> np.ndarray:
     """What may change (k,) in colour and alpha, per unit of colour; moved (k, m): in what is laid itself."""
     doubt = (before * (span.high - span.low)).sum(1)
-    t_low = span.front_low * (1 - span.high) * (1 - _STOP)
-    t_high = span.front_high * (1 - span.low) * (1 + _STOP)
+    t_low = span.front_low * (1 - span.high) * (1 - STOP)
+    t_high = span.front_high * (1 - span.low) * (1 + STOP)
     may_stop = (span.high > 0) & (t_low <= view.stop) & (t_high >= view.stop)
     # an exclusive stop drops a fragment, an inclusive one only what follows
     lost = span.front_high * span.high if s.exclusive else np.full_like(before, view.stop)
@@ -216,18 +217,11 @@ def of_depth(span: Span, weight: np.ndarray, z: np.ndarray) -> dict[str, np.ndar
     }
 
 
-def of_median(span: Span) -> np.ndarray:
-    """Whether another fragment (k,) may be the last with half of the light in front of it."""
-    may = (span.high > 0) & (span.front_high > 0.5 * (1 - _STOP))
-    sure = (span.low > 0) & (span.front_low > 0.5 * (1 + _STOP))
-    return np.asarray((may & ~sure).any(1))
-
-
 def of_first(span: Span, light: float) -> np.ndarray:
     """Whether another fragment (k,) may be the first behind which no more than `light` is left."""
     high, low = span.high, span.low
-    may = (high > 0) & (span.front_low * (1 - high) * (1 - _STOP) <= light)
-    sure = (low > 0) & (span.front_high * (1 - low) * (1 + _STOP) <= light)
+    may = (high > 0) & (span.front_low * (1 - high) * (1 - STOP) <= light)
+    sure = (low > 0) & (span.front_high * (1 - low) * (1 + STOP) <= light)
     return first_column(may, 0) != first_column(sure, 0)
 
 
@@ -239,8 +233,8 @@ def of_count(
     may, must = span.high > 0, span.low > 0
     off = np.where(may, doubt + np.where(must, 0, count), 0)
     # from where the light may have reached the stop to where it must have, whatever comes may be drawn or not
-    open_to = (span.front_high >= stop * (1 - _STOP)) & (
-        span.front_low * (1 - span.high) <= stop * (1 + _STOP)
+    open_to = (span.front_high >= stop * (1 - STOP)) & (
+        span.front_low * (1 - span.high) <= stop * (1 + STOP)
     )
     off = np.where(may & open_to & (stop > 0), count + doubt, off)
     return np.where(reordered, np.inf, off.sum(1))
@@ -251,4 +245,4 @@ def of_label(span: Span, labels: np.ndarray, label: np.ndarray) -> np.ndarray:
     own = labels == label[:, None]
     heaviest = np.where(own, span.front_low * span.low, 0.0).max(1, initial=0.0)
     other = np.where(own, 0.0, span.front_high * span.high).max(1, initial=0.0)
-    return ((other > 0) | (label >= 0)) & (other * (1 + _STOP) >= heaviest)
+    return ((other > 0) | (label >= 0)) & (other * (1 + STOP) >= heaviest)

@@ -37,35 +37,37 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
     doubt = samples.get("certificate_planes", doubt)  # the other planes show one shot
     if "alpha" in features.names:
         out["alpha"] = 1 - t
+    told, unsure = samples["shown"], samples["shown_may_flip"].any(1)
+    doubt_told = np.where(told, doubt, 0.0).sum(1)
     # of the ray through each sample, per metre of depth
     length = ray_lengths(samples["x"], samples["y"], view)
     if "depth" in features.names:
-        weight = samples["weight"].sum(1)
-        out["depth"] = _ratio(samples["depth"].sum(1), weight, 0.0)
-        out["distance"] = _ratio((samples["depth"] * length).sum(1), weight, 0.0)
-        # light that moves from the nearest to the furthest fragment, in a mean over at least `least`
-        spread = samples["furthest"].max(1) - samples["nearest"].min(1)
-        moved = doubt.sum(1) * np.where(doubt.sum(1) > 0, np.maximum(spread, 0), 0)
-        least = weight - doubt.sum(1)
-        out["certificate_depth"] = _ratio(moved + samples["depth_moved"].sum(1), least, math.inf)
         # samples whose rays differ in length share out what moves, too
-        spread = (samples["furthest"] * length).max(1) - (samples["nearest"] * length).min(1)
-        moved = doubt.sum(1) * np.where(doubt.sum(1) > 0, np.maximum(spread, 0), 0)
-        moved += (samples["depth_moved"] * length).sum(1)
-        out["certificate_distance"] = _ratio(moved, least, math.inf)
+        for name, along in (("depth", 1.0), ("distance", length)):
+            depth, off, weight = (
+                np.where(told, samples[key], 0.0) for key in ("depth", "depth_moved", "weight")
+            )
+            out[name] = _ratio((depth * along).sum(1), weight.sum(1), 0.0)
+            # light that moves from the nearest to the furthest fragment, in a mean over at least `least`
+            spread = np.where(told, samples["furthest"] * along, -math.inf).max(1)
+            spread -= np.where(told, samples["nearest"] * along, math.inf).min(1)
+            moved = doubt_told * np.where(doubt_told > 0, np.maximum(spread, 0), 0)
+            moved += (off * along).sum(1)
+            least = weight.sum(1) - doubt_told
+            out[f"certificate_{name}"] = _told(_ratio(moved, least, math.inf), told, unsure)
     for name, along in (("depth_median", "distance_median"), ("depth_first", "distance_first")):
         if name in features.names:
             place = _median if name == "depth_median" else _nearest
             out[name], out[along] = place(samples[name]), place(samples[name] * length)
             out[f"{name}_may_flip"] = out[f"{along}_may_flip"] = samples[f"{name}_may_flip"].any(1)
     if "normal" in features.names:
-        total = samples["normal"].sum(1)
+        total = np.where(told[..., None], samples["normal"], 0.0).sum(1)
         length = np.linalg.norm(total, axis=1)
         out["normal"] = total / np.where(length > 0, length, 1)[:, None]
         turns = view.turns_of_rows[np.floor(center_y / view.samples).astype(int)]
         out["normal_world"] = np.einsum("ki,kij->kj", out["normal"], turns)
-        moved = 2 * doubt.sum(1) + _ROUND * (1 - samples["t"]).sum(1)
-        out["certificate_normal"] = _ratio(moved, length - doubt.sum(1), math.inf)
+        moved = 2 * doubt_told + _ROUND * (1 - samples["t"]).sum(1)
+        out["certificate_normal"] = _told(_ratio(moved, length - doubt_told, math.inf), told, unsure)
         out["certificate_normal_world"] = out["certificate_normal"]
     for name in sorted({"label", "splat_id"} & features.names):
         heaviest = np.argmax(samples["heaviest"], axis=1)
@@ -94,6 +96,11 @@ def _nearest(values: np.ndarray) -> np.ndarray:
     """The smallest (k,) of those of (k, n) above 0; 0 where there is none."""
     nearest = np.where(values > 0, values, math.inf).min(1)
     return np.where(np.isfinite(nearest), nearest, 0.0)
+
+
+def _told(doubt: np.ndarray, told: np.ndarray, unsure: np.ndarray) -> np.ndarray:
+    """What may change (k,) in a plane that is 0 where no sample (k, n) is told of, which may flip."""
+    return np.where(unsure, math.inf, np.where(told.any(1), doubt, 0.0))
 
 
 def _ratio(above: np.ndarray, below: np.ndarray, otherwise: float) -> np.ndarray:

@@ -22,16 +22,17 @@ def run_arithmetic(
 
     Returns:
         (n,) float32: `exp` of exponents, `log` of shares, `division` above / below, `sqrt` of below, `fma`
-        above * below + above; (n,) float64: `division64`, `sqrt64`, `log64`; `denormal` (2,) float32: half of
-        the smallest normal number, and twice that.
+        above * below + above, `fast_exp` of exponents, `fast_log` of shares; (n,) float64: `division64`,
+        `sqrt64`, `log64`; `denormal` (2,) float32: half of the smallest normal number, and twice that.
 
     Raises:
         DeviceError: the device cannot compile or run the kernels.
     """
     n = len(exponents)
     single = [array.astype(np.float32) for array in (exponents, shares, above, below)]
-    (planes,) = run(backend, "arithmetic", n, single, [np.zeros((5, n), np.float32)])
-    results: dict[str, np.ndarray] = dict(zip(("exp", "log", "division", "sqrt", "fma"), planes, strict=True))
+    (planes,) = run(backend, "arithmetic", n, single, [np.zeros((7, n), np.float32)])
+    names = ("exp", "log", "division", "sqrt", "fma", "fast_exp", "fast_log")
+    results: dict[str, np.ndarray] = dict(zip(names, planes, strict=True))
     (planes,) = run(backend, "arithmetic_wide", n, [above, below], [np.zeros((3, n))])
     results |= dict(zip(("division64", "sqrt64", "log64"), planes, strict=True))
     smallest = np.array([np.finfo(np.float32).tiny, 0.5], np.float32)

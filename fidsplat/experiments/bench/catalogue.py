@@ -18,7 +18,7 @@ from fidsplat.quality import Quality
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.splats import SplatCloud
 
-TIMED = Quality(alpha_cutoff=1 / 255, transmittance_stop=1e-4)
+TIMED = Quality(alpha_cutoff=1 / 255, transmittance_stop=1e-4, arithmetic="precise")
 """how scenes are timed: with the cut-off and the stop that all peers share, so that the work is the same"""
 WALL_COLUMNS, WALL_ROWS = 20, 10
 _WALL_CODES = 10  # different ones; each hangs in as many places

@@ -24,7 +24,7 @@ from fidsplat.quality import (
 BASE = TIMED
 """what every other setting is measured beside, turn by turn: the cut-off and the stop that other systems
 share, and our rules; pinned, so that presets may change"""
-EXACT = Quality(alpha_cutoff=1e-6, transmittance_stop=0.0)
+EXACT = Quality(alpha_cutoff=1e-6, transmittance_stop=0.0, arithmetic="precise")
 """what leaves nothing out that float32 can show; a constant put into this alone shows the error it makes"""
 SHARP = {"lowpass": "none", "samples": 3}
 """for markers: exact splats, the mean of 3 x 3 samples"""

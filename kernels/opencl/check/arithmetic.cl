@@ -1,9 +1,9 @@
 // What the device's own functions return, as the stages call them (vectors of LANES; `real` in the set-up), for the host
-// to compare with the truth. Built with prelude.cl and math.cl in front.
+// to compare with the truth. Built with prelude.cl and math.cl in front, the latter with the functions of slot/arithmetic_fast.cl.
 
 // Index space: one work-item per LANES values.
 // Reads:  exponents, shares, above, below (each n; n a multiple of LANES). Writes: out, planes of n floats:
-//         exp, log, above / below, sqrt of below, fma, native_exp, native_recip of below.
+//         exp, log, above / below, sqrt of below, fma, fast_exp, fast_log.
 kernel void arithmetic_float(uint n, global const float *restrict exponents, global const float *restrict shares,
                              global const float *restrict above, global const float *restrict below,
                              global float *restrict out) {
@@ -15,8 +15,8 @@ kernel void arithmetic_float(uint n, global const float *restrict exponents, glo
     VSTORE(a / b, out + 2 * (size_t)n + at);
     VSTORE(sqrt(b), out + 3 * (size_t)n + at);
     VSTORE(fma(a, b, a), out + 4 * (size_t)n + at);
-    VSTORE(native_exp(VLOAD(exponents + at)), out + 5 * (size_t)n + at);
-    VSTORE(native_recip(b), out + 6 * (size_t)n + at);
+    VSTORE(fast_exp(VLOAD(exponents + at)), out + 5 * (size_t)n + at);
+    VSTORE(fast_log(VLOAD(shares + at)), out + 6 * (size_t)n + at);
 }
 
 // Index space: one work-item per value.

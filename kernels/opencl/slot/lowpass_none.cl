@@ -5,6 +5,6 @@ static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, wide y, w
     return c.inside;
 }
 //@ fragment_half_rho
-static inline vfloat fragment_half_rho(Crossing c, vfloat inverse_d, vfloat screen) {
+static inline vfloat fragment_half_rho(const Splat *s, Crossing c, vfloat inverse_d, vfloat screen) {
     return (c.q * inverse_d) * inverse_d;
 }

@@ -26,16 +26,27 @@
 //@ project
         record.fx = pz >= near ? (wide)(center_x - anchor_x) : 1e18f;
         record.fy = pz >= near ? (wide)(center_y - anchor_y) : 1e18f;
+//@@ camera_dot
 //@@ footprint_dot
 //@ fragment_mask
+// Vectors of pixels pass over a dot that is far away; to single pixels the question costs what it saves.
+#if LANES > 1
+#define HAS_DOT(s) ((s)->fx < 1e17f)
+#else
+#define HAS_DOT(s) true
+#endif
+
 static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, wide y, wide half_r2, wide filter,
                                  vfloat *screen) {
+    *screen = 0.0f;
+    if (!HAS_DOT(s)) return c.inside;
     vfloat ex = x - s->fx;
     wide ey = y - s->fy;
     *screen = FMA(ex, ex, (vfloat)(ey * ey)) * filter;
     return c.inside | VMASK(*screen <= half_r2);
 }
 //@ fragment_half_rho
-static inline vfloat fragment_half_rho(Crossing c, vfloat inverse_d, vfloat screen) {
-    return VSELECT(screen, fmin((c.q * inverse_d) * inverse_d, screen), c.inside);
+static inline vfloat fragment_half_rho(const Splat *s, Crossing c, vfloat inverse_d, vfloat screen) {
+    vfloat half_rho = (c.q * inverse_d) * inverse_d;
+    return HAS_DOT(s) ? VSELECT(screen, fmin(half_rho, screen), c.inside) : half_rho;
 }

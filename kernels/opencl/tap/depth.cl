@@ -1,4 +1,4 @@
-// depth (h, w): expected depth along z [m], sum w z / sum w; 0 where nothing was drawn.
+// depth (h, w): expected depth along z [m], sum w z / sum w; 0 where less than 1/255 is covered.
 //@ state
     vfloat depth, depth_weight;
 //@ start
@@ -10,8 +10,8 @@
 //@ blend_args
     , global float *restrict depth_raw       // 2 planes: sum w z, sum w
 //@ store
-        VSTORE(pixel->depth, depth_raw + at);
-        VSTORE(pixel->depth_weight, depth_raw + plane + at);
+        VSTORE(VSELECT((vfloat)0.0f, pixel->depth, pixel_shown(pixel)), depth_raw + at);
+        VSTORE(VSELECT((vfloat)0.0f, pixel->depth_weight, pixel_shown(pixel)), depth_raw + plane + at);
 //@ resolve_args
     , global const float *restrict depth_raw, global float *restrict depth_out
 //@ resolve_start

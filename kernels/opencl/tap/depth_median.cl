@@ -1,11 +1,17 @@
-// depth_median (h, w): depth [m] of the last fragment in front of which more than half of the light remains; 0 where nothing
-// was drawn. Of several samples per pixel the lower median of those that hit something.
+// depth_median (h, w): depth [m] of the last fragment in front of which more than half of the light remains; 0 where less than
+// 1/255 is covered. Fragments that take less light than that count together: the one with which they have taken it stands for
+// them. Of several samples per pixel the lower median of those that hit something.
 //@ state
     vfloat depth_median;
+    vfloat median_light;    // left behind the fragment that counted last
 //@ start
     pixel->depth_median = 0.0f;
+    pixel->median_light = 1.0f;
 //@ lay
-    pixel->depth_median = VSELECT(pixel->depth_median, seen->z, live & VMASK(pixel->t > 0.5f));
+    vfloat behind = pixel->t - weight;
+    vint counts = live & VMASK(pixel->t > 0.5f) & VMASK(pixel->median_light - behind >= LEAST_ALPHA);
+    pixel->depth_median = VSELECT(pixel->depth_median, seen->z, counts);
+    pixel->median_light = VSELECT(pixel->median_light, behind, counts);
 //@ blend_args
     , global float *restrict depth_median_raw
 //@ store

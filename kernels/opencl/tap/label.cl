@@ -1,4 +1,5 @@
-// label (h, w) int: label of the fragment or layer with the largest weight, the nearest of equals; -1 where nothing was drawn.
+// label (h, w) int: label of the fragment or layer with the largest weight, the nearest of equals; -1 where less
+// than 1/255 is covered.
 //@ record
     int label;
 //@ project_args
@@ -30,7 +31,7 @@
 //@ blend_args
     , global float *restrict label_raw, global int *restrict label_id_raw
 //@ store
-        VSTORE(pixel->label_weight, label_raw + at);
+        VSTORE(VSELECT((vfloat)0.0f, pixel->label_weight, pixel_shown(pixel)), label_raw + at);
         VSTORE(pixel->label, label_id_raw + at);
 //@ resolve_args
     , global const float *restrict label_raw, global const int *restrict label_id_raw, global int *restrict label_out

@@ -1,5 +1,5 @@
 // normal (h, w, 3): unit normal in the camera frame, towards the camera, of the mean of the splats' normals by weight; 0 where
-// nothing was drawn.
+// less than 1/255 is covered.
 //@ record
     wide nx, ny, nz;
 //@ project
@@ -35,9 +35,9 @@
 //@ blend_args
     , global float *restrict normal_raw      // 3 planes
 //@ store
-        VSTORE(pixel->normal_x, normal_raw + at);
-        VSTORE(pixel->normal_y, normal_raw + plane + at);
-        VSTORE(pixel->normal_z, normal_raw + 2 * plane + at);
+        VSTORE(VSELECT((vfloat)0.0f, pixel->normal_x, pixel_shown(pixel)), normal_raw + at);
+        VSTORE(VSELECT((vfloat)0.0f, pixel->normal_y, pixel_shown(pixel)), normal_raw + plane + at);
+        VSTORE(VSELECT((vfloat)0.0f, pixel->normal_z, pixel_shown(pixel)), normal_raw + 2 * plane + at);
 //@ resolve_args
     , global const float *restrict normal_raw, global float *restrict normal_out
 //@ resolve_start

@@ -1,5 +1,5 @@
 // splat_id (h, w) int: index in the cloud of the fragment with the largest weight, of a layer its splat of greatest optical
-// depth, the nearest of equals; -1 where nothing was drawn.
+// depth, the nearest of equals; -1 where less than 1/255 is covered.
 //@ record
     int splat_id;
 //@ project_args
@@ -31,7 +31,7 @@
 //@ blend_args
     , global float *restrict splat_id_raw, global int *restrict splat_id_index_raw
 //@ store
-        VSTORE(pixel->splat_id_weight, splat_id_raw + at);
+        VSTORE(VSELECT((vfloat)0.0f, pixel->splat_id_weight, pixel_shown(pixel)), splat_id_raw + at);
         VSTORE(pixel->splat_id, splat_id_index_raw + at);
 //@ resolve_args
     , global const float *restrict splat_id_raw, global const int *restrict splat_id_index_raw, global int *restrict splat_id_out

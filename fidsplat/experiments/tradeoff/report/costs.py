@@ -32,7 +32,7 @@ CONSTANTS = (
     Constant("16-bit depth keys", "depth_key_bits 16"),
     Constant("float16 colours", "color_precision float16"),
     Constant("float32 set-up", "setup_precision float32"),
-    Constant("fast exponentials and divisions", "arithmetic fast"),
+    Constant("our own exponentials and logarithms", "arithmetic fast"),
 )
 """those of gsplat and of the 2DGS authors first"""
 

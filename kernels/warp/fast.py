@@ -1,0 +1,49 @@
+"""Exponentials and logarithms that are shorter than the library's: `arithmetic="fast"`.
+
+The polynomials and the bounds are those of kernels/opencl/slot/arithmetic_fast.cl, and so are the bits.
+"""
+
+import warp as wp
+
+from .common import fma
+
+_LOG2_E, _LN2_HIGH, _LN2_LOW = wp.constant(1.44269504), wp.constant(-0.693359375), wp.constant(2.12194440e-4)
+_LN2 = wp.constant(6.93147181e-1)
+_ROUNDER = wp.constant(12582912.0)  # 1.5 * 2^23: a sum's last bits are the whole number
+_LEAST = wp.constant(-87.0)
+_MANTISSA_BITS = wp.constant(wp.uint32(23))
+_MANTISSA = wp.constant(0x7FFFFF)
+_ROOT_HALF = wp.constant(0x3F3504F3)  # bits of sqrt(1/2)
+
+
+@wp.func
+def fast_exp(x: float) -> float:
+    """e^x for x <= 0, within 2 units of the last place; below -87 it stays e^-87, 1.6e-38."""
+    y = wp.max(x, _LEAST)
+    sum = fma(y, _LOG2_E, _ROUNDER)
+    k = sum - _ROUNDER
+    r = fma(k, _LN2_LOW, fma(k, _LN2_HIGH, y))  # ln 2 in two words: the inner one is exact
+    p = fma(8.29030946e-3, r, 4.18979935e-2)
+    p = fma(p, r, 1.66676372e-1)
+    p = fma(p, r, 4.99991477e-1)
+    p = fma(p, r, 9.99999702e-1)
+    p = fma(p, r, 1.0)
+    return wp.cast(wp.cast(p, wp.uint32) + (wp.cast(sum, wp.uint32) << _MANTISSA_BITS), wp.float32)
+
+
+@wp.func
+def fast_log(x: float) -> float:
+    """ln x for normal x > 0, within 1 unit of the last place."""
+    bits = wp.cast(x, wp.int32) - _ROOT_HALF
+    m = wp.cast((bits & _MANTISSA) + _ROOT_HALF, wp.float32) - 1.0
+    m2 = m * m
+    p = fma(7.0376836292e-2, m, -1.1514610310e-1)
+    p = fma(p, m, 1.1676998740e-1)
+    p = fma(p, m, -1.2420140846e-1)
+    p = fma(p, m, 1.4249322787e-1)
+    p = fma(p, m, -1.6668057665e-1)
+    p = fma(p, m, 2.0000714765e-1)
+    p = fma(p, m, -2.4999993993e-1)
+    p = fma(p, m, 3.3333331174e-1)
+    p = fma(m2, -0.5, p * m * m2)
+    return fma(float(bits >> 23), _LN2, m + p)

@@ -1,0 +1,111 @@
+"""Our own short exponential and logarithm (`Quality.arithmetic`): bounds, bits, pictures."""
+
+from dataclasses import replace
+from importlib import import_module
+
+import numpy as np
+import pytest
+from agreement import ALL_OUTPUTS, assert_agrees, random_splats
+from test_agreement import coplanar_cloud
+
+import fidsplat as fs
+from fidsplat.effects import select
+from fidsplat.hard_cases.agreement import Picture
+from fidsplat.hard_cases.arithmetic import BOUNDS, worst
+from fidsplat.hard_cases.invariance import differing, other_schedule, trace
+
+CAMERA = fs.Camera.look_at(83, 61, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
+AROUND = random_splats(200, seed=1)
+FAST, PRECISE = fs.Quality(arithmetic="fast"), fs.Quality(arithmetic="precise")
+
+
+def floats(low, high, count=1 << 19):
+    """float32 from low > 0 to high, as many between any two powers of two; both ends among them."""
+    first, last = np.array([low, high], np.float32).view(np.uint32).astype(np.int64)
+    return np.linspace(first, last, count).round().astype(np.uint32).view(np.float32).astype(float)
+
+
+EXPONENTS = np.concatenate([-floats(2.0**-30, 87.0)[:-16], [0.0] * 16])
+SHARES = floats(2.0**-24, 1.0)
+
+
+def functions(renderer, exponents=EXPONENTS, shares=SHARES):
+    """Bits of the device's short functions there."""
+    family = renderer.device.name.split(":")[0]
+    run = import_module(f"fidsplat.backends.{family}.arithmetic").run_arithmetic
+    got = run(renderer.backend, exponents, shares, shares, shares)
+    return got["fast_exp"], got["fast_log"]
+
+
+def compilations(renderer, monkeypatch):
+    """The device as it is; where the choice is ours also one value at a time, and nothing fused."""
+    yield True
+    own = renderer.backend.shape
+    if hasattr(own, "fast_fma"):
+        for fused, lanes in ((own.fast_fma, 1), (False, own.lanes), (False, 1)):
+            monkeypatch.setattr(renderer.backend, "shape", replace(own, fast_fma=fused, lanes=lanes))
+            yield fused
+
+
+def test_short_functions_keep_their_bounds_on_every_device(renderer, monkeypatch):
+    for _ in compilations(renderer, monkeypatch):
+        exponential, logarithm = functions(renderer)
+        assert 0.5 < worst(exponential, np.exp(EXPONENTS)) <= BOUNDS["fast_exp"]
+        assert 0.5 < worst(logarithm, np.log(SHARES)) <= BOUNDS["fast_log"]
+
+
+def test_an_opacity_of_one_stays_one_and_no_exponent_runs_over(renderer):
+    exponents = np.repeat([0.0, -0.0, -1e-42, -1e-9, -87.0, -88.0, -1e9, -np.inf], 2)
+    exponential, logarithm = functions(renderer, exponents, np.ones(16))
+    assert (exponential[:8] == 1).all()
+    assert np.allclose(exponential[8:], np.exp(-87.0), rtol=1e-6, atol=0)
+    assert (logarithm == 0).all()
+
+
+def test_the_bits_are_the_same_on_every_device():
+    found = []
+    for info in fs.devices():
+        if info.usable and info.name != "reference":
+            renderer = fs.Renderer(info.name)
+            if getattr(renderer.backend.shape, "fast_fma", True):
+                found.append(functions(renderer))
+    for exponential, logarithm in found[1:]:
+        assert np.array_equal(exponential, found[0][0])
+        assert np.array_equal(logarithm, found[0][1])
+
+
+@pytest.mark.parametrize("cloud", [AROUND, coplanar_cloud(1)], ids=["around", "planes"])
+def test_pictures_move_by_the_rounding_of_opacities(renderer, cloud):
+    for quality in (FAST, PRECISE):
+        assert_agrees(renderer, cloud, CAMERA, quality=quality)
+    # a relative error e of all opacities changes colours by e at most; without a stop no decision hangs on it
+    precise, fast = (
+        renderer.render(cloud, CAMERA, ("rgb",), quality.with_(transmittance_stop=0.0))["rgb"]
+        for quality in (PRECISE, FAST)
+    )
+    assert 0 < np.abs(precise - fast).max() <= 1e-6 * max(1.0, precise.max())
+
+
+def test_faint_fragments_stay_faint(renderer):
+    """At this cut-off the faintest lie below the smallest normal float32."""
+    precise, fast = (
+        renderer.render(
+            AROUND, CAMERA, ALL_OUTPUTS, quality.with_(alpha_cutoff=1e-42, transmittance_stop=0.0)
+        )
+        for quality in (PRECISE, FAST)
+    )
+    for name in ("rgb", "alpha", "normal"):
+        assert np.abs(precise[name] - fast[name]).max() <= 2e-6
+
+
+@pytest.mark.parametrize("cloud", [AROUND, coplanar_cloud(1)], ids=["around", "planes"])
+def test_both_schedules_draw_the_same_bits(renderer, cloud):
+    picture = Picture(cloud, CAMERA, FAST, ALL_OUTPUTS)
+    own, other = trace(renderer, picture), trace(renderer, picture, other_schedule(renderer))
+    assert differing(own, other, ALL_OUTPUTS) == 0
+
+
+def test_blending_in_float64_takes_the_library_s():
+    double = FAST.with_(blend_precision="float64")
+    assert "arithmetic_precise" in select(AROUND, ("rgb",), double).slots
+    assert "arithmetic_fast" in select(AROUND, ("rgb",), FAST).slots

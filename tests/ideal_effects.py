@@ -1,0 +1,76 @@
+"""A perfectly printed marker under any lens, shutter, surroundings and sensor, in float64: how well a tag can
+be localised there at all. No splats; poses, rays and the sensor's steps are those of the reference."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+import fidsplat as fs
+from fidsplat.backends.base import View
+from fidsplat.backends.exposure import exposed_view
+from fidsplat.backends.reference.optics import ray_lengths, rays_of
+from fidsplat.backends.reference.post import background_at, developed
+from fidsplat.scenes import PlacedMarker
+
+
+def ideal_picture(
+    placed: PlacedMarker,
+    camera: fs.Camera,
+    samples: int,
+    background: Any = (0.0, 0.0, 0.0),
+    *,
+    motion: fs.Motion | None = None,
+    shutter: fs.Shutter | None = None,
+    sensor: fs.Sensor | None = None,
+    fog: fs.Fog | None = None,
+) -> np.ndarray:
+    """(h, w, 3) float64 of the texture, quiet zone included; a pixel is the mean of samples x samples points.
+
+    motion: groups by the marker's label.
+    """
+    quality = fs.Quality(samples=samples)
+    motion, shutter = motion or fs.Motion(), shutter or fs.Shutter()
+    view = exposed_view(camera, quality, np.zeros(3), background, motion, shutter, sensor, fog)
+    light = np.zeros((view.height, view.width, 3))
+    for shot in view.shots:
+        light[shot.top : shot.top + shot.view.height] += shot.weight * _samples(placed, shot.view)
+    if not view.shots:
+        light = _samples(placed, view)
+    height, width = camera.height, camera.width
+    pixels = light.reshape(height, samples, width, samples, 3).mean((1, 3)).reshape(-1, 3)
+    y, x = (grid.ravel() for grid in np.mgrid[:height, :width])
+    steps = () if sensor is None else sensor.steps
+    return developed(pixels, np.zeros(len(x)), steps, view, x, y)[0].reshape(height, width, 3)
+
+
+def assert_as_good(error, ideal, distance):
+    """Within 1 % of the distance wherever the ideal plane is (errors in metres; inf: not found)."""
+    assert error < 0.01 * distance or ideal >= 0.01 * distance, (error, ideal, distance)
+
+
+def _samples(placed: PlacedMarker, view: View) -> np.ndarray:
+    """What the samples of one pose see (h, w, 3)."""
+    y, x = (grid.ravel() + 0.5 for grid in np.mgrid[: view.height, : view.width])
+    rays, seen = rays_of(view, x, y)
+    behind = np.broadcast_to(np.asarray(view.background), (len(x), 3))
+    if view.surroundings is not None:
+        behind = background_at(view, x, y)[0]
+    moved = dict(view.groups).get(placed.label, view)
+    turn = moved.rotation @ placed.pose[:3, :3]
+    middle = moved.rotation @ placed.pose[:3, 3] + moved.translation
+    start = np.zeros_like(rays)
+    if view.parallel:
+        start[:, 0], start[:, 1] = (x - view.cx) / view.fx, (y - view.cy) / view.fy
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = (middle - start) @ turn[:, 2] / (rays @ turn[:, 2])
+        place = (start + along[:, None] * rays - middle) @ turn[:, :2] / placed.marker.module
+    grid = placed.marker.grid
+    column, row = np.floor(place[:, 0] + grid.shape[1] / 2), np.floor(place[:, 1] + grid.shape[0] / 2)
+    on = seen & (along > 0) & (column >= 0) & (row >= 0) & (column < grid.shape[1]) & (row < grid.shape[0])
+    value = 1.0 - grid[row[on].astype(int), column[on].astype(int), None]
+    left = np.exp(-view.fog_density * along[on] * ray_lengths(x[on], y[on], view))[:, None]
+    light = behind.copy()
+    light[on] = left * value + (1 - left) * view.background
+    return light.reshape(view.height, view.width, 3)
