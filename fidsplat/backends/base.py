@@ -124,11 +124,6 @@ class View:
         return Orthographic() if self.parallel else None
 
     @property
-    def turns(self) -> bool:
-        """Whether its shots look in different directions."""
-        return any(not np.array_equal(shot.view.rotation, self.rotation) for shot in self.shots)
-
-    @property
     def turns_of_rows(self) -> np.ndarray:
         """(h, 3, 3) world to camera, for each row of pixels that of the pose which normals show there."""
         turns = np.tile(self.rotation, (self.height // self.samples, 1, 1))

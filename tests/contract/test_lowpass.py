@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from agreement import assert_agrees, random_splats, unless_warp
+from agreement import assert_agrees, random_splats
 
 import fidsplat as fs
 from fidsplat.rotations import quaternion_to_matrix
@@ -70,8 +70,7 @@ def test_tilted_to_edge_on(renderer, tilt):
 @pytest.mark.parametrize("scale", [(1e-6, 1e-2), (1e-3, 2.0)], ids=["small", "any"])
 def test_splats_of_every_size_through_every_lens(renderer, camera, scale):
     cloud = random_splats(200, seed=8, depth=(-4.0, 5.0), scale=scale)
-    with unless_warp(renderer, True):
-        assert_agrees(renderer, cloud, camera, quality=PIXEL)
+    assert_agrees(renderer, cloud, camera, quality=PIXEL)
 
 
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
@@ -89,9 +88,8 @@ def test_a_lens_keeps_the_light_of_a_splat(renderer, camera):
     )
     want = 2 * math.pi * 0.9 * abs(u[0] * v[1] - u[1] * v[0])
     quality = PIXEL.with_(alpha_cutoff=1e-9)
-    with unless_warp(renderer, True):
-        light = float(renderer.render(cloud, camera, "alpha", quality)["alpha"].sum())
-        assert light == pytest.approx(want, rel=0.032)
+    light = float(renderer.render(cloud, camera, "alpha", quality)["alpha"].sum())
+    assert light == pytest.approx(want, rel=0.032)
 
 
 def test_boxes_are_left_to_their_own_filter(renderer):
