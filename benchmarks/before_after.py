@@ -2,10 +2,11 @@
 
     python benchmarks/before_after.py COMMIT [--scene r1m_1080p] [--device opencl] [--repeats 15] [--json]
 
-Both processes draw the scene of this tree with its constants (alpha cut-off 1/255, stop 1e-4, precise arithmetic), splats
-resident, the picture left on the device. One frame each, in turns, and which goes first changes from pair to
-pair; the figure is the median of the ratios of this tree's time to the commit's, with quartiles. So it is
-measured that the kernels of a scene without effects cost what they did before there were effects.
+Both processes draw the scene of this tree with its constants (alpha cut-off 1/255, stop 1e-4, precise
+arithmetic), splats resident, the picture left on the device. One frame each, in turns, and which goes first
+changes from pair to pair; the figure is the median of the ratios of this tree's time to the commit's, with
+quartiles. So it is measured that the kernels of a scene without effects cost what they did before there were
+effects.
 """
 
 from __future__ import annotations
