@@ -91,6 +91,7 @@ _EFFECTS = (
     ),
     Effect("motion_groups", "slot/motion_groups.cl", inputs=("labels", "moving"), view_inputs=("moving",)),
     Effect("shutter_exposure", "slot/shutter_exposure.cl"),
+    Effect("shutter_rows", "slot/shutter_rows.cl"),
     Effect("color_rgb", "slot/color_rgb.cl", inputs=("colors",)),
     Effect("color_rgb_half", "slot/color_rgb_half.cl", inputs=("colors_half",)),
     Effect("color_sh", "slot/color_sh.cl", inputs=("sh",), parts=("sh_terms",)),
@@ -140,7 +141,13 @@ _EFFECTS = (
     Effect("ray_depth", "slot/ray_depth.cl", record_lanes=3),
     Effect("shown", "slot/shown.cl"),
     Effect("alpha", "tap/alpha.cl", output=Output("alpha", 1, "float32")),
-    Effect("depth", "tap/depth.cl", planes=(2,), output=Output("depth", 1, "float32"), parts=("ray_depth", "shown")),
+    Effect(
+        "depth",
+        "tap/depth.cl",
+        planes=(2,),
+        output=Output("depth", 1, "float32"),
+        parts=("ray_depth", "shown"),
+    ),
     Effect(
         "depth_median",
         "tap/depth_median.cl",
