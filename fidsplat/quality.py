@@ -77,11 +77,12 @@ class MarkerQuality:
     """Of `paper`: copies of all levels but the last, 1 to 100: opaque insides against more to blend."""
 
     growth: float | None = None
-    """Modules, 0 to 1, by which a rectangle reaches into its own colour across shared sides: closes seams,
-    and rounds what lies behind. None: what the mixture was made with (0.4 for fitted, 0 for paper)."""
+    """Modules, 0 to 1, by which a rectangle reaches into its own colour across shared sides (a long one
+    further along its axis): closes seams, and rounds what lies behind. None: what the mixture was made with
+    (0.4 for fitted, 0 for paper)."""
 
     template: int = 25
-    """Of `fitted`: Gaussians of a rectangle up to an aspect ratio of 8, one of `TEMPLATE_SIZES`: 1, 5, 9,
+    """Of `fitted`: Gaussians of a rectangle up to an aspect ratio of 6, one of `TEMPLATE_SIZES`: 1, 5, 9,
     13, 25 or 41. Fewer are drawn faster and leave edges blurred and corners round."""
 
     def __post_init__(self) -> None:
@@ -147,7 +148,8 @@ class Quality:
     arithmetic: str = "fast"
     """Exponentials and logarithms of blending. `fast`: our own polynomials, the same bits wherever devices
     fuse multiply-adds; exponentials within 2.3 units of the last place, logarithms within 1.1. `precise`:
-    the library's, of which OpenCL promises 3; by those colours move by less than 1e-6, and take longer."""
+    the library's, of which OpenCL promises 3. Colours differ by less than 1e-6, and by the stop at most
+    where a pixel reaches it a splat earlier."""
 
     blend_precision: str = "float32"
     """Arithmetic of each fragment: crossing, weight and blending. `float64`: a device's truth picture, many

@@ -2,12 +2,9 @@
 
 import hashlib
 import pickle
-from contextlib import nullcontext
 
 import numpy as np
-import pytest
 
-from fidsplat.errors import DeviceError
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture, compare
 from fidsplat.hard_cases.agreement import truth_of as draw_truth
 from fidsplat.quality import Quality
@@ -38,13 +35,6 @@ def assert_agrees(renderer, cloud, camera, outputs=ALL_OUTPUTS, quality=None, ba
     differences = compare(frame, truth, outputs)
     assert all(difference.agrees for difference in differences), differences
     return frame
-
-
-def unless_warp(renderer, refuses):
-    """Around a picture that Warp refuses by name (docs/backends.md) if `refuses`, and OpenCL draws."""
-    if refuses and renderer.device.name.startswith("warp"):
-        return pytest.raises(DeviceError, match="use an OpenCL device")
-    return nullcontext()
 
 
 def random_splats(count, seed, depth=(-1.0, 6.0), scale=(1e-3, 2.0), across=2.0, sh_degree=None):

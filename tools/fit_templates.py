@@ -32,6 +32,7 @@ from scipy.optimize import minimize
 
 from fidsplat.files import atomic_write
 from fidsplat.markers import marker
+from fidsplat.markers.mixture import in_pieces
 from fidsplat.markers.partition import partition
 from fidsplat.markers.seams import grow
 
@@ -41,15 +42,15 @@ LONGEST = {"c": 0.42, "x": 0.42, "y": 0.42, "q": 0.25}  # largest sigma: longer 
 FEW, LONGEST_OF_FEW = 13, 0.8  # below so many Gaussians they must be wide, hairs or not
 CUT = 1 / 255
 # largest aspect ratio, aspect ratio of stage 1
-CLASSES = ((8.0, 1.0), (None, 10.0))
+CLASSES = ((2.5, 1.0), (6.0, 4.0), (10.0, 9.0))
 # of each class, beside the one in the middle: pairs on the long axis, pairs on the short axis, fours
 COUNTS = {
-    1: ((0, 0, 0), (0, 0, 0)),
-    5: ((1, 1, 0), (1, 1, 0)),
-    9: ((1, 1, 1), (2, 1, 1)),
-    13: ((2, 2, 1), (3, 2, 1)),
-    25: ((4, 4, 2), (5, 5, 3)),
-    41: ((6, 6, 4), (7, 7, 5)),
+    1: ((0, 0, 0), (0, 0, 0), (0, 0, 0)),
+    5: ((1, 1, 0), (1, 1, 0), (1, 1, 0)),
+    9: ((1, 1, 1), (1, 1, 1), (2, 1, 1)),
+    13: ((2, 2, 1), (2, 2, 1), (3, 2, 1)),
+    25: ((4, 4, 2), (4, 4, 2), (5, 4, 3)),
+    41: ((6, 6, 4), (6, 6, 4), (7, 7, 5)),
 }
 BACKGROUNDS = (0.0, 0.5, 1.0)
 ORDERS = {"layer": 2.0, "0": 1.0, "130": 1.0}  # weights; an angle sorts the centres along that direction
@@ -164,23 +165,24 @@ class Layout:
     model: Symmetric
     per_module: float
     seed: int
-    margin: float = 1.0
+    margin: float = 2.0
     orders: list = field(default_factory=list)
 
     def __post_init__(self) -> None:
         boxes = partition(self.grid)
         grown = grow(self.grid, boxes, GROWTH)
         w, h = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
-        limits = [np.inf if limit is None else limit for limit, _ in CLASSES]
-        kind = np.searchsorted(limits, np.maximum(w, h) / np.minimum(w, h) - 1e-9)
+        limits = [limit for limit, _ in CLASSES]
+        pieces, aspect, source = in_pieces(grown, w / h, limits[-1])
+        kind = np.searchsorted(limits, np.maximum(aspect, 1 / aspect) - 1e-9)
         first = np.array(self.model.first)
         n = np.diff(first)[kind]
-        owner = np.repeat(np.arange(len(boxes)), n)
+        owner = np.repeat(np.arange(len(pieces)), n)
         self.slot = np.arange(len(owner)) + np.repeat(first[kind] - (np.cumsum(n) - n), n)
-        self.upright = (h > w)[owner]
-        self.centre = ((grown[:, :2] + grown[:, 2:]) / 2)[owner]
-        self.half = ((grown[:, 2:] - grown[:, :2]) / 2)[owner]
-        self.light = 1.0 - self.grid[boxes[:, 1], boxes[:, 0]][owner]
+        self.upright = (aspect < 1)[owner]
+        self.centre = ((pieces[:, :2] + pieces[:, 2:]) / 2)[owner]
+        self.half = ((pieces[:, 2:] - pieces[:, :2]) / 2)[owner]
+        self.light = 1.0 - self.grid[boxes[:, 1], boxes[:, 0]][source[owner]]
 
         rng = np.random.default_rng(self.seed)
         rows, columns = (int((edge + 2 * self.margin) * self.per_module) for edge in self.grid.shape)

@@ -9,7 +9,7 @@ import numpy as np
 from fidsplat.experiments.methods import mixtures, plain_marker
 from fidsplat.experiments.setup import CATEGORIES, Category
 from fidsplat.markers import marker
-from fidsplat.markers.mixture import fitted_templates, paper_template
+from fidsplat.markers.mixture import fitted_templates, paper_template, place
 
 NAME = "counts"
 FULL_REPEATS, QUICK_REPEATS = 15, 3
@@ -67,13 +67,12 @@ def _by_colour(grid: np.ndarray, boxes: np.ndarray) -> dict[str, int]:
 
 
 def _gaussians(mixture: str, boxes: np.ndarray) -> int | None:
-    """How many a mixture of templates would need for other rectangles; None for one without templates."""
+    """How many a mixture would need for other rectangles; None for one that is not known here."""
+    if mixture == "exact":
+        return len(boxes)
     if mixture == "paper":
         return len(boxes) * len(paper_template())
     if mixture != "fitted":
         return None
     sides = boxes[:, 2:] - boxes[:, :2]
-    aspect = sides.max(1) / sides.min(1)
-    templates = fitted_templates()
-    which = np.searchsorted([t.max_aspect for t in templates], aspect)
-    return int(np.array([len(t.gaussians) for t in templates])[which].sum())
+    return len(place(boxes.astype(np.float64), sides[:, 0] / sides[:, 1], fitted_templates())[1])

@@ -20,6 +20,9 @@ from fidsplat.quality import MAX_DENSITY, MAX_LEVELS, MarkerQuality, whole_numbe
 GAMMA = 3.0
 """The paper's cut-off: a Gaussian ends at 3 standard deviations."""
 
+OVERLAP = 0.2
+"""Widths by which the pieces of a long rectangle reach into each other."""
+
 
 class Template(NamedTuple):
     """Gaussians of rectangles up to an aspect ratio, in units of the rectangle's half sizes."""
@@ -77,8 +80,7 @@ def _fitted() -> tuple[dict[int, tuple[Template, ...]], float]:
 def _template(entry: dict) -> Template:
     gaussians = np.array([mirror for row in entry["quadrant"] for mirror in _mirrors(row)])
     gaussians.flags.writeable = False
-    limit = entry["max_aspect"]
-    return Template(np.inf if limit is None else limit, gaussians)
+    return Template(entry["max_aspect"], gaussians)
 
 
 def _mirrors(row: list[float]) -> list[list[float]]:
@@ -88,8 +90,8 @@ def _mirrors(row: list[float]) -> list[list[float]]:
 
 
 def fitted_templates(size: int = MarkerQuality.template) -> tuple[Template, ...]:
-    """The shipped templates of a size (`TEMPLATE_SIZES`) in rising order of aspect ratio; the last has no
-    limit."""
+    """The shipped templates of a size (`TEMPLATE_SIZES`) in rising order of aspect ratio. Longer rectangles
+    than the last is for are cut, see `place`."""
     return _fitted()[0][size]
 
 
@@ -104,9 +106,11 @@ def place(
     """The Gaussians of n rectangles, in the order of the rectangles.
 
     rectangles: (n, 4) float64 x0, y0, x1, y1. aspect: (n,) width over height, which chooses the template;
-    its first axis goes along the longer side. Returns (m, 5) float64 x, y, sigma_x, sigma_y, opacity and
-    (m,) int64 the rectangle that each belongs to.
+    its first axis goes along the longer side. Rectangles longer than any template is for are cut into equal
+    pieces. Returns (m, 5) float64 x, y, sigma_x, sigma_y, opacity and (m,) int64 the rectangle that each
+    belongs to.
     """
+    pieces, aspect, source = in_pieces(rectangles, aspect, templates[-1].max_aspect)
     upright = aspect < 1
     which = np.searchsorted([t.max_aspect for t in templates], np.maximum(aspect, 1 / aspect) * (1 - 1e-9))
     counts = np.array([len(t.gaussians) for t in templates])
@@ -119,9 +123,31 @@ def place(
     start = first[which] + np.where(upright, len(lying), 0)
     owner = np.repeat(np.arange(len(n)), n)
     row = np.arange(len(owner)) + np.repeat(start - (np.cumsum(n) - n), n)
-    centre = (rectangles[:, :2] + rectangles[:, 2:]) / 2
-    half = (rectangles[:, 2:] - rectangles[:, :2]) / 2
+    centre = (pieces[:, :2] + pieces[:, 2:]) / 2
+    half = (pieces[:, 2:] - pieces[:, :2]) / 2
     out = table[row]
     out[:, 0:2] = centre[owner] + half[owner] * out[:, 0:2]
     out[:, 2:4] *= half[owner]
-    return out, owner
+    return out, source[owner]
+
+
+def in_pieces(
+    rectangles: np.ndarray, aspect: np.ndarray, longest: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cut n rectangles across their longer sides into the fewest equal pieces of at most an aspect ratio.
+
+    rectangles: (n, 4) float64 x0, y0, x1, y1. aspect: (n,) width over height, which decides. Returns (m, 4)
+    pieces, (m,) their aspect and (m,) int64 the rectangle that each is of. Templates fade towards their ends,
+    so at a cut pieces reach into each other, `OVERLAP` of their width each.
+    """
+    parts = np.maximum(np.ceil(np.maximum(aspect, 1 / aspect) * (1 - 1e-9) / longest), 1).astype(np.int64)
+    owner = np.repeat(np.arange(len(parts)), parts)
+    nth = np.arange(len(owner)) - np.repeat(np.cumsum(parts) - parts, parts)
+    pieces, aspect, parts = rectangles[owner], aspect[owner], parts[owner]
+    each, axis = np.arange(len(owner)), (aspect < 1).astype(np.int64)
+    low, high = pieces[each, axis], pieces[each, axis + 2]
+    step = (high - low) / parts
+    overlap = OVERLAP * (pieces[each, 3 - axis] - pieces[each, 1 - axis])
+    pieces[each, axis] = np.where(nth > 0, low + nth * step - overlap, low)
+    pieces[each, axis + 2] = np.where(nth < parts - 1, low + (nth + 1) * step + overlap, high)
+    return pieces, np.where(axis, aspect * parts, aspect / parts), owner

@@ -2,31 +2,51 @@
 
 import numpy as np
 
+LONG = 0.6
+"""Where a rectangle is L modules long it grows by LONG L times as much along that axis, or once if that is
+more."""
+
 
 def grow(grid: np.ndarray, rectangles: np.ndarray, growth: float) -> np.ndarray:
     """Extend rectangles of an (h, w) 0/1 grid across those sides that lie wholly against their own colour.
 
-    rectangles: (n, 4) ints x0, y0, x1, y1 in cells. growth: modules, 0 to 1. Returns (n, 4) float64. A
-    mixture fades towards its edges, so two rectangles of one component leave a seam; where they overlap it
-    closes. The rows of cells that a rectangle grows into, corners included, are checked to be of its
-    colour.
+    rectangles: (n, 4) ints x0, y0, x1, y1 in cells. growth: modules, 0 to 1, for short ones; `LONG` says
+    what longer ones take. Returns (n, 4) float64. A mixture fades towards its edges, so two rectangles of one
+    component leave a seam; where they overlap it closes. Templates are scaled, so long rectangles fade over a
+    long way, and reach accordingly far beneath what lies at their ends. All cells that a rectangle grows into,
+    corners included, are of its colour. Its longer axis comes first.
     """
     h, w = grid.shape
     padded = np.full((h + 2, w + 2), 2, np.int8)  # 2: outside, nobody's colour
     padded[1:-1, 1:-1] = grid
-    x0, y0, x1, y1 = (rectangles + 1).T
-    color = padded[y0, x0]
-    # sums[c, y, x]: cells of colour c above and left of the vertex
+    color = grid[rectangles[:, 1], rectangles[:, 0]]
+    # sums[c, y, x]: cells of colour c above and left of the vertex of the padded grid
     sums = np.zeros((2, h + 3, w + 3), np.int64)
     for c in (0, 1):
         np.cumsum(np.cumsum(padded == c, 0), 1, out=sums[c, 1:, 1:])
 
-    def own(left, top, right, bottom):
-        count = sums[color, bottom, right] - sums[color, top, right]
-        count -= sums[color, bottom, left] - sums[color, top, left]
-        return count == (right - left) * (bottom - top)
-
-    to_left, to_right = own(x0 - 1, y0, x0, y1), own(x1, y0, x1 + 1, y1)
-    left, right = x0 - to_left, x1 + to_right
-    up, down = own(left, y0 - 1, right, y0), own(left, y1, right, y1 + 1)
-    return rectangles + growth * np.stack([-1 * to_left, -1 * up, to_right, down], 1)
+    size = rectangles[:, 2:] - rectangles[:, :2]
+    wanted = growth * np.maximum(1.0, LONG * size)
+    cells = rectangles + 1  # that a rectangle covers wholly or in part, in the padded grid
+    grown = rectangles.astype(np.float64)
+    first = (size[:, 1] > size[:, 0]).astype(np.int64)
+    for axis in (first, 1 - first):
+        for end, way in ((0, -1), (2, 1)):
+            left = wanted[np.arange(len(size)), axis]
+            moving = np.flatnonzero(left > 0)
+            while len(moving):
+                side = axis[moving] + end
+                each = np.arange(len(moving))
+                strip = cells[moving]
+                strip[each, axis[moving] + 2 - end] = strip[each, side]
+                strip[each, side] += way
+                x0, y0, x1, y1 = strip.T
+                c = color[moving]
+                own = sums[c, y1, x1] - sums[c, y0, x1] - sums[c, y1, x0] + sums[c, y0, x0]
+                free = own == (x1 - x0) * (y1 - y0)
+                moving, side = moving[free], side[free]
+                cells[moving, side] += way
+                grown[moving, side] += way * np.minimum(left[moving], 1.0)
+                left[moving] -= 1.0
+                moving = moving[left[moving] > 0]
+    return grown

@@ -9,9 +9,10 @@ import warp as wp
 
 from .bounds import Bounds, make_bounds
 from .common import STRICT, View, lowest, store_line
-from .lens import make_rays
+from .lens import SLOPES
 from .pixel import make_pixel
 from .planes import make_samples, of_samples
+from .splat import make_splat
 from .staging import BLOCK_H, BLOCK_W, STAGED
 
 NONE, ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
@@ -23,8 +24,9 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
     tile's samples.
     """
     parts = make_pixel(effects)
-    pool, stage, touched = parts.staging.pool, parts.staging.stage, parts.staging.touched
-    load_staged = parts.load_staged
+    splats = make_splat(effects)
+    pool, stage, touched = splats.staging.pool, splats.staging.stage, splats.staging.touched
+    load, load_staged = splats.load, splats.load_staged
     Pixel = parts.Pixel
     limits = make_bounds("lowpass_screen" in effects)
     Samples = make_samples(tuple(of_samples(effects).items()))
@@ -32,17 +34,16 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
         name in effects
         for name in ("depth", "depth_median", "depth_first", "normal", "heaviest", "blended", "fog")
     )
-    load, start, row_of, cross, unfinished, blend_one = (
-        parts.load,
+    start, row_of, cross, unfinished, blend_one = (
         parts.start,
         parts.row,
         parts.cross,
         parts.unfinished,
         parts.blend,
     )
-    finish, cross_ray = parts.finish, parts.cross_ray
-    bent = "rays" in effects
-    Rays = make_rays(bent)
+    finish, cross_ray, cross_slopes = parts.finish, parts.cross_ray, parts.cross_slopes
+    bent, curved = "rays" in effects, cross_slopes is not None
+    Rays = parts.Rays
 
     @wp.func
     def store(p: Pixel, at: int, samples: Samples):
@@ -84,13 +85,17 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
         top = (tile / view.tiles_x) * view.tile_h + (block / across) * BLOCK_H
         x0 = left + lane % BLOCK_W
         y0 = top + lane / BLOCK_W
-        p = start(x0, y0, view)
+        p = start(x0, y0, rays, view)
         if x0 >= view.width or y0 >= view.height:
             p.t = 0.0  # what lies beyond the picture is finished from the start
         if wp.static(bent):
             ray = wp.vec3()
             if p.t > 0.0:
                 ray = rays.rays[y0 * view.width + x0]
+        if wp.static(curved):
+            slopes = SLOPES()
+            if p.t > 0.0:
+                slopes = rays.slopes[y0 * view.width + x0]
         records = pool()
         k = starts[tile]
         end = starts[tile + 1]
@@ -108,7 +113,9 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
                     index = lists[k + which]
                     if unfinished(p, view):
                         x, y = float(x0) - s.d[3], float(y0) - s.c[0]
-                        if wp.static(bent):
+                        if wp.static(curved):
+                            c = cross_slopes(s, ray, slopes, x, y, view)
+                        elif wp.static(bent):
                             c = cross_ray(s, ray, x, y, view)
                         else:
                             c = cross(s, row_of(s.u, y), row_of(s.v, y), row_of(s.d, y), x, y, view)
@@ -139,7 +146,7 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
         x0 = (tile % view.tiles_x) * view.tile_w
         y0 = (tile / view.tiles_x) * view.tile_h
         for k in range(view.tile_w * view.tile_h):
-            state[state_first + k] = start(x0 + k % view.tile_w, y0 + k / view.tile_w, view)
+            state[state_first + k] = start(x0 + k % view.tile_w, y0 + k / view.tile_w, rays, view)
         x_end = wp.min(x0 + view.tile_w, view.width)
         y_end = wp.min(y0 + view.tile_h, view.height)
         alive = (x_end - x0) * (y_end - y0)
@@ -159,7 +166,10 @@ def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
                 u, v, d = row_of(s.u, y), row_of(s.v, y), row_of(s.d, y)
                 for column in range(left, right):
                     x = float(column) - s.d[3]
-                    if wp.static(bent):
+                    if wp.static(curved):
+                        at = row * view.width + column
+                        c = cross_slopes(s, rays.rays[at], rays.slopes[at], x, y, view)
+                    elif wp.static(bent):
                         c = cross_ray(s, rays.rays[row * view.width + column], x, y, view)
                     else:
                         c = cross(s, u, v, d, x, y, view)

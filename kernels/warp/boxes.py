@@ -1,7 +1,8 @@
 """Boxes: rectangles |u| <= 1, |v| <= 1 of a splat's plane, whose edges the sample filters (docs/effects.md).
 
-The image of an edge is a straight line, and D + n_u, D - n_u, D + n_v, D - n_v are affine in the sample: over
-their gradients they are the sample's distances from the four edges, inwards, in samples.
+D + n_u, D - n_u, D + n_v, D - n_v over their gradients are the sample's distances from the four edges,
+inwards, in samples. Where they are affine in the sample, gradients are the splat's own; where a lens gives
+each sample its own ray, edges are curves, and gradients follow from the ray's derivatives.
 """
 
 from functools import cache
@@ -10,6 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .common import View, fma
+from .lens import SLOPES
 
 SQRT2 = wp.constant(wp.float32(2.0**0.5))
 LINES = wp.constant(10)
@@ -26,9 +28,26 @@ def between(d: float, n: float, edges: wp.vec2) -> float:
     return wp.max(low + high - 1.0, 0.0)
 
 
+@wp.func
+def ramp(form: float, gradient: wp.vec2) -> float:
+    """Which share of a sample lies on the side of an edge where its form is above 0."""
+    steep = wp.sqrt(wp.max(fma(gradient[0], gradient[0], gradient[1] * gradient[1]), 1.0e-36))
+    return wp.clamp(form / steep + 0.5, 0.0, 1.0)
+
+
+@wp.func
+def between_curves(d: float, n: float, of_d: wp.vec3, of_n: wp.vec3, slopes: SLOPES) -> float:
+    """`between`, of forms with these factors of a ray's X, Y, Z, and with the ray's derivatives."""
+    low = ramp(fma(SQRT2, n, d), slopes * (of_d + SQRT2 * of_n))
+    high = ramp(fma(-SQRT2, n, d), slopes * (of_d - SQRT2 * of_n))
+    return wp.max(low + high - 1.0, 0.0)
+
+
 @cache
 def make_boxes(real) -> SimpleNamespace:
-    """edges: what turns a box's forms into distances from its edges; extent: what it can touch."""
+    """edges: what turns a box's forms into distances from its edges; extent, parallel: what it can touch
+    before a pinhole and for parallel rays; spread: a rectangle whose image a lens may enclose instead.
+    """
     vec2, vec3, vec4 = (wp.types.vector(n, real) for n in (2, 3, 4))
     lines_type = wp.types.matrix((int(LINES), 3), real)
     zero, half, one = real(0.0), real(0.5), real(1.0)
@@ -134,4 +153,40 @@ def make_boxes(real) -> SimpleNamespace:
             box = rim(lines)
         return vec4(box[0] + cx, box[1] + cx, box[2] + cy, box[3] + cy)
 
-    return SimpleNamespace(edges=edges, extent=extent)
+    @wp.func
+    def parallel(tangent_u: vec3, tangent_v: vec3, su: real, sv: real, x: real, y: real, view: View):
+        """`extent` where parallel rays show the centre at (x, y): the image of a larger rectangle, whose
+        sides are half a sample further out.
+        """
+        per_fx, per_fy = real(view.per_fx), real(view.per_fy)
+        facing = wp.abs(tangent_u[0] * tangent_v[1] - tangent_u[1] * tangent_v[0])
+        if not (facing > zero):
+            return vec4(one, zero, one, zero)  # edge-on: no ray meets it
+        # metres of the plane per sample, across each pair of sides
+        step_u = wp.length(vec2(tangent_v[1] * per_fx, tangent_v[0] * per_fy)) / facing
+        step_v = wp.length(vec2(tangent_u[1] * per_fx, tangent_u[0] * per_fy)) / facing
+        u, v = su + half * step_u, sv + half * step_v
+        across = (wp.abs(tangent_u[0]) * u + wp.abs(tangent_v[0]) * v) * real(view.fx)
+        down = (wp.abs(tangent_u[1]) * u + wp.abs(tangent_v[1]) * v) * real(view.fy)
+        return vec4(x - across, x + across, y - down, y + down)
+
+    @wp.func
+    def spread(tangent_u: vec3, tangent_v: vec3, p: vec3, su: real, sv: real, step: real) -> vec2:
+        """Half of the sides [m] of a rectangle about p that holds the places where rays meet the plane whose
+        samples the box covers in part; step: how far a ray is from that of the next sample, at most.
+
+        There |u| <= s_u + s_u |grad F| / 2 D for F = D -+ n_u, with |s_u grad F| <= (s_u + |t_v x p|) step
+        and D >= |n p| / |P| of the place P; the same along v. |P| <= |p| + |u| + |v| is then a linear
+        inequality. Where it has no solution, near the plane's own horizon, all of the plane is taken.
+        """
+        away = wp.length(p)
+        grown = half * step / wp.abs(wp.dot(wp.cross(tangent_u, tangent_v), p))
+        by_u = grown * (su + wp.length(wp.cross(tangent_v, p)))
+        by_v = grown * (sv + wp.length(wp.cross(p, tangent_u)))
+        if by_u + by_v < real(0.9):
+            furthest = (away + su + sv) / (one - by_u - by_v)
+            return vec2(su + by_u * furthest, sv + by_v * furthest)
+        everything = real(1e6) * (away + su + sv)
+        return vec2(everything, everything)
+
+    return SimpleNamespace(edges=edges, extent=extent, parallel=parallel, spread=spread)

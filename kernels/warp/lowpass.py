@@ -4,12 +4,11 @@ from functools import cache
 
 import warp as wp
 
-from .common import View
-
 
 @cache
 def make_filter(real):
-    """widened(a, b, p, view): how a Gaussian with scaled tangents a, b around p is filtered.
+    """widened(a, b, by_x, by_y): how a Gaussian with scaled tangents a, b is filtered, with gradients of the
+    sample's column and row by the point at its centre (slopes.py).
 
     G, 2 x 2, is the derivative of the sample's position by (u, v) at the centre. A sample of standard
     deviation s = 1/2 has the covariance s^2 (G^T G)^-1 in (u, v), so the filtered one has
@@ -20,12 +19,10 @@ def make_filter(real):
     variance = real(0.25)
 
     @wp.func
-    def widened(a: vec3, b: vec3, p: vec3, view: View):
+    def widened(a: vec3, b: vec3, by_x: vec3, by_y: vec3):
         """L_uu, L_vu, L_vv, and the factor of the area; not finite of a disk that is seen edge-on."""
-        x, y = p[0] / p[2], p[1] / p[2]
-        fx, fy = real(view.fx) / p[2], real(view.fy) / p[2]
-        by_u = vec2(fx * (a[0] - x * a[2]), fy * (a[1] - y * a[2]))
-        by_v = vec2(fx * (b[0] - x * b[2]), fy * (b[1] - y * b[2]))
+        by_u = vec2(wp.dot(by_x, a), wp.dot(by_y, a))
+        by_v = vec2(wp.dot(by_x, b), wp.dot(by_y, b))
         area = by_u[0] * by_v[1] - by_v[0] * by_u[1]
         share = variance / (area * area)
         uu, uv, vv = wp.dot(by_u, by_u), wp.dot(by_u, by_v), wp.dot(by_v, by_v)

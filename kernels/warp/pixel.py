@@ -9,13 +9,14 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .boxes import between
+from .boxes import between, between_curves
 from .common import View, fma, line_of, struct_of
 from .fast import fast_exp
 from .layers import make_layer, make_laying
+from .lens import SLOPES
 from .records import BOXES, Layout
-from .staging import make_staging
-from .surroundings import ray_length
+from .sight import make_sight
+from .splat import make_splat
 
 _STATE = {
     "stop_exclusive": {"finished": wp.int32},
@@ -29,21 +30,18 @@ _STATE = {
     # fog_slope: -density, per metre of depth; fogged: sum of weights times what the fog hides
     "fog": {"fog_slope": wp.float32, "fogged": wp.float32},
 }
-
 LEAST_ALPHA = wp.constant(wp.float32(1.0 / 255.0))
 """less of a sample than this is nothing to label, depth, median depth and normal"""
 
 
 @cache
 def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
-    """The state of a sample, what it reads of a splat, and what is done with them: Pixel, Splat; load, start,
-    row, cross, unfinished, blend, finish; and what brings splats to the threads of a GPU block:
-    staging, load_staged.
+    """The state of a sample, and what is done with it: Rays, Pixel; start, row, cross, cross_ray,
+    cross_slopes, unfinished, blend, finish.
     """
+    Splat = make_splat(effects).Splat
     layout = Layout(effects)
     each = layout.lines
-    staging = make_staging(layout)
-    staged_line = staging.line
     screen, exclusive, ray_depth, layers = (
         name in effects for name in ("lowpass_screen", "stop_exclusive", "ray_depth", "compose_planes")
     )
@@ -54,15 +52,9 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     exp = fast_exp if "arithmetic_fast" in effects else wp.exp
     bent, parallel = "rays" in effects, "camera_orthographic" in effects
     boxes, all_boxes = any(name in effects for name in BOXES), "footprint_box" in effects
-    # u: nu0, nux, nuy, log opacity; v: nv0, nvx, nvy, D at the near plane; d: d0, dx, dy, ax; c: ay, r, g, b
-    splat = {"u": wp.vec4, "v": wp.vec4, "d": wp.vec4, "c": wp.vec4, "half_r2": wp.float32}
-    splat |= {"dot_x": wp.float32, "dot_y": wp.float32} if screen else {}
-    splat |= {"edges": wp.vec4} if boxes else {}
-    # w: factors of the ray's Z, then the anchor's X; origin: the anchor's ray
-    splat |= {"w": wp.vec4, "origin": wp.vec3} if bent else {}
-    # plane_z0, plane_zx, plane_zy, plane_near
-    splat |= {"plane": wp.vec4} if parallel else {}
-    Splat = struct_of("Splat", "What of a record each sample needs.", splat)
+    sight = make_sight(bent, "rays_length" in effects, bent and boxes)
+    Rays, length_of = sight.Rays, sight.length_of
+    curved, edged = boxes and bent, boxes and not bent  # their edges: from each sample's ray, from a record
     # q / d^2 is rho / 2; inside: the ray meets the disk within R and beyond the near plane
     crossing = {"d": wp.float32, "q": wp.float32, "inside": wp.bool, "drawn": wp.bool}
     # screen: squared distance from the projected centre in pixels, which is rho / 2 of the low-pass
@@ -85,71 +77,15 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
     # pending: the layer that still gathers, and one that arrived before it
     fields |= {"open": layer.Layer, "waiting": layer.Layer} if layer else {}
     Pixel = struct_of("Pixel", "What a sample keeps.", fields)
-    dot_line, dot_lane = layout.place("dot_x")
-    dot_y_lane = layout.place("dot_y")[1]  # of the same line
-    edge_line = layout.place("edge_u0")[0]
     z_line, z_lane = layout.place("z_numerator")
     zc_line, zc_lane = layout.place("z_center")
     zr_line, zr_lane = layout.place("z_reach")
     nx_line, nx_lane = layout.place("nx")
     ny_line, ny_lane = layout.place("ny")
     nz_line, nz_lane = layout.place("nz")
-    ray_line, plane_line = layout.place("nuz")[0], layout.place("plane_z0")[0]
 
     @wp.func
-    def load(lines: wp.array(dtype=wp.vec4), index: int, view: View):
-        s = Splat()
-        at = index * each
-        s.u = line_of(lines, at)
-        s.v = line_of(lines, at + 1)
-        s.d = line_of(lines, at + 2)
-        s.c = line_of(lines, at + 3)
-        if wp.static(screen):
-            dot = line_of(lines, at + dot_line)
-            s.dot_x = dot[dot_lane]
-            s.dot_y = dot[dot_y_lane]
-        if wp.static(boxes):
-            s.edges = line_of(lines, at + edge_line)
-        if wp.static(bent):
-            s.w = line_of(lines, at + ray_line)
-            rest = line_of(lines, at + ray_line + 1)
-            s.origin = wp.vec3(s.w[3], rest[0], rest[1])
-        if wp.static(parallel):
-            s.plane = line_of(lines, at + plane_line)
-        s.half_r2 = s.u[3] - view.log_cut
-        return s
-
-    @wp.func
-    def load_staged(
-        pool: wp.uint64,
-        lines: wp.array(dtype=wp.vec4),
-        lists: wp.array(dtype=wp.int32),
-        first: int,
-        which: int,
-        view: View,
-    ):
-        s = Splat()
-        s.u = staged_line(pool, lines, lists, first, which, 0)
-        s.v = staged_line(pool, lines, lists, first, which, 1)
-        s.d = staged_line(pool, lines, lists, first, which, 2)
-        s.c = staged_line(pool, lines, lists, first, which, 3)
-        if wp.static(screen):
-            dot = staged_line(pool, lines, lists, first, which, dot_line)
-            s.dot_x = dot[dot_lane]
-            s.dot_y = dot[dot_y_lane]
-        if wp.static(boxes):
-            s.edges = staged_line(pool, lines, lists, first, which, edge_line)
-        if wp.static(bent):
-            s.w = staged_line(pool, lines, lists, first, which, ray_line)
-            rest = staged_line(pool, lines, lists, first, which, ray_line + 1)
-            s.origin = wp.vec3(s.w[3], rest[0], rest[1])
-        if wp.static(parallel):
-            s.plane = staged_line(pool, lines, lists, first, which, plane_line)
-        s.half_r2 = s.u[3] - view.log_cut
-        return s
-
-    @wp.func
-    def start(x: int, y: int, view: View):
+    def start(x: int, y: int, rays: Rays, view: View):
         """The state of a sample before anything is drawn."""
         p = Pixel()
         p.t = 1.0
@@ -161,7 +97,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             p.open.plane = -1
             p.waiting.plane = -1
         if wp.static(fog):
-            p.fog_slope = -view.fog_density * ray_length(float(x) + 0.5, float(y) + 0.5, view)
+            p.fog_slope = -view.fog_density * length_of(x, y, rays, view)
         return p
 
     @wp.func
@@ -171,7 +107,12 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
 
     @wp.func
     def is_box(s: Splat) -> bool:
-        return s.edges[0] > 0.0
+        if wp.static(all_boxes):
+            return True
+        elif wp.static(curved):
+            return s.boxed > 0.0
+        else:
+            return s.edges[0] > 0.0
 
     @wp.func
     def cross(s: Splat, row_u: float, row_v: float, row_d: float, x: float, y: float, view: View):
@@ -179,14 +120,33 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         return meet(s, fma(s.u[1], x, row_u), fma(s.v[1], x, row_v), fma(s.d[1], x, row_d), x, y, view)
 
     @wp.func
+    def forms_of(s: Splat, ray: wp.vec3) -> wp.vec3:
+        """n_u, n_v and D of a ray."""
+        r = ray - s.origin
+        return wp.vec3(
+            fma(s.w[0], r[2], fma(s.u[1], r[0], fma(s.u[2], r[1], s.u[0]))),
+            fma(s.w[1], r[2], fma(s.v[1], r[0], fma(s.v[2], r[1], s.v[0]))),
+            fma(s.w[2], r[2], fma(s.d[1], r[0], fma(s.d[2], r[1], s.d[0]))),
+        )
+
+    @wp.func
     def cross_ray(s: Splat, ray: wp.vec3, x: float, y: float, view: View):
         """The same for the sample that has this ray."""
-        r = ray - s.origin
-        nu = fma(s.w[0], r[2], fma(s.u[1], r[0], fma(s.u[2], r[1], s.u[0])))
-        nv = fma(s.w[1], r[2], fma(s.v[1], r[0], fma(s.v[2], r[1], s.v[0])))
-        d = fma(s.w[2], r[2], fma(s.d[1], r[0], fma(s.d[2], r[1], s.d[0])))
-        c = meet(s, nu, nv, d, x, y, view)
-        c.drawn = c.drawn and d == d  # nothing is seen without a ray
+        n = forms_of(s, ray)
+        c = meet(s, n[0], n[1], n[2], x, y, view)
+        c.drawn = c.drawn and n[2] == n[2]  # nothing is seen without a ray
+        return c
+
+    @wp.func
+    def cross_slopes(s: Splat, ray: wp.vec3, slopes: SLOPES, x: float, y: float, view: View):
+        """The same where there are boxes, with the ray's derivatives."""
+        c = cross_ray(s, ray, x, y, view)
+        if is_box(s):
+            n, of_d = forms_of(s, ray), wp.vec3(s.d[1], s.d[2], s.w[2])
+            across = between_curves(n[2], n[0], of_d, wp.vec3(s.u[1], s.u[2], s.w[0]), slopes)
+            c.cover = across * between_curves(n[2], n[1], of_d, wp.vec3(s.v[1], s.v[2], s.w[1]), slopes)
+            c.inside = c.cover > 0.0 and c.d > 0.0 and c.d <= s.v[3]
+            c.drawn = c.inside
         return c
 
     @wp.func
@@ -201,7 +161,7 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
             c.q = fma(nu, nu, nv * nv)
             # product form: no division, no special value of D (numerics B2)
             c.inside = c.q <= s.half_r2 * (c.d * c.d) and ahead
-        if wp.static(boxes):
+        if wp.static(edged):
             if is_box(s):
                 across = between(c.d, nu, wp.vec2(s.edges[0], s.edges[1]))
                 c.cover = across * between(c.d, nv, wp.vec2(s.edges[2], s.edges[3]))
@@ -372,15 +332,13 @@ def make_pixel(effects: tuple[str, ...]) -> SimpleNamespace:
         return p
 
     return SimpleNamespace(
+        Rays=Rays,
         Pixel=Pixel,
-        Splat=Splat,
-        load=load,
-        load_staged=load_staged,
-        staging=staging,
         start=start,
         row=row,
         cross=cross,
         cross_ray=cross_ray,
+        cross_slopes=cross_slopes if curved else None,
         unfinished=unfinished,
         blend=blend,
         finish=finish,

@@ -40,9 +40,11 @@ def make_samples(fields: tuple[tuple[str, type], ...]):
 @cache
 def make_outputs(names: tuple[str, ...], integers: tuple[str, ...]):
     """The struct of the finished planes, (h w channels) each; with `labels` (n) of the splats where `label`
-    is one of them.
+    is one of them, and `turns` (h), world to camera, where `normal_world` is.
     """
     arrays = {name: wp.array(dtype=wp.int32 if name in integers else wp.float32) for name in names}
     if "label" in names:
         arrays["labels"] = wp.array(dtype=wp.int32)
+    if "normal_world" in names:
+        arrays["turns"] = wp.array(dtype=wp.mat33)
     return struct_of("Outputs", "What resolving leaves of each pixel.", arrays)

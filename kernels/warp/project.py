@@ -25,6 +25,7 @@ from .lens import LENSES, make_lens, make_optics
 from .lowpass import make_filter
 from .motion import make_motion
 from .records import Layout
+from .slopes import make_slopes
 
 # [m]; nobody sees the difference, and what is divided by it stays above float32's denormals (numerics B6)
 SMALLEST_SCALE = wp.constant(wp.float32(1e-20))
@@ -46,9 +47,10 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
         for name in ("normal", "ray_depth", "lowpass_screen", "lowpass_pixel", "compose_planes")
     )
     real = wp.float64 if precision == "float64" else wp.float32
-    vec2, vec3, mat33 = wp.types.vector(2, real), wp.types.vector(3, real), wp.types.matrix((3, 3), real)
+    vec2, vec3, vec4 = (wp.types.vector(n, real) for n in (2, 3, 4))
+    mat33 = wp.types.matrix((3, 3), real)
     words = wp.types.vector(4 * layout.lines, wp.float32)
-    sqrt_half = real(math.sqrt(0.5))
+    sqrt_half, sqrt_two = real(math.sqrt(0.5)), real(math.sqrt(2.0))
     edge_on = real(1e-13 if precision == "float64" else 1e-6)
     one, two, half, zero = real(1.0), real(2.0), real(0.5), real(0.0)
     all_boxes, mixed = "footprint_box" in effects, "footprint_mixed" in effects
@@ -62,14 +64,28 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
     parallel = "camera_orthographic" in effects
     ray_depths = camera in ("camera_fisheye", "camera_equirectangular")  # distances, not along z
     mapped, bent = camera == "camera_brown_conrady", camera is not None
+    edged, flagged = boxes_too and not bent, mixed and bent
+    """whether records say of a box where its edges are, or of any splat whether it is a box"""
     optics = make_optics(camera, real) if camera else None
     Lens = make_lens(camera)
+    slopes_at = make_slopes("camera_orthographic" if parallel else camera, real)
     word = {name: layout.names.index(name) for name in layout.names}
-    extras = ("dot_x", "z_numerator", "nx", "edge_u0", "nuz", "plane_z0")
+    extras = ("dot_x", "z_numerator", "nx", "edge_u0", "nuz", "plane_z0", "boxed")
     first_extra = {name: word.get(name, 0) for name in extras}
     at_dot, at_depth, at_normal = first_extra["dot_x"], first_extra["z_numerator"], first_extra["nx"]
     at_edges, at_box = first_extra["edge_u0"], word["columns"]
     at_ray, at_plane = first_extra["nuz"], first_extra["plane_z0"]
+    at_flag = first_extra["boxed"]
+
+    @wp.func
+    def seen(a: vec3, b: vec3, p: vec3, radius: real, reach: real, x: real, y: real, view: View, lens: Lens):
+        """Bounds of a disk, or of what a lens takes for its picture; x, y: where parallel rays show p."""
+        if wp.static(parallel):
+            return disk.parallel(a, b, x, y, radius, view)
+        elif wp.static(ray_depths):
+            return optics.enclose(a, b, p, radius, view, lens)
+        else:
+            return disk.seen(a, b, p, radius, reach, view)
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False, launch_bounds=LIMITS)
     def project(
@@ -126,6 +142,9 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
         p = turn * mean + shift
         a = tangent_u * su
         b = tangent_v * sv
+        depth = p[2]
+        if wp.static(ray_depths):
+            depth = wp.length(p)
 
         near = real(view.near)
         if wp.static(boxes_too):
@@ -133,29 +152,32 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
             if wp.static(mixed):
                 boxed = boxes[i] != 0
         if wp.static(filtered):
-            widens = p[2] >= near
+            widens = depth >= near
             if wp.static(boxes_too):
                 widens = widens and not boxed
             if widens:
-                wide = widened(a, b, p, view)
-                log_opacity -= float(wp.log(wide[3]))
-                half_r2 = log_opacity - view.log_cut
-                if not (half_r2 > 0.0):
-                    return  # edge-on too: infinitely thin, infinitely faint
-                a = wide[0] * a + wide[1] * b
-                b = wide[2] * b
-                su *= wide[0]
-                sv *= wide[2]
-                tangent_u = a / su  # of unit area with tangent_v, whose direction stays
+                by_x, by_y, here = slopes_at(p, view, lens)
+                if here:
+                    wide = widened(a, b, by_x, by_y)
+                    log_opacity -= float(wp.log(wide[3]))
+                    half_r2 = log_opacity - view.log_cut
+                    if not (half_r2 > 0.0):
+                        return  # edge-on too: infinitely thin, infinitely faint
+                    a = wide[0] * a + wide[1] * b
+                    b = wide[2] * b
+                    su *= wide[0]
+                    sv *= wide[2]
+                    tangent_u = a / su  # of unit area with tangent_v, whose direction stays
         radius = wp.sqrt(two * real(half_r2))
-        depth = p[2]
         reach = radius * wp.sqrt(a[2] * a[2] + b[2] * b[2])  # half of the disk's depth range (numerics A3)
         if wp.static(boxes_too):
             if boxed:
                 reach = wp.abs(a[2]) + wp.abs(b[2])
         if wp.static(ray_depths):
-            depth = wp.length(p)
             reach = radius * wp.sqrt(wp.max(wp.dot(a, a), wp.dot(b, b)))
+            if wp.static(boxes_too):
+                if boxed:
+                    reach = su + sv
         if not (depth + reach >= near and depth - reach <= real(view.far)):
             return
 
@@ -164,28 +186,37 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
         per_fx, per_fy = real(view.per_fx), real(view.per_fy)
         in_front = depth >= near  # or, of a lens, whether it is known where the centre falls
         center_x, center_y = zero, zero
-        box = Bounds()
         if wp.static(parallel):
             center_x = fx * p[0] + cx
             center_y = fy * p[1] + cy
-            box = disk.parallel(a, b, center_x, center_y, radius, view)
-        elif wp.static(ray_depths):
-            box = optics.enclose(a, b, p, radius, view, lens)
-        else:
+        elif wp.static(not bent):
             if in_front:
                 center_x = fx * (p[0] / p[2]) + cx
                 center_y = fy * (p[1] / p[2]) + cy
-            if wp.static(boxes_too):
-                if boxed:
-                    area = of_box.extent(tangent_u, tangent_v, p, su, sv, p[2] - reach >= near, view)
-                    if not (area[0] <= area[1]):
-                        return
-                    box = box_bounds(float(area[0]), float(area[1]), float(area[2]), float(area[3]))
+        box = Bounds()
+        if wp.static(edged):
+            if boxed:
+                area = vec4()
+                if wp.static(parallel):
+                    area = of_box.parallel(tangent_u, tangent_v, su, sv, center_x, center_y, view)
                 else:
-                    if wp.static(mixed):
-                        box = disk.seen(a, b, p, radius, reach, view)
-            else:
-                box = disk.seen(a, b, p, radius, reach, view)
+                    area = of_box.extent(tangent_u, tangent_v, p, su, sv, p[2] - reach >= near, view)
+                if not (area[0] <= area[1]):
+                    return
+                box = box_bounds(float(area[0]), float(area[1]), float(area[2]), float(area[3]))
+            elif wp.static(mixed):
+                box = seen(a, b, p, radius, reach, center_x, center_y, view, lens)
+        elif wp.static(boxes_too):
+            if boxed:
+                # the disk around a larger rectangle
+                sides = of_box.spread(tangent_u, tangent_v, p, su, sv, real(view.ray_step))
+                side_u, side_v = tangent_u * sides[0], tangent_v * sides[1]
+                range_z = sqrt_two * wp.length(vec2(side_u[2], side_v[2]))
+                box = seen(side_u, side_v, p, sqrt_two, range_z, center_x, center_y, view, lens)
+            elif wp.static(mixed):
+                box = seen(a, b, p, radius, reach, center_x, center_y, view, lens)
+        else:
+            box = seen(a, b, p, radius, reach, center_x, center_y, view, lens)
         if wp.static(mapped):
             x0, x1 = real(box.x - box.half_x), real(box.x + box.half_x)
             y0, y1 = real(box.y - box.half_y), real(box.y + box.half_y)
@@ -286,15 +317,19 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
         record[15] = rgb[2]
         record[at_box] = as_bits(first_column, end_column)
         record[at_box + 1] = as_bits(row_first, row_end)
-        if wp.static(boxes_too):
+        if wp.static(edged):
             if boxed:
                 of_d = vec2(normal[0] * per_fx, normal[1] * per_fy)
+                if wp.static(parallel):
+                    of_d = vec2(zero, zero)  # D is the same everywhere
                 of_u = of_box.edges(of_d, vec2(nux, nuy), scale)
                 of_v = of_box.edges(of_d, vec2(nvx, nvy), scale)
                 record[at_edges] = of_u[0]
                 record[at_edges + 1] = of_u[1]
                 record[at_edges + 2] = of_v[0]
                 record[at_edges + 3] = of_v[1]
+        if wp.static(flagged):
+            record[at_flag] = wp.where(boxed, 1.0, 0.0)
         if wp.static(screen):
             # far away if there is none
             record[at_dot] = wp.where(in_front, float(center_x - anchor_x), 1.0e18)

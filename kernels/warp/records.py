@@ -23,8 +23,6 @@ _EDGES = ("edge_u0", "edge_u1", "edge_v0", "edge_v1")
 BOXES = ("footprint_box", "footprint_mixed")
 """effects with boxes"""
 _WHOLE = {
-    "footprint_box": _EDGES,
-    "footprint_mixed": _EDGES,
     "camera_orthographic": ("plane_z0", "plane_zx", "plane_zy", "plane_near"),
     "rays": ("nuz", "nvz", "dz", "ray_x", "ray_y", "ray_z"),
 }
@@ -42,14 +40,19 @@ class Layout:
     (ax, ay); D is at
     most d_near beyond the near plane. dot_x, dot_y: projected centre from the anchor's; z_numerator / D is
     the depth. columns and rows hold first and end, 16 bits each, of the box of samples that it can touch.
-    Behind a lens x, y, z are a sample's ray from the anchor's (ray_x, ray_y, ray_z). For parallel rays
-    plane_z0 + plane_zx x + plane_zy y is D times the depth, which is at least plane_near.
+    Behind a lens x, y, z are a sample's ray from the anchor's (ray_x, ray_y, ray_z), and boxed is 1 of a box,
+    0 of another splat. For parallel rays plane_z0 + plane_zx x + plane_zy y is D times the depth, which is at
+    least plane_near.
     """
 
     def __init__(self, effects: tuple[str, ...]) -> None:
         # before the rest, so that they begin a line
-        whole = (name for effect in effects for name in _WHOLE.get(effect, ()))
-        extra = (name for effect in effects for name in _EXTRA.get(effect, ()))
+        whole = [name for effect in effects for name in _WHOLE.get(effect, ())]
+        extra = [name for effect in effects for name in _EXTRA.get(effect, ())]
+        if "rays" not in effects:
+            whole += _EDGES if any(name in effects for name in BOXES) else ()
+        elif "footprint_mixed" in effects:
+            extra.append("boxed")
         self.names = [*_FORMS, *whole, "columns", "rows", *extra]
         self.lines = -(-len(self.names) // 4)
 

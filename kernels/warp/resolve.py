@@ -6,7 +6,7 @@ import warp as wp
 
 from .common import STRICT, View, fma
 from .planes import make_outputs, make_samples
-from .surroundings import make_surroundings, ray_length, to_world
+from .sight import make_sight
 
 
 @cache
@@ -14,15 +14,15 @@ def make_resolve(
     outputs: tuple[str, ...],
     integers: tuple[str, ...],
     planes: tuple[tuple[str, type], ...],
-    behind: str,
+    stretched: bool,
     samples: int,
 ):
-    """The kernel for these outputs, of which some are integers, from these planes of samples, with such a
-    background and samples x samples per pixel; its structs Samples, Outputs, Around.
+    """The kernel for these outputs, of which some are integers, from these planes of samples, samples x
+    samples per pixel; stretched: a lens gives rays their lengths.
     """
     Samples, Outputs = make_samples(planes), make_outputs(outputs, integers)
-    around_us = make_surroundings(behind)
-    Around, color_behind = around_us.Around, around_us.behind
+    sight = make_sight(stretched, stretched)
+    Rays, length_of = sight.Rays, sight.length_of
     has = {name for name, _ in planes}
     depth, median, first, normal, heaviest, blended, fog = (
         name in has
@@ -63,7 +63,8 @@ def make_resolve(
         first_pixel: int,  # of thread 0
         view: View,
         width: int,  # of the picture
-        around: Around,
+        background: wp.vec3,
+        rays: Rays,
         samples: Samples,
         out: Outputs,
     ):
@@ -72,7 +73,6 @@ def make_resolve(
         y = (pixel / width) * n
         stride = view.tiles_x * view.tile_w
         total = wp.vec4()
-        backdrop = wp.vec3()
         fogged = float(0.0)
         z = wp.vec2()
         along = float(0.0)
@@ -90,13 +90,9 @@ def make_resolve(
             row = y + sample / n
             at = row * stride + column
             total += samples.color[at]
-            if wp.static(behind != "constant"):
-                backdrop += samples.color[at][3] * color_behind(
-                    around, float(column) + 0.5, float(row) + 0.5, view
-                )
             length = float(1.0)
             if wp.static(lengths):
-                length = ray_length(float(column) + 0.5, float(row) + 0.5, view)
+                length = length_of(column, row, rays, view)
             if wp.static(fog):
                 fogged += samples.fogged[at]
             if wp.static(depth):
@@ -130,13 +126,8 @@ def make_resolve(
         left = t
         if wp.static(fog):
             left += fogged * mean
-        if wp.static(behind == "constant"):
-            background = color_behind(around, 0.0, 0.0, view)
-            for channel in range(3):
-                out.rgb[3 * pixel + channel] = fma(left, background[channel], total[channel] * mean)
-        else:
-            for channel in range(3):
-                out.rgb[3 * pixel + channel] = (total[channel] + backdrop[channel]) * mean
+        for channel in range(3):
+            out.rgb[3 * pixel + channel] = fma(left, background[channel], total[channel] * mean)
         if wp.static(alpha):
             out.alpha[pixel] = 1.0 - t
         if wp.static(depth):
@@ -159,7 +150,7 @@ def make_resolve(
             for channel in range(3):
                 out.normal[3 * pixel + channel] = unit[channel]
             if wp.static(normal_world):
-                turned = to_world(unit, view)
+                turned = wp.transpose(out.turns[pixel / width]) * unit
                 for channel in range(3):
                     out.normal_world[3 * pixel + channel] = turned[channel]
         if wp.static(splat_id):

@@ -1,58 +1,38 @@
-"""What is seen behind everything, and the rays that it takes: one colour, a gradient, a panorama."""
+"""What each sample sees behind everything, by the direction of its ray: a gradient, a panorama. (One colour
+is the same for all, and is left to resolving.)
+"""
 
 from functools import cache
-from types import SimpleNamespace
 
 import warp as wp
 
-from .common import View, fma, struct_of
+from .common import STRICT, View, fma, store_line, struct_of
+from .sight import make_sight
 
 TURN = wp.constant(0.15915494309189535)
 """1 / (2 pi)"""
 
 KINDS = {
-    "constant": {"color": wp.vec3},
     "gradient": {"top": wp.vec3, "bottom": wp.vec3, "up": wp.vec3},
     "panorama": {"image": wp.array2d(dtype=wp.vec3)},
 }
 
 
-@wp.func
-def ray_at(x: float, y: float, view: View) -> wp.vec3:
-    """The ray through a point of the sample grid, of a length of 1 along z; straight ahead where depths are
-    distances already.
-    """
-    ray = view.ray
-    return wp.vec3((x - ray[2]) * ray[0], (y - ray[3]) * ray[1], 1.0)
-
-
-@wp.func
-def ray_length(x: float, y: float, view: View) -> float:
-    """What turns depths at a point of the sample grid into distances."""
-    return wp.length(ray_at(x, y, view))
-
-
-@wp.func
-def to_world(direction: wp.vec3, view: View) -> wp.vec3:
-    """A direction of the camera in the axes of the world."""
-    return wp.transpose(wp.mat33(view.rotation)) * direction
+@cache
+def make_around(kind: str):
+    """The struct of the numbers of this kind of background."""
+    return struct_of("Around", "What lies behind everything.", KINDS[kind])
 
 
 @cache
-def make_surroundings(kind: str) -> SimpleNamespace:
-    """Around, the numbers of this kind of background; behind(around, x, y, view), its colour in the direction
-    of a point of the sample grid.
-    """
-    Around = struct_of("Around", "What lies behind everything.", KINDS[kind])
+def make_backdrop(kind: str, bent: bool):
+    """The kernel that adds this kind of background to the samples; bent: rays are a lens's own."""
+    Around, sight = make_around(kind), make_sight(bent)
+    Rays, ray_of = sight.Rays, sight.ray_of
 
     @wp.func
-    def constant(around: Around, x: float, y: float, view: View) -> wp.vec3:
-        return around.color
-
-    @wp.func
-    def gradient(around: Around, x: float, y: float, view: View) -> wp.vec3:
+    def gradient(around: Around, ray: wp.vec3) -> wp.vec3:
         """By the sine of the ray's height above the horizon."""
-        ray = to_world(ray_at(x, y, view), view)
         share = wp.clamp(0.5 + 0.5 * wp.dot(ray, around.up) / wp.length(ray), 0.0, 1.0)
         return around.bottom + share * (around.top - around.bottom)
 
@@ -63,9 +43,8 @@ def make_surroundings(kind: str) -> SimpleNamespace:
         return around.image[wp.clamp(row, 0, height - 1), (column + width) % width]
 
     @wp.func
-    def panorama(around: Around, x: float, y: float, view: View) -> wp.vec3:
+    def panorama(around: Around, ray: wp.vec3) -> wp.vec3:
         """Bilinear; the middle column lies towards +z, to the right of it is +x, the top row is -y."""
-        ray = to_world(ray_at(x, y, view), view)
         flat = wp.sqrt(fma(ray[0], ray[0], ray[2] * ray[2]))
         height, width = float(around.image.shape[0]), float(around.image.shape[1])
         u = fma(fma(wp.atan2(ray[0], ray[2]), TURN, 0.5), width, -0.5)
@@ -76,5 +55,26 @@ def make_surroundings(kind: str) -> SimpleNamespace:
         below = wp.lerp(pixel_of(around, column, row + 1), pixel_of(around, column + 1, row + 1), across)
         return wp.lerp(above, below, down)
 
-    kinds = {"constant": constant, "gradient": gradient, "panorama": panorama}
-    return SimpleNamespace(Around=Around, behind=kinds[kind])
+    behind = {"gradient": gradient, "panorama": panorama}[kind]
+
+    @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+    def backdrop(
+        first: int,  # sample of thread 0, of those of the picture, row by row
+        view: View,
+        around: Around,
+        rays: Rays,
+        color: wp.array(dtype=wp.vec4),  # in and out: r, g, b, transmittance
+    ):
+        sample = wp.tid() + first
+        column, row = sample % view.width, sample / view.width
+        ray = ray_of(column, row, rays, view)
+        if ray[0] == ray[0]:
+            at = row * view.tiles_x * view.tile_w + column
+            light = color[at]
+            # in the axes of the world
+            seen = behind(around, wp.transpose(wp.mat33(view.rotation)) * ray)
+            for channel in range(3):
+                light[channel] = fma(light[3], seen[channel], light[channel])
+            store_line(color, at, light)
+
+    return backdrop

@@ -39,11 +39,11 @@ def compiled(kernel, folder, block=256, assembly=False):
     return re.sub(r"//[^\n]*", "", source.read_text())
 
 
-def resolving(behind, samples):
+def resolving(stretched, samples):
     """The kernel for all outputs."""
     planes = tuple(made("planes.of_samples", ALL).items())
     integers = tuple(output.name for output in OUTPUTS.values() if output.dtype == "int32")
-    return made("resolve.make_resolve", tuple(OUTPUTS), integers, planes, behind, samples)
+    return made("resolve.make_resolve", tuple(OUTPUTS), integers, planes, stretched, samples)
 
 
 @pytest.fixture(autouse=True)
@@ -57,21 +57,26 @@ def started():
         lambda: made("project.make_project", RECORD, 16, "float64", False),
         lambda: made("project.make_project", (*RECORD, "motion_groups"), 0, "float32", True),
         *(lambda camera=name: made("project.make_project", camera, 0, "float64", False) for name in LENSES),
-        lambda: made("project.make_project", ("lowpass_pixel",), 0, "float64", False),
+        lambda: made("project.make_project", (*LENSES[1], "lowpass_pixel"), 0, "float64", False),
         lambda: made(
             "project.make_project", (*RECORD, "footprint_mixed", "lowpass_pixel"), 0, "float64", False
         ),
         lambda: made("project.make_project", ("footprint_box",), 0, "float32", False),
+        lambda: made("project.make_project", (*LENSES[2], "footprint_mixed"), 0, "float64", False),
+        lambda: made("project.make_project", (*LENSES[0], "footprint_mixed"), 0, "float64", False),
         lambda: made("blend.make_blend", ALL, True, 256)[0],
         lambda: made("blend.make_blend", (*ALL, "arithmetic_fast"), True, 256)[0],
         lambda: made("blend.make_blend", MIXED, True, 256)[0],
         lambda: made("blend.make_blend", ("footprint_box",), True, 256)[0],
-        lambda: made("blend.make_blend", ("rays", *ALL), True, 256)[0],
+        lambda: made("blend.make_blend", ("rays", "footprint_box"), True, 256)[0],
+        lambda: made("blend.make_blend", ("rays", *MIXED), True, 256)[0],
+        lambda: made("blend.make_blend", ("rays", *ALL, "rays_length"), True, 256)[0],
         lambda: made("blend.make_blend", ("camera_orthographic", *ALL), True, 256)[0],
         lambda: made("blend.make_blend", ("lowpass_screen", "stop_exclusive"), True, 256)[0],
-        lambda: resolving("constant", 3),
-        lambda: resolving("gradient", 1),
-        lambda: resolving("panorama", 1),
+        lambda: resolving(False, 3),
+        lambda: resolving(True, 1),
+        lambda: made("surroundings.make_backdrop", "gradient", False),
+        lambda: made("surroundings.make_backdrop", "panorama", True),
         lambda: made("sensor.make_develop", STEPS)[0],
         lambda: made("shutter.make_expose", wp.vec4),
         lambda: made("lists.make_lists", True).emit,
@@ -82,15 +87,18 @@ def started():
     ],
     ids=[
         *("project", "project-float32", *(names[0] for names in LENSES), "project-filtered"),
-        *("project-mixed", "project-boxes", "blend-all", "blend-fast", "blend-mixed", "blend-boxes"),
+        *("project-mixed", "project-boxes", "project-fisheye-mixed", "project-parallel-mixed"),
         *(
+            "blend-all",
+            "blend-fast",
+            "blend-mixed",
+            "blend-boxes",
+            "blend-rays-boxes",
+            "blend-rays-mixed",
             "blend-rays",
-            "blend-parallel",
-            "blend-exclusive",
-            "resolve",
-            "resolve-gradient",
-            "resolve-panorama",
         ),
+        *("blend-parallel", "blend-exclusive", "resolve", "resolve-stretched"),
+        *("backdrop-gradient", "backdrop-panorama"),
         *("sensor", "expose", "emit", "count", "histogram", "compact", "starts"),
     ],
 )
@@ -137,6 +145,8 @@ def test_a_record_grows_by_what_is_asked_for():
     assert layout(()).place("nz") == (0, 0)
     assert layout(("lowpass_screen", "footprint_mixed")).lines == 6
     assert layout(("footprint_box",)).place("edge_u0") == (4, 0), "a line of their own"
+    assert layout(("rays", "footprint_box")).names == layout(("rays",)).names, "edges are curves"
+    assert "boxed" in layout(("rays", "footprint_mixed")).names
 
 
 def test_a_factory_makes_one_kernel_of_a_set():

@@ -11,12 +11,10 @@ from test_lens_pictures import CAMERAS
 
 import fidsplat as fs
 from fidsplat.backends.exposure import exposed_view
-from fidsplat.backends.opencl.assemble import DeviceShape
 from fidsplat.cameras.raster import raster_of
 from fidsplat.effects import select
+from fidsplat.hard_cases.invariance import other_schedule
 from fidsplat.rotations import quaternion_to_matrix
-
-BACKEND = "opencl"
 
 SEAM = 1e-3
 each_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
@@ -142,7 +140,7 @@ def test_the_other_schedule_draws_the_same_boxes(renderer):
     cloud = random_splats(60, seed=3, depth=(-2, 4))
     cloud = cloud.with_boxes(np.arange(60) % 2 == 0)
     backend = renderer.backend
-    shape = DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, 256, backend.shape.fast_fma)
+    shape = other_schedule(renderer)
     for name in ("distortion", "fisheye", "panorama", "parallel"):
         camera = CAMERAS[name]
         view = exposed_view(camera, fs.Quality(), cloud.origin, (0, 0, 0), fs.Motion(), fs.Shutter())

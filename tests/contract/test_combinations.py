@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from agreement import random_splats, unless_warp
+from agreement import random_splats
 
 import fidsplat as fs
 from fidsplat.backends.exposure import exposed_view
@@ -65,8 +65,7 @@ def test_outputs_and_sensors_behind_every_lens(renderer, camera):
 def test_fog_and_distances_behind_lenses(renderer, camera, samples):
     outputs = ("rgb", "distance", "distance_median", "distance_first")
     quality = fs.Quality(samples=samples)
-    with unless_warp(renderer, camera is CAMERAS["distortion"]):
-        assert_agrees(renderer, camera=camera, outputs=outputs, quality=quality, fog=FOG)
+    assert_agrees(renderer, camera=camera, outputs=outputs, quality=quality, fog=FOG)
 
 
 @pytest.mark.parametrize("name", ALONG)
@@ -83,8 +82,7 @@ def test_effects_of_the_picture_under_a_shutter(renderer, around, shutter):
     quality = fs.Quality(lowpass="pixel" if around == "pixel" else "screen")
     behind = {"sky": SKY, "panorama": PANORAMA}.get(around, (0.1, 0.2, 0.3))
     fog = FOG if around == "fog" else None
-    # Warp has no directions of the world for a camera that turns
-    motion = fs.Motion(sliding if renderer.device.name.startswith("warp") else turning, {0: sliding})
+    motion = fs.Motion(turning, {0: sliding})
     outputs = ("rgb", "alpha", "distance", "splat_id", "normal_world")
     frame = renderer.render(
         cloud, PLAIN, outputs, quality, behind, motion=motion, shutter=shutter, sensor=SENSOR, fog=fog
@@ -122,16 +120,7 @@ def test_fog_is_averaged_over_the_poses_of_a_shutter(renderer):
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 def test_backgrounds_behind_every_lens(renderer, camera, behind, samples):
     picture = {"camera": camera, "background": behind, "quality": fs.Quality(samples=samples)}
-    with unless_warp(renderer, True):
-        assert_agrees(renderer, outputs=("rgb", "normal_world"), **picture)
-
-
-@pytest.mark.parametrize("asked", [{"outputs": "normal_world"}, {"background": SKY}], ids=["normal", "sky"])
-def test_directions_of_the_world_for_a_camera_that_turns(renderer, asked):
-    with unless_warp(renderer, True):
-        renderer.render(CLOUD, PLAIN, motion=fs.Motion(turning), shutter=BLUR, **asked)
-    # at one time there is one direction
-    renderer.render(CLOUD, PLAIN, motion=fs.Motion(turning), shutter=fs.Shutter(time=0.3), **asked)
+    assert_agrees(renderer, outputs=("rgb", "normal_world"), **picture)
 
 
 @pytest.mark.skipif(WARP is None, reason="no Warp device here")

@@ -10,10 +10,19 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from fidsplat.errors import InputError
-from fidsplat.markers.mixture import Template, fitted_growth, fitted_templates, paper_template, place
+from fidsplat.markers.mixture import (
+    OVERLAP,
+    Template,
+    fitted_growth,
+    fitted_templates,
+    in_pieces,
+    paper_template,
+    place,
+)
 from fidsplat.markers.partition import partition
-from fidsplat.markers.seams import grow
+from fidsplat.markers.seams import LONG, grow
 from fidsplat.markers.spec import bits_of, parse_spec
+from fidsplat.quality import TEMPLATE_SIZES
 from fidsplat.vision.dictionaries import dictionary_bits, families
 
 
@@ -74,7 +83,7 @@ def all_templates():
     return [*(template.gaussians for template in fitted_templates()), paper_template(4, 3)]
 
 
-@pytest.mark.parametrize("gaussians", all_templates(), ids=["short", "long", "paper"])
+@pytest.mark.parametrize("gaussians", all_templates(), ids=["short", "middle", "long", "paper"])
 def test_templates_are_symmetric_and_drawable(gaussians):
     for axis in (0, 1):
         mirrored = gaussians.copy()
@@ -138,22 +147,69 @@ def test_place_scales_a_template_along_the_longer_side():
     )
 
 
+def test_long_rectangles_are_cut_into_equal_pieces_that_overlap():
+    boxes = np.array([[0, 0, 24, 2], [5, 1, 6, 5], [0, 0, 2, 10], [0, 0, 9, 2]], float)
+    pieces, aspect, owner = in_pieces(boxes, np.array([12, 0.25, 0.2, 4.5]), 4.0)
+    assert owner.tolist() == [0, 0, 0, 1, 2, 2, 3, 3]
+    reach = 2 * OVERLAP
+    lying = [[0, 0, 8 + reach, 2], [8 - reach, 0, 16 + reach, 2], [16 - reach, 0, 24, 2]]
+    upright = [[0, 0, 2, 5 + reach], [0, 5 - reach, 2, 10]]
+    assert np.allclose(pieces, [*lying, boxes[1], *upright, [0, 0, 4.5 + reach, 2], [4.5 - reach, 0, 9, 2]])
+    assert np.allclose(aspect, [4, 4, 4, 0.25, 0.4, 0.4, 2.25, 2.25])
+
+
+@pytest.mark.parametrize("size", TEMPLATE_SIZES)
+def test_no_template_is_stretched_beyond_what_it_was_fitted_for(size):
+    templates = fitted_templates(size)
+    longest = templates[-1].max_aspect
+    boxes = np.array([[0, 0, length, 1] for length in (longest, longest + 1, 100)], float)
+    _, owner = place(boxes, boxes[:, 2], templates)
+    parts = [1, 2, np.ceil(100 / longest)]
+    kinds = [np.searchsorted([t.max_aspect for t in templates], boxes[i, 2] / n) for i, n in enumerate(parts)]
+    assert np.bincount(owner).tolist() == [
+        n * len(templates[kind].gaussians) for n, kind in zip(parts, kinds, strict=True)
+    ]
+
+
+def grown_by_definition(grid: np.ndarray, box: list[int], growth: float) -> list[float]:
+    """What `grow` says of one rectangle, cell by cell."""
+    own = grid[box[1], box[0]]
+    lengths = (box[2] - box[0], box[3] - box[1])
+    cells, grown = list(box), [float(edge) for edge in box]
+    for axis in (1, 0) if lengths[1] > lengths[0] else (0, 1):
+        wanted = growth * max(1.0, LONG * lengths[axis])
+        for side, way in ((axis, -1), (axis + 2, 1)):
+            free = 0
+            while free < wanted:
+                x0, y0, x1, y1 = cells
+                at = cells[side] + min(way, 0)  # the cells beyond this side
+                if not 0 <= at < grid.shape[1 - axis]:
+                    break
+                beyond = grid[y0:y1, at] if axis == 0 else grid[at, x0:x1]
+                if (beyond != own).any():
+                    break
+                cells[side] += way
+                free += 1
+            grown[side] += way * min(wanted, free)
+    return grown
+
+
 @settings(max_examples=200, deadline=None)
-@given(arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9)), elements=st.integers(0, 1)))
-def test_growth_stays_within_the_own_colour(grid):
+@given(
+    arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9)), elements=st.integers(0, 1)),
+    st.sampled_from([0.0, 0.4, 1.0]),
+)
+def test_growth_stays_within_the_own_colour(grid, growth):
     boxes = partition(grid)
-    grown = grow(grid, boxes, 1.0).astype(int)  # a whole module: cells can be looked up
-    for (x0, y0, x1, y1), (u0, v0, u1, v1) in zip(boxes.tolist(), grown.tolist(), strict=True):
-        assert u0 in (x0, x0 - 1)
-        assert u1 in (x1, x1 + 1)
-        assert v0 in (y0, y0 - 1)
-        assert v1 in (y1, y1 + 1)
-        assert 0 <= u0 < u1 <= grid.shape[1]
-        assert 0 <= v0 < v1 <= grid.shape[0]
-        assert (grid[v0:v1, u0:u1] == grid[y0, x0]).all()
-        # nothing is held back: a side that could move on its own has moved, unless a corner forbids it
-        if x0 and (grid[y0:y1, x0 - 1] == grid[y0, x0]).all():
-            assert u0 == x0 - 1
+    grown = grow(grid, boxes, growth)
+    for box, (u0, v0, u1, v1) in zip(boxes.tolist(), grown, strict=True):
+        touched = grid[int(np.floor(v0)) : int(np.ceil(v1)), int(np.floor(u0)) : int(np.ceil(u1))]
+        assert u0 >= 0
+        assert v0 >= 0
+        assert u1 <= grid.shape[1]
+        assert v1 <= grid.shape[0]
+        assert (touched == grid[box[1], box[0]]).all()
+        assert np.allclose([u0, v0, u1, v1], grown_by_definition(grid, box, growth))
 
 
 def test_growth_is_measured_in_modules():
@@ -162,3 +218,15 @@ def test_growth_is_measured_in_modules():
     grown = grow(grid, boxes, 0.25)
     assert grown.tolist() == [[0, 0, 3, 1], [1, 0.75, 2, 2], [0, 1, 1, 2], [2, 1, 3, 2]]
     assert 0 < fitted_growth() <= 1
+
+
+def test_long_rectangles_grow_along_their_axis_in_proportion():
+    """As the sides of a quiet zone do, beneath its top and its bottom."""
+    grid = np.zeros((24, 30), np.uint8)
+    grid[4:20, 4:26] = 1
+    side = np.array([[0, 4, 4, 20]])
+    for growth in (0.1, 0.2):
+        assert np.allclose(
+            grow(grid, side, growth), [[0, 4 - 16 * LONG * growth, 4, 20 + 16 * LONG * growth]]
+        )
+    assert grow(grid, side, 1.0).tolist() == [[0, 0, 4, 24]]

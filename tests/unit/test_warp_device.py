@@ -14,7 +14,6 @@ import fidsplat as fs
 from fidsplat.backends.warp import backend as warp_backend
 from fidsplat.backends.warp import runtime
 from fidsplat.backends.warp.pipeline import KNOWN
-from fidsplat.backends.warp.together import refuse_strangers
 from fidsplat.effects import CATALOGUE, FeatureSet
 
 wp = pytest.importorskip("warp")
@@ -51,25 +50,6 @@ def test_the_cpu_is_listed_and_opened_by_its_name():
     assert info.kind == "cpu"
     assert fs.Renderer("warp:cpu").device == info
     assert fs.Renderer("WARP: CPU").device == info
-
-
-@pytest.mark.parametrize(
-    ("names", "turns"),
-    [
-        ({"camera_fisheye", "lowpass_pixel"}, False),
-        ({"camera_orthographic", "footprint_mixed"}, False),
-        ({"camera_brown_conrady", "background_panorama"}, False),
-        ({"camera_pinhole", "normal_world"}, True),
-        ({"camera_pinhole", "background_gradient"}, True),
-    ],
-)
-def test_effects_that_warp_has_but_not_together_are_named(names, turns):
-    with pytest.raises(fs.DeviceError) as caught:
-        refuse_strangers(names, turns)
-    assert all(name in str(caught.value) for name in names - {"camera_pinhole"})
-    refuse_strangers(
-        {"camera_pinhole", "lowpass_pixel", "footprint_box", "background_panorama", "normal_world"}
-    )
 
 
 def test_unknown_devices_and_missing_gpus_are_named():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 from fidsplat.backends.base import View
@@ -14,11 +15,22 @@ if TYPE_CHECKING:
 
 
 class Surroundings:
-    """Fills the struct of one kind of background. A panorama stays on the device as long as it lives."""
+    """The kernel of one kind of background, and its struct. A panorama stays on the device as long as it
+    lives."""
 
-    def __init__(self, backend: WarpBackend, kind: str) -> None:
+    def __init__(self, backend: WarpBackend, kind: str, bent: bool) -> None:
+        kernels = runtime.kernels("surroundings")
         self._backend = backend
-        self._type = runtime.kernels("surroundings").make_surroundings(kind).Around
+        self._type = kernels.make_around(kind)
+        self.kernel = kernels.make_backdrop(kind, bent)
+
+    @classmethod
+    def among(cls, names: Collection[str], backend: WarpBackend) -> Surroundings | None:
+        """That of the effects with these names; None if what lies behind everything is of one colour."""
+        for kind in runtime.kernels("surroundings").KINDS:
+            if f"background_{kind}" in names:
+                return cls(backend, kind, "rays" in names)
+        return None
 
     def of(self, view: View) -> Any:
         """The struct for this view.
@@ -33,8 +45,6 @@ class Surroundings:
             around.top, around.bottom, around.up = (wp.vec3(*numbers[k : k + 3]) for k in (0, 3, 6))
         elif isinstance(behind, Panorama):
             around.image = self._uploaded(behind)
-        else:
-            around.color = wp.vec3(*view.background)
         return around
 
     def nbytes(self, view: View) -> int:

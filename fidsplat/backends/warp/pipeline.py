@@ -13,7 +13,6 @@ from fidsplat.backends.warp.finished import WarpPlanes
 from fidsplat.backends.warp.launch import BLOCK, Launcher
 from fidsplat.backends.warp.memory import Resident
 from fidsplat.backends.warp.run import Run
-from fidsplat.backends.warp.together import refuse_strangers
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError
 
@@ -46,7 +45,7 @@ _PROJECT = (
 )
 _SAMPLE = (
     *(*_RECORD, "stop_exclusive", "arithmetic_fast"),
-    *("depth", "depth_median", "depth_first", "heaviest", "blended", "fog"),
+    *("depth", "depth_median", "depth_first", "heaviest", "blended", "fog", "rays_length"),
 )
 
 
@@ -61,8 +60,6 @@ class WarpPipeline:
                 f"{backend.info.name} ({backend.info.platform}) has no {', '.join(lacking)}; "
                 "use an OpenCL device for it"
             )
-        refuse_strangers(names)
-        self._names = features.names
         self.backend, self.features, self.shape = backend, features, shape
         if names & {"label", "splat_id"}:
             names |= {"heaviest"}  # both are the same splat's
@@ -93,14 +90,18 @@ class WarpPipeline:
             integers = tuple(output.name for output in features.outputs if output.dtype == "int32")
             self.samples_type = planes.make_samples(tuple(self.sample_planes.items()))
             self.outputs_type = planes.make_outputs(finished, integers)
-            kinds = runtime.kernels("surroundings").KINDS
-            behind = next((kind for kind in kinds if f"background_{kind}" in names), "constant")
-            self.surroundings = Surroundings(backend, behind)
+            self.surroundings = Surroundings.among(names, backend)
+            self.sloped = "rays_box" in names
+            """whether blending needs the derivatives of a lens's rays"""
+            self.stretched = "rays_sample_length" in names
+            """whether a lens gives rays the lengths that resolving needs"""
             self.resolve = runtime.kernels("resolve").make_resolve(
-                finished, integers, tuple(self.sample_planes.items()), behind, features.samples
+                finished, integers, tuple(self.sample_planes.items()), self.stretched, features.samples
             )
             common = [self.sort.compact, self.sort.gather, self.sort.find_starts, self.sort.sum_up]
             self.sensor = sensor.Development.of(features.posts)
+            if self.surroundings:
+                common.append(self.surroundings.kernel)
             if self.sensor:
                 common.append(self.sensor.kernel)
             self.expose = exposure.kernels_of(self.sample_planes) if "shutter_exposure" in names else {}
@@ -133,9 +134,8 @@ class WarpPipeline:
         """Draw one picture.
 
         Raises:
-            DeviceError: the device runs out of memory or fails, or lacks what the view asks for.
+            DeviceError: the device runs out of memory or fails.
         """
-        refuse_strangers(self._names, view.turns)
         return self._drawn(resident, view).planes
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:

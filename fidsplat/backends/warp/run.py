@@ -78,7 +78,8 @@ class Run:
         self._take("bounds", self.resident.count, runtime.kernels("bounds").Bounds)
         self._take("lines", self.resident.count * self.pipeline.layout.lines, self.wp.vec4)
         self.launcher.stage("project")
-        self.lens, self.rays = self.backend.lens_arrays.of(self.view, self.pool)
+        self.lens = self.backend.lens_arrays.lens(self.view, self.pool)
+        self.rays = self.backend.lens_arrays.rays(self.view, self.pool, sloped=self.pipeline.sloped)
         visible, pairs = self._project() if self.resident.count else (0, 0)
         self.launcher.stage("sort")
         if pairs:
@@ -89,6 +90,13 @@ class Run:
             self._list(visible, first, end, listed, whole=listed == pairs)
             self.launcher.stage("blend")
             self._blend(first, end, samples)
+        if self.pipeline.surroundings:
+            # here, as shots may look in different directions
+            self.launcher.stage("resolve")
+            count, around = self.view.width * self.view.height, self.pipeline.surroundings
+            # without the derivatives that blending may have: a struct of another type
+            rays = self.backend.lens_arrays.rays(self.view, self.pool)
+            self.launch(around.kernel, count, self.u, around.of(self.view), rays, samples.color)
         self.stats |= {"visible": visible, "pairs": pairs}
         return samples
 
@@ -178,7 +186,8 @@ class Run:
         fixed = resident.nbytes + each * resident.count + _VISIBLE * visible
         fixed += self._planes_bytes() + self.beside
         fixed += self.backend.lens_arrays.nbytes(self.view)
-        fixed += self.pipeline.surroundings.nbytes(self.view)
+        if self.pipeline.surroundings:
+            fixed += self.pipeline.surroundings.nbytes(self.view)
         room = (budget - fixed) // _PAIR
         if room < 1:
             raise DeviceError(
@@ -245,10 +254,14 @@ class Run:
             array = self.pool.fresh(output.name, height * width * output.channels, dtype)
             outputs[output.name] = output, array
             setattr(finished, output.name, array)
-        around = self.pipeline.surroundings.of(view)
+        rays = self.backend.lens_arrays.rays(view, self.pool, given=self.pipeline.stretched)
+        background = wp.vec3(*view.background)
+        if "normal_world" in outputs:
+            finished.turns = self._exact("turns", height, wp.mat33)
+            wp.copy(finished.turns, wp.array(view.array("turns"), dtype=wp.mat33, device="cpu"))
         if "label" in outputs:
             finished.labels = self.resident.arrays["labels"]
-        self.launch(self.pipeline.resolve, height * width, self.u, width, around, samples, finished)
+        self.launch(self.pipeline.resolve, height * width, self.u, width, background, rays, samples, finished)
         if self.pipeline.sensor:
             args = self.pipeline.sensor.arguments(view, self.pool)
             self.launch(self.pipeline.sensor.kernel, height * width, *args, width, outputs["rgb"][1])
@@ -274,6 +287,7 @@ class Run:
             setattr(u, name, getattr(view, name))
         u.tile_w, u.tile_h, u.tiles_x, u.tiles_y = shape.tile_width, shape.tile_height, tiles_x, tiles_y
         u.per_pixel = 1.0 / view.samples**2
+        u.ray_step = view.raster.step if view.raster and self.pipeline.sloped else 0.0
         fx, fy, cx, cy = view.uniform("ray")
         u.ray = wp.vec4(1 / fx, 1 / fy, cx, cy)
         return u

@@ -1,0 +1,93 @@
+"""How a point's place in the picture moves with the point, for each camera."""
+
+from functools import cache
+
+import warp as wp
+
+from .common import View
+from .lens import LENSES, make_lens
+
+
+@cache
+def make_slopes(camera: str | None, real):
+    """slopes(p, view, lens): gradients by the point of the column and of the row in which it falls [samples
+    per metre], and whether the lens sees it. camera: a lens; None for a pinhole.
+    """
+    Lens = make_lens(camera if camera in LENSES else None)
+    vec3 = wp.types.vector(3, real)
+    zero, one, two, three = (real(float(k)) for k in range(4))
+    polar = real(1e-6)  # of the distance: so far from a panorama's axis its poles end
+
+    @wp.func
+    def slopes_pinhole(p: vec3, view: View, lens: Lens):
+        per_z = one / p[2]
+        by_x = vec3(per_z, zero, -p[0] * per_z * per_z)
+        by_y = vec3(zero, per_z, -p[1] * per_z * per_z)
+        return real(view.fx) * by_x, real(view.fy) * by_y, True
+
+    @wp.func
+    def slopes_parallel(p: vec3, view: View, lens: Lens):
+        return vec3(real(view.fx), zero, zero), vec3(zero, real(view.fy), zero), True
+
+    @wp.func
+    def slopes_distorted(p: vec3, view: View, lens: Lens):
+        """The image is (x, y) radial(q) + ..., q = x^2 + y^2 of the ideal picture (lens.py)."""
+        x, y = p[0] / p[2], p[1] / p[2]
+        q = x * x + y * y
+        k1, k2, k3 = real(lens.k[0]), real(lens.k[1]), real(lens.k[2])
+        k4, k5, k6 = real(lens.k[3]), real(lens.k[4]), real(lens.k[5])
+        p1, p2 = real(lens.k[6]), real(lens.k[7])
+        s1, s2, s3, s4 = real(lens.k[8]), real(lens.k[9]), real(lens.k[10]), real(lens.k[11])
+        below = one + q * (k4 + q * (k5 + q * k6))
+        radial = (one + q * (k1 + q * (k2 + q * k3))) / below
+        by_q = k1 + q * (two * k2 + q * three * k3) - radial * (k4 + q * (two * k5 + q * three * k6))
+        by_q /= below
+        mixed = two * (x * y * by_q + p1 * x + p2 * y)
+        prism_a, prism_b = two * (s1 + two * q * s2), two * (s3 + two * q * s4)
+        a_x = radial + two * (x * x * by_q + p1 * y + three * p2 * x) + x * prism_a
+        b_y = radial + two * (y * y * by_q + three * p1 * y + p2 * x) + y * prism_b
+        a_y, b_x = mixed + y * prism_a, mixed + x * prism_b
+        per_z = one / p[2]
+        by_a = vec3(a_x, a_y, -(x * a_x + y * a_y)) * per_z
+        by_b = vec3(b_x, b_y, -(x * b_x + y * b_y)) * per_z
+        return real(view.fx) * by_a, real(view.fy) * by_b, q < real(lens.limit)
+
+    @wp.func
+    def slopes_fisheye(p: vec3, view: View, lens: Lens):
+        """Away from the middle, by the angle from the axis, and around it."""
+        across = wp.sqrt(p[0] * p[0] + p[1] * p[1])
+        angle = wp.atan2(across, p[2])
+        q = angle * angle
+        k1, k2, k3, k4 = real(lens.k[0]), real(lens.k[1]), real(lens.k[2]), real(lens.k[3])
+        by_angle = one + q * (three * k1 + q * (real(5.0) * k2 + q * (real(7.0) * k3 + q * real(9.0) * k4)))
+        cos, sin, per_across = one, zero, one / p[2]
+        if across > zero:
+            cos = p[0] / across
+            sin = p[1] / across
+            per_across = angle * (one + q * (k1 + q * (k2 + q * (k3 + q * k4)))) / across
+        away = vec3(p[2] * cos, p[2] * sin, -across) * (by_angle / wp.dot(p, p))
+        around = vec3(-sin, cos, zero) * per_across
+        by_x, by_y = cos * away - sin * around, sin * away + cos * around
+        return real(view.fx) * by_x, real(view.fy) * by_y, angle <= real(lens.limit)
+
+    @wp.func
+    def slopes_panorama(p: vec3, view: View, lens: Lens):
+        """At a pole, where the longitude jumps, those of a point beside it, towards z."""
+        away2 = wp.dot(p, p)
+        x, z = p[0], p[2]
+        if x * x + z * z < polar * polar * away2:
+            x = zero
+            z = polar * wp.sqrt(away2)
+        flat2 = x * x + z * z
+        flat = wp.sqrt(flat2)
+        by_x = vec3(z, zero, -x) / flat2
+        by_y = vec3(-x * p[1] / flat, flat, -z * p[1] / flat) / away2
+        return real(view.fx) * by_x, real(view.fy) * by_y, True
+
+    return {
+        None: slopes_pinhole,
+        "camera_orthographic": slopes_parallel,
+        "camera_brown_conrady": slopes_distorted,
+        "camera_fisheye": slopes_fisheye,
+        "camera_equirectangular": slopes_panorama,
+    }[camera]

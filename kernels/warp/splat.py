@@ -1,0 +1,95 @@
+"""What a sample reads of a splat: of its record in memory, or in a GPU block's shared memory."""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from .common import View, line_of, struct_of
+from .records import BOXES, Layout
+from .staging import make_staging
+
+
+@cache
+def make_splat(effects: tuple[str, ...]) -> SimpleNamespace:
+    """Splat; load and load_staged; and `staging`, what brings splats to the threads of a GPU block."""
+    layout = Layout(effects)
+    each = layout.lines
+    staging = make_staging(layout)
+    staged_line = staging.line
+    screen, bent, parallel = (name in effects for name in ("lowpass_screen", "rays", "camera_orthographic"))
+    edged = not bent and any(name in effects for name in BOXES)
+    flagged = bent and "footprint_mixed" in effects
+    # u: nu0, nux, nuy, log opacity; v: nv0, nvx, nvy, D at the near plane; d: d0, dx, dy, ax; c: ay, r, g, b
+    splat = {"u": wp.vec4, "v": wp.vec4, "d": wp.vec4, "c": wp.vec4, "half_r2": wp.float32}
+    splat |= {"dot_x": wp.float32, "dot_y": wp.float32} if screen else {}
+    splat |= {"edges": wp.vec4} if edged else {}
+    splat |= {"boxed": wp.float32} if flagged else {}
+    # w: factors of the ray's Z, then the anchor's X; origin: the anchor's ray
+    splat |= {"w": wp.vec4, "origin": wp.vec3} if bent else {}
+    # plane_z0, plane_zx, plane_zy, plane_near
+    splat |= {"plane": wp.vec4} if parallel else {}
+    Splat = struct_of("Splat", "What of a record each sample needs.", splat)
+    dot_line, dot_lane = layout.place("dot_x")
+    dot_y_lane = layout.place("dot_y")[1]  # of the same line
+    edge_line = layout.place("edge_u0")[0]
+    boxed_line, boxed_lane = layout.place("boxed")
+    ray_line, plane_line = layout.place("nuz")[0], layout.place("plane_z0")[0]
+
+    @wp.func
+    def load(lines: wp.array(dtype=wp.vec4), index: int, view: View):
+        s = Splat()
+        at = index * each
+        s.u = line_of(lines, at)
+        s.v = line_of(lines, at + 1)
+        s.d = line_of(lines, at + 2)
+        s.c = line_of(lines, at + 3)
+        if wp.static(screen):
+            dot = line_of(lines, at + dot_line)
+            s.dot_x = dot[dot_lane]
+            s.dot_y = dot[dot_y_lane]
+        if wp.static(edged):
+            s.edges = line_of(lines, at + edge_line)
+        if wp.static(flagged):
+            s.boxed = line_of(lines, at + boxed_line)[boxed_lane]
+        if wp.static(bent):
+            s.w = line_of(lines, at + ray_line)
+            rest = line_of(lines, at + ray_line + 1)
+            s.origin = wp.vec3(s.w[3], rest[0], rest[1])
+        if wp.static(parallel):
+            s.plane = line_of(lines, at + plane_line)
+        s.half_r2 = s.u[3] - view.log_cut
+        return s
+
+    @wp.func
+    def load_staged(
+        pool: wp.uint64,
+        lines: wp.array(dtype=wp.vec4),
+        lists: wp.array(dtype=wp.int32),
+        first: int,
+        which: int,
+        view: View,
+    ):
+        s = Splat()
+        s.u = staged_line(pool, lines, lists, first, which, 0)
+        s.v = staged_line(pool, lines, lists, first, which, 1)
+        s.d = staged_line(pool, lines, lists, first, which, 2)
+        s.c = staged_line(pool, lines, lists, first, which, 3)
+        if wp.static(screen):
+            dot = staged_line(pool, lines, lists, first, which, dot_line)
+            s.dot_x = dot[dot_lane]
+            s.dot_y = dot[dot_y_lane]
+        if wp.static(edged):
+            s.edges = staged_line(pool, lines, lists, first, which, edge_line)
+        if wp.static(flagged):
+            s.boxed = staged_line(pool, lines, lists, first, which, boxed_line)[boxed_lane]
+        if wp.static(bent):
+            s.w = staged_line(pool, lines, lists, first, which, ray_line)
+            rest = staged_line(pool, lines, lists, first, which, ray_line + 1)
+            s.origin = wp.vec3(s.w[3], rest[0], rest[1])
+        if wp.static(parallel):
+            s.plane = staged_line(pool, lines, lists, first, which, plane_line)
+        s.half_r2 = s.u[3] - view.log_cut
+        return s
+
+    return SimpleNamespace(Splat=Splat, load=load, load_staged=load_staged, staging=staging)
