@@ -13,8 +13,8 @@ def grow(grid: np.ndarray, rectangles: np.ndarray, growth: float) -> np.ndarray:
     rectangles: (n, 4) ints x0, y0, x1, y1 in cells. growth: modules, 0 to 1, for short ones; `LONG` says
     what longer ones take. Returns (n, 4) float64. A mixture fades towards its edges, so two rectangles of one
     component leave a seam; where they overlap it closes. Templates are scaled, so long rectangles fade over a
-    long way, and reach accordingly far beneath what lies at their ends. All cells that a rectangle grows into,
-    corners included, are of its colour. Its longer axis comes first.
+    long way, and reach accordingly far beneath what lies at their ends. All cells that a rectangle grows
+    into, corners included, are of its colour. Its longer axis comes first.
     """
     h, w = grid.shape
     padded = np.full((h + 2, w + 2), 2, np.int8)  # 2: outside, nobody's colour
