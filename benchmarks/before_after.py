@@ -2,7 +2,7 @@
 
     python benchmarks/before_after.py COMMIT [--scene r1m_1080p] [--device opencl] [--repeats 15] [--json]
 
-Both processes draw the scene of this tree with its constants (alpha cut-off 1/255, stop 1e-4), splats
+Both processes draw the scene of this tree with its constants (alpha cut-off 1/255, stop 1e-4, precise arithmetic), splats
 resident, the picture left on the device. One frame each, in turns, and which goes first changes from pair to
 pair; the figure is the median of the ratios of this tree's time to the commit's, with quartiles. So it is
 measured that the kernels of a scene without effects cost what they did before there were effects.
@@ -33,7 +33,8 @@ from fidsplat.experiments.scenes import load_scene
 cloud, camera = load_scene(sys.argv[1])
 renderer = fs.Renderer(sys.argv[2])
 resident = renderer.upload(cloud)
-quality = fs.Quality(alpha_cutoff=1 / 255, transmittance_stop=1e-4)
+knobs = {"arithmetic": "precise"} if "arithmetic" in fs.Quality.__dataclass_fields__ else {}
+quality = fs.Quality(alpha_cutoff=1 / 255, transmittance_stop=1e-4, **knobs)
 print(renderer.device.title, "|", renderer.device.version, flush=True)
 for line in sys.stdin:
     start = time.perf_counter()

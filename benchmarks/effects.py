@@ -87,6 +87,10 @@ def shutters() -> dict[str, dict]:
             "shutter": fs.Shutter(readout=0.02, rows_per_band=64),
         },
         "rolling, bands of 8 rows": {"motion": turn, "shutter": fs.Shutter(readout=0.02)},
+        "blur, 8 poses, and rolling, bands of 64 rows": {
+            "motion": turn,
+            "shutter": fs.Shutter(exposure=0.01, readout=0.02, rows_per_band=64),
+        },
     }
 
 
@@ -103,6 +107,7 @@ def effects(base: fs.Camera) -> dict[str, dict]:
         "2 x 2 samples": {"quality": TIMED.with_(samples=2)},
         "boxes": {"cloud": "box"},
         "1 box in 100": {"cloud": "mixed"},
+        **{f"boxes, {name}": {**lens, "cloud": "box"} for name, lens in lenses(base).items()},
         **{f"SH degree {degree}": {"cloud": degree} for degree in (1, 2, 3)},
         **{f"output {name}": {"outputs": ("rgb", name)} for name in OUTPUTS if name != "rgb"},
         "fog": {"fog": fs.Fog(0.05)},

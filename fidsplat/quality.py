@@ -148,7 +148,8 @@ class Quality:
     arithmetic: str = "fast"
     """Exponentials and logarithms of blending. `fast`: our own polynomials, the same bits wherever devices
     fuse multiply-adds; exponentials within 2.3 units of the last place, logarithms within 1.1. `precise`:
-    the library's, of which OpenCL promises 3; by those colours move by less than 1e-6, and take longer."""
+    the library's, of which OpenCL promises 3. Colours differ by less than 1e-6, and by the stop at most
+    where a pixel reaches it a splat earlier."""
 
     blend_precision: str = "float32"
     """Arithmetic of each fragment: crossing, weight and blending. `float64`: a device's truth picture, many

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -62,6 +62,9 @@ class Rates:
     """float32 divisions, as the blend stage writes them"""
 
 
+_NO_SENSOR = Sensor()
+
+
 @dataclass(frozen=True)
 class View:
     """The uniforms of one picture: numbers that change from view to view, in float64.
@@ -97,7 +100,7 @@ class View:
     """the fog's colour where there is fog"""
     first_light: float
     """transmittance that is left behind a first hit"""
-    sensor: Sensor = field(default_factory=Sensor)
+    sensor: Sensor = _NO_SENSOR
     fog_density: float = 0.0
     """1 / metres"""
     surroundings: Gradient | Panorama | None = None
@@ -233,7 +236,7 @@ class View:
             stop=float(np.float32(quality.transmittance_stop)),
             background=color,
             first_light=float(np.float32(1 - quality.first_hit)),
-            sensor=sensor or Sensor(),
+            sensor=sensor or _NO_SENSOR,
             fog_density=0.0 if fog is None else fog.density,
             surroundings=surroundings,
             raster=raster,

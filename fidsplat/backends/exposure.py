@@ -53,7 +53,8 @@ def exposed_view(
         # the position follows from the pose
         now = camera if pose is None else replace(camera, world_to_camera=pose, position=None)
         view = View.of(now, quality, origin, background, sensor, fog)
-        return replace(view, groups=tuple((k, _moved(view, m, origin)) for k, m in motion.groups_at(time)))
+        groups = tuple((k, _moved(view, m, origin)) for k, m in motion.groups_at(time))
+        return replace(view, groups=groups) if groups else view
 
     whole = at(shutter.time)
     still = motion.camera is None and not motion.groups

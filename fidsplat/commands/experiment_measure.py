@@ -10,6 +10,7 @@ import tyro
 
 from fidsplat.commands.experiment_files import CATEGORY_HELP, Names, write_report
 from fidsplat.commands.output import Json, console, option, print_json
+from fidsplat.errors import InputError
 
 if TYPE_CHECKING:
     from fidsplat.experiments.run import Settings
@@ -136,7 +137,8 @@ def measure(names: tuple[str, ...], settings: Settings, as_json: bool) -> int:
                 for done, line in plan.run():
                     bars.update(bar, completed=done, description=f"{name} {_what(line['key'])}")
                 bars.update(bar, description=name)
-            files[name] = str(plan.records.file)
+            if plan.work:
+                files[name] = str(plan.records.file)
     if as_json:
         print_json({"files": files})
     else:
@@ -228,6 +230,10 @@ Examples:
   fidsplat experiment localisation --mixture fitted"""
 
     def run(self) -> int:
+        from fidsplat.experiments.localisation import LOCATED
+
+        if self.category and not set(self.category) & set(LOCATED):
+            raise InputError(f"localisation is of {' and '.join(LOCATED)}, not of {', '.join(self.category)}")
         return measure(("localisation",), self.settings(), self.json)
 
 

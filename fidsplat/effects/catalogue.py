@@ -140,7 +140,13 @@ _EFFECTS = (
     Effect("ray_depth", "slot/ray_depth.cl", record_lanes=3),
     Effect("shown", "slot/shown.cl"),
     Effect("alpha", "tap/alpha.cl", output=Output("alpha", 1, "float32")),
-    Effect("depth", "tap/depth.cl", planes=(2,), output=Output("depth", 1, "float32"), parts=("ray_depth", "shown")),
+    Effect(
+        "depth",
+        "tap/depth.cl",
+        planes=(2,),
+        output=Output("depth", 1, "float32"),
+        parts=("ray_depth", "shown"),
+    ),
     Effect(
         "depth_median",
         "tap/depth_median.cl",

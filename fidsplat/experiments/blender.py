@@ -57,7 +57,8 @@ def check_pictures(folder: Path, view: str, seed: int, samples: int | None = Non
     for name, wanted in (("seed", seed), ("samples", samples)):
         if wanted is not None and about.get(name) != wanted:
             raise InputError(
-                f"{folder / view} holds pictures of {name} {about.get(name)}, not {wanted}; give another folder"
+                f"{folder / view} holds pictures of {name} {about.get(name)}, not {wanted}; "
+                "give another folder"
             )
     return about
 

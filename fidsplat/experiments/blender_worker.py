@@ -21,7 +21,8 @@ def main(job: dict) -> None:
         plane = build(marker, job["view"])
         for shot in marker["shots"]:
             aim(scene, shot)
-            part = shot["file"] + ".part.png"
+            # a killed run may have left a worker that still draws the same picture
+            part = f"{shot['file']}.{os.getpid()}.part.png"
             scene.render.filepath = part
             bpy.ops.render.render(write_still=True)
             os.replace(part, shot["file"])

@@ -7,7 +7,11 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-COLOURS = ("#777777", "#d1495b", "#edae49", "#00798c", "#30638e", "#7b4f9d", "#2e8b57", "#c26a2d", "#1f2d3d")
+COLOURS = (
+    "#777777", "#d1495b", "#edae49", "#00798c", "#30638e", "#7b4f9d", "#2e8b57", "#c26a2d", "#1f2d3d",
+    "#e377c2", "#8c6d31", "#6baed6", "#9c9ede",
+)  # fmt: skip
+"""as many as a chart has series: the ideal, three mixtures in three ways, and what is the paper's"""
 _WIDTH, _HEIGHT = 900, 360
 _LEFT, _RIGHT, _BOTTOM = 62, 16, 34
 _ROW = 16  # of the legend

@@ -67,7 +67,9 @@ def _by_colour(grid: np.ndarray, boxes: np.ndarray) -> dict[str, int]:
 
 
 def _gaussians(mixture: str, boxes: np.ndarray) -> int | None:
-    """How many a mixture of templates would need for other rectangles; None for one without templates."""
+    """How many a mixture would need for other rectangles; None for one that is not known here."""
+    if mixture == "exact":
+        return len(boxes)
     if mixture == "paper":
         return len(boxes) * len(paper_template())
     if mixture != "fitted":

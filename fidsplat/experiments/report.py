@@ -46,6 +46,33 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
     pictures = out.with_suffix("") if out.suffix == ".md" else out
     writable_folder(pictures)
     document = Document("Results of the paper's experiments")
+    try:
+        charts = _tables(document, lines)
+    except KeyError as error:
+        raise InputError(
+            f"results in {', '.join(map(str, folders))} are of another version of fidsplat, they lack "
+            f"{error}; measure again with --anew"
+        ) from error
+    sheets = next((found for folder in (*folders, pictures) if (found := sheet_files(folder))), [])
+    if sheets:
+        document.heading("Pictures")
+        document.text("The middle 160 x 160 pixels of 800 x 800, marker 0 of each category.")
+    for sheet in sheets:
+        document.picture(sheet.name, sheet.stem)
+        if sheet.parent.resolve() != pictures.resolve():
+            with atomic_write(pictures / sheet.name) as stream, open(sheet, "rb") as source:
+                shutil.copyfileobj(source, stream)
+    before = "" if pictures == page.parent else f"{pictures.name}/"
+    texts = {page: document.markdown(before), page.with_suffix(".html"): document.html(before)}
+    texts |= {pictures / name: chart for name, chart in charts.items()}
+    for file, text in texts.items():
+        with atomic_write(file) as stream:
+            stream.write(text.encode())
+    return list(texts)
+
+
+def _tables(document: Document, lines: dict[str, list[dict]]) -> dict[str, str]:
+    """Add every table; returns charts, file name -> SVG."""
     _provenance(document, lines)
     report_targets(
         document,
@@ -64,22 +91,7 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
             charts |= report(document, lines[name])
         else:
             document.text(f"Nothing was measured by `{_COMMANDS.format(name)}`.")
-    sheets = next((found for folder in (*folders, pictures) if (found := sheet_files(folder))), [])
-    if sheets:
-        document.heading("Pictures")
-        document.text("The middle 160 x 160 pixels of 800 x 800, marker 0 of each category.")
-    for sheet in sheets:
-        document.picture(sheet.name, sheet.stem)
-        if sheet.parent.resolve() != pictures.resolve():
-            with atomic_write(pictures / sheet.name) as stream, open(sheet, "rb") as source:
-                shutil.copyfileobj(source, stream)
-    before = "" if pictures == page.parent else f"{pictures.name}/"
-    texts = {page: document.markdown(before), page.with_suffix(".html"): document.html(before)}
-    texts |= {pictures / name: chart for name, chart in charts.items()}
-    for file, text in texts.items():
-        with atomic_write(file) as stream:
-            stream.write(text.encode())
-    return list(texts)
+    return charts
 
 
 def _provenance(document: Document, lines: dict[str, list[dict]]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from fidsplat.experiments.angles import largest, parse_tilts
@@ -23,6 +23,10 @@ from fidsplat.vision.readers import TITLES
 
 # the detectors of each kind by how far they read on the ideal texture: the first that is there is shown
 _FURTHEST = {"apriltag": ("pupil", "aruco"), "qr": ("zxing-tall", "zxing", "cv2")}
+
+
+NEVER = 90.0
+"""degrees behind the ideal of what is not read at all"""
 
 
 class Scan(NamedTuple):
@@ -64,18 +68,39 @@ class Angles:
         there = self.names(4)
         return next((name for name in _FURTHEST[kind] if name in there), _FURTHEST[kind][0])
 
-    def behind(self, protocol: str, category: str, method: str, reader: str) -> list[float]:
-        """By how many degrees each marker's unbroken reading ends below that of the ideal texture, on the
-        tilts that both have; 90 where it never begins."""
+    def behind(self, protocol: str, category: str, method: str, reader: str, which: int) -> list[float]:
+        """By how many degrees each marker's largest tilt of reading (`which` 0), or the largest without a
+        miss (1), lies below that of the ideal texture, on the tilts that both have; `NEVER` where there is
+        none."""
         gaps = []
+        for tilts, ours, theirs in self._beside_ideal(protocol, category, method, reader):
+            own, ceiling = (largest(tilts, hits)[which] for hits in (ours, theirs))
+            if ceiling is not None:
+                gaps.append(NEVER if own is None else ceiling - own)
+        return gaps
+
+    def missed(
+        self, protocol: str, category: str, method: str, reader: str, less: float
+    ) -> tuple[int, int] | None:
+        """How many tilts are not read of those up to ``less`` degrees below the one to which the ideal
+        texture is read without a miss, and how many those are, over the markers; None where there is none."""
+        missed = total = 0
+        for tilts, ours, theirs in self._beside_ideal(protocol, category, method, reader):
+            ceiling = largest(tilts, theirs)[1]
+            if ceiling is not None:
+                below = [hit for tilt, hit in zip(tilts, ours, strict=True) if tilt <= ceiling - less + 1e-6]
+                missed, total = missed + below.count("0"), total + len(below)
+        return (missed, total) if total else None
+
+    def _beside_ideal(
+        self, protocol: str, category: str, method: str, reader: str
+    ) -> Iterator[tuple[list[float], str, str]]:
+        """Of each marker that the ideal has as well: the tilts that both have, and who reads them."""
         ideals = self.of(protocol, category, IDEAL, reader)
         for index, scan in self.of(protocol, category, method, reader).items():
-            if index not in ideals:
-                continue
-            ours, theirs = _common(scan, ideals[index])
-            if theirs is not None:
-                gaps.append(90.0 if ours is None else theirs - ours)
-        return gaps
+            if index in ideals:
+                both = sorted(set(scan.tilts) & set(ideals[index].tilts))
+                yield both, _at(scan, both), _at(ideals[index], both)
 
 
 def _size(line: dict) -> tuple[tuple, float]:
@@ -83,14 +108,9 @@ def _size(line: dict) -> tuple[tuple, float]:
     return (key["protocol"], key["category"], key["index"], key["method"]), len(parse_tilts(key["tilts"]))
 
 
-def _common(scan: Scan, ideal: Scan) -> tuple[float | None, float | None]:
-    both = sorted(set(scan.tilts) & set(ideal.tilts))
-
-    def unbroken(one: Scan) -> float | None:
-        at = dict(zip(one.tilts, one.read, strict=True))
-        return largest(both, "".join(at[tilt] for tilt in both))[1]
-
-    return unbroken(scan), unbroken(ideal)
+def _at(scan: Scan, tilts: list[float]) -> str:
+    read = dict(zip(scan.tilts, scan.read, strict=True))
+    return "".join(read[tilt] for tilt in tilts)
 
 
 def report_angles(document: Document, lines: Sequence[dict]) -> dict[str, str]:
@@ -111,7 +131,14 @@ def report_angles(document: Document, lines: Sequence[dict]) -> dict[str, str]:
             rows = _rows(angles, protocol, reader)
             if rows:
                 document.heading(f"{protocol}, {TITLES[reader]}", 4)
-                heads = ("category", "method", "markers", "found", "read", "read, behind the ideal: worst")
+                heads = (
+                    "category",
+                    "method",
+                    "markers",
+                    "found",
+                    "read",
+                    "read, behind the ideal: worst of each",
+                )
                 document.table(heads, rows)
         charts[f"angles-{protocol}.svg"] = _chart(angles, protocol)
         document.picture(f"angles-{protocol}.svg", f"Reading angles, {protocol}")
@@ -148,7 +175,10 @@ def _short(document: Document, angles: Angles, protocol: str) -> None:
 
 def _plain(values: list[float | None]) -> str:
     there = [value for value in values if value is not None]
-    return NOTHING if not there else f"{sum(there) / len(there):.1f}"
+    if not there:
+        return "never" if values else NOTHING
+    never = f" ({len(values) - len(there)} of {len(values)} never)" if there != values else ""
+    return f"{sum(there) / len(there):.1f}{never}"
 
 
 def _rows(angles: Angles, protocol: str, reader: str) -> list[tuple[str, ...]]:
@@ -163,14 +193,17 @@ def _rows(angles: Angles, protocol: str, reader: str) -> list[tuple[str, ...]]:
                 pairs = [largest(*one) for one in hits]
                 single, unbroken = ([pair[k] for pair in pairs] for k in (0, 1))
                 cells.append(f"{mean_spread(single, 1, True)} / {mean_spread(unbroken, 1, True)}")
-            gaps = angles.behind(protocol, category, method, reader)
-            worst = NOTHING if not gaps or method == IDEAL else _gap(max(gaps))
+            gaps = [angles.behind(protocol, category, method, reader, which) for which in (0, 1)]
+            worst = NOTHING if method == IDEAL else " / ".join(map(gap_text, gaps))
             rows.append((category, method, str(len(scans)), *cells, worst))
     return rows
 
 
-def _gap(degrees: float) -> str:
-    return "not read frontally" if degrees >= 90 else f"{degrees:+.1f}"
+def gap_text(gaps: Sequence[float]) -> str:
+    """The worst of some degrees behind the ideal."""
+    if not gaps:
+        return NOTHING
+    return "not read frontally" if max(gaps) >= NEVER else f"{max(gaps):+.1f}"
 
 
 def _chart(angles: Angles, protocol: str) -> str:
@@ -181,7 +214,7 @@ def _chart(angles: Angles, protocol: str) -> str:
         for category in categories:
             reader = angles.furthest(CATEGORIES[category].kind)
             scans = angles.of(protocol, category, method, reader).values()
-            row.append(bar([largest(s.tilts, s.read)[1] for s in scans]))
+            row.append(bar([largest(s.tilts, s.read)[1] or 0.0 for s in scans]))
         if any(row):
             series[method] = row
     titles = [CATEGORIES[name].title for name in categories]

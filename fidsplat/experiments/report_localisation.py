@@ -53,7 +53,7 @@ def report_localisation(document: Document, lines: Sequence[dict]) -> dict[str, 
         shown = {name: row for name, row in series.items() if any(row)}
         if shown:
             file = f"localisation-{category}.svg"
-            title = f"{CATEGORIES[category].title}: error of position, mean over tilts and markers"
+            title = f"{CATEGORIES[category].title}: error of position, mean over tilts and markers where read"
             charts[file] = bar_chart(title, "mm", [f"{x:g} m" for x in distances], shown)
             document.picture(file, title)
     return charts

@@ -60,10 +60,11 @@ def report_views(document: Document, lines: Sequence[dict]) -> dict[str, str]:
     """Add table 4; returns charts, file name -> SVG."""
     views = Views(lines)
     document.heading("Table 4: novel views")
+    counted = {len(markers) for markers in views.found.values()}
     document.text(
         f"PSNR in dB / SSIM / LPIPS / FLIP, mean over {_list(views.views)} random views of each marker and "
-        "over the markers, 800 x 800, whole frame, 8 bits. LPIPS is measured with weights that the user "
-        "supplies (--lpips), FLIP where flip-evaluator is installed; '-' where not."
+        f"over {_list(counted)} markers of each category, 800 x 800, whole frame, 8 bits."
+        + _not_measured(views)
     )
     charts = {}
     for truth in (name for name in TRUTHS if name in views.names(0)):
@@ -100,6 +101,22 @@ def report_views(document: Document, lines: Sequence[dict]) -> dict[str, str]:
             "blend linear light and encode it as the last step (the sensor's response srgb)."
         )
     return charts
+
+
+def _not_measured(views: Views) -> str:
+    """What the columns of metrics lack, and what would fill them."""
+    needs = {
+        "lpips": "weights, which the user supplies (--lpips FILE.npz)",
+        "flip": "flip-evaluator (pip install 'fidsplat[experiments]')",
+    }
+    every = [means for markers in views.found.values() for means in markers.values()]
+    words = ""
+    for metric, need in needs.items():
+        there = sum(means[metric] is not None for means in every)
+        if there < len(every):
+            share = "not" if there == 0 else f"in {there} of {len(every)} parts"
+            words += f" {metric.upper()} was {share} measured ('-' where not): it needs {need}."
+    return words
 
 
 def _cell(views: Views, truth: str, category: str, method: str) -> str:

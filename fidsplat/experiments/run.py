@@ -122,8 +122,9 @@ def planned(names: Iterable[str], settings: Settings) -> Iterator[dict[str, Plan
 
 
 def _records(name: str, settings: Settings, renderer: Renderer | None) -> Records:
-    drawn = renderer is not None and name != counts.NAME
-    device = f"{renderer.device.title}, {renderer.device.version}" if drawn else None
+    device = None
+    if renderer is not None and name != counts.NAME:
+        device = f"{renderer.device.title}, {renderer.device.version}"
     versions = reader_versions() | (metric_versions() if name == views.NAME else {})
     return Records(settings.file(name), run_facts(name, device, settings.seed, versions), settings.anew)
 
@@ -138,10 +139,7 @@ def check(settings: Settings) -> None:
         raise InputError(f"--markers is {settings.markers}; each category has 1 to {MARKERS}")
     if settings.workers < 1:
         raise InputError(f"--workers is {settings.workers}; at least 1 thread looks at pictures")
-    if settings.trained is not None and not settings.trained.is_dir():
-        raise InputError(
-            f"{settings.trained} is not a folder; give one with 2dgs-17/small-0.ply and the like"
-        )
+    _check_trained(settings)
     if settings.blender is not None and not settings.blender.is_dir():
         raise InputError(
             f"{settings.blender} is not a folder; give the one that fidsplat experiment blender wrote"
@@ -151,6 +149,25 @@ def check(settings: Settings) -> None:
     if settings.tilts is not None:
         angles.parse_tilts(settings.tilts)
     method_names(settings.mixtures)
+
+
+def _check_trained(settings: Settings) -> None:
+    folder = settings.trained
+    if folder is None or settings.ideal_only:
+        return
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder; give one with 2dgs-17/small-0.ply and the like")
+    models = [method for method in settings.methods if method.startswith("2dgs-")]
+    if not models:
+        raise InputError(f"{folder} holds none of 2dgs-3, 2dgs-5, 2dgs-9 and 2dgs-17")
+    for model in models:
+        for category in chosen_categories(settings.categories):
+            for index in range(settings.marker_count):
+                file = folder / model / f"{category.name}-{index}.ply"
+                if not file.is_file():
+                    raise InputError(
+                        f"{file} is missing; --category and --markers leave out what was not trained"
+                    )
 
 
 def _work(name: str, settings: Settings) -> list[dict]:

@@ -80,7 +80,8 @@ def layered(renderer: Renderer, parts: Sequence[SplatCloud], camera: Camera) -> 
     """Clouds of one plane or one splat each, drawn together, and composited pixel by pixel from pictures of
     each alone, by their depths there (both (h, w, 3)). 0 where two depths agree to 1e-4.
     """
-    quality, outputs = Quality(transmittance_stop=0.0), ("rgb", "alpha", "depth")
+    # with a cut-off above 1/255 all that is drawn has a depth
+    quality, outputs = Quality(alpha_cutoff=1 / 250, transmittance_stop=0.0), ("rgb", "alpha", "depth")
     alone = [draw(renderer, Picture(part, camera, quality, outputs, (0, 0, 0))) for part in parts]
     whole = Picture(SplatCloud.concatenate(parts), camera, quality, outputs, (0, 0, 0))
     rgb, alpha, depth = (np.stack([frame[name] for frame in alone]) for name in outputs)

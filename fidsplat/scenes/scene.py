@@ -118,7 +118,7 @@ class Scene:
             raise InputError(f"outputs must be one or more names, not {self.outputs!r}")
         put(self, "outputs", outputs)
 
-    @property
+    @cached_property
     def motion(self) -> Motion:
         """What moves: the camera, markers by their labels (and whatever else has these), and clouds."""
         groups = {

@@ -52,6 +52,19 @@ def align(
     return found
 
 
+def fit(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> float:
+    """How well the pattern lies over the picture between these corners: their correlation, at most 1; -1
+    where that cannot be told. Arguments as of `align`."""
+    window = _window(grey, corners, bits, _LARGE)
+    if window is None:
+        return -1.0
+    picture, offset, shrink = window
+    start = (corners - offset) / shrink
+    model = _Model(bits, picture.shape, _module(start, bits))
+    smooth = cv2.GaussianBlur(picture, (0, 0), FINE_BLUR)
+    return model.correlation(smooth, _homography(_SQUARE, start), FINE_BLUR)
+
+
 def _settled(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> np.ndarray | None:
     window = _window(grey, corners, bits, _LARGE)
     if window is None:

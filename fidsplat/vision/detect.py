@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import zxingcpp
 
-from fidsplat.vision.align import align
+from fidsplat.vision.align import align, fit
 from fidsplat.vision.dictionaries import dictionary_bits, parse_family, predefined
 
 # One family for every grid that people print; with each, a random dark square reads as a tag less than once
@@ -67,32 +67,63 @@ def detect(image: np.ndarray, families: Iterable[str] | None = None, qr: bool = 
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if pixels.ndim == 3 else np.ascontiguousarray(pixels)
     found: list[Detection] = []
     for kind, family in dict.fromkeys(wanted):
-        found += [tag for tag in _tags(grey, kind, family) if not any(_same_place(tag, old) for old in found)]
+        found += [tag for tag in _tags(grey, kind, family) if not _known(tag, found)]
     return found + (_qr_codes(grey) if qr else [])
 
 
 def _tags(grey: np.ndarray, kind: str, family: str) -> list[Detection]:
     """Tags of one family, sorted by id."""
-    contours = cv2.aruco.DetectorParameters()
-    contours.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    found: list[Detection] = []
+    loose: list[Detection] = []
     # OpenCV's other way to squares, that of the AprilTag library, bridges a hair across the white ring, which
     # opens a contour; at half size, where it costs no more than the first and small tags are the first one's
-    segments = cv2.aruco.DetectorParameters()
-    segments.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
-    segments.aprilTagQuadDecimate = 2.0
-    found: list[Detection] = []
-    for parameters in (contours, segments):
-        detector = cv2.aruco.ArucoDetector(predefined(kind, family), parameters)
-        quads, ids, _ = detector.detectMarkers(grey)
-        for quad, tag_id in zip(quads, [] if ids is None else ids.ravel(), strict=True):
-            # OpenCV counts from the centre of the first pixel
-            rough = quad.reshape(4, 2).astype(np.float64) + 0.5
-            tag = Detection(kind, family, int(tag_id), None, rough)
-            if not any(_same_place(tag, old) for old in found):
-                # a dark line that touches a corner can pull it a module away
-                better = align(grey, rough, dictionary_bits(kind, family, int(tag_id)), unsure=range(4))
-                found.append(tag if better is None else replace(tag, corners=better))
+    for refinement, decimate in (
+        (cv2.aruco.CORNER_REFINE_SUBPIX, 0.0),
+        (cv2.aruco.CORNER_REFINE_APRILTAG, 2.0),
+    ):
+        _read_tags(grey, kind, family, refinement, decimate, found, loose)
+    if any(not _known(tag, found) for tag in loose):
+        # A contour becomes four points to within 3 % of its length: on a steep tag several corners lie
+        # modules away along the long sides, where no window around them reaches the true ones. Lines through
+        # the sides do, but a dark line that touches the tag turns them.
+        _read_tags(grey, kind, family, cv2.aruco.CORNER_REFINE_CONTOUR, 0.0, found, loose)
+    # the pattern settles from none of the corners: those that it fits best
+    bits = {tag.id: dictionary_bits(kind, family, int(tag.id or 0)) for tag in loose}
+    for tag in sorted(loose, key=lambda tag: -fit(grey, tag.corners, bits[tag.id])):
+        if not _known(tag, found):
+            found.append(tag)
     return sorted(found, key=lambda tag: tag.id or 0)
+
+
+def _read_tags(
+    grey: np.ndarray,
+    kind: str,
+    family: str,
+    refinement: int,
+    decimate: float,
+    found: list[Detection],
+    loose: list[Detection],
+) -> None:
+    """Adds the tags that OpenCV reads with this refinement of its corners and that are not found yet: to
+    `found` with corners on which their pattern settles, else to `loose` with OpenCV's own."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = refinement
+    parameters.aprilTagQuadDecimate = decimate
+    quads, ids, _ = cv2.aruco.ArucoDetector(predefined(kind, family), parameters).detectMarkers(grey)
+    for quad, tag_id in zip(quads, [] if ids is None else ids.ravel(), strict=True):
+        # OpenCV counts from the centre of the first pixel
+        rough = quad.reshape(4, 2).astype(np.float64) + 0.5
+        tag = Detection(kind, family, int(tag_id), None, rough)
+        if not _known(tag, found):
+            # a dark line that touches a corner can pull it a module away
+            better = align(grey, rough, dictionary_bits(kind, family, int(tag_id)), unsure=range(4))
+            (loose if better is None else found).append(
+                tag if better is None else replace(tag, corners=better)
+            )
+
+
+def _known(tag: Detection, found: Iterable[Detection]) -> bool:
+    return any(_same_place(tag, old) for old in found)
 
 
 def _same_place(one: Detection, other: Detection) -> bool:

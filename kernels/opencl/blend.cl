@@ -64,7 +64,7 @@ static inline void pixel_finish(Pixel *pixel, const BlendConstants *constants) {
 // Draws the fragment where `mask` is set.
 static inline void pixel_blend(Pixel *pixel, const Splat *s, Crossing c, vint mask, vfloat screen,
                                const BlendConstants *constants) {
-//@@ reciprocal
+    vfloat inverse_d = 1.0f / c.d;
     vfloat opacity = fragment_opacity(s, fragment_half_rho(s, c, inverse_d, screen), constants->ceiling);
 //@@ footprint_opacity
     const Seen seen = see(s, c, inverse_d);

@@ -22,7 +22,7 @@ SHAPE = DeviceShape("lanes", "ordered", 16, 16, 16, 8, 11, 1, True)
 GROUP = DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, 1024, True)
 TAPS = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
-DIGESTS = ["e6a7ea0cbcb68970", "552744e49b05e8d5"]
+DIGESTS = ["9c907ba55001a9b6", "04793b83405177e4"]
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The low-pass `pixel`: every device against the reference, and what it promises."""
+"""The low-passes: every device against the reference, and what `pixel` promises."""
 
 import math
 
@@ -25,6 +25,32 @@ LENSES = {
     "panorama": fs.Camera.equirectangular(110, 55),
     "parallel": fs.Camera.orthographic(75, 62, 4.0),
 }
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+@pytest.mark.parametrize("place", ["ahead", "near", "aside"])
+def test_the_screen_dot_of_splats_about_as_wide_as_it(renderer, place, samples):
+    """Devices may pass over a dot that is never the larger weight, and over no other: splats of 0.5 to 4
+    pixels, tilted at will, in the middle of the view, close to the near plane, at the edge of the picture.
+    """
+    camera = fs.Camera.pinhole(61, 47, 40.0, 40.0, 30.0, 24.0)
+    generator = np.random.default_rng(5)
+    count = 120
+    depth = generator.uniform(*{"near": (0.011, 0.05)}.get(place, (1.0, 4.0)), count)
+    across = {"aside": (0.6, 0.9)}.get(place, (-0.6, 0.6))
+    means = np.column_stack([generator.uniform(*across, (count, 2)), np.ones(count)]) * depth[:, None]
+    widths = generator.uniform(0.5, 4.0, (count, 2)) * depth[:, None] / 40.0
+    quats = generator.normal(size=(count, 4))
+    colors = generator.uniform(0, 1, (count, 3))
+    cloud = fs.SplatCloud(means, quats, widths, generator.uniform(0.2, 1.0, count), colors=colors)
+    # one by one: none hides behind another
+    for one in range(0, count, 6):
+        shown = np.arange(one, one + 3)
+        few = fs.SplatCloud(
+            means[shown], quats[shown], widths[shown], cloud.opacities[shown], colors=colors[shown]
+        )
+        assert_agrees(renderer, few, camera, quality=fs.Quality(samples=samples))
+    assert_agrees(renderer, cloud, camera, quality=fs.Quality(samples=samples))
 
 
 @pytest.mark.parametrize("scale", [(1e-6, 1e-2), (1e-3, 2.0), (1e-3, 50.0)])

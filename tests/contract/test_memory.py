@@ -71,7 +71,7 @@ def whole(opencl, cloud):
     return {name: frame[name] for name in frame}, dict(frame.stats)
 
 
-@pytest.mark.parametrize("mebibytes", [3.5, 4, 4.75])
+@pytest.mark.parametrize("mebibytes", [3.6, 4, 4.75])
 @pytest.mark.parametrize("streamed", [False, True])
 def test_little_memory_gives_the_same_bits(opencl, cloud, whole, mebibytes, streamed):
     """Chunks of splats, bands of rows, and a cloud that is copied chunk by chunk or stays where it is."""

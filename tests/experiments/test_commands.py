@@ -9,8 +9,10 @@ import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.commands.experiment import Experiment
 from fidsplat.experiments import angles
+from fidsplat.experiments import run as run_module
 from fidsplat.experiments.blender import check_pictures, note_pictures
 from fidsplat.experiments.records import read_lines
+from fidsplat.experiments.run import Settings
 from fidsplat.vision.images import write_png
 
 SMALL = ["--category", "apriltag", "--markers", "1"]
@@ -142,6 +144,8 @@ def test_scenes_for_trainers(capsys, tmp_path):
         (["blender", "--environment", "nowhere"], "fidsplat experiment blender --install"),
         (["blender", "--samples", "0"], "--samples at least 1"),
         (["blender", "--threads", "0"], "--threads is 0"),
+        (["views", "--trained", "."], "holds none of 2dgs-3, 2dgs-5, 2dgs-9 and 2dgs-17"),
+        (["localisation", "--category", "huge"], "localisation is of apriltag and small, not of huge"),
         (["views", "--blender", "nowhere"], "nowhere is not a folder; give the one that"),
         (["blender", "--view", "agx"], "unknown view 'agx'"),
         (["merge", "nowhere"], "no results of shards in nowhere"),
@@ -180,6 +184,16 @@ def test_what_is_wrong_with_the_last_experiment_is_told_before_the_first(capsys,
     assert "cut.npz is no .npz file with LPIPS weights" in err
     assert read_lines(tmp_path / "counts.jsonl") == []
     assert (tmp_path / "angles.jsonl").read_text() == old  # --anew drops nothing for it
+
+
+def test_trained_models_that_are_missing_are_told_before_the_work(capsys, tmp_path):
+    (tmp_path / "2dgs-9").mkdir()
+    (tmp_path / "2dgs-9" / "apriltag-0.ply").touch()
+    words = ("all", "--quick", "--trained", tmp_path, "-o", tmp_path / "out")
+    status, _, err = run(capsys, *words)
+    assert status == 2
+    assert "small-0.ply is missing; --category and --markers leave out" in err
+    run_module.check(Settings(tmp_path, categories=("apriltag",), markers=1, trained=tmp_path))
 
 
 def test_merge_tells_of_shards_that_are_missing(capsys, tmp_path):

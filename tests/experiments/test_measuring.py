@@ -210,7 +210,7 @@ def test_counts_of_a_marker_that_one_can_count():
 
 def test_gaussians_of_the_minimum_partition_by_the_rule_for_others():
     """The count for other partitions, applied to the minimum one, is the cloud's."""
-    for name in ("paper", "fitted"):
+    for name in mixtures():
         made = fs.marker("qr-v2-L:count me", mixture=name)
         assert counts._gaussians(name, made.boxes) == len(made.cloud)
 

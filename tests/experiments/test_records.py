@@ -120,9 +120,8 @@ def test_merging_one_machine_after_the_other_loses_nothing_and_says_what_differs
     target = tmp_path / "counts.jsonl"
     for number, device in enumerate((None, "a device", "another")):
         file = tmp_path / f"counts-{number + 1}-of-4.jsonl"
-        list(
-            Records(file, facts(device=device)).measure([WORK[0], WORK[number]], lambda part: {"by": number})
-        )  # noqa: B023
+        records, by = Records(file, facts(device=device)), {"by": number}
+        list(records.measure([WORK[0], WORK[number]], lambda part, by=by: by))
         joined = merge([file], target)
         assert joined == (number + 1, 0, ("device",) if number == 2 else ())
     # a shard that was measured anew replaces what was merged of it before

@@ -114,9 +114,15 @@ def test_the_report_says_what_was_measured(results):
     assert row_of(text, "small", "fitted/best")[3:] == [
         "84.0 ± 0.0 / 84.0 ± 0.0",
         "82.0 ± 1.4 / 40.5 ± 57.3",
-        "+83.0",
+        "+1.0 / +83.0",
     ]
-    assert row_of(text, "huge", "fitted/best")[4:] == ["never / never", "not read frontally"]
+    assert row_of(text, "huge", "fitted/best")[4:] == [
+        "never / never",
+        "not read frontally / not read frontally",
+    ]
+    assert row_of(text, "QR Huge", "84.0 82.2")[2:4] == ["84.0 83.0", "84.0 never"]
+    assert "LPIPS was not measured ('-' where not): it needs weights, which the user supplies" in text
+    assert "FLIP was not" not in text
     assert "31.50 / 0.980 / - / 0.050" in text
     assert row_of(text, "1 m, 0 deg")[1] == "0.500 / 0.100 / 0.020 (1 of 2)"
     assert row_of(text, "QR Huge", "7.0 + 8.0")[2:] == ["5000.0 + 6000.0", "300.0 + 200.0", "60.0 + 40.0"]
@@ -130,14 +136,27 @@ def test_targets_are_judged(results):
     def verdict(what: str) -> list[str]:
         return row_of(text, what)[2:]
 
-    gap = "zxing-tall, fixed-module: behind the ideal"
-    assert verdict(f"fitted/best, small, {gap}") == ["83.0 deg, worst of 2", "no"]
-    assert verdict(f"fitted/best, huge, {gap}") == ["not read frontally", "no"]
+    gap = "zxing-tall, fixed-module: behind the ideal, largest / without a miss"
+    assert verdict(f"fitted/best, small, {gap}") == ["+1.0 / +83.0 deg, worst of 2", "no"]
+    assert verdict(f"fitted/best, huge, {gap}")[-1] == "no"
+    # the ideal reads to 82 and 83: of the 6 and 7 tilts to one degree below, one is missed
+    missed = "fixed-module: tilts missed below the ceiling"
+    assert verdict(f"fitted/best, small, {missed}") == ["zxing-tall 1 of 13", "no"]
+    assert verdict(f"fitted/best, huge, {missed}") == ["zxing-tall 7 of 7", "no"]
+    assert f"tilts of {TILTS}, 2 views" in text
+    verdicts = [row[-1] for row in rows_of(text) if row[-1].strip("| ") in ("yes", "no")]
+    reached = sum("yes" in verdict for verdict in verdicts)
+    assert f"{reached} of {len(verdicts)} are reached." in text
+    best = "fitted/best, small, fixed-module: largest tilt that is read, mean"
+    assert verdict(best) == ["82.0 deg (ideal: 82.5), mean of 2", "yes"]
     assert verdict("fitted/best above paper/screen, small, PSNR against exact")[-1] == "yes"
     assert "+5.50 dB (31.50 and 26.00)" in text
+    # 25.41 in the paper's table 4
+    own = verdict("fitted/best above the paper's own figure, small, PSNR against exact-linear")
+    assert own == ["+2.59 dB (28.00 and 25.41) (a perfect picture of display values: 33.00)", "no"]
     share = "fitted, huge: Gaussians of those of the paper's mixture"
-    assert verdict(share) == ["0.234, worst marker", "yes"]
-    assert verdict("fitted, QR Huge: construction") == ["0.200 s, mean of medians", "no"]
+    assert verdict(share) == ["0.234, worst of 2", "yes"]
+    assert verdict("fitted, QR Huge: construction") == ["0.200 s, median of the slowest of 2", "no"]
 
 
 class Tags(HTMLParser):
@@ -208,7 +227,34 @@ def test_the_scan_with_more_tilts_counts_and_gaps_use_common_tilts():
     ]
     angles = Angles(lines)
     assert len(angles.of("fixed-module", "small", "ideal", "zxing-tall")[0].tilts) == 86
-    assert angles.behind("fixed-module", "small", "fitted/best", "zxing-tall") == [0.0]
+    for which in (0, 1):
+        assert angles.behind("fixed-module", "small", "fitted/best", "zxing-tall", which) == [0.0]
+
+
+def test_a_hole_is_not_hidden_by_where_reading_ends():
+    lines = [
+        {"key": key, "result": result}
+        for key, result in (
+            scan("small", 0, "ideal", "1111100001", "0:81:9"),  # to 36 without a miss, 81 at most
+            scan("small", 0, "exact/best", "1111111110", "0:81:9"),
+            scan("small", 1, "ideal", "1111111110", "0:81:9"),
+            scan("small", 1, "exact/best", "1110111110", "0:81:9"),
+        )
+    ]
+    angles, about = Angles(lines), ("fixed-module", "small", "exact/best", "zxing-tall")
+    assert angles.behind(*about, 0) == [9, 0]
+    assert angles.behind(*about, 1) == [-36, 54]
+    assert angles.missed(*about, 0.0) == (1, 14)
+    assert angles.missed(*about, 0.2) == (1, 12)
+    assert angles.missed("fixed-plane", *about[1:], 0.2) is None
+
+
+def test_results_of_another_version_are_one_line(tmp_path):
+    (tmp_path / "views.jsonl").write_text('{"key": {"category": "small"}, "result": {}, "run": {}}\n')
+    with pytest.raises(
+        fs.InputError, match=r"of another version of fidsplat, they lack '\w+'; measure again"
+    ):
+        make_report([tmp_path], tmp_path)
 
 
 def test_without_the_apriltag_library_the_short_table_shows_opencv():

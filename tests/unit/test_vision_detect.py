@@ -7,7 +7,7 @@ from ideal_picture import draw, photographed, pose, qr_bits, turned
 
 from fidsplat.cameras import Camera
 from fidsplat.errors import InputError
-from fidsplat.vision.align import align
+from fidsplat.vision.align import align, fit
 from fidsplat.vision.detect import DEFAULT_FAMILIES, detect
 from fidsplat.vision.dictionaries import dictionary_bits, families, parse_family, predefined
 from fidsplat.vision.pose import marker_pose, pose_error
@@ -82,6 +82,33 @@ def test_a_steep_qr_code_is_read_by_stretching_the_picture(aside):
         for k in range(4)
     )
     assert best < 1.0
+
+
+# OpenCV's own corners are 2.5 px off here, more than a module of the short sides
+STEEP = Camera.look_at(
+    640, 480, 0.351, (-2.80253, -0.350656, -0.332148), (-0.0381, -0.0284, 0.0), (-0.196, 0.981, 0.3)
+)
+
+
+def test_a_steep_tags_corners_are_looked_for_in_more_than_one_way():
+    picture, corners = draw(dictionary_bits("apriltag", "36h11", 5), 0.16, STEEP.world_to_camera, STEEP)
+    (tag,) = detect(photographed(picture), ["36h11"], qr=False)
+    assert corner_error(tag.corners, corners) < 0.2
+
+
+def test_where_no_corners_settle_those_that_fit_best_are_given(monkeypatch):
+    bits = dictionary_bits("apriltag", "36h11", 5)
+    picture, corners = draw(bits, 0.16, STEEP.world_to_camera, STEEP)
+    grey, tried = photographed(picture), {}
+    monkeypatch.setattr("fidsplat.vision.detect.align", lambda *args, **more: None)
+    monkeypatch.setattr(
+        "fidsplat.vision.detect.fit", lambda *args: tried.setdefault(args[1].tobytes(), fit(*args))
+    )
+    (tag,) = detect(grey, ["36h11"], qr=False)
+    assert tag.name == "apriltag:36h11:5"
+    assert len(tried) > 1
+    assert tried[tag.corners.tobytes()] == max(tried.values())
+    assert fit(grey, corners, bits) > max(tried.values()) > fit(grey, np.roll(corners, 1, 0), bits)
 
 
 def test_one_square_is_given_once_and_in_the_family_named_first():

@@ -96,7 +96,7 @@ class OpenCLBackend:
             DeviceError: the compiler refuses; its log is in the message. Or the device has no float64 for
                 blending.
         """
-        if not self.info.float64 and "blend_double" in features.names:
+        if not self.info.float64 and "blend_double" in features.slots:
             raise DeviceError(
                 f"{self.info.title} has no float64 (cl_khr_fp64) for blend_precision='float64'; use "
                 "blend_precision='float32', or another device"

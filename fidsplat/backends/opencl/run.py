@@ -122,6 +122,8 @@ class Run:
         )
 
     def _uniforms(self, names: tuple[str, ...]) -> list[np.generic]:
+        if not names:  # of nearly all effects, several times a picture
+            return []
         numbers = [number for name in names for number in self.view.uniform(name)]
         return [number if isinstance(number, np.generic) else np.float32(number) for number in numbers]
 

@@ -233,9 +233,7 @@ def of_count(
     may, must = span.high > 0, span.low > 0
     off = np.where(may, doubt + np.where(must, 0, count), 0)
     # from where the light may have reached the stop to where it must have, whatever comes may be drawn or not
-    open_to = (span.front_high >= stop * (1 - STOP)) & (
-        span.front_low * (1 - span.high) <= stop * (1 + STOP)
-    )
+    open_to = (span.front_high >= stop * (1 - STOP)) & (span.front_low * (1 - span.high) <= stop * (1 + STOP))
     off = np.where(may & open_to & (stop > 0), count + doubt, off)
     return np.where(reordered, np.inf, off.sum(1))
 

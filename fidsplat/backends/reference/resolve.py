@@ -37,7 +37,7 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
     doubt = samples.get("certificate_planes", doubt)  # the other planes show one shot
     if "alpha" in features.names:
         out["alpha"] = 1 - t
-    told, unsure = samples["shown"], samples["shown_may_flip"].any(1)
+    told, unsure = samples["shown"], np.asarray(samples["shown_may_flip"].any(1))
     doubt_told = np.where(told, doubt, 0.0).sum(1)
     # of the ray through each sample, per metre of depth
     length = ray_lengths(samples["x"], samples["y"], view)

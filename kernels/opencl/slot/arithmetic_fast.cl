@@ -1,6 +1,7 @@
 // Shorter exponentials and logarithms than the library's, of sums and products that every device rounds alike: the same bits
 // wherever FMA is one operation, and bounds that hold everywhere. Over all arguments (tools/fast_bounds.py), in units of the
 // last place, with FMA / without: exp 1.98 / 2.26 of -87 to 0, log 0.89 / 1.07 of 2^-24 to 1; OpenCL promises 3 of its own.
+// Divisions have no substitute: CPUs have an instruction, and OpenCL promises 2.5 ulp of a GPU's.
 //@ arithmetic
 // e^x of x <= 0, as 2^k e^r with |r| <= ln(2) / 2; e^r by a polynomial of degree 5, 1 at 0, whose greatest relative error,
 // 9.2e-8, is the least possible. Below -87 it stays e^-87, 1.6e-38: further down the exponent's bits would run over.
@@ -35,8 +36,5 @@ static inline vfloat fast_log(vfloat x) {
 }
 //@ opacity
     return fmin(fast_exp(s->log_opacity - half_rho), (vfloat)ceiling);
-//@ reciprocal
-    // no substitute: CPUs divide in one instruction, GPUs as fast as the 2.5 ulp allow that OpenCL promises
-    vfloat inverse_d = 1.0f / c.d;
 //@ layer_tau
     vfloat tau = -fast_log(fmax(1.0f - opacity, (vfloat)0x1p-24f));
