@@ -91,6 +91,7 @@ _EFFECTS = (
     ),
     Effect("motion_groups", "slot/motion_groups.cl", inputs=("labels", "moving"), view_inputs=("moving",)),
     Effect("shutter_exposure", "slot/shutter_exposure.cl"),
+    Effect("shutter_rows", "slot/shutter_rows.cl"),
     Effect("color_rgb", "slot/color_rgb.cl", inputs=("colors",)),
     Effect("color_rgb_half", "slot/color_rgb_half.cl", inputs=("colors_half",)),
     Effect("color_sh", "slot/color_sh.cl", inputs=("sh",), parts=("sh_terms",)),

@@ -136,6 +136,8 @@ def select(
     layered = cloud.has_planes and quality.coplanar == "blend"
     # the splats of a plane arrive together because no other has their key
     key_bits = 32 if layered else quality.depth_key_bits
+    pinhole = camera is None or camera.lens is None
+    in_spheres = pinhole and cloud.footprint == "gaussian" and lowpass != "pixel"
     color = "color_rgb" if cloud.sh_degree < 0 else "color_sh"
     return FeatureSet(
         slots=(
@@ -151,6 +153,7 @@ def select(
             f"arithmetic_{'precise' if precision == 'float64' else quality.arithmetic}",
             *(("motion_groups",) if moving else ()),
             *(("shutter_exposure",) if exposed else ()),
+            *(("shutter_rows",) if exposed and in_spheres else ()),
             *(("blend_double",) if precision == "float64" else ()),
             *(("keys_short",) if key_bits < 32 else ()),
         ),

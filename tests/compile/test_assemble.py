@@ -227,6 +227,22 @@ def test_knobs_compile_and_run_with_every_output_and_none(renderer, name, output
     assert all(np.isfinite(frame[each]).all() for each in frame)
 
 
+def test_only_pictures_of_several_poses_seen_by_a_pinhole_are_culled_by_spheres():
+    lens = fs.Camera.fisheye(20, 20, 2.0)
+    for expected, footprint, quality, camera, exposed in (
+        (True, "gaussian", fs.Quality(), None, True),
+        (True, "gaussian", PLAIN, None, True),
+        (False, "gaussian", PLAIN, None, False),
+        (False, "gaussian", PLAIN, lens, True),
+        (False, "mixed", PLAIN, None, True),
+        (False, "box", PLAIN, None, True),
+        (False, "gaussian", fs.Quality(lowpass="pixel"), None, True),
+    ):
+        chosen = select(Cloud(footprint=footprint), ("rgb",), quality, camera, exposed=exposed)
+        assert ("shutter_rows" in chosen.names) == expected
+        assert ("reach * sqrt(fy" in assemble(chosen, SHAPE).text) == expected
+
+
 def test_pipelines_are_compiled_once(renderer):
     features = select(COLORS, ("rgb",), PLAIN)
     assert renderer.backend.pipeline(features) is renderer.backend.pipeline(features)

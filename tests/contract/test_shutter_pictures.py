@@ -2,6 +2,7 @@
 poses."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -130,6 +131,24 @@ def test_many_views_share_a_motion_and_a_shutter(renderer):
         assert all(np.array_equal(frame[name], single[name]) for name in outputs)
         single = renderer.render(scene, camera, outputs)
         assert all(np.array_equal(moved[name], single[name]) for name in outputs)
+
+
+@pytest.mark.parametrize("lowpass", ["screen", "none"])
+@pytest.mark.parametrize("samples", [1, 2])
+def test_what_bands_leave_out_by_its_sphere_draws_nothing_there(renderer, lowpass, samples):
+    """The same bits with and without `shutter_rows`: near, behind, large and far below a pixel."""
+    cloud = random_splats(3000, 11, depth=(-2.0, 6.0), scale=(1e-4, 1.0), across=2.0)
+    cloud = cloud.with_labels(np.arange(3000) % 7)
+    quality = Quality(lowpass=lowpass, samples=samples)
+    camera, shutter = CAMERAS["pinhole"], fs.Shutter(readout=0.5, rows_per_band=3)
+    view = exposed_view(camera, quality, cloud.origin, BACKGROUND, MOTION, shutter)
+    features = select(cloud, ALL_OUTPUTS, quality, camera, moving=True, exposed=True)
+    assert "shutter_rows" in features.names
+    without = replace(features, slots=tuple(name for name in features.slots if name != "shutter_rows"))
+    backend = renderer.backend
+    one, other = (backend.pipeline(each).render(backend.upload(cloud), view) for each in (features, without))
+    for name in ALL_OUTPUTS:
+        assert np.array_equal(one.read(name), other.read(name)), name
 
 
 def test_a_rolling_shutter_takes_each_row_at_its_own_time(renderer):

@@ -30,7 +30,8 @@ KNOWN = frozenset(
     | {"normal", "normal_world", "label", "splat_id", "blended"}
     | sensor.STEPS
     | lens.EFFECTS
-    | {"motion_groups", "shutter_exposure", "camera_orthographic"}
+    # shutter_rows changes no picture, and nothing here
+    | {"motion_groups", "shutter_exposure", "shutter_rows", "camera_orthographic"}
 )
 """effects that kernels/warp has"""
 # of these depend on an effect: a stage is compiled once for all feature sets that mean the same to it
