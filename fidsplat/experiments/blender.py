@@ -50,7 +50,7 @@ def check_pictures(folder: Path, view: str, seed: int, samples: int | None = Non
     """
     try:
         about = json.loads(_note(folder, view).read_text("utf-8"))
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return {}
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read {_note(folder, view)}: {error}") from error
