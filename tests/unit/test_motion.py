@@ -8,6 +8,7 @@ import pytest
 from agreement import random_splats
 
 import fidsplat as fs
+from fidsplat.backends.exposure import exposed_view
 from fidsplat.cameras.motion import between
 from fidsplat.rotations import quaternion_to_matrix
 from fidsplat.scenes import PlacedMarker
@@ -58,6 +59,26 @@ def test_when_rows_are_exposed():
     assert shutter.times(2.0) == pytest.approx([1.85, 1.95, 2.05, 2.15])
     assert fs.Shutter(time=3.0).bands(10) == [(0, 10, 3.0)]
     assert fs.Shutter().times(1.0) == [1.0]
+
+
+MOVING = fs.Motion(lambda time: np.eye(4), {1: lambda time: np.eye(4)})
+
+
+@pytest.mark.parametrize(
+    ("motion", "shutter", "shots"),
+    [
+        (MOVING, fs.Shutter(time=0.3, sub_poses=4, rows_per_band=2), 0),
+        (MOVING, fs.Shutter(exposure=0.1, sub_poses=1), 0),
+        (MOVING, fs.Shutter(readout=0.1, rows_per_band=48), 0),
+        (fs.Motion(), fs.Shutter(exposure=0.1, readout=0.1), 0),
+        (MOVING, fs.Shutter(exposure=0.1, sub_poses=2, readout=0.1, rows_per_band=40), 4),
+    ],
+)
+def test_a_shutter_that_does_nothing_is_none(motion, shutter, shots):
+    """One picture, without the code of several."""
+    camera = fs.Camera.pinhole(64, 48, 50, 50, 32, 24)
+    view = exposed_view(camera, fs.Quality(), np.zeros(3), (0.0, 0.0, 0.0), motion, shutter)
+    assert len(view.shots) == shots
 
 
 @pytest.mark.parametrize(
