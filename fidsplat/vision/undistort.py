@@ -45,8 +45,8 @@ def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
     """
     if isinstance(camera.lens, Orthographic):
         raise InputError(
-            "undistort: the camera's rays are parallel, so no pinhole has seen what it has; its picture is flat "
-            "as it is"
+            "undistort: the camera's rays are parallel, and no pinhole sees what they see; its picture is "
+            "flat as it is"
         )
     if image.shape[:2] != (camera.height, camera.width):
         raise InputError(
