@@ -61,6 +61,7 @@ def test_when_rows_are_exposed():
     assert fs.Shutter().times(1.0) == [1.0]
 
 
+TAG = fs.marker("aruco:4x4_50:7", size=0.2)
 MOVING = fs.Motion(lambda time: np.eye(4), {1: lambda time: np.eye(4)})
 
 
@@ -98,6 +99,11 @@ def test_a_shutter_that_does_nothing_is_none(motion, shutter, shots):
         (lambda: fs.Motion(groups={"tag": lambda t: np.eye(4)}), "the label 'tag' is no whole number"),
         (lambda: fs.Trajectory(["noon"], [np.eye(4)]), r"increasing numbers of seconds, not \['noon'\]"),
         (lambda: PlacedMarker(None, motion=np.eye(4)), "a marker's motion is .*function of the time"),
+        (lambda: fs.Scene(camera_motion=np.eye(4)), "must be a Trajectory or a function"),
+        (
+            lambda: fs.Scene(markers=[PlacedMarker(TAG, motion=lambda t: None)]).motion.groups_at(0.5),
+            "a marker's pose at 0.5 s must be a 4x4 matrix",
+        ),
         (lambda: fs.Scene(cloud_motions={0: np.eye(4)}), "cloud_motions must be"),
         (lambda: fs.Scene(cloud_motions={0: lambda t: np.eye(4)}), "no cloud 0; this scene has 0"),
         (lambda: fs.Motion(groups={1: lambda t: np.zeros((4, 4))}).groups_at(0), "label 1 at 0 s"),
