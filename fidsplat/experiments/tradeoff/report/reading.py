@@ -66,8 +66,8 @@ def _steadiness(results: Results, scenes: list[str]) -> str:
         words.append(f"{scene} {least} to {most} ms, median {fixed(results.base_ms(scene), 2)}")
     return (
         f"In the course of the run the base took {'; '.join(words)}. A delay of as many milliseconds for "
-        "both frames of a pair, as of a busy host, brings their ratio nearer to 1: a setting that was drawn at "
-        "such a time looks cheaper beside the others than it is."
+        "both frames of a pair, as of a busy host, brings their ratio nearer to 1: a setting that was drawn "
+        "at such a time looks cheaper beside the others than it is."
     )
 
 
