@@ -74,8 +74,3 @@ def load(kind: str) -> tuple[Setting, ...]:
     classes = json.loads(FILE.read_text("utf-8"))["classes"]
     rows = classes.get(kind, classes["cpu"])["settings"]
     return tuple(sorted((Setting(**row) for row in rows), key=lambda setting: setting.cost))
-
-
-def version() -> str:
-    """When and by what the table was made, as text."""
-    return json.dumps(json.loads(FILE.read_text("utf-8"))["made"], sort_keys=True)

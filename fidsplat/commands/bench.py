@@ -28,11 +28,11 @@ class Bench:
 
     HELP: ClassVar[str] = """Time frames of standard scenes on one device, or on several side by side.
 
-The devices draw the same frames in turn, with the cut-off and stop that all renderers share (1/255, 1e-4;
-`fidsplat tradeoff` prices others). For each scene: milliseconds per frame and per stage, what there was
-to draw, device memory, and how many times the device's measured floor that is. Without --scenes: tag,
-r100k_720p, r1m_1080p and tag_in_million, about a minute on two cores. A run that is stopped shows what it
-has.
+The devices draw the same frames in turn, with the cut-off and stop that all renderers share and in precise
+arithmetic (1/255, 1e-4; `fidsplat tradeoff` prices others). For each scene: milliseconds per frame and per
+stage, what there was to draw, device memory, and how many times the device's measured floor that is. Without
+--scenes: tag, r100k_720p, r1m_1080p and tag_in_million, about a minute on two cores. A run that is stopped
+shows what it has.
 
   tag             an AprilTag alone, 640 x 480
   r100k_720p      100,000 random splats, 1280 x 720

@@ -202,7 +202,8 @@ def _measure(
         return lambda part: localisation.measure_localisation(part, painter, seed, pool)
     if name == views.NAME:
         perceptual = None if settings.lpips is None else load_lpips(settings.lpips)
+        kept = views.Kept()
         return lambda part: views.measure_views(
-            part, painter, seed, settings.blender_folder, pool, perceptual
+            part, painter, seed, settings.blender_folder, pool, perceptual, kept
         )
     return lambda part: angles.measure_angles(part, painter, seed, pool, settings.workers)

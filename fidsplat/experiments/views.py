@@ -4,14 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.errors import InputError
 from fidsplat.experiments.blender import VIEW_NAMES, novel_picture
-from fidsplat.experiments.methods import IDEAL, Painter, in_linear_light, plain_marker, with_linear_light
+from fidsplat.experiments.methods import (
+    IDEAL,
+    Draw,
+    Painter,
+    in_linear_light,
+    plain_marker,
+    with_linear_light,
+)
 from fidsplat.experiments.plane import from_srgb, plane_picture, srgb
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS, TEST_VIEWS, Category, novel_cameras
 from fidsplat.vision.images import read_image, to_uint8
@@ -71,6 +80,26 @@ def views_work(
     return work
 
 
+class Kept:
+    """8-bit pictures that the parts after this one need again."""
+
+    def __init__(self) -> None:
+        self._about: dict[str, tuple] = {}
+        self._pictures: dict[str, dict[int, np.ndarray]] = {}
+        self._lock = Lock()  # truths are made by the threads that look at pictures
+
+    def get(self, kind: str, about: tuple, number: int, make: Callable[[], np.ndarray]) -> np.ndarray:
+        """Picture `number` of what `about` names, made if it is not there; of each kind one thing is kept."""
+        with self._lock:
+            if self._about.get(kind) != about:
+                self._about[kind], self._pictures[kind] = about, {}
+            there = self._pictures[kind]
+        picture = there.get(number)
+        if picture is None:
+            picture = there[number] = to_uint8(make())
+        return picture
+
+
 def measure_views(
     part: dict,
     painter: Painter,
@@ -78,8 +107,13 @@ def measure_views(
     blender: Path,
     pool: ThreadPoolExecutor,
     lpips: Perceptual | None = None,
+    kept: Kept | None = None,
 ) -> dict:
     """Compare one marker's pictures, in 8 bits, with the truth.
+
+    Args:
+        kept: the same for all parts of a run: a method's pictures are drawn once for all truths, which follow
+            one another, and a marker's exact truths once for all methods.
 
     Returns `psnr` (dB), `ssim`, `flip` and `lpips`: a number for each view; None for a metric that cannot be
     measured here, and for the PSNR of equal pictures.
@@ -87,17 +121,28 @@ def measure_views(
     category = CATEGORIES[part["category"]]
     spec = category.spec(part["index"], seed)
     module = PROTOCOLS["fixed-plane"].module(plain_marker(spec).grid.shape[0])
-    draw = painter.open(part["method"], f"{category.name}-{part['index']}", spec, module)
+    kept = kept or Kept()
+    marker = (part["category"], part["index"], seed)
+    opened: list[Draw] = []
+
+    def draw(camera: Camera) -> np.ndarray:
+        if not opened:
+            name = f"{category.name}-{part['index']}"
+            opened.append(painter.open(part["method"], name, spec, module))
+        return opened[0](camera)
+
+    def true(number: int, camera: Camera) -> np.ndarray:
+        kind = part["truth"]
+        if kind.startswith("exact"):
+            return kept.get(kind, marker, number, lambda: exact_view(spec, camera, kind == "exact-linear"))
+        view = kind.removeprefix("blender-")
+        return read_image(novel_picture(blender, view, category.name, part["index"], number))[:, :, 0]
 
     def compare(number: int, camera: Camera, picture: np.ndarray) -> dict[str, float | None]:
-        if part["truth"].startswith("exact"):
-            truth = exact_view(spec, camera, part["truth"] == "exact-linear")
-        else:
-            view = part["truth"].removeprefix("blender-")
-            truth = read_image(novel_picture(blender, view, category.name, part["index"], number))[:, :, 0]
-            if truth.shape != picture.shape:
-                raise InputError(f"the Blender pictures in {blender} have another size; render them again")
-        ours, theirs = to_uint8(picture) / 255.0, to_uint8(truth) / 255.0
+        truth = true(number, camera)
+        if truth.shape != picture.shape:
+            raise InputError(f"the Blender pictures in {blender} have another size; render them again")
+        ours, theirs = picture / 255.0, to_uint8(truth) / 255.0
         ratio = psnr(ours, theirs)
         found = {"psnr": None if np.isinf(ratio) else ratio, "ssim": ssim(ours, theirs)}
         if part["flip"]:
@@ -107,7 +152,11 @@ def measure_views(
         return found
 
     cameras = novel_cameras(category, part["index"], seed)[: part["views"]]
-    waiting = [pool.submit(compare, i, camera, draw(camera)) for i, camera in enumerate(cameras)]
+    about = (*marker, part["method"])
+    waiting = [
+        pool.submit(compare, i, camera, kept.get("drawn", about, i, partial(draw, camera)))
+        for i, camera in enumerate(cameras)
+    ]
     measured = [future.result() for future in waiting]
     names = ("psnr", "ssim", "flip", "lpips")
     return {name: [one[name] for one in measured] if name in measured[0] else None for name in names}

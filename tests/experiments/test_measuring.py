@@ -146,6 +146,29 @@ def test_views_of_the_ideal_texture(pool, tmp_path):
     assert all(30 < value < 36 for value in linear["psnr"])
 
 
+def test_pictures_are_drawn_once_for_all_truths(pool, tmp_path):
+    """And what is kept is the right marker's, method's and truth's."""
+    drawn = []
+
+    class Counting(Painter):
+        def open(self, method, name, spec, module):
+            draw = super().open(method, name, spec, module)
+
+            def counted(camera):
+                drawn.append(name)
+                return draw(camera)
+
+            return counted
+
+    kept = views.Kept()
+    for index, truths in ((0, ("exact", "exact-linear", "exact")), (1, ("exact-linear", "exact"))):
+        for truth in truths:
+            part = part_of(IDEAL, truth) | {"index": index}
+            alone = views.measure_views(part, CEILING, 0, tmp_path, pool)
+            assert views.measure_views(part, Counting(None), 0, tmp_path, pool, kept=kept) == alone
+    assert drawn == ["small-0", "small-0", "small-1", "small-1"]
+
+
 def test_views_by_the_renderer_with_every_metric(renderer, pool, tmp_path):
     part = part_of("fitted/best", "exact")
     found = views.measure_views(

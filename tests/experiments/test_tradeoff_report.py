@@ -172,6 +172,7 @@ def test_the_report_says_what_the_numbers_say(capsys, tmp_path):
         "**Waste**: transmittance_stop 0.",
         "**No difference** on any scene: setup_precision float32.",
         "alpha_cutoff 1/1024 (r100k_720p +25 %, error / 13; hard +25 %, error / 13)",
+        "the base took r100k_720p 10.00 to 10.00 ms, median 10.00; hard 10.00 to 10.00 ms, median 10.00.",
         "| hard | at gsplat's error at least as fast | 0.900 of its time | transmittance_stop 1/512 | yes |",
         "| hard | in gsplat's time 10 times as accurate | 20 times | tile_size 16 | yes |",
         "on random scenes: alpha_cutoff 1/1024 (r100k_720p +25 %, error 0.0015)",
@@ -196,6 +197,14 @@ def test_what_is_free_on_one_scene_and_bought_on_another_is_worth_turning():
         "**Worth turning** for accuracy: alpha_cutoff 1/1024 (r100k_720p +25 %, error / 13; hard +0.0 %, "
         "error / 13); "
     ) in document.markdown()
+
+
+def test_a_run_that_was_disturbed_says_so():
+    lines = plain_lines("hard")
+    lines[3]["result"]["base_ms"] = 17.0  # a busy host, and the base beside itself was drawn at another time
+    document = Document("t")
+    report_reading(document, Results("d", lines))
+    assert "the base took hard 10.00 to 17.00 ms, median 10.00." in document.markdown()
 
 
 def test_a_preset_is_what_it_says_today(monkeypatch):

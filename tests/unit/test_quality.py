@@ -108,3 +108,12 @@ def test_a_marker_takes_from_a_quality_what_it_does_not_say():
         fs.marker("apriltag:36h11:5", mixture="paper", template=9)
     with pytest.raises(fs.InputError, match="MarkerQuality"):
         fs.marker("apriltag:36h11:5", quality=fs.Quality())  # type: ignore[arg-type]
+
+
+def test_numbers_of_numpy_are_numbers_and_truth_values_are_not():
+    made = fs.Quality(alpha_cutoff=np.float32(0.25), samples=np.int64(2), tile_size=np.int32(16))
+    assert made == fs.Quality(alpha_cutoff=0.25, samples=2, tile_size=16)
+    assert {type(made.alpha_cutoff), type(made.samples), type(made.tile_size)} == {float, int}
+    for knob in ("samples", "opacity_ceiling"):
+        with pytest.raises(fs.InputError, match=f"{knob} is True"):
+            fs.Quality(**{knob: True})

@@ -22,17 +22,17 @@ then several together, and has its price beside it: what it saves of a frame's t
 picture is wrong for it.
 
 Every setting draws in turn with the base (`alpha_cutoff` 1/255, `transmittance_stop` 1e-4, inclusive stop, no
-ceiling, float32), frame by frame in the same run, splats resident, picture left on the device; "time" is the
-median over the pairs of frames of the ratio of the two, so that what slows the machine slows both. Errors
-are of rgb (peak 1), against the same splats drawn on the same device at full precision: blended in float64
-(by OpenCL on the processor where the device cannot), nothing cut off above 1e-8, no stop, no ceiling. That
-truth is itself checked, at pixels drawn by lot, against the NumPy reference. Low-pass, samples per pixel and
-the rule for coplanar splats say what a picture *is*; a setting that changes one of them is compared with the
-truth of its own definition (marked *), never with the base's. Markers are also compared with the ideal
-printed texture, each pixel its exact mean. "Beyond certificates": at most the largest error when each pixel
-may be off by its certificate, what float32 may change in it because a decision lies within rounding of its
-threshold; the reference gives it for the pixels with the largest errors, all others count whole. FLIP is of
-the middle 256 x 256 pixels, of the hard cases of the whole picture."""
+ceiling, float32, the library's exponentials), frame by frame in the same run, splats resident, picture left
+on the device; "time" is the median over the pairs of frames of the ratio of the two, so that what slows the
+machine by a factor slows both. Errors are of rgb (peak 1), against the same splats drawn on the same device
+at full precision: blended in float64 (by OpenCL on the processor where the device cannot), nothing cut off
+above 1e-8, no stop, no ceiling. That truth is itself checked, at pixels drawn by lot, against the NumPy
+reference. Low-pass, samples per pixel and the rule for coplanar splats say what a picture *is*; a setting
+that changes one of them is compared with the truth of its own definition (marked *), never with the base's.
+Markers are also compared with the ideal printed texture, each pixel its exact mean. "Beyond certificates": at
+most the largest error when each pixel may be off by its certificate, what float32 may change in it because a
+decision lies within rounding of its threshold; the reference gives it for the pixels with the largest errors,
+all others count whole. FLIP is of the middle 256 x 256 pixels, of the hard cases of the whole picture."""
 
 
 def write_report(folders: Sequence[Path], out: Path) -> list[Path]:

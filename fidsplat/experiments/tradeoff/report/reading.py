@@ -9,7 +9,7 @@ from fidsplat.experiments.figures import NOTHING
 from fidsplat.experiments.tradeoff.points import ALONE, PRESETS_KNOB
 from fidsplat.experiments.tradeoff.report import verdicts
 from fidsplat.experiments.tradeoff.report.results import Measured, Results
-from fidsplat.experiments.tradeoff.report.wording import listed, number, percent
+from fidsplat.experiments.tradeoff.report.wording import fixed, listed, number, percent
 from fidsplat.experiments.tradeoff.scenes import HARD, is_marker
 
 GSPLAT = (PRESETS_KNOB, "gsplat")
@@ -50,11 +50,25 @@ def report_reading(document: Document, results: Results) -> None:
         "that buy accuracy on some scenes and have it free on the others, first those whose error falls most "
         "for the time."
     )
+    document.text(_steadiness(results, scenes))
     rows = [
         (_words(results, setting), *(by_scene.get(scene, NOTHING) for scene in scenes))
         for setting, by_scene in found.items()
     ]
     document.table(("setting", *scenes), rows)
+
+
+def _steadiness(results: Results, scenes: list[str]) -> str:
+    """How long the base took at different times of a run: the base beside itself shows one moment."""
+    words = []
+    for scene in scenes:
+        least, most = (fixed(ms, 2) for ms in results.base_range(scene))
+        words.append(f"{scene} {least} to {most} ms, median {fixed(results.base_ms(scene), 2)}")
+    return (
+        f"In the course of the run the base took {'; '.join(words)}. A delay of as many milliseconds for "
+        "both frames of a pair, as of a busy host, brings their ratio nearer to 1: a setting that was drawn "
+        "at such a time looks cheaper beside the others than it is."
+    )
 
 
 def _verdicts(results: Results, scenes: list[str]) -> dict[tuple[str, str], dict[str, str]]:

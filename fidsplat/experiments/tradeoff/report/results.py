@@ -135,6 +135,11 @@ class Results:
         """Milliseconds of the base: the median over all settings that it was drawn beside."""
         return statistics.median(point.result["base_ms"] for point in self.of(scene))
 
+    def base_range(self, scene: str) -> tuple[float, float]:
+        """`base_ms` of the setting beside which the base was the fastest, and the slowest."""
+        times = [point.result["base_ms"] for point in self.of(scene)]
+        return min(times), max(times)
+
     def angle(self, marker: str, knob: str, value: str) -> float | None:
         """The largest tilt up to which every tilt of the scan is read, degrees; None if it was not scanned
         or is not read frontally."""
