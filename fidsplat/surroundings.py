@@ -85,9 +85,11 @@ class Panorama:
                 f"background: a panorama of {width} x {height} pixels; 2 to {MAX_PANORAMA} a side can be used"
             )
         whole = np.iinfo(given.dtype).max if given.dtype in (np.uint8, np.uint16) else 1
-        image = np.array(given, np.float32, order="C") / np.float32(whole)
+        with np.errstate(over="ignore"):  # what float32 cannot hold is told below
+            image = np.array(given, np.float32, order="C") / np.float32(whole)
         if not np.isfinite(image).all():
-            raise InputError("background: the panorama holds numbers that are not finite")
+            which = f"the panorama {self.file}" if self.file else "the panorama"
+            raise InputError(f"background: {which} holds numbers that are not finite; replace them")
         image.flags.writeable = False
         object.__setattr__(self, "image", image)
 

@@ -91,6 +91,7 @@ class Scene:
     def __post_init__(self) -> None:
         put = object.__setattr__
         put(self, "clouds", _all_of(self.clouds, SplatCloud, "clouds"))
+        Motion(self.camera_motion)  # which is refused here rather than when the scene is drawn
         moving = self.cloud_motions
         if not isinstance(moving, Mapping) or not all(map(callable, moving.values())):
             raise InputError(
@@ -176,7 +177,9 @@ class Scene:
 
 def _moved_from(start: np.ndarray, motion: Pose, time: float) -> np.ndarray:
     """The motion of the world that takes a marker from its pose to where it is then."""
-    return np.asarray(motion(time), np.float64) @ np.linalg.inv(start)
+    pose = motion(time)
+    check_similarity(pose, f"a marker's pose at {time:g} s", rigid=True)
+    return np.asarray(pose, np.float64) @ np.linalg.inv(start)
 
 
 def _all_of(values: Iterable, kind: type, name: str) -> tuple:

@@ -5,7 +5,7 @@ import math
 import cv2
 import numpy as np
 
-from fidsplat.cameras import Camera, focal_length, look_at_matrix
+from fidsplat.cameras import Camera, Orthographic, focal_length, look_at_matrix
 from fidsplat.errors import InputError
 
 MAX_FIELD = math.radians(150)
@@ -40,8 +40,14 @@ def undistort(image: np.ndarray, camera: Camera, pinhole: Camera) -> np.ndarray:
         pinhole: its pose may turn, so that a flat picture shows what lies at the side of a fisheye's.
 
     Raises:
-        InputError: the picture has another size than the camera's, or the pinhole stands elsewhere.
+        InputError: the picture has another size than the camera's, the pinhole stands elsewhere, or the
+            camera's rays are parallel.
     """
+    if isinstance(camera.lens, Orthographic):
+        raise InputError(
+            "undistort: the camera's rays are parallel, and no pinhole sees what they see; its picture is "
+            "flat as it is"
+        )
     if image.shape[:2] != (camera.height, camera.width):
         raise InputError(
             f"the picture has {image.shape[1]} x {image.shape[0]} pixels, but its camera {camera.width} x "

@@ -66,6 +66,7 @@ def test_sensors_that_cannot_be(values, words):
         (lambda: fs.Panorama(np.zeros((4, 4))), r"must be \(h, w, 3\)"),
         (lambda: fs.Panorama(np.zeros((1, 4, 3))), "4 x 1 pixels"),
         (lambda: fs.Panorama(np.full((4, 4, 3), np.nan)), "not finite"),
+        (lambda: fs.Panorama(np.full((4, 4, 3), 1e300), "sky.tiff"), "sky.tiff holds numbers .* not finite"),
         (lambda: fs.Panorama.load("nowhere.png"), "nowhere.png"),
         (lambda: fs.Scene(fog=0.2), "fog must be a Fog"),
         (lambda: fs.Scene(sensor="srgb"), "sensor must be a Sensor"),

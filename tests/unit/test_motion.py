@@ -8,6 +8,7 @@ import pytest
 from agreement import random_splats
 
 import fidsplat as fs
+from fidsplat.backends.exposure import exposed_view
 from fidsplat.cameras.motion import between
 from fidsplat.rotations import quaternion_to_matrix
 from fidsplat.scenes import PlacedMarker
@@ -60,6 +61,27 @@ def test_when_rows_are_exposed():
     assert fs.Shutter().times(1.0) == [1.0]
 
 
+TAG = fs.marker("aruco:4x4_50:7", size=0.2)
+MOVING = fs.Motion(lambda time: np.eye(4), {1: lambda time: np.eye(4)})
+
+
+@pytest.mark.parametrize(
+    ("motion", "shutter", "shots"),
+    [
+        (MOVING, fs.Shutter(time=0.3, sub_poses=4, rows_per_band=2), 0),
+        (MOVING, fs.Shutter(exposure=0.1, sub_poses=1), 0),
+        (MOVING, fs.Shutter(readout=0.1, rows_per_band=48), 0),
+        (fs.Motion(), fs.Shutter(exposure=0.1, readout=0.1), 0),
+        (MOVING, fs.Shutter(exposure=0.1, sub_poses=2, readout=0.1, rows_per_band=40), 4),
+    ],
+)
+def test_a_shutter_that_does_nothing_is_none(motion, shutter, shots):
+    """One picture, without the code of several."""
+    camera = fs.Camera.pinhole(64, 48, 50, 50, 32, 24)
+    view = exposed_view(camera, fs.Quality(), np.zeros(3), (0.0, 0.0, 0.0), motion, shutter)
+    assert len(view.shots) == shots
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -77,6 +99,11 @@ def test_when_rows_are_exposed():
         (lambda: fs.Motion(groups={"tag": lambda t: np.eye(4)}), "the label 'tag' is no whole number"),
         (lambda: fs.Trajectory(["noon"], [np.eye(4)]), r"increasing numbers of seconds, not \['noon'\]"),
         (lambda: PlacedMarker(None, motion=np.eye(4)), "a marker's motion is .*function of the time"),
+        (lambda: fs.Scene(camera_motion=np.eye(4)), "must be a Trajectory or a function"),
+        (
+            lambda: fs.Scene(markers=[PlacedMarker(TAG, motion=lambda t: None)]).motion.groups_at(0.5),
+            "a marker's pose at 0.5 s must be a 4x4 matrix",
+        ),
         (lambda: fs.Scene(cloud_motions={0: np.eye(4)}), "cloud_motions must be"),
         (lambda: fs.Scene(cloud_motions={0: lambda t: np.eye(4)}), "no cloud 0; this scene has 0"),
         (lambda: fs.Motion(groups={1: lambda t: np.zeros((4, 4))}).groups_at(0), "label 1 at 0 s"),
