@@ -147,6 +147,18 @@ def test_the_cheapest_invisible_error_is_the_cheapest_on_all_scenes():
     assert verdicts.cheapest_within(Results("d", lines), ("hard",), 1e-9) is None
 
 
+def test_on_a_gpu_what_delays_both_frames_makes_nothing_cheaper():
+    lines = plain_lines("hard")
+    slow = next(line for line in lines if line["key"]["value"] == "1/1024")
+    ratio = slow["result"]["ratio"]
+    slow["result"] |= {"base_ms": 2 * slow["result"]["base_ms"], "ratio": (1 + ratio) / 2}
+    for kind, wanted in (("cpu", (1 + ratio) / 2), ("gpu", ratio)):
+        for line in lines:
+            line["run"]["kind"] = kind
+        results = Results("d", lines)
+        assert results.cost(results.at("hard", "alpha_cutoff", "1/1024")) == pytest.approx(wanted)
+
+
 def test_the_report_says_what_the_numbers_say(capsys, tmp_path):
     write(tmp_path / "cpu", [*plain_lines("hard"), *plain_lines("r100k_720p"), *marker_lines()])
     gpu = {"device": "A card, driver 2", "title": "A card", "kind": "gpu"}

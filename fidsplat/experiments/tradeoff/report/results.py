@@ -140,6 +140,13 @@ class Results:
         times = [point.result["base_ms"] for point in self.of(scene)]
         return min(times), max(times)
 
+    def cost(self, point: Measured) -> float:
+        """Its time over the base's, for comparing settings with each other. A GPU's host delays both frames of
+        a pair by as many milliseconds, so there their difference counts, over the base's median."""
+        if self.kind != "gpu":
+            return point.ratio
+        return 1 + (point.ratio - 1) * point.result["base_ms"] / self.base_ms(point.scene)
+
     def angle(self, marker: str, knob: str, value: str) -> float | None:
         """The largest tilt up to which every tilt of the scan is read, degrees; None if it was not scanned
         or is not read frontally."""

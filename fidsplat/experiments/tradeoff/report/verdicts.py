@@ -86,7 +86,7 @@ def front(points: Iterable[Measured]) -> list[Measured]:
 
 def cheapest_within(results: Results, scenes: Iterable[str], bound: float) -> tuple[Measured, ...] | None:
     """The setting, measured on all the scenes, whose error is at most the bound on each apart from certified
-    flips and whose product of time ratios is least: what was measured of it, or None."""
+    flips and whose product of costs (`Results.cost`) is least: what was measured of it, or None."""
     scenes = list(scenes)
     best: tuple[float, tuple[Measured, ...]] | None = None
     for knob, value in results.settings():
@@ -96,7 +96,7 @@ def cheapest_within(results: Results, scenes: Iterable[str], bound: float) -> tu
             continue
         cost = 1.0
         for point in there:
-            cost *= point.ratio
+            cost *= results.cost(point)
         if best is None or cost < best[0]:
             best = cost, there
     return None if best is None else best[1]
