@@ -141,8 +141,8 @@ class Results:
         return min(times), max(times)
 
     def cost(self, point: Measured) -> float:
-        """Its time over the base's, for comparing settings with each other. A GPU's host delays both frames of
-        a pair by as many milliseconds, so there their difference counts, over the base's median."""
+        """Its time over the base's, for comparing settings with each other. A GPU's host delays both frames
+        of a pair by as many milliseconds, so there their difference counts, over the base's median."""
         if self.kind != "gpu":
             return point.ratio
         return 1 + (point.ratio - 1) * point.result["base_ms"] / self.base_ms(point.scene)
