@@ -102,7 +102,8 @@ def test_certificates_are_small_where_nothing_is_hard():
     rim = np.abs(truth["alpha"] - 1 / 255) < 6e-5
     assert rim.mean() < 1e-3
     assert not truth["label_may_flip"][~rim].any()
-    assert not truth["depth_median_may_flip"][~rim].any()
+    # and where a fragment takes 1/255 of the light, no more or less, which the median asks
+    assert truth["depth_median_may_flip"].mean() < 5e-4
 
 
 def test_certificates_name_what_single_precision_cannot_decide():
