@@ -176,7 +176,7 @@ class Quality:
     def __post_init__(self) -> None:
         for knob in fields(self):
             value = getattr(self, knob.name)
-            if isinstance(value, np.generic):
+            if isinstance(value, np.generic):  # as `own_scalars`, but a quality loads no other module
                 object.__setattr__(self, knob.name, value.item())
 
         def within(name: str, low: float, high: float, low_open: bool, high_open: bool) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError
+from fidsplat.scalars import own_scalars
 
 RESPONSES = ("linear", "srgb")
 BITS = (8, 16)
@@ -49,10 +50,7 @@ class Sensor:
     rounded"""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, np.generic):  # a scene file says Python's own numbers
-                object.__setattr__(self, field.name, value.item())
+        own_scalars(self)
         if not (_is_number(self.full_well) and self.full_well >= 1):
             raise InputError(
                 f"sensor: full_well is {self.full_well!r}; it must be a number of electrons, 1 or more"

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError
+from fidsplat.scalars import own_scalars
 
 MAX_PANORAMA = 16384
 """pixels along a side"""
@@ -29,8 +30,7 @@ class Fog:
     """RGB"""
 
     def __post_init__(self) -> None:
-        if isinstance(self.density, np.generic):  # a scene file says Python's own numbers
-            object.__setattr__(self, "density", self.density.item())
+        own_scalars(self)
         ok = isinstance(self.density, (int, float)) and not isinstance(self.density, bool)
         if not (ok and 0 <= self.density < math.inf):
             raise InputError(

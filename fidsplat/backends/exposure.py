@@ -49,10 +49,7 @@ def exposed_view(
     bands = shutter.bands(camera.height)
 
     def at(time: float) -> View:
-        pose = motion.camera_at(time)
-        # the position follows from the pose
-        now = camera if pose is None else replace(camera, world_to_camera=pose, position=None)
-        view = View.of(now, quality, origin, background, sensor, fog)
+        view = View.of(motion.moved(camera, time), quality, origin, background, sensor, fog)
         groups = tuple((k, _moved(view, m, origin)) for k, m in motion.groups_at(time))
         return replace(view, groups=groups) if groups else view
 

@@ -5,14 +5,18 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from fidsplat.errors import InputError
 from fidsplat.rotations import check_similarity, matrix_to_quaternion
+from fidsplat.scalars import own_scalars
+
+if TYPE_CHECKING:
+    from fidsplat.cameras.pinhole import Camera
 
 MAX_SUB_POSES = 1024
 
@@ -41,10 +45,7 @@ class Shutter:
     of h rows is off by at most v (rows_per_band - 1) / (2 h) pixels; 1 is exact, and slow"""
 
     def __post_init__(self) -> None:
-        for each in fields(self):
-            value = getattr(self, each.name)
-            if isinstance(value, np.generic):  # a scene file says Python's own numbers
-                object.__setattr__(self, each.name, value.item())
+        own_scalars(self)
         for name in ("time", "exposure", "readout"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
@@ -182,6 +183,12 @@ class Motion:
     def camera_at(self, time: float) -> np.ndarray | None:
         """world_to_camera (4, 4) then; None if it does not move."""
         return None if self.camera is None else _checked(self.camera(time), "the camera", time)
+
+    def moved(self, camera: Camera, time: float) -> Camera:
+        """The camera as it stands then."""
+        pose = self.camera_at(time)
+        # the position follows from the pose
+        return camera if pose is None else replace(camera, world_to_camera=pose, position=None)
 
     def groups_at(self, time: float) -> list[tuple[int, np.ndarray]]:
         """(label, motion (4, 4)) then, of each group."""

@@ -118,14 +118,11 @@ Examples:
 def _standing(scene):
     """The camera and the markers of a scene where they are at its shutter's time."""
     time = 0.0 if scene.shutter is None else scene.shutter.time
-    pose, camera = scene.motion.camera_at(time), scene.camera
-    if pose is not None:
-        camera = replace(camera, world_to_camera=pose, position=None)
     markers = [
         marker if marker.motion is None else replace(marker, pose=marker.motion(time))
         for marker in scene.markers
     ]
-    return camera, markers
+    return scene.motion.moved(scene.camera, time), markers
 
 
 def reading_row(reading) -> tuple[str, ...]:

@@ -12,13 +12,14 @@ import fidsplat
 
 PACKAGE = Path(fidsplat.__file__).parent
 
-BASE = {"errors", "files", "rotations"}
+BASE = {"errors", "files", "rotations", "scalars"}
 PLAIN = BASE | {"splats", "harmonics", "cameras", "quality", "sensor", "surroundings"}
 # wing: what of fidsplat it may import, at the top or inside a function
 MAY_IMPORT = {
     "errors": set(),
     "files": BASE,
     "rotations": BASE,
+    "scalars": set(),
     "harmonics": BASE,
     # a budget is measured by drawing: `Quality.within` loads what draws when it is called, and its arguments
     # have the types of those (test_a_quality_loads_nothing_that_draws)
