@@ -52,6 +52,7 @@ HOME_OF = {
     "flip_evaluator": ("vision",),
     "bpy": ("experiments.blender_worker",),
     "shapely": ("markers",),
+    "networkx": ("markers",),
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
     "warp": ("backends.warp",),
