@@ -5,8 +5,8 @@ say) the answer is "generic", which PoCL then hands to clang as -target-cpu, whe
 fails with "unknown target CPU 'generic'" (pocl issues #512, #1049). For one that LLVM 14 takes for an older
 one (Zen 4, with AVX-512, for Zen 3, without) builds crash or never end: PoCL picks its kernel library by the
 processor's feature flags, and that one is for AVX-512. PoCL 3.1 and later read POCL_LLVM_CPU_NAME; 3.0 has no
-such setting, so the name is corrected where PoCL keeps it, in the device's record: the field `llvm_cpu`, which
-follows `llvm_target_triplet`. The new name is the one for which PoCL built that kernel library.
+such setting, so the name is corrected where PoCL keeps it, in the device's record: the field `llvm_cpu`,
+which follows `llvm_target_triplet`. The new name is the one for which PoCL built that kernel library.
 """
 
 from __future__ import annotations
@@ -59,8 +59,7 @@ def correct_target(device_address: int, device_version: str) -> str | None:
         places = [
             index + 1
             for index in range(len(words) - 1)
-            if _text(memory, words[index]).startswith(b"x86_64-")
-            and _text(memory, words[index + 1]) == wrong
+            if _text(memory, words[index]).startswith(b"x86_64-") and _text(memory, words[index + 1]) == wrong
         ]
     finally:
         os.close(memory)
