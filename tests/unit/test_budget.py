@@ -9,8 +9,8 @@ import pytest
 import fidsplat as fs
 from fidsplat.accuracy import errors, truth
 from fidsplat.budget import calibrate, choose, store, table
-from fidsplat.budget.random_scenes import HELD_OUT, random_scene
 from fidsplat.errors import InputError
+from fidsplat.random_clouds import HELD_OUT, random_scene
 
 BACKEND = "opencl"
 BOUNDS = (1e-2, 1e-3, 1e-4)
