@@ -192,7 +192,7 @@ def test_scene_files_switch_lenses_on(tmp_path, text, fx):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("fov_x_deg = 90\n[camera.distortion]\nk7 = 1.0\n", r"camera.distortion.k7; did you mean k"),
+        ("fov_x_deg = 90\n[camera.distortion]\nk7 = 1.0\n", r"'camera.distortion.k7' .did you mean 'k"),
         ("fov_x_deg = 90\n[camera.distortion]\n[camera.fisheye]\n", "fisheye and distortion exclude"),
         ("fov_x_deg = 90\n[camera.equirectangular]\n", "fov_x_deg and equirectangular exclude"),
         ("fov_x_deg = 90\n[camera.orthographic]\n", "fov_x_deg and orthographic exclude"),
