@@ -26,8 +26,8 @@ Examples:
   fidsplat bench                                    what a frame costs here
   fidsplat tradeoff --quick                         what accuracy costs in time
 
-`fidsplat COMMAND --help` explains a command, `fidsplat --version` says which this is. --debug, anywhere, shows
-where an error arose."""
+`fidsplat COMMAND --help` explains a command. --debug, anywhere, shows where an error arose; --version, alone,
+says which fidsplat this is."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -33,8 +33,8 @@ MARKERS = ("spec", "size", "position", "quaternion", *knobs(MarkerQuality), "qui
 RENDER = ("outputs", "background", "quality", "samples", "lowpass", "first_hit", "device")
 IMAGE = "image:"
 
-# A dotted key of too many parts, outside of strings and comments, which are matched to be passed over. The
-# quantifiers are possessive, and what is not closed ends with the file: time is linear whatever the file holds.
+# A dotted key of too many parts, outside of strings and comments, which are matched to be passed over. What
+# is not closed ends with the file, and quantifiers are possessive: time is linear whatever the file holds.
 _BASIC, _LITERAL = r'"(?:[^"\\\n]|\\.)*+"?', r"'[^'\n]*+'?"
 _LONG_KEY = re.compile(
     r"[\s\[\]{}=,]++"

@@ -56,7 +56,7 @@ CHANGES = [
     ("background", "colour", "unknown key 'render.colour' (did you mean"),
     ("[render]", "[rendering]", "unknown table 'rendering' (did you mean 'render'?)"),
     ("[[splats]]", "[[splat]]", "unknown key 'splat' (did you mean 'splats'?)"),
-    ("[camera]", "[camera.distorsion]\nk1 = 0.1\n[camera]", "unknown table 'camera.distorsion' (did you mean"),
+    ("[camera]", "[camera.distorsion]\nk1 = 0.1\n[camera]", "unknown table 'camera.distorsion' (did"),
     ("width = 64\n", "", "camera.width is missing"),
     ("fov_x_deg = 60.0\n", "", "camera.fov_x_deg is missing (or fx and fy)"),
     ("fov_x_deg = 60.0\n", "fx = 60.0\n", "camera.fy is missing"),
@@ -189,7 +189,7 @@ def test_dots_that_join_no_keys_are_read(tmp_path):
     dots = "a." * 1000
     path.write_text(
         f'[[markers]] # {dots}\nspec = "qr:\\"{dots}"\nsize = 0.1\nposition = [{"1.5, " * 3}]\n'
-        f'[render]\ndevice = """\n"" {dots}"""\noutputs = [\'{dots}\', \'\'\'{dots}\'\'\']\n'
+        f"[render]\ndevice = \"\"\"\n\"\" {dots}\"\"\"\noutputs = ['{dots}', '''{dots}''']\n"
     )
     scene = fs.Scene.load(path)
     assert scene.device == f'"" {dots}'
