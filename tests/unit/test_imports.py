@@ -27,6 +27,7 @@ MAY_IMPORT = {
     "sensor": BASE,
     "surroundings": BASE | {"vision.images"},
     "kernel_files": BASE,
+    "provenance": BASE | {"kernel_files"},
     "defects": BASE,
     "splats": BASE | {"harmonics", "defects"},
     "cameras": BASE,
@@ -42,7 +43,7 @@ MAY_IMPORT = {
     | {"scenes", "effects", "backends", "render", "vision", "kernel_files", "random_clouds"},
     "render": PLAIN | {"scenes", "effects", "backends"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
-    "budget": PLAIN | {"scenes", "render", "accuracy", "kernel_files", "timing"},
+    "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__"}
 
@@ -54,6 +55,7 @@ HOME_OF = {
     "flip_evaluator": ("vision",),
     "bpy": ("experiments.blender_worker",),
     "shapely": ("markers",),
+    "networkx": ("markers",),
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
     "warp": ("backends.warp",),
