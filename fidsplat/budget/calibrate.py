@@ -80,16 +80,17 @@ class Calibration:
 
     def time(self, quality: Quality) -> float:
         """Milliseconds of one frame, now."""
-        return self._timer(quality).run()
+        return self.timer(quality).run()
 
     def times(self, qualities: Iterable[Quality], repeats: int = REPEATS) -> list[Times]:
         """Times of qualities that this device draws. Frames take turns; one of each goes before those that
         count."""
-        timers = [self._timer(quality) for quality in qualities]
+        timers = [self.timer(quality) for quality in qualities]
         self._tell(f"timing {len(timers)} settings")
         take_turns(timers, repeats, least=min(FEWEST, repeats), seconds=PATIENCE, warm_up=1)
         return [Times(timer.median, float(np.quantile(timer.ms, 0.9))) for timer in timers]
 
-    def _timer(self, quality: Quality) -> Timer:
+    def timer(self, quality: Quality) -> Timer:
+        """Times frames of a quality."""
         how = {"outputs": ("rgb",), "quality": quality, **self._around}
         return frame_timer(self.renderer, self._resident, self._camera, **how)
