@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fidsplat.markers.matching import maximum_independent_set
+from fidsplat.markers.conflicts import maximum_independent_set
 
 
 class Runs(NamedTuple):

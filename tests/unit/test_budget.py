@@ -125,15 +125,6 @@ def test_what_is_kept_is_for_one_question(renderer, scene):
     assert len(list(store.folder().iterdir())) == 6
 
 
-def test_answers_of_another_table_do_not_count(tmp_path, monkeypatch):
-    """Made anew on the same day, of as many scenes, on the same device."""
-    before = store.versions()
-    other = tmp_path / "table.json"
-    other.write_text(table.FILE.read_text("utf-8").replace('"cost": ', '"cost": 1'), "utf-8")
-    monkeypatch.setattr(table, "FILE", other)
-    assert store.versions.__wrapped__() != before
-
-
 def test_a_folder_that_cannot_be_written_is_no_obstacle(renderer, scene, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setattr(store, "folder", lambda: tmp_path / "file" / "cache")

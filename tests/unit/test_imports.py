@@ -27,6 +27,7 @@ MAY_IMPORT = {
     "sensor": BASE,
     "surroundings": BASE | {"vision.images"},
     "kernel_files": BASE,
+    "provenance": BASE | {"kernel_files"},
     "defects": BASE,
     "splats": BASE | {"harmonics", "defects"},
     "cameras": BASE,
@@ -39,7 +40,7 @@ MAY_IMPORT = {
     "hard_cases": PLAIN | {"scenes", "effects", "backends", "render", "vision", "kernel_files"},
     "render": PLAIN | {"scenes", "effects", "backends"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
-    "budget": PLAIN | {"scenes", "render", "accuracy", "kernel_files"},
+    "budget": PLAIN | {"scenes", "render", "accuracy", "provenance"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__"}
 
@@ -51,6 +52,7 @@ HOME_OF = {
     "flip_evaluator": ("vision",),
     "bpy": ("experiments.blender_worker",),
     "shapely": ("markers",),
+    "networkx": ("markers",),
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
     "warp": ("backends.warp",),
