@@ -74,6 +74,7 @@ def test_help_loads_nothing_heavy():
 @pytest.mark.parametrize(
     ("words", "says"),
     [
+        ([], "try `fidsplat demo` first"),
         ([], "demo, devices, marker, render, detect"),
         (["mraker"], "Available subcommands: demo, devices"),
         (["marker"], "SPEC"),
@@ -144,6 +145,11 @@ def test_a_terminal_without_unicode_gets_help_and_errors(tmp_path):
     wrong = run("marker", "qr:a", "--sise", "1")
     assert (wrong.returncode, wrong.stderr.count("\n")) == (2, 1)
     assert "perhaps --size M" in wrong.stderr
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr() == (f"fidsplat {fs.__version__}\n", "")
 
 
 # --- statuses

@@ -249,8 +249,7 @@ def test_files_of_a_saved_scene(tmp_path):
 BETWEEN = fs.Quality(
     alpha_cutoff=0.123,
     samples=2,
-    tile_size=8,
-    depth_key_bits=24,
+    arithmetic="precise",
     marker=fs.MarkerQuality("paper", levels=3, growth=0.25),
 )
 
@@ -310,9 +309,9 @@ def test_knobs_of_a_scene_file(tmp_path):
     ("text", "says"),
     [
         ("[quality]\npreset = 'fats'", "quality.preset: unknown quality 'fats'"),
-        ("[quality]\nalpha_cutof = 1", "unknown key quality.alpha_cutof; did you mean alpha_cutoff"),
+        ("[quality]\nalpha_cutof = 1", "unknown key 'quality.alpha_cutof' (did you mean 'alpha_cutoff'"),
         ("[quality]\nalpha_cutoff = 2", "quality: quality: alpha_cutoff is 2"),
-        ("[quality]\ntile_size = 'big'", "quality.tile_size must be a whole number"),
+        ("[quality]\nsamples = 'big'", "quality.samples must be a whole number"),
         ("[quality.marker]\ntemplate = 4", "template is 4; known: 1, 5, 9"),
         (
             "[render]\nsamples = 2\n[quality]\npreset = 'fast'",

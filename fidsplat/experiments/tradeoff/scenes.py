@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 
 from fidsplat.cameras import Camera
-from fidsplat.errors import InputError
+from fidsplat.errors import InputError, unknown
 from fidsplat.experiments.scenes import load_scene
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS
 from fidsplat.experiments.tradeoff.hard import hard_scene
@@ -55,9 +54,7 @@ def scene_names(words: Iterable[str], quick: bool = False) -> tuple[str, ...]:
     names = tuple(dict.fromkeys(words)) or (QUICK_NAMES if quick else NAMES)
     for name in names:
         if name not in NAMES:
-            near = difflib.get_close_matches(name, NAMES, 1)
-            hint = f" (did you mean {near[0]!r}?)" if near else ""
-            raise InputError(f"there is no scene {name!r}{hint}; known: {', '.join(NAMES)}")
+            raise InputError(unknown("scene", name, NAMES))
     return names
 
 
