@@ -34,9 +34,7 @@ STOPS = (0.05, 0.015, 4e-3, 1e-3, 1e-4, 1e-6)
 MODIFIERS = (
     {"setup_precision": "float32"},
     {"arithmetic": "fast"},
-    {"color_precision": "float16"},
     {"setup_precision": "float32", "arithmetic": "fast"},
-    {"setup_precision": "float32", "arithmetic": "fast", "color_precision": "float16", "depth_key_bits": 24},
 )
 FINEST = (
     {"alpha_cutoff": 1e-8, "transmittance_stop": 0.0},

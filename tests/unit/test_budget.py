@@ -74,8 +74,8 @@ def test_less_error_is_never_cheaper(renderer):
 
 
 def test_the_definition_stays():
-    base = fs.Quality(lowpass="pixel", samples=3, coplanar="order", first_hit=0.3, tile_size=8)
-    kept = ("lowpass", "samples", "coplanar", "first_hit", "tile_size", "marker")
+    base = fs.Quality(lowpass="pixel", samples=3, coplanar="order", first_hit=0.3)
+    kept = ("lowpass", "samples", "coplanar", "first_hit", "marker")
     for setting in table.load("cpu"):
         assert all(getattr(setting.of(base), name) == getattr(base, name) for name in kept)
         parity = setting.of(fs.Quality.named("gsplat"))
