@@ -19,8 +19,10 @@ from fidsplat.vision.detect import detect
 from fidsplat.vision.images import to_uint8, write_png
 from fidsplat.vision.paint import (
     contact_sheet,
+    depth_key,
     depth_picture,
-    label_picture,
+    depth_span,
+    normal_key,
     normal_picture,
     outlined,
 )
@@ -124,7 +126,7 @@ def run_demo(
     files += sorted(folder.glob("scene-splats-*.ply"))
     save_ply((scene if mixture != "exact" else demo_scene()).cloud(), files[1])
 
-    sightings, strangers, frame_ms, visible, sheet = [], [], {}, {}, []
+    sightings, strangers, frame_ms, visible, seen = [], [], {}, {}, {}
     for view, camera in demo_views().items():
         tell(f"drawing and reading: {view}")
         planes, frame_ms[view], visible[view] = _draw(renderer, resident, scene, camera)
@@ -134,8 +136,8 @@ def run_demo(
         strangers += [code.name for code in others]
         marked = _marked(image, readings)
         files += _save(folder, view.replace(" ", "-"), planes, marked)
-        sheet.append(_row(view, planes, image, marked))
-    files.append(write_png(folder / "contact-sheet.png", contact_sheet(sheet)))
+        seen[view] = (marked, planes["depth"], planes["normal"])
+    files.append(write_png(folder / "contact-sheet.png", _sheet(seen)))
 
     result = DemoResult(
         device=renderer.device.title,
@@ -165,10 +167,8 @@ def _draw(
 
 
 def _marked(image: np.ndarray, readings: list[Reading]) -> np.ndarray:
-    for reading in readings:
-        if reading.detection is not None:
-            image = outlined(image, reading.detection.corners, reading.placed.marker.spec)
-    return image
+    found = [(r.detection.corners, r.placed.marker.spec) for r in readings if r.detection is not None]
+    return outlined(image, found)
 
 
 def _save(folder: Path, stem: str, planes: dict[str, np.ndarray], marked: np.ndarray) -> list[Path]:
@@ -180,12 +180,13 @@ def _save(folder: Path, stem: str, planes: dict[str, np.ndarray], marked: np.nda
     return [*files, write_png(folder / f"{stem}-detection.png", marked)]
 
 
-def _row(view: str, planes: dict[str, np.ndarray], image: np.ndarray, marked: np.ndarray):
-    pictures = {
-        "rgb": image,
-        "depth": depth_picture(planes["depth"]),
-        "normal": normal_picture(planes["normal"]),
-        "label": label_picture(planes["label"]),
-        "detection": marked,
-    }
-    return [(f"{view}: {name}", picture) for name, picture in pictures.items()]
+def _sheet(seen: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:
+    """A column for each view: what was read there, its depth and its normals, with their keys."""
+    span = depth_span(depth for _, depth, _ in seen.values())
+    rows = [
+        [(f"{view}: what was read", marked) for view, (marked, _, _) in seen.items()],
+        [(f"{view}: depth", depth_picture(depth, span)) for view, (_, depth, _) in seen.items()],
+        [(f"{view}: normals", normal_picture(normal)) for view, (_, _, normal) in seen.items()],
+    ]
+    keys = (lambda height: None, lambda height: depth_key(span, height), normal_key)
+    return contact_sheet(rows, width=560, key=lambda row, height: keys[row](height))
