@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -36,6 +38,30 @@ def console(as_json: bool) -> Console:
     from rich.console import Console
 
     return Console(stderr=as_json, highlight=False)
+
+
+@contextmanager
+def reading() -> Iterator[Callable[[int, int], None]]:
+    """A function to be told how many splats of how many are read. From one second on it says so on stderr: in
+    place on a terminal, else in lines that come twice as far apart each time."""
+    from rich.console import Console
+
+    where, begun, due = Console(stderr=True, highlight=False), time.monotonic(), 1.0
+    with where.status("reading") as status:
+
+        def progress(done: int, total: int) -> None:
+            nonlocal due
+            seconds = time.monotonic() - begun
+            if seconds < due:
+                return
+            text = f"reading: {done:,} of {total:,} splats"
+            if where.is_terminal:
+                status.update(text)
+            else:
+                where.print(text)
+                due = 2 * seconds
+
+        yield progress
 
 
 def print_json(value: dict[str, Any]) -> None:
