@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-import time
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -40,30 +40,6 @@ def console(as_json: bool) -> Console:
     return Console(stderr=as_json, highlight=False)
 
 
-@contextmanager
-def reading() -> Iterator[Callable[[int, int], None]]:
-    """A function to be told how many splats of how many are read. From one second on it says so on stderr: in
-    place on a terminal, else in lines that come twice as far apart each time."""
-    from rich.console import Console
-
-    where, begun, due = Console(stderr=True, highlight=False), time.monotonic(), 1.0
-    with where.status("reading") as status:
-
-        def progress(done: int, total: int) -> None:
-            nonlocal due
-            seconds = time.monotonic() - begun
-            if seconds < due:
-                return
-            text = f"reading: {done:,} of {total:,} splats"
-            if where.is_terminal:
-                status.update(text)
-            else:
-                where.print(text)
-                due = 2 * seconds
-
-        yield progress
-
-
 def print_json(value: dict[str, Any]) -> None:
     """The one object; a number that JSON does not have becomes null."""
     sys.stdout.write(json_text(value) + "\n")
@@ -92,6 +68,29 @@ def print_table(where: Console, title: str, heads: Sequence[str], rows: Iterable
     for row in rows:
         table.add_row(*(Text(str(cell)) for cell in row))
     where.print(table)
+
+
+@contextmanager
+def late_progress(where: Console, after: float = 1.0) -> Iterator[Callable[[str, float], None]]:
+    """What to call with words and the share that is done, 0 to 1; a bar shows it once that many seconds
+    passed.
+
+    Short work prints nothing, and long work between two calls is seen too: a thread watches the time.
+    """
+    from rich.progress import Progress
+
+    shown = Progress(console=where, transient=True)
+    task = shown.add_task("", total=1.0)
+    timer = threading.Timer(after, shown.start)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield lambda words, share: shown.update(task, description=words, completed=share)
+    finally:
+        timer.cancel()
+        timer.join()
+        if shown.live.is_started:
+            shown.stop()
 
 
 def writable_file(path: str | Path) -> Path:

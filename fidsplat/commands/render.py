@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
-from fidsplat.commands.output import Json, console, option, print_json, print_table, reading
+from fidsplat.commands.output import Json, console, late_progress, option, print_json, print_table
 from fidsplat.errors import FidsplatError, InputError
 from fidsplat.files import writable_folder
 
@@ -47,7 +47,7 @@ Lenses, shutters and motion, fog, backgrounds, sensors and boxes are tables of a
 
 Examples:
   fidsplat render scene.toml
-  fidsplat render scene.toml --quality standard,alpha_cutoff=1e-3,tile_size=8
+  fidsplat render scene.toml --quality standard,alpha_cutoff=1e-3,samples=2
   fidsplat render scene.toml -o frames --outputs rgb,depth,normal,label
   fidsplat render tag.ply -o tag.png --device reference --quality gsplat
   fidsplat render scene.toml --max-error 1e-3        measures first, and keeps what it found for the next time
@@ -94,7 +94,7 @@ Examples:
             check_bounds(self.max_error, self.max_ms)
         name_of = _names(self.out, Path(self.source))
         where = console(self.json)
-        with reading() as progress:
+        with late_progress(console(True)) as progress:
             scene = _load(self.source, self.quality, progress)
         with _named(self.source, "render.outputs", names is None):
             select(fs.SplatCloud.empty(), scene.outputs, Quality.of(None))

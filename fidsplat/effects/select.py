@@ -36,7 +36,7 @@ class FeatureSet:
 
     slots: tuple[str, ...]
     """One effect per kind, in the fixed order camera, color, lowpass, stop, compose, footprint, background,
-    arithmetic; then motion, shutter, double blending and short keys, if any."""
+    arithmetic; then motion, shutter and double blending, if any."""
     taps: tuple[str, ...]
     """Sorted names of the planes beside rgb."""
     sh_degree: int
@@ -44,9 +44,6 @@ class FeatureSet:
     setup_precision: str
     posts: tuple[str, ...] = ()
     """What changes rgb on its way out, in its order: fog, the steps of the sensor."""
-    depth_key_bits: int = 32
-    tile_size: int | None = None
-    """samples; None: the device's own"""
 
     @cached_property
     def effects(self) -> tuple[Effect, ...]:
@@ -131,15 +128,12 @@ def select(
     precision = quality.blend_precision
     refuse_strangers(foggy, camera, precision)
     layered = cloud.has_planes and quality.coplanar == "blend"
-    # the splats of a plane arrive together because no other has their key
-    key_bits = 32 if layered else quality.depth_key_bits
     pinhole = camera is None or camera.lens is None
     in_spheres = pinhole and cloud.footprint == "gaussian" and lowpass != "pixel"
-    color = "color_rgb" if cloud.sh_degree < 0 else "color_sh"
     return FeatureSet(
         slots=(
             f"camera_{camera.lens.kind if camera is not None and camera.lens else 'pinhole'}",
-            f"{color}_half" if quality.color_precision == "float16" else color,
+            "color_rgb" if cloud.sh_degree < 0 else "color_sh",
             # boxes are filtered by their own footprint
             f"lowpass_{lowpass}",
             f"stop_{quality.stop_rule}",
@@ -152,15 +146,12 @@ def select(
             *(("shutter_exposure",) if exposed else ()),
             *(("shutter_rows",) if exposed and in_spheres else ()),
             *(("blend_double",) if precision == "float64" else ()),
-            *(("keys_short",) if key_bits < 32 else ()),
         ),
         taps=tuple(sorted(wanted - {"rgb"})),
         sh_degree=max(cloud.sh_degree, 0),
         samples=quality.samples,
         setup_precision=quality.setup_precision,
         posts=(*(("fog",) if foggy else ()), *(() if sensor is None else sensor.steps)),
-        depth_key_bits=key_bits,
-        tile_size=quality.tile_size,
     )
 
 

@@ -4,6 +4,7 @@ memory follows what is kept and not what the file says it holds."""
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,8 +20,8 @@ BLOCK = 2048
 that walking over them once per property costs no memory traffic"""
 _FIRST_ROOM = 1_000_000  # splats; only a file of more rows makes its arrays grow
 
-Progress = Callable[[int, int], None]
-"""told rows read and rows in all, now and then"""
+Progress = Callable[[str, float], Any]
+"""called now and then with what is being done and the share of it that is done, 0 to 1"""
 _CHECKED = ("means", "quats", "scales", "opacities", "sh")
 
 
@@ -77,7 +78,7 @@ def _collect(rows: Rows, progress: Progress | None, scales: str):
         for reason, count in reasons.items():
             dropped[reason] = dropped.get(reason, 0) + count
         if progress is not None:
-            progress(min(first + WINDOW, rows.count), rows.count)
+            progress(f"reading {rows.path.name}", min(1.0, (first + WINDOW) / rows.count))
     return kept.finished(), dropped
 
 

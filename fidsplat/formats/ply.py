@@ -28,7 +28,7 @@ def load_ply(path: str | os.PathLike[str], progress: Progress | None = None) -> 
     properties ``label`` and ``plane`` are taken up. Colours come as SH of degree 0 to 3. Splats that cannot
     be drawn are left out while the file is read, as `SplatCloud` does, and one warning counts them.
 
-    progress: called now and then with the numbers of rows that are read and that there are.
+    progress: called now and then with what is being done and the share of it that is done, 0 to 1.
 
     Raises InputError for a file that is missing, damaged, of another kind, or lacks a property.
     """

@@ -30,7 +30,8 @@ CAMERA = ("width", "height", "fov_x_deg", "fx", "fy", "cx", "cy")
 CAMERA += ("position", "look_at", "up", "world_to_camera", "near", "far", *TABLES, "shutter", "motion")
 CAMERA_POSE = ("position", "look_at", "up", "world_to_camera")
 SPLATS = ("file", "position", "quaternion", "scale", "motion")
-MARKERS = ("spec", "size", "position", "quaternion", *knobs(MarkerQuality), "quiet_zone", "motion")
+MARKER = ("spec", "size", "position", "quaternion", "quiet_zone", "max_splats", "motion")
+MARKERS = (*MARKER, *knobs(MarkerQuality))
 RENDER = ("outputs", "background", "quality", "samples", "lowpass", "first_hit", "device")
 IMAGE = "image:"
 
@@ -54,7 +55,8 @@ def read_scene(
 ) -> Scene:
     """The scene of a file and of the splat and image files that it names, which are looked for beside it.
 
-    quality: instead of the file's; markers are made with it too. progress: of each splat file.
+    quality: instead of the file's; markers are made with it too. progress: as
+    `load_ply` takes it.
 
     Raises InputError, naming the file and the key, for whatever is wrong.
     """
@@ -76,7 +78,9 @@ def read_scene(
     return Scene(
         clouds=tuple(cloud for cloud, _ in splats),
         camera=camera,
-        markers=tuple(_marker(table, file.parent, made_with) for table in top.tables("markers", MARKERS)),
+        markers=tuple(
+            _marker(table, file.parent, made_with, progress) for table in top.tables("markers", MARKERS)
+        ),
         background=read_background(top, file.parent) or render.numbers("background", 3, (0.0, 0.0, 0.0)),
         outputs=render.texts("outputs", ("rgb",)),
         quality=quality,
@@ -170,19 +174,21 @@ def _splats(table: Table, folder: Path, progress: Progress | None) -> tuple[Spla
         return (cloud.transformed(pose) if moved else cloud), motion
 
 
-def _marker(table: Table, folder: Path, quality: MarkerQuality) -> PlacedMarker:
+def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progress | None) -> PlacedMarker:
     spec, size = table.text("spec"), table.number("size")
     if not size > 0:
         raise table.error("size", f"must be above 0 metres, not {size!r}")
     if spec.startswith(IMAGE):
         spec = IMAGE + str(folder / spec.removeprefix(IMAGE))
     pose, motion = _pose(table), read_keyframes(table, POSE, _pose)
-    quiet_zone = table.whole("quiet_zone", None)
+    quiet_zone, max_splats = table.whole("quiet_zone", None), table.whole("max_splats", None)
     own = read_knobs(table, MarkerQuality)
     if quiet_zone is not None and quiet_zone < 0:
         raise table.error("quiet_zone", f"must be 0 or more modules, not {quiet_zone}")
-    from fidsplat.markers import marker  # late: it brings shapely and networkx
+    from fidsplat.markers import marker  # late: it brings what makes markers
 
+    limit = {} if max_splats is None else {"max_splats": max_splats}
+    known = {"quiet_zone": quiet_zone, "quality": quality, "progress": progress, **limit}
     with table.at():
-        made = marker(spec, size=size, quiet_zone=quiet_zone, quality=quality, **own)
+        made = marker(spec, size, **known, **own)
         return PlacedMarker(made, pose, motion=motion)

@@ -163,7 +163,7 @@ class Scene:
         """Read a scene file (docs/scene-files.md).
 
         quality: instead of the file's; its knobs of markers hold for markers that do not say theirs.
-        progress: as `load_ply` takes it, for each splat file.
+        progress: called with what is being done and the share of it that is done, 0 to 1.
 
         Raises InputError, naming file and key, for whatever is wrong.
         """

@@ -224,5 +224,5 @@ def test_progress_is_told(tmp_path, content, monkeypatch):
     monkeypatch.setattr(collect, "WINDOW", 128)
     path, told = tmp_path / "good.ply", []
     path.write_bytes(content)
-    fs.load_ply(path, progress=lambda *rows: told.append(rows))
-    assert told == [(128, N), (256, N), (N, N)]
+    fs.load_ply(path, progress=lambda *done: told.append(done))
+    assert told == [("reading good.ply", share) for share in (128 / N, 256 / N, 1.0)]

@@ -107,7 +107,7 @@ class OpenCLBackend:
         if key[1].blend_items > self.device.max_work_group_size:
             raise DeviceError(
                 f"{self.info.title} has work-groups of at most {self.device.max_work_group_size}, and "
-                f"tile_size={features.tile_size} needs {key[1].blend_items}; use smaller tiles"
+                f"tiles of {key[1].tile_width} x {key[1].tile_height} need {key[1].blend_items}"
             )
         if key not in self._pipelines:
             source = assemble(*key)
