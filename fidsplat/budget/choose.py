@@ -14,6 +14,7 @@ from fidsplat.budget.search import Search
 from fidsplat.budget.table import Setting
 from fidsplat.cameras import Camera
 from fidsplat.errors import DeviceError, InputError
+from fidsplat.provenance import code_hash
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer, default_device
 from fidsplat.scenes import Scene
@@ -89,7 +90,7 @@ def choose(
             around[name] = getattr(own, name)
     splats = cloud.cloud() if isinstance(cloud, Scene) else cloud
     info = renderer.device
-    drawn_by = (info.name, info.title, info.platform, info.version, store.versions())
+    drawn_by = (info.name, info.title, info.platform, info.version, code_hash())
     key = store.digest(drawn_by, (error, ms), definition, camera, splats, around)
     kept = _kept(key, definition, info.name)
     if kept is not None:

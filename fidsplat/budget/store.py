@@ -7,32 +7,18 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fidsplat import __version__
-from fidsplat.budget import table
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
-from fidsplat.kernel_files import kernels_folder
 
 
 def folder() -> Path:
     """Where answers are kept: fidsplat/budget in the user's cache folder."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fidsplat" / "budget"
-
-
-@cache
-def versions() -> tuple[str, ...]:
-    """Of all that an answer hangs on besides the device and its driver: fidsplat, its kernels, the table."""
-    state = hashlib.blake2b(table.FILE.read_bytes(), digest_size=16)
-    for file in sorted(kernels_folder().rglob("*")):
-        if file.suffix in (".cl", ".py"):
-            state.update(file.read_bytes())
-    return __version__, state.hexdigest()
 
 
 def digest(*parts: Any) -> str | None:

@@ -3,47 +3,15 @@ are joined, and every number keeps the device, versions, commit and seed that it
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
-import platform
 import re
-import subprocess
 from collections.abc import Callable, Iterable, Iterator
-from datetime import date
-from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
-from fidsplat import __version__
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write, ordinary_file, writable_folder
-from fidsplat.kernel_files import kernels_folder
-
-_CODE = ("markers", "backends", "effects", "cameras", "vision")
-# of this folder: what every experiment stands on
-_SHARED = ("setup", "methods", "plane")
-
-
-def run_facts(experiment: str, device: str | None, seed: int, extra: dict[str, str] | None = None) -> dict:
-    """What a run's numbers depend on, for every line.
-
-    Args:
-        experiment: name of its module or package in this folder (of a package, what lies at its top).
-        device: title and driver of what draws; None when nothing is drawn.
-        seed: of texts and views.
-        extra: versions of packages, by name.
-    """
-    versions = {"fidsplat": __version__, "numpy": version("numpy"), **(extra or {})}
-    return {
-        "device": device,
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
-        "versions": versions,
-        "commit": _commit(),
-        "code": _code_hash(experiment),
-        "seed": seed,
-        "date": date.today().isoformat(),
-    }
 
 
 def _differences(old: dict, new: dict) -> list[str]:
@@ -53,46 +21,12 @@ def _differences(old: dict, new: dict) -> list[str]:
     return names + (["device"] if None not in devices and devices[0] != devices[1] else [])
 
 
-def _commit() -> str | None:
-    """Commit of the working tree, with "+" when files differ from it; None outside one."""
-    here = Path(__file__)
-    try:
-        git = ["git", "-C", str(here.parent)]
-        # an environment may lie inside somebody else's repository
-        tracked = subprocess.run([*git, "ls-files", "--error-unmatch", here.name], capture_output=True)
-        if tracked.returncode:
-            return None
-        head = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True)
-        if head.returncode:
-            return None
-        dirty = subprocess.run([*git, "status", "--porcelain", "-uno"], capture_output=True, text=True)
-        return head.stdout.strip() + ("+" if dirty.stdout.strip() else "")
-    except OSError:
-        return None
-
-
-def _code_hash(experiment: str) -> str:
-    """Of everything that decides what is drawn and read."""
-    package = Path(__file__).parent.parent
-    files = [f for part in _CODE for f in (package / part).rglob("*") if f.suffix in (".py", ".json")]
-    files += [f for f in package.glob("*.py") if f.name != "cli.py"]
-    files += [package / "experiments" / f"{name}.py" for name in _SHARED]
-    own = package / "experiments" / experiment
-    files += own.glob("*.py") if own.is_dir() else [own.with_suffix(".py")]
-    files += kernels_folder().rglob("*.cl")
-    found = hashlib.sha256()
-    # by name: kernels lie elsewhere in a wheel
-    for file in sorted(files, key=lambda f: (f.name, f.parent.name)):
-        found.update(file.name.encode() + b"\0" + file.read_bytes())
-    return found.hexdigest()[:16]
-
-
 class Records:
     """The lines of one file.
 
     Args:
         file: made when it is missing.
-        run: `run_facts` of this run.
+        run: `fidsplat.provenance.run_facts` of this run.
         anew: drop what the file holds.
 
     Raises InputError when the file cannot be written, is none of ours, or holds results of another device,

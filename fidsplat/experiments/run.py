@@ -13,9 +13,10 @@ from fidsplat.errors import InputError
 from fidsplat.experiments import angles, counts, localisation, views
 from fidsplat.experiments.blender import VIEW_NAMES, check_pictures
 from fidsplat.experiments.methods import IDEAL, Painter, method_names
-from fidsplat.experiments.records import Records, run_facts, shard
+from fidsplat.experiments.records import Records, shard
 from fidsplat.experiments.setup import MARKERS, PROTOCOLS, SEED, TEST_VIEWS, chosen_categories
 from fidsplat.files import writable_folder
+from fidsplat.provenance import run_facts
 from fidsplat.render import Renderer
 from fidsplat.vision.lpips import load_lpips, weights_name
 from fidsplat.vision.metrics import metric_versions
@@ -126,7 +127,7 @@ def _records(name: str, settings: Settings, renderer: Renderer | None) -> Record
     if renderer is not None and name != counts.NAME:
         device = f"{renderer.device.title}, {renderer.device.version}"
     versions = reader_versions() | (metric_versions() if name == views.NAME else {})
-    return Records(settings.file(name), run_facts(name, device, settings.seed, versions), settings.anew)
+    return Records(settings.file(name), run_facts(device, settings.seed, versions), settings.anew)
 
 
 def check(settings: Settings) -> None:

@@ -1,19 +1,19 @@
 """Results that survive interrupts, shards and other machines."""
 
-import json
 import math
 from pathlib import Path
 
 import pytest
 
 import fidsplat as fs
-from fidsplat.experiments.records import Records, merge, missing_shards, read_lines, run_facts, shard
+from fidsplat.experiments.records import Records, merge, missing_shards, read_lines, shard
+from fidsplat.provenance import run_facts
 
 WORK = [{"category": "small", "index": i} for i in range(5)]
 
 
 def facts(**changes) -> dict:
-    return run_facts("counts", "a device", 0, {"opencv": "5"}) | changes
+    return run_facts("a device", 0, {"opencv": "5"}) | changes
 
 
 def test_a_run_that_was_stopped_goes_on(tmp_path):
@@ -135,10 +135,3 @@ def test_missing_shards_are_named():
     files = [Path(f"a/angles-{i}-of-4.jsonl") for i in (1, 4)] + [Path("b/angles-2-of-2.jsonl")]
     assert missing_shards([*files, Path("angles.jsonl")]) == ["1/2", "2/4", "3/4"]
     assert missing_shards(files[:2] + [Path(f"b/angles-{i}-of-4.jsonl") for i in (2, 3)]) == []
-
-
-def test_facts_name_what_numbers_hang_on():
-    found = json.loads(json.dumps(run_facts("angles", None, 3)))
-    assert set(found) == {"device", "machine", "versions", "commit", "code", "seed", "date"}
-    assert found["versions"]["fidsplat"] == fs.__version__
-    assert found["code"] != run_facts("views", None, 3)["code"]

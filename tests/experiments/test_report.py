@@ -11,16 +11,17 @@ import fidsplat as fs
 from fidsplat.experiments.charts import Bar, bar_chart
 from fidsplat.experiments.document import Document
 from fidsplat.experiments.figures import mean_spread
-from fidsplat.experiments.records import Records, run_facts
+from fidsplat.experiments.records import Records
 from fidsplat.experiments.report import make_report
 from fidsplat.experiments.report_angles import Angles
+from fidsplat.provenance import run_facts
 from fidsplat.vision.images import write_png
 
 TILTS = "0:80:20,81:84:1"  # 0 20 40 60 80 81 82 83 84
 
 
 def write(folder, name, parts) -> None:
-    records = Records(folder / f"{name}.jsonl", run_facts(name, "a device", 0))
+    records = Records(folder / f"{name}.jsonl", run_facts("a device", 0))
     keys = [key for key, _ in parts]
     results = iter([result for _, result in parts])
     list(records.measure(keys, lambda key: next(results)))

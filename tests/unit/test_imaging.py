@@ -150,7 +150,7 @@ def test_a_panorama_of_no_file_cannot_be_written(tmp_path):
 @pytest.mark.parametrize(
     ("tables", "words"),
     [
-        ("[sensor]\nexposre = 2.0", "sensor.exposre; did you mean exposure"),
+        ("[sensor]\nexposre = 2.0", "'sensor.exposre' .did you mean 'exposure'"),
         ("[sensor]\nexposure = -2.0", "sensor: sensor: exposure is -2.0"),
         ("[sensor]\nresponse = true", "sensor.response must be a number"),
         ("[sensor]\nvignetting = 0.1", "sensor.vignetting must be a list of numbers"),

@@ -27,6 +27,7 @@ MAY_IMPORT = {
     "sensor": BASE,
     "surroundings": BASE | {"vision.images"},
     "kernel_files": BASE,
+    "provenance": BASE | {"kernel_files"},
     "defects": BASE,
     "splats": BASE | {"harmonics", "defects"},
     "cameras": BASE,
@@ -36,10 +37,13 @@ MAY_IMPORT = {
     "scenes": PLAIN | {"markers", "formats"},
     "effects": PLAIN | {"scenes"},
     "backends": PLAIN | {"scenes", "effects", "kernel_files"},
-    "hard_cases": PLAIN | {"scenes", "effects", "backends", "render", "vision", "kernel_files"},
+    "timing": BASE,
+    "random_clouds": PLAIN,
+    "hard_cases": PLAIN
+    | {"scenes", "effects", "backends", "render", "vision", "kernel_files", "random_clouds"},
     "render": PLAIN | {"scenes", "effects", "backends"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
-    "budget": PLAIN | {"scenes", "render", "accuracy", "kernel_files"},
+    "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__"}
 
@@ -51,6 +55,7 @@ HOME_OF = {
     "flip_evaluator": ("vision",),
     "bpy": ("experiments.blender_worker",),
     "shapely": ("markers",),
+    "networkx": ("markers",),
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
     "warp": ("backends.warp",),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -93,8 +92,6 @@ class WarpBackend:
         Raises:
             DeviceError: an effect that the Warp kernels have not, or the compiler refuses.
         """
-        if shape is None and features.tile_size is not None:
-            shape = replace(self.shape, tile_width=features.tile_size, tile_height=features.tile_size)
         key = (features, shape or self.shape)
         if key not in self._pipelines:
             program = Program(self.device, self.info.name, *key)

@@ -13,13 +13,14 @@ from typing import Any
 
 from fidsplat.accuracy import TRUTH_CUTOFF
 from fidsplat.errors import FidsplatError
-from fidsplat.experiments.records import Records, run_facts
+from fidsplat.experiments.records import Records
 from fidsplat.experiments.tradeoff import decoding, points, scenes
 from fidsplat.experiments.tradeoff.judging import check_truth, judge_picture
 from fidsplat.experiments.tradeoff.points import ALONE, BASE, MARKER_KNOB, PRESETS_KNOB
 from fidsplat.experiments.tradeoff.table import DEFINITION, Table
 from fidsplat.experiments.tradeoff.timing import FULL, QUICK, time_point
 from fidsplat.files import writable_folder
+from fidsplat.provenance import run_facts
 from fidsplat.render import Renderer
 from fidsplat.vision.metrics import metric_versions
 from fidsplat.vision.readers import reader_versions
@@ -96,7 +97,7 @@ def planned(settings: Settings) -> Iterator[Plan]:
     renderer = Renderer(settings.device)
     info = renderer.device
     versions = reader_versions() | metric_versions() | {"pyopencl": version("pyopencl")}
-    facts = run_facts(NAME, f"{info.title}, {info.version}", scenes.SEED, versions)
+    facts = run_facts(f"{info.title}, {info.version}", scenes.SEED, versions)
     facts |= {"kind": info.kind, "title": info.title}
     records = Records(settings.out / FILE, facts, settings.anew)
     # a device that failed may be there again: what has an error is not done

@@ -29,8 +29,6 @@ CONSTANTS = (
     Constant("0.99: no fragment is more opaque", "opacity_ceiling 0.99"),
     Constant("exclusive stop at 1e-4: the last fragment is dropped", "stop_rule exclusive"),
     Constant("no low-pass, beside that of 2DGS", "lowpass none"),
-    Constant("16-bit depth keys", "depth_key_bits 16"),
-    Constant("float16 colours", "color_precision float16"),
     Constant("float32 set-up", "setup_precision float32"),
     Constant("our own exponentials and logarithms", "arithmetic fast"),
 )
