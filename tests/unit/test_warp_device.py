@@ -277,9 +277,9 @@ def test_warp_pipelines_share_kernels_that_mean_the_same():
     one, two = (
         backend.pipeline(FeatureSet(slots, taps, 0, n, "float64")) for taps, n in (((), 1), (("alpha",), 2))
     )
-    assert one.project is two.project
-    assert one.blend is two.blend
-    assert one.resolve is not two.resolve
+    assert one.program.project is two.program.project
+    assert one.program.blend is two.program.blend
+    assert one.program.resolve is not two.program.resolve
     assert one is backend.pipeline(FeatureSet(slots, (), 0, 1, "float64"))
 
 
@@ -300,7 +300,7 @@ def test_a_memory_budget_draws_in_bands_with_the_same_bits():
     wanted = fs.Renderer("warp:cpu").render(cloud, view, ALL_OUTPUTS)
     own = fs.Renderer("warp:cpu", memory_budget=6_894_400)
     frame = own.render(cloud, view, ALL_OUTPUTS)
-    assert own.backend.workspace.pool._arrays["tile totals", wp.int32].size == 300, "it was drawn in bands"
+    assert own.backend.workspace.pool._arrays["tile_totals", wp.int32].size == 300, "it was drawn in bands"
     assert frame.stats == wanted.stats
     assert all(np.array_equal(frame[name], wanted[name]) for name in ALL_OUTPUTS)
     with pytest.raises(fs.DeviceError, match=r"budget of 1 MiB is too small .* raise memory_budget"):
@@ -317,7 +317,7 @@ def test_a_memory_budget_counts_rays_and_the_planes_of_all_poses():
     wanted = fs.Renderer("warp:cpu").render(cloud, view, ("rgb", "depth"), **exposed)
     own = fs.Renderer("warp:cpu", memory_budget=7_400_000)
     frame = own.render(cloud, view, ("rgb", "depth"), **exposed)
-    assert own.backend.workspace.pool._arrays["tile totals", wp.int32].size == 300, "it was drawn in bands"
+    assert own.backend.workspace.pool._arrays["tile_totals", wp.int32].size == 300, "it was drawn in bands"
     assert all(np.array_equal(frame[name], wanted[name]) for name in ("rgb", "depth"))
     small = fs.Renderer("warp:cpu", memory_budget=5_500_000)
     small.render(cloud, view, ("rgb", "depth"))

@@ -125,8 +125,9 @@ class Program:
         self.stretched = long_rays and bool(output.having(images, "length"))
         """whether resolving reads the lengths of a lens's rays"""
         self.resolve = kernels("resolve").make_resolve(kinds, outputs, self.stretched, features.samples)
-        kind = next(name for name in wanted if name.startswith("background_")).removeprefix("background_")
-        self.backdrop = None if kind == "constant" else kernels("surroundings").make_backdrop(kind, lens)
+        behind = kernels("surroundings")
+        kinds_behind = [kind for kind in behind.KINDS if f"background_{kind}" in wanted]
+        self.backdrop = behind.make_backdrop(kinds_behind[0], lens) if kinds_behind else None
         """the kernel of what is seen behind everything; None where that is of one colour"""
         steps = tuple(name for name in features.posts if name in kernels("post").known())
         self.sensor = SensorKernel(steps) if steps else None
