@@ -33,7 +33,6 @@ SPLATS = ("file", "position", "quaternion", "scale", "motion")
 MARKER = ("spec", "size", "position", "quaternion", "quiet_zone", "max_splats", "motion")
 MARKERS = (*MARKER, *knobs(MarkerQuality))
 RENDER = ("outputs", "background", "quality", "samples", "lowpass", "first_hit", "device")
-IMAGE = "image:"
 
 # A dotted key of too many parts, outside of strings and comments, which are matched to be passed over. What
 # is not closed ends with the file, and quantifiers are possessive: time is linear whatever the file holds.
@@ -178,17 +177,16 @@ def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progre
     spec, size = table.text("spec"), table.number("size")
     if not size > 0:
         raise table.error("size", f"must be above 0 metres, not {size!r}")
-    if spec.startswith(IMAGE):
-        spec = IMAGE + str(folder / spec.removeprefix(IMAGE))
     pose, motion = _pose(table), read_keyframes(table, POSE, _pose)
     quiet_zone, max_splats = table.whole("quiet_zone", None), table.whole("max_splats", None)
     own = read_knobs(table, MarkerQuality)
     if quiet_zone is not None and quiet_zone < 0:
         raise table.error("quiet_zone", f"must be 0 or more modules, not {quiet_zone}")
-    from fidsplat.markers import marker  # late: it brings what makes markers
+    from fidsplat.markers import marker, with_file  # late: it brings what makes markers
 
     limit = {} if max_splats is None else {"max_splats": max_splats}
     known = {"quiet_zone": quiet_zone, "quality": quality, "progress": progress, **limit}
     with table.at():
+        spec = with_file(spec, lambda name: str(folder / name))
         made = marker(spec, size, **known, **own)
         return PlacedMarker(made, pose, motion=motion)
