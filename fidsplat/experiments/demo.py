@@ -1,4 +1,4 @@
-"""The main job end to end: markers from text to splats, three views drawn, read back, judged and pictured."""
+"""The main job end to end: markers from text to splats, three views drawn, read back, checked and pictured."""
 
 import json
 import time
@@ -61,10 +61,10 @@ class DemoResult:
     background_splats: int
     marker_splats: dict[str, int]
     sightings: list[Sighting]
-    strangers: list[str]
+    unexpected: list[str]
     """codes that a detector saw and that nobody placed"""
     frame_ms: dict[str, float]
-    """by view: milliseconds on the device for one frame with all planes"""
+    """by view: milliseconds on the device for one frame with all outputs"""
     visible_splats: dict[str, int]
     """by view: splats that were not culled"""
     seconds: float
@@ -75,8 +75,8 @@ class DemoResult:
     def passed(self) -> bool:
         """Every wholly visible marker was found within the limit, there was one, and nothing else was
         seen."""
-        judged = [s.passed for s in self.sightings if s.passed is not None]
-        return bool(judged) and all(judged) and not self.strangers
+        decided = [s.passed for s in self.sightings if s.passed is not None]
+        return bool(decided) and all(decided) and not self.unexpected
 
     def as_dict(self) -> dict:
         """For JSON."""
@@ -88,7 +88,7 @@ class DemoResult:
             "frame_ms": self.frame_ms,
             "visible_splats": self.visible_splats,
             "seconds": self.seconds,
-            "strangers": self.strangers,
+            "unexpected": self.unexpected,
             "sightings": [
                 {"view": s.view, "visible": s.visible, "passed": s.passed, **s.reading.as_dict()}
                 for s in self.sightings
@@ -100,7 +100,7 @@ class DemoResult:
 def run_demo(
     out: str | Path,
     device: str | None = None,
-    tell: Callable[[str], None] = lambda text: None,
+    progress: Callable[[str], None] = lambda text: None,
     mixture: str = "fitted",
 ) -> DemoResult:
     """Run the demo and write its pictures, its scene and its figures into the folder ``out``.
@@ -108,7 +108,7 @@ def run_demo(
     Args:
         out: made when it is missing; files of an earlier run are overwritten.
         device: as for `Renderer`.
-        tell: called with what is being done, for a progress display.
+        progress: called with what is being done, for a progress display.
         mixture: of the markers. Those of `exact` stand in scene.ply as `fitted`: a PLY file has no boxes.
 
     Raises InputError when the folder cannot be written or there is no such mixture, DeviceError when the
@@ -116,9 +116,9 @@ def run_demo(
     """
     begun = time.perf_counter()
     folder = writable_folder(out)
-    tell("making three markers and their scene")
+    progress("making three markers and their scene")
     scene = demo_scene(mixture=mixture)
-    tell("opening the device")
+    progress("opening the device")
     renderer = Renderer(device)
     resident = renderer.upload(scene)
     files = [folder / "scene.toml", folder / "scene.ply"]
@@ -126,17 +126,17 @@ def run_demo(
     files += sorted(folder.glob("scene-splats-*.ply"))
     save_ply((scene if mixture != "exact" else demo_scene()).cloud(), files[1])
 
-    sightings, strangers, frame_ms, visible, seen = [], [], {}, {}, {}
+    sightings, unexpected, frame_ms, visible, seen = [], [], {}, {}, {}
     for view, camera in demo_views().items():
-        tell(f"drawing and reading: {view}")
-        planes, frame_ms[view], visible[view] = _draw(renderer, resident, scene, camera)
-        image = to_uint8(planes["rgb"])
+        progress(f"drawing and reading: {view}")
+        images, frame_ms[view], visible[view] = _draw(renderer, resident, scene, camera)
+        image = to_uint8(images["rgb"])
         readings, others = read_back(detect(image, families_of(scene.markers)), scene.markers, camera)
-        sightings += [Sighting(view, r, visible_share(r.placed, camera, planes["label"])) for r in readings]
-        strangers += [code.name for code in others]
+        sightings += [Sighting(view, r, visible_share(r.placed, camera, images["label"])) for r in readings]
+        unexpected += [code.name for code in others]
         marked = _marked(image, readings)
-        files += _save(folder, view.replace(" ", "-"), planes, marked)
-        seen[view] = (marked, planes["depth"], planes["normal"])
+        files += _save(folder, view.replace(" ", "-"), images, marked)
+        seen[view] = (marked, images["depth"], images["normal"])
     files.append(write_png(folder / "contact-sheet.png", _sheet(seen)))
 
     result = DemoResult(
@@ -144,7 +144,7 @@ def run_demo(
         background_splats=sum(len(cloud) for cloud in scene.clouds),
         marker_splats={p.marker.spec: len(p.marker.cloud) for p in scene.markers},
         sightings=sightings,
-        strangers=strangers,
+        unexpected=unexpected,
         frame_ms=frame_ms,
         visible_splats=visible,
         seconds=time.perf_counter() - begun,
@@ -158,7 +158,7 @@ def run_demo(
 def _draw(
     renderer: Renderer, resident, scene: Scene, camera: Camera
 ) -> tuple[dict[str, np.ndarray], float, int]:
-    """Planes, milliseconds of a frame once all is compiled, splats that were not culled."""
+    """Output images, milliseconds of a frame once all is compiled, splats that were not culled."""
     times = []
     for _ in range(1 + _FRAMES):
         frame = renderer.render(resident, camera, outputs=OUTPUTS, background=scene.background)
@@ -171,11 +171,11 @@ def _marked(image: np.ndarray, readings: list[Reading]) -> np.ndarray:
     return outlined(image, found)
 
 
-def _save(folder: Path, stem: str, planes: dict[str, np.ndarray], marked: np.ndarray) -> list[Path]:
+def _save(folder: Path, stem: str, images: dict[str, np.ndarray], marked: np.ndarray) -> list[Path]:
     files = [
         file
-        for name, plane in planes.items()
-        for file in save_plane(name, plane, lambda kind, suffix: folder / f"{stem}-{kind}{suffix}")
+        for name, image in images.items()
+        for file in save_plane(name, image, lambda kind, suffix: folder / f"{stem}-{kind}{suffix}")
     ]
     return [*files, write_png(folder / f"{stem}-detection.png", marked)]
 
