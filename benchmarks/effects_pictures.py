@@ -38,6 +38,7 @@ sys.path.insert(0, str(ROOT / "examples"))
 from make_data import globe, sky  # noqa: E402
 
 WIDTH, HEIGHT = 480, 300
+DUSK = (0.0, 0.15, 0.6), (1.0, 0.7, 0.3)  # above, below
 
 
 def room(mixture: str) -> fs.Scene:
@@ -106,7 +107,7 @@ def turned(degrees: float) -> Callable[[float], np.ndarray]:
 
 def shining(degree: int) -> fs.Scene:
     """The globe with its spherical harmonics up to a degree."""
-    camera = fs.Camera.look_at(WIDTH, HEIGHT, math.radians(40), (0.9, -0.9, -1.6), (0, 0, 0))
+    camera = fs.Camera.look_at(WIDTH, HEIGHT, math.radians(50), (0.9, -0.9, -1.6), (0, 0, 0))
     return fs.Scene([globe(degree)], camera, background=(0.5, 0.5, 0.5))
 
 
@@ -122,19 +123,22 @@ def all_effects(renderer: fs.Renderer) -> list[tuple[str, np.ndarray]]:
     def seen(scene: fs.Scene = boxes, **call) -> np.ndarray:
         return to_uint8(renderer.render(scene, **call)["rgb"])
 
-    round_ = fs.Camera.equirectangular(WIDTH, HEIGHT, world_to_camera=camera.world_to_camera)
+    def example(name: str) -> fs.Scene:
+        return fs.Scene.load(ROOT / "examples" / f"{name}.toml")
+
+    fisheye = fs.Camera.fisheye(WIDTH, HEIGHT, math.radians(200))
     wide = fs.Camera.orthographic(WIDTH, HEIGHT, 4.0, world_to_camera=camera.world_to_camera)
     turn = fs.Motion(turned(150))
     panels = {
         "pinhole": lambda: seen(gaussians),
-        "distortion (Brown-Conrady)": lambda: seen(gaussians, camera=through(fs.BrownConrady(-0.28, 0.07))),
-        "fisheye": lambda: seen(gaussians, camera=through(fs.Fisheye(), fx=195.0, fy=195.0)),
-        "panorama": lambda: seen(gaussians, camera=round_),
+        "distortion (Brown-Conrady)": lambda: seen(gaussians, camera=through(fs.BrownConrady(-0.4, 0.12))),
+        "fisheye, 200 degrees": lambda: seen(example("lens-fisheye"), camera=fisheye),
+        "panorama": lambda: seen(example("lens-panorama"), camera=fs.Camera.equirectangular(WIDTH, HEIGHT)),
         "parallel rays": lambda: seen(gaussians, camera=wide),
         "motion blur": lambda: seen(motion=turn, shutter=fs.Shutter(exposure=0.03, sub_poses=16)),
         "rolling shutter": lambda: seen(motion=turn, shutter=fs.Shutter(readout=0.1, rows_per_band=4)),
         "fog": lambda: seen(fog=fs.Fog(0.15, (0.75, 0.78, 0.8))),
-        "background: gradient": lambda: seen(background=fs.Gradient((0.1, 0.25, 0.7), (1.0, 0.95, 0.85))),
+        "background: gradient": lambda: seen(background=fs.Gradient(*DUSK)),
         "background: panorama": lambda: seen(background=fs.Panorama(sky())),
         "vignetting": lambda: seen(sensor=fs.Sensor(vignetting=(-0.6,))),
         "noise": lambda: seen(sensor=fs.Sensor(full_well=200, read_noise=6)),
@@ -184,7 +188,7 @@ def main() -> None:
     seen = [
         ("plain", picture(exact)),
         ("fog, 0.15 / m", picture(exact, fog=fs.Fog(0.15, (0.75, 0.78, 0.8)))),
-        ("gradient", picture(exact, background=fs.Gradient((0.1, 0.25, 0.7), (1.0, 0.95, 0.85)))),
+        ("gradient", picture(exact, background=fs.Gradient(*DUSK))),
         ("panorama", picture(exact, background=fs.Panorama(sky()))),
         ("vignetting, -0.6", picture(exact, sensor=fs.Sensor(vignetting=(-0.6,)))),
         ("noise, 200 electrons", picture(exact, sensor=fs.Sensor(full_well=200, read_noise=6))),

@@ -1,4 +1,4 @@
-"""The main job end to end: markers from text to splats, three views drawn, read back, checked and pictured."""
+"""The main job end to end: markers from text to splats, three views drawn, read back, checked, pictured."""
 
 import json
 import time

@@ -101,7 +101,7 @@ def count_key(most: int, height: int) -> np.ndarray:
 def outlined(
     image: np.ndarray, marks: Sequence[tuple[np.ndarray, str]], thickness: int = 2, size: float = 0.9
 ) -> np.ndarray:
-    """A copy of an image (h, w, 3) uint8 with quadrilaterals and captions below them, none over another.
+    """A copy of an image (h, w, 3) uint8 with quadrilaterals and, in dark boxes below them, captions.
 
     Args:
         marks: (corners (4, 2), caption) each; the first corner gets a dot.
@@ -114,15 +114,20 @@ def outlined(
         points = np.rint((corners - 0.5) * 2**_SHIFT).astype(np.int32)
         cv2.polylines(drawn, [points.reshape(-1, 1, 2)], True, _OUTLINE, thickness, cv2.LINE_AA, _SHIFT)
         cv2.circle(drawn, points[0].tolist(), (2 + thickness) * 2**_SHIFT, _OUTLINE, -1, cv2.LINE_AA, _SHIFT)
-    line = round(36 * size)
-    taken: list[tuple[int, int, int]] = []  # left, right, foot of the captions that stand
+    line, bottom = round(36 * size), image.shape[0] - 8
+    taken = [(*corners.min(axis=0), *corners.max(axis=0)) for corners, _ in marks]  # left, top, right, foot
     for corners, text in sorted(marks, key=lambda mark: mark[0][:, 1].max()):
         wide = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, max(1, round(2 * size)))[0][0]
         left = round(min(max(corners[:, 0].mean() - wide / 2, 4), max(image.shape[1] - wide - 4, 4)))
-        foot = round(min(corners[:, 1].max() + line, image.shape[0] - 8))
-        while any(left < end and left + wide > begin and abs(foot - y) < line for begin, end, y in taken):
-            foot += line
-        taken.append((left, left + wide, foot))
+        foot = round(min(corners[:, 1].max() + line, bottom))
+        while foot < bottom and any(
+            left - 4 < right and left + wide + 4 > begin and foot - line + 8 < low and foot + 8 > high
+            for begin, high, right, low in taken
+        ):
+            foot += 1
+        box = (left - 4, foot - line + 8, left + wide + 4, foot + 8)
+        taken.append(box)
+        cv2.rectangle(drawn, box[:2], box[2:], (_SHEET,) * 3, -1)
         write(drawn, text, (left, foot), size=size)
     return drawn
 
