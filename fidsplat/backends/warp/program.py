@@ -59,13 +59,11 @@ class Program:
     """The stages' kernels, and what the host must know of them."""
 
     def __init__(self, device: Any, name: str, features: FeatureSet, shape: WarpShape) -> None:
-        """name: of the device, for errors.
+        """name: of the device, for errors. The kernels have all of the features (`lacking`).
 
         Raises:
-            DeviceError: an effect that the Warp kernels have not, or the compiler refuses.
+            DeviceError: the compiler refuses.
         """
-        if lacks := lacking(features):
-            raise DeviceError(f"{name} (NVIDIA Warp) has no {', '.join(lacks)}; use an OpenCL device for it")
         self.device, self.shape, self._name = device, shape, name
         self.images = tuple(each for each in features.outputs if each.name in {"rgb", *features.taps})
         """the output images"""
