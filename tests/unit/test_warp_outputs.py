@@ -16,7 +16,7 @@ from typing import Any
 import warp as wp
 
 from ..common import View
-from ..window import Window, sample_at
+from ..pixel_grid import PixelGrid, sample_at
 from . import Output
 
 
@@ -33,11 +33,11 @@ def store(pixel: Any, at: int, samples: Any):
 
 
 @wp.func
-def resolve(window: Window, samples: Any, lengths: Any, out: Any):
+def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
     total = float(0.0)
-    for k in range(window.count):
-        total += samples.strongest[sample_at(window, k)]
-    out.strongest[window.pixel] = total * window.mean
+    for k in range(grid.count):
+        total += samples.strongest[sample_at(grid, k)]
+    out.strongest[grid.pixel] = total * grid.mean
 
 
 OUTPUT = Output(
