@@ -7,8 +7,8 @@ import warp as wp
 from . import output
 from .buffers import make_images, make_samples, sample_fields
 from .common import STRICT, View, fma
-from .rays import make_rays
 from .pixel_grid import PixelGrid, sample_at
+from .rays import make_rays
 
 
 @cache

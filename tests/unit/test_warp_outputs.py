@@ -3,9 +3,9 @@ the kernels' own do not know."""
 
 import numpy as np
 import pytest
+from fidsplat.backends.view import View
 
 import fidsplat as fs
-from fidsplat.backends.view import View
 from fidsplat.backends.warp import runtime
 from fidsplat.effects import CATALOGUE, Effect, FeatureSet, Output
 
@@ -104,7 +104,7 @@ def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch):
     backend = fs.Renderer("warp:cpu").backend
     monkeypatch.setitem(CATALOGUE, "strongest", Effect("strongest", output=Output("strongest", 1, "float32")))
     monkeypatch.setitem(CATALOGUE, "negative", Effect("negative"))
-    with pytest.raises(fs.DeviceError, match="warp:cpu .* has no negative, strongest; use an OpenCL device"):
+    with pytest.raises(fs.DeviceError, match=r"warp:cpu .* has no negative, strongest; use an OpenCL device"):
         backend.pipeline(features)
     beside("output", "strongest", STRONGEST)
     beside("post", "negative", NEGATIVE)
