@@ -21,7 +21,7 @@ from rich.progress import track
 from rich.table import Table
 
 import fidsplat as fs
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.effects import select
 from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.experiments.scenes import SCENES, load_scene

@@ -130,8 +130,8 @@ def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
     import numpy as np
 
     import fidsplat as fs
-    from fidsplat.backends.base import View
     from fidsplat.backends.opencl.arithmetic import run_arithmetic
+    from fidsplat.backends.view import View
     from fidsplat.effects import select
     from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture, truth_of
     from fidsplat.hard_cases.clouds import camera, random_splats, splats

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.base import View
 from fidsplat.backends.reference import ReferenceBackend
+from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
 from fidsplat.effects import select
 from fidsplat.quality import Quality

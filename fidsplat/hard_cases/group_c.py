@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, COLOR_TOLERANCE, Picture
 from fidsplat.hard_cases.case import Case, Finding

@@ -9,7 +9,7 @@ from types import ModuleType
 
 import numpy as np
 
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import Picture
 from fidsplat.render import Frame, Renderer

@@ -7,7 +7,7 @@ from agreement import ALL_OUTPUTS, random_splats
 from test_lens_pictures import CAMERAS
 
 import fidsplat as fs
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.effects import OUTPUTS, select
 from fidsplat.hard_cases.agreement import Picture, compare, truth_of
 from fidsplat.hard_cases.invariance import other_schedule

@@ -8,8 +8,8 @@ import pytest
 from agreement import ALL_OUTPUTS, random_splats
 
 import fidsplat as fs
-from fidsplat.backends.base import View
 from fidsplat.backends.planes import PlaneTable
+from fidsplat.backends.view import View
 from fidsplat.effects import select
 from fidsplat.hard_cases.invariance import group_shape, has_tiles, other_schedule, out_of_order
 

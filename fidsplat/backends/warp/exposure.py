@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from fidsplat.backends.exposure import Shot
+from fidsplat.backends.view import Shot
 from fidsplat.backends.warp import runtime
 from fidsplat.backends.warp.launch import Launcher
 

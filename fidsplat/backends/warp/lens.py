@@ -7,7 +7,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.backends.warp import runtime
 from fidsplat.backends.warp.memory import ArrayPool
 from fidsplat.cameras.raster import RayRaster

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.backends.warp import exposure, lens, runtime, sensor
 from fidsplat.backends.warp.around import Surroundings
 from fidsplat.backends.warp.finished import WarpPlanes

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.backends.warp import exposure, motion, runtime
 from fidsplat.backends.warp.finished import WarpPlanes
 from fidsplat.backends.warp.launch import Launcher

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.backends.warp import runtime
 from fidsplat.backends.warp.memory import ArrayPool
 from fidsplat.effects.catalogue import CATALOGUE
