@@ -29,7 +29,8 @@ CAMERA = ("width", "height", "fov_x_deg", "fx", "fy", "cx", "cy")
 CAMERA += ("position", "look_at", "up", "world_to_camera", "near", "far", *TABLES, "shutter", "motion")
 CAMERA_POSE = ("position", "look_at", "up", "world_to_camera")
 SPLATS = ("file", "position", "quaternion", "scale", "motion")
-MARKERS = ("spec", "size", "position", "quaternion", *knobs(MarkerQuality), "quiet_zone", "motion")
+MARKER = ("spec", "size", "position", "quaternion", "quiet_zone", "max_splats", "motion")
+MARKERS = (*MARKER, *knobs(MarkerQuality))
 RENDER = ("outputs", "background", "quality", "samples", "lowpass", "first_hit", "device")
 IMAGE = "image:"
 
@@ -174,12 +175,13 @@ def _marker(table: Table, folder: Path, quality: MarkerQuality) -> PlacedMarker:
     if spec.startswith(IMAGE):
         spec = IMAGE + str(folder / spec.removeprefix(IMAGE))
     pose, motion = _pose(table), read_keyframes(table, POSE, _pose)
-    quiet_zone = table.whole("quiet_zone", None)
+    quiet_zone, max_splats = table.whole("quiet_zone", None), table.whole("max_splats", None)
     own = read_knobs(table, MarkerQuality)
     if quiet_zone is not None and quiet_zone < 0:
         raise table.error("quiet_zone", f"must be 0 or more modules, not {quiet_zone}")
-    from fidsplat.markers import marker  # late: it brings shapely and networkx
+    from fidsplat.markers import marker  # late: it brings what makes markers
 
+    limit = {} if max_splats is None else {"max_splats": max_splats}
     with table.at():
-        made = marker(spec, size=size, quiet_zone=quiet_zone, quality=quality, **own)
+        made = marker(spec, size=size, quiet_zone=quiet_zone, quality=quality, **limit, **own)
         return PlacedMarker(made, pose, motion=motion)

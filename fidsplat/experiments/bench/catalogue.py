@@ -11,9 +11,9 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.errors import InputError, unknown
-from fidsplat.experiments.scenes import SCENES, load_scene, standard_camera
 from fidsplat.markers import marker
 from fidsplat.quality import Quality
+from fidsplat.random_clouds import SCENES, load_scene, standard_camera
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.splats import SplatCloud
 

@@ -8,11 +8,11 @@ from functools import lru_cache
 
 from fidsplat.cameras import Camera
 from fidsplat.errors import InputError, unknown
-from fidsplat.experiments.scenes import load_scene
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS
 from fidsplat.experiments.tradeoff.hard import hard_scene
 from fidsplat.markers import Marker, marker
 from fidsplat.quality import MarkerQuality
+from fidsplat.random_clouds import load_scene
 from fidsplat.splats import SplatCloud
 
 RANDOM = ("r100k_720p", "r1m_1080p")
