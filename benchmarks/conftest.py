@@ -9,6 +9,7 @@ from dataclasses import asdict
 import pytest
 
 import fidsplat as fs
+from fidsplat.backends.base import Measurable
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES
 from fidsplat.experiments.bench.measure import SceneRun
 
@@ -41,11 +42,10 @@ def pytest_addoption(parser) -> None:
 
 def pytest_benchmark_update_machine_info(config, machine_info) -> None:
     renderer = fs.Renderer(config.getoption("--device"))
-    rates = getattr(renderer.backend, "rates", None)
     machine_info["fidsplat"] = {
         "version": fs.__version__,
         "device": asdict(renderer.device),
-        "rates": asdict(rates()) if rates else None,
+        "rates": asdict(renderer.backend.rates()) if isinstance(renderer.backend, Measurable) else None,
     }
 
 

@@ -159,7 +159,7 @@ class Adopts(Protocol):
 
 @runtime_checkable
 class Measurable(Protocol):
-    """A backend that can be held against its hardware: it has these, and kernels for the effect `overdraw`."""
+    """A backend that can be held against its hardware. It also has kernels for the effect `overdraw`."""
 
     @property
     def memory_bytes(self) -> int:
@@ -243,9 +243,9 @@ class Probed(Protocol):
 class Reshapes(Protocol):
     """A backend whose build constants (its "shape") tests may replace: sizes of tiles, ways of sorting."""
 
-    def shapes(self, kind: str) -> list[Any]:
-        """Other build constants. kind: `tiles`, of other sizes, whose pictures have the same bits; `schedule`,
-        the way in which another kind of device walks its tiles (on that kind: other tiles), whose pictures
+    def shapes(self, kind: str) -> dict[str, Any]:
+        """Build constants by a name that people read. kind: `tiles`, of other sizes, whose pictures have the
+        same bits; `schedule`, the way in which a GPU walks its tiles (on a GPU: other tiles), whose pictures
         agree but for rounding; `sorting`, the device's own and others for listing and sorting."""
         ...
 

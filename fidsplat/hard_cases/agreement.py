@@ -102,7 +102,7 @@ def truth_of(picture: Picture, pixels: tuple[np.ndarray, np.ndarray] | None = No
     pipeline, resident = judge.pipeline(features), judge.upload(picture.cloud)
     if pixels is not None:
         return pipeline.pixels(resident, view, *pixels)
-    return pipeline.render(resident, view).planes
+    return pipeline.render(resident, view).images
 
 
 def compare(planes: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], outputs) -> list[Difference]:

@@ -5,18 +5,20 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from fidsplat.backends.base import DeviceInfo
+from fidsplat.backends.base import DeviceInfo, Probe
 from fidsplat.backends.warp import runtime
+from fidsplat.backends.warp.arithmetic import run_arithmetic
 from fidsplat.backends.warp.launch import Commands
 from fidsplat.backends.warp.lens import LensArrays
 from fidsplat.backends.warp.memory import ArrayPool, Resident
-from fidsplat.backends.warp.pipeline import WarpPipeline
+from fidsplat.backends.warp.pipeline import KNOWN, WarpPipeline
+from fidsplat.backends.warp.probe import WarpProbe
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
@@ -67,6 +69,8 @@ def open_device(selector: str = "") -> WarpBackend:
 class WarpBackend:
     """An open Warp device with its pool of arrays and compiled pipelines."""
 
+    always_float64 = False
+
     def __init__(self, device: Any) -> None:
         self.info = _describe(device)
         self.device = device
@@ -101,16 +105,49 @@ class WarpBackend:
         """Arrays (`means`, `quats`, ...) that are on the device already, used where they lie."""
         return Resident.around(arrays, origin, self.pool)
 
+    def unsupported(self, features: FeatureSet) -> str:
+        """The effects that the Warp kernels have not; empty if they have all."""
+        lacking = sorted(features.names - KNOWN)
+        if not lacking:
+            return ""
+        named = ", ".join(lacking)
+        return f"{self.info.name} ({self.info.platform}) has no {named}; use an OpenCL device for it"
+
     def pipeline(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpPipeline:
         """The stages compiled for these features; `shape` replaces the device's own tiles (tests).
 
         Raises:
-            DeviceError: an effect that the Warp kernels have not, or the compiler refuses.
+            DeviceError: what is `unsupported`, or the compiler refuses.
         """
+        if why := self.unsupported(features):
+            raise DeviceError(why)
         key = (features, shape or self.shape)
         if key not in self._pipelines:
             self._pipelines[key] = WarpPipeline(self, *key)
         return self._pipelines[key]
+
+    def run_arithmetic(
+        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """As `ProbesArithmetic` (fidsplat/backends/base.py)."""
+        return run_arithmetic(self, exponents, shares, above, below)
+
+    def probe(self) -> Probe:
+        """What tests look into the device with."""
+        return WarpProbe(self)
+
+    def shapes(self, kind: str) -> dict[str, WarpShape]:
+        """As `Reshapes` (fidsplat/backends/base.py)."""
+        own = self.shape
+        if kind == "schedule":
+            return {"groups": WarpShape("group", 8, 8)}
+        if kind == "sorting":
+            return {"own": own}
+        return {f"{side} x {side}": replace(own, tile_width=side, tile_height=side) for side in (8, 32)}
+
+    def pieces(self, shape: WarpShape) -> int:
+        """Warp's sorts take everything at once."""
+        return 1
 
 
 def _describe(device: Any) -> DeviceInfo:

@@ -81,8 +81,8 @@ class Resident:
         self.footprint = footprint
 
     @property
-    def nbytes(self) -> int:
-        """Bytes that the splats take."""
+    def memory_bytes(self) -> int:
+        """Bytes that the splats take on the device."""
         return sum(array.size * array.strides[0] for array in self.arrays.values())
 
     @classmethod

@@ -54,12 +54,6 @@ class WarpPipeline:
 
     def __init__(self, backend: WarpBackend, features: FeatureSet, shape: WarpShape) -> None:
         names = {effect.name for effect in features.effects}
-        lacking = sorted(names - KNOWN)
-        if lacking:
-            raise DeviceError(
-                f"{backend.info.name} ({backend.info.platform}) has no {', '.join(lacking)}; "
-                "use an OpenCL device for it"
-            )
         self.backend, self.features, self.shape = backend, features, shape
         if names & {"label", "splat_id"}:
             names |= {"heaviest"}  # both are the same splat's

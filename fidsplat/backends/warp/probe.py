@@ -38,51 +38,6 @@ def run(
         raise DeviceError(f"{backend.info.name} failed in a test of its arithmetic: {error}") from error
 
 
-def contraction(backend: WarpBackend, a: np.ndarray, b: np.ndarray) -> tuple[list[np.ndarray], bool]:
-    """a b - a b; a b + a; (a / 3) (b / 3) - (a / 3) (b / 3) in float64; a b - (a b), fused: each (n,), from
-    a, b (n,) float32.
-    And whether the device fuses where it is asked to.
-    """
-    n = len(a)
-    types = (np.float32, np.float32, np.float64, np.float32)
-    return run(backend, "contraction", n, (a, b, a), [np.zeros(n, each) for each in types]), True
-
-
-def not_a_number(backend: WarpBackend, x: np.ndarray) -> Sequence[np.ndarray]:
-    """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
-    (told,) = run(backend, "not_a_number", len(x), (x,), [np.zeros((4, len(x)), np.int32)])
-    return list(told)
-
-
-def options(backend: WarpBackend) -> list[str]:
-    """What every kernel is compiled with, switches that are on."""
-    return [name for name, value in runtime.kernels("common").STRICT.items() if value]
-
-
-def scan(pipeline: WarpPipeline, lengths: np.ndarray) -> tuple[np.ndarray, int]:
-    """Where lists of these lengths (n,) uint32 start, modulo 2^32, (n + 1,) uint32; and the sum of all in 64
-    bits.
-    """
-    wp, device = runtime.load(), pipeline.backend.device
-    with wp.ScopedDevice(device):
-        given = wp.array(lengths.astype(np.int64), dtype=wp.int64, device=device)
-        ends = wp.zeros_like(given)
-        wp.utils.array_scan(given, ends, inclusive=True)
-    places = np.concatenate([[0], ends.numpy()])
-    return places.astype(np.uint32), int(places[-1])
-
-
-@contextmanager
-def poisoned(backend: WarpBackend) -> Iterator[None]:
-    """Within it, every array that a picture takes is filled with 0xFF first: NaN, or the integer -1."""
-    pool = backend.pool
-    backend.pool = PoisonedPool(backend.device)
-    try:
-        yield
-    finally:
-        backend.pool = pool
-
-
 class PoisonedPool(ArrayPool):
     """A pool whose arrays hold nothing useful."""
 
@@ -99,3 +54,50 @@ def poison(array: Any) -> Any:
     size = array.size * array.strides[0]
     wp.array(ptr=array.ptr, dtype=wp.uint8, shape=(size,), device=array.device).fill_(0xFF)
     return array
+
+
+class WarpProbe:
+    """Single kernels of kernels/warp/check.py, and arrays that are filled with rubbish first: `Probe` of
+    fidsplat/backends/base.py."""
+
+    def __init__(self, backend: WarpBackend) -> None:
+        self._backend = backend
+
+    def contraction(self, a: np.ndarray, b: np.ndarray) -> tuple[list[np.ndarray], bool]:
+        """a b - a b; a b + a; (a / 3) (b / 3) - (a / 3) (b / 3) in float64; a b - (a b), fused: each (n,),
+        from a, b (n,) float32. And whether the device fuses where it is asked to.
+        """
+        n = len(a)
+        types = (np.float32, np.float32, np.float64, np.float32)
+        return run(self._backend, "contraction", n, (a, b, a), [np.zeros(n, each) for each in types]), True
+
+    def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
+        """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
+        (told,) = run(self._backend, "not_a_number", len(x), (x,), [np.zeros((4, len(x)), np.int32)])
+        return list(told)
+
+    def options(self) -> list[str]:
+        """What every kernel is compiled with, switches that are on."""
+        return [name for name, value in runtime.kernels("common").STRICT.items() if value]
+
+    def scan(self, pipeline: WarpPipeline, lengths: np.ndarray) -> tuple[np.ndarray, int]:
+        """Where lists of these lengths (n,) uint32 start, modulo 2^32, (n + 1,) uint32; and the sum of all in
+        64 bits.
+        """
+        wp, device = runtime.load(), pipeline.backend.device
+        with wp.ScopedDevice(device):
+            given = wp.array(lengths.astype(np.int64), dtype=wp.int64, device=device)
+            ends = wp.zeros_like(given)
+            wp.utils.array_scan(given, ends, inclusive=True)
+        places = np.concatenate([[0], ends.numpy()])
+        return places.astype(np.uint32), int(places[-1])
+
+    @contextmanager
+    def poisoned(self) -> Iterator[None]:
+        """Within it, every array that a picture takes is filled with 0xFF first: NaN, or the integer -1."""
+        pool = self._backend.pool
+        self._backend.pool = PoisonedPool(self._backend.device)
+        try:
+            yield
+        finally:
+            self._backend.pool = pool

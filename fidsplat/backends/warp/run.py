@@ -182,7 +182,7 @@ class Run:
         budget, resident = self.backend.memory_budget, self.resident
         # as `_project`, `_sort`, `_list`, `_samples` and `_resolve` take them; the sorts have as much again
         each = 16 * self.pipeline.layout.lines + _BOUNDS + _PROJECTED
-        fixed = resident.nbytes + each * resident.count + _VISIBLE * visible
+        fixed = resident.memory_bytes + each * resident.count + _VISIBLE * visible
         fixed += self._planes_bytes() + self.beside
         fixed += self.backend.lens_arrays.nbytes(self.view)
         if self.pipeline.surroundings:
