@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -15,25 +12,14 @@ from fidsplat.backends.base import DeviceInfo, Probe
 from fidsplat.backends.warp import runtime
 from fidsplat.backends.warp.arithmetic import run_arithmetic
 from fidsplat.backends.warp.launch import Commands
-from fidsplat.backends.warp.lens import LensArrays
-from fidsplat.backends.warp.memory import ArrayPool, Resident
-from fidsplat.backends.warp.pipeline import KNOWN, WarpPipeline
+from fidsplat.backends.warp.pipeline import WarpPipeline
 from fidsplat.backends.warp.probe import WarpProbe
+from fidsplat.backends.warp.program import Program, WarpShape, unsupported
+from fidsplat.backends.warp.resident import Resident
+from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
-from fidsplat.surroundings import Panorama
-
-
-@dataclass(frozen=True)
-class WarpShape:
-    """How pictures are cut for a device."""
-
-    schedule: str
-    """`tiles`: a thread draws a tile (CPU). `group`: a block of threads draws a tile (CUDA)."""
-    tile_width: int
-    """samples, a multiple of 4"""
-    tile_height: int
 
 
 def devices() -> list[DeviceInfo]:
@@ -67,7 +53,7 @@ def open_device(selector: str = "") -> WarpBackend:
 
 
 class WarpBackend:
-    """An open Warp device with its pool of arrays and compiled pipelines."""
+    """An open Warp device with what its pictures share, and compiled pipelines."""
 
     always_float64 = False
 
@@ -75,19 +61,18 @@ class WarpBackend:
         self.info = _describe(device)
         self.device = device
         self.shape = WarpShape("group" if device.is_cuda else "tiles", 16, 16)
-        self.pool = ArrayPool(device)
-        self.lens_arrays = LensArrays()
-        self.pair_budget = 2**30 - 1
-        """Most pairs of splats and tiles that are listed at once; tests make it small."""
-        self.memory_budget = self.info.memory_bytes // 10 * 9
-        """bytes of the device that a picture and its cloud may take"""
-        self.threads = 1 if device.is_cuda else self.info.compute_units
-        # Warp runs a CPU launch on the thread that calls it, without the interpreter's lock
-        self.workers = None if device.is_cuda else ThreadPoolExecutor(self.threads, "fidsplat-warp")
-        self.commands = Commands(device)
-        self.panoramas: WeakKeyDictionary[Panorama, Any] = WeakKeyDictionary()
-        """on the device, each as long as it is somewhere else"""
+        self.workspace = Workspace(device, self.info.memory_bytes // 10 * 9)
+        self._commands = Commands(device, 1 if device.is_cuda else self.info.compute_units)
         self._pipelines: dict[tuple[FeatureSet, WarpShape], WarpPipeline] = {}
+
+    @property
+    def pair_budget(self) -> int:
+        """Most pairs of splats and tiles that are listed at once; tests make it small."""
+        return self.workspace.pair_budget
+
+    @pair_budget.setter
+    def pair_budget(self, pairs: int) -> None:
+        self.workspace.pair_budget = pairs
 
     def limit_memory(self, budget: int) -> None:
         """Let a picture and its cloud take at most `budget` bytes of the device.
@@ -95,55 +80,49 @@ class WarpBackend:
         Pictures that need more for their lists are drawn in bands of tiles, with the same bits; a cloud that
         does not fit is an error.
         """
-        self.memory_budget = budget
+        self.workspace.memory_budget = budget
 
     def upload(self, cloud: SplatCloud) -> Resident:
         """The cloud in arrays on the device."""
-        return Resident.of(cloud, self.pool)
+        return Resident.of(cloud, self.workspace.pool)
 
     def adopt(self, arrays: Mapping[str, Any], origin: np.ndarray) -> Resident:
         """Arrays (`means`, `quats`, ...) that are on the device already, used where they lie."""
-        return Resident.around(arrays, origin, self.pool)
+        return Resident.around(arrays, origin, self.workspace.pool)
 
     def unsupported(self, features: FeatureSet) -> str:
         """The effects that the Warp kernels have not; empty if they have all."""
-        lacking = sorted(features.names - KNOWN)
-        if not lacking:
-            return ""
-        named = ", ".join(lacking)
-        return f"{self.info.name} ({self.info.platform}) has no {named}; use an OpenCL device for it"
+        return unsupported(features, self.info.name)
 
     def pipeline(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpPipeline:
         """The stages compiled for these features; `shape` replaces the device's own tiles (tests).
 
         Raises:
-            DeviceError: what is `unsupported`, or the compiler refuses.
+            DeviceError: an effect that the Warp kernels have not, or the compiler refuses.
         """
-        if why := self.unsupported(features):
-            raise DeviceError(why)
         key = (features, shape or self.shape)
         if key not in self._pipelines:
-            self._pipelines[key] = WarpPipeline(self, *key)
+            program = Program(self.device, self.info.name, *key)
+            self._pipelines[key] = WarpPipeline(program, self.workspace, self._commands, self.info.name)
         return self._pipelines[key]
 
     def run_arithmetic(
         self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
     ) -> dict[str, np.ndarray]:
         """As `ProbesArithmetic` (fidsplat/backends/base.py)."""
-        return run_arithmetic(self, exponents, shares, above, below)
+        return run_arithmetic(self.device, exponents, shares, above, below)
 
     def probe(self) -> Probe:
         """What tests look into the device with."""
-        return WarpProbe(self)
+        return WarpProbe(self.workspace)
 
     def shapes(self, kind: str) -> dict[str, WarpShape]:
         """As `Reshapes` (fidsplat/backends/base.py)."""
-        own = self.shape
         if kind == "schedule":
             return {"groups": WarpShape("group", 8, 8)}
         if kind == "sorting":
-            return {"own": own}
-        return {f"{side} x {side}": replace(own, tile_width=side, tile_height=side) for side in (8, 32)}
+            return {"own": self.shape}
+        return {f"{side} x {side}": WarpShape(self.shape.schedule, side, side) for side in (8, 32)}
 
     def pieces(self, shape: WarpShape) -> int:
         """Warp's sorts take everything at once."""
