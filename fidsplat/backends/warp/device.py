@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import DeviceInfo
+from fidsplat.backends.base import DeviceInfo, Probe
 from fidsplat.backends.warp import runtime
+from fidsplat.backends.warp.arithmetic import run_arithmetic
 from fidsplat.backends.warp.launch import Commands
 from fidsplat.backends.warp.pipeline import WarpPipeline
-from fidsplat.backends.warp.program import Program, WarpShape
+from fidsplat.backends.warp.probe import WarpProbe
+from fidsplat.backends.warp.program import Program, WarpShape, unsupported
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.effects import FeatureSet
@@ -53,6 +55,8 @@ def open_device(selector: str = "") -> WarpBackend:
 class WarpBackend:
     """An open Warp device with what its pictures share, and compiled pipelines."""
 
+    always_float64 = False
+
     def __init__(self, device: Any) -> None:
         self.info = _describe(device)
         self.device = device
@@ -86,6 +90,10 @@ class WarpBackend:
         """Arrays (`means`, `quats`, ...) that are on the device already, used where they lie."""
         return Resident.around(arrays, origin, self.workspace.pool)
 
+    def unsupported(self, features: FeatureSet) -> str:
+        """The effects that the Warp kernels have not; empty if they have all."""
+        return unsupported(features, self.info.name)
+
     def pipeline(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpPipeline:
         """The stages compiled for these features; `shape` replaces the device's own tiles (tests).
 
@@ -97,6 +105,28 @@ class WarpBackend:
             program = Program(self.device, self.info.name, *key)
             self._pipelines[key] = WarpPipeline(program, self.workspace, self._commands, self.info.name)
         return self._pipelines[key]
+
+    def run_arithmetic(
+        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """As `ProbesArithmetic` (fidsplat/backends/base.py)."""
+        return run_arithmetic(self.device, exponents, shares, above, below)
+
+    def probe(self) -> Probe:
+        """What tests look into the device with."""
+        return WarpProbe(self.workspace)
+
+    def shapes(self, kind: str) -> dict[str, WarpShape]:
+        """As `Reshapes` (fidsplat/backends/base.py)."""
+        if kind == "schedule":
+            return {"groups": WarpShape("group", 8, 8)}
+        if kind == "sorting":
+            return {"own": self.shape}
+        return {f"{side} x {side}": WarpShape(self.shape.schedule, side, side) for side in (8, 32)}
+
+    def pieces(self, shape: WarpShape) -> int:
+        """Warp's sorts take everything at once."""
+        return 1
 
 
 def _describe(device: Any) -> DeviceInfo:
