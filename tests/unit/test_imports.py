@@ -32,7 +32,7 @@ MAY_IMPORT = {
     "splats": BASE | {"harmonics", "defects"},
     "cameras": BASE,
     "vision": BASE | {"cameras"},
-    "formats": BASE | {"splats", "harmonics", "cameras"},
+    "formats": BASE | {"splats", "harmonics", "defects", "cameras"},
     "markers": BASE | {"splats", "quality", "vision.dictionaries", "vision.images"},
     "scenes": PLAIN | {"markers", "formats"},
     "effects": PLAIN | {"scenes"},
@@ -118,7 +118,7 @@ def within_any(names, package) -> bool:
 
 
 # modules of the wing that every backend may import
-SHARED = ("base", "registry", "planes", "exposure")
+SHARED = ("base", "view", "registry", "planes", "exposure")
 
 
 def test_backends_do_not_import_each_other():

@@ -1,13 +1,15 @@
 """What an output and a step after blending cost on Warp: one file each. Toys of both stand in a folder that
 the kernels' own do not know."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from fidsplat.backends.view import View
 
 import fidsplat as fs
+from fidsplat.backends.view import View
 from fidsplat.backends.warp import runtime
-from fidsplat.effects import CATALOGUE, Effect, FeatureSet, Output
+from fidsplat.effects import CATALOGUE, FeatureSet, Output
 
 wp = pytest.importorskip("warp")
 STRONGEST = '''"""The largest weight of a fragment: of a pixel the mean of its samples."""
@@ -102,8 +104,9 @@ def drawn(taps, posts):
 def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch):
     features = FeatureSet(SLOTS, ("strongest",), 0, 1, "float64", ("negative",))
     backend = fs.Renderer("warp:cpu").backend
-    monkeypatch.setitem(CATALOGUE, "strongest", Effect("strongest", output=Output("strongest", 1, "float32")))
-    monkeypatch.setitem(CATALOGUE, "negative", Effect("negative"))
+    output = Output("strongest", 1, "float32")
+    monkeypatch.setitem(CATALOGUE, "strongest", replace(CATALOGUE["alpha"], name="strongest", output=output))
+    monkeypatch.setitem(CATALOGUE, "negative", replace(CATALOGUE["gain"], name="negative"))
     with pytest.raises(fs.DeviceError, match=r"warp:cpu .* has no negative, strongest; use an OpenCL device"):
         backend.pipeline(features)
     beside("output", "strongest", STRONGEST)

@@ -15,7 +15,7 @@ from fidsplat.backends.warp.arithmetic import run_arithmetic
 from fidsplat.backends.warp.launch import Commands
 from fidsplat.backends.warp.pipeline import WarpPipeline
 from fidsplat.backends.warp.probe import WarpProbe
-from fidsplat.backends.warp.program import Program, WarpShape, lacking
+from fidsplat.backends.warp.program import Program, WarpShape, unsupported
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.effects import FeatureSet
@@ -92,11 +92,8 @@ class WarpBackend:
         return Resident.around(arrays, origin, self.workspace.pool)
 
     def unsupported(self, features: FeatureSet) -> str:
-        """The effects that the Warp kernels have not, in a sentence; empty if they have all."""
-        names = ", ".join(lacking(features))
-        if not names:
-            return ""
-        return f"{self.info.name} ({self.info.platform}) has no {names}; use an OpenCL device for it"
+        """The effects that the Warp kernels have not; empty if they have all."""
+        return unsupported(features, self.info.name)
 
     def pipeline(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpPipeline:
         """The stages compiled for these features; `shape` replaces the device's own tiles (tests).
@@ -104,8 +101,6 @@ class WarpBackend:
         Raises:
             DeviceError: what is `unsupported`, or the compiler refuses.
         """
-        if why := self.unsupported(features):
-            raise DeviceError(why)
         key = (features, shape or self.shape)
         if key not in self._pipelines:
             program = Program(self.device, self.info.name, *key)
@@ -115,7 +110,7 @@ class WarpBackend:
     def run_arithmetic(
         self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
     ) -> dict[str, np.ndarray]:
-        """Results of the device's functions, as the stages call them (arithmetic.py)."""
+        """As `ProbesArithmetic` (fidsplat/backends/base.py)."""
         return run_arithmetic(self.workspace, exponents, shares, above, below)
 
     def probe(self) -> WarpProbe:
@@ -123,7 +118,7 @@ class WarpBackend:
         return WarpProbe(self.workspace)
 
     def shapes(self, kind: str) -> dict[str, WarpShape]:
-        """Build constants that tests may give to `pipeline`, by a name; kind: tiles, schedule, sorting."""
+        """As `Reshapes` (fidsplat/backends/base.py)."""
         own = self.shape
         if kind == "schedule":
             return {"groups": WarpShape("group", 8, 8)}
@@ -132,7 +127,7 @@ class WarpBackend:
         return {f"{side} x {side}": replace(own, tile_width=side, tile_height=side) for side in (8, 32)}
 
     def pieces(self, shape: WarpShape) -> int:
-        """In how many pieces the sorts cut what they sort: Warp's take everything at once."""
+        """Warp's sorts take everything at once."""
         return 1
 
 

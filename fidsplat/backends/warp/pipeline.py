@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.backends.warp import bands
 from fidsplat.backends.warp.exposure import gather
 from fidsplat.backends.warp.images import WarpImages

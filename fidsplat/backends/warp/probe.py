@@ -16,7 +16,7 @@ from fidsplat.errors import DeviceError
 
 
 class WarpProbe:
-    """Of one device, by its workspace."""
+    """`Probe` of fidsplat/backends/base.py, for the device of a workspace."""
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace

@@ -50,20 +50,24 @@ def known() -> frozenset[str]:
     return SLOTS | kernels("output").known() | kernels("post").known()
 
 
-def lacking(features: FeatureSet) -> list[str]:
-    """What of these features the Warp kernels have not, sorted."""
-    return sorted({*features.slots, *features.taps, *features.posts} - known())
+def unsupported(features: FeatureSet, name: str) -> str:
+    """What of these features the Warp kernels have not, as the message of an error; empty if they have all.
+    name: of the device."""
+    lacking = ", ".join(sorted({*features.slots, *features.taps, *features.posts} - known()))
+    return f"{name} (NVIDIA Warp) has no {lacking}; use an OpenCL device for it" if lacking else ""
 
 
 class Program:
     """The stages' kernels, and what the host must know of them."""
 
     def __init__(self, device: Any, name: str, features: FeatureSet, shape: WarpShape) -> None:
-        """name: of the device, for errors. The kernels have all of the features (`lacking`).
+        """name: of the device, for errors.
 
         Raises:
-            DeviceError: the compiler refuses.
+            DeviceError: what is `unsupported`, or the compiler refuses.
         """
+        if why := unsupported(features, name):
+            raise DeviceError(why)
         self.device, self.shape, self._name = device, shape, name
         self.images = tuple(each for each in features.outputs if each.name in {"rgb", *features.taps})
         """the output images"""
