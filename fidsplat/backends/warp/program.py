@@ -53,8 +53,8 @@ def known() -> frozenset[str]:
 def unsupported(features: FeatureSet, name: str) -> str:
     """What of these features the Warp kernels have not, as the message of an error; empty if they have all.
     name: of the device."""
-    lacking = sorted({*features.slots, *features.taps, *features.posts} - known())
-    return f"{name} (NVIDIA Warp) has no {', '.join(lacking)}; use an OpenCL device for it" if lacking else ""
+    lacking = ", ".join(sorted({*features.slots, *features.taps, *features.posts} - known()))
+    return f"{name} (NVIDIA Warp) has no {lacking}; use an OpenCL device for it" if lacking else ""
 
 
 class Program:
@@ -64,7 +64,7 @@ class Program:
         """name: of the device, for errors.
 
         Raises:
-            DeviceError: an effect that the Warp kernels have not, or the compiler refuses.
+            DeviceError: what is `unsupported`, or the compiler refuses.
         """
         if why := unsupported(features, name):
             raise DeviceError(why)
