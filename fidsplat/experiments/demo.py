@@ -26,7 +26,7 @@ from fidsplat.vision.paint import (
     normal_picture,
     outlined,
 )
-from fidsplat.vision.planes import save_plane
+from fidsplat.vision.output_files import save_output
 
 # a marker counts as wholly visible from this share of its area on; the rest is the soft edge of its quiet
 # zone
@@ -175,7 +175,7 @@ def _save(folder: Path, stem: str, images: dict[str, np.ndarray], marked: np.nda
     files = [
         file
         for name, image in images.items()
-        for file in save_plane(name, image, lambda kind, suffix: folder / f"{stem}-{kind}{suffix}")
+        for file in save_output(name, image, lambda kind, suffix: folder / f"{stem}-{kind}{suffix}")
     ]
     return [*files, write_png(folder / f"{stem}-detection.png", marked)]
 
