@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from fidsplat.vision.output_files import save_output
 from fidsplat.vision.paint import (
     KEY_WIDTH,
     contact_sheet,
@@ -17,7 +18,6 @@ from fidsplat.vision.paint import (
     normal_picture,
     outlined,
 )
-from fidsplat.vision.output_files import save_output
 
 SQUARE = np.array([[20.5, 10.5], [60.5, 10.5], [60.5, 40.5], [20.5, 40.5]])
 
