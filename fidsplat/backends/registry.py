@@ -11,7 +11,7 @@ from fidsplat.backends.base import Backend, DeviceInfo
 from fidsplat.errors import UnknownDeviceError
 
 _FAMILIES = {
-    "opencl": "fidsplat.backends.opencl",
+    "opencl": "fidsplat.backends.opencl.device",
     "warp": "fidsplat.backends.warp",
     "reference": "fidsplat.backends.reference",
 }

@@ -6,11 +6,13 @@ from itertools import product
 import numpy as np
 import pytest
 from agreement import random_splats
-from test_assemble import COLORS, GROUP, PLAIN, SHAPE, Cloud
+from test_assemble import COLORS, GROUP, PLAIN, SHAPE, Cloud, record_bytes
 
 import fidsplat as fs
-from fidsplat.backends.opencl.assemble import DeviceShape, assemble
-from fidsplat.effects import CATALOGUE, select
+from fidsplat.backends.opencl.assemble import assemble
+from fidsplat.backends.opencl.layout import LAYOUTS
+from fidsplat.backends.opencl.shapes import gpu_shape
+from fidsplat.effects import select
 
 BACKEND = "opencl"
 
@@ -82,7 +84,7 @@ def test_what_lenses_take():
     """Bytes of a record and words of bounds; the base's are those of test_assemble."""
 
     def record(kind):
-        return assemble(select(COLORS, ("rgb",), PLAIN, CAMERAS[kind]), SHAPE).record_bytes
+        return record_bytes(select(COLORS, ("rgb",), PLAIN, CAMERAS[kind]))
 
     assert {kind: record(kind) for kind in CAMERAS} == {
         "pinhole": 80,
@@ -92,7 +94,7 @@ def test_what_lenses_take():
         "orthographic": 96,
     }
     assert not any(
-        CATALOGUE[name].record_lanes for name in ("shutter_exposure", "motion_groups", "ray_map", "polygon")
+        LAYOUTS[name].splat for name in ("shutter_exposure", "motion_groups", "ray_map", "polygon")
     )
 
 
@@ -112,7 +114,7 @@ def test_the_other_schedule_draws_the_same_picture(renderer):
 
     cloud = random_splats(60, seed=3, depth=(-2, 4))
     backend = renderer.backend
-    shape = DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, 256, backend.shape.fast_fma)
+    shape = gpu_shape(256, backend.shape.fast_fma)
     for camera in CAMERAS.values():
         view = exposed_view(camera, fs.Quality(), cloud.origin, (0, 0, 0), fs.Motion(), fs.Shutter())
         features = select(cloud, ("rgb", "depth"), fs.Quality(), camera)
