@@ -5,17 +5,15 @@ A `Quality` says what is computed, never where: the same object works on every b
 
 from __future__ import annotations
 
-import difflib
 import math
 import operator
-from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fidsplat.errors import InputError
+from fidsplat.errors import InputError, unknown
 
 if TYPE_CHECKING:
     from fidsplat.cameras import Camera, Motion, Shutter
@@ -210,7 +208,7 @@ class Quality:
         """The preset of that name: standard, fast, reference, gsplat or surfel."""
         if name in PRESETS:
             return PRESETS[name]
-        raise InputError(f"unknown quality {name!r}{_hint(name, PRESETS)}; known: {', '.join(PRESETS)}")
+        raise InputError(unknown("quality", name, PRESETS))
 
     @classmethod
     def of(cls, quality: Quality | str | None) -> Quality:
@@ -311,12 +309,7 @@ def _check_known(kind: type[Quality] | type[MarkerQuality], name: str) -> None:
     known = [knob.name for knob in fields(kind)]
     if name not in known:
         whose = "marker quality" if kind is MarkerQuality else "quality"
-        raise InputError(f"{whose} has no knob {name!r}{_hint(name, known)}; known: {', '.join(known)}")
-
-
-def _hint(name: Any, known: Iterable[str]) -> str:
-    near = difflib.get_close_matches(str(name), known, 1)
-    return f" (did you mean {near[0]!r}?)" if near else ""
+        raise InputError(unknown(f"knob of {whose}", name, known))
 
 
 def _read(kind: type[Quality] | type[MarkerQuality], name: str, text: str) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,7 +10,7 @@ from typing import Protocol
 from fidsplat.cameras import Camera
 from fidsplat.effects.catalogue import CATALOGUE, Output
 from fidsplat.effects.together import refuse_strangers
-from fidsplat.errors import InputError
+from fidsplat.errors import InputError, unknown
 from fidsplat.quality import Quality
 from fidsplat.sensor import Sensor
 from fidsplat.surroundings import Background, Fog, Gradient, background_of
@@ -104,9 +103,7 @@ def select(
     wanted = set(outputs)
     for name in wanted:
         if name not in OUTPUTS:
-            near = difflib.get_close_matches(str(name), OUTPUTS, 1)
-            hint = f" (did you mean {near[0]!r}?)" if near else ""
-            raise InputError(f"unknown output {name!r}{hint}; known: {', '.join(OUTPUTS)}")
+            raise InputError(unknown("output", name, OUTPUTS))
     foggy = fog is not None and fog.density > 0
     lowpass = "none" if cloud.footprint == "box" else quality.lowpass
     precision = quality.blend_precision

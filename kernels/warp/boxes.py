@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .common import View, fma
-from .lens import SLOPES
+from .rays import SLOPES
 
 SQRT2 = wp.constant(wp.float32(2.0**0.5))
 LINES = wp.constant(10)

@@ -266,8 +266,8 @@ def test_what_a_device_refuses_is_a_result(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--scenes", "qr11"], "there is no scene 'qr11' (did you mean 'qr10'?)"),
-        (["--knobs", "alpha_cutof"], "there is no knob 'alpha_cutof' (did you mean 'alpha_cutoff'?)"),
+        (["--scenes", "qr11"], "unknown scene 'qr11' (did you mean 'qr10'?)"),
+        (["--knobs", "alpha_cutof"], "unknown knob 'alpha_cutof' (did you mean 'alpha_cutoff'?)"),
         (["--device", "reference"], "give another --device"),
         (["report", "nowhere"], "no results in nowhere"),
     ],

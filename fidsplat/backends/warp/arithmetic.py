@@ -9,7 +9,7 @@ import numpy as np
 from fidsplat.backends.warp.probe import run
 
 if TYPE_CHECKING:
-    from fidsplat.backends.warp.backend import WarpBackend
+    from fidsplat.backends.warp.device import WarpBackend
 
 
 def run_arithmetic(

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fidsplat.backends.warp import runtime
-from fidsplat.backends.warp.memory import ArrayPool
+from fidsplat.backends.warp.workspace import ArrayPool
 from fidsplat.errors import DeviceError
 
 if TYPE_CHECKING:
-    from fidsplat.backends.warp.backend import WarpBackend
+    from fidsplat.backends.warp.device import WarpBackend
     from fidsplat.backends.warp.pipeline import WarpPipeline
 
 
@@ -50,8 +50,8 @@ def contraction(backend: WarpBackend, a: np.ndarray, b: np.ndarray) -> tuple[lis
 
 def not_a_number(backend: WarpBackend, x: np.ndarray) -> Sequence[np.ndarray]:
     """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
-    (told,) = run(backend, "not_a_number", len(x), (x,), [np.zeros((4, len(x)), np.int32)])
-    return list(told)
+    (found,) = run(backend, "not_a_number", len(x), (x,), [np.zeros((4, len(x)), np.int32)])
+    return list(found)
 
 
 def options(backend: WarpBackend) -> list[str]:
@@ -63,7 +63,7 @@ def scan(pipeline: WarpPipeline, lengths: np.ndarray) -> tuple[np.ndarray, int]:
     """Where lists of these lengths (n,) uint32 start, modulo 2^32, (n + 1,) uint32; and the sum of all in 64
     bits.
     """
-    wp, device = runtime.load(), pipeline.backend.device
+    wp, device = runtime.load(), pipeline.workspace.device
     with wp.ScopedDevice(device):
         given = wp.array(lengths.astype(np.int64), dtype=wp.int64, device=device)
         ends = wp.zeros_like(given)
@@ -75,12 +75,12 @@ def scan(pipeline: WarpPipeline, lengths: np.ndarray) -> tuple[np.ndarray, int]:
 @contextmanager
 def poisoned(backend: WarpBackend) -> Iterator[None]:
     """Within it, every array that a picture takes is filled with 0xFF first: NaN, or the integer -1."""
-    pool = backend.pool
-    backend.pool = PoisonedPool(backend.device)
+    pool = backend.workspace.pool
+    backend.workspace.pool = PoisonedPool(backend.device)
     try:
         yield
     finally:
-        backend.pool = pool
+        backend.workspace.pool = pool
 
 
 class PoisonedPool(ArrayPool):

@@ -3,13 +3,12 @@ useful combinations."""
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from fidsplat.errors import InputError
+from fidsplat.errors import InputError, unknown
 from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.quality import (
     PRESETS,
@@ -125,9 +124,7 @@ def knob_names(words: Iterable[str]) -> tuple[str, ...]:
     names = tuple(dict.fromkeys(words)) or KNOBS
     for name in names:
         if name not in KNOBS:
-            near = difflib.get_close_matches(name, KNOBS, 1)
-            hint = f" (did you mean {near[0]!r}?)" if near else ""
-            raise InputError(f"there is no knob {name!r}{hint}; known: {', '.join(KNOBS)}")
+            raise InputError(unknown("knob", name, KNOBS))
     return names
 
 

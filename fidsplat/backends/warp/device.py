@@ -4,34 +4,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from fidsplat.backends.base import DeviceInfo
 from fidsplat.backends.warp import runtime
 from fidsplat.backends.warp.launch import Commands
-from fidsplat.backends.warp.lens import LensArrays
-from fidsplat.backends.warp.memory import ArrayPool, Resident
 from fidsplat.backends.warp.pipeline import WarpPipeline
+from fidsplat.backends.warp.program import Program, WarpShape
+from fidsplat.backends.warp.resident import Resident
+from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
-from fidsplat.surroundings import Panorama
-
-
-@dataclass(frozen=True)
-class WarpShape:
-    """How pictures are cut for a device."""
-
-    schedule: str
-    """`tiles`: a thread draws a tile (CPU). `group`: a block of threads draws a tile (CUDA)."""
-    tile_width: int
-    """samples, a multiple of 4"""
-    tile_height: int
 
 
 def devices() -> list[DeviceInfo]:
@@ -65,25 +51,24 @@ def open_device(selector: str = "") -> WarpBackend:
 
 
 class WarpBackend:
-    """An open Warp device with its pool of arrays and compiled pipelines."""
+    """An open Warp device with what its pictures share, and compiled pipelines."""
 
     def __init__(self, device: Any) -> None:
         self.info = _describe(device)
         self.device = device
         self.shape = WarpShape("group" if device.is_cuda else "tiles", 16, 16)
-        self.pool = ArrayPool(device)
-        self.lens_arrays = LensArrays()
-        self.pair_budget = 2**30 - 1
-        """Most pairs of splats and tiles that are listed at once; tests make it small."""
-        self.memory_budget = self.info.memory_bytes // 10 * 9
-        """bytes of the device that a picture and its cloud may take"""
-        self.threads = 1 if device.is_cuda else self.info.compute_units
-        # Warp runs a CPU launch on the thread that calls it, without the interpreter's lock
-        self.workers = None if device.is_cuda else ThreadPoolExecutor(self.threads, "fidsplat-warp")
-        self.commands = Commands(device)
-        self.panoramas: WeakKeyDictionary[Panorama, Any] = WeakKeyDictionary()
-        """on the device, each as long as it is somewhere else"""
+        self.workspace = Workspace(device, self.info.memory_bytes // 10 * 9)
+        self._commands = Commands(device, 1 if device.is_cuda else self.info.compute_units)
         self._pipelines: dict[tuple[FeatureSet, WarpShape], WarpPipeline] = {}
+
+    @property
+    def pair_budget(self) -> int:
+        """Most pairs of splats and tiles that are listed at once; tests make it small."""
+        return self.workspace.pair_budget
+
+    @pair_budget.setter
+    def pair_budget(self, pairs: int) -> None:
+        self.workspace.pair_budget = pairs
 
     def limit_memory(self, budget: int) -> None:
         """Let a picture and its cloud take at most `budget` bytes of the device.
@@ -91,15 +76,15 @@ class WarpBackend:
         Pictures that need more for their lists are drawn in bands of tiles, with the same bits; a cloud that
         does not fit is an error.
         """
-        self.memory_budget = budget
+        self.workspace.memory_budget = budget
 
     def upload(self, cloud: SplatCloud) -> Resident:
         """The cloud in arrays on the device."""
-        return Resident.of(cloud, self.pool)
+        return Resident.of(cloud, self.workspace.pool)
 
     def adopt(self, arrays: Mapping[str, Any], origin: np.ndarray) -> Resident:
         """Arrays (`means`, `quats`, ...) that are on the device already, used where they lie."""
-        return Resident.around(arrays, origin, self.pool)
+        return Resident.around(arrays, origin, self.workspace.pool)
 
     def pipeline(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpPipeline:
         """The stages compiled for these features; `shape` replaces the device's own tiles (tests).
@@ -109,7 +94,8 @@ class WarpBackend:
         """
         key = (features, shape or self.shape)
         if key not in self._pipelines:
-            self._pipelines[key] = WarpPipeline(self, *key)
+            program = Program(self.device, self.info.name, *key)
+            self._pipelines[key] = WarpPipeline(program, self.workspace, self._commands, self.info.name)
         return self._pipelines[key]
 
 

@@ -1,4 +1,4 @@
-"""Finished planes on a Warp device."""
+"""Finished output images on a Warp device."""
 
 from __future__ import annotations
 
@@ -8,31 +8,33 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.warp.launch import Launcher
-from fidsplat.effects.catalogue import Output
+from fidsplat.effects import Output
 
 
-class WarpPlanes:
-    """Finished planes on the device."""
+class WarpImages:
+    """The output images of one picture, on the device until asked for."""
 
     def __init__(
         self,
-        outputs: dict[str, tuple[Output, Any]],
+        images: dict[str, tuple[Output, Any]],
         size: tuple[int, int],
         launcher: Launcher,
         stats: dict[str, int],
     ) -> None:
-        self._outputs, self._size, self._launcher = outputs, size, launcher
+        self._images, self._size, self._launcher = images, size, launcher
         self.stats: Mapping[str, int] = stats
 
     def device_array(self, name: str) -> Any:
-        """The plane as a wp.array (h, w) or (h, w, 3) on the device; no copy."""
-        output, array = self._outputs[name]
+        """The image as a wp.array (h, w) or (h, w, 3) on the device; no copy."""
+        output, array = self._images[name]
         return array.reshape(self._size if output.channels == 1 else (*self._size, output.channels))
 
     def read(self, name: str) -> np.ndarray:
+        """The image as a NumPy array of its own."""
         # a CPU array's numpy() is its own memory, which device_array gives away
         return np.array(self.device_array(name).numpy())
 
     @property
     def timings(self) -> dict[str, float]:
+        """Milliseconds on the device by stage, in the order in which they ran."""
         return self._launcher.timings()

@@ -5,19 +5,32 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .common import View
-from .lens import make_rays
+from .common import View, struct_of
+
+SLOPES = wp.types.matrix((2, 3), wp.float32)
+"""a ray's derivatives by the sample's column, and by its row"""
 
 
 @cache
-def make_sight(bent: bool, stretched: bool = False, sloped: bool = False) -> SimpleNamespace:
+def struct_of_rays(bent: bool, sloped: bool = False):
+    """The struct of what a sample reads: nothing, if all rays follow from the view; with their derivatives,
+    if `sloped`.
+    """
+    # X, Y, Z along the rows of samples; NaN where nothing is seen
+    fields = {"rays": wp.array(dtype=wp.vec3)}
+    fields |= {"slopes": wp.array(dtype=SLOPES)} if sloped else {}
+    return struct_of("Rays", "The samples' rays.", fields if bent else {})
+
+
+@cache
+def make_rays(bent: bool, stretched: bool = False, sloped: bool = False) -> SimpleNamespace:
     """Rays; ray_of(column, row, rays, view), NaN where nothing is seen; length_of(column, row, rays, view),
     what turns depths there into distances, 1 where nothing is seen.
 
     bent: rays are a lens's own. stretched: so are their lengths; else they follow from the view. sloped: Rays
     has the rays' derivatives too.
     """
-    Rays = make_rays(bent, sloped)
+    Rays = struct_of_rays(bent, sloped)
 
     @wp.func
     def ray_in(column: int, row: int, view: View) -> wp.vec3:

@@ -1,4 +1,4 @@
-"""Arrays on a Warp device: clouds that stay, and a pool of scratch arrays that frames share."""
+"""Clouds on a Warp device: uploaded, or arrays that are there already."""
 
 from __future__ import annotations
 
@@ -8,60 +8,11 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.planes import PlaneTable
-from fidsplat.backends.warp import runtime
+from fidsplat.backends.warp.runtime import load
+from fidsplat.backends.warp.workspace import ArrayPool, nbytes
 from fidsplat.errors import DeviceError, InputError
 from fidsplat.harmonics import C0, MAX_DEGREE
 from fidsplat.splats import SplatCloud
-
-
-class ArrayPool:
-    """Scratch arrays by name, kept from frame to frame and replaced only when one is too small."""
-
-    def __init__(self, device: Any) -> None:
-        self.device = device
-        self._arrays: dict[tuple[str, Any], Any] = {}
-        self._parts: dict[tuple[str, Any], Any] = {}
-        self._hosts: dict[str, Any] = {}
-
-    def scratch(self, name: str, size: int, dtype: Any) -> Any:
-        """An array of at least `size` elements whose content is undefined."""
-        held = self._arrays.get((name, dtype))
-        if held is None or held.size < size:
-            self._arrays.pop((name, dtype), None)
-            held = self._arrays[name, dtype] = self.fresh(name, size, dtype)
-        return held
-
-    def exact(self, name: str, size: int, dtype: Any) -> Any:
-        """The first `size` elements of a scratch array."""
-        whole = self.scratch(name, size, dtype)
-        part = self._parts.get((name, dtype))
-        if part is None or part.ptr != whole.ptr or part.size != size:
-            part = self._parts[name, dtype] = whole[:size]
-        return part
-
-    def host(self, name: str, size: int, dtype: Any) -> Any:
-        """An array of the host that the device can write to without a detour."""
-        import warp as wp
-
-        if name not in self._hosts:
-            self._hosts[name] = wp.empty(size, dtype=dtype, device="cpu", pinned=self.device.is_cuda)
-        return self._hosts[name]
-
-    def fresh(self, name: str, size: int, dtype: Any) -> Any:
-        """An array that nobody else holds.
-
-        Raises:
-            DeviceError: the device cannot give that much.
-        """
-        import warp as wp
-
-        try:
-            return wp.empty(max(size, 1), dtype=dtype, device=self.device)
-        except (RuntimeError, MemoryError, ValueError) as error:  # the last: 2^31 elements and more
-            raise DeviceError(
-                f"{name} needs {size * wp.types.type_size_in_bytes(dtype) / 2**20:.0f} MiB, which "
-                f"{self.device} has not; use fewer splats or a smaller picture"
-            ) from error
 
 
 class Resident:
@@ -81,9 +32,9 @@ class Resident:
         self.footprint = footprint
 
     @property
-    def nbytes(self) -> int:
-        """Bytes that the splats take."""
-        return sum(array.size * array.strides[0] for array in self.arrays.values())
+    def memory_bytes(self) -> int:
+        """Bytes of the device that the splats take; adopted arrays are among them."""
+        return sum(map(nbytes, self.arrays.values()))
 
     @classmethod
     def of(cls, cloud: SplatCloud, pool: ArrayPool) -> Resident:
@@ -129,7 +80,7 @@ class Resident:
                     f"sh holds {terms} coefficients per splat; on a device it must be one of {known}"
                 )
         if "labels" not in arrays:
-            arrays["labels"] = pool.fresh("labels", count, runtime.load().int32)
+            arrays["labels"] = pool.fresh("labels", count, load().int32)
             arrays["labels"].zero_()
         for name, array in arrays.items():
             wanted = count * max(terms, 1) if name == "colors" else count
@@ -139,7 +90,7 @@ class Resident:
 
 
 def _dtype(name: str) -> Any:
-    import warp as wp
+    wp = load()
 
     return {
         "means": wp.vec3,
@@ -155,7 +106,7 @@ def _dtype(name: str) -> Any:
 
 
 def _uploaded(name: str, array: np.ndarray, pool: ArrayPool) -> Any:
-    import warp as wp
+    wp = load()
 
     if array.size == 0:
         return pool.fresh(name, 1, _dtype(name))
@@ -170,7 +121,7 @@ def _uploaded(name: str, array: np.ndarray, pool: ArrayPool) -> Any:
 
 def _adopted(name: str, value: Any, pool: ArrayPool) -> Any:
     """One array of elements as the kernels read them, on the memory of `value` wherever it can be."""
-    import warp as wp
+    wp = load()
 
     dtype = _dtype(name)
     scalar, width = (wp.int32, 1) if dtype is wp.int32 else (wp.float32, wp.types.type_size(dtype))

@@ -1,0 +1,152 @@
+"""The kernels of one feature set, made and compiled for one Warp device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from fidsplat.backends.warp.launch import BLOCK
+from fidsplat.backends.warp.runtime import kernels, load, quiet
+from fidsplat.backends.warp.sensor import SensorKernel
+from fidsplat.effects import FeatureSet
+from fidsplat.errors import DeviceError
+
+SLOTS = frozenset(
+    {"camera_pinhole", "camera_orthographic", "color_rgb", "color_sh"}
+    | {"camera_brown_conrady", "camera_fisheye", "camera_equirectangular"}
+    | {"lowpass_none", "lowpass_screen", "lowpass_pixel", "stop_inclusive", "stop_exclusive"}
+    | {"compose_ordered", "compose_planes", "footprint_gaussian", "footprint_box", "footprint_mixed"}
+    | {"background_constant", "background_gradient", "background_panorama"}
+    | {"arithmetic_precise", "arithmetic_fast", "motion_groups", "shutter_exposure"}
+    # it changes no picture, and nothing here
+    | {"shutter_rows"}
+)
+"""effects of slots that the kernels have; outputs and steps after blending are those that have a file"""
+# what depends on an effect: a stage is compiled once for all feature sets that mean the same to it
+_RECORD = (
+    *("lowpass_screen", "rays", "camera_orthographic", "ray_depth", "compose_planes"),
+    *("footprint_box", "footprint_mixed"),
+)
+_PROJECT = (
+    *(*_RECORD, "lowpass_pixel", "motion_groups"),
+    *("camera_brown_conrady", "camera_fisheye", "camera_equirectangular"),
+)
+_SAMPLE = (*_RECORD, "stop_exclusive", "arithmetic_fast", "rays_length")
+
+
+@dataclass(frozen=True)
+class WarpShape:
+    """How pictures are cut for a device."""
+
+    schedule: str
+    """`tiles`: a thread draws a tile (CPU). `group`: a block of threads draws a tile (CUDA)."""
+    tile_width: int
+    """samples, a multiple of 4"""
+    tile_height: int
+
+
+def known() -> frozenset[str]:
+    """All effects that the Warp kernels have."""
+    return SLOTS | kernels("output").known() | kernels("post").known()
+
+
+def lacking(features: FeatureSet) -> list[str]:
+    """What of these features the Warp kernels have not, sorted."""
+    return sorted({*features.slots, *features.taps, *features.posts} - known())
+
+
+class Program:
+    """The stages' kernels, and what the host must know of them."""
+
+    def __init__(self, device: Any, name: str, features: FeatureSet, shape: WarpShape) -> None:
+        """name: of the device, for errors.
+
+        Raises:
+            DeviceError: an effect that the Warp kernels have not, or the compiler refuses.
+        """
+        if lacks := lacking(features):
+            raise DeviceError(f"{name} (NVIDIA Warp) has no {', '.join(lacks)}; use an OpenCL device for it")
+        self.device, self.shape, self._name = device, shape, name
+        self.images = tuple(each for each in features.outputs if each.name in {"rgb", *features.taps})
+        """the output images"""
+        self.block_dim = shape.tile_width * shape.tile_height
+        """threads that draw a tile on a GPU"""
+        self.project_block = kernels("project").BLOCK
+        with quiet():
+            self._make(features)
+            made = (self.project, self.lists.emit, self.blend, self.resolve, *self.expose.values())
+            common = (self.sort.compact, self.sort.gather, self.sort.find_starts, self.sort.sum_up)
+            further = (self.backdrop, self.sensor and self.sensor.kernel)
+            for kernel in (*made, *common, *filter(None, further)):
+                self._compile(kernel)
+
+    def _make(self, features: FeatureSet) -> None:
+        output, buffers, wanted = kernels("output"), kernels("buffers"), set(features.slots)
+        images = [image.name for image in self.images[1:]]
+        outputs = output.with_needed([*images, *(set(features.posts) & output.known())])
+        lens = not wanted.isdisjoint(kernels("lens").LENSES)
+        # rays of other lenses have a length of 1
+        long_rays = "camera_brown_conrady" in wanted
+        blending = output.having(outputs, "seen", "state", "samples")
+        measured = output.having(output.having(outputs, "start"), "length")
+        wanted |= {"rays"} if lens else set()
+        wanted |= {"rays_length"} if long_rays and measured else set()
+        wanted |= {"ray_depth"} if "compose_planes" in wanted or output.having(outputs, "depth") else set()
+        record, project, sample = (
+            tuple(name for name in names if name in wanted) for names in (_RECORD, _PROJECT, _SAMPLE)
+        )
+        boxes = not wanted.isdisjoint(kernels("records").BOXES)
+
+        self.layout = kernels("records").Layout(record, blending)
+        self.layered = "compose_planes" in wanted
+        self.sloped = lens and boxes
+        """whether blending reads the derivatives of a lens's rays"""
+        self.project = kernels("project").make_project(
+            project,
+            output.having(outputs, "record"),
+            (features.sh_degree + 1) ** 2 if "color_sh" in wanted else 0,
+            features.setup_precision,
+            self.shape.schedule == "tiles",
+        )
+        self.sort = kernels("lists")
+        self.lists = self.sort.make_lists("lowpass_screen" in wanted)
+        self.blend, self.state = kernels("blend").make_blend(
+            sample, blending, self.shape.schedule == "group", self.block_dim
+        )
+        self.sample_fields = buffers.sample_fields(blending)
+        """sample buffers: type of an element"""
+        self.samples_type = buffers.make_samples(tuple(self.sample_fields.items()))
+        kinds = tuple((image.name, getattr(load(), image.dtype)) for image in self.images)
+        self.images_type = buffers.make_images(kinds, outputs)
+        self.cloud_arrays, self.view_arrays = (
+            output.fields(outputs, part) for part in ("cloud_arrays", "view_arrays")
+        )
+        """what resolving reads besides: type of an element"""
+        self.stretched = long_rays and bool(output.having(images, "length"))
+        """whether resolving reads the lengths of a lens's rays"""
+        self.resolve = kernels("resolve").make_resolve(kinds, outputs, self.stretched, features.samples)
+        behind = kernels("surroundings")
+        kinds_behind = [kind for kind in behind.KINDS if f"background_{kind}" in wanted]
+        self.backdrop = behind.make_backdrop(kinds_behind[0], lens) if kinds_behind else None
+        """the kernel of what is seen behind everything; None where that is of one colour"""
+        steps = tuple(name for name in features.posts if name in kernels("post").known())
+        self.sensor = SensorKernel(steps) if steps else None
+        light = buffers.light_of(blending) if "shutter_exposure" in wanted else ()
+        self.expose = {name: kernels("shutter").make_expose(self.sample_fields[name]) for name in light}
+        """kernels that gather sample buffers of several poses, by the buffer's name"""
+
+    def _compile(self, kernel: Any) -> None:
+        # here rather than at the first launch: several threads launch it
+        block = {self.blend: self.block_dim, self.project: self.project_block}.get(kernel, BLOCK)
+        try:
+            loaded = kernel.module.load(self.device, block if self.device.is_cuda else 1)
+        except Exception as error:
+            raise DeviceError(f"{self._name} cannot compile {kernel.key}: {error}") from error
+        if loaded is None:
+            raise DeviceError(f"{self._name} cannot compile {kernel.key}; Warp says more on stderr")
+
+    def load_banding(self) -> None:
+        """Compile what only a picture with more pairs than the budget needs."""
+        with quiet():
+            self._compile(self.lists.histogram)
+            self._compile(self.lists.count)
