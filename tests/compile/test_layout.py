@@ -1,4 +1,4 @@
-"""What layout.py declares, held against what the device's compiler makes of it; and effects from elsewhere."""
+"""What layout.py declares, compared with what the device's compiler makes of it; effects from elsewhere."""
 
 import re
 import subprocess
@@ -117,7 +117,7 @@ TOY_OUTPUT = """// nearest (h, w): depth [m] of the nearest fragment that is dra
 """
 TOY_STEP = """// The negative of what the sensor gives.
 //@ resolve_end
-    for (int channel = 0; channel < 3; channel++) rgb_out[3 * out + channel] = white - rgb_out[3 * out + channel];
+    for (size_t k = 3 * out; k < 3 * out + 3; k++) rgb_out[k] = white - rgb_out[k];
 """
 
 

@@ -31,7 +31,9 @@ def assert_well_formed(names):
         assert "//" not in source.text
         assert source.text.count("{") == source.text.count("}")
         assert source.records["Splat"].itemsize % 16 == 0
-        heads = dict(re.findall(r"^kernel\b.*?\bvoid (\w+)\((.*?)\) \{", source.text, re.MULTILINE | re.DOTALL))
+        heads = dict(
+            re.findall(r"^kernel\b.*?\bvoid (\w+)\((.*?)\) \{", source.text, re.MULTILINE | re.DOTALL)
+        )
         assert heads.keys() == source.arguments.keys()
         for kernel, arguments in source.arguments.items():
             lines = [line.strip(" ,") for line in heads[kernel].splitlines() if line and line[0] != "#"]

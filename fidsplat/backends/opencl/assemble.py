@@ -1,9 +1,9 @@
 """One flat source text from a FeatureSet and the shape of a device. Needs no OpenCL.
 
-A stage's file, or a section of an effect's, has hooks, lines `//@@ name`, where the sections `//@ name` of the
-chosen effects go, and lines `//@@ struct NAME` and `//@@ arguments KERNEL`, where the declarations of layout.py
-are printed. What nobody fills leaves an empty line, so the text names no effect that was not asked for; `#line`
-directives say where each line comes from.
+A stage's file, or a section of an effect's, has hooks, lines `//@@ name`, where the sections `//@ name` of
+the chosen effects go, and lines `//@@ struct NAME` and `//@@ arguments KERNEL`, where the declarations of
+layout.py are printed. What nobody fills leaves an empty line, so the text names no effect that was not asked
+for; `#line` directives say where each line comes from.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from fidsplat.backends.opencl.declare import Argument, Layout, Record, Samples, 
 from fidsplat.backends.opencl.layout import BOUNDS, KERNELS, LAYOUTS, SPLAT, VIEW
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.effects import FeatureSet
-from fidsplat.effects.catalogue import Output
 from fidsplat.errors import DeviceError
 from fidsplat.kernel_files import kernels_folder
 
@@ -58,8 +57,8 @@ class Source:
 
 
 def layouts_of(features: FeatureSet) -> dict[str, Layout]:
-    """The layouts of all effects, in the order in which their text is put together: those of which there is one
-    of each kind, parts, outputs, what changes rgb."""
+    """The layouts of all effects, in the order in which their text is put together: those of which there is
+    one of each kind, parts, outputs, what changes rgb."""
     chosen = (*features.slots, *features.taps, *features.posts)
     parts = _parts_of(chosen)
     taps = [name for name in features.taps if name not in parts]

@@ -1,5 +1,5 @@
-"""What declarations of the kernels' data are made of, and what is made from them: C text, NumPy types, and the
-kinds of arguments that the host binds. The declarations themselves stand in layout.py.
+"""What declarations of the kernels' data are made of, and what is made from them: C text, NumPy types, and
+the kinds of arguments that the host binds. The declarations themselves stand in layout.py.
 """
 
 from __future__ import annotations
@@ -96,7 +96,8 @@ class Record:
         """The C struct, and a line that does not compile where its size is not the host's."""
         aligned = f" __attribute__((aligned({self.alignment})))" if self.alignment > 1 else ""
         size = self.dtype(scalars).itemsize
-        check = f"typedef char {self.name}_has_the_size_that_the_host_knows[(sizeof({self.name}) == {size}) ? 1 : -1];"
+        check = f"typedef char {self.name}_has_the_size_that_the_host_knows"
+        check += f"[(sizeof({self.name}) == {size}) ? 1 : -1];"
         body = "".join(one.text for one in self.members)
         return f"typedef struct{aligned} {{\n{body}}} {self.name};\n{check}\n"
 
@@ -110,8 +111,8 @@ class Argument:
     access: Access
     """of a buffer: whether the kernel only reads it; empty: a number"""
     source: Source = "stage"
-    """Who gives it: the stage that is launched, or what it holds by this name; the cloud; a uniform of the view
-    (`View.uniform`); an array of the view (`View.array`)."""
+    """Who gives it: the stage that is launched, or what it holds by this name; the cloud; a uniform of the
+    view (`View.uniform`); an array of the view (`View.array`)."""
     uniform: tuple[str, int] = ("", 0)
     """of which group of uniforms it is which"""
     note: str = ""

@@ -1,14 +1,25 @@
-"""What host and kernels both know, declared once: records, arguments of kernels, and what effects add to them.
+"""What host and kernels both know, declared once: records, arguments of kernels, and what effects add to
+them.
 
-The C structs and signatures of kernels/opencl/ are printed from this (assemble.py), and the host binds arguments
-by these names (program.py). Buffers are of planes: (k, rows, columns) of the padded grid of samples, unless they
-say otherwise.
+The C structs and signatures of kernels/opencl/ are printed from this (assemble.py), and the host binds
+arguments by these names (program.py). Buffers are of planes: (k, rows, columns) of the padded grid of
+samples, unless they say otherwise.
 """
 
 from __future__ import annotations
 
 from fidsplat.backends.opencl.declare import (
-    Argument, Layout, Record, Samples, array, cloud, member, number, reads, uniforms, writes,
+    Argument,
+    Layout,
+    Record,
+    Samples,
+    array,
+    cloud,
+    member,
+    number,
+    reads,
+    uniforms,
+    writes,
 )  # fmt: skip
 
 VIEW = Record(
@@ -25,7 +36,8 @@ VIEW = Record(
         member("real band band_end", "rows of samples that are drawn now"),
     ),
 )
-"""The uniforms of the projection; one for the picture, then one for each group of splats that moves by itself."""
+"""The uniforms of the projection; one for the picture, then one for each group of splats that moves by
+itself."""
 
 SPLAT = Record(
     "Splat",

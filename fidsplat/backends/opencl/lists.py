@@ -183,8 +183,8 @@ class ChunkedLists(OrderedLists):
         """A band in parts that each hold few enough splats, if they are spread evenly."""
         if end - top == 1:
             raise DeviceError(
-                f"a row of tiles sees more than the {self.picture.plan.capacity:,} splats for which the memory "
-                "budget has room; raise memory_budget or draw fewer splats"
+                f"a row of tiles sees more than the {self.picture.plan.capacity:,} splats for which the "
+                "memory budget has room; raise memory_budget or draw fewer splats"
             )
         parts = min(max(2, -(-needed * 11 // (10 * self.picture.plan.capacity))), end - top)
         cuts = np.linspace(top, end, parts + 1).round().astype(int).tolist()

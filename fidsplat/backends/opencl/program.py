@@ -66,8 +66,8 @@ class Program:
         """Launches a kernel with buffers and numbers in the order of its arguments.
 
         Only those are set that have changed since its last launch: from picture to picture hardly any do, and
-        setting them takes the host longer than a small stage takes a GPU. A buffer is remembered by its token,
-        so that a cloud or a picture that nobody has any more is let go.
+        setting them takes the host longer than a small stage takes a GPU. A buffer is remembered by its
+        token, so that a cloud or a picture that nobody has any more is let go.
         """
         kernel, types = self._kernels[name], self._types[name]
         bound = self._bound.pop(name, None) or [None] * len(types)
@@ -86,8 +86,8 @@ class Program:
 def check_kernels(
     workspace: Workspace, file: str = "", text: str = "", lanes: int = 0, **sections: str
 ) -> dict[str, cl.Kernel]:
-    """The kernels of a file below kernels/opencl/, or of a text, compiled as the stages are: after prelude.cl and
-    math.cl, whose hooks `sections` fill. lanes: 0 for the device's own.
+    """The kernels of a file below kernels/opencl/, or of a text, compiled as the stages are: after prelude.cl
+    and math.cl, whose hooks `sections` fill. lanes: 0 for the device's own.
 
     Raises:
         DeviceError: the compiler refuses.

@@ -1,5 +1,5 @@
-"""What an open device holds for all pictures: its queues, a pool of scratch buffers, the rays of lenses, and how
-much memory a picture may take.
+"""What an open device holds for all pictures: its queues, a pool of scratch buffers, the rays of lenses, and
+how much memory a picture may take.
 """
 
 from __future__ import annotations
