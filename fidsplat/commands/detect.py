@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar
 
 import tyro
 
-from fidsplat.commands.output import Json, console, option, print_json, print_table
+from fidsplat.commands.output import Json, console, late_progress, option, print_json, print_table
 from fidsplat.errors import InputError
 
 
@@ -103,7 +103,8 @@ Examples:
     def _load_scene(self, shape: tuple[int, ...]):
         import fidsplat as fs
 
-        scene = fs.Scene.load(str(self.scene))
+        with late_progress(console(True)) as progress:
+            scene = fs.Scene.load(str(self.scene), progress=progress)
         if scene.camera is None:
             raise InputError(f"{self.scene} has no [camera] table, so the pose of its markers cannot be told")
         size = (scene.camera.width, scene.camera.height)

@@ -32,7 +32,7 @@ MAY_IMPORT = {
     "splats": BASE | {"harmonics", "defects"},
     "cameras": BASE,
     "vision": BASE | {"cameras"},
-    "formats": BASE | {"splats", "harmonics", "cameras"},
+    "formats": BASE | {"splats", "harmonics", "defects", "cameras"},
     "markers": BASE | {"splats", "quality", "vision.dictionaries", "vision.images"},
     "scenes": PLAIN | {"markers", "formats"},
     "effects": PLAIN | {"scenes"},
