@@ -68,8 +68,8 @@ def test_values_that_mean_nothing_call_for_nothing(renderer):
 def test_a_lens_brings_its_own_text_alone(kind):
     text = assemble(select(COLORS, ("rgb",), PLAIN, CAMERAS[kind]), SHAPE).text
     words = {
-        "brown_conrady": ("LENS_FOLD",),
-        "fisheye": ("chart_box", "LENS_LIMIT"),
+        "brown_conrady": ("lens_fold",),
+        "fisheye": ("chart_box", "lens_limit"),
         "equirectangular": ("cone_bounds",),
         "orthographic": ("z_near",),
     }
