@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 import fidsplat as fs
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.effects import select
 from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.random_clouds import SCENES, load_scene

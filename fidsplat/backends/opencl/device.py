@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
+import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.base import DeviceInfo, Rates
 from fidsplat.backends.opencl import pocl_target
+from fidsplat.backends.opencl.arithmetic import run_arithmetic
 from fidsplat.backends.opencl.assemble import assemble
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
+from fidsplat.backends.opencl.probe import OpenCLProbe
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.roofline import measure_rates
-from fidsplat.backends.opencl.shapes import DeviceShape, cpu_shape, gpu_shape, shape_for
+from fidsplat.backends.opencl.shapes import DeviceShape, cpu_shape, gpu_shape, other_shapes, shape_for
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError, UnknownDeviceError
@@ -57,6 +60,8 @@ def open_device(selector: str = "") -> OpenCLBackend:
 class OpenCLBackend(Workspace):
     """An open OpenCL device, and what is compiled for it."""
 
+    always_float64 = False
+
     def __init__(self, device: cl.Device) -> None:
         super().__init__(device, _describe(device, _name_of(device)), _shape(device))
         self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
@@ -65,18 +70,23 @@ class OpenCLBackend(Workspace):
         """The cloud in device buffers."""
         return Resident(self, cloud)
 
+    def unsupported(self, features: FeatureSet) -> str:
+        """Blending in float64 where the device has none; empty for all else."""
+        if self.info.float64 or "blend_double" not in features.slots:
+            return ""
+        return (
+            f"{self.info.title} has no float64 (cl_khr_fp64) for blend_precision='float64'; use "
+            "blend_precision='float32', or another device"
+        )
+
     def pipeline(self, features: FeatureSet, shape: DeviceShape | None = None) -> OpenCLPipeline:
         """The stages compiled for these features; `shape` replaces the device's own build constants (tests).
 
         Raises:
-            DeviceError: the compiler refuses; its log is in the message. Or the device has no float64 for
-                blending.
+            DeviceError: the compiler refuses; its log is in the message. Or what is `unsupported`.
         """
-        if not self.info.float64 and "blend_double" in features.slots:
-            raise DeviceError(
-                f"{self.info.title} has no float64 (cl_khr_fp64) for blend_precision='float64'; use "
-                "blend_precision='float32', or another device"
-            )
+        if why := self.unsupported(features):
+            raise DeviceError(why)
         if not self.info.float64 and features.setup_precision != "float32":
             features = replace(features, setup_precision="float32")
         key = (features, shape or shape_for(features, self.shape))
@@ -101,6 +111,24 @@ class OpenCLBackend(Workspace):
     def rates(self) -> Rates:
         """What the device can do at best; measured anew at each call."""
         return measure_rates(self)
+
+    def run_arithmetic(
+        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """As `ProbesArithmetic` (fidsplat/backends/base.py)."""
+        return run_arithmetic(self, exponents, shares, above, below)
+
+    def probe(self) -> OpenCLProbe:
+        """What tests look into the device with."""
+        return OpenCLProbe(self)
+
+    def shapes(self, kind: str) -> dict[str, DeviceShape]:
+        """As `Reshapes` (fidsplat/backends/base.py)."""
+        return other_shapes(self.shape, kind)
+
+    def pieces(self, shape: DeviceShape) -> int:
+        """Chunks of the sorts."""
+        return shape.chunks
 
 
 def _all_devices() -> Iterator[cl.Device]:

@@ -11,10 +11,9 @@ from collections.abc import Callable, Iterator
 
 import pyopencl as cl
 
-from fidsplat.backends.base import View
-from fidsplat.backends.exposure import Shot
 from fidsplat.backends.opencl.lists import LISTS
 from fidsplat.backends.opencl.picture import Picture
+from fidsplat.backends.view import Shot, View
 from fidsplat.effects.catalogue import Output
 
 Images = dict[str, tuple[Output, cl.Buffer]]

@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.base import View
 from fidsplat.backends.opencl.assemble import Source
 from fidsplat.backends.opencl.drawing import Images, draw
 from fidsplat.backends.opencl.memory_plan import BIG, SMALL, MemoryPlan, plan_of, table_bytes
@@ -19,6 +18,7 @@ from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.backends.opencl.workspace import RayBuffers, Workspace
+from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError
 

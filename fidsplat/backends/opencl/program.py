@@ -70,7 +70,8 @@ class Program:
         token, so that a cloud or a picture that nobody has any more is let go.
         """
         kernel, types = self._kernels[name], self._types[name]
-        bound = self._bound.pop(name, None) or [None] * len(types)
+        nothing: list[object] = [None] * len(types)
+        bound = self._bound.pop(name, nothing)
         for index, (value, scalar) in enumerate(zip(values, types, strict=True)):
             if scalar is not None:
                 mark: object = value

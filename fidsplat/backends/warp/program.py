@@ -50,9 +50,11 @@ def known() -> frozenset[str]:
     return SLOTS | kernels("output").known() | kernels("post").known()
 
 
-def lacking(features: FeatureSet) -> list[str]:
-    """What of these features the Warp kernels have not, sorted."""
-    return sorted({*features.slots, *features.taps, *features.posts} - known())
+def unsupported(features: FeatureSet, name: str) -> str:
+    """What of these features the Warp kernels have not, as the message of an error; empty if they have all.
+    name: of the device."""
+    lacking = ", ".join(sorted({*features.slots, *features.taps, *features.posts} - known()))
+    return f"{name} (NVIDIA Warp) has no {lacking}; use an OpenCL device for it" if lacking else ""
 
 
 class Program:
@@ -62,10 +64,10 @@ class Program:
         """name: of the device, for errors.
 
         Raises:
-            DeviceError: an effect that the Warp kernels have not, or the compiler refuses.
+            DeviceError: what is `unsupported`, or the compiler refuses.
         """
-        if lacks := lacking(features):
-            raise DeviceError(f"{name} (NVIDIA Warp) has no {', '.join(lacks)}; use an OpenCL device for it")
+        if why := unsupported(features, name):
+            raise DeviceError(why)
         self.device, self.shape, self._name = device, shape, name
         self.images = tuple(each for each in features.outputs if each.name in {"rgb", *features.taps})
         """the output images"""
