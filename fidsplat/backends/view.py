@@ -104,7 +104,7 @@ class View:
         )
 
     def uniform(self, name: str) -> tuple[Any, ...]:
-        """Numbers of an effect, by the name of their group, in an order that the kernels of all backends know."""
+        """Numbers of an effect, by the name of their group, in an order that all kernels know."""
         around = self.surroundings
         match name:
             case "ray" if self.along_ray or self.parallel:

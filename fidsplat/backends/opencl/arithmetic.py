@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pyopencl as cl
 
+from fidsplat.backends.opencl.assemble import section_text
+from fidsplat.backends.opencl.program import check_kernels
+from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.errors import DeviceError
-from fidsplat.workspaces.opencl.assemble import section_text
-from fidsplat.workspaces.opencl.program import check_kernels
-from fidsplat.workspaces.opencl.workspace import Workspace
 
 
 def run_arithmetic(
