@@ -104,7 +104,7 @@ def test_certificates_are_small_where_nothing_is_hard():
     assert truth["alpha"].max() > 0.9
     assert truth["certificate"].max() < 1e-5
     assert np.median(truth["certificate"]) < 2e-6
-    # but at the rim of what outputs other than colour cover, where 1/255 is covered: a decision, which has its certificate
+    # but where 1/255 is covered, the rim of every output but colour: a decision, which has its certificate
     rim = np.abs(truth["alpha"] - 1 / 255) < 6e-5
     assert rim.mean() < 1e-3
     assert not truth["label_may_flip"][~rim].any()
