@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
 from fidsplat.effects import select
 from fidsplat.quality import Quality
