@@ -1,13 +1,13 @@
-"""Interrupts and full disks: whether anything that was whole is lost, and whether the next run has the same bits.
+"""Interrupts and full disks: whether anything whole is lost, and whether the next run has the same bits.
 
     python tools/interrupt.py kills [--moments 50] [--commands demo,render,...] [--seed 0] [--json FILE]
     python tools/interrupt.py disks [--sizes 8] [--commands ...] [--json FILE]
 
-Each command runs twice undisturbed, into two folders: what agrees in both is its result, bit for bit; the rest
-(times of day, durations) must only parse. `kills` then starts it again and again in an empty folder, sends SIGINT,
-SIGTERM and SIGKILL in turn at random moments, looks at every file that has its final name, and runs the command
-once more in the same folder. `disks` does the same on a file system (tmpfs, which only root can mount) that is
-full after a part of what the command writes, and gives it room for the second run.
+Each command runs twice undisturbed, into two folders: what agrees in both is its result, bit for bit; the
+rest (times of day, durations) must only parse. `kills` then starts it again and again in an empty folder,
+sends SIGINT, SIGTERM and SIGKILL in turn at random moments, looks at every file that has its final name, and
+runs the command once more in the same folder. `disks` does the same on a file system (tmpfs, which only root
+can mount) that is full after a part of what the command writes, and gives it room for the second run.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def words(name: str, out: Path, scene: Path) -> list[str]:
 
 
 def files_below(folder: Path) -> dict[str, Path]:
-    """Files with their final names, by their names below the folder. Names with a dot in front are temporary."""
+    """Files with their final names, by their names below the folder; temporary ones begin with a dot."""
     found = sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
     return {str(path.relative_to(folder)): path for path in found}
 
@@ -209,7 +209,9 @@ def disks(trial: Trial, work: Path, sizes: int) -> Tally:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=("kills", "disks"))
     parser.add_argument("--moments", type=int, default=50, help="kills of each command (default: 50)")
     parser.add_argument("--sizes", type=int, default=8, help="sizes of the full disk (default: 8)")
@@ -239,7 +241,9 @@ def main() -> int:
         table.add_row(name, *(str(getattr(tally, column)) for column in columns))
     Console().print(table)
     if given.json:
-        given.json.write_text(json.dumps({name: vars(tally) for name, tally in tallies.items()}, indent=1) + "\n")
+        given.json.write_text(
+            json.dumps({name: vars(tally) for name, tally in tallies.items()}, indent=1) + "\n"
+        )
     return int(any(tally.broken + tally.unclear + tally.changed for tally in tallies.values()))
 
 

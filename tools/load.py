@@ -2,11 +2,11 @@
 
     python tools/load.py threads [--device D]     one renderer used by 16 threads; 16 renderers in 16 threads
     python tools/load.py processes [--device D]   8 processes that share one empty kernel cache
-    python tools/load.py caches [--device D]      every file of a kernel cache cut off, filled with noise, emptied
+    python tools/load.py caches [--device D]      every file of a kernel cache cut off, noise, empty
     python tools/load.py soak [--minutes 120] [--devices opencl,warp:cpu,reference]
 
-Each compares pictures, bit for bit, with those of one renderer in one thread. The soak draws random scenes with
-random effects in one process, draws some of them a second time much later, and watches the memory.
+Each compares pictures, bit for bit, with those of one renderer in one thread. The soak draws random scenes
+with random effects in one process, draws them again much later, and watches the memory.
 """
 
 from __future__ import annotations
@@ -35,7 +35,10 @@ from fidsplat.random_clouds import random_splats
 
 THREADS, PROCESSES, VIEWS = 16, 8, 8
 OUTPUTS = ("rgb", "depth", "normal", "label")
-CHILD = "import sys; sys.path[:0] = sys.argv[2:]; import load; print(load.pictures(load.fs.Renderer(sys.argv[1])))"
+CHILD = """import sys
+sys.path[:0] = sys.argv[2:]
+import load
+print(load.pictures(load.fs.Renderer(sys.argv[1])))"""
 SIZE = (160, 120)
 FOUR_KINDS = ("perspective", "distortion", "fisheye", "orthographic")
 
@@ -48,7 +51,9 @@ def cloud_of(seed: int) -> fs.SplatCloud:
 def camera_of(view: int) -> fs.Camera:
     """One of the views of a scene."""
     angle = 2 * math.pi * view / VIEWS
-    return fs.Camera.look_at(*SIZE, 1.0, position=(0.3 * math.cos(angle), 0.3 * math.sin(angle), 0), target=(0, 0, 2))
+    return fs.Camera.look_at(
+        *SIZE, 1.0, position=(0.3 * math.cos(angle), 0.3 * math.sin(angle), 0), target=(0, 0, 2)
+    )
 
 
 def digest(frame: fs.Frame) -> str:
@@ -82,7 +87,9 @@ def threads(device: str) -> dict[str, int]:
 
 def _start(device: str, cache: Path) -> subprocess.Popen[str]:
     """A process that draws with the kernel caches in a folder."""
-    folders = {name: str(cache / name.lower()) for name in ("POCL_CACHE_DIR", "XDG_CACHE_HOME", "WARP_CACHE_PATH")}
+    folders = {
+        name: str(cache / name.lower()) for name in ("POCL_CACHE_DIR", "XDG_CACHE_HOME", "WARP_CACHE_PATH")
+    }
     for folder in folders.values():
         Path(folder).mkdir(exist_ok=True)
     here = str(Path(__file__).resolve().parent)
@@ -177,7 +184,9 @@ def soak(minutes: float, devices: list[str]) -> dict[str, float]:
             seed += 1
             if seed % 50 == 0:
                 memory.append((spent, _resident_bytes()))
-                status.update(f"{spent / 60:.1f} min, {seed} frames, {memory[-1][1] / 2**20:.0f} MiB, {wrong} wrong")
+                status.update(
+                    f"{spent / 60:.1f} min, {seed} frames, {memory[-1][1] / 2**20:.0f} MiB, {wrong} wrong"
+                )
     settled = min(600.0, 10 * minutes)  # the first ten minutes fill caches and pools
     early = [size for at, size in memory if at <= settled][-5:] or [memory[0][1]]
     late = [size for _, size in memory][-5:]
@@ -192,7 +201,9 @@ def soak(minutes: float, devices: list[str]) -> dict[str, float]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=("threads", "processes", "caches", "soak"))
     parser.add_argument("--device", default="opencl")
     parser.add_argument("--minutes", type=float, default=120.0)
