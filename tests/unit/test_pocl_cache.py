@@ -37,7 +37,7 @@ def full_cache(tmp_path_factory):
 def draw(folder):
     return subprocess.run(
         [sys.executable, "-c", DRAW],
-        env=os.environ | {"POCL_CACHE_DIR": str(folder)},
+        env=os.environ | {"POCL_CACHE_DIR": str(folder), "XDG_CACHE_HOME": str(folder / "other")},
         capture_output=True,
         text=True,
     )
@@ -66,6 +66,15 @@ def test_a_damaged_cache_is_compiled_again(full_cache, tmp_path):
     done = draw(folder)
     assert (done.returncode, done.stdout) == (0, full_cache[1]), done.stderr
     assert all(map(is_whole, compiled(folder)))
+
+
+def test_a_damaged_cache_of_pyopencl_is_done_without(full_cache, tmp_path):
+    folder = tmp_path / "cache"
+    shutil.copytree(full_cache[0], folder)
+    (database,) = (folder / "other").rglob("*.sqlite")
+    database.write_bytes(DAMAGES["noise"](database.read_bytes()))
+    done = draw(folder)
+    assert (done.returncode, done.stdout) == (0, full_cache[1]), done.stderr
 
 
 def test_what_is_whole_stays(full_cache, tmp_path):
