@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference import ReferenceBackend
-from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
-from fidsplat.effects import select
+from fidsplat.capture import Capture
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer
 from fidsplat.sensor import Sensor
@@ -65,6 +65,12 @@ class Picture:
     sensor: Sensor | None = None
     fog: Fog | None = None
 
+    @property
+    def capture(self) -> Capture:
+        """How it is taken."""
+        sensor = self.sensor or Sensor()
+        return Capture(self.camera, self.outputs, self.quality, self.background, sensor=sensor, fog=self.fog)
+
 
 @dataclass(frozen=True)
 class Difference:
@@ -95,10 +101,7 @@ class Difference:
 def truth_of(picture: Picture, pixels: tuple[np.ndarray, np.ndarray] | None = None) -> dict[str, np.ndarray]:
     """The reference's planes with `alpha` and `certificate`: whole, or (k, ...) at pixels (rows, columns)."""
     judge = ReferenceBackend()
-    around = {"sensor": picture.sensor, "fog": picture.fog, "background": picture.background}
-    outputs = (*picture.outputs, "alpha")
-    features = select(picture.cloud, outputs, picture.quality, picture.camera, **around)
-    view = View.of(picture.camera, picture.quality, picture.cloud.origin, **around)
+    features, view = prepare(picture.cloud, picture.capture.with_(outputs=(*picture.outputs, "alpha")))
     pipeline, resident = judge.pipeline(features), judge.upload(picture.cloud)
     if pixels is not None:
         return pipeline.pixels(resident, view, *pixels)
@@ -140,13 +143,5 @@ def compare(planes: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], o
 
 def judge(renderer: Renderer, picture: Picture) -> list[Difference]:
     """Draw a picture on a device and compare every output with the reference."""
-    frame = renderer.render(
-        picture.cloud,
-        picture.camera,
-        outputs=picture.outputs,
-        quality=picture.quality,
-        background=picture.background,
-        sensor=picture.sensor,
-        fog=picture.fog,
-    )
+    frame = renderer.render(picture.cloud, picture.capture)
     return compare(frame, truth_of(picture), picture.outputs)

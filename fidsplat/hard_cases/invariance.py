@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from fidsplat.backends.base import Reshapes
-from fidsplat.backends.view import View
-from fidsplat.effects import select
+from fidsplat.backends.prepare import prepare
 from fidsplat.hard_cases.agreement import Picture
 from fidsplat.render import Frame, Renderer
 
@@ -18,15 +17,12 @@ CULLED = 0xFFFFFFFF
 
 def draw(renderer: Renderer, picture: Picture) -> Frame:
     """The picture on a device."""
-    return renderer.render(
-        picture.cloud, picture.camera, picture.outputs, picture.quality, picture.background
-    )
+    return renderer.render(picture.cloud, picture.capture)
 
 
 def trace(renderer: Renderer, picture: Picture, shape=None) -> dict[str, np.ndarray]:
     """What passes between the stages of a device, with the planes; `shape` replaces its build constants."""
-    features = select(picture.cloud, picture.outputs, picture.quality)
-    view = View.of(picture.camera, picture.quality, picture.cloud.origin, picture.background)
+    features, view = prepare(picture.cloud, picture.capture)
     backend = renderer.backend
     reshaped = isinstance(backend, Reshapes) and shape is not None
     pipeline = backend.pipeline(features, shape) if reshaped else backend.pipeline(features)

@@ -42,7 +42,7 @@ COLORS = Cloud()
 
 
 def test_base_text_names_no_effect_that_was_not_asked_for():
-    text = assemble(select(COLORS, ("rgb",), PLAIN), SHAPE).text
+    text = assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE).text
     assert "//" not in text
     absent = set(CATALOGUE) - {
         "camera_pinhole",
@@ -61,8 +61,8 @@ def test_base_text_names_no_effect_that_was_not_asked_for():
 
 @pytest.mark.parametrize("tap", TAPS)
 def test_a_tap_brings_its_text_and_nothing_else(tap):
-    base = assemble(select(COLORS, ("rgb",), PLAIN), SHAPE)
-    with_tap = assemble(select(COLORS, (tap,), PLAIN), SHAPE)
+    base = assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE)
+    with_tap = assemble(select(COLORS, fs.Capture(outputs=(tap,), quality=PLAIN)), SHAPE)
     assert with_tap.digest != base.digest
     base_lines, tap_lines = base.text.splitlines(), with_tap.text.splitlines()
     remaining = iter(tap_lines)
@@ -80,9 +80,11 @@ def test_a_tap_brings_its_text_and_nothing_else(tap):
 def test_only_splats_on_planes_bring_layers(taps):
     """What a tap says of layers stays out as well, and layers bring the depth that places them."""
     words = ("Layer", "layer_pick", "layer_gather", "plane_keys", "label_tau", "share")
-    plain = assemble(select(COLORS, taps, PLAIN), SHAPE).text
-    layered = assemble(select(Cloud(has_planes=True), taps, PLAIN), SHAPE).text
-    in_order = assemble(select(Cloud(has_planes=True), taps, PLAIN.with_(coplanar="order")), SHAPE).text
+    plain = assemble(select(COLORS, fs.Capture(outputs=taps, quality=PLAIN)), SHAPE).text
+    layered = assemble(select(Cloud(has_planes=True), fs.Capture(outputs=taps, quality=PLAIN)), SHAPE).text
+    in_order = assemble(
+        select(Cloud(has_planes=True), fs.Capture(outputs=taps, quality=PLAIN.with_(coplanar="order"))), SHAPE
+    ).text
     for word in words:
         assert not re.search(rf"\b{word}\b", plain), word
         assert re.search(rf"\b{word}\b", layered) or (word == "label_tau" and "label" not in taps), word
@@ -93,7 +95,7 @@ def test_only_splats_on_planes_bring_layers(taps):
 def test_only_a_scene_of_both_footprints_pays_for_the_choice():
     texts = {
         kind: assemble(
-            select(Cloud(has_planes=True, footprint=kind), ("depth", "label"), fs.Quality()), SHAPE
+            select(Cloud(has_planes=True, footprint=kind), fs.Capture(outputs=("depth", "label"))), SHAPE
         )
         for kind in ("gaussian", "box", "mixed")
     }
@@ -106,12 +108,18 @@ def test_only_a_scene_of_both_footprints_pays_for_the_choice():
 
 
 def test_an_effect_added_to_the_catalogue_leaves_other_texts_as_they_were(monkeypatch):
-    before = {taps: assemble(select(COLORS, taps, PLAIN), SHAPE).digest for taps in combinations(TAPS, 2)}
+    before = {
+        taps: assemble(select(COLORS, fs.Capture(outputs=taps, quality=PLAIN)), SHAPE).digest
+        for taps in combinations(TAPS, 2)
+    }
     dummy = Effect("dummy", "tap/alpha.cl", record_lanes=5, output=Output("dummy", 1, "float32"))
     monkeypatch.setitem(catalogue_module.CATALOGUE, "dummy", dummy)
-    after = {taps: assemble(select(COLORS, taps, PLAIN), SHAPE).digest for taps in combinations(TAPS, 2)}
+    after = {
+        taps: assemble(select(COLORS, fs.Capture(outputs=taps, quality=PLAIN)), SHAPE).digest
+        for taps in combinations(TAPS, 2)
+    }
     assert before == after
-    features = select(COLORS, ("rgb",), PLAIN)
+    features = select(COLORS, fs.Capture(quality=PLAIN))
     base, chosen = assemble(features, SHAPE), assemble(replace(features, taps=("dummy",)), SHAPE)
     assert chosen.record_bytes == base.record_bytes + 16
     assert "alpha_out" in chosen.text
@@ -120,38 +128,42 @@ def test_an_effect_added_to_the_catalogue_leaves_other_texts_as_they_were(monkey
 
 def test_record_sizes_are_what_the_effects_declare():
     def record(outputs, quality=PLAIN, degree=-1):
-        return assemble(select(Cloud(degree), outputs, quality), SHAPE).record_bytes
+        return assemble(
+            select(Cloud(degree), fs.Capture(outputs=outputs, quality=quality)), SHAPE
+        ).record_bytes
 
     # 68 bytes and 4 for each lane that an effect adds, in whole vectors of 16
     assert record(("rgb",)) == record(("alpha",)) == record(("rgb",), degree=3) == 80
-    assert assemble(select(COLORS, ("rgb",), PLAIN), SHAPE).bounds_bytes == 32
+    assert assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE).bounds_bytes == 32
     assert record(("rgb",), fs.Quality()) == record(("label",)) == 80
     assert record(("depth",)) == record(("depth", "depth_median")) == record(("normal",)) == 80
     assert record(("depth", "normal")) == record(("depth", "label"), fs.Quality()) == 96
-    on_planes = select(Cloud(has_planes=True), ("rgb",), PLAIN)
+    on_planes = select(Cloud(has_planes=True), fs.Capture(quality=PLAIN))
     assert assemble(on_planes, SHAPE).record_bytes == 96
 
 
 def test_a_section_that_no_stage_has_is_refused(monkeypatch):
     monkeypatch.setattr(assembly, "sections_of", lambda path: {"no_such_hook": "x"})
     with pytest.raises(fs.DeviceError, match="no_such_hook"):
-        assemble(select(COLORS, ("rgb",), PLAIN), SHAPE)
+        assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE)
 
 
 def test_text_does_not_depend_on_numbers():
     numbers = fs.Quality(lowpass="none", alpha_cutoff=0.01, transmittance_stop=0.5, opacity_ceiling=0.7)
-    assert select(COLORS, ("rgb",), numbers) == select(COLORS, ("rgb",), PLAIN)
+    assert select(COLORS, fs.Capture(quality=numbers)) == select(COLORS, fs.Capture(quality=PLAIN))
 
 
 def test_features_are_the_same_whatever_the_order_of_outputs():
-    assert select(Cloud(2), ["rgb", "label", "depth"], PLAIN) == select(Cloud(2), ("depth", "label"), PLAIN)
+    assert select(Cloud(2), fs.Capture(outputs=["rgb", "label", "depth"], quality=PLAIN)) == select(
+        Cloud(2), fs.Capture(outputs=("depth", "label"), quality=PLAIN)
+    )
 
 
 def test_the_base_is_what_it_was():
     """A change of the stages themselves records new digests here; an effect must not."""
     digests = {
         lowpass: [
-            assemble(select(COLORS, ("rgb",), fs.Quality(lowpass=lowpass)), shape).digest[:16]
+            assemble(select(COLORS, fs.Capture(quality=fs.Quality(lowpass=lowpass))), shape).digest[:16]
             for shape in (SHAPE, GROUP)
         ]
         for lowpass in DIGESTS
@@ -190,7 +202,7 @@ TAKEN = {
 def test_what_the_kernels_of_the_base_take(renderer, schedule):
     """An effect must not change it, nor registers and private memory, which follow from the text."""
     shape = SHAPE if schedule == "lanes" else GROUP
-    pipeline = renderer.backend.pipeline(select(COLORS, ("rgb",), PLAIN), shape)
+    pipeline = renderer.backend.pipeline(select(COLORS, fs.Capture(quality=PLAIN)), shape)
     local = cl.kernel_work_group_info.LOCAL_MEM_SIZE
     taken = {}
     for name, kernel in pipeline._kernels.items():
@@ -237,6 +249,9 @@ def test_knobs_compile_and_run_with_every_output_and_none(renderer, name, output
     assert all(np.isfinite(frame[each]).all() for each in frame)
 
 
+MOVING = fs.Motion(lambda time: np.eye(4))
+
+
 def test_only_pictures_of_several_poses_seen_by_a_pinhole_are_culled_by_spheres():
     lens = fs.Camera.fisheye(20, 20, 2.0)
     for expected, footprint, quality, camera, exposed in (
@@ -248,11 +263,14 @@ def test_only_pictures_of_several_poses_seen_by_a_pinhole_are_culled_by_spheres(
         (False, "box", PLAIN, None, True),
         (False, "gaussian", fs.Quality(lowpass="pixel"), None, True),
     ):
-        chosen = select(Cloud(footprint=footprint), ("rgb",), quality, camera, exposed=exposed)
+        chosen = select(
+            Cloud(footprint=footprint),
+            fs.Capture(camera, quality=quality, motion=MOVING, shutter=fs.Shutter(exposure=0.1 * exposed)),
+        )
         assert ("shutter_rows" in chosen.names) == expected
         assert ("reach * sqrt(fy" in assemble(chosen, SHAPE).text) == expected
 
 
 def test_pipelines_are_compiled_once(renderer):
-    features = select(COLORS, ("rgb",), PLAIN)
+    features = select(COLORS, fs.Capture(quality=PLAIN))
     assert renderer.backend.pipeline(features) is renderer.backend.pipeline(features)

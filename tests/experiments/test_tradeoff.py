@@ -183,7 +183,7 @@ def test_memory_does_not_hang_on_what_was_drawn_before(table, monkeypatch):
 
 def test_a_device_without_float64_is_held_against_one_with_it(table, monkeypatch):
     """As Warp's."""
-    monkeypatch.setattr(table_module, "judge_for", lambda renderer: table.renderer)
+    monkeypatch.setattr(table_module, "reference_for", lambda *_: table.renderer)
     lacking = fs.Renderer("opencl")
     monkeypatch.setattr(lacking, "render", lambda *_, **__: pytest.fail("it drew its own truth"))
     want = table.truth("apriltag@0", BASE)
