@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _LEGEND = (
     "ms: median (quartiles) of whole frames, medians of the stages by the device's own clock; splats "
     "resident, picture left on the device. x roofline: how many times the least that the device's "
-    "measured best rates allow (docs/performance.md)."
+    "measured best rates allow (docs/roofline.md)."
 )
 
 

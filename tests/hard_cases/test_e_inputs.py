@@ -56,7 +56,7 @@ def test_places_of_lists_wrap_around_at_two_to_the_32(renderer, monkeypatch, bud
     original = getattr(LISTS[backend.shape.lists], method)
 
     def moved(own, *args):
-        result, run = original(own, *args), own.run
+        result, run = original(own, *args), own.picture
         starts = run.read("starts", np.uint32, (run.tiles + 1,))
         starts += np.uint32(-(int(starts[-1]) // 2) % 2**32)
         run.held["starts"], run.held["cursors"] = (probe.buffer_of(backend, s) for s in (starts, starts[:-1]))

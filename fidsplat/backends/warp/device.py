@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import DeviceInfo, Probe
+from fidsplat.backends.base import DeviceInfo
 from fidsplat.backends.warp import runtime
 from fidsplat.backends.warp.arithmetic import run_arithmetic
 from fidsplat.backends.warp.launch import Commands
@@ -61,7 +62,7 @@ class WarpBackend:
         self.info = _describe(device)
         self.device = device
         self.shape = WarpShape("group" if device.is_cuda else "tiles", 16, 16)
-        self.workspace = Workspace(device, self.info.memory_bytes // 10 * 9)
+        self.workspace = Workspace(device, self.info.name, self.info.memory_bytes // 10 * 9)
         self._commands = Commands(device, 1 if device.is_cuda else self.info.compute_units)
         self._pipelines: dict[tuple[FeatureSet, WarpShape], WarpPipeline] = {}
 
@@ -98,31 +99,32 @@ class WarpBackend:
         """The stages compiled for these features; `shape` replaces the device's own tiles (tests).
 
         Raises:
-            DeviceError: an effect that the Warp kernels have not, or the compiler refuses.
+            DeviceError: what is `unsupported`, or the compiler refuses.
         """
         key = (features, shape or self.shape)
         if key not in self._pipelines:
             program = Program(self.device, self.info.name, *key)
-            self._pipelines[key] = WarpPipeline(program, self.workspace, self._commands, self.info.name)
+            self._pipelines[key] = WarpPipeline(program, self.workspace, self._commands)
         return self._pipelines[key]
 
     def run_arithmetic(
         self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
     ) -> dict[str, np.ndarray]:
         """As `ProbesArithmetic` (fidsplat/backends/base.py)."""
-        return run_arithmetic(self.device, exponents, shares, above, below)
+        return run_arithmetic(self.workspace, exponents, shares, above, below)
 
-    def probe(self) -> Probe:
+    def probe(self) -> WarpProbe:
         """What tests look into the device with."""
         return WarpProbe(self.workspace)
 
     def shapes(self, kind: str) -> dict[str, WarpShape]:
         """As `Reshapes` (fidsplat/backends/base.py)."""
+        own = self.shape
         if kind == "schedule":
             return {"groups": WarpShape("group", 8, 8)}
         if kind == "sorting":
-            return {"own": self.shape}
-        return {f"{side} x {side}": WarpShape(self.shape.schedule, side, side) for side in (8, 32)}
+            return {"own": own}
+        return {f"{side} x {side}": replace(own, tile_width=side, tile_height=side) for side in (8, 32)}
 
     def pieces(self, shape: WarpShape) -> int:
         """Warp's sorts take everything at once."""

@@ -10,52 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.warp import runtime
-from fidsplat.backends.warp.pipeline import WarpPipeline
-from fidsplat.backends.warp.workspace import ArrayPool, Workspace
+from fidsplat.backends.warp.runtime import kernels, load, quiet
+from fidsplat.backends.warp.workspace import ArrayPool, Workspace, nbytes
 from fidsplat.errors import DeviceError
 
 
-def run(
-    device: Any, kernel: str, count: int, inputs: Sequence[np.ndarray], outputs: Sequence[np.ndarray]
-) -> list[np.ndarray]:
-    """Launch `count` threads of a kernel of kernels/warp/check.py on arrays; what stands in `outputs`
-    afterwards.
-
-    Raises:
-        DeviceError: the compiler refuses, or the device fails.
-    """
-    wp = runtime.load()
-    arrays = [wp.array(array, device=device) for array in (*inputs, *outputs)]
-    try:
-        with runtime.quiet():
-            wp.launch(getattr(runtime.kernels("check"), kernel), count, arrays, device=device)
-        return [array.numpy().copy() for array in arrays[len(inputs) :]]
-    except RuntimeError as error:
-        raise DeviceError(f"warp:{device.alias} failed in a test of its arithmetic: {error}") from error
-
-
-class PoisonedPool(ArrayPool):
-    """A pool whose arrays hold nothing useful."""
-
-    def scratch(self, name: str, size: int, dtype: Any) -> Any:
-        return poison(super().scratch(name, size, dtype))
-
-    def fresh(self, name: str, size: int, dtype: Any) -> Any:
-        return poison(super().fresh(name, size, dtype))
-
-
-def poison(array: Any) -> Any:
-    """The array, its bytes all 0xFF."""
-    wp = runtime.load()
-    size = array.size * array.strides[0]
-    wp.array(ptr=array.ptr, dtype=wp.uint8, shape=(size,), device=array.device).fill_(0xFF)
-    return array
-
-
 class WarpProbe:
-    """Single kernels of kernels/warp/check.py, and arrays that are filled with rubbish first: `Probe` of
-    fidsplat/backends/base.py."""
+    """`Probe` of fidsplat/backends/base.py, for the device of a workspace."""
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace
@@ -66,26 +27,22 @@ class WarpProbe:
         """
         n = len(a)
         types = (np.float32, np.float32, np.float64, np.float32)
-        return run(
-            self._workspace.device, "contraction", n, (a, b, a), [np.zeros(n, each) for each in types]
-        ), True
+        return run(self._workspace, "contraction", n, (a, b, a), [np.zeros(n, each) for each in types]), True
 
     def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
         """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
-        (found,) = run(
-            self._workspace.device, "not_a_number", len(x), (x,), [np.zeros((4, len(x)), np.int32)]
-        )
+        (found,) = run(self._workspace, "not_a_number", len(x), (x,), [np.zeros((4, len(x)), np.int32)])
         return list(found)
 
     def options(self) -> list[str]:
         """What every kernel is compiled with, switches that are on."""
-        return [name for name, value in runtime.kernels("common").STRICT.items() if value]
+        return [name for name, value in kernels("common").STRICT.items() if value is True]
 
-    def scan(self, pipeline: WarpPipeline, lengths: np.ndarray) -> tuple[np.ndarray, int]:
+    def scan(self, pipeline: Any, lengths: np.ndarray) -> tuple[np.ndarray, int]:
         """Where lists of these lengths (n,) uint32 start, modulo 2^32, (n + 1,) uint32; and the sum of all in
-        64 bits.
+        64 bits. All pipelines scan alike.
         """
-        wp, device = runtime.load(), pipeline.workspace.device
+        wp, device = load(), self._workspace.device
         with wp.ScopedDevice(device):
             given = wp.array(lengths.astype(np.int64), dtype=wp.int64, device=device)
             ends = wp.zeros_like(given)
@@ -102,3 +59,39 @@ class WarpProbe:
             yield
         finally:
             self._workspace.pool = pool
+
+
+class PoisonedPool(ArrayPool):
+    """A pool whose arrays hold nothing useful."""
+
+    def scratch(self, name: str, size: int, dtype: Any) -> Any:
+        return poison(super().scratch(name, size, dtype))
+
+    def fresh(self, name: str, size: int, dtype: Any) -> Any:
+        return poison(super().fresh(name, size, dtype))
+
+
+def poison(array: Any) -> Any:
+    """The array, its bytes all 0xFF."""
+    wp = load()
+    wp.array(ptr=array.ptr, dtype=wp.uint8, shape=(nbytes(array),), device=array.device).fill_(0xFF)
+    return array
+
+
+def run(
+    workspace: Workspace, kernel: str, count: int, inputs: Sequence[np.ndarray], outputs: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Launch `count` threads of a kernel of kernels/warp/check.py on arrays; what stands in `outputs`
+    afterwards.
+
+    Raises:
+        DeviceError: the compiler refuses, or the device fails.
+    """
+    wp, device = load(), workspace.device
+    arrays = [wp.array(array, device=device) for array in (*inputs, *outputs)]
+    try:
+        with quiet():
+            wp.launch(getattr(kernels("check"), kernel), count, arrays, device=device)
+        return [array.numpy().copy() for array in arrays[len(inputs) :]]
+    except RuntimeError as error:
+        raise DeviceError(f"{workspace.name} failed in a test of its arithmetic: {error}") from error

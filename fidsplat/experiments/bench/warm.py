@@ -20,7 +20,7 @@ COUNTS = (2, 70_000)
 
 _OUTPUTS = (("rgb",), ("rgb", "depth"), ("rgb", "depth", "normal", "label"))
 _STANDARD = Quality()
-_SHARP = Quality(lowpass="none", samples=3)  # what docs/rendering.md advises for dense codes
+_SHARP = Quality(lowpass="none", samples=3)  # what docs/quality.md advises for dense codes
 
 
 @dataclass(frozen=True)
