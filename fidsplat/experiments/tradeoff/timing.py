@@ -10,7 +10,7 @@ import numpy as np
 
 from fidsplat.backends.base import Measurable
 from fidsplat.experiments.tradeoff.points import BASE
-from fidsplat.experiments.tradeoff.table import Table
+from fidsplat.experiments.tradeoff.session import Session
 from fidsplat.quality import Quality
 from fidsplat.render import Frame
 
@@ -27,7 +27,7 @@ class Effort:
 FULL, QUICK = Effort(), Effort(3, 5, 0.2)
 
 
-def time_point(table: Table, view: str, quality: Quality, effort: Effort) -> tuple[Frame, dict]:
+def time_point(session: Session, view: str, quality: Quality, effort: Effort) -> tuple[Frame, dict]:
     """Draw a picture at a setting and at the base in turn.
 
     Splats lie on the device, the picture stays there; a time is from the call until the device is done.
@@ -37,10 +37,10 @@ def time_point(table: Table, view: str, quality: Quality, effort: Effort) -> tup
     and its quartiles), `repeats`, `stages_ms` by the device's own clock, `memory_bytes` (scratch, cloud and
     picture; None where the backend cannot tell), `splats`, `pairs`.
     """
-    memory = memory_of(table, view, quality)
-    frame = table.draw(view, quality)
+    memory = memory_of(session, view, quality)
+    frame = session.draw(view, quality)
     stats = dict(frame.stats)
-    _ = table.draw(view, BASE).timings
+    _ = session.draw(view, BASE).timings
     own: list[float] = []
     base: list[float] = []
     stages: dict[str, list[float]] = {}
@@ -49,7 +49,7 @@ def time_point(table: Table, view: str, quality: Quality, effort: Effort) -> tup
         turns = [(quality, own), (BASE, base)]
         for which, times in turns[:: -1 if len(own) % 2 else 1]:
             start = time.perf_counter()
-            timings = table.draw(view, which).timings  # waits for the device
+            timings = session.draw(view, which).timings  # waits for the device
             times.append(1e3 * (time.perf_counter() - start))
             if times is own:
                 for stage, ms in timings.items():
@@ -72,16 +72,16 @@ def time_point(table: Table, view: str, quality: Quality, effort: Effort) -> tup
     }
 
 
-def memory_of(table: Table, view: str, quality: Quality) -> int | None:
+def memory_of(session: Session, view: str, quality: Quality) -> int | None:
     """Bytes on the device of a picture at a setting: scratch, cloud and picture; None where the backend
     cannot tell."""
-    backend, scene = table.renderer.backend, table.scene(view, quality.marker).scene
+    backend, scene = session.renderer.backend, session.scene(view, quality.marker).scene
     if not isinstance(backend, Measurable):
         return None
     backend.release_scratch()
     # a cloud keeps every form of its colours that was ever asked for; this one has been asked for nothing yet
-    resident = table.renderer.upload(scene.cloud)
-    table.renderer.render(resident, scene.camera, ("rgb",), quality, background=scene.background)
+    resident = session.renderer.upload(scene.cloud)
+    session.renderer.render(resident, scene.camera, ("rgb",), quality, background=scene.background)
     picture = 12 * scene.camera.width * scene.camera.height
     return backend.memory_bytes + resident.memory_bytes + picture
 

@@ -29,14 +29,14 @@ class OnDevice:
     resident: ResidentCloud
 
 
-class Table:
+class Session:
     """Scenes and truths are made when they are first asked for, and the last few are kept.
 
     Truths are drawn by the renderer itself, or by OpenCL on the processor where it cannot blend in float64.
     """
 
     def __init__(self, renderer: Renderer) -> None:
-        self.renderer, self._judge = renderer, judge_for(renderer)
+        self.renderer, self._reference = renderer, judge_for(renderer)
         self._scenes: OrderedDict[Hashable, OnDevice] = OrderedDict()
         self._truths: OrderedDict[Hashable, np.ndarray] = OrderedDict()
 
@@ -61,9 +61,9 @@ class Table:
         like = self.definition(view, quality)
 
         def draw() -> np.ndarray:
-            on, judge = self.scene(view, quality.marker), self._judge
-            what = on.resident if judge is self.renderer else on.scene.cloud
-            return truth(judge, what, on.scene.camera, like, background=on.scene.background)
+            on, reference = self.scene(view, quality.marker), self._reference
+            what = on.resident if reference is self.renderer else on.scene.cloud
+            return truth(reference, what, on.scene.camera, like, background=on.scene.background)
 
         return _kept(self._truths, (view, like), draw, _TRUTHS)
 
@@ -76,14 +76,14 @@ class Table:
 
     def full(self, view: str, quality: Quality) -> Quality:
         """The setting at which `truth` is drawn."""
-        return full_precision(self.definition(view, quality), self._judge)
+        return full_precision(self.definition(view, quality), self._reference)
 
 
-def _kept(shelf: OrderedDict[Hashable, Any], key: Hashable, make: Callable[[], Any], most: int) -> Any:
-    """What lies on a shelf, made if it does not; the shelf keeps the last `most`."""
-    if key not in shelf:
-        shelf[key] = make()
-        if len(shelf) > most:
-            shelf.popitem(last=False)
-    shelf.move_to_end(key)
-    return shelf[key]
+def _kept(cache: OrderedDict[Hashable, Any], key: Hashable, make: Callable[[], Any], most: int) -> Any:
+    """A value of a cache, made if it is not there; the cache keeps the `most` that were asked for last."""
+    if key not in cache:
+        cache[key] = make()
+        if len(cache) > most:
+            cache.popitem(last=False)
+    cache.move_to_end(key)
+    return cache[key]

@@ -29,12 +29,12 @@ _MOST, _LEAST = 64, 12
 _SAMPLED = 64
 
 
-def judge_picture(picture: np.ndarray, truth: np.ndarray, scene: TradeScene, quality: Quality) -> dict:
+def compare_picture(picture: np.ndarray, truth: np.ndarray, scene: TradeScene, quality: Quality) -> dict:
     """Errors of rgb (h, w, 3) against the truth of the same definition.
 
     Returns `maximum`, `p999`, `rmse`, `psnr` (None for equal pictures), `maximum_sure` (see
     `beyond_certificates`), `flip`; for the hard cases `cells`, the largest error in each; for markers what
-    `judge_marker` gives.
+    `compare_marker` gives.
     """
     found = errors(picture, truth)
     off = np.abs(picture - truth).max(-1)
@@ -48,7 +48,7 @@ def judge_picture(picture: np.ndarray, truth: np.ndarray, scene: TradeScene, qua
     }
     if scene.name == HARD:
         result["cells"] = {name: float(off[cell_window(i)].max()) for i, name in enumerate(CELLS)}
-    return result if scene.made is None else result | judge_marker(picture, scene)
+    return result if scene.made is None else result | compare_marker(picture, scene)
 
 
 def beyond_certificates(off: np.ndarray, scene: TradeScene, quality: Quality) -> float | None:
@@ -82,7 +82,7 @@ def beyond_certificates(off: np.ndarray, scene: TradeScene, quality: Quality) ->
     return max(sure, float(off.flat[worst[count]]) if len(worst) > count else 0.0, 0.0)
 
 
-def judge_marker(picture: np.ndarray, scene: TradeScene) -> dict:
+def compare_marker(picture: np.ndarray, scene: TradeScene) -> dict:
     """A marker against the ideal area-sampled texture: `ideal_psnr` dB, `ideal_maximum`; `corners_px`, root
     mean square of the detected corners' errors in pixels, None where `fidsplat detect` does not read it;
     `rectangles` of its partition."""
@@ -106,7 +106,7 @@ def judge_marker(picture: np.ndarray, scene: TradeScene) -> dict:
 
 
 def check_truth(truth: np.ndarray, scene: TradeScene, full: Quality) -> dict:
-    """The truth against the NumPy reference at pixels drawn by lot: `pixels`, `maximum`, the largest
+    """The truth against the NumPy reference at pixels chosen at random: `pixels`, `maximum`, the largest
     difference of their colours."""
     height, width = truth.shape[:2]
     count = max(4, min(_SAMPLED, _PAIRS // max(1, len(scene.cloud) * full.samples**2)))
