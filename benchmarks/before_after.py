@@ -30,7 +30,7 @@ CHILD = """
 import hashlib, sys, time
 import fidsplat as fs
 sys.path.insert(0, sys.argv[3])
-from fidsplat.experiments.scenes import load_scene
+from fidsplat.random_clouds import load_scene
 cloud, camera = load_scene(sys.argv[1])
 renderer = fs.Renderer(sys.argv[2])
 resident = renderer.upload(cloud)

@@ -30,10 +30,10 @@ from rich.table import Table
 import fidsplat as fs
 from fidsplat.accuracy import errors, truth
 from fidsplat.budget import choose
-from fidsplat.budget.random_scenes import HELD_OUT, RandomScene, random_scene
 from fidsplat.errors import InputError
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED
 from fidsplat.files import atomic_write
+from fidsplat.random_clouds import HELD_OUT, RandomScene, random_scene
 
 BOUNDS = (1e-2, 1e-3, 1e-4)
 SCENES = ("tag", "r100k_720p", "r1m_1080p")

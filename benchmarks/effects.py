@@ -29,7 +29,7 @@ from rich.table import Table
 import fidsplat as fs
 from fidsplat.effects import OUTPUTS
 from fidsplat.experiments.bench.catalogue import TIMED
-from fidsplat.experiments.scenes import SCENES, load_scene
+from fidsplat.random_clouds import SCENES, load_scene
 
 TABLE = tuple(np.linspace(0, 1, 64) ** 0.5)
 SENSORS = {

@@ -25,7 +25,7 @@ from rich.table import Table
 
 import fidsplat as fs
 from fidsplat.experiments.bench.catalogue import TIMED
-from fidsplat.experiments.scenes import SCENES, random_cloud, standard_camera
+from fidsplat.random_clouds import SCENES, random_cloud, standard_camera
 
 SCENE = SCENES["r20m_4k"]
 

@@ -24,7 +24,7 @@ import fidsplat as fs
 from fidsplat.backends.base import View
 from fidsplat.effects import select
 from fidsplat.experiments.bench.catalogue import TIMED
-from fidsplat.experiments.scenes import SCENES, load_scene
+from fidsplat.random_clouds import SCENES, load_scene
 
 WAYS = ("ordered", "tiled")
 

@@ -1,12 +1,13 @@
-"""Turns measured figures into the Markdown tables of docs/performance.md.
+"""Turns measured figures into the Markdown tables of docs/performance.md, roofline.md and growth.md.
 
     python benchmarks/performance_tables.py benchmarks/results/*.json*
-    python benchmarks/performance_tables.py benchmarks/results/*.json* --into docs/performance.md
+    python benchmarks/performance_tables.py benchmarks/results/*.json* --into docs/*.md
 
 Takes what `fidsplat bench --json`, benchmarks/peers, benchmarks/first_frame.py --json,
 benchmarks/listing_ways.py --json, benchmarks/large_scenes.py --json and benchmarks/growth.py write, in any
-mixture. Without --into the tables are printed. With it, each replaces what stands in that page between
-`<!-- begin NAME -->` and `<!-- end NAME -->`; a table for which nothing was measured is left alone.
+mixture. Without --into the tables are printed. With it, each replaces what stands between
+`<!-- begin NAME -->` and `<!-- end NAME -->` in those of the pages that have such lines; a table for which
+nothing was measured is left alone.
 """
 
 from __future__ import annotations
@@ -204,12 +205,8 @@ TABLES: dict[str, Callable[[dict[str, list[dict]]], str]] = {
 
 
 def insert(page: str, name: str, text: str) -> str:
-    """The page with the text between the marks of that name. Raises SystemExit if it has no such marks."""
+    """The page with the text between the marks of that name, if it has them."""
     marks = re.compile(rf"(<!-- begin {name} -->\n).*?(<!-- end {name} -->)", re.DOTALL)
-    if not marks.search(page):
-        raise SystemExit(
-            f"performance_tables: the page has no lines <!-- begin {name} --> and <!-- end {name} -->"
-        )
     return marks.sub(lambda match: f"{match[1]}{text}\n{match[2]}", page)
 
 
@@ -229,18 +226,21 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("files", nargs="+", type=Path)
-    parser.add_argument("--into", type=Path, metavar="PAGE")
+    parser.add_argument("--into", nargs="+", type=Path, metavar="PAGE")
     options = parser.parse_args()
     records = load(options.files)
     made = {name: text for name, make in TABLES.items() if (text := make(records))}
     if options.into is None:
         print("\n\n".join(f"## {name}\n{text}" for name, text in made.items()))
         return
-    page = options.into.read_text("utf-8")
-    for name, text in made.items():
-        page = insert(page, name, text)
-    with atomic_write(options.into) as stream:
-        stream.write(page.encode())
+    for path in options.into:
+        page = path.read_text("utf-8")
+        filled = page
+        for name, text in made.items():
+            filled = insert(filled, name, text)
+        if filled != page:
+            with atomic_write(path) as stream:
+                stream.write(filled.encode())
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Makes the files that some examples read: a sky and a globe whose colours depend on the view.
+"""Makes examples/data again, which some examples read: a sky, and a globe whose colours depend on the view.
 
 python examples/make_data.py [FOLDER]        default: examples/data, beside this file
 """
@@ -15,18 +15,16 @@ from fidsplat.vision.images import write_png
 
 
 def sky() -> np.ndarray:
-    """A panorama with clouds, made of a few waves: (256, 512, 3), 0 to 1."""
-    v, u = np.mgrid[0:256, 0:512] / [[[256]], [[512]]]
+    """A panorama with clouds, made of a few waves: (128, 256, 3), 0 to 1."""
+    v, u = np.mgrid[0:128, 0:256] / [[[128]], [[256]]]
     waves = sum(np.sin(2 * np.pi * (k * u + 3 * v * k) + k * k) / k for k in (3, 5, 8, 13, 21)) / 2
     cloud = np.clip(waves + 0.3, 0, 1)[..., None] * np.clip(1.6 - 3 * v, 0, 1)[..., None]
     blue = np.array([0.35, 0.55, 0.9]) * (1 - v[..., None]) + 0.75 * v[..., None]
     return (blue * (1 - cloud) + cloud).astype(np.float32)
 
 
-def globe(degree: int = 3) -> fs.SplatCloud:
-    """A sphere of radius 0.5 m around the origin that shines from above: spherical harmonics up to a
-    degree."""
-    n = 1500
+def globe(degree: int = 3, n: int = 1500) -> fs.SplatCloud:
+    """A sphere of radius 0.5 m around the origin, of n splats with spherical harmonics up to a degree."""
     z = 1 - (2 * np.arange(n) + 1) / n
     turn = np.pi * (1 + 5**0.5) * np.arange(n)
     normals = np.column_stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z])
@@ -39,14 +37,14 @@ def globe(degree: int = 3) -> fs.SplatCloud:
     # each degree falls off as its square, so that what a degree adds is seen and does not drown the rest
     weights = np.concatenate([np.full(2 * k + 1, 1 / max(k, 1) ** 1.5) for k in range(degree + 1)])
     sh[:, 1:] = (shine * weights)[1:, None]
-    return fs.SplatCloud(0.5 * normals, quats, np.full((n, 2), 0.025), np.full(n, 0.95), sh=sh)
+    return fs.SplatCloud(0.5 * normals, quats, np.full((n, 2), 0.97 / np.sqrt(n)), np.full(n, 0.95), sh=sh)
 
 
 def main() -> None:
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).resolve().parent / "data"
     folder.mkdir(parents=True, exist_ok=True)
     print(write_png(folder / "sky.png", sky()))
-    fs.save_ply(globe(), folder / "globe.ply")
+    fs.save_ply(globe(n=400), folder / "globe.ply")
     print(folder / "globe.ply")
 
 

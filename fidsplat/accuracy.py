@@ -91,8 +91,6 @@ def full_precision(
         stop_rule="inclusive",
         setup_precision="float64",
         arithmetic="precise",
-        color_precision="float32",
-        depth_key_bits=32,
     )
     if renderer.device.name != "reference" and draws_float64(renderer, camera, fog):
         return best.with_(blend_precision="float64")

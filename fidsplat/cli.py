@@ -26,7 +26,8 @@ Examples:
   fidsplat bench                                    what a frame costs here
   fidsplat tradeoff --quick                         what accuracy costs in time
 
-`fidsplat COMMAND --help` explains a command. --debug, anywhere, shows where an error arose."""
+`fidsplat COMMAND --help` explains a command. --debug, anywhere, shows where an error arose; --version, alone,
+says which fidsplat this is."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -64,12 +65,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parse(words: list[str]):
-    """The command that the words make. Raises SystemExit: 0 after help, 2 after one line about what is
-    wrong."""
+    """The command that the words make. Raises SystemExit: 0 after help or the version, 2 after one line about
+    what is wrong."""
     import tyro
 
+    from fidsplat import __version__
     from fidsplat.commands import COMMANDS
 
+    if not words:
+        _fail(
+            "no command; try `fidsplat demo` first, which makes, draws and reads markers here; "
+            f"`fidsplat --help` explains: {', '.join(COMMANDS)}",
+            2,
+        )
+        raise SystemExit(2)
+    if words == ["--version"]:
+        print(f"fidsplat {__version__}")
+        raise SystemExit(0)
     known: dict[str, Any] = COMMANDS
     kind: Any = None
     about, program = ABOUT, "fidsplat"

@@ -1,11 +1,21 @@
 """The two kinds of error that a user meets; the command line turns them into one line and an exit status."""
 
+import difflib
+from collections.abc import Iterable
+
+LONGEST = 2000
+"""characters of an error's text: one that quotes more of what it was given is cut in its middle"""
+
 
 class FidsplatError(Exception):
     """Base of every error that fidsplat raises on purpose; its text says what was wrong and what would be
     right."""
 
     exit_status = 1
+
+    def __str__(self) -> str:
+        text = super().__str__()
+        return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
 
 
 class InputError(FidsplatError, ValueError):
@@ -24,3 +34,19 @@ class UnknownDeviceError(DeviceError):
     """The name of a device that nothing here answers to."""
 
     exit_status = 2
+
+
+def unknown(what: str, name: object, known: Iterable[str], within: str = "", likeness: float = 0.6) -> str:
+    """What an error says about a name that is none of those known, the nearest of which it offers.
+
+    Args:
+        what: what was named: "output", "quality".
+        within: stands before the name, "camera." say, and has no part in the comparison.
+        likeness: how like the name the nearest must be to be offered, 0 to 1.
+    """
+    names = list(known)
+    near = difflib.get_close_matches(str(name)[:100].lower(), names, 1, likeness)
+    hint = f" (did you mean {near[0]!r}?)" if near else ""
+    shown = repr(within + name if isinstance(name, str) else name)
+    valid = f"known: {', '.join(names)}" if names else "none is known here"
+    return f"unknown {what} {shown}{hint}; {valid}"

@@ -18,12 +18,6 @@ _C3 = (
     -0.5900435899266435,
 )
 MAX_DEGREE = 3
-_LARGEST_HALF = 65504.0
-
-
-def halves(values: np.ndarray) -> np.ndarray:
-    """Colours or coefficients in float16, to the nearest; what is beyond its range is the largest it has."""
-    return np.clip(values, -_LARGEST_HALF, _LARGEST_HALF).astype(np.float16)
 
 
 def sh_basis(degree: int, dirs: np.ndarray) -> np.ndarray:

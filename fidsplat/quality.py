@@ -5,17 +5,15 @@ A `Quality` says what is computed, never where: the same object works on every b
 
 from __future__ import annotations
 
-import difflib
 import math
 import operator
-from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fidsplat.errors import InputError
+from fidsplat.errors import InputError, unknown
 
 if TYPE_CHECKING:
     from fidsplat.cameras import Camera, Motion, Shutter
@@ -30,9 +28,6 @@ COPLANAR = ("blend", "order")
 SETUP_PRECISIONS = ("float64", "float32")
 ARITHMETIC = ("precise", "fast")
 BLEND_PRECISIONS = ("float32", "float64")
-COLOR_PRECISIONS = ("float32", "float16")
-DEPTH_KEY_BITS = (16, 24, 32)
-TILE_SIZES = (8, 16, 32)
 MAX_SAMPLES = 8
 MIXTURES = ("fitted", "paper", "exact")
 TEMPLATE_SIZES = (1, 5, 9, 13, 25, 41)
@@ -157,19 +152,6 @@ class Quality:
     """Arithmetic of each fragment: crossing, weight and blending. `float64`: a device's truth picture, many
     times slower, whose arithmetic is always precise; needs float64 in the device and in the set-up."""
 
-    color_precision: str = "float32"
-    """How a cloud's colours and spherical harmonics are held. `float16`: half the memory and traffic for 11
-    bits, a relative error up to 2^-11 (5e-4)."""
-
-    depth_key_bits: int = 32
-    """Leading bits of the depth's float32 by which splats are sorted, 16, 24 or 32: sign, exponent, and then
-    7, 15 or 23 bits of mantissa. Depths that agree in them (to 1/128, 1/32768 or 1/8388608 at best) tie and
-    keep the cloud's order. Fewer sort faster on CPUs. Where planes are layers there are always all 32."""
-
-    tile_size: int | None = None
-    """Edge in samples of the tiles in which pictures are drawn, 8, 16 or 32; None: the device's own. CPUs
-    draw tiles as high as this and at most as wide as their vectors. The same bits; time alone changes."""
-
     marker: MarkerQuality = field(default_factory=MarkerQuality)
     """How markers become splats."""
 
@@ -205,9 +187,6 @@ class Quality:
             ("setup_precision", SETUP_PRECISIONS),
             ("arithmetic", ARITHMETIC),
             ("blend_precision", BLEND_PRECISIONS),
-            ("color_precision", COLOR_PRECISIONS),
-            ("depth_key_bits", DEPTH_KEY_BITS),
-            ("tile_size", (None, *TILE_SIZES)),
         ):
             _one_of(f"quality: {name}", getattr(self, name), known)
         if not isinstance(self.marker, MarkerQuality):
@@ -229,7 +208,7 @@ class Quality:
         """The preset of that name: standard, fast, reference, gsplat or surfel."""
         if name in PRESETS:
             return PRESETS[name]
-        raise InputError(f"unknown quality {name!r}{_hint(name, PRESETS)}; known: {', '.join(PRESETS)}")
+        raise InputError(unknown("quality", name, PRESETS))
 
     @classmethod
     def of(cls, quality: Quality | str | None) -> Quality:
@@ -330,12 +309,7 @@ def _check_known(kind: type[Quality] | type[MarkerQuality], name: str) -> None:
     known = [knob.name for knob in fields(kind)]
     if name not in known:
         whose = "marker quality" if kind is MarkerQuality else "quality"
-        raise InputError(f"{whose} has no knob {name!r}{_hint(name, known)}; known: {', '.join(known)}")
-
-
-def _hint(name: Any, known: Iterable[str]) -> str:
-    near = difflib.get_close_matches(str(name), known, 1)
-    return f" (did you mean {near[0]!r}?)" if near else ""
+        raise InputError(unknown(f"knob of {whose}", name, known))
 
 
 def _read(kind: type[Quality] | type[MarkerQuality], name: str, text: str) -> Any:

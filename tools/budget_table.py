@@ -4,7 +4,7 @@ over random scenes and what they cost.
     python tools/budget_table.py --device opencl:pocl       about 15 minutes on two busy cores
     python tools/budget_table.py --device opencl:nvidia     adds the settings of GPUs
 
-Each scene of `fidsplat/budget/random_scenes.py` is drawn with every setting and held against the same
+Each scene of `fidsplat/random_clouds.py` is drawn with every setting and held against the same
 definition at full precision, which the device draws in float64 (`fidsplat.accuracy.judge_for`). Costs are
 medians of frames of the scenes of TIMED, drawn in turn; on CPUs those of the processor's time. In a second
 round the settings on the front of error and cost are drawn with every set of MODIFIERS, and FINEST beside
@@ -24,20 +24,17 @@ import numpy as np
 
 import fidsplat as fs
 from fidsplat.accuracy import doubt, errors, judge_for, truth
-from fidsplat.budget.random_scenes import random_scene
 from fidsplat.budget.table import FILE, Setting
 from fidsplat.errors import InputError
-from fidsplat.experiments.scenes import random_cloud, standard_camera
 from fidsplat.files import atomic_write
+from fidsplat.random_clouds import random_cloud, random_scene, standard_camera
 
 CUTOFFS = (0.03, 0.015, 2 / 255, 1 / 255, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 1e-7)
 STOPS = (0.05, 0.015, 4e-3, 1e-3, 1e-4, 1e-6)
 MODIFIERS = (
     {"setup_precision": "float32"},
     {"arithmetic": "fast"},
-    {"color_precision": "float16"},
     {"setup_precision": "float32", "arithmetic": "fast"},
-    {"setup_precision": "float32", "arithmetic": "fast", "color_precision": "float16", "depth_key_bits": 24},
 )
 FINEST = (
     {"alpha_cutoff": 1e-8, "transmittance_stop": 0.0},

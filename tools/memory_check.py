@@ -134,7 +134,8 @@ def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
     from fidsplat.backends.opencl.arithmetic import run_arithmetic
     from fidsplat.effects import select
     from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture, truth_of
-    from fidsplat.hard_cases.clouds import camera, random_splats, splats
+    from fidsplat.hard_cases.clouds import camera, splats
+    from fidsplat.random_clouds import random_splats
 
     backend = renderer.backend
     lanes = replace(backend.shape, schedule="lanes", lanes=4, tile_width=4, tile_height=8, scan_items=1)

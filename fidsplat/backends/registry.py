@@ -4,11 +4,10 @@ first use.
 
 from __future__ import annotations
 
-import difflib
 from importlib import import_module
 
 from fidsplat.backends.base import Backend, DeviceInfo
-from fidsplat.errors import UnknownDeviceError
+from fidsplat.errors import UnknownDeviceError, unknown
 
 _FAMILIES = {
     "opencl": "fidsplat.backends.opencl",
@@ -28,11 +27,8 @@ def open_backend(name: str) -> Backend:
     """
     family, _, selector = str(name).strip().partition(":")
     if family.lower() not in _FAMILIES:
-        near = difflib.get_close_matches(family.lower(), _FAMILIES, 1)
-        hint = f" (did you mean {near[0]!r}?)" if near else ""
         raise UnknownDeviceError(
-            f"unknown device {name!r}{hint}; known families: {', '.join(_FAMILIES)}; `fidsplat "
-            "devices` lists all"
+            f"{unknown('device', family, _FAMILIES)}, and their devices, which `fidsplat devices` lists"
         )
     return import_module(_FAMILIES[family.lower()]).open_device(selector)
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,13 +14,14 @@ from fidsplat.cameras import Camera
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer
 from fidsplat.splats import SplatCloud
+from fidsplat.timing import Timer, frame_timer, take_turns
 
 REPEATS = 9
 """frames of each quality that are timed, in turn with those of the others"""
 FEWEST = 3
-PATIENCE_MS = 10_000.0
-"""what timing several qualities may take in all; where it would take longer, fewer frames are timed, but
-`FEWEST` of each"""
+PATIENCE = 10.0
+"""seconds that timing several qualities may take in all; where it would take longer, fewer frames are timed,
+but `FEWEST` of each"""
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,6 @@ class Times:
     median: float
     late: float
     """90th percentile"""
-
-    @classmethod
-    def of(cls, taken: Sequence[float]) -> Times:
-        """From the times of single frames."""
-        return cls(float(np.median(taken)), float(np.quantile(taken, 0.9)))
 
 
 class Calibration:
@@ -85,17 +80,17 @@ class Calibration:
 
     def time(self, quality: Quality) -> float:
         """Milliseconds of one frame, now."""
-        begun = time.perf_counter()
-        frame = self.renderer.render(self._resident, self._camera, ("rgb",), quality, **self._around)
-        assert frame.timings is not None  # it waits for the device
-        return 1e3 * (time.perf_counter() - begun)
+        return self.timer(quality).run()
 
     def times(self, qualities: Iterable[Quality], repeats: int = REPEATS) -> list[Times]:
-        """Times of qualities that this device draws. Frames take turns, so that what disturbs one disturbs
-        all; one of each goes before those that count."""
-        several = list(qualities)
-        self._tell(f"timing {len(several)} settings")
-        first = sum(self.time(quality) for quality in several)
-        repeats = max(FEWEST, min(repeats, int(PATIENCE_MS / first)))
-        taken = [[self.time(quality) for quality in several] for _ in range(repeats)]
-        return [Times.of([row[k] for row in taken]) for k in range(len(several))]
+        """Times of qualities that this device draws. Frames take turns; one of each goes before those that
+        count."""
+        timers = [self.timer(quality) for quality in qualities]
+        self._tell(f"timing {len(timers)} settings")
+        take_turns(timers, repeats, least=min(FEWEST, repeats), seconds=PATIENCE, warm_up=1)
+        return [Times(timer.median, float(np.quantile(timer.ms, 0.9))) for timer in timers]
+
+    def timer(self, quality: Quality) -> Timer:
+        """Times frames of a quality."""
+        how = {"outputs": ("rgb",), "quality": quality, **self._around}
+        return frame_timer(self.renderer, self._resident, self._camera, **how)

@@ -22,12 +22,10 @@ FREE: dict[str, Any] = {
     "setup_precision": "float64",
     "arithmetic": "precise",
     "blend_precision": "float32",
-    "color_precision": "float32",
-    "depth_key_bits": 32,
 }
 """The knobs that a budget turns, and where they stand unless a setting says otherwise. Of the other knobs
-those that only make a picture wrong are off (opacity ceiling, exclusive stop); the rest are its definition,
-or, as tile_size, cost no accuracy: they stay as the base quality has them."""
+those that only make a picture wrong are off (opacity ceiling, exclusive stop); the rest are its definition
+and stay as the base quality has them."""
 COMMON = ("alpha_cutoff", "transmittance_stop", "arithmetic")
 """those of them that every device has"""
 

@@ -5,7 +5,15 @@ from typing import Annotated, ClassVar
 
 import tyro
 
-from fidsplat.commands.output import Json, console, option, print_json, print_table, writable_file
+from fidsplat.commands.output import (
+    Json,
+    console,
+    late_progress,
+    option,
+    print_json,
+    print_table,
+    writable_file,
+)
 from fidsplat.errors import InputError
 
 
@@ -31,6 +39,9 @@ Knobs of the mixtures (fs.MarkerQuality) are part of a quality: marker.levels (1
 to 100) of paper, marker.template of fitted (Gaussians of a rectangle: 1, 5, 9, 13, 25 or 41), and
 marker.growth (modules).
 
+A picture of noise becomes tens of millions of splats; more than a million are refused unless --max-splats
+allows them.
+
 Examples:
   fidsplat marker apriltag:36h11:5 --size 0.16 -o tag.ply
   fidsplat marker qr:hello --quality marker.template=9
@@ -51,6 +62,9 @@ Examples:
         bool,
         tyro.conf.arg(help="leave the third scale out of the file, as 2DGS does", help_behavior_hint=""),
     ] = False
+    max_splats: Annotated[int | None, option("N", "most splats that it may become (default: a million)")] = (
+        None
+    )
     json: Json = False
 
     def run(self) -> int:
@@ -62,11 +76,13 @@ Examples:
         if file is not None and file.suffix.lower() != ".ply":
             raise InputError(f"splats are written as PLY: name {file.with_suffix('.ply')}, not {file}")
         quality = fs.Quality.of(self.quality).marker
-        made = fs.marker(self.spec, size=self.size, mixture=self.mixture, quality=quality)
+        limit = {} if self.max_splats is None else {"max_splats": self.max_splats}
+        with late_progress(console(self.json)) as progress:
+            made = fs.marker(self.spec, self.size, self.mixture, quality=quality, progress=progress, **limit)
         if file is not None:
             fs.save_ply(made.gaussians, file, native_2dgs=self.native_2dgs)
         written = "fitted" if made.mixture == "exact" else made.mixture
-        dark = sum(1 for rectangle in made.rectangles if rectangle.dark)
+        dark = int(made.grid[made.boxes[:, 1], made.boxes[:, 0]].sum(dtype=int))
         facts = {
             "spec": made.spec,
             "kind": made.kind,
@@ -76,7 +92,7 @@ Examples:
             "shape": list(made.bits.shape),
             "quiet_zone": made.quiet_zone,
             "components": made.components,
-            "rectangles": {"dark": dark, "light": len(made.rectangles) - dark},
+            "rectangles": {"dark": dark, "light": len(made.boxes) - dark},
             "splats": len(made.cloud),
             "seconds": made.seconds,
             "mixture": made.mixture,
@@ -92,7 +108,7 @@ Examples:
             ("modules", f"{made.bits.shape[0]} x {made.bits.shape[1]}, quiet zone {made.quiet_zone}"),
             ("size", f"{made.size:g} m, a module {made.module * 1e3:.4g} mm"),
             ("components", made.components),
-            ("rectangles", f"{dark} dark, {len(made.rectangles) - dark} light"),
+            ("rectangles", f"{dark} dark, {len(made.boxes) - dark} light"),
             ("splats", f"{len(made.cloud)} ({made.mixture})"),
             ("seconds", f"{made.seconds:.3f}"),
         ]

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterable, Sequence
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -66,6 +68,29 @@ def print_table(where: Console, title: str, heads: Sequence[str], rows: Iterable
     for row in rows:
         table.add_row(*(Text(str(cell)) for cell in row))
     where.print(table)
+
+
+@contextmanager
+def late_progress(where: Console, after: float = 1.0) -> Iterator[Callable[[str, float], None]]:
+    """What to call with words and the share that is done, 0 to 1; a bar shows it once that many seconds
+    passed.
+
+    Short work prints nothing, and long work between two calls is seen too: a thread watches the time.
+    """
+    from rich.progress import Progress
+
+    shown = Progress(console=where, transient=True)
+    task = shown.add_task("", total=1.0)
+    timer = threading.Timer(after, shown.start)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield lambda words, share: shown.update(task, description=words, completed=share)
+    finally:
+        timer.cancel()
+        timer.join()
+        if shown.live.is_started:
+            shown.stop()
 
 
 def writable_file(path: str | Path) -> Path:

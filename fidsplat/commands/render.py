@@ -46,7 +46,7 @@ Lenses, shutters and motion, fog, backgrounds, sensors and boxes are tables of a
 
 Examples:
   fidsplat render scene.toml
-  fidsplat render scene.toml --quality standard,alpha_cutoff=1e-3,tile_size=8
+  fidsplat render scene.toml --quality standard,alpha_cutoff=1e-3,samples=2
   fidsplat render scene.toml -o frames --outputs rgb,depth,normal,label
   fidsplat render tag.ply -o tag.png --device reference --quality gsplat
   fidsplat render scene.toml --max-error 1e-3        measures first, and keeps what it found for the next time

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,7 +10,7 @@ from typing import Protocol
 from fidsplat.cameras import Camera
 from fidsplat.effects.catalogue import CATALOGUE, Effect, Output
 from fidsplat.effects.together import refuse_strangers
-from fidsplat.errors import InputError
+from fidsplat.errors import InputError, unknown
 from fidsplat.quality import Quality
 from fidsplat.sensor import Sensor
 from fidsplat.surroundings import Background, Fog, Gradient, background_of
@@ -37,7 +36,7 @@ class FeatureSet:
 
     slots: tuple[str, ...]
     """One effect per kind, in the fixed order camera, color, lowpass, stop, compose, footprint, background,
-    arithmetic; then motion, shutter, double blending and short keys, if any."""
+    arithmetic; then motion, shutter and double blending, if any."""
     taps: tuple[str, ...]
     """Sorted names of the planes beside rgb."""
     sh_degree: int
@@ -45,9 +44,6 @@ class FeatureSet:
     setup_precision: str
     posts: tuple[str, ...] = ()
     """What changes rgb on its way out, in its order: fog, the steps of the sensor."""
-    depth_key_bits: int = 32
-    tile_size: int | None = None
-    """samples; None: the device's own"""
 
     @cached_property
     def effects(self) -> tuple[Effect, ...]:
@@ -126,23 +122,18 @@ def select(
     wanted = set(outputs)
     for name in wanted:
         if name not in OUTPUTS:
-            near = difflib.get_close_matches(str(name), OUTPUTS, 1)
-            hint = f" (did you mean {near[0]!r}?)" if near else ""
-            raise InputError(f"unknown output {name!r}{hint}; known: {', '.join(OUTPUTS)}")
+            raise InputError(unknown("output", name, OUTPUTS))
     foggy = fog is not None and fog.density > 0
     lowpass = "none" if cloud.footprint == "box" else quality.lowpass
     precision = quality.blend_precision
     refuse_strangers(foggy, camera, precision)
     layered = cloud.has_planes and quality.coplanar == "blend"
-    # the splats of a plane arrive together because no other has their key
-    key_bits = 32 if layered else quality.depth_key_bits
     pinhole = camera is None or camera.lens is None
     in_spheres = pinhole and cloud.footprint == "gaussian" and lowpass != "pixel"
-    color = "color_rgb" if cloud.sh_degree < 0 else "color_sh"
     return FeatureSet(
         slots=(
             f"camera_{camera.lens.kind if camera is not None and camera.lens else 'pinhole'}",
-            f"{color}_half" if quality.color_precision == "float16" else color,
+            "color_rgb" if cloud.sh_degree < 0 else "color_sh",
             # boxes are filtered by their own footprint
             f"lowpass_{lowpass}",
             f"stop_{quality.stop_rule}",
@@ -155,15 +146,12 @@ def select(
             *(("shutter_exposure",) if exposed else ()),
             *(("shutter_rows",) if exposed and in_spheres else ()),
             *(("blend_double",) if precision == "float64" else ()),
-            *(("keys_short",) if key_bits < 32 else ()),
         ),
         taps=tuple(sorted(wanted - {"rgb"})),
         sh_degree=max(cloud.sh_degree, 0),
         samples=quality.samples,
         setup_precision=quality.setup_precision,
         posts=(*(("fog",) if foggy else ()), *(() if sensor is None else sensor.steps)),
-        depth_key_bits=key_bits,
-        tile_size=quality.tile_size,
     )
 
 

@@ -9,7 +9,7 @@ from importlib import import_module
 import numpy as np
 
 from fidsplat.hard_cases.case import Finding
-from fidsplat.hard_cases.clouds import log_uniform
+from fidsplat.random_clouds import log_uniform
 from fidsplat.render import Renderer
 
 _COUNT = 1 << 18

@@ -11,7 +11,6 @@ from fidsplat.cameras import Camera
 from fidsplat.rotations import matrix_to_quaternion
 from fidsplat.splats import SplatCloud
 
-HARD_OPACITIES = np.array([0.002, 0.05, 0.3, 0.5, 0.9, 0.99, 1.0], np.float32)
 ORANGE = (0.9, 0.5, 0.2)
 
 
@@ -47,33 +46,6 @@ def splats(
 
     more.setdefault("labels", np.arange(n) % 100)
     return SplatCloud(means, each(quats, 4), each(scales, 2), each(opacities), colors=each(colors, 3), **more)
-
-
-def log_uniform(generator: np.random.Generator, low: float, high: float, shape=()) -> np.ndarray:
-    """Random numbers whose logarithms are uniform."""
-    return np.exp(generator.uniform(math.log(low), math.log(high), shape))
-
-
-def random_splats(
-    count: int,
-    seed: int,
-    depth: tuple[float, float] = (-1.0, 6.0),
-    scale: tuple[float, float] = (1e-3, 2.0),
-    across: float = 2.0,
-) -> SplatCloud:
-    """Splats with hard opacities: centres uniform in a box, scales log-uniform, orientations uniform."""
-    generator = np.random.default_rng(seed)
-    means = np.column_stack(
-        [generator.uniform(-across, across, (count, 2)), generator.uniform(*depth, count)]
-    )
-    return splats(
-        means.astype(np.float32),
-        generator.normal(size=(count, 4)),
-        log_uniform(generator, *scale, (count, 2)),
-        generator.choice(HARD_OPACITIES, count),
-        generator.uniform(0, 1, (count, 3)),
-        labels=generator.integers(0, 9, count),
-    )
 
 
 def taken(cloud: SplatCloud, index) -> SplatCloud:

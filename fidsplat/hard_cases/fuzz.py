@@ -13,8 +13,9 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
-from fidsplat.hard_cases.clouds import log_uniform, quaternion
+from fidsplat.hard_cases.clouds import quaternion
 from fidsplat.quality import Quality
+from fidsplat.random_clouds import log_uniform
 from fidsplat.rotations import quaternion_multiply, quaternion_to_matrix
 from fidsplat.splats import SplatCloud
 

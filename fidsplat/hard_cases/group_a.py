@@ -9,8 +9,9 @@ import numpy as np
 
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
 from fidsplat.hard_cases.case import Case, Finding
-from fidsplat.hard_cases.clouds import camera, log_uniform, quaternion, random_splats, splats, taken, turned
+from fidsplat.hard_cases.clouds import camera, quaternion, splats, taken, turned
 from fidsplat.hard_cases.invariance import CULLED, differing, draw, has_tiles, tile_shapes, trace
+from fidsplat.random_clouds import log_uniform, random_splats
 from fidsplat.render import Renderer
 from fidsplat.splats import SplatCloud
 

@@ -10,10 +10,11 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, COLOR_TOLERANCE, Picture
 from fidsplat.hard_cases.case import Case, Finding
-from fidsplat.hard_cases.clouds import camera, quaternion, random_splats, splats, turned
+from fidsplat.hard_cases.clouds import camera, quaternion, splats, turned
 from fidsplat.hard_cases.homography import grazing_errors
 from fidsplat.hard_cases.invariance import differing, draw
 from fidsplat.quality import Quality
+from fidsplat.random_clouds import random_splats
 from fidsplat.render import Renderer
 from fidsplat.splats import SplatCloud
 

@@ -10,7 +10,7 @@ from fidsplat.backends.base import View
 from fidsplat.cameras import Camera
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, COLOR_TOLERANCE, Picture
 from fidsplat.hard_cases.case import Case, Finding
-from fidsplat.hard_cases.clouds import camera, random_splats, splats, taken, turned
+from fidsplat.hard_cases.clouds import camera, splats, taken, turned
 from fidsplat.hard_cases.coplanar import (
     WALL_STEP,
     beside_a_big_splat,
@@ -31,6 +31,7 @@ from fidsplat.hard_cases.invariance import (
     trace,
 )
 from fidsplat.quality import Quality
+from fidsplat.random_clouds import random_splats
 from fidsplat.render import Renderer
 from fidsplat.rotations import quaternion_to_matrix
 from fidsplat.splats import SplatCloud

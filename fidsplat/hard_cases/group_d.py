@@ -8,8 +8,9 @@ import numpy as np
 
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
 from fidsplat.hard_cases.case import Case, Finding
-from fidsplat.hard_cases.clouds import camera, random_splats, splats, turned
+from fidsplat.hard_cases.clouds import camera, splats, turned
 from fidsplat.quality import Quality
+from fidsplat.random_clouds import random_splats
 from fidsplat.render import Renderer
 from fidsplat.splats import SplatCloud
 

@@ -12,9 +12,10 @@ from fidsplat.cameras import Camera
 from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, CATALOGUED, Picture
 from fidsplat.hard_cases.case import Case, Finding
-from fidsplat.hard_cases.clouds import camera, random_splats, splats, taken, turned
+from fidsplat.hard_cases.clouds import camera, splats, taken, turned
 from fidsplat.hard_cases.invariance import probe_of
 from fidsplat.quality import Quality
+from fidsplat.random_clouds import random_splats
 from fidsplat.render import Renderer
 from fidsplat.splats import SplatCloud
 

@@ -12,9 +12,10 @@ from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
 from fidsplat.hard_cases.arithmetic import measure
 from fidsplat.hard_cases.case import Case, Finding
-from fidsplat.hard_cases.clouds import camera, random_splats, splats
+from fidsplat.hard_cases.clouds import camera, splats
 from fidsplat.hard_cases.invariance import has_tiles, odd_shapes, other_schedule, out_of_order, probe_of
 from fidsplat.quality import Quality
+from fidsplat.random_clouds import random_splats
 from fidsplat.render import Renderer
 from fidsplat.splats import SplatCloud
 

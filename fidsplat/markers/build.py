@@ -14,20 +14,29 @@ import numpy as np
 from fidsplat.errors import InputError
 from fidsplat.markers.mixture import (
     Template,
+    count_gaussians,
     fitted_growth,
     fitted_templates,
     paper_template,
-    place,
 )
-from fidsplat.markers.partition import partition
+from fidsplat.markers.partition import least_rectangles, partition
+from fidsplat.markers.printing import (
+    MAX_SPLATS,
+    Printed,
+    Progress,
+    aspect_of,
+    box_cloud,
+    gaussian_cloud,
+    refuse_more,
+)
 from fidsplat.markers.regions import label_components, polygons
-from fidsplat.markers.seams import grow
 from fidsplat.markers.spec import QUIET_ZONE, bits_of, parse_spec
 from fidsplat.quality import MIXTURES, MarkerQuality, whole_number
-from fidsplat.splats import SplatCloud
 
 if TYPE_CHECKING:
     from shapely import Polygon
+
+    from fidsplat.splats import SplatCloud
 
 MAX_MODULES = 4096
 """Longest edge of a grid with its quiet zone."""
@@ -81,6 +90,8 @@ class Marker:
     """
     seconds: float
     """time from the spec to the cloud"""
+    max_splats: int = MAX_SPLATS
+    """most splats that it may be made of"""
 
     def __repr__(self) -> str:
         return (
@@ -94,11 +105,19 @@ class Marker:
 
     @cached_property
     def gaussians(self) -> SplatCloud:
-        """Splats that every renderer can draw: ``cloud``, or the mixture `fitted` in place of `exact`."""
+        """Splats that every renderer can draw: ``cloud``, or the mixture `fitted` in place of `exact`.
+
+        Raises:
+            InputError: these are more than ``max_splats``.
+        """
         if self.mixture != "exact":
             return self.cloud
         templates = fitted_templates(self.quality.template)
-        return _gaussians(self.grid, self.boxes, templates, fitted_growth(), self.module)
+        count = int(count_gaussians(aspect_of(self.boxes), templates).sum())
+        refuse_more(f"as Gaussians {self.spec}", count, self.max_splats)
+        return gaussian_cloud(
+            Printed(self.grid, self.boxes, self.module), templates, fitted_growth(), _unseen
+        )
 
     @cached_property
     def rectangles(self) -> list[Rectangle]:
@@ -133,6 +152,8 @@ def marker(
     growth: float | None = None,
     template: int | None = None,
     quality: MarkerQuality | None = None,
+    max_splats: int = MAX_SPLATS,
+    progress: Progress | None = None,
 ) -> Marker:
     """Make a marker of splats.
 
@@ -150,11 +171,16 @@ def marker(
             paper.
         quality: what mixture, levels, density, growth and template are where they are left out
             (`Quality.marker`); what does not concern the mixture is let be.
+        max_splats: most splats that it may become; a picture of noise easily becomes tens of millions.
+        progress: called with what is being done and the share of it that is done, 0 to 1.
 
     Raises:
-        InputError: a value above that cannot be used; the message gives the valid range.
+        InputError: a value above that cannot be used; the message gives the valid range. More splats than
+            ``max_splats``, mostly before the work begins.
     """
     start = time.perf_counter()
+    progress = _unseen if progress is None else progress
+    max_splats = whole_number("max_splats", max_splats, 1, 2**31 - 1)
     parsed = parse_spec(spec)
     given = {"levels": levels, "density": density, "growth": growth, "template": template}
     chosen = _chosen(MarkerQuality() if quality is None else quality, mixture, duplicates, given)
@@ -171,10 +197,16 @@ def marker(
     quiet = whole_number("the quiet zone", quiet, 0, longest // 2)
 
     grid = np.pad(bits, quiet)
+    each = 1 if exact else min(len(template.gaussians) for template in templates)
+    refuse_more(spec, least_rectangles(grid) * each, max_splats, "at least ")
+    progress("components", 0.0)
     labels, components = label_components(grid)
+    progress("rectangles", 0.0)
     boxes = partition(grid)
-    module = size / bits.shape[1]
-    cloud = _boxes(grid, boxes, module) if exact else _gaussians(grid, boxes, templates, growth, module)
+    count = len(boxes) if exact else int(count_gaussians(aspect_of(boxes), templates).sum())
+    refuse_more(spec, count, max_splats)
+    printed = Printed(grid, boxes, size / bits.shape[1])
+    cloud = box_cloud(printed, progress) if exact else gaussian_cloud(printed, templates, growth, progress)
     for array in (bits, grid, boxes, labels):
         array.flags.writeable = False
     return Marker(
@@ -194,7 +226,12 @@ def marker(
         components=components,
         cloud=cloud,
         seconds=time.perf_counter() - start,
+        max_splats=max_splats,
     )
+
+
+def _unseen(words: str, share: float) -> None:
+    """Progress that nobody looks at."""
 
 
 def _chosen(
@@ -234,49 +271,3 @@ def _check_size(size: float) -> None:
     # beyond these, a module or a splat's scale leaves the range of float32
     if not (isinstance(size, Real) and 1e-9 <= size <= 1e9):
         raise InputError(f"the marker's size is {size!r}; it must be a length from 1e-9 to 1e9 metres")
-
-
-def _boxes(grid: np.ndarray, boxes: np.ndarray, module: float) -> SplatCloud:
-    """One box for each rectangle."""
-    corners = boxes.astype(np.float64)
-    middle, half = (corners[:, :2] + corners[:, 2:]) / 2, (corners[:, 2:] - corners[:, :2]) / 2
-    return _printed(
-        grid, boxes, np.arange(len(boxes)), middle, half, np.ones(len(boxes)), module
-    ).with_boxes()
-
-
-def _gaussians(
-    grid: np.ndarray, boxes: np.ndarray, templates: tuple[Template, ...], growth: float, module: float
-) -> SplatCloud:
-    width, height = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
-    gaussians, owner = place(grow(grid, boxes, growth), width / height, templates)
-    return _printed(grid, boxes, owner, gaussians[:, :2], gaussians[:, 2:4], gaussians[:, 4], module)
-
-
-def _printed(
-    grid: np.ndarray,
-    boxes: np.ndarray,
-    owner: np.ndarray,
-    places: np.ndarray,
-    scales: np.ndarray,
-    opacities: np.ndarray,
-    module: float,
-) -> SplatCloud:
-    """Splats of rectangles ``owner`` (n,) in their colours, at places (n, 2) with scales (n, 2) in
-    modules."""
-    n = len(owner)
-    means = np.zeros((n, 3), np.float32)
-    means[:, 0] = (places[:, 0] - grid.shape[1] / 2) * module
-    means[:, 1] = (places[:, 1] - grid.shape[0] / 2) * module
-    quats = np.zeros((n, 4), np.float32)
-    quats[:, 0] = 1
-    light = 1 - grid[boxes[:, 1], boxes[:, 0]].astype(np.float32)
-    cloud = SplatCloud(
-        means,
-        quats,
-        (scales * module).astype(np.float32),
-        opacities.astype(np.float32),
-        colors=np.broadcast_to(light[owner, None], (n, 3)),
-    )
-    # one sheet of paper: where its splats meet, their order means nothing
-    return cloud.with_planes(0)

@@ -100,6 +100,13 @@ def fitted_growth() -> float:
     return _fitted()[1]
 
 
+def count_gaussians(aspect: np.ndarray, templates: tuple[Template, ...]) -> np.ndarray:
+    """How many Gaussians `place` makes of each of n rectangles, (n,) int64."""
+    parts = _parts(aspect, templates[-1].max_aspect)
+    counts = np.array([len(t.gaussians) for t in templates])
+    return parts * counts[_which(np.maximum(aspect, 1 / aspect) / parts, templates)]
+
+
 def place(
     rectangles: np.ndarray, aspect: np.ndarray, templates: tuple[Template, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -112,7 +119,7 @@ def place(
     """
     pieces, aspect, source = in_pieces(rectangles, aspect, templates[-1].max_aspect)
     upright = aspect < 1
-    which = np.searchsorted([t.max_aspect for t in templates], np.maximum(aspect, 1 / aspect) * (1 - 1e-9))
+    which = _which(np.maximum(aspect, 1 / aspect), templates)
     counts = np.array([len(t.gaussians) for t in templates])
     # every template twice: as it is, and turned for upright rectangles
     lying = np.concatenate([t.gaussians for t in templates])
@@ -140,7 +147,7 @@ def in_pieces(
     pieces, (m,) their aspect and (m,) int64 the rectangle that each is of. Templates fade towards their ends,
     so at a cut pieces reach into each other, `OVERLAP` of their width each.
     """
-    parts = np.maximum(np.ceil(np.maximum(aspect, 1 / aspect) * (1 - 1e-9) / longest), 1).astype(np.int64)
+    parts = _parts(aspect, longest)
     owner = np.repeat(np.arange(len(parts)), parts)
     nth = np.arange(len(owner)) - np.repeat(np.cumsum(parts) - parts, parts)
     pieces, aspect, parts = rectangles[owner], aspect[owner], parts[owner]
@@ -151,3 +158,13 @@ def in_pieces(
     pieces[each, axis] = np.where(nth > 0, low + nth * step - overlap, low)
     pieces[each, axis + 2] = np.where(nth < parts - 1, low + (nth + 1) * step + overlap, high)
     return pieces, np.where(axis, aspect * parts, aspect / parts), owner
+
+
+def _parts(aspect: np.ndarray, longest: float) -> np.ndarray:
+    """The fewest equal pieces, none longer than that, of rectangles of these aspect ratios."""
+    return np.maximum(np.ceil(np.maximum(aspect, 1 / aspect) * (1 - 1e-9) / longest), 1).astype(np.int64)
+
+
+def _which(aspect: np.ndarray, templates: tuple[Template, ...]) -> np.ndarray:
+    """The template for each aspect ratio, at least 1."""
+    return np.searchsorted([t.max_aspect for t in templates], aspect * (1 - 1e-9))

@@ -98,6 +98,20 @@ def independent_chords(grid: np.ndarray, concave: np.ndarray) -> tuple[np.ndarra
     return across[keep_across], down[keep_down]
 
 
+def least_rectangles(grid: np.ndarray) -> int:
+    """A number of rectangles below which no partition of an (h, w) uint8 0/1 grid comes, from one look at it.
+
+    Of all components' corners, convex and concave, it is a quarter: independent chords end at two concave
+    corners each and share none, and convex - concave = 4 (components - holes).
+    """
+    dark = (grid[:-1, :-1] + grid[:-1, 1:]) + (grid[1:, :-1] + grid[1:, 1:])
+    corners = 2 * np.count_nonzero(dark & 1)  # one concave, and one convex of the other colour
+    corners += 4 * np.count_nonzero((dark == 2) & (grid[:-1, :-1] == grid[1:, 1:]))
+    for edge in (grid[0], grid[-1], grid[:, 0], grid[:, -1]):
+        corners += 2 * np.count_nonzero(edge[1:] != edge[:-1])
+    return int(corners + 4) // 4
+
+
 def partition(grid: np.ndarray) -> np.ndarray:
     """Minimum partition of every 4-connected component of an (h, w) uint8 0/1 grid into rectangles.
 

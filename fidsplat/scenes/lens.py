@@ -34,7 +34,7 @@ def read_lens(camera: Table) -> Lens | None:
         table = camera.table(named[0], known)
         return kind(**{name: table.number(name, 0.0) for name in known})
     if named[0] == "equirectangular":
-        camera.table("equirectangular", ("",))
+        camera.table("equirectangular", ())
         return Equirectangular()
     camera.table("orthographic", ORTHOGRAPHIC)
     return Orthographic()

@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 import tomllib
 from pathlib import Path
 
@@ -20,14 +21,30 @@ from fidsplat.scenes.table import Table
 from fidsplat.splats import SplatCloud
 
 MAX_BYTES = 16 * 2**20
+MAX_PARTS = 8
+"""parts of a dotted key, of which a scene file has at most three; the parser takes time and memory as their
+square"""
 TOP = ("camera", "splats", "markers", "render", "quality", "sensor", "fog", "background")
 CAMERA = ("width", "height", "fov_x_deg", "fx", "fy", "cx", "cy")
 CAMERA += ("position", "look_at", "up", "world_to_camera", "near", "far", *TABLES, "shutter", "motion")
 CAMERA_POSE = ("position", "look_at", "up", "world_to_camera")
 SPLATS = ("file", "position", "quaternion", "scale", "motion")
-MARKERS = ("spec", "size", "position", "quaternion", *knobs(MarkerQuality), "quiet_zone", "motion")
+MARKER = ("spec", "size", "position", "quaternion", "quiet_zone", "max_splats", "motion")
+MARKERS = (*MARKER, *knobs(MarkerQuality))
 RENDER = ("outputs", "background", "quality", "samples", "lowpass", "first_hit", "device")
 IMAGE = "image:"
+
+# A dotted key of too many parts, outside of strings and comments, which are matched to be passed over. What
+# is not closed ends with the file, and quantifiers are possessive: time is linear whatever the file holds.
+_BASIC, _LITERAL = r'"(?:[^"\\\n]|\\.)*+"?', r"'[^'\n]*+'?"
+_LONG_KEY = re.compile(
+    r"[\s\[\]{}=,]++"
+    r'|"""(?:[^"\\]|\\.|"(?!""))*+(?:"""|\Z)'
+    r"|'{3}(?:[^']|'(?!''))*+(?:'{3}|\Z)"
+    rf"|(?P<long>(?<![\w.-])(?:(?:[\w-]++|{_BASIC}|{_LITERAL})[ \t]*+\.[ \t]*+){{{MAX_PARTS}}})"
+    rf"|{_BASIC}|{_LITERAL}|#[^\n]*+",
+    re.DOTALL,
+)
 
 
 def read_scene(path: str | os.PathLike[str], quality: Quality | str | None = None) -> Scene:
@@ -77,11 +94,19 @@ def _parse(file: Path) -> dict:
     if len(content) > MAX_BYTES:
         raise InputError(f"{file} is longer than {MAX_BYTES} bytes, which no scene file is")
     try:
-        return tomllib.loads(content.decode("utf-8"))
+        text = content.decode("utf-8")
+        if any(match["long"] for match in _LONG_KEY.finditer(text)):
+            raise InputError(
+                f"{file} is not a scene file: a dotted key has more than {MAX_PARTS} parts; scene files have "
+                "at most three"
+            )
+        return tomllib.loads(text)
     except UnicodeDecodeError:
         raise InputError(f"{file} is not a scene file: it is not text in UTF-8") from None
     except RecursionError:
         raise InputError(f"{file} is not a scene file: its lists are nested too deeply") from None
+    except InputError:
+        raise
     except ValueError as error:  # TOMLDecodeError, and what int() says to a number of thousands of digits
         raise InputError(f"{file} is not a scene file in TOML: {error}") from None
 
@@ -150,12 +175,13 @@ def _marker(table: Table, folder: Path, quality: MarkerQuality) -> PlacedMarker:
     if spec.startswith(IMAGE):
         spec = IMAGE + str(folder / spec.removeprefix(IMAGE))
     pose, motion = _pose(table), read_keyframes(table, POSE, _pose)
-    quiet_zone = table.whole("quiet_zone", None)
+    quiet_zone, max_splats = table.whole("quiet_zone", None), table.whole("max_splats", None)
     own = read_knobs(table, MarkerQuality)
     if quiet_zone is not None and quiet_zone < 0:
         raise table.error("quiet_zone", f"must be 0 or more modules, not {quiet_zone}")
-    from fidsplat.markers import marker  # late: it brings shapely and networkx
+    from fidsplat.markers import marker  # late: it brings what makes markers
 
+    limit = {} if max_splats is None else {"max_splats": max_splats}
     with table.at():
-        made = marker(spec, size=size, quiet_zone=quiet_zone, quality=quality, **own)
+        made = marker(spec, size=size, quiet_zone=quiet_zone, quality=quality, **limit, **own)
         return PlacedMarker(made, pose, motion=motion)

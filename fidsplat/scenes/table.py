@@ -1,12 +1,11 @@
 """A table of a scene file whose keys, types and lengths are checked, with errors that name the key."""
 
-import difflib
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from fidsplat.errors import InputError
+from fidsplat.errors import InputError, unknown
 
 _MISSING = object()
 
@@ -24,12 +23,9 @@ class Table:
             raise InputError(f"{file}: {path} must be a table, not {_kind(values)}")
         for key in values:
             if key not in known:
-                nearest = difflib.get_close_matches(key.lower(), known, 1, 0.0)[0]
                 what = "table" if isinstance(values[key], dict) else "key"
-                raise InputError(
-                    f"{file}: unknown {what} {self._name(key)}; did you mean {nearest}? "
-                    f"Known here: {', '.join(known)}"
-                )
+                within = self._name("")
+                raise InputError(f"{file}: {unknown(what, key, known, within, likeness=0.0)}")
         self._values = values
 
     def __contains__(self, key: str) -> bool:

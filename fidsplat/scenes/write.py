@@ -8,6 +8,7 @@ import numpy as np
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
 from fidsplat.formats import save_ply
+from fidsplat.markers.printing import MAX_SPLATS
 from fidsplat.quality import Quality
 from fidsplat.rotations import matrix_to_quaternion
 from fidsplat.scenes.imaging import imaging_tables
@@ -74,6 +75,7 @@ def _marker(placed: PlacedMarker, folder: Path, quality: Quality | str | None) -
     if spec.startswith(IMAGE):
         spec = IMAGE + os.path.relpath(spec.removeprefix(IMAGE), folder)
     motion = {} if placed.motion is None else {"motion": keyframe_tables(placed.motion, marker.spec)}
+    limit = {} if marker.max_splats == MAX_SPLATS else {"max_splats": marker.max_splats}
     return {
         "spec": spec,
         "size": float(marker.size),
@@ -81,6 +83,7 @@ def _marker(placed: PlacedMarker, folder: Path, quality: Quality | str | None) -
         "quaternion": matrix_to_quaternion(placed.pose[:3, :3]).tolist(),
         **marker_knobs(marker.quality, quality),
         "quiet_zone": int(marker.quiet_zone),
+        **limit,
         **motion,
     }
 

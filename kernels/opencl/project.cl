@@ -167,5 +167,4 @@ kernel void project(
     float key = (float)pz;
 //@@ key
     keys[i] = sortable(key);
-//@@ key_bits
 }

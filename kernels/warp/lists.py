@@ -23,14 +23,13 @@ def compact(
     keys: wp.array(dtype=wp.uint32),  # (n)
     drawn: wp.array(dtype=wp.int32),  # (n)
     places: wp.array(dtype=wp.int32),  # (n) inclusive sums of drawn
-    leading: wp.uint32,  # the bits of a key that count
     sorted_keys: wp.array(dtype=wp.uint32),  # out: keys of those drawn, by index
     order: wp.array(dtype=wp.int32),  # out: their indices
 ):
     i = wp.tid() + first
     if drawn[i] != 0:
         k = places[i] - 1
-        sorted_keys[k] = keys[i] & leading
+        sorted_keys[k] = keys[i]
         order[k] = i
 
 

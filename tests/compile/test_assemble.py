@@ -53,7 +53,7 @@ def test_base_text_names_no_effect_that_was_not_asked_for():
         "footprint_gaussian",
         "arithmetic_fast",
     }
-    of_knobs = ("vload_half", "colors_half", "KEY_BITS", "wide", "WIDE")
+    of_knobs = ("wide", "WIDE")
     of_layers = ("planes", "plane_keys", "layer", "Layer", "open", "waiting", "ink")
     for name in (*absent, *TAPS, "sh", "finished", *of_layers, *of_knobs):
         assert not re.search(rf"\b{name}(_|\b)", text), name
@@ -220,7 +220,7 @@ def test_no_kernel_calls_what_opencl_promises_nothing_of():
 # what the compile matrix (test_matrix.py) does not have with everything
 KNOBS = {
     "double": {"quality": fs.Quality(blend_precision="float64")},
-    "knobs": {"quality": fs.Quality(arithmetic="precise", color_precision="float16", tile_size=8)},
+    "precise": {"quality": fs.Quality(arithmetic="precise")},
 }
 
 

@@ -8,7 +8,7 @@ from agreement import ALL_OUTPUTS, assert_agrees, compare, random_splats, refere
 
 import fidsplat as fs
 from fidsplat.cameras.pinhole import FOCAL_LENGTHS
-from fidsplat.experiments.scenes import load_scene
+from fidsplat.random_clouds import load_scene
 
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 

@@ -49,7 +49,7 @@ NUMBERS = {
     ("transmittance_stop", "0"): (1.2, 0.02),
     ("opacity_ceiling", "0.99"): (1.0, 0.03),
     ("setup_precision", "float32"): (1.01, 0.02),
-    ("tile_size", "16"): (1.0, 0.002),
+    ("arithmetic", "fast"): (1.0, 0.002),
     ("lowpass", "none"): (0.7, 0.5),
     (ALONE, "exact"): (2.0, 1e-6),
     (ALONE, "alpha_cutoff 1/255"): (1.2, 0.019),
@@ -96,7 +96,7 @@ def write(folder, lines) -> None:
         (("transmittance_stop", "0"), verdicts.WASTE),
         (("opacity_ceiling", "0.99"), verdicts.TRAP),
         (("setup_precision", "float32"), verdicts.NOTHING),
-        (("tile_size", "16"), verdicts.FREE),
+        (("arithmetic", "fast"), verdicts.FREE),
     ],
 )
 def test_a_verdict_follows_from_time_and_error(setting, wanted):
@@ -114,8 +114,8 @@ def test_times_within_the_noise_of_the_base_do_not_differ():
     point = results.points["hard", "transmittance_stop", "1/512"]
     assert verdicts.verdict(point, results.base("hard"), least) == verdicts.NOTHING
     one_side = result(0.9, 0.02, ratio_quartiles=[0.8, 1.02])
-    noisy = line("hard", Point("tile_size", "16", BASE), one_side)
-    assert verdicts.time_sign(Results("d", [noisy]).points["hard", "tile_size", "16"], 0.02) == 0
+    noisy = line("hard", Point("arithmetic", "fast", BASE), one_side)
+    assert verdicts.time_sign(Results("d", [noisy]).points["hard", "arithmetic", "fast"], 0.02) == 0
 
 
 def test_what_was_measured_twice_shows_the_noise():
@@ -129,7 +129,7 @@ def test_the_front_has_nothing_that_is_beaten():
     results = Results("d", plain_lines("hard"))
     front = verdicts.front(point for point in results.of("hard") if point.same_picture)
     assert [point.words for point in front] == [
-        "alpha_cutoff 4/255", "transmittance_stop 1/512", "tile_size 16", "alpha_cutoff 1/1024",
+        "alpha_cutoff 4/255", "transmittance_stop 1/512", "arithmetic fast", "alpha_cutoff 1/1024",
         "alpha_cutoff 0.0001", "reference",
     ]  # fmt: skip
 
@@ -140,10 +140,10 @@ def test_the_cheapest_invisible_error_is_the_cheapest_on_all_scenes():
     assert {point.words for point in chosen or ()} == {"alpha_cutoff 1/1024"}
     # beyond its certificates the other is invisible too, on one of the scenes
     for each in lines:
-        if each["key"]["value"] == "16" and each["key"]["scene"] == "hard":
+        if each["key"]["knob"] == "arithmetic" and each["key"]["scene"] == "hard":
             each["result"]["maximum_sure"] = 0.001
     chosen = verdicts.cheapest_within(Results("d", lines), ("hard",), verdicts.INVISIBLE)
-    assert {point.words for point in chosen or ()} == {"tile_size 16"}
+    assert {point.words for point in chosen or ()} == {"arithmetic fast"}
     assert verdicts.cheapest_within(Results("d", lines), ("hard",), 1e-9) is None
 
 
@@ -177,7 +177,7 @@ def test_the_report_says_what_the_numbers_say(capsys, tmp_path):
     text = page.read_text()
     assert text.index("## A processor, driver 1") < text.index("## A card, driver 2")
     for words in (
-        "**Free accuracy**: tile_size 16.",
+        "**Free accuracy**: arithmetic fast.",
         "**Free time**: transmittance_stop 1/512.",
         "**Traps**: gsplat; opacity_ceiling 0.99.",
         "traps: opacity_ceiling 0.99; free time: none; buying time on some scene: alpha_cutoff 1/255;",
@@ -186,7 +186,7 @@ def test_the_report_says_what_the_numbers_say(capsys, tmp_path):
         "alpha_cutoff 1/1024 (r100k_720p +25 %, error / 13; hard +25 %, error / 13)",
         "the base took r100k_720p 10.00 to 10.00 ms, median 10.00; hard 10.00 to 10.00 ms, median 10.00.",
         "| hard | at gsplat's error at least as fast | 0.900 of its time | transmittance_stop 1/512 | yes |",
-        "| hard | in gsplat's time 10 times as accurate | 20 times | tile_size 16 | yes |",
+        "| hard | in gsplat's time 10 times as accurate | 20 times | arithmetic fast | yes |",
         "on random scenes: alpha_cutoff 1/1024 (r100k_720p +25 %, error 0.0015)",
         "| 1/255: nothing fainter is drawn | -40 % | 0.019 | 0.0019 |",
         "| lowpass none | -30 % | 0.5 * | 0.05 * |",

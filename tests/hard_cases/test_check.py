@@ -13,7 +13,8 @@ from fidsplat.hard_cases import check
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
 from fidsplat.hard_cases.arithmetic import BOUNDS, measure
 from fidsplat.hard_cases.case import Case, Finding
-from fidsplat.hard_cases.clouds import camera, random_splats, splats, turned
+from fidsplat.hard_cases.clouds import camera, splats, turned
+from fidsplat.random_clouds import random_splats
 from fidsplat.vision.images import read_image
 
 CLOUD = random_splats(40, seed=41, depth=(1.0, 4.0), scale=(0.02, 0.5))

@@ -7,9 +7,10 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
-from fidsplat.hard_cases.clouds import camera, random_splats, splats, taken, turned
+from fidsplat.hard_cases.clouds import camera, splats, taken, turned
 from fidsplat.hard_cases.coplanar import tag
 from fidsplat.hard_cases.invariance import CULLED, differing, draw, has_tiles, tile_shapes, trace
+from fidsplat.random_clouds import random_splats
 
 CLOUDS = {
     "around the camera": random_splats(150, seed=31),

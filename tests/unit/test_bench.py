@@ -11,7 +11,7 @@ from fidsplat.cli import main
 from fidsplat.experiments.bench import catalogue, measure
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, BenchScene, scene_names
 from fidsplat.experiments.bench.overdraw import overdraw
-from fidsplat.experiments.scenes import random_cloud, standard_camera
+from fidsplat.random_clouds import random_cloud, standard_camera
 
 CAMERA = standard_camera(64, 48)
 # of every record, and of one that has frames

@@ -1,18 +1,22 @@
 """The command line: exit statuses, one line for an error, --json alone on stdout, the words of the
 contract."""
 
+import io
 import json
 import os
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
 from ideal_picture import draw, photographed, pose, qr_bits, turned
+from rich.console import Console
 
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.commands import COMMANDS
+from fidsplat.commands.output import late_progress
 from fidsplat.vision.dictionaries import dictionary_bits
 from fidsplat.vision.images import write_png
 
@@ -70,6 +74,7 @@ def test_help_loads_nothing_heavy():
 @pytest.mark.parametrize(
     ("words", "says"),
     [
+        ([], "try `fidsplat demo` first"),
         ([], "demo, devices, marker, render, detect"),
         (["mraker"], "Available subcommands: demo, devices"),
         (["marker"], "SPEC"),
@@ -140,6 +145,11 @@ def test_a_terminal_without_unicode_gets_help_and_errors(tmp_path):
     wrong = run("marker", "qr:a", "--sise", "1")
     assert (wrong.returncode, wrong.stderr.count("\n")) == (2, 1)
     assert "perhaps --size M" in wrong.stderr
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr() == (f"fidsplat {fs.__version__}\n", "")
 
 
 # --- statuses
@@ -232,6 +242,28 @@ def test_marker_says_what_it_is_made_of(capsys, tmp_path):
     assert 0 < facts["seconds"] < 30
     assert main(["marker", "apriltag:36h11:5"]) == 0
     assert "rectangles" in capsys.readouterr().out
+
+
+def test_a_marker_of_more_splats_than_allowed(capsys, tmp_path):
+    bits = np.random.default_rng(0).random((350, 350)) < 0.5
+    spec = f"image:{write_png(tmp_path / 'noise.png', bits)}"
+    status, line = fails(capsys, "marker", spec)
+    assert status == 2
+    assert "more than 1,000,000" in line
+    assert "--max-splats" in line
+    facts = prints_json(capsys, "marker", "qr:a", "--max-splats", "10000000")
+    assert facts["splats"] > 0
+
+
+def test_work_is_shown_once_it_takes_long():
+    for after in (60.0, 0.0):
+        shown = io.StringIO()
+        with late_progress(Console(file=shown, force_terminal=True), after) as progress:
+            progress("squares", 0.5)
+            deadline = time.monotonic() + 30
+            while not after and "squares" not in shown.getvalue() and time.monotonic() < deadline:
+                time.sleep(0.01)
+        assert ("squares" in shown.getvalue()) == (after == 0)
 
 
 def test_marker_writes_two_scales_when_asked(capsys, tmp_path):

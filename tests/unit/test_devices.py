@@ -9,6 +9,8 @@ import fidsplat as fs
 from fidsplat.backends.opencl import pocl_target
 from fidsplat.errors import UnknownDeviceError
 
+POCL = "OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-"
+
 
 def test_devices_lists_pocl_and_the_reference():
     names = [info.name for info in fs.devices()]
@@ -87,7 +89,7 @@ def test_target_is_corrected_only_where_the_record_looks_as_expected():
         return Record(*words)
 
     good = record(1, 2, ctypes.addressof(triplet), ctypes.addressof(generic), 5)
-    name = pocl_target.correct_target(ctypes.addressof(good))
+    name = pocl_target.correct_target(ctypes.addressof(good), POCL + "generic")
     assert name in [level for level, _ in pocl_target._LEVELS]
     assert ctypes.string_at(good[3]) == name.encode()
     assert list(good[:3]) == [1, 2, ctypes.addressof(triplet)]
@@ -99,11 +101,20 @@ def test_target_is_corrected_only_where_the_record_looks_as_expected():
         record(8, 1 << 63),
     ):
         before = list(bad)
-        assert pocl_target.correct_target(ctypes.addressof(bad)) is None
+        assert pocl_target.correct_target(ctypes.addressof(bad), POCL + "generic") is None
         assert list(bad) == before
 
 
-def test_only_pocl_with_an_unknown_processor_is_corrected():
-    known = "OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-skylake-avx512"
-    assert not pocl_target.needs_correction(known)
+@pytest.mark.parametrize(
+    ("processor", "llvm", "needed"),
+    [
+        ("skylake-avx512", "skylake-avx512", False),
+        ("haswell", "znver3", False),
+        ("skylake-avx512", "znver3", True),  # Zen 4: kernels for Zen 3 with a library for AVX-512 never build
+        ("haswell", "generic", True),
+    ],
+)
+def test_only_pocl_that_mistakes_the_processor_is_corrected(monkeypatch, processor, llvm, needed):
+    monkeypatch.setattr(pocl_target, "_processor_name", lambda: processor)
+    assert pocl_target.needs_correction(POCL + llvm) == needed
     assert not pocl_target.needs_correction("OpenCL 3.0 CUDA")

@@ -1,9 +1,6 @@
 """Sensors, fog and backgrounds: values, scene files, and what is wrong with them."""
 
 import math
-import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -150,7 +147,7 @@ def test_a_panorama_of_no_file_cannot_be_written(tmp_path):
 @pytest.mark.parametrize(
     ("tables", "words"),
     [
-        ("[sensor]\nexposre = 2.0", "sensor.exposre; did you mean exposure"),
+        ("[sensor]\nexposre = 2.0", "'sensor.exposre' .did you mean 'exposure'"),
         ("[sensor]\nexposure = -2.0", "sensor: sensor: exposure is -2.0"),
         ("[sensor]\nresponse = true", "sensor.response must be a number"),
         ("[sensor]\nvignetting = 0.1", "sensor.vignetting must be a list of numbers"),
@@ -188,19 +185,9 @@ def test_the_command_writes_as_many_bits_as_the_sensor_has(tmp_path, bits):
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
-@pytest.fixture(scope="module")
-def examples(tmp_path_factory):
-    """The examples with the files that `make_data.py` makes."""
-    folder = tmp_path_factory.mktemp("examples")
-    for file in EXAMPLES.glob("*.toml"):
-        shutil.copy(file, folder)
-    subprocess.run([sys.executable, str(EXAMPLES / "make_data.py"), str(folder / "data")], check=True)
-    return folder
-
-
 @pytest.mark.parametrize("name", sorted(file.stem for file in EXAMPLES.glob("*.toml")))
-def test_the_examples_are_drawn(name, renderer, examples):
-    scene = fs.Scene.load(examples / f"{name}.toml")
+def test_the_examples_are_drawn(name, renderer):
+    scene = fs.Scene.load(EXAMPLES / f"{name}.toml")
     frame = renderer.render(scene)
     assert scene.camera is not None
     assert frame["rgb"].shape == (scene.camera.height, scene.camera.width, 3)

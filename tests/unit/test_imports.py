@@ -37,10 +37,13 @@ MAY_IMPORT = {
     "scenes": PLAIN | {"markers", "formats"},
     "effects": PLAIN | {"scenes"},
     "backends": PLAIN | {"scenes", "effects", "kernel_files"},
-    "hard_cases": PLAIN | {"scenes", "effects", "backends", "render", "vision", "kernel_files"},
+    "timing": BASE,
+    "random_clouds": PLAIN,
+    "hard_cases": PLAIN
+    | {"scenes", "effects", "backends", "render", "vision", "kernel_files", "random_clouds"},
     "render": PLAIN | {"scenes", "effects", "backends"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
-    "budget": PLAIN | {"scenes", "render", "accuracy", "provenance"},
+    "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__"}
 

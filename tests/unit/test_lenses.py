@@ -192,13 +192,16 @@ def test_scene_files_switch_lenses_on(tmp_path, text, fx):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("fov_x_deg = 90\n[camera.distortion]\nk7 = 1.0\n", r"camera.distortion.k7; did you mean k"),
+        ("fov_x_deg = 90\n[camera.distortion]\nk7 = 1.0\n", r"'camera.distortion.k7' .did you mean 'k"),
         ("fov_x_deg = 90\n[camera.distortion]\n[camera.fisheye]\n", "fisheye and distortion exclude"),
         ("fov_x_deg = 90\n[camera.equirectangular]\n", "fov_x_deg and equirectangular exclude"),
         ("fov_x_deg = 90\n[camera.orthographic]\n", "fov_x_deg and orthographic exclude"),
         ("[camera.orthographic]\n", "metres_wide is missing"),
         ("[camera.orthographic]\nmetres_wide = -1\n", "metres_wide must be above 0"),
-        ("[camera.equirectangular]\nradius = 1\n", "unknown key camera.equirectangular.radius"),
+        (
+            "[camera.equirectangular]\nradius = 1\n",
+            "unknown key 'camera.equirectangular.radius'; none is known here",
+        ),
         ("fov_x_deg = 210\n[camera.fisheye]\n", "fov_x_deg: camera fov_x of this fisheye"),
         ("fov_x_deg = 120\n[camera.distortion]\nk1 = -2.0\n", "cannot be inverted in"),
     ],

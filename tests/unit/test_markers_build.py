@@ -10,6 +10,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.markers import Marker, Rectangle, marker
+from fidsplat.vision.images import write_png
 
 
 def text_of(length: int) -> str:
@@ -147,11 +148,67 @@ def test_the_same_bits_on_every_run():
         ({"growth": "much"}, "from 0 to 1 module"),
         ({"levels": 4}, "mixture='paper'"),
         ({"mixture": "paper", "levels": 40}, "1 to 8"),
+        ({"max_splats": 0}, "max_splats is 0"),
+        ({"max_splats": "many"}, "whole number from 1"),
+        ({"max_splats": 26}, "apriltag:36h11:0 becomes at least"),
     ],
 )
 def test_bad_options_are_refused(options, says):
     with pytest.raises(fs.InputError, match=says):
         marker("apriltag:36h11:0", **options)
+
+
+@pytest.fixture(scope="module")
+def noise(tmp_path_factory):
+    bits = np.random.default_rng(0).random((120, 120)) < 0.5
+    return f"image:{write_png(tmp_path_factory.mktemp('noise') / 'noise.png', bits)}"
+
+
+def test_too_many_splats_are_refused_before_the_work(noise, monkeypatch):
+    def partition(grid):
+        raise AssertionError("cut into rectangles all the same")
+
+    monkeypatch.setattr("fidsplat.markers.build.partition", partition)
+    with pytest.raises(fs.InputError, match=r"at least 1\d\d,\d{3} splats, more than 100,000: .*max_splats"):
+        marker(noise, max_splats=100_000)
+
+
+def test_too_many_splats_are_refused_by_their_number(noise):
+    count = len(marker(noise).cloud)
+    assert len(marker(noise, max_splats=count).cloud) == count
+    with pytest.raises(fs.InputError, match=f"becomes {count:,} splats, more than {count - 1:,}"):
+        marker(noise, max_splats=count - 1)
+
+
+def test_an_exact_marker_may_have_more_boxes_than_gaussians(noise):
+    made = marker(noise, mixture="exact", max_splats=100_000)
+    assert len(made.cloud) == len(made.boxes)
+    with pytest.raises(fs.InputError, match=r"as Gaussians image:.* more than 100,000"):
+        _ = made.gaussians
+
+
+def test_clouds_are_filled_part_by_part_with_the_same_bits(noise, monkeypatch):
+    for mixture in ("fitted", "exact"):
+        whole, told = marker(noise, mixture=mixture).cloud, []
+        with monkeypatch.context() as patched:
+            patched.setattr("fidsplat.markers.printing.CHUNK", 4321)
+            parts = marker(noise, mixture=mixture, progress=lambda *now, to=told: to.append(now)).cloud
+        for name in ("means", "scales", "opacities", "colors", "quats"):
+            assert np.array_equal(getattr(whole, name), getattr(parts, name))
+        assert [words for words, _ in told[:2]] == ["components", "rectangles"]
+        shares = [share for words, share in told if words == "splats"]
+        assert shares == sorted(shares)
+        assert 0 == shares[0] < shares[-1] < 1
+
+
+def test_a_large_checkerboard(tmp_path):
+    """Every module a rectangle: what grows faster than the picture would not end."""
+    bits = np.indices((1000, 1000)).sum(0) % 2 == 1
+    spec = f"image:{write_png(tmp_path / 'board.png', bits)}"
+    made = marker(spec, mixture="exact")
+    assert len(made.cloud) == made.components == 1_000_000
+    with pytest.raises(fs.InputError, match="at least 25,000,000 splats"):
+        marker(spec)
 
 
 def test_the_quiet_zone():

@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from fidsplat.markers import marker
-from fidsplat.markers.partition import chords, concave_vertices, independent_chords, partition
+from fidsplat.markers.partition import (
+    chords,
+    concave_vertices,
+    independent_chords,
+    least_rectangles,
+    partition,
+)
 from fidsplat.markers.regions import count_holes, label_components
 from fidsplat.vision.dictionaries import dictionary_bits
 
@@ -140,6 +146,29 @@ def test_no_partition_has_fewer_rectangles(grid):
     for i in range(count):
         cells = frozenset((int(y), int(x)) for y, x in np.argwhere(labels == i))
         assert found[i] == fewest_rectangles(cells)
+
+
+@settings(max_examples=200, deadline=None)
+@given(SMALL)
+@example(CHECKERBOARD)
+@example(TOUCHING)
+def test_the_estimate_is_a_lower_bound(grid):
+    labels, _ = label_components(grid)
+    padded = np.pad(labels, 1, constant_values=-1)
+    corners = 0  # of every component, by its cells around each vertex
+    for y, x in np.ndindex(grid.shape[0] + 1, grid.shape[1] + 1):
+        around = padded[y : y + 2, x : x + 2]
+        for label in set(around.ravel().tolist()) - {-1}:
+            cells = around == label
+            corners += {1: 1, 3: 1, 2: 2 * (cells[0, 0] == cells[1, 1])}.get(int(cells.sum()), 0)
+    assert 4 * least_rectangles(grid) <= corners
+    assert least_rectangles(grid) <= len(partition(grid))
+
+
+def test_the_estimate_is_near():
+    assert least_rectangles(CHECKERBOARD) == 36
+    noise = (np.random.default_rng(0).random((150, 150)) < 0.5).astype(np.uint8)
+    assert least_rectangles(noise) > 0.85 * len(partition(noise))
 
 
 def test_every_tag_of_36h11():

@@ -170,7 +170,7 @@ def test_a_marker_moves_from_where_it_is_drawn(tmp_path):
     ("old", "new", "words"),
     [
         ("exposure_ms = 10.0", "exposure_ms = -1.0", "camera.shutter: shutter exposure must be 0 or more"),
-        ("exposure_ms", "exposure", "camera.shutter.exposure; did you mean exposure_ms"),
+        ("exposure_ms", "exposure", "'camera.shutter.exposure' .did you mean 'exposure_ms"),
         ("time = 0.5", "time = 0.0", r"camera.motion\[1\].time must be above"),
         ("time = 1.0", "time = -1.0", r"markers\[0\].motion\[1\].time must be above"),
         ("fov_x_deg = 60.0", "fov_x_deg = 60.0\nposition = [0, 0, 0]", "position and motion exclude"),

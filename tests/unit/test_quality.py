@@ -14,9 +14,7 @@ TEMPLATES = files("fidsplat.markers").joinpath("templates.json")
 WRONG = {
     "arithmetic": "quick",
     "blend_precision": "float16",
-    "color_precision": "float64",
-    "depth_key_bits": 20,
-    "tile_size": 12,
+    "samples": 9,
     "marker": "paper",
 }
 WRONG_OF_MARKERS = {"mixture": "best", "levels": 9, "density": 0, "growth": 1.5, "template": 4}
@@ -34,10 +32,10 @@ def test_so_is_a_knob_of_markers(name):
         fs.MarkerQuality(**{name: WRONG_OF_MARKERS[name]})
 
 
-@pytest.mark.parametrize("value", [True, 16.0, "16", None])
-def test_key_bits_are_whole_numbers(value):
-    with pytest.raises(fs.InputError, match="depth_key_bits"):
-        fs.Quality(depth_key_bits=value)
+@pytest.mark.parametrize("value", [True, 2.0, "2", None])
+def test_samples_are_whole_numbers(value):
+    with pytest.raises(fs.InputError, match="samples"):
+        fs.Quality(samples=value)
 
 
 def test_blending_in_float64_refuses_what_would_undo_it():
@@ -50,8 +48,8 @@ def test_blending_in_float64_refuses_what_would_undo_it():
     [
         ("fast", fs.Quality.named("fast")),
         ("alpha_cutoff=1e-3", fs.Quality(alpha_cutoff=1e-3)),
-        (" fast , samples = 2 ,tile_size=none", fs.Quality.named("fast").with_(samples=2)),
-        ("tile_size=16,marker.template=9", fs.Quality(tile_size=16, marker=fs.MarkerQuality(template=9))),
+        (" fast , samples = 2 ", fs.Quality.named("fast").with_(samples=2)),
+        ("samples=3,marker.growth=none", fs.Quality(samples=3)),
         (
             "standard,marker.mixture=paper,marker.growth=0.1",
             fs.Quality(marker=fs.MarkerQuality("paper", growth=0.1)),
@@ -111,9 +109,9 @@ def test_a_marker_takes_from_a_quality_what_it_does_not_say():
 
 
 def test_numbers_of_numpy_are_numbers_and_truth_values_are_not():
-    made = fs.Quality(alpha_cutoff=np.float32(0.25), samples=np.int64(2), tile_size=np.int32(16))
-    assert made == fs.Quality(alpha_cutoff=0.25, samples=2, tile_size=16)
-    assert {type(made.alpha_cutoff), type(made.samples), type(made.tile_size)} == {float, int}
+    made = fs.Quality(alpha_cutoff=np.float32(0.25), samples=np.int64(2), first_hit=np.float64(0.5))
+    assert made == fs.Quality(alpha_cutoff=0.25, samples=2, first_hit=0.5)
+    assert {type(made.alpha_cutoff), type(made.samples)} == {float, int}
     for knob in ("samples", "opacity_ceiling"):
         with pytest.raises(fs.InputError, match=f"{knob} is True"):
             fs.Quality(**{knob: True})

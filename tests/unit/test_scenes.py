@@ -28,7 +28,7 @@ def cloud_of(n=5, seed=0, **changes):
     return fs.SplatCloud(**fields | changes)
 
 
-def fake_marker(spec, size=1.0, mixture=None, quiet_zone=None, quality=None, **own):
+def fake_marker(spec, size=1.0, mixture=None, quiet_zone=None, quality=None, max_splats=1_000_000, **own):
     """What a scene needs of a marker, without partitioning one: two splats and four corners."""
     if "unknown" in spec:
         raise fs.InputError(f"unknown spec {spec!r}")
@@ -48,6 +48,7 @@ def fake_marker(spec, size=1.0, mixture=None, quiet_zone=None, quality=None, **o
         mixture=knobs.mixture,
         quality=knobs,
         quiet_zone=quiet_zone,
+        max_splats=max_splats,
         cloud=cloud,
         corners=corners,
     )
@@ -248,8 +249,7 @@ def test_files_of_a_saved_scene(tmp_path):
 BETWEEN = fs.Quality(
     alpha_cutoff=0.123,
     samples=2,
-    tile_size=8,
-    depth_key_bits=24,
+    arithmetic="precise",
     marker=fs.MarkerQuality("paper", levels=3, growth=0.25),
 )
 
@@ -276,6 +276,15 @@ def test_markers_are_saved_as_they_were_made(tmp_path, made, quality):
         assert again.growth in (made.growth, 0.4)  # which the fitted templates were made with
 
 
+def test_how_many_splats_a_marker_may_have_is_saved(tmp_path):
+    allowed = [1_000_000, 5_000_000]
+    markers = [PlacedMarker(fake_marker("qr:a", max_splats=most)) for most in allowed]
+    fs.Scene(markers=markers).save(tmp_path / "a.toml")
+    assert (tmp_path / "a.toml").read_text().count("max_splats") == 1
+    again = fs.Scene.load(tmp_path / "a.toml").markers
+    assert [placed.marker.max_splats for placed in again] == allowed
+
+
 def test_knobs_of_a_scene_file(tmp_path):
     file = tmp_path / "a.toml"
     file.write_text(
@@ -300,9 +309,9 @@ def test_knobs_of_a_scene_file(tmp_path):
     ("text", "says"),
     [
         ("[quality]\npreset = 'fats'", "quality.preset: unknown quality 'fats'"),
-        ("[quality]\nalpha_cutof = 1", "unknown key quality.alpha_cutof; did you mean alpha_cutoff"),
+        ("[quality]\nalpha_cutof = 1", "unknown key 'quality.alpha_cutof' (did you mean 'alpha_cutoff'"),
         ("[quality]\nalpha_cutoff = 2", "quality: quality: alpha_cutoff is 2"),
-        ("[quality]\ntile_size = 'big'", "quality.tile_size must be a whole number"),
+        ("[quality]\nsamples = 'big'", "quality.samples must be a whole number"),
         ("[quality.marker]\ntemplate = 4", "template is 4; known: 1, 5, 9"),
         (
             "[render]\nsamples = 2\n[quality]\npreset = 'fast'",

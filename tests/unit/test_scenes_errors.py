@@ -47,16 +47,16 @@ def refused(tmp_path):
 
 
 CHANGES = [
-    ("width", "widht", "unknown key camera.widht; did you mean width?"),
-    ("fov_x_deg", "fov_deg", "camera.fov_deg; did you mean fov_x_deg?"),
-    ("look_at", "lookat", "camera.lookat; did you mean look_at?"),
-    ("near", "Near", "camera.Near; did you mean near?"),
-    ("file", "fiel", "unknown key splats[0].fiel; did you mean file?"),
-    ("outputs", "output", "unknown key render.output; did you mean outputs?"),
-    ("background", "colour", "unknown key render.colour; did you mean"),
-    ("[render]", "[rendering]", "unknown table rendering; did you mean render?"),
-    ("[[splats]]", "[[splat]]", "unknown key splat; did you mean splats?"),
-    ("[camera]", "[camera.distorsion]\nk1 = 0.1\n[camera]", "unknown table camera.distorsion; did you mean"),
+    ("width", "widht", "unknown key 'camera.widht' (did you mean 'width'?)"),
+    ("fov_x_deg", "fov_deg", "'camera.fov_deg' (did you mean 'fov_x_deg'?)"),
+    ("look_at", "lookat", "'camera.lookat' (did you mean 'look_at'?)"),
+    ("near", "Near", "'camera.Near' (did you mean 'near'?)"),
+    ("file", "fiel", "unknown key 'splats[0].fiel' (did you mean 'file'?)"),
+    ("outputs", "output", "unknown key 'render.output' (did you mean 'outputs'?)"),
+    ("background", "colour", "unknown key 'render.colour' (did you mean"),
+    ("[render]", "[rendering]", "unknown table 'rendering' (did you mean 'render'?)"),
+    ("[[splats]]", "[[splat]]", "unknown key 'splat' (did you mean 'splats'?)"),
+    ("[camera]", "[camera.distorsion]\nk1 = 0.1\n[camera]", "unknown table 'camera.distorsion' (did"),
     ("width = 64\n", "", "camera.width is missing"),
     ("fov_x_deg = 60.0\n", "", "camera.fov_x_deg is missing (or fx and fy)"),
     ("fov_x_deg = 60.0\n", "fx = 60.0\n", "camera.fy is missing"),
@@ -119,7 +119,7 @@ def test_one_thing_wrong(refused, old, new, words):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("size", "siez", "unknown key markers[0].siez; did you mean size?"),
+        ("size", "siez", "unknown key 'markers[0].siez' (did you mean 'size'?)"),
         ("size = 0.1\n", "", "markers[0].size is missing"),
         ("0.1", '"big"', "markers[0].size must be a number, not 'big'"),
         ("0.1", "0", "markers[0].size must be above 0 metres"),
@@ -170,6 +170,11 @@ def test_a_matrix_wrong(refused, rows, words):
         (b"\x89PNG\r\n\x1a\n\xff\xfe", "not text in UTF-8"),
         (b"a = " + b"[" * 100000, "is not a scene file"),
         (b"#" * (2**24 + 1), "longer than 16777216 bytes"),
+        (b"camera" + b".a" * 100_000 + b" = 1", "a dotted key has more than 8 parts"),
+        (b"[" + b"a . " * 1_000_000 + b"a]", "a dotted key has more than 8 parts"),
+        (b"a = {b = {" + b"'x'.\"y\"." * 4 + b"z = 1}}", "a dotted key has more than 8 parts"),
+        (b"a = {b" * 100_000, "is not a scene file"),
+        (b"a" * 10**6 + b" = 1", "unknown key 'a{900,} ... a+.*; known: camera, splats"),
         (b"camera = 3", "camera must be a table, not 3"),
         (b"splats = [3]", r"splats\[0\] must be a table, not 3"),
         (b"splats = 'a'", r"splats must be written \[\[splats\]\]"),
@@ -177,6 +182,19 @@ def test_a_matrix_wrong(refused, rows, words):
 )
 def test_what_is_no_scene_file(refused, content, words):
     refused(content, words)
+
+
+def test_dots_that_join_no_keys_are_read(tmp_path):
+    path = tmp_path / "scene.toml"
+    dots = "a." * 1000
+    path.write_text(
+        f'[[markers]] # {dots}\nspec = "qr:\\"{dots}"\nsize = 0.1\nposition = [{"1.5, " * 3}]\n'
+        f"[render]\ndevice = \"\"\"\n\"\" {dots}\"\"\"\noutputs = ['{dots}', '''{dots}''']\n"
+    )
+    scene = fs.Scene.load(path)
+    assert scene.device == f'"" {dots}'
+    assert scene.outputs == (dots, dots)
+    assert scene.markers[0].marker.payload == f'"{dots}'
 
 
 def test_missing_and_unreadable_files(tmp_path):

@@ -82,10 +82,8 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         "TILE_H": shape.tile_height,
         "TILE_W": shape.tile_width,
     }
-    if features.sh_degree > 0 or "sh_terms" in features.names:
+    if "color_sh" in features.names:
         defines["SH_DEGREE"] = features.sh_degree
-    if "keys_short" in features.names:
-        defines["KEY_BITS"] = features.depth_key_bits
     files = [effect.file for effect in effects]
     if shape.lists == "tiled":
         files.append("list/tiled.cl")

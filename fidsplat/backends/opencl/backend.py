@@ -107,7 +107,7 @@ class OpenCLBackend:
         if key[1].blend_items > self.device.max_work_group_size:
             raise DeviceError(
                 f"{self.info.title} has work-groups of at most {self.device.max_work_group_size}, and "
-                f"tile_size={features.tile_size} needs {key[1].blend_items}; use smaller tiles"
+                f"tiles of {key[1].tile_width} x {key[1].tile_height} need {key[1].blend_items}"
             )
         if key not in self._pipelines:
             source = assemble(*key)
@@ -199,7 +199,7 @@ def _why_unusable(device: cl.Device) -> str:
         return "it has no compiler for OpenCL C"
     if not device.endian_little:
         return "it is big-endian"
-    if pocl_target.needs_correction(device.version) and not pocl_target.correct_target(device.int_ptr):
+    if _target(device) == "generic":
         return (
             "this PoCL's compiler does not know the processor; install a newer one (Debian: pocl-opencl-icd) "
             "or set POCL_LLVM_CPU_NAME if it is PoCL 3.1 or later"
@@ -210,7 +210,7 @@ def _why_unusable(device: cl.Device) -> str:
 def _target(device: cl.Device) -> str:
     """What the kernels are compiled for, as far as the driver tells."""
     if pocl_target.needs_correction(device.version):
-        return pocl_target.correct_target(device.int_ptr) or "generic"
+        return pocl_target.correct_target(device.int_ptr, device.version) or "generic"
     return device.version
 
 

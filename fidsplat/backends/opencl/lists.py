@@ -115,11 +115,10 @@ class OrderedLists(Lists):
         table = run.take("sort table", 4 * bins * self.shape.chunks)
         keys, order, tallies = run.held["keys"], run.take("order 0", 4 * count), run.held["tallies"]
         length = np.array([count, 0], np.uint32)
-        least = 32 - run.pipeline.features.depth_key_bits  # the bits below are 0
         run.uploads.append(
             cl.enqueue_copy(run.queue, tallies, length, dst_offset=4 * _ALL, is_blocking=False)
         )
-        for number, shift in enumerate(range(least, 32, self.shape.radix_bits)):
+        for number, shift in enumerate(range(0, 32, self.shape.radix_bits)):
             slot = np.uint32(_ALL if number == 0 else _VISIBLE)
             keys_out = run.take(f"sorted keys {number % 2}", 4 * count)
             order_out = run.take(f"order {(number + 1) % 2}", 4 * count)

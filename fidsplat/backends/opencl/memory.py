@@ -11,7 +11,7 @@ import pyopencl as cl
 
 from fidsplat.backends.planes import PlaneTable
 from fidsplat.errors import DeviceError
-from fidsplat.harmonics import C0, halves
+from fidsplat.harmonics import C0
 from fidsplat.splats import SplatCloud
 
 if TYPE_CHECKING:
@@ -121,8 +121,8 @@ class Resident:
     """A SplatCloud on the device. SH of degree 0 does not depend on the view and becomes plain colours.
 
     A CPU reads the cloud's own arrays, without a copy. On other devices they are copied, labels and colours
-    when a picture first asks for them (in the precision that it wants), or, where they would take more than
-    half of the memory budget, a chunk at a time for every picture (`streamed`).
+    when a picture first asks for them, or, where they would take more than half of the memory budget, a chunk
+    at a time for every picture (`streamed`).
     """
 
     def __init__(self, backend: OpenCLBackend, cloud: SplatCloud) -> None:
@@ -197,12 +197,9 @@ class Resident:
         return whole.get_sub_region(first * row, (end - first) * row)
 
     def _array(self, name: str) -> np.ndarray:
-        """The array on the host; ids and halves are made when a picture first asks for them."""
-        if name not in self._arrays:
-            if name == "splat_ids":
-                self._arrays[name] = np.arange(self.count, dtype=np.int32)
-            else:
-                self._arrays[name] = halves(self._arrays[name.removesuffix("_half")])
+        """The array on the host; ids are made when a picture first asks for them."""
+        if name == "splat_ids" and name not in self._arrays:
+            self._arrays[name] = np.arange(self.count, dtype=np.int32)
         return self._arrays[name]
 
     def _whole(self, name: str) -> cl.Buffer:

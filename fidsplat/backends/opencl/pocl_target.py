@@ -2,10 +2,11 @@
 
 PoCL 3.0 from PyPI asks its LLVM 14 for the processor's name. For one that is newer than LLVM 14 (AMD Zen 5,
 say) the answer is "generic", which PoCL then hands to clang as -target-cpu, where it is an error: every build
-fails with "unknown target CPU 'generic'" (pocl issues #512, #1049). PoCL 3.1 and later read
-POCL_LLVM_CPU_NAME; 3.0 has no such setting, so the name is corrected where PoCL keeps it, in the device's
-record: the field `llvm_cpu`, which follows `llvm_target_triplet`. The new name is the one for which PoCL
-built the kernel library that it picks from the processor's feature flags.
+fails with "unknown target CPU 'generic'" (pocl issues #512, #1049). For one that LLVM 14 takes for an older
+one (Zen 4, with AVX-512, for Zen 3, without) builds crash or never end: PoCL picks its kernel library by the
+processor's feature flags, and that one is for AVX-512. PoCL 3.1 and later read POCL_LLVM_CPU_NAME; 3.0 has no
+such setting, so the name is corrected where PoCL keeps it, in the device's record: the field `llvm_cpu`,
+which follows `llvm_target_triplet`. The new name is the one for which PoCL built that kernel library.
 """
 
 from __future__ import annotations
@@ -27,21 +28,21 @@ _LEVELS = (
     ("haswell", ("avx2", "cx16", "popcnt", "abm", "f16c", "fma", "bmi1", "bmi2")),
     ("skylake-avx512", ("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl")),
 )
+_NAME = re.compile(r"PoCL.*-x86_64-[\w-]*gnu-([\w-]+)$")
 _RECORD_BYTES = 2048
 _corrected: dict[int, ctypes.Array] = {}  # PoCL keeps pointing at these
 
 
 def needs_correction(device_version: str) -> bool:
-    """Whether this device is one of PoCL 3.0's whose processor LLVM did not recognise."""
-    return (
-        platform.system() == "Linux"
-        and platform.machine() == "x86_64"
-        and re.search(r"PoCL.*-generic$", device_version.strip()) is not None
-    )
+    """Whether this device is one of PoCL 3.0's whose processor LLVM took for another one."""
+    if platform.system() != "Linux" or platform.machine() != "x86_64":
+        return False
+    name = _name_of_llvm(device_version)
+    return name == "generic" or (name.startswith("znver") and _processor_name() == _LEVELS[-1][0])
 
 
-def correct_target(device_address: int) -> str | None:
-    """Give the PoCL device whose record lies at this address a processor name that its LLVM knows.
+def correct_target(device_address: int, device_version: str) -> str | None:
+    """Give the PoCL device whose record lies at this address the processor name of its kernel library.
 
     Returns the name, or None if the record does not look as expected (then nothing is changed).
     """
@@ -51,14 +52,14 @@ def correct_target(device_address: int) -> str | None:
         memory = os.open("/proc/self/mem", os.O_RDONLY)
     except OSError:  # a system that hides it
         return None
+    wrong = _name_of_llvm(device_version).encode()
     try:
         record = _read(memory, device_address, _RECORD_BYTES)
         words = struct.unpack(f"<{len(record) // 8}Q", record[: len(record) // 8 * 8])
         places = [
             index + 1
             for index in range(len(words) - 1)
-            if _text(memory, words[index]).startswith(b"x86_64-")
-            and _text(memory, words[index + 1]) == b"generic"
+            if _text(memory, words[index]).startswith(b"x86_64-") and _text(memory, words[index + 1]) == wrong
         ]
     finally:
         os.close(memory)
@@ -69,6 +70,12 @@ def correct_target(device_address: int) -> str | None:
     field = ctypes.c_uint64.from_address(device_address + 8 * places[0])
     field.value = ctypes.addressof(name)
     return name.value.decode()
+
+
+def _name_of_llvm(device_version: str) -> str:
+    """What LLVM takes the processor for, from PoCL's version string; empty if that does not say."""
+    found = _NAME.search(device_version.strip())
+    return found[1] if found else ""
 
 
 def _processor_name() -> str:

@@ -8,7 +8,6 @@ from fidsplat.backends.base import View
 from fidsplat.backends.planes import PlaneTable
 from fidsplat.backends.reference import optics
 from fidsplat.effects import FeatureSet
-from fidsplat.harmonics import halves
 from fidsplat.splats import SplatCloud, sh_basis
 
 
@@ -49,8 +48,6 @@ class Setup:
             table = PlaneTable(cloud)
             planes = table.index
             self.key = np.where(planes < 0, self.key, np.append(table.keys(view), 0)[planes])
-        if "keys_short" in features.names:
-            self.key = _leading(self.key, features.depth_key_bits)
         half_r2 = log_opacity - view.log_cut
         if view.along_ray:
             long_a, long_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
@@ -92,8 +89,7 @@ class Setup:
         self.anchors = optics.anchors_of(view, self.anchor_x, self.anchor_y)
         self.round = optics.ROUND if view.raster is None else optics.ROUND_OF_RAYS
         """of a form in float32, relative to its terms"""
-        held = np.float16 if features.names & {"color_rgb_half", "color_sh_half"} else np.float32
-        self.colors = _colors(cloud, order, outward[order], held)
+        self.colors = _colors(cloud, order, outward[order])
         self.normal = normal * np.where(height > 0, -1.0, 1.0)[:, None]
         self.screen = "lowpass_screen" in features.slots
         self.exclusive = "stop_exclusive" in features.slots
@@ -140,22 +136,11 @@ def _anchor(center: np.ndarray, known: np.ndarray, size: int) -> np.ndarray:
     return np.where(known, nearest, -float(size))
 
 
-def _leading(keys: np.ndarray, bits: int) -> np.ndarray:
-    """The leading bits (n,) uint32 of float32 keys, in an order that unsigned comparison keeps."""
-    words = (keys + np.float32(0)).view(np.uint32)  # -0 becomes +0
-    words = np.where(words >> 31 != 0, ~words, words | np.uint32(1 << 31))
-    return words >> np.uint32(32 - bits)
-
-
-def _colors(cloud: SplatCloud, order: np.ndarray, rays: np.ndarray, held: type) -> np.ndarray:
-    """Colours (n, 3) of the splats in order, from what is held in the type `held`."""
-    rounded = halves if held is np.float16 else np.asarray
+def _colors(cloud: SplatCloud, order: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Colours (n, 3) of the splats in order."""
     if cloud.sh is None:
-        return rounded(cloud.colors[order]).astype(np.float64)  # type: ignore[index]
+        return cloud.colors[order].astype(np.float64)  # type: ignore[index]
     length = np.linalg.norm(rays, axis=1, keepdims=True)
     directions = rays / np.where(length > 0, length, 1)
     basis = sh_basis(cloud.sh_degree, directions)
-    plain = cloud.sh_degree == 0  # held as colours
-    coefficients = (cloud.sh if plain else rounded(cloud.sh))[order].astype(np.float64)
-    colors = np.maximum(0.5 + np.einsum("nk,nkc->nc", basis, coefficients), 0)
-    return rounded(colors).astype(np.float64) if plain else colors
+    return np.maximum(0.5 + np.einsum("nk,nkc->nc", basis, cloud.sh[order].astype(np.float64)), 0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -107,8 +107,6 @@ class WarpBackend:
         Raises:
             DeviceError: an effect that the Warp kernels have not, or the compiler refuses.
         """
-        if shape is None and features.tile_size is not None:
-            shape = replace(self.shape, tile_width=features.tile_size, tile_height=features.tile_size)
         key = (features, shape or self.shape)
         if key not in self._pipelines:
             self._pipelines[key] = WarpPipeline(self, *key)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 KNOWN = frozenset(
     {"camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen", "lowpass_pixel"}
     | {"stop_inclusive", "stop_exclusive", "compose_ordered", "compose_planes", "ray_depth"}
-    | {"sh_terms", "arithmetic_precise", "arithmetic_fast", "keys_short", "shown"}
+    | {"arithmetic_precise", "arithmetic_fast", "shown"}
     | {"perspective", "footprint_gaussian", "footprint_box", "footprint_mixed", "box_edges", "box_cover"}
     | {"background_constant", "background_gradient", "background_panorama", "fog"}
     | {"ray", "ray_length", "sample_length", "turn", "world_ray"}

@@ -148,8 +148,7 @@ class Run:
         keys = self._take("sorted keys", 2 * visible, wp.uint32)
         order = self._take("order", 2 * visible, wp.int32)
         given = (self.held[name] for name in ("keys", "drawn", "places"))
-        leading = wp.uint32(-1 << (32 - self.pipeline.features.depth_key_bits) & 0xFFFFFFFF)
-        self.launch(self.pipeline.sort.compact, self.resident.count, *given, leading, keys, order)
+        self.launch(self.pipeline.sort.compact, self.resident.count, *given, keys, order)
         wp.utils.radix_sort_pairs(keys, order, visible)
 
     def _bands(self, visible: int, pairs: int) -> Iterator[tuple[int, int, int]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import random
 import string
 from collections.abc import Callable, Iterable
@@ -11,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.errors import InputError
-from fidsplat.experiments.scenes import SCENES, load_scene, standard_camera
+from fidsplat.errors import InputError, unknown
 from fidsplat.markers import marker
 from fidsplat.quality import Quality
+from fidsplat.random_clouds import SCENES, load_scene, standard_camera
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.splats import SplatCloud
 
@@ -92,9 +91,7 @@ def scene_names(words: Iterable[str]) -> tuple[str, ...]:
         names += BENCH_SCENES if word == "all" else (word,)
     for name in names:
         if name not in BENCH_SCENES:
-            near = difflib.get_close_matches(name, BENCH_SCENES, 1)
-            hint = f" (did you mean {near[0]!r}?)" if near else ""
-            raise InputError(f"there is no scene {name!r}{hint}; known: all, {', '.join(BENCH_SCENES)}")
+            raise InputError(unknown("scene", name, ("all", *BENCH_SCENES)))
     return tuple(dict.fromkeys(names)) or DEFAULT_SCENES
 
 

@@ -13,7 +13,7 @@ from fidsplat.cameras import Camera
 from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.experiments.bench.measure import WARM_UP, SceneRun
 from fidsplat.experiments.bench.overdraw import overdraw
-from fidsplat.experiments.scenes import random_cloud, standard_camera
+from fidsplat.random_clouds import random_cloud, standard_camera
 from fidsplat.splats import SplatCloud
 
 MILLION = 1_000_000
@@ -33,7 +33,7 @@ class Point:
     height: int
 
     def make(self) -> tuple[SplatCloud, Camera]:
-        """The random scene, as those of experiments/scenes.py."""
+        """The random scene, as those of random_clouds.py."""
         return random_cloud(self.count, self.median_scale), standard_camera(self.width, self.height)
 
 

@@ -68,9 +68,7 @@ def beyond_certificates(off: np.ndarray, scene: TradeScene, quality: Quality) ->
     worst = np.argsort(off, axis=None)[::-1][: count + 1]
     rows, columns = np.unravel_index(worst[:count], off.shape)
     # the reference knows no rounding: what only rounds is nothing to it
-    plain = quality.with_(
-        arithmetic="precise", blend_precision="float32", color_precision="float32", tile_size=None
-    )
+    plain = quality.with_(arithmetic="precise", blend_precision="float32")
     picture = Picture(scene.cloud, scene.camera, plain, ("rgb",), scene.background)
     try:
         certified = truth_of(picture, (rows, columns))["certificate"]

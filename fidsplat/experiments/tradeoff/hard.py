@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.hard_cases.clouds import log_uniform, splats, turned
+from fidsplat.hard_cases.clouds import splats, turned
+from fidsplat.random_clouds import log_uniform
 from fidsplat.rotations import quaternion_multiply
 from fidsplat.splats import SplatCloud
 

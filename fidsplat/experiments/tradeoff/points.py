@@ -3,20 +3,16 @@ useful combinations."""
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from fidsplat.errors import InputError
+from fidsplat.errors import InputError, unknown
 from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.quality import (
-    COLOR_PRECISIONS,
-    DEPTH_KEY_BITS,
     PRESETS,
     TEMPLATE_SIZES,
-    TILE_SIZES,
     MarkerQuality,
     Quality,
 )
@@ -44,17 +40,12 @@ _LADDERS: dict[str, tuple[tuple[Any, ...], str]] = {
     "setup_precision": (("float32",), "rm"),
     "arithmetic": (("fast",), "rm"),
     "blend_precision": (("float64",), "rm"),
-    "color_precision": (tuple(p for p in COLOR_PRECISIONS if p != "float32"), "r"),
-    "depth_key_bits": (tuple(b for b in DEPTH_KEY_BITS if b != 32), "r"),
-    "tile_size": (TILE_SIZES, "rm"),
 }
 _QUICK = {
     "alpha_cutoff": (1e-4, 1 / 1024, 2 / 255),
     "transmittance_stop": (0.0, 1 / 512),
     "lowpass": ("none",),
     "samples": (2,),
-    "tile_size": (16,),
-    "depth_key_bits": (16,),
 }
 _MARKER_LADDER = (
     *(MarkerQuality("paper", levels=levels, density=1) for levels in (1, 2, 3, 4, 5)),
@@ -76,8 +67,6 @@ _ALONE: tuple[dict[str, Any], ...] = (
     {"opacity_ceiling": 0.99},
     {"stop_rule": "exclusive", "transmittance_stop": 1e-4, "coplanar": "order"},
     {"lowpass": "none"},
-    {"depth_key_bits": 16},
-    {"color_precision": "float16"},
     {"setup_precision": "float32"},
     {"arithmetic": "fast"},
 )
@@ -135,9 +124,7 @@ def knob_names(words: Iterable[str]) -> tuple[str, ...]:
     names = tuple(dict.fromkeys(words)) or KNOBS
     for name in names:
         if name not in KNOBS:
-            near = difflib.get_close_matches(name, KNOBS, 1)
-            hint = f" (did you mean {near[0]!r}?)" if near else ""
-            raise InputError(f"there is no knob {name!r}{hint}; known: {', '.join(KNOBS)}")
+            raise InputError(unknown("knob", name, KNOBS))
     return names
 
 

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 
 from fidsplat.cameras import Camera
-from fidsplat.errors import InputError
-from fidsplat.experiments.scenes import load_scene
+from fidsplat.errors import InputError, unknown
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS
 from fidsplat.experiments.tradeoff.hard import hard_scene
 from fidsplat.markers import Marker, marker
 from fidsplat.quality import MarkerQuality
+from fidsplat.random_clouds import load_scene
 from fidsplat.splats import SplatCloud
 
 RANDOM = ("r100k_720p", "r1m_1080p")
@@ -55,9 +54,7 @@ def scene_names(words: Iterable[str], quick: bool = False) -> tuple[str, ...]:
     names = tuple(dict.fromkeys(words)) or (QUICK_NAMES if quick else NAMES)
     for name in names:
         if name not in NAMES:
-            near = difflib.get_close_matches(name, NAMES, 1)
-            hint = f" (did you mean {near[0]!r}?)" if near else ""
-            raise InputError(f"there is no scene {name!r}{hint}; known: {', '.join(NAMES)}")
+            raise InputError(unknown("scene", name, NAMES))
     return names
 
 

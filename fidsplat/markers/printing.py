@@ -1,0 +1,113 @@
+"""From the rectangles of a grid to splats on the marker's plane: a box each, or Gaussians of a mixture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fidsplat.errors import InputError
+from fidsplat.markers.mixture import Template, count_gaussians, place
+from fidsplat.markers.seams import grow
+from fidsplat.splats import SplatCloud
+
+MAX_SPLATS = 1_000_000
+"""Most splats of a marker unless the caller allows more."""
+
+CHUNK = 1 << 18
+"""Splats that are placed at a time: intermediate results are in float64 and several."""
+
+Progress = Callable[[str, float], Any]
+"""Called with what is being done and the share of it that is done, 0 to 1."""
+
+
+class Printed(NamedTuple):
+    """The rectangles of a marker, where they are printed."""
+
+    grid: np.ndarray
+    """(H, W) uint8, 1 = dark"""
+    boxes: np.ndarray
+    """(n, 4) int64 x0, y0, x1, y1 in modules"""
+    module: float
+    """metres"""
+
+
+def refuse_more(spec: str, least: int, max_splats: int, words: str = "") -> None:
+    """Raise InputError where a marker becomes more splats than are allowed."""
+    if least > max_splats:
+        raise InputError(
+            f"{spec} becomes {words}{least:,} splats, more than {max_splats:,}: take a smaller picture or a "
+            "mixture of fewer, or allow them by max_splats (--max-splats N)"
+        )
+
+
+def box_cloud(printed: Printed, progress: Progress) -> SplatCloud:
+    """One box for each rectangle."""
+    boxes = printed.boxes
+
+    def parts() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for start in range(0, len(boxes), CHUNK):
+            corners = boxes[start : start + CHUNK].astype(np.float64)
+            middle, half = (corners[:, :2] + corners[:, 2:]) / 2, (corners[:, 2:] - corners[:, :2]) / 2
+            owner = np.arange(start, start + len(corners))
+            yield np.column_stack([middle, half, np.ones(len(corners))]), owner
+
+    return _cloud(printed, len(boxes), parts(), progress).with_boxes()
+
+
+def aspect_of(boxes: np.ndarray) -> np.ndarray:
+    """Width over height of (n, 4) rectangles."""
+    return (boxes[:, 2] - boxes[:, 0]) / (boxes[:, 3] - boxes[:, 1])
+
+
+def gaussian_cloud(
+    printed: Printed, templates: tuple[Template, ...], growth: float, progress: Progress
+) -> SplatCloud:
+    """The Gaussians of a mixture."""
+    boxes, aspect = printed.boxes, aspect_of(printed.boxes)
+    grown = grow(printed.grid, boxes, growth)
+    ends = np.cumsum(count_gaussians(aspect, templates))
+    total = int(ends[-1])
+
+    def parts() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        start = 0
+        while start < len(boxes):
+            before = int(ends[start - 1]) if start else 0
+            stop = max(int(np.searchsorted(ends, before + CHUNK, "right")), start + 1)
+            gaussians, owner = place(grown[start:stop], aspect[start:stop], templates)
+            yield gaussians, owner + start
+            start = stop
+
+    return _cloud(printed, total, parts(), progress)
+
+
+def _cloud(
+    printed: Printed, total: int, parts: Iterator[tuple[np.ndarray, np.ndarray]], progress: Progress
+) -> SplatCloud:
+    """Splats in the colours of their rectangles.
+
+    parts: rows (m, 5) of place and scale in modules and opacity, and (m,) the rectangle of each; ``total`` in
+    all. They are filled in part by part, so that memory stays near that of the cloud.
+    """
+    grid, boxes, module = printed
+    light = 1 - grid[boxes[:, 1], boxes[:, 0]].astype(np.float32)
+    means, scales = np.zeros((total, 3), np.float32), np.empty((total, 2), np.float32)
+    opacities, colors = np.empty(total, np.float32), np.empty((total, 3), np.float32)
+    quats = np.zeros((total, 4), np.float32)
+    quats[:, 0] = 1
+    middle = np.array(grid.shape[::-1]) / 2
+    done = 0
+    for rows, owner in parts:
+        progress("splats", done / total)
+        at = slice(done, done + len(rows))
+        means[at, :2] = (rows[:, :2] - middle) * module
+        scales[at] = rows[:, 2:4] * module
+        opacities[at] = rows[:, 4]
+        colors[at] = light[owner, None]
+        done = at.stop
+    arrays = (means, quats, scales, opacities, colors)
+    for array in arrays:
+        array.flags.writeable = False  # a cloud takes these as they are
+    # one sheet of paper: where its splats meet, their order means nothing
+    return SplatCloud(means, quats, scales, opacities, colors=colors).with_planes(0)

@@ -1,0 +1,61 @@
+"""One loop times everything (`fidsplat.timing`)."""
+
+import math
+
+import pytest
+
+from fidsplat.errors import DeviceError
+from fidsplat.timing import Clock, Timer, quartiles, ratios, take_turns
+
+
+def timers(order, *seconds):
+    """A timer for each list of seconds, by one clock that they move on; `order` is told who runs."""
+    clock = Clock()
+
+    def work(number, left):
+        def once():
+            order.append(number)
+            taken = next(left)
+            if isinstance(taken, Exception):
+                raise taken
+            clock.seconds += taken
+            return {"half": 500 * taken}
+
+        return once
+
+    return [Timer(work(k, iter(given)), clock, drops_out=True) for k, given in enumerate(seconds)]
+
+
+def test_turns_alternate_and_warm_up_does_not_count():
+    order, ticks = [], []
+    one, other = timers(order, [9, 1, 2, 3, 4], [9, 2, 2, 2, 2])
+    take_turns([one, other], 4, warm_up=1, tick=lambda: ticks.append(1))
+    assert order == [0, 1, 0, 1, 1, 0, 0, 1, 1, 0]
+    assert one.ms == [1000, 2000, 3000, 4000]
+    assert one.parts == {"half": [500, 1000, 1500, 2000]}
+    assert one.quartiles == quartiles(one.ms) == (1750, 2500, 3250)
+    assert (one.median, one.part_medians) == (2500, {"half": 1250})
+    assert ratios(one, other) == [0.5, 1, 1.5, 2]
+    assert len(ticks) == 8
+
+
+def test_what_fails_drops_out_or_raises():
+    order = []
+    one, other = timers(order, [1, 1, DeviceError("it broke"), 1], [1] * 6)
+    take_turns([one, other], 4)
+    assert (one.ms, one.error) == ([], "it broke")
+    assert len(other.ms) == 4
+    assert order.count(0) == 3
+    assert math.isnan(one.run())
+    assert math.isnan(one.median)
+    (fragile,) = timers(order, [DeviceError("it broke")])
+    fragile._drops_out = False
+    with pytest.raises(DeviceError, match="it broke"):
+        take_turns([fragile], 1)
+
+
+@pytest.mark.parametrize(("least", "done"), [(3, 3), (None, 10), (20, 10)])
+def test_no_more_than_the_least_once_time_is_up(least, done):
+    (timer,) = timers([], [0.001] * 12)
+    take_turns([timer], 10, least=least, seconds=0.0)
+    assert len(timer.ms) == done
