@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from fidsplat.commands.output import Json, console, option, print_json
-from fidsplat.commands.sweeps import Folders, Names, ReportTo, Seed, switch
+from fidsplat.commands.sweeps import Folders, Names, ReportTo, Seed, need_reports, switch
 from fidsplat.errors import InputError
 
 if TYPE_CHECKING:
@@ -210,14 +210,12 @@ Examples:
 
 @dataclass
 class Report:
-    """Tables, plots and picture sheets from results."""
+    """A page with tables, charts and picture sheets from results."""
 
-    HELP: ClassVar[
-        str
-    ] = """Write report.md and report.html: tables as in the paper, beside the paper's figures.
+    HELP: ClassVar[str] = """Write report.md: tables as in the paper, beside the paper's figures.
 
-Plots and pictures lie in its folder, or for FILE.md in a folder of that name. Tables say what is
-missing.
+Charts, pictures and small tables of all results lie in its folder, or for FILE.md in a folder of that name;
+the report can be made again from those tables. It says what was not measured.
 
 Examples:
   fidsplat experiment report
@@ -234,6 +232,7 @@ Examples:
 
 def write_report(folders: list[Path], out: Path, where: Console, as_json: bool = False) -> int:
     """Write the report and say where it is."""
+    need_reports()
     from fidsplat.experiments.report import make_report
 
     files = make_report(folders, out)

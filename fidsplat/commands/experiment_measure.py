@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from fidsplat.commands.experiment_files import CATEGORY_HELP, write_report
 from fidsplat.commands.output import Json, console, option, print_json
-from fidsplat.commands.sweeps import Names, Overwrite, Seed, run_sweeps, switch
+from fidsplat.commands.sweeps import Names, Overwrite, Seed, need_reports, run_sweeps, switch
 from fidsplat.errors import InputError
 
 if TYPE_CHECKING:
@@ -38,10 +38,10 @@ class Basic:
 
         # rough results and full ones do not mix
         out = self.out or "fidsplat-experiments" + ("-quick" if getattr(self, "quick", False) else "")
-        given = {name: getattr(self, name, None) for name in (field.name for field in fields(Options))}
-        return Options(
-            **{name: value for name, value in given.items() if value is not None} | {"out": Path(out)}
-        )
+        given = {field.name: getattr(self, field.name, None) for field in fields(Options)} | {
+            "out": Path(out)
+        }
+        return Options(**{name: value for name, value in given.items() if value is not None})
 
 
 @dataclass
@@ -251,6 +251,8 @@ Examples:
 
         options = self.options()
         check(options)
+        if self.shard is None:
+            need_reports()
         status = measure(NAMES, options, self.json)
         if self.shard is not None:
             return status

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from fidsplat.commands.output import console, option
+from fidsplat.errors import InputError
 
 if TYPE_CHECKING:
     from fidsplat.experiments.sweep import Key, Record, Sweep
@@ -27,6 +29,13 @@ ReportTo = Annotated[
 def switch(text: str):
     """tyro's description of an option that is given or not."""
     return tyro.conf.arg(help=text, help_behavior_hint="")
+
+
+def need_reports() -> None:
+    """Raises InputError where what makes reports is not installed."""
+    missing = [name for name in ("pandas", "matplotlib", "jinja2") if find_spec(name) is None]
+    if missing:
+        raise InputError(f"reports need {' and '.join(missing)}; pip install 'fidsplat[experiments]'")
 
 
 def run_sweeps(sweeps: Iterable[Sweep]) -> list[Record]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 from fidsplat.commands.output import Json, console, option, print_json
-from fidsplat.commands.sweeps import Folders, Overwrite, ReportTo, run_sweeps, switch, words
+from fidsplat.commands.sweeps import Folders, Overwrite, ReportTo, need_reports, run_sweeps, switch, words
 from fidsplat.errors import InputError
 
 DEFAULT_FOLDER = "fidsplat-tradeoff"
@@ -15,15 +15,16 @@ DEFAULT_FOLDER = "fidsplat-tradeoff"
 
 @dataclass
 class TradeoffReport:
-    """Plots, tables and a reading from results of `fidsplat tradeoff`."""
+    """A page with charts and tables from results of `fidsplat tradeoff`."""
 
     HELP: ClassVar[
         str
-    ] = """Write a report from results: what each constant costs, Pareto plots, what is worth turning.
+    ] = """Write a report from results: what each constant saves and costs, and what to make of it.
 
 Results of several devices stand side by side; results of the same device in several folders are joined, and
-of a part that was measured twice the first file's stays. All that the text says of the numbers is worked out
-from them. Plots lie in the report's folder, or for FILE.md in a folder of that name.
+of a point that was measured twice the larger measurement counts. Charts and a small table of each device's
+results lie in the report's folder, or for FILE.md in a folder of that name; the report can be made again from
+those tables. What the text says of the numbers is worked out from them.
 
 Examples:
   fidsplat tradeoff report
@@ -34,6 +35,7 @@ Examples:
     json: Json = False
 
     def run(self) -> int:
+        need_reports()
         from fidsplat.experiments.tradeoff.report import write_report
 
         folders = [Path(folder) for folder in self.folders or (DEFAULT_FOLDER,)]
@@ -68,7 +70,7 @@ Examples:
   fidsplat tradeoff --quick                              a rough picture, under 3 minutes on two cores
   fidsplat tradeoff -o gpu --device opencl:nvidia        everything
   fidsplat tradeoff --scenes hard --knobs alpha_cutoff transmittance_stop
-  fidsplat tradeoff report cpu gpu -o docs/accuracy.md   plots and tables from results"""
+  fidsplat tradeoff report cpu gpu -o docs/accuracy.md   a page from results"""
     PARTS: ClassVar[dict[str, type]] = {"report": TradeoffReport}
 
     out: Annotated[

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -19,7 +20,7 @@ from matplotlib.transforms import Bbox
 from fidsplat.files import atomic_write
 
 Values = Sequence[float]
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     # the same file for the same numbers
     "svg.hashsalt": "fidsplat",
     "figure.dpi": 72,  # as SVG counts, so that labels are where they were placed

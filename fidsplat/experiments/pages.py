@@ -9,6 +9,7 @@ from typing import Any
 import jinja2
 import pandas as pd
 
+from fidsplat.experiments.summary import Frame
 from fidsplat.files import atomic_write, writable_folder
 
 NOTHING = "-"
@@ -43,7 +44,7 @@ def write_page(page: Path, folder: Path, template: str, context: Mapping[str, An
         stream.write(text.encode())
 
 
-def markdown_table(frame: pd.DataFrame) -> str:
+def markdown_table(frame: Frame) -> str:
     """A table; its first column is text, the others stand at the right."""
     rows = [frame.columns, ["---", *["---:"] * (len(frame.columns) - 1)], *frame.itertuples(index=False)]
     return "\n".join("| " + " | ".join(_cell(cell) for cell in row) + " |" for row in rows)

@@ -16,7 +16,7 @@ from fidsplat.experiments.paper import ANGLES, CONSTRUCTION_SECONDS, TRAINING_SE
 from fidsplat.experiments.pictures import sheet_files
 from fidsplat.experiments.results import load
 from fidsplat.experiments.setup import CATEGORIES, COLLECTIONS, PROTOCOLS
-from fidsplat.experiments.summary import provenance
+from fidsplat.experiments.summary import Frame, Row, provenance
 from fidsplat.experiments.targets import targets
 from fidsplat.experiments.views import LINEAR, TRUTHS
 from fidsplat.files import atomic_write
@@ -76,7 +76,7 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
     return [page, *files, missed, *sorted(folder.glob("*.svg"))]
 
 
-def _kinds(reached: pd.DataFrame) -> pd.DataFrame:
+def _kinds(reached: Frame) -> Frame:
     """Targets by kind: how many there are, and how many are reached."""
     table = reached.groupby("kind", sort=False)["reached"].agg(["sum", "size"]).reset_index()
     return table.set_axis(["target", "reached", "of"], axis=1)
@@ -100,7 +100,7 @@ def _titles(categories: Iterable[str]) -> list[str]:
     return [CATEGORIES[name].title for name in categories]
 
 
-def _counts(rows: pd.DataFrame, folder: Path) -> dict[str, pd.DataFrame]:
+def _counts(rows: Frame, folder: Path) -> dict[str, Frame]:
     """Tables 1 and 2, and the chart of each."""
     categories = category_order(rows["category"])
     made = [name for name in mixtures() if name in set(rows["mixture"])]
@@ -146,7 +146,7 @@ def _counts(rows: pd.DataFrame, folder: Path) -> dict[str, pd.DataFrame]:
     return {"sizes": pd.DataFrame(sizes), "seconds": pd.DataFrame(seconds)}
 
 
-def _angles(rows: pd.DataFrame, folder: Path) -> dict[str, pd.DataFrame]:
+def _angles(rows: Frame, folder: Path) -> dict[str, Frame]:
     """Table 3 by protocol, and its chart."""
     there = set(rows["reader"])
     furthest = {
@@ -182,7 +182,7 @@ def _angles(rows: pd.DataFrame, folder: Path) -> dict[str, pd.DataFrame]:
     return tables
 
 
-def _angle(values: pd.Series) -> str:
+def _angle(values: Row) -> str:
     there = values.dropna()
     if there.empty:
         return "never"
@@ -190,7 +190,7 @@ def _angle(values: pd.Series) -> str:
     return f"{there.mean():.1f}" + (f" ({never} of {len(values)} never)" if never else "")
 
 
-def _views(rows: pd.DataFrame, folder: Path) -> dict:
+def _views(rows: Frame, folder: Path) -> dict:
     """Table 4 against a truth of display values and one of linear light, and its chart."""
     categories = category_order(rows["category"])
     there = set(rows["truth"])
@@ -201,7 +201,7 @@ def _views(rows: pd.DataFrame, folder: Path) -> dict:
         methods = method_order(own["method"])
         mean = own.groupby(["category", "method"])[["psnr", "ssim"]].mean()
 
-        def cell(place: tuple[str, str], mean: pd.DataFrame = mean) -> str:
+        def cell(place: tuple[str, str], mean: Frame = mean) -> str:
             if place not in mean.index:
                 return NOTHING
             return f"{fixed(mean['psnr'][place], 1)} / {fixed(mean['ssim'][place], 3)}"
@@ -221,7 +221,7 @@ def _views(rows: pd.DataFrame, folder: Path) -> dict:
     return {"tables": tables, "views": int(rows["amount"].max()), "rows": len(rows), "measured": measured}
 
 
-def _localisation(rows: pd.DataFrame, folder: Path) -> pd.DataFrame:
+def _localisation(rows: Frame, folder: Path) -> Frame:
     """Median error of position by distance, and how many of the views were read."""
     methods = method_order(rows["method"])
     table = []
@@ -243,7 +243,7 @@ def _beside_paper(
     methods: Sequence[str],
     cell: Callable[[tuple[str, str]], str],
     paper: dict[str, dict],
-) -> pd.DataFrame:
+) -> Frame:
     """A row for each category: the paper's figures, then ours."""
     return pd.DataFrame(
         [
@@ -259,7 +259,7 @@ def _beside_paper(
 
 
 def _series(
-    categories: Sequence[str], methods: Sequence[str], values: pd.Series, paper: dict[str, dict]
+    categories: Sequence[str], methods: Sequence[str], values: Row, paper: dict[str, dict]
 ) -> dict[str, list[float]]:
     """Ours by method, then the paper's, for `_panels`."""
     nan = float("nan")

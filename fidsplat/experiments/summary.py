@@ -11,7 +11,7 @@ import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import pandas as pd
 
@@ -20,13 +20,17 @@ from fidsplat.experiments.sweep import Record, read_records
 from fidsplat.files import atomic_write
 
 _MARK = "# "
+Frame: TypeAlias = Any
+"""a `pandas.DataFrame`, which has no types that could be followed into its cells"""
+Row: TypeAlias = Any
+"""a `pandas.Series`"""
 
 
 @dataclass(eq=False)
 class Summary:
     """One table of results."""
 
-    rows: pd.DataFrame
+    rows: Frame
     runs: list[dict[str, Any]]
     """facts of each run (`fidsplat.provenance.run_facts`), and its `points`: how many it measured"""
     notes: list[str] = field(default_factory=list)
@@ -90,7 +94,7 @@ def join(summaries: Sequence[Summary], about: Sequence[str]) -> Summary:
     return Summary(rows.loc[sorted(chosen.index)].reset_index(drop=True), runs, notes)
 
 
-def provenance(summaries: Mapping[str, Summary]) -> pd.DataFrame:
+def provenance(summaries: Mapping[str, Summary]) -> Frame:
     """What made the numbers: a row for each run of each summary, by what it measured."""
     return pd.DataFrame(
         [

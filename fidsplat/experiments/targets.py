@@ -11,7 +11,7 @@ from fidsplat.experiments import angles, counts, views
 from fidsplat.experiments.methods import IDEAL
 from fidsplat.experiments.paper import ANGLES, VIEWS
 from fidsplat.experiments.results import ALLOWED_GAP, NEVER
-from fidsplat.experiments.summary import Summary
+from fidsplat.experiments.summary import Frame, Summary
 from fidsplat.experiments.views import LINEAR
 
 EXACT_PSNR, EXACT_SSIM = 38.7, 0.99
@@ -33,7 +33,7 @@ class Target(NamedTuple):
     reached: bool
 
 
-def targets(summaries: dict[str, Summary]) -> pd.DataFrame:
+def targets(summaries: dict[str, Summary]) -> Frame:
     """A row for each target of which anything was measured."""
     found: list[Target] = []
     rows = {name: summary.rows for name, summary in summaries.items()}
@@ -43,17 +43,17 @@ def targets(summaries: dict[str, Summary]) -> pd.DataFrame:
         found += _views(rows[views.NAME])
     if counts.NAME in rows:
         found += _counts(rows[counts.NAME])
-    return pd.DataFrame(found, columns=Target._fields)
+    return pd.DataFrame(found, columns=Target._fields).astype({"reached": bool})
 
 
-def _best(rows: pd.DataFrame) -> Iterator[tuple[str, str, pd.DataFrame]]:
+def _best(rows: Frame) -> Iterator[tuple[str, str, Frame]]:
     """Of mixtures that have a target, drawn sharp: mixture, method, rows."""
     for mixture in ALLOWED_GAP:
         method = f"{mixture}/best"
         yield mixture, method, rows[rows["method"] == method]
 
 
-def _gaps(rows: pd.DataFrame) -> Iterator[Target]:
+def _gaps(rows: Frame) -> Iterator[Target]:
     """The paper's angle is the largest one; what is read without a miss up to it is the stricter question."""
     for mixture, method, own in _best(rows):
         allowed = ALLOWED_GAP[mixture]
@@ -76,7 +76,7 @@ def _gap(worst: float) -> str:
     return "-" if pd.isna(worst) else "not read frontally" if worst >= NEVER else f"{worst:+.1f}"
 
 
-def _misses(rows: pd.DataFrame) -> Iterator[Target]:
+def _misses(rows: Frame) -> Iterator[Target]:
     for mixture, method, own in _best(rows):
         for (protocol, category), scans in own.groupby(["protocol", "category"], sort=False):
             sums = scans.groupby("reader")[["missed", "below"]].sum()
@@ -93,7 +93,7 @@ def _misses(rows: pd.DataFrame) -> Iterator[Target]:
                 )
 
 
-def _paper_angles(rows: pd.DataFrame) -> Iterator[Target]:
+def _paper_angles(rows: Frame) -> Iterator[Target]:
     rows = rows[(rows["protocol"] == "fixed-module") & (rows["reader"] == "zxing-tall")]
     for column, words in (("read", "largest tilt that is read"), ("read_all", "read without a miss up to")):
         means = rows.assign(value=rows[column].fillna(0.0)).groupby(["category", "method"])["value"]
@@ -114,7 +114,7 @@ def _paper_angles(rows: pd.DataFrame) -> Iterator[Target]:
                     )
 
 
-def _views(rows: pd.DataFrame) -> Iterator[Target]:
+def _views(rows: Frame) -> Iterator[Target]:
     means = rows.groupby(["truth", "category", "method"])[["psnr", "ssim"]].mean()
 
     def mean(method: str, metric: str = "psnr") -> float | None:
@@ -148,7 +148,7 @@ def _views(rows: pd.DataFrame) -> Iterator[Target]:
                 )
 
 
-def _counts(rows: pd.DataFrame) -> Iterator[Target]:
+def _counts(rows: Frame) -> Iterator[Target]:
     for category, own in rows.groupby("category", sort=False):
         gaussians = own.pivot(index="marker", columns="mixture", values="gaussians")
         rectangles = own.groupby("marker")[["rectangles_dark", "rectangles_light"]].first().sum(axis=1)

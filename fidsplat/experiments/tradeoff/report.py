@@ -11,8 +11,8 @@ import pandas as pd
 
 from fidsplat.experiments.charts import chart, label_points, plain_ticks
 from fidsplat.experiments.pages import fixed, number, percent, places, write_page
-from fidsplat.experiments.summary import provenance
-from fidsplat.experiments.tradeoff.points import ALONE, MARKER_KNOB, PRESETS_KNOB
+from fidsplat.experiments.summary import Frame, Row, provenance
+from fidsplat.experiments.tradeoff.points import ALONE, MARKER_KNOB, PRESETS_KNOB, TOGETHER
 from fidsplat.experiments.tradeoff.scenes import HARD, RANDOM, is_marker
 from fidsplat.experiments.tradeoff.summary import TILT, Device, load
 
@@ -147,7 +147,7 @@ def draw_chart(device: Device, scene: str, file: Path) -> None:
         label_points(figure, axes, list(zip(named["ms"], named["error"], names[names.notna()], strict=True)))
 
 
-def constants_table(devices: Sequence[Device]) -> pd.DataFrame:
+def constants_table(devices: Sequence[Device]) -> Frame:
     """What each constant saves beside the exact picture on each device, and the error that it makes; no row
     for what nobody measured."""
     rows = []
@@ -183,7 +183,7 @@ def _verdict(device: Device, constant: Constant) -> str:
     return "no gain, invisible" if verdict == "trap" and point["maximum"] <= INVISIBLE / 2 else verdict
 
 
-def markers_table(device: Device) -> pd.DataFrame:
+def markers_table(device: Device) -> Frame:
     """What Gaussians of a marker give, drawn sharp: time, PSNR from the print, how far it is read."""
     view, rows = f"{MARKER}@{TILT}", []
     if view not in device.scenes:
@@ -214,8 +214,13 @@ def choices(devices: Sequence[Device]) -> list[dict[str, str]]:
             best = device.cheapest_within(scenes, INVISIBLE) if scenes else []
             if best:
                 costs = ", ".join(f"{row['scene']} {percent(row['ratio'])}" for row in best)
-                found.append({"kind": device.kind, "on": words, "setting": best[0]["value"], "costs": costs})
+                found.append({"kind": device.kind, "on": words, "setting": _words(best[0]), "costs": costs})
     return found
+
+
+def _words(point: Row) -> str:
+    plain = point["knob"] in ("base", PRESETS_KNOB, TOGETHER)
+    return point["value"] if plain else f"{point['knob']} {point['value']}"
 
 
 def _facts(device: Device) -> dict[str, str]:

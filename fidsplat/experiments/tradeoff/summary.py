@@ -12,7 +12,7 @@ import pandas as pd
 
 from fidsplat.errors import InputError
 from fidsplat.experiments.angles import largest, parse_tilts
-from fidsplat.experiments.summary import Summary, join, read_summary, records_of, summarise
+from fidsplat.experiments.summary import Frame, Row, Summary, join, read_summary, records_of, summarise
 from fidsplat.experiments.sweep import Record
 from fidsplat.experiments.tradeoff.points import KNOBS, PRESETS_KNOB, Point
 from fidsplat.experiments.tradeoff.run import DECODE, NAME, POINT, TRUTH
@@ -105,7 +105,7 @@ class Device:
         self.title, self.kind = run.get("title", self.name), run.get("kind", "device")
         presets = rows["knob"] == PRESETS_KNOB
         stale = presets & (rows["quality"] != rows["value"].map(_today))
-        points = rows[(rows["what"] == POINT) & rows["error"].isna() & ~stale]
+        points: Frame = rows[(rows["what"] == POINT) & rows["error"].isna() & ~stale]
         for name in rows.loc[presets, "value"].unique():
             same = points[points["quality"] == _today(name)].drop_duplicates("scene")
             named = same.assign(knob=PRESETS_KNOB, value=name)
@@ -117,18 +117,18 @@ class Device:
     def __contains__(self, point: tuple[str, str, str]) -> bool:
         return point in self.points.index
 
-    def at(self, scene: str, knob: str, value: str) -> pd.Series | None:
+    def at(self, scene: str, knob: str, value: str) -> Row | None:
         """A setting on a scene; None where it was not measured."""
         return self.points.loc[(scene, knob, value)] if (scene, knob, value) in self else None
 
-    def of(self, scene: str) -> pd.DataFrame:
+    def of(self, scene: str) -> Frame:
         """What was measured on a scene, knob by knob in their order, with `ms` as `ms_of` has it."""
-        found = self.points[self.points["scene"] == scene]
+        found: Frame = self.points[self.points["scene"] == scene]
         order = found["knob"].map(list(("base", *KNOBS)).index)
         found = found.iloc[order.argsort(kind="stable")]
         return found.assign(ms=self.base_ms(scene) * found["ratio"])
 
-    def same_picture(self, scene: str) -> pd.DataFrame:
+    def same_picture(self, scene: str) -> Frame:
         """Of `of` what has the base's definition, so that errors may be compared."""
         found = self.of(scene)
         # without coplanar splats their rule defines nothing
@@ -148,14 +148,14 @@ class Device:
         shares = [abs(base["ratio_low"] - 1), abs(base["ratio_high"] - 1), twice.max()]
         return max(TIME_CHANGES, *map(float, shares))
 
-    def cost(self, point: pd.Series) -> float:
+    def cost(self, point: Row) -> float:
         """A setting's time over the base's, for comparing settings with each other. A GPU's host delays both
         frames of a pair by as many milliseconds, so there their difference counts, over the base's median."""
         if self.kind != "gpu":
             return point["ratio"]
         return 1 + (point["ratio"] - 1) * point["base_ms"] / self.base_ms(point["scene"])
 
-    def verdict(self, point: pd.Series, other: pd.Series) -> str:
+    def verdict(self, point: Row, other: Row) -> str:
         """What a setting is on a scene beside another of the same definition."""
         signs = {_sign(point[name], other[name]) for name in ("maximum", "rmse")}
         if {-1, 1} <= signs:
@@ -168,12 +168,12 @@ class Device:
             time = 1
         return _VERDICTS[time, next((sign for sign in signs if sign), 0)]
 
-    def cheapest_within(self, scenes: Iterable[str], bound: float) -> list[pd.Series]:
+    def cheapest_within(self, scenes: Iterable[str], bound: float) -> list[Row]:
         """The setting, measured on all the scenes, whose error beyond certified flips is at most the bound on
         each and whose product of costs is least: what was measured of it, [] if there is none."""
         scenes = list(scenes)
-        fit = pd.concat([self.same_picture(scene) for scene in scenes])
-        best: tuple[float, list[pd.Series]] = (math.inf, [])
+        fit: Frame = pd.concat([self.same_picture(scene) for scene in scenes])
+        best: tuple[float, list[Row]] = (math.inf, [])
         for _, found in fit.groupby(["knob", "value"], sort=False):
             worst = found["beyond"].fillna(found["maximum"]).max()
             there = [row for _, row in found.iterrows()]
@@ -190,7 +190,7 @@ class Device:
         return None if found.empty else float(found.iloc[0])
 
 
-def front(points: pd.DataFrame) -> pd.DataFrame:
+def front(points: Frame) -> Frame:
     """Those than which none is both as fast and as accurate, from fast to accurate."""
     ranked = points.sort_values(["ratio", "maximum"])
     best = ranked["maximum"].cummin().shift(fill_value=math.inf)
