@@ -100,6 +100,23 @@ class SplatCloud:
             given = single["means"] if given.dtype == _F32 else given[keep]
             new_labels = new_labels[keep]
             warnings.warn(drop_report(dropped, n, source), stacklevel=2)
+        self._finish(given, single, new_labels, origin, dropped)
+
+    @classmethod
+    def of_checked(cls, means, quats, scales, opacities, sh, labels=None, *, origin, dropped) -> "SplatCloud":
+        """A cloud that takes over arrays of splats that can all be drawn, as a reader of files has found.
+
+        means (n, 3) float32 or float64, all else as the attributes are, but quats of any length above 0.
+        dropped: what the reader left out.
+        """
+        cloud = object.__new__(cls)
+        single = {"quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
+        single["means"] = means if means.dtype == _F32 else _single(means)
+        cloud._finish(means, single, _labels(None, len(means)) if labels is None else labels, origin, dropped)
+        return cloud
+
+    def _finish(self, given, single: dict[str, np.ndarray], labels, origin, dropped: dict[str, int]) -> None:
+        """Freeze splats that can be drawn; given: the means in the type that they came in."""
         single["quats"] = _unit(single["quats"])
         if origin is not None:
             new_origin = _check_origin(origin)
@@ -107,7 +124,7 @@ class SplatCloud:
             single["means"], new_origin = _choose_origin(given, single["means"], single["scales"])
         self._set(
             **{"colors": None, "sh": None, "planes": None, "boxes": None, **single},
-            labels=new_labels,
+            labels=labels,
             origin=new_origin,
             dropped=dropped,
         )

@@ -31,6 +31,9 @@ SPEC is one of
   qr:TEXT              the smallest code that fits      qr:https://example.org
   qr-vN-L:TEXT         version N, error level L M Q H   qr-v22-L:TEXT
   image:FILE           any one-bit picture              image:logo.png
+  charuco:CxR:FAMILY   columns x rows of squares        charuco:7x5:4x4_50
+  gridboard:CxR:FAMILY columns x rows of tags           gridboard:5x7:4x4_50
+  aprilgrid:CxR:FAMILY the same with corner squares     aprilgrid:6x6:36h11
 
 The mixture exact draws every rectangle as one box with sharp edges. A PLY file has no boxes: -o then writes
 the Gaussians of fitted, and says so.
@@ -50,7 +53,8 @@ Examples:
     spec: Annotated[tyro.conf.Positional[str], option("SPEC", "what to make, as above")]
     out: Annotated[str | None, option("FILE.ply", "write the splats there", "-o")] = None
     size: Annotated[
-        float, option("M", "edge of the code in metres, its quiet zone not counted (default: 1)")
+        float,
+        option("M", "edge of the code (a board's width) in metres, quiet zone not counted (default: 1)"),
     ] = 1.0
     mixture: Annotated[
         str | None, option("NAME", "how rectangles become splats: fitted, paper or exact (default: fitted)")

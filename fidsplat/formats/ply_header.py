@@ -58,12 +58,13 @@ class Header:
     elements: dict[str, Element]
     comments: tuple[str, ...]
 
-    def rows(self, name: str) -> np.ndarray:
-        """The rows of an element as a read-only structured array (count,), mapped from the file, not read."""
+    def rows(self, name: str, first: int, end: int) -> np.ndarray:
+        """Rows first to end of an element as a read-only structured array, mapped from the file, not read."""
         element = self.elements[name]
-        if element.count == 0:
+        if end <= first:
             return np.zeros(0, element.dtype)
-        mapped = np.memmap(self.path, element.dtype, "r", element.offset, (element.count,))
+        offset = element.offset + first * element.dtype.itemsize
+        mapped = np.memmap(self.path, element.dtype, "r", offset, (end - first,))
         return mapped.view(np.ndarray)  # indexing a memmap costs several times that of an array
 
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
-from fidsplat.formats.ply import ORIGIN_COMMENT, PADDED_LOG_SCALE
+from fidsplat.formats.collect import PADDED_LOG_SCALE
+from fidsplat.formats.ply import ORIGIN_COMMENT
 from fidsplat.harmonics import C0
 from fidsplat.splats import SplatCloud
 

@@ -7,10 +7,14 @@ marker needs them.
 from importlib import import_module
 
 _HOME = {
+    "Kind": "fidsplat.markers.spec",
     "Marker": "fidsplat.markers.build",
     "Rectangle": "fidsplat.markers.build",
+    "Spec": "fidsplat.markers.spec",
     "marker": "fidsplat.markers.build",
-    "parse_spec": "fidsplat.markers.spec",
+    "parse_spec": "fidsplat.markers.kinds",
+    "register": "fidsplat.markers.kinds",
+    "with_file": "fidsplat.markers.kinds",
 }
 
 __all__ = sorted(_HOME)

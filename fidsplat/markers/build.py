@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from fidsplat.errors import InputError
+from fidsplat.markers.kinds import bits_of, kind_of, parse_spec
 from fidsplat.markers.mixture import (
     Template,
     count_gaussians,
@@ -30,7 +31,6 @@ from fidsplat.markers.printing import (
     refuse_more,
 )
 from fidsplat.markers.regions import label_components, polygons
-from fidsplat.markers.spec import QUIET_ZONE, bits_of, parse_spec
 from fidsplat.quality import MIXTURES, MarkerQuality, whole_number
 
 if TYPE_CHECKING:
@@ -59,13 +59,14 @@ class Marker:
     spec: str
     """the text that it was made from"""
     kind: str
-    """"apriltag", "aruco", "qr" or "image\""""
+    """name of its kind: "apriltag", "aruco", "qr", "image", "charuco", "gridboard", "aprilgrid", or of one
+    that was registered"""
     family: str | None
-    """tag family, e.g. "36h11"; QR version and level, e.g. "v5-L"; None for an image"""
+    """tag family, of a board too, e.g. "36h11"; QR version and level, e.g. "v5-L"; None for an image"""
     id: int | None
-    """tag id, None for QR codes and images"""
+    """tag id, None for all but tags"""
     payload: str | None
-    """text of a QR code, path of an image, None for tags"""
+    """text of a QR code, path of an image, None for tags and boards"""
     bits: np.ndarray
     """(h, w) uint8, 1 = dark, the code alone"""
     quiet_zone: int
@@ -158,11 +159,12 @@ def marker(
     """Make a marker of splats.
 
     Args:
-        spec: apriltag:36h11:5, aruco:4x4_50:7, qr:TEXT, qr-v22-L:TEXT or image:FILE.png.
-        size: metres, edge of the code itself, quiet zone not counted (an image's width).
+        spec: apriltag:36h11:5, aruco:4x4_50:7, qr:TEXT, qr-v22-L:TEXT, image:FILE.png, charuco:7x5:4x4_50,
+            gridboard:5x7:4x4_50, aprilgrid:6x6:36h11, or of a kind that was registered.
+        size: metres, edge of the code itself, quiet zone not counted (the width of a board or an image).
         mixture: "fitted" (default), "paper", or "exact": one box for each rectangle, which only this renderer
             draws (`SplatCloud.with_boxes`, `Marker.gaussians`).
-        quiet_zone: modules of white around it; default 1 for AprilTag and ArUco, 4 for QR, 0 for images.
+        quiet_zone: modules of white around it; default 1 for tags, 4 for QR, 2 for boards, 0 for images.
         levels, density, duplicates: of the mixture `paper` only, see `paper_template`; default 4, 3, False.
         template: of the mixtures `fitted` and (for `Marker.gaussians`) `exact` only: Gaussians of a
             rectangle, 1, 5, 9, 13, 25 or 41; default 25.
@@ -188,7 +190,7 @@ def marker(
     templates, growth = _mixture(chosen, bool(duplicates))
     _check_size(size)
     parsed, bits = bits_of(parsed)
-    quiet = QUIET_ZONE[parsed.kind] if quiet_zone is None else quiet_zone
+    quiet = kind_of(parsed).quiet_zone if quiet_zone is None else quiet_zone
     longest = MAX_MODULES - max(bits.shape)
     if longest < 0:
         raise InputError(

@@ -28,12 +28,12 @@ def maximum_independent_set(
     """
     keep = np.ones(n_left + n_right, bool)
     if len(left):
-        cover = _minimum_cover(np.stack([left, right + n_left], 1).tolist(), n_left)
+        cover = _minimum_cover(list(zip(left.tolist(), (right + n_left).tolist(), strict=True)), n_left)
         keep[list(cover)] = False
     return keep[:n_left], keep[n_left:]
 
 
-def _minimum_cover(edges: list[list[int]], n_left: int) -> set[int]:
+def _minimum_cover(edges: list[tuple[int, int]], n_left: int) -> set[int]:
     """Koenig's cover of a bipartite graph whose left vertices are those below ``n_left``."""
     import networkx as nx  # late: it takes longer to load than most markers to make
 

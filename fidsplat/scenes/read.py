@@ -10,6 +10,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera, Trajectory, look_at_matrix
 from fidsplat.errors import InputError
+from fidsplat.formats import Progress, load_ply
 from fidsplat.quality import MarkerQuality, Quality, knobs
 from fidsplat.rotations import rigid_matrix
 from fidsplat.scenes.imaging import read_background, read_fog, read_sensor
@@ -32,7 +33,6 @@ SPLATS = ("file", "position", "quaternion", "scale", "motion")
 MARKER = ("spec", "size", "position", "quaternion", "quiet_zone", "max_splats", "motion")
 MARKERS = (*MARKER, *knobs(MarkerQuality))
 RENDER = ("outputs", "background", "quality", "samples", "lowpass", "first_hit", "device")
-IMAGE = "image:"
 
 # A dotted key of too many parts, outside of strings and comments, which are matched to be passed over. What
 # is not closed ends with the file, and quantifiers are possessive: time is linear whatever the file holds.
@@ -47,10 +47,15 @@ _LONG_KEY = re.compile(
 )
 
 
-def read_scene(path: str | os.PathLike[str], quality: Quality | str | None = None) -> Scene:
+def read_scene(
+    path: str | os.PathLike[str],
+    quality: Quality | str | None = None,
+    progress: Progress | None = None,
+) -> Scene:
     """The scene of a file and of the splat and image files that it names, which are looked for beside it.
 
-    quality: instead of the file's; markers are made with it too.
+    quality: instead of the file's; markers are made with it too. progress: as
+    `load_ply` takes it.
 
     Raises InputError, naming the file and the key, for whatever is wrong.
     """
@@ -68,11 +73,13 @@ def read_scene(path: str | os.PathLike[str], quality: Quality | str | None = Non
         raise render.error("background", "and the table [background] exclude each other")
     quality = quality_of(top, render) if quality is None else quality
     made_with = Quality.of(quality).marker
-    splats = [_splats(table, file.parent) for table in top.tables("splats", SPLATS)]
+    splats = [_splats(table, file.parent, progress) for table in top.tables("splats", SPLATS)]
     return Scene(
         clouds=tuple(cloud for cloud, _ in splats),
         camera=camera,
-        markers=tuple(_marker(table, file.parent, made_with) for table in top.tables("markers", MARKERS)),
+        markers=tuple(
+            _marker(table, file.parent, made_with, progress) for table in top.tables("markers", MARKERS)
+        ),
         background=read_background(top, file.parent) or render.numbers("background", 3, (0.0, 0.0, 0.0)),
         outputs=render.texts("outputs", ("rgb",)),
         quality=quality,
@@ -152,10 +159,8 @@ def _pose(table: Table, scale: float = 1.0):
         return rigid_matrix(position, quaternion, scale)
 
 
-def _splats(table: Table, folder: Path) -> tuple[SplatCloud, Trajectory | None]:
+def _splats(table: Table, folder: Path, progress: Progress | None) -> tuple[SplatCloud, Trajectory | None]:
     """A file's splats where they are put, and how they move from there."""
-    from fidsplat.formats import load_ply
-
     name, scale = table.text("file"), table.number("scale", 1.0)
     if not scale > 0:
         raise table.error("scale", f"must be above 0, not {scale!r}")
@@ -163,25 +168,25 @@ def _splats(table: Table, folder: Path) -> tuple[SplatCloud, Trajectory | None]:
     if motion is not None:
         motion = Trajectory(motion.times, motion.poses @ np.linalg.inv(_pose(table)))
     with table.at("file"):
-        cloud = load_ply(folder / name)
+        cloud = load_ply(folder / name, progress)
         moved = any(key in table for key in ("position", "quaternion", "scale"))
         return (cloud.transformed(pose) if moved else cloud), motion
 
 
-def _marker(table: Table, folder: Path, quality: MarkerQuality) -> PlacedMarker:
+def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progress | None) -> PlacedMarker:
     spec, size = table.text("spec"), table.number("size")
     if not size > 0:
         raise table.error("size", f"must be above 0 metres, not {size!r}")
-    if spec.startswith(IMAGE):
-        spec = IMAGE + str(folder / spec.removeprefix(IMAGE))
     pose, motion = _pose(table), read_keyframes(table, POSE, _pose)
     quiet_zone, max_splats = table.whole("quiet_zone", None), table.whole("max_splats", None)
     own = read_knobs(table, MarkerQuality)
     if quiet_zone is not None and quiet_zone < 0:
         raise table.error("quiet_zone", f"must be 0 or more modules, not {quiet_zone}")
-    from fidsplat.markers import marker  # late: it brings what makes markers
+    from fidsplat.markers import marker, with_file  # late: it brings what makes markers
 
     limit = {} if max_splats is None else {"max_splats": max_splats}
+    known = {"quiet_zone": quiet_zone, "quality": quality, "progress": progress, **limit}
     with table.at():
-        made = marker(spec, size=size, quiet_zone=quiet_zone, quality=quality, **limit, **own)
+        spec = with_file(spec, lambda name: str(folder / name))
+        made = marker(spec, size, **known, **own)
         return PlacedMarker(made, pose, motion=motion)

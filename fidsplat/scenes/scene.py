@@ -20,6 +20,7 @@ from fidsplat.surroundings import Background, Fog, background_of
 
 if TYPE_CHECKING:
     from fidsplat.cameras.motion import Pose
+    from fidsplat.formats import Progress
     from fidsplat.markers import Marker
     from fidsplat.quality import Quality
 
@@ -154,16 +155,21 @@ class Scene:
         return dict(zip(sorted(self.cloud_motions), free, strict=False))
 
     @staticmethod
-    def load(path: str | os.PathLike[str], quality: Quality | str | None = None) -> Scene:
+    def load(
+        path: str | os.PathLike[str],
+        quality: Quality | str | None = None,
+        progress: Progress | None = None,
+    ) -> Scene:
         """Read a scene file (docs/scene-files.md).
 
         quality: instead of the file's; its knobs of markers hold for markers that do not say theirs.
+        progress: called with what is being done and the share of it that is done, 0 to 1.
 
         Raises InputError, naming file and key, for whatever is wrong.
         """
         from fidsplat.scenes.read import read_scene
 
-        return read_scene(path, quality)
+        return read_scene(path, quality, progress)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a scene file, and beside it one PLY file STEM-splats-I.ply for each of ``clouds``.

@@ -8,6 +8,7 @@ import numpy as np
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
 from fidsplat.formats import save_ply
+from fidsplat.markers import with_file
 from fidsplat.markers.printing import MAX_SPLATS
 from fidsplat.quality import Quality
 from fidsplat.rotations import matrix_to_quaternion
@@ -15,7 +16,6 @@ from fidsplat.scenes.imaging import imaging_tables
 from fidsplat.scenes.knobs import marker_knobs, quality_tables
 from fidsplat.scenes.lens import lens_table
 from fidsplat.scenes.moving import keyframe_tables, shutter_table
-from fidsplat.scenes.read import IMAGE
 from fidsplat.scenes.scene import PlacedMarker, Scene
 
 
@@ -71,9 +71,7 @@ def _camera(scene: Scene) -> dict:
 
 def _marker(placed: PlacedMarker, folder: Path, quality: Quality | str | None) -> dict:
     marker = placed.marker
-    spec = marker.spec
-    if spec.startswith(IMAGE):
-        spec = IMAGE + os.path.relpath(spec.removeprefix(IMAGE), folder)
+    spec = with_file(marker.spec, lambda name: os.path.relpath(name, folder))
     motion = {} if placed.motion is None else {"motion": keyframe_tables(placed.motion, marker.spec)}
     limit = {} if marker.max_splats == MAX_SPLATS else {"max_splats": marker.max_splats}
     return {

@@ -7,11 +7,13 @@ from functools import cache
 
 import warp as wp
 
+from . import output
 from .bounds import Bounds, make_bounds
+from .buffers import make_samples, sample_fields
 from .common import STRICT, View, lowest, store_line
-from .lens import SLOPES
+from .crossing import make_crossing
 from .pixel import make_pixel
-from .planes import make_samples, of_samples
+from .rays import SLOPES
 from .splat import make_splat
 from .staging import BLOCK_H, BLOCK_W, STAGED
 
@@ -19,50 +21,30 @@ NONE, ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 
 
 @cache
-def make_blend(effects: tuple[str, ...], on_gpu: bool, threads: int):
-    """The kernel for these effects of splats and samples; threads: of a block on a GPU, one for each of a
-    tile's samples.
+def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool, threads: int):
+    """The kernel for these effects of splats and samples, and these outputs, and the struct that a sample
+    keeps; threads: of a block on a GPU, one for each of a tile's samples.
     """
-    parts = make_pixel(effects)
-    splats = make_splat(effects)
+    splats, crossing = make_splat(effects, outputs), make_crossing(effects, outputs)
     pool, stage, touched = splats.staging.pool, splats.staging.stage, splats.staging.touched
     load, load_staged = splats.load, splats.load_staged
-    Pixel = parts.Pixel
+    row_of, cross, cross_ray, cross_slopes = (
+        *(crossing.row, crossing.cross),
+        *(crossing.cross_ray, crossing.cross_slopes),
+    )
+    pixels = make_pixel(effects, outputs)
+    Rays, Pixel, start, unfinished = pixels.Rays, pixels.Pixel, pixels.start, pixels.unfinished
+    blend_one, finish = pixels.blend, pixels.finish
     limits = make_bounds("lowpass_screen" in effects)
-    Samples = make_samples(tuple(of_samples(effects).items()))
-    depth, median, first, normal, heaviest, blended, fog = (
-        name in effects
-        for name in ("depth", "depth_median", "depth_first", "normal", "heaviest", "blended", "fog")
-    )
-    start, row_of, cross, unfinished, blend_one = (
-        parts.start,
-        parts.row,
-        parts.cross,
-        parts.unfinished,
-        parts.blend,
-    )
-    finish, cross_ray, cross_slopes = parts.finish, parts.cross_ray, parts.cross_slopes
+    Samples = make_samples(tuple(sample_fields(outputs).items()))
+    stores = output.functions(outputs, "store")
     bent, curved = "rays" in effects, cross_slopes is not None
-    Rays = parts.Rays
 
     @wp.func
     def store(p: Pixel, at: int, samples: Samples):
         store_line(samples.color, at, wp.vec4(p.r, p.g, p.b, p.t))
-        if wp.static(depth):
-            samples.depth[at] = wp.vec2(p.depth, p.depth_weight)
-        if wp.static(median):
-            samples.depth_median[at] = p.depth_median
-        if wp.static(first):
-            samples.depth_first[at] = p.depth_first
-        if wp.static(normal):
-            samples.normal[at] = p.normal
-        if wp.static(heaviest):
-            samples.heaviest[at] = p.heaviest
-            samples.weight[at] = p.weight
-        if wp.static(blended):
-            samples.blended[at] = p.blended
-        if wp.static(fog):
-            samples.fogged[at] = p.fogged
+        for k in range(wp.static(len(stores))):
+            wp.static(stores[k])(p, at, samples)
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False, launch_bounds=threads)
     def blend_gpu(

@@ -1,4 +1,4 @@
-"""Boxes: rectangles |u| <= 1, |v| <= 1 of a splat's plane, whose edges the sample filters (docs/effects.md).
+"""Boxes: rectangles |u| <= 1, |v| <= 1 of a splat's plane, whose edges the sample filters (docs/boxes.md).
 
 D + n_u, D - n_u, D + n_v, D - n_v over their gradients are the sample's distances from the four edges,
 inwards, in samples. Where they are affine in the sample, gradients are the splat's own; where a lens gives
@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .common import View, fma
-from .lens import SLOPES
+from .rays import SLOPES
 
 SQRT2 = wp.constant(wp.float32(2.0**0.5))
 LINES = wp.constant(10)

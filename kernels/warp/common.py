@@ -5,10 +5,16 @@ import warp as wp
 # Order and culling must not depend on what a compiler fuses: contraction is off everywhere, and fused
 # operations are
 # written out as `fma` (numerics F1). No fast maths: a NaN must fail a comparison (numerics F3).
-STRICT = {"fuse_fp": False, "fast_math": False, "enable_backward": False, "default_grid_stride": False}
+# Loops over the functions of outputs are unrolled, however many there are.
+STRICT = {
+    **{"fuse_fp": False, "fast_math": False, "enable_backward": False, "default_grid_stride": False},
+    "max_unroll": 64,
+}
 
 CULLED = wp.constant(wp.uint32(0xFFFFFFFF))
 """key of a splat that is not drawn"""
+LEAST_ALPHA = wp.constant(wp.float32(1.0 / 255.0))
+"""less of a sample than this is nothing to label, depth, median depth and normal"""
 
 
 _SIGN = wp.constant(wp.uint32(0x80000000))

@@ -1,15 +1,16 @@
-"""Splats of one plane are one layer at a sample (docs/rendering.md, coplanar splats): its colour and depth
+"""Splats of one plane are one layer at a sample (docs/coplanar.md): its colour and depth
 are means of its fragments by optical depth.
 
-They arrive together, before anything that the layer is compared with; it is laid before the first fragment of
-no plane that lies behind it there, or at the end. Two layers may be pending; when a third begins the nearer
-of them is laid.
+They arrive together, before anything that the layer is compared with; it is composited before the first
+fragment of no plane that lies behind it there, or at the end. Two layers may be pending; when a third begins
+the nearer of them is composited.
 """
 
 from types import SimpleNamespace
 
 import warp as wp
 
+from . import output
 from .common import View, fma, struct_of
 from .fast import fast_log
 
@@ -19,13 +20,13 @@ DARKEST = wp.constant(wp.float32(2.0**-24))
 """transmittance of an opaque fragment, whose optical depth would be infinite"""
 
 
-def make_layer(Seen, effects: tuple[str, ...]) -> SimpleNamespace:
+def make_layer(Seen, effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
     """Layer, and what is known of it: gather, gather_box; nothing, depth, shown."""
-    normal, heaviest, blended = (name in effects for name in ("normal", "heaviest", "blended"))
     log = fast_log if "arithmetic_fast" in effects else wp.log
-    # `mean` holds sums over the layer's fragments, each times its optical depth; of boxes, times its opacity
-    fields = {"plane": wp.int32, "opacity": wp.float32, "ink": wp.float32, "mean": Seen}
-    fields |= {"thickest": wp.float32} if heaviest else {}
+    gathers, averages = (output.functions(outputs, part) for part in ("gather", "average"))
+    # tau: optical depth; `mean`: sums over fragments, each times its optical depth; of boxes, its opacity
+    fields = {"plane": wp.int32, "opacity": wp.float32, "tau": wp.float32, "mean": Seen}
+    fields |= output.fields(outputs, "layer")
     Layer = struct_of("Layer", "What a sample sees of one plane; plane -1: nothing.", fields)
 
     @wp.func
@@ -36,16 +37,16 @@ def make_layer(Seen, effects: tuple[str, ...]) -> SimpleNamespace:
 
     @wp.func
     def depth(layer: Layer) -> float:
-        return layer.mean.z / layer.ink
+        return layer.mean.z / layer.tau
 
     @wp.func
     def shown(layer: Layer):
         """What the layer shows as one thing."""
         seen = layer.mean
-        seen.rgb = layer.mean.rgb / layer.ink
+        seen.rgb = layer.mean.rgb / layer.tau
         seen.z = depth(layer)
-        if wp.static(normal):
-            seen.normal = layer.mean.normal / layer.ink
+        for k in range(wp.static(len(averages))):
+            seen = wp.static(averages[k])(seen, layer.tau)
         return seen
 
     @wp.func
@@ -63,27 +64,19 @@ def make_layer(Seen, effects: tuple[str, ...]) -> SimpleNamespace:
     def gather_box(layer: Layer, plane: int, seen: Seen, opacity: float):
         """The layer with one more box: they lie side by side, so what they cover adds up."""
         after = mixed_in(layer, plane, seen, opacity)
-        after.opacity = wp.min(after.ink, 1.0)
+        after.opacity = wp.min(after.tau, 1.0)
         return after
 
     @wp.func
     def mixed_in(layer: Layer, plane: int, seen: Seen, tau: float):
-        """The layer with more ink, tau, that shows `seen`."""
+        """The layer with a fragment of optical depth tau that shows `seen`."""
         after = layer
         after.plane = plane
-        after.ink = layer.ink + tau
-        mean = layer.mean
-        mean.rgb = layer.mean.rgb + tau * seen.rgb
-        mean.z = fma(tau, seen.z, layer.mean.z)
-        if wp.static(normal):
-            mean.normal = layer.mean.normal + tau * seen.normal
-        if wp.static(heaviest):
-            if tau > layer.thickest:
-                after.thickest = tau
-                mean.heaviest = seen.heaviest
-        if wp.static(blended):
-            mean.blended = layer.mean.blended + seen.blended
-        after.mean = mean
+        after.tau = layer.tau + tau
+        after.mean.rgb = layer.mean.rgb + tau * seen.rgb
+        after.mean.z = fma(tau, seen.z, layer.mean.z)
+        for k in range(wp.static(len(gathers))):
+            after = wp.static(gathers[k])(after, seen, tau)
         return after
 
     return SimpleNamespace(
@@ -91,13 +84,13 @@ def make_layer(Seen, effects: tuple[str, ...]) -> SimpleNamespace:
     )
 
 
-def make_laying(layer: SimpleNamespace, Pixel, lay) -> SimpleNamespace:
-    """lay_before and begin: when the pending layers `open` and `waiting` of a Pixel are laid by `lay`."""
+def make_pending(layer: SimpleNamespace, Pixel, composite) -> SimpleNamespace:
+    """composite_before and begin: when the pending layers `open` and `waiting` of a Pixel are composited."""
     nothing, depth, shown = layer.nothing, layer.depth, layer.shown
 
     @wp.func
-    def lay_before(pixel: Pixel, z: float, view: View):
-        """The pixel with its pending layers laid that lie before depth z, the nearer first."""
+    def composite_before(pixel: Pixel, z: float, view: View):
+        """The pixel with its pending layers composited that lie before depth z, the nearer first."""
         p = pixel
         for turn in range(2):
             has_open = bool(False)
@@ -113,25 +106,25 @@ def make_laying(layer: SimpleNamespace, Pixel, lay) -> SimpleNamespace:
                 else:
                     has_open = False
             if has_waiting:
-                p = lay(p, shown(p.waiting), p.waiting.opacity, view)
+                p = composite(p, shown(p.waiting), p.waiting.opacity, view)
                 p.waiting = nothing()
             if has_open:
-                p = lay(p, shown(p.open), p.open.opacity, view)
+                p = composite(p, shown(p.open), p.open.opacity, view)
                 p.open = nothing()
         return p
 
     @wp.func
     def begin(pixel: Pixel, view: View):
-        """The pixel with no open layer: it waits, and of two that would wait the nearer is laid."""
+        """The pixel with no open layer: it waits, and of two that would wait the nearer is composited."""
         p = pixel
         if p.waiting.plane >= 0:
             if depth(p.open) < depth(p.waiting):
-                p = lay(p, shown(p.open), p.open.opacity, view)
+                p = composite(p, shown(p.open), p.open.opacity, view)
                 p.open = nothing()
                 return p
-            p = lay(p, shown(p.waiting), p.waiting.opacity, view)
+            p = composite(p, shown(p.waiting), p.waiting.opacity, view)
         p.waiting = p.open
         p.open = nothing()
         return p
 
-    return SimpleNamespace(lay_before=lay_before, begin=begin)
+    return SimpleNamespace(composite_before=composite_before, begin=begin)

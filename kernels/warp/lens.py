@@ -21,19 +21,6 @@ COEFFICIENTS = {
 seen
 """
 LENSES = (*COEFFICIENTS, "camera_equirectangular")
-SLOPES = wp.types.matrix((2, 3), wp.float32)
-
-
-@cache
-def make_rays(given: bool, sloped: bool = False):
-    """The struct of what a sample reads: nothing, if all rays follow from the view; with their derivatives,
-    if `sloped`.
-    """
-    # X, Y, Z along the rows of samples; NaN where nothing is seen
-    fields = {"rays": wp.array(dtype=wp.vec3)}
-    # its derivatives by the sample's column, and by its row
-    fields |= {"slopes": wp.array(dtype=SLOPES)} if sloped else {}
-    return struct_of("Rays", "The samples' rays.", fields if given else {})
 
 
 @cache

@@ -47,25 +47,25 @@ def gather(
 @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
 def find_starts(
     first: int,
-    count: int,  # pairs
+    pairs: int,
     band_first: int,
     tiles: wp.array(dtype=wp.int32),  # sorted
     starts: wp.array(dtype=wp.int32),  # out: where each tile's list begins
 ):
     tile = band_first + first + wp.tid()
     # Warp's search answers with its last place at most, so its end is one further
-    starts[tile] = wp.lower_bound(tiles, 0, count + 1, tile)
+    starts[tile] = wp.lower_bound(tiles, 0, pairs + 1, tile)
 
 
 @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
 def sum_up(
-    count: int,
+    splats: int,
     places: wp.array(dtype=wp.int32),  # inclusive sums
-    ends: wp.array(dtype=wp.int64),  # inclusive sums
+    ends_by_index: wp.array(dtype=wp.int64),  # inclusive sums
     totals: wp.array(dtype=wp.int64),  # (2) out: splats drawn, pairs
 ):
-    totals[0] = wp.int64(places[count - 1])
-    totals[1] = ends[count - 1]
+    totals[0] = wp.int64(places[splats - 1])
+    totals[1] = ends_by_index[splats - 1]
 
 
 @wp.func
@@ -92,7 +92,7 @@ def make_lists(screen: bool) -> SimpleNamespace:
         order: wp.array(dtype=wp.int32),
         windows: wp.array(dtype=wp.uint64),
         bounds: wp.array(dtype=Bounds),
-        totals: wp.array(dtype=wp.int32),  # out: length of each tile's list; sums of integers have no order
+        tile_totals: wp.array(dtype=wp.int32),  # out: lengths of lists; sums of integers have no order
     ):
         index = order[wp.tid() + first]
         corner, bits = window_of(windows[index])
@@ -102,10 +102,10 @@ def make_lists(screen: bool) -> SimpleNamespace:
             while row < end:
                 left, right = limits.tile_span(b, row, view)
                 for column in range(left, right):
-                    wp.atomic_add(totals, row * view.tiles_x + column, 1)
+                    wp.atomic_add(tile_totals, row * view.tiles_x + column, 1)
                 row += 1
         while bits != NONE:
-            wp.atomic_add(totals, window_tile(corner, lowest(bits), view), 1)
+            wp.atomic_add(tile_totals, window_tile(corner, lowest(bits), view), 1)
             bits = bits & (bits - ONE)
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)

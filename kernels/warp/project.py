@@ -16,6 +16,7 @@ from functools import cache
 
 import warp as wp
 
+from . import output
 from .bounds import PAD, PAD_RELATIVE, Bounds, box_bounds, make_bounds
 from .boxes import make_boxes
 from .color import make_color
@@ -36,16 +37,21 @@ NONE, BITS = wp.constant(wp.uint32(0)), wp.constant(wp.uint64(32))
 
 
 @cache
-def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_bounds: bool):
-    """The kernel for these record effects; sh_terms: coefficients per colour, 0 for plain colours;
-    every_bounds: bounds are written of all that is drawn, not only of splats that touch more than a window.
+def make_project(
+    effects: tuple[str, ...], outputs: tuple[str, ...], sh_terms: int, precision: str, every_bounds: bool
+):
+    """The kernel for these effects and outputs that matter to records; sh_terms: coefficients per colour, 0
+    for plain colours; every_bounds: bounds are written of all that is drawn, not only of splats that touch
+    more than a window.
     """
-    layout = Layout(effects)
+    layout = Layout(effects, outputs)
     lines_each = layout.lines
-    has_normal, has_depth, screen, filtered, layers = (
-        name in effects
-        for name in ("normal", "ray_depth", "lowpass_screen", "lowpass_pixel", "compose_planes")
+    has_depth, screen, filtered, layers = (
+        name in effects for name in ("ray_depth", "lowpass_screen", "lowpass_pixel", "compose_planes")
     )
+    recorded = output.having(outputs, "project")
+    projects = output.functions(recorded, "project")
+    places = [layout.word(output.declared(name).record[0]) for name in recorded]
     real = wp.float64 if precision == "float64" else wp.float32
     vec2, vec3, vec4 = (wp.types.vector(n, real) for n in (2, 3, 4))
     mat33 = wp.types.matrix((3, 3), real)
@@ -69,13 +75,10 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
     optics = make_optics(camera, real) if camera else None
     Lens = make_lens(camera)
     slopes_at = make_slopes("camera_orthographic" if parallel else camera, real)
-    word = {name: layout.names.index(name) for name in layout.names}
-    extras = ("dot_x", "z_numerator", "nx", "edge_u0", "nuz", "plane_z0", "boxed")
-    first_extra = {name: word.get(name, 0) for name in extras}
-    at_dot, at_depth, at_normal = first_extra["dot_x"], first_extra["z_numerator"], first_extra["nx"]
-    at_edges, at_box = first_extra["edge_u0"], word["columns"]
-    at_ray, at_plane = first_extra["nuz"], first_extra["plane_z0"]
-    at_flag = first_extra["boxed"]
+    at_dot, at_depth, at_edges, at_ray, at_plane, at_flag, at_box = (
+        layout.word(name)
+        for name in ("dot_x", "z_numerator", "edge_u0", "nuz", "plane_z0", "boxed", "columns")
+    )
 
     @wp.func
     def seen(a: vec3, b: vec3, p: vec3, radius: real, reach: real, x: real, y: real, view: View, lens: Lens):
@@ -359,12 +362,8 @@ def make_project(effects: tuple[str, ...], sh_terms: int, precision: str, every_
             record[at_depth] = float(height * facing)
             record[at_depth + 1] = float(depth)
             record[at_depth + 2] = float(reach)
-        if wp.static(has_normal):
-            # the camera is on one side of the whole plane, so the sign is the splat's (numerics B7)
-            towards = wp.where(height > zero, -one, one)
-            record[at_normal] = float(normal[0] * towards)
-            record[at_normal + 1] = float(normal[1] * towards)
-            record[at_normal + 2] = float(normal[2] * towards)
+        for k in range(wp.static(len(projects))):
+            record = wp.static(projects[k])(record, wp.static(places[k]), normal, height)
         for line in range(wp.static(lines_each)):
             k = 4 * line
             store_line(

@@ -1,22 +1,14 @@
 """Where each number of a visible splat's record lies."""
 
+from collections.abc import Iterable
+
+from . import output
+
 _FORMS = (
-    "nu0",
-    "nux",
-    "nuy",
-    "log_opacity",
-    "nv0",
-    "nvx",
-    "nvy",
-    "d_near",
-    "d0",
-    "dx",
-    "dy",
-    "ax",
-    "ay",
-    "r",
-    "g",
-    "b",
+    *("nu0", "nux", "nuy", "log_opacity"),
+    *("nv0", "nvx", "nvy", "d_near"),
+    *("d0", "dx", "dy", "ax"),
+    *("ay", "r", "g", "b"),
 )
 # 1 / |gradient| of D + n_u, D - n_u, D + n_v, D - n_v; all 0: no box
 _EDGES = ("edge_u0", "edge_u1", "edge_v0", "edge_v1")
@@ -29,7 +21,6 @@ _WHOLE = {
 _EXTRA = {
     "lowpass_screen": ("dot_x", "dot_y"),
     "ray_depth": ("z_numerator", "z_center", "z_reach"),
-    "normal": ("nx", "ny", "nz"),
 }
 
 
@@ -42,10 +33,10 @@ class Layout:
     the depth. columns and rows hold first and end, 16 bits each, of the box of samples that it can touch.
     Behind a lens x, y, z are a sample's ray from the anchor's (ray_x, ray_y, ray_z), and boxed is 1 of a box,
     0 of another splat. For parallel rays plane_z0 + plane_zx x + plane_zy y is D times the depth, which is at
-    least plane_near.
+    least plane_near. At last stands what outputs add.
     """
 
-    def __init__(self, effects: tuple[str, ...]) -> None:
+    def __init__(self, effects: Iterable[str], outputs: Iterable[str] = ()) -> None:
         # before the rest, so that they begin a line
         whole = [name for effect in effects for name in _WHOLE.get(effect, ())]
         extra = [name for effect in effects for name in _EXTRA.get(effect, ())]
@@ -53,9 +44,14 @@ class Layout:
             whole += _EDGES if any(name in effects for name in BOXES) else ()
         elif "footprint_mixed" in effects:
             extra.append("boxed")
+        extra += [name for each in outputs for name in output.declared(each).record]
         self.names = [*_FORMS, *whole, "columns", "rows", *extra]
         self.lines = -(-len(self.names) // 4)
 
     def place(self, name: str) -> tuple[int, int]:
         """Line and lane of a number; (0, 0) for one that this record has not, which no kernel then reads."""
-        return divmod(self.names.index(name), 4) if name in self.names else (0, 0)
+        return divmod(self.word(name), 4)
+
+    def word(self, name: str) -> int:
+        """Its place among all numbers; 0 for one that this record has not."""
+        return self.names.index(name) if name in self.names else 0

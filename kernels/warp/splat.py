@@ -11,9 +11,9 @@ from .staging import make_staging
 
 
 @cache
-def make_splat(effects: tuple[str, ...]) -> SimpleNamespace:
+def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
     """Splat; load and load_staged; and `staging`, what brings splats to the threads of a GPU block."""
-    layout = Layout(effects)
+    layout = Layout(effects, outputs)
     each = layout.lines
     staging = make_staging(layout)
     staged_line = staging.line

@@ -7,7 +7,7 @@ from functools import cache
 import warp as wp
 
 from .common import STRICT, View, fma, store_line, struct_of
-from .sight import make_sight
+from .rays import make_rays
 
 TURN = wp.constant(0.15915494309189535)
 """1 / (2 pi)"""
@@ -19,41 +19,44 @@ KINDS = {
 
 
 @cache
-def make_around(kind: str):
+def struct_of_surroundings(kind: str):
     """The struct of the numbers of this kind of background."""
-    return struct_of("Around", "What lies behind everything.", KINDS[kind])
+    return struct_of("Surroundings", "What lies behind everything.", KINDS[kind])
 
 
 @cache
 def make_backdrop(kind: str, bent: bool):
     """The kernel that adds this kind of background to the samples; bent: rays are a lens's own."""
-    Around, sight = make_around(kind), make_sight(bent)
-    Rays, ray_of = sight.Rays, sight.ray_of
+    Surroundings, rays = struct_of_surroundings(kind), make_rays(bent)
+    Rays, ray_of = rays.Rays, rays.ray_of
 
     @wp.func
-    def gradient(around: Around, ray: wp.vec3) -> wp.vec3:
+    def gradient(surroundings: Surroundings, ray: wp.vec3) -> wp.vec3:
         """By the sine of the ray's height above the horizon."""
-        share = wp.clamp(0.5 + 0.5 * wp.dot(ray, around.up) / wp.length(ray), 0.0, 1.0)
-        return around.bottom + share * (around.top - around.bottom)
+        share = wp.clamp(0.5 + 0.5 * wp.dot(ray, surroundings.up) / wp.length(ray), 0.0, 1.0)
+        return surroundings.bottom + share * (surroundings.top - surroundings.bottom)
 
     @wp.func
-    def pixel_of(around: Around, column: int, row: int) -> wp.vec3:
+    def pixel_of(surroundings: Surroundings, column: int, row: int) -> wp.vec3:
         """Round the seam, and the first and last row for what lies beyond them."""
-        height, width = around.image.shape[0], around.image.shape[1]
-        return around.image[wp.clamp(row, 0, height - 1), (column + width) % width]
+        height, width = surroundings.image.shape[0], surroundings.image.shape[1]
+        return surroundings.image[wp.clamp(row, 0, height - 1), (column + width) % width]
 
     @wp.func
-    def panorama(around: Around, ray: wp.vec3) -> wp.vec3:
+    def panorama(surroundings: Surroundings, ray: wp.vec3) -> wp.vec3:
         """Bilinear; the middle column lies towards +z, to the right of it is +x, the top row is -y."""
         flat = wp.sqrt(fma(ray[0], ray[0], ray[2] * ray[2]))
-        height, width = float(around.image.shape[0]), float(around.image.shape[1])
+        height, width = float(surroundings.image.shape[0]), float(surroundings.image.shape[1])
         u = fma(fma(wp.atan2(ray[0], ray[2]), TURN, 0.5), width, -0.5)
         v = fma(fma(wp.atan2(ray[1], flat), 2.0 * TURN, 0.5), height, -0.5)
         column, row = int(wp.floor(u)), int(wp.floor(v))
         across, down = u - wp.floor(u), v - wp.floor(v)
-        above = wp.lerp(pixel_of(around, column, row), pixel_of(around, column + 1, row), across)
-        below = wp.lerp(pixel_of(around, column, row + 1), pixel_of(around, column + 1, row + 1), across)
-        return wp.lerp(above, below, down)
+        above = between(surroundings, column, row, across)
+        return wp.lerp(above, between(surroundings, column, row + 1, across), down)
+
+    @wp.func
+    def between(surroundings: Surroundings, column: int, row: int, share: float) -> wp.vec3:
+        return wp.lerp(pixel_of(surroundings, column, row), pixel_of(surroundings, column + 1, row), share)
 
     behind = {"gradient": gradient, "panorama": panorama}[kind]
 
@@ -61,7 +64,7 @@ def make_backdrop(kind: str, bent: bool):
     def backdrop(
         first: int,  # sample of thread 0, of those of the picture, row by row
         view: View,
-        around: Around,
+        surroundings: Surroundings,
         rays: Rays,
         color: wp.array(dtype=wp.vec4),  # in and out: r, g, b, transmittance
     ):
@@ -72,7 +75,7 @@ def make_backdrop(kind: str, bent: bool):
             at = row * view.tiles_x * view.tile_w + column
             light = color[at]
             # in the axes of the world
-            seen = behind(around, wp.transpose(wp.mat33(view.rotation)) * ray)
+            seen = behind(surroundings, wp.transpose(wp.mat33(view.rotation)) * ray)
             for channel in range(3):
                 light[channel] = fma(light[3], seen[channel], light[channel])
             store_line(color, at, light)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.opencl.memory import Resident
+from fidsplat.backends.opencl.resident import Resident
 from fidsplat.cli import main
 from fidsplat.experiments.sweep import read_records
 from fidsplat.experiments.tradeoff import compare, run
@@ -174,7 +174,7 @@ def test_memory_is_that_of_the_setting_alone(session):
 def test_memory_does_not_hang_on_what_was_drawn_before(session, monkeypatch):
     """As on a GPU, where a cloud keeps its colours once a picture has asked for them."""
     held = property(lambda self: sum(buffer.size for buffer in self._buffers.values()))
-    monkeypatch.setattr(Resident, "device_bytes", held)
+    monkeypatch.setattr(Resident, "memory_bytes", held)
     before = memory_of(session, "apriltag@0", BASE)
     session.draw("apriltag@0", BASE.with_(samples=2))
     assert before is not None

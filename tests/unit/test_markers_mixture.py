@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from fidsplat.errors import InputError
+from fidsplat.markers.kinds import bits_of, parse_spec
 from fidsplat.markers.mixture import (
     OVERLAP,
     Template,
@@ -21,7 +22,6 @@ from fidsplat.markers.mixture import (
 )
 from fidsplat.markers.partition import partition
 from fidsplat.markers.seams import LONG, grow
-from fidsplat.markers.spec import bits_of, parse_spec
 from fidsplat.quality import TEMPLATE_SIZES
 from fidsplat.vision.dictionaries import dictionary_bits, families
 

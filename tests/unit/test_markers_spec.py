@@ -6,7 +6,8 @@ import pytest
 
 from fidsplat.errors import InputError
 from fidsplat.markers import marker, parse_spec
-from fidsplat.markers.spec import bits_of, qr_capacity
+from fidsplat.markers.kinds import bits_of
+from fidsplat.markers.qr import qr_capacity
 from fidsplat.vision.detect import detect
 from fidsplat.vision.dictionaries import dictionary_bits, families
 

@@ -28,7 +28,9 @@ def cloud_of(n=5, seed=0, **changes):
     return fs.SplatCloud(**fields | changes)
 
 
-def fake_marker(spec, size=1.0, mixture=None, quiet_zone=None, quality=None, max_splats=1_000_000, **own):
+def fake_marker(
+    spec, size=1.0, mixture=None, quiet_zone=None, quality=None, max_splats=1_000_000, progress=None, **own
+):
     """What a scene needs of a marker, without partitioning one: two splats and four corners."""
     if "unknown" in spec:
         raise fs.InputError(f"unknown spec {spec!r}")

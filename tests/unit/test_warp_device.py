@@ -11,9 +11,9 @@ import pytest
 from agreement import ALL_OUTPUTS, random_splats
 
 import fidsplat as fs
-from fidsplat.backends.warp import backend as warp_backend
+from fidsplat.backends.warp import device as warp_device
 from fidsplat.backends.warp import runtime
-from fidsplat.backends.warp.pipeline import KNOWN
+from fidsplat.backends.warp.program import known
 from fidsplat.effects import CATALOGUE, FeatureSet
 
 wp = pytest.importorskip("warp")
@@ -95,13 +95,12 @@ def test_an_effect_that_warp_lacks_is_an_error_that_names_both(renderer):
 
 def test_what_warp_lacks_stands_in_its_page():
     page = (Path(__file__).parents[2] / "docs" / "backends.md").read_text("utf-8")
-    assert set(CATALOGUE) >= KNOWN
-    for name in set(CATALOGUE) - KNOWN:
+    for name in set(CATALOGUE) - known():
         assert f"`{name}`" in page, name
 
 
 def test_a_panorama_is_on_the_device_once_and_as_long_as_it_is_used(renderer):
-    held, before = renderer.backend.panoramas, len(renderer.backend.panoramas)
+    held, before = renderer.backend.workspace.panoramas, len(renderer.backend.workspace.panoramas)
     sky = fs.Panorama(np.random.default_rng(1).uniform(0, 1, (8, 16, 3)))
     first, second = (renderer.render(CLOUD, CAMERA, names, background=sky) for names in ("rgb", "alpha"))
     assert len(held) == before + 1
@@ -272,14 +271,14 @@ def test_arrays_of_another_device_are_refused():
 
 def test_warp_pipelines_share_kernels_that_mean_the_same():
     """A stage is compiled once for all feature sets that it cannot tell apart."""
-    backend = warp_backend.open_device("cpu")
+    backend = warp_device.open_device("cpu")
     slots = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "compose_ordered")
     one, two = (
         backend.pipeline(FeatureSet(slots, taps, 0, n, "float64")) for taps, n in (((), 1), (("alpha",), 2))
     )
-    assert one.project is two.project
-    assert one.blend is two.blend
-    assert one.resolve is not two.resolve
+    assert one.program.project is two.program.project
+    assert one.program.blend is two.program.blend
+    assert one.program.resolve is not two.program.resolve
     assert one is backend.pipeline(FeatureSet(slots, (), 0, 1, "float64"))
 
 
@@ -300,7 +299,7 @@ def test_a_memory_budget_draws_in_bands_with_the_same_bits():
     wanted = fs.Renderer("warp:cpu").render(cloud, view, ALL_OUTPUTS)
     own = fs.Renderer("warp:cpu", memory_budget=6_894_400)
     frame = own.render(cloud, view, ALL_OUTPUTS)
-    assert own.backend.pool._arrays["tile totals", wp.int32].size == 300, "it was drawn in bands"
+    assert own.backend.workspace.pool._arrays["tile_totals", wp.int32].size == 300, "it was drawn in bands"
     assert frame.stats == wanted.stats
     assert all(np.array_equal(frame[name], wanted[name]) for name in ALL_OUTPUTS)
     with pytest.raises(fs.DeviceError, match=r"budget of 1 MiB is too small .* raise memory_budget"):
@@ -317,7 +316,7 @@ def test_a_memory_budget_counts_rays_and_the_planes_of_all_poses():
     wanted = fs.Renderer("warp:cpu").render(cloud, view, ("rgb", "depth"), **exposed)
     own = fs.Renderer("warp:cpu", memory_budget=7_400_000)
     frame = own.render(cloud, view, ("rgb", "depth"), **exposed)
-    assert own.backend.pool._arrays["tile totals", wp.int32].size == 300, "it was drawn in bands"
+    assert own.backend.workspace.pool._arrays["tile_totals", wp.int32].size == 300, "it was drawn in bands"
     assert all(np.array_equal(frame[name], wanted[name]) for name in ("rgb", "depth"))
     small = fs.Renderer("warp:cpu", memory_budget=5_500_000)
     small.render(cloud, view, ("rgb", "depth"))
@@ -331,9 +330,9 @@ def test_poison_reaches_every_array(renderer, monkeypatch):
 
     taken, poison = [], probe.poison
     monkeypatch.setattr(probe, "poison", lambda array: taken.append(poison(array)) or taken[-1])
-    with probe.poisoned(renderer.backend):
+    with renderer.backend.probe().poisoned():
         renderer.render(CLOUD, CAMERA, ("rgb", "depth"))
-        again = renderer.backend.pool.scratch("lines", 4, wp.vec4)
+        again = renderer.backend.workspace.pool.scratch("lines", 4, wp.vec4)
     assert len(taken) > 15
     assert (again.numpy().view(np.uint8) == 0xFF).all()
 
@@ -341,4 +340,4 @@ def test_poison_reaches_every_array(renderer, monkeypatch):
 @pytest.mark.parametrize("size", [2**46, 2**31])
 def test_an_array_that_the_device_cannot_give_is_an_error_with_a_remedy(renderer, size):
     with pytest.raises(fs.DeviceError, match=r"lists needs \d+ MiB, which .* use fewer splats or a smaller"):
-        renderer.backend.pool.fresh("lists", size, wp.int32)
+        renderer.backend.workspace.pool.fresh("lists", size, wp.int32)

@@ -3,6 +3,6 @@
 Nothing here imports warp until a device is asked for.
 """
 
-from fidsplat.backends.warp.backend import devices, open_device
+from fidsplat.backends.warp.device import devices, open_device
 
 __all__ = ["devices", "open_device"]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from fidsplat.backends.warp import runtime
-
-if TYPE_CHECKING:
-    from fidsplat.backends.warp.backend import WarpBackend
+from fidsplat.backends.warp.runtime import load
 
 BLOCK = 256
 """threads of a block on a GPU, where nothing else is said"""
@@ -17,18 +17,34 @@ _SMALLEST = 2048
 """threads of a kernel below which a piece of a CPU launch is not worth its call"""
 
 
-class Commands:
-    """Launches kept from picture to picture: what has not changed since the last need not be packed again."""
+@cache
+def _arguments(kernel: Any) -> tuple[str, ...]:
+    return tuple(argument.label for argument in kernel.adj.args)
 
-    def __init__(self, device: Any) -> None:
-        self._wp, self._device = runtime.load(), device
+
+def _bound(kernel: Any, given: Mapping[str, Any], first: int = 0) -> list[Any]:
+    """The kernel's arguments from `first` on, by the names in its signature."""
+    return [given[name] for name in _arguments(kernel)[first:]]
+
+
+class Commands:
+    """Launches on one device, kept from picture to picture: what has not changed since the last need not be
+    packed again.
+    """
+
+    def __init__(self, device: Any, threads: int) -> None:
+        """threads: of the host, over which launches on the CPU are cut."""
+        self.device, self.threads = device, threads
+        # Warp runs a CPU launch on the thread that calls it, without the interpreter's lock
+        self.workers = None if device.is_cuda else ThreadPoolExecutor(threads, "fidsplat-warp")
+        self._wp = load()
         self._held: dict[tuple[Any, int], tuple[Any, list[Any], list[int]]] = {}
 
     def launch(self, kernel: Any, count: int, args: list[Any], block: int = BLOCK) -> None:
         """`count` threads of a kernel, in blocks of `block` on a GPU."""
         held = self._held.get((kernel, block))
         if held is None:
-            options = {"device": self._device, "block_dim": block, "record_tape": False, "record_cmd": True}
+            options = {"device": self.device, "block_dim": block, "record_tape": False, "record_cmd": True}
             command = self._wp.launch(kernel, count, args, **options)
             self._held[kernel, block] = command, list(args), [count]
         else:
@@ -44,17 +60,18 @@ class Commands:
 
 
 class Launcher:
-    """Launches of one picture."""
+    """Launches of one picture. Arguments are given by the names that a kernel's signature has for them."""
 
-    def __init__(self, backend: WarpBackend) -> None:
-        self._wp = runtime.load()
-        self._device, self._workers, self._commands = backend.device, backend.workers, backend.commands
-        self.pieces = 8 * backend.threads
+    def __init__(self, commands: Commands) -> None:
+        self._wp = load()
+        self._device, self._workers, self._commands = commands.device, commands.workers, commands
+        self.pieces = 8 * commands.threads
         """into which a CPU launch is cut, so that threads share uneven work"""
         self._marks: list[tuple[str | None, Any]] = []
 
-    def launch(self, kernel: Any, count: int, *args: Any, block: int = BLOCK) -> None:
+    def launch(self, kernel: Any, count: int, given: Mapping[str, Any], block: int = BLOCK) -> None:
         """`count` threads of a kernel whose first argument is the number of thread 0."""
+        args = _bound(kernel, given, 1)
         if self._workers is None:
             self._commands.launch(kernel, count, [0, *args], block)
             return
@@ -62,14 +79,17 @@ class Launcher:
         cuts = [count * k // pieces for k in range(pieces + 1)]
         self._each(kernel, [(first, end - first, [first, *args]) for first, end in pairwise(cuts)])
 
-    def blocks(self, kernel: Any, count: int, block: int, *args: Any) -> None:
-        """`count` threads in blocks of `block`."""
-        self._commands.launch(kernel, count, list(args), block)
+    def once(self, kernel: Any, count: int, given: Mapping[str, Any], block: int = BLOCK) -> None:
+        """`count` threads in one piece, whatever the device; all arguments are given."""
+        self._commands.launch(kernel, count, _bound(kernel, given), block)
 
-    def tiles(self, kernel: Any, first: int, end: int, area: int, *args: Any) -> None:
-        """A CPU thread for each tile; each piece has `area` samples of the state, the last argument."""
+    def tiles(self, kernel: Any, first: int, end: int, area: int, given: Mapping[str, Any]) -> None:
+        """A CPU thread for each tile; the kernel's first argument is the first tile of a piece, its last the
+        first of the `area` samples of state that the piece has.
+        """
         pieces = min(self.pieces, end - first)
         cuts = [first + (end - first) * k // pieces for k in range(pieces + 1)]
+        args = _bound(kernel, {**given, "state_first": 0}, 1)[:-1]
         spans = enumerate(pairwise(cuts))
         self._each(kernel, [(k, b - a, [a, *args, k * area]) for k, (a, b) in spans])
 
@@ -83,10 +103,6 @@ class Launcher:
             self._commands.launch(kernel, *pieces[0][1:])
         elif self._workers is not None:
             list(self._workers.map(run, pieces))  # a piece that fails raises here
-
-    def once(self, kernel: Any, count: int, *args: Any) -> None:
-        """`count` threads in one piece, whatever the device."""
-        self._commands.launch(kernel, count, list(args))
 
     def read_back(self, totals: Any, host: Any) -> list[int]:
         """A few integers from the device by way of `host`, as long: waits for all that was launched."""

@@ -1,177 +1,266 @@
-"""The stages of one FeatureSet, compiled for one Warp device."""
+"""One picture on a Warp device: the stages project, sort, bin, blend, resolve.
+
+The host reads two numbers between the stages, how many splats are drawn and how many pairs of splats and
+tiles there are: they size arrays and launches. A picture with more pairs than the device's budget is drawn in
+bands of tiles, with the same bits.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import View
-from fidsplat.backends.warp import exposure, lens, runtime, sensor
-from fidsplat.backends.warp.around import Surroundings
-from fidsplat.backends.warp.finished import WarpPlanes
-from fidsplat.backends.warp.launch import BLOCK, Launcher
-from fidsplat.backends.warp.memory import Resident
-from fidsplat.backends.warp.run import Run
-from fidsplat.effects import FeatureSet
+from fidsplat.backends.view import View
+from fidsplat.backends.warp import bands
+from fidsplat.backends.warp.exposure import gather
+from fidsplat.backends.warp.images import WarpImages
+from fidsplat.backends.warp.launch import BLOCK, Commands, Launcher
+from fidsplat.backends.warp.lens import lens_of, rays_of
+from fidsplat.backends.warp.motion import moving_of
+from fidsplat.backends.warp.program import Program
+from fidsplat.backends.warp.resident import Resident
+from fidsplat.backends.warp.runtime import kernels, load
+from fidsplat.backends.warp.surroundings import surroundings_of
+from fidsplat.backends.warp.uniforms import uniforms
+from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.errors import DeviceError
-
-if TYPE_CHECKING:
-    from fidsplat.backends.warp.backend import WarpBackend, WarpShape
-
-KNOWN = frozenset(
-    {"camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen", "lowpass_pixel"}
-    | {"stop_inclusive", "stop_exclusive", "compose_ordered", "compose_planes", "ray_depth"}
-    | {"arithmetic_precise", "arithmetic_fast", "shown"}
-    | {"perspective", "footprint_gaussian", "footprint_box", "footprint_mixed", "box_edges", "box_cover"}
-    | {"background_constant", "background_gradient", "background_panorama", "fog"}
-    | {"ray", "ray_length", "sample_length", "turn", "world_ray"}
-    | {"alpha", "depth", "depth_median", "depth_first", "distance", "distance_median", "distance_first"}
-    | {"normal", "normal_world", "label", "splat_id", "blended"}
-    | sensor.STEPS
-    | lens.EFFECTS
-    # shutter_rows changes no picture, and nothing here
-    | {"motion_groups", "shutter_exposure", "shutter_rows", "camera_orthographic"}
-)
-"""effects that kernels/warp has"""
-# of these depend on an effect: a stage is compiled once for all feature sets that mean the same to it
-_RECORD = (
-    *("lowpass_screen", "rays", "camera_orthographic", "ray_depth", "normal", "compose_planes"),
-    *("footprint_box", "footprint_mixed"),
-)
-_PROJECT = (
-    *(*_RECORD, "lowpass_pixel", "motion_groups"),
-    *("camera_brown_conrady", "camera_fisheye", "camera_equirectangular"),
-)
-_SAMPLE = (
-    *(*_RECORD, "stop_exclusive", "arithmetic_fast"),
-    *("depth", "depth_median", "depth_first", "heaviest", "blended", "fog", "rays_length"),
-)
 
 
 class WarpPipeline:
-    """Compiled stages."""
+    """The stages of one feature set on one device."""
 
-    def __init__(self, backend: WarpBackend, features: FeatureSet, shape: WarpShape) -> None:
-        names = {effect.name for effect in features.effects}
-        lacking = sorted(names - KNOWN)
-        if lacking:
-            raise DeviceError(
-                f"{backend.info.name} ({backend.info.platform}) has no {', '.join(lacking)}; "
-                "use an OpenCL device for it"
-            )
-        self.backend, self.features, self.shape = backend, features, shape
-        if names & {"label", "splat_id"}:
-            names |= {"heaviest"}  # both are the same splat's
-        record = tuple(name for name in _RECORD if name in names)
-        sample = tuple(name for name in _SAMPLE if name in names)
-        terms = (features.sh_degree + 1) ** 2 if "color_sh" in names else 0
-        screen = "lowpass_screen" in names
-        with runtime.quiet():
-            self.layout = runtime.kernels("records").Layout(record)
-            self.project = runtime.kernels("project").make_project(
-                tuple(name for name in _PROJECT if name in names),
-                terms,
-                features.setup_precision,
-                shape.schedule == "tiles",
-            )
-            self.project_block = runtime.kernels("project").BLOCK
-            self.lists = runtime.kernels("lists").make_lists(screen)
-            self.sort = runtime.kernels("lists")
-            self.block_dim = shape.tile_width * shape.tile_height
-            """threads that draw a tile on a GPU"""
-            self.blend, self.state = runtime.kernels("blend").make_blend(
-                sample, shape.schedule == "group", self.block_dim
-            )
-            planes = runtime.kernels("planes")
-            self.sample_planes = planes.of_samples(sample)
-            """type of an element of each"""
-            finished = tuple(output.name for output in features.outputs)
-            integers = tuple(output.name for output in features.outputs if output.dtype == "int32")
-            self.samples_type = planes.make_samples(tuple(self.sample_planes.items()))
-            self.outputs_type = planes.make_outputs(finished, integers)
-            self.surroundings = Surroundings.among(names, backend)
-            self.sloped = "rays_box" in names
-            """whether blending needs the derivatives of a lens's rays"""
-            self.stretched = "rays_sample_length" in names
-            """whether a lens gives rays the lengths that resolving needs"""
-            self.resolve = runtime.kernels("resolve").make_resolve(
-                finished, integers, tuple(self.sample_planes.items()), self.stretched, features.samples
-            )
-            common = [self.sort.compact, self.sort.gather, self.sort.find_starts, self.sort.sum_up]
-            self.sensor = sensor.Development.of(features.posts)
-            if self.surroundings:
-                common.append(self.surroundings.kernel)
-            if self.sensor:
-                common.append(self.sensor.kernel)
-            self.expose = exposure.kernels_of(self.sample_planes) if "shutter_exposure" in names else {}
-            """by the name of a plane of samples"""
-            common += self.expose.values()
-            for kernel in (self.project, self.lists.emit, self.blend, self.resolve, *common):
-                self._compile(kernel)
+    def __init__(self, program: Program, workspace: Workspace, commands: Commands) -> None:
+        self.program, self.workspace, self._commands = program, workspace, commands
 
-    def _compile(self, kernel: Any) -> None:
-        # here rather than at the first launch: several threads launch it
-        block = {self.blend: self.block_dim, self.project: self.project_block}.get(kernel, BLOCK)
-        if not self.backend.device.is_cuda:
-            block = 1
-        try:
-            loaded = kernel.module.load(self.backend.device, block)
-        except Exception as error:
-            raise DeviceError(f"{self.backend.info.name} cannot compile {kernel.key}: {error}") from error
-        if loaded is None:
-            raise DeviceError(
-                f"{self.backend.info.name} cannot compile {kernel.key}; Warp says more on stderr"
-            )
-
-    def load_banding(self) -> None:
-        """Compile what only a picture with more pairs than the budget needs."""
-        with runtime.quiet():
-            self._compile(self.lists.histogram)
-            self._compile(self.lists.count)
-
-    def render(self, resident: Resident, view: View) -> WarpPlanes:
+    def render(self, resident: Resident, view: View) -> WarpImages:
         """Draw one picture.
 
         Raises:
             DeviceError: the device runs out of memory or fails.
         """
-        return self._drawn(resident, view).planes
+        return self._drawn(resident, view).images
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Draw one picture and return what passes between the stages.
 
         keys (n,) uint32; order (visible,), splat indices by depth; starts (tiles + 1,); lists (pairs,), of
-        the last band;
-        records (n, words) float32 (undefined for culled splats); raw (4, rows, columns) float32: r, g, b,
-        transmittance of the
-        padded sample grid; and the finished outputs by name.
+        the last band; records (n, words) float32 (undefined for culled splats); raw (4, rows, columns)
+        float32: r, g, b, transmittance of the padded sample grid; and the finished outputs by name.
         """
-        run = self._drawn(resident, view)
-        stats = run.planes.stats
-        rows, stride = run.grid
-        raw = run.held["raw color"].numpy()[: rows * stride]
+        picture = self._drawn(resident, view)
+        held, stats, n = picture.held, picture.images.stats, resident.count
+        rows, stride = picture.grid
+        raw = held["raw color"].numpy()[: rows * stride]
+        lines = held["lines"].numpy()[: n * self.program.layout.lines]
         return {
-            "keys": run.held["keys"].numpy()[: resident.count].copy(),
-            "order": run.held["order"].numpy()[: stats["visible"]].astype(np.uint32),
-            "starts": run.held["starts"].numpy()[: run.tiles + 1].astype(np.uint32),
-            "lists": run.held["lists"].numpy()[: stats["pairs"]].astype(np.uint32),
-            "records": run.held["lines"]
-            .numpy()[: resident.count * self.layout.lines]
-            .reshape(resident.count, -1)
-            .copy(),
+            "keys": held["keys"].numpy()[:n].copy(),
+            "order": held["order"].numpy()[: stats["visible"]].astype(np.uint32),
+            "starts": held["starts"].numpy()[: picture.tiles + 1].astype(np.uint32),
+            "lists": held["lists"].numpy()[: stats["pairs"]].astype(np.uint32),
+            "records": lines.reshape(n, -1).copy(),
             "raw": raw.reshape(rows, stride, 4).transpose(2, 0, 1).copy(),
-            **{output.name: run.planes.read(output.name) for output in self.features.outputs},
+            **{output.name: picture.images.read(output.name) for output in self.program.images},
         }
 
-    def _drawn(self, resident: Resident, view: View) -> Run:
-        wp = runtime.load()
+    def _drawn(self, resident: Resident, view: View) -> Picture:
         try:
-            with wp.ScopedDevice(self.backend.device):
-                run = Run(self, resident, view, Launcher(self.backend))
-                run.draw()
-                return run
+            with load().ScopedDevice(self.workspace.device):
+                picture = Picture(self.program, self.workspace, resident, view, Launcher(self._commands))
+                picture.draw()
+                return picture
         except RuntimeError as error:
             if isinstance(error, DeviceError):
                 raise
-            raise DeviceError(f"{self.backend.info.name} failed while drawing: {error}") from error
+            raise DeviceError(f"{self.workspace.name} failed while drawing: {error}") from error
+
+
+class Picture:
+    """One picture: the stages in order, each a method."""
+
+    def __init__(
+        self,
+        program: Program,
+        workspace: Workspace,
+        resident: Resident,
+        view: View,
+        launcher: Launcher,
+        beside: int = 0,
+    ) -> None:
+        """beside: bytes on the device that belong to the picture of which this one is a part."""
+        self.program, self.workspace, self.pool = program, workspace, workspace.pool
+        self.resident, self.view, self.launcher, self.beside = resident, view, launcher, beside
+        self.wp = load()
+        u = uniforms(view, program.shape, program.sloped)
+        self.tiles = u.tiles_x * u.tiles_y
+        self.grid = u.tiles_y * u.tile_h, u.tiles_x * u.tile_w
+        self.held: dict[str, Any] = {"view": u}
+        """arrays and structs by the names that kernels' signatures have for them"""
+        self.stats: dict[str, int] = {"splats": resident.count, "visible": 0, "pairs": 0}
+
+    def draw(self) -> None:
+        """All stages; `images` are the finished ones."""
+        samples = self._exposed() if self.view.shots else self._drawn()
+        self.launcher.stage("resolve")
+        self.images = self._resolve(samples)
+        self.launcher.stage(None)
+
+    def _exposed(self) -> Any:
+        """All stages but the last of each shot, and what their samples are together."""
+        whole = self._samples("exposed")
+        beside = bands.image_bytes(self.program, self.view, self.grid)
+        for shot in self.view.shots:
+            part = Picture(self.program, self.workspace, self.resident, shot.view, self.launcher, beside)
+            samples = part._drawn()
+            self.launcher.stage("expose")
+            gather(self.program, self.launcher, shot, samples, whole, self.grid[1])
+            self.stats = {name: max(value, part.stats[name]) for name, value in self.stats.items()}
+        return whole
+
+    def _drawn(self) -> Any:
+        """All stages but the last; sample buffers."""
+        wp, n, program = self.wp, self.resident.count, self.program
+        self._take("starts", self.tiles + 1, wp.int32)
+        self._take("lists", 1, wp.int32)
+        self._take("order", 1, wp.int32)
+        self._take("bounds", n, kernels("bounds").Bounds)
+        self._take("lines", n * program.layout.lines, wp.vec4)
+        self.launcher.stage("project")
+        self.held["lens"] = lens_of(self.view, self.workspace)
+        rays = rays_of(self.view, self.workspace, sloped=program.sloped)
+        visible, pairs = self._project() if n else (0, 0)
+        self.launcher.stage("sort")
+        if pairs:
+            self._sort(visible)
+        samples = self._samples("raw")
+        for first, end, listed in self._bands(visible, pairs):
+            self.launcher.stage("bin")
+            self._list(visible, first, end, listed, whole=listed == pairs)
+            self.launcher.stage("blend")
+            self._blend(first, end, rays, samples)
+        if program.backdrop:
+            # here, as shots may look in different directions
+            self.launcher.stage("resolve")
+            given = {"surroundings": surroundings_of(self.view, self.workspace), "color": samples.color}
+            # without the derivatives that blending may have: a struct of another type
+            given["rays"] = rays_of(self.view, self.workspace)
+            self._launch(program.backdrop, self.view.width * self.view.height, **given)
+        self.stats |= {"visible": visible, "pairs": pairs}
+        return samples
+
+    # stages
+
+    def _project(self) -> tuple[int, int]:
+        wp, n, sort = self.wp, self.resident.count, self.program.sort
+        self._take("windows", n, wp.uint64)
+        self._take("keys", n, wp.uint32)
+        counts, ends = self._exact("counts", n, wp.int64), self._exact("ends_by_index", n, wp.int64)
+        drawn, places = self._exact("drawn", n, wp.int32), self._exact("places", n, wp.int32)
+        cloud = {"boxes": drawn} | self.resident.arrays  # not read where all are of one kind
+        cloud |= {"moving": moving_of(self.resident, self.view, self.pool)} | self._planes()
+        self._launch(self.program.project, n, block=self.program.project_block, **cloud)
+        wp.utils.array_scan(drawn, places, inclusive=True)
+        wp.utils.array_scan(counts, ends, inclusive=True)
+        totals = self._take("totals", 2, wp.int64)
+        self.launcher.once(sort.sum_up, 1, {**self.held, "splats": n})
+        visible, pairs = self.launcher.read_back(totals, self.pool.host("totals", 2, wp.int64))
+        return visible, pairs
+
+    def _planes(self) -> dict[str, Any]:
+        """Each splat's plane, and the planes' sort keys in this view."""
+        wp, table = self.wp, self.resident.planes
+        if table is None or not self.program.layered:
+            none = self._take("no planes", 1, wp.int32), self._take("no plane keys", 1, wp.float32)
+            return dict(zip(("planes", "plane_keys"), none, strict=True))
+        keys = self.pool.filled("plane keys", table.keys(self.view), wp.float32)
+        return {"planes": self.resident.arrays["planes"], "plane_keys": keys}
+
+    def _sort(self, visible: int) -> None:
+        """Splats that are drawn by depth, ties by index."""
+        # the sort takes the second half as its scratch
+        keys = self._take("sorted_keys", 2 * visible, self.wp.uint32)
+        order = self._take("order", 2 * visible, self.wp.int32)
+        self._launch(self.program.sort.compact, self.resident.count)
+        self.wp.utils.radix_sort_pairs(keys, order, visible)
+
+    def _bands(self, visible: int, pairs: int) -> Iterator[tuple[int, int, int]]:
+        """Ranges of tiles (first, end, pairs) whose lists fit the budgets; one, unless they are long."""
+        images = bands.image_bytes(self.program, self.view, self.grid) + self.beside
+        most = bands.room(self.program, self.workspace, self.resident, self.view, visible, images)
+        if pairs <= most:
+            return iter([(0, self.tiles, pairs)])
+        totals = self._take("tile_totals", self.tiles, self.wp.int32)
+        totals.zero_()
+        self.program.load_banding()
+        # in one piece: on the CPU its sums are plain additions
+        self.launcher.once(self.program.lists.histogram, visible, {**self.held, "first": 0})
+        return bands.cut(totals.numpy()[: self.tiles], most)
+
+    def _list(self, visible: int, first: int, end: int, pairs: int, whole: bool) -> None:
+        """The lists of the tiles of one band, each in depth order."""
+        wp, lists, sort = self.wp, self.program.lists, self.program.sort
+        tiles = self._take("tiles", 2 * pairs, wp.int32)
+        listed = self._take("lists", 2 * pairs, wp.int32)
+        band = {"band_first": first, "band_end": end}
+        if pairs:
+            lengths, ends = (self._exact(name, visible, wp.int64) for name in ("lengths", "ends"))
+            self._launch(sort.gather if whole else lists.count, visible, **band)
+            wp.utils.array_scan(lengths, ends, inclusive=True)
+            self._launch(lists.emit, visible, **band)
+            wp.utils.radix_sort_pairs(tiles, listed, pairs, 0, max(self.tiles - 1, 1).bit_length())
+        self._launch(sort.find_starts, end - first + 1, **band, pairs=pairs)
+
+    def _samples(self, kind: str) -> Any:
+        """Sample buffers that blending fills, as one struct; those of another kind are others."""
+        samples = self.program.samples_type()
+        for name, dtype in self.program.sample_fields.items():
+            setattr(samples, name, self._take(f"{kind} {name}", self.grid[0] * self.grid[1], dtype))
+        return samples
+
+    def _blend(self, first: int, end: int, rays: Any, samples: Any) -> None:
+        """Draws the tiles of one band."""
+        program, shape = self.program, self.program.shape
+        planes = self.resident.arrays.get("planes", self.held["lists"])  # not read where there are none
+        given = {**self.held, "rays": rays, "samples": samples, "planes": planes}
+        area = shape.tile_width * shape.tile_height
+        if shape.schedule == "group":
+            count = (end - first) * program.block_dim
+            self.launcher.once(program.blend, count, given | {"band_first": first}, program.block_dim)
+            return
+        given["state"] = self._take("state", self.launcher.pieces * area, program.state)
+        self.launcher.tiles(program.blend, first, end, area, given)
+
+    def _resolve(self, samples: Any) -> WarpImages:
+        view, wp, program = self.view, self.wp, self.program
+        height, width = view.height // view.samples, view.width // view.samples
+        images, out = {}, program.images_type()
+        for output in program.images:
+            # a fresh one: the caller keeps it
+            array = self.pool.fresh(output.name, height * width * output.channels, getattr(wp, output.dtype))
+            images[output.name] = output, array
+            setattr(out, output.name, array)
+        for name in program.cloud_arrays:
+            setattr(out, name, self.resident.arrays[name])
+        for name, dtype in program.view_arrays.items():
+            setattr(out, name, self.pool.filled(name, view.array(name), dtype))
+        given = {"width": width, "background": wp.vec3(*view.background), "samples": samples, "out": out}
+        given["rays"] = rays_of(view, self.workspace, bent=program.stretched)
+        self._launch(program.resolve, height * width, **given)
+        if program.sensor:
+            given = {"settings": program.sensor.settings(view, self.pool), "rgb": out.rgb}
+            self._launch(program.sensor.kernel, height * width, **given, width=width)
+        return WarpImages(images, (height, width), self.launcher, self.stats)
+
+    # helpers
+
+    def _launch(self, kernel: Any, count: int, block: int = BLOCK, **given: Any) -> None:
+        self.launcher.launch(kernel, count, {**self.held, **given}, block)
+
+    def _take(self, name: str, size: int, dtype: Any) -> Any:
+        self.held[name] = array = self.pool.scratch(name, size, dtype)
+        return array
+
+    def _exact(self, name: str, size: int, dtype: Any) -> Any:
+        self.held[name] = array = self.pool.exact(name, size, dtype)
+        return array

@@ -2,50 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
-from fidsplat.backends.base import View
-from fidsplat.backends.warp import runtime
-from fidsplat.backends.warp.memory import ArrayPool
-from fidsplat.effects.catalogue import CATALOGUE
-
-STEPS = frozenset(
-    {"exposure", "vignetting", "noise", "gain", "response_gamma", "response_srgb", "response_table"}
-    | {"quantise"}
-)
-"""effects that change rgb pixel by pixel"""
+from fidsplat.backends.view import View
+from fidsplat.backends.warp.runtime import kernels
+from fidsplat.backends.warp.workspace import ArrayPool
 
 
-@dataclass(frozen=True)
-class Development:
-    """The steps that a feature set has."""
+class SensorKernel:
+    """The kernel of some steps, and what it reads."""
 
-    steps: tuple[str, ...]
-    kernel: Any
-    settings: Any
-    """its first argument's type"""
+    def __init__(self, steps: tuple[str, ...]) -> None:
+        self._steps = [kernels("post").declared(name) for name in steps]
+        self.kernel, self._settings = kernels("sensor").make_sensor(steps)
 
-    @classmethod
-    def of(cls, posts: tuple[str, ...]) -> Development | None:
-        """Of those of the posts that are a sensor's; None if there are none."""
-        steps = tuple(name for name in posts if name in STEPS)
-        return cls(steps, *runtime.kernels("sensor").make_develop(steps)) if steps else None
-
-    def arguments(self, view: View, pool: ArrayPool) -> list[Any]:
-        """The kernel's for a view: numbers, and the response's curve."""
-        import warp as wp
-
-        settings = self.settings()
-        names = [name for step in self.steps for name in CATALOGUE[step].resolve_uniforms]
-        numbers = [number for name in names for number in view.uniform(name)]
-        known = runtime.kernels("sensor").NUMBERS
-        fields = [field for step in self.steps for field in known[step]]
-        for field, number in zip(fields, numbers, strict=True):
-            setattr(settings, field, number)
-        if "response_table" not in self.steps:
-            return [settings, pool.scratch("no response", 1, wp.float32)]
-        curve = wp.array(view.array("response"), dtype=wp.float32, device="cpu")
-        response = pool.exact("response", curve.size, wp.float32)
-        wp.copy(response, curve)
-        return [settings, response]
+    def settings(self, view: View, pool: ArrayPool) -> Any:
+        """The struct `Settings` of a view."""
+        filled = self._settings()
+        for step in self._steps:
+            numbers = [number for name in step.uniforms for number in view.uniform(name)]
+            for field, number in zip(step.numbers, numbers, strict=True):
+                setattr(filled, field, number)
+            for name, dtype in step.arrays.items():
+                setattr(filled, name, pool.filled(name, view.array(name), dtype))
+        return filled

@@ -1,0 +1,171 @@
+"""Warp devices: listing, choosing, opening; compiled pipelines by FeatureSet."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends.base import DeviceInfo
+from fidsplat.backends.warp import runtime
+from fidsplat.backends.warp.arithmetic import run_arithmetic
+from fidsplat.backends.warp.launch import Commands
+from fidsplat.backends.warp.pipeline import WarpPipeline
+from fidsplat.backends.warp.probe import WarpProbe
+from fidsplat.backends.warp.program import Program, WarpShape, unsupported
+from fidsplat.backends.warp.resident import Resident
+from fidsplat.backends.warp.workspace import Workspace
+from fidsplat.effects import FeatureSet
+from fidsplat.errors import DeviceError, UnknownDeviceError
+from fidsplat.splats import SplatCloud
+
+
+def devices() -> list[DeviceInfo]:
+    """Warp's devices here; one that says how to install Warp if it is missing."""
+    try:
+        wp = runtime.load()
+    except DeviceError as error:
+        return [_describe_missing(str(error))]
+    return [_describe(device) for device in wp.get_devices()]
+
+
+def open_device(selector: str = "") -> WarpBackend:
+    """`cpu`, `cuda` (the first), `cuda:1`, or part of a device's name; without a selector CUDA before the
+    CPU.
+
+    Raises:
+        DeviceError: Warp is missing or cannot be started, or there is no CUDA device.
+        UnknownDeviceError: nothing matches the selector.
+    """
+    found = runtime.load().get_devices()
+    wanted = selector.strip().lower()
+    matching = [d for d in found if wanted in (d.alias, d.alias.split(":")[0]) or wanted in d.name.lower()]
+    if not matching:
+        if wanted.split(":")[0] == "cuda" and not any(device.is_cuda for device in found):
+            raise DeviceError(
+                "Warp sees no CUDA device here (no NVIDIA driver, or no GPU); use device='warp:cpu'"
+            )
+        known = ", ".join(f"warp:{device.alias}" for device in found)
+        raise UnknownDeviceError(f"no Warp device matches {selector!r}; there are: {known}")
+    return WarpBackend(min(matching, key=lambda device: not device.is_cuda))
+
+
+class WarpBackend:
+    """An open Warp device with what its pictures share, and compiled pipelines."""
+
+    always_float64 = False
+
+    def __init__(self, device: Any) -> None:
+        self.info = _describe(device)
+        self.device = device
+        self.shape = WarpShape("group" if device.is_cuda else "tiles", 16, 16)
+        self.workspace = Workspace(device, self.info.name, self.info.memory_bytes // 10 * 9)
+        self._commands = Commands(device, 1 if device.is_cuda else self.info.compute_units)
+        self._pipelines: dict[tuple[FeatureSet, WarpShape], WarpPipeline] = {}
+
+    @property
+    def pair_budget(self) -> int:
+        """Most pairs of splats and tiles that are listed at once; tests make it small."""
+        return self.workspace.pair_budget
+
+    @pair_budget.setter
+    def pair_budget(self, pairs: int) -> None:
+        self.workspace.pair_budget = pairs
+
+    def limit_memory(self, budget: int) -> None:
+        """Let a picture and its cloud take at most `budget` bytes of the device.
+
+        Pictures that need more for their lists are drawn in bands of tiles, with the same bits; a cloud that
+        does not fit is an error.
+        """
+        self.workspace.memory_budget = budget
+
+    def upload(self, cloud: SplatCloud) -> Resident:
+        """The cloud in arrays on the device."""
+        return Resident.of(cloud, self.workspace.pool)
+
+    def adopt(self, arrays: Mapping[str, Any], origin: np.ndarray) -> Resident:
+        """Arrays (`means`, `quats`, ...) that are on the device already, used where they lie."""
+        return Resident.around(arrays, origin, self.workspace.pool)
+
+    def unsupported(self, features: FeatureSet) -> str:
+        """The effects that the Warp kernels have not; empty if they have all."""
+        return unsupported(features, self.info.name)
+
+    def pipeline(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpPipeline:
+        """The stages compiled for these features; `shape` replaces the device's own tiles (tests).
+
+        Raises:
+            DeviceError: what is `unsupported`, or the compiler refuses.
+        """
+        key = (features, shape or self.shape)
+        if key not in self._pipelines:
+            program = Program(self.device, self.info.name, *key)
+            self._pipelines[key] = WarpPipeline(program, self.workspace, self._commands)
+        return self._pipelines[key]
+
+    def run_arithmetic(
+        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """As `ProbesArithmetic` (fidsplat/backends/base.py)."""
+        return run_arithmetic(self.workspace, exponents, shares, above, below)
+
+    def probe(self) -> WarpProbe:
+        """What tests look into the device with."""
+        return WarpProbe(self.workspace)
+
+    def shapes(self, kind: str) -> dict[str, WarpShape]:
+        """As `Reshapes` (fidsplat/backends/base.py)."""
+        own = self.shape
+        if kind == "schedule":
+            return {"groups": WarpShape("group", 8, 8)}
+        if kind == "sorting":
+            return {"own": own}
+        return {f"{side} x {side}": replace(own, tile_width=side, tile_height=side) for side in (8, 32)}
+
+    def pieces(self, shape: WarpShape) -> int:
+        """Warp's sorts take everything at once."""
+        return 1
+
+
+def _describe(device: Any) -> DeviceInfo:
+    wp = runtime.load()
+    if device.is_cuda:
+        title, kind, units = device.name, "gpu", device.sm_count
+        memory = device.total_memory
+    else:
+        units = len(os.sched_getaffinity(0))
+        title, kind = f"CPU, {units} thread{'s' if units > 1 else ''}", "cpu"
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return DeviceInfo(
+        name=f"warp:{device.alias}",
+        title=title,
+        platform="NVIDIA Warp",
+        version=f"Warp {wp.__version__}",
+        kind=kind,
+        compute_units=units,
+        memory_bytes=memory,
+        largest_allocation_bytes=memory,
+        float64=True,
+        usable=True,
+        reason="",
+    )
+
+
+def _describe_missing(why: str) -> DeviceInfo:
+    return DeviceInfo(
+        name="warp",
+        title="NVIDIA Warp: CPU and CUDA",
+        platform="NVIDIA Warp",
+        version="not installed",
+        kind="other",
+        compute_units=0,
+        memory_bytes=0,
+        largest_allocation_bytes=0,
+        float64=True,
+        usable=False,
+        reason=why,
+    )

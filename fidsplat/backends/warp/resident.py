@@ -1,0 +1,152 @@
+"""Clouds on a Warp device: uploaded, or arrays that are there already."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends.planes import PlaneTable
+from fidsplat.backends.warp.runtime import load
+from fidsplat.backends.warp.workspace import ArrayPool, nbytes
+from fidsplat.errors import DeviceError, InputError
+from fidsplat.harmonics import C0, MAX_DEGREE
+from fidsplat.splats import SplatCloud
+
+
+class Resident:
+    """Splats on the device. SH of degree 0 does not depend on the view and becomes plain colours."""
+
+    def __init__(
+        self,
+        arrays: dict[str, Any],
+        count: int,
+        origin: np.ndarray,
+        sh_degree: int,
+        planes: PlaneTable | None = None,
+        footprint: str = "gaussian",
+    ) -> None:
+        self.arrays, self.count, self.origin = arrays, count, origin
+        self.sh_degree, self.planes, self.has_planes = sh_degree, planes, planes is not None
+        self.footprint = footprint
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes of the device that the splats take; adopted arrays are among them."""
+        return sum(map(nbytes, self.arrays.values()))
+
+    @classmethod
+    def of(cls, cloud: SplatCloud, pool: ArrayPool) -> Resident:
+        """The cloud on the device."""
+        colors = cloud.colors
+        if cloud.sh is not None:
+            colors = cloud.sh.reshape(-1, 3)
+            if cloud.sh_degree == 0:
+                colors = np.maximum(np.float32(C0) * colors + np.float32(0.5), np.float32(0))
+        arrays = {
+            "means": cloud.means,
+            "quats": cloud.quats,
+            "scales": cloud.scales,
+            "opacities": cloud.opacities,
+            "colors": colors,
+            "labels": cloud.labels,
+        }
+        planes = None if cloud.planes is None else PlaneTable(cloud)
+        if planes is not None:
+            arrays["planes"] = planes.index
+        if cloud.footprint == "mixed" and cloud.boxes is not None:
+            arrays["boxes"] = cloud.boxes.astype(np.int32)
+        device = {name: _uploaded(name, array, pool) for name, array in arrays.items()}
+        degree = cloud.sh_degree if cloud.sh_degree > 0 else -1
+        return cls(device, len(cloud), cloud.origin, degree, planes, cloud.footprint)
+
+    @classmethod
+    def around(cls, given: Mapping[str, Any], origin: np.ndarray, pool: ArrayPool) -> Resident:
+        """Arrays that are on the device already, or NumPy's; no copy where none is needed.
+
+        Raises:
+            InputError: an array has the wrong shape or type, or lies on another device.
+        """
+        arrays = {name: _adopted(name, value, pool) for name, value in given.items()}
+        count = arrays["means"].size
+        terms = 0
+        if "sh" in arrays:
+            arrays["colors"] = arrays.pop("sh")
+            terms = arrays["colors"].size // max(count, 1)
+            known = [(degree + 1) ** 2 for degree in range(1, MAX_DEGREE + 1)]
+            if count and terms not in known:
+                raise InputError(
+                    f"sh holds {terms} coefficients per splat; on a device it must be one of {known}"
+                )
+        if "labels" not in arrays:
+            arrays["labels"] = pool.fresh("labels", count, load().int32)
+            arrays["labels"].zero_()
+        for name, array in arrays.items():
+            wanted = count * max(terms, 1) if name == "colors" else count
+            if count and array.size != wanted:
+                raise InputError(f"{name} holds {array.size} elements, but {count} means need {wanted}")
+        return cls(arrays, count, origin, int(np.sqrt(terms)) - 1 if terms else -1)
+
+
+def _dtype(name: str) -> Any:
+    wp = load()
+
+    return {
+        "means": wp.vec3,
+        "quats": wp.vec4,
+        "scales": wp.vec2,
+        "opacities": wp.float32,
+        "colors": wp.vec3,
+        "sh": wp.vec3,
+        "labels": wp.int32,
+        "planes": wp.int32,
+        "boxes": wp.int32,
+    }[name]
+
+
+def _uploaded(name: str, array: np.ndarray, pool: ArrayPool) -> Any:
+    wp = load()
+
+    if array.size == 0:
+        return pool.fresh(name, 1, _dtype(name))
+    try:
+        return wp.array(np.ascontiguousarray(array), dtype=_dtype(name), device=pool.device).flatten()
+    except (RuntimeError, MemoryError) as error:
+        size = array.nbytes / 2**20
+        raise DeviceError(
+            f"the cloud's {name} need {size:.0f} MiB, which {pool.device} has not; use fewer splats"
+        ) from error
+
+
+def _adopted(name: str, value: Any, pool: ArrayPool) -> Any:
+    """One array of elements as the kernels read them, on the memory of `value` wherever it can be."""
+    wp = load()
+
+    dtype = _dtype(name)
+    scalar, width = (wp.int32, 1) if dtype is wp.int32 else (wp.float32, wp.types.type_size(dtype))
+    if not isinstance(value, wp.array) and not hasattr(value, "__dlpack__"):
+        value = np.asarray(value)
+    if isinstance(value, np.ndarray):
+        typed = value.astype(np.int32 if dtype is wp.int32 else np.float32, copy=False)
+        if width > 1 and (typed.ndim < 2 or typed.shape[-1] != width):
+            raise InputError(f"{name} has the shape {typed.shape}; its last axis must be {width}")
+        return _uploaded(name, typed, pool)
+    array: Any = value if isinstance(value, wp.array) else wp.from_dlpack(value)
+    if array.device != pool.device:
+        raise InputError(
+            f"{name} lies on {array.device}, but this renderer draws on {pool.device}; move it there"
+        )
+    if not array.is_contiguous:
+        raise InputError(f"{name} is not contiguous; give a contiguous array")
+    if array.dtype == scalar and width > 1 and array.shape[-1] == width:
+        array = wp.from_dlpack(array, dtype=dtype)
+    if (
+        wp.types.type_size(array.dtype) != width
+        or getattr(array.dtype, "_wp_scalar_type_", array.dtype) != scalar
+    ):
+        raise InputError(
+            f"{name} has the type {wp.types.type_repr(array.dtype)} and the shape {array.shape}; it must "
+            f"hold {scalar.__name__}, {width} to an element"
+        )
+    return array.flatten()

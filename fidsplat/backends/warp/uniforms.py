@@ -1,0 +1,55 @@
+"""The struct `View` of kernels/warp/common.py from a picture's view: each of its fields by its name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends.view import View
+from fidsplat.backends.warp.program import WarpShape
+from fidsplat.backends.warp.runtime import kernels, load
+
+
+def _ray(view: View) -> tuple[float, ...]:
+    fx, fy, cx, cy = view.uniform("ray")
+    return 1 / fx, 1 / fy, cx, cy
+
+
+_DERIVED: dict[str, Callable[[View, WarpShape], Any]] = {
+    "per_fx": lambda view, shape: 1.0 / view.fx,
+    "per_fy": lambda view, shape: 1.0 / view.fy,
+    "per_near": lambda view, shape: 1.0 / view.near,
+    "tile_w": lambda view, shape: shape.tile_width,
+    "tile_h": lambda view, shape: shape.tile_height,
+    "tiles_x": lambda view, shape: -(-view.width // shape.tile_width),
+    "tiles_y": lambda view, shape: -(-view.height // shape.tile_height),
+    "per_pixel": lambda view, shape: 1.0 / view.samples**2,
+    "ray": lambda view, shape: _ray(view),
+}
+"""fields that a view does not have by their names"""
+
+
+@cache
+def _fields() -> tuple[tuple[str, Any], ...]:
+    """Name of each field, and the type of those that are vectors or matrices."""
+    types = load().types
+    kinds = {name: field.type for name, field in kernels("common").View.vars.items()}
+    wide = {name for name, kind in kinds.items() if types.type_is_vector(kind) or types.type_is_matrix(kind)}
+    return tuple((name, kind if name in wide else None) for name, kind in kinds.items())
+
+
+def uniforms(view: View, shape: WarpShape, sloped: bool) -> Any:
+    """The struct for a picture in tiles of this shape; sloped: its kernels read rays' derivatives."""
+    filled = kernels("common").View()
+    for name, wide in _fields():
+        if name == "ray_step":
+            value = view.raster.step if view.raster and sloped else 0.0
+        else:
+            value = _DERIVED[name](view, shape) if name in _DERIVED else getattr(view, name)
+        if wide:
+            value = wide(*(value.ravel().tolist() if isinstance(value, np.ndarray) else value))
+        setattr(filled, name, value)
+    return filled

@@ -1,0 +1,89 @@
+"""What a device's pictures share: scratch arrays, arrays of lenses and panoramas, and the memory they may
+take."""
+
+from __future__ import annotations
+
+from typing import Any
+from weakref import WeakKeyDictionary
+
+from fidsplat.backends.warp.runtime import load
+from fidsplat.cameras.raster import RayRaster
+from fidsplat.errors import DeviceError
+from fidsplat.surroundings import Panorama
+
+
+class ArrayPool:
+    """Scratch arrays by name, kept from frame to frame and replaced only when one is too small."""
+
+    def __init__(self, device: Any) -> None:
+        self.device = device
+        self._arrays: dict[tuple[str, Any], Any] = {}
+        self._parts: dict[tuple[str, Any], Any] = {}
+        self._hosts: dict[str, Any] = {}
+
+    def scratch(self, name: str, size: int, dtype: Any) -> Any:
+        """An array of at least `size` elements whose content is undefined."""
+        held = self._arrays.get((name, dtype))
+        if held is None or held.size < size:
+            self._arrays.pop((name, dtype), None)
+            held = self._arrays[name, dtype] = self.fresh(name, size, dtype)
+        return held
+
+    def exact(self, name: str, size: int, dtype: Any) -> Any:
+        """The first `size` elements of a scratch array."""
+        whole = self.scratch(name, size, dtype)
+        part = self._parts.get((name, dtype))
+        if part is None or part.ptr != whole.ptr or part.size != size:
+            part = self._parts[name, dtype] = whole[:size]
+        return part
+
+    def filled(self, name: str, values: Any, dtype: Any) -> Any:
+        """A scratch array that holds these values of the host, as long as they are."""
+        wp = load()
+        given = wp.array(values, dtype=dtype, device="cpu")
+        held = self.exact(name, given.size, dtype)
+        wp.copy(held, given)
+        return held
+
+    def host(self, name: str, size: int, dtype: Any) -> Any:
+        """An array of the host that the device can write to without a detour."""
+        if name not in self._hosts:
+            self._hosts[name] = load().empty(size, dtype=dtype, device="cpu", pinned=self.device.is_cuda)
+        return self._hosts[name]
+
+    def fresh(self, name: str, size: int, dtype: Any) -> Any:
+        """An array that nobody else holds.
+
+        Raises:
+            DeviceError: the device cannot give that much.
+        """
+        wp = load()
+        try:
+            return wp.empty(max(size, 1), dtype=dtype, device=self.device)
+        except (RuntimeError, MemoryError, ValueError) as error:  # the last: 2^31 elements and more
+            raise DeviceError(
+                f"{name} needs {size * wp.types.type_size_in_bytes(dtype) / 2**20:.0f} MiB, which "
+                f"{self.device} has not; use fewer splats or a smaller picture"
+            ) from error
+
+
+class Workspace:
+    """Of one open device."""
+
+    def __init__(self, device: Any, name: str, memory_budget: int) -> None:
+        """name: of the device, for errors."""
+        self.device, self.name = device, name
+        self.pool = ArrayPool(device)
+        self.memory_budget = memory_budget
+        """bytes of the device that a picture and its cloud may take"""
+        self.pair_budget = 2**30 - 1
+        """Most pairs of splats and tiles that are listed at once; tests make it small."""
+        self.lenses: WeakKeyDictionary[RayRaster, dict[str, Any]] = WeakKeyDictionary()
+        """arrays of the whole rasters that are in use, by name"""
+        self.panoramas: WeakKeyDictionary[Panorama, Any] = WeakKeyDictionary()
+        """on the device, each as long as it is somewhere else"""
+
+
+def nbytes(array: Any) -> int:
+    """Bytes of a wp.array."""
+    return array.size * array.strides[0]

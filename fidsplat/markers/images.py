@@ -1,0 +1,25 @@
+"""Pictures of two grey levels, one pixel a module."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.errors import InputError
+from fidsplat.markers.spec import Kind, Spec
+
+
+def _parse(text: str, head: str, rest: str) -> Spec:
+    if not rest:
+        raise InputError(f"{text!r} names no file; write image:FILE.png")
+    return Spec(text=text, kind="image", payload=rest)
+
+
+def _bits(spec: Spec) -> tuple[Spec, np.ndarray]:
+    from fidsplat.vision.images import read_bits
+
+    return spec, np.ascontiguousarray(read_bits(Path(spec.payload or "")), np.uint8)
+
+
+KINDS = (Kind("image", "image:FILE.png", 0, _parse, _bits, is_file=True),)

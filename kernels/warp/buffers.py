@@ -1,0 +1,41 @@
+"""Sample buffers, which blending leaves for resolving, and output images, which resolving leaves for the
+user: structs of arrays with the fields that the outputs of a picture declare.
+"""
+
+from functools import cache
+
+import warp as wp
+
+from . import output
+from .common import struct_of
+
+
+def sample_fields(outputs: tuple[str, ...]) -> dict[str, type]:
+    """Type of an element of each sample buffer; color: r, g, b, transmittance."""
+    return {"color": wp.vec4} | output.fields(outputs, "samples")
+
+
+def light_of(outputs: tuple[str, ...]) -> frozenset[str]:
+    """Sample buffers whose mean is what several poses leave together."""
+    return frozenset({"color"} | output.fields(output.having(outputs, "light"), "samples").keys())
+
+
+@cache
+def make_samples(fields: tuple[tuple[str, type], ...]):
+    """The struct of sample buffers with these fields, (rows columns) of the padded grid each."""
+    arrays = {name: wp.array(dtype=dtype) for name, dtype in fields}
+    return struct_of("Samples", "What blending leaves of each sample.", arrays)
+
+
+@cache
+def make_images(images: tuple[tuple[str, type], ...], outputs: tuple[str, ...]):
+    """The struct of output images, (h w channels) elements of these types each, and of the arrays that the
+    outputs read.
+    """
+    fields = {
+        **dict(images),
+        **output.fields(outputs, "cloud_arrays"),
+        **output.fields(outputs, "view_arrays"),
+    }
+    arrays = {name: wp.array(dtype=dtype) for name, dtype in fields.items()}
+    return struct_of("Images", "What resolving leaves of each pixel.", arrays)

@@ -1,0 +1,153 @@
+"""Where the ray of a sample meets a splat: how opaque the splat is there, and how far away."""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from .boxes import between, between_curves
+from .common import View, fma, line_of, struct_of
+from .fast import fast_exp
+from .rays import SLOPES
+from .records import BOXES, Layout
+from .splat import make_splat
+
+
+@cache
+def make_crossing(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
+    """Crossing; row, cross, cross_ray, cross_slopes (None without boxes behind a lens); is_box, opacity_of,
+    depth_of.
+    """
+    Splat = make_splat(effects, outputs).Splat
+    layout = Layout(effects, outputs)
+    each = layout.lines
+    screen, bent, parallel, all_boxes = (
+        name in effects for name in ("lowpass_screen", "rays", "camera_orthographic", "footprint_box")
+    )
+    boxes = any(name in effects for name in BOXES)
+    curved, edged = boxes and bent, boxes and not bent  # their edges: from each sample's ray, from a record
+    exp = fast_exp if "arithmetic_fast" in effects else wp.exp
+    # q / d^2 is rho / 2; inside: the ray meets the disk within R and beyond the near plane
+    fields = {"d": wp.float32, "q": wp.float32, "inside": wp.bool, "drawn": wp.bool}
+    # screen: squared distance from the projected centre in pixels, which is rho / 2 of the low-pass
+    fields |= {"screen": wp.float32} if screen else {}
+    fields |= {"z": wp.float32} if parallel else {}  # d times the depth
+    # cover: share of the sample that a box covers
+    fields |= {"cover": wp.float32} if boxes else {}
+    Crossing = struct_of("Crossing", "Where the ray of a sample meets a splat.", fields)
+    z_line, z_lane = layout.place("z_numerator")
+    zc_line, zc_lane = layout.place("z_center")
+    zr_line, zr_lane = layout.place("z_reach")
+
+    @wp.func
+    def row(form: wp.vec4, y: float) -> float:
+        """The part of an affine form that does not change along a row of samples."""
+        return fma(form[2], y, form[0])
+
+    @wp.func
+    def is_box(s: Splat) -> bool:
+        if wp.static(all_boxes):
+            return True
+        elif wp.static(curved):
+            return s.boxed > 0.0
+        else:
+            return s.edges[0] > 0.0
+
+    @wp.func
+    def cross(s: Splat, row_u: float, row_v: float, row_d: float, x: float, y: float, view: View):
+        """x, y: the sample from the anchor; row_*: `row` of the three forms at y."""
+        return meet(s, fma(s.u[1], x, row_u), fma(s.v[1], x, row_v), fma(s.d[1], x, row_d), x, y, view)
+
+    @wp.func
+    def forms_of(s: Splat, ray: wp.vec3) -> wp.vec3:
+        """n_u, n_v and D of a ray."""
+        r = ray - s.origin
+        return wp.vec3(
+            fma(s.w[0], r[2], fma(s.u[1], r[0], fma(s.u[2], r[1], s.u[0]))),
+            fma(s.w[1], r[2], fma(s.v[1], r[0], fma(s.v[2], r[1], s.v[0]))),
+            fma(s.w[2], r[2], fma(s.d[1], r[0], fma(s.d[2], r[1], s.d[0]))),
+        )
+
+    @wp.func
+    def cross_ray(s: Splat, ray: wp.vec3, x: float, y: float, view: View):
+        """The same for the sample that has this ray."""
+        n = forms_of(s, ray)
+        c = meet(s, n[0], n[1], n[2], x, y, view)
+        c.drawn = c.drawn and n[2] == n[2]  # nothing is seen without a ray
+        return c
+
+    @wp.func
+    def cross_slopes(s: Splat, ray: wp.vec3, slopes: SLOPES, x: float, y: float, view: View):
+        """The same where there are boxes, with the ray's derivatives."""
+        c = cross_ray(s, ray, x, y, view)
+        if is_box(s):
+            n, of_d = forms_of(s, ray), wp.vec3(s.d[1], s.d[2], s.w[2])
+            across = between_curves(n[2], n[0], of_d, wp.vec3(s.u[1], s.u[2], s.w[0]), slopes)
+            c.cover = across * between_curves(n[2], n[1], of_d, wp.vec3(s.v[1], s.v[2], s.w[1]), slopes)
+            c.inside = c.cover > 0.0 and c.d > 0.0 and c.d <= s.v[3]
+            c.drawn = c.inside
+        return c
+
+    @wp.func
+    def meet(s: Splat, nu: float, nv: float, d: float, x: float, y: float, view: View):
+        c = Crossing()
+        c.d = d
+        ahead = c.d > 0.0 and c.d <= s.v[3]
+        if wp.static(parallel):
+            c.z = fma(s.plane[2], y, fma(s.plane[1], x, s.plane[0]))
+            ahead = ahead and c.z >= s.plane[3] * c.d
+        if wp.static(not all_boxes):
+            c.q = fma(nu, nu, nv * nv)
+            # product form: no division, no special value of D (numerics B2)
+            c.inside = c.q <= s.half_r2 * (c.d * c.d) and ahead
+        if wp.static(edged):
+            if is_box(s):
+                across = between(c.d, nu, wp.vec2(s.edges[0], s.edges[1]))
+                c.cover = across * between(c.d, nv, wp.vec2(s.edges[2], s.edges[3]))
+                c.inside = c.cover > 0.0 and ahead
+        c.drawn = c.inside
+        if wp.static(screen):
+            ex = x - s.dot_x
+            ey = y - s.dot_y
+            c.screen = fma(ex, ex, ey * ey) * view.per_pixel
+            c.drawn = c.inside or c.screen <= s.half_r2
+        return c
+
+    @wp.func
+    def opacity_of(s: Splat, c: Crossing, inverse_d: float, view: View) -> float:
+        if wp.static(boxes):
+            if is_box(s):
+                return wp.min(wp.exp(s.u[3]), view.ceiling) * c.cover
+        half_rho = c.q * inverse_d * inverse_d
+        if wp.static(screen):
+            if c.inside:
+                half_rho = wp.min(half_rho, c.screen)
+            else:
+                half_rho = c.screen
+        return wp.min(exp(s.u[3] - half_rho), view.ceiling)
+
+    @wp.func
+    def depth_of(lines: wp.array(dtype=wp.vec4), index: int, c: Crossing, inverse_d: float) -> float:
+        """Depth of ray and plane within the disk's own range; the centre's where the ray misses the plane
+        (numerics B2, B4).
+        """
+        at = index * each
+        center = line_of(lines, at + zc_line)[zc_lane]
+        reach = line_of(lines, at + zr_line)[zr_lane]
+        if c.d > 0.0:
+            if wp.static(parallel):
+                return wp.clamp(c.z * inverse_d, center - reach, center + reach)
+            met = line_of(lines, at + z_line)[z_lane] * inverse_d
+            return wp.clamp(met, center - reach, center + reach)
+        return center
+
+    return SimpleNamespace(
+        Crossing=Crossing,
+        row=row,
+        cross=cross,
+        cross_ray=cross_ray,
+        cross_slopes=cross_slopes if curved else None,
+        is_box=is_box,
+        opacity_of=opacity_of,
+        depth_of=depth_of,
+    )

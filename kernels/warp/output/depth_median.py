@@ -1,0 +1,76 @@
+"""Median depth [m]: where half of a sample's light is taken; of a pixel the lower median of its samples that
+have one, 0 if none has."""
+
+from typing import Any
+
+import warp as wp
+
+from ..common import LEAST_ALPHA, View
+from ..pixel_grid import PixelGrid, sample_at
+from . import Output
+
+
+@wp.func
+def start(pixel: Any, length: float, view: View):
+    p = pixel
+    p.median_light = 1.0
+    return p
+
+
+@wp.func
+def composite(pixel: Any, seen: Any, weight: float, shown: float, view: View):
+    p = pixel
+    # faint ones count together
+    if p.t > 0.5 and p.median_light - (p.t - weight) >= LEAST_ALPHA:
+        p.depth_median = seen.z
+        p.median_light = p.t - weight
+    return p
+
+
+@wp.func
+def store(pixel: Any, at: int, samples: Any):
+    samples.depth_median[at] = pixel.depth_median
+
+
+@wp.func
+def sorted_in(values: Any, count: int, value: float):
+    """`count` values in order and one more."""
+    after = values
+    place = count
+    while place > 0 and after[wp.max(place - 1, 0)] > value:
+        after[place] = after[place - 1]
+        place -= 1
+    after[place] = value
+    return after
+
+
+@wp.func
+def middle_of(values: Any, count: int) -> float:
+    """The lower median of `count` values in order; 0 of none."""
+    if count > 0:
+        return values[(count - 1) / 2]
+    return 0.0
+
+
+@wp.func
+def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
+    medians = type(lengths)()
+    hits = int(0)
+    for k in range(grid.count):
+        half = samples.depth_median[sample_at(grid, k)]
+        if half > 0.0:
+            medians = sorted_in(medians, hits, half)
+            hits += 1
+    out.depth_median[grid.pixel] = middle_of(medians, hits)
+
+
+OUTPUT = Output(
+    depth=True,
+    # median_light: left behind the fragment that counted last
+    state={"depth_median": wp.float32, "median_light": wp.float32},
+    start=start,
+    composite=composite,
+    samples={"depth_median": wp.float32},
+    store=store,
+    resolve=resolve,
+)

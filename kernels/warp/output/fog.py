@@ -1,0 +1,58 @@
+"""Fog: light fades with the distance along the ray, and the fog's colour shows in its place. No output image
+of its own: it changes rgb."""
+
+from typing import Any
+
+import warp as wp
+
+from ..common import View
+from ..pixel_grid import PixelGrid, sample_at
+from . import Output
+
+
+@wp.func
+def start(pixel: Any, length: float, view: View):
+    p = pixel
+    p.fog_slope = -view.fog_density * length
+    return p
+
+
+@wp.func
+def attenuate(pixel: Any, seen: Any, shown: float) -> float:
+    return shown * wp.exp(pixel.fog_slope * seen.z)
+
+
+@wp.func
+def composite(pixel: Any, seen: Any, weight: float, shown: float, view: View):
+    p = pixel
+    p.fogged += weight - shown
+    return p
+
+
+@wp.func
+def store(pixel: Any, at: int, samples: Any):
+    samples.fogged[at] = pixel.fogged
+
+
+@wp.func
+def hidden(grid: PixelGrid, samples: Any) -> float:
+    """Fog is of one colour with what lies behind everything."""
+    fogged = float(0.0)
+    for k in range(grid.count):
+        fogged += samples.fogged[sample_at(grid, k)]
+    return fogged * grid.mean
+
+
+OUTPUT = Output(
+    depth=True,
+    length=True,
+    # fog_slope: -density, per metre of depth; fogged: sum of weights times what the fog hides
+    state={"fog_slope": wp.float32, "fogged": wp.float32},
+    start=start,
+    attenuate=attenuate,
+    composite=composite,
+    samples={"fogged": wp.float32},
+    store=store,
+    light=True,
+    hidden=hidden,
+)

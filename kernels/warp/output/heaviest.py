@@ -1,0 +1,81 @@
+"""The splat of the largest weight, -1 for none: labels and splat ids are this one's. No output by itself."""
+
+from typing import Any
+
+import warp as wp
+
+from ..common import View
+from ..pixel_grid import PixelGrid, sample_at
+from . import Output
+
+
+@wp.func
+def see(seen: Any, numbers: float, index: int):
+    s = seen
+    s.heaviest = index
+    return s
+
+
+@wp.func
+def gather(layer: Any, seen: Any, tau: float):
+    after = layer
+    if tau > layer.thickest:
+        after.thickest = tau
+        after.mean.heaviest = seen.heaviest
+    return after
+
+
+@wp.func
+def start(pixel: Any, length: float, view: View):
+    p = pixel
+    p.heaviest = -1
+    return p
+
+
+@wp.func
+def composite(pixel: Any, seen: Any, weight: float, shown: float, view: View):
+    p = pixel
+    if weight > p.weight:
+        p.weight = weight
+        p.heaviest = seen.heaviest
+    return p
+
+
+@wp.func
+def clear(pixel: Any):
+    p = pixel
+    p.weight = 0.0
+    return p
+
+
+@wp.func
+def store(pixel: Any, at: int, samples: Any):
+    samples.heaviest[at] = pixel.heaviest
+    samples.weight[at] = pixel.weight
+
+
+@wp.func
+def heaviest_of(grid: PixelGrid, samples: Any) -> int:
+    """Of all samples of the pixel."""
+    weight = float(0.0)
+    which = int(-1)
+    for k in range(grid.count):
+        at = sample_at(grid, k)
+        if samples.weight[at] > weight:
+            weight = samples.weight[at]
+            which = samples.heaviest[at]
+    return which
+
+
+OUTPUT = Output(
+    seen={"heaviest": wp.int32},  # index; a layer's of its splat of greatest optical depth
+    see=see,
+    layer={"thickest": wp.float32},
+    gather=gather,
+    state={"weight": wp.float32, "heaviest": wp.int32},
+    start=start,
+    composite=composite,
+    clear=clear,
+    samples={"heaviest": wp.int32, "weight": wp.float32},
+    store=store,
+)

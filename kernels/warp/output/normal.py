@@ -1,0 +1,97 @@
+"""Unit normal towards the camera, in its frame: the mean of what shows, by weight; 0 where nothing does."""
+
+from typing import Any
+
+import warp as wp
+
+from ..common import View
+from ..pixel_grid import PixelGrid, sample_at
+from . import Output
+
+
+@wp.func
+def project(record: Any, at: int, normal: Any, height: Any):
+    """The camera is on one side of the whole plane, so the sign is the splat's (numerics B7)."""
+    r = record
+    one = type(height)(1.0)
+    towards = wp.where(height > type(height)(0.0), -one, one)
+    r[at] = float(normal[0] * towards)
+    r[at + 1] = float(normal[1] * towards)
+    r[at + 2] = float(normal[2] * towards)
+    return r
+
+
+@wp.func
+def see(seen: Any, numbers: wp.vec3, index: int):
+    s = seen
+    s.normal = numbers
+    return s
+
+
+@wp.func
+def gather(layer: Any, seen: Any, tau: float):
+    after = layer
+    after.mean.normal = layer.mean.normal + tau * seen.normal
+    return after
+
+
+@wp.func
+def average(seen: Any, tau: float):
+    s = seen
+    s.normal = seen.normal / tau
+    return s
+
+
+@wp.func
+def composite(pixel: Any, seen: Any, weight: float, shown: float, view: View):
+    p = pixel
+    p.normal += weight * seen.normal
+    return p
+
+
+@wp.func
+def clear(pixel: Any):
+    p = pixel
+    p.normal = wp.vec3()
+    return p
+
+
+@wp.func
+def store(pixel: Any, at: int, samples: Any):
+    samples.normal[at] = pixel.normal
+
+
+@wp.func
+def unit_of(grid: PixelGrid, samples: Any) -> wp.vec3:
+    """The pixel's normal, of length 1 or 0."""
+    sum = wp.vec3()
+    for k in range(grid.count):
+        sum += samples.normal[sample_at(grid, k)]
+    length = wp.length(sum)
+    unit = wp.vec3()
+    if length > 0.0:
+        unit = sum / length
+    return unit
+
+
+@wp.func
+def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
+    unit = unit_of(grid, samples)
+    for channel in range(3):
+        out.normal[3 * grid.pixel + channel] = unit[channel]
+
+
+OUTPUT = Output(
+    record=("nx", "ny", "nz"),
+    project=project,
+    seen={"normal": wp.vec3},
+    see=see,
+    gather=gather,
+    average=average,
+    state={"normal": wp.vec3},
+    composite=composite,
+    clear=clear,
+    samples={"normal": wp.vec3},
+    store=store,
+    resolve=resolve,
+)

@@ -1,0 +1,17 @@
+"""The index of the splat of the largest weight; -1 where nothing shows."""
+
+from typing import Any
+
+import warp as wp
+
+from ..pixel_grid import PixelGrid
+from . import Output
+from .heaviest import heaviest_of
+
+
+@wp.func
+def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
+    out.splat_id[grid.pixel] = heaviest_of(grid, samples)
+
+
+OUTPUT = Output(needs=("heaviest",), resolve=resolve)

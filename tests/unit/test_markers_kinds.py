@@ -1,0 +1,127 @@
+"""Kinds of markers: boards that OpenCV's detectors read back, and kinds that are added from outside."""
+
+import cv2
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.markers import Kind, Spec, marker, register, with_file
+from fidsplat.markers.kinds import bits_of, parse_spec
+from fidsplat.scenes import PlacedMarker
+from fidsplat.vision.dictionaries import predefined
+
+PIXELS = 10
+
+
+def printed(made: fs.markers.Marker) -> np.ndarray:
+    """A picture of the grid, quiet zone included."""
+    return np.kron(255 * (1 - made.grid), np.ones((PIXELS, PIXELS))).astype(np.uint8)
+
+
+def place(made, corners: np.ndarray) -> np.ndarray:
+    """Pixels in modules of the code: as drawn, pixel centres lie at halves."""
+    return (corners + 0.5) / PIXELS - made.quiet_zone
+
+
+@pytest.mark.parametrize(
+    ("columns", "rows", "family"), [(7, 5, "4x4_50"), (4, 6, "5x5_100"), (2, 2, "6x6_250")]
+)
+def test_charuco_boards(columns, rows, family):
+    made = marker(f"charuco:{columns}x{rows}:{family}")
+    square = made.bits.shape[1] // columns
+    assert made.bits.shape == (rows * square, columns * square)
+    dictionary = predefined("aruco", family)
+    board = cv2.aruco.CharucoBoard((columns, rows), square, square - 2, dictionary)
+    drawn = board.generateImage(made.bits.shape[::-1], marginSize=0, borderBits=1)
+    assert np.array_equal(made.bits, drawn < 128)
+    corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(printed(made))
+    assert sorted(ids.ravel().tolist()) == list(range((columns - 1) * (rows - 1)))
+    expected = board.getChessboardCorners()[ids.ravel(), :2]
+    assert np.allclose(place(made, corners.reshape(-1, 2)), expected, atol=0.05)
+
+
+def test_grid_boards():
+    made = marker("gridboard:5x3:4x4_50")
+    board = cv2.aruco.GridBoard((5, 3), 6, 2, predefined("aruco", "4x4_50"))
+    drawn = board.generateImage(made.bits.shape[::-1], marginSize=0, borderBits=1)
+    assert np.array_equal(made.bits, drawn < 128)
+    found, ids, _ = cv2.aruco.ArucoDetector(board.getDictionary()).detectMarkers(printed(made))
+    at, image = board.matchImagePoints(found, ids)
+    assert len(at) == 4 * 15
+    assert np.allclose(place(made, image.reshape(-1, 2)), at.reshape(-1, 3)[:, :2], atol=0.15)
+
+
+def test_april_grids():
+    made = marker("aprilgrid:6x4:36h11")
+    assert made.bits.shape == (4 * 10 + 2, 6 * 10 + 2)
+    options = cv2.aruco.DetectorParameters()
+    # dark squares touch the tags' corners, where contours run on from one to the other
+    options.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
+    detector = cv2.aruco.ArucoDetector(predefined("apriltag", "36h11"), options)
+    found, ids, _ = detector.detectMarkers(printed(made))
+    places = {int(i): place(made, c.reshape(4, 2)) for i, c in zip(ids.ravel(), found, strict=True)}
+    assert sorted(places) == list(range(24))
+    for number, corners in places.items():
+        row, column = divmod(number, 6)  # from the bottom left, as Kalibr counts
+        x, y = 2 + 10 * column, 2 + 10 * (3 - row)
+        expected = [[x, y], [x + 8, y], [x + 8, y + 8], [x, y + 8]]
+        assert np.abs(corners[:, None] - expected).max(-1).min(0).max() < 0.3
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("charuco:7x5", "charuco:7x5:4x4_50"),
+        ("charuco:7:4x4_50", "COLUMNSxROWS"),
+        ("charuco:1x5:4x4_50", "from 2 to 64"),
+        ("gridboard:0x5:4x4_50", "from 1 to 64"),
+        ("gridboard:5x5:4x4_51", "unknown tag family"),
+        ("gridboard:8x8:4x4_50", "needs 64 tags, but 4x4_50 has 50"),
+        ("aprilgrid:6x6:4x4_50", "has AprilTags"),
+    ],
+)
+def test_errors_say_what_would_be_right(text, says):
+    with pytest.raises(fs.InputError, match=says):
+        bits_of(parse_spec(text))
+
+
+def stripes(spec: Spec) -> tuple[Spec, np.ndarray]:
+    return spec, np.arange(int(spec.payload or 0), dtype=np.uint8)[None] % 2
+
+
+@pytest.fixture
+def toy(monkeypatch):
+    """A kind of marker from outside, taken away again."""
+    import fidsplat.markers.kinds as kinds
+
+    monkeypatch.setattr(kinds, "_kinds", dict(kinds._kinds))
+    register(
+        Kind(
+            "stripes", "stripes:N", 3, lambda text, _, n: Spec(text=text, kind="stripes", payload=n), stripes
+        )
+    )
+
+
+def test_a_kind_from_outside_is_a_marker_like_any_other(toy, tmp_path):
+    made = marker("stripes:5", size=0.5)
+    assert (made.kind, made.quiet_zone, made.module) == ("stripes", 3, 0.1)
+    assert made.bits.tolist() == [[0, 1, 0, 1, 0]]
+    assert len(made.cloud) > 0
+    scene = fs.Scene(markers=[PlacedMarker(made)])
+    scene.save(tmp_path / "a.toml")
+    again = fs.Scene.load(tmp_path / "a.toml").markers[0].marker
+    assert np.array_equal(again.cloud.means, made.cloud.means)
+    with pytest.raises(fs.InputError, match="or stripes:N"):
+        marker("squares:5")
+
+
+def test_names_that_are_no_names_of_kinds(toy):
+    for name, says in (("qr", "already"), ("stripes", "already"), ("a-b", "lower-case"), ("", "lower-case")):
+        with pytest.raises(fs.InputError, match=says):
+            register(Kind(name, "x:Y", 0, lambda text, *_: Spec(text=text, kind="x"), stripes))
+
+
+def test_files_of_specs_are_put_elsewhere():
+    assert with_file("image:a.png", lambda name: f"there/{name}") == "image:there/a.png"
+    for text in ("qr:a.png", "image:", "image", "unknown:a"):
+        assert with_file(text, str.upper) == text
