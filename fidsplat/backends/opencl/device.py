@@ -9,7 +9,7 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.base import DeviceInfo, Rates
-from fidsplat.backends.opencl import pocl_target
+from fidsplat.backends.opencl import pocl_cache, pocl_target
 from fidsplat.backends.opencl.arithmetic import run_arithmetic
 from fidsplat.backends.opencl.assemble import assemble
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
@@ -72,6 +72,8 @@ class OpenCLBackend(Workspace):
     always_float64 = False
 
     def __init__(self, device: cl.Device) -> None:
+        if "Portable Computing Language" in device.platform.name:
+            pocl_cache.check_once()
         super().__init__(device, _describe(device, _name_of(device)), _shape(device))
         self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
 

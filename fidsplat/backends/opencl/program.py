@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import sqlite3
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -12,6 +14,18 @@ from fidsplat.backends.opencl.assemble import Source, kernel_text, with_scalars
 from fidsplat.backends.opencl.pocl_target import correct_target, needs_correction
 from fidsplat.backends.opencl.workspace import DeviceBuffer, Workspace
 from fidsplat.errors import DeviceError
+
+
+def load_invoker() -> None:
+    """Imports the part of pyopencl that sets arguments, which opens a database in the user's cache folder.
+
+    Where that is damaged this process does without it, and makes anew what it holds.
+    """
+    try:
+        importlib.import_module("pyopencl.invoker")
+    except sqlite3.DatabaseError:
+        cl._PYOPENCL_NO_CACHE = True
+        importlib.import_module("pyopencl.invoker")
 
 
 def build_options(device: cl.Device) -> list[str]:
@@ -51,6 +65,7 @@ class Program:
         self.source = source
         built = build(workspace, source.text)
         self._queue = workspace.queue
+        load_invoker()
         self._kernels = {kernel.function_name: kernel for kernel in built.all_kernels()}
         self._types = {
             kernel: [None if one.access else source.scalars.dtype(one.ctype).type for one in arguments]
@@ -107,4 +122,5 @@ def check_kernels(
     for name, section in sections.items():
         head = head.replace(f"//@@ {name}\n", section)
     built = build(workspace, with_scalars(head) + text)
+    load_invoker()
     return {kernel.function_name: kernel for kernel in built.all_kernels()}
