@@ -7,22 +7,16 @@ from collections.abc import Mapping
 import numpy as np
 
 from fidsplat.backends.base import Reshapes
-from fidsplat.backends.prepare import prepare
 from fidsplat.hard_cases.agreement import Picture
-from fidsplat.render import Frame, Renderer
+from fidsplat.render import Renderer
 
 CULLED = 0xFFFFFFFF
 """depth key of a splat that is not drawn, on devices"""
 
 
-def draw(renderer: Renderer, picture: Picture) -> Frame:
-    """The picture on a device."""
-    return renderer.render(picture.cloud, picture.capture)
-
-
 def trace(renderer: Renderer, picture: Picture, shape=None) -> dict[str, np.ndarray]:
-    """What passes between the stages of a device, with the planes; `shape` replaces its build constants."""
-    features, view = prepare(picture.cloud, picture.capture)
+    """What passes between the stages of a device, with the outputs; `shape` replaces its build constants."""
+    features, view = picture.prepared()
     backend = renderer.backend
     reshaped = isinstance(backend, Reshapes) and shape is not None
     pipeline = backend.pipeline(features, shape) if reshaped else backend.pipeline(features)

@@ -58,7 +58,7 @@ def test_records_lie_on_the_device_as_the_host_has_them(renderer, name):
             pytest.skip("the device has no float64")
         capture = asked.capture
         double = fs.Capture(outputs=capture.outputs, quality=capture.quality.with_(blend_precision="float64"))
-        features = select(asked.cloud, double)
+        features = select(asked.cloud, fs.Capture(outputs=double))
     else:
         features = asked.features()
     if not renderer.device.float64:
