@@ -168,7 +168,7 @@ def test_too_many_splats_are_refused_before_the_work(noise, monkeypatch):
     def partition(grid):
         raise AssertionError("cut into rectangles all the same")
 
-    monkeypatch.setattr("fidsplat.markers.build.partition", partition)
+    monkeypatch.setattr("fidsplat.markers.build.partition_colors", partition)
     with pytest.raises(fs.InputError, match=r"at least 1\d\d,\d{3} splats, more than 100,000: .*max_splats"):
         marker(noise, max_splats=100_000)
 
