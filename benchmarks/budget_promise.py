@@ -79,7 +79,7 @@ def capture_of(scene: RandomScene) -> fs.Capture:
 
 def errors_kept(renderer: fs.Renderer, count: int, measured: int, where: Console) -> list[dict]:
     """A row for each way of asking and each bound: of `count` scenes, and of the first `measured` of them."""
-    judge = fs.Renderer("reference")
+    reference = fs.Renderer("reference")
     ways = ("table", "crossing", "measured", "elsewhere")
     kept = {(way, bound): Kept() for way in ways for bound in BOUNDS}
     table = {bound: fs.quality_within(error=bound, device=renderer) for bound in BOUNDS}
@@ -89,7 +89,7 @@ def errors_kept(renderer: fs.Renderer, count: int, measured: int, where: Console
         kept[way, bound].worst.append(errors(frame["rgb"], want).maximum / bound)
 
     def truth_of(scene: RandomScene) -> np.ndarray:
-        return truth(judge, scene.cloud, capture_of(scene))
+        return truth(reference, scene.cloud, capture_of(scene))
 
     for k in track(range(count), "errors", console=where):
         scene = random_scene(HELD_OUT + k)

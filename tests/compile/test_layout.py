@@ -106,7 +106,7 @@ TOY_OUTPUT = """// nearest (h, w): depth [m] of the nearest fragment that is dra
     vfloat nearest;
 //@ start
     pixel->nearest = INFINITY;
-//@ lay
+//@ composite
     pixel->nearest = fmin(pixel->nearest, VSELECT((vfloat)INFINITY, seen->z, live & VMASK(weight > 0.0f)));
 //@ store
         VSTORE(pixel->nearest, nearest_raw + at);
@@ -188,7 +188,7 @@ def test_line_directives_lead_to_the_lines_of_the_files():
 
     source = assemble(combination(everything("distortion")).features(), cpu_shape())
     assert source.listing.count("\n") == source.text.count("\n")
-    file, number, told = "", 0, 0
+    file, number, found = "", 0, 0
     for line in source.listing.splitlines():
         if directive := re.fullmatch(r'#line (\d+) "(.*)"', line):
             number, file = int(directive[1]), directive[2]
@@ -196,9 +196,9 @@ def test_line_directives_lead_to_the_lines_of_the_files():
         if file.startswith("opencl/") and line.strip():
             written = (kernels_folder() / file).read_text("utf-8").splitlines()[number - 1]
             assert re.sub(r"WIDE\(([^()]+)\)", r"\1f", written).replace("wide ", "float ")[:4] == line[:4]
-            told += 1
+            found += 1
         number += 1
-    assert told > 800
+    assert found > 800
 
 
 def test_the_text_needs_no_opencl():
