@@ -42,7 +42,7 @@ class Calibration:
         camera: from where.
         base: whose definition the truth has.
         around: background, motion, shutter, fog, as `Renderer.render` takes them.
-        tell: is told what is being done.
+        tell: called with what is being done.
     """
 
     def __init__(

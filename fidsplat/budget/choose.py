@@ -66,7 +66,8 @@ def choose(
     tell: Callable[[str], None] = lambda text: None,
     **around: Any,
 ) -> Choice:
-    """As `Quality.within`, with what is known about the quality beside it. `tell` is told what is being done.
+    """As `Quality.within`, with what is known about the quality beside it. `tell`: called with what is being
+    done.
 
     Raises:
         InputError: as `Quality.within`. DeviceError: the device cannot be used or fails.
@@ -103,8 +104,8 @@ def choose(
 
 
 def check_bounds(error: float | None, ms: float | None) -> None:
-    """Raises InputError for bounds that are no numbers. Those that nothing can keep are told from the others
-    by measuring what is possible."""
+    """Raises InputError for bounds that are no numbers. Only measuring shows which of the others cannot be
+    kept."""
     if error is None and ms is None:
         raise InputError("a budget of nothing: give error=1e-3, or ms=20 with camera=... and cloud=...")
     for name, value, example in (("error", error, "1e-3"), ("ms", ms, "20")):

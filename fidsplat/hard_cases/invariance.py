@@ -27,7 +27,7 @@ def differing(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray],
     """Number of pixels whose bits differ in any of the outputs; all of them where the shapes differ."""
     different = np.zeros((), bool)
     for name in outputs:
-        one, other = (np.ascontiguousarray(planes[name]) for planes in (first, second))
+        one, other = (np.ascontiguousarray(images[name]) for images in (first, second))
         if one.shape != other.shape:
             return max(one.size, other.size)
         bits = f"u{one.itemsize}"

@@ -137,7 +137,7 @@ def test_growth_goes_on_where_it_was(tmp_path, capsys):
     file.write_text(lines + '{"cut off')  # as a run that is killed leaves it
     again = growth.run({"splats": small}, "opencl", 2, 60.0, file)
     assert [record["x"] for record in again] == [20, 40, 80]
-    assert again[:2] == first  # not measured anew
+    assert again[:2] == first  # not measured again
     assert file.read_text().startswith(lines)
     assert growth.read(file) == again
     (thick,) = growth.run(
