@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,9 @@ import pytest
 from fidsplat.experiments.bench.growth import Point
 
 FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
+
+
+sys.path.append(str(FOLDER))  # scripts import what they share
 
 
 def script(name: str):
