@@ -6,8 +6,8 @@
 Takes what `fidsplat bench --json`, benchmarks/peers, benchmarks/first_frame.py --json,
 benchmarks/listing_ways.py --json, benchmarks/large_scenes.py --json and benchmarks/growth.py write, in any
 mixture; other figures are left alone. Without --into the tables are printed. With it, each replaces what
-stands between `<!-- begin NAME -->` and `<!-- end NAME -->` in those of the pages that have such lines; a table
-for which nothing was measured is left alone.
+stands between `<!-- begin NAME -->` and `<!-- end NAME -->` in those of the pages that have such lines; a
+table for which nothing was measured is left alone.
 """
 
 from __future__ import annotations

@@ -170,11 +170,8 @@ def d4(renderer: Renderer) -> Found:
     yield Finding("pixels of the faintest splat that are missing", float(not covered[MIDDLE]), 0.0)
     for name in names[1:]:
         depth = frame[name]
-        yield Finding(
-            f"{name} where less than 1/255 is covered [m]",
-            float(np.abs(depth[~covered]).max(initial=0.0)),
-            0.0,
-        )
+        stray = float(np.abs(depth[~covered]).max(initial=0.0))
+        yield Finding(f"{name} where less than 1/255 is covered [m]", stray, 0.0)
         error = np.abs(depth[covered] / 3 - 1).max(initial=0.0)
         yield Finding(f"{name} of the faintest splat, relative error", float(error), 1e-6)
 

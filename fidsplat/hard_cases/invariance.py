@@ -18,8 +18,10 @@ def trace(renderer: Renderer, picture: Picture, shape=None) -> dict[str, np.ndar
     """What passes between the stages of a device, with the outputs; `shape` replaces its build constants."""
     features, view = picture.prepared()
     backend = renderer.backend
-    reshaped = isinstance(backend, Reshapes) and shape is not None
-    pipeline = backend.pipeline(features, shape) if reshaped else backend.pipeline(features)
+    if shape is not None and isinstance(backend, Reshapes):
+        pipeline = backend.pipeline(features, shape)
+    else:
+        pipeline = backend.pipeline(features)
     return pipeline.trace(backend.upload(picture.cloud), view)
 
 

@@ -48,11 +48,11 @@ class Broken:
 
 
 def test_a_good_device_passes(renderer):
-    steps = []
-    result = check.run_check(renderer, [GOOD], steps.append)
+    said = []
+    result = check.run_check(renderer, [GOOD], said.append)
     assert result.passed
     assert result.failures == []
-    assert steps == ["arithmetic", "A1: a good case"]
+    assert said == ["arithmetic", "A1: a good case"]
     (only,) = result.groups["A"]
     assert (only.pictures, only.passed) == (1, True)
     assert set(only.largest) == set(only.uncertified) == {"rgb", "alpha", "depth"}
@@ -124,14 +124,14 @@ def test_certificates_name_what_single_precision_cannot_decide():
     assert all(truth["certificate"][0, 0] < 1e-5 for truth in truths)
 
 
-def test_too_many_risky_pixels_fail(renderer, monkeypatch):
+def test_too_many_uncertain_pixels_fail(renderer, monkeypatch):
     truth_of = check.truth_of
 
-    def risky(picture):
+    def uncertain(picture):
         truth = truth_of(picture)
         return truth | {"certificate": truth["certificate"] + 0.06}
 
-    monkeypatch.setattr(check, "truth_of", risky)
+    monkeypatch.setattr(check, "truth_of", uncertain)
     failures = check.run_check(renderer, [GOOD]).failures
     assert "certificates above 0.05" in failures[0]
 
