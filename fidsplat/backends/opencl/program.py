@@ -11,7 +11,7 @@ from typing import Any
 import pyopencl as cl
 
 from fidsplat.backends.opencl.assemble import Source, kernel_text, with_scalars
-from fidsplat.backends.opencl.pocl_target import target_of
+from fidsplat.backends.opencl.pocl_target import correct_target, needs_correction
 from fidsplat.backends.opencl.workspace import DeviceBuffer, Workspace
 from fidsplat.errors import DeviceError
 
@@ -30,9 +30,12 @@ def load_invoker() -> None:
 
 def build_options(device: cl.Device) -> list[str]:
     """What every program is compiled with: no option that lets go of IEEE arithmetic."""
+    version, target = device.version, device.version
+    if needs_correction(version):
+        target = correct_target(device.int_ptr, version)
     # the target's name is part of pyopencl's cache key: PoCL's own version string does not tell processors
     # apart
-    target = "".join(c if c.isalnum() else "_" for c in target_of(device))
+    target = "".join(c if c.isalnum() else "_" for c in target)
     options = ["-cl-std=CL1.2", "-w", f"-DTARGET_{target}"]
     if device.platform.name == "NVIDIA CUDA":
         # the projection wants 98 registers; two fewer let a quarter more work-items run at once
