@@ -108,8 +108,8 @@ def test_imports_point_downwards(module):
 
 def needed(path: Path, modules) -> set[str]:
     """The modules that a file's import statements need, wherever they stand: `from fidsplat.a import b` needs
-    fidsplat.a.b if that is a module, else fidsplat.a. That a.b.c brings the `__init__` of a.b with it does not
-    count."""
+    fidsplat.a.b if that is a module, else fidsplat.a. That a.b.c brings the `__init__` of a.b with it does
+    not count."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.Import):
