@@ -58,7 +58,7 @@ def test_records_lie_on_the_device_as_the_host_has_them(renderer, name):
             pytest.skip("the device has no float64")
         capture = asked.capture
         double = fs.Capture(outputs=capture.outputs, quality=capture.quality.with_(blend_precision="float64"))
-        features = select(asked.cloud, fs.Capture(outputs=double))
+        features = select(asked.cloud, double)
     else:
         features = asked.features()
     if not renderer.device.float64:
@@ -208,7 +208,7 @@ def test_the_text_needs_no_opencl():
         "from fidsplat.backends.opencl.assemble import assemble\n"
         "from fidsplat.backends.opencl.shapes import cpu_shape\n"
         "from fidsplat.effects import select\n"
-        "features = select(fs.SplatCloud.empty(), ('rgb', 'depth'), fs.Quality())\n"
+        "features = select(fs.SplatCloud.empty(), fs.Capture(outputs=('rgb', 'depth')))\n"
         "print(assemble(features, cpu_shape()).digest)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
