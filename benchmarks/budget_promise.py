@@ -17,9 +17,9 @@ import math
 import os
 import sys
 import tempfile
-import time
 from dataclasses import dataclass, field, replace
 from datetime import date
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +34,7 @@ from fidsplat.errors import InputError
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED
 from fidsplat.files import atomic_write
 from fidsplat.random_clouds import HELD_OUT, RandomScene, random_scene
+from fidsplat.timing import Timer, frame_timer, take_turns
 
 BOUNDS = (1e-2, 1e-3, 1e-4)
 SCENES = ("tag", "r100k_720p", "r1m_1080p")
@@ -114,42 +115,39 @@ def times_kept(renderer: fs.Renderer, names: list[str], where: Console) -> list[
     for name in names:
         cloud, camera = BENCH_SCENES[name].make()
         resident = renderer.upload(cloud)
-        usual = float(np.median(frame_times(renderer, resident, camera, TIMED, 10)))
+        usual = timed(renderer, resident, camera, TIMED, 10).median
         for times in track(TIMES, f"times, {name}", console=where):
             ms = times * usual
             row = {"scene": name, "base_ms": usual, "budget_ms": ms}
-            begun = time.perf_counter()
-            try:
-                found = choose(ms=ms, camera=camera, cloud=cloud, device=renderer)
-            except InputError as error:
-                rows.append(row | {"refused": str(error)})
+            answers = []
+            ask = partial(choose, ms=ms, camera=camera, cloud=cloud, device=renderer)
+            calibration = Timer(lambda answers=answers, ask=ask: answers.append(ask()), drops_out=True)
+            seconds = calibration.run() / 1e3
+            if calibration.error:
+                rows.append(row | {"refused": calibration.error})
                 continue
-            calibration = time.perf_counter() - begun
-            taken = frame_times(renderer, resident, camera, found.quality, FRAMES)
+            (found,) = answers
+            taken = timed(renderer, resident, camera, found.quality, FRAMES)
             rows.append(
                 row
                 | {
-                    "calibration_s": calibration,
+                    "calibration_s": seconds,
                     "chosen": found.knobs,
                     "error": found.error,
                     "frames": FRAMES,
-                    "in_time": int((taken <= ms).sum()),
-                    "median_ms": float(np.median(taken)),
-                    "p90_ms": float(np.quantile(taken, 0.9)),
+                    "in_time": int((np.array(taken.ms) <= ms).sum()),
+                    "median_ms": taken.median,
+                    "p90_ms": float(np.quantile(taken.ms, 0.9)),
                 }
             )
     return rows
 
 
-def frame_times(renderer: fs.Renderer, resident, camera, quality, count: int) -> np.ndarray:
-    """Milliseconds of frames (count,), after one that does not count."""
-    taken = []
-    for _ in range(count + 1):
-        begun = time.perf_counter()
-        frame = renderer.render(resident, camera, quality=quality)
-        assert frame.timings is not None  # waits for the device
-        taken.append(1e3 * (time.perf_counter() - begun))
-    return np.array(taken[1:])
+def timed(renderer: fs.Renderer, resident, camera, quality, count: int) -> Timer:
+    """The times of so many frames, after one that does not count."""
+    timer = frame_timer(renderer, resident, camera, quality=quality)
+    take_turns([timer], count, warm_up=1)
+    return timer
 
 
 def main() -> int:

@@ -69,15 +69,15 @@ def picture(panels: dict) -> np.ndarray:
         jump, before, after = panels["QR 5", mode]
         titled = (
             (f"coplanar={mode}", before),
-            ("0.0001 deg on", after),
-            (f"difference, {jump:.2g}", np.abs(after - before)),
+            ("turned by 0.0001 degrees", after),
+            (f"difference, at most {jump:.2g}", np.abs(after - before)),
         )
-        # the code's middle, each pixel two wide
+        # the code's middle, each pixel three wide
         crop = np.s_[48:144, 72:168]
         rows.append(
-            [(title, to_uint8(image[crop]).repeat(2, axis=0).repeat(2, axis=1)) for title, image in titled]
+            [(title, to_uint8(image[crop]).repeat(3, axis=0).repeat(3, axis=1)) for title, image in titled]
         )
-    return contact_sheet(rows, width=192)
+    return contact_sheet(rows, width=288)
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """What each effect costs: a standard random scene without and with it, in turns, splats resident.
 
     python benchmarks/effects.py [NAME ...] [--scene r1m_1080p] [--device opencl] [--repeats 5] [--json]
-    python benchmarks/effects.py --table FILE.json [FILE.json ...]       the table of docs/effects.md
+    python benchmarks/effects.py --table FILE.json [FILE.json ...]       the table of docs/effect-prices.md
 
 Every frame with an effect is followed by one without, the picture left on the device, the queue drained
 before and after each, so that what else the machine does falls on both. The price is the median of the ratios
@@ -15,9 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import statistics
 import sys
-import time
 from datetime import date
 from pathlib import Path
 
@@ -30,6 +28,7 @@ import fidsplat as fs
 from fidsplat.effects import OUTPUTS
 from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.random_clouds import SCENES, load_scene
+from fidsplat.timing import frame_timer, quartiles, ratios, take_turns
 
 TABLE = tuple(np.linspace(0, 1, 64) ** 0.5)
 SENSORS = {
@@ -128,14 +127,6 @@ def changed(cloud: fs.SplatCloud, what: str | int) -> fs.SplatCloud:
     return fs.SplatCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, sh=sh)
 
 
-def milliseconds(renderer: fs.Renderer, resident, call: dict) -> float:
-    """Wall time of one frame."""
-    start = time.perf_counter()
-    frame = renderer.render(resident, **{"quality": TIMED, **call})
-    _ = frame.timings  # waits for the device
-    return (time.perf_counter() - start) * 1e3
-
-
 def measure(options: argparse.Namespace) -> list[dict]:
     """One row for each effect."""
     renderer = fs.Renderer(options.device)
@@ -148,21 +139,17 @@ def measure(options: argparse.Namespace) -> list[dict]:
         call = {"camera": camera, **known[name]}
         what = call.pop("cloud", None)
         resident = plain if what is None else renderer.upload(changed(cloud, what))
-        for _ in range(2):
-            milliseconds(renderer, resident, call), milliseconds(renderer, plain, {"camera": camera})
-        pairs = [
-            (milliseconds(renderer, resident, call), milliseconds(renderer, plain, {"camera": camera}))
-            for _ in range(options.repeats)
-        ]
-        ratios = [mine / base for mine, base in pairs]
-        quartiles = statistics.quantiles(ratios, n=4)
+        base = frame_timer(renderer, plain, camera, quality=TIMED)
+        mine = frame_timer(renderer, resident, **{"quality": TIMED, **call})
+        take_turns([mine, base], options.repeats)
+        low, middle, high = quartiles([100 * (ratio - 1) for ratio in ratios(mine, base)])
         rows.append(
             {
                 "effect": name,
-                "base_ms": statistics.median(base for _, base in pairs),
-                "effect_ms": statistics.median(mine for mine, _ in pairs),
-                "price_percent": (statistics.median(ratios) - 1) * 100,
-                "quartiles_percent": [(quartiles[0] - 1) * 100, (quartiles[2] - 1) * 100],
+                "base_ms": base.median,
+                "effect_ms": mine.median,
+                "price_percent": middle,
+                "quartiles_percent": [low, high],
             }
         )
     about = {

@@ -80,11 +80,11 @@ def main() -> None:
             row.append(f"{-10 * math.log10(float((error * error).mean())):.1f}")
             if px == 2.0:
                 crop = to_uint8(rgb[6:46, 6:46])
-                crops.append((name, cv2.resize(crop, (160, 160), interpolation=cv2.INTER_NEAREST)))
+                crops.append((name, cv2.resize(crop, (240, 240), interpolation=cv2.INTER_NEAREST)))
         table.add_row(name, *row)
     Console(width=100).print(table)
     if options.picture:
-        write_png(options.picture, contact_sheet([crops[:4], crops[4:]], width=120) // 16 * 16)
+        write_png(options.picture, contact_sheet([crops[:4], crops[4:]], width=240) // 16 * 16)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""Draws what benchmarks/growth.py measured: a picture for each series, log-log, a line for each device.
+"""Draws what benchmarks/growth.py measured: a picture for each series, log-log, a panel for each device.
 
     pip install '.[bench]'
     python benchmarks/growth_plots.py growth-cpu.jsonl growth-gpu.jsonl -o docs/images
 
 Writes growth-splats.png, growth-pixels.png and growth-overdraw.png. Whole frames are bold, stages thin;
-legends give the exponent of the frame's upper half.
+titles give the exponent of the frame's upper half.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from matplotlib import pyplot as plt
 from fidsplat.experiments.bench.growth import abscissa, exponents
 from fidsplat.files import atomic_write
 
+STAGES = ("project", "sort", "bin", "blend", "resolve")
 UNITS = {"splats": "splats", "pixels": "pixels", "overdraw": "splats over a pixel, seen or hidden"}
 TITLES = {
     "splats": "1920 x 1080, the same covered area",
@@ -30,25 +31,34 @@ TITLES = {
 
 
 def plot(series: str, records: list[dict], file: Path) -> None:
-    """One series of every device in one picture."""
+    """One series: a panel for each device, all of one scale."""
     chosen = [record for record in records if record["series"] == series and "frame_ms" in record]
-    figure, axes = plt.subplots(figsize=(6.4, 4.4), dpi=110, layout="constrained")
+    titles = list(dict.fromkeys(record["title"] for record in chosen))
     slopes = {title: found["frame"] for title, name, found in exponents(chosen) if name == series}
-    styles = {}
-    for number, title in enumerate(dict.fromkeys(record["title"] for record in chosen)):
+    figure, panels = plt.subplots(
+        1,
+        len(titles),
+        figsize=(4.2 * len(titles) + 0.9, 4),
+        dpi=110,
+        layout="constrained",
+        sharey=True,
+        squeeze=False,
+    )
+    lines: dict = {}
+    for axes, title in zip(panels[0], titles, strict=True):
         own = sorted((record for record in chosen if record["title"] == title), key=abscissa)
-        over, dashes = [abscissa(record) for record in own], ("-", "--", ":", "-.")[number % 4]
-        slope = slopes[title]
-        words = title if slope is None else f"{title}: frame ~ x^{slope:.2f}"
-        axes.loglog(over, [r["fastest_ms"] for r in own], f"k{dashes}", marker="o", lw=2, ms=4, label=words)
-        for stage in own[0]["fastest_stages_ms"]:
-            color = styles.setdefault(stage, f"C{len(styles)}")
+        over, slope = [abscissa(record) for record in own], slopes[title]
+        (lines["frame"],) = axes.loglog(over, [r["fastest_ms"] for r in own], "k", marker="o", lw=2, ms=4)
+        for number, stage in enumerate(STAGES):
             times = [record["fastest_stages_ms"].get(stage) for record in own]
-            label = stage if number == 0 else None
-            axes.loglog(over, times, color=color, ls=dashes, lw=1, marker=".", ms=4, label=label)
-    axes.set(xlabel=UNITS[series], ylabel="ms, fastest of the repeats", title=TITLES[series])
-    axes.grid(which="both", alpha=0.25, lw=0.5)
-    axes.legend(fontsize=8)
+            (lines[stage],) = axes.loglog(over, times, color=f"C{number}", lw=1.2, marker=".", ms=5)
+        grows = "" if slope is None else f"\nframe grows as x^{slope:.2f}"
+        axes.set_title(f"{title}{grows}", fontsize=10)
+        axes.set_xlabel(UNITS[series])
+        axes.grid(which="major", alpha=0.3, lw=0.5)
+    panels[0, 0].set_ylabel("ms, fastest of the repeats")
+    figure.suptitle(TITLES[series], fontsize=11)
+    figure.legend(lines.values(), lines.keys(), loc="outside right center", frameon=False)
     with atomic_write(file) as stream:
         figure.savefig(stream, format="png", metadata={"Software": None})
     plt.close(figure)

@@ -15,7 +15,6 @@ import json
 import resource
 import subprocess
 import sys
-import time
 from datetime import date
 from pathlib import Path
 
@@ -26,6 +25,7 @@ from rich.table import Table
 import fidsplat as fs
 from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.random_clouds import SCENES, random_cloud, standard_camera
+from fidsplat.timing import Timer
 
 SCENE = SCENES["r20m_4k"]
 
@@ -54,12 +54,15 @@ def measure(millions: int, device: str, budget: float | None) -> dict:
     renderer = fs.Renderer(device, None if budget is None else round(budget * 2**30))
     resident = renderer.upload(cloud)
     camera = standard_camera(SCENE.width, SCENE.height)
-    seconds = []
-    for _ in range(2):
-        start = time.perf_counter()
+    frame, mean = None, 0.0
+
+    def draw() -> None:
+        nonlocal frame, mean
         frame = renderer.render(resident, camera, quality=TIMED)
         mean = float(frame["rgb"].mean())
-        seconds.append(time.perf_counter() - start)
+
+    seconds = [Timer(draw).run() / 1e3 for _ in range(2)]
+    assert frame is not None
     return {
         "millions": millions,
         "device": f"{renderer.device.title}, {renderer.device.version}",

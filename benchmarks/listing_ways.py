@@ -4,27 +4,26 @@
 
 `ordered` sorts all visible splats by depth and lists them per tile in that order (counting sorts, no
 atomics); `tiled` writes the pairs to their tiles in any order and sorts each tile's list in local memory.
-Both give the same lists. docs/performance.md says which one a device gets, and why.
+Both give the same lists. docs/growth.md says which one a device gets, and why.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import statistics
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import track
 from rich.table import Table
 
 import fidsplat as fs
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.effects import select
 from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.random_clouds import SCENES, load_scene
+from fidsplat.timing import Timer, take_turns
 
 WAYS = ("ordered", "tiled")
 
@@ -35,17 +34,15 @@ def measure(renderer: fs.Renderer, name: str, repeats: int) -> list[dict]:
     cloud, camera = load_scene(name)
     resident = backend.upload(cloud)
     view = View.of(camera, quality, cloud.origin, (0, 0, 0))
-    features = select(resident, ("rgb",), quality)
+    features = select(resident, ("rgb",), quality, camera)
     # the GPU's way scans with many work-items, the CPU's with one
     items = {"ordered": backend.shape.scan_items, "tiled": max(backend.shape.scan_items, 64)}
     ways = {
         way: backend.pipeline(features, replace(backend.shape, lists=way, scan_items=items[way]))
         for way in WAYS
     }
-    times: dict[str, list[dict]] = {way: [] for way in WAYS}
-    for _ in track(range(repeats + 1), name, console=Console(stderr=True)):
-        for way, pipeline in ways.items():
-            times[way].append(dict(pipeline.render(resident, view).timings))
+    timers = {way: Timer(lambda made=made: made.render(resident, view).timings) for way, made in ways.items()}
+    take_turns(list(timers.values()), repeats, warm_up=1)
     return [
         {
             "scene": name,
@@ -53,9 +50,9 @@ def measure(renderer: fs.Renderer, name: str, repeats: int) -> list[dict]:
             "device": f"{renderer.device.title}, {renderer.device.version}",
             "date": date.today().isoformat(),
             "repeats": repeats,
-            "stages_ms": {stage: statistics.median(row[stage] for row in rows[1:]) for stage in rows[0]},
+            "stages_ms": timer.part_medians,
         }
-        for way, rows in times.items()
+        for way, timer in timers.items()
     ]
 
 

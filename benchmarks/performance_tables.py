@@ -83,11 +83,11 @@ def frames(records: dict[str, list[dict]]) -> str:
                 record["date"],
             )
         )
-    return table(("scene", "device", "ms per frame", "x floor", "splats/s", "memory", "date"), rows)
+    return table(("scene", "device", "ms per frame", "x roofline", "splats/s", "memory", "date"), rows)
 
 
 def stages(records: dict[str, list[dict]]) -> str:
-    """Stages, each with how many times its floor it takes."""
+    """Stages, each with how many times its roofline it takes."""
     names = list(dict.fromkeys(stage for record in records["frames"] for stage in record["stages_ms"]))
     rows = []
     for record in records["frames"]:
@@ -216,8 +216,8 @@ def ms(value: float) -> str:
 
 
 def times(record: dict, name: str) -> str:
-    """How many times its floor, or a dash."""
-    value = record["times_floor"].get(name)
+    """How many times its roofline, or a dash."""
+    value = record["times_roofline"].get(name)
     return "-" if value is None else f"{value:.3g}"
 
 

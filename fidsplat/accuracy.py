@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fidsplat.backends.reference.backend import ReferencePlanes
+from fidsplat.backends.base import GivesFloat64
 from fidsplat.cameras import Camera
 from fidsplat.effects import select
 from fidsplat.errors import DeviceError, InputError
@@ -92,7 +92,7 @@ def full_precision(
         setup_precision="float64",
         arithmetic="precise",
     )
-    if renderer.device.name != "reference" and draws_float64(renderer, camera, fog):
+    if not renderer.backend.always_float64 and draws_float64(renderer, camera, fog):
         return best.with_(blend_precision="float64")
     return best
 
@@ -100,19 +100,18 @@ def full_precision(
 def draws_float64(renderer: Renderer, camera: Camera | None = None, fog: Fog | None = None) -> bool:
     """Whether its pictures at full precision are float64 throughout: the reference's, and those of OpenCL on
     a device with float64, but for lenses and fog, whose rays are float32."""
-    family = renderer.device.name.partition(":")[0]
-    if family != "opencl" or not renderer.device.float64:
-        return family == "reference"
+    if renderer.backend.always_float64:
+        return True
     try:
-        select(SplatCloud.empty(), ("rgb",), Quality(blend_precision="float64"), camera, fog=fog)
+        features = select(SplatCloud.empty(), ("rgb",), Quality(blend_precision="float64"), camera, fog=fog)
     except InputError:
         return False
-    return True
+    return not renderer.backend.unsupported(features)
 
 
 def doubt(judge: Renderer, camera: Camera | None = None, fog: Fog | None = None) -> float:
     """What the truth may be off itself that a renderer draws."""
-    if judge.device.name == "reference":
+    if judge.backend.always_float64:
         return 0.0
     return FLOAT32_OUTPUT if draws_float64(judge, camera, fog) else FLOAT32_TRUTH
 
@@ -157,6 +156,6 @@ def truth(
     seen_from, fog = camera or own.camera, around.get("fog") or own.fog
     quality = full_precision(Quality.of(like), renderer, seen_from, fog)
     frame = renderer.render(scene, camera, (output,), quality, **around)
-    if isinstance(frame._planes, ReferencePlanes):  # float32 is made of its planes when they are read
-        return frame._planes.planes[output]
+    if isinstance(frame._images, GivesFloat64):  # what is read otherwise is rounded to float32
+        return frame._images.read_float64(output)
     return np.asarray(frame[output], np.float64)

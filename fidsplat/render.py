@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import DeviceInfo, Planes
+from fidsplat.backends.base import Adopts, DeviceInfo, GivesArrays, Images, ResidentData
 from fidsplat.backends.exposure import exposed_view
 from fidsplat.backends.registry import open_backend
 from fidsplat.cameras import Camera, Motion, Shutter
@@ -35,38 +35,37 @@ class Frame(Mapping):
     `Quality.first_hit`, labels and ids are -1, the others of these 0.
     """
 
-    def __init__(self, planes: Planes, outputs: tuple[str, ...]) -> None:
-        self._planes = planes
+    def __init__(self, images: Images, outputs: tuple[str, ...]) -> None:
+        self._images = images
         self._arrays: dict[str, np.ndarray] = {}
         self.outputs = outputs
-        """Names of the planes, in the order in which they were asked for."""
+        """Names of the images, in the order in which they were asked for."""
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.outputs:
             raise KeyError(f"this frame has no {name!r}; it was rendered with {', '.join(self.outputs)}")
         if name not in self._arrays:
-            self._arrays[name] = plane = self._planes.read(name)
-            plane.flags.writeable = False  # what is kept is what was drawn
+            self._arrays[name] = image = self._images.read(name)
+            image.flags.writeable = False  # what is kept is what was drawn
         return self._arrays[name]
 
     def device_array(self, name: str) -> Any:
-        """The plane where it was drawn, without a copy: on a Warp device a wp.array, (h, w) or (h, w, 3).
+        """The image where it was drawn, without a copy: on a Warp device a wp.array, (h, w) or (h, w, 3).
 
         It belongs to this frame: the next picture is drawn into another array. `wp.to_torch`, DLPack and
         `__cuda_array_interface__` make a tensor of it on the same device.
 
         Raises:
-            KeyError: a plane that was not asked for; InputError: the backend has no arrays to give.
+            KeyError: an output that was not asked for; InputError: the backend has no arrays to give.
         """
         if name not in self.outputs:
             raise KeyError(f"this frame has no {name!r}; it was rendered with {', '.join(self.outputs)}")
-        give = getattr(self._planes, "device_array", None)
-        if give is None:
+        if not isinstance(self._images, GivesArrays):
             raise InputError(
                 f"this device keeps {name} in no array that others can use; draw with device='warp:cuda' or "
                 "'warp:cpu', or take frame[name], which is copied to the host"
             )
-        return give(name)
+        return self._images.device_array(name)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.outputs)
@@ -77,12 +76,12 @@ class Frame(Mapping):
     @property
     def timings(self) -> Mapping[str, float]:
         """Milliseconds on the device by stage: project, sort, bin, blend, resolve."""
-        return self._planes.timings
+        return self._images.timings
 
     @property
     def stats(self) -> Mapping[str, int]:
         """splats (in the cloud), visible (not culled), pairs (of splats and tiles)."""
-        return self._planes.stats
+        return self._images.stats
 
 
 def default_device() -> str:
@@ -93,16 +92,16 @@ def default_device() -> str:
 class ResidentCloud:
     """A cloud on a renderer's device; rendering it transfers no splat."""
 
-    def __init__(self, renderer: Renderer, data: Any, count: int) -> None:
-        self._renderer, self._data, self._count = renderer, data, count
+    def __init__(self, renderer: Renderer, data: ResidentData) -> None:
+        self._renderer, self._data = renderer, data
 
     def __len__(self) -> int:
-        return self._count
+        return self._data.count
 
     @property
     def memory_bytes(self) -> int:
-        """Device memory that it takes; 0 on a CPU, which reads the host's own arrays."""
-        return getattr(self._data, "device_bytes", 0)
+        """Device memory that it takes; 0 where the device reads the host's own arrays, as OpenCL on a CPU."""
+        return self._data.memory_bytes
 
 
 class Renderer:
@@ -140,7 +139,7 @@ class Renderer:
         cloud = scene.cloud() if isinstance(scene, Scene) else scene
         if not isinstance(cloud, SplatCloud):
             raise InputError(f"cannot render a {type(scene).__name__}; give a Scene or a SplatCloud")
-        return ResidentCloud(self, self.backend.upload(cloud), len(cloud))
+        return ResidentCloud(self, self.backend.upload(cloud))
 
     def adopt(
         self,
@@ -165,8 +164,7 @@ class Renderer:
         Raises:
             InputError: the backend takes no arrays, or one has the wrong shape, type or device.
         """
-        take = getattr(self.backend, "adopt", None)
-        if take is None:
+        if not isinstance(self.backend, Adopts):
             raise InputError(
                 f"{self.device.name} takes no arrays of a device; use a Warp device, or a SplatCloud"
             )
@@ -175,8 +173,7 @@ class Renderer:
         given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
         given |= {"colors": colors} if sh is None else {"sh": sh}
         given |= {} if labels is None else {"labels": labels}
-        data = take(given, np.asarray(tuple(origin), dtype=np.float64))
-        return ResidentCloud(self, data, data.count)
+        return ResidentCloud(self, self.backend.adopt(given, np.asarray(tuple(origin), dtype=np.float64)))
 
     def render(
         self,

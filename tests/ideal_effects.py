@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 import fidsplat as fs
-from fidsplat.backends.base import View
 from fidsplat.backends.exposure import exposed_view
 from fidsplat.backends.reference.optics import ray_lengths, rays_of
 from fidsplat.backends.reference.post import background_at, developed
+from fidsplat.backends.view import View
 from fidsplat.scenes import PlacedMarker
 
 

@@ -28,6 +28,7 @@ from fidsplat.budget.table import FILE, Setting
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
 from fidsplat.random_clouds import random_cloud, random_scene, standard_camera
+from fidsplat.timing import Timer, frame_timer, take_turns
 
 CUTOFFS = (0.03, 0.015, 2 / 255, 1 / 255, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 1e-7)
 STOPS = (0.05, 0.015, 4e-3, 1e-3, 1e-4, 1e-6)
@@ -166,17 +167,11 @@ def all_costs(renderer: fs.Renderer, settings: list[dict], repeats: int) -> np.n
     ratios = []
     for count, scale, width, height in TIMED:
         resident, camera = renderer.upload(random_cloud(count, scale)), standard_camera(width, height)
-        taken = np.empty((repeats + 1, len(qualities)))
-        for k in range(repeats + 1):
-            for j, each in enumerate(qualities):
-                begun = clock()
-                frame = renderer.render(resident, camera, quality=each)
-                assert frame.timings is not None  # waits for the device
-                taken[k, j] = clock() - begun
-            say(f"times: {k} of {repeats} rounds, {count:,} splats", end="\r")
-        middle = np.median(taken[1:], 0)
-        ratios.append(middle[1:] / middle[0])
-        say("")
+        frames = [frame_timer(renderer, resident, camera, quality=each) for each in qualities]
+        timers = [Timer(frame.run, clock) for frame in frames]
+        say(f"times: {repeats} rounds, {count:,} splats")
+        take_turns(timers, repeats, warm_up=1)
+        ratios.append(np.array([timer.median for timer in timers[1:]]) / timers[0].median)
     return np.mean(ratios, 0)
 
 

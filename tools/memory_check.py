@@ -130,8 +130,7 @@ def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
     import numpy as np
 
     import fidsplat as fs
-    from fidsplat.backends.base import View
-    from fidsplat.backends.opencl.arithmetic import run_arithmetic
+    from fidsplat.backends.view import View
     from fidsplat.effects import select
     from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture, truth_of
     from fidsplat.hard_cases.clouds import camera, splats
@@ -166,7 +165,7 @@ def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
 
     def arithmetic() -> float:
         numbers = np.linspace(0.5, 1.0, 64)
-        results = run_arithmetic(backend, -numbers, numbers, numbers, numbers)
+        results = backend.run_arithmetic(-numbers, numbers, numbers, numbers)
         return float(np.abs(results["exp"] - np.exp(-numbers)).max())
 
     yield "the self-test's arithmetic", arithmetic

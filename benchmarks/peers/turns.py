@@ -5,18 +5,18 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import time
 from collections.abc import Callable
 
 import numpy as np
 from rich.console import Console
-from rich.progress import track
+from rich.progress import Progress
 from rich.table import Table
 
 import fidsplat as fs
 from fidsplat.backends.base import DeviceInfo
-from fidsplat.experiments.bench.measure import WARM_UP, Result, SceneRun
+from fidsplat.experiments.bench.measure import Result, SceneRun
 from fidsplat.files import atomic_write
+from fidsplat.timing import Timer, take_turns
 
 
 def arguments(about: str | None, repeats: int, device: str) -> argparse.ArgumentParser:
@@ -48,25 +48,23 @@ def peer_device(name: str, title: str, platform: str, version: str, kind: str, u
     )
 
 
-def take_turns(ours: SceneRun, peer: Result, draw: Callable[[], np.ndarray], repeats: int) -> list[dict]:
+def compared(ours: SceneRun, peer: Result, draw: Callable[[], np.ndarray], repeats: int) -> list[dict]:
     """Time both and return their records, the peer's with the ratio of the medians and the PSNR of its
     picture against ours.
 
     Args:
-        draw: draws one frame, waits until it is done, and returns the picture, (h, w, 3 or more), as
-            something that NumPy can read. The reading is not timed.
+        peer: its `timer` times `draw`, which draws one frame, waits until it is done, and returns the
+        picture,
+            (h, w, 3 or more), as something that NumPy can read. The reading is not timed.
     """
-    begun = time.perf_counter()
-    picture = np.asarray(draw())[..., :3]
-    peer.first_frame_ms = 1e3 * (time.perf_counter() - begun)
+    drawn = []
+    peer.first_frame_ms = Timer(lambda: drawn.append(np.asarray(draw())[..., :3])).run()
+    picture = drawn.pop()
     peer.mean_rgb = float(picture.mean(dtype=np.float64))
     error = np.mean((np.clip(picture, 0, 1).astype(np.float64) - np.clip(ours.picture, 0, 1)) ** 2)
-    for number in track(range(WARM_UP + repeats), description=peer.scene, console=Console(stderr=True)):
-        ours.draw(counts=number >= WARM_UP)
-        begun = time.perf_counter()
-        draw()
-        if number >= WARM_UP:
-            peer.frames.append(1e3 * (time.perf_counter() - begun))
+    with Progress(console=Console(stderr=True)) as progress:
+        task = progress.add_task(peer.scene, total=2 * repeats)
+        take_turns([ours.result.timer, peer.timer], repeats, tick=lambda: progress.advance(task))
     records = [ours.result.as_dict(), peer.as_dict()]
     records[1]["times_ours"] = records[1]["frame_ms"] / records[0]["frame_ms"]
     records[1]["psnr_db"] = -10 * math.log10(max(error, 1e-12))

@@ -2,32 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from fidsplat.backends.base import FAR_EYE, View
+from fidsplat.backends.view import FAR_EYE, Shot, View
 from fidsplat.cameras import Camera
 from fidsplat.cameras.motion import Motion, Shutter
 from fidsplat.quality import Quality
 from fidsplat.sensor import Sensor
 from fidsplat.surroundings import Background, Fog
-
-
-@dataclass(frozen=True)
-class Shot:
-    """One sub-picture."""
-
-    view: View
-    """of its rows alone"""
-    top: int
-    """its first row of samples in the picture"""
-    weight: float
-    """in the mean of its rows' sub-pictures"""
-    first: bool
-    """whether it is the first of its rows"""
-    middle: bool
-    """whether the planes beside rgb and alpha show it: the sub-pose n // 2 of n"""
 
 
 def exposed_view(

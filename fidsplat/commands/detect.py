@@ -73,9 +73,9 @@ Examples:
             from fidsplat.experiments.readback import read_back
 
             camera, markers = _standing(scene)
-            readings, strangers = read_back(found, markers, camera)
+            readings, others = read_back(found, markers, camera)
             result["markers"] = [reading.as_dict() for reading in readings]
-            result["not_in_scene"] = [code.name for code in strangers]
+            result["not_in_scene"] = [code.name for code in others]
         if self.json:
             print_json(result)
             return 0

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.base import View
 from fidsplat.backends.reference import ReferenceBackend
+from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
 from fidsplat.effects import select
 from fidsplat.quality import Quality
@@ -102,7 +102,7 @@ def truth_of(picture: Picture, pixels: tuple[np.ndarray, np.ndarray] | None = No
     pipeline, resident = judge.pipeline(features), judge.upload(picture.cloud)
     if pixels is not None:
         return pipeline.pixels(resident, view, *pixels)
-    return pipeline.render(resident, view).planes
+    return pipeline.render(resident, view).images
 
 
 def compare(planes: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], outputs) -> list[Difference]:

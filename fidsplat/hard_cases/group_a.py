@@ -7,10 +7,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from fidsplat.backends.base import Reshapes
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
 from fidsplat.hard_cases.case import Case, Finding
 from fidsplat.hard_cases.clouds import camera, quaternion, splats, taken, turned
-from fidsplat.hard_cases.invariance import CULLED, differing, draw, has_tiles, tile_shapes, trace
+from fidsplat.hard_cases.invariance import CULLED, differing, draw, trace
 from fidsplat.random_clouds import log_uniform, random_splats
 from fidsplat.render import Renderer
 from fidsplat.splats import SplatCloud
@@ -98,12 +99,11 @@ def _a4() -> Iterator[Picture]:
 def _a4_tiles(renderer: Renderer) -> Iterator[Finding]:
     clouds = [_tilted(0.2), _crossing(60), random_splats(120, seed=4), _specks()]
     picture = _picture(SplatCloud.concatenate(clouds), width=93, height=77)
-    if not has_tiles(renderer):
+    if not isinstance(renderer.backend, Reshapes):
         return
     base = trace(renderer, picture)
-    for shape in tile_shapes(renderer):
+    for name, shape in renderer.backend.shapes("tiles").items():
         changed = differing(base, trace(renderer, picture, shape), ALL_OUTPUTS)
-        name = f"{shape.tile_width} x {shape.tile_height}"
         yield Finding(f"pixels that change in tiles of {name}", changed, 0)
 
 

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fidsplat.backends.base import View
+from fidsplat.backends.base import Reshapes
+from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, COLOR_TOLERANCE, Picture
 from fidsplat.hard_cases.case import Case, Finding
@@ -25,9 +26,7 @@ from fidsplat.hard_cases.invariance import (
     CULLED,
     differing,
     draw,
-    has_tiles,
     out_of_order,
-    tile_shapes,
     trace,
 )
 from fidsplat.quality import Quality
@@ -203,8 +202,9 @@ def _c3(renderer: Renderer) -> Iterator[Finding]:
     kept = {name: first[name].copy() for name in first}
     changed = max(differing(kept, draw(renderer, picture), ALL_OUTPUTS) for _ in range(3))
     yield Finding("pixels that change when drawn again", changed, 0)
-    if has_tiles(renderer):
-        changed = differing(kept, trace(renderer, picture, tile_shapes(renderer)[0]), ALL_OUTPUTS)
+    if isinstance(renderer.backend, Reshapes):
+        tiles = next(iter(renderer.backend.shapes("tiles").values()))
+        changed = differing(kept, trace(renderer, picture, tiles), ALL_OUTPUTS)
         yield Finding("pixels that change in other tiles", changed, 0)
     plain = Picture(taken(picture.cloud, np.arange(300)), picture.camera, outputs=("rgb",))
     yield Finding(

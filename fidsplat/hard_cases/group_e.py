@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.backends.base import Probed
 from fidsplat.cameras import Camera
 from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, CATALOGUED, Picture
 from fidsplat.hard_cases.case import Case, Finding
 from fidsplat.hard_cases.clouds import camera, splats, taken, turned
-from fidsplat.hard_cases.invariance import probe_of
 from fidsplat.quality import Quality
 from fidsplat.random_clouds import random_splats
 from fidsplat.render import Renderer
@@ -141,9 +141,8 @@ def far_check(renderer: Renderer) -> Iterator[Finding]:
 
 def count_check(renderer: Renderer) -> Iterator[Finding]:
     """Pairs of splats and tiles: sums beyond 32 bits, and a picture that is drawn in bands of tiles."""
-    backend: Any = renderer.backend
-    probe = probe_of(renderer)
-    if probe is None:
+    backend = renderer.backend
+    if not isinstance(backend, Probed):
         return
     cloud = random_splats(200, 43, depth=(0.5, 4.0), scale=(0.05, 1.0))
     pipeline = backend.pipeline(select(cloud, ("rgb", "alpha"), Quality()))
@@ -156,7 +155,7 @@ def count_check(renderer: Renderer) -> Iterator[Finding]:
             )
             if lengths.max() >= 2**32:
                 continue
-            starts, counted = probe.scan(pipeline, lengths.astype(np.uint32))
+            starts, counted = backend.probe().scan(pipeline, lengths.astype(np.uint32))
             places = np.concatenate([[0], np.cumsum(lengths)]) % 2**32
             wrong += counted != total or not np.array_equal(starts, places)
     yield Finding("sums of list lengths around 2^31 and 2^32 that are wrong", wrong, 0)
@@ -227,16 +226,15 @@ def frame_check(renderer: Renderer) -> Iterator[Finding]:
 
 def unwritten_check(renderer: Renderer) -> Iterator[Finding]:
     """Buffers full of NaN before the picture is drawn: nothing of them may survive."""
-    backend: Any = renderer.backend
-    probe = probe_of(renderer)
-    if probe is None:
+    backend = renderer.backend
+    if not isinstance(backend, Probed):
         return
     different = 0
     for cloud in (crowd(), crowd().with_planes(0), SplatCloud.empty()):
         for width, height in ((60, 45), (33, 1), (1, 1)):
             for quality in (Quality(), Quality(samples=2)):
                 clean = renderer.render(cloud, sized(width, height), ALL_OUTPUTS, quality)
-                with probe.poisoned(backend):
+                with backend.probe().poisoned():
                     frame = renderer.render(cloud, sized(width, height), ALL_OUTPUTS, quality)
                     planes = {name: frame[name] for name in ALL_OUTPUTS}
                 different += not all(np.array_equal(planes[name], clean[name]) for name in ALL_OUTPUTS)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import View
+from fidsplat.backends.base import Probed, Reshapes
+from fidsplat.backends.view import View
 from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
 from fidsplat.hard_cases.arithmetic import measure
 from fidsplat.hard_cases.case import Case, Finding
 from fidsplat.hard_cases.clouds import camera, splats
-from fidsplat.hard_cases.invariance import has_tiles, odd_shapes, other_schedule, out_of_order, probe_of
+from fidsplat.hard_cases.invariance import out_of_order
 from fidsplat.quality import Quality
 from fidsplat.random_clouds import random_splats
 from fidsplat.render import Renderer
@@ -27,12 +27,12 @@ UNSAFE = ("fast", "unsafe", "finite", "denorms", "mad-enable", "signed-zeros")
 
 def contraction_check(renderer: Renderer) -> Iterator[Finding]:
     """Products that are subtracted round alike, and FMA fuses where the device is said to."""
-    probe = probe_of(renderer)
-    if probe is None:
+    if not isinstance(renderer.backend, Probed):
         return
+    probe = renderer.backend.probe()
     generator = np.random.default_rng(61)
     a, b = generator.uniform(0.5, 2.0, (2, 4096)).astype(np.float32)
-    (difference, total, wide, fused), fuses = probe.contraction(renderer.backend, a, b)
+    (difference, total, wide, fused), fuses = probe.contraction(a, b)
     yield Finding("a b - a b that is not 0", int(np.count_nonzero(difference)), 0)
     yield Finding("the same in the set-up's precision", int(np.count_nonzero(wide)), 0)
     yield Finding("a b + c that is not rounded twice", int(np.count_nonzero(total != a * b + a)), 0)
@@ -51,10 +51,10 @@ def function_check(renderer: Renderer) -> Iterator[Finding]:
 
 def option_check(renderer: Renderer) -> Iterator[Finding]:
     """No build option lets go of NaN, and the compiler does not by itself."""
-    probe = probe_of(renderer)
-    if probe is None:
+    if not isinstance(renderer.backend, Probed):
         return
-    unsafe = [option for option in probe.options(renderer.backend) if any(word in option for word in UNSAFE)]
+    probe = renderer.backend.probe()
+    unsafe = [option for option in probe.options() if any(word in option for word in UNSAFE)]
     yield Finding("build options that let go of IEEE arithmetic", len(unsafe), 0)
     bits = [
         0x7FC00000,
@@ -69,7 +69,7 @@ def option_check(renderer: Renderer) -> Iterator[Finding]:
         1,
     ]
     x = np.array(bits, np.uint32).view(np.float32)
-    unequal, named, survives, infinite = probe.not_a_number(renderer.backend, x)
+    unequal, named, survives, infinite = probe.not_a_number(x)
     is_nan = np.isnan(x)
     for name, seen in (("x != x", unequal), ("isnan(x)", named), ("a comparison that fails", survives)):
         yield Finding(f"NaN told wrongly by {name}", int((seen.astype(bool) != is_nan).sum()), 0)
@@ -98,8 +98,8 @@ def denormal_check(renderer: Renderer) -> Iterator[Finding]:
 
 def barrier_check(renderer: Renderer) -> Iterator[Finding]:
     """The schedule with barriers against the one without; on a GPU, against other sizes of its groups."""
-    backend: Any = renderer.backend
-    if not has_tiles(renderer):
+    backend = renderer.backend
+    if not isinstance(backend, Reshapes):
         return
     # lists from none to several times what a group stages at once (128), and pixels that finish early
     crowded = random_splats(260, 65, depth=(0.8, 1.5), scale=(0.02, 0.25), across=0.25)
@@ -108,7 +108,8 @@ def barrier_check(renderer: Renderer) -> Iterator[Finding]:
     view = View.of(VIEW, Quality(), cloud.origin, (0.1, 0.2, 0.3))
     resident = backend.upload(cloud)
     base = backend.pipeline(features).render(resident, view)
-    other = backend.pipeline(features, other_schedule(renderer)).render(resident, view)
+    (schedule,) = backend.shapes("schedule").values()
+    other = backend.pipeline(features, schedule).render(resident, view)
     for name in ("rgb", "alpha", "depth"):
         error = np.abs(other.read(name) - base.read(name)).max()
         yield Finding(f"{name}: difference between schedules", float(error), 5e-6)
@@ -125,17 +126,17 @@ def in_a_row(depths) -> SplatCloud:
 
 def sort_check(renderer: Renderer) -> Iterator[Finding]:
     """Depth order, tile lists and their starts at awkward lengths, against NumPy's stable sort."""
-    backend: Any = renderer.backend
-    if not has_tiles(renderer):
+    backend = renderer.backend
+    if not isinstance(backend, Reshapes):
         return
     generator = np.random.default_rng(67)
     features = select(in_a_row([1.0]), ("rgb",), Quality())
     view = View.of(VIEW, Quality(), np.zeros(3), (0.0, 0.0, 0.0))
     unsorted = unlisted = tried = 0
-    for shape in odd_shapes(renderer):
+    for shape in backend.shapes("sorting").values():
         pipeline = backend.pipeline(features, shape)
-        c = min(getattr(shape, "chunks", 2048), 2000)
-        for n in sorted({1, 2, 3, c - 1, c, c + 1, 2 * c + 1, 255, 256, 257, 1000, 4097}):
+        c = backend.pieces(shape)
+        for n in sorted({1, 2, 3, c - 1, c, c + 1, 2 * c + 1, 255, 256, 257, 1000, 4097} - {0}):
             for kind in ("random", "few values", "one value", "descending", "half culled"):
                 depths = generator.uniform(1.0, 9.0, n)
                 if kind == "few values":

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from combined import LENSES, SWITCHES, assert_drawn, combination, everything, goes
 
-from fidsplat.backends.warp.program import lacking
+from fidsplat.backends.warp.program import unsupported
 
 BACKEND = "warp"
 
 
 def has(name):
     """Whether the Warp kernels have the effect."""
-    return not lacking(combination([name]).features())
+    return not unsupported(combination([name]).features(), "warp")
 
 
 OWN = [name for name in SWITCHES if has(name)]

@@ -13,7 +13,6 @@ import fidsplat as fs
 from fidsplat.backends.exposure import exposed_view
 from fidsplat.cameras.raster import raster_of
 from fidsplat.effects import select
-from fidsplat.hard_cases.invariance import other_schedule
 from fidsplat.rotations import quaternion_to_matrix
 
 SEAM = 1e-3
@@ -140,7 +139,7 @@ def test_the_other_schedule_draws_the_same_boxes(renderer):
     cloud = random_splats(60, seed=3, depth=(-2, 4))
     cloud = cloud.with_boxes(np.arange(60) % 2 == 0)
     backend = renderer.backend
-    shape = other_schedule(renderer)
+    shape = backend.shapes("schedule")["groups"]
     for name in ("distortion", "fisheye", "panorama", "parallel"):
         camera = CAMERAS[name]
         view = exposed_view(camera, fs.Quality(), cloud.origin, (0, 0, 0), fs.Motion(), fs.Shutter())

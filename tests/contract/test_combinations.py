@@ -91,7 +91,7 @@ def test_effects_of_the_picture_under_a_shutter(renderer, around, shutter):
     how = {"sensor": SENSOR, "fog": fog, "background": behind}
     features = select(cloud, outputs, quality, PLAIN, moving=True, exposed=True, **how)
     reference = ReferenceBackend()
-    truth = reference.pipeline(features).render(reference.upload(cloud), view).planes
+    truth = reference.pipeline(features).render(reference.upload(cloud), view).images
     differences = compare(frame, truth, outputs)
     assert all(difference.agrees for difference in differences), differences
 

@@ -10,8 +10,8 @@ from agreement import random_splats
 from ideal_effects import assert_as_good, ideal_picture
 
 import fidsplat as fs
-from fidsplat.backends.base import View
 from fidsplat.backends.reference.post import variates
+from fidsplat.backends.view import View
 from fidsplat.hard_cases.agreement import Picture, judge
 
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.3, -0.2, -0.1), (0.0, 0.1, 3.0))

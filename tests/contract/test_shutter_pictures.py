@@ -58,7 +58,7 @@ def truth(cloud, camera, quality, outputs, motion, shutter):
     kinds = {"moving": bool(view.groups), "exposed": bool(view.shots)}
     features = select(cloud, (*outputs, "alpha"), quality, camera, **kinds)
     judge = ReferenceBackend()
-    return judge.pipeline(features).render(judge.upload(cloud), view).planes
+    return judge.pipeline(features).render(judge.upload(cloud), view).images
 
 
 def assert_exposed(renderer, cloud, camera, motion, shutter, quality=None, outputs=ALL_OUTPUTS):

@@ -7,10 +7,9 @@ from agreement import ALL_OUTPUTS, random_splats
 from test_lens_pictures import CAMERAS
 
 import fidsplat as fs
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.effects import OUTPUTS, select
 from fidsplat.hard_cases.agreement import Picture, compare, truth_of
-from fidsplat.hard_cases.invariance import other_schedule
 
 BACKEND = "warp"
 
@@ -51,7 +50,9 @@ def test_the_schedule_of_gpus_agrees_with_the_reference(renderer, name):
         cloud, picture.outputs, picture.quality, picture.camera, fog=picture.fog, background=behind
     )
     view = View.of(picture.camera, picture.quality, cloud.origin, behind, fog=picture.fog)
-    planes = backend.pipeline(features, other_schedule(renderer)).render(backend.upload(cloud), view)
+    planes = backend.pipeline(features, backend.shapes("schedule")["groups"]).render(
+        backend.upload(cloud), view
+    )
     drawn = {output: planes.read(output) for output in picture.outputs}
     differences = compare(drawn, truth_of(picture), picture.outputs)
     assert all(difference.agrees for difference in differences), differences

@@ -174,7 +174,7 @@ def test_memory_is_that_of_the_setting_alone(table):
 def test_memory_does_not_hang_on_what_was_drawn_before(table, monkeypatch):
     """As on a GPU, where a cloud keeps its colours once a picture has asked for them."""
     held = property(lambda self: sum(buffer.size for buffer in self._buffers.values()))
-    monkeypatch.setattr(Resident, "device_bytes", held)
+    monkeypatch.setattr(Resident, "memory_bytes", held)
     before = memory_of(table, "apriltag@0", BASE)
     table.draw("apriltag@0", BASE.with_(samples=2))
     assert before is not None

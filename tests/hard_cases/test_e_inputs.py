@@ -82,7 +82,7 @@ def test_poison_reaches_every_buffer(renderer):
 
     backend = opencl(renderer)
     taken = []
-    with probe.poisoned(backend):
+    with backend.probe().poisoned():
         filled = backend.pool._filled
         backend.pool._filled = lambda buffer: taken.append(buffer) or filled(buffer)
         renderer.render(random_splats(20, seed=1, depth=(1, 3)), group_e.VIEW, ("rgb", "depth"))

@@ -8,10 +8,11 @@ import pytest
 from agreement import ALL_OUTPUTS, random_splats
 
 import fidsplat as fs
-from fidsplat.backends.base import View
+from fidsplat.backends.base import Reshapes
 from fidsplat.backends.planes import PlaneTable
+from fidsplat.backends.view import View
 from fidsplat.effects import select
-from fidsplat.hard_cases.invariance import group_shape, has_tiles, other_schedule, out_of_order
+from fidsplat.hard_cases.invariance import out_of_order
 
 CULLED = np.uint32(0xFFFFFFFF)
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
@@ -19,7 +20,7 @@ CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 
 @pytest.fixture(scope="module")
 def backend(renderer):
-    if not has_tiles(renderer):
+    if not isinstance(renderer.backend, Reshapes):
         pytest.skip("draws in one piece")
     return renderer.backend
 
@@ -30,13 +31,18 @@ def traced(backend, cloud, quality, outputs=("rgb",), shape=None):
     return backend.pipeline(features, shape).trace(backend.upload(cloud), view), view
 
 
+def groups(backend, side):
+    """The schedule of a GPU in tiles of side x side."""
+    return replace(backend.shapes("schedule")["groups"], tile_width=side, tile_height=side)
+
+
 def listing(backend, lists, side=16):
     """The shape with one of the two ways of listing; Warp's own has one."""
     if not hasattr(backend.shape, "lists"):
         if lists == "tiled":
             pytest.skip("lists in one way")
         return backend.shape
-    return replace(group_shape(backend.shape, side), lists=lists)
+    return replace(groups(backend, side), lists=lists)
 
 
 def footprint(cloud, view, index, dot=True):
@@ -197,7 +203,7 @@ def test_layers_are_the_same_in_every_tile_size_and_schedule(backend, renderer):
     planes = np.random.default_rng(9).choice([-1, -1, -1, 0, 1, 2, 3], 300)
     cloud = random_splats(300, seed=9, scale=(0.05, 0.5)).with_planes(planes)
     base, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS)
-    other, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS, other_schedule(renderer))
+    other, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS, backend.shapes("schedule")["groups"])
     for name in ("rgb", "alpha", "normal", "depth"):
         assert np.abs(other[name] - base[name]).max() < 2e-5, name
     width = backend.shape.tile_width if backend.shape.schedule == "lanes" else 32
@@ -226,7 +232,7 @@ def test_splats_of_a_plane_share_its_key(backend):
 def test_both_schedules_draw_the_same_picture(backend, renderer):
     cloud = random_splats(300, seed=9)
     base, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS)
-    other, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS, other_schedule(renderer))
+    other, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS, backend.shapes("schedule")["groups"])
     for name in ("rgb", "alpha", "normal", "depth"):
         assert np.allclose(other[name], base[name], rtol=1e-5, atol=2e-6), name
     assert np.array_equal(other["label"], base["label"])
@@ -293,7 +299,7 @@ def test_room_for_exactly_the_pairs_of_a_picture(backend, spare):
 def test_a_list_longer_than_local_memory_is_sorted(backend):
     """tiles.cl sorts 2048 pairs at once in local memory, longer lists in global memory as well."""
     cloud = random_splats(11000, seed=8, depth=(1.0, 9.0), scale=(0.2, 0.3), across=0.1)
-    trace, _ = traced(backend, cloud, fs.Quality(), shape=group_shape(backend.shape, 16))
+    trace, _ = traced(backend, cloud, fs.Quality(), shape=groups(backend, 16))
     visible = np.flatnonzero(trace["keys"] != CULLED)
     assert max(np.diff(trace["starts"].astype(int))) > 8192
     assert out_of_order(trace, visible[np.argsort(trace["keys"][visible], kind="stable")]) == 0

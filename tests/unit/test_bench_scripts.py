@@ -40,7 +40,7 @@ RECORD = {
     "splats_per_second": 5.6e5,
     "memory_bytes": 2**30,
     "rates": {"copy_bytes": 45e9, "fma": 250e9, "exp": 12.5e9, "division": 50e9},
-    "times_floor": {"blend": 15.5, "frame": 12.25},
+    "times_roofline": {"blend": 15.5, "frame": 12.25},
 }
 PEER = RECORD | {
     "renderer": "Peer 1",

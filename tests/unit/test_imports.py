@@ -118,7 +118,7 @@ def within_any(names, package) -> bool:
 
 
 # modules of the wing that every backend may import
-SHARED = ("base", "registry", "planes", "exposure")
+SHARED = ("base", "view", "registry", "planes", "exposure")
 
 
 def test_backends_do_not_import_each_other():

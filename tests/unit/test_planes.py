@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.base import View
 from fidsplat.backends.planes import PlaneTable
+from fidsplat.backends.view import View
 from fidsplat.hard_cases.clouds import splats, taken, turned
 from fidsplat.rotations import quaternion_to_matrix
 

@@ -331,7 +331,7 @@ def test_poison_reaches_every_array(renderer, monkeypatch):
 
     taken, poison = [], probe.poison
     monkeypatch.setattr(probe, "poison", lambda array: taken.append(poison(array)) or taken[-1])
-    with probe.poisoned(renderer.backend):
+    with renderer.backend.probe().poisoned():
         renderer.render(CLOUD, CAMERA, ("rgb", "depth"))
         again = renderer.backend.workspace.pool.scratch("lines", 4, wp.vec4)
     assert len(taken) > 15

@@ -10,15 +10,16 @@ from functools import cached_property
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.base import DeviceInfo, Rates
+from fidsplat.backends.base import DeviceInfo, Probe, Rates
 from fidsplat.backends.opencl import pocl_target
+from fidsplat.backends.opencl.arithmetic import run_arithmetic
 from fidsplat.backends.opencl.assemble import DeviceShape, assemble
 from fidsplat.backends.opencl.floor import measure_rates
 from fidsplat.backends.opencl.memory import BufferPool, Resident
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.plan import PAIR
 from fidsplat.backends.opencl.ray_buffers import RayBuffers
-from fidsplat.backends.opencl.shapes import shape_for
+from fidsplat.backends.opencl.shapes import other_shapes, shape_for
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
@@ -61,6 +62,8 @@ def open_device(selector: str = "") -> OpenCLBackend:
 class OpenCLBackend:
     """An open OpenCL device with its queue, buffer pool and compiled pipelines."""
 
+    always_float64 = False
+
     def __init__(self, device: cl.Device) -> None:
         self.info = _describe(device, _name_of(device))
         self.device = device
@@ -89,18 +92,23 @@ class OpenCLBackend:
         self.pair_budget = max(1, min(largest, budget // 8 // PAIR[self.shape.lists], 2**32 - 1))
         """most pairs of splats and tiles that are listed at once"""
 
+    def unsupported(self, features: FeatureSet) -> str:
+        """Blending in float64 where the device has none; empty for all else."""
+        if self.info.float64 or "blend_double" not in features.slots:
+            return ""
+        return (
+            f"{self.info.title} has no float64 (cl_khr_fp64) for blend_precision='float64'; use "
+            "blend_precision='float32', or another device"
+        )
+
     def pipeline(self, features: FeatureSet, shape: DeviceShape | None = None) -> OpenCLPipeline:
         """The stages compiled for these features; `shape` replaces the device's own build constants (tests).
 
         Raises:
-            DeviceError: the compiler refuses; its log is in the message. Or the device has no float64 for
-                blending.
+            DeviceError: the compiler refuses; its log is in the message. Or what is `unsupported`.
         """
-        if not self.info.float64 and "blend_double" in features.slots:
-            raise DeviceError(
-                f"{self.info.title} has no float64 (cl_khr_fp64) for blend_precision='float64'; use "
-                "blend_precision='float32', or another device"
-            )
+        if why := self.unsupported(features):
+            raise DeviceError(why)
         if not self.info.float64 and features.setup_precision != "float32":
             features = replace(features, setup_precision="float32")
         key = (features, shape or shape_for(features, self.shape))
@@ -127,6 +135,26 @@ class OpenCLBackend:
     def rates(self) -> Rates:
         """What the device can do at best; measured anew at each call."""
         return measure_rates(self)
+
+    def run_arithmetic(
+        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """As `ProbesArithmetic` (fidsplat/backends/base.py)."""
+        return run_arithmetic(self, exponents, shares, above, below)
+
+    def probe(self) -> Probe:
+        """What tests look into the device with."""
+        from fidsplat.backends.opencl.probe import OpenCLProbe
+
+        return OpenCLProbe(self)
+
+    def shapes(self, kind: str) -> dict[str, DeviceShape]:
+        """As `Reshapes` (fidsplat/backends/base.py)."""
+        return other_shapes(self.shape, kind)
+
+    def pieces(self, shape: DeviceShape) -> int:
+        """Chunks of the sorts."""
+        return shape.chunks
 
     @cached_property
     def build_options(self) -> list[str]:

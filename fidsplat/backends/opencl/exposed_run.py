@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.base import View
-from fidsplat.backends.exposure import Shot
 from fidsplat.backends.opencl.memory import Resident
 from fidsplat.backends.opencl.plan import Plan
 from fidsplat.backends.opencl.run import Run
+from fidsplat.backends.view import Shot, View
 from fidsplat.effects.catalogue import Output
 
 if TYPE_CHECKING:

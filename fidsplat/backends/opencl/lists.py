@@ -3,7 +3,7 @@
 On CPUs (`ordered`) all visible splats are sorted by depth, then listed per tile in that order, by counting
 sorts over a few contiguous pieces: long sequential walks and no atomics. On GPUs (`tiled`) every splat counts
 its tiles while it is projected, pairs are written to the tiles in any order, and each tile's list is sorted
-in local memory: few launches, all of them wide. docs/performance.md has both on both kinds of device.
+in local memory: few launches, all of them wide. docs/growth.md has both on both kinds of device.
 """
 
 from __future__ import annotations

@@ -179,7 +179,7 @@ class Resident:
         return self.count * self._bytes_of({*names, *self._buffers}), 0
 
     @property
-    def device_bytes(self) -> int:
+    def memory_bytes(self) -> int:
         """Bytes that the cloud holds on the device; a CPU's are the host's."""
         return 0 if self._shared else sum(buffer.size for buffer in self._buffers.values())
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.base import View
 from fidsplat.backends.opencl.assemble import DeviceShape, Source
 from fidsplat.backends.opencl.exposed_run import ExposedRun
 from fidsplat.backends.opencl.lists import SPLAT_ARRAYS
@@ -19,6 +18,7 @@ from fidsplat.backends.opencl.memory import DeviceBuffer, Resident
 from fidsplat.backends.opencl.plan import BIG, SMALL, Plan, plan_of, table_bytes
 from fidsplat.backends.opencl.ray_buffers import RayBuffers
 from fidsplat.backends.opencl.run import Run
+from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.catalogue import Output
 from fidsplat.errors import DeviceError

@@ -45,37 +45,6 @@ def evaluate(
     return made
 
 
-def scan(pipeline: OpenCLPipeline, lengths: np.ndarray) -> tuple[np.ndarray, int]:
-    """What the device makes of lengths of lists (n,) uint32: where each list starts (n + 1,) uint32,
-    and the sum of all in 64 bits.
-    """
-    backend, items = pipeline.backend, (pipeline.shape.scan_items,)
-    count, starts = np.uint32(len(lengths)), buffer_of(backend, np.empty(len(lengths) + 1, np.uint32))
-    sums = buffer_of(backend, np.zeros(8, np.uint32))
-    if pipeline.shape.lists == "tiled":
-        tallies = buffer_of(backend, np.concatenate([np.zeros(8, np.uint32), lengths]))
-        cursors = buffer_of(backend, lengths)
-        args, kernel, place = (count, np.uint32(2**32 - 1), tallies, starts, cursors, sums), "tile_starts", 1
-    else:
-        totals = buffer_of(backend, lengths)
-        args, kernel, place = (count, totals, starts, sums, np.uint32(4)), "scan_bins", 4
-    pipeline.launch(backend.queue, kernel, items, items, args)
-    places = contents(backend, starts).view(np.uint32)
-    words = contents(backend, sums).view(np.uint32)
-    return places, int(words[place]) | int(words[place + 1]) << 32
-
-
-@contextmanager
-def poisoned(backend: OpenCLBackend) -> Iterator[None]:
-    """Within it, every buffer that a picture takes is filled with 0xFF first: NaN, or the integer -1."""
-    pool = backend.pool
-    backend.pool = _PoisonedPool(backend)
-    try:
-        yield
-    finally:
-        backend.pool = pool
-
-
 class _PoisonedPool(BufferPool):
     def __init__(self, backend: OpenCLBackend) -> None:
         super().__init__(backend.context, backend.device)
@@ -131,21 +100,55 @@ kernel void probe(global const float *x, global int *unequal, global int *named,
 """
 
 
-def contraction(backend: OpenCLBackend, a: np.ndarray, b: np.ndarray) -> tuple[list[np.ndarray], bool]:
-    """a b - a b; a b + a; the difference in the set-up's precision, of thirds; a b - (a b), fused: each (n,),
-    from a, b (n,)
-    float32. And whether the device fuses where it is asked to.
-    """
-    real = np.float64 if backend.info.float64 else np.float32
-    types = (np.float32, np.float32, real, np.float32)
-    return evaluate(backend, CONTRACTION, (a, b, a), types), backend.shape.fast_fma
+class OpenCLProbe:
+    """Small kernels under the build options and the pragmas of the stages, single stages on made-up input,
+    and buffers that are filled with rubbish first: `Probe` of fidsplat/backends/base.py."""
 
+    def __init__(self, backend: OpenCLBackend) -> None:
+        self._backend = backend
 
-def not_a_number(backend: OpenCLBackend, x: np.ndarray) -> Sequence[np.ndarray]:
-    """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
-    return evaluate(backend, NOT_A_NUMBER, (x,), (np.int32,) * 4)
+    def contraction(self, a: np.ndarray, b: np.ndarray) -> tuple[list[np.ndarray], bool]:
+        """a b - a b; a b + a; the difference in the set-up's precision, of thirds; a b - (a b), fused: each
+        (n,), from a, b (n,) float32. And whether the device fuses where it is asked to.
+        """
+        real = np.float64 if self._backend.info.float64 else np.float32
+        types = (np.float32, np.float32, real, np.float32)
+        return evaluate(self._backend, CONTRACTION, (a, b, a), types), self._backend.shape.fast_fma
 
+    def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
+        """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
+        return evaluate(self._backend, NOT_A_NUMBER, (x,), (np.int32,) * 4)
 
-def options(backend: OpenCLBackend) -> list[str]:
-    """What every program is compiled with."""
-    return backend.build_options
+    def options(self) -> list[str]:
+        """What every program is compiled with."""
+        return self._backend.build_options
+
+    def scan(self, pipeline: OpenCLPipeline, lengths: np.ndarray) -> tuple[np.ndarray, int]:
+        """What the device makes of lengths of lists (n,) uint32: where each list starts (n + 1,) uint32,
+        and the sum of all in 64 bits.
+        """
+        backend, items = pipeline.backend, (pipeline.shape.scan_items,)
+        count, starts = np.uint32(len(lengths)), buffer_of(backend, np.empty(len(lengths) + 1, np.uint32))
+        sums = buffer_of(backend, np.zeros(8, np.uint32))
+        if pipeline.shape.lists == "tiled":
+            tallies = buffer_of(backend, np.concatenate([np.zeros(8, np.uint32), lengths]))
+            cursors = buffer_of(backend, lengths)
+            args = (count, np.uint32(2**32 - 1), tallies, starts, cursors, sums)
+            kernel, place = "tile_starts", 1
+        else:
+            totals = buffer_of(backend, lengths)
+            args, kernel, place = (count, totals, starts, sums, np.uint32(4)), "scan_bins", 4
+        pipeline.launch(backend.queue, kernel, items, items, args)
+        places = contents(backend, starts).view(np.uint32)
+        words = contents(backend, sums).view(np.uint32)
+        return places, int(words[place]) | int(words[place + 1]) << 32
+
+    @contextmanager
+    def poisoned(self) -> Iterator[None]:
+        """Within it, every buffer that a picture takes is filled with 0xFF first: NaN, or the integer -1."""
+        pool = self._backend.pool
+        self._backend.pool = _PoisonedPool(self._backend)
+        try:
+            yield
+        finally:
+            self._backend.pool = pool

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.base import View
 from fidsplat.backends.opencl.lists import LISTS
 from fidsplat.backends.opencl.memory import Resident
 from fidsplat.backends.opencl.plan import Plan
+from fidsplat.backends.view import View
 from fidsplat.effects.catalogue import Output
 
 if TYPE_CHECKING:

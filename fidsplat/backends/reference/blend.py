@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from fidsplat.backends.base import View
 from fidsplat.backends.reference import doubt
 from fidsplat.backends.reference.fragments import fragments_of, shifted
 from fidsplat.backends.reference.layers import in_layers, in_order
@@ -12,6 +11,7 @@ from fidsplat.backends.reference.optics import ray_lengths
 from fidsplat.backends.reference.post import background_at
 from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.reference.shown import LEAST_ALPHA, median_of
+from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 
 

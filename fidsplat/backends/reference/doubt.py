@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.base import View
 from fidsplat.backends.reference.fragments import Fragments, cover, shifted
 from fidsplat.backends.reference.optics import ROUND
 from fidsplat.backends.reference.setup import Setup
+from fidsplat.backends.view import View
 
 _ROUND = ROUND
 _WEIGHT = 2 * _ROUND  # relative, of half rho and of an opacity: a division, two products, exp

@@ -1,4 +1,4 @@
-"""The splats of a plane as one layer per sample, placed by its own depth (docs/rendering.md).
+"""The splats of a plane as one layer per sample, placed by its own depth (docs/coplanar.md).
 
 Columns are what arrives in the depth order: splats of no plane one by one, the splats of a plane together,
 where their common key puts them. A layer is pending from there until a fragment of no plane arrives that lies

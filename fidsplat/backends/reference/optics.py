@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 
 ROUND = 4 * 2.0**-24
 """of a form, relative to its terms: its coefficients' rounding, and its sums'"""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fidsplat.backends.base import View
 from fidsplat.backends.reference.optics import rays_of
+from fidsplat.backends.view import View
 from fidsplat.surroundings import Gradient, Panorama
 
 _ROUND = 2e-6

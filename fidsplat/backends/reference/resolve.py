@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from fidsplat.backends.base import View
 from fidsplat.backends.reference.optics import ray_lengths
 from fidsplat.backends.reference.post import brightest, developed
+from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 
 _ROUND = 1e-6  # relative, of a sum of weights

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from fidsplat.backends.base import DeviceInfo
 from fidsplat.backends.warp import runtime
+from fidsplat.backends.warp.arithmetic import run_arithmetic
 from fidsplat.backends.warp.launch import Commands
 from fidsplat.backends.warp.pipeline import WarpPipeline
-from fidsplat.backends.warp.program import Program, WarpShape
+from fidsplat.backends.warp.probe import WarpProbe
+from fidsplat.backends.warp.program import Program, WarpShape, unsupported
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.effects import FeatureSet
@@ -53,11 +56,13 @@ def open_device(selector: str = "") -> WarpBackend:
 class WarpBackend:
     """An open Warp device with what its pictures share, and compiled pipelines."""
 
+    always_float64 = False
+
     def __init__(self, device: Any) -> None:
         self.info = _describe(device)
         self.device = device
         self.shape = WarpShape("group" if device.is_cuda else "tiles", 16, 16)
-        self.workspace = Workspace(device, self.info.memory_bytes // 10 * 9)
+        self.workspace = Workspace(device, self.info.name, self.info.memory_bytes // 10 * 9)
         self._commands = Commands(device, 1 if device.is_cuda else self.info.compute_units)
         self._pipelines: dict[tuple[FeatureSet, WarpShape], WarpPipeline] = {}
 
@@ -86,17 +91,44 @@ class WarpBackend:
         """Arrays (`means`, `quats`, ...) that are on the device already, used where they lie."""
         return Resident.around(arrays, origin, self.workspace.pool)
 
+    def unsupported(self, features: FeatureSet) -> str:
+        """The effects that the Warp kernels have not; empty if they have all."""
+        return unsupported(features, self.info.name)
+
     def pipeline(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpPipeline:
         """The stages compiled for these features; `shape` replaces the device's own tiles (tests).
 
         Raises:
-            DeviceError: an effect that the Warp kernels have not, or the compiler refuses.
+            DeviceError: what is `unsupported`, or the compiler refuses.
         """
         key = (features, shape or self.shape)
         if key not in self._pipelines:
             program = Program(self.device, self.info.name, *key)
-            self._pipelines[key] = WarpPipeline(program, self.workspace, self._commands, self.info.name)
+            self._pipelines[key] = WarpPipeline(program, self.workspace, self._commands)
         return self._pipelines[key]
+
+    def run_arithmetic(
+        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """As `ProbesArithmetic` (fidsplat/backends/base.py)."""
+        return run_arithmetic(self.workspace, exponents, shares, above, below)
+
+    def probe(self) -> WarpProbe:
+        """What tests look into the device with."""
+        return WarpProbe(self.workspace)
+
+    def shapes(self, kind: str) -> dict[str, WarpShape]:
+        """As `Reshapes` (fidsplat/backends/base.py)."""
+        own = self.shape
+        if kind == "schedule":
+            return {"groups": WarpShape("group", 8, 8)}
+        if kind == "sorting":
+            return {"own": own}
+        return {f"{side} x {side}": replace(own, tile_width=side, tile_height=side) for side in (8, 32)}
+
+    def pieces(self, shape: WarpShape) -> int:
+        """Warp's sorts take everything at once."""
+        return 1
 
 
 def _describe(device: Any) -> DeviceInfo:

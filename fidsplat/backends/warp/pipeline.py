@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.backends.warp import bands
 from fidsplat.backends.warp.exposure import gather
 from fidsplat.backends.warp.images import WarpImages
@@ -31,10 +31,8 @@ from fidsplat.errors import DeviceError
 class WarpPipeline:
     """The stages of one feature set on one device."""
 
-    def __init__(self, program: Program, workspace: Workspace, commands: Commands, name: str) -> None:
-        """name: of the device, for errors."""
-        self.program, self.workspace = program, workspace
-        self._commands, self._name = commands, name
+    def __init__(self, program: Program, workspace: Workspace, commands: Commands) -> None:
+        self.program, self.workspace, self._commands = program, workspace, commands
 
     def render(self, resident: Resident, view: View) -> WarpImages:
         """Draw one picture.
@@ -75,7 +73,7 @@ class WarpPipeline:
         except RuntimeError as error:
             if isinstance(error, DeviceError):
                 raise
-            raise DeviceError(f"{self._name} failed while drawing: {error}") from error
+            raise DeviceError(f"{self.workspace.name} failed while drawing: {error}") from error
 
 
 class Picture:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.backends.warp import runtime
 from fidsplat.backends.warp.program import WarpShape
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
 from fidsplat.effects import select
 from fidsplat.quality import Quality
@@ -20,6 +20,6 @@ def overdraw(renderer: Renderer, resident: ResidentCloud, camera: Camera, qualit
         FidsplatError: the device fails, or its backend has no such count.
     """
     data = resident._data
-    features = replace(select(data, ("rgb",), quality), taps=("overdraw",))
+    features = replace(select(data, ("rgb",), quality, camera), taps=("overdraw",))
     view = View.of(camera, quality, data.origin, (0.0, 0.0, 0.0))
     return renderer.backend.pipeline(features).render(data, view).read("overdraw")

@@ -1,10 +1,10 @@
-"""A pixel of the picture as a window of the sample grid."""
+"""The samples of a pixel of the picture, and where they lie in sample buffers."""
 
 import warp as wp
 
 
 @wp.struct
-class Window:
+class PixelGrid:
     """The samples of one pixel."""
 
     pixel: int  # of the picture, row by row
@@ -17,6 +17,6 @@ class Window:
 
 
 @wp.func
-def sample_at(window: Window, k: int) -> int:
+def sample_at(grid: PixelGrid, k: int) -> int:
     """Where sample k, 0 to count - 1, lies in a buffer."""
-    return window.first + k / window.side * window.stride + k % window.side
+    return grid.first + k / grid.side * grid.stride + k % grid.side
