@@ -13,7 +13,7 @@ from fidsplat.backends.exposure import exposed_view
 from fidsplat.backends.registry import open_backend
 from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.effects import select
-from fidsplat.errors import InputError
+from fidsplat.errors import InputError, MissingOutputError
 from fidsplat.quality import Quality
 from fidsplat.scenes import Scene
 from fidsplat.sensor import Sensor
@@ -42,8 +42,7 @@ class Frame(Mapping):
         """Names of the images, in the order in which they were asked for."""
 
     def __getitem__(self, name: str) -> np.ndarray:
-        if name not in self.outputs:
-            raise KeyError(f"this frame has no {name!r}; it was rendered with {', '.join(self.outputs)}")
+        self._check(name)
         if name not in self._arrays:
             self._arrays[name] = image = self._images.read(name)
             image.flags.writeable = False  # what is kept is what was drawn
@@ -56,16 +55,21 @@ class Frame(Mapping):
         `__cuda_array_interface__` make a tensor of it on the same device.
 
         Raises:
-            KeyError: an output that was not asked for; InputError: the backend has no arrays to give.
+            InputError: an output that was not asked for, or the backend has no arrays to give.
         """
-        if name not in self.outputs:
-            raise KeyError(f"this frame has no {name!r}; it was rendered with {', '.join(self.outputs)}")
+        self._check(name)
         if not isinstance(self._images, GivesArrays):
             raise InputError(
                 f"this device keeps {name} in no array that others can use; draw with device='warp:cuda' or "
                 "'warp:cpu', or take frame[name], which is copied to the host"
             )
         return self._images.device_array(name)
+
+    def _check(self, name: str) -> None:
+        if not isinstance(name, str) or name not in self.outputs:
+            raise MissingOutputError(
+                f"this frame has no {name!r}; it was rendered with {', '.join(self.outputs)}; name it there"
+            )
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.outputs)

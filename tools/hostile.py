@@ -64,7 +64,9 @@ def outcome(kind: str, seed: int, number: int, folder: Path) -> tuple[str, str]:
         where = error.__traceback__
         while where is not None and where.tb_next is not None:
             where = where.tb_next
-        place = "" if where is None else f" ({Path(where.tb_frame.f_code.co_filename).name}:{where.tb_lineno})"
+        place = (
+            "" if where is None else f" ({Path(where.tb_frame.f_code.co_filename).name}:{where.tb_lineno})"
+        )
         notes = " ".join(getattr(error, "__notes__", ()))
         return "fault", f"{notes} {type(error).__name__}: {error}{place}"
     finally:
@@ -106,7 +108,9 @@ def run(kind: str, seed: int, numbers: range) -> list[tuple[int, str, str, float
         rest = numbers[len(done) :]
         span = [str(rest.start), str(rest.stop), str(rest.step)]
         command = [sys.executable, __file__, "--worker", kind, "--seed", str(seed), *span]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as worker:
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        ) as worker:
             assert worker.stdout is not None
             while len(done) < len(numbers):
                 # twice the alarm's time, and a process that has yet to load all it needs: not Python alone hangs
@@ -123,10 +127,14 @@ def run(kind: str, seed: int, numbers: range) -> list[tuple[int, str, str, float
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--count", type=int, default=3000, help="inputs of all kinds together")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--kinds", nargs="+", choices=list(hostile_inputs.KINDS), default=list(hostile_inputs.KINDS))
+    parser.add_argument(
+        "--kinds", nargs="+", choices=list(hostile_inputs.KINDS), default=list(hostile_inputs.KINDS)
+    )
     parser.add_argument("--only", type=int, help="the one input of this number")
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     parser.add_argument("span", nargs="*", type=int, help=argparse.SUPPRESS)
@@ -143,7 +151,9 @@ def main() -> int:
         for number, ending, words, seconds in found:
             if ending not in GOOD or given.only is not None:
                 bad += ending not in GOOD
-                print(f"{kind} {number}: {ending} after {seconds:.1f} s: {' '.join(words.split())}", flush=True)
+                print(
+                    f"{kind} {number}: {ending} after {seconds:.1f} s: {' '.join(words.split())}", flush=True
+                )
     print(f"| input | {' | '.join(ENDS)} | slowest |\n|{'---|' * (len(ENDS) + 2)}")
     for kind, counts in table.items():
         print(f"| {kind} | {' | '.join(str(counts[end]) for end in ENDS)} | {counts['slowest']:.1f} s |")

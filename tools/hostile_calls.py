@@ -16,7 +16,12 @@ Call = tuple[Callable[..., Any], dict[str, Any], Callable[[Any], Any] | None]
 
 R = np.random.default_rng(0)
 N = 6
-MEANS, QUATS, SCALES, OPACITIES = R.normal(size=(N, 3)), R.normal(size=(N, 4)), R.uniform(0.1, 1, (N, 2)), R.random(N)
+MEANS, QUATS, SCALES, OPACITIES = (
+    R.normal(size=(N, 3)),
+    R.normal(size=(N, 4)),
+    R.uniform(0.1, 1, (N, 2)),
+    R.random(N),
+)
 CLOUD = fs.SplatCloud(MEANS, QUATS, SCALES, OPACITIES, colors=R.random((N, 3)))
 CAMERA = fs.Camera.look_at(24, 16, 1.0, (0, 0, -9), (0, 0, 0))
 RENDERER = fs.Renderer("reference")

@@ -31,21 +31,76 @@ JUNK: list[Any] = [
 ]  # fmt: skip
 """values that nobody expects"""
 
-NUMBERS = ["0", "-1", "1", "0.5", "1e308", "-1e308", "1e400", "nan", "inf", "-inf", "9" * 400, "9" * 5000, "0x10"]
-NUMBERS += ["99999999999999999999", "-0.0", "1_0", "true", '""', '"a"', "[]", "[1, 2]", "[[1]]", "{}", "1979-05-27"]
-TEXTS = ["", " ", "\0", "\n", "\ud800", "\x1b[31m", "%s%n", "..", "/", "/dev/null", "/dev/zero", "-", "--", "'", '"', "{}"]
-TEXTS += ["rgb", "nan", "-1", "0", "1e999", "𝕏é", "a,b,=", "=,=", "qr:", "image:", "image:.", "aruco::", LONG, "a." * 9]
+NUMBERS = [
+    "0",
+    "-1",
+    "1",
+    "0.5",
+    "1e308",
+    "-1e308",
+    "1e400",
+    "nan",
+    "inf",
+    "-inf",
+    "0x10",
+    "-0.0",
+    "1_0",
+    "true",
+    "[]",
+    "{}",
+    "[[1]]",
+    "1979-05-27",
+]
+NUMBERS += ["9" * 20, "9" * 400, "9" * 5000, '""', '"a"', "[1, 2]"]
+TEXTS = [
+    "",
+    " ",
+    "\0",
+    "\n",
+    "\ud800",
+    "\x1b[31m",
+    "qr:",
+    "image:",
+    "image:.",
+    "aruco::",
+    "a,b,=",
+    LONG,
+    "a." * 9,
+]
+TEXTS += [
+    "%s%n",
+    "..",
+    "/",
+    "/dev/null",
+    "/dev/zero",
+    "-",
+    "--",
+    "'",
+    '"',
+    "{}",
+    "rgb",
+    "nan",
+    "-1",
+    "0",
+    "1e999",
+    "𝕏é",
+    "=,=",
+]
 
 
 def scene_text(rng: Random) -> str:
     """A scene file that is good."""
-    lens = rng.choice(["", "[camera.distortion]\nk1 = 0.1\n", "[camera.fisheye]\nk1 = 0.01\n", "[camera.equirectangular]\n"])
+    lens = rng.choice(
+        ["", "[camera.distortion]\nk1 = 0.1\n", "[camera.fisheye]\nk1 = 0.01\n", "[camera.equirectangular]\n"]
+    )
     view = "" if "equi" in lens else "fov_x_deg = 60.0\n"
+    pose = "position = [0.0, 0.0, -1.0]\nlook_at = [0.0, 0.0, 0.0]\n"
+    moves = rng.random() < 0.3
     parts = [
-        f"[camera]\nwidth = 24\nheight = 16\n{view}position = [0.0, 0.0, -1.0]\nlook_at = [0.0, 0.0, 0.0]\nnear = 0.1\n",
+        f"[camera]\nwidth = 24\nheight = 16\n{view}near = 0.1\n{'' if moves else pose}",
         lens,
         rng.choice(["", "[camera.shutter]\nexposure_ms = 5.0\nsub_poses = 2\nreadout_ms = 3.0\nrows_per_band = 8\n"]),
-        rng.choice(["", "[[camera.motion]]\ntime = 0.0\nposition = [0.0, 0.0, -1.0]\nlook_at = [0, 0, 0]\n"]),
+        f"[[camera.motion]]\ntime = 0.0\n{pose}" if moves else "",
         '[[splats]]\nfile = "good.ply"\nposition = [0.0, 0.0, 1.0]\nquaternion = [1.0, 0.0, 0.0, 0.0]\nscale = 1.0\n',
         rng.choice(["", '[[markers]]\nspec = "aruco:4x4_50:7"\nsize = 0.1\nquiet_zone = 1\nmixture = "exact"\n']),
         rng.choice(["", "[sensor]\nexposure = 1.5\nfull_well = 1000.0\nread_noise = 2.0\nresponse = 2.2\nbits = 8\n"]),
@@ -71,7 +126,9 @@ def _ground(folder: Path) -> None:
 def _cloud(n: int) -> fs.SplatCloud:
     r = np.random.default_rng(n)
     sh = r.normal(size=(n, 4, 3))
-    return fs.SplatCloud(r.normal(size=(n, 3)), r.normal(size=(n, 4)), r.uniform(0.1, 1, (n, 2)), r.random(n), sh=sh)
+    return fs.SplatCloud(
+        r.normal(size=(n, 3)), r.normal(size=(n, 4)), r.uniform(0.1, 1, (n, 2)), r.random(n), sh=sh
+    )
 
 
 def _spoil(rng: Random, data: bytes) -> bytes:
@@ -90,14 +147,15 @@ def _spoil(rng: Random, data: bytes) -> bytes:
 
 # --- command lines
 
-COMMANDS = [
+COMMANDS = 2 * [
     "marker aruco:4x4_50:7 --size 0.1 -o tag.ply --mixture fitted --quality marker.template=9",
     "marker qr:hello --json",
     "marker image:bits.png --mixture exact --native-2dgs -o tag.ply",
     "render scene.toml -o frames --outputs rgb,depth,label --device reference --quality fast,samples=2",
-    "render good.ply -o a.png --device reference --json",
+    "render none.ply -o a.png --device reference --json",
     "detect good.png --family 36h11 --scene scene.toml --json",
     "devices --json",
+] + [
     "check --device nowhere",
     "bench --scenes nothing --json out.json",
     "tradeoff --scenes nothing -o out",
@@ -112,13 +170,15 @@ def words(rng: Random, folder: Path) -> int:
     (folder / "scene.toml").write_text(scene_text(rng))
     given = rng.choice(COMMANDS).split()
     slow = given[0] in ("check", "bench", "tradeoff", "experiment", "demo", "warm")
-    for _ in range(rng.randint(1, 3)):
+    for _ in range(rng.choice([1, 1, 2, 3])):
         at = rng.randrange(1, len(given) + 1)
         match rng.randrange(2 if slow else 6):
             case 0:
                 given.insert(at, rng.choice(TEXTS))
             case 1:
-                given.insert(at, rng.choice(["--size", "--debugg", "--jsno", "-o", "--outputs", "--quality", "--seed"]))
+                given.insert(
+                    at, rng.choice(["--size", "--debugg", "--jsno", "-o", "--outputs", "--quality", "--seed"])
+                )
             case 2:
                 given[at - 1] = rng.choice(TEXTS)
             case 3:
@@ -128,7 +188,9 @@ def words(rng: Random, folder: Path) -> int:
                 cut = rng.randrange(len(word) + 1)
                 given[at - 1] = word[:cut] + rng.choice(TEXTS)[:9] + word[cut + rng.randrange(2) :]
             case _:
-                given[at - 1] = given[at - 1].replace("=", rng.choice("=,:")) + rng.choice(["", ",", "=", *NUMBERS])
+                given[at - 1] = given[at - 1].replace("=", rng.choice("=,:")) + rng.choice(
+                    ["", ",", "=", *NUMBERS]
+                )
         given = given or [""]
     with _inside(folder):
         return cli.main([word for word in given if word != "--debug"])
@@ -158,7 +220,7 @@ class _inside:
 def scenes(rng: Random, folder: Path) -> None:
     _ground(folder)
     lines = scene_text(rng).split("\n")
-    for _ in range(rng.randint(1, 3)):
+    for _ in range(rng.choice([1, 1, 2, 3])):
         at = rng.randrange(len(lines))
         key, equals, value = lines[at].partition(" = ")
         match rng.randrange(9):
@@ -188,7 +250,11 @@ def scenes(rng: Random, folder: Path) -> None:
     path = folder / "hostile.toml"
     path.write_bytes(_spoil(rng, data) if rng.random() < 0.2 else data)
     scene = fs.Scene.load(path)
-    if scene.camera is not None and scene.camera.width * scene.camera.height < 10_000 and len(scene.cloud()) < 10_000:
+    if (
+        scene.camera is not None
+        and scene.camera.width * scene.camera.height < 10_000
+        and len(scene.cloud()) < 10_000
+    ):
         fs.Renderer("reference").render(scene)
     scene.save(folder / "again.toml")
     fs.Scene.load(folder / "again.toml")
@@ -220,7 +286,9 @@ def splats(rng: Random, folder: Path) -> None:
             stream.truncate(rng.choice([10**6, 10**8, 10**12]))
     cloud = fs.load_ply(path)
     if 0 < len(cloud) < 1000:
-        fs.Renderer("reference").render(cloud, fs.Camera.look_at(24, 16, 1.0, (0, 0, -9), (0, 0, 0)), ["rgb", "depth"])
+        fs.Renderer("reference").render(
+            cloud, fs.Camera.look_at(24, 16, 1.0, (0, 0, -9), (0, 0, 0)), ["rgb", "depth"]
+        )
     fs.save_ply(cloud, folder / "again.ply")
 
 
@@ -229,7 +297,12 @@ def _png(width: int, height: int, depth: int, color: int, pixels: bytes) -> byte
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
     head = struct.pack(">IIBBBBB", width, height, depth, color, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(pixels)) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", head)
+        + chunk(b"IDAT", zlib.compress(pixels))
+        + chunk(b"IEND", b"")
+    )
 
 
 def pictures(rng: Random, folder: Path) -> int | None:
@@ -289,7 +362,9 @@ def calls(rng: Random, folder: Path) -> None:
     except fs.FidsplatError:
         raise
     except Exception as error:
-        changed = ", ".join(f"{key}={_short(value)}" for key, value in given.items() if value is not good[key])
+        changed = ", ".join(
+            f"{key}={_short(value)}" for key, value in given.items() if value is not good[key]
+        )
         error.add_note(f"{name}({changed})")
         raise
 

@@ -245,7 +245,7 @@ def _chosen(
             f"quality is {quality!r}; it must be an fs.MarkerQuality, e.g. fs.Quality(...).marker"
         )
     name = quality.mixture if mixture is None else mixture
-    if name not in MIXTURES:
+    if not isinstance(name, str) or name not in MIXTURES:
         raise InputError(f"unknown mixture {name!r}; known: {', '.join(MIXTURES)}")
     given = {key: value for key, value in given.items() if value is not None}
     of_paper = [key for key in ("levels", "density") if key in given]

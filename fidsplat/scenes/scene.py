@@ -39,6 +39,10 @@ class PlacedMarker:
     """its pose at a time in seconds; None: it stays at `pose`"""
 
     def __post_init__(self) -> None:
+        if not isinstance(getattr(self.marker, "cloud", None), SplatCloud):
+            raise InputError(
+                f"marker is {self.marker!r}; it must be an fs.Marker, e.g. fs.marker('apriltag:36h11:5')"
+            )
         check_similarity(self.pose, "a marker's pose", rigid=True)
         if self.motion is not None and not callable(self.motion):
             raise InputError(

@@ -19,7 +19,7 @@ MAY_IMPORT = {
     "errors": set(),
     "files": BASE,
     "rotations": BASE,
-    "scalars": set(),
+    "scalars": {"errors"},
     "harmonics": BASE,
     # a budget is measured by drawing: `Quality.within` loads what draws when it is called, and its arguments
     # have the types of those (test_a_quality_loads_nothing_that_draws)
