@@ -24,9 +24,9 @@ from rich.progress import track
 from rich.table import Table
 
 import fidsplat as fs
+from fidsplat.hard_cases.agreement import draw
 from fidsplat.hard_cases.clouds import taken
 from fidsplat.hard_cases.coplanar import STEP, WALL_STEP, largest_jump, turning, wall
-from fidsplat.hard_cases.invariance import draw
 from fidsplat.vision.images import to_uint8, write_png
 from fidsplat.vision.paint import contact_sheet
 

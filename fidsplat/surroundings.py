@@ -85,7 +85,7 @@ class Panorama:
                 f"background: a panorama of {width} x {height} pixels; 2 to {MAX_PANORAMA} a side can be used"
             )
         whole = np.iinfo(given.dtype).max if given.dtype in (np.uint8, np.uint16) else 1
-        with np.errstate(over="ignore"):  # what float32 cannot hold is told below
+        with np.errstate(over="ignore"):  # what float32 cannot hold is refused below
             image = np.array(given, np.float32, order="C") / np.float32(whole)
         if not np.isfinite(image).all():
             which = f"the panorama {self.file}" if self.file else "the panorama"

@@ -19,7 +19,7 @@ from rich.progress import track
 
 import fidsplat as fs
 from fidsplat.backends.base import ProbesArithmetic
-from fidsplat.backends.opencl.backend import OpenCLBackend
+from fidsplat.backends.opencl.device import OpenCLBackend
 from fidsplat.hard_cases.arithmetic import worst
 
 AT_ONCE = 1 << 22

@@ -10,7 +10,7 @@ from fidsplat.backends.base import Backend, DeviceInfo
 from fidsplat.errors import UnknownDeviceError, unknown
 
 _FAMILIES = {
-    "opencl": "fidsplat.backends.opencl",
+    "opencl": "fidsplat.backends.opencl.device",
     "warp": "fidsplat.backends.warp",
     "reference": "fidsplat.backends.reference",
 }

@@ -104,8 +104,7 @@ class View:
         )
 
     def uniform(self, name: str) -> tuple[Any, ...]:
-        """Numbers that an effect asks for (`Effect.blend_uniforms`), in the order of its kernel arguments:
-        floats, or NumPy's integers where the kernel wants them."""
+        """Numbers of an effect, by the name of their group, in an order that all kernels know."""
         around = self.surroundings
         match name:
             case "ray" if self.along_ray or self.parallel:
@@ -130,7 +129,7 @@ class View:
                 return self.sensor.uniform(name)
 
     def array(self, name: str) -> np.ndarray:
-        """A float32 array that an effect asks for (`Effect.resolve_arrays`, `Effect.backdrop_arrays`)."""
+        """A float32 array of an effect, by its name."""
         if name == "turns":
             return self.turns_of_rows.astype(np.float32)
         if name == "panorama" and isinstance(self.surroundings, Panorama):

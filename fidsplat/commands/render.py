@@ -84,7 +84,7 @@ Examples:
         from fidsplat.budget import check_bounds, choose
         from fidsplat.effects import select
         from fidsplat.quality import Quality
-        from fidsplat.vision.planes import save_plane
+        from fidsplat.vision.output_files import save_output
 
         names = None if self.outputs is None else tuple(n.strip() for n in self.outputs.split(","))
         # what is wrong with the words is said before anything is read or opened
@@ -120,7 +120,7 @@ Examples:
             planes = {name: frame[name] for name in frame.outputs}
         seconds = time.perf_counter() - begun
         bits = None if scene.sensor is None else scene.sensor.bits
-        files = [file for name, plane in planes.items() for file in save_plane(name, plane, name_of, bits)]
+        files = [file for name, plane in planes.items() for file in save_output(name, plane, name_of, bits)]
         if self.json:
             print_json(
                 {

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Protocol
 
 from fidsplat.cameras import Camera
-from fidsplat.effects.catalogue import CATALOGUE, Effect, Output
+from fidsplat.effects.catalogue import CATALOGUE, Output
 from fidsplat.effects.together import refuse_strangers
 from fidsplat.errors import InputError, unknown
 from fidsplat.quality import Quality
@@ -46,36 +46,17 @@ class FeatureSet:
     """What changes rgb on its way out, in its order: fog, the steps of the sensor."""
 
     @cached_property
-    def effects(self) -> tuple[Effect, ...]:
-        """All effects in the order in which their text is put together: slots, parts, taps, posts."""
-        parts = _parts_of((*self.slots, *self.taps, *self.posts))
-        taps = [tap for tap in self.taps if tap not in parts]
-        return tuple(CATALOGUE[name] for name in (*self.slots, *parts, *taps, *self.posts))
-
-    @cached_property
     def names(self) -> frozenset[str]:
-        """Names of all effects."""
-        return frozenset(effect.name for effect in self.effects)
+        """Names of all effects, those of outputs that others are made from among them."""
+        return frozenset((*self.slots, *(output.name for output in self.outputs[1:]), *self.posts))
 
     @cached_property
     def outputs(self) -> tuple[Output, ...]:
-        """Finished planes, rgb first; with those that other taps are made from."""
-        return (RGB, *(effect.output for effect in self.effects if effect.output))
-
-
-def _parts_of(names: Iterable[str]) -> list[str]:
-    """What effects need, and what that needs, sorted."""
-    parts: set[str] = set()
-    todo = list(names)
-    cameras = [name for name in todo if name.startswith("camera_")]
-    while todo:
-        needed = CATALOGUE[todo.pop()].parts
-        for camera in cameras:
-            needed = [CATALOGUE[part].behind.get(camera, part) for part in needed]
-        fresh = set(needed) - parts
-        parts |= fresh
-        todo += fresh
-    return sorted(parts)
+        """Output images, rgb first, then those that others are made from."""
+        needed = sorted({name for tap in self.taps for name in CATALOGUE[tap].needs})
+        names = (*needed, *(tap for tap in self.taps if tap not in needed))
+        effects = (CATALOGUE[name] for name in names)
+        return (RGB, *(effect.output for effect in effects if effect.output))
 
 
 class Traits(Protocol):

@@ -17,6 +17,7 @@ from fidsplat.render import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.vision.detect import detect
 from fidsplat.vision.images import to_uint8, write_png
+from fidsplat.vision.output_files import save_output
 from fidsplat.vision.paint import (
     contact_sheet,
     depth_key,
@@ -26,7 +27,6 @@ from fidsplat.vision.paint import (
     normal_picture,
     outlined,
 )
-from fidsplat.vision.planes import save_plane
 
 # a marker counts as wholly visible from this share of its area on; the rest is the soft edge of its quiet
 # zone
@@ -175,7 +175,7 @@ def _save(folder: Path, stem: str, images: dict[str, np.ndarray], marked: np.nda
     files = [
         file
         for name, image in images.items()
-        for file in save_plane(name, image, lambda kind, suffix: folder / f"{stem}-{kind}{suffix}")
+        for file in save_output(name, image, lambda kind, suffix: folder / f"{stem}-{kind}{suffix}")
     ]
     return [*files, write_png(folder / f"{stem}-detection.png", marked)]
 

@@ -8,9 +8,8 @@ import math
 
 import numpy as np
 
-from fidsplat.hard_cases.agreement import Picture, truth_of
+from fidsplat.hard_cases.agreement import Picture, draw, truth_of
 from fidsplat.hard_cases.clouds import camera, quaternion, splats
-from fidsplat.hard_cases.invariance import draw
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer
 

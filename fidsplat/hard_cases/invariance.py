@@ -7,26 +7,16 @@ from collections.abc import Mapping
 import numpy as np
 
 from fidsplat.backends.base import Reshapes
-from fidsplat.backends.view import View
-from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import Picture
-from fidsplat.render import Frame, Renderer
+from fidsplat.render import Renderer
 
 CULLED = 0xFFFFFFFF
 """depth key of a splat that is not drawn, on devices"""
 
 
-def draw(renderer: Renderer, picture: Picture) -> Frame:
-    """The picture on a device."""
-    return renderer.render(
-        picture.cloud, picture.camera, picture.outputs, picture.quality, picture.background
-    )
-
-
 def trace(renderer: Renderer, picture: Picture, shape=None) -> dict[str, np.ndarray]:
-    """What passes between the stages of a device, with the planes; `shape` replaces its build constants."""
-    features = select(picture.cloud, picture.outputs, picture.quality)
-    view = View.of(picture.camera, picture.quality, picture.cloud.origin, picture.background)
+    """What passes between the stages of a device, with the outputs; `shape` replaces its build constants."""
+    features, view = picture.prepared()
     backend = renderer.backend
     reshaped = isinstance(backend, Reshapes) and shape is not None
     pipeline = backend.pipeline(features, shape) if reshaped else backend.pipeline(features)

@@ -6,11 +6,13 @@ from itertools import product
 import numpy as np
 import pytest
 from agreement import random_splats
-from test_assemble import COLORS, GROUP, PLAIN, SHAPE, Cloud
+from test_assemble import COLORS, GROUP, PLAIN, SHAPE, Cloud, record_bytes
 
 import fidsplat as fs
-from fidsplat.backends.opencl.assemble import DeviceShape, assemble
-from fidsplat.effects import CATALOGUE, select
+from fidsplat.backends.opencl.assemble import assemble
+from fidsplat.backends.opencl.layout import LAYOUTS
+from fidsplat.backends.opencl.shapes import gpu_shape
+from fidsplat.effects import select
 
 BACKEND = "opencl"
 
@@ -25,10 +27,10 @@ CAMERAS = {
 
 # of the texts as they were before there were lenses; a change here changes what every plain picture runs
 BEFORE_LENSES = {
-    ("lanes", ("rgb",)): "4cc27a288d0205d20ec5c7a45b98a133a2717eca5b886431e9cf1285022b54c4",
-    ("lanes", TAPS): "8d129690c0da413037964d0cd200e9ecdb7ae8f50786578cfadfbca70709950a",
-    ("group", ("rgb",)): "13d40946e4e9b01ae005464a37a6d189befed91a4c6e671921e058836d099e24",
-    ("group", TAPS): "74168286aa0335365092b58ac23447d117ceaccc951bac6c381d4ab895729f48",
+    ("lanes", ("rgb",)): "45a83fbd0b35b2fdbc5148b64dac51341794ca553021a4958b4d9180055bbbf4",
+    ("lanes", TAPS): "fe67355b61f845772288c98d3f877fe9b12221559f8cb598c22e8607ccbdf4ce",
+    ("group", ("rgb",)): "7f9e7d564e9b0f82499b688e6b611805317344ca508ea312502dd379d467b07b",
+    ("group", TAPS): "64893feebcde61293c8a4912a860ab8a2f91c37090ef92c9db27500e27430e5d",
 }
 
 
@@ -66,8 +68,8 @@ def test_values_that_mean_nothing_call_for_nothing(renderer):
 def test_a_lens_brings_its_own_text_alone(kind):
     text = assemble(select(COLORS, ("rgb",), PLAIN, CAMERAS[kind]), SHAPE).text
     words = {
-        "brown_conrady": ("LENS_FOLD",),
-        "fisheye": ("chart_box", "LENS_LIMIT"),
+        "brown_conrady": ("lens_fold",),
+        "fisheye": ("chart_box", "lens_limit"),
         "equirectangular": ("cone_bounds",),
         "orthographic": ("z_near",),
     }
@@ -82,7 +84,7 @@ def test_what_lenses_take():
     """Bytes of a record and words of bounds; the base's are those of test_assemble."""
 
     def record(kind):
-        return assemble(select(COLORS, ("rgb",), PLAIN, CAMERAS[kind]), SHAPE).record_bytes
+        return record_bytes(select(COLORS, ("rgb",), PLAIN, CAMERAS[kind]))
 
     assert {kind: record(kind) for kind in CAMERAS} == {
         "pinhole": 80,
@@ -92,7 +94,7 @@ def test_what_lenses_take():
         "orthographic": 96,
     }
     assert not any(
-        CATALOGUE[name].record_lanes for name in ("shutter_exposure", "motion_groups", "ray_map", "polygon")
+        LAYOUTS[name].splat for name in ("shutter_exposure", "motion_groups", "ray_map", "polygon")
     )
 
 
@@ -112,7 +114,7 @@ def test_the_other_schedule_draws_the_same_picture(renderer):
 
     cloud = random_splats(60, seed=3, depth=(-2, 4))
     backend = renderer.backend
-    shape = DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, 256, backend.shape.fast_fma)
+    shape = gpu_shape(256, backend.shape.fast_fma)
     for camera in CAMERAS.values():
         view = exposed_view(camera, fs.Quality(), cloud.origin, (0, 0, 0), fs.Motion(), fs.Shutter())
         features = select(cloud, ("rgb", "depth"), fs.Quality(), camera)

@@ -11,7 +11,7 @@ import fidsplat as fs
 from fidsplat.backends.exposure import exposed_view
 from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.effects import select
-from fidsplat.hard_cases.agreement import Picture, compare, judge
+from fidsplat.hard_cases.agreement import Picture, against_reference, compare
 
 SIZE = (41, 29)
 CLOUD = random_splats(120, 21, depth=(0.5, 5.0), scale=(0.02, 0.4))
@@ -51,7 +51,7 @@ def turning(time):
 
 
 def assert_agrees(renderer, **picture):
-    differences = judge(renderer, Picture(**{"cloud": CLOUD, **picture}))
+    differences = against_reference(renderer, Picture(**{"cloud": CLOUD, **picture}))
     assert all(difference.agrees for difference in differences), differences
 
 
@@ -91,7 +91,7 @@ def test_effects_of_the_picture_under_a_shutter(renderer, around, shutter):
     how = {"sensor": SENSOR, "fog": fog, "background": behind}
     features = select(cloud, outputs, quality, PLAIN, moving=True, exposed=True, **how)
     reference = ReferenceBackend()
-    truth = reference.pipeline(features).render(reference.upload(cloud), view).images
+    truth = reference.pipeline(features).render(reference.upload(cloud), view).planes
     differences = compare(frame, truth, outputs)
     assert all(difference.agrees for difference in differences), differences
 

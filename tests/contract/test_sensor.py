@@ -12,7 +12,7 @@ from ideal_effects import assert_as_good, ideal_picture
 import fidsplat as fs
 from fidsplat.backends.reference.post import variates
 from fidsplat.backends.view import View
-from fidsplat.hard_cases.agreement import Picture, judge
+from fidsplat.hard_cases.agreement import Picture, against_reference
 
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.3, -0.2, -0.1), (0.0, 0.1, 3.0))
 CLOUD = random_splats(120, 3)
@@ -70,7 +70,7 @@ def test_backgrounds(renderer, background, samples):
 
 
 def agree(renderer, picture):
-    differences = judge(renderer, picture)
+    differences = against_reference(renderer, picture)
     assert all(difference.agrees for difference in differences), differences
 
 

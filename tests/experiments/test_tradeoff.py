@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.opencl.memory import Resident
+from fidsplat.backends.opencl.resident import Resident
 from fidsplat.cli import main
 from fidsplat.experiments.records import read_lines
 from fidsplat.experiments.tradeoff import judging, run

@@ -10,7 +10,7 @@ import pytest
 import fidsplat as fs
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, CATALOGUED
 from fidsplat.hard_cases.clouds import taken
-from fidsplat.hard_cases.group_e import BROKEN, VICTIM, VIEW, broken_fields, crowd, spoilt
+from fidsplat.hard_cases.e_inputs import BROKEN, VICTIM, VIEW, broken_fields, crowd, spoilt
 
 NAN, INF = float("nan"), float("inf")
 ALL_ZERO_ROWS = 889_536

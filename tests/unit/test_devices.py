@@ -43,7 +43,7 @@ def test_unknown_devices_are_named(name, words):
 
 def test_devices_of_one_name_are_numbered(monkeypatch):
     """Two PoCLs in one process, or two cards of one platform: each can be typed."""
-    from fidsplat.backends.opencl import backend
+    from fidsplat.backends.opencl import device as backend
 
     def card(platform, name, available=True):
         return SimpleNamespace(
@@ -73,7 +73,7 @@ def test_devices_of_one_name_are_numbered(monkeypatch):
 
 
 def test_no_platform_says_how_to_get_one(monkeypatch):
-    from fidsplat.backends.opencl import backend
+    from fidsplat.backends.opencl import device as backend
 
     monkeypatch.setattr(backend, "_all_devices", lambda: iter(()))
     with pytest.raises(fs.DeviceError, match=r"pip install 'pyopencl\[pocl\]'"):

@@ -40,7 +40,7 @@ MAY_IMPORT = {
     "timing": BASE,
     "random_clouds": PLAIN,
     "hard_cases": PLAIN
-    | {"scenes", "effects", "backends", "render", "vision", "kernel_files", "random_clouds"},
+    | {"scenes", "effects", "backends", "render", "vision", "provenance", "random_clouds"},
     "render": PLAIN | {"scenes", "effects", "backends"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
     "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},

@@ -1,9 +1,10 @@
-"""Planes as pictures: what a colour means, what nothing looks like."""
+"""Output images as pictures: what a colour means, what nothing looks like."""
 
 import cv2
 import numpy as np
 import pytest
 
+from fidsplat.vision.output_files import save_output
 from fidsplat.vision.paint import (
     KEY_WIDTH,
     contact_sheet,
@@ -17,7 +18,6 @@ from fidsplat.vision.paint import (
     normal_picture,
     outlined,
 )
-from fidsplat.vision.planes import save_plane
 
 SQUARE = np.array([[20.5, 10.5], [60.5, 10.5], [60.5, 40.5], [20.5, 40.5]])
 
@@ -133,10 +133,10 @@ def test_a_sheet_holds_every_picture_under_its_title():
         ("label", (4, 5), ["label.npy", "label.png"]),
     ],
 )
-def test_planes_as_files(tmp_path, name, shape, files):
+def test_outputs_as_files(tmp_path, name, shape, files):
     plane = np.random.default_rng(0).uniform(0, 1, shape).astype(np.float32)
     plane = (plane * 5).astype(np.int32) if name == "label" else plane
-    written = save_plane(name, plane, lambda kind, suffix: tmp_path / f"{kind}{suffix}")
+    written = save_output(name, plane, lambda kind, suffix: tmp_path / f"{kind}{suffix}")
     assert [path.name for path in written] == files
     assert {path.name for path in tmp_path.iterdir()} == set(files)
     if name in ("depth", "label"):

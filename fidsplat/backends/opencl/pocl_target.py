@@ -17,6 +17,7 @@ import platform
 import re
 import struct
 from pathlib import Path
+from typing import Any
 
 # The x86 levels of PoCL's "distro" kernel libraries, best last, with LLVM's name for each.
 _LEVELS = (
@@ -31,6 +32,13 @@ _LEVELS = (
 _NAME = re.compile(r"PoCL.*-x86_64-[\w-]*gnu-([\w-]+)$")
 _RECORD_BYTES = 2048
 _corrected: dict[int, ctypes.Array] = {}  # PoCL keeps pointing at these
+
+
+def target_of(device: Any) -> str:
+    """What kernels for an OpenCL device are compiled for, as far as the driver tells."""
+    if needs_correction(device.version):
+        return correct_target(device.int_ptr, device.version) or "generic"
+    return device.version
 
 
 def needs_correction(device_version: str) -> bool:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
 
 from fidsplat.backends.view import View
-from fidsplat.backends.warp import runtime
 from fidsplat.backends.warp.program import WarpShape
+from fidsplat.backends.warp.runtime import kernels, load
 
 
 def _ray(view: View) -> tuple[float, ...]:
@@ -31,15 +32,24 @@ _DERIVED: dict[str, Callable[[View, WarpShape], Any]] = {
 """fields that a view does not have by their names"""
 
 
+@cache
+def _fields() -> tuple[tuple[str, Any], ...]:
+    """Name of each field, and the type of those that are vectors or matrices."""
+    types = load().types
+    kinds = {name: field.type for name, field in kernels("common").View.vars.items()}
+    wide = {name for name, kind in kinds.items() if types.type_is_vector(kind) or types.type_is_matrix(kind)}
+    return tuple((name, kind if name in wide else None) for name, kind in kinds.items())
+
+
 def uniforms(view: View, shape: WarpShape, sloped: bool) -> Any:
     """The struct for a picture in tiles of this shape; sloped: its kernels read rays' derivatives."""
-    struct = runtime.kernels("common").View
-    filled = struct()
-    for name, field in struct.vars.items():
+    filled = kernels("common").View()
+    for name, wide in _fields():
         if name == "ray_step":
             value = view.raster.step if view.raster and sloped else 0.0
         else:
             value = _DERIVED[name](view, shape) if name in _DERIVED else getattr(view, name)
-        # a vector or matrix takes its numbers one by one
-        setattr(filled, name, field.type(*np.ravel(value).tolist()) if np.ndim(value) else value)
+        if wide:
+            value = wide(*(value.ravel().tolist() if isinstance(value, np.ndarray) else value))
+        setattr(filled, name, value)
     return filled

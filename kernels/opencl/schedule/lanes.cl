@@ -5,14 +5,7 @@
 #define AHEAD_SPLATS 8
 
 kernel void blend(
-    global const Splat *restrict splats,
-    global const uint *restrict lists,
-    global const uint *restrict starts,
-    uint band_first,                         // the first tile of this launch; lists begin with its list
-    int width, int height,
-    wide log_cut, wide ceiling, wide stop, wide filter,
-    global float *restrict raw
-//@@ blend_args
+//@@ arguments blend
 ) {
     const BlendConstants constants = {log_cut, ceiling, stop, filter};
     uint tile = band_first + get_global_id(0);

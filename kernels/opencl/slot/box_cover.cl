@@ -21,7 +21,7 @@
 //@ footprint_dot_bounds
         if (BOX_HERE) bounds.pr = -1.0f;
 //@ footprint_dot
-        if (BOX_HERE) record.fx = record.fy = 1e18f;
+        if (BOX_HERE) record.dot_x = record.dot_y = 1e18f;
 //@ footprint_opacity
     if (IS_BOX(s)) opacity = fmin(exp(s->log_opacity), constants->ceiling) * c.cover;
 //@ footprint_tau

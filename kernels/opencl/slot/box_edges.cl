@@ -1,7 +1,5 @@
 // Edges of boxes (slot/box_cover.cl) where forms are affine in the sample: straight lines, whose distances in samples need
 // one number for each edge of a splat.
-//@ record
-    wide edge_u0, edge_u1, edge_v0, edge_v1;   // 1 / |grad| of the forms D + n_u, D - n_u, D + n_v, D - n_v
 //@ footprint_functions
 static inline vfloat between(vfloat d, vfloat n, wide edge_0, wide edge_1) {
     vfloat above = clamp(FMA(FMA((vfloat)SQRT_2, n, d), (vfloat)edge_0, (vfloat)0.5f), (vfloat)0.0f, (vfloat)1.0f);
@@ -71,10 +69,10 @@ static inline bool box_touches(real3_ k0, real3_ kx, real3_ ky, real facing, rea
 }
 //@ footprint_bounds
     if (BOX_HERE) {
-        real3_ cu = image_row(view[VIEW_FX], view[VIEW_CX] - center_x, row_x, tw);
-        real3_ cv = image_row(view[VIEW_FY], view[VIEW_CY] - center_y, row_y, tw);
-        real box[4] = {-1 - center_x, view[VIEW_WIDTH] + 1 - center_x, -1 - center_y, view[VIEW_HEIGHT] + 1 - center_y};
-        real d_near = fabs(view[VIEW_FX] * view[VIEW_FY] * su * sv * offset) / near;
+        real3_ cu = image_row(view->focal_x, view->center_x - center_x, row_x, tw);
+        real3_ cv = image_row(view->focal_y, view->center_y - center_y, row_y, tw);
+        real box[4] = {-1 - center_x, view->width + 1 - center_x, -1 - center_y, view->height + 1 - center_y};
+        real d_near = fabs(view->focal_x * view->focal_y * su * sv * offset) / near;
 //@@ camera_box_near
         real towards_box = offset < 0 ? -1 : 1;
         if (!box_touches(cross3(cu, cv), cross3(cv, tw), cross3(tw, cu), towards_box, d_near, box)) return;

@@ -6,11 +6,6 @@
 // The splats of a plane arrive together (plane_keys), before anything that the layer is compared with. It is pending until
 // a fragment of no plane (-1) arrives whose own depth at the pixel lies behind the layer's, or nothing more arrives. Of
 // more than two pending layers the nearer of the first two is laid when the third begins.
-//@ record
-    int plane;
-//@ project_args
-    , global const int *restrict planes      // (n) index of the splat's plane; -1: none
-    , global const float *restrict plane_keys // (planes) depth at which its splats are sorted in [m]
 //@ project
     record.plane = planes[i];
 //@ key

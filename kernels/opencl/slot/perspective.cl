@@ -8,15 +8,15 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
 }
 //@ camera_bounds
     real3_ row_x = {a.x, b.x, p.x}, row_y = {a.y, b.y, p.y}, tw = {a.z, b.z, p.z};
-    real3_ tu = image_row(view[VIEW_FX], view[VIEW_CX], row_x, tw);
-    real3_ tv = image_row(view[VIEW_FY], view[VIEW_CY], row_y, tw);
+    real3_ tu = image_row(view->focal_x, view->center_x, row_x, tw);
+    real3_ tv = image_row(view->focal_y, view->center_y, row_y, tw);
     real center_x, center_y;
     Bounds bounds;
     if (pz - reach >= near) {
         center_x = tu.z / pz;
         center_y = tv.z / pz;
-        real3_ cu = image_row(view[VIEW_FX], view[VIEW_CX] - center_x, row_x, tw);
-        real3_ cv = image_row(view[VIEW_FY], view[VIEW_CY] - center_y, row_y, tw);
+        real3_ cu = image_row(view->focal_x, view->center_x - center_x, row_x, tw);
+        real3_ cv = image_row(view->focal_y, view->center_y - center_y, row_y, tw);
         bounds = ellipse_bounds(cu, cv, tw, center_x, center_y, radius * radius);
     } else {
         real box[4];

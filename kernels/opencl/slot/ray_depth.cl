@@ -1,9 +1,6 @@
 // Depth along z of a fragment, for those that need it: the ray's meeting with the splat's plane, within the
 // depth range of the R-sigma disk; in the low-pass dot of a splat whose plane the ray misses, the centre's depth
 // (numerics B2, B4).
-//@ record
-    wide z_numerator;       // depth = z_numerator / D
-    wide z_center, z_reach;
 //@ project
     record.z_numerator = (wide)z_numerator;
     record.z_center = (wide)pz;

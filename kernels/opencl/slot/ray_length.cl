@@ -5,4 +5,4 @@ static inline float ray_length(float x, float y, float fx, float fy, float cx, f
     return sqrt(FMA(across, across, FMA(down, down, 1.0f)));
 }
 //@ fog_length
-                ray_length((float)fog_x + 0.5f, (float)fog_y + 0.5f, fog_fx, fog_fy, fog_cx, fog_cy)
+                ray_length((float)fog_x + 0.5f, (float)fog_y + 0.5f, ray_focal_x, ray_focal_y, ray_center_x, ray_center_y)

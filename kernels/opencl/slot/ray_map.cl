@@ -31,5 +31,3 @@ static inline Bounds mapped_bounds(global const real *numbers, global const shor
     real top = numbers[5] - REAL(0.5);
     return box_bounds(box.x + REAL(0.5), box.y + REAL(0.5), box.z - top, box.w - top);
 }
-//@ project_args
-    , global const short4 *restrict ray_map

@@ -2,9 +2,6 @@
 // where nothing is seen. A ray r meets the splat's plane at (u, v) with (u, v, 1) D = (n_u, n_v, D) = r . (b x p, p x a, a x b),
 // at the depth det[a b p] / D in units of r's length: along z if rays have Z = 1, else along the ray. The forms are kept
 // relative to the ray of the sample nearest to the centre, so that nothing cancels (numerics B1).
-//@ record
-    wide nuz, nvz, dz;      // n_u = nu0 + nux X + nuy Y + nuz Z, likewise n_v and D
-    wide ray_x, ray_y, ray_z;    // X, Y, Z are relative to this ray
 //@ cross_functions
 static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfloat ray_z, float half_r2
 //@@ ray_cross_parameters
@@ -17,8 +14,6 @@ static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfl
 //@@ ray_cross
     return c;
 }
-//@ project_args
-    , global const float *restrict rays      // (3, rows, columns) of the padded grid
 //@ camera_forms
     // any ray will do for an anchor; where that sample sees nothing it is the centre's
     size_t ray_stride = (width + TILE_W - 1) / TILE_W * TILE_W;
@@ -47,8 +42,6 @@ static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfl
     record.ray_x = anchor_ray[0];
     record.ray_y = anchor_ray[1];
     record.ray_z = anchor_ray[2];
-//@ blend_args
-    , global const float *restrict rays
 //@ lanes_start
     size_t ray_stride = (size_t)tiles_x * TILE_W, ray_plane = ray_stride * tiles_y * TILE_H;
 #define RAY(k) VLOAD(rays + (k) * ray_plane + (y0 + row) * ray_stride + x0)
@@ -62,8 +55,6 @@ static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfl
     c = cross_ray(&s, RAY(0), RAY(1), RAY(2), half_r2
 //@@ ray_cross_arguments
     );
-//@ backdrop_args
-    , global const float *restrict rays
 //@ backdrop_ray
     ray_x = rays[at];
     ray_y = rays[plane + at];

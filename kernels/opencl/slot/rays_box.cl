@@ -30,8 +30,6 @@ static inline vfloat along(wide x, wide y, wide z, vfloat to_x, vfloat to_y, vfl
     }
 //@ ray_cross_arguments
                               , SLOPE(0), SLOPE(1), SLOPE(2), SLOPE(3), SLOPE(4), SLOPE(5)
-//@ blend_args
-    , global const float *restrict ray_slopes
 //@ lanes_start
 #define SLOPE(k) VLOAD(ray_slopes + (k) * ray_plane + (y0 + row) * ray_stride + x0)
 //@ group_start
@@ -39,8 +37,6 @@ static inline vfloat along(wide x, wide y, wide z, vfloat to_x, vfloat to_y, vfl
     for (int row = 0; row < ROWS; row++)
         for (int k = 0; k < 6; k++) own_slopes[k][row] = ray_slopes[k * ray_plane + (py + row) * ray_stride + px];
 #define SLOPE(k) own_slopes[k][row]
-//@ project_args
-    , global const float *restrict ray_step  // (1) how far a ray turns from a sample to the next, at most
 //@ footprint_spread
     // A sample that is partly covered meets the plane at |u| <= 1 + |grad F| / 2 D for the forms F = D -+ n_u, likewise v. With
     // |grad F| <= |F| ray_step (|F| of its three factors) and D >= su sv |offset| / |P|, the point P on the plane is no further

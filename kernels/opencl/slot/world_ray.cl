@@ -3,17 +3,13 @@
 //@ kernels
 // Index space: one work-item per sample (x, y). Reads: raw's transmittances. Writes: raw's colours.
 kernel void backdrop(
-    int width, int height, int stride, uint plane,
-    float ray_fx, float ray_fy, float ray_cx, float ray_cy,
-    float turn_00, float turn_01, float turn_02, float turn_10, float turn_11, float turn_12,   // world to camera
-    float turn_20, float turn_21, float turn_22,
-    global float *restrict raw
-//@@ backdrop_args
+//@@ arguments backdrop
 ) {
     int x = get_global_id(0), y = get_global_id(1);
     if (x >= width || y >= height) return;
     size_t at = (size_t)y * stride + x;
-    float ray_x = ((float)x + 0.5f - ray_cx) / ray_fx, ray_y = ((float)y + 0.5f - ray_cy) / ray_fy, ray_z = 1.0f;
+    float ray_x = ((float)x + 0.5f - ray_center_x) / ray_focal_x;
+    float ray_y = ((float)y + 0.5f - ray_center_y) / ray_focal_y, ray_z = 1.0f;
 //@@ backdrop_ray
     float world_x = FMA(turn_00, ray_x, FMA(turn_10, ray_y, turn_20 * ray_z));
     float world_y = FMA(turn_01, ray_x, FMA(turn_11, ray_y, turn_21 * ray_z));

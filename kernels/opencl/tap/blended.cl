@@ -13,12 +13,8 @@
     layer->mean.blended += VSELECT((vint)0, (vint)1, VMASK(opacity > 0.0f));
 //@ lay
     pixel->blended += live & seen->blended;
-//@ blend_args
-    , global int *restrict blended_raw
 //@ store
         VSTORE(pixel->blended, blended_raw + at);
-//@ resolve_args
-    , global const int *restrict blended_raw, global int *restrict blended_out
 //@ resolve_start
     int blended = 0;
 //@ resolve_sample

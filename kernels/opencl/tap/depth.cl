@@ -7,13 +7,9 @@
 //@ lay
     pixel->depth = FMA(weight, seen->z, pixel->depth);
     pixel->depth_weight += weight;
-//@ blend_args
-    , global float *restrict depth_raw       // 2 planes: sum w z, sum w
 //@ store
         VSTORE(VSELECT((vfloat)0.0f, pixel->depth, pixel_shown(pixel)), depth_raw + at);
         VSTORE(VSELECT((vfloat)0.0f, pixel->depth_weight, pixel_shown(pixel)), depth_raw + plane + at);
-//@ resolve_args
-    , global const float *restrict depth_raw, global float *restrict depth_out
 //@ resolve_start
     float depth = 0, depth_weight = 0;
 //@ resolve_sample

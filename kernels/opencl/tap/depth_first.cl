@@ -9,12 +9,8 @@
 //@ lay
     pixel->depth_first = VSELECT(pixel->depth_first, seen->z,
                                  live & VMASK(pixel->depth_first == 0.0f) & VMASK(pixel->t - weight <= pixel->first_light));
-//@ blend_args
-    , float first_light, global float *restrict depth_first_raw
 //@ store
         VSTORE(pixel->depth_first, depth_first_raw + at);
-//@ resolve_args
-    , global const float *restrict depth_first_raw, global float *restrict depth_first_out
 //@ resolve_start
     float depth_first = INFINITY;
 //@ resolve_sample

@@ -12,12 +12,8 @@
     vint counts = live & VMASK(pixel->t > 0.5f) & VMASK(pixel->median_light - behind >= LEAST_ALPHA);
     pixel->depth_median = VSELECT(pixel->depth_median, seen->z, counts);
     pixel->median_light = VSELECT(pixel->median_light, behind, counts);
-//@ blend_args
-    , global float *restrict depth_median_raw
 //@ store
         VSTORE(pixel->depth_median, depth_median_raw + at);
-//@ resolve_args
-    , global const float *restrict depth_median_raw, global float *restrict depth_median_out
 //@ resolve_start
     float depth_medians[SAMPLES * SAMPLES];
     int depth_median_hits = 0;

@@ -1,6 +1,4 @@
 // distance_first (h, w): distance along the ray [m] of what depth_first sees; of several samples the nearest.
-//@ resolve_args
-    , global float *restrict distance_first_out
 //@ resolve_start
     float first_along = INFINITY;
 //@ resolve_sample

@@ -1,6 +1,4 @@
 // distance_median (h, w): distance along the ray [m] of what depth_median sees; of several samples the lower median.
-//@ resolve_args
-    , global float *restrict distance_median_out
 //@ resolve_start
     float medians_along[SAMPLES * SAMPLES];
     int medians_hit = 0;

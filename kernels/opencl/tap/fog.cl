@@ -25,18 +25,14 @@
     pixel->g = FMA(-hidden, seen->g, pixel->g);
     pixel->b = FMA(-hidden, seen->b, pixel->b);
     pixel->fogged += hidden;
-//@ blend_args
-    , float fog_density, float fog_fx, float fog_fy, float fog_cx, float fog_cy, global float *restrict fog_raw
 //@ store
         VSTORE(pixel->fogged, fog_raw + at);
-//@ resolve_args
-    , global const float *restrict fog_raw
 //@ resolve_start
     float fogged = 0;
 //@ resolve_sample
             fogged += fog_raw[at];
 //@ resolve_end
     fogged *= mean;
-    rgb[3 * out] = FMA(fogged, background_r, rgb[3 * out]);
-    rgb[3 * out + 1] = FMA(fogged, background_g, rgb[3 * out + 1]);
-    rgb[3 * out + 2] = FMA(fogged, background_b, rgb[3 * out + 2]);
+    rgb_out[3 * out] = FMA(fogged, background_r, rgb_out[3 * out]);
+    rgb_out[3 * out + 1] = FMA(fogged, background_g, rgb_out[3 * out + 1]);
+    rgb_out[3 * out + 2] = FMA(fogged, background_b, rgb_out[3 * out + 2]);

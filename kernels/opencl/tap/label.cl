@@ -1,9 +1,5 @@
 // label (h, w) int: label of the fragment or layer with the largest weight, the nearest of equals; -1 where less
 // than 1/255 is covered.
-//@ record
-    int label;
-//@ project_args
-    , global const int *restrict labels      // (n)
 //@ project
     record.label = labels[i];
 //@ state
@@ -28,13 +24,9 @@
     vint heavier = VMASK(weight > pixel->label_weight);
     pixel->label = VSELECT(pixel->label, seen->label, heavier);
     pixel->label_weight = fmax(pixel->label_weight, weight);
-//@ blend_args
-    , global float *restrict label_raw, global int *restrict label_id_raw
 //@ store
         VSTORE(VSELECT((vfloat)0.0f, pixel->label_weight, pixel_shown(pixel)), label_raw + at);
         VSTORE(pixel->label, label_id_raw + at);
-//@ resolve_args
-    , global const float *restrict label_raw, global const int *restrict label_id_raw, global int *restrict label_out
 //@ resolve_start
     float label_weight = 0;
     int label = -1;

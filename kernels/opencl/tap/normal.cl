@@ -1,7 +1,5 @@
 // normal (h, w, 3): unit normal in the camera frame, towards the camera, of the mean of the splats' normals by weight; 0 where
 // less than 1/255 is covered.
-//@ record
-    wide nx, ny, nz;
 //@ project
     // the camera is on one side of the whole plane, so the sign is the splat's (numerics B7)
     real towards = offset > 0 ? -1 : 1;
@@ -32,14 +30,10 @@
     pixel->normal_x = FMA(weight, seen->nx, pixel->normal_x);
     pixel->normal_y = FMA(weight, seen->ny, pixel->normal_y);
     pixel->normal_z = FMA(weight, seen->nz, pixel->normal_z);
-//@ blend_args
-    , global float *restrict normal_raw      // 3 planes
 //@ store
         VSTORE(VSELECT((vfloat)0.0f, pixel->normal_x, pixel_shown(pixel)), normal_raw + at);
         VSTORE(VSELECT((vfloat)0.0f, pixel->normal_y, pixel_shown(pixel)), normal_raw + plane + at);
         VSTORE(VSELECT((vfloat)0.0f, pixel->normal_z, pixel_shown(pixel)), normal_raw + 2 * plane + at);
-//@ resolve_args
-    , global const float *restrict normal_raw, global float *restrict normal_out
 //@ resolve_start
     float normal_x = 0, normal_y = 0, normal_z = 0;
 //@ resolve_sample

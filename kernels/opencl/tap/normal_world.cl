@@ -1,6 +1,4 @@
 // normal_world (h, w, 3): the normal in the axes of the world.
-//@ resolve_args
-    , global float *restrict normal_world_out
 //@ resolve_end
     for (int axis = 0; axis < 3; axis++)
         normal_world_out[3 * out + axis] =

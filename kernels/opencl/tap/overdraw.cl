@@ -14,12 +14,8 @@
     layer->mean.fragments -= mask;
 //@ lay
     pixel->overdraw += seen->fragments & live;
-//@ blend_args
-    , global int *restrict overdraw_raw
 //@ store
         VSTORE(pixel->overdraw, overdraw_raw + at);
-//@ resolve_args
-    , global const int *restrict overdraw_raw, global int *restrict overdraw_out
 //@ resolve_start
     int overdraw = 0;
 //@ resolve_sample

@@ -1,9 +1,5 @@
 // splat_id (h, w) int: index in the cloud of the fragment with the largest weight, of a layer its splat of greatest optical
 // depth, the nearest of equals; -1 where less than 1/255 is covered.
-//@ record
-    int splat_id;
-//@ project_args
-    , global const int *restrict splat_ids      // (n)
 //@ project
     record.splat_id = splat_ids[i];
 //@ state
@@ -28,13 +24,9 @@
     vint heavier_id = VMASK(weight > pixel->splat_id_weight);
     pixel->splat_id = VSELECT(pixel->splat_id, seen->splat_id, heavier_id);
     pixel->splat_id_weight = fmax(pixel->splat_id_weight, weight);
-//@ blend_args
-    , global float *restrict splat_id_raw, global int *restrict splat_id_index_raw
 //@ store
         VSTORE(VSELECT((vfloat)0.0f, pixel->splat_id_weight, pixel_shown(pixel)), splat_id_raw + at);
         VSTORE(pixel->splat_id, splat_id_index_raw + at);
-//@ resolve_args
-    , global const float *restrict splat_id_raw, global const int *restrict splat_id_index_raw, global int *restrict splat_id_out
 //@ resolve_start
     float splat_id_weight = 0;
     int splat_id = -1;

@@ -5,7 +5,7 @@
 #define CHAINS 8
 
 // Index space: one work-item per float4. Reads: in. Writes: out, the same.
-kernel void floor_copy(global const float4 *restrict in, global float4 *restrict out) {
+kernel void roofline_copy(global const float4 *restrict in, global float4 *restrict out) {
     size_t at = get_global_id(0);
     out[at] = in[at];
 }
@@ -24,6 +24,6 @@ kernel void floor_copy(global const float4 *restrict in, global float4 *restrict
         VSTORE(sum, out + (size_t)get_global_id(0) * LANES); \
     }
 
-RATE(floor_fma, fma(x[k], (vfloat)a, (vfloat)b))
-RATE(floor_exp, exp((vfloat)a - x[k]))
-RATE(floor_division, (vfloat)a / x[k])
+RATE(roofline_fma, fma(x[k], (vfloat)a, (vfloat)b))
+RATE(roofline_exp, exp((vfloat)a - x[k]))
+RATE(roofline_division, (vfloat)a / x[k])

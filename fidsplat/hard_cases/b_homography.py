@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.hard_cases.agreement import ALL_OUTPUTS, COLOR_TOLERANCE, Picture
-from fidsplat.hard_cases.case import Case, Finding
+from fidsplat.hard_cases.agreement import ALL_OUTPUTS, COLOR_TOLERANCE, Picture, draw
+from fidsplat.hard_cases.case import Finding, Found, case
 from fidsplat.hard_cases.clouds import camera, quaternion, splats, turned
 from fidsplat.hard_cases.homography import grazing_errors
-from fidsplat.hard_cases.invariance import differing, draw
+from fidsplat.hard_cases.invariance import differing
 from fidsplat.quality import Quality
 from fidsplat.random_clouds import random_splats
 from fidsplat.render import Renderer
@@ -26,7 +25,8 @@ SIDE = quaternion((0, 1, 0), (0, 0, 1))
 AHEAD = (1.0, 0.0, 0.0, 0.0)
 
 
-def _b1(renderer: Renderer) -> Iterator[Finding]:
+@case("B1", "cancellation in pixel coordinates", "8192 px wide, tilts to 89.9 deg at its far corner")
+def b1(renderer: Renderer) -> Found:
     for tilt, bound in ((0.0, 1e-4), (60.0, 1e-4), (85.0, 1e-4), (89.9, 1e-3)):
         for sigma in (3, 30):
             errors = grazing_errors(renderer, tilt, sigma)
@@ -43,15 +43,13 @@ def _edge_on(angle: float) -> Picture:
     return Picture(splats([[0, 0, 0]], SIDE, 0.3, 0.9), moved, outputs=ALL_OUTPUTS)
 
 
-def _b2() -> Iterator[Picture]:
+@case("B2", "edge-on", "0, 1e-7, 1e-4, 1e-2 rad beside the plane; steps of 1e-6")
+def b2(renderer: Renderer) -> Found:
     for angle in (0.0, 1e-7, -1e-7, 1e-4, -1e-4, 1e-2, -1e-2):
         yield _edge_on(angle)
     # exactly edge-on, and the camera within the disk
     yield Picture(splats([[0, 0, 3]], SIDE, 0.3, 0.9), camera(33, 25, 40.0), outputs=ALL_OUTPUTS)
     yield Picture(splats([[0, 0, 0.5]], SIDE, 1.0, 0.9), camera(33, 25, 40.0), outputs=ALL_OUTPUTS)
-
-
-def _b2_sweep(renderer: Renderer) -> Iterator[Finding]:
     frames = [draw(renderer, _edge_on(step * 1e-6)) for step in range(-12, 13)]
     alpha = np.stack([frame["alpha"] for frame in frames])
     finite = all(np.isfinite(frame[name]).all() for frame in frames for name in ALL_OUTPUTS)
@@ -61,14 +59,12 @@ def _b2_sweep(renderer: Renderer) -> Iterator[Finding]:
     yield Finding("outputs that are not finite", float(not finite), 0)
 
 
-def _b3() -> Iterator[Picture]:
+@case("B3", "low-pass filter", "splats of 1e-4 px; a crowd at 50 to 200 m")
+def b3(renderer: Renderer) -> Found:
     crowd = random_splats(300, seed=6, depth=(50.0, 200.0), scale=(1e-4, 1e-2), across=60.0)
     yield Picture(crowd, camera(), outputs=ALL_OUTPUTS)
     yield Picture(splats([[0.01, 0.02, 4]], turned((1, 0, 0), 70), 0.03, 0.8), camera(), outputs=ALL_OUTPUTS)
-
-
-def _b3_formula(renderer: Renderer) -> Iterator[Finding]:
-    """A splat without extent is exp(-d^2) of its opacity, within its radius."""
+    # A splat without extent is exp(-d^2) of its opacity, within its radius
     view = camera(31, 31, 100.0)
     error = 0.0
     rows, columns = np.mgrid[0:31, 0:31] + 0.5
@@ -83,15 +79,12 @@ def _b3_formula(renderer: Renderer) -> Iterator[Finding]:
     yield Finding("error against exp(-d^2)", error, COLOR_TOLERANCE)
 
 
-def _b4() -> Iterator[Picture]:
-    # the plane of a splat thinner than a pixel, almost edge-on: the ray meets it far away
+@case("B4", "depth of grazing and thin splats", "tilts of 60, 89, 89.99 and 90 deg")
+def b4(renderer: Renderer) -> Found:
     for degrees in (89.0, 89.99, 90.0):
         cloud = splats([[0.1, 0.05, 4]], turned((0, 1, 0), degrees), (1e-3, 5e-3))
         yield Picture(cloud, camera(), outputs=ALL_OUTPUTS)
-
-
-def _b4_plane(renderer: Renderer) -> Iterator[Finding]:
-    """Depth of a tilted wall against the plane's own, and no depth beyond the disk's."""
+    # depth of a tilted wall against the plane's own, and no depth beyond the disk's
     view = camera()
     wall = turned((0.3, 1, 0), 60)
     cloud = splats([[0, 0, 5]], wall, 1.0)
@@ -119,22 +112,21 @@ def _shifted(shift: np.ndarray) -> Picture:
     return Picture(cloud, Camera.look_at(100, 80, 1.0, position, target), outputs=ALL_OUTPUTS)
 
 
-def _b5() -> Iterator[Picture]:
+@case("B5", "far from the world's origin", "camera and cloud at (5e5, 4.5e6, 300) m")
+def b5(renderer: Renderer) -> Found:
     yield _shifted(SHIFT)
     # float64 means without an origin of their own: they are given one
     near = _shifted(np.zeros(3)).cloud
     means = near.world_means() + SHIFT
     cloud = SplatCloud(means, near.quats, near.scales, near.opacities, colors=near.colors, labels=near.labels)
     yield Picture(cloud, _shifted(SHIFT).camera, outputs=ALL_OUTPUTS)
-
-
-def _b5_bits(renderer: Renderer) -> Iterator[Finding]:
     here, there = (draw(renderer, _shifted(shift)) for shift in (np.zeros(3), SHIFT))
     changed = differing(here, there, ALL_OUTPUTS)
     yield Finding("pixels that change at (5e5, 4.5e6, 300) m", changed, 0)
 
 
-def _b6() -> Iterator[Picture]:
+@case("B6", "scales whose products underflow", "1e-38 to 1e9 m")
+def b6(renderer: Renderer) -> Found:
     means = [[-0.6, 0.1, 3], [0.0, -0.2, 3], [0.6, 0.3, 3], [0.2, 0.4, 2.5]]
     for scales in (1e-25, 1e-12, 1e-6, 1e4, 1e9):
         yield Picture(splats(means, turned((1, 2, 3), 50), scales, 0.6), camera(), outputs=ALL_OUTPUTS)
@@ -142,15 +134,13 @@ def _b6() -> Iterator[Picture]:
     yield Picture(splats(means, turned((1, 2, 3), 50), mixed, 0.6), camera(), outputs=ALL_OUTPUTS)
 
 
-def _b7() -> Iterator[Picture]:
+@case("B7", "normals", "both sides of a splat")
+def b7(renderer: Renderer) -> Found:
     for side in (-1.0, 1.0):
         cloud = random_splats(40, seed=9, depth=(-1.0, 1.0), scale=(0.05, 0.5), across=0.8)
         view = Camera.look_at(100, 80, 0.9, (0.3, -0.2, 4.0 * side), (0, 0, 0))
         yield Picture(cloud, view, outputs=ALL_OUTPUTS)
-
-
-def _b7_sides(renderer: Renderer) -> Iterator[Finding]:
-    """Seen from the other side the same splat has the opposite normal in the world."""
+    # seen from the other side the same splat has the opposite normal in the world
     cloud = splats([[0, 0, 0]], turned((1, 0.5, 0.2), 35), 0.5)
     normals = []
     for side in (-1.0, 1.0):
@@ -162,39 +152,19 @@ def _b7_sides(renderer: Renderer) -> Iterator[Finding]:
     yield Finding("sum of the normals of both sides", float(np.abs(sum(normals)).max()), 1e-6)
 
 
-def _b8() -> Iterator[Picture]:
+def _centred() -> SplatCloud:
+    return splats([[0, 0, 2]], AHEAD, (0.3, 0.2), 0.9)
+
+
+@case("B8", "pixel centres", "odd sizes, 1 x 1; principal point outside; 3 x 3 samples")
+def b8(renderer: Renderer) -> Found:
     for width, height in ((1, 1), (7, 5), (33, 1), (101, 79)):
         yield Picture(_centred(), camera(width, height, 30.0), outputs=ALL_OUTPUTS)
     beside = camera(53, 31, 60.0, cx=-20.5, cy=44.25)
     yield Picture(random_splats(80, seed=2), beside, outputs=ALL_OUTPUTS)
     yield Picture(random_splats(60, seed=13), camera(47, 33, 40.0), Quality(samples=3), ALL_OUTPUTS)
-
-
-def _centred() -> SplatCloud:
-    return splats([[0, 0, 2]], AHEAD, (0.3, 0.2), 0.9)
-
-
-def _b8_mirror(renderer: Renderer) -> Iterator[Finding]:
-    """A splat on the axis of a camera of odd size is symmetric, bit for bit."""
+    # A splat on the axis of a camera of odd size is symmetric, bit for bit
     planes = draw(renderer, Picture(_centred(), camera(101, 79, 30.0), outputs=("rgb", "depth")))
     for name, turned_over in (("left and right", np.s_[:, ::-1]), ("top and bottom", np.s_[::-1])):
         mirrored = {key: plane[turned_over] for key, plane in planes.items()}
         yield Finding(f"pixels that differ {name}", differing(planes, mirrored, planes.outputs), 0)
-
-
-CASES = (
-    Case(
-        "B1",
-        "cancellation in pixel coordinates",
-        "8192 px wide, tilts to 89.9 deg at its far corner",
-        None,
-        _b1,
-    ),
-    Case("B2", "edge-on", "0, 1e-7, 1e-4, 1e-2 rad beside the plane; steps of 1e-6", _b2, _b2_sweep),
-    Case("B3", "low-pass filter", "splats of 1e-4 px; a crowd at 50 to 200 m", _b3, _b3_formula),
-    Case("B4", "depth of grazing and thin splats", "tilts of 60, 89, 89.99 and 90 deg", _b4, _b4_plane),
-    Case("B5", "far from the world's origin", "camera and cloud at (5e5, 4.5e6, 300) m", _b5, _b5_bits),
-    Case("B6", "scales whose products underflow", "1e-38 to 1e9 m", _b6),
-    Case("B7", "normals", "both sides of a splat", _b7, _b7_sides),
-    Case("B8", "pixel centres", "odd sizes, 1 x 1; principal point outside; 3 x 3 samples", _b8, _b8_mirror),
-)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
-from fidsplat.hard_cases.case import Case, Finding
+from fidsplat.hard_cases.case import Finding, Found, case
 from fidsplat.hard_cases.clouds import camera, splats, turned
 from fidsplat.quality import Quality
 from fidsplat.random_clouds import random_splats
@@ -38,7 +36,12 @@ def near_values(value: float, ulps) -> np.ndarray:
     return bits.astype(np.int32).view(np.float32)
 
 
-def opaque_pictures() -> Iterator[Picture]:
+@case(
+    "D1",
+    "opaque layers hide what is behind them",
+    "1 to 4 layers of opacity 1; opacity 0.99 +- 3 ulp under the exclusive stop at T = 1e-4",
+)
+def d1(renderer: Renderer) -> Found:
     stripes = [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)]
     for n in (1, 2, 4):
         yield Picture(stack([1.0] * n, stripes[:n]), SMALL)
@@ -54,8 +57,6 @@ def opaque_pictures() -> Iterator[Picture]:
         stack([1.0, 1.0, 0.5, 1.0], stripes, step=0.0, size=0.3).with_planes(0), camera(61, 45, 48.0)
     )
 
-
-def opaque_check(renderer: Renderer) -> Iterator[Finding]:
     def light(n: int, quality) -> float:
         frame = renderer.render(stack([1.0] * n), SMALL, quality=quality, background=(1.0, 1.0, 1.0))
         return float(frame["rgb"][MIDDLE].max())
@@ -68,22 +69,22 @@ def opaque_check(renderer: Renderer) -> Iterator[Finding]:
         yield Finding(f"{preset}: difference from the 1 % that its system lets through", worst, 1e-5)
 
 
-def cut_pictures() -> Iterator[Picture]:
-    # opacities at and around the cut-off, each splat's centre on a pixel's centre
+@case(
+    "D2",
+    "the alpha cut-off is one radius, in bounds and pixels",
+    "opacity 1/255 +- 7 ulp; 100 to 5000 layers of 0.0039; cut-offs 1e-6, 1e-4 and 0.1",
+)
+def d2(renderer: Renderer) -> Found:
     grid = np.stack(np.meshgrid(np.arange(2, 23, 5), np.arange(3, 15, 5)), axis=-1).reshape(-1, 2)
     steps = np.linspace(-7, 7, len(grid)).astype(int)
     means = np.column_stack([(grid + 0.5 - (SMALL.cx, SMALL.cy)) / SMALL.fx, np.ones(len(grid))])
     for sizes in ((0.2, 0.2), (1e-4, 1e-4)):
         faint = splats(means, FACING, sizes, near_values(CUT, steps), np.eye(3)[np.arange(len(grid)) % 3])
         yield Picture(faint, SMALL)
-    haze = stack([0.0039] * 300, step=0.01)
-    yield Picture(haze, SMALL, Quality.named("reference"))
+    yield Picture(stack([0.0039] * 300, step=0.01), SMALL, Quality.named("reference"))
     contours = random_splats(150, 21, depth=(1.0, 4.0), scale=(0.05, 0.5), across=1.5)
     yield Picture(contours, camera(), Quality(alpha_cutoff=0.1))
     yield Picture(contours, camera(), Quality(alpha_cutoff=1e-4))
-
-
-def cut_check(renderer: Renderer) -> Iterator[Finding]:
     small = camera(3, 3, 20.0)
 
     def haze(n: int, opacity: float, quality) -> tuple[float, float]:
@@ -100,7 +101,12 @@ def cut_check(renderer: Renderer) -> Iterator[Finding]:
     yield Finding("error of alpha of 1000 layers of 0.004, above the cut-off", abs(drawn - wanted), 2e-5)
 
 
-def dim_pictures() -> Iterator[Picture]:
+@case(
+    "D3",
+    "transmittance underflows without harm",
+    "400 layers of opacity 0.3 to 1 with no stop, ordered and coplanar",
+)
+def d3(renderer: Renderer) -> Found:
     unending = Quality.named("reference")  # its transmittance stop is 0
     colors = np.resize(np.eye(3), (400, 3))
     for opacity in (0.3, 0.9, 1.0):
@@ -109,10 +115,7 @@ def dim_pictures() -> Iterator[Picture]:
     yield Picture(
         stack([0.6] * 200, colors[:200], step=0.01).with_planes(np.arange(200) // 40), SMALL, unending
     )
-
-
-def dim_check(renderer: Renderer) -> Iterator[Finding]:
-    """Transmittance runs into the denormals and to 0, in layers and in runs of coplanar splats."""
+    # transmittance runs into the denormals and to 0, in layers and in runs of coplanar splats
     layers = stack([0.9] * 400, [1.0, 0.5, 0.0], step=0.001)
     for cloud, name in ((layers, "layers"), (layers.with_planes(0), "coplanar splats")):
         rgb = renderer.render(cloud, SMALL, quality="reference")["rgb"][MIDDLE]
@@ -120,7 +123,12 @@ def dim_check(renderer: Renderer) -> Iterator[Finding]:
         yield Finding(f"error of the colour of 400 {name} whose light underflows", error, 2e-5)
 
 
-def depth_pictures() -> Iterator[Picture]:
+@case(
+    "D4",
+    "expected and median depth",
+    "layers at T = 1, 0.6, 0.36; T = 1/2 +- 2 ulp; the faintest splat drawn; silhouettes",
+)
+def d4(renderer: Renderer) -> Found:
     tilted = splats(
         [[0.0, 0.0, 2.0], [0.3, -0.1, 2.2], [-0.4, 0.2, 1.5]],
         [turned((1, 0, 0), 60), turned((0, 1, 0), 75), turned((1, 1, 0), 40)],
@@ -132,9 +140,6 @@ def depth_pictures() -> Iterator[Picture]:
     silhouettes = random_splats(120, 5, depth=(0.5, 9.0), scale=(0.02, 0.5))
     yield Picture(silhouettes, camera(), outputs=ALL_OUTPUTS)
     yield Picture(silhouettes, camera(), Quality(alpha_cutoff=1e-3), ALL_OUTPUTS)
-
-
-def depth_check(renderer: Renderer) -> Iterator[Finding]:
     names = ("alpha", "depth", "depth_median")
 
     def middle(opacities, depths) -> tuple[float, float]:
@@ -172,7 +177,12 @@ def depth_check(renderer: Renderer) -> Iterator[Finding]:
         yield Finding(f"{name} of the faintest splat, relative error", float(error), 1e-6)
 
 
-def color_pictures() -> Iterator[Picture]:
+@case(
+    "D5",
+    "colours outside [0, 1] and the background",
+    "colours -1 to 4 and 1e15, negative SH, backgrounds -1 to 3",
+)
+def d5(renderer: Renderer) -> Found:
     generator = np.random.default_rng(31)
     plain = random_splats(100, 31, depth=(1.0, 5.0), scale=(0.03, 0.5))
     bright = SplatCloud(
@@ -180,9 +190,6 @@ def color_pictures() -> Iterator[Picture]:
     )
     for background in ((0.0, 0.0, 0.0), (1.0, 0.5, 0.25), (3.0, -0.5, 0.1)):
         yield Picture(bright, camera(), background=background)
-
-
-def color_check(renderer: Renderer) -> Iterator[Finding]:
     cloud = random_splats(100, 32, depth=(1.0, 5.0), scale=(0.03, 0.5))
     names, behind = ("rgb", "alpha"), (2.0, 0.5, -1.0)
     black = renderer.render(cloud, camera(), names)
@@ -210,42 +217,3 @@ def color_check(renderer: Renderer) -> Iterator[Finding]:
     dark = SplatCloud(fire.means, fire.quats, fire.scales, fire.opacities, sh=np.full((1, 1, 3), -9.0))
     lowest = float(renderer.render(dark, camera())["rgb"].min())
     yield Finding("how far below 0 a negative SH colour goes", -lowest, 0.0)
-
-
-CASES = (
-    Case(
-        "D1",
-        "opaque layers hide what is behind them",
-        "1 to 4 layers of opacity 1; opacity 0.99 +- 3 ulp under the exclusive stop at T = 1e-4",
-        opaque_pictures,
-        opaque_check,
-    ),
-    Case(
-        "D2",
-        "the alpha cut-off is one radius, in bounds and pixels",
-        "opacity 1/255 +- 7 ulp; 100 to 5000 layers of 0.0039; cut-offs 1e-6, 1e-4 and 0.1",
-        cut_pictures,
-        cut_check,
-    ),
-    Case(
-        "D3",
-        "transmittance underflows without harm",
-        "400 layers of opacity 0.3 to 1 with no stop, ordered and coplanar",
-        dim_pictures,
-        dim_check,
-    ),
-    Case(
-        "D4",
-        "expected and median depth",
-        "layers at T = 1, 0.6, 0.36; T = 1/2 +- 2 ulp; the faintest splat drawn; silhouettes",
-        depth_pictures,
-        depth_check,
-    ),
-    Case(
-        "D5",
-        "colours outside [0, 1] and the background",
-        "colours -1 to 4 and 1e15, negative SH, backgrounds -1 to 3",
-        color_pictures,
-        color_check,
-    ),
-)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from fidsplat.backends.base import Probed, Reshapes
@@ -11,7 +9,7 @@ from fidsplat.backends.view import View
 from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
 from fidsplat.hard_cases.arithmetic import measure
-from fidsplat.hard_cases.case import Case, Finding
+from fidsplat.hard_cases.case import Finding, Found, case
 from fidsplat.hard_cases.clouds import camera, splats
 from fidsplat.hard_cases.invariance import out_of_order
 from fidsplat.quality import Quality
@@ -25,8 +23,13 @@ UNSAFE = ("fast", "unsafe", "finite", "denorms", "mad-enable", "signed-zeros")
 """words of build options that let go of IEEE arithmetic"""
 
 
-def contraction_check(renderer: Renderer) -> Iterator[Finding]:
-    """Products that are subtracted round alike, and FMA fuses where the device is said to."""
+@case(
+    "F1",
+    "products are rounded before they are subtracted",
+    "a b - a b in float32 and in the set-up's precision; FMA where it is asked for",
+)
+def f1(renderer: Renderer) -> Found:
+    # products that are subtracted round alike, and FMA fuses where the device is said to
     if not isinstance(renderer.backend, Probed):
         return
     probe = renderer.backend.probe()
@@ -43,14 +46,20 @@ def contraction_check(renderer: Renderer) -> Iterator[Finding]:
     )
 
 
-def function_check(renderer: Renderer) -> Iterator[Finding]:
-    """exp, log, division and square root against float64, by what OpenCL promises."""
+@case(
+    "F2",
+    "precision of exp, log, division and square root",
+    "a quarter of a million arguments each: exp of -14 to 0, quotients and roots of 1e-9 to 1e9",
+)
+def f2(renderer: Renderer) -> Found:
+    # exp, log, division and square root against float64, by what OpenCL promises
     measured = measure(renderer)
     yield from measured.findings if measured else ()
 
 
-def option_check(renderer: Renderer) -> Iterator[Finding]:
-    """No build option lets go of NaN, and the compiler does not by itself."""
+@case("F3", "NaN and infinity are told from numbers", "quiet, negative and signalling NaN; the build options")
+def f3(renderer: Renderer) -> Found:
+    # no build option lets go of NaN, and the compiler does not by itself
     if not isinstance(renderer.backend, Probed):
         return
     probe = renderer.backend.probe()
@@ -76,8 +85,9 @@ def option_check(renderer: Renderer) -> Iterator[Finding]:
     yield Finding("infinities told wrongly", int((infinite.astype(bool) != np.isinf(x)).sum()), 0)
 
 
-def denormal_pictures() -> Iterator[Picture]:
-    """Weights, scales, colours and positions at and below the smallest normal number."""
+@case("F4", "denormals", "opacities, scales, colours and backgrounds of 1e-45 to 1e-30")
+def f4(renderer: Renderer) -> Found:
+    # weights, scales, colours and positions at and below the smallest normal number
     quality = Quality(alpha_cutoff=1e-30, transmittance_stop=0.0)
     means = [[0.1 * k - 0.4, 0.05 * k - 0.2, 1.0 + 0.2 * k] for k in range(9)]
     opacities = [1e-38, 1e-40, 1e-30, 1e-20, 1e-10, 1e-5, 0.5, 1.0, 0.9]
@@ -87,17 +97,19 @@ def denormal_pictures() -> Iterator[Picture]:
     yield Picture(thin, VIEW, outputs=ALL_OUTPUTS)
     dark = splats(means, (1, 0.2, 0.1, 0), (0.2, 0.3), 0.7, (1e-39, 1e-44, 1e-38))
     yield Picture(dark, VIEW, background=(1e-40, 0.0, 1e-45))
-
-
-def denormal_check(renderer: Renderer) -> Iterator[Finding]:
     measured = measure(renderer)
     if measured:
         # either will do: nothing that is drawn is as small (the cut-off of the presets is at least 1e-6)
         yield Finding("denormals are flushed to 0 (1) or kept (0)", float(not measured.denormals), 1)
 
 
-def barrier_check(renderer: Renderer) -> Iterator[Finding]:
-    """The schedule with barriers against the one without; on a GPU, against other sizes of its groups."""
+@case(
+    "F5",
+    "barriers",
+    "tile lists of 0 to 300 splats with 64 staged at a time, pixels that finish at different times",
+)
+def f5(renderer: Renderer) -> Found:
+    # the schedule with barriers against the one without; on a GPU, against other sizes of its groups
     backend = renderer.backend
     if not isinstance(backend, Reshapes):
         return
@@ -124,8 +136,13 @@ def in_a_row(depths) -> SplatCloud:
     return splats(means, (1, 0, 0, 0), (0.05, 0.05), 0.05)
 
 
-def sort_check(renderer: Renderer) -> Iterator[Finding]:
-    """Depth order, tile lists and their starts at awkward lengths, against NumPy's stable sort."""
+@case(
+    "F6",
+    "sorting and prefix sums",
+    "1 to 4097 splats around the number of chunks; ties, one depth, descending, half of them culled",
+)
+def f6(renderer: Renderer) -> Found:
+    # depth order, tile lists and their starts at awkward lengths, against NumPy's stable sort
     backend = renderer.backend
     if not isinstance(backend, Reshapes):
         return
@@ -164,49 +181,3 @@ def _lists_are_whole(trace: dict[str, np.ndarray], visible: int) -> bool:
     whole = starts[0] == 0 and starts[-1] == len(trace["lists"]) and bool((np.diff(starts) >= 0).all())
     # all lie on the axis: the tiles around the middle have every one of them
     return whole and int(np.diff(starts).max()) == visible
-
-
-CASES = (
-    Case(
-        "F1",
-        "products are rounded before they are subtracted",
-        "a b - a b in float32 and in the set-up's precision; FMA where it is asked for",
-        None,
-        contraction_check,
-    ),
-    Case(
-        "F2",
-        "precision of exp, log, division and square root",
-        "a quarter of a million arguments each: exp of -14 to 0, quotients and roots of 1e-9 to 1e9",
-        None,
-        function_check,
-    ),
-    Case(
-        "F3",
-        "NaN and infinity are told from numbers",
-        "quiet, negative and signalling NaN; the build options",
-        None,
-        option_check,
-    ),
-    Case(
-        "F4",
-        "denormals",
-        "opacities, scales, colours and backgrounds of 1e-45 to 1e-30",
-        denormal_pictures,
-        denormal_check,
-    ),
-    Case(
-        "F5",
-        "barriers",
-        "tile lists of 0 to 300 splats with 64 staged at a time, pixels that finish at different times",
-        None,
-        barrier_check,
-    ),
-    Case(
-        "F6",
-        "sorting and prefix sums",
-        "1 to 4097 splats around the number of chunks; ties, one depth, descending, half of them culled",
-        None,
-        sort_check,
-    ),
-)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 
 from fidsplat.backends.base import Reshapes
-from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
-from fidsplat.hard_cases.case import Case, Finding
+from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture, draw
+from fidsplat.hard_cases.case import Finding, Found, case
 from fidsplat.hard_cases.clouds import camera, quaternion, splats, taken, turned
-from fidsplat.hard_cases.invariance import CULLED, differing, draw, trace
+from fidsplat.hard_cases.invariance import CULLED, differing, trace
 from fidsplat.random_clouds import log_uniform, random_splats
 from fidsplat.render import Renderer
 from fidsplat.splats import SplatCloud
@@ -45,7 +44,8 @@ def _crossing(count: int = 300, seed: int = 1) -> SplatCloud:
     return splats(means, generator.normal(size=(count, 4)), scales, opacities, generator.random((count, 3)))
 
 
-def _a1() -> Iterator[Picture]:
+@case("A1", "disk through the camera's plane", "d >= 0: ground splat at 5 m, s = 1 to 4; wall at 0.4 m")
+def a1(renderer: Renderer) -> Found:
     for scale in (1.0, 1.6, 2.0, 4.0):
         yield _picture(_ground(scale))
     for degrees in (45, 60, 85):
@@ -62,14 +62,12 @@ def _ring(count: int = 60) -> SplatCloud:
     return splats(means, generator.normal(size=(count, 4)), (0.35, 0.2), 0.6, colors)
 
 
-def _a2() -> Iterator[Picture]:
+@case("A2", "fragments behind the camera", "s = 4 at 5 m; wall turned by 85 deg; a ring")
+def a2(renderer: Renderer) -> Found:
     yield _picture(_ground(4.0))
     yield _picture(_wall(85))
     yield _picture(_ring())
-
-
-def _a2_deleted(renderer: Renderer) -> Iterator[Finding]:
-    """What a device culls may as well not be there."""
+    # what a device culls may as well not be there
     picture = _picture(_ring())
     planes = trace(renderer, picture)
     kept = planes["order"] if planes["keys"].dtype != np.uint32 else np.flatnonzero(planes["keys"] != CULLED)
@@ -79,7 +77,8 @@ def _a2_deleted(renderer: Renderer) -> Iterator[Finding]:
     yield Finding("splats behind that are not culled", float(len(kept)), len(picture.cloud) * 0.75)
 
 
-def _a3() -> Iterator[Picture]:
+@case("A3", "near plane by the disk, not its centre", "s = 30 under the camera; near 0.01, 0.2, 1")
+def a3(renderer: Renderer) -> Found:
     for near in (0.01, 0.2, 1.0):
         for depth in (0.0, -3.0):
             yield _picture(_ground(30.0, depth, below=1.7), near=near)
@@ -91,12 +90,10 @@ def _tilted(ratio: float, degrees: float = 80.0, depth: float = 5.0, opacity: fl
     return splats([[0.1, 0.05, depth]], turned((0.2, 1, 0), degrees), ratio * depth, opacity)
 
 
-def _a4() -> Iterator[Picture]:
+@case("A4", "box of a disk in perspective", "tilt 80 deg, s / z = 0.05 to 0.28; tiles")
+def a4(renderer: Renderer) -> Found:
     for ratio in (0.05, 0.1, 0.2, 0.28):
         yield _picture(_tilted(ratio), focal=80.0)
-
-
-def _a4_tiles(renderer: Renderer) -> Iterator[Finding]:
     clouds = [_tilted(0.2), _crossing(60), random_splats(120, seed=4), _specks()]
     picture = _picture(SplatCloud.concatenate(clouds), width=93, height=77)
     if not isinstance(renderer.backend, Reshapes):
@@ -123,26 +120,22 @@ def _speck(x: float) -> Picture:
     return Picture(splats(means, (1, 0, 0, 0), 1e-4), view, outputs=ALL_OUTPUTS)
 
 
-def _a5() -> Iterator[Picture]:
+@case("A5", "support of the low-pass", "s f / z = 5e-4 centred at x = 15.0, tile of 16")
+def a5(renderer: Renderer) -> Found:
     for x in (15.0, 15.9, 31.3):
         yield _speck(x)
     yield _picture(_specks(), width=93, height=77)
-
-
-def _a5_neighbour(renderer: Renderer) -> Iterator[Finding]:
-    """The first pixel of the next tile is 1.5 px from x = 15.0 and gets exp(-1.5^2)."""
+    # the first pixel of the next tile is 1.5 px from x = 15.0 and gets exp(-1.5^2)
     alpha = draw(renderer, _speck(15.0))["alpha"]
     yield Finding("alpha error across the tile's edge", abs(float(alpha[20, 16]) - math.exp(-2.25)), 2e-5)
 
 
-def _a6() -> Iterator[Picture]:
+@case("A6", "centre of the low-pass", "tilt 60 deg, s / z = 0.1 and 0.2")
+def a6(renderer: Renderer) -> Found:
     for ratio in (0.1, 0.2):
         yield _picture(_tilted(ratio, 60.0), focal=80.0)
     yield _picture(_tilted(0.1, 60.0, opacity=0.3), focal=80.0)
-
-
-def _a6_dot(renderer: Renderer) -> Iterator[Finding]:
-    """Nothing bright stands where the middle of the 3 sigma box is: only the disk's own value."""
+    # nothing bright stands where the middle of the 3 sigma box is: only the disk's own value
     picture = _picture(_tilted(0.2, 60.0), focal=80.0)
     alpha = draw(renderer, picture)["alpha"].astype(float)
     # a dot would stand out from its neighbours two pixels away by up to 0.7; a disk is smooth
@@ -151,7 +144,8 @@ def _a6_dot(renderer: Renderer) -> Iterator[Finding]:
     yield Finding("height of the largest dot above its surroundings", float((alpha - around).max()), 0.02)
 
 
-def _a7() -> Iterator[Picture]:
+@case("A7", "huge, tiny and thin splats", "s / z = 1e-6 to 1e6, anisotropy 1 to 1e6, denormal")
+def a7(renderer: Renderer) -> Found:
     generator = np.random.default_rng(5)
     for ratio in (1e-6, 1e-3, 1.0, 1e3, 1e6):
         rows = []
@@ -166,20 +160,3 @@ def _a7() -> Iterator[Picture]:
     means = [[0, 0, 4], [0.5, 0.2, 4], [-0.5, 0.1, -4], [0, 0, 1e6]]
     thin = [[1.0, 1.4e-45], [1.4e-45, 1.4e-45], [1.0, 1e-3], [1e5, 1e5]]
     yield _picture(splats(means, turned((1, 1, 1), 30), thin, 0.7), far=1e5)
-
-
-CASES = (
-    Case(
-        "A1", "disk through the camera's plane", "d >= 0: ground splat at 5 m, s = 1 to 4; wall at 0.4 m", _a1
-    ),
-    Case(
-        "A2", "fragments behind the camera", "s = 4 at 5 m; wall turned by 85 deg; a ring", _a2, _a2_deleted
-    ),
-    Case("A3", "near plane by the disk, not its centre", "s = 30 under the camera; near 0.01, 0.2, 1", _a3),
-    Case("A4", "box of a disk in perspective", "tilt 80 deg, s / z = 0.05 to 0.28; tiles", _a4, _a4_tiles),
-    Case(
-        "A5", "support of the low-pass", "s f / z = 5e-4 centred at x = 15.0, tile of 16", _a5, _a5_neighbour
-    ),
-    Case("A6", "centre of the low-pass", "tilt 60 deg, s / z = 0.1 and 0.2", _a6, _a6_dot),
-    Case("A7", "huge, tiny and thin splats", "s / z = 1e-6 to 1e6, anisotropy 1 to 1e6, denormal", _a7),
-)

@@ -12,7 +12,7 @@ from fidsplat.backends.base import Probed
 from fidsplat.cameras import Camera
 from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, CATALOGUED, Picture
-from fidsplat.hard_cases.case import Case, Finding
+from fidsplat.hard_cases.case import Finding, Found, case
 from fidsplat.hard_cases.clouds import camera, splats, taken, turned
 from fidsplat.quality import Quality
 from fidsplat.random_clouds import random_splats
@@ -76,7 +76,22 @@ def broken_fields(cloud: SplatCloud) -> Iterator[tuple[str, dict[str, Any]]]:
     yield "an all-zero row of a file", {**zeros, "scales": 1.0, "opacities": 0.5}
 
 
-def broken_check(renderer: Renderer) -> Iterator[Finding]:
+@case(
+    "E1",
+    "broken and odd values of every field",
+    "NaN, +-inf, +-0, denormals, 1e38 in each component; zero quaternions; opacities outside [0, 1]",
+)
+def e1(renderer: Renderer) -> Found:
+    cloud = crowd()
+    for name, values in ODD.items():
+        for value in values:
+            field = np.array(getattr(cloud, name)[VICTIM])
+            field[0 if field.ndim else ()] = value
+            outputs = ALL_OUTPUTS if name == "scales" else ("rgb", "alpha")
+            yield Picture(spoilt(cloud, {name: field}), VIEW, outputs=outputs)
+    yield Picture(spoilt(cloud, {"scales": DENORMAL}), VIEW, outputs=ALL_OUTPUTS)
+    yield Picture(spoilt(cloud, {"means": (0.0, 0.0, 1e15), "scales": 1e15}), VIEW)
+    yield Picture(spoilt(cloud, {"means": (1e15, -1e15, 1e15)}), VIEW)
     cloud = crowd()
     without = taken(cloud, np.delete(np.arange(len(cloud)), VICTIM))
     wanted = renderer.render(without, VIEW, ALL_OUTPUTS)
@@ -93,21 +108,13 @@ def broken_check(renderer: Renderer) -> Iterator[Finding]:
     yield Finding("those that are not counted as one splat left out", miscounted, 0)
 
 
-def odd_pictures() -> Iterator[Picture]:
-    cloud = crowd()
-    for name, values in ODD.items():
-        for value in values:
-            field = np.array(getattr(cloud, name)[VICTIM])
-            field[0 if field.ndim else ()] = value
-            outputs = ALL_OUTPUTS if name == "scales" else ("rgb", "alpha")
-            yield Picture(spoilt(cloud, {name: field}), VIEW, outputs=outputs)
-    yield Picture(spoilt(cloud, {"scales": DENORMAL}), VIEW, outputs=ALL_OUTPUTS)
-    yield Picture(spoilt(cloud, {"means": (0.0, 0.0, 1e15), "scales": 1e15}), VIEW)
-    yield Picture(spoilt(cloud, {"means": (1e15, -1e15, 1e15)}), VIEW)
-
-
-def far_pictures() -> Iterator[Picture]:
-    """Disks whose centres fall far off the picture and whose rims reach into it."""
+@case(
+    "E2",
+    "centres far off the picture",
+    "1e3 to 1e15 pixels off, with disks that reach into the picture and without",
+)
+def e2(renderer: Renderer) -> Found:
+    # disks whose centres fall far off the picture and whose rims reach into it
     generator = np.random.default_rng(42)
     for pixels in (1e3, 1e6, 1e9, 1e12):
         n = 24
@@ -124,10 +131,7 @@ def far_pictures() -> Iterator[Picture]:
     yield Picture(
         splats(means, generator.normal(size=(40, 4)), (0.5, 0.8), 0.8), camera(60, 45, 48.0, near=1e-8)
     )
-
-
-def far_check(renderer: Renderer) -> Iterator[Finding]:
-    """Off the picture by 2 pixels to 1e15: no tile has them, and no edge tile is one off."""
+    # off the picture by 2 pixels to 1e15: no tile has them, and no edge tile is one off
     pairs = visible = 0
     for pixels in (2.5, 1e2, 1e6, 1e9, 1e12, 1e15):
         for x, y in ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, 1)):
@@ -139,8 +143,13 @@ def far_check(renderer: Renderer) -> Iterator[Finding]:
     yield Finding("tiles that list them", pairs, 0)
 
 
-def count_check(renderer: Renderer) -> Iterator[Finding]:
-    """Pairs of splats and tiles: sums beyond 32 bits, and a picture that is drawn in bands of tiles."""
+@case(
+    "E3",
+    "more pairs of splats and tiles than an integer or the memory holds",
+    "list lengths that add up to 2^31 - 1 .. 5 * 2^32 + 17; budgets from one pair upwards",
+)
+def e3(renderer: Renderer) -> Found:
+    # pairs of splats and tiles: sums beyond 32 bits, and a picture that is drawn in bands of tiles
     backend = renderer.backend
     if not isinstance(backend, Probed):
         return
@@ -195,16 +204,18 @@ def sized(width: int, height: int) -> Camera:
     return Camera.pinhole(width, height, focal, focal, width / 2, height / 2)
 
 
-def frame_pictures() -> Iterator[Picture]:
+@case(
+    "E4",
+    "empty and degenerate pictures",
+    "0 splats, 0 visible, 1 pair in 80 tiles; 1 x 1 to 16384 x 1 pixels, no multiples of a tile",
+)
+def e4(renderer: Renderer) -> Found:
     cloud = random_splats(12, 44, depth=(1.0, 4.0), scale=(0.05, 0.6), across=0.8)
     for width, height in SIZES:
         yield Picture(cloud, sized(width, height))
     dot = splats([[0.0, 0.0, 2.0]], (1, 0, 0, 0), (1e-3, 1e-3))
     yield Picture(dot, sized(160, 120))  # one pair, many tiles
     yield Picture(dot, sized(160, 120), outputs=ALL_OUTPUTS)
-
-
-def frame_check(renderer: Renderer) -> Iterator[Finding]:
     nothing = SplatCloud.empty()
     behind = splats([[0.0, 0.0, -3.0]], (1, 0, 0, 0), (0.1, 0.1))
     clear = splats([[0.0, 0.0, 2.0]], (1, 0, 0, 0), (0.1, 0.1), 0.0)
@@ -224,8 +235,9 @@ def frame_check(renderer: Renderer) -> Iterator[Finding]:
     yield Finding("splats and pairs counted in them", counted, 0)
 
 
-def unwritten_check(renderer: Renderer) -> Iterator[Finding]:
-    """Buffers full of NaN before the picture is drawn: nothing of them may survive."""
+@case("E5", "memory that nothing has written", "all buffers filled with 0xFF before the picture")
+def e5(renderer: Renderer) -> Found:
+    # buffers full of NaN before the picture is drawn: nothing of them may survive
     backend = renderer.backend
     if not isinstance(backend, Probed):
         return
@@ -239,42 +251,3 @@ def unwritten_check(renderer: Renderer) -> Iterator[Finding]:
                     planes = {name: frame[name] for name in ALL_OUTPUTS}
                 different += not all(np.array_equal(planes[name], clean[name]) for name in ALL_OUTPUTS)
     yield Finding("pictures that change when their buffers held NaN", different, 0)
-
-
-CASES = (
-    Case(
-        "E1",
-        "broken and odd values of every field",
-        "NaN, +-inf, +-0, denormals, 1e38 in each component; zero quaternions; opacities outside [0, 1]",
-        odd_pictures,
-        broken_check,
-    ),
-    Case(
-        "E2",
-        "centres far off the picture",
-        "1e3 to 1e15 pixels off, with disks that reach into the picture and without",
-        far_pictures,
-        far_check,
-    ),
-    Case(
-        "E3",
-        "more pairs of splats and tiles than an integer or the memory holds",
-        "list lengths that add up to 2^31 - 1 .. 5 * 2^32 + 17; budgets from one pair upwards",
-        None,
-        count_check,
-    ),
-    Case(
-        "E4",
-        "empty and degenerate pictures",
-        "0 splats, 0 visible, 1 pair in 80 tiles; 1 x 1 to 16384 x 1 pixels, no multiples of a tile",
-        frame_pictures,
-        frame_check,
-    ),
-    Case(
-        "E5",
-        "memory that nothing has written",
-        "all buffers filled with 0xFF before the picture",
-        None,
-        unwritten_check,
-    ),
-)

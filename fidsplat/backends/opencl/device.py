@@ -1,25 +1,23 @@
-"""OpenCL devices: listing, choosing, opening; compiled pipelines by FeatureSet."""
+"""OpenCL devices: listing, choosing, opening."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.base import DeviceInfo, Probe, Rates
+from fidsplat.backends.base import DeviceInfo, Rates
 from fidsplat.backends.opencl import pocl_target
 from fidsplat.backends.opencl.arithmetic import run_arithmetic
-from fidsplat.backends.opencl.assemble import DeviceShape, assemble
-from fidsplat.backends.opencl.floor import measure_rates
-from fidsplat.backends.opencl.memory import BufferPool, Resident
+from fidsplat.backends.opencl.assemble import assemble
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
-from fidsplat.backends.opencl.plan import PAIR
-from fidsplat.backends.opencl.ray_buffers import RayBuffers
-from fidsplat.backends.opencl.shapes import other_shapes, shape_for
+from fidsplat.backends.opencl.probe import OpenCLProbe
+from fidsplat.backends.opencl.resident import Resident
+from fidsplat.backends.opencl.roofline import measure_rates
+from fidsplat.backends.opencl.shapes import DeviceShape, cpu_shape, gpu_shape, other_shapes, shape_for
+from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
@@ -59,38 +57,18 @@ def open_device(selector: str = "") -> OpenCLBackend:
     return OpenCLBackend(min(usable, key=lambda device: not device.type & cl.device_type.GPU))
 
 
-class OpenCLBackend:
-    """An open OpenCL device with its queue, buffer pool and compiled pipelines."""
+class OpenCLBackend(Workspace):
+    """An open OpenCL device, and what is compiled for it."""
 
     always_float64 = False
 
     def __init__(self, device: cl.Device) -> None:
-        self.info = _describe(device, _name_of(device))
-        self.device = device
-        self.target = _target(device)
-        self.shape = _shape(device)
-        self.context = cl.Context([device])
-        self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
-        self.side_queue = cl.CommandQueue(self.context)
-        """for what the host reads while the stages run"""
-        self.pool = BufferPool(self.context, device)
-        self.ray_buffers = RayBuffers(self)
-        self.limit_memory(self.info.memory_bytes * 9 // 10)
+        super().__init__(device, _describe(device, _name_of(device)), _shape(device))
         self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
 
     def upload(self, cloud: SplatCloud) -> Resident:
         """The cloud in device buffers."""
         return Resident(self, cloud)
-
-    def limit_memory(self, budget: int) -> None:
-        """Lets a picture and the cloud take at most `budget` bytes of the device.
-
-        Pictures that need more are drawn in bands of tiles and chunks of splats, with the same bits.
-        """
-        self.memory_budget = budget
-        largest = self.device.max_mem_alloc_size // 8
-        self.pair_budget = max(1, min(largest, budget // 8 // PAIR[self.shape.lists], 2**32 - 1))
-        """most pairs of splats and tiles that are listed at once"""
 
     def unsupported(self, features: FeatureSet) -> str:
         """Blending in float64 where the device has none; empty for all else."""
@@ -118,9 +96,7 @@ class OpenCLBackend:
                 f"tiles of {key[1].tile_width} x {key[1].tile_height} need {key[1].blend_items}"
             )
         if key not in self._pipelines:
-            source = assemble(*key)
-            program = self.build(source.text)
-            self._pipelines[key] = OpenCLPipeline(self, source, program, *key)
+            self._pipelines[key] = OpenCLPipeline(self, assemble(*key), *key, self.pipeline)
         return self._pipelines[key]
 
     @property
@@ -142,10 +118,8 @@ class OpenCLBackend:
         """As `ProbesArithmetic` (fidsplat/backends/base.py)."""
         return run_arithmetic(self, exponents, shares, above, below)
 
-    def probe(self) -> Probe:
+    def probe(self) -> OpenCLProbe:
         """What tests look into the device with."""
-        from fidsplat.backends.opencl.probe import OpenCLProbe
-
         return OpenCLProbe(self)
 
     def shapes(self, kind: str) -> dict[str, DeviceShape]:
@@ -155,31 +129,6 @@ class OpenCLBackend:
     def pieces(self, shape: DeviceShape) -> int:
         """Chunks of the sorts."""
         return shape.chunks
-
-    @cached_property
-    def build_options(self) -> list[str]:
-        """What every program here is compiled with: no option that lets go of IEEE arithmetic."""
-        # the target's name is part of pyopencl's cache key: PoCL's own version string does not tell
-        # processors apart
-        target = "".join(c if c.isalnum() else "_" for c in self.target)
-        options = ["-cl-std=CL1.2", "-w", f"-DTARGET_{target}"]
-        if self.device.platform.name == "NVIDIA CUDA":
-            # the projection wants 98 registers; two fewer let a quarter more work-items run at once
-            options.append("-cl-nv-maxrregcount=96")
-        return options
-
-    def build(self, text: str) -> cl.Program:
-        """A program from OpenCL C.
-
-        Raises:
-            DeviceError: the compiler refuses; its log is in the message.
-        """
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", cl.CompilerWarning)
-                return cl.Program(self.context, text).build(options=self.build_options)
-        except cl.Error as error:
-            raise DeviceError(f"{self.info.title} cannot compile the kernels: {error}") from error
 
 
 def _all_devices() -> Iterator[cl.Device]:
@@ -227,19 +176,12 @@ def _why_unusable(device: cl.Device) -> str:
         return "it has no compiler for OpenCL C"
     if not device.endian_little:
         return "it is big-endian"
-    if _target(device) == "generic":
+    if pocl_target.target_of(device) == "generic":
         return (
             "this PoCL's compiler does not know the processor; install a newer one (Debian: pocl-opencl-icd) "
             "or set POCL_LLVM_CPU_NAME if it is PoCL 3.1 or later"
         )
     return ""
-
-
-def _target(device: cl.Device) -> str:
-    """What the kernels are compiled for, as far as the driver tells."""
-    if pocl_target.needs_correction(device.version):
-        return pocl_target.correct_target(device.int_ptr, device.version) or "generic"
-    return device.version
 
 
 def _describe(device: cl.Device, name: str) -> DeviceInfo:
@@ -264,11 +206,9 @@ def _describe(device: cl.Device, name: str) -> DeviceInfo:
 
 
 def _shape(device: cl.Device) -> DeviceShape:
-    """Build constants for this device. CPUs: the widest vector; GPUs: 16 x 16 pixels per work-group."""
+    """Build constants for this device."""
     fast_fma = bool(device.single_fp_config & cl.device_fp_config.FMA)
     if device.type & cl.device_type.CPU:
         lanes = 16 if device.native_vector_width_float >= 16 else 8
-        chunks = int(np.clip(4 * device.max_compute_units, 8, 256))
-        return DeviceShape("lanes", "ordered", lanes, lanes, 16, chunks, 11, 1, fast_fma)
-    scan_items = min(1024, device.max_work_group_size)
-    return DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, scan_items, fast_fma)
+        return cpu_shape(lanes, device.max_compute_units, fast_fma)
+    return gpu_shape(min(1024, device.max_work_group_size), fast_fma)

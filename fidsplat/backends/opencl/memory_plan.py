@@ -20,7 +20,7 @@ SMALL = 1 << 14
 
 
 @dataclass(frozen=True)
-class Plan:
+class MemoryPlan:
     """What one picture may hold at once."""
 
     chunk: int
@@ -41,8 +41,8 @@ def table_bytes(lists: str, tiles: int, chunks: int, radix_bits: int) -> int:
 
 def plan_of(
     count: int, record_bytes: int, upload_bytes: int, fixed_bytes: int, lists: str, budget: int, largest: int
-) -> Plan:
-    """The plan for `count` splats.
+) -> MemoryPlan:
+    """The memory plan for `count` splats.
 
     Args:
         record_bytes: of a splat's record.
@@ -57,7 +57,7 @@ def plan_of(
     pairs = budget // 8
     fits = not upload_bytes and fixed_bytes + direct + pairs <= budget
     if fits and count * record_bytes <= largest:
-        return Plan(0, count, fixed_bytes + direct + pairs)
+        return MemoryPlan(0, count, fixed_bytes + direct + pairs)
     free = budget - fixed_bytes - pairs
     each = record_bytes + KEYS + WINDOWS
     chunk = CHUNK
@@ -71,4 +71,4 @@ def plan_of(
             f"{fixed_bytes / 2**20:.0f} MiB; raise memory_budget, or draw a smaller picture or fewer outputs"
         )
     held = fixed_bytes + pairs + chunk * (each + upload_bytes) + capacity * (each + SORTED)
-    return Plan(chunk, capacity, held)
+    return MemoryPlan(chunk, capacity, held)

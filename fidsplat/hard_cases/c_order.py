@@ -9,8 +9,8 @@ import numpy as np
 from fidsplat.backends.base import Reshapes
 from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
-from fidsplat.hard_cases.agreement import ALL_OUTPUTS, COLOR_TOLERANCE, Picture
-from fidsplat.hard_cases.case import Case, Finding
+from fidsplat.hard_cases.agreement import ALL_OUTPUTS, COLOR_TOLERANCE, Picture, draw
+from fidsplat.hard_cases.case import Finding, Found, case
 from fidsplat.hard_cases.clouds import camera, splats, taken, turned
 from fidsplat.hard_cases.coplanar import (
     WALL_STEP,
@@ -22,13 +22,7 @@ from fidsplat.hard_cases.coplanar import (
     turning,
     wall,
 )
-from fidsplat.hard_cases.invariance import (
-    CULLED,
-    differing,
-    draw,
-    out_of_order,
-    trace,
-)
+from fidsplat.hard_cases.invariance import CULLED, differing, out_of_order, trace
 from fidsplat.quality import Quality
 from fidsplat.random_clouds import random_splats
 from fidsplat.render import Renderer
@@ -85,19 +79,6 @@ def before_a_wall(count: int) -> SplatCloud:
     return SplatCloud.concatenate([tag(), wall(count)])
 
 
-def _c1() -> Iterator[Picture]:
-    for away in (0.0, 1.0, 1000.0):
-        yield fronto_parallel(away)
-    yield _tilted_planes(Quality())
-    yield _tilted_planes(Quality(coplanar="order"))
-    yield _three_tags()
-    for side in SIDES:
-        cloud = SplatCloud.concatenate(beside_a_big_splat(side))
-        yield Picture(cloud, ON_TAGS, outputs=ALL_OUTPUTS)
-    at_wall = next(turning(before_a_wall(150), "blend", 0, 30))
-    yield Picture(at_wall.cloud, at_wall.camera, outputs=ALL_OUTPUTS)
-
-
 def _shuffled(cloud: SplatCloud) -> SplatCloud:
     return taken(cloud, np.random.default_rng(3).permutation(len(cloud)))
 
@@ -145,7 +126,18 @@ def _c1_layers(renderer: Renderer) -> Iterator[Finding]:
         yield Finding(f"{title}, from pictures of each", float(np.abs(got - wanted).max()), COLOR_TOLERANCE)
 
 
-def _c1_check(renderer: Renderer) -> Iterator[Finding]:
+@case("C1", "coplanar splats and ties", "200 at depth 5, 0 to 1000 m from the origin; tags")
+def c1(renderer: Renderer) -> Found:
+    for away in (0.0, 1.0, 1000.0):
+        yield fronto_parallel(away)
+    yield _tilted_planes(Quality())
+    yield _tilted_planes(Quality(coplanar="order"))
+    yield _three_tags()
+    for side in SIDES:
+        cloud = SplatCloud.concatenate(beside_a_big_splat(side))
+        yield Picture(cloud, ON_TAGS, outputs=ALL_OUTPUTS)
+    at_wall = next(turning(before_a_wall(150), "blend", 0, 30))
+    yield Picture(at_wall.cloud, at_wall.camera, outputs=ALL_OUTPUTS)
     yield from _c1_order(renderer)
     yield from _c1_layers(renderer)
 
@@ -188,7 +180,9 @@ def _key_pictures() -> Iterator[Picture]:
     yield _depths([*np.geomspace(0.02, 1e6, 40)])
 
 
-def _c2_order(renderer: Renderer) -> Iterator[Finding]:
+@case("C2", "precision and sign of keys", "depths 1 ulp apart, below 0, 1e12 m")
+def c2(renderer: Renderer) -> Found:
+    yield from _key_pictures()
     found = [_keys_and_order(renderer, picture) for picture in _key_pictures()]
     yield Finding("keys beyond 2 ulp of their depth", sum(pair[0] for pair in found), 0)
     yield Finding("splats out of the order by depth and index", sum(pair[1] for pair in found), 0)
@@ -196,7 +190,8 @@ def _c2_order(renderer: Renderer) -> Iterator[Finding]:
     yield Finding("neighbouring depths with one key", len(keys) - len(np.unique(keys)), 0)
 
 
-def _c3(renderer: Renderer) -> Iterator[Finding]:
+@case("C3", "the same bits every time", "300 splats, again and in other tiles")
+def c3(renderer: Renderer) -> Found:
     picture = Picture(random_splats(300, seed=12), camera(), outputs=ALL_OUTPUTS)
     first = draw(renderer, picture)
     kept = {name: first[name].copy() for name in first}
@@ -210,12 +205,3 @@ def _c3(renderer: Renderer) -> Iterator[Finding]:
     yield Finding(
         "pixels that change without other outputs", differing(kept, draw(renderer, plain), ("rgb",)), 0
     )
-
-
-CASES = (
-    Case(
-        "C1", "coplanar splats and ties", "200 at depth 5, 0 to 1000 m from the origin; tags", _c1, _c1_check
-    ),
-    Case("C2", "precision and sign of keys", "depths 1 ulp apart, below 0, 1e12 m", _key_pictures, _c2_order),
-    Case("C3", "the same bits every time", "300 splats, again and in other tiles", None, _c3),
-)
