@@ -16,8 +16,11 @@ def path_of(path: str | os.PathLike[str]) -> Path:
         name = os.fspath(path)
     except TypeError:
         name = None
-    if not isinstance(name, str) or "\0" in name:
-        raise InputError(f"{path!r} names no file; give a path as text or a pathlib.Path")
+    try:
+        if not isinstance(name, str) or b"\0" in os.fsencode(name):
+            raise ValueError
+    except ValueError:  # or half of a surrogate pair, which no name has
+        raise InputError(f"{path!r} names no file; give a path as text or a pathlib.Path") from None
     return Path(name)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ class Frame(Mapping):
     """
 
     def __init__(self, images: Images, outputs: tuple[str, ...]) -> None:
-        self._images = images
+        self._images, self._process = images, os.getpid()
         self._arrays: dict[str, np.ndarray] = {}
         self.outputs = outputs
         """Names of the images, in the order in which they were asked for."""
@@ -44,6 +45,7 @@ class Frame(Mapping):
     def __getitem__(self, name: str) -> np.ndarray:
         self._check(name)
         if name not in self._arrays:
+            check_process(self._process, "frame")
             self._arrays[name] = image = self._images.read(name)
             image.flags.writeable = False  # what is kept is what was drawn
         return self._arrays[name]
@@ -58,6 +60,7 @@ class Frame(Mapping):
             InputError: an output that was not asked for, or the backend has no arrays to give.
         """
         self._check(name)
+        check_process(self._process, "frame")
         if not isinstance(self._images, GivesArrays):
             raise InputError(
                 f"this device keeps {name} in no array that others can use; draw with device='warp:cuda' or "
@@ -77,6 +80,10 @@ class Frame(Mapping):
     def __len__(self) -> int:
         return len(self.outputs)
 
+    def __reduce__(self):
+        """Pickled and copied as NumPy arrays: what `device_array` gives stays on its device."""
+        return _kept_frame, (dict(self), dict(self.timings), dict(self.stats))
+
     @property
     def timings(self) -> Mapping[str, float]:
         """Milliseconds on the device by stage: project, sort, bin, blend, resolve."""
@@ -86,6 +93,31 @@ class Frame(Mapping):
     def stats(self) -> Mapping[str, int]:
         """splats (in the cloud), visible (not culled), pairs (of splats and tiles)."""
         return self._images.stats
+
+
+@dataclass(frozen=True)
+class _KeptImages:
+    """Images that are no longer on a device."""
+
+    arrays: dict[str, np.ndarray]
+    timings: Mapping[str, float]
+    stats: Mapping[str, int]
+
+    def read(self, name: str) -> np.ndarray:
+        return self.arrays[name]
+
+
+def _kept_frame(arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int]) -> Frame:
+    return Frame(_KeptImages(arrays, timings, stats), tuple(arrays))
+
+
+def check_process(opened_by: int, what: str) -> None:
+    """Raises InputError in a fork of the process that opened it, where its driver does not work."""
+    if opened_by != os.getpid():
+        raise InputError(
+            f"this {what} belongs to process {opened_by}, of which this one is a fork; open a Renderer in "
+            "each process, and read frames before the fork"
+        )
 
 
 def default_device() -> str:
@@ -101,6 +133,12 @@ class ResidentCloud:
 
     def __len__(self) -> int:
         return self._data.count
+
+    def __reduce__(self):
+        raise InputError(
+            "a ResidentCloud is on a device and cannot be pickled or copied; take the SplatCloud, and upload "
+            "it there"
+        )
 
     @property
     def memory_bytes(self) -> int:
@@ -126,12 +164,19 @@ class Renderer:
 
     def __init__(self, device: str | None = None, memory_budget: int | None = None) -> None:
         self.backend = open_backend(default_device() if device is None else device)
+        self._process = os.getpid()
         if memory_budget is not None:
             if isinstance(memory_budget, bool) or not isinstance(memory_budget, int) or memory_budget <= 0:
                 raise InputError(
                     f"memory_budget is {memory_budget!r}; it must be a whole number of bytes, e.g. 2 * 2**30"
                 )
             self.backend.limit_memory(memory_budget)
+
+    def __reduce__(self):
+        raise InputError(
+            "a Renderer holds a device and cannot be pickled or copied; open one where it is used, e.g. "
+            f"fs.Renderer({self.device.name!r}) in each worker"
+        )
 
     @property
     def device(self) -> DeviceInfo:
@@ -140,6 +185,7 @@ class Renderer:
 
     def upload(self, scene: Scene | SplatCloud) -> ResidentCloud:
         """Put a scene's splats on the device, to be rendered many times."""
+        check_process(self._process, "Renderer")
         cloud = scene.cloud() if isinstance(scene, Scene) else scene
         if not isinstance(cloud, SplatCloud):
             raise InputError(f"cannot render a {type(scene).__name__}; give a Scene or a SplatCloud")
@@ -172,6 +218,7 @@ class Renderer:
             raise InputError(
                 f"{self.device.name} takes no arrays of a device; use a Warp device, or a SplatCloud"
             )
+        check_process(self._process, "Renderer")
         if (colors is None) == (sh is None):
             raise InputError("give exactly one of colors (n, 3) and sh (n, k, 3)")
         given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
@@ -230,6 +277,7 @@ class Renderer:
                 raise InputError(f"{kind.__name__.lower()} is {value!r}; it must be a {kind.__name__}")
 
         resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
+        check_process(self._process, "Renderer")
         if resident._renderer is not self:
             raise InputError(
                 "this cloud was uploaded by another Renderer; upload it with the one that draws it"

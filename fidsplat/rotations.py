@@ -60,11 +60,11 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
     (0, 0, 0, 1), or the upper left 3x3 is not scale * rotation within 1e-6 (a reflection is not; with
     ``rigid`` the scale must be 1).
     """
-    m = real_array(name, matrix)
+    m = real_array(name, matrix, "a 4x4 matrix of numbers")
     if m.shape != (4, 4):
         raise InputError(f"{name} must be a 4x4 matrix, but its shape is {m.shape}")
-    if not (np.abs(m) <= LARGEST).all():
-        raise InputError(f"{name} holds a value that is not finite, or beyond {LARGEST:g}")
+    if not (np.isfinite(m).all() and (np.abs(m[:3, 3]) <= LARGEST).all()):
+        raise InputError(f"{name} holds a value that is not finite, or moves by more than {LARGEST:g} metres")
     if not np.array_equal(m[3], [0.0, 0.0, 0.0, 1.0]):
         raise InputError(f"{name} must have the last row (0, 0, 0, 1), not {tuple(m[3].tolist())}")
     linear = m[:3, :3]

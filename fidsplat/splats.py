@@ -15,7 +15,7 @@ from fidsplat.rotations import (
     quaternion_multiply,
     quaternion_to_matrix,
 )
-from fidsplat.scalars import LARGEST
+from fidsplat.scalars import LARGEST, PickledByFields
 
 __all__ = ["SplatCloud", "sh_basis"]
 
@@ -23,7 +23,7 @@ _F32 = np.dtype(np.float32)
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
-class SplatCloud:
+class SplatCloud(PickledByFields):
     """2D Gaussian splats. Every array is read-only; make a new cloud to change one."""
 
     means: np.ndarray

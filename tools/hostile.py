@@ -1,9 +1,9 @@
-"""Hostile input: random command lines, scene files, splat files, pictures and Python calls, and how each ends.
+"""Hostile input: random command lines, scene files, splat files, pictures and Python calls.
 
     PYTHONPATH=. python tools/hostile.py --count 3000 --seed 0
 
-Input i of a kind is made from the seed, the kind and i alone, so that `--kinds calls --only 17` does one again.
-Every input should be used or refused in one clear line. What ends otherwise is listed, and makes the exit
+Input i of a kind is made from the seed, the kind and i alone: `--kinds calls --only 17` does one again.
+Every input should be used, or refused in one clear line. What ends otherwise is listed, and makes the exit
 status 1. Inputs run in a process with limits of time and memory, which is replaced when one ends it.
 """
 
@@ -113,7 +113,7 @@ def run(kind: str, seed: int, numbers: range) -> list[tuple[int, str, str, float
         ) as worker:
             assert worker.stdout is not None
             while len(done) < len(numbers):
-                # twice the alarm's time, and a process that has yet to load all it needs: not Python alone hangs
+                # an alarm does not reach what hangs outside of Python; a new process has to load first
                 ready, *_ = select.select([worker.stdout], [], [], 2 * SECONDS + 20)
                 line = worker.stdout.readline() if ready else ""
                 if not line:

@@ -23,7 +23,7 @@ JUNK: list[Any] = [
     None, True, False, 0, -1, 1, 5, 2**31, 2**70, -(2**70), 10**400, 0.5, -0.0, 1e-320, 1e308, float("nan"),
     float("inf"), -float("inf"), "", "a", "rgb", "nan", "../..", "\0", "\ud800", "\n", "𝕏", LONG, b"", b"\xff", 1j,
     [], [1], [1, 2, 3], [[1], [2, 3]], ["a", "b", "c"], [None], [float("nan")] * 3, [1e300] * 3, (), (0, 0, 0), {},
-    {1: 2}, {"rgb": 1}, {1, 2, 3}, object(), object, len, lambda: None, iter(()), range(3), ..., Decimal("1e999"),
+    {1: 2}, {"rgb": 1}, {1, 2, 3}, object(), lambda *_: None, iter(()), range(3), ..., Decimal("1e999"),
     Fraction(1, 3), Path("nowhere"), slice(None), np.float32("nan"), np.int64(-5), np.bool_(True), np.array(3.0),
     np.array("text"), np.array([None]), np.zeros((0, 3)), np.zeros((3, 3, 3)), np.zeros((4, 4)), -np.eye(4), np.eye(3),
     np.full((4, 4), np.nan), np.eye(4) * 1e300, np.eye(4, dtype=complex), np.zeros((2, 2), "O"),

@@ -9,7 +9,7 @@ import numpy as np
 from fidsplat.cameras.lenses import BrownConrady, Equirectangular, Fisheye, Lens, Orthographic
 from fidsplat.errors import InputError
 from fidsplat.rotations import check_similarity
-from fidsplat.scalars import LARGEST, real_array
+from fidsplat.scalars import LARGEST, PickledByFields, real_array
 
 MAX_SIZE = 32767
 """largest width and height in pixels: pixel numbers fit 16 bits on every device"""
@@ -19,7 +19,7 @@ FOCAL_LENGTHS = 1e-6, 1e18
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class Camera(PickledByFields):
     """A camera. Without a lens it is a pinhole: a point (X, Y, Z) of the camera frame falls on
     x = fx X / Z + cx, y = fy Y / Z + cy. A lens says what stands there for X / Z and Y / Z.
 
@@ -139,7 +139,7 @@ class Camera:
         factors = np.ravel(coefficients).tolist()
         if len(factors) != 4:
             raise InputError(f"a fisheye has 4 coefficients, k1 to k4, not {len(factors)}")
-        lens, width = Fisheye(*factors), _size("width", width)
+        lens, width, height = Fisheye(*factors), _size("width", width), _size("height", height)
         f = fisheye_focal_length(width, fov_x, lens)
         pose = np.eye(4) if world_to_camera is None else world_to_camera
         return Camera(width, height, f, f, width / 2, height / 2, pose, near, far, lens=lens)
@@ -285,7 +285,7 @@ def _number(name: str, value) -> float:
 
 
 def _vector(name: str, value) -> np.ndarray:
-    vector = real_array(f"camera {name}", value)
+    vector = real_array(f"camera {name}", value, "three numbers")
     if vector.shape != (3,) or not (np.abs(vector) <= LARGEST).all():
         raise InputError(f"camera {name} must be three numbers, at most {LARGEST:g}, not {value!r}")
     return vector

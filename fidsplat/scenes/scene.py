@@ -14,6 +14,7 @@ import numpy as np
 from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.errors import InputError
 from fidsplat.rotations import check_similarity
+from fidsplat.scalars import PickledByFields
 from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
 from fidsplat.surroundings import Background, Fog, background_of
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedMarker:
+class PlacedMarker(PickledByFields):
     """A marker somewhere in the world. Raises InputError when the pose is not rigid, or the motion is no
     function."""
 
@@ -39,15 +40,15 @@ class PlacedMarker:
     """its pose at a time in seconds; None: it stays at `pose`"""
 
     def __post_init__(self) -> None:
-        if not isinstance(getattr(self.marker, "cloud", None), SplatCloud):
-            raise InputError(
-                f"marker is {self.marker!r}; it must be an fs.Marker, e.g. fs.marker('apriltag:36h11:5')"
-            )
         check_similarity(self.pose, "a marker's pose", rigid=True)
         if self.motion is not None and not callable(self.motion):
             raise InputError(
                 f"a marker's motion is a {type(self.motion).__name__}; it must be an fs.Trajectory or a "
                 "function of the time"
+            )
+        if not isinstance(getattr(self.marker, "cloud", None), SplatCloud):
+            raise InputError(
+                f"marker is {self.marker!r}; it must be an fs.Marker, e.g. fs.marker('apriltag:36h11:5')"
             )
         pose = np.array(self.pose, dtype=np.float64)
         pose.flags.writeable = False
@@ -65,7 +66,7 @@ class PlacedMarker:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class Scene(PickledByFields):
     """What is drawn and how. Raises InputError for a part of the wrong kind."""
 
     clouds: tuple[SplatCloud, ...] = ()
