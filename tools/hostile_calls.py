@@ -173,8 +173,14 @@ CALLS: dict[str, Callable[[Path], Call]] = {
         dict,
     ),
     "Renderer.render_views": lambda _: (
-        lambda **given: list(RENDERER.render_views(**given)), {"scene": CLOUD, "cameras": [CAMERA], "outputs": ("rgb",)}, None
+        lambda **given: list(RENDERER.render_views(**given)), {"scene": CLOUD, "captures": [CAMERA], "outputs": ("rgb",)}, None
     ),
+    "Capture": lambda _: (
+        fs.Capture,
+        {"camera": CAMERA, "outputs": ("rgb",), "quality": "fast", "background": (0, 0, 0), "motion": None, "shutter": None},
+        lambda capture: RENDERER.render(CLOUD, capture),
+    ),
+    "Capture.with_": lambda _: (fs.Capture(CAMERA).with_, {"outputs": ("rgb",), "fog": fs.Fog(0.1)}, None),
     "Frame[]": lambda _: (lambda key: _frame()[key], {"key": "rgb"}, None),
     "Frame.get": lambda _: (lambda key: _frame().get(key), {"key": "rgb"}, None),
     "Frame.device_array": lambda _: (_frame().device_array, {"name": "rgb"}, None),

@@ -36,7 +36,18 @@ def plain() -> list:
     )
     scene.cloud(), scene.motion  # kept for later; need not come along
     motion, quality = fs.Motion(groups={0: PATH}), fs.Quality(samples=2)
-    return [CLOUD, CAMERA, tag, PATH, motion, scene, quality, fs.Shutter(time=1.0), fs.BrownConrady(k1=0.1)]
+    return [
+        CLOUD,
+        CAMERA,
+        fs.Capture(CAMERA, fog=fs.Fog(0.1)),
+        tag,
+        PATH,
+        motion,
+        scene,
+        quality,
+        fs.Shutter(time=1.0),
+        fs.BrownConrady(k1=0.1),
+    ]
 
 
 @pytest.mark.parametrize("way", WAYS)

@@ -9,7 +9,7 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.base import DeviceInfo, Rates
-from fidsplat.backends.opencl import pocl_target
+from fidsplat.backends.opencl import pocl_cache, pocl_target
 from fidsplat.backends.opencl.arithmetic import run_arithmetic
 from fidsplat.backends.opencl.assemble import assemble
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
@@ -17,11 +17,17 @@ from fidsplat.backends.opencl.probe import OpenCLProbe
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.roofline import measure_rates
 from fidsplat.backends.opencl.shapes import DeviceShape, cpu_shape, gpu_shape, other_shapes, shape_for
+from fidsplat.backends.opencl.vendors import intel_among_them
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
 
+_NO_PATCH_NEEDED = (
+    "a newer PoCL (Debian: pocl-opencl-icd; conda: pocl) or Intel's runtime for CPUs needs no patch "
+    "(docs/backends.md)"
+)
+_PATCHED = f"PoCL 3.0 mistakes this processor, and is patched in memory where it is used; {_NO_PATCH_NEEDED}"
 _NO_PLATFORM = (
     "no OpenCL platform found; install a CPU one with: pip install 'pyopencl[pocl]' "
     "(GPUs bring theirs with the driver; its path belongs in a file under /etc/OpenCL/vendors)"
@@ -34,8 +40,9 @@ def devices() -> list[DeviceInfo]:
 
 
 def open_device(selector: str = "") -> OpenCLBackend:
-    """The best usable device (GPU before CPU) of those whose platform, name or vendor contains `selector`, or
-    the one that `devices` lists as opencl:`selector` where that ends with a number.
+    """The best usable device (GPU before CPU, and last what must be patched) of those whose platform, name or
+    vendor contains `selector`, or the one that `devices` lists as opencl:`selector` where that ends with a
+    number.
 
     Raises:
         DeviceError: no OpenCL at all, or none of the devices can be used.
@@ -54,7 +61,9 @@ def open_device(selector: str = "") -> OpenCLBackend:
     if not usable:
         reasons = "; ".join(f"{device.name}: {_why_unusable(device)}" for device in matching)
         raise DeviceError(f"no usable OpenCL device ({reasons})")
-    return OpenCLBackend(min(usable, key=lambda device: not device.type & cl.device_type.GPU))
+    return OpenCLBackend(
+        min(usable, key=lambda device: (not device.type & cl.device_type.GPU, _needs_patch(device)))
+    )
 
 
 class OpenCLBackend(Workspace):
@@ -63,6 +72,8 @@ class OpenCLBackend(Workspace):
     always_float64 = False
 
     def __init__(self, device: cl.Device) -> None:
+        if "Portable Computing Language" in device.platform.name:
+            pocl_cache.check_once()
         super().__init__(device, _describe(device, _name_of(device)), _shape(device))
         self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
 
@@ -133,7 +144,8 @@ class OpenCLBackend(Workspace):
 
 def _all_devices() -> Iterator[cl.Device]:
     try:
-        platforms = cl.get_platforms()
+        with intel_among_them():
+            platforms = cl.get_platforms()
     except cl.Error:  # the loader's way to say that there is none
         return
     for platform in platforms:
@@ -148,7 +160,9 @@ def _named_devices() -> dict[str, cl.Device]:
     named: dict[str, cl.Device] = {}
     for device in _all_devices():
         platform = device.platform.name
-        short = "pocl" if "Portable Computing Language" in platform else platform.split()[0].lower()
+        short = (
+            "pocl" if "Portable Computing Language" in platform else platform.split()[0].split("(")[0].lower()
+        )
         name, number = f"opencl:{short}", 1
         while name in named:
             number += 1
@@ -176,12 +190,13 @@ def _why_unusable(device: cl.Device) -> str:
         return "it has no compiler for OpenCL C"
     if not device.endian_little:
         return "it is big-endian"
-    if pocl_target.target_of(device) == "generic":
-        return (
-            "this PoCL's compiler does not know the processor; install a newer one (Debian: pocl-opencl-icd) "
-            "or set POCL_LLVM_CPU_NAME if it is PoCL 3.1 or later"
-        )
+    if _needs_patch(device) and (why := pocl_target.why_not(device.int_ptr, device.version)):
+        return f"this PoCL's compiler does not know the processor, and {why}; {_NO_PATCH_NEEDED}"
     return ""
+
+
+def _needs_patch(device: cl.Device) -> bool:
+    return pocl_target.needs_correction(device.version)
 
 
 def _describe(device: cl.Device, name: str) -> DeviceInfo:
@@ -190,6 +205,7 @@ def _describe(device: cl.Device, name: str) -> DeviceInfo:
         "gpu" if device.type & cl.device_type.GPU else "cpu" if device.type & cl.device_type.CPU else "other"
     )
     float64 = "cl_khr_fp64" in device.extensions
+    remarks = ["no float64: per-splat set-up in float32"] * (not float64) + [_PATCHED] * _needs_patch(device)
     return DeviceInfo(
         name=name,
         title=device.name.strip(),
@@ -201,7 +217,7 @@ def _describe(device: cl.Device, name: str) -> DeviceInfo:
         largest_allocation_bytes=device.max_mem_alloc_size,
         float64=float64,
         usable=not why,
-        reason=why or ("" if float64 else "no float64: per-splat set-up in float32"),
+        reason=why or "; ".join(remarks),
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import sqlite3
 import warnings
 from collections.abc import Sequence
 from typing import Any
@@ -9,16 +11,31 @@ from typing import Any
 import pyopencl as cl
 
 from fidsplat.backends.opencl.assemble import Source, kernel_text, with_scalars
-from fidsplat.backends.opencl.pocl_target import target_of
+from fidsplat.backends.opencl.pocl_target import correct_target, needs_correction
 from fidsplat.backends.opencl.workspace import DeviceBuffer, Workspace
 from fidsplat.errors import DeviceError
 
 
+def load_invoker() -> None:
+    """Imports the part of pyopencl that sets arguments, which opens a database in the user's cache folder.
+
+    Where that is damaged this process does without it, and makes anew what it holds.
+    """
+    try:
+        importlib.import_module("pyopencl.invoker")
+    except sqlite3.DatabaseError:
+        cl._PYOPENCL_NO_CACHE = True
+        importlib.import_module("pyopencl.invoker")
+
+
 def build_options(device: cl.Device) -> list[str]:
     """What every program is compiled with: no option that lets go of IEEE arithmetic."""
+    version, target = device.version, device.version
+    if needs_correction(version):
+        target = correct_target(device.int_ptr, version)
     # the target's name is part of pyopencl's cache key: PoCL's own version string does not tell processors
     # apart
-    target = "".join(c if c.isalnum() else "_" for c in target_of(device))
+    target = "".join(c if c.isalnum() else "_" for c in target)
     options = ["-cl-std=CL1.2", "-w", f"-DTARGET_{target}"]
     if device.platform.name == "NVIDIA CUDA":
         # the projection wants 98 registers; two fewer let a quarter more work-items run at once
@@ -48,6 +65,7 @@ class Program:
         self.source = source
         built = build(workspace, source.text)
         self._queue = workspace.queue
+        load_invoker()
         self._kernels = {kernel.function_name: kernel for kernel in built.all_kernels()}
         self._types = {
             kernel: [None if one.access else source.scalars.dtype(one.ctype).type for one in arguments]
@@ -104,4 +122,5 @@ def check_kernels(
     for name, section in sections.items():
         head = head.replace(f"//@@ {name}\n", section)
     built = build(workspace, with_scalars(head) + text)
+    load_invoker()
     return {kernel.function_name: kernel for kernel in built.all_kernels()}

@@ -8,6 +8,7 @@ from typing import Any
 from fidsplat.backends.warp.launch import BLOCK
 from fidsplat.backends.warp.runtime import kernels, load, quiet
 from fidsplat.backends.warp.sensor import SensorKernel
+from fidsplat.backends.warp.shapes import WarpShape
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError
 
@@ -32,17 +33,6 @@ _PROJECT = (
     *("camera_brown_conrady", "camera_fisheye", "camera_equirectangular"),
 )
 _SAMPLE = (*_RECORD, "stop_exclusive", "arithmetic_fast", "rays_length")
-
-
-@dataclass(frozen=True)
-class WarpShape:
-    """How pictures are cut for a device."""
-
-    schedule: str
-    """`tiles`: a thread draws a tile (CPU). `group`: a block of threads draws a tile (CUDA)."""
-    tile_width: int
-    """samples, a multiple of 4"""
-    tile_height: int
 
 
 def known() -> frozenset[str]:

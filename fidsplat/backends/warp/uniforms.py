@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.view import View
-from fidsplat.backends.warp.program import WarpShape
 from fidsplat.backends.warp.runtime import kernels, load
+from fidsplat.backends.warp.shapes import WarpShape
 
 
 def _ray(view: View) -> tuple[float, ...]:
@@ -45,6 +45,7 @@ def uniforms(view: View, shape: WarpShape, sloped: bool) -> Any:
     """The struct for a picture in tiles of this shape; sloped: its kernels read rays' derivatives."""
     filled = kernels("common").View()
     for name, wide in _fields():
+        value: Any
         if name == "ray_step":
             value = view.raster.step if view.raster and sloped else 0.0
         else:
