@@ -212,3 +212,34 @@ def test_the_text_needs_no_opencl():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert len(done.stdout.strip()) == 64
+
+
+def source(*words, block=""):
+    code = f"import sys\n{block}\nfrom fidsplat.cli import main\nsys.exit(main(sys.argv[1:]))"
+    return subprocess.run([sys.executable, "-c", code, "source", *words], capture_output=True, text=True)
+
+
+def test_a_scene_s_program_is_printed_without_opencl(tmp_path):
+    cloud, file = random_splats(5, seed=1, depth=(1, 3)), tmp_path / "cloud.ply"
+    fs.save_ply(cloud, str(file))
+    blocked = "sys.modules['pyopencl'] = None"
+    lanes = source(str(file), "--outputs", "rgb,depth", block=blocked)
+    assert (lanes.returncode, lanes.stderr) == (0, "")
+    assert '#line 6 "opencl/tap/depth.cl"' in lanes.stdout
+    assert "// depth = z_numerator / D" in lanes.stdout
+    assert "tap/normal.cl" not in lanes.stdout
+    group = source(str(file), "--schedule", "group", block=blocked)
+    assert "schedule/group.cl" in group.stdout
+    assert "schedule/group.cl" not in lanes.stdout
+    without = source(str(file), "--device", "reference")
+    assert without.returncode == 2
+    assert "reference is no OpenCL device" in without.stderr
+
+
+def test_the_program_of_a_device_is_what_it_compiles(renderer, tmp_path):
+    cloud, file = random_splats(5, seed=1, depth=(1, 3)), tmp_path / "cloud.ply"
+    fs.save_ply(cloud, str(file))
+    frame = renderer.render(cloud, fs.Camera.pinhole(8, 8, 8.0, 8.0, 4.0, 4.0))
+    assert frame["rgb"].shape == (8, 8, 3)
+    compiled = {pipeline.source.listing for pipeline in renderer.backend._pipelines.values()}
+    assert source(str(file), "--device", renderer.device.name).stdout in compiled
