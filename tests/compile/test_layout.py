@@ -104,7 +104,7 @@ TOY_OUTPUT = """// nearest (h, w): depth [m] of the nearest fragment that is dra
     vfloat nearest;
 //@ start
     pixel->nearest = INFINITY;
-//@ lay
+//@ composite
     pixel->nearest = fmin(pixel->nearest, VSELECT((vfloat)INFINITY, seen->z, live & VMASK(weight > 0.0f)));
 //@ store
         VSTORE(pixel->nearest, nearest_raw + at);
@@ -225,9 +225,9 @@ def test_a_scene_s_program_is_printed_without_opencl(tmp_path):
     blocked = "sys.modules['pyopencl'] = None"
     lanes = source(str(file), "--outputs", "rgb,depth", block=blocked)
     assert (lanes.returncode, lanes.stderr) == (0, "")
-    assert '#line 6 "opencl/tap/depth.cl"' in lanes.stdout
+    assert '#line 6 "opencl/output/depth.cl"' in lanes.stdout
     assert "// depth = z_numerator / D" in lanes.stdout
-    assert "tap/normal.cl" not in lanes.stdout
+    assert "output/normal.cl" not in lanes.stdout
     group = source(str(file), "--schedule", "group", block=blocked)
     assert "schedule/group.cl" in group.stdout
     assert "schedule/group.cl" not in lanes.stdout
