@@ -1,4 +1,4 @@
-"""How often `fs.Quality.within` keeps what it promises, on scenes that its table was not made of.
+"""How often `fs.quality_within` keeps what it promises, on scenes that its table was not made of.
 
     python benchmarks/budget_promise.py [--device opencl:pocl] [--scenes 200] [-o FILE.json]
 
@@ -73,19 +73,23 @@ def moved(scene: RandomScene) -> RandomScene:
     )
 
 
+def capture_of(scene: RandomScene) -> fs.Capture:
+    return fs.Capture(scene.camera, background=scene.background)
+
+
 def errors_kept(renderer: fs.Renderer, count: int, measured: int, where: Console) -> list[dict]:
     """A row for each way of asking and each bound: of `count` scenes, and of the first `measured` of them."""
     judge = fs.Renderer("reference")
     ways = ("table", "crossing", "measured", "elsewhere")
     kept = {(way, bound): Kept() for way in ways for bound in BOUNDS}
-    table = {bound: fs.Quality.within(error=bound, device=renderer) for bound in BOUNDS}
+    table = {bound: fs.quality_within(error=bound, device=renderer) for bound in BOUNDS}
 
     def hold(way: str, bound: float, scene: RandomScene, quality: fs.Quality, want: np.ndarray) -> None:
         frame = renderer.render(scene.cloud, scene.camera, quality=quality, background=scene.background)
         kept[way, bound].worst.append(errors(frame["rgb"], want).maximum / bound)
 
     def truth_of(scene: RandomScene) -> np.ndarray:
-        return truth(judge, scene.cloud, scene.camera, background=scene.background)
+        return truth(judge, scene.cloud, capture_of(scene))
 
     for k in track(range(count), "errors", console=where):
         scene = random_scene(HELD_OUT + k)
@@ -98,9 +102,9 @@ def errors_kept(renderer: fs.Renderer, count: int, measured: int, where: Console
         mixed, there = truth_of(crossing), truth_of(elsewhere)
         for bound, quality in table.items():
             hold("crossing", bound, crossing, quality, mixed)
-            place = {"camera": scene.camera, "cloud": scene.cloud, "background": scene.background}
+            place = {"scene": scene.cloud, "capture": capture_of(scene)}
             try:
-                own = fs.Quality.within(error=bound, device=renderer, **place)
+                own = fs.quality_within(error=bound, device=renderer, **place)
             except InputError:
                 kept["measured", bound].refused += 1
                 continue
@@ -120,7 +124,7 @@ def times_kept(renderer: fs.Renderer, names: list[str], where: Console) -> list[
             ms = times * usual
             row = {"scene": name, "base_ms": usual, "budget_ms": ms}
             answers = []
-            ask = partial(choose, ms=ms, camera=camera, cloud=cloud, device=renderer)
+            ask = partial(choose, ms=ms, scene=cloud, capture=camera, device=renderer)
             calibration = Timer(lambda answers=answers, ask=ask: answers.append(ask()), drops_out=True)
             seconds = calibration.run() / 1e3
             if calibration.error:

@@ -33,8 +33,8 @@ def measure(renderer: fs.Renderer, name: str, repeats: int) -> list[dict]:
     backend, quality = renderer.backend, TIMED
     cloud, camera = load_scene(name)
     resident = backend.upload(cloud)
-    view = View.of(camera, quality, cloud.origin, (0, 0, 0))
-    features = select(resident, ("rgb",), quality, camera)
+    view = View.of(fs.Capture(camera, quality=quality), cloud.origin)
+    features = select(resident, fs.Capture(camera, quality=quality))
     # the GPU's way scans with many work-items, the CPU's with one
     items = {"ordered": backend.shape.scan_items, "tiled": max(backend.shape.scan_items, 64)}
     ways = {

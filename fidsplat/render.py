@@ -9,19 +9,19 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.base import Adopts, DeviceInfo, GivesArrays, Images, ResidentData
-from fidsplat.backends.exposure import exposed_view
+from fidsplat.backends.prepare import prepare
 from fidsplat.backends.registry import open_backend
+from fidsplat.backends.view import NO_CAMERA
 from fidsplat.cameras import Camera, Motion, Shutter
-from fidsplat.effects import select
+from fidsplat.capture import Capture
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
 from fidsplat.scenes import Scene
 from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
-from fidsplat.surroundings import Fog, Gradient, Panorama, background_of
+from fidsplat.surroundings import Fog, Gradient, Panorama
 
-_NO_SCENE = Scene(())
-_INSTANT = Shutter()
+_PLAIN = Capture()
 
 
 class Frame(Mapping):
@@ -92,8 +92,10 @@ def default_device() -> str:
 class ResidentCloud:
     """A cloud on a renderer's device; rendering it transfers no splat."""
 
-    def __init__(self, renderer: Renderer, data: ResidentData) -> None:
+    def __init__(self, renderer: Renderer, data: ResidentData, capture: Capture) -> None:
         self._renderer, self._data = renderer, data
+        self.capture = capture
+        """how its pictures are taken unless `render` is told otherwise: that of the scene it came from"""
 
     def __len__(self) -> int:
         return self._data.count
@@ -135,11 +137,12 @@ class Renderer:
         return self.backend.info
 
     def upload(self, scene: Scene | SplatCloud) -> ResidentCloud:
-        """Put a scene's splats on the device, to be rendered many times."""
+        """Put a scene's splats on the device, to be rendered many times. A scene's capture is kept."""
         cloud = scene.cloud() if isinstance(scene, Scene) else scene
         if not isinstance(cloud, SplatCloud):
             raise InputError(f"cannot render a {type(scene).__name__}; give a Scene or a SplatCloud")
-        return ResidentCloud(self, self.backend.upload(cloud))
+        capture = scene.capture if isinstance(scene, Scene) else _PLAIN
+        return ResidentCloud(self, self.backend.upload(cloud), capture)
 
     def adopt(
         self,
@@ -173,12 +176,13 @@ class Renderer:
         given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
         given |= {"colors": colors} if sh is None else {"sh": sh}
         given |= {} if labels is None else {"labels": labels}
-        return ResidentCloud(self, self.backend.adopt(given, np.asarray(tuple(origin), dtype=np.float64)))
+        data = self.backend.adopt(given, np.asarray(tuple(origin), dtype=np.float64))
+        return ResidentCloud(self, data, _PLAIN)
 
     def render(
         self,
         scene: Scene | SplatCloud | ResidentCloud,
-        camera: Camera | None = None,
+        capture: Capture | Camera | None = None,
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
         background: Iterable[float] | Gradient | Panorama | None = None,
@@ -186,69 +190,30 @@ class Renderer:
         shutter: Shutter | None = None,
         sensor: Sensor | None = None,
         fog: Fog | None = None,
+        *,
+        camera: Camera | None = None,
     ) -> Frame:
-        """Draw one picture.
+        """Draw one picture: `render(scene, Capture(camera, ...))`, or the parts of a capture as arguments.
 
         Args:
-            scene: what to draw. A Scene's own camera, outputs, quality, background, sensor and fog are used
-                where the arguments are left out.
-            camera: needed unless the scene has one.
-            outputs: names of planes; default rgb.
-            quality: a Quality, or text such as "fast" or "fast,samples=2" (`Quality.of`); default standard.
-            background: (r, g, b), a Gradient or a Panorama behind the splats; default black.
-            motion: how the camera and groups of splats move; default: they stand still.
-            shutter: when the picture is taken, and how long that takes; default: at time 0, at once.
-            sensor: what becomes of rgb on its way out; default nothing.
-            fog: between the camera and what it sees; default none.
+            scene: what to draw.
+            capture: how; or a camera alone. Without a Capture a Scene's own is taken, which its ResidentCloud
+                has too.
+            outputs, quality, background, motion, shutter, sensor, fog, camera: take the place of the
+                capture's.
 
         Raises:
             InputError: no camera, an unknown output or preset, a picture that is too large, a cloud uploaded
                 elsewhere.
             DeviceError: the device fails or lacks memory.
         """
-        own = scene if isinstance(scene, Scene) else _NO_SCENE
-        camera = camera or own.camera
-        if camera is None:
-            raise InputError("no camera: pass camera=fs.Camera... or give the scene a [camera] table")
-        if not isinstance(camera, Camera):
-            raise InputError(f"camera is {camera!r}; it must be a Camera, e.g. fs.Camera.look_at(...)")
-        names = own.outputs if outputs is None else outputs
-        names = (names,) if isinstance(names, str) else tuple(dict.fromkeys(names))
-        if not names:
-            raise InputError("outputs is empty; name at least one, e.g. 'rgb'")
-        chosen = Quality.of(own.quality if quality is None else quality)
-        behind = background_of(own.background if background is None else background)
-        sensor, fog = (own.sensor if sensor is None else sensor), (own.fog if fog is None else fog)
-        moving = own.motion if motion is None else motion
-        when = (own.shutter or _INSTANT) if shutter is None else shutter
-        for value, kind in ((sensor, Sensor), (fog, Fog), (moving, Motion), (when, Shutter)):
-            if value is not None and not isinstance(value, kind):
-                raise InputError(f"{kind.__name__.lower()} is {value!r}; it must be a {kind.__name__}")
-
-        resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
-        if resident._renderer is not self:
-            raise InputError(
-                "this cloud was uploaded by another Renderer; upload it with the one that draws it"
-            )
-        data = resident._data
-        view = exposed_view(camera, chosen, data.origin, behind, moving, when, sensor, fog)
-        features = select(
-            data,
-            names,
-            chosen,
-            camera,
-            moving=bool(view.groups),
-            exposed=bool(view.shots),
-            sensor=sensor,
-            fog=fog,
-            background=behind,
-        )
-        return Frame(self.backend.pipeline(features).render(data, view), names)
+        asked = _asked(scene, capture, camera, outputs, quality, background, motion, shutter, sensor, fog)
+        return self._draw(self._resident(scene), asked)
 
     def render_views(
         self,
         scene: Scene | SplatCloud | ResidentCloud,
-        cameras: Iterable[Camera],
+        captures: Iterable[Capture | Camera],
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
         background: Iterable[float] | Gradient | Panorama | None = None,
@@ -257,28 +222,24 @@ class Renderer:
         sensor: Sensor | None = None,
         fog: Fog | None = None,
     ) -> Iterator[Frame]:
-        """Draw one cloud from many cameras, one Frame for each, in their order.
+        """Draw one cloud many times, one Frame for each capture or camera, in their order.
 
         The cloud is uploaded once, kernels and buffers are used again, and on a device that works beside the
         host the next picture is under way while the caller has the last. Arguments and errors: as `render`
         (a motion of the camera takes the place of each camera's pose); an error comes after the pictures of
-        the cameras before it.
+        the captures before it.
         """
-        own = scene if isinstance(scene, Scene) else _NO_SCENE
-        chosen = own.quality if quality is None else quality
-        names = own.outputs if outputs is None else outputs
-        names = names if isinstance(names, str) else tuple(names)
-        behind = background_of(own.background if background is None else background)
-        motion = own.motion if motion is None else motion
-        shutter = own.shutter if shutter is None else shutter
-        sensor, fog = (own.sensor if sensor is None else sensor), (own.fog if fog is None else fog)
-        resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
+        outputs = outputs if outputs is None or isinstance(outputs, str) else tuple(outputs)
+        resident = self._resident(scene)
         waiting: Frame | None = None
         failure: Exception | None = None
-        rest = iter(cameras)
+        rest = iter(captures)
         while True:
             try:
-                frame = self.render(resident, next(rest), names, chosen, behind, motion, shutter, sensor, fog)
+                asked = _asked(
+                    scene, next(rest), None, outputs, quality, background, motion, shutter, sensor, fog
+                )
+                frame = self._draw(resident, asked)
             except StopIteration:
                 break
             except Exception as error:
@@ -291,3 +252,44 @@ class Renderer:
             yield waiting
         if failure is not None:
             raise failure
+
+    def _resident(self, scene: Scene | SplatCloud | ResidentCloud) -> ResidentCloud:
+        resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
+        if resident._renderer is not self:
+            raise InputError(
+                "this cloud was uploaded by another Renderer; upload it with the one that draws it"
+            )
+        return resident
+
+    def _draw(self, resident: ResidentCloud, capture: Capture) -> Frame:
+        features, view = prepare(resident._data, capture)
+        return Frame(self.backend.pipeline(features).render(resident._data, view), capture.outputs)
+
+
+def _asked(
+    scene: Any,
+    capture: Capture | Camera | None,
+    camera: Camera | None,
+    outputs: Any,
+    quality: Any,
+    background: Any,
+    motion: Any,
+    shutter: Any,
+    sensor: Any,
+    fog: Any,
+) -> Capture:
+    """The capture that is given or the scene's own, changed by the parts that are given beside it.
+
+    Raises:
+        InputError: a part of the wrong kind, or no camera.
+    """
+    if not isinstance(capture, Capture):
+        camera = capture or camera
+        capture = scene.capture if isinstance(scene, (Scene, ResidentCloud)) else _PLAIN
+    asked = capture.with_(
+        camera=camera, outputs=outputs, quality=quality, background=background, motion=motion,
+        shutter=shutter, sensor=sensor, fog=fog,
+    )  # fmt: skip
+    if asked.camera is None:
+        raise InputError(NO_CAMERA)
+    return asked

@@ -155,6 +155,14 @@ class SplatCloud:
         return -1 if self.sh is None else int(np.sqrt(self.sh.shape[1])) - 1
 
     @property
+    def plain_colors(self) -> np.ndarray | None:
+        """(n, 3) float32 colours that do not depend on the view: `colors`, or what SH of degree 0 means; None
+        for SH of a higher degree."""
+        if self.sh is None or self.sh_degree > 0:
+            return self.colors
+        return np.maximum(np.float32(C0) * self.sh[:, 0, :] + np.float32(0.5), np.float32(0))
+
+    @property
     def has_planes(self) -> bool:
         """Whether some splats are printed on planes."""
         return self.planes is not None

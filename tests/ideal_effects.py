@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 import fidsplat as fs
-from fidsplat.backends.exposure import exposed_view
+from fidsplat.backends.prepare import view_of
 from fidsplat.backends.reference.optics import ray_lengths, rays_of
 from fidsplat.backends.reference.post import background_at, developed
 from fidsplat.backends.view import View
@@ -32,7 +32,18 @@ def ideal_picture(
     """
     quality = fs.Quality(samples=samples)
     motion, shutter = motion or fs.Motion(), shutter or fs.Shutter()
-    view = exposed_view(camera, quality, np.zeros(3), background, motion, shutter, sensor, fog)
+    view = view_of(
+        fs.Capture(
+            camera,
+            quality=quality,
+            background=background,
+            motion=motion,
+            shutter=shutter,
+            sensor=sensor,
+            fog=fog,
+        ),
+        np.zeros(3),
+    )
     light = np.zeros((view.height, view.width, 3))
     for shot in view.shots:
         light[shot.top : shot.top + shot.view.height] += shot.weight * _samples(placed, shot.view)

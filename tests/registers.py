@@ -59,7 +59,7 @@ def measure(backend: OpenCLBackend) -> Numbers:
     Raises:
         DeviceError: the driver's log does not say.
     """
-    features = select(fs.SplatCloud.empty(), ("rgb",), fs.Quality(lowpass="none"))
+    features = select(fs.SplatCloud.empty(), fs.Capture(quality=fs.Quality(lowpass="none")))
     # the driver keeps what it has compiled, and has no log of what it kept: a kernel that is new each time
     name = f"unlike_{secrets.token_hex(8)}"
     text = assemble(features, backend.shape).text + f"kernel void {name}(global int *out) {{ out[0] = 1; }}\n"

@@ -147,8 +147,8 @@ def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
     def task(shape, cloud, view_from, outputs=("rgb", "alpha"), quality=None, budget=None):
         def work() -> float:
             chosen = quality or fs.Quality()
-            features = select(cloud, outputs, chosen)
-            view = View.of(view_from, chosen, cloud.origin, (0.1, 0.2, 0.3))
+            features = select(cloud, fs.Capture(outputs=outputs, quality=chosen))
+            view = View.of(fs.Capture(view_from, quality=chosen, background=(0.1, 0.2, 0.3)), cloud.origin)
             backend.pair_budget, kept = budget or backend.pair_budget, backend.pair_budget
             planes = backend.pipeline(features, shape).render(backend.upload(cloud), view)
             drawn = {name: planes.read(name) for name in ("rgb", *features.taps)}

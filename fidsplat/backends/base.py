@@ -240,7 +240,7 @@ class Probed(Protocol):
 
 
 @runtime_checkable
-class Reshapes(Protocol):
+class Reshapes(Backend, Protocol):
     """A backend whose build constants (its "shape") tests may replace: sizes of tiles, ways of sorting."""
 
     def shapes(self, kind: str) -> dict[str, Any]:

@@ -11,13 +11,14 @@ import numpy as np
 from fidsplat.cameras import Camera, Orthographic
 from fidsplat.cameras.lenses import Lens
 from fidsplat.cameras.raster import RayRaster, raster_of
+from fidsplat.capture import Capture
 from fidsplat.errors import InputError
-from fidsplat.quality import Quality
 from fidsplat.sensor import Sensor
-from fidsplat.surroundings import Background, Fog, Gradient, Panorama, background_of
+from fidsplat.surroundings import Gradient, Panorama
 
 FAR_EYE = 1e9
 """metres: where the eye of a parallel projection is taken to be"""
+NO_CAMERA = "no camera: pass camera=fs.Camera... or give the scene a [camera] table"
 MAX_GRID = 32767
 """Largest side of the sample grid: anchors and rows are kept in 16 bits."""
 _NO_SENSOR = Sensor()
@@ -137,31 +138,24 @@ class View:
         return np.asarray(self.sensor.response, np.float32)
 
     @classmethod
-    def of(
-        cls,
-        camera: Camera,
-        quality: Quality,
-        origin: np.ndarray,
-        background: Background,
-        sensor: Sensor | None = None,
-        fog: Fog | None = None,
-    ) -> View:
-        """The view of a camera under a quality, for a cloud whose means are relative to `origin` (3,).
+    def of(cls, capture: Capture, origin: np.ndarray, camera: Camera | None = None) -> View:
+        """The view of a capture's camera, or of another in its place, for a cloud whose means are relative to
+        `origin` (3,). Nothing moves in it.
 
         Raises:
-            InputError: the sample grid is too large, or the background is not three finite numbers.
+            InputError: there is no camera, or the sample grid is too large.
         """
+        camera = camera or capture.camera
+        if camera is None:
+            raise InputError(NO_CAMERA)
+        quality, backdrop = capture.quality, capture.backdrop
         n = quality.samples
         if max(camera.width, camera.height) * n > MAX_GRID:
             raise InputError(
                 f"{camera.width} x {camera.height} pixels with {n} x {n} samples each is too large: at most "
                 f"{MAX_GRID} samples along a side; use fewer samples or a smaller picture"
             )
-        behind = background_of(background)
-        surroundings = None if isinstance(behind, tuple) else behind
-        color = behind if isinstance(behind, tuple) else (0.0, 0.0, 0.0)
-        if fog is not None and fog.density > 0:
-            color, surroundings = fog.color, None
+        plain = isinstance(backdrop, tuple)
         rotation = camera.world_to_camera[:3, :3]
         # the difference first, then the rotation: nothing large is ever rotated (numerics B5)
         eye = camera.position - np.asarray(origin, dtype=np.float64)
@@ -186,11 +180,11 @@ class View:
             log_cut=float(np.float32(math.log(quality.alpha_cutoff))),
             ceiling=float(np.float32(quality.opacity_ceiling)),
             stop=float(np.float32(quality.transmittance_stop)),
-            background=color,
+            background=backdrop if plain else (0.0, 0.0, 0.0),
             first_light=float(np.float32(1 - quality.first_hit)),
-            sensor=sensor or _NO_SENSOR,
-            fog_density=0.0 if fog is None else fog.density,
-            surroundings=surroundings,
+            sensor=capture.sensor,
+            fog_density=0.0 if capture.fog is None else capture.fog.density,
+            surroundings=None if plain else backdrop,
             raster=raster,
             along_ray=lens is not None and lens.along_ray,
             parallel=parallel,

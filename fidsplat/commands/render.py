@@ -88,7 +88,7 @@ Examples:
 
         names = None if self.outputs is None else tuple(n.strip() for n in self.outputs.split(","))
         # what is wrong with the words is said before anything is read or opened
-        select(fs.SplatCloud.empty(), names or (), Quality.of(self.quality))
+        select(fs.SplatCloud.empty(), fs.Capture(outputs=names or "rgb", quality=Quality.of(self.quality)))
         budget = self.max_error is not None or self.max_ms is not None
         if budget:
             check_bounds(self.max_error, self.max_ms)
@@ -97,7 +97,7 @@ Examples:
         with late_progress(console(True)) as progress:
             scene = load_source(self.source, self.quality, progress)
         with _named(self.source, "render.outputs", names is None):
-            select(fs.SplatCloud.empty(), scene.outputs, Quality.of(None))
+            select(fs.SplatCloud.empty(), fs.Capture(outputs=scene.outputs))
         of_scene = _named(self.source, "render.device", self.device is None)
         with where.status("opening the device"), of_scene:
             renderer = fs.Renderer(self.device or scene.device)
@@ -107,9 +107,9 @@ Examples:
                 choice = choose(
                     self.max_error,
                     self.max_ms,
-                    cloud=scene,
-                    device=renderer,
-                    base=self.quality,
+                    scene,
+                    scene.capture.with_(quality=self.quality),
+                    renderer,
                     tell=status.update,
                 )
         begun = time.perf_counter()

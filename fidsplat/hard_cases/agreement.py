@@ -10,14 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
-from fidsplat.effects import FeatureSet, select
+from fidsplat.capture import Capture
+from fidsplat.effects import FeatureSet
 from fidsplat.quality import Quality
 from fidsplat.render import Frame, Renderer
 from fidsplat.sensor import Sensor
@@ -67,14 +68,14 @@ class Picture:
     fog: Fog | None = None
 
     @property
-    def around(self) -> dict[str, Any]:
-        """What else is drawn or done, as `Renderer.render` takes it."""
-        return {"background": self.background, "sensor": self.sensor, "fog": self.fog}
+    def capture(self) -> Capture:
+        """How it is taken."""
+        sensor = self.sensor or Sensor()
+        return Capture(self.camera, self.outputs, self.quality, self.background, sensor=sensor, fog=self.fog)
 
     def prepared(self, *more: str) -> tuple[FeatureSet, View]:
         """What a backend draws, with these outputs too."""
-        features = select(self.cloud, (*self.outputs, *more), self.quality, self.camera, **self.around)
-        return features, View.of(self.camera, self.quality, self.cloud.origin, **self.around)
+        return prepare(self.cloud, self.capture.with_(outputs=(*self.outputs, *more)))
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ class Difference:
 
 def draw(renderer: Renderer, picture: Picture) -> Frame:
     """The picture on a device."""
-    return renderer.render(picture.cloud, picture.camera, picture.outputs, picture.quality, **picture.around)
+    return renderer.render(picture.cloud, picture.capture)
 
 
 def truth_of(picture: Picture, pixels: tuple[np.ndarray, np.ndarray] | None = None) -> dict[str, np.ndarray]:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from fidsplat.backends.base import Reshapes
-from fidsplat.backends.view import View
+from fidsplat.backends.prepare import view_of
 from fidsplat.cameras import Camera
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, COLOR_TOLERANCE, Picture, draw
 from fidsplat.hard_cases.case import Finding, Found, case
@@ -145,7 +145,7 @@ def c1(renderer: Renderer) -> Found:
 def _keys_and_order(renderer: Renderer, picture: Picture) -> tuple[int, int]:
     """How many keys are not their splat's depth to 2 ulp, and how many splats stand where they should not."""
     planes = trace(renderer, picture)
-    view = View.of(picture.camera, picture.quality, picture.cloud.origin, picture.background)
+    view = view_of(picture.capture, picture.cloud.origin)
     depth = (picture.cloud.means.astype(float) @ view.rotation.T + view.translation)[:, 2]
     keys = planes["keys"]
     if keys.dtype == np.uint32:

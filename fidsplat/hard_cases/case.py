@@ -1,5 +1,5 @@
 """A hard case: a name of the catalogue (numerics.md, A1 to F6), its trigger, and pictures and numbers that
-must hold. """
+must hold."""
 
 from __future__ import annotations
 

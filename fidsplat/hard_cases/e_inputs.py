@@ -10,6 +10,7 @@ import numpy as np
 
 from fidsplat.backends.base import Probed
 from fidsplat.cameras import Camera
+from fidsplat.capture import Capture
 from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, CATALOGUED, Picture
 from fidsplat.hard_cases.case import Finding, Found, case
@@ -154,7 +155,7 @@ def e3(renderer: Renderer) -> Found:
     if not isinstance(backend, Probed):
         return
     cloud = random_splats(200, 43, depth=(0.5, 4.0), scale=(0.05, 1.0))
-    pipeline = backend.pipeline(select(cloud, ("rgb", "alpha"), Quality()))
+    pipeline = backend.pipeline(select(cloud, Capture(outputs=("rgb", "alpha"))))
     generator = np.random.default_rng(0)
     wrong = 0
     for total in (2**31 - 1, 2**31, 2**32 - 1, 2**32, 5 * 2**32 + 17):

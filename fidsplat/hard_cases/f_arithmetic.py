@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from fidsplat.backends.base import Probed, Reshapes
-from fidsplat.backends.view import View
-from fidsplat.effects import select
+from fidsplat.backends.prepare import prepare
+from fidsplat.capture import Capture
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
 from fidsplat.hard_cases.arithmetic import measure
 from fidsplat.hard_cases.case import Finding, Found, case
@@ -116,8 +116,7 @@ def f5(renderer: Renderer) -> Found:
     # lists from none to several times what a group stages at once (128), and pixels that finish early
     crowded = random_splats(260, 65, depth=(0.8, 1.5), scale=(0.02, 0.25), across=0.25)
     cloud = SplatCloud.concatenate([crowded, random_splats(60, 66, depth=(1.5, 6.0), scale=(0.05, 0.5))])
-    features = select(cloud, ALL_OUTPUTS, Quality())
-    view = View.of(VIEW, Quality(), cloud.origin, (0.1, 0.2, 0.3))
+    features, view = prepare(cloud, Capture(VIEW, ALL_OUTPUTS, background=(0.1, 0.2, 0.3)))
     resident = backend.upload(cloud)
     base = backend.pipeline(features).render(resident, view)
     (schedule,) = backend.shapes("schedule").values()
@@ -147,8 +146,7 @@ def f6(renderer: Renderer) -> Found:
     if not isinstance(backend, Reshapes):
         return
     generator = np.random.default_rng(67)
-    features = select(in_a_row([1.0]), ("rgb",), Quality())
-    view = View.of(VIEW, Quality(), np.zeros(3), (0.0, 0.0, 0.0))
+    features, view = prepare(in_a_row([1.0]), Capture(VIEW))
     unsorted = unlisted = tried = 0
     for shape in backend.shapes("sorting").values():
         pipeline = backend.pipeline(features, shape)

@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fidsplat.cameras import Camera, Motion, Shutter
+from fidsplat.capture import Capture
 from fidsplat.errors import InputError
+from fidsplat.quality import Quality
 from fidsplat.rotations import check_similarity
 from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
@@ -22,7 +24,6 @@ if TYPE_CHECKING:
     from fidsplat.cameras.motion import Pose
     from fidsplat.formats import Progress
     from fidsplat.markers import Marker
-    from fidsplat.quality import Quality
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +131,14 @@ class Scene:
         }
         groups |= {self._labels[number]: motion for number, motion in self.cloud_motions.items()}
         return Motion(self.camera_motion, groups)
+
+    @cached_property
+    def capture(self) -> Capture:
+        """How the scene's picture is taken. Raises InputError for a quality that does not exist."""
+        return Capture(
+            self.camera, self.outputs, Quality.of(self.quality), self.background, self.motion,
+            self.shutter or Shutter(), self.sensor or Sensor(), self.fog,
+        )  # fmt: skip
 
     def cloud(self) -> SplatCloud:
         """All splats in one cloud: the clouds' in their order, with their own labels if they do not move by

@@ -45,7 +45,7 @@ def record_bytes(features):
 
 
 def test_base_text_names_no_effect_that_was_not_asked_for():
-    text = assemble(select(COLORS, ("rgb",), PLAIN), SHAPE).text
+    text = assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE).text
     assert "//" not in text
     absent = set(LAYOUTS) - {
         "camera_pinhole",
@@ -65,8 +65,8 @@ def test_base_text_names_no_effect_that_was_not_asked_for():
 
 @pytest.mark.parametrize("tap", TAPS)
 def test_a_tap_brings_its_text_and_nothing_else(tap):
-    base = assemble(select(COLORS, ("rgb",), PLAIN), SHAPE)
-    with_tap = assemble(select(COLORS, (tap,), PLAIN), SHAPE)
+    base = assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE)
+    with_tap = assemble(select(COLORS, fs.Capture(outputs=(tap,), quality=PLAIN)), SHAPE)
     assert with_tap.digest != base.digest
     # arguments that follow add a comma, fields that follow change a size
     base_lines, tap_lines = (
@@ -87,9 +87,11 @@ def test_a_tap_brings_its_text_and_nothing_else(tap):
 def test_only_splats_on_planes_bring_layers(taps):
     """What a tap says of layers stays out as well, and layers bring the depth that places them."""
     words = ("Layer", "layer_pick", "layer_gather", "plane_keys", "label_tau", "share")
-    plain = assemble(select(COLORS, taps, PLAIN), SHAPE).text
-    layered = assemble(select(Cloud(has_planes=True), taps, PLAIN), SHAPE).text
-    in_order = assemble(select(Cloud(has_planes=True), taps, PLAIN.with_(coplanar="order")), SHAPE).text
+    plain = assemble(select(COLORS, fs.Capture(outputs=taps, quality=PLAIN)), SHAPE).text
+    layered = assemble(select(Cloud(has_planes=True), fs.Capture(outputs=taps, quality=PLAIN)), SHAPE).text
+    in_order = assemble(
+        select(Cloud(has_planes=True), fs.Capture(outputs=taps, quality=PLAIN.with_(coplanar="order"))), SHAPE
+    ).text
     for word in words:
         assert not re.search(rf"\b{word}\b", plain), word
         assert re.search(rf"\b{word}\b", layered) or (word == "label_tau" and "label" not in taps), word
@@ -99,7 +101,7 @@ def test_only_splats_on_planes_bring_layers(taps):
 
 def test_only_a_scene_of_both_footprints_pays_for_the_choice():
     features = {
-        kind: select(Cloud(has_planes=True, footprint=kind), ("depth", "label"), fs.Quality())
+        kind: select(Cloud(has_planes=True, footprint=kind), fs.Capture(outputs=("depth", "label")))
         for kind in ("gaussian", "box", "mixed")
     }
     texts = {kind: assemble(each, SHAPE).text for kind, each in features.items()}
@@ -113,37 +115,39 @@ def test_only_a_scene_of_both_footprints_pays_for_the_choice():
 
 def test_record_sizes_are_what_the_effects_declare():
     def record(outputs, quality=PLAIN, degree=-1):
-        return record_bytes(select(Cloud(degree), outputs, quality))
+        return record_bytes(select(Cloud(degree), fs.Capture(outputs=outputs, quality=quality)))
 
     # 68 bytes and 4 for each word that an effect adds, in whole vectors of 16
     assert record(("rgb",)) == record(("alpha",)) == record(("rgb",), degree=3) == 80
-    assert assemble(select(COLORS, ("rgb",), PLAIN), SHAPE).records["Bounds"].itemsize == 32
+    assert assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE).records["Bounds"].itemsize == 32
     assert record(("rgb",), fs.Quality()) == record(("label",)) == 80
     assert record(("depth",)) == record(("depth", "depth_median")) == record(("normal",)) == 80
     assert record(("depth", "normal")) == record(("depth", "label"), fs.Quality()) == 96
-    assert record_bytes(select(Cloud(has_planes=True), ("rgb",), PLAIN)) == 96
+    assert record_bytes(select(Cloud(has_planes=True), fs.Capture(quality=PLAIN))) == 96
 
 
 def test_a_section_that_no_stage_has_is_refused(monkeypatch):
     monkeypatch.setattr(assembly, "sections_of", lambda path: {"no_such_hook": [(1, ("x",))]})
     with pytest.raises(fs.DeviceError, match="no_such_hook"):
-        assemble(select(COLORS, ("rgb",), PLAIN), SHAPE)
+        assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE)
 
 
 def test_text_does_not_depend_on_numbers():
     numbers = fs.Quality(lowpass="none", alpha_cutoff=0.01, transmittance_stop=0.5, opacity_ceiling=0.7)
-    assert select(COLORS, ("rgb",), numbers) == select(COLORS, ("rgb",), PLAIN)
+    assert select(COLORS, fs.Capture(quality=numbers)) == select(COLORS, fs.Capture(quality=PLAIN))
 
 
 def test_features_are_the_same_whatever_the_order_of_outputs():
-    assert select(Cloud(2), ["rgb", "label", "depth"], PLAIN) == select(Cloud(2), ("depth", "label"), PLAIN)
+    assert select(Cloud(2), fs.Capture(outputs=["rgb", "label", "depth"], quality=PLAIN)) == select(
+        Cloud(2), fs.Capture(outputs=("depth", "label"), quality=PLAIN)
+    )
 
 
 def test_the_base_is_what_it_was():
     """A change of the stages themselves records new digests here; an effect must not."""
     digests = {
         lowpass: [
-            assemble(select(COLORS, ("rgb",), fs.Quality(lowpass=lowpass)), shape).digest[:16]
+            assemble(select(COLORS, fs.Capture(quality=fs.Quality(lowpass=lowpass))), shape).digest[:16]
             for shape in (SHAPE, GROUP)
         ]
         for lowpass in DIGESTS
@@ -182,7 +186,7 @@ TAKEN = {
 def test_what_the_kernels_of_the_base_take(renderer, schedule):
     """An effect must not change it, nor registers and private memory, which follow from the text."""
     shape = SHAPE if schedule == "lanes" else GROUP
-    pipeline = renderer.backend.pipeline(select(COLORS, ("rgb",), PLAIN), shape)
+    pipeline = renderer.backend.pipeline(select(COLORS, fs.Capture(quality=PLAIN)), shape)
     local = cl.kernel_work_group_info.LOCAL_MEM_SIZE
     taken = {}
     for name, kernel in pipeline.program.kernels.items():
@@ -231,6 +235,9 @@ def test_knobs_compile_and_run_with_every_output_and_none(renderer, name, output
     assert all(np.isfinite(frame[each]).all() for each in frame)
 
 
+MOVING = fs.Motion(lambda time: np.eye(4))
+
+
 def test_only_pictures_of_several_poses_seen_by_a_pinhole_are_culled_by_spheres():
     lens = fs.Camera.fisheye(20, 20, 2.0)
     for expected, footprint, quality, camera, exposed in (
@@ -242,11 +249,14 @@ def test_only_pictures_of_several_poses_seen_by_a_pinhole_are_culled_by_spheres(
         (False, "box", PLAIN, None, True),
         (False, "gaussian", fs.Quality(lowpass="pixel"), None, True),
     ):
-        chosen = select(Cloud(footprint=footprint), ("rgb",), quality, camera, exposed=exposed)
+        chosen = select(
+            Cloud(footprint=footprint),
+            fs.Capture(camera, quality=quality, motion=MOVING, shutter=fs.Shutter(exposure=0.1 * exposed)),
+        )
         assert ("shutter_rows" in chosen.names) == expected
         assert ("reach * sqrt(fy" in assemble(chosen, SHAPE).text) == expected
 
 
 def test_pipelines_are_compiled_once(renderer):
-    features = select(COLORS, ("rgb",), PLAIN)
+    features = select(COLORS, fs.Capture(quality=PLAIN))
     assert renderer.backend.pipeline(features) is renderer.backend.pipeline(features)

@@ -56,7 +56,9 @@ def test_records_lie_on_the_device_as_the_host_has_them(renderer, name):
     if name == "double":
         if not renderer.device.float64:
             pytest.skip("the device has no float64")
-        features = select(asked.cloud, asked.outputs, asked.quality.with_(blend_precision="float64"))
+        capture = asked.capture
+        double = fs.Capture(outputs=capture.outputs, quality=capture.quality.with_(blend_precision="float64"))
+        features = select(asked.cloud, fs.Capture(outputs=double))
     else:
         features = asked.features()
     if not renderer.device.float64:
@@ -164,7 +166,7 @@ def test_an_output_and_a_step_from_elsewhere_are_drawn(renderer, toys):
 
 
 def test_effects_from_elsewhere_leave_other_texts_as_they_were(request):
-    asked = [select(random_splats(3, seed=1), (name,), fs.Quality()) for name in OUTPUTS]
+    asked = [select(random_splats(3, seed=1), fs.Capture(outputs=(name,))) for name in OUTPUTS]
     before = [assemble(features, cpu_shape()).digest for features in asked]
     request.getfixturevalue("toys")
     assert [assemble(features, cpu_shape()).digest for features in asked] == before
@@ -176,7 +178,7 @@ def test_a_mistake_in_a_kernel_is_told_with_its_file_and_line(renderer, toys):
     layout = Layout(str(toys / "wrong.cl"), splat=(member("int wrong"),))
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(LAYOUTS, "nearest", layout)
-        features = select(random_splats(3, seed=1), ("nearest",), fs.Quality())
+        features = select(random_splats(3, seed=1), fs.Capture(outputs=("nearest",)))
         with pytest.raises(fs.DeviceError, match=r"wrong\.cl:3:\d+: .*no_such_name"):
             renderer.backend.pipeline(features)
 

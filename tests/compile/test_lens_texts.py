@@ -37,7 +37,7 @@ BEFORE_LENSES = {
 @pytest.mark.parametrize(("schedule", "taps"), BEFORE_LENSES, ids=str)
 def test_plain_pictures_have_the_text_that_they_had_before_there_were_lenses(schedule, taps):
     shape = SHAPE if schedule == "lanes" else GROUP
-    text = assemble(select(Cloud(2, True), taps, fs.Quality()), shape)
+    text = assemble(select(Cloud(2, True), fs.Capture(outputs=taps)), shape)
     assert text.digest == BEFORE_LENSES[schedule, taps]
 
 
@@ -46,13 +46,13 @@ def test_numbers_of_a_lens_are_not_in_its_text():
         fs.Camera.pinhole(64, 48, f, f, 30.0, 20.0, lens=fs.BrownConrady(k))
         for f, k in ((50, 0.1), (60, -0.1))
     ]
-    features = [select(COLORS, ("rgb",), PLAIN, camera) for camera in cameras]
+    features = [select(COLORS, fs.Capture(camera, quality=PLAIN)) for camera in cameras]
     assert features[0] == features[1]
 
 
 def test_values_that_mean_nothing_call_for_nothing(renderer):
     nothing = fs.Camera.pinhole(33, 21, 30.0, 30.0, 16.0, 10.0, lens=fs.BrownConrady())
-    assert select(COLORS, ("rgb",), PLAIN, nothing) == select(COLORS, ("rgb",), PLAIN)
+    assert select(COLORS, fs.Capture(nothing, quality=PLAIN)) == select(COLORS, fs.Capture(quality=PLAIN))
     # a shutter that needs no time is no shutter, and a motion without one is where it is then
     cloud = random_splats(10, seed=1, depth=(1, 4))
     before = set(renderer.backend._pipelines)
@@ -66,7 +66,7 @@ def test_values_that_mean_nothing_call_for_nothing(renderer):
 
 @pytest.mark.parametrize("kind", CAMERAS)
 def test_a_lens_brings_its_own_text_alone(kind):
-    text = assemble(select(COLORS, ("rgb",), PLAIN, CAMERAS[kind]), SHAPE).text
+    text = assemble(select(COLORS, fs.Capture(CAMERAS[kind], quality=PLAIN)), SHAPE).text
     words = {
         "brown_conrady": ("lens_fold",),
         "fisheye": ("chart_box", "lens_limit"),
@@ -84,7 +84,7 @@ def test_what_lenses_take():
     """Bytes of a record and words of bounds; the base's are those of test_assemble."""
 
     def record(kind):
-        return record_bytes(select(COLORS, ("rgb",), PLAIN, CAMERAS[kind]))
+        return record_bytes(select(COLORS, fs.Capture(CAMERAS[kind], quality=PLAIN)))
 
     assert {kind: record(kind) for kind in CAMERAS} == {
         "pinhole": 80,
@@ -110,14 +110,14 @@ def test_every_lens_builds_with_everything(renderer, kind, exposed):
 
 def test_the_other_schedule_draws_the_same_picture(renderer):
     """The kernels of GPUs on whatever device this is, through every lens."""
-    from fidsplat.backends.exposure import exposed_view
+    from fidsplat.backends.prepare import view_of
 
     cloud = random_splats(60, seed=3, depth=(-2, 4))
     backend = renderer.backend
     shape = gpu_shape(256, backend.shape.fast_fma)
     for camera in CAMERAS.values():
-        view = exposed_view(camera, fs.Quality(), cloud.origin, (0, 0, 0), fs.Motion(), fs.Shutter())
-        features = select(cloud, ("rgb", "depth"), fs.Quality(), camera)
+        view = view_of(fs.Capture(camera), cloud.origin)
+        features = select(cloud, fs.Capture(camera, ("rgb", "depth")))
         resident = backend.upload(cloud)
         one = backend.pipeline(features).render(resident, view)
         other = backend.pipeline(features, shape).render(resident, view)

@@ -116,8 +116,7 @@ def started():
         pytest.param(lambda: made("lists.make_lists", True).emit, id="emit"),
         pytest.param(lambda: made("lists.make_lists", True).count, id="count"),
         pytest.param(lambda: made("lists.make_lists", False).histogram, id="histogram"),
-        pytest.param(lambda: made("lists.compact"), id="compact"),
-        pytest.param(lambda: made("lists.find_starts"), id="starts"),
+        pytest.param(lambda: made("lists.compact"), id="compact, gather, starts, sums"),
     ],
 )
 def test_the_kernels_compile_for_cuda(kernel, tmp_path):

@@ -36,7 +36,7 @@ def test_warp_has_all_effects():
     assert set(SWITCHES) == set(OWN)
 
 
-@pytest.mark.parametrize("name", some(OWN, 6))
+@pytest.mark.parametrize("name", some(OWN, 3))
 def test_each_effect_alone(renderer, name):
     assert_drawn(renderer, (name,))
 
@@ -46,6 +46,6 @@ def test_all_effects(renderer, lens):
     assert_drawn(renderer, [name for name in everything(lens) if has(name)])
 
 
-@pytest.mark.parametrize("pair", some(PAIRS, 6), ids=" and ".join)
+@pytest.mark.parametrize("pair", some(PAIRS, 4), ids=" and ".join)
 def test_pairs(renderer, pair):
     assert_drawn(renderer, pair)

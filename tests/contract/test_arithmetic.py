@@ -107,5 +107,5 @@ def test_both_schedules_draw_the_same_bits(renderer, cloud):
 
 def test_blending_in_float64_takes_the_library_s():
     double = FAST.with_(blend_precision="float64")
-    assert "arithmetic_precise" in select(AROUND, ("rgb",), double).slots
-    assert "arithmetic_fast" in select(AROUND, ("rgb",), FAST).slots
+    assert "arithmetic_precise" in select(AROUND, fs.Capture(quality=double)).slots
+    assert "arithmetic_fast" in select(AROUND, fs.Capture(quality=FAST)).slots

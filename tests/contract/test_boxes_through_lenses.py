@@ -10,9 +10,8 @@ from test_boxes import EXACT, boxes_of, cut
 from test_lens_pictures import CAMERAS
 
 import fidsplat as fs
-from fidsplat.backends.exposure import exposed_view
+from fidsplat.backends.prepare import prepare
 from fidsplat.cameras.raster import raster_of
-from fidsplat.effects import select
 from fidsplat.rotations import quaternion_to_matrix
 
 SEAM = 1e-3
@@ -142,8 +141,7 @@ def test_the_other_schedule_draws_the_same_boxes(renderer):
     shape = backend.shapes("schedule")["groups"]
     for name in ("distortion", "fisheye", "panorama", "parallel"):
         camera = CAMERAS[name]
-        view = exposed_view(camera, fs.Quality(), cloud.origin, (0, 0, 0), fs.Motion(), fs.Shutter())
-        features = select(cloud, ("rgb", "depth"), fs.Quality(), camera)
+        features, view = prepare(cloud, fs.Capture(camera, ("rgb", "depth")))
         resident = backend.upload(cloud)
         one = backend.pipeline(features).render(resident, view)
         other = backend.pipeline(features, shape).render(resident, view)

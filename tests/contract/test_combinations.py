@@ -8,7 +8,7 @@ import pytest
 from agreement import random_splats
 
 import fidsplat as fs
-from fidsplat.backends.exposure import exposed_view
+from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import Picture, against_reference, compare
@@ -84,12 +84,9 @@ def test_effects_of_the_picture_under_a_shutter(renderer, around, shutter):
     fog = FOG if around == "fog" else None
     motion = fs.Motion(turning, {0: sliding})
     outputs = ("rgb", "alpha", "distance", "splat_id", "normal_world")
-    frame = renderer.render(
-        cloud, PLAIN, outputs, quality, behind, motion=motion, shutter=shutter, sensor=SENSOR, fog=fog
-    )
-    view = exposed_view(PLAIN, quality, cloud.origin, behind, motion, shutter, SENSOR, fog)
-    how = {"sensor": SENSOR, "fog": fog, "background": behind}
-    features = select(cloud, outputs, quality, PLAIN, moving=True, exposed=True, **how)
+    capture = fs.Capture(PLAIN, outputs, quality, behind, motion, shutter, SENSOR, fog)
+    frame = renderer.render(cloud, capture)
+    features, view = prepare(cloud, capture)
     reference = ReferenceBackend()
     truth = reference.pipeline(features).render(reference.upload(cloud), view).planes
     differences = compare(frame, truth, outputs)
@@ -125,6 +122,6 @@ def test_backgrounds_behind_every_lens(renderer, camera, behind, samples):
 
 @pytest.mark.skipif(WARP is None, reason="no Warp device here")
 def test_warp_names_what_it_lacks():
-    features = replace(select(CLOUD, ("rgb",), fs.Quality(), PLAIN), taps=("overdraw",))
+    features = replace(select(CLOUD, fs.Capture(PLAIN)), taps=("overdraw",))
     with pytest.raises(fs.DeviceError, match=r"warp.*no overdraw; use an OpenCL device"):
         fs.Renderer(WARP).backend.pipeline(features)

@@ -295,8 +295,8 @@ def test_a_leased_buffer_has_the_size_that_was_asked_for(opencl):
 
 def test_a_plane_that_cannot_be_read_is_an_error_of_the_device(opencl):
     frame = opencl.render(random_splats(10, seed=8), CAMERA)
-    output, _ = frame._planes._images["rgb"]
-    frame._planes._images["rgb"] = output, opencl.backend.pool.fresh("too small", 16)
+    output, _ = frame._images._images["rgb"]
+    frame._images._images["rgb"] = output, opencl.backend.pool.fresh("too small", 16)
     with pytest.raises(fs.DeviceError, match="failed while drawing rgb"):
         frame["rgb"]
 

@@ -169,16 +169,13 @@ def test_values_that_mean_nothing_select_nothing(renderer):
         fs.Sensor(response=(0, 0.25, 0.5, 0.75, 1)),
         None,
     ]
-    plain = select(CLOUD, ("rgb",), fs.Quality())
+    plain = select(CLOUD, fs.Capture())
     for sensor in nothing:
-        assert (
-            select(CLOUD, ("rgb",), fs.Quality(), sensor=sensor, fog=fs.Fog(0.0), background=(1, 2, 3))
-            == plain
-        )
-    assert select(CLOUD, ("rgb",), fs.Quality(), sensor=NOISY) != plain
+        assert select(CLOUD, fs.Capture(background=(1, 2, 3), sensor=sensor, fog=fs.Fog(0.0))) == plain
+    assert select(CLOUD, fs.Capture(sensor=NOISY)) != plain
     grey = fs.Gradient(GREY, GREY, (1, 0, 0))
-    assert select(CLOUD, ("rgb",), fs.Quality(), background=grey) == plain
-    assert select(CLOUD, ("rgb",), fs.Quality(), background=fs.Gradient(GREY, (0, 0, 0))) != plain
+    assert select(CLOUD, fs.Capture(background=grey)) == plain
+    assert select(CLOUD, fs.Capture(background=fs.Gradient(GREY, (0, 0, 0)))) != plain
     frames = [renderer.render(CLOUD, CAMERA, background=behind) for behind in (grey, GREY)]
     assert np.array_equal(frames[0]["rgb"], frames[1]["rgb"])
     around = fs.Scene([CLOUD], CAMERA, background=grey)
@@ -224,5 +221,5 @@ def test_a_tag_is_found_where_it_is_in_fog_and_noise(renderer, mixture):
 
 
 def test_a_view_needs_no_sensor():
-    view = View.of(CAMERA, fs.Quality(), np.zeros(3), (0, 0, 0))
+    view = View.of(fs.Capture(CAMERA), np.zeros(3))
     assert view.sensor.steps == ()

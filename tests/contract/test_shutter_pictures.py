@@ -10,9 +10,8 @@ from agreement import random_splats
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
-from fidsplat.backends.exposure import exposed_view
+from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference import ReferenceBackend
-from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, compare
 from fidsplat.quality import Quality
 
@@ -54,9 +53,8 @@ MOTION = fs.Motion(pose_at, {3: turned, 5: lambda time: turned(-time)})
 
 
 def truth(cloud, camera, quality, outputs, motion, shutter):
-    view = exposed_view(camera, quality, cloud.origin, BACKGROUND, motion, shutter)
-    kinds = {"moving": bool(view.groups), "exposed": bool(view.shots)}
-    features = select(cloud, (*outputs, "alpha"), quality, camera, **kinds)
+    capture = fs.Capture(camera, (*outputs, "alpha"), quality, BACKGROUND, motion, shutter)
+    features, view = prepare(cloud, capture)
     judge = ReferenceBackend()
     return judge.pipeline(features).render(judge.upload(cloud), view).images
 
@@ -141,8 +139,8 @@ def test_what_bands_leave_out_by_its_sphere_draws_nothing_there(renderer, lowpas
     cloud = cloud.with_labels(np.arange(3000) % 7)
     quality = Quality(lowpass=lowpass, samples=samples)
     camera, shutter = CAMERAS["pinhole"], fs.Shutter(readout=0.5, rows_per_band=3)
-    view = exposed_view(camera, quality, cloud.origin, BACKGROUND, MOTION, shutter)
-    features = select(cloud, ALL_OUTPUTS, quality, camera, moving=True, exposed=True)
+    capture = fs.Capture(camera, ALL_OUTPUTS, quality, BACKGROUND, MOTION, shutter)
+    features, view = prepare(cloud, capture)
     assert "shutter_rows" in features.names
     without = replace(features, slots=tuple(name for name in features.slots if name != "shutter_rows"))
     backend = renderer.backend

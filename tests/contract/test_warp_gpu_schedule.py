@@ -7,8 +7,8 @@ from agreement import ALL_OUTPUTS, random_splats
 from test_lens_pictures import CAMERAS
 
 import fidsplat as fs
-from fidsplat.backends.view import View
-from fidsplat.effects import OUTPUTS, select
+from fidsplat.backends.prepare import prepare
+from fidsplat.effects import OUTPUTS
 from fidsplat.hard_cases.agreement import Picture, compare, truth_of
 
 BACKEND = "warp"
@@ -45,11 +45,8 @@ PICTURES = {
 @pytest.mark.parametrize("name", PICTURES)
 def test_the_schedule_of_gpus_agrees_with_the_reference(renderer, name):
     picture = PICTURES[name]()
-    backend, cloud, behind = renderer.backend, picture.cloud, picture.background
-    features = select(
-        cloud, picture.outputs, picture.quality, picture.camera, fog=picture.fog, background=behind
-    )
-    view = View.of(picture.camera, picture.quality, cloud.origin, behind, fog=picture.fog)
+    backend, cloud = renderer.backend, picture.cloud
+    features, view = prepare(cloud, picture.capture)
     planes = backend.pipeline(features, backend.shapes("schedule")["groups"]).render(
         backend.upload(cloud), view
     )

@@ -10,6 +10,7 @@ from agreement import ALL_OUTPUTS, random_splats
 import fidsplat as fs
 from fidsplat.backends.base import Reshapes
 from fidsplat.backends.planes import PlaneTable
+from fidsplat.backends.prepare import prepare
 from fidsplat.backends.view import View
 from fidsplat.effects import select
 from fidsplat.hard_cases.invariance import out_of_order
@@ -26,8 +27,7 @@ def backend(renderer):
 
 
 def traced(backend, cloud, quality, outputs=("rgb",), shape=None):
-    features = select(cloud, outputs, quality)
-    view = View.of(CAMERA, quality, cloud.origin, (0, 0, 0))
+    features, view = prepare(cloud, fs.Capture(CAMERA, outputs, quality))
     return backend.pipeline(features, shape).trace(backend.upload(cloud), view), view
 
 
@@ -180,8 +180,8 @@ def test_the_box_of_a_record_holds_all_that_the_splat_touches(backend, lowpass):
     """What a block of a GPU passes over, it must not have needed."""
     quality = fs.Quality(lowpass=lowpass)
     cloud = random_splats(200, seed=5, scale=(1e-3, 5.0))
-    features = select(cloud, ("rgb",), quality)
-    view = View.of(CAMERA, quality, cloud.origin, (0, 0, 0))
+    features = select(cloud, fs.Capture(quality=quality))
+    view = View.of(fs.Capture(CAMERA, quality=quality), cloud.origin)
     pipeline = backend.pipeline(features)
     if not hasattr(pipeline, "layout"):
         pytest.skip("not Warp's records")
@@ -259,8 +259,8 @@ def test_lists_that_outgrow_their_buffers_are_made_again(backend):
     """A picture that has far more pairs, or big splats, than the last one."""
     groups = listing(backend, "tiled", 8)
     few, many = random_splats(30, seed=2, scale=(1e-3, 0.05)), random_splats(9000, seed=2, scale=(0.5, 5.0))
-    features, quality = select(few, ALL_OUTPUTS, fs.Quality()), fs.Quality()
-    view = View.of(CAMERA, quality, few.origin, (0, 0, 0))
+    features, quality = select(few, fs.Capture(outputs=ALL_OUTPUTS)), fs.Quality()
+    view = View.of(fs.Capture(CAMERA, quality=quality), few.origin)
     backend = type(backend)(backend.device)  # with buffers that no other test has made larger
     pipeline = backend.pipeline(features, groups)
     fresh = pipeline.render(backend.upload(many), view)
@@ -280,7 +280,7 @@ def test_room_for_exactly_the_pairs_of_a_picture(backend, spare):
     """Lists are made again if and only if there is no room for all of them."""
     cloud, quality = random_splats(3000, seed=5, scale=(1e-3, 0.5)), fs.Quality()
     groups = listing(backend, "tiled")
-    features, view = select(cloud, ALL_OUTPUTS, quality), View.of(CAMERA, quality, cloud.origin, (0, 0, 0))
+    features, view = prepare(cloud, fs.Capture(CAMERA, ALL_OUTPUTS, quality))
     drawn = []
     for room in (None, spare):
         own = type(backend)(backend.device)  # with buffers of its own
@@ -310,8 +310,7 @@ def test_a_list_longer_than_local_memory_is_sorted(backend):
 def test_a_small_pair_budget_gives_the_same_bits(backend, monkeypatch, budget, lists):
     """numerics E3: a picture with more pairs than fit is drawn in bands of tiles."""
     cloud = random_splats(300, seed=12)
-    features = select(cloud, ALL_OUTPUTS, fs.Quality())
-    view = View.of(CAMERA, fs.Quality(), cloud.origin, (0, 0, 0))
+    features, view = prepare(cloud, fs.Capture(CAMERA, ALL_OUTPUTS))
     own = getattr(backend.shape, "lists", lists)
     shape = backend.shape if lists == own == "ordered" else listing(backend, lists, 8)
     pipeline, resident = backend.pipeline(features, shape), backend.upload(cloud)

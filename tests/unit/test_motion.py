@@ -8,7 +8,7 @@ import pytest
 from agreement import random_splats
 
 import fidsplat as fs
-from fidsplat.backends.exposure import exposed_view
+from fidsplat.backends.prepare import view_of
 from fidsplat.cameras.motion import between
 from fidsplat.rotations import quaternion_to_matrix
 from fidsplat.scenes import PlacedMarker
@@ -78,7 +78,7 @@ MOVING = fs.Motion(lambda time: np.eye(4), {1: lambda time: np.eye(4)})
 def test_a_shutter_that_does_nothing_is_none(motion, shutter, shots):
     """One picture, without the code of several."""
     camera = fs.Camera.pinhole(64, 48, 50, 50, 32, 24)
-    view = exposed_view(camera, fs.Quality(), np.zeros(3), (0.0, 0.0, 0.0), motion, shutter)
+    view = view_of(fs.Capture(camera, motion=motion, shutter=shutter), np.zeros(3))
     assert len(view.shots) == shots
 
 

@@ -13,7 +13,7 @@ CAMERA = fs.Camera.look_at(64, 48, 1.0, (0.4, -0.2, -2.0), (0, 0, 0))
 
 
 def view_of(cloud, camera=CAMERA, quality=None):
-    return View.of(camera, quality or fs.Quality(), cloud.origin, (0, 0, 0))
+    return View.of(fs.Capture(camera, quality=quality or fs.Quality()), cloud.origin)
 
 
 def some_planes(seed=0, ids=(7, 3, 2_000_000_000)):

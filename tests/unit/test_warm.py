@@ -34,7 +34,9 @@ def test_a_recipe_compiles_what_its_words_say(renderer, recipe):
         sh_degree, has_planes, footprint = recipe.sh_degree, recipe.markers, "gaussian"
 
     # a device without float64 has these in float32
-    wanted = replace(select(Traits(), recipe.outputs, recipe.quality), setup_precision="")
+    wanted = replace(
+        select(Traits(), fs.Capture(outputs=recipe.outputs, quality=recipe.quality)), setup_precision=""
+    )
     compiled = [replace(key[0], setup_precision="") for key in renderer.backend._pipelines]
     assert wanted in compiled
 

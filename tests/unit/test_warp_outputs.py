@@ -96,7 +96,7 @@ def drawn(taps, posts):
     backend = fs.Renderer("warp:cpu").backend
     cloud = two_splats()
     pipeline = backend.pipeline(FeatureSet(SLOTS, taps, 0, 1, "float64", posts))
-    view = View.of(CAMERA, fs.Quality(), cloud.origin, (0.0, 0.0, 0.0))
+    view = View.of(fs.Capture(CAMERA), cloud.origin)
     images = pipeline.render(backend.upload(cloud), view)
     return {name: images.read(name) for name in ("rgb", *taps)}
 

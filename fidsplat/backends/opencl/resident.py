@@ -10,12 +10,11 @@ import pyopencl as cl
 from fidsplat.backends.opencl.workspace import DeviceBuffer, Workspace
 from fidsplat.backends.planes import PlaneTable
 from fidsplat.errors import DeviceError
-from fidsplat.harmonics import C0
 from fidsplat.splats import SplatCloud
 
 
 class Resident:
-    """A SplatCloud on the device. SH of degree 0 does not depend on the view and becomes plain colours.
+    """A SplatCloud on the device.
 
     A CPU reads the cloud's own arrays, without a copy. On other devices they are copied, labels and colours
     when a picture first asks for them, or, where they would take more than half of the memory budget, a chunk
@@ -26,7 +25,7 @@ class Resident:
         self._workspace = workspace
         self.count = len(cloud)
         self.origin = cloud.origin
-        self.sh_degree = cloud.sh_degree if cloud.sh_degree > 0 else -1
+        self.sh_degree = cloud.sh_degree
         self.has_planes = cloud.planes is not None
         self.footprint = cloud.footprint
         self.planes = PlaneTable(cloud) if self.has_planes else None
@@ -41,11 +40,11 @@ class Resident:
             self._arrays["planes"] = self.planes.index
         if cloud.boxes is not None:
             self._arrays["boxes"] = cloud.boxes.astype(np.int32)
-        if cloud.colors is not None:
-            self._arrays["colors"] = cloud.colors
+        plain = cloud.plain_colors
+        if plain is not None:
+            self._arrays["colors"] = plain
         elif cloud.sh is not None:  # always: a cloud has one of the two
-            degree_0 = np.maximum(np.float32(C0) * cloud.sh[:, 0, :] + np.float32(0.5), 0)
-            self._arrays |= {"sh": cloud.sh} if self.sh_degree > 0 else {"colors": degree_0}
+            self._arrays["sh"] = cloud.sh
         self._buffers: dict[str, cl.Buffer] = {}
         total = self.count * self._bytes_of(self._arrays)
         widest = max(array.nbytes for array in self._arrays.values())

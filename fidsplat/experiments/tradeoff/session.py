@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.accuracy import full_precision, judge_for, truth
+from fidsplat.accuracy import full_precision, reference_for, truth
+from fidsplat.capture import Capture
 from fidsplat.experiments.tradeoff.points import BASE
 from fidsplat.experiments.tradeoff.scenes import TradeScene, make
 from fidsplat.quality import MarkerQuality, Quality
@@ -36,7 +37,7 @@ class Session:
     """
 
     def __init__(self, renderer: Renderer) -> None:
-        self.renderer, self._reference = renderer, judge_for(renderer)
+        self.renderer, self._reference = renderer, reference_for(renderer, Capture())
         self._scenes: OrderedDict[Hashable, OnDevice] = OrderedDict()
         self._truths: OrderedDict[Hashable, np.ndarray] = OrderedDict()
 
@@ -63,7 +64,8 @@ class Session:
         def draw() -> np.ndarray:
             on, reference = self.scene(view, quality.marker), self._reference
             what = on.resident if reference is self.renderer else on.scene.cloud
-            return truth(reference, what, on.scene.camera, like, background=on.scene.background)
+            capture = Capture(on.scene.camera, quality=like, background=on.scene.background)
+            return truth(reference, what, capture)
 
         return _kept(self._truths, (view, like), draw, _TRUTHS)
 
@@ -76,7 +78,8 @@ class Session:
 
     def full(self, view: str, quality: Quality) -> Quality:
         """The setting at which `truth` is drawn."""
-        return full_precision(self.definition(view, quality), self._reference)
+        like = Capture(quality=self.definition(view, quality))
+        return full_precision(like, self._reference).quality
 
 
 def _kept(cache: OrderedDict[Hashable, Any], key: Hashable, make: Callable[[], Any], most: int) -> Any:
