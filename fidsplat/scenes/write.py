@@ -16,10 +16,10 @@ from fidsplat.scenes.imaging import imaging_tables
 from fidsplat.scenes.knobs import marker_knobs, quality_tables
 from fidsplat.scenes.lens import lens_table
 from fidsplat.scenes.moving import keyframe_tables, shutter_table
-from fidsplat.scenes.scene import PlacedMarker, Scene
+from fidsplat.scenes.parts import PlacedMarker, SceneParts
 
 
-def write_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
+def write_scene(scene: SceneParts, path: str | os.PathLike[str]) -> None:
     """Write STEM-splats-I.ply for each cloud, then the scene file, so that it never names a file that is
     missing.
 
@@ -60,7 +60,7 @@ def write_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
         stream.write(content)
 
 
-def _camera(scene: Scene) -> dict:
+def _camera(scene: SceneParts) -> dict:
     camera = scene.camera
     assert camera is not None
     keys = ("width", "height", "fx", "fy", "cx", "cy", "near", "far")
@@ -86,7 +86,7 @@ def _marker(placed: PlacedMarker, folder: Path, quality: Quality | str | None) -
     }
 
 
-def _render(scene: Scene) -> tuple[dict, dict[str, dict]]:
+def _render(scene: SceneParts) -> tuple[dict, dict[str, dict]]:
     table: dict = {"outputs": list(scene.outputs)}
     if isinstance(scene.background, tuple):
         table["background"] = list(scene.background)
