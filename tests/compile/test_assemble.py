@@ -251,7 +251,9 @@ def test_only_pictures_of_several_poses_seen_by_a_pinhole_are_culled_by_spheres(
     ):
         chosen = select(
             Cloud(footprint=footprint),
-            fs.Capture(camera, quality=quality, motion=MOVING, shutter=fs.Shutter(exposure=0.1 * exposed)),
+            fs.Capture(
+                camera, quality=quality, motion=MOVING, shutter=fs.Shutter(exposure_time=0.1 * exposed)
+            ),
         )
         assert ("shutter_rows" in chosen.names) == expected
         assert ("reach * sqrt(fy" in assemble(chosen, SHAPE).text) == expected

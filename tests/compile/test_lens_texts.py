@@ -59,7 +59,7 @@ def test_values_that_mean_nothing_call_for_nothing(renderer):
     motion = fs.Motion(lambda time: CAMERAS["pinhole"].world_to_camera)
     renderer.render(cloud, nothing, quality=PLAIN, motion=motion, shutter=fs.Shutter(time=0.5, sub_poses=9))
     # nor is one before which nothing moves
-    renderer.render(cloud, nothing, quality=PLAIN, shutter=fs.Shutter(exposure=0.1, readout=0.2))
+    renderer.render(cloud, nothing, quality=PLAIN, shutter=fs.Shutter(exposure_time=0.1, readout=0.2))
     added = set(renderer.backend._pipelines) - before
     assert not any("shutter" in slot or "motion" in slot for features, _ in added for slot in features.slots)
 
@@ -102,7 +102,7 @@ def test_what_lenses_take():
 def test_every_lens_builds_with_everything(renderer, kind, exposed):
     """All outputs, layers, colours that depend on the view, moving groups; with and without a shutter."""
     cloud = random_splats(20, seed=1, depth=(1, 4), sh_degree=1).with_planes(np.repeat([-1, 0], 10))
-    shutter = fs.Shutter(exposure=0.1 if exposed else 0.0, sub_poses=2)
+    shutter = fs.Shutter(exposure_time=0.1 if exposed else 0.0, sub_poses=2)
     motion = fs.Motion(None, {1: lambda time: np.eye(4)})
     frame = renderer.render(cloud, CAMERAS[kind], ("rgb", *TAPS), None, motion=motion, shutter=shutter)
     assert all(np.isfinite(frame[name]).all() for name in frame)
