@@ -13,7 +13,7 @@ import numpy as np
 
 from fidsplat.errors import InputError
 from fidsplat.rotations import check_similarity, matrix_to_quaternion
-from fidsplat.scalars import own_scalars
+from fidsplat.scalars import PickledByFields, own_scalars
 
 if TYPE_CHECKING:
     from fidsplat.cameras.pinhole import Camera
@@ -74,7 +74,7 @@ class Shutter:
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class Trajectory(PickledByFields):
     """A pose between keyframes: the screw motion from one to the next (a geodesic of SE(3)), at rest before
     the first and after the last. Call it with a time in seconds.
 
@@ -179,6 +179,9 @@ class Motion:
                     "(SplatCloud.with_labels)"
                 )
         object.__setattr__(self, "groups", MappingProxyType(dict(self.groups)))
+
+    def __reduce__(self):
+        return Motion, (self.camera, dict(self.groups))  # a mapping proxy is not pickled
 
     def camera_at(self, time: float) -> np.ndarray | None:
         """world_to_camera (4, 4) then; None if it does not move."""
