@@ -20,7 +20,7 @@ MAY_IMPORT = {
     "errors": set(),
     "files": BASE,
     "rotations": BASE,
-    "scalars": set(),
+    "scalars": {"errors"},
     "harmonics": BASE,
     "quality": BASE,
     "capture": BASE | {"cameras", "quality", "sensor", "surroundings"},
