@@ -76,7 +76,7 @@ def shutters() -> dict[str, dict]:
     return {
         # every tenth splat
         "moving group": {"motion": fs.Motion(None, {1: moved}), "shutter": fs.Shutter(time=0.1)},
-        "blur, 8 poses": {"motion": turn, "shutter": fs.Shutter(exposure=0.02)},
+        "blur, 8 poses": {"motion": turn, "shutter": fs.Shutter(exposure_time=0.02)},
         "rolling, bands of 64 rows": {
             "motion": turn,
             "shutter": fs.Shutter(readout=0.02, rows_per_band=64),
@@ -84,7 +84,7 @@ def shutters() -> dict[str, dict]:
         "rolling, bands of 8 rows": {"motion": turn, "shutter": fs.Shutter(readout=0.02)},
         "blur, 8 poses, and rolling, bands of 64 rows": {
             "motion": turn,
-            "shutter": fs.Shutter(exposure=0.01, readout=0.02, rows_per_band=64),
+            "shutter": fs.Shutter(exposure_time=0.01, readout=0.02, rows_per_band=64),
         },
     }
 

@@ -40,7 +40,7 @@ def whole_number(name: str, value: Any, low: int, high: int) -> int:
 
 
 def _one_of(what: str, value: Any, known: tuple) -> None:
-    if isinstance(value, (bool, float)) or value not in known:
+    if not isinstance(value, (str, int, type(None))) or isinstance(value, bool) or value not in known:
         raise InputError(f"{what} is {value!r}; known: {', '.join(map(str, known))}")
 
 
@@ -199,7 +199,7 @@ class Quality:
     @classmethod
     def named(cls, name: str) -> Quality:
         """The preset of that name: standard, fast, reference, gsplat or surfel."""
-        if name in PRESETS:
+        if isinstance(name, str) and name in PRESETS:
             return PRESETS[name]
         raise InputError(unknown("quality", name, PRESETS))
 

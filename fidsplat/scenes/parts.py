@@ -15,6 +15,7 @@ from fidsplat.capture import Capture
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
 from fidsplat.rotations import check_similarity
+from fidsplat.scalars import PickledByFields
 from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
 from fidsplat.surroundings import Background, Fog, background_of
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedMarker:
+class PlacedMarker(PickledByFields):
     """A marker somewhere in the world. Raises InputError when the pose is not rigid, or the motion is no
     function."""
 
@@ -44,6 +45,10 @@ class PlacedMarker:
                 f"a marker's motion is a {type(self.motion).__name__}; it must be an fs.Trajectory or a "
                 "function of the time"
             )
+        if not isinstance(getattr(self.marker, "cloud", None), SplatCloud):
+            raise InputError(
+                f"marker is {self.marker!r}; it must be an fs.Marker, e.g. fs.marker('apriltag:36h11:5')"
+            )
         pose = np.array(self.pose, dtype=np.float64)
         pose.flags.writeable = False
         object.__setattr__(self, "pose", pose)
@@ -60,7 +65,7 @@ class PlacedMarker:
 
 
 @dataclass(frozen=True, eq=False)
-class SceneParts:
+class SceneParts(PickledByFields):
     """What is drawn and how. Raises InputError for a part of the wrong kind."""
 
     clouds: tuple[SplatCloud, ...] = ()

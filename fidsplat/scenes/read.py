@@ -11,6 +11,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera, Trajectory, look_at_matrix
 from fidsplat.errors import InputError
+from fidsplat.files import path_of
 from fidsplat.formats import Progress, load_ply
 from fidsplat.quality import MarkerQuality, Quality, knobs
 from fidsplat.rotations import rigid_matrix
@@ -60,7 +61,7 @@ def read_scene(
 
     Raises InputError, naming the file and the key, for whatever is wrong.
     """
-    file = Path(path)
+    file = path_of(path)
     top = Table(_parse(file), str(file), "", TOP)
     table = top.table("camera", CAMERA)
     keyframes = read_keyframes(table, ("time", *CAMERA_POSE), lambda frame: _camera_pose(frame)[0])

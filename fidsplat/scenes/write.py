@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write
+from fidsplat.files import atomic_write, path_of
 from fidsplat.formats import save_ply
 from fidsplat.markers import with_file
 from fidsplat.markers.printing import MAX_SPLATS
@@ -25,7 +25,7 @@ def write_scene(scene: SceneParts, path: str | os.PathLike[str]) -> None:
 
     Raises InputError when a file cannot be written, or a marker cannot be said in a scene file.
     """
-    file = Path(path)
+    file = path_of(path)
     render, qualities = _render(scene)
     around = imaging_tables(scene, file.parent)
     markers = [_marker(placed, file.parent, scene.quality) for placed in scene.markers]

@@ -38,7 +38,7 @@ static inline Seen see(const Splat *s, Crossing c, vfloat inverse_d) {
     return seen;
 }
 
-// Lays it over all that follows, where `mask` is set and the pixel still lets light through.
+// Composites it over all that follows, where `mask` is set and the pixel still lets light through.
 static inline void composite(Pixel *pixel, const Seen *seen, vfloat opacity, vint mask, const BlendConstants *constants) {
     vint live = mask & VMASK(pixel->t > constants->stop);
 //@@ stop

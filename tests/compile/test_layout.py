@@ -53,16 +53,12 @@ def offsets_on(backend, source: Source) -> dict[str, dict[str, int]]:
 @pytest.mark.parametrize("name", SETS)
 def test_records_lie_on_the_device_as_the_host_has_them(renderer, name):
     asked = combination(SETS[name])
-    if name == "double":
-        if not renderer.device.float64:
-            pytest.skip("the device has no float64")
-        capture = asked.capture
-        double = fs.Capture(outputs=capture.outputs, quality=capture.quality.with_(blend_precision="float64"))
-        features = select(asked.cloud, double)
-    else:
-        features = asked.features()
     if not renderer.device.float64:
         pytest.skip("records of a device without float64 are those of `setup_precision` float32")
+    features = asked.features()
+    if name == "double":
+        quality = asked.capture.quality.with_(blend_precision="float64")
+        features = select(asked.cloud, asked.capture.with_(quality=quality))
     source = assemble(features, gpu_shape())
     places = offsets_on(renderer.backend, source)
     for record, dtype in source.records.items():
@@ -188,7 +184,7 @@ def test_line_directives_lead_to_the_lines_of_the_files():
 
     source = assemble(combination(everything("distortion")).features(), cpu_shape())
     assert source.listing.count("\n") == source.text.count("\n")
-    file, number, found = "", 0, 0
+    file, number, told = "", 0, 0
     for line in source.listing.splitlines():
         if directive := re.fullmatch(r'#line (\d+) "(.*)"', line):
             number, file = int(directive[1]), directive[2]
@@ -196,9 +192,9 @@ def test_line_directives_lead_to_the_lines_of_the_files():
         if file.startswith("opencl/") and line.strip():
             written = (kernels_folder() / file).read_text("utf-8").splitlines()[number - 1]
             assert re.sub(r"WIDE\(([^()]+)\)", r"\1f", written).replace("wide ", "float ")[:4] == line[:4]
-            found += 1
+            told += 1
         number += 1
-    assert found > 800
+    assert told > 800
 
 
 def test_the_text_needs_no_opencl():
@@ -214,3 +210,34 @@ def test_the_text_needs_no_opencl():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert len(done.stdout.strip()) == 64
+
+
+def source(*words, block=""):
+    code = f"import sys\n{block}\nfrom fidsplat.cli import main\nsys.exit(main(sys.argv[1:]))"
+    return subprocess.run([sys.executable, "-c", code, "source", *words], capture_output=True, text=True)
+
+
+def test_a_scene_s_program_is_printed_without_opencl(tmp_path):
+    cloud, file = random_splats(5, seed=1, depth=(1, 3)), tmp_path / "cloud.ply"
+    fs.save_ply(cloud, str(file))
+    blocked = "sys.modules['pyopencl'] = None"
+    lanes = source(str(file), "--outputs", "rgb,depth", block=blocked)
+    assert (lanes.returncode, lanes.stderr) == (0, "")
+    assert '"opencl/output/depth.cl"' in lanes.stdout
+    assert "// depth = z_numerator / D" in lanes.stdout
+    assert "output/normal.cl" not in lanes.stdout
+    group = source(str(file), "--schedule", "group", block=blocked)
+    assert "schedule/group.cl" in group.stdout
+    assert "schedule/group.cl" not in lanes.stdout
+    without = source(str(file), "--device", "reference")
+    assert without.returncode == 2
+    assert "reference is no OpenCL device" in without.stderr
+
+
+def test_the_program_of_a_device_is_what_it_compiles(renderer, tmp_path):
+    cloud, file = random_splats(5, seed=1, depth=(1, 3)), tmp_path / "cloud.ply"
+    fs.save_ply(cloud, str(file))
+    frame = renderer.render(cloud, fs.Camera.pinhole(8, 8, 8.0, 8.0, 4.0, 4.0))
+    assert frame["rgb"].shape == (8, 8, 3)
+    compiled = {pipeline.source.listing for pipeline in renderer.backend._pipelines.values()}
+    assert source(str(file), "--device", renderer.device.name).stdout in compiled

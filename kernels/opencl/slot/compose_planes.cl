@@ -14,7 +14,7 @@
 typedef struct {
     vint plane;             // -1: no layer
     vfloat opacity;         // 1 - the product of its fragments' transmittances; itself, so that a faint one stays exact
-    vfloat optical_depth;   // the sum of its fragments'
+    vfloat optical_depth;   // sum of its fragments'
     Seen mean;              // of its fragments by optical depth
 //@@ layer
 } Layer;
@@ -57,27 +57,27 @@ static inline void layer_gather(Layer *layer, const Splat *s, const Seen *seen, 
 //@@ gather
 }
 
-static inline void layer_lay(Pixel *pixel, Layer *layer, vint mask, const BlendConstants *constants) {
+static inline void layer_composite(Pixel *pixel, Layer *layer, vint mask, const BlendConstants *constants) {
     if (!VANY(mask)) return;
     const Layer none = no_layer();
     composite(pixel, &layer->mean, layer->opacity, mask, constants);
     layer_pick(layer, &none, mask);
 }
 
-// Lays the pending layers `open` and `waiting` (masks), the nearer first.
-static inline void layers_lay(Pixel *pixel, vint open, vint waiting, const BlendConstants *constants) {
+// Composites the pending layers `open` and `waiting` (masks), the nearer first.
+static inline void layers_composite(Pixel *pixel, vint open, vint waiting, const BlendConstants *constants) {
     vint nearer = open & waiting & VMASK(pixel->open.mean.z < pixel->waiting.mean.z);
-    layer_lay(pixel, &pixel->open, nearer, constants);
-    layer_lay(pixel, &pixel->waiting, waiting, constants);
-    layer_lay(pixel, &pixel->open, open & ~nearer, constants);
+    layer_composite(pixel, &pixel->open, nearer, constants);
+    layer_composite(pixel, &pixel->waiting, waiting, constants);
+    layer_composite(pixel, &pixel->open, open & ~nearer, constants);
 }
 
 // A layer of another plane begins: the open one waits, and of two that would wait the nearer is composited.
 static inline void layers_shift(Pixel *pixel, vint begins, const BlendConstants *constants) {
     vint both = begins & VMASK(pixel->waiting.plane >= 0);
     vint nearer = both & VMASK(pixel->open.mean.z < pixel->waiting.mean.z);
-    layer_lay(pixel, &pixel->open, nearer, constants);
-    layer_lay(pixel, &pixel->waiting, both & ~nearer, constants);
+    layer_composite(pixel, &pixel->open, nearer, constants);
+    layer_composite(pixel, &pixel->waiting, both & ~nearer, constants);
     const Layer none = no_layer();
     vint moves = begins & ~nearer;
     layer_pick(&pixel->waiting, &pixel->open, moves);
@@ -87,7 +87,7 @@ static inline void layers_shift(Pixel *pixel, vint begins, const BlendConstants 
     if (s->plane < 0) {
         vint open = mask & VMASK(pixel->open.plane >= 0) & VMASK(pixel->open.mean.z < seen.z);
         vint waiting = mask & VMASK(pixel->waiting.plane >= 0) & VMASK(pixel->waiting.mean.z < seen.z);
-        if (VANY(open | waiting)) layers_lay(pixel, open, waiting, constants);
+        if (VANY(open | waiting)) layers_composite(pixel, open, waiting, constants);
         composite(pixel, &seen, opacity, mask, constants);
     } else {
         vint begins = mask & VMASK(pixel->open.plane >= 0) & VMASK(pixel->open.plane != (vint)s->plane);
@@ -95,4 +95,4 @@ static inline void layers_shift(Pixel *pixel, vint begins, const BlendConstants 
         layer_gather(&pixel->open, s, &seen, opacity, mask);
     }
 //@ finish
-    layers_lay(pixel, VMASK(pixel->open.plane >= 0), VMASK(pixel->waiting.plane >= 0), constants);
+    layers_composite(pixel, VMASK(pixel->open.plane >= 0), VMASK(pixel->waiting.plane >= 0), constants);
