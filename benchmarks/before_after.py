@@ -1,6 +1,6 @@
 """A commit against this tree: frames of both in turns, each in a process of its own.
 
-    python benchmarks/before_after.py COMMIT [--scene r1m_1080p] [--device opencl] [--repeats 15] [--json]
+    python benchmarks/before_after.py COMMIT [--scene r1m_1080p] [--device D] [--repeats 15] [--json FILE]
 
 Both processes draw the scene of this tree with its constants (alpha cut-off 1/255, stop 1e-4, precise
 arithmetic), splats resident, the picture left on the device. One frame each, in turns, and which goes first
@@ -11,8 +11,6 @@ effects.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import subprocess
 import sys
@@ -21,7 +19,7 @@ from datetime import date
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
+from measuring import PROGRESS, keep, options
 from rich.progress import Progress
 
 from fidsplat.random_clouds import load_scene
@@ -108,7 +106,7 @@ def measure(commit: str, scene: str, device: str, repeats: int) -> dict:
         file = saved_scene(scene, Path(folder) / "scene.npz")
         trees = [Tree(old, file, device), Tree(ROOT, file, device)]
         before, now = (Timer(tree.frame, tree.clock) for tree in trees)
-        with Progress(console=Console(stderr=True)) as progress:
+        with Progress(console=PROGRESS) as progress:
             task = progress.add_task(scene, total=2 * repeats)
             take_turns([before, now], repeats, warm_up=3, tick=lambda: progress.advance(task))
         for tree in trees:
@@ -129,18 +127,12 @@ def measure(commit: str, scene: str, device: str, repeats: int) -> dict:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, repeats=15)
     parser.add_argument("commit", help="any name that git knows, or a folder with its files")
     parser.add_argument("--scene", default="r1m_1080p")
-    parser.add_argument("--device", default="opencl")
-    parser.add_argument("--repeats", type=int, default=15, help="pairs of frames, 2 or more")
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
-    row = measure(options.commit, options.scene, options.device, max(options.repeats, 2))
-    if options.json:
-        print(json.dumps(row))
+    asked = parser.parse_args()
+    row = measure(asked.commit, asked.scene, asked.device, max(asked.repeats, 2))
+    if keep(row, asked.json):
         return
     print("{scene} on {device}, {date}, {pairs} pairs".format(**row))
     print("{commit} {before_ms:.2f} ms, now {now_ms:.2f} ms".format(**row))

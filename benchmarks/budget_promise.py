@@ -1,6 +1,6 @@
 """How often `fs.quality_within` keeps what it promises, on scenes that its table was not made of.
 
-    python benchmarks/budget_promise.py [--device opencl:pocl] [--scenes 200] [-o FILE.json]
+    python benchmarks/budget_promise.py [--device opencl:pocl] [--scenes 200] [--json FILE]
 
 Errors: random scenes with held-out seeds, each with every bound of BOUNDS, against the float64 reference.
 `table` is the setting that the table gives for the bound; `measured` the one that was calibrated on the scene
@@ -11,28 +11,21 @@ times what TIMED takes in each scene; then FRAMES frames are drawn, and those in
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import os
-import sys
 import tempfile
 from dataclasses import dataclass, field, replace
-from datetime import date
 from functools import partial
-from pathlib import Path
 
 import numpy as np
-from rich.console import Console
+from measuring import PROGRESS, facts, keep, options, show
 from rich.progress import track
-from rich.table import Table
 
 import fidsplat as fs
 from fidsplat.accuracy import errors, truth
 from fidsplat.budget import choose
 from fidsplat.errors import InputError
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED
-from fidsplat.files import atomic_write
 from fidsplat.random_clouds import HELD_OUT, RandomScene, random_scene
 from fidsplat.timing import Timer, frame_timer, take_turns
 
@@ -77,9 +70,9 @@ def capture_of(scene: RandomScene) -> fs.Capture:
     return fs.Capture(scene.camera, background=scene.background)
 
 
-def errors_kept(renderer: fs.Renderer, count: int, measured: int, where: Console) -> list[dict]:
+def errors_kept(renderer: fs.Renderer, count: int, measured: int) -> list[dict]:
     """A row for each way of asking and each bound: of `count` scenes, and of the first `measured` of them."""
-    judge = fs.Renderer("reference")
+    reference = fs.Renderer("reference")
     ways = ("table", "crossing", "measured", "elsewhere")
     kept = {(way, bound): Kept() for way in ways for bound in BOUNDS}
     table = {bound: fs.quality_within(error=bound, device=renderer) for bound in BOUNDS}
@@ -89,9 +82,9 @@ def errors_kept(renderer: fs.Renderer, count: int, measured: int, where: Console
         kept[way, bound].worst.append(errors(frame["rgb"], want).maximum / bound)
 
     def truth_of(scene: RandomScene) -> np.ndarray:
-        return truth(judge, scene.cloud, capture_of(scene))
+        return truth(reference, scene.cloud, capture_of(scene))
 
-    for k in track(range(count), "errors", console=where):
+    for k in track(range(count), "errors", console=PROGRESS):
         scene = random_scene(HELD_OUT + k)
         want = truth_of(scene)
         for bound, quality in table.items():
@@ -113,14 +106,14 @@ def errors_kept(renderer: fs.Renderer, count: int, measured: int, where: Console
     return [{"way": way, "error": bound, **found.as_dict()} for (way, bound), found in kept.items()]
 
 
-def times_kept(renderer: fs.Renderer, names: list[str], where: Console) -> list[dict]:
+def times_kept(renderer: fs.Renderer, names: list[str]) -> list[dict]:
     """A row for each scene and budget."""
     rows = []
     for name in names:
         cloud, camera = BENCH_SCENES[name].make()
         resident = renderer.upload(cloud)
         usual = timed(renderer, resident, camera, TIMED, 10).median
-        for times in track(TIMES, f"times, {name}", console=where):
+        for times in track(TIMES, f"times, {name}", console=PROGRESS):
             ms = times * usual
             row = {"scene": name, "base_ms": usual, "budget_ms": ms}
             answers = []
@@ -154,50 +147,47 @@ def timed(renderer: fs.Renderer, resident, camera, quality, count: int) -> Timer
     return timer
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--device", default=None)
+def main() -> None:
+    parser = options(__doc__)
     parser.add_argument("--scenes", type=int, default=200)
     parser.add_argument("--measured", type=int, default=60, help="scenes that are calibrated too")
     parser.add_argument("--timed", default=",".join(SCENES), help="bench scenes, or nothing")
-    parser.add_argument("-o", "--out", type=Path)
-    args = parser.parse_args()
-    where = Console(stderr=True)
+    asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder  # nothing that was measured before counts
-        renderer = fs.Renderer(args.device)
+        renderer = fs.Renderer(asked.device)
         found = {
-            "device": renderer.device.title,
-            "driver": renderer.device.version,
-            "date": date.today().isoformat(),
-            "fidsplat": fs.__version__,
-            "scenes": args.scenes,
-            "errors": errors_kept(renderer, args.scenes, args.measured, where),
-            "times": times_kept(renderer, [name for name in args.timed.split(",") if name], where),
+            **facts(renderer),
+            "scenes": asked.scenes,
+            "errors": errors_kept(renderer, asked.scenes, asked.measured),
+            "times": times_kept(renderer, [name for name in asked.timed.split(",") if name]),
         }
-    table = Table("way", "error", "kept", "refused", "worst / bound", "median / bound", box=None)
-    for row in found["errors"]:
-        ratios = (f"{row[f'{which}_over_bound']:.3g}" for which in ("worst", "median"))
-        share = f"{row['kept']} of {row['promises']}"
-        table.add_row(row["way"], f"{row['error']:g}", share, str(row["refused"]), *ratios)
-    where.print(table)
-    table = Table("scene", "budget ms", "error", "median ms", "in time", "calibrated in s", box=None)
-    for row in found["times"]:
-        if "refused" in row:
-            table.add_row(row["scene"], f"{row['budget_ms']:.1f}", row["refused"])
-        else:
-            numbers = (
-                f"{row['error']:.2g}",
-                f"{row['median_ms']:.1f}",
-                f"{row['in_time']} of {row['frames']}",
-            )
-            table.add_row(row["scene"], f"{row['budget_ms']:.1f}", *numbers, f"{row['calibration_s']:.1f}")
-    where.print(table)
-    if args.out:
-        with atomic_write(args.out) as stream:
-            stream.write((json.dumps(found, indent=1) + "\n").encode())
-    return 0
+    if keep(found, asked.json):
+        return
+    heads = ("way", "error", "kept", "refused", "worst / bound", "median / bound")
+    show("Errors", heads, map(error_cells, found["errors"]))
+    heads = ("scene", "budget ms", "error", "median ms", "in time", "calibrated in s")
+    show("Times", heads, map(time_cells, found["times"]))
+
+
+def error_cells(row: dict) -> tuple[str, ...]:
+    ratios = (f"{row[f'{which}_over_bound']:.3g}" for which in ("worst", "median"))
+    return (
+        row["way"],
+        f"{row['error']:g}",
+        f"{row['kept']} of {row['promises']}",
+        str(row["refused"]),
+        *ratios,
+    )
+
+
+def time_cells(row: dict) -> tuple[str, ...]:
+    budget = f"{row['budget_ms']:.1f}"
+    if "refused" in row:
+        return row["scene"], budget, row["refused"]
+    numbers = f"{row['error']:.2g}", f"{row['median_ms']:.1f}", f"{row['in_time']} of {row['frames']}"
+    return row["scene"], budget, *numbers, f"{row['calibration_s']:.1f}"
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -1,4 +1,4 @@
-"""Makes the pictures of the pages anew: docs/images/demo.jpg, and real-scene.jpg when a captured scene is
+"""Makes the pictures of the pages again: docs/images/demo.jpg, and real-scene.jpg when a captured scene is
 given.
 
 python benchmarks/docs_images.py [biker.compressed.ply]

@@ -135,7 +135,7 @@ def all_effects(renderer: fs.Renderer) -> list[tuple[str, np.ndarray]]:
         "fisheye, 200 degrees": lambda: seen(example("lens-fisheye"), camera=fisheye),
         "panorama": lambda: seen(example("lens-panorama"), camera=fs.Camera.equirectangular(WIDTH, HEIGHT)),
         "parallel rays": lambda: seen(gaussians, camera=wide),
-        "motion blur": lambda: seen(motion=turn, shutter=fs.Shutter(exposure=0.03, sub_poses=16)),
+        "motion blur": lambda: seen(motion=turn, shutter=fs.Shutter(exposure_time=0.03, sub_poses=16)),
         "rolling shutter": lambda: seen(motion=turn, shutter=fs.Shutter(readout=0.1, rows_per_band=4)),
         "fog": lambda: seen(fog=fs.Fog(0.15, (0.75, 0.78, 0.8))),
         "background: gradient": lambda: seen(background=fs.Gradient(*DUSK)),

@@ -9,14 +9,9 @@ Both give the same lists. docs/growth.md says which one a device gets, and why.
 
 from __future__ import annotations
 
-import argparse
-import json
 from dataclasses import replace
-from datetime import date
-from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
+from measuring import facts, keep, options, show
 
 import fidsplat as fs
 from fidsplat.backends.view import View
@@ -47,8 +42,7 @@ def measure(renderer: fs.Renderer, name: str, repeats: int) -> list[dict]:
         {
             "scene": name,
             "way": way,
-            "device": f"{renderer.device.title}, {renderer.device.version}",
-            "date": date.today().isoformat(),
+            **facts(renderer),
             "repeats": repeats,
             "stages_ms": timer.part_medians,
         }
@@ -57,24 +51,21 @@ def measure(renderer: fs.Renderer, name: str, repeats: int) -> list[dict]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, repeats=10)
     parser.add_argument("scenes", nargs="*", default=["r100k_720p"], choices=[*SCENES, []], metavar="SCENE")
-    parser.add_argument("--device", default="opencl")
-    parser.add_argument("--repeats", type=int, default=10)
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    renderer = fs.Renderer(options.device)
-    rows = [row for name in options.scenes for row in measure(renderer, name, max(options.repeats, 1))]
-    if options.json:
-        options.json.write_text(json.dumps(rows, indent=1) + "\n", "utf-8")
-    table = Table("scene", "way", "project", "sort", "bin", "both", title=f"ms on {renderer.device.title}")
-    for row in rows:
-        stages = row["stages_ms"]
-        figures = (stages["project"], stages["sort"], stages["bin"], stages["sort"] + stages["bin"])
-        table.add_row(row["scene"], row["way"], *(f"{figure:.2f}" for figure in figures))
-    Console().print(table)
+    asked = parser.parse_args()
+    renderer = fs.Renderer(asked.device)
+    rows = [row for name in asked.scenes for row in measure(renderer, name, max(asked.repeats, 1))]
+    if keep(rows, asked.json):
+        return
+
+    def cells(row: dict) -> tuple[str, ...]:
+        project, sort, bins = (row["stages_ms"][stage] for stage in ("project", "sort", "bin"))
+        figures = (project, sort, bins, sort + bins)
+        return row["scene"], row["way"], *(f"{figure:.2f}" for figure in figures)
+
+    heads = ("scene", "way", "project", "sort", "bin", "both")
+    show(f"ms on {renderer.device.title}", heads, map(cells, rows))
 
 
 if __name__ == "__main__":

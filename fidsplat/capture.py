@@ -10,12 +10,13 @@ from typing import Any
 from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.errors import InputError, unknown
 from fidsplat.quality import Quality
+from fidsplat.scalars import PickledByFields
 from fidsplat.sensor import Sensor
 from fidsplat.surroundings import Background, Fog, background_of
 
 
 @dataclass(frozen=True, eq=False)
-class Capture:
+class Capture(PickledByFields):
     """How a picture is taken: from where, of what, and how well.
 
     The same object works on every device. Raises InputError for a value of the wrong kind; whether an output
@@ -84,12 +85,12 @@ class Capture:
 
 def _names(outputs: Any) -> tuple[str, ...]:
     names = (outputs,) if isinstance(outputs, str) else outputs
-    names = tuple(dict.fromkeys(names)) if isinstance(names, Iterable) else (names,)
+    names = tuple(names) if isinstance(names, Iterable) else (names,)
     if not names:
         raise InputError("outputs is empty; name at least one, e.g. 'rgb'")
     if not all(isinstance(name, str) for name in names):
         raise InputError(f"outputs must be one or more names, not {outputs!r}")
-    return names
+    return tuple(dict.fromkeys(names))
 
 
 def _of_kind(name: str, value: Any, kind: type) -> Any:

@@ -40,7 +40,7 @@ def whole_number(name: str, value: Any, low: int, high: int) -> int:
 
 
 def _one_of(what: str, value: Any, known: tuple) -> None:
-    if isinstance(value, (bool, float)) or value not in known:
+    if not isinstance(value, (str, int, type(None))) or isinstance(value, bool) or value not in known:
         raise InputError(f"{what} is {value!r}; known: {', '.join(map(str, known))}")
 
 
@@ -48,8 +48,8 @@ def _one_of(what: str, value: Any, known: tuple) -> None:
 class MarkerQuality:
     """Knobs of making a marker of splats: how its rectangles become Gaussians.
 
-    More Gaussians follow sharp edges better and cost time in every picture. `fs.marker` takes these where it
-    is not told otherwise, and so do the markers of scene files and `fidsplat marker`.
+    More Gaussians follow sharp edges better and cost time in every picture. `fs.marker` takes these that it
+    is not given, and so do the markers of scene files and `fidsplat marker`.
 
     Raises:
         InputError: a value lies outside its range; the message names the range.
@@ -199,7 +199,7 @@ class Quality:
     @classmethod
     def named(cls, name: str) -> Quality:
         """The preset of that name: standard, fast, reference, gsplat or surfel."""
-        if name in PRESETS:
+        if isinstance(name, str) and name in PRESETS:
             return PRESETS[name]
         raise InputError(unknown("quality", name, PRESETS))
 
@@ -289,7 +289,7 @@ _PARITY = Quality(
     arithmetic="precise",
 )
 
-# standard: of the settings that docs/accuracy.md measures the cheapest whose largest error is at most 1/512
+# standard: of the qualities that docs/accuracy.md measures the cheapest whose largest error is at most 1/512
 # on every scene, the hard cases included; in fast arithmetic, which is cheaper on CPUs and at most 1 % slower
 # on GPUs
 PRESETS: dict[str, Quality] = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from fidsplat.backends.registry import open_backend
 from fidsplat.backends.view import NO_CAMERA
 from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.capture import Capture
-from fidsplat.errors import InputError
+from fidsplat.errors import InputError, MissingOutputError
 from fidsplat.quality import Quality
 from fidsplat.scenes import Scene
 from fidsplat.sensor import Sensor
@@ -36,15 +37,15 @@ class Frame(Mapping):
     """
 
     def __init__(self, images: Images, outputs: tuple[str, ...]) -> None:
-        self._images = images
+        self._images, self._process = images, os.getpid()
         self._arrays: dict[str, np.ndarray] = {}
         self.outputs = outputs
         """Names of the images, in the order in which they were asked for."""
 
     def __getitem__(self, name: str) -> np.ndarray:
-        if name not in self.outputs:
-            raise KeyError(f"this frame has no {name!r}; it was rendered with {', '.join(self.outputs)}")
+        self._check(name)
         if name not in self._arrays:
+            check_process(self._process, "frame")
             self._arrays[name] = image = self._images.read(name)
             image.flags.writeable = False  # what is kept is what was drawn
         return self._arrays[name]
@@ -56,10 +57,10 @@ class Frame(Mapping):
         `__cuda_array_interface__` make a tensor of it on the same device.
 
         Raises:
-            KeyError: an output that was not asked for; InputError: the backend has no arrays to give.
+            InputError: an output that was not asked for, or the backend has no arrays to give.
         """
-        if name not in self.outputs:
-            raise KeyError(f"this frame has no {name!r}; it was rendered with {', '.join(self.outputs)}")
+        self._check(name)
+        check_process(self._process, "frame")
         if not isinstance(self._images, GivesArrays):
             raise InputError(
                 f"this device keeps {name} in no array that others can use; draw with device='warp:cuda' or "
@@ -67,11 +68,21 @@ class Frame(Mapping):
             )
         return self._images.device_array(name)
 
+    def _check(self, name: str) -> None:
+        if not isinstance(name, str) or name not in self.outputs:
+            raise MissingOutputError(
+                f"this frame has no {name!r}; it was rendered with {', '.join(self.outputs)}; name it there"
+            )
+
     def __iter__(self) -> Iterator[str]:
         return iter(self.outputs)
 
     def __len__(self) -> int:
         return len(self.outputs)
+
+    def __reduce__(self):
+        """Pickled and copied as NumPy arrays: what `device_array` gives stays on its device."""
+        return _kept_frame, (dict(self), dict(self.timings), dict(self.stats))
 
     @property
     def timings(self) -> Mapping[str, float]:
@@ -82,6 +93,31 @@ class Frame(Mapping):
     def stats(self) -> Mapping[str, int]:
         """splats (in the cloud), visible (not culled), pairs (of splats and tiles)."""
         return self._images.stats
+
+
+@dataclass(frozen=True)
+class _KeptImages:
+    """Images that are no longer on a device."""
+
+    arrays: dict[str, np.ndarray]
+    timings: Mapping[str, float]
+    stats: Mapping[str, int]
+
+    def read(self, name: str) -> np.ndarray:
+        return self.arrays[name]
+
+
+def _kept_frame(arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int]) -> Frame:
+    return Frame(_KeptImages(arrays, timings, stats), tuple(arrays))
+
+
+def check_process(opened_by: int, what: str) -> None:
+    """Raises InputError in a fork of the process that opened it, where its driver does not work."""
+    if opened_by != os.getpid():
+        raise InputError(
+            f"this {what} belongs to process {opened_by}, of which this one is a fork; open a Renderer in "
+            "each process, and read frames before the fork"
+        )
 
 
 def default_device() -> str:
@@ -99,6 +135,12 @@ class ResidentCloud:
 
     def __len__(self) -> int:
         return self._data.count
+
+    def __reduce__(self):
+        raise InputError(
+            "a ResidentCloud is on a device and cannot be pickled or copied; take the SplatCloud, and upload "
+            "it there"
+        )
 
     @property
     def memory_bytes(self) -> int:
@@ -124,12 +166,19 @@ class Renderer:
 
     def __init__(self, device: str | None = None, memory_budget: int | None = None) -> None:
         self.backend = open_backend(default_device() if device is None else device)
+        self._process = os.getpid()
         if memory_budget is not None:
             if isinstance(memory_budget, bool) or not isinstance(memory_budget, int) or memory_budget <= 0:
                 raise InputError(
                     f"memory_budget is {memory_budget!r}; it must be a whole number of bytes, e.g. 2 * 2**30"
                 )
             self.backend.limit_memory(memory_budget)
+
+    def __reduce__(self):
+        raise InputError(
+            "a Renderer holds a device and cannot be pickled or copied; open one where it is used, e.g. "
+            f"fs.Renderer({self.device.name!r}) in each worker"
+        )
 
     @property
     def device(self) -> DeviceInfo:
@@ -138,6 +187,7 @@ class Renderer:
 
     def upload(self, scene: Scene | SplatCloud) -> ResidentCloud:
         """Put a scene's splats on the device, to be rendered many times. A scene's capture is kept."""
+        check_process(self._process, "Renderer")
         cloud = scene.cloud() if isinstance(scene, Scene) else scene
         if not isinstance(cloud, SplatCloud):
             raise InputError(f"cannot render a {type(scene).__name__}; give a Scene or a SplatCloud")
@@ -171,6 +221,7 @@ class Renderer:
             raise InputError(
                 f"{self.device.name} takes no arrays of a device; use a Warp device, or a SplatCloud"
             )
+        check_process(self._process, "Renderer")
         if (colors is None) == (sh is None):
             raise InputError("give exactly one of colors (n, 3) and sh (n, k, 3)")
         given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
@@ -229,7 +280,10 @@ class Renderer:
         (a motion of the camera takes the place of each camera's pose); an error comes after the pictures of
         the captures before it.
         """
-        outputs = outputs if outputs is None or isinstance(outputs, str) else tuple(outputs)
+        if isinstance(outputs, Iterable) and not isinstance(outputs, str):
+            outputs = tuple(outputs)
+        if not isinstance(captures, Iterable):
+            raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera")
         resident = self._resident(scene)
         waiting: Frame | None = None
         failure: Exception | None = None
@@ -255,6 +309,7 @@ class Renderer:
 
     def _resident(self, scene: Scene | SplatCloud | ResidentCloud) -> ResidentCloud:
         resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
+        check_process(self._process, "Renderer")
         if resident._renderer is not self:
             raise InputError(
                 "this cloud was uploaded by another Renderer; upload it with the one that draws it"

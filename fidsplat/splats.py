@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fidsplat.defects import LARGEST, drop_report, find_defects, rows_beyond, square_of
+from fidsplat.defects import drop_report, find_defects, rows_beyond, square_of
 from fidsplat.errors import InputError
 from fidsplat.harmonics import C0, MAX_DEGREE, rotation_of_coefficients, sh_basis
 from fidsplat.rotations import (
@@ -15,6 +15,7 @@ from fidsplat.rotations import (
     quaternion_multiply,
     quaternion_to_matrix,
 )
+from fidsplat.scalars import LARGEST, PickledByFields
 
 __all__ = ["SplatCloud", "sh_basis"]
 
@@ -22,7 +23,7 @@ _F32 = np.dtype(np.float32)
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
-class SplatCloud:
+class SplatCloud(PickledByFields):
     """2D Gaussian splats. Every array is read-only; make a new cloud to change one."""
 
     means: np.ndarray
@@ -247,7 +248,10 @@ class SplatCloud:
         those of a partition, their sides parallel, leave no seam. Raises InputError for anything but bools,
         and for a plane of both kinds.
         """
-        mask = np.asarray(boxes)
+        try:
+            mask = np.asarray(boxes)
+        except ValueError:  # rows that differ in length
+            mask = np.empty(0)
         if mask.dtype != bool or mask.shape not in ((), (len(self),)):
             raise InputError(f"boxes must be one bool or have the shape ({len(self)},) and the type bool")
         mask = np.full(len(self), mask) if mask.ndim == 0 else mask.copy()
@@ -262,7 +266,13 @@ class SplatCloud:
         that share an origin keep their bits; otherwise a common one is chosen as in the constructor.
         Planes of different clouds stay different planes. ``dropped`` adds up.
         """
-        clouds = list(clouds)
+        try:
+            clouds = list(clouds)
+        except TypeError:
+            clouds = [None]  # type: ignore[list-item]
+        for cloud in clouds:
+            if not isinstance(cloud, SplatCloud):
+                raise InputError(f"concatenate takes a list of SplatCloud, not of {type(cloud).__name__}")
         dropped: dict[str, int] = {}
         for cloud in clouds:
             for reason, count in cloud.dropped.items():
@@ -350,8 +360,8 @@ def _labels(labels, n: int, name: str = "labels") -> np.ndarray:
 
 def _check_origin(origin) -> np.ndarray:
     array = _numbers("origin", origin).astype(np.float64)
-    if array.shape != (3,) or not np.isfinite(array).all():
-        raise InputError(f"origin must be three finite numbers, not {origin!r}")
+    if array.shape != (3,) or rows_beyond(array, LARGEST) is not None:
+        raise InputError(f"origin must be three numbers, at most {LARGEST:g} metres, not {origin!r}")
     return array
 
 

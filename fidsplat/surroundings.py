@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.scalars import own_scalars
+from fidsplat.scalars import LARGEST, PickledByFields, own_scalars
 
 MAX_PANORAMA = 16384
 """pixels along a side"""
@@ -32,7 +32,7 @@ class Fog:
     def __post_init__(self) -> None:
         own_scalars(self)
         ok = isinstance(self.density, (int, float)) and not isinstance(self.density, bool)
-        if not (ok and 0 <= self.density < math.inf):
+        if not (ok and 0 <= self.density <= LARGEST):
             raise InputError(
                 f"fog: density is {self.density!r}; it must be a number of at least 0 (1 / metres)"
             )
@@ -61,7 +61,7 @@ class Gradient:
 
 
 @dataclass(frozen=True, eq=False)
-class Panorama:
+class Panorama(PickledByFields):
     """An equirectangular picture of the world as background: its middle column lies towards +z, to the right
     of it is +x, its top row is -y.
 

@@ -58,7 +58,7 @@ _FIXED = {
     "fisheye": Switch("lens", fs.Camera.fisheye(*SIZE, math.radians(170))),
     "equirectangular": Switch("lens", fs.Camera.equirectangular(*SIZE)),
     "orthographic": Switch("lens", fs.Camera.orthographic(*SIZE, 4.0)),
-    "motion blur": Switch("exposure", shutter={"exposure": 0.3, "sub_poses": 2}),
+    "motion blur": Switch("exposure time", shutter={"exposure_time": 0.3, "sub_poses": 2}),
     "rolling shutter": Switch("readout", shutter={"readout": 0.4, "rows_per_band": 8}),
     "moving group": Switch("groups", arguments={"groups": {0: sliding}}),
     "spherical harmonics": Switch("colour"),

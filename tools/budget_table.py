@@ -4,7 +4,7 @@ over random scenes and what they cost.
     python tools/budget_table.py --device opencl:pocl       about 15 minutes on two busy cores
     python tools/budget_table.py --device opencl:nvidia     adds the settings of GPUs
 
-Each scene of `fidsplat/random_clouds.py` is drawn with every setting and held against the same
+Each scene of `fidsplat/random_clouds.py` is drawn with every setting and compared with the same
 definition at full precision, which the device draws in float64 (`fidsplat.accuracy.reference_for`). Costs are
 medians of frames of the scenes of TIMED, drawn in turn; on CPUs those of the processor's time. In a second
 round the settings on the front of error and cost are drawn with every set of MODIFIERS, and FINEST beside

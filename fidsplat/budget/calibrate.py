@@ -39,7 +39,7 @@ class Calibration:
         renderer: who draws.
         cloud: what.
         capture: how; its quality has the definition of the truth.
-        tell: is told what is being done.
+        tell: called with what is being done.
     """
 
     def __init__(

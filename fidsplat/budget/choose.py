@@ -100,7 +100,7 @@ def choose(
     device: str | Renderer | None = None,
     tell: Callable[[str], None] = lambda text: None,
 ) -> Choice:
-    """As `quality_within`, with what is known about the quality beside it. `tell` is told what is being done.
+    """As `quality_within`, with what is known about the quality beside it. `tell`: called with what is done.
 
     Raises:
         InputError: as `quality_within`. DeviceError: the device cannot be used or fails.
@@ -134,8 +134,8 @@ def choose(
 
 
 def check_bounds(error: float | None, ms: float | None) -> None:
-    """Raises InputError for bounds that are no numbers. Those that nothing can keep are told from the others
-    by measuring what is possible."""
+    """Raises InputError for bounds that are no numbers. Only measuring shows which of the others cannot be
+    kept."""
     if error is None and ms is None:
         raise InputError("a budget of nothing: give error=1e-3, or ms=20 with scene=... and capture=...")
     for name, value, example in (("error", error, "1e-3"), ("ms", ms, "20")):

@@ -95,7 +95,7 @@ Examples:
         name_of = _names(self.out, Path(self.source))
         where = console(self.json)
         with late_progress(console(True)) as progress:
-            scene = _load(self.source, self.quality, progress)
+            scene = load_source(self.source, self.quality, progress)
         with _named(self.source, "render.outputs", names is None):
             select(fs.SplatCloud.empty(), fs.Capture(outputs=scene.outputs))
         of_scene = _named(self.source, "render.device", self.device is None)
@@ -178,7 +178,12 @@ def _names(out: str | None, source: Path):
     return lambda plane, suffix: file / f"{plane}{suffix}"
 
 
-def _load(source: str, quality: str | None, progress: "Progress") -> "Scene":
+def load_source(source: str, quality: str | None, progress: "Progress") -> "Scene":
+    """A scene file, or a splat file as a scene of its own, seen by a camera that fits it.
+
+    Raises:
+        InputError: neither; a scene without a camera.
+    """
     import fidsplat as fs
     from fidsplat.commands.framing import framing_camera
 

@@ -141,7 +141,7 @@ def _counts(rows: Frame, folder: Path) -> dict[str, Frame]:
         axes.axhline(
             TRAINING_SECONDS[17], color="#555555", linestyle=":", label="paper, training 2DGS, 17 views"
         )
-        axes.set_ylabel("seconds from the text to the splats")
+        axes.set_ylabel("seconds from text to splats")
         legend_above(figure, axes)
     return {"sizes": pd.DataFrame(sizes), "seconds": pd.DataFrame(seconds)}
 
@@ -215,7 +215,7 @@ def _views(rows: Frame, folder: Path) -> dict:
         ending = "/light" if truth in LINEAR else "/best"
         drawn = [method for method in methods if "/" not in method or method.endswith(ending)]
         psnr = {c: {k: v[0] for k, v in row.items()} for c, row in VIEWS.items()}
-        series[f"{truth}, drawn as {ending[1:]}"] = _series(categories, drawn, mean["psnr"], psnr)
+        series[f"MIXTURE{ending} against {truth}"] = _series(categories, drawn, mean["psnr"], psnr)
     _panels(folder / "psnr.svg", categories, series, "PSNR, dB")
     measured = {name: int(rows[name].notna().sum()) for name in ("flip", "lpips")}
     return {"tables": tables, "views": int(rows["amount"].max()), "rows": len(rows), "measured": measured}

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.errors import InputError
+from fidsplat.files import path_of
 
 MAX_HEADER = 65536
 """bytes; a splat file's header has some 2,000"""
@@ -75,7 +76,7 @@ def read_header(path: str | os.PathLike[str]) -> Header:
     PLY, its header is damaged, longer than 64 KiB or holds a list property, or the file is shorter than its
     header says. Warns when it is longer.
     """
-    file = Path(path)
+    file = path_of(path)
     head, size = _beginning(file)
     lines, start = _lines(file, head)
     counts: dict[str, int] = {}

@@ -69,8 +69,8 @@ def a2(renderer: Renderer) -> Found:
     yield _picture(_ring())
     # what a device culls may as well not be there
     picture = _picture(_ring())
-    planes = trace(renderer, picture)
-    kept = planes["order"] if planes["keys"].dtype != np.uint32 else np.flatnonzero(planes["keys"] != CULLED)
+    traced = trace(renderer, picture)
+    kept = traced["order"] if traced["keys"].dtype != np.uint32 else np.flatnonzero(traced["keys"] != CULLED)
     fewer = _picture(taken(picture.cloud, np.sort(kept)))
     changed = differing(draw(renderer, picture), draw(renderer, fewer), ALL_OUTPUTS)
     yield Finding("pixels that change without the culled splats", changed, 0)

@@ -164,7 +164,7 @@ def b8(renderer: Renderer) -> Found:
     yield Picture(random_splats(80, seed=2), beside, outputs=ALL_OUTPUTS)
     yield Picture(random_splats(60, seed=13), camera(47, 33, 40.0), Quality(samples=3), ALL_OUTPUTS)
     # A splat on the axis of a camera of odd size is symmetric, bit for bit
-    planes = draw(renderer, Picture(_centred(), camera(101, 79, 30.0), outputs=("rgb", "depth")))
+    frame = draw(renderer, Picture(_centred(), camera(101, 79, 30.0), outputs=("rgb", "depth")))
     for name, turned_over in (("left and right", np.s_[:, ::-1]), ("top and bottom", np.s_[::-1])):
-        mirrored = {key: plane[turned_over] for key, plane in planes.items()}
-        yield Finding(f"pixels that differ {name}", differing(planes, mirrored, planes.outputs), 0)
+        mirrored = {key: image[turned_over] for key, image in frame.items()}
+        yield Finding(f"pixels that differ {name}", differing(frame, mirrored, frame.outputs), 0)

@@ -144,20 +144,20 @@ def c1(renderer: Renderer) -> Found:
 
 def _keys_and_order(renderer: Renderer, picture: Picture) -> tuple[int, int]:
     """How many keys are not their splat's depth to 2 ulp, and how many splats stand where they should not."""
-    planes = trace(renderer, picture)
+    traced = trace(renderer, picture)
     view = view_of(picture.capture, picture.cloud.origin)
     depth = (picture.cloud.means.astype(float) @ view.rotation.T + view.translation)[:, 2]
-    keys = planes["keys"]
+    keys = traced["keys"]
     if keys.dtype == np.uint32:
         visible = np.flatnonzero(keys != CULLED)
         bits = keys[visible]
         decoded = np.where(bits & 0x80000000, bits & 0x7FFFFFFF, ~bits).view(np.float32)
     else:  # the reference keeps depths
-        visible = np.sort(planes["order"])
+        visible = np.sort(traced["order"])
         decoded = keys[visible]
     off = np.abs(decoded - depth[visible]) > 2 * np.spacing(np.abs(depth[visible]).astype(np.float32))
     wanted = visible[np.argsort(decoded, kind="stable")]
-    return int(off.sum()), out_of_order(planes, wanted)
+    return int(off.sum()), out_of_order(traced, wanted)
 
 
 def _depths(values) -> Picture:

@@ -118,7 +118,7 @@ def run_check(
     """Run cases on a device. What the device cannot do at all fails its case; the others go on.
 
     Args:
-        tell: is told what is being done, before each case.
+        tell: called with what is being done, before each case.
     """
     begun = time.perf_counter()
     tell("arithmetic")

@@ -166,14 +166,13 @@ def d4(renderer: Renderer) -> Found:
     # the guard: what covers less than 1/255 is 0, the faintest that covers more has its own depth
     lone = splats([[0.0, 0.0, 3.0]], FACING, (0.05, 0.05), 1.01 / 255)
     frame = renderer.render(lone, SMALL, ALL_OUTPUTS, Quality(alpha_cutoff=1e-5))
-    told = frame["alpha"] >= np.float32(1 / 255)
-    yield Finding("pixels of the faintest splat that are missing", float(not told[MIDDLE]), 0.0)
+    covered = frame["alpha"] >= np.float32(1 / 255)
+    yield Finding("pixels of the faintest splat that are missing", float(not covered[MIDDLE]), 0.0)
     for name in names[1:]:
         depth = frame[name]
-        yield Finding(
-            f"{name} where less than 1/255 is covered [m]", float(np.abs(depth[~told]).max(initial=0.0)), 0.0
-        )
-        error = np.abs(depth[told] / 3 - 1).max(initial=0.0)
+        stray = float(np.abs(depth[~covered]).max(initial=0.0))
+        yield Finding(f"{name} where less than 1/255 is covered [m]", stray, 0.0)
+        error = np.abs(depth[covered] / 3 - 1).max(initial=0.0)
         yield Finding(f"{name} of the faintest splat, relative error", float(error), 1e-6)
 
 

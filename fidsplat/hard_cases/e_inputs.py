@@ -53,7 +53,7 @@ def crowd() -> SplatCloud:
 
 
 def spoilt(cloud: SplatCloud, changes: Mapping[str, Any]) -> SplatCloud:
-    """The cloud made anew from arrays in which fields of the victim have other values; it may be left out."""
+    """The cloud from arrays in which fields of the victim have other values; it may be left out."""
     arrays = {name: getattr(cloud, name).copy() for name in BROKEN}
     for name, value in changes.items():
         arrays[name][VICTIM] = value
@@ -249,6 +249,6 @@ def e5(renderer: Renderer) -> Found:
                 clean = renderer.render(cloud, sized(width, height), ALL_OUTPUTS, quality)
                 with backend.probe().poisoned():
                     frame = renderer.render(cloud, sized(width, height), ALL_OUTPUTS, quality)
-                    planes = {name: frame[name] for name in ALL_OUTPUTS}
-                different += not all(np.array_equal(planes[name], clean[name]) for name in ALL_OUTPUTS)
+                    drawn = {name: frame[name] for name in ALL_OUTPUTS}
+                different += not all(np.array_equal(drawn[name], clean[name]) for name in ALL_OUTPUTS)
     yield Finding("pictures that change when their buffers held NaN", different, 0)

@@ -57,7 +57,7 @@ def f2(renderer: Renderer) -> Found:
     yield from measured.findings if measured else ()
 
 
-@case("F3", "NaN and infinity are told from numbers", "quiet, negative and signalling NaN; the build options")
+@case("F3", "NaN and infinity are no numbers", "quiet, negative and signalling NaN; the build options")
 def f3(renderer: Renderer) -> Found:
     # no build option lets go of NaN, and the compiler does not by itself
     if not isinstance(renderer.backend, Probed):
@@ -81,8 +81,8 @@ def f3(renderer: Renderer) -> Found:
     unequal, named, survives, infinite = probe.not_a_number(x)
     is_nan = np.isnan(x)
     for name, seen in (("x != x", unequal), ("isnan(x)", named), ("a comparison that fails", survives)):
-        yield Finding(f"NaN told wrongly by {name}", int((seen.astype(bool) != is_nan).sum()), 0)
-    yield Finding("infinities told wrongly", int((infinite.astype(bool) != np.isinf(x)).sum()), 0)
+        yield Finding(f"NaN taken wrongly by {name}", int((seen.astype(bool) != is_nan).sum()), 0)
+    yield Finding("infinities taken wrongly", int((infinite.astype(bool) != np.isinf(x)).sum()), 0)
 
 
 @case("F4", "denormals", "opacities, scales, colours and backgrounds of 1e-45 to 1e-30")

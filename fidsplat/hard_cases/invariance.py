@@ -18,8 +18,10 @@ def trace(renderer: Renderer, picture: Picture, shape=None) -> dict[str, np.ndar
     """What passes between the stages of a device, with the outputs; `shape` replaces its build constants."""
     features, view = picture.prepared()
     backend = renderer.backend
-    reshaped = isinstance(backend, Reshapes) and shape is not None
-    pipeline = backend.pipeline(features, shape) if reshaped else backend.pipeline(features)
+    if shape is not None and isinstance(backend, Reshapes):
+        pipeline = backend.pipeline(features, shape)
+    else:
+        pipeline = backend.pipeline(features)
     return pipeline.trace(backend.upload(picture.cloud), view)
 
 
@@ -27,7 +29,7 @@ def differing(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray],
     """Number of pixels whose bits differ in any of the outputs; all of them where the shapes differ."""
     different = np.zeros((), bool)
     for name in outputs:
-        one, other = (np.ascontiguousarray(planes[name]) for planes in (first, second))
+        one, other = (np.ascontiguousarray(images[name]) for images in (first, second))
         if one.shape != other.shape:
             return max(one.size, other.size)
         bits = f"u{one.itemsize}"

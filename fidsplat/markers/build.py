@@ -32,11 +32,11 @@ from fidsplat.markers.printing import (
 )
 from fidsplat.markers.regions import label_components, polygons
 from fidsplat.quality import MIXTURES, MarkerQuality, whole_number
+from fidsplat.scalars import PickledByFields
 
 if TYPE_CHECKING:
     from shapely import Polygon
-
-    from fidsplat.splats import SplatCloud
+from fidsplat.splats import SplatCloud
 
 MAX_MODULES = 4096
 """Longest edge of a grid with its quiet zone."""
@@ -53,7 +53,7 @@ class Rectangle(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Marker:
+class Marker(PickledByFields):
     """A fiducial marker and the splats that show it, made by `marker`."""
 
     spec: str
@@ -193,6 +193,8 @@ def marker(
     max_splats = whole_number("max_splats", max_splats, 1, 2**31 - 1)
     parsed = parse_spec(spec)
     given = {"levels": levels, "density": density, "growth": growth, "template": template}
+    if not isinstance(duplicates, bool | None):
+        raise InputError(f"duplicates is {duplicates!r}; it must be True or False")
     chosen = _chosen(MarkerQuality() if quality is None else quality, mixture, duplicates, given)
     exact = chosen.mixture == "exact"
     templates, growth = _mixture(chosen, bool(duplicates))
@@ -256,7 +258,7 @@ def _chosen(
             f"quality is {quality!r}; it must be an fs.MarkerQuality, e.g. fs.Quality(...).marker"
         )
     name = quality.mixture if mixture is None else mixture
-    if name not in MIXTURES:
+    if not isinstance(name, str) or name not in MIXTURES:
         raise InputError(f"unknown mixture {name!r}; known: {', '.join(MIXTURES)}")
     given = {key: value for key, value in given.items() if value is not None}
     of_paper = [key for key in ("levels", "density") if key in given]

@@ -1,15 +1,17 @@
-"""Scene files: TOML in, Scene out."""
+"""Scene files: TOML in, the parts of a Scene out."""
 
 import math
 import os
 import re
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fidsplat.cameras import Camera, Trajectory, look_at_matrix
 from fidsplat.errors import InputError
+from fidsplat.files import path_of
 from fidsplat.formats import Progress, load_ply
 from fidsplat.quality import MarkerQuality, Quality, knobs
 from fidsplat.rotations import rigid_matrix
@@ -17,7 +19,7 @@ from fidsplat.scenes.imaging import read_background, read_fog, read_sensor
 from fidsplat.scenes.knobs import quality_of, read_knobs
 from fidsplat.scenes.lens import TABLES, read_focal_lengths, read_lens
 from fidsplat.scenes.moving import POSE, read_keyframes, read_shutter
-from fidsplat.scenes.scene import PlacedMarker, Scene
+from fidsplat.scenes.parts import PlacedMarker
 from fidsplat.scenes.table import Table
 from fidsplat.splats import SplatCloud
 
@@ -51,15 +53,15 @@ def read_scene(
     path: str | os.PathLike[str],
     quality: Quality | str | None = None,
     progress: Progress | None = None,
-) -> Scene:
-    """The scene of a file and of the splat and image files that it names, which are looked for beside it.
+) -> dict[str, Any]:
+    """What `SceneParts` takes, from a scene file and from the splat and image files that it names, which are
+    looked for beside it.
 
-    quality: instead of the file's; markers are made with it too. progress: as
-    `load_ply` takes it.
+    quality: instead of the file's; markers are made with it too. progress: as `load_ply` takes it.
 
     Raises InputError, naming the file and the key, for whatever is wrong.
     """
-    file = Path(path)
+    file = path_of(path)
     top = Table(_parse(file), str(file), "", TOP)
     table = top.table("camera", CAMERA)
     keyframes = read_keyframes(table, ("time", *CAMERA_POSE), lambda frame: _camera_pose(frame)[0])
@@ -74,7 +76,7 @@ def read_scene(
     quality = quality_of(top, render) if quality is None else quality
     made_with = Quality.of(quality).marker
     splats = [_splats(table, file.parent, progress) for table in top.tables("splats", SPLATS)]
-    return Scene(
+    return dict(
         clouds=tuple(cloud for cloud, _ in splats),
         camera=camera,
         markers=tuple(

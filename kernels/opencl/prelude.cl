@@ -8,7 +8,7 @@
 //   SAMPLES        n of the n x n samples per pixel
 
 // Contraction is chosen by hand (FMA below), never by the compiler: the same pixel must get the same bits in every
-// schedule, tile size and set of taps, and order and culling must not depend on the device (numerics F1).
+// schedule, tile size and set of outputs, and order and culling must not depend on the device (numerics F1).
 #pragma OPENCL FP_CONTRACT OFF
 
 #if SETUP_FP64

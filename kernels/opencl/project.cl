@@ -1,5 +1,5 @@
 // Index space: one work-item per splat.
-// Reads:  view, means, quats, scales, opacities, and what the colour slot and the taps ask for.
+// Reads:  view, means, quats, scales, opacities, and what the colour slot and the outputs ask for.
 // Writes: splats[i] of visible splats; keys[i]: depth key, or CULLED or OUTSIDE; windows[i]
 //         of visible splats: the tiles that they touch; big, big_bounds and their number in tallies (numerics A5).
 //

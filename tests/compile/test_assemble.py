@@ -22,8 +22,8 @@ SHAPE, GROUP = cpu_shape(lanes=16, cores=2), gpu_shape()
 TAPS = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
 DIGESTS = {
-    "none": ["6076fc056d33aa7d", "b8539fa1ae229dd5"],
-    "screen": ["6781b5deed4298d0", "db42a7e8517e16f2"],
+    "none": ["1746d2a5d2cedc9d", "be842943924e0e73"],
+    "screen": ["4a8c4332caa5dfe9", "b9607e863d3a6160"],
 }
 """of a scene that asks for nothing, by low-pass; `screen` is the default"""
 
@@ -58,7 +58,7 @@ def test_base_text_names_no_effect_that_was_not_asked_for():
         "arithmetic_fast",
     }
     of_knobs = ("wide", "WIDE")
-    of_layers = ("planes", "plane_keys", "layer", "Layer", "open", "waiting", "ink")
+    of_layers = ("planes", "plane_keys", "layer", "Layer", "open", "waiting", "optical_depth")
     for name in (*absent, *TAPS, "sh", "finished", *of_layers, *of_knobs):
         assert not re.search(rf"\b{name}(_|\b)", text), name
 
@@ -251,7 +251,9 @@ def test_only_pictures_of_several_poses_seen_by_a_pinhole_are_culled_by_spheres(
     ):
         chosen = select(
             Cloud(footprint=footprint),
-            fs.Capture(camera, quality=quality, motion=MOVING, shutter=fs.Shutter(exposure=0.1 * exposed)),
+            fs.Capture(
+                camera, quality=quality, motion=MOVING, shutter=fs.Shutter(exposure_time=0.1 * exposed)
+            ),
         )
         assert ("shutter_rows" in chosen.names) == expected
         assert ("reach * sqrt(fy" in assemble(chosen, SHAPE).text) == expected

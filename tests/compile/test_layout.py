@@ -53,16 +53,12 @@ def offsets_on(backend, source: Source) -> dict[str, dict[str, int]]:
 @pytest.mark.parametrize("name", SETS)
 def test_records_lie_on_the_device_as_the_host_has_them(renderer, name):
     asked = combination(SETS[name])
-    if name == "double":
-        if not renderer.device.float64:
-            pytest.skip("the device has no float64")
-        capture = asked.capture
-        double = fs.Capture(outputs=capture.outputs, quality=capture.quality.with_(blend_precision="float64"))
-        features = select(asked.cloud, fs.Capture(outputs=double))
-    else:
-        features = asked.features()
     if not renderer.device.float64:
         pytest.skip("records of a device without float64 are those of `setup_precision` float32")
+    features = asked.features()
+    if name == "double":
+        quality = asked.capture.quality.with_(blend_precision="float64")
+        features = select(asked.cloud, asked.capture.with_(quality=quality))
     source = assemble(features, gpu_shape())
     places = offsets_on(renderer.backend, source)
     for record, dtype in source.records.items():
@@ -106,7 +102,7 @@ TOY_OUTPUT = """// nearest (h, w): depth [m] of the nearest fragment that is dra
     vfloat nearest;
 //@ start
     pixel->nearest = INFINITY;
-//@ lay
+//@ composite
     pixel->nearest = fmin(pixel->nearest, VSELECT((vfloat)INFINITY, seen->z, live & VMASK(weight > 0.0f)));
 //@ store
         VSTORE(pixel->nearest, nearest_raw + at);
@@ -208,9 +204,40 @@ def test_the_text_needs_no_opencl():
         "from fidsplat.backends.opencl.assemble import assemble\n"
         "from fidsplat.backends.opencl.shapes import cpu_shape\n"
         "from fidsplat.effects import select\n"
-        "features = select(fs.SplatCloud.empty(), ('rgb', 'depth'), fs.Quality())\n"
+        "features = select(fs.SplatCloud.empty(), fs.Capture(outputs=('rgb', 'depth')))\n"
         "print(assemble(features, cpu_shape()).digest)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert len(done.stdout.strip()) == 64
+
+
+def source(*words, block=""):
+    code = f"import sys\n{block}\nfrom fidsplat.cli import main\nsys.exit(main(sys.argv[1:]))"
+    return subprocess.run([sys.executable, "-c", code, "source", *words], capture_output=True, text=True)
+
+
+def test_a_scene_s_program_is_printed_without_opencl(tmp_path):
+    cloud, file = random_splats(5, seed=1, depth=(1, 3)), tmp_path / "cloud.ply"
+    fs.save_ply(cloud, str(file))
+    blocked = "sys.modules['pyopencl'] = None"
+    lanes = source(str(file), "--outputs", "rgb,depth", block=blocked)
+    assert (lanes.returncode, lanes.stderr) == (0, "")
+    assert '"opencl/output/depth.cl"' in lanes.stdout
+    assert "// depth = z_numerator / D" in lanes.stdout
+    assert "output/normal.cl" not in lanes.stdout
+    group = source(str(file), "--schedule", "group", block=blocked)
+    assert "schedule/group.cl" in group.stdout
+    assert "schedule/group.cl" not in lanes.stdout
+    without = source(str(file), "--device", "reference")
+    assert without.returncode == 2
+    assert "reference is no OpenCL device" in without.stderr
+
+
+def test_the_program_of_a_device_is_what_it_compiles(renderer, tmp_path):
+    cloud, file = random_splats(5, seed=1, depth=(1, 3)), tmp_path / "cloud.ply"
+    fs.save_ply(cloud, str(file))
+    frame = renderer.render(cloud, fs.Camera.pinhole(8, 8, 8.0, 8.0, 4.0, 4.0))
+    assert frame["rgb"].shape == (8, 8, 3)
+    compiled = {pipeline.source.listing for pipeline in renderer.backend._pipelines.values()}
+    assert source(str(file), "--device", renderer.device.name).stdout in compiled

@@ -27,10 +27,10 @@ CAMERAS = {
 
 # of the texts as they were before there were lenses; a change here changes what every plain picture runs
 BEFORE_LENSES = {
-    ("lanes", ("rgb",)): "45a83fbd0b35b2fdbc5148b64dac51341794ca553021a4958b4d9180055bbbf4",
-    ("lanes", TAPS): "fe67355b61f845772288c98d3f877fe9b12221559f8cb598c22e8607ccbdf4ce",
-    ("group", ("rgb",)): "7f9e7d564e9b0f82499b688e6b611805317344ca508ea312502dd379d467b07b",
-    ("group", TAPS): "64893feebcde61293c8a4912a860ab8a2f91c37090ef92c9db27500e27430e5d",
+    ("lanes", ("rgb",)): "4a500e3ba6dc2d6fcc3102e13452791e8fc436f1994615db268bb01e14b40003",
+    ("lanes", TAPS): "08817447bcd5193c15e7bf96a7a7ecf9600423f146fa97d669498e7adff9cb08",
+    ("group", ("rgb",)): "a9ab5b91a85cf8e7d1f36402cf2aa5c133146040ba8f40645e1fce80f2f8d727",
+    ("group", TAPS): "5bc7e026fcea24b088506537ab911ca15ab5ae4a9325088d2bad96277add6c88",
 }
 
 
@@ -59,7 +59,7 @@ def test_values_that_mean_nothing_call_for_nothing(renderer):
     motion = fs.Motion(lambda time: CAMERAS["pinhole"].world_to_camera)
     renderer.render(cloud, nothing, quality=PLAIN, motion=motion, shutter=fs.Shutter(time=0.5, sub_poses=9))
     # nor is one before which nothing moves
-    renderer.render(cloud, nothing, quality=PLAIN, shutter=fs.Shutter(exposure=0.1, readout=0.2))
+    renderer.render(cloud, nothing, quality=PLAIN, shutter=fs.Shutter(exposure_time=0.1, readout=0.2))
     added = set(renderer.backend._pipelines) - before
     assert not any("shutter" in slot or "motion" in slot for features, _ in added for slot in features.slots)
 
@@ -102,7 +102,7 @@ def test_what_lenses_take():
 def test_every_lens_builds_with_everything(renderer, kind, exposed):
     """All outputs, layers, colours that depend on the view, moving groups; with and without a shutter."""
     cloud = random_splats(20, seed=1, depth=(1, 4), sh_degree=1).with_planes(np.repeat([-1, 0], 10))
-    shutter = fs.Shutter(exposure=0.1 if exposed else 0.0, sub_poses=2)
+    shutter = fs.Shutter(exposure_time=0.1 if exposed else 0.0, sub_poses=2)
     motion = fs.Motion(None, {1: lambda time: np.eye(4)})
     frame = renderer.render(cloud, CAMERAS[kind], ("rgb", *TAPS), None, motion=motion, shutter=shutter)
     assert all(np.isfinite(frame[name]).all() for name in frame)

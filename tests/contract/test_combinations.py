@@ -31,9 +31,9 @@ CAMERAS = {
 }
 ALONG = {name: camera for name, camera in CAMERAS.items() if name != "distortion"}
 OUTPUTS = ("depth_first", "normal_world", "splat_id", "blended")
-BLUR = fs.Shutter(exposure=0.4, sub_poses=3)
+BLUR = fs.Shutter(exposure_time=0.4, sub_poses=3)
 WARP = next((info.name for info in fs.devices() if info.usable and info.name.startswith("warp")), None)
-ROLLING = fs.Shutter(time=0.1, exposure=0.2, sub_poses=2, readout=0.4, rows_per_band=8)
+ROLLING = fs.Shutter(time=0.1, exposure_time=0.2, sub_poses=2, readout=0.4, rows_per_band=8)
 
 
 def sliding(time):
@@ -107,7 +107,7 @@ def test_fog_is_averaged_over_the_poses_of_a_shutter(renderer):
         motion = {} if not when else {"motion": fs.Motion(away), "shutter": fs.Shutter(**when)}
         return renderer.render(wall, camera, fog=FOG, **motion)["rgb"][14, 20].astype(float)
 
-    near, none, both = middle(), np.array(FOG.color), middle(exposure=1.0, sub_poses=2)
+    near, none, both = middle(), np.array(FOG.color), middle(exposure_time=1.0, sub_poses=2)
     assert (near < none - 0.1).all()
     assert np.allclose(both, (near + none) / 2, atol=1e-5)
 

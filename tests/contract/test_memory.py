@@ -184,7 +184,7 @@ PICTURES = {
     "rolling shutter": {
         "camera": fs.Camera.pinhole(161, 117, 150.0, 150.0, 80.0, 60.0, lens=fs.BrownConrady(-0.1)),
         "motion": fs.Motion(lambda time: np.eye(4)),
-        "shutter": fs.Shutter(readout=0.1, exposure=0.05, sub_poses=2),
+        "shutter": fs.Shutter(readout=0.1, exposure_time=0.05, sub_poses=2),
     },
 }
 
@@ -224,7 +224,7 @@ def test_a_panorama_is_copied_once(opencl, monkeypatch):
     monkeypatch.setattr(
         cl, "enqueue_copy", lambda *args, **more: copied.append(args[2]) or copy(*args, **more)
     )
-    some, shutter = random_splats(20, seed=9), fs.Shutter(exposure=0.1, sub_poses=2)
+    some, shutter = random_splats(20, seed=9), fs.Shutter(exposure_time=0.1, sub_poses=2)
 
     def draw(around, **more):
         copied.clear()

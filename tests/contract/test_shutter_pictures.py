@@ -44,9 +44,9 @@ CAMERAS = {
     "parallel": fs.Camera.orthographic(*SIZE, 4.0),
 }
 SHUTTERS = {
-    "blur": fs.Shutter(exposure=0.3, sub_poses=5),
+    "blur": fs.Shutter(exposure_time=0.3, sub_poses=5),
     "rolling": fs.Shutter(readout=0.5, rows_per_band=7),
-    "both": fs.Shutter(time=0.2, exposure=0.2, sub_poses=2, readout=0.4, rows_per_band=16),
+    "both": fs.Shutter(time=0.2, exposure_time=0.2, sub_poses=2, readout=0.4, rows_per_band=16),
     "instant": fs.Shutter(time=0.4),
 }
 MOTION = fs.Motion(pose_at, {3: turned, 5: lambda time: turned(-time)})
@@ -79,7 +79,7 @@ def test_moving_layers(renderer, samples):
     cloud = coplanar_cloud(1)
     labels = np.where(cloud.planes < 0, 0, cloud.planes + 3)
     motion = fs.Motion(None, {3: turned, 4: lambda time: turned(-time)})
-    shutter = fs.Shutter(exposure=0.5, sub_poses=3)
+    shutter = fs.Shutter(exposure_time=0.5, sub_poses=3)
     camera = CAMERAS["pinhole"]
     assert_exposed(renderer, cloud.with_labels(labels), camera, motion, shutter, Quality(samples=samples))
 
@@ -104,7 +104,7 @@ def test_a_moved_group_is_the_transformed_cloud(renderer):
 
 def test_blur_is_the_mean_of_its_poses(renderer):
     cloud, camera = random_splats(100, 5, depth=(1, 5), scale=(0.02, 0.3)), CAMERAS["pinhole"]
-    shutter = fs.Shutter(time=0.1, exposure=0.4, sub_poses=4)
+    shutter = fs.Shutter(time=0.1, exposure_time=0.4, sub_poses=4)
     frame = renderer.render(cloud, camera, ("rgb", "alpha", "depth"), None, BACKGROUND, MOTION, shutter)
     single = [
         renderer.render(

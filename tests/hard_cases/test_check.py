@@ -48,11 +48,11 @@ class Broken:
 
 
 def test_a_good_device_passes(renderer):
-    told = []
-    result = check.run_check(renderer, [GOOD], told.append)
+    said = []
+    result = check.run_check(renderer, [GOOD], said.append)
     assert result.passed
     assert result.failures == []
-    assert told == ["arithmetic", "A1: a good case"]
+    assert said == ["arithmetic", "A1: a good case"]
     (only,) = result.groups["A"]
     assert (only.pictures, only.passed) == (1, True)
     assert set(only.largest) == set(only.uncertified) == {"rgb", "alpha", "depth"}
@@ -117,21 +117,21 @@ def test_certificates_name_what_single_precision_cannot_decide():
     needle = splats([[0.00625, 0.00625, 1]], turned((0, 0, 1), 45), (0.4, 1.25e-6))
     faint = splats([[0.00625, 0.00625, 1]], (1, 0, 0, 0), 0.2, np.float32(1 / 255) * (1 + 1e-6))
     tie = splats([[0, 0, 1], [0, 0, 2]], (1, 0, 0, 0), 50.0, [0.5, 1.0], labels=[1, 2])
-    doubt = [check.truth_of(Picture(cloud, camera(), outputs=ALL_OUTPUTS)) for cloud in (needle, faint, tie)]
-    assert doubt[0]["certificate"].max() > 1e-3
-    assert 0.003 < doubt[1]["certificate"].max() < 0.005
-    assert doubt[2]["label_may_flip"].any()
-    assert all(truth["certificate"][0, 0] < 1e-5 for truth in doubt)
+    truths = [check.truth_of(Picture(cloud, camera(), outputs=ALL_OUTPUTS)) for cloud in (needle, faint, tie)]
+    assert truths[0]["certificate"].max() > 1e-3
+    assert 0.003 < truths[1]["certificate"].max() < 0.005
+    assert truths[2]["label_may_flip"].any()
+    assert all(truth["certificate"][0, 0] < 1e-5 for truth in truths)
 
 
-def test_too_many_doubtful_pixels_fail(renderer, monkeypatch):
+def test_too_many_uncertain_pixels_fail(renderer, monkeypatch):
     truth_of = check.truth_of
 
-    def doubtful(picture):
+    def uncertain(picture):
         truth = truth_of(picture)
         return truth | {"certificate": truth["certificate"] + 0.06}
 
-    monkeypatch.setattr(check, "truth_of", doubtful)
+    monkeypatch.setattr(check, "truth_of", uncertain)
     failures = check.run_check(renderer, [GOOD]).failures
     assert "certificates above 0.05" in failures[0]
 

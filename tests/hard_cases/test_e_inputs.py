@@ -11,7 +11,7 @@ from fidsplat.hard_cases.agreement import COLOR_TOLERANCE, Picture, draw, truth_
 
 @pytest.mark.parametrize(("width", "height"), [(32767, 3), (3, 32767), (4001, 1003)])
 def test_the_largest_grids_at_a_few_pixels(renderer, width, height):
-    """E4: tens of thousands of tiles; the reference judges 200 pixels."""
+    """E4: tens of thousands of tiles; compared with the reference in 200 pixels."""
     cloud = random_splats(60, seed=45, depth=(1.0, 4.0), scale=(0.01, 0.3))
     camera = e_inputs.sized(width, height)
     generator = np.random.default_rng(0)

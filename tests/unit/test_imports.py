@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from networkx import DiGraph, strongly_connected_components
 
 import fidsplat
 
@@ -19,7 +20,7 @@ MAY_IMPORT = {
     "errors": set(),
     "files": BASE,
     "rotations": BASE,
-    "scalars": set(),
+    "scalars": {"errors"},
     "harmonics": BASE,
     "quality": BASE,
     "capture": BASE | {"cameras", "quality", "sensor", "surroundings"},
@@ -58,10 +59,25 @@ HOME_OF = {
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
     "warp": ("backends.warp",),
+    "pandas": ("experiments",),
+    "matplotlib": ("experiments.charts",),
+    "jinja2": ("experiments.pages",),
     "tyro": ("cli", "commands"),
     "rich": ("cli", "commands"),
 }
-HEAVY = ("pyopencl", "warp", "shapely", "networkx", "segno", "cv2", "zxingcpp", "tyro", "rich")
+HEAVY = (
+    "pyopencl",
+    "warp",
+    "shapely",
+    "networkx",
+    "pandas",
+    "matplotlib",
+    "segno",
+    "cv2",
+    "zxingcpp",
+    "tyro",
+    "rich",
+)
 
 # A wheel carries the kernels inside the package (`_kernels`), a checkout beside it; Warp's are Python files
 # of another house, which fidsplat loads by path and which import each other by relative names.
@@ -103,6 +119,29 @@ def test_imports_point_downwards(module):
     allowed = MAY_IMPORT[wing] | {wing}
     known = {name for name in inside if name in MODULES or f"{name}.__init__" in MODULES}
     assert {name for name in known if not within(name, allowed)} == set()
+
+
+def needed(path: Path, modules) -> set[str]:
+    """The modules that a file's import statements need, wherever they stand: `from fidsplat.a import b` needs
+    fidsplat.a.b if that is a module, else fidsplat.a. That a.b.c brings the `__init__` of a.b with it does
+    not count."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            named = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {name if name in modules else name.rpartition(".")[0] for name in named}
+    return found & set(modules)
+
+
+def test_no_module_imports_itself_by_way_of_others():
+    """Not for types alone either, nor late, inside a function."""
+    modules = {f"fidsplat.{name}".removesuffix(".__init__"): path for name, path in MODULES.items()}
+    edges = [(name, other) for name, path in modules.items() for other in needed(path, modules)]
+    assert len(edges) > len(modules)
+    circles = [sorted(circle) for circle in strongly_connected_components(DiGraph(edges)) if len(circle) > 1]
+    assert circles == []
 
 
 @pytest.mark.parametrize("package", sorted(HOME_OF))

@@ -27,7 +27,7 @@ def coverage(made: Marker, per_module: int = 12) -> tuple[np.ndarray, np.ndarray
     reach = np.sqrt(2 * np.log(255 * cloud.opacities))
     x0, x1 = (np.searchsorted(x, means[:, 0] + side * reach * scales[:, 0]) for side in (-1, 1))
     y0, y1 = (np.searchsorted(y, means[:, 1] + side * reach * scales[:, 1]) for side in (-1, 1))
-    depth, ink = np.full((len(y), len(x)), 1e-12), np.zeros((len(y), len(x)))
+    depth, shone = np.full((len(y), len(x)), 1e-12), np.zeros((len(y), len(x)))
     for i in range(len(cloud)):
         at = np.s_[y0[i] : y1[i], x0[i] : x1[i]]
         gx = np.exp(-0.5 * ((x[at[1]] - means[i, 0]) / scales[i, 0]) ** 2)
@@ -35,9 +35,9 @@ def coverage(made: Marker, per_module: int = 12) -> tuple[np.ndarray, np.ndarray
         alpha = cloud.opacities[i] * np.outer(gy, gx)
         tau = -np.log(np.maximum(1 - np.where(alpha < 1 / 255, 0, alpha), 2.0**-24))
         depth[at] += tau
-        ink[at] += tau * cloud.colors[i, 0]
+        shone[at] += tau * cloud.colors[i, 0]
     left = np.exp(-depth)
-    shown = (1 - left) * ink / depth + left * 0.5
+    shown = (1 - left) * shone / depth + left * 0.5
     return shown, np.kron(1.0 - made.grid, np.ones((per_module, per_module)))
 
 
@@ -189,14 +189,14 @@ def test_an_exact_marker_may_have_more_boxes_than_gaussians(noise):
 
 def test_clouds_are_filled_part_by_part_with_the_same_bits(noise, monkeypatch):
     for mixture in ("fitted", "exact"):
-        whole, told = marker(noise, mixture=mixture).cloud, []
+        whole, said = marker(noise, mixture=mixture).cloud, []
         with monkeypatch.context() as patched:
             patched.setattr("fidsplat.markers.printing.CHUNK", 4321)
-            parts = marker(noise, mixture=mixture, progress=lambda *now, to=told: to.append(now)).cloud
+            parts = marker(noise, mixture=mixture, progress=lambda *now, to=said: to.append(now)).cloud
         for name in ("means", "scales", "opacities", "colors", "quats"):
             assert np.array_equal(getattr(whole, name), getattr(parts, name))
-        assert [words for words, _ in told[:2]] == ["components", "rectangles"]
-        shares = [share for words, share in told if words == "splats"]
+        assert [words for words, _ in said[:2]] == ["components", "rectangles"]
+        shares = [share for words, share in said if words == "splats"]
         assert shares == sorted(shares)
         assert 0 == shares[0] < shares[-1] < 1
 

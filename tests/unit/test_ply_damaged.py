@@ -133,7 +133,7 @@ def test_pipe_is_not_waited_for(tmp_path):
 
 
 def test_name_that_cannot_be_one():
-    with pytest.raises(fs.InputError, match="cannot read"):
+    with pytest.raises(fs.InputError, match="names no file"):
         fs.load_ply("a\0b.ply")
 
 
@@ -222,7 +222,7 @@ def test_arrays_that_grow_while_a_file_is_read(tmp_path, content, monkeypatch):
 
 def test_progress_is_told(tmp_path, content, monkeypatch):
     monkeypatch.setattr(collect, "WINDOW", 128)
-    path, told = tmp_path / "good.ply", []
+    path, said = tmp_path / "good.ply", []
     path.write_bytes(content)
-    fs.load_ply(path, progress=lambda *done: told.append(done))
-    assert told == [("reading good.ply", share) for share in (128 / N, 256 / N, 1.0)]
+    fs.load_ply(path, progress=lambda *done: said.append(done))
+    assert said == [("reading good.ply", share) for share in (128 / N, 256 / N, 1.0)]

@@ -321,7 +321,7 @@ def test_a_memory_budget_counts_rays_and_the_planes_of_all_poses():
     start, end = np.eye(4), np.eye(4)
     end[0, 3] = 0.5
     poses = fs.Trajectory([-1.0, 1.0], np.stack([start, end]))
-    exposed = {"motion": fs.Motion(poses), "shutter": fs.Shutter(exposure=0.3, sub_poses=2)}
+    exposed = {"motion": fs.Motion(poses), "shutter": fs.Shutter(exposure_time=0.3, sub_poses=2)}
     wanted = fs.Renderer("warp:cpu").render(cloud, view, ("rgb", "depth"), **exposed)
     own = fs.Renderer("warp:cpu", memory_budget=7_400_000)
     frame = own.render(cloud, view, ("rgb", "depth"), **exposed)

@@ -117,3 +117,11 @@ def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch):
     # the nearer splat lets three quarters through, of which the other takes up to a half
     assert np.array_equal(toys["strongest"], plain["rgb"][..., :2].max(-1))
     assert toys["strongest"].max() == pytest.approx(0.375)
+
+
+def test_two_outputs_that_keep_a_field_of_one_name_are_told_apart(beside):
+    text = "import warp as wp\nfrom . import Output\nOUTPUT = Output(state={'normal': wp.float32})\n"
+    beside("output", "taken", text)
+    output = runtime.kernels("output")
+    with pytest.raises(ValueError, match="output taken declares state 'normal', which another has too"):
+        output.fields(output.with_needed(("normal", "taken")), "state")

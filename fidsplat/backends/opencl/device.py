@@ -11,7 +11,7 @@ import pyopencl as cl
 from fidsplat.backends.base import DeviceInfo, Rates
 from fidsplat.backends.opencl import pocl_cache, pocl_target
 from fidsplat.backends.opencl.arithmetic import run_arithmetic
-from fidsplat.backends.opencl.assemble import assemble
+from fidsplat.backends.opencl.assemble import Source, assemble
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.probe import OpenCLProbe
 from fidsplat.backends.opencl.resident import Resident
@@ -98,9 +98,7 @@ class OpenCLBackend(Workspace):
         """
         if why := self.unsupported(features):
             raise DeviceError(why)
-        if not self.info.float64 and features.setup_precision != "float32":
-            features = replace(features, setup_precision="float32")
-        key = (features, shape or shape_for(features, self.shape))
+        key = self._key(features, shape)
         if key[1].blend_items > self.device.max_work_group_size:
             raise DeviceError(
                 f"{self.info.title} has work-groups of at most {self.device.max_work_group_size}, and "
@@ -109,6 +107,15 @@ class OpenCLBackend(Workspace):
         if key not in self._pipelines:
             self._pipelines[key] = OpenCLPipeline(self, assemble(*key), *key, self.pipeline)
         return self._pipelines[key]
+
+    def _key(self, features: FeatureSet, shape: DeviceShape | None) -> tuple[FeatureSet, DeviceShape]:
+        if not self.info.float64 and features.setup_precision != "float32":
+            features = replace(features, setup_precision="float32")
+        return features, shape or shape_for(features, self.shape)
+
+    def source(self, features: FeatureSet) -> Source:
+        """The program for these features on this device, not compiled."""
+        return assemble(*self._key(features, None))
 
     @property
     def memory_bytes(self) -> int:

@@ -27,30 +27,29 @@ _DERIVED: dict[str, Callable[[View, WarpShape], Any]] = {
     "tiles_x": lambda view, shape: -(-view.width // shape.tile_width),
     "tiles_y": lambda view, shape: -(-view.height // shape.tile_height),
     "per_pixel": lambda view, shape: 1.0 / view.samples**2,
+    "ray_step": lambda view, shape: 0.0,
     "ray": lambda view, shape: _ray(view),
 }
 """fields that a view does not have by their names"""
 
 
 @cache
-def _fields() -> tuple[tuple[str, Any], ...]:
-    """Name of each field, and the type of those that are vectors or matrices."""
+def _fields() -> tuple[tuple[str, Any, Any], ...]:
+    """Name of each field, where it comes from if it is derived, and its type if it is a vector or matrix."""
     types = load().types
     kinds = {name: field.type for name, field in kernels("common").View.vars.items()}
     wide = {name for name, kind in kinds.items() if types.type_is_vector(kind) or types.type_is_matrix(kind)}
-    return tuple((name, kind if name in wide else None) for name, kind in kinds.items())
+    return tuple((name, _DERIVED.get(name), kind if name in wide else None) for name, kind in kinds.items())
 
 
 def uniforms(view: View, shape: WarpShape, sloped: bool) -> Any:
     """The struct for a picture in tiles of this shape; sloped: its kernels read rays' derivatives."""
     filled = kernels("common").View()
-    for name, wide in _fields():
-        value: Any
-        if name == "ray_step":
-            value = view.raster.step if view.raster and sloped else 0.0
-        else:
-            value = _DERIVED[name](view, shape) if name in _DERIVED else getattr(view, name)
+    for name, derive, wide in _fields():
+        value: Any = derive(view, shape) if derive else getattr(view, name)
         if wide:
             value = wide(*(value.ravel().tolist() if isinstance(value, np.ndarray) else value))
         setattr(filled, name, value)
+    if sloped and view.raster:
+        filled.ray_step = view.raster.step  # of which it takes long to ask
     return filled

@@ -96,7 +96,7 @@ class Bench:
 
         Args:
             devices: names as `Renderer` takes them.
-            tell: is told what is being done.
+            tell: called with what is being done.
             tick: is called after each frame that counts.
 
         Raises:

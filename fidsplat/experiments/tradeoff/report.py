@@ -140,6 +140,7 @@ def draw_chart(device: Device, scene: str, file: Path) -> None:
             "half a step of 8 bits", (0, INVISIBLE), (4, 3), xycoords=("axes fraction", "data"),
             textcoords="offset points", fontsize=9, color="#555555",
         )  # fmt: skip
+        axes.margins(0.08)
         plain_ticks(axes.xaxis)
         axes.set_title(f"{scene} on {device.title}")
         figure.legend(loc="outside lower center", ncols=4, frameon=False)

@@ -1,4 +1,4 @@
-// Some splats are boxes (slot/box_edges.cl), the others Gaussians: the choice is made for each splat.
+// Some splats are boxes (part/box_edges.cl), the others Gaussians: the choice is made for each splat.
 //@ footprint
 #define IS_BOX(s) ((s)->box)
 //@ footprint_here

@@ -11,7 +11,7 @@
     layer->mean.blended = VSELECT(layer->mean.blended, other->mean.blended, mask);
 //@ gather
     layer->mean.blended += VSELECT((vint)0, (vint)1, VMASK(opacity > 0.0f));
-//@ lay
+//@ composite
     pixel->blended += live & seen->blended;
 //@ store
         VSTORE(pixel->blended, blended_raw + at);

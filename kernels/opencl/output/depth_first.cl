@@ -6,7 +6,7 @@
     pixel->depth_first = 0.0f;
 //@ pixels_start
     for (int row = 0; row < (int)(sizeof(pixels) / sizeof(pixels[0])); row++) pixels[row].first_light = first_light;
-//@ lay
+//@ composite
     pixel->depth_first = VSELECT(pixel->depth_first, seen->z,
                                  live & VMASK(pixel->depth_first == 0.0f) & VMASK(pixel->t - weight <= pixel->first_light));
 //@ store

@@ -25,7 +25,7 @@
 //@ footprint_opacity
     if (IS_BOX(s)) opacity = fmin(exp(s->log_opacity), constants->ceiling) * c.cover;
 //@ footprint_tau
-    // what lies side by side adds up: the ink of boxes is the area that they cover, and their colour its mean
+    // what lies side by side adds up: the optical depth of boxes is the area that they cover, and their colour its mean
     if (IS_BOX(s)) tau = opacity;
 //@ footprint_gather
-    if (IS_BOX(s)) layer->opacity = fmin(layer->ink, (vfloat)1.0f);
+    if (IS_BOX(s)) layer->opacity = fmin(layer->optical_depth, (vfloat)1.0f);

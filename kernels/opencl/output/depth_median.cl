@@ -7,7 +7,7 @@
 //@ start
     pixel->depth_median = 0.0f;
     pixel->median_light = 1.0f;
-//@ lay
+//@ composite
     vfloat behind = pixel->t - weight;
     vint counts = live & VMASK(pixel->t > 0.5f) & VMASK(pixel->median_light - behind >= LEAST_ALPHA);
     pixel->depth_median = VSELECT(pixel->depth_median, seen->z, counts);

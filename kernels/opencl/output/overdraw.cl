@@ -1,4 +1,4 @@
-// overdraw (h, w) int: fragments that the samples of a pixel draw, those of a layer when it is laid. No output for users:
+// overdraw (h, w) int: fragments that the samples of a pixel draw, those of a layer when it is composited. No output for users:
 // `fidsplat bench` counts with it what a frame must blend.
 //@ state
     vint overdraw;
@@ -12,7 +12,7 @@
     layer->mean.fragments = VSELECT(layer->mean.fragments, other->mean.fragments, mask);
 //@ gather
     layer->mean.fragments -= mask;
-//@ lay
+//@ composite
     pixel->overdraw += seen->fragments & live;
 //@ store
         VSTORE(pixel->overdraw, overdraw_raw + at);

@@ -26,7 +26,7 @@
     layer->mean.nx = FMA(share, seen->nx - layer->mean.nx, layer->mean.nx);
     layer->mean.ny = FMA(share, seen->ny - layer->mean.ny, layer->mean.ny);
     layer->mean.nz = FMA(share, seen->nz - layer->mean.nz, layer->mean.nz);
-//@ lay
+//@ composite
     pixel->normal_x = FMA(weight, seen->nx, pixel->normal_x);
     pixel->normal_y = FMA(weight, seen->ny, pixel->normal_y);
     pixel->normal_z = FMA(weight, seen->nz, pixel->normal_z);

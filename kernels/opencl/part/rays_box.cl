@@ -1,4 +1,4 @@
-// Edges of boxes (slot/box_cover.cl) where samples have rays of their own: curves, which within a sample are straight. The
+// Edges of boxes (part/box_cover.cl) where samples have rays of their own: curves, which within a sample are straight. The
 // gradients of the forms come from the ray's derivatives by the sample's position, in the buffer `ray_slopes`: 6 planes
 // dX/dx, dY/dx, dZ/dx, dX/dy, dY/dy, dZ/dy.
 //@ footprint_functions

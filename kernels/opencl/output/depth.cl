@@ -4,7 +4,7 @@
 //@ start
     pixel->depth = 0.0f;
     pixel->depth_weight = 0.0f;
-//@ lay
+//@ composite
     pixel->depth = FMA(weight, seen->z, pixel->depth);
     pixel->depth_weight += weight;
 //@ store

@@ -20,7 +20,7 @@
 //@ gather
     layer->mean.splat_id = VSELECT(layer->mean.splat_id, seen->splat_id, VMASK(tau > layer->splat_id_tau));
     layer->splat_id_tau = fmax(layer->splat_id_tau, tau);
-//@ lay
+//@ composite
     vint heavier_id = VMASK(weight > pixel->splat_id_weight);
     pixel->splat_id = VSELECT(pixel->splat_id, seen->splat_id, heavier_id);
     pixel->splat_id_weight = fmax(pixel->splat_id_weight, weight);

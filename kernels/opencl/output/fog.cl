@@ -1,5 +1,5 @@
 // Fog of even density: of what is seen at distance r along the ray exp(-density r) is left, the rest is the fog's colour. Exact for
-// each fragment and layer, as each is laid with its own distance. Behind everything is fog alone: its colour is the background.
+// each fragment and layer, as each is composited with its own distance. Behind everything is fog alone: its colour is the background.
 //@ state
     vfloat fog_slope;       // -density, per metre of depth
     vfloat fogged;          // sum of weights times what the fog hides
@@ -19,7 +19,7 @@
 //@@ fog_length
                 ;
         }
-//@ lay
+//@ composite
     vfloat hidden = weight * (1.0f - exp(pixel->fog_slope * seen->z));
     pixel->r = FMA(-hidden, seen->r, pixel->r);
     pixel->g = FMA(-hidden, seen->g, pixel->g);

@@ -20,7 +20,7 @@
 //@ gather
     layer->mean.label = VSELECT(layer->mean.label, seen->label, VMASK(tau > layer->label_tau));
     layer->label_tau = fmax(layer->label_tau, tau);
-//@ lay
+//@ composite
     vint heavier = VMASK(weight > pixel->label_weight);
     pixel->label = VSELECT(pixel->label, seen->label, heavier);
     pixel->label_weight = fmax(pixel->label_weight, weight);

@@ -1,4 +1,4 @@
-// Edges of boxes (slot/box_cover.cl) where forms are affine in the sample: straight lines, whose distances in samples need
+// Edges of boxes (part/box_cover.cl) where forms are affine in the sample: straight lines, whose distances in samples need
 // one number for each edge of a splat.
 //@ footprint_functions
 static inline vfloat between(vfloat d, vfloat n, wide edge_0, wide edge_1) {
