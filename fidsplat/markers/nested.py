@@ -2,8 +2,9 @@
 
 Along each axis stands one Gaussian in the middle and pairs at the distances d = RATIO^-k from the ends, each
 as wide as lets it fall to 1/255, where other renderers cut it off, OVERHANG beyond the end; a template is
-their product over both axes. Every point inside lies in the cores of several, so that the rectangle is opaque
-up to its edges, and nothing reaches further beyond than the overhang, in whatever order splats are composited.
+their product over both axes. Every point inside lies in the cores of several, so that the rectangle is
+opaque up to its edges, and nothing reaches further beyond than the overhang, in whatever order splats are
+composited.
 """
 
 from __future__ import annotations
