@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from fidsplat.commands.experiment_files import CATEGORY_HELP, write_report
 from fidsplat.commands.output import Json, console, option, print_json
@@ -38,9 +38,8 @@ class Basic:
 
         # rough results and full ones do not mix
         out = self.out or "fidsplat-experiments" + ("-quick" if getattr(self, "quick", False) else "")
-        given = {field.name: getattr(self, field.name, None) for field in fields(Options)} | {
-            "out": Path(out)
-        }
+        given: dict[str, Any] = {field.name: getattr(self, field.name, None) for field in fields(Options)}
+        given["out"] = Path(out)
         return Options(**{name: value for name, value in given.items() if value is not None})
 
 

@@ -59,10 +59,25 @@ HOME_OF = {
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
     "warp": ("backends.warp",),
+    "pandas": ("experiments",),
+    "matplotlib": ("experiments.charts",),
+    "jinja2": ("experiments.pages",),
     "tyro": ("cli", "commands"),
     "rich": ("cli", "commands"),
 }
-HEAVY = ("pyopencl", "warp", "shapely", "networkx", "segno", "cv2", "zxingcpp", "tyro", "rich")
+HEAVY = (
+    "pyopencl",
+    "warp",
+    "shapely",
+    "networkx",
+    "pandas",
+    "matplotlib",
+    "segno",
+    "cv2",
+    "zxingcpp",
+    "tyro",
+    "rich",
+)
 
 # A wheel carries the kernels inside the package (`_kernels`), a checkout beside it; Warp's are Python files
 # of another house, which fidsplat loads by path and which import each other by relative names.

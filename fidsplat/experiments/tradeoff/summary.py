@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from fidsplat.errors import InputError
@@ -122,7 +123,7 @@ class Device:
         return self.points.loc[(scene, knob, value)] if (scene, knob, value) in self else None
 
     def of(self, scene: str) -> Frame:
-        """What was measured on a scene, knob by knob in their order, with `ms` as `ms_of` has it."""
+        """What was measured on a scene, knob by knob in their order; `ms` is beside the base's median."""
         found: Frame = self.points[self.points["scene"] == scene]
         order = found["knob"].map(list(("base", *KNOBS)).index)
         found = found.iloc[order.argsort(kind="stable")]
@@ -185,8 +186,9 @@ class Device:
     def read_to(self, marker: str, knob: str, value: str) -> float | None:
         """The largest tilt, degrees, up to which a marker is read at every tilt of the scan; None if it was
         not scanned or is not read frontally."""
-        rows = self.summary.rows
-        found = rows[(rows[list(ABOUT)] == (DECODE, marker, knob, value)).all(axis=1)]["read_to"].dropna()
+        rows, wanted = self.summary.rows, (DECODE, marker, knob, value)
+        same = [rows[column] == one for column, one in zip(ABOUT, wanted, strict=True)]
+        found = rows.loc[np.logical_and.reduce(same), "read_to"].dropna()
         return None if found.empty else float(found.iloc[0])
 
 
