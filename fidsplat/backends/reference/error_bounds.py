@@ -168,8 +168,8 @@ def of_places(span: Span, is_layer: np.ndarray) -> np.ndarray:
     """What may change (k,) in colour where it is not certain in which order layers and fragments
     are composited.
 
-    Columns (k, m) in the order in which they arrive. Two things composited the other way round change a colour
-    by the product of their opacities and the light in front of them, at most.
+    Columns (k, m) in the order in which they arrive. Two that are composited the other way round change a
+    colour by the product of their opacities and the light in front of them, at most.
     """
     bound = np.zeros(len(span.low))
     layers = np.flatnonzero(is_layer).tolist()
