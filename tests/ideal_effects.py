@@ -73,7 +73,7 @@ def _samples(placed: PlacedMarker, view: View) -> np.ndarray:
     middle = moved.rotation @ placed.pose[:3, 3] + moved.translation
     start = np.zeros_like(rays)
     if view.parallel:
-        start[:, 0], start[:, 1] = (x - view.cx) / view.fx, (y - view.cy) / view.fy
+        start[:, 0], start[:, 1] = (x - view.center_x) / view.focal_x, (y - view.center_y) / view.focal_y
     with np.errstate(divide="ignore", invalid="ignore"):
         along = (middle - start) @ turn[:, 2] / (rays @ turn[:, 2])
         place = (start + along[:, None] * rays - middle) @ turn[:, :2] / placed.marker.module
