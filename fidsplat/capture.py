@@ -44,7 +44,7 @@ class Capture(PickledByFields):
         put = object.__setattr__
         if self.camera is not None and not isinstance(self.camera, Camera):
             raise InputError(f"camera is {self.camera!r}; it must be a Camera, e.g. fs.Camera.look_at(...)")
-        put(self, "outputs", _names(self.outputs))
+        put(self, "outputs", output_names(self.outputs))
         put(self, "quality", Quality.of(self.quality))
         put(self, "background", background_of(self.background))
         for name, kind in (("motion", Motion), ("shutter", Shutter), ("sensor", Sensor)):
@@ -83,7 +83,8 @@ class Capture(PickledByFields):
         return replace(self, **{name: value for name, value in changes.items() if value is not None})
 
 
-def _names(outputs: Any) -> tuple[str, ...]:
+def output_names(outputs: Any) -> tuple[str, ...]:
+    """Names of outputs, each once, from one or several. Raises InputError for anything else, and for none."""
     names = (outputs,) if isinstance(outputs, str) else outputs
     names = tuple(names) if isinstance(names, Iterable) else (names,)
     if not names:

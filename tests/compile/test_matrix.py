@@ -34,7 +34,8 @@ def assert_well_formed(names):
         assert heads.keys() == source.arguments.keys()
         for kernel, arguments in source.arguments.items():
             lines = [line.strip(" ,") for line in heads[kernel].splitlines() if line and line[0] != "#"]
-            assert lines == [one.text for one in arguments], kernel
+            declared = [one.text.replace("wide", source.scalars.wide) for one in arguments]
+            assert lines == declared, kernel
         taken = {one.name for one in source.arguments["resolve"]}
         assert {f"{output.name}_out" for output in features.outputs} <= taken
         assert {one.name for one, _ in source.samples} <= taken

@@ -21,21 +21,21 @@ def composite(
     """Samples (k,) at grid positions x, y against all splats: what blending leaves, before resolving."""
     f = fragments_of(s, view, x, y)
     span = error_bounds.span_of(s, view, f)
-    columns = in_order(s, f, span) if s.planes is None else in_layers(s, f, span, s.planes)
-    alpha, z, span = columns.alpha, columns.z, columns.span
+    stack = in_order(s, f, span) if s.planes is None else in_layers(s, f, span, s.planes)
+    alpha, z, span = stack.alpha, stack.z, stack.span
     before, live, final = _transmittance(alpha, view.stop, s.exclusive)
     weight = np.where(live, before * alpha, 0.0)
     out = {
-        "rgb": _sum(weight, columns.colors),
+        "rgb": _sum(weight, stack.colors),
         "t": final,
-        "certificate": error_bounds.of_color(s, view, span, before, columns.moved) + columns.reordered,
+        "certificate": error_bounds.of_color(s, view, span, before, stack.moved) + stack.reordered,
     }
     out["shown"] = 1 - final >= LEAST_ALPHA
     out["shown_may_flip"] = np.abs(1 - final - LEAST_ALPHA) <= out["certificate"] + error_bounds.STOP
     if "fog" in features.posts:
         reach = -view.fog_density * ray_lengths(x, y, view)[:, None]
         left = np.exp(reach * z)
-        out["rgb"] = _sum(weight * left, columns.colors)
+        out["rgb"] = _sum(weight * left, stack.colors)
         out["fogged"] = (weight * (1 - left)).sum(1)
         with np.errstate(invalid="ignore"):
             moved = np.abs(np.exp(reach * np.maximum(span.z_low, 0)) - np.exp(reach * span.z_high))
@@ -45,7 +45,7 @@ def composite(
         out["rgb"] = out["rgb"] + final[:, None] * behind
         out["behind_bound"] = final * moved
     drawn = live & (alpha > 0)
-    uncertain = columns.reordered > 0
+    uncertain = stack.reordered > 0
     if {"depth", "depth_median", "depth_first"} & features.names:
         out["weight"] = weight.sum(1)
         out["depth"] = (weight * z).sum(1)
@@ -65,9 +65,9 @@ def composite(
             > 1e-5 * out["depth_first"]
         )
     if "normal" in features.names:
-        out["normal"] = _sum(weight, columns.normal)
-    ids = {"label": columns.labels, "splat_id": columns.ids}
-    flips = {"label": columns.label_may_flip, "splat_id": columns.id_may_flip}
+        out["normal"] = _sum(weight, stack.normal)
+    ids = {"label": stack.labels, "splat_id": stack.ids}
+    flips = {"label": stack.label_may_flip, "splat_id": stack.id_may_flip}
     for name in sorted(ids.keys() & features.names):
         heaviest = _first(weight)
         out["heaviest"] = _pick(weight, heaviest, out["shown"], 0.0)
@@ -77,9 +77,9 @@ def composite(
     if "splat_id" in features.names and len(s.order):
         out["splat_id"] = np.where(out["splat_id"] >= 0, s.order[out["splat_id"].astype(int)], -1)
     if "blended" in features.names:
-        out["blended"] = np.where(drawn, columns.count, 0).sum(1)
+        out["blended"] = np.where(drawn, stack.count, 0).sum(1)
         out["blended_bound"] = error_bounds.of_count(
-            span, columns.count, columns.count_bound, view.stop, uncertain
+            span, stack.count, stack.count_bound, view.stop, uncertain
         )
     return out
 

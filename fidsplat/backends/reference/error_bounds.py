@@ -165,10 +165,11 @@ def first_column(mask: np.ndarray, start: int) -> np.ndarray:
 
 
 def of_places(span: Span, is_layer: np.ndarray) -> np.ndarray:
-    """What may change (k,) in colour where it is not certain which of layers and fragments comes first.
+    """What may change (k,) in colour where it is not certain in which order layers and fragments
+    are composited.
 
-    Columns (k, m) in the order in which they arrive. Two things the other way round change a colour by the
-    product of their opacities and the light in front of them, at most.
+    Columns (k, m) in the order in which they arrive. Two that are composited the other way round change a
+    colour by the product of their opacities and the light in front of them, at most.
     """
     bound = np.zeros(len(span.low))
     layers = np.flatnonzero(is_layer).tolist()
@@ -195,7 +196,7 @@ def of_places(span: Span, is_layer: np.ndarray) -> np.ndarray:
         for second, d in enumerate(layers[:number]):
             meet = (earliest[:, number] <= latest[:, second]) & (earliest[:, second] <= latest[:, number])
             level = (span.z_low[:, c] <= span.z_high[:, d]) & (span.z_low[:, d] <= span.z_high[:, c])
-            # a fragment behind the further is behind the nearer too and composites both, unless it is late
+            # what lies behind the further one lies behind the nearer too and lays both, unless that is late
             apart = span.z_low[:, d] > span.z_high[:, c]
             late = apart & (earliest[:, second] < c) & (latest[:, second] > c)
             unsure = drawn[:, number] & drawn[:, second] & ((level & meet) | late)

@@ -18,8 +18,9 @@ from fidsplat.backends.reference.setup import Setup
 
 
 @dataclass
-class Columns:
-    """What k samples see, m things each in the order of compositing: fragments, or layers as one."""
+class Stack:
+    """What k samples see, m things each in the order in which they are composited: fragments, or layers as
+    one."""
 
     alpha: np.ndarray
     """(k, m), as z [m], labels, moved, label_may_flip"""
@@ -43,7 +44,7 @@ class Columns:
     reordered: np.ndarray
     """(k,) what may change in colour because things may be composited in another order"""
 
-    def take(self, rank: np.ndarray) -> Columns:
+    def take(self, rank: np.ndarray) -> Stack:
         """The same in another order: rank (k, m)."""
 
         def of(array: np.ndarray) -> np.ndarray:
@@ -51,7 +52,7 @@ class Columns:
 
         s = self.span
         span = Span.of(of(s.low), of(s.high), of(s.z_low), of(s.z_high))
-        return Columns(
+        return Stack(
             span=span, reordered=self.reordered, **{name: of(getattr(self, name)) for name in _COLUMNS}
         )
 
@@ -69,14 +70,14 @@ _COLUMNS = (
     "label_may_flip",
     "id_may_flip",
 )
-"""fields of Columns that have a value for each of the m things"""
+"""fields of Stack that have a value for each of the m things"""
 
 
-def in_order(s: Setup, f: Fragments, span: Span) -> Columns:
+def in_order(s: Setup, f: Fragments, span: Span) -> Stack:
     """Every fragment by itself, in the depth order of the splats."""
     shape = f.alpha.shape
     nothing = np.zeros(shape)
-    return Columns(
+    return Stack(
         alpha=f.alpha,
         z=f.z,
         span=span,
@@ -93,8 +94,8 @@ def in_order(s: Setup, f: Fragments, span: Span) -> Columns:
     )
 
 
-def in_layers(s: Setup, f: Fragments, span: Span, planes: np.ndarray) -> Columns:
-    """The fragments of each plane as one layer, each where the rule places it. planes (n,): -1 for none."""
+def in_layers(s: Setup, f: Fragments, span: Span, planes: np.ndarray) -> Stack:
+    """The fragments of each plane as one layer, each where the rule lays it. planes (n,): -1 for none."""
     plain = np.flatnonzero(planes < 0)
     members = [np.flatnonzero(planes == plane) for plane in np.unique(planes[planes >= 0])]
     members.sort(key=lambda splats: splats[0])
@@ -112,10 +113,10 @@ def in_layers(s: Setup, f: Fragments, span: Span, planes: np.ndarray) -> Columns
     return columns.take(np.lexsort((nearness, behind, place), axis=1))
 
 
-def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Columns:
+def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Stack:
     k, m = len(f.alpha), len(splats)
     nothing = np.zeros((k, m))
-    return Columns(
+    return Stack(
         alpha=f.alpha[:, splats],
         z=f.z[:, splats],
         span=Span.of(
@@ -134,7 +135,7 @@ def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Columns:
     )
 
 
-def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Columns:
+def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Stack:
     """The layer (k, 1) of the splats (indices) of a plane."""
     alpha, z = f.alpha[:, splats], f.z[:, splats]
     low, high = span.low[:, splats], span.high[:, splats]
@@ -157,7 +158,7 @@ def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Columns:
     depth = np.where(total > 0, (share * z).sum(1, keepdims=True), (z_low + z_high) / 2)
     covered = (_covered(each, boxes) for each in (alpha, low, high))
     opacity, least, most = covered
-    return Columns(
+    return Stack(
         alpha=opacity,
         z=depth,
         span=Span.of(least, most, z_low, z_high),
@@ -181,7 +182,7 @@ def _covered(opacity: np.ndarray, boxes: bool) -> np.ndarray:
     return 1 - (1 - opacity).prod(1, keepdims=True)
 
 
-def _side_by_side(parts: list[Columns]) -> Columns:
+def _side_by_side(parts: list[Stack]) -> Stack:
     def joined(name: str) -> np.ndarray:
         return np.concatenate([getattr(part, name) for part in parts], axis=1)
 
@@ -189,13 +190,13 @@ def _side_by_side(parts: list[Columns]) -> Columns:
         np.concatenate([getattr(part.span, name) for part in parts], axis=1)
         for name in ("low", "high", "z_low", "z_high")
     )
-    return Columns(
+    return Stack(
         span=Span.of(*spans), reordered=parts[0].reordered, **{name: joined(name) for name in _COLUMNS}
     )
 
 
-def _places(columns: Columns, is_layer: np.ndarray) -> np.ndarray:
-    """Before which column (k, m) each is composited; a fragment at its own, m for those at the end."""
+def _places(columns: Stack, is_layer: np.ndarray) -> np.ndarray:
+    """Before which column (k, m) each is composited; a fragment at its own, m for what comes at the end."""
     k, m = columns.alpha.shape
     place = np.tile(np.arange(m), (k, 1))
     drawn = columns.alpha > 0

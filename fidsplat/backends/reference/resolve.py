@@ -34,11 +34,11 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
             unsure = unsure + samples["behind_bound"].mean(1)
         columns, rows = (np.floor(center / view.samples).astype(int) for center in (center_x, center_y))
         out["rgb"], out["certificate_rgb"] = apply_sensor(out["rgb"], unsure, steps, view, columns, rows)
-    bound = samples.get("certificate_planes", bound)  # the other outputs show one shot
+    bound = samples.get("certificate_planes", bound)  # the other planes show one shot
     if "alpha" in features.names:
         out["alpha"] = 1 - t
     covered, unsure = samples["shown"], np.asarray(samples["shown_may_flip"].any(1))
-    covered_bound = np.where(covered, bound, 0.0).sum(1)
+    bound_covered = np.where(covered, bound, 0.0).sum(1)
     # of the ray through each sample, per metre of depth
     length = ray_lengths(samples["x"], samples["y"], view)
     if "depth" in features.names:
@@ -51,9 +51,9 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
             # light that moves from the nearest to the furthest fragment, in a mean over at least `least`
             spread = np.where(covered, samples["furthest"] * along, -math.inf).max(1)
             spread -= np.where(covered, samples["nearest"] * along, math.inf).min(1)
-            moved = covered_bound * np.where(covered_bound > 0, np.maximum(spread, 0), 0)
+            moved = bound_covered * np.where(bound_covered > 0, np.maximum(spread, 0), 0)
             moved += (off * along).sum(1)
-            least = weight.sum(1) - covered_bound
+            least = weight.sum(1) - bound_covered
             out[f"certificate_{name}"] = _where_covered(_ratio(moved, least, math.inf), covered, unsure)
     for name, along in (("depth_median", "distance_median"), ("depth_first", "distance_first")):
         if name in features.names:
@@ -66,9 +66,9 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
         out["normal"] = total / np.where(length > 0, length, 1)[:, None]
         turns = view.turns_of_rows[np.floor(center_y / view.samples).astype(int)]
         out["normal_world"] = np.einsum("ki,kij->kj", out["normal"], turns)
-        moved = 2 * covered_bound + _ROUND * (1 - samples["t"]).sum(1)
+        moved = 2 * bound_covered + _ROUND * (1 - samples["t"]).sum(1)
         out["certificate_normal"] = _where_covered(
-            _ratio(moved, length - covered_bound, math.inf), covered, unsure
+            _ratio(moved, length - bound_covered, math.inf), covered, unsure
         )
         out["certificate_normal_world"] = out["certificate_normal"]
     for name in sorted({"label", "splat_id"} & features.names):
@@ -101,7 +101,7 @@ def _nearest(values: np.ndarray) -> np.ndarray:
 
 
 def _where_covered(bound: np.ndarray, covered: np.ndarray, unsure: np.ndarray) -> np.ndarray:
-    """What may change (k,) in an output that is 0 where no sample (k, n) is covered, which may flip."""
+    """What may change (k,) in a plane that is 0 where no sample (k, n) is covered of, which may flip."""
     return np.where(unsure, math.inf, np.where(covered.any(1), bound, 0.0))
 
 
