@@ -20,7 +20,7 @@ class Capture(PickledByFields):
     """How a picture is taken: from where, of what, and how well.
 
     The same object works on every device. Raises InputError for a value of the wrong kind; whether an output
-    exists is told when it is drawn.
+    exists is checked when it is drawn.
     """
 
     camera: Camera | None = None
@@ -44,7 +44,7 @@ class Capture(PickledByFields):
         put = object.__setattr__
         if self.camera is not None and not isinstance(self.camera, Camera):
             raise InputError(f"camera is {self.camera!r}; it must be a Camera, e.g. fs.Camera.look_at(...)")
-        put(self, "outputs", _names(self.outputs))
+        put(self, "outputs", output_names(self.outputs))
         put(self, "quality", Quality.of(self.quality))
         put(self, "background", background_of(self.background))
         for name, kind in (("motion", Motion), ("shutter", Shutter), ("sensor", Sensor)):
@@ -84,7 +84,8 @@ class Capture(PickledByFields):
         return replace(self, **given) if given else self
 
 
-def _names(outputs: Any) -> tuple[str, ...]:
+def output_names(outputs: Any) -> tuple[str, ...]:
+    """Names of outputs, each once, from one or several. Raises InputError for anything else, and for none."""
     names = (outputs,) if isinstance(outputs, str) else outputs
     names = tuple(names) if isinstance(names, Iterable) else (names,)
     if not names:

@@ -23,8 +23,10 @@ ARITHMETIC = ("precise", "fast")
 BLEND_PRECISIONS = ("float32", "float64")
 MAX_SAMPLES = 8
 MIXTURES = ("fitted", "paper", "exact")
-TEMPLATE_SIZES = (1, 5, 9, 13, 25, 41)
-"""Gaussians of a rectangle in the templates that are shipped (fidsplat/markers/templates.json)"""
+NESTED = 562
+TEMPLATE_SIZES = (1, 5, 9, 13, 25, 41, NESTED)
+"""Gaussians of a rectangle in the templates that are shipped (fidsplat/markers/templates.json), and in the
+opaque one (fidsplat/markers/nested.py)"""
 MAX_LEVELS, MAX_DENSITY = 8, 100
 
 
@@ -73,7 +75,8 @@ class MarkerQuality:
 
     template: int = 25
     """Of `fitted`: Gaussians of a rectangle up to an aspect ratio of 6, one of `TEMPLATE_SIZES`: 1, 5, 9,
-    13, 25 or 41. Fewer are drawn faster and leave edges blurred and corners round."""
+    13, 25, 41 or 562. Fewer are drawn faster and leave edges blurred and corners round; 562 are opaque and
+    look printed in every renderer."""
 
     def __post_init__(self) -> None:
         _one_of("marker quality: mixture", self.mixture, MIXTURES)

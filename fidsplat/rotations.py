@@ -96,7 +96,8 @@ def rigid_matrix(position, quaternion=(1.0, 0.0, 0.0, 0.0), scale: float = 1.0) 
     move, turn = real_array("position", position), real_array("quaternion", quaternion)
     if move.shape != (3,) or not np.isfinite(move).all():
         raise InputError(f"position must be three finite numbers, not {position!r}")
-    length = np.linalg.norm(turn) if turn.shape == (4,) else np.nan
+    with np.errstate(over="ignore"):  # what is too long for a float is infinitely long, and refused
+        length = np.linalg.norm(turn) if turn.shape == (4,) else np.nan
     if not (0 < length < np.inf):
         raise InputError(
             f"quaternion must be four finite numbers (w, x, y, z), not all 0, but it is {quaternion!r}"

@@ -74,7 +74,10 @@ class Panorama(PickledByFields):
     """where it came from"""
 
     def __post_init__(self) -> None:
-        given = np.asarray(self.image)
+        try:
+            given = np.asarray(self.image)
+        except ValueError:  # rows that differ in length
+            given = np.empty(0)
         if given.ndim != 3 or given.shape[2] != 3 or given.dtype.kind not in "fiu":
             raise InputError(
                 f"background: a panorama must be (h, w, 3) numbers, not {given.shape} {given.dtype}"

@@ -162,8 +162,8 @@ def assert_drawn(renderer: fs.Renderer, names: Iterable[str]) -> None:
     asked = combination(names)
     frame = renderer.render(asked.cloud, asked.capture)
     view = view_of(asked.capture, asked.cloud.origin)
-    judge = ReferenceBackend()
-    truth = judge.pipeline(asked.features("alpha")).render(judge.upload(asked.cloud), view).images
+    reference = ReferenceBackend()
+    truth = reference.pipeline(asked.features("alpha")).render(reference.upload(asked.cloud), view).images
     differences = compare(frame, truth, frame.outputs)
     if any(SWITCHES[name].kind in COARSE for name in names):
         assert all(one.finite for one in differences)

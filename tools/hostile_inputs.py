@@ -192,6 +192,8 @@ def words(rng: Random, folder: Path) -> int:
                     ["", ",", "=", *NUMBERS]
                 )
         given = given or [""]
+    if slow:  # which would work for minutes, were its words good after all
+        given.append("--debugg")
     with _inside(folder):
         return cli.main([word for word in given if word != "--debug"])
 

@@ -37,11 +37,13 @@ class View:
     """samples"""
     samples: int
     """per pixel and axis"""
-    fx: float
-    """samples, as fy, cx, cy"""
-    fy: float
-    cx: float
-    cy: float
+    focal_x: float
+    """samples per unit of what the lens makes of a direction: of x / z for a pinhole, of radians for a
+    panorama, of metres where rays are parallel. A camera's fx is that in pixels"""
+    focal_y: float
+    center_x: float
+    """samples: where the optical axis meets the picture, as center_y"""
+    center_y: float
     rotation: np.ndarray
     """(3, 3) world to camera"""
     translation: np.ndarray
@@ -69,7 +71,7 @@ class View:
     along_ray: bool = False
     """whether near, far, sort keys and depths are distances from the camera's centre; else along z"""
     parallel: bool = False
-    """whether all rays are parallel to z; fx and fy are samples per metre then"""
+    """whether all rays are parallel to z; focal_x and focal_y are samples per metre then"""
     groups: tuple[tuple[int, View], ...] = ()
     """(label, the view that its splats have), for splats that move by themselves"""
     shots: tuple[Shot, ...] = ()
@@ -99,7 +101,7 @@ class View:
         return replace(
             self,
             height=end - top,
-            cy=self.cy - top,
+            center_y=self.center_y - top,
             raster=None if self.raster is None else self.raster.cropped(top, end),
             groups=tuple((label, view.rows(top, end)) for label, view in self.groups),
         )
@@ -112,7 +114,7 @@ class View:
                 # depths are distances already: rays of a length of 1 per metre of depth
                 return math.inf, math.inf, 0.0, 0.0
             case "ray":
-                return self.fx, self.fy, self.cx, self.cy
+                return self.focal_x, self.focal_y, self.center_x, self.center_y
             case "rotation":
                 return tuple(self.rotation.ravel().tolist())
             case "gradient" if isinstance(around, Gradient):
@@ -123,7 +125,7 @@ class View:
                 return np.int32(width), np.int32(height)
             case "vignette_center":
                 half_diagonal = math.hypot(self.width, self.height) / 2 / self.samples
-                return self.cx / self.samples, self.cy / self.samples, 1 / half_diagonal
+                return self.center_x / self.samples, self.center_y / self.samples, 1 / half_diagonal
             case "first_light" | "fog_density":
                 return (getattr(self, name),)
             case _:
@@ -167,10 +169,10 @@ class View:
             width=camera.width * n,
             height=camera.height * n,
             samples=n,
-            fx=camera.fx * n,
-            fy=camera.fy * n,
-            cx=camera.cx * n,
-            cy=camera.cy * n,
+            focal_x=intrinsics[0],
+            focal_y=intrinsics[1],
+            center_x=intrinsics[2],
+            center_y=intrinsics[3],
             rotation=rotation,
             translation=-rotation @ eye,
             # colours that depend on the view see parallel rays come from very far away

@@ -13,7 +13,7 @@ import numpy as np
 
 from fidsplat.errors import InputError
 from fidsplat.rotations import check_similarity, matrix_to_quaternion
-from fidsplat.scalars import PickledByFields, own_scalars
+from fidsplat.scalars import PickledByFields, own_scalars, real_array
 
 if TYPE_CHECKING:
     from fidsplat.cameras.pinhole import Camera
@@ -87,10 +87,7 @@ class Trajectory(PickledByFields):
     """(k, 4, 4) rigid"""
 
     def __post_init__(self) -> None:
-        try:
-            times = np.array(self.times, np.float64)
-        except (TypeError, ValueError):
-            times = np.empty(0)
+        times = real_array("the times of a trajectory", self.times, "increasing numbers of seconds")
         if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
             raise InputError(
                 "the times of a trajectory must be one or more finite, increasing numbers of seconds, not "

@@ -40,7 +40,7 @@ The mixture exact draws every rectangle as one box with sharp edges. A PLY file 
 the Gaussians of fitted, and says so.
 
 Knobs of the mixtures (fs.MarkerQuality) are part of a quality: marker.levels (1 to 8) and marker.density (1
-to 100) of paper, marker.template of fitted (Gaussians of a rectangle: 1, 5, 9, 13, 25 or 41), and
+to 100) of paper, marker.template of fitted (Gaussians of a rectangle: 1, 5, 9, 13, 25, 41 or 562), and
 marker.growth (modules).
 
 A picture of noise becomes tens of millions of splats; more than a million are refused unless --max-splats

@@ -132,7 +132,7 @@ def compare(images: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], o
             error = error.max(-1)
         if TOLERANCE[name] == 0:
             error = error > (
-                DEPTH_TOLERANCE * want if name.startswith("d") else truth.get(f"{name}_doubt", 0)
+                DEPTH_TOLERANCE * want if name.startswith("d") else truth.get(f"{name}_bound", 0)
             )
             worst = float(error.mean())
             beyond = float((error & ~truth.get(f"{name}_may_flip", np.zeros(error.shape, bool))).mean())

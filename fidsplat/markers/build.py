@@ -175,7 +175,7 @@ def marker(
             drawings.
         levels, density, duplicates: of the mixture `paper` only, see `paper_template`; default 4, 3, False.
         template: of the mixtures `fitted` and (for `Marker.gaussians`) `exact` only: Gaussians of a
-            rectangle, 1, 5, 9, 13, 25 or 41; default 25.
+            rectangle, 1, 5, 9, 13, 25, 41 or 562; default 25.
         growth: modules, 0 to 1, by which a rectangle reaches into its own colour beyond a side that is wholly
             shared with it, against seams; default what the fitted templates were optimised with, and 0 for
             paper.

@@ -91,7 +91,7 @@ def _commands(text: str) -> Iterator[tuple[str, np.ndarray]]:
                 yield command, np.zeros(0)
             for i in range(0, len(numbers), size or 1):
                 yield command, np.array(numbers[i : i + size])
-                command = {"M": "L", "m": "l"}.get(command, command)
+                command = "L" if command == "M" else "l" if command == "m" else command
         elif numbers:
             raise ValueError("numbers before a command")
         command, numbers = letter, []

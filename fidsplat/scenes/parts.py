@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fidsplat.cameras import Camera, Motion, Shutter
-from fidsplat.capture import Capture
+from fidsplat.capture import Capture, output_names
 from fidsplat.errors import InputError
 from fidsplat.quality import Quality
 from fidsplat.rotations import check_similarity
@@ -119,10 +119,7 @@ class SceneParts(PickledByFields):
         for name, kind in (("sensor", Sensor), ("fog", Fog)):
             if not isinstance(getattr(self, name), kind | None):
                 raise InputError(f"{name} must be a {kind.__name__}, not {getattr(self, name)!r}")
-        outputs = (self.outputs,) if isinstance(self.outputs, str) else tuple(self.outputs)
-        if not outputs or not all(isinstance(name, str) for name in outputs):
-            raise InputError(f"outputs must be one or more names, not {self.outputs!r}")
-        put(self, "outputs", outputs)
+        put(self, "outputs", output_names(self.outputs))
 
     @cached_property
     def motion(self) -> Motion:

@@ -24,6 +24,8 @@ MIN_SIDE = 8
 """pixels: the smallest tag has six modules"""
 MAX_SIDE = 32767
 """pixels, of OpenCV's detector"""
+MAX_QR_SIDE = 65535
+"""pixels, of zxing-cpp"""
 # how much taller or wider the picture is made when a plain look finds no QR code: a tilted one has flat
 # modules
 STRETCHES = (1.5, 2.0, 3.0, 4.0)
@@ -151,6 +153,8 @@ def _qr_codes(grey: np.ndarray) -> list[Detection]:
 
 def _read_qr(grey: np.ndarray, wider: float, taller: float) -> list[Detection]:
     picture = grey
+    if max(grey.shape[1] * wider, grey.shape[0] * taller) > MAX_QR_SIDE:
+        return []
     if (wider, taller) != (1.0, 1.0):
         picture = cv2.resize(grey, None, fx=wider, fy=taller, interpolation=cv2.INTER_LINEAR)
     scale = np.array([grey.shape[1] / picture.shape[1], grey.shape[0] / picture.shape[0]])

@@ -55,8 +55,8 @@ MOTION = fs.Motion(pose_at, {3: turned, 5: lambda time: turned(-time)})
 def truth(cloud, camera, quality, outputs, motion, shutter):
     capture = fs.Capture(camera, (*outputs, "alpha"), quality, BACKGROUND, motion, shutter)
     features, view = prepare(cloud, capture)
-    judge = ReferenceBackend()
-    return judge.pipeline(features).render(judge.upload(cloud), view).images
+    reference = ReferenceBackend()
+    return reference.pipeline(features).render(reference.upload(cloud), view).images
 
 
 def assert_exposed(renderer, cloud, camera, motion, shutter, quality=None, outputs=ALL_OUTPUTS):

@@ -47,10 +47,10 @@ def test_the_schedule_of_gpus_agrees_with_the_reference(renderer, name):
     picture = PICTURES[name]()
     backend, cloud = renderer.backend, picture.cloud
     features, view = prepare(cloud, picture.capture)
-    planes = backend.pipeline(features, backend.shapes("schedule")["groups"]).render(
+    images = backend.pipeline(features, backend.shapes("schedule")["groups"]).render(
         backend.upload(cloud), view
     )
-    drawn = {output: planes.read(output) for output in picture.outputs}
+    drawn = {output: images.read(output) for output in picture.outputs}
     differences = compare(drawn, truth_of(picture), picture.outputs)
     assert all(difference.agrees for difference in differences), differences
     assert drawn["rgb"].std() > 0.05

@@ -60,7 +60,10 @@ def footprint(cloud, view, index, dot=True):
     tangents = view.rotation @ rotation[:, :2] * cloud.scales[index].astype(float)
     center = view.rotation @ cloud.means[index].astype(float) + view.translation
     rows, columns = np.mgrid[0 : view.height, 0 : view.width] + 0.5
-    rays = np.stack([(columns - view.cx) / view.fx, (rows - view.cy) / view.fy, np.ones_like(rows)], -1)
+    rays = np.stack(
+        [(columns - view.center_x) / view.focal_x, (rows - view.center_y) / view.focal_y, np.ones_like(rows)],
+        -1,
+    )
     # center + tangents @ (u, v) = depth * ray
     system = np.concatenate([np.broadcast_to(tangents, (*rays.shape[:2], 3, 2)), -rays[..., None]], axis=-1)
     solution = np.linalg.solve(system, np.broadcast_to(-center[:, None], (*rays.shape, 1)))[..., 0]
@@ -68,7 +71,10 @@ def footprint(cloud, view, index, dot=True):
     inside = (solution[..., :2] ** 2).sum(-1) <= 2 * half_r2 * (1 - 1e-6)
     inside &= solution[..., 2] >= view.near
     if dot and center[2] >= view.near:
-        px, py = view.fx * center[0] / center[2] + view.cx, view.fy * center[1] / center[2] + view.cy
+        px, py = (
+            view.focal_x * center[0] / center[2] + view.center_x,
+            view.focal_y * center[1] / center[2] + view.center_y,
+        )
         inside |= (columns - px) ** 2 + (rows - py) ** 2 <= half_r2 * (1 - 1e-6)
     return np.nonzero(inside)
 

@@ -15,7 +15,7 @@ PACKAGE = Path(fidsplat.__file__).parent
 
 BASE = {"errors", "files", "rotations", "scalars"}
 PLAIN = BASE | {"splats", "harmonics", "cameras", "quality", "sensor", "surroundings", "capture"}
-# wing: what of fidsplat it may import, at the top or inside a function
+# package or module of fidsplat: what of fidsplat it may import, at the top or inside a function
 MAY_IMPORT = {
     "errors": set(),
     "files": BASE,
@@ -47,7 +47,7 @@ MAY_IMPORT = {
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__"}
 
-# third-party module: the wings that alone may import it
+# third-party module: the places that alone may import it
 HOME_OF = {
     "cv2": ("vision",),
     "zxingcpp": ("vision",),
@@ -102,21 +102,21 @@ def imported(path: Path) -> set[str]:
     return found
 
 
-def within(name: str, wings) -> bool:
-    return any(name == wing or name.startswith(wing + ".") for wing in wings)
+def within(name: str, places) -> bool:
+    return any(name == place or name.startswith(place + ".") for place in places)
 
 
 @pytest.mark.parametrize("module", sorted(MODULES))
 def test_imports_point_downwards(module):
-    wing = module.split(".")[0]
-    if wing in ANYTHING:
+    place = module.split(".")[0]
+    if place in ANYTHING:
         return
-    assert wing in MAY_IMPORT, f"say in this test what {wing} may import"
+    assert place in MAY_IMPORT, f"say in this test what {place} may import"
     inside = {
         name.removeprefix("fidsplat.") for name in imported(MODULES[module]) if name.startswith("fidsplat.")
     }
     # `from fidsplat.a import b` gives both a and a.b: whatever lies in an allowed module is allowed
-    allowed = MAY_IMPORT[wing] | {wing}
+    allowed = MAY_IMPORT[place] | {place}
     known = {name for name in inside if name in MODULES or f"{name}.__init__" in MODULES}
     assert {name for name in known if not within(name, allowed)} == set()
 
@@ -155,7 +155,7 @@ def within_any(names, package) -> bool:
     return any(within(name, (package,)) for name in names)
 
 
-# modules of the wing that every backend may import
+# modules of the package that every backend may import
 SHARED = ("base", "view", "prepare", "registry", "planes")
 
 

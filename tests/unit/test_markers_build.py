@@ -10,6 +10,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.markers import Marker, Rectangle, marker
+from fidsplat.quality import NESTED
 from fidsplat.vision.images import write_png
 
 
@@ -109,6 +110,41 @@ def test_fitted_is_nearer_to_the_print_with_a_quarter_of_the_splats(spec):
     assert psnr(fitted) > 23
     assert psnr(fitted) > psnr(paper) + 2.5
     assert psnr(fitted) > psnr(marker(spec, growth=0.0))
+
+
+def in_order(made: Marker, angle: float, per_module: int = 24) -> tuple[np.ndarray, np.ndarray]:
+    """Light over grey, and alpha, as other renderers composite: one splat after the other by their centres'
+    depth, here along a direction of the plane; alphas at most 0.99, cut off at 1/255.
+    """
+    cloud = made.gaussians
+    h, w = made.grid.shape
+    x = ((np.arange(w * per_module) + 0.37) / per_module - w / 2) * made.module
+    y = ((np.arange(h * per_module) + 0.37) / per_module - h / 2) * made.module
+    means, scales = cloud.means.astype(float), cloud.scales.astype(float)
+    reach = np.sqrt(2 * np.log(255))
+    x0, x1 = (np.searchsorted(x, means[:, 0] + side * reach * scales[:, 0]) for side in (-1, 1))
+    y0, y1 = (np.searchsorted(y, means[:, 1] + side * reach * scales[:, 1]) for side in (-1, 1))
+    light, left = np.zeros((len(y), len(x))), np.ones((len(y), len(x)))
+    for i in np.argsort(means[:, 0] * np.cos(angle) + means[:, 1] * np.sin(angle), kind="stable"):
+        at = np.s_[y0[i] : y1[i], x0[i] : x1[i]]
+        gx = np.exp(-0.5 * ((x[at[1]] - means[i, 0]) / scales[i, 0]) ** 2)
+        gy = np.exp(-0.5 * ((y[at[0]] - means[i, 1]) / scales[i, 1]) ** 2)
+        alpha = np.minimum(cloud.opacities[i] * np.outer(gy, gx), 0.99)
+        alpha = np.where(alpha < 1 / 255, 0.0, alpha)
+        light[at] += left[at] * alpha * cloud.colors[i, 0]
+        left[at] *= 1 - alpha
+    return light + left * 0.5, 1 - left
+
+
+@pytest.mark.parametrize("angle", [0.3, 3.8])
+def test_the_nested_template_is_opaque_and_clean_in_any_order(angle):
+    made = marker("aruco:4x4_50:7", mixture="fitted", template=NESTED)
+    shown, alpha = in_order(made, angle)
+    error = shown - np.kron(1.0 - made.grid, np.ones((24, 24)))
+    assert alpha[1:-1, 1:-1].min() > 0.999  # but for 2 % of a module, less than a sample
+    assert -10 * np.log10(np.mean(error**2)) > 35
+    inside = np.tile(np.arange(24) % 23 > 0, len(error) // 24)  # cells less a sample on each side
+    assert np.abs(error[np.ix_(inside, inside)]).max() < 0.02
 
 
 def test_no_hairs_stand_out_of_the_paper():

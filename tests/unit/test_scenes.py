@@ -349,7 +349,7 @@ def test_a_folder_that_cannot_be_written(tmp_path):
         ({"background": (0, 0)}, "background must be three"),
         ({"background": (0, 0, math.nan)}, "background must be three"),
         ({"background": "black"}, "background must be three"),
-        ({"outputs": ()}, "outputs must be one or more names"),
+        ({"outputs": ()}, "outputs is empty"),
         ({"outputs": (1,)}, "outputs must be one or more names"),
     ],
 )

@@ -15,6 +15,10 @@ from fidsplat.effects import Output
 
 Access = Literal["", "in", "out"]
 Source = Literal["stage", "cloud", "uniform", "array"]
+_KINDS: dict[str, tuple[Access, Source]] = {
+    **{"in": ("in", "stage"), "out": ("out", "stage")},
+    **{"cloud": ("in", "cloud"), "array": ("in", "array")},
+}
 _NAME = re.compile(r"(\w+)(?:\[(\d+)\])?")
 _TYPES = {"float": "f4", "int": "i4", "uint": "u4", "short": "i2", "ulong": "u8", "double": "f8"}
 
@@ -126,34 +130,25 @@ class Argument:
         return f"global {const}{self.ctype} *restrict {self.name}"
 
 
-def _arguments(declaration: str, note: str, access: Access, source: Source = "stage") -> tuple[Argument, ...]:
-    ctype, *names = declaration.split()
-    return tuple(Argument(ctype, name, access, source, note=note) for name in names)
+def takes(*declared: str | tuple[Argument, ...]) -> tuple[Argument, ...]:
+    """Arguments from lines of words, and others among them as they are.
 
-
-def number(declaration: str, note: str = "") -> tuple[Argument, ...]:
-    """Numbers that the stage gives: `int width height`."""
-    return _arguments(declaration, note, "")
-
-
-def reads(declaration: str, note: str = "") -> tuple[Argument, ...]:
-    """Buffers that the stage has: `float raw`."""
-    return _arguments(declaration, note, "in")
-
-
-def writes(declaration: str, note: str = "") -> tuple[Argument, ...]:
-    """Buffers that the stage has and the kernel changes."""
-    return _arguments(declaration, note, "out")
-
-
-def cloud(declaration: str, note: str = "") -> tuple[Argument, ...]:
-    """Arrays of the cloud, one row for each splat."""
-    return _arguments(declaration, note, "in", "cloud")
-
-
-def array(declaration: str, note: str = "") -> tuple[Argument, ...]:
-    """Arrays of the view that are copied to the device for the picture (`View.array`)."""
-    return _arguments(declaration, note, "in", "array")
+    A line is a type, names that have it, and a remark behind `//`. Alone it declares numbers that the stage
+    gives (`int width height`); behind `in` buffers of the stage that the kernel reads (`in float raw  // 4
+    planes`), behind `out` those that it changes, behind `cloud` arrays with a row for each splat, behind
+    `array` those that the view has on the host and that are copied to the device for the picture.
+    """
+    found: list[Argument] = []
+    for one in declared:
+        if not isinstance(one, str):
+            found += one
+            continue
+        words, _, note = one.partition("//")
+        kind, *rest = words.split()
+        access, source = _KINDS.get(kind, ("", "stage"))
+        ctype, *names = rest if kind in _KINDS else (kind, *rest)
+        found += (Argument(ctype, name, access, source, note=note.strip()) for name in names)
+    return tuple(found)
 
 
 def uniforms(group: str, *declarations: str, note: str = "") -> tuple[Argument, ...]:

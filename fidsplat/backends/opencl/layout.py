@@ -8,19 +8,7 @@ samples, unless they say otherwise.
 
 from __future__ import annotations
 
-from fidsplat.backends.opencl.declare import (
-    Argument,
-    Layout,
-    Record,
-    Samples,
-    array,
-    cloud,
-    member,
-    number,
-    reads,
-    uniforms,
-    writes,
-)  # fmt: skip
+from fidsplat.backends.opencl.declare import Argument, Layout, Record, Samples, member, takes, uniforms
 
 VIEW = Record(
     "View",
@@ -67,119 +55,94 @@ BOUNDS = Record(
     ),
 )
 
-_SIZE = number("int width height", "of the sample grid")
-_BIG = (*number("uint big_capacity"), *reads("Bounds big_bounds"))
-_DIGIT = (*reads("uint tallies"), *number("uint slot shift"))
-_WALK = (*reads("uint order tallies"), *reads("uint2 windows"), *_BIG, *_SIZE, *writes("uint table"))
-_EXPOSED = (
-    *_SIZE,
-    *number("int stride", "samples per row of a shot"),
-    *number("uint plane", "samples per plane of a shot"),
-    *number("int whole_stride"),
-    *number("uint whole_plane"),
-    *number("int top planes"),
+_SIZE = takes("int width height  // of the sample grid")
+_BIG = takes("uint big_capacity", "in Bounds big_bounds")
+_DIGIT = takes("in uint tallies", "uint slot shift")
+_WALK = takes("in uint order tallies", "in uint2 windows", _BIG, _SIZE, "out uint table")
+_EXPOSED = takes(
+    _SIZE,
+    "int stride  // samples per row of a shot",
+    "uint plane  // samples per plane of a shot",
+    *("int whole_stride", "uint whole_plane", "int top planes"),
 )
-
-KERNELS: dict[str, tuple[Argument, ...]] = {
-    "project": (
-        *number("uint count"),
-        *reads("View view"),
-        *cloud("float means", "(n, 3) [m], relative to the cloud's origin"),
-        *cloud("float quats", "(n, 4) w x y z"),
-        *cloud("float scales", "(n, 2) [m]"),
-        *cloud("float opacities", "(n)"),
-        *writes("Splat splats", "(n)"),
-        *writes("uint keys", "(n)"),
-        *writes("uint2 windows", "(n): corner and bits, or a place in `big` and 0"),
-        *writes("uint tallies"),
-        *number("uint big_capacity"),
-        *writes("uint big", "splats that touch more than a window"),
-        *writes("Bounds big_bounds"),
-    ),
-    "pack_count": (*number("uint count"), *reads("uint keys"), *writes("uint held")),
-    "pack_move": (
-        *number("uint count"),
-        *(*reads("uint places"), *reads("Splat splats"), *reads("uint keys"), *reads("uint2 windows")),
-        *(*writes("Splat splats_out"), *writes("uint keys_out"), *writes("uint2 windows_out")),
-    ),
-    "scan_chunks": (*number("uint bins"), *writes("uint table totals")),
-    "scan_bins": (
-        *number("uint bins"),
-        *reads("uint totals"),
-        *writes("uint starts tallies"),
-        *number("uint slot"),
-    ),
-    "sort_count": (*reads("uint keys"), *_DIGIT, *writes("uint table")),
-    "sort_scatter": (
-        *reads("uint keys indices"),
-        *_DIGIT,
-        *number("uint first"),
-        *(*writes("uint table"), *reads("uint starts"), *writes("uint keys_out indices_out")),
-    ),
-    "bin_count": _WALK,
-    "bin_emit": (
-        *_WALK,
-        *(*reads("uint starts"), *number("int band_first band_end"), *number("uint capacity")),
-        *writes("uint lists"),
-    ),
-    "tile_starts": (*number("uint tiles capacity"), *writes("uint tallies starts cursors counts")),
-    "tally_big": (*_SIZE, *_BIG, *writes("uint tallies")),
-    "emit": (
-        *(*number("uint count splat_groups first_band"), *_SIZE, *number("int band_first band_end")),
-        *(*number("uint capacity big_capacity"), *reads("uint2 windows"), *reads("uint keys big")),
-        *(
-            *reads("Bounds big_bounds"),
-            *reads("uint starts"),
-            *writes("uint tallies cursors"),
-            *writes("uint2 pairs"),
-        ),
-    ),
-    "sort_tiles": (
-        *number("int band_first"),
-        *reads("uint starts"),
-        *writes("ulong pairs"),
-        *writes("uint lists"),
-    ),
-    "blend": (
-        *(*reads("Splat splats"), *reads("uint lists starts")),
-        *number("uint band_first", "the first tile of this launch; lists begin with its list"),
-        *(*_SIZE, *number("wide log_cut ceiling stop filter")),
-        *writes("float raw", "4 planes: r, g, b, transmittance"),
-    ),
-    "expose": (
-        *_EXPOSED,
-        *number("float weight"),
-        *number("int first"),
-        *reads("float raw"),
-        *writes("float exposed"),
-    ),
-    "expose_middle": (*_EXPOSED, *reads("uint raw"), *writes("uint exposed")),
-    "backdrop": (
-        *(*_SIZE, *number("int stride"), *number("uint plane")),
-        *uniforms("ray", "float ray_focal_x ray_focal_y ray_center_x ray_center_y"),
-        *uniforms(
-            "rotation",
-            "float turn_00 turn_01 turn_02 turn_10 turn_11 turn_12 turn_20 turn_21 turn_22",
-            note="world to camera",
-        ),
-        *writes("float raw"),
-    ),
-    "resolve": (
-        *number("int width height", "of the picture"),
-        *number("int stride", "samples per row of raw"),
-        *number("uint plane", "samples per plane of raw"),
-        *number("float background_r background_g background_b"),
-        *reads("float raw"),
-    ),
-}
-"""The arguments of each kernel; those of effects and outputs follow them."""
-
 _RAY = uniforms(
     "ray",
     "float ray_focal_x ray_focal_y ray_center_x ray_center_y",
     note="of the sample grid; infinite where depths are distances",
 )
-_RAYS = reads("float rays", "3 planes X, Y, Z; NaN where nothing is seen")
+
+KERNELS: dict[str, tuple[Argument, ...]] = {
+    "project": takes(
+        "uint count",
+        "in View view",
+        "cloud float means  // (n, 3) [m], relative to the cloud's origin",
+        "cloud float quats  // (n, 4) w x y z",
+        "cloud float scales  // (n, 2) [m]",
+        "cloud float opacities  // (n)",
+        "out Splat splats  // (n)",
+        "out uint keys  // (n)",
+        "out uint2 windows  // (n): corner and bits, or a place in `big` and 0",
+        "out uint tallies",
+        "uint big_capacity",
+        "out uint big  // splats that touch more than a window",
+        "out Bounds big_bounds",
+    ),
+    "pack_count": takes("uint count", "in uint keys", "out uint held"),
+    "pack_move": takes(
+        *("uint count", "in uint places", "in Splat splats", "in uint keys", "in uint2 windows"),
+        *("out Splat splats_out", "out uint keys_out", "out uint2 windows_out"),
+    ),
+    "scan_chunks": takes("uint bins", "out uint table totals"),
+    "scan_bins": takes("uint bins", "in uint totals", "out uint starts tallies", "uint slot"),
+    "sort_count": takes("in uint keys", _DIGIT, "out uint table"),
+    "sort_scatter": takes(
+        *("in uint keys indices", _DIGIT, "uint first"),
+        *("out uint table", "in uint starts", "out uint keys_out indices_out"),
+    ),
+    "bin_count": _WALK,
+    "bin_emit": takes(
+        *(_WALK, "in uint starts", "int band_first band_end", "uint capacity", "out uint lists"),
+    ),
+    "tile_starts": takes("uint tiles capacity", "out uint tallies starts cursors counts"),
+    "tally_big": takes(_SIZE, _BIG, "out uint tallies"),
+    "emit": takes(
+        *(
+            "uint count splat_groups first_band",
+            _SIZE,
+            "int band_first band_end",
+            "uint capacity big_capacity",
+        ),
+        *("in uint2 windows", "in uint keys big", "in Bounds big_bounds", "in uint starts"),
+        *("out uint tallies cursors", "out uint2 pairs"),
+    ),
+    "sort_tiles": takes("int band_first", "in uint starts", "out ulong pairs", "out uint lists"),
+    "blend": takes(
+        *("in Splat splats", "in uint lists starts"),
+        "uint band_first  // the first tile of this launch; lists begin with its list",
+        *(_SIZE, "wide log_cut ceiling stop filter"),
+        "out float raw  // 4 planes: r, g, b, transmittance",
+    ),
+    "expose": takes(_EXPOSED, "float weight", "int first", "in float raw", "out float exposed"),
+    "expose_middle": takes(_EXPOSED, "in uint raw", "out uint exposed"),
+    "backdrop": takes(
+        *(_SIZE, "int stride", "uint plane", _RAY),
+        uniforms(
+            "rotation",
+            "float turn_00 turn_01 turn_02 turn_10 turn_11 turn_12 turn_20 turn_21 turn_22",
+            note="world to camera",
+        ),
+        "out float raw",
+    ),
+    "resolve": takes(
+        "int width height  // of the picture",
+        "int stride  // samples per row of raw",
+        "uint plane  // samples per plane of raw",
+        *("float background_r background_g background_b", "in float raw"),
+    ),
+}
+"""The arguments of each kernel; those of effects and outputs follow them."""
+
+_RAYS = takes("in float rays  // 3 planes X, Y, Z; NaN where nothing is seen")
 _OWN_RAYS = ("camera_brown_conrady", "camera_fisheye", "camera_equirectangular")
 
 LAYOUTS: dict[str, Layout] = {
@@ -206,8 +169,8 @@ LAYOUTS: dict[str, Layout] = {
         "slot/camera_orthographic.cl",
         splat=(member("wide z0 zx zy", "depth times D = z0 + zx x + zy y"), member("wide z_near")),
     ),
-    "color_rgb": Layout("slot/color_rgb.cl", project=cloud("float colors", "(n, 3)")),
-    "color_sh": Layout("slot/color_sh.cl", project=cloud("float sh", "(n, (SH_DEGREE + 1)^2, 3)")),
+    "color_rgb": Layout("slot/color_rgb.cl", project=takes("cloud float colors  // (n, 3)")),
+    "color_sh": Layout("slot/color_sh.cl", project=takes("cloud float sh  // (n, (SH_DEGREE + 1)^2, 3)")),
     "lowpass_none": Layout("slot/lowpass_none.cl"),
     "lowpass_pixel": Layout("slot/lowpass_pixel.cl", parts=("lowpass_none",)),
     "lowpass_screen": Layout(
@@ -228,9 +191,9 @@ LAYOUTS: dict[str, Layout] = {
         "slot/compose_planes.cl",
         parts=("ray_depth",),
         splat=(member("int plane"),),
-        project=(
-            *cloud("int planes", "(n) index of the splat's plane; -1: none"),
-            *reads("float plane_keys", "(planes) depth at which its splats are sorted in [m]"),
+        project=takes(
+            "cloud int planes  // (n) index of the splat's plane; -1: none",
+            "in float plane_keys  // (planes) depth at which its splats are sorted in [m]",
         ),
     ),
     "footprint_gaussian": Layout(),
@@ -239,7 +202,7 @@ LAYOUTS: dict[str, Layout] = {
         "slot/footprint_mixed.cl",
         parts=("box_edges",),
         splat=(member("int box"),),
-        project=cloud("int boxes", "(n) 1: box, 0: Gaussian"),
+        project=takes("cloud int boxes  // (n) 1: box, 0: Gaussian"),
     ),
     "background_constant": Layout(),
     "background_gradient": Layout(
@@ -252,19 +215,16 @@ LAYOUTS: dict[str, Layout] = {
     "background_panorama": Layout(
         "slot/background_panorama.cl",
         parts=("world_ray",),
-        backdrop=(
-            *uniforms("panorama_size", "int panorama_width panorama_height"),
-            *array("float panorama", "(panorama_height, panorama_width, 3)"),
+        backdrop=takes(
+            uniforms("panorama_size", "int panorama_width panorama_height"),
+            "array float panorama  // (panorama_height, panorama_width, 3)",
         ),
     ),
     "arithmetic_precise": Layout("slot/arithmetic_precise.cl"),
     "arithmetic_fast": Layout("slot/arithmetic_fast.cl"),
     "motion_groups": Layout(
         "slot/motion_groups.cl",
-        project=(
-            *cloud("int labels", "(n)"),
-            *reads("int moving", "number of groups, then their labels"),
-        ),
+        project=takes("cloud int labels  // (n)", "in int moving  // number of groups, then their labels"),
     ),
     "shutter_exposure": Layout("slot/shutter_exposure.cl"),
     "shutter_rows": Layout("slot/shutter_rows.cl"),
@@ -275,7 +235,7 @@ LAYOUTS: dict[str, Layout] = {
     "ray_map": Layout(
         "part/ray_map.cl",
         view=(member("real map[6]", "low corner, cells per unit along x and y, cells a side, first row"),),
-        project=reads("short4 ray_map"),
+        project=takes("in short4 ray_map"),
     ),
     "rays": Layout(
         "part/rays.cl",
@@ -302,8 +262,8 @@ LAYOUTS: dict[str, Layout] = {
     "rays_box": Layout(
         "part/rays_box.cl",
         parts=("box_cover",),
-        project=reads("float ray_step", "(1) how far a ray turns from a sample to the next, at most"),
-        blend=reads("float ray_slopes", "6 planes dX/dx, dY/dx, dZ/dx, dX/dy, dY/dy, dZ/dy"),
+        project=takes("in float ray_step  // (1) how far a ray turns from a sample to the next, at most"),
+        blend=takes("in float ray_slopes  // 6 planes dX/dx, dY/dx, dZ/dx, dX/dy, dY/dy, dZ/dy"),
     ),
     "ray_depth": Layout(
         "part/ray_depth.cl",
@@ -311,7 +271,7 @@ LAYOUTS: dict[str, Layout] = {
     ),
     "shown": Layout("part/shown.cl"),
     "ray": Layout(resolve=_RAY),
-    "turn": Layout("part/turn.cl", resolve=array("float turns", "(h, 3, 3)")),
+    "turn": Layout("part/turn.cl", resolve=takes("array float turns  // (h, 3, 3)")),
     # rays of fisheyes and panoramas have a length of 1
     "ray_length": Layout("part/ray_length.cl", behind=(("camera_brown_conrady", "rays_length"),)),
     "rays_length": Layout("part/rays_length.cl"),
@@ -354,14 +314,14 @@ LAYOUTS: dict[str, Layout] = {
         "output/label.cl",
         parts=("shown",),
         splat=(member("int label"),),
-        project=cloud("int labels", "(n)"),
+        project=takes("cloud int labels  // (n)"),
         samples=(Samples("float", "label_raw"), Samples("int", "label_id_raw")),
     ),
     "splat_id": Layout(
         "output/splat_id.cl",
         parts=("shown",),
         splat=(member("int splat_id"),),
-        project=cloud("int splat_ids", "(n)"),
+        project=takes("cloud int splat_ids  // (n)"),
         samples=(Samples("float", "splat_id_raw"), Samples("int", "splat_id_index_raw")),
     ),
     "overdraw": Layout("output/overdraw.cl", samples=(Samples("int", "overdraw_raw"),)),
@@ -370,20 +330,20 @@ LAYOUTS: dict[str, Layout] = {
     "fog": Layout(
         "output/fog.cl",
         parts=("ray_depth", "ray_length"),
-        blend=(*uniforms("fog_density", "float fog_density"), *_RAY),
+        blend=takes(uniforms("fog_density", "float fog_density"), _RAY),
         samples=(Samples("float", "fog_raw"),),
         averaged=True,
     ),
     "exposure": Layout("post/exposure.cl", resolve=uniforms("exposure", "float exposure")),
     "vignetting": Layout(
         "post/vignetting.cl",
-        resolve=(
-            *uniforms(
+        resolve=takes(
+            uniforms(
                 "vignette_center",
                 "float vignette_x vignette_y vignette_scale",
                 note="principal point [px], 1 / (half diagonal [px])",
             ),
-            *uniforms("vignetting", "float vignette_a vignette_b vignette_c"),
+            uniforms("vignetting", "float vignette_a vignette_b vignette_c"),
         ),
     ),
     "noise": Layout(
@@ -402,9 +362,9 @@ LAYOUTS: dict[str, Layout] = {
     "response_srgb": Layout("post/response_srgb.cl"),
     "response_table": Layout(
         "post/response_table.cl",
-        resolve=(
-            *uniforms("response_count", "int response_count"),
-            *array("float response", "(response_count)"),
+        resolve=takes(
+            uniforms("response_count", "int response_count"),
+            "array float response  // (response_count)",
         ),
     ),
     "quantise": Layout("post/quantise.cl", resolve=uniforms("quantise_steps", "float quantise_steps")),

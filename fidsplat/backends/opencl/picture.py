@@ -135,7 +135,12 @@ def _uniforms(view: View, row: int, end: int, record: np.dtype) -> np.ndarray:
     made = np.zeros(1, record)
     values = {
         **{"rotation": view.rotation.ravel(), "translation": view.translation, "eye": view.eye},
-        **{"focal_x": view.fx, "focal_y": view.fy, "center_x": view.cx, "center_y": view.cy},
+        **{
+            "focal_x": view.focal_x,
+            "focal_y": view.focal_y,
+            "center_x": view.center_x,
+            "center_y": view.center_y,
+        },
         **{"near": view.near, "far": view.far, "log_cut": view.log_cut},
         **{"width": view.width, "height": view.height, "filter": 1.0 / view.samples**2},
         **{"band": row, "band_end": end},

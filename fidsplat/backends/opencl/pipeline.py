@@ -23,7 +23,7 @@ from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError
 
 
-class OpenCLPlanes:
+class OpenCLImages:
     """Output images on the device, with the events of the kernels that made them.
 
     Their buffers go back to the pool when nobody holds the images any more.
@@ -82,7 +82,7 @@ class OpenCLPipeline:
         self._other = other
         """gives the pipeline of another shape"""
 
-    def render(self, resident: Resident, view: View) -> OpenCLPlanes:
+    def render(self, resident: Resident, view: View) -> OpenCLImages:
         """Draw one picture.
 
         Raises:
@@ -97,7 +97,7 @@ class OpenCLPipeline:
         # what this picture takes anew is planned for; that of its own kind is there already
         workspace.pool.make_way((self, view.width, view.height, resident.count, plan), way)
         try:
-            return OpenCLPlanes(*self._draw(resident, view, plan))
+            return OpenCLImages(*self._draw(resident, view, plan))
         except BaseException as error:
             with suppress(cl.Error):
                 workspace.queue.finish()  # a CPU may be reading the arrays of a cloud that nobody keeps
@@ -144,7 +144,7 @@ class OpenCLPipeline:
         transmittance of the padded sample grid; and the finished outputs by name.
         """
         picture, images = self._draw(resident, view, MemoryPlan(0, resident.count, 0))
-        made = OpenCLPlanes(picture, images)
+        made = OpenCLImages(picture, images)
         return {
             "keys": picture.read("keys", np.uint32, (resident.count,)),
             "starts": picture.read("starts", np.uint32, (picture.tiles + 1,)),

@@ -173,7 +173,7 @@ class ReferencePipeline:
             seen["certificate_planes"] = seen["certificate"]
             for name, values in seen.items():
                 plane = out.setdefault(name, np.zeros((len(x), *values.shape[1:]), values.dtype))
-                if name in ("rgb", "t", "fogged", "certificate", "behind_doubt"):
+                if name in ("rgb", "t", "fogged", "certificate", "behind_bound"):
                     plane[mine] += shot.weight * values
                 elif shot.middle:
                     plane[mine] = values

@@ -22,13 +22,13 @@ def background_at(view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray,
     if isinstance(around, Gradient):
         up = np.array(around.up) / np.linalg.norm(around.up)
         share = np.clip(0.5 + 0.5 * (rays @ up) / np.linalg.norm(rays, axis=1), 0, 1)[:, None]
-        colors, doubt = (
+        colors, bound = (
             np.add(around.bottom, share * np.subtract(around.top, around.bottom)),
             np.zeros(len(x)),
         )
     else:
-        colors, doubt = _panorama_at(around, rays)
-    return np.where(seen[:, None], colors, 0.0), np.where(seen, doubt, 0.0)
+        colors, bound = _panorama_at(around, rays)
+    return np.where(seen[:, None], colors, 0.0), np.where(seen, bound, 0.0)
 
 
 def brightest(around: Gradient | Panorama | None) -> float:
@@ -59,14 +59,14 @@ def _panorama_at(panorama: Panorama, rays: np.ndarray) -> tuple[np.ndarray, np.n
     return above * (1 - bottom) + below * bottom, contrast * np.minimum(off, 1)
 
 
-def developed(
-    light: np.ndarray, doubt: np.ndarray, steps: tuple[str, ...], view: View, x: np.ndarray, y: np.ndarray
+def apply_sensor(
+    light: np.ndarray, bound: np.ndarray, steps: tuple[str, ...], view: View, x: np.ndarray, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Values (k, 3) after the sensor's steps for light (k, 3) at pixels (column x, row y), and what may
     change in
-    them (k,) where the light may be off by `doubt` (k,): each step is followed from both ends.
+    them (k,) where the light may be off by `bound` (k,): each step is followed from both ends.
     """
-    low, high = light - doubt[:, None], light + doubt[:, None]
+    low, high = light - bound[:, None], light + bound[:, None]
     for step in steps:
         slack = _ROUND * np.maximum(np.abs(low), np.abs(high))
         low, light, high = (_step(step, value, view, x, y) for value in (low - slack, light, high + slack))

@@ -14,13 +14,13 @@ from fidsplat.backends.warp.shapes import WarpShape
 
 
 def _ray(view: View) -> tuple[float, ...]:
-    fx, fy, cx, cy = view.uniform("ray")
-    return 1 / fx, 1 / fy, cx, cy
+    focal_x, focal_y, center_x, center_y = view.uniform("ray")
+    return 1 / focal_x, 1 / focal_y, center_x, center_y
 
 
 _DERIVED: dict[str, Callable[[View, WarpShape], Any]] = {
-    "per_fx": lambda view, shape: 1.0 / view.fx,
-    "per_fy": lambda view, shape: 1.0 / view.fy,
+    "per_focal_x": lambda view, shape: 1.0 / view.focal_x,
+    "per_focal_y": lambda view, shape: 1.0 / view.focal_y,
     "per_near": lambda view, shape: 1.0 / view.near,
     "tile_w": lambda view, shape: shape.tile_width,
     "tile_h": lambda view, shape: shape.tile_height,

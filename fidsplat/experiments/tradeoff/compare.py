@@ -124,5 +124,5 @@ def _flip(picture: np.ndarray, truth: np.ndarray, whole: bool) -> dict:
     side = (height, width) if whole else (min(FLIP_SIDE, height), min(FLIP_SIDE, width))
     top, left = (height - side[0]) // 2, (width - side[1]) // 2
     window = slice(top, top + side[0]), slice(left, left + side[1])
-    a, b = (np.clip(plane[window], 0.0, 1.0) for plane in (picture, truth))
+    a, b = (np.clip(image[window], 0.0, 1.0) for image in (picture, truth))
     return {"flip": flip(a, b), "flip_of": f"{side[1]} x {side[0]} px in the middle"}

@@ -40,7 +40,7 @@ class Span:
 
     @classmethod
     def of(cls, low: np.ndarray, high: np.ndarray, z_low: np.ndarray, z_high: np.ndarray) -> Span:
-        """With the transmittances that follow, for things in the order in which they are laid."""
+        """With the transmittances that follow, for things in the order in which they are composited."""
         fronts = shifted(np.cumprod(1 - high, axis=1)), shifted(np.cumprod(1 - low, axis=1))
         return cls(low, high, z_low, z_high, *fronts)
 
@@ -105,15 +105,15 @@ def _rounding(s: Setup, f: Fragments, form: np.ndarray, terms: np.ndarray) -> np
 
 
 def of_color(s: Setup, view: View, span: Span, before: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """What may change (k,) in colour and alpha, per unit of colour; moved (k, m): in what is laid itself."""
-    doubt = (before * (span.high - span.low)).sum(1)
+    """What may change (k,) in colour and alpha, per unit of colour; moved (k, m): in each thing itself."""
+    bound = (before * (span.high - span.low)).sum(1)
     t_low = span.front_low * (1 - span.high) * (1 - STOP)
     t_high = span.front_high * (1 - span.low) * (1 + STOP)
     may_stop = (span.high > 0) & (t_low <= view.stop) & (t_high >= view.stop)
     # an exclusive stop drops a fragment, an inclusive one only what follows
     lost = span.front_high * span.high if s.exclusive else np.full_like(before, view.stop)
-    doubt += np.where(may_stop, lost, 0.0).max(1, initial=0.0)
-    return doubt + (span.front_high * moved).sum(1)
+    bound += np.where(may_stop, lost, 0.0).max(1, initial=0.0)
+    return bound + (span.front_high * moved).sum(1)
 
 
 def of_layer_color(thin: np.ndarray, thick: np.ndarray) -> np.ndarray:
@@ -165,18 +165,19 @@ def first_column(mask: np.ndarray, start: int) -> np.ndarray:
 
 
 def of_places(span: Span, is_layer: np.ndarray) -> np.ndarray:
-    """What may change (k,) in colour where it is not certain in which order layers and fragments are laid.
+    """What may change (k,) in colour where it is not certain in which order layers and fragments
+    are composited.
 
-    Columns (k, m) in the order in which they arrive. Two things laid the other way round change a colour by
-    the product of their opacities and the light in front of them, at most.
+    Columns (k, m) in the order in which they arrive. Two that are composited the other way round change a
+    colour by the product of their opacities and the light in front of them, at most.
     """
-    doubt = np.zeros(len(span.low))
+    bound = np.zeros(len(span.low))
     layers = np.flatnonzero(is_layer).tolist()
     fragment = ~is_layer
     may, must = (span.high > 0) & fragment, (span.low > 0) & fragment
     light = shifted(np.cumprod(np.where(fragment, 1 - span.low, 1.0), axis=1), last=True)
-    rows = np.arange(len(doubt))
-    earliest, latest = (np.zeros((len(doubt), len(layers)), int) for _ in range(2))
+    rows = np.arange(len(bound))
+    earliest, latest = (np.zeros((len(bound), len(layers)), int) for _ in range(2))
     for number, c in enumerate(layers):
         after = np.s_[:, c + 1 :]
         earliest[:, number] = first_column(may[after] & (span.z_high[after] > span.z_low[:, c, None]), c + 1)
@@ -189,7 +190,7 @@ def of_places(span: Span, is_layer: np.ndarray) -> np.ndarray:
         first, end = earliest[unsure, number], latest[unsure, number]
         between = fragment & (columns >= first[:, None]) & (columns < end[:, None])
         others = 1 - np.where(between, 1 - span.high[unsure], 1.0).prod(1)
-        doubt[unsure] += light[unsure, first] * span.high[unsure, c] * others
+        bound[unsure] += light[unsure, first] * span.high[unsure, c] * others
     wrong = uncertain.any(1) | (drawn & ~present).any(1)
     for number, c in enumerate(layers):
         for second, d in enumerate(layers[:number]):
@@ -200,11 +201,11 @@ def of_places(span: Span, is_layer: np.ndarray) -> np.ndarray:
             late = apart & (earliest[:, second] < c) & (latest[:, second] > c)
             unsure = drawn[:, number] & drawn[:, second] & ((level & meet) | late)
             front = light[rows, np.minimum(earliest[:, number], earliest[:, second])]
-            doubt += np.where(unsure, front * span.high[:, c] * span.high[:, d], 0.0)
+            bound += np.where(unsure, front * span.high[:, c] * span.high[:, d], 0.0)
             wrong |= unsure
-    # of three layers the first may be laid early, and which one it is hangs on all of them
+    # of three layers the first may be composited early, and which one it is hangs on all of them
     crowded = (drawn.sum(1) > 2) & wrong
-    return np.where(crowded, 1.0, doubt)
+    return np.where(crowded, 1.0, bound)
 
 
 def of_depth(span: Span, weight: np.ndarray, z: np.ndarray) -> dict[str, np.ndarray]:
@@ -226,15 +227,15 @@ def of_first(span: Span, light: float) -> np.ndarray:
 
 
 def of_count(
-    span: Span, count: np.ndarray, doubt: np.ndarray, stop: float, reordered: np.ndarray
+    span: Span, count: np.ndarray, bound: np.ndarray, stop: float, reordered: np.ndarray
 ) -> np.ndarray:
-    """By how much (k,) the number of splats blended may differ. count, doubt (k, m): in each thing that is
-    laid."""
+    """By how much (k,) the number of splats blended may differ. count, bound (k, m): in each thing that is
+    composited."""
     may, must = span.high > 0, span.low > 0
-    off = np.where(may, doubt + np.where(must, 0, count), 0)
+    off = np.where(may, bound + np.where(must, 0, count), 0)
     # from where the light may have reached the stop to where it must have, whatever comes may be drawn or not
     open_to = (span.front_high >= stop * (1 - STOP)) & (span.front_low * (1 - span.high) <= stop * (1 + STOP))
-    off = np.where(may & open_to & (stop > 0), count + doubt, off)
+    off = np.where(may & open_to & (stop > 0), count + bound, off)
     return np.where(reordered, np.inf, off.sum(1))
 
 
