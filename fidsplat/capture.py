@@ -19,7 +19,7 @@ class Capture(PickledByFields):
     """How a picture is taken: from where, of what, and how well.
 
     The same object works on every device. Raises InputError for a value of the wrong kind; whether an output
-    exists is told when it is drawn.
+    exists is checked when it is drawn.
     """
 
     camera: Camera | None = None
