@@ -68,6 +68,34 @@ def test_a_damaged_cache_is_compiled_again(full_cache, tmp_path):
     assert all(map(is_whole, compiled(folder)))
 
 
+def test_a_program_without_kernels_is_built_again(monkeypatch):
+    """As PoCL gives it where another process has not finished writing."""
+    pytest.importorskip("pyopencl")
+    import fidsplat as fs
+    from fidsplat.backends.opencl import program
+
+    renderer, builds, build = fs.Renderer("opencl:pocl"), [], program.build
+
+    class Empty:
+        def all_kernels(self):
+            return []
+
+    def first_in_vain(workspace, text, *options):
+        builds.append(options)
+        return Empty() if len(builds) <= failures else build(workspace, text, *options)
+
+    monkeypatch.setattr(program, "build", first_in_vain)
+    cloud = fs.SplatCloud([[0, 0, 2]], [[1, 0, 0, 0]], [[0.3, 0.3]], [0.5], colors=[[1, 1, 1]])
+    camera = fs.Camera.pinhole(8, 8, 8, 8, 4, 4)
+    failures = 3
+    with pytest.raises(fs.DeviceError, match="cache of compiled kernels"):
+        renderer.render(cloud, camera)
+    builds.clear()
+    failures = 1
+    assert renderer.render(cloud, camera)["rgb"].sum() > 0
+    assert builds == [(), ("-DATTEMPT_1",)]
+
+
 def test_a_damaged_cache_of_pyopencl_is_done_without(full_cache, tmp_path):
     folder = tmp_path / "cache"
     shutil.copytree(full_cache[0], folder)
@@ -92,3 +120,12 @@ def test_the_cache_is_where_pocl_looks(monkeypatch, tmp_path):
     assert cache_folder() == tmp_path / "pocl" / "kcache"
     monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path / "mine"))
     assert cache_folder() == tmp_path / "mine"
+
+
+def test_what_another_process_is_about_to_finish_is_left_alone(tmp_path):
+    unfinished, broken = tmp_path / "tempfile_ab12cd.so", tmp_path / "blend.so"
+    for file in (unfinished, broken):
+        file.write_bytes(b"")
+    assert remove_broken(tmp_path) == 1
+    assert unfinished.exists()
+    assert not broken.exists()
