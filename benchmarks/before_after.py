@@ -1,6 +1,6 @@
 """A commit against this tree: frames of both in turns, each in a process of its own.
 
-    python benchmarks/before_after.py COMMIT [--scene r1m_1080p] [--device opencl] [--repeats 15] [--json]
+    python benchmarks/before_after.py COMMIT [--scene r1m_1080p] [--device D] [--repeats 15] [--json FILE]
 
 Both processes draw the scene of this tree with its constants (alpha cut-off 1/255, stop 1e-4, precise
 arithmetic), splats resident, the picture left on the device. One frame each, in turns, and which goes first
@@ -11,27 +11,29 @@ effects.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
-import statistics
 import subprocess
 import sys
 import tempfile
 from datetime import date
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import track
+import numpy as np
+from measuring import PROGRESS, keep, options
+from rich.progress import Progress
+
+from fidsplat.random_clouds import load_scene
+from fidsplat.timing import Clock, Timer, quartiles, ratios, take_turns
 
 ROOT = Path(__file__).resolve().parent.parent
-WARM_UP = 3
 CHILD = """
 import hashlib, sys, time
+import numpy as np
 import fidsplat as fs
-sys.path.insert(0, sys.argv[3])
-from fidsplat.random_clouds import load_scene
-cloud, camera = load_scene(sys.argv[1])
+scene = np.load(sys.argv[1])
+cloud = fs.SplatCloud(**{name: scene[name] for name in ("means", "quats", "scales", "opacities", "colors")})
+width, height, focal = scene["camera"]
+camera = fs.Camera.pinhole(int(width), int(height), focal, focal, width / 2, height / 2)
 renderer = fs.Renderer(sys.argv[2])
 resident = renderer.upload(cloud)
 knobs = {"arithmetic": "precise"} if "arithmetic" in fs.Quality.__dataclass_fields__ else {}
@@ -46,28 +48,36 @@ for line in sys.stdin:
 """
 
 
+def saved_scene(name: str, file: Path) -> Path:
+    """A scene in a file that every commit can read."""
+    cloud, camera = load_scene(name)
+    arrays = {field: getattr(cloud, field) for field in ("means", "quats", "scales", "opacities", "colors")}
+    np.savez(file, camera=(camera.width, camera.height, camera.fx), **arrays)
+    return file
+
+
 class Tree:
     """A process that draws with one tree's code."""
 
-    def __init__(self, tree: Path, scene: str, device: str) -> None:
+    def __init__(self, tree: Path, scene: Path, device: str) -> None:
         self.child = subprocess.Popen(
-            [sys.executable, "-c", CHILD, scene, device, str(tree)],
+            [sys.executable, "-c", CHILD, str(scene), device],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
             cwd=tree,
             env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tree), os.environ.get("PYTHONPATH", "")])},
         )
-        self.device = self._line()
+        self.device, self.clock = self._line(), Clock()
         self.picture = ""
 
-    def frame(self) -> float:
-        """Milliseconds of one more frame."""
+    def frame(self) -> None:
+        """One more frame; the clock goes on by what it took the process."""
         assert self.child.stdin is not None
         self.child.stdin.write("\n")
         self.child.stdin.flush()
         spent, self.picture = self._line().split()
-        return float(spent)
+        self.clock.seconds += float(spent) / 1e3
 
     def _line(self) -> str:
         assert self.child.stdout is not None
@@ -93,25 +103,23 @@ def measure(commit: str, scene: str, device: str, repeats: int) -> dict:
     """Both trees' times and the ratio of this tree's to the commit's."""
     with tempfile.TemporaryDirectory() as folder:
         old = Path(commit).resolve() if Path(commit).is_dir() else checked_out(commit, Path(folder))
-        trees = [Tree(old, scene, device), Tree(ROOT, scene, device)]
-        for _ in range(WARM_UP):
-            [tree.frame() for tree in trees]
-        times: list[list[float]] = [[], []]
-        for turn in track(range(repeats), scene, console=Console(stderr=True)):
-            for k in (0, 1) if turn % 2 else (1, 0):
-                times[k].append(trees[k].frame())
+        file = saved_scene(scene, Path(folder) / "scene.npz")
+        trees = [Tree(old, file, device), Tree(ROOT, file, device)]
+        before, now = (Timer(tree.frame, tree.clock) for tree in trees)
+        with Progress(console=PROGRESS) as progress:
+            task = progress.add_task(scene, total=2 * repeats)
+            take_turns([before, now], repeats, warm_up=3, tick=lambda: progress.advance(task))
         for tree in trees:
             tree.close()
-    ratios = [mine / before for before, mine in zip(*times, strict=True)]
-    low, middle, high = statistics.quantiles(ratios, n=4)
+    low, middle, high = quartiles(ratios(now, before))
     return {
         "scene": scene,
         "device": trees[1].device,
         "date": date.today().isoformat(),
         "commit": commit,
         "pairs": repeats,
-        "before_ms": statistics.median(times[0]),
-        "now_ms": statistics.median(times[1]),
+        "before_ms": before.median,
+        "now_ms": now.median,
         "ratio": middle,
         "quartiles": [low, high],
         "same_bits": trees[0].picture == trees[1].picture,
@@ -119,18 +127,12 @@ def measure(commit: str, scene: str, device: str, repeats: int) -> dict:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, repeats=15)
     parser.add_argument("commit", help="any name that git knows, or a folder with its files")
     parser.add_argument("--scene", default="r1m_1080p")
-    parser.add_argument("--device", default="opencl")
-    parser.add_argument("--repeats", type=int, default=15, help="pairs of frames, 2 or more")
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
-    row = measure(options.commit, options.scene, options.device, max(options.repeats, 2))
-    if options.json:
-        print(json.dumps(row))
+    asked = parser.parse_args()
+    row = measure(asked.commit, asked.scene, asked.device, max(asked.repeats, 2))
+    if keep(row, asked.json):
         return
     print("{scene} on {device}, {date}, {pairs} pairs".format(**row))
     print("{commit} {before_ms:.2f} ms, now {now_ms:.2f} ms".format(**row))

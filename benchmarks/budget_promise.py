@@ -1,6 +1,6 @@
-"""How often `fs.Quality.within` keeps what it promises, on scenes that its table was not made of.
+"""How often `fs.quality_within` keeps what it promises, on scenes that its table was not made of.
 
-    python benchmarks/budget_promise.py [--device opencl:pocl] [--scenes 200] [-o FILE.json]
+    python benchmarks/budget_promise.py [--device opencl:pocl] [--scenes 200] [--json FILE]
 
 Errors: random scenes with held-out seeds, each with every bound of BOUNDS, against the float64 reference.
 `table` is the setting that the table gives for the bound; `measured` the one that was calibrated on the scene
@@ -11,29 +11,23 @@ times what TIMED takes in each scene; then FRAMES frames are drawn, and those in
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import os
-import sys
 import tempfile
-import time
 from dataclasses import dataclass, field, replace
-from datetime import date
-from pathlib import Path
+from functools import partial
 
 import numpy as np
-from rich.console import Console
+from measuring import PROGRESS, facts, keep, options, show
 from rich.progress import track
-from rich.table import Table
 
 import fidsplat as fs
 from fidsplat.accuracy import errors, truth
 from fidsplat.budget import choose
 from fidsplat.errors import InputError
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED
-from fidsplat.files import atomic_write
 from fidsplat.random_clouds import HELD_OUT, RandomScene, random_scene
+from fidsplat.timing import Timer, frame_timer, take_turns
 
 BOUNDS = (1e-2, 1e-3, 1e-4)
 SCENES = ("tag", "r100k_720p", "r1m_1080p")
@@ -72,21 +66,25 @@ def moved(scene: RandomScene) -> RandomScene:
     )
 
 
-def errors_kept(renderer: fs.Renderer, count: int, measured: int, where: Console) -> list[dict]:
+def capture_of(scene: RandomScene) -> fs.Capture:
+    return fs.Capture(scene.camera, background=scene.background)
+
+
+def errors_kept(renderer: fs.Renderer, count: int, measured: int) -> list[dict]:
     """A row for each way of asking and each bound: of `count` scenes, and of the first `measured` of them."""
-    judge = fs.Renderer("reference")
+    reference = fs.Renderer("reference")
     ways = ("table", "crossing", "measured", "elsewhere")
     kept = {(way, bound): Kept() for way in ways for bound in BOUNDS}
-    table = {bound: fs.Quality.within(error=bound, device=renderer) for bound in BOUNDS}
+    table = {bound: fs.quality_within(error=bound, device=renderer) for bound in BOUNDS}
 
     def hold(way: str, bound: float, scene: RandomScene, quality: fs.Quality, want: np.ndarray) -> None:
         frame = renderer.render(scene.cloud, scene.camera, quality=quality, background=scene.background)
         kept[way, bound].worst.append(errors(frame["rgb"], want).maximum / bound)
 
     def truth_of(scene: RandomScene) -> np.ndarray:
-        return truth(judge, scene.cloud, scene.camera, background=scene.background)
+        return truth(reference, scene.cloud, capture_of(scene))
 
-    for k in track(range(count), "errors", console=where):
+    for k in track(range(count), "errors", console=PROGRESS):
         scene = random_scene(HELD_OUT + k)
         want = truth_of(scene)
         for bound, quality in table.items():
@@ -97,9 +95,9 @@ def errors_kept(renderer: fs.Renderer, count: int, measured: int, where: Console
         mixed, there = truth_of(crossing), truth_of(elsewhere)
         for bound, quality in table.items():
             hold("crossing", bound, crossing, quality, mixed)
-            place = {"camera": scene.camera, "cloud": scene.cloud, "background": scene.background}
+            place = {"scene": scene.cloud, "capture": capture_of(scene)}
             try:
-                own = fs.Quality.within(error=bound, device=renderer, **place)
+                own = fs.quality_within(error=bound, device=renderer, **place)
             except InputError:
                 kept["measured", bound].refused += 1
                 continue
@@ -108,94 +106,88 @@ def errors_kept(renderer: fs.Renderer, count: int, measured: int, where: Console
     return [{"way": way, "error": bound, **found.as_dict()} for (way, bound), found in kept.items()]
 
 
-def times_kept(renderer: fs.Renderer, names: list[str], where: Console) -> list[dict]:
+def times_kept(renderer: fs.Renderer, names: list[str]) -> list[dict]:
     """A row for each scene and budget."""
     rows = []
     for name in names:
         cloud, camera = BENCH_SCENES[name].make()
         resident = renderer.upload(cloud)
-        usual = float(np.median(frame_times(renderer, resident, camera, TIMED, 10)))
-        for times in track(TIMES, f"times, {name}", console=where):
+        usual = timed(renderer, resident, camera, TIMED, 10).median
+        for times in track(TIMES, f"times, {name}", console=PROGRESS):
             ms = times * usual
             row = {"scene": name, "base_ms": usual, "budget_ms": ms}
-            begun = time.perf_counter()
-            try:
-                found = choose(ms=ms, camera=camera, cloud=cloud, device=renderer)
-            except InputError as error:
-                rows.append(row | {"refused": str(error)})
+            answers = []
+            ask = partial(choose, ms=ms, scene=cloud, capture=camera, device=renderer)
+            calibration = Timer(lambda answers=answers, ask=ask: answers.append(ask()), drops_out=True)
+            seconds = calibration.run() / 1e3
+            if calibration.error:
+                rows.append(row | {"refused": calibration.error})
                 continue
-            calibration = time.perf_counter() - begun
-            taken = frame_times(renderer, resident, camera, found.quality, FRAMES)
+            (found,) = answers
+            taken = timed(renderer, resident, camera, found.quality, FRAMES)
             rows.append(
                 row
                 | {
-                    "calibration_s": calibration,
+                    "calibration_s": seconds,
                     "chosen": found.knobs,
                     "error": found.error,
                     "frames": FRAMES,
-                    "in_time": int((taken <= ms).sum()),
-                    "median_ms": float(np.median(taken)),
-                    "p90_ms": float(np.quantile(taken, 0.9)),
+                    "in_time": int((np.array(taken.ms) <= ms).sum()),
+                    "median_ms": taken.median,
+                    "p90_ms": float(np.quantile(taken.ms, 0.9)),
                 }
             )
     return rows
 
 
-def frame_times(renderer: fs.Renderer, resident, camera, quality, count: int) -> np.ndarray:
-    """Milliseconds of frames (count,), after one that does not count."""
-    taken = []
-    for _ in range(count + 1):
-        begun = time.perf_counter()
-        frame = renderer.render(resident, camera, quality=quality)
-        assert frame.timings is not None  # waits for the device
-        taken.append(1e3 * (time.perf_counter() - begun))
-    return np.array(taken[1:])
+def timed(renderer: fs.Renderer, resident, camera, quality, count: int) -> Timer:
+    """The times of so many frames, after one that does not count."""
+    timer = frame_timer(renderer, resident, camera, quality=quality)
+    take_turns([timer], count, warm_up=1)
+    return timer
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--device", default=None)
+def main() -> None:
+    parser = options(__doc__)
     parser.add_argument("--scenes", type=int, default=200)
     parser.add_argument("--measured", type=int, default=60, help="scenes that are calibrated too")
     parser.add_argument("--timed", default=",".join(SCENES), help="bench scenes, or nothing")
-    parser.add_argument("-o", "--out", type=Path)
-    args = parser.parse_args()
-    where = Console(stderr=True)
+    asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder  # nothing that was measured before counts
-        renderer = fs.Renderer(args.device)
+        renderer = fs.Renderer(asked.device)
         found = {
-            "device": renderer.device.title,
-            "driver": renderer.device.version,
-            "date": date.today().isoformat(),
-            "fidsplat": fs.__version__,
-            "scenes": args.scenes,
-            "errors": errors_kept(renderer, args.scenes, args.measured, where),
-            "times": times_kept(renderer, [name for name in args.timed.split(",") if name], where),
+            **facts(renderer),
+            "scenes": asked.scenes,
+            "errors": errors_kept(renderer, asked.scenes, asked.measured),
+            "times": times_kept(renderer, [name for name in asked.timed.split(",") if name]),
         }
-    table = Table("way", "error", "kept", "refused", "worst / bound", "median / bound", box=None)
-    for row in found["errors"]:
-        ratios = (f"{row[f'{which}_over_bound']:.3g}" for which in ("worst", "median"))
-        share = f"{row['kept']} of {row['promises']}"
-        table.add_row(row["way"], f"{row['error']:g}", share, str(row["refused"]), *ratios)
-    where.print(table)
-    table = Table("scene", "budget ms", "error", "median ms", "in time", "calibrated in s", box=None)
-    for row in found["times"]:
-        if "refused" in row:
-            table.add_row(row["scene"], f"{row['budget_ms']:.1f}", row["refused"])
-        else:
-            numbers = (
-                f"{row['error']:.2g}",
-                f"{row['median_ms']:.1f}",
-                f"{row['in_time']} of {row['frames']}",
-            )
-            table.add_row(row["scene"], f"{row['budget_ms']:.1f}", *numbers, f"{row['calibration_s']:.1f}")
-    where.print(table)
-    if args.out:
-        with atomic_write(args.out) as stream:
-            stream.write((json.dumps(found, indent=1) + "\n").encode())
-    return 0
+    if keep(found, asked.json):
+        return
+    heads = ("way", "error", "kept", "refused", "worst / bound", "median / bound")
+    show("Errors", heads, map(error_cells, found["errors"]))
+    heads = ("scene", "budget ms", "error", "median ms", "in time", "calibrated in s")
+    show("Times", heads, map(time_cells, found["times"]))
+
+
+def error_cells(row: dict) -> tuple[str, ...]:
+    ratios = (f"{row[f'{which}_over_bound']:.3g}" for which in ("worst", "median"))
+    return (
+        row["way"],
+        f"{row['error']:g}",
+        f"{row['kept']} of {row['promises']}",
+        str(row["refused"]),
+        *ratios,
+    )
+
+
+def time_cells(row: dict) -> tuple[str, ...]:
+    budget = f"{row['budget_ms']:.1f}"
+    if "refused" in row:
+        return row["scene"], budget, row["refused"]
+    numbers = f"{row['error']:.2g}", f"{row['median_ms']:.1f}", f"{row['in_time']} of {row['frames']}"
+    return row["scene"], budget, *numbers, f"{row['calibration_s']:.1f}"
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -9,8 +9,10 @@ from dataclasses import asdict
 import pytest
 
 import fidsplat as fs
+from fidsplat.backends.base import Measurable
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES
 from fidsplat.experiments.bench.measure import SceneRun
+from fidsplat.timing import Clock
 
 try:
     import pytest_benchmark  # noqa: F401  the fixture `benchmark`
@@ -21,17 +23,8 @@ SMALL_MACHINE = 8
 """Compute units of a processor below which heavy scenes are left out."""
 
 
-class Clock:
-    """A timer that what is measured moves on: a stage by the device's clock, a part of a child process."""
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
-
-    def __call__(self) -> float:
-        return self.seconds
-
-
 CLOCK = Clock()
+"""what is measured moves it on: a stage by the device's clock, a part of a child process"""
 
 
 def pytest_addoption(parser) -> None:
@@ -41,11 +34,12 @@ def pytest_addoption(parser) -> None:
 
 def pytest_benchmark_update_machine_info(config, machine_info) -> None:
     renderer = fs.Renderer(config.getoption("--device"))
-    rates = getattr(renderer.backend, "rates", None)
+    backend = renderer.backend
+    rates = backend.rates() if isinstance(backend, Measurable) else None
     machine_info["fidsplat"] = {
         "version": fs.__version__,
         "device": asdict(renderer.device),
-        "rates": asdict(rates()) if rates else None,
+        "rates": rates and asdict(rates),
     }
 
 
@@ -69,5 +63,5 @@ def run(request, device) -> SceneRun:
     if scene.heavy and small and not request.config.getoption("--big"):
         pytest.skip(f"{request.param} takes long on {info.compute_units} cores; --big draws it all the same")
     made = SceneRun(request.param, device, None, *scene.make())
-    assert not made.result.error, made.result.error
+    assert not made.result.timer.error, made.result.timer.error
     return made

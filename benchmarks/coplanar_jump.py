@@ -1,7 +1,7 @@
 """How far a pixel jumps when a camera turns about a marker in steps of 1e-4 degrees, and when the marker's
 splats are re-ordered.
 
-    python benchmarks/coplanar_jump.py [--device opencl] [-o docs/images/coplanar-jump.png] [--json]
+    python benchmarks/coplanar_jump.py [--device opencl] [-o docs/images/coplanar-jump.png] [--json FILE]
 
 "order" composites a marker's splats by the depth of their centres, as other renderers do and fidsplat does
 with Quality(coplanar="order"); "blend" draws them as one layer. 20 steps about the view in which centres
@@ -12,21 +12,16 @@ QR code face to face before and after the worst step.
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
-from datetime import date
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
+from measuring import PROGRESS, facts, keep, options, show
 from rich.progress import track
-from rich.table import Table
 
 import fidsplat as fs
+from fidsplat.hard_cases.agreement import draw
 from fidsplat.hard_cases.clouds import taken
 from fidsplat.hard_cases.coplanar import STEP, WALL_STEP, largest_jump, turning, wall
-from fidsplat.hard_cases.invariance import draw
 from fidsplat.vision.images import to_uint8, write_png
 from fidsplat.vision.paint import contact_sheet
 
@@ -69,55 +64,36 @@ def picture(panels: dict) -> np.ndarray:
         jump, before, after = panels["QR 5", mode]
         titled = (
             (f"coplanar={mode}", before),
-            ("0.0001 deg on", after),
-            (f"difference, {jump:.2g}", np.abs(after - before)),
+            ("turned by 0.0001 degrees", after),
+            (f"difference, at most {jump:.2g}", np.abs(after - before)),
         )
-        # the code's middle, each pixel two wide
+        # the code's middle, each pixel three wide
         crop = np.s_[48:144, 72:168]
         rows.append(
-            [(title, to_uint8(image[crop]).repeat(2, axis=0).repeat(2, axis=1)) for title, image in titled]
+            [(title, to_uint8(image[crop]).repeat(3, axis=0).repeat(3, axis=1)) for title, image in titled]
         )
-    return contact_sheet(rows, width=192)
+    return contact_sheet(rows, width=288)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--device", default="opencl")
+    parser = options(__doc__)
     parser.add_argument("-o", "--out", type=Path, help="PNG file for the picture")
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
-    renderer = fs.Renderer(options.device)
+    asked = parser.parse_args()
+    renderer = fs.Renderer(asked.device)
     panels: dict = {}
-    console = Console(stderr=True)
-    rows = [
-        row for name in track(SPECS, "markers", console=console) for row in measure(renderer, name, panels)
-    ]
-    if options.out is not None:
-        write_png(options.out, picture(panels))
-    if options.json:
-        facts = {"date": date.today().isoformat(), "device": renderer.device.title, "rows": rows}
-        json.dump(facts, sys.stdout, indent=2)
-        print()
+    markers = track(SPECS, "markers", console=PROGRESS)
+    rows = [row for name in markers for row in measure(renderer, name, panels)]
+    if asked.out is not None:
+        write_png(asked.out, picture(panels))
+    if keep({**facts(renderer), "rows": rows}, asked.json):
         return
-    table = Table(title=f"Largest jump of a pixel on {renderer.device.title}", title_justify="left")
-    for head in (
-        "marker",
-        "splats",
-        "tilt",
-        "step, order",
-        "step, blend",
-        "shuffled, order",
-        "shuffled, blend",
-    ):
-        table.add_column(head, justify="left" if head == "marker" else "right")
-    for row in rows:
+
+    def cells(row: dict) -> tuple[str, ...]:
         jumps = (row[f"{what}_{mode}"] for what in ("step", "shuffle") for mode in MODES)
-        table.add_row(
-            row["marker"], str(row["splats"]), f"{row['tilt_deg']:g}", *(f"{jump:.1e}" for jump in jumps)
-        )
-    Console().print(table)
+        return row["marker"], str(row["splats"]), f"{row['tilt_deg']:g}", *(f"{jump:.1e}" for jump in jumps)
+
+    heads = ("marker", "splats", "tilt", "step, order", "step, blend", "shuffled, order", "shuffled, blend")
+    show(f"Largest jump of a pixel on {renderer.device.title}", heads, map(cells, rows))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Makes the pictures of the pages anew: docs/images/demo.jpg, and real-scene.jpg when a captured scene is
+"""Makes the pictures of the pages again: docs/images/demo.jpg, and real-scene.jpg when a captured scene is
 given.
 
 python benchmarks/docs_images.py [biker.compressed.ply]
@@ -15,22 +15,27 @@ HERE = Path(__file__).resolve().parent
 IMAGES = HERE.parent / "docs" / "images"
 
 
-def save(sheet: Path, name: str, width: int) -> None:
+def save(sheet: Path, name: str) -> None:
+    """As JPEG with its colours at full resolution, so that edges of markers stay sharp."""
     image = cv2.imread(str(sheet))
     assert image is not None
-    height = round(image.shape[0] * width / image.shape[1])
-    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    cv2.imwrite(str(IMAGES / name), small, [cv2.IMWRITE_JPEG_QUALITY, 88])
+    wanted = [
+        cv2.IMWRITE_JPEG_QUALITY,
+        85,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+    ]
+    cv2.imwrite(str(IMAGES / name), image, wanted)
 
 
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run([sys.executable, "-m", "fidsplat.cli", "demo", "--out", folder], check=True)
-        save(Path(folder) / "contact-sheet.png", "demo.jpg", 1600)
+        save(Path(folder) / "contact-sheet.png", "demo.jpg")
         for scene in sys.argv[1:]:
             script = str(HERE / "real_scene.py")
             subprocess.run([sys.executable, script, scene, "-o", folder], check=True)
-            save(Path(folder) / "sheet.png", "real-scene.jpg", 1224)
+            save(Path(folder) / "sheet.png", "real-scene.jpg")
 
 
 if __name__ == "__main__":

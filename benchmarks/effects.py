@@ -1,7 +1,7 @@
 """What each effect costs: a standard random scene without and with it, in turns, splats resident.
 
-    python benchmarks/effects.py [NAME ...] [--scene r1m_1080p] [--device opencl] [--repeats 5] [--json]
-    python benchmarks/effects.py --table FILE.json [FILE.json ...]       the table of docs/effects.md
+    python benchmarks/effects.py [NAME ...] [--scene r1m_1080p] [--device opencl] [--repeats 5] [--json FILE]
+    python benchmarks/effects.py --table FILE.json [FILE.json ...]       the table of docs/effect-prices.md
 
 Every frame with an effect is followed by one without, the picture left on the device, the queue drained
 before and after each, so that what else the machine does falls on both. The price is the median of the ratios
@@ -12,24 +12,19 @@ Gaussians and cover less of the picture.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
-import statistics
-import sys
-import time
-from datetime import date
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
+from measuring import PROGRESS, facts, keep, options, show
 from rich.progress import track
-from rich.table import Table
 
 import fidsplat as fs
 from fidsplat.effects import OUTPUTS
 from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.random_clouds import SCENES, load_scene
+from fidsplat.timing import frame_timer, quartiles, ratios, take_turns
 
 TABLE = tuple(np.linspace(0, 1, 64) ** 0.5)
 SENSORS = {
@@ -81,7 +76,7 @@ def shutters() -> dict[str, dict]:
     return {
         # every tenth splat
         "moving group": {"motion": fs.Motion(None, {1: moved}), "shutter": fs.Shutter(time=0.1)},
-        "blur, 8 poses": {"motion": turn, "shutter": fs.Shutter(exposure=0.02)},
+        "blur, 8 poses": {"motion": turn, "shutter": fs.Shutter(exposure_time=0.02)},
         "rolling, bands of 64 rows": {
             "motion": turn,
             "shutter": fs.Shutter(readout=0.02, rows_per_band=64),
@@ -89,7 +84,7 @@ def shutters() -> dict[str, dict]:
         "rolling, bands of 8 rows": {"motion": turn, "shutter": fs.Shutter(readout=0.02)},
         "blur, 8 poses, and rolling, bands of 64 rows": {
             "motion": turn,
-            "shutter": fs.Shutter(exposure=0.01, readout=0.02, rows_per_band=64),
+            "shutter": fs.Shutter(exposure_time=0.01, readout=0.02, rows_per_band=64),
         },
     }
 
@@ -128,50 +123,32 @@ def changed(cloud: fs.SplatCloud, what: str | int) -> fs.SplatCloud:
     return fs.SplatCloud(cloud.means, cloud.quats, cloud.scales, cloud.opacities, sh=sh)
 
 
-def milliseconds(renderer: fs.Renderer, resident, call: dict) -> float:
-    """Wall time of one frame."""
-    start = time.perf_counter()
-    frame = renderer.render(resident, **{"quality": TIMED, **call})
-    _ = frame.timings  # waits for the device
-    return (time.perf_counter() - start) * 1e3
-
-
-def measure(options: argparse.Namespace) -> list[dict]:
+def measure(names: list[str], scene: str, device: str, repeats: int) -> list[dict]:
     """One row for each effect."""
-    renderer = fs.Renderer(options.device)
-    cloud, camera = load_scene(options.scene)
+    renderer = fs.Renderer(device)
+    cloud, camera = load_scene(scene)
     cloud = cloud.with_labels((np.arange(len(cloud)) % 10 == 0).astype(np.int32))
     plain = renderer.upload(cloud)
     known = effects(camera)
     rows = []
-    for name in track(options.names or list(known), "effects", console=Console(stderr=True)):
+    for name in track(names or list(known), "effects", console=PROGRESS):
         call = {"camera": camera, **known[name]}
         what = call.pop("cloud", None)
         resident = plain if what is None else renderer.upload(changed(cloud, what))
-        for _ in range(2):
-            milliseconds(renderer, resident, call), milliseconds(renderer, plain, {"camera": camera})
-        pairs = [
-            (milliseconds(renderer, resident, call), milliseconds(renderer, plain, {"camera": camera}))
-            for _ in range(options.repeats)
-        ]
-        ratios = [mine / base for mine, base in pairs]
-        quartiles = statistics.quantiles(ratios, n=4)
+        base = frame_timer(renderer, plain, camera, quality=TIMED)
+        mine = frame_timer(renderer, resident, **{"quality": TIMED, **call})
+        take_turns([mine, base], repeats)
+        low, middle, high = quartiles([100 * (ratio - 1) for ratio in ratios(mine, base)])
         rows.append(
             {
                 "effect": name,
-                "base_ms": statistics.median(base for _, base in pairs),
-                "effect_ms": statistics.median(mine for mine, _ in pairs),
-                "price_percent": (statistics.median(ratios) - 1) * 100,
-                "quartiles_percent": [(quartiles[0] - 1) * 100, (quartiles[2] - 1) * 100],
+                "base_ms": base.median,
+                "effect_ms": mine.median,
+                "price_percent": middle,
+                "quartiles_percent": [low, high],
             }
         )
-    about = {
-        "scene": options.scene,
-        "device": f"{renderer.device.title} ({renderer.device.platform})",
-        "driver": renderer.device.version,
-        "date": date.today().isoformat(),
-        "repeats": options.repeats,
-    }
+    about = {"scene": scene, **facts(renderer), "repeats": repeats}
     return [about | row for row in rows]
 
 
@@ -195,40 +172,34 @@ def page_table(files: list[str]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, repeats=5)
     known = list(effects(fs.Camera.pinhole(8, 8, 8, 8, 4, 4)))
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"default all of: {', '.join(known)}")
     parser.add_argument("--scene", default="r1m_1080p", choices=list(SCENES))
-    parser.add_argument("--device", default="opencl")
-    parser.add_argument("--repeats", type=int, default=5, help="2 or more")
-    parser.add_argument("--json", action="store_true")
     parser.add_argument("--table", nargs="+", metavar="FILE", help="print results side by side instead")
-    options = parser.parse_args()
-    if options.table:
-        print(page_table(options.table))
+    asked = parser.parse_args()
+    if asked.table:
+        print(page_table(asked.table))
         return
-    if unknown := set(options.names) - set(known):
+    if unknown := set(asked.names) - set(known):
         parser.error(f"no effect is called {', '.join(sorted(unknown))}; there are: {', '.join(known)}")
-    options.repeats = max(options.repeats, 2)
-    rows = measure(options)
-    if options.json:
-        json.dump(rows, sys.stdout, indent=1)
-        print()
+    rows = measure(asked.names, asked.scene, asked.device, max(asked.repeats, 2))
+    if keep(rows, asked.json):
         return
-    title = "{scene}, {device}, {driver}, {date}, {repeats} pairs".format(**rows[0])
-    table = Table("effect", "base [ms]", "with it [ms]", "price", "quartiles", title=title)
-    for row in rows:
-        low, high = row["quartiles_percent"]
-        table.add_row(
-            row["effect"],
-            f"{row['base_ms']:.2f}",
-            f"{row['effect_ms']:.2f}",
-            f"{row['price_percent']:+.0f} %",
-            f"{low:+.0f} to {high:+.0f} %",
-        )
-    Console(width=130).print(table)
+    show(
+        "{scene}, {device}, {driver}, {date}, {repeats} pairs".format(**rows[0]),
+        ("effect", "base [ms]", "with it [ms]", "price", "quartiles"),
+        (
+            (
+                row["effect"],
+                f"{row['base_ms']:.2f}",
+                f"{row['effect_ms']:.2f}",
+                f"{row['price_percent']:+.0f} %",
+                "{:+.0f} to {:+.0f} %".format(*row["quartiles_percent"]),
+            )
+            for row in rows
+        ),
+    )
 
 
 if __name__ == "__main__":

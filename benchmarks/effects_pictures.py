@@ -1,4 +1,4 @@
-"""Makes the pictures of docs/effects.md but the low-passes' (filter_quality.py), and the sheet in the README.
+"""Makes the pictures of effects in the pages and the README, but the low-passes' (filter_quality.py).
 
 python benchmarks/effects_pictures.py [--device opencl] [--out docs/images]
 """
@@ -10,6 +10,7 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -19,16 +20,25 @@ from rich.progress import track
 
 import fidsplat as fs
 from fidsplat.scenes import PlacedMarker
-from fidsplat.vision.images import to_uint8, write_png
-from fidsplat.vision.paint import contact_sheet, count_picture, depth_picture, label_picture, normal_picture
+from fidsplat.vision.images import to_uint8
+from fidsplat.vision.paint import (
+    contact_sheet,
+    count_key,
+    count_picture,
+    depth_key,
+    depth_picture,
+    depth_span,
+    label_picture,
+    normal_key,
+    normal_picture,
+)
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "examples"))
 from make_data import globe, sky  # noqa: E402
 
-WIDTH, HEIGHT = 320, 200
-PAINT = {"depth": depth_picture, "distance": depth_picture, "normal": normal_picture}
-PAINT |= {"label": label_picture, "splat_id": label_picture, "blended": count_picture}
+WIDTH, HEIGHT = 480, 300
+DUSK = (0.0, 0.15, 0.6), (1.0, 0.7, 0.3)  # above, below
 
 
 def room(mixture: str) -> fs.Scene:
@@ -53,19 +63,35 @@ def room(mixture: str) -> fs.Scene:
     return fs.Scene([ground], camera, tags, background=(0.55, 0.7, 0.9))
 
 
-def small(rows: list[list[tuple[str, np.ndarray]]], width: int) -> np.ndarray:
-    """A sheet with 5 bits per channel: pages should load fast."""
-    return contact_sheet(rows, width=width) // 8 * 8
+def save(file: Path, image: np.ndarray) -> None:
+    """As JPEG with its colours at full resolution: edges of markers are what these pictures are about."""
+    wanted = [
+        cv2.IMWRITE_JPEG_QUALITY,
+        88,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+        cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+    ]
+    cv2.imwrite(str(file), image[:, :, ::-1], wanted)
 
 
 def examples(renderer: fs.Renderer, out: Path) -> None:
-    """The scene files whose picture stands beside them in docs/effects.md."""
+    """The scene files whose picture stands beside them in the pages, each drawn WIDTH pixels wide."""
     folder = ROOT / "examples"
     files = sorted(
         file for name in ("lens-*", "shutter-*", "together") for file in folder.glob(f"{name}.toml")
     )
     for file in track(files, "examples", console=Console(stderr=True)):
-        write_png(out / f"effect-{file.stem}.png", renderer.render(fs.Scene.load(file))["rgb"])
+        scene = fs.Scene.load(file)
+        small = scene.camera
+        assert small is not None
+        times = WIDTH / small.width
+        camera = replace(
+            small,
+            width=WIDTH,
+            height=round(small.height * times),
+            **{name: getattr(small, name) * times for name in ("fx", "fy", "cx", "cy")},
+        )
+        save(out / f"effect-{file.stem}.jpg", to_uint8(renderer.render(scene, camera)["rgb"]))
 
 
 def turned(degrees: float) -> Callable[[float], np.ndarray]:
@@ -81,19 +107,12 @@ def turned(degrees: float) -> Callable[[float], np.ndarray]:
 
 def shining(degree: int) -> fs.Scene:
     """The globe with its spherical harmonics up to a degree."""
-    camera = fs.Camera.look_at(WIDTH, HEIGHT, math.radians(40), (0.9, -0.9, -1.6), (0, 0, 0))
+    camera = fs.Camera.look_at(WIDTH, HEIGHT, math.radians(50), (0.9, -0.9, -1.6), (0, 0, 0))
     return fs.Scene([globe(degree)], camera, background=(0.5, 0.5, 0.5))
 
 
-def dense() -> fs.Scene:
-    """A QR code of version 10 at 2.5 pixels per module."""
-    marker = PlacedMarker(fs.marker("qr-v10-L:fidsplat", size=1.0))
-    camera = fs.Camera.look_at(WIDTH, HEIGHT, math.radians(45), (0.3, -0.2, -2.6), (0, 0, 0))
-    return fs.Scene([], camera, [marker], background=(0.5, 0.5, 0.5))
-
-
 def all_effects(renderer: fs.Renderer) -> list[tuple[str, np.ndarray]]:
-    """A titled picture of each effect, all of one shape."""
+    """A titled picture of each of twelve effects, all of one shape."""
     gaussians, boxes = room("fitted"), room("exact")
     camera = boxes.camera
     assert camera is not None
@@ -104,41 +123,42 @@ def all_effects(renderer: fs.Renderer) -> list[tuple[str, np.ndarray]]:
     def seen(scene: fs.Scene = boxes, **call) -> np.ndarray:
         return to_uint8(renderer.render(scene, **call)["rgb"])
 
-    def plane(name: str) -> np.ndarray:
-        return PAINT[name](renderer.render(boxes, outputs=("rgb", name))[name])
+    def example(name: str) -> fs.Scene:
+        return fs.Scene.load(ROOT / "examples" / f"{name}.toml")
 
-    code = dense()
-    round_ = fs.Camera.equirectangular(WIDTH, HEIGHT, world_to_camera=camera.world_to_camera)
+    fisheye = fs.Camera.fisheye(WIDTH, HEIGHT, math.radians(200))
     wide = fs.Camera.orthographic(WIDTH, HEIGHT, 4.0, world_to_camera=camera.world_to_camera)
     turn = fs.Motion(turned(150))
     panels = {
-        "pinhole, mixture fitted": lambda: seen(gaussians),
-        "boxes (mixture exact)": seen,
-        "Brown-Conrady": lambda: seen(gaussians, camera=through(fs.BrownConrady(-0.28, 0.07))),
-        "fisheye": lambda: seen(gaussians, camera=through(fs.Fisheye(), fx=130.0, fy=130.0)),
-        "panorama": lambda: seen(gaussians, camera=round_),
+        "pinhole": lambda: seen(gaussians),
+        "distortion (Brown-Conrady)": lambda: seen(gaussians, camera=through(fs.BrownConrady(-0.4, 0.12))),
+        "fisheye, 200 degrees": lambda: seen(example("lens-fisheye"), camera=fisheye),
+        "panorama": lambda: seen(example("lens-panorama"), camera=fs.Camera.equirectangular(WIDTH, HEIGHT)),
         "parallel rays": lambda: seen(gaussians, camera=wide),
-        "motion blur": lambda: seen(motion=turn, shutter=fs.Shutter(exposure=0.03, sub_poses=16)),
+        "motion blur": lambda: seen(motion=turn, shutter=fs.Shutter(exposure_time=0.03, sub_poses=16)),
         "rolling shutter": lambda: seen(motion=turn, shutter=fs.Shutter(readout=0.1, rows_per_band=4)),
-        "both": lambda: seen(motion=turn, shutter=fs.Shutter(exposure=0.03, readout=0.1, sub_poses=24)),
-        "QR 10, low-pass screen": lambda: seen(code),
-        "low-pass pixel": lambda: seen(code, quality=fs.Quality(lowpass="pixel")),
-        "none, 3 x 3 samples": lambda: seen(code, quality=fs.Quality(lowpass="none", samples=3)),
-        "plain colour": lambda: seen(shining(0)),
-        "SH degree 3": lambda: seen(shining(3)),
-        "depth": lambda: plane("depth"),
-        "normal": lambda: plane("normal"),
-        "label": lambda: plane("label"),
-        "splat_id": lambda: plane("splat_id"),
-        "blended": lambda: plane("blended"),
         "fog": lambda: seen(fog=fs.Fog(0.15, (0.75, 0.78, 0.8))),
-        "gradient": lambda: seen(background=fs.Gradient((0.1, 0.25, 0.7), (1.0, 0.95, 0.85))),
-        "image behind": lambda: seen(background=fs.Panorama(sky())),
+        "background: gradient": lambda: seen(background=fs.Gradient(*DUSK)),
+        "background: panorama": lambda: seen(background=fs.Panorama(sky())),
         "vignetting": lambda: seen(sensor=fs.Sensor(vignetting=(-0.6,))),
         "noise": lambda: seen(sensor=fs.Sensor(full_well=200, read_noise=6)),
-        "response curve": lambda: seen(sensor=fs.Sensor(exposure=0.5, response="srgb")),
     }
     return [(name, draw()) for name, draw in track(panels.items(), "effects", console=Console(stderr=True))]
+
+
+def outputs_sheet(renderer: fs.Renderer, scene: fs.Scene) -> np.ndarray:
+    """Six outputs of one picture, two in a row, with the key of what stands on the right."""
+    frame = renderer.render(scene, outputs=("rgb", "normal", "depth", "distance", "label", "blended"))
+    depth, distance = frame["depth"], frame["distance"]
+    span = depth_span([depth, distance])
+    rows = [
+        [("rgb", to_uint8(frame["rgb"])), ("normal", normal_picture(frame["normal"]))],
+        [("depth", depth_picture(depth, span)), ("distance", depth_picture(distance, span))],
+        [("label", label_picture(frame["label"])), ("blended (splats)", count_picture(frame["blended"]))],
+    ]
+    most = int(frame["blended"].max())
+    keys = (normal_key, partial(depth_key, span), partial(count_key, most))
+    return contact_sheet(rows, width=WIDTH, key=lambda row, height: keys[row](height))
 
 
 def main() -> None:
@@ -162,30 +182,29 @@ def main() -> None:
         [("fitted, near", picture(scene, camera=near)), ("exact, near", picture(exact, camera=near))],
         [("fitted, far", picture(scene, camera=far)), ("exact, far", picture(exact, camera=far))],
     ]
-    write_png(options.out / "effect-boxes.png", small(boxes, 170))
-
-    frame = renderer.render(exact, outputs=("rgb", *PAINT))
-    planes = [(name, paint(frame[name])) for name, paint in PAINT.items()]
-    write_png(options.out / "effect-outputs.png", small([planes[:3], planes[3:]], 150))
+    save(options.out / "effect-boxes.jpg", contact_sheet(boxes, width=WIDTH))
+    save(options.out / "effect-outputs.jpg", outputs_sheet(renderer, exact))
 
     seen = [
         ("plain", picture(exact)),
-        ("fog 0.15 / m", picture(exact, fog=fs.Fog(0.15, (0.75, 0.78, 0.8)))),
-        ("gradient", picture(exact, background=fs.Gradient((0.1, 0.25, 0.7), (1.0, 0.95, 0.85)))),
+        ("fog, 0.15 / m", picture(exact, fog=fs.Fog(0.15, (0.75, 0.78, 0.8)))),
+        ("gradient", picture(exact, background=fs.Gradient(*DUSK))),
         ("panorama", picture(exact, background=fs.Panorama(sky()))),
-        ("vignetting -0.6", picture(exact, sensor=fs.Sensor(vignetting=(-0.6,)))),
+        ("vignetting, -0.6", picture(exact, sensor=fs.Sensor(vignetting=(-0.6,)))),
         ("noise, 200 electrons", picture(exact, sensor=fs.Sensor(full_well=200, read_noise=6))),
     ]
-    write_png(options.out / "effect-sensor.png", small([seen[:3], seen[3:]], 140))
+    save(options.out / "effect-sensor.jpg", contact_sheet([seen[:2], seen[2:4], seen[4:]], width=WIDTH))
 
     globes = [("plain" if degree == 0 else f"degree {degree}", shining(degree)) for degree in range(4)]
     colors = [(name, picture(what)) for name, what in globes]
-    write_png(options.out / "effect-color.png", small([colors], 120))
+    save(options.out / "effect-color.jpg", contact_sheet([colors[:2], colors[2:]], width=WIDTH))
 
     examples(renderer, options.out)
     panels = all_effects(renderer)
-    sheet = contact_sheet([panels[k : k + 5] for k in range(0, len(panels), 5)], width=WIDTH)
-    cv2.imwrite(str(options.out / "effects.jpg"), sheet[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
+    save(
+        options.out / "effects.jpg",
+        contact_sheet([panels[k : k + 3] for k in range(0, len(panels), 3)], width=WIDTH),
+    )
 
 
 if __name__ == "__main__":

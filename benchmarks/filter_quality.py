@@ -8,15 +8,13 @@ texture over its area. `--picture` writes a crop of each at 2 pixels per module,
 
 from __future__ import annotations
 
-import argparse
 import math
 import random
 import string
 
 import cv2
 import numpy as np
-from rich.console import Console
-from rich.table import Table
+from measuring import facts, keep, options, show
 
 import fidsplat as fs
 from fidsplat.vision.images import to_uint8, write_png
@@ -59,32 +57,33 @@ def area_sampled(made: fs.Marker, px: float, camera: fs.Camera) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--device", default="opencl")
+    parser = options(__doc__)
     parser.add_argument("--picture", help="PNG file of crops")
-    options = parser.parse_args()
-    renderer = fs.Renderer(options.device)
+    asked = parser.parse_args()
+    renderer = fs.Renderer(asked.device)
     text = "".join(random.Random(0).choices(string.ascii_letters + string.digits, k=1000))
     markers = {mixture: fs.marker(f"qr-v22-L:{text}", mixture=mixture) for mixture in ("fitted", "exact")}
-    table = Table("QR 22, PSNR in dB", *(f"{px:g} px" for px in SIZES), title=renderer.device.title)
+    rows: list[dict] = []
     crops: list[tuple[str, np.ndarray]] = []
     for name, (mixture, lowpass, samples) in WAYS.items():
-        made, row = markers[mixture], []
+        made, row = markers[mixture], {}
         for px in SIZES:
             camera = camera_of(made, px)
             quality = fs.Quality(alpha_cutoff=1 / 255, lowpass=lowpass, samples=samples)
             rgb = renderer.render(made.cloud, camera, quality=quality, background=(GREY,) * 3)["rgb"]
             error = rgb[..., 0] - area_sampled(made, px, camera)
-            row.append(f"{-10 * math.log10(float((error * error).mean())):.1f}")
+            row[f"{px:g} px"] = -10 * math.log10(float((error * error).mean()))
             if px == 2.0:
                 crop = to_uint8(rgb[6:46, 6:46])
-                crops.append((name, cv2.resize(crop, (160, 160), interpolation=cv2.INTER_NEAREST)))
-        table.add_row(name, *row)
-    Console(width=100).print(table)
-    if options.picture:
-        write_png(options.picture, contact_sheet([crops[:4], crops[4:]], width=120) // 16 * 16)
+                crops.append((name, cv2.resize(crop, (240, 240), interpolation=cv2.INTER_NEAREST)))
+        rows.append({"way": name, "psnr_db": row})
+    if asked.picture:
+        write_png(asked.picture, contact_sheet([crops[:4], crops[4:]], width=240) // 16 * 16)
+    if keep({**facts(renderer), "rows": rows}, asked.json):
+        return
+    heads = ("QR 22, PSNR in dB", *rows[0]["psnr_db"])
+    cells = ((row["way"], *(f"{value:.1f}" for value in row["psnr_db"].values())) for row in rows)
+    show(renderer.device.title, heads, cells)
 
 
 if __name__ == "__main__":

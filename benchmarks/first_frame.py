@@ -10,8 +10,6 @@ compiled. The caches of pyopencl, PoCL and NVIDIA's driver are pointed at folder
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import statistics
 import subprocess
@@ -21,11 +19,8 @@ import time
 from datetime import date
 from pathlib import Path
 
-from rich.console import Console
+from measuring import PROGRESS, keep, options, show
 from rich.progress import track
-from rich.table import Table
-
-from fidsplat.files import atomic_write
 
 SCENES = ("tag", "demo")
 CACHES = ("empty", "warmed", "kept")
@@ -88,12 +83,11 @@ def measure(scenes: list[str], device: str, repeats: int) -> list[dict]:
     records = []
     with tempfile.TemporaryDirectory() as name:
         top = Path(name)
-        console = Console(stderr=True)
-        with console.status("fidsplat warm"):
+        with PROGRESS.status("fidsplat warm"):
             warmed_in = warm(device, top / "warmed")
         for scene in scenes:
             runs: dict[str, list[dict[str, float]]] = {cache: [] for cache in CACHES}
-            for number in track(range(repeats), description=scene, console=console):
+            for number in track(range(repeats), description=scene, console=PROGRESS):
                 # kept: what the first of the empty ones left
                 folders = {"empty": top / f"{scene} {number}", "kept": top / f"{scene} 0"}
                 for cache in CACHES:
@@ -116,27 +110,22 @@ def measure(scenes: list[str], device: str, repeats: int) -> list[dict]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, repeats=5)
     parser.add_argument("scenes", nargs="*", default=list(SCENES), metavar="SCENE")
-    parser.add_argument("--device", default="opencl")
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--json", metavar="FILE")
-    options = parser.parse_args()
-    records = measure(options.scenes, options.device, max(options.repeats, 1))
-    table = Table("scene", "caches", "seconds", "range", *PARTS, title=f"First frame on {options.device}")
-    for record in records:
+    asked = parser.parse_args()
+    records = measure(asked.scenes, asked.device, max(asked.repeats, 1))
+    if keep(records, asked.json):
+        return
+
+    def cells(record: dict) -> tuple[str, ...]:
         seconds, (low, high) = record["seconds"], record["range"]
         parts = (f"{seconds[part]:.2f}" for part in PARTS)
         total = f"{seconds['total']:.2f}"
-        table.add_row(record["scene"], record["caches"], total, f"{low:.2f} to {high:.2f}", *parts)
-    console = Console()
-    console.print(table)
-    console.print(f"fidsplat warm, with empty caches: {records[0]['warm_seconds']:.1f} s")
-    if options.json:
-        with atomic_write(options.json) as stream:
-            stream.write(json.dumps(records, indent=2).encode() + b"\n")
+        return record["scene"], record["caches"], total, f"{low:.2f} to {high:.2f}", *parts
+
+    warmed = f"fidsplat warm, with empty caches: {records[0]['warm_seconds']:.1f} s"
+    heads = ("scene", "caches", "seconds", "range", *PARTS)
+    show(f"First frame on {asked.device}; {warmed}", heads, map(cells, records))
 
 
 if __name__ == "__main__":

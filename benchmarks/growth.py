@@ -1,26 +1,27 @@
 """Measures how frames grow with splats, pixels and overdraw, into a file of JSON lines.
 
     python benchmarks/growth.py growth.jsonl --device opencl
-    python benchmarks/growth_plots.py growth.jsonl more.jsonl -o docs/images     draws what was measured
+    python benchmarks/growth.py growth.jsonl more.jsonl --plot docs/images       plots what was measured
+
+A plot for each series, log-log, a panel for each device (`pip install '.[bench]'`): whole frames are bold,
+stages thin; titles give the exponent of the frame's upper half.
 
 A series ends when a frame takes longer than --longest, or when the device cannot hold the scene. Each point
-is written when it is done; a run that was stopped goes on where it was when it is given the same file. Needs
-nothing beyond fidsplat itself.
+is written when it is done; a run that was stopped goes on where it was when it is given the same file.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 
-from rich.console import Console
+from measuring import PROGRESS, keep, options, show
 from rich.progress import Progress, TextColumn
-from rich.table import Table
 
 import fidsplat as fs
 from fidsplat.backends.base import Measurable
-from fidsplat.experiments.bench.growth import Point, exponents, measure, points
+from fidsplat.experiments.bench.growth import Point, abscissa, exponents, measure, points
+from fidsplat.files import atomic_write
 
 
 def read(file: Path) -> list[dict]:
@@ -44,7 +45,7 @@ def run(series: dict[str, list[Point]], device: str, repeats: int, longest: floa
     del renderer
     known = {(record["title"], record["series"], record["x"]): record for record in records}
     columns = (*Progress.get_default_columns(), TextColumn("{task.fields[now]}"))
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    with Progress(*columns, console=PROGRESS) as progress:
         task = progress.add_task("points", total=sum(map(len, series.values())), now="")
         for row in series.values():
             for number, point in enumerate(row):
@@ -64,25 +65,76 @@ def run(series: dict[str, list[Point]], device: str, repeats: int, longest: floa
     return records
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+STAGES = ("project", "sort", "bin", "blend", "resolve")
+UNITS = {"splats": "splats", "pixels": "pixels", "overdraw": "splats over a pixel, seen or hidden"}
+TITLES = {
+    "splats": "1920 x 1080, the same covered area",
+    "pixels": "a million splats",
+    "overdraw": "300,000 splats of growing size, 1920 x 1080",
+}
+
+
+def plot(series: str, records: list[dict], file: Path) -> None:
+    """One series: a panel for each device, all of one scale."""
+    from matplotlib import pyplot as plt
+
+    plt.switch_backend("agg")
+    chosen = [record for record in records if record["series"] == series and "frame_ms" in record]
+    titles = list(dict.fromkeys(record["title"] for record in chosen))
+    slopes = {title: found["frame"] for title, name, found in exponents(chosen) if name == series}
+    figure, panels = plt.subplots(
+        1,
+        len(titles),
+        figsize=(4.2 * len(titles) + 0.9, 4),
+        dpi=110,
+        layout="constrained",
+        sharey=True,
+        squeeze=False,
     )
-    parser.add_argument("file", type=Path, help="JSON lines; what it holds already is not measured again")
-    parser.add_argument("--device", default="opencl")
-    parser.add_argument("--repeats", type=int, default=10, help="frames of each point (default: 10)")
+    lines: dict = {}
+    for axes, title in zip(panels[0], titles, strict=True):
+        own = sorted((record for record in chosen if record["title"] == title), key=abscissa)
+        over, slope = [abscissa(record) for record in own], slopes[title]
+        (lines["frame"],) = axes.loglog(over, [r["fastest_ms"] for r in own], "k", marker="o", lw=2, ms=4)
+        for number, stage in enumerate(STAGES):
+            times = [record["fastest_stages_ms"].get(stage) for record in own]
+            (lines[stage],) = axes.loglog(over, times, color=f"C{number}", lw=1.2, marker=".", ms=5)
+        grows = "" if slope is None else f"\nframe grows as x^{slope:.2f}"
+        axes.set_title(f"{title}{grows}", fontsize=10)
+        axes.set_xlabel(UNITS[series])
+        axes.grid(which="major", alpha=0.3, lw=0.5)
+    panels[0, 0].set_ylabel("ms, fastest of the repeats")
+    figure.suptitle(TITLES[series], fontsize=11)
+    figure.legend(lines.values(), lines.keys(), loc="outside right center", frameon=False)
+    with atomic_write(file) as stream:
+        figure.savefig(stream, format="png", metadata={"Software": None})
+    plt.close(figure)
+
+
+def main() -> None:
+    parser = options(__doc__, repeats=10)
+    parser.add_argument("files", nargs="+", type=Path, help="JSON lines; what is there is not measured again")
     parser.add_argument("--longest", type=float, default=2.0, metavar="S", help="seconds (default: 2)")
-    options = parser.parse_args()
+    parser.add_argument("--plot", type=Path, metavar="DIR", help="measure nothing; plot what the files hold")
+    asked = parser.parse_args()
+    if asked.plot is not None:
+        records = [record for file in asked.files for record in read(file)]
+        for series in dict.fromkeys(record["series"] for record in records):
+            plot(series, records, asked.plot / f"growth-{series}.png")
+        return
     try:
-        records = run(points(), options.device, max(options.repeats, 1), options.longest, options.file)
+        records = run(points(), asked.device, max(asked.repeats, 1), asked.longest, asked.files[0])
     except KeyboardInterrupt:
-        raise SystemExit(f"growth: stopped; {options.file} holds what was measured") from None
+        raise SystemExit(f"growth: stopped; {asked.files[0]} holds what was measured") from None
+    if keep(records, asked.json):
+        return
     stages = list(dict.fromkeys(stage for record in records for stage in record.get("stages_ms", ())))
-    table = Table("device", "over", "frame", *stages, title="Exponents over the upper half of each series")
+    rows = []
     for title, series, found in exponents(records):
         cells = (found.get(name) for name in ("frame", *stages))
-        table.add_row(title, series, *("-" if cell is None else f"{cell:.2f}" for cell in cells))
-    Console().print(table)
+        rows.append((title, series, *("-" if cell is None else f"{cell:.2f}" for cell in cells)))
+    heads = ("device", "over", "frame", *stages)
+    show("Exponents over the upper half of each series", heads, rows)
 
 
 if __name__ == "__main__":

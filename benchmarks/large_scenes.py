@@ -15,17 +15,14 @@ import json
 import resource
 import subprocess
 import sys
-import time
-from datetime import date
-from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
+from measuring import PROGRESS, facts, keep, options, show
 
 import fidsplat as fs
 from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.random_clouds import SCENES, random_cloud, standard_camera
+from fidsplat.timing import Timer
 
 SCENE = SCENES["r20m_4k"]
 
@@ -49,21 +46,23 @@ def cloud_of(millions: int) -> fs.SplatCloud:
 
 
 def measure(millions: int, device: str, budget: float | None) -> dict:
-    """Seconds, memory and the plan of one size."""
+    """Seconds and memory of one size."""
     cloud = cloud_of(millions)
     renderer = fs.Renderer(device, None if budget is None else round(budget * 2**30))
     resident = renderer.upload(cloud)
     camera = standard_camera(SCENE.width, SCENE.height)
-    seconds = []
-    for _ in range(2):
-        start = time.perf_counter()
+    frame, mean = None, 0.0
+
+    def draw() -> None:
+        nonlocal frame, mean
         frame = renderer.render(resident, camera, quality=TIMED)
         mean = float(frame["rgb"].mean())
-        seconds.append(time.perf_counter() - start)
+
+    seconds = [Timer(draw).run() / 1e3 for _ in range(2)]
+    assert frame is not None
     return {
         "millions": millions,
-        "device": f"{renderer.device.title}, {renderer.device.version}",
-        "date": date.today().isoformat(),
+        **facts(renderer),
         "budget_gib": budget,
         "first_s": seconds[0],
         "next_s": seconds[1],
@@ -77,41 +76,43 @@ def measure(millions: int, device: str, budget: float | None) -> dict:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__)
     parser.add_argument("millions", nargs="+", type=int)
-    parser.add_argument("--device", default="opencl")
     parser.add_argument("--budget", type=float, metavar="GIB")
-    parser.add_argument("--json", type=Path)
     parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.inside:
-        print(json.dumps(measure(options.millions[0], options.device, options.budget)))
+    asked = parser.parse_args()
+    if asked.inside:
+        print(json.dumps(measure(asked.millions[0], asked.device, asked.budget)))
         return
-    rows = []
-    table = Table("splats", "first [s]", "next [s]", "device", "peak", "in chunks", "visible", "pairs")
-    for millions in options.millions:
-        command = [sys.executable, __file__, str(millions), "--device", options.device, "--inside"]
-        if options.budget is not None:
-            command += ["--budget", str(options.budget)]
-        with Console(stderr=True).status(f"{millions} M splats on {options.device}"):
+    rows: list[dict] = []
+    for millions in asked.millions:
+        command = [sys.executable, __file__, str(millions), "--device", asked.device, "--inside"]
+        if asked.budget is not None:
+            command += ["--budget", str(asked.budget)]
+        with PROGRESS.status(f"{millions} M splats on {asked.device}"):
             made = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-        row = json.loads(made.stdout)
-        rows.append(row)
-        if options.json:
-            options.json.write_text(json.dumps(rows, indent=1) + "\n", "utf-8")
-        table.add_row(
-            f"{millions} M",
-            f"{row['first_s']:.2f}",
-            f"{row['next_s']:.2f}",
-            *(f"{row[name] / 2**30:.2f} GiB" for name in ("device_bytes", "peak_bytes")),
-            "yes" if row["chunks"] else "no",
-            f"{row['visible']:,}",
-            f"{row['pairs']:,}",
-        )
-    table.title = rows[-1]["device"]
-    Console().print(table)
+        rows.append(json.loads(made.stdout))
+        if asked.json != "-":
+            keep(rows, asked.json)
+    if asked.json == "-":
+        keep(rows, "-")
+        return
+    show(
+        rows[-1]["device"],
+        ("splats", "first [s]", "next [s]", "device", "peak", "in chunks", "visible", "pairs"),
+        (
+            (
+                f"{row['millions']} M",
+                f"{row['first_s']:.2f}",
+                f"{row['next_s']:.2f}",
+                *(f"{row[name] / 2**30:.2f} GiB" for name in ("device_bytes", "peak_bytes")),
+                "yes" if row["chunks"] else "no",
+                f"{row['visible']:,}",
+                f"{row['pairs']:,}",
+            )
+            for row in rows
+        ),
+    )
 
 
 if __name__ == "__main__":

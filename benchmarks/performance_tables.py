@@ -5,9 +5,9 @@
 
 Takes what `fidsplat bench --json`, benchmarks/peers, benchmarks/first_frame.py --json,
 benchmarks/listing_ways.py --json, benchmarks/large_scenes.py --json and benchmarks/growth.py write, in any
-mixture. Without --into the tables are printed. With it, each replaces what stands between
-`<!-- begin NAME -->` and `<!-- end NAME -->` in those of the pages that have such lines; a table for which
-nothing was measured is left alone.
+mixture; other figures are left alone. Without --into the tables are printed. With it, each replaces what
+stands between `<!-- begin NAME -->` and `<!-- end NAME -->` in those of the pages that have such lines; a
+table for which nothing was measured is left alone.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ def load(files: Iterable[Path]) -> dict[str, list[dict]]:
             continue
         content = json.loads(text)
         if isinstance(content, list):
-            kind = "ways" if "way" in content[0] else "large" if "millions" in content[0] else "first"
-            found[kind] += content
+            kinds = {"way": "ways", "millions": "large", "caches": "first"}
+            for kind in (kinds[key] for key in kinds if key in content[0]):
+                found[kind] += content
             continue
-        results = [record for record in content["results"] if record.get("frame_ms")]
+        results = [record for record in content.get("results", ()) if record.get("frame_ms")]
         with_peer = any(record["renderer"] != "fidsplat" for record in results)
         found["peers" if with_peer else "frames"] += results
     scenes = list(BENCH_SCENES)
@@ -83,11 +84,11 @@ def frames(records: dict[str, list[dict]]) -> str:
                 record["date"],
             )
         )
-    return table(("scene", "device", "ms per frame", "x floor", "splats/s", "memory", "date"), rows)
+    return table(("scene", "device", "ms per frame", "x roofline", "splats/s", "memory", "date"), rows)
 
 
 def stages(records: dict[str, list[dict]]) -> str:
-    """Stages, each with how many times its floor it takes."""
+    """Stages, each with how many times its roofline it takes."""
     names = list(dict.fromkeys(stage for record in records["frames"] for stage in record["stages_ms"]))
     rows = []
     for record in records["frames"]:
@@ -216,8 +217,8 @@ def ms(value: float) -> str:
 
 
 def times(record: dict, name: str) -> str:
-    """How many times its floor, or a dash."""
-    value = record["times_floor"].get(name)
+    """How many times its roofline, or a dash."""
+    value = record["times_roofline"].get(name)
     return "-" if value is None else f"{value:.3g}"
 
 

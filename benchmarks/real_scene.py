@@ -80,10 +80,9 @@ def run(file: str, folder: Path, device: str) -> int:
         reading_ms = 1e3 * (time.perf_counter() - begun)
         readings, _ = read_back(found, scene.markers, camera)
         missed += sum(reading.detection is None for reading in readings)
-        marked = image
-        for reading in readings:
-            if reading.detection is not None:
-                marked = outlined(marked, reading.detection.corners, reading.placed.marker.spec)
+        marked = outlined(
+            image, [(r.detection.corners, r.placed.marker.spec) for r in readings if r.detection is not None]
+        )
         write_png(folder / f"{view.replace(' ', '-')}.png", image)
         sheet.append((view, marked))
         figures["views"][view] = {
@@ -92,7 +91,7 @@ def run(file: str, folder: Path, device: str) -> int:
             "detect_ms": reading_ms,
             "markers": [reading.as_dict() for reading in readings],
         }
-    write_png(folder / "sheet.png", contact_sheet([sheet], width=400))
+    write_png(folder / "sheet.png", contact_sheet([sheet], width=600))
     (folder / "figures.json").write_text(json.dumps(figures, indent=2))
     report(figures)
     return 1 if missed else 0

@@ -3,12 +3,10 @@
 import pytest
 from conftest import CLOCK
 
-from fidsplat.experiments.bench.catalogue import TIMED
-
 
 def drawn(run):
     """One frame, finished; its stages in ms."""
-    return run.renderer.render(run.resident, run.camera, quality=TIMED).timings
+    return run.draw().timings
 
 
 def facts(benchmark, run) -> None:

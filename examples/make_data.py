@@ -18,7 +18,7 @@ def sky() -> np.ndarray:
     """A panorama with clouds, made of a few waves: (128, 256, 3), 0 to 1."""
     v, u = np.mgrid[0:128, 0:256] / [[[128]], [[256]]]
     waves = sum(np.sin(2 * np.pi * (k * u + 3 * v * k) + k * k) / k for k in (3, 5, 8, 13, 21)) / 2
-    cloud = np.clip(waves + 0.3, 0, 1)[..., None] * np.clip(1.6 - 3 * v, 0, 1)[..., None]
+    cloud = np.clip(1.5 * waves + 0.4, 0, 1)[..., None] * np.clip(2.4 - 4 * v, 0, 1)[..., None]
     blue = np.array([0.35, 0.55, 0.9]) * (1 - v[..., None]) + 0.75 * v[..., None]
     return (blue * (1 - cloud) + cloud).astype(np.float32)
 

@@ -10,6 +10,7 @@ __version__ = "0.1.0"
 _HOME = {
     "SplatCloud": "fidsplat.splats",
     "Camera": "fidsplat.cameras",
+    "Capture": "fidsplat.capture",
     "BrownConrady": "fidsplat.cameras",
     "Fisheye": "fidsplat.cameras",
     "Equirectangular": "fidsplat.cameras",
@@ -20,6 +21,7 @@ _HOME = {
     "Scene": "fidsplat.scenes",
     "MarkerQuality": "fidsplat.quality",
     "Quality": "fidsplat.quality",
+    "quality_within": "fidsplat.budget.choose",
     "Sensor": "fidsplat.sensor",
     "Fog": "fidsplat.surroundings",
     "Gradient": "fidsplat.surroundings",

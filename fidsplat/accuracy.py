@@ -1,7 +1,8 @@
 """How wrong a picture is: its error against the same definition drawn at full precision.
 
-What a picture is (low-pass, samples per pixel, how coplanar splats are laid) is its definition; constants
-that leave something out of it (cut-off, stop, ceiling) and the arithmetic decide how accurate it is.
+What a picture is (low-pass, samples per pixel, how coplanar splats are composited) is its definition;
+constants that leave something out of it (cut-off, stop, ceiling) and the arithmetic decide how accurate it
+is.
 """
 
 from __future__ import annotations
@@ -11,15 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fidsplat.backends.reference.backend import ReferencePlanes
-from fidsplat.cameras import Camera
+from fidsplat.backends.base import GivesFloat64
+from fidsplat.capture import Capture
 from fidsplat.effects import select
 from fidsplat.errors import DeviceError, InputError
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer, ResidentCloud
 from fidsplat.scenes import Scene
 from fidsplat.splats import SplatCloud
-from fidsplat.surroundings import Fog
 
 TRUTH_CUTOFF = 1e-8
 """alpha below which the truth leaves a contribution out: a thousand such layers hide 1e-5"""
@@ -32,7 +32,7 @@ FLOAT32_TRUTH = 1e-5
 
 @dataclass(frozen=True)
 class Errors:
-    """Differences between two planes, over all their values."""
+    """Differences between two images, over all their values."""
 
     maximum: float
     """largest absolute difference"""
@@ -41,11 +41,11 @@ class Errors:
     rmse: float
     """root of the mean squared difference"""
     psnr: float
-    """dB against a peak of 1; infinite where the planes are equal"""
+    """dB against a peak of 1; infinite where the images are equal"""
 
 
 def errors(picture: ArrayLike, truth: ArrayLike) -> Errors:
-    """The error of a plane, worked out in float64.
+    """The error of an image, worked out in float64.
 
     Args:
         picture: any shape, e.g. (h, w, 3) or (h, w).
@@ -59,11 +59,11 @@ def errors(picture: ArrayLike, truth: ArrayLike) -> Errors:
         raise InputError(f"a picture of shape {seen.shape} cannot be compared with one of shape {want.shape}")
     if seen.size == 0:
         raise InputError(f"a picture of shape {seen.shape} has no values to compare")
-    for name, plane in (("picture", seen), ("truth", want)):
-        bad = plane.size - int(np.isfinite(plane).sum())
+    for name, image in (("picture", seen), ("truth", want)):
+        bad = image.size - int(np.isfinite(image).sum())
         if bad:
             raise InputError(
-                f"{bad} of {plane.size} values of the {name} are not finite; they have no error to measure"
+                f"{bad} of {image.size} values of the {name} are not finite; they have no error to measure"
             )
     off = np.abs(seen - want)
     mean_square = float(np.mean(off**2))
@@ -75,16 +75,13 @@ def errors(picture: ArrayLike, truth: ArrayLike) -> Errors:
     )
 
 
-def full_precision(
-    like: Quality, renderer: Renderer, camera: Camera | None = None, fog: Fog | None = None
-) -> Quality:
-    """The quality that draws the same definition with nothing left out, in the best arithmetic of the device.
+def full_precision(capture: Capture, renderer: Renderer) -> Capture:
+    """The capture of the same definition with nothing left out, in the best arithmetic of the device.
 
-    Low-pass, samples, coplanar and first_hit are those of `like`. OpenCL blends in float64 where that can be
-    (`draws_float64`); else the arithmetic is the device's own, with the set-up in float64 if the device has
-    that.
+    Low-pass, samples, coplanar and first_hit stay. A device composites in float64 where it can
+    (`draws_float64`); else the arithmetic is its own, with the set-up in float64 if it has that.
     """
-    best = like.with_(
+    best = capture.quality.with_(
         alpha_cutoff=TRUTH_CUTOFF,
         transmittance_stop=0.0,
         opacity_ceiling=1.0,
@@ -92,71 +89,61 @@ def full_precision(
         setup_precision="float64",
         arithmetic="precise",
     )
-    if renderer.device.name != "reference" and draws_float64(renderer, camera, fog):
-        return best.with_(blend_precision="float64")
-    return best
+    if not renderer.backend.always_float64 and draws_float64(renderer, capture):
+        best = best.with_(blend_precision="float64")
+    return capture.with_(quality=best)
 
 
-def draws_float64(renderer: Renderer, camera: Camera | None = None, fog: Fog | None = None) -> bool:
-    """Whether its pictures at full precision are float64 throughout: the reference's, and those of OpenCL on
-    a device with float64, but for lenses and fog, whose rays are float32."""
-    family = renderer.device.name.partition(":")[0]
-    if family != "opencl" or not renderer.device.float64:
-        return family == "reference"
+def draws_float64(renderer: Renderer, capture: Capture) -> bool:
+    """Whether its pictures at full precision are float64 throughout: the reference's, and those of devices
+    that composite in float64, but for lenses and fog, whose rays are float32."""
+    if renderer.backend.always_float64:
+        return True
     try:
-        select(SplatCloud.empty(), ("rgb",), Quality(blend_precision="float64"), camera, fog=fog)
+        double = Quality(blend_precision="float64")
+        features = select(SplatCloud.empty(), capture.with_(quality=double))
     except InputError:
         return False
-    return True
+    return not renderer.backend.unsupported(features)
 
 
-def doubt(judge: Renderer, camera: Camera | None = None, fog: Fog | None = None) -> float:
-    """What the truth may be off itself that a renderer draws."""
-    if judge.device.name == "reference":
+def error_bound(reference: Renderer, capture: Capture) -> float:
+    """What the truth that a renderer draws may be off itself."""
+    if reference.backend.always_float64:
         return 0.0
-    return FLOAT32_OUTPUT if draws_float64(judge, camera, fog) else FLOAT32_TRUTH
+    return FLOAT32_OUTPUT if draws_float64(reference, capture) else FLOAT32_TRUTH
 
 
-def judge_for(renderer: Renderer, camera: Camera | None = None, fog: Fog | None = None) -> Renderer:
+def reference_for(renderer: Renderer, capture: Capture) -> Renderer:
     """Who draws the truth for a renderer's pictures: itself if it can in float64, else OpenCL on this
     machine's processor if that is there and can, else itself."""
-    if draws_float64(renderer, camera, fog):
+    if draws_float64(renderer, capture):
         return renderer
     try:
         processor = Renderer("opencl:cpu")
     except DeviceError:
         return renderer
-    return processor if draws_float64(processor, camera, fog) else renderer
+    return processor if draws_float64(processor, capture) else renderer
 
 
 def truth(
-    renderer: Renderer,
-    scene: Scene | SplatCloud | ResidentCloud,
-    camera: Camera | None = None,
-    like: Quality | str | None = None,
-    output: str = "rgb",
-    **around,
+    renderer: Renderer, scene: Scene | SplatCloud | ResidentCloud, capture: Capture, output: str = "rgb"
 ) -> np.ndarray:
-    """The picture of the same definition as `like`, drawn by `renderer` at full precision (`full_precision`).
+    """The picture of the same definition, drawn by `renderer` at full precision (`full_precision`).
 
     Args:
-        renderer: who draws; "reference" gives float64 planes, other devices what they give, as float64.
-        scene: as `Renderer.render`.
-        camera: as `Renderer.render`.
-        like: whose definition; default standard.
-        output: the plane.
-        around: background, motion, shutter, sensor, fog, as `Renderer.render`.
+        renderer: who draws; "reference" gives float64 images, other devices what they give, as float64.
+        scene: whose splats.
+        capture: how; its outputs do not count.
+        output: the image.
 
     Returns:
-        float64, of the shape of the plane: (h, w, 3) for rgb.
+        float64, of the shape of the image: (h, w, 3) for rgb.
 
     Raises:
         InputError, DeviceError: as `Renderer.render`.
     """
-    own = scene if isinstance(scene, Scene) else Scene()
-    seen_from, fog = camera or own.camera, around.get("fog") or own.fog
-    quality = full_precision(Quality.of(like), renderer, seen_from, fog)
-    frame = renderer.render(scene, camera, (output,), quality, **around)
-    if isinstance(frame._planes, ReferencePlanes):  # float32 is made of its planes when they are read
-        return frame._planes.planes[output]
+    frame = renderer.render(scene, full_precision(capture.with_(outputs=output), renderer))
+    if isinstance(frame._images, GivesFloat64):  # what is read otherwise is rounded to float32
+        return frame._images.read_float64(output)
     return np.asarray(frame[output], np.float64)

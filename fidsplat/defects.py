@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from fidsplat.scalars import LARGEST
+
 _F32 = np.dtype(np.float32)
-LARGEST = 1e15
-"""metres, or units of colour: with anything larger, products of single precision would overflow on devices"""
 
 
 def rows_beyond(array: np.ndarray, limit: float) -> np.ndarray | None:

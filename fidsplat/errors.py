@@ -14,14 +14,22 @@ class FidsplatError(Exception):
     exit_status = 1
 
     def __str__(self) -> str:
-        text = super().__str__()
+        text = Exception.__str__(self)  # a KeyError's own would be a repr
         return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
 
 
 class InputError(FidsplatError, ValueError):
-    """The user's input (file, spec, pose, size, option) cannot be used. Exit status 2."""
+    """The user's input (file, spec, pose, size, option) cannot be used. Exit status 2. Its text is one line,
+    whatever it quotes."""
 
     exit_status = 2
+
+    def __str__(self) -> str:
+        return " ".join(line.strip() for line in super().__str__().splitlines())
+
+
+class MissingOutputError(InputError, KeyError):
+    """An output that a frame was not rendered with; to a Mapping, a key that is missing."""
 
 
 class DeviceError(FidsplatError, RuntimeError):

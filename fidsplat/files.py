@@ -10,12 +10,26 @@ from typing import BinaryIO
 from fidsplat.errors import InputError
 
 
+def path_of(path: str | os.PathLike[str]) -> Path:
+    """The path that is meant. Raises InputError for anything but text or a path that a file can have."""
+    try:
+        name = os.fspath(path)
+    except TypeError:
+        name = None
+    try:
+        if not isinstance(name, str) or b"\0" in os.fsencode(name):
+            raise ValueError
+    except ValueError:  # or half of a surrogate pair, which no name has
+        raise InputError(f"{path!r} names no file; give a path as text or a pathlib.Path") from None
+    return Path(name)
+
+
 def ordinary_file(path: str | os.PathLike[str]) -> Path:
     """The path of a file, there or yet to be made.
 
     Raises InputError for a folder, a device or a pipe: moving a file onto one would replace it.
     """
-    target = Path(path)
+    target = path_of(path)
     if target.exists() and not target.is_file():
         raise InputError(f"cannot write {target}: it is not an ordinary file; give the name of a file")
     return target
@@ -53,7 +67,7 @@ def writable_folder(path: str | os.PathLike[str]) -> Path:
 
     Raises InputError when it cannot.
     """
-    folder = Path(path)
+    folder = path_of(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

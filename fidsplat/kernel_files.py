@@ -1,4 +1,4 @@
-"""Finds the device wing: `kernels/` beside the package in a checkout, `fidsplat/_kernels` in a wheel."""
+"""Finds the kernels: `kernels/` beside the package in a checkout, `fidsplat/_kernels` in a wheel."""
 
 from pathlib import Path
 

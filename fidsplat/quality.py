@@ -9,18 +9,11 @@ import math
 import operator
 from dataclasses import dataclass, field, fields, replace
 from numbers import Real
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from fidsplat.errors import InputError, unknown
-
-if TYPE_CHECKING:
-    from fidsplat.cameras import Camera, Motion, Shutter
-    from fidsplat.render import Renderer
-    from fidsplat.scenes import Scene
-    from fidsplat.splats import SplatCloud
-    from fidsplat.surroundings import Background, Fog
 
 LOWPASS = ("screen", "pixel", "none")
 STOP_RULES = ("inclusive", "exclusive")
@@ -30,8 +23,10 @@ ARITHMETIC = ("precise", "fast")
 BLEND_PRECISIONS = ("float32", "float64")
 MAX_SAMPLES = 8
 MIXTURES = ("exact", "fitted", "paper")
-TEMPLATE_SIZES = (1, 5, 9, 13, 25, 41)
-"""Gaussians of a rectangle in the templates that are shipped (fidsplat/markers/templates.json)"""
+NESTED = 562
+TEMPLATE_SIZES = (1, 5, 9, 13, 25, 41, NESTED)
+"""Gaussians of a rectangle in the templates that are shipped (fidsplat/markers/templates.json), and in the
+opaque one (fidsplat/markers/nested.py)"""
 MAX_LEVELS, MAX_DENSITY = 8, 100
 
 
@@ -47,7 +42,7 @@ def whole_number(name: str, value: Any, low: int, high: int) -> int:
 
 
 def _one_of(what: str, value: Any, known: tuple) -> None:
-    if isinstance(value, (bool, float)) or value not in known:
+    if not isinstance(value, (str, int, type(None))) or isinstance(value, bool) or value not in known:
         raise InputError(f"{what} is {value!r}; known: {', '.join(map(str, known))}")
 
 
@@ -55,8 +50,8 @@ def _one_of(what: str, value: Any, known: tuple) -> None:
 class MarkerQuality:
     """Knobs of making a marker of splats: how its rectangles become Gaussians.
 
-    More Gaussians follow sharp edges better and cost time in every picture. `fs.marker` takes these where it
-    is not told otherwise, and so do the markers of scene files and `fidsplat marker`.
+    More Gaussians follow sharp edges better and cost time in every picture. `fs.marker` takes these that it
+    is not given, and so do the markers of scene files and `fidsplat marker`.
 
     Raises:
         InputError: a value lies outside its range; the message names the range.
@@ -81,8 +76,8 @@ class MarkerQuality:
 
     template: int = 25
     """Of `fitted`, and of the Gaussians that stand for `exact` in files: Gaussians of a rectangle up to an
-    aspect ratio of 6, one of `TEMPLATE_SIZES`: 1, 5, 9, 13, 25 or 41. Fewer are drawn faster and leave edges
-    blurred and corners round."""
+    aspect ratio of 6, one of `TEMPLATE_SIZES`: 1, 5, 9, 13, 25, 41 or 562. Fewer are drawn faster and leave
+    edges blurred and corners round; 562 are opaque and clean, under a low-pass from 24 px a module on."""
 
     def __post_init__(self) -> None:
         _one_of("marker quality: mixture", self.mixture, MIXTURES)
@@ -208,7 +203,7 @@ class Quality:
     @classmethod
     def named(cls, name: str) -> Quality:
         """The preset of that name: standard, fast, reference, gsplat or surfel."""
-        if name in PRESETS:
+        if isinstance(name, str) and name in PRESETS:
             return PRESETS[name]
         raise InputError(unknown("quality", name, PRESETS))
 
@@ -241,51 +236,6 @@ class Quality:
             else:
                 changes[name] = _read(cls, name, value)
         return chosen.with_(**changes)
-
-    @classmethod
-    def within(
-        cls,
-        error: float | None = None,
-        ms: float | None = None,
-        *,
-        camera: Camera | None = None,
-        cloud: Scene | SplatCloud | None = None,
-        device: str | Renderer | None = None,
-        base: Quality | str | None = None,
-        background: Background | None = None,
-        motion: Motion | None = None,
-        shutter: Shutter | None = None,
-        fog: Fog | None = None,
-    ) -> Quality:
-        """The cheapest quality that keeps an error, or the most accurate one that keeps a time.
-
-        The error is the largest absolute difference of rgb, over all pixels and channels and before any
-        sensor, from the same definition at full precision in float64 (`fidsplat.accuracy.truth`). The
-        definition (low-pass, samples, coplanar, marker) is that of `base`.
-
-        With the error alone the answer comes from a table of errors over random scenes. With a camera and a
-        cloud it is measured: on this device, in that scene, from there. What was measured is kept in the
-        user's cache folder. docs/budget.md says how often each promise was kept.
-
-        Args:
-            error: largest error allowed.
-            ms: milliseconds that nine frames of ten may take, with the splats on the device and the picture
-                left there; needs camera and cloud.
-            camera: from where it is measured; not needed for a Scene that has one.
-            cloud: splats, or a Scene, whose background, fog and motion count too.
-            device: a device's name or a Renderer; by default that of `Renderer()`.
-            base: whose definition; default the Scene's quality, or standard.
-            background: as `Renderer.render`, with motion, shutter and fog.
-
-        Raises:
-            InputError: no bound, one that is no finite number, or one that nothing keeps; the message says
-                what the best possible is.
-            DeviceError: the device cannot be used or fails.
-        """
-        from fidsplat.budget import choose  # late: a budget is measured by drawing, with all that this takes
-
-        around = {"background": background, "motion": motion, "shutter": shutter, "fog": fog}
-        return choose(error, ms, camera, cloud, device, base, **around).quality
 
     def with_(self, **changes) -> Quality:
         """A copy with some knobs changed; an unknown knob is an error that names the known ones.
@@ -343,9 +293,9 @@ _PARITY = Quality(
     arithmetic="precise",
 )
 
-# standard: of the settings that docs/accuracy.md measures the cheapest whose largest error is at most 1/512
-# on every scene, the hard cases included; in fast arithmetic, which is cheaper on CPUs and on GPUs dearer by
-# a hundredth of a frame at most
+# standard: of the qualities that docs/accuracy.md measures the cheapest whose largest error is at most 1/512
+# on every scene, the hard cases included; in fast arithmetic, which is cheaper on CPUs and at most 1 % slower
+# on GPUs
 PRESETS: dict[str, Quality] = {
     "standard": Quality(),
     "fast": Quality(alpha_cutoff=2.0 / 255.0, transmittance_stop=1.0 / 256.0, setup_precision="float32"),

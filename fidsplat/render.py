@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import DeviceInfo, Planes
-from fidsplat.backends.exposure import exposed_view
+from fidsplat.backends.base import Adopts, DeviceInfo, GivesArrays, Images, ResidentData
+from fidsplat.backends.prepare import prepare
 from fidsplat.backends.registry import open_backend
+from fidsplat.backends.view import NO_CAMERA
 from fidsplat.cameras import Camera, Motion, Shutter
-from fidsplat.effects import select
-from fidsplat.errors import InputError
+from fidsplat.capture import Capture
+from fidsplat.errors import InputError, MissingOutputError
 from fidsplat.quality import Quality
 from fidsplat.scenes import Scene
 from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
-from fidsplat.surroundings import Fog, Gradient, Panorama, background_of
+from fidsplat.surroundings import Fog, Gradient, Panorama
 
-_NO_SCENE = Scene(())
-_INSTANT = Shutter()
+_PLAIN = Capture()
 
 
 class Frame(Mapping):
@@ -35,38 +36,43 @@ class Frame(Mapping):
     `Quality.first_hit`, labels and ids are -1, the others of these 0.
     """
 
-    def __init__(self, planes: Planes, outputs: tuple[str, ...]) -> None:
-        self._planes = planes
+    def __init__(self, images: Images, outputs: tuple[str, ...]) -> None:
+        self._images, self._process = images, os.getpid()
         self._arrays: dict[str, np.ndarray] = {}
         self.outputs = outputs
-        """Names of the planes, in the order in which they were asked for."""
+        """Names of the images, in the order in which they were asked for."""
 
     def __getitem__(self, name: str) -> np.ndarray:
-        if name not in self.outputs:
-            raise KeyError(f"this frame has no {name!r}; it was rendered with {', '.join(self.outputs)}")
+        self._check(name)
         if name not in self._arrays:
-            self._arrays[name] = plane = self._planes.read(name)
-            plane.flags.writeable = False  # what is kept is what was drawn
+            check_process(self._process, "frame")
+            self._arrays[name] = image = self._images.read(name)
+            image.flags.writeable = False  # what is kept is what was drawn
         return self._arrays[name]
 
     def device_array(self, name: str) -> Any:
-        """The plane where it was drawn, without a copy: on a Warp device a wp.array, (h, w) or (h, w, 3).
+        """The image where it was drawn, without a copy: on a Warp device a wp.array, (h, w) or (h, w, 3).
 
         It belongs to this frame: the next picture is drawn into another array. `wp.to_torch`, DLPack and
         `__cuda_array_interface__` make a tensor of it on the same device.
 
         Raises:
-            KeyError: a plane that was not asked for; InputError: the backend has no arrays to give.
+            InputError: an output that was not asked for, or the backend has no arrays to give.
         """
-        if name not in self.outputs:
-            raise KeyError(f"this frame has no {name!r}; it was rendered with {', '.join(self.outputs)}")
-        give = getattr(self._planes, "device_array", None)
-        if give is None:
+        self._check(name)
+        check_process(self._process, "frame")
+        if not isinstance(self._images, GivesArrays):
             raise InputError(
                 f"this device keeps {name} in no array that others can use; draw with device='warp:cuda' or "
                 "'warp:cpu', or take frame[name], which is copied to the host"
             )
-        return give(name)
+        return self._images.device_array(name)
+
+    def _check(self, name: str) -> None:
+        if not isinstance(name, str) or name not in self.outputs:
+            raise MissingOutputError(
+                f"this frame has no {name!r}; it was rendered with {', '.join(self.outputs)}; name it there"
+            )
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.outputs)
@@ -74,15 +80,44 @@ class Frame(Mapping):
     def __len__(self) -> int:
         return len(self.outputs)
 
+    def __reduce__(self):
+        """Pickled and copied as NumPy arrays: what `device_array` gives stays on its device."""
+        return _kept_frame, (dict(self), dict(self.timings), dict(self.stats))
+
     @property
     def timings(self) -> Mapping[str, float]:
         """Milliseconds on the device by stage: project, sort, bin, blend, resolve."""
-        return self._planes.timings
+        return self._images.timings
 
     @property
     def stats(self) -> Mapping[str, int]:
         """splats (in the cloud), visible (not culled), pairs (of splats and tiles)."""
-        return self._planes.stats
+        return self._images.stats
+
+
+@dataclass(frozen=True)
+class _KeptImages:
+    """Images that are no longer on a device."""
+
+    arrays: dict[str, np.ndarray]
+    timings: Mapping[str, float]
+    stats: Mapping[str, int]
+
+    def read(self, name: str) -> np.ndarray:
+        return self.arrays[name]
+
+
+def _kept_frame(arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int]) -> Frame:
+    return Frame(_KeptImages(arrays, timings, stats), tuple(arrays))
+
+
+def check_process(opened_by: int, what: str) -> None:
+    """Raises InputError in a fork of the process that opened it, where its driver does not work."""
+    if opened_by != os.getpid():
+        raise InputError(
+            f"this {what} belongs to process {opened_by}, of which this one is a fork; open a Renderer in "
+            "each process, and read frames before the fork"
+        )
 
 
 def default_device() -> str:
@@ -93,16 +128,24 @@ def default_device() -> str:
 class ResidentCloud:
     """A cloud on a renderer's device; rendering it transfers no splat."""
 
-    def __init__(self, renderer: Renderer, data: Any, count: int) -> None:
-        self._renderer, self._data, self._count = renderer, data, count
+    def __init__(self, renderer: Renderer, data: ResidentData, capture: Capture) -> None:
+        self._renderer, self._data = renderer, data
+        self.capture = capture
+        """how its pictures are taken unless `render` is told otherwise: that of the scene it came from"""
 
     def __len__(self) -> int:
-        return self._count
+        return self._data.count
+
+    def __reduce__(self):
+        raise InputError(
+            "a ResidentCloud is on a device and cannot be pickled or copied; take the SplatCloud, and upload "
+            "it there"
+        )
 
     @property
     def memory_bytes(self) -> int:
-        """Device memory that it takes; 0 on a CPU, which reads the host's own arrays."""
-        return getattr(self._data, "device_bytes", 0)
+        """Device memory that it takes; 0 where the device reads the host's own arrays, as OpenCL on a CPU."""
+        return self._data.memory_bytes
 
 
 class Renderer:
@@ -123,6 +166,7 @@ class Renderer:
 
     def __init__(self, device: str | None = None, memory_budget: int | None = None) -> None:
         self.backend = open_backend(default_device() if device is None else device)
+        self._process = os.getpid()
         if memory_budget is not None:
             if isinstance(memory_budget, bool) or not isinstance(memory_budget, int) or memory_budget <= 0:
                 raise InputError(
@@ -130,17 +174,25 @@ class Renderer:
                 )
             self.backend.limit_memory(memory_budget)
 
+    def __reduce__(self):
+        raise InputError(
+            "a Renderer holds a device and cannot be pickled or copied; open one where it is used, e.g. "
+            f"fs.Renderer({self.device.name!r}) in each worker"
+        )
+
     @property
     def device(self) -> DeviceInfo:
         """The device that draws."""
         return self.backend.info
 
     def upload(self, scene: Scene | SplatCloud) -> ResidentCloud:
-        """Put a scene's splats on the device, to be rendered many times."""
+        """Put a scene's splats on the device, to be rendered many times. A scene's capture is kept."""
+        check_process(self._process, "Renderer")
         cloud = scene.cloud() if isinstance(scene, Scene) else scene
         if not isinstance(cloud, SplatCloud):
             raise InputError(f"cannot render a {type(scene).__name__}; give a Scene or a SplatCloud")
-        return ResidentCloud(self, self.backend.upload(cloud), len(cloud))
+        capture = scene.capture if isinstance(scene, Scene) else _PLAIN
+        return ResidentCloud(self, self.backend.upload(cloud), capture)
 
     def adopt(
         self,
@@ -165,23 +217,23 @@ class Renderer:
         Raises:
             InputError: the backend takes no arrays, or one has the wrong shape, type or device.
         """
-        take = getattr(self.backend, "adopt", None)
-        if take is None:
+        if not isinstance(self.backend, Adopts):
             raise InputError(
                 f"{self.device.name} takes no arrays of a device; use a Warp device, or a SplatCloud"
             )
+        check_process(self._process, "Renderer")
         if (colors is None) == (sh is None):
             raise InputError("give exactly one of colors (n, 3) and sh (n, k, 3)")
         given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
         given |= {"colors": colors} if sh is None else {"sh": sh}
         given |= {} if labels is None else {"labels": labels}
-        data = take(given, np.asarray(tuple(origin), dtype=np.float64))
-        return ResidentCloud(self, data, data.count)
+        data = self.backend.adopt(given, np.asarray(tuple(origin), dtype=np.float64))
+        return ResidentCloud(self, data, _PLAIN)
 
     def render(
         self,
         scene: Scene | SplatCloud | ResidentCloud,
-        camera: Camera | None = None,
+        capture: Capture | Camera | None = None,
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
         background: Iterable[float] | Gradient | Panorama | None = None,
@@ -189,69 +241,30 @@ class Renderer:
         shutter: Shutter | None = None,
         sensor: Sensor | None = None,
         fog: Fog | None = None,
+        *,
+        camera: Camera | None = None,
     ) -> Frame:
-        """Draw one picture.
+        """Draw one picture: `render(scene, Capture(camera, ...))`, or the parts of a capture as arguments.
 
         Args:
-            scene: what to draw. A Scene's own camera, outputs, quality, background, sensor and fog are used
-                where the arguments are left out.
-            camera: needed unless the scene has one.
-            outputs: names of planes; default rgb.
-            quality: a Quality, or text such as "fast" or "fast,samples=2" (`Quality.of`); default standard.
-            background: (r, g, b), a Gradient or a Panorama behind the splats; default black.
-            motion: how the camera and groups of splats move; default: they stand still.
-            shutter: when the picture is taken, and how long that takes; default: at time 0, at once.
-            sensor: what becomes of rgb on its way out; default nothing.
-            fog: between the camera and what it sees; default none.
+            scene: what to draw.
+            capture: how; or a camera alone. Without a Capture a Scene's own is taken, which its ResidentCloud
+                has too.
+            outputs, quality, background, motion, shutter, sensor, fog, camera: take the place of the
+                capture's.
 
         Raises:
             InputError: no camera, an unknown output or preset, a picture that is too large, a cloud uploaded
                 elsewhere.
             DeviceError: the device fails or lacks memory.
         """
-        own = scene if isinstance(scene, Scene) else _NO_SCENE
-        camera = camera or own.camera
-        if camera is None:
-            raise InputError("no camera: pass camera=fs.Camera... or give the scene a [camera] table")
-        if not isinstance(camera, Camera):
-            raise InputError(f"camera is {camera!r}; it must be a Camera, e.g. fs.Camera.look_at(...)")
-        names = own.outputs if outputs is None else outputs
-        names = (names,) if isinstance(names, str) else tuple(dict.fromkeys(names))
-        if not names:
-            raise InputError("outputs is empty; name at least one, e.g. 'rgb'")
-        chosen = Quality.of(own.quality if quality is None else quality)
-        behind = background_of(own.background if background is None else background)
-        sensor, fog = (own.sensor if sensor is None else sensor), (own.fog if fog is None else fog)
-        moving = own.motion if motion is None else motion
-        when = (own.shutter or _INSTANT) if shutter is None else shutter
-        for value, kind in ((sensor, Sensor), (fog, Fog), (moving, Motion), (when, Shutter)):
-            if value is not None and not isinstance(value, kind):
-                raise InputError(f"{kind.__name__.lower()} is {value!r}; it must be a {kind.__name__}")
-
-        resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
-        if resident._renderer is not self:
-            raise InputError(
-                "this cloud was uploaded by another Renderer; upload it with the one that draws it"
-            )
-        data = resident._data
-        view = exposed_view(camera, chosen, data.origin, behind, moving, when, sensor, fog)
-        features = select(
-            data,
-            names,
-            chosen,
-            camera,
-            moving=bool(view.groups),
-            exposed=bool(view.shots),
-            sensor=sensor,
-            fog=fog,
-            background=behind,
-        )
-        return Frame(self.backend.pipeline(features).render(data, view), names)
+        asked = _asked(scene, capture, camera, outputs, quality, background, motion, shutter, sensor, fog)
+        return self._draw(self._resident(scene), asked)
 
     def render_views(
         self,
         scene: Scene | SplatCloud | ResidentCloud,
-        cameras: Iterable[Camera],
+        captures: Iterable[Capture | Camera],
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
         background: Iterable[float] | Gradient | Panorama | None = None,
@@ -260,28 +273,27 @@ class Renderer:
         sensor: Sensor | None = None,
         fog: Fog | None = None,
     ) -> Iterator[Frame]:
-        """Draw one cloud from many cameras, one Frame for each, in their order.
+        """Draw one cloud many times, one Frame for each capture or camera, in their order.
 
         The cloud is uploaded once, kernels and buffers are used again, and on a device that works beside the
         host the next picture is under way while the caller has the last. Arguments and errors: as `render`
         (a motion of the camera takes the place of each camera's pose); an error comes after the pictures of
-        the cameras before it.
+        the captures before it.
         """
-        own = scene if isinstance(scene, Scene) else _NO_SCENE
-        chosen = own.quality if quality is None else quality
-        names = own.outputs if outputs is None else outputs
-        names = names if isinstance(names, str) else tuple(names)
-        behind = background_of(own.background if background is None else background)
-        motion = own.motion if motion is None else motion
-        shutter = own.shutter if shutter is None else shutter
-        sensor, fog = (own.sensor if sensor is None else sensor), (own.fog if fog is None else fog)
-        resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
+        if isinstance(outputs, Iterable) and not isinstance(outputs, str):
+            outputs = tuple(outputs)
+        if not isinstance(captures, Iterable):
+            raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera")
+        resident = self._resident(scene)
         waiting: Frame | None = None
         failure: Exception | None = None
-        rest = iter(cameras)
+        rest = iter(captures)
         while True:
             try:
-                frame = self.render(resident, next(rest), names, chosen, behind, motion, shutter, sensor, fog)
+                asked = _asked(
+                    scene, next(rest), None, outputs, quality, background, motion, shutter, sensor, fog
+                )
+                frame = self._draw(resident, asked)
             except StopIteration:
                 break
             except Exception as error:
@@ -294,3 +306,45 @@ class Renderer:
             yield waiting
         if failure is not None:
             raise failure
+
+    def _resident(self, scene: Scene | SplatCloud | ResidentCloud) -> ResidentCloud:
+        resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
+        check_process(self._process, "Renderer")
+        if resident._renderer is not self:
+            raise InputError(
+                "this cloud was uploaded by another Renderer; upload it with the one that draws it"
+            )
+        return resident
+
+    def _draw(self, resident: ResidentCloud, capture: Capture) -> Frame:
+        features, view = prepare(resident._data, capture)
+        return Frame(self.backend.pipeline(features).render(resident._data, view), capture.outputs)
+
+
+def _asked(
+    scene: Any,
+    capture: Capture | Camera | None,
+    camera: Camera | None,
+    outputs: Any,
+    quality: Any,
+    background: Any,
+    motion: Any,
+    shutter: Any,
+    sensor: Any,
+    fog: Any,
+) -> Capture:
+    """The capture that is given or the scene's own, changed by the parts that are given beside it.
+
+    Raises:
+        InputError: a part of the wrong kind, or no camera.
+    """
+    if not isinstance(capture, Capture):
+        camera = capture or camera
+        capture = scene.capture if isinstance(scene, (Scene, ResidentCloud)) else _PLAIN
+    asked = capture.with_(
+        camera=camera, outputs=outputs, quality=quality, background=background, motion=motion,
+        shutter=shutter, sensor=sensor, fog=fog,
+    )  # fmt: skip
+    if asked.camera is None:
+        raise InputError(NO_CAMERA)
+    return asked

@@ -3,6 +3,7 @@
 import numpy as np
 
 from fidsplat.errors import InputError
+from fidsplat.scalars import LARGEST, real_array
 
 
 def quaternion_multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -59,14 +60,11 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
     (0, 0, 0, 1), or the upper left 3x3 is not scale * rotation within 1e-6 (a reflection is not; with
     ``rigid`` the scale must be 1).
     """
-    try:
-        m = np.array(matrix, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{name} must be a 4x4 matrix of numbers") from None
+    m = real_array(name, matrix, "a 4x4 matrix of numbers")
     if m.shape != (4, 4):
         raise InputError(f"{name} must be a 4x4 matrix, but its shape is {m.shape}")
-    if not np.isfinite(m).all():
-        raise InputError(f"{name} holds a value that is not finite")
+    if not (np.isfinite(m).all() and (np.abs(m[:3, 3]) <= LARGEST).all()):
+        raise InputError(f"{name} holds a value that is not finite, or moves by more than {LARGEST:g} metres")
     if not np.array_equal(m[3], [0.0, 0.0, 0.0, 1.0]):
         raise InputError(f"{name} must have the last row (0, 0, 0, 1), not {tuple(m[3].tolist())}")
     linear = m[:3, :3]
@@ -95,10 +93,11 @@ def rigid_matrix(position, quaternion=(1.0, 0.0, 0.0, 0.0), scale: float = 1.0) 
     Raises InputError when position is not three finite numbers, quaternion not four or all 0, or scale not
     above 0.
     """
-    move, turn = np.asarray(position, np.float64), np.asarray(quaternion, np.float64)
+    move, turn = real_array("position", position), real_array("quaternion", quaternion)
     if move.shape != (3,) or not np.isfinite(move).all():
         raise InputError(f"position must be three finite numbers, not {position!r}")
-    length = np.linalg.norm(turn) if turn.shape == (4,) else np.nan
+    with np.errstate(over="ignore"):  # what is too long for a float is infinitely long, and refused
+        length = np.linalg.norm(turn) if turn.shape == (4,) else np.nan
     if not (0 < length < np.inf):
         raise InputError(
             f"quaternion must be four finite numbers (w, x, y, z), not all 0, but it is {quaternion!r}"

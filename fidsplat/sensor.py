@@ -67,7 +67,7 @@ class Sensor:
             )
         if not (isinstance(self.seed, int) and not isinstance(self.seed, bool) and 0 <= self.seed < 2**32):
             raise InputError(f"sensor: seed is {self.seed!r}; it must be a whole number from 0 to 2^32 - 1")
-        if self.bits is not None and (isinstance(self.bits, float) or self.bits not in BITS):
+        if self.bits is not None and not (isinstance(self.bits, int) and self.bits in BITS):
             raise InputError(f"sensor: bits is {self.bits!r}; known: 8, 16, or none")
         object.__setattr__(self, "vignetting", _numbers("vignetting", self.vignetting, 0, 3))
         if isinstance(self.response, str):

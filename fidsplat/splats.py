@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fidsplat.defects import LARGEST, drop_report, find_defects, rows_beyond, square_of
+from fidsplat.defects import drop_report, find_defects, rows_beyond, square_of
 from fidsplat.errors import InputError
 from fidsplat.harmonics import C0, MAX_DEGREE, rotation_of_coefficients, sh_basis
 from fidsplat.rotations import (
@@ -15,6 +15,7 @@ from fidsplat.rotations import (
     quaternion_multiply,
     quaternion_to_matrix,
 )
+from fidsplat.scalars import LARGEST, PickledByFields
 
 __all__ = ["SplatCloud", "sh_basis"]
 
@@ -22,7 +23,7 @@ _F32 = np.dtype(np.float32)
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
-class SplatCloud:
+class SplatCloud(PickledByFields):
     """2D Gaussian splats. Every array is read-only; make a new cloud to change one."""
 
     means: np.ndarray
@@ -100,6 +101,23 @@ class SplatCloud:
             given = single["means"] if given.dtype == _F32 else given[keep]
             new_labels = new_labels[keep]
             warnings.warn(drop_report(dropped, n, source), stacklevel=2)
+        self._finish(given, single, new_labels, origin, dropped)
+
+    @classmethod
+    def of_checked(cls, means, quats, scales, opacities, sh, labels=None, *, origin, dropped) -> "SplatCloud":
+        """A cloud that takes over arrays of splats that can all be drawn, as a reader of files has found.
+
+        means (n, 3) float32 or float64, all else as the attributes are, but quats of any length above 0.
+        dropped: what the reader left out.
+        """
+        cloud = object.__new__(cls)
+        single = {"quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
+        single["means"] = means if means.dtype == _F32 else _single(means)
+        cloud._finish(means, single, _labels(None, len(means)) if labels is None else labels, origin, dropped)
+        return cloud
+
+    def _finish(self, given, single: dict[str, np.ndarray], labels, origin, dropped: dict[str, int]) -> None:
+        """Freeze splats that can be drawn; given: the means in the type that they came in."""
         single["quats"] = _unit(single["quats"])
         if origin is not None:
             new_origin = _check_origin(origin)
@@ -107,7 +125,7 @@ class SplatCloud:
             single["means"], new_origin = _choose_origin(given, single["means"], single["scales"])
         self._set(
             **{"colors": None, "sh": None, "planes": None, "boxes": None, **single},
-            labels=new_labels,
+            labels=labels,
             origin=new_origin,
             dropped=dropped,
         )
@@ -136,6 +154,14 @@ class SplatCloud:
     def sh_degree(self) -> int:
         """Degree 0 to 3 of the SH colours, -1 for plain colours."""
         return -1 if self.sh is None else int(np.sqrt(self.sh.shape[1])) - 1
+
+    @property
+    def plain_colors(self) -> np.ndarray | None:
+        """(n, 3) float32 colours that do not depend on the view: `colors`, or what SH of degree 0 means; None
+        for SH of a higher degree."""
+        if self.sh is None or self.sh_degree > 0:
+            return self.colors
+        return np.maximum(np.float32(C0) * self.sh[:, 0, :] + np.float32(0.5), np.float32(0))
 
     @property
     def has_planes(self) -> bool:
@@ -222,7 +248,10 @@ class SplatCloud:
         those of a partition, their sides parallel, leave no seam. Raises InputError for anything but bools,
         and for a plane of both kinds.
         """
-        mask = np.asarray(boxes)
+        try:
+            mask = np.asarray(boxes)
+        except ValueError:  # rows that differ in length
+            mask = np.empty(0)
         if mask.dtype != bool or mask.shape not in ((), (len(self),)):
             raise InputError(f"boxes must be one bool or have the shape ({len(self)},) and the type bool")
         mask = np.full(len(self), mask) if mask.ndim == 0 else mask.copy()
@@ -237,7 +266,13 @@ class SplatCloud:
         that share an origin keep their bits; otherwise a common one is chosen as in the constructor.
         Planes of different clouds stay different planes. ``dropped`` adds up.
         """
-        clouds = list(clouds)
+        try:
+            clouds = list(clouds)
+        except TypeError:
+            clouds = [None]  # type: ignore[list-item]
+        for cloud in clouds:
+            if not isinstance(cloud, SplatCloud):
+                raise InputError(f"concatenate takes a list of SplatCloud, not of {type(cloud).__name__}")
         dropped: dict[str, int] = {}
         for cloud in clouds:
             for reason, count in cloud.dropped.items():
@@ -325,8 +360,8 @@ def _labels(labels, n: int, name: str = "labels") -> np.ndarray:
 
 def _check_origin(origin) -> np.ndarray:
     array = _numbers("origin", origin).astype(np.float64)
-    if array.shape != (3,) or not np.isfinite(array).all():
-        raise InputError(f"origin must be three finite numbers, not {origin!r}")
+    if array.shape != (3,) or rows_beyond(array, LARGEST) is not None:
+        raise InputError(f"origin must be three numbers, at most {LARGEST:g} metres, not {origin!r}")
     return array
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.scalars import own_scalars
+from fidsplat.scalars import LARGEST, PickledByFields, own_scalars
 
 MAX_PANORAMA = 16384
 """pixels along a side"""
@@ -32,7 +32,7 @@ class Fog:
     def __post_init__(self) -> None:
         own_scalars(self)
         ok = isinstance(self.density, (int, float)) and not isinstance(self.density, bool)
-        if not (ok and 0 <= self.density < math.inf):
+        if not (ok and 0 <= self.density <= LARGEST):
             raise InputError(
                 f"fog: density is {self.density!r}; it must be a number of at least 0 (1 / metres)"
             )
@@ -61,7 +61,7 @@ class Gradient:
 
 
 @dataclass(frozen=True, eq=False)
-class Panorama:
+class Panorama(PickledByFields):
     """An equirectangular picture of the world as background: its middle column lies towards +z, to the right
     of it is +x, its top row is -y.
 
@@ -74,7 +74,10 @@ class Panorama:
     """where it came from"""
 
     def __post_init__(self) -> None:
-        given = np.asarray(self.image)
+        try:
+            given = np.asarray(self.image)
+        except ValueError:  # rows that differ in length
+            given = np.empty(0)
         if given.ndim != 3 or given.shape[2] != 3 or given.dtype.kind not in "fiu":
             raise InputError(
                 f"background: a panorama must be (h, w, 3) numbers, not {given.shape} {given.dtype}"
@@ -85,7 +88,7 @@ class Panorama:
                 f"background: a panorama of {width} x {height} pixels; 2 to {MAX_PANORAMA} a side can be used"
             )
         whole = np.iinfo(given.dtype).max if given.dtype in (np.uint8, np.uint16) else 1
-        with np.errstate(over="ignore"):  # what float32 cannot hold is told below
+        with np.errstate(over="ignore"):  # what float32 cannot hold is refused below
             image = np.array(given, np.float32, order="C") / np.float32(whole)
         if not np.isfinite(image).all():
             which = f"the panorama {self.file}" if self.file else "the panorama"

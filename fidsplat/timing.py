@@ -53,7 +53,7 @@ class Timer:
         self.ms: list[float] = []
         """milliseconds of each run that counts"""
         self.parts: dict[str, list[float]] = {}
-        """the same runs part by part, as `work` told them"""
+        """the same runs part by part, as `work` returned them"""
         self.error = ""
 
     def run(self, counts: bool = True) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 from agreement import random_splats
 
 import fidsplat as fs
-from fidsplat.backends.exposure import exposed_view
+from fidsplat.backends.prepare import view_of
 from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.effects import OUTPUTS, FeatureSet, select
 from fidsplat.hard_cases.agreement import compare
@@ -58,7 +58,7 @@ _FIXED = {
     "fisheye": Switch("lens", fs.Camera.fisheye(*SIZE, math.radians(170))),
     "equirectangular": Switch("lens", fs.Camera.equirectangular(*SIZE)),
     "orthographic": Switch("lens", fs.Camera.orthographic(*SIZE, 4.0)),
-    "motion blur": Switch("exposure", shutter={"exposure": 0.3, "sub_poses": 2}),
+    "motion blur": Switch("exposure time", shutter={"exposure_time": 0.3, "sub_poses": 2}),
     "rolling shutter": Switch("readout", shutter={"readout": 0.4, "rows_per_band": 8}),
     "moving group": Switch("groups", arguments={"groups": {0: sliding}}),
     "spherical harmonics": Switch("colour"),
@@ -125,23 +125,11 @@ class Combination:
     """What a set of switches asks for."""
 
     cloud: fs.SplatCloud
-    camera: fs.Camera
-    outputs: tuple[str, ...]
-    quality: fs.Quality
-    background: Any
-    motion: fs.Motion
-    shutter: fs.Shutter
-    sensor: fs.Sensor | None
-    fog: fs.Fog | None
+    capture: fs.Capture
 
     def features(self, *more: str) -> FeatureSet:
         """What it calls for, and more outputs."""
-        around = {"sensor": self.sensor, "fog": self.fog, "background": self.background}
-        around |= {
-            "moving": bool(self.motion.groups),
-            "exposed": self.shutter.exposure > 0 or self.shutter.readout > 0,
-        }
-        return select(self.cloud, (*self.outputs, *more), self.quality, self.camera, **around)
+        return select(self.cloud, self.capture.with_(outputs=(*self.capture.outputs, *more)))
 
 
 def combination(names: Iterable[str]) -> Combination:
@@ -156,33 +144,27 @@ def combination(names: Iterable[str]) -> Combination:
         for name, into in merged.items():
             into.update(getattr(switch, name))
     asked = merged["arguments"]
-    return Combination(
-        cloud,
+    capture = fs.Capture(
         camera,
         ("rgb", *(switch.output for switch in chosen if switch.output)),
         fs.Quality().with_(**merged["quality"]),
         asked.get("background", (0.1, 0.2, 0.3)),
         fs.Motion(turning if merged["shutter"] else None, asked.get("groups", {})),
         fs.Shutter(**merged["shutter"]),
-        fs.Sensor(**merged["sensor"]) if merged["sensor"] else None,
+        fs.Sensor(**merged["sensor"]),
         asked.get("fog"),
     )
+    return Combination(cloud, capture)
 
 
 def assert_drawn(renderer: fs.Renderer, names: Iterable[str]) -> None:
-    """It builds, it draws, and all its planes are the reference's within tolerance and certificate."""
+    """It builds, it draws, and all its images are the reference's within tolerance and certificate."""
     asked = combination(names)
-    frame = renderer.render(
-        asked.cloud, asked.camera, asked.outputs, asked.quality, asked.background,
-        asked.motion, asked.shutter, asked.sensor, asked.fog,
-    )  # fmt: skip
-    view = exposed_view(
-        asked.camera, asked.quality, asked.cloud.origin, asked.background,
-        asked.motion, asked.shutter, asked.sensor, asked.fog,
-    )  # fmt: skip
-    judge = ReferenceBackend()
-    truth = judge.pipeline(asked.features("alpha")).render(judge.upload(asked.cloud), view).planes
-    differences = compare(frame, truth, asked.outputs)
+    frame = renderer.render(asked.cloud, asked.capture)
+    view = view_of(asked.capture, asked.cloud.origin)
+    reference = ReferenceBackend()
+    truth = reference.pipeline(asked.features("alpha")).render(reference.upload(asked.cloud), view).images
+    differences = compare(frame, truth, frame.outputs)
     if any(SWITCHES[name].kind in COARSE for name in names):
         assert all(one.finite for one in differences)
         assert np.quantile(np.abs(frame["rgb"] - truth["rgb"]), 0.95) < 0.5 / 255

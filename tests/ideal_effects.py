@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 import fidsplat as fs
-from fidsplat.backends.base import View
-from fidsplat.backends.exposure import exposed_view
+from fidsplat.backends.prepare import view_of
 from fidsplat.backends.reference.optics import ray_lengths, rays_of
 from fidsplat.backends.reference.post import background_at, developed
+from fidsplat.backends.view import View
 from fidsplat.scenes import PlacedMarker
 
 
@@ -32,7 +32,18 @@ def ideal_picture(
     """
     quality = fs.Quality(samples=samples)
     motion, shutter = motion or fs.Motion(), shutter or fs.Shutter()
-    view = exposed_view(camera, quality, np.zeros(3), background, motion, shutter, sensor, fog)
+    view = view_of(
+        fs.Capture(
+            camera,
+            quality=quality,
+            background=background,
+            motion=motion,
+            shutter=shutter,
+            sensor=sensor,
+            fog=fog,
+        ),
+        np.zeros(3),
+    )
     light = np.zeros((view.height, view.width, 3))
     for shot in view.shots:
         light[shot.top : shot.top + shot.view.height] += shot.weight * _samples(placed, shot.view)
@@ -62,7 +73,7 @@ def _samples(placed: PlacedMarker, view: View) -> np.ndarray:
     middle = moved.rotation @ placed.pose[:3, 3] + moved.translation
     start = np.zeros_like(rays)
     if view.parallel:
-        start[:, 0], start[:, 1] = (x - view.cx) / view.fx, (y - view.cy) / view.fy
+        start[:, 0], start[:, 1] = (x - view.center_x) / view.focal_x, (y - view.center_y) / view.focal_y
     with np.errstate(divide="ignore", invalid="ignore"):
         along = (middle - start) @ turn[:, 2] / (rays @ turn[:, 2])
         place = (start + along[:, None] * rays - middle) @ turn[:, :2] / placed.marker.module

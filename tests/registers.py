@@ -19,7 +19,8 @@ import pyopencl as cl
 
 import fidsplat as fs
 from fidsplat.backends.opencl.assemble import assemble
-from fidsplat.backends.opencl.backend import OpenCLBackend
+from fidsplat.backends.opencl.device import OpenCLBackend
+from fidsplat.backends.opencl.program import build
 from fidsplat.effects import select
 from fidsplat.errors import DeviceError
 
@@ -58,11 +59,11 @@ def measure(backend: OpenCLBackend) -> Numbers:
     Raises:
         DeviceError: the driver's log does not say.
     """
-    features = select(fs.SplatCloud.empty(), ("rgb",), fs.Quality(lowpass="none"))
+    features = select(fs.SplatCloud.empty(), fs.Capture(quality=fs.Quality(lowpass="none")))
     # the driver keeps what it has compiled, and has no log of what it kept: a kernel that is new each time
     name = f"unlike_{secrets.token_hex(8)}"
     text = assemble(features, backend.shape).text + f"kernel void {name}(global int *out) {{ out[0] = 1; }}\n"
-    program = cl.Program(backend.context, text).build([*backend.build_options, "-cl-nv-verbose"])
+    program = build(backend, text, "-cl-nv-verbose")
     log = program.get_build_info(backend.device, cl.program_build_info.LOG)
     numbers = of_log(log)
     info = cl.kernel_work_group_info

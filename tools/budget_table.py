@@ -1,11 +1,11 @@
-"""Makes fidsplat/budget/table.json: the settings that `fs.Quality.within` chooses among, with their errors
+"""Makes fidsplat/budget/table.json: the settings that `fs.quality_within` chooses among, with their errors
 over random scenes and what they cost.
 
     python tools/budget_table.py --device opencl:pocl       about 15 minutes on two busy cores
     python tools/budget_table.py --device opencl:nvidia     adds the settings of GPUs
 
-Each scene of `fidsplat/random_clouds.py` is drawn with every setting and held against the same
-definition at full precision, which the device draws in float64 (`fidsplat.accuracy.judge_for`). Costs are
+Each scene of `fidsplat/random_clouds.py` is drawn with every setting and compared with the same
+definition at full precision, which the device draws in float64 (`fidsplat.accuracy.reference_for`). Costs are
 medians of frames of the scenes of TIMED, drawn in turn; on CPUs those of the processor's time. In a second
 round the settings on the front of error and cost are drawn with every set of MODIFIERS, and FINEST beside
 them; what is on that front then is kept. Knobs that the device does not have are left out. What the file
@@ -23,11 +23,12 @@ from datetime import date
 import numpy as np
 
 import fidsplat as fs
-from fidsplat.accuracy import doubt, errors, judge_for, truth
+from fidsplat.accuracy import error_bound, errors, reference_for, truth
 from fidsplat.budget.table import FILE, Setting
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
 from fidsplat.random_clouds import random_cloud, random_scene, standard_camera
+from fidsplat.timing import Timer, frame_timer, take_turns
 
 CUTOFFS = (0.03, 0.015, 2 / 255, 1 / 255, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 1e-7)
 STOPS = (0.05, 0.015, 4e-3, 1e-3, 1e-4, 1e-6)
@@ -86,13 +87,13 @@ def main() -> int:
     parser.add_argument("--out", default=str(FILE))
     args = parser.parse_args()
     renderer = fs.Renderer(args.device)
-    judge = judge_for(renderer)
+    judge = reference_for(renderer, fs.Capture())
 
     say(f"truths of {args.scenes} scenes by {judge.device.name}")
     scenes = [random_scene(seed) for seed in range(args.scenes)]
     truths = []
     for k, scene in enumerate(scenes):
-        truths.append(truth(judge, scene.cloud, scene.camera, background=scene.background))
+        truths.append(truth(judge, scene.cloud, fs.Capture(scene.camera, background=scene.background)))
         say(f"truths: {k + 1} of {args.scenes}", end="\r")
 
     def measure(settings: list[dict]) -> Measurement:
@@ -147,7 +148,7 @@ def all_errors(renderer: fs.Renderer, scenes, truths, settings: list[dict]) -> n
     """Largest absolute error of rgb (scenes, settings)."""
     qualities = [quality(knobs) for knobs in settings]
     found = np.empty((len(scenes), len(settings)))
-    off = doubt(judge_for(renderer))
+    off = error_bound(reference_for(renderer, fs.Capture()), fs.Capture())
     for k, (scene, want) in enumerate(zip(scenes, truths, strict=True)):
         resident = renderer.upload(scene.cloud)
         for j, each in enumerate(qualities):
@@ -166,17 +167,11 @@ def all_costs(renderer: fs.Renderer, settings: list[dict], repeats: int) -> np.n
     ratios = []
     for count, scale, width, height in TIMED:
         resident, camera = renderer.upload(random_cloud(count, scale)), standard_camera(width, height)
-        taken = np.empty((repeats + 1, len(qualities)))
-        for k in range(repeats + 1):
-            for j, each in enumerate(qualities):
-                begun = clock()
-                frame = renderer.render(resident, camera, quality=each)
-                assert frame.timings is not None  # waits for the device
-                taken[k, j] = clock() - begun
-            say(f"times: {k} of {repeats} rounds, {count:,} splats", end="\r")
-        middle = np.median(taken[1:], 0)
-        ratios.append(middle[1:] / middle[0])
-        say("")
+        frames = [frame_timer(renderer, resident, camera, quality=each) for each in qualities]
+        timers = [Timer(frame.run, clock) for frame in frames]
+        say(f"times: {repeats} rounds, {count:,} splats")
+        take_turns(timers, repeats, warm_up=1)
+        ratios.append(np.array([timer.median for timer in timers[1:]]) / timers[0].median)
     return np.mean(ratios, 0)
 
 

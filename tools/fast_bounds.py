@@ -12,13 +12,14 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from dataclasses import replace
-from importlib import import_module
 from itertools import zip_longest
 
 import numpy as np
 from rich.progress import track
 
 import fidsplat as fs
+from fidsplat.backends.base import ProbesArithmetic
+from fidsplat.backends.opencl.device import OpenCLBackend
 from fidsplat.hard_cases.arithmetic import worst
 
 AT_ONCE = 1 << 22
@@ -48,17 +49,17 @@ def main() -> None:
     parser.add_argument("--no-fma", action="store_true", help="as on a device without them (OpenCL)")
     options = parser.parse_args()
     renderer = fs.Renderer(options.device)
-    family = renderer.device.name.split(":")[0]
-    run = import_module(f"fidsplat.backends.{family}.arithmetic").run_arithmetic
     backend = renderer.backend
+    if not isinstance(backend, ProbesArithmetic):
+        parser.error(f"{renderer.device.name} runs no functions alone")
     if options.no_fma:
-        if family != "opencl":
+        if not isinstance(backend, OpenCLBackend):
             parser.error("--no-fma: only OpenCL draws without them")
         backend.shape = replace(backend.shape, fast_fma=False)
     most = dict.fromkeys(NAMES, 0.0)
     pairs = zip_longest(every(*EXPONENTS), every(*SHARES), fillvalue=np.ones(AT_ONCE))
     for x, share in track(pairs, "every float32", total=len(range(*_bits(*EXPONENTS), AT_ONCE))):
-        got = run(backend, -x, share, share, share)
+        got = backend.run_arithmetic(-x, share, share, share)
         for name, function in NAMES.items():
             truth = function(share if name.endswith("log") else -x)
             most[name] = max(most[name], worst(got[name], truth))

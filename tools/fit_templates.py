@@ -262,9 +262,9 @@ def _layered(alpha, light, start, ideal, sample) -> tuple[float, np.ndarray]:
     """Coplanar splats as one layer (kernels/opencl/slot/compose_planes.cl): error, gradient of alpha."""
     tau = -np.log1p(-alpha)
     n = np.diff(start, append=len(alpha))
-    depth, ink = np.add.reduceat(tau, start), np.add.reduceat(tau * light, start)
+    depth, shone = np.add.reduceat(tau, start), np.add.reduceat(tau * light, start)
     left = np.exp(-depth)
-    mean = ink / np.maximum(depth, 1e-9)
+    mean = shone / np.maximum(depth, 1e-9)
     per_depth = (1 - left) / np.maximum(depth, 1e-9)
     error, g = 0.0, 0.0
     for background, e, off in _off((1 - left) * mean, left, ideal, sample):
@@ -280,11 +280,11 @@ def _ordered(alpha, light, start, ideal, sample) -> tuple[float, np.ndarray]:
     log_left = np.log1p(-alpha)
     total = np.cumsum(log_left)
     before = np.exp(total - log_left - np.repeat((total - log_left)[start], n))
-    ink = np.cumsum(alpha * before * light)
+    shone = np.cumsum(alpha * before * light)
     stop = np.append(start[1:], len(alpha)) - 1
     left = before[stop] * (1 - alpha[stop])
-    value = np.diff(ink[stop], prepend=0.0)
-    behind = np.repeat(ink[stop], n) - ink
+    value = np.diff(shone[stop], prepend=0.0)
+    behind = np.repeat(shone[stop], n) - shone
     error, g = 0.0, 0.0
     for background, e, off in _off(value, left, ideal, sample):
         error += e

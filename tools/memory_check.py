@@ -96,7 +96,7 @@ def plant() -> int:
 def draw() -> int:
     """Under oclgrind: pictures in both schedules, each compared with the reference."""
     import fidsplat as fs
-    from fidsplat.backends.opencl.memory import BufferPool
+    from fidsplat.backends.opencl.workspace import BufferPool
 
     renderer = fs.Renderer("opencl:oclgrind")
     kept = []
@@ -130,8 +130,7 @@ def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
     import numpy as np
 
     import fidsplat as fs
-    from fidsplat.backends.base import View
-    from fidsplat.backends.opencl.arithmetic import run_arithmetic
+    from fidsplat.backends.view import View
     from fidsplat.effects import select
     from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture, truth_of
     from fidsplat.hard_cases.clouds import camera, splats
@@ -148,8 +147,8 @@ def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
     def task(shape, cloud, view_from, outputs=("rgb", "alpha"), quality=None, budget=None):
         def work() -> float:
             chosen = quality or fs.Quality()
-            features = select(cloud, outputs, chosen)
-            view = View.of(view_from, chosen, cloud.origin, (0.1, 0.2, 0.3))
+            features = select(cloud, fs.Capture(outputs=outputs, quality=chosen))
+            view = View.of(fs.Capture(view_from, quality=chosen, background=(0.1, 0.2, 0.3)), cloud.origin)
             backend.pair_budget, kept = budget or backend.pair_budget, backend.pair_budget
             planes = backend.pipeline(features, shape).render(backend.upload(cloud), view)
             drawn = {name: planes.read(name) for name in ("rgb", *features.taps)}
@@ -166,7 +165,7 @@ def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
 
     def arithmetic() -> float:
         numbers = np.linspace(0.5, 1.0, 64)
-        results = run_arithmetic(backend, -numbers, numbers, numbers, numbers)
+        results = backend.run_arithmetic(-numbers, numbers, numbers, numbers)
         return float(np.abs(results["exp"] - np.exp(-numbers)).max())
 
     yield "the self-test's arithmetic", arithmetic

@@ -14,12 +14,13 @@ from __future__ import annotations
 import gsplat
 import numpy as np
 import torch
-from turns import arguments, peer_device, report, take_turns
+from turns import arguments, compared, peer_device, report
 
 from fidsplat.cameras import Camera
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, scene_names
 from fidsplat.experiments.bench.measure import Result, SceneRun
 from fidsplat.splats import SplatCloud
+from fidsplat.timing import Timer
 
 
 def tensors(cloud: SplatCloud, camera: Camera) -> dict:
@@ -57,9 +58,8 @@ def main() -> None:
     for name in names:
         cloud, camera = BENCH_SCENES[name].make()
         ours = SceneRun(name, options.device, None, cloud, camera)
-        if ours.result.error:
-            raise SystemExit(f"gsplat_cuda: {ours.result.error}")
-        peer = Result(name, device, camera.width, camera.height, renderer=f"gsplat {gsplat.__version__}")
+        if ours.result.timer.error:
+            raise SystemExit(f"gsplat_cuda: {ours.result.timer.error}")
         given = tensors(cloud, camera)
         torch.cuda.reset_peak_memory_stats()
 
@@ -71,8 +71,10 @@ def main() -> None:
             torch.cuda.synchronize()
             return _Picture(colors)
 
+        size = camera.width, camera.height
+        peer = Result(name, device, *size, Timer(draw), renderer=f"gsplat {gsplat.__version__}")
         peer.counts = {"splats": len(cloud)}
-        records += take_turns(ours, peer, draw, max(options.repeats, 1))
+        records += compared(ours, peer, draw, max(options.repeats, 1))
         radii, pairs = last["meta"]["radii"], last["meta"]["flatten_ids"]
         seen = radii.reshape(-1, 2).amin(-1) if radii.shape[-1] == 2 else radii.reshape(-1)  # 1.4: one radius
         records[-1] |= {

@@ -19,12 +19,13 @@ import math
 
 import mitsuba as mi
 import numpy as np
-from turns import arguments, peer_device, report, take_turns
+from turns import arguments, compared, peer_device, report
 
 from fidsplat.cameras import Camera
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, scene_names
 from fidsplat.experiments.bench.measure import Result, SceneRun
 from fidsplat.splats import SplatCloud
+from fidsplat.timing import Timer
 
 THICKNESS = 1e-4  # metres, standard deviation
 C0 = 0.28209479177387814  # of the constant spherical harmonic
@@ -77,13 +78,11 @@ def main() -> None:
     for name in names:
         cloud, camera = BENCH_SCENES[name].make()
         ours = SceneRun(name, options.device, None, cloud, camera)
-        if ours.result.error:
-            raise SystemExit(f"mitsuba_cpu: {ours.result.error}")
+        if ours.result.timer.error:
+            raise SystemExit(f"mitsuba_cpu: {ours.result.timer.error}")
         scene = mi.load_dict(mitsuba_scene(cloud, camera))
         threads = dr.thread_count()
         device = peer_device("cpu", f"{threads} threads", "Dr.Jit LLVM", mi.__version__, "cpu", threads)
-        peer = Result(name, device, camera.width, camera.height, renderer=f"Mitsuba {mi.__version__}")
-        peer.counts = {"splats": len(cloud)}
 
         def draw(scene=scene):
             picture = mi.render(scene, spp=1)
@@ -91,7 +90,10 @@ def main() -> None:
             dr.sync_thread()
             return picture
 
-        records += take_turns(ours, peer, draw, max(options.repeats, 1))
+        size = camera.width, camera.height
+        peer = Result(name, device, *size, Timer(draw), renderer=f"Mitsuba {mi.__version__}")
+        peer.counts = {"splats": len(cloud)}
+        records += compared(ours, peer, draw, max(options.repeats, 1))
     report(records, list(names), options.json)
 
 

@@ -3,31 +3,27 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import time
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
-from rich.table import Table
+from rich.progress import Progress
 
 import fidsplat as fs
 from fidsplat.backends.base import DeviceInfo
-from fidsplat.experiments.bench.measure import WARM_UP, Result, SceneRun
-from fidsplat.files import atomic_write
+from fidsplat.experiments.bench.measure import Result, SceneRun
+from fidsplat.timing import Timer, take_turns
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from measuring import PROGRESS, keep, options, show
 
 
 def arguments(about: str | None, repeats: int, device: str) -> argparse.ArgumentParser:
-    """What every peer's script takes."""
-    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """What every peer's script takes; --device is where fidsplat draws."""
+    parser = options(about, device, repeats)
     parser.add_argument("scenes", nargs="*", default=["r100k_720p"], help="as in `fidsplat bench --help`")
-    parser.add_argument("--device", default=device, help=f"where fidsplat draws (default: {device})")
-    parser.add_argument(
-        "--repeats", type=int, default=repeats, help=f"frames that count (default: {repeats})"
-    )
-    parser.add_argument("--json", metavar="FILE", help="write the figures, as `fidsplat bench --json` does")
     return parser
 
 
@@ -48,25 +44,23 @@ def peer_device(name: str, title: str, platform: str, version: str, kind: str, u
     )
 
 
-def take_turns(ours: SceneRun, peer: Result, draw: Callable[[], np.ndarray], repeats: int) -> list[dict]:
+def compared(ours: SceneRun, peer: Result, draw: Callable[[], np.ndarray], repeats: int) -> list[dict]:
     """Time both and return their records, the peer's with the ratio of the medians and the PSNR of its
     picture against ours.
 
     Args:
-        draw: draws one frame, waits until it is done, and returns the picture, (h, w, 3 or more), as
-            something that NumPy can read. The reading is not timed.
+        peer: its `timer` times `draw`, which draws one frame, waits until it is done, and returns the
+        picture,
+            (h, w, 3 or more), as something that NumPy can read. The reading is not timed.
     """
-    begun = time.perf_counter()
-    picture = np.asarray(draw())[..., :3]
-    peer.first_frame_ms = 1e3 * (time.perf_counter() - begun)
+    drawn = []
+    peer.first_frame_ms = Timer(lambda: drawn.append(np.asarray(draw())[..., :3])).run()
+    picture = drawn.pop()
     peer.mean_rgb = float(picture.mean(dtype=np.float64))
     error = np.mean((np.clip(picture, 0, 1).astype(np.float64) - np.clip(ours.picture, 0, 1)) ** 2)
-    for number in track(range(WARM_UP + repeats), description=peer.scene, console=Console(stderr=True)):
-        ours.draw(counts=number >= WARM_UP)
-        begun = time.perf_counter()
-        draw()
-        if number >= WARM_UP:
-            peer.frames.append(1e3 * (time.perf_counter() - begun))
+    with Progress(console=PROGRESS) as progress:
+        task = progress.add_task(peer.scene, total=2 * repeats)
+        take_turns([ours.result.timer, peer.timer], repeats, tick=lambda: progress.advance(task))
     records = [ours.result.as_dict(), peer.as_dict()]
     records[1]["times_ours"] = records[1]["frame_ms"] / records[0]["frame_ms"]
     records[1]["psnr_db"] = -10 * math.log10(max(error, 1e-12))
@@ -74,14 +68,15 @@ def take_turns(ours: SceneRun, peer: Result, draw: Callable[[], np.ndarray], rep
 
 
 def report(records: list[dict], scenes: list[str], file: str | None) -> None:
-    """Print a table, and write the file if there is one."""
-    table = Table(
-        "scene", "renderer", "device", "ms per frame", "times ours", "mean RGB", "PSNR against ours"
-    )
-    for record in records:
+    """Print a table, and write the file if there is one, as `fidsplat bench --json` does."""
+    figures = {"fidsplat": fs.__version__, "scenes": scenes, "interrupted": False, "results": records}
+    if keep(figures, file):
+        return
+
+    def cells(record: dict) -> tuple[str, ...]:
         low, high = record["quartiles_ms"]
         times, psnr = record.get("times_ours"), record.get("psnr_db")
-        table.add_row(
+        return (
             record["scene"],
             record["renderer"],
             record["title"],
@@ -90,10 +85,6 @@ def report(records: list[dict], scenes: list[str], file: str | None) -> None:
             f"{record['mean_rgb']:.4f}",
             "" if psnr is None else f"{psnr:.1f} dB",
         )
-    console = Console()
-    console.width = max(console.width, 140)  # numbers are not to be broken
-    console.print(table)
-    if file is not None:
-        record = {"fidsplat": fs.__version__, "scenes": scenes, "interrupted": False, "results": records}
-        with atomic_write(file) as stream:
-            stream.write(json.dumps(record, indent=2).encode() + b"\n")
+
+    heads = ("scene", "renderer", "device", "ms per frame", "times ours", "mean RGB", "PSNR against ours")
+    show("fidsplat and its peer, in turns", heads, map(cells, records))

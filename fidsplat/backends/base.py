@@ -1,31 +1,21 @@
-"""What every backend offers, and the plain data that passes between a backend and the renderer."""
+"""What every backend offers, and what only some do: typed protocols, by which others tell what a backend can.
+
+Nobody outside a backend asks for its name: a capability is asked for with `isinstance(backend, Adopts)`.
+"""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from fidsplat.cameras import Camera, Orthographic
-from fidsplat.cameras.lenses import Lens
-from fidsplat.cameras.raster import RayRaster, raster_of
+from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
-from fidsplat.errors import InputError
-from fidsplat.quality import Quality
-from fidsplat.sensor import Sensor
+from fidsplat.effects.select import Traits
 from fidsplat.splats import SplatCloud
-from fidsplat.surroundings import Background, Fog, Gradient, Panorama, background_of
-
-if TYPE_CHECKING:
-    from fidsplat.backends.exposure import Shot
-
-FAR_EYE = 1e9
-"""metres: where the eye of a parallel projection is taken to be"""
-MAX_GRID = 32767
-"""Largest side of the sample grid: anchors and rows are kept in 16 bits."""
 
 
 @dataclass(frozen=True)
@@ -62,189 +52,30 @@ class Rates:
     """float32 divisions, as the blend stage writes them"""
 
 
-_NO_SENSOR = Sensor()
-
-
-@dataclass(frozen=True)
-class View:
-    """The uniforms of one picture: numbers that change from view to view, in float64.
-
-    The sample grid is the picture with `samples` x `samples` samples in each pixel.
-    """
-
-    width: int
-    """samples"""
-    height: int
-    """samples"""
-    samples: int
-    """per pixel and axis"""
-    fx: float
-    """samples, as fy, cx, cy"""
-    fy: float
-    cx: float
-    cy: float
-    rotation: np.ndarray
-    """(3, 3) world to camera"""
-    translation: np.ndarray
-    """(3,) metres: where the cloud's origin lies in the camera frame"""
-    eye: np.ndarray
-    """(3,) metres: the camera's centre relative to the cloud's origin, world axes; far behind it for parallel
-    rays"""
-    near: float
-    far: float
-    log_cut: float
-    """natural logarithm of the alpha cut-off, rounded to float32"""
-    ceiling: float
-    stop: float
-    background: tuple[float, float, float]
-    """the fog's colour where there is fog"""
-    first_light: float
-    """transmittance that is left behind a first hit"""
-    sensor: Sensor = _NO_SENSOR
-    fog_density: float = 0.0
-    """1 / metres"""
-    surroundings: Gradient | Panorama | None = None
-    """a background that is not one colour"""
-    raster: RayRaster | None = None
-    """the samples' rays behind a lens; None for a pinhole and for parallel rays"""
-    along_ray: bool = False
-    """whether near, far, sort keys and depths are distances from the camera's centre; else along z"""
-    parallel: bool = False
-    """whether all rays are parallel to z; fx and fy are samples per metre then"""
-    groups: tuple[tuple[int, View], ...] = ()
-    """(label, the view that its splats have), for splats that move by themselves"""
-    shots: tuple[Shot, ...] = ()
-    """the sub-pictures of which this picture is made; none: it is one"""
+class ResidentData(Traits, Protocol):
+    """A cloud on a device."""
 
     @property
-    def lens(self) -> Lens | None:
-        """What stands before a pinhole; None for a pinhole."""
-        if self.raster is not None:
-            return self.raster.lens
-        return Orthographic() if self.parallel else None
+    def count(self) -> int:
+        """Splats."""
+        ...
 
     @property
-    def turns_of_rows(self) -> np.ndarray:
-        """(h, 3, 3) world to camera, for each row of pixels that of the pose which normals show there."""
-        turns = np.tile(self.rotation, (self.height // self.samples, 1, 1))
-        for shot in self.shots:
-            if shot.middle:
-                top = shot.top // self.samples
-                turns[top : top + shot.view.height // self.samples] = shot.view.rotation
-        return turns
+    def origin(self) -> np.ndarray:
+        """(3,) float64 metres: the world's position of the means' zero."""
+        ...
 
-    def rows(self, top: int, end: int) -> View:
-        """The view of rows of samples [top, end) alone."""
-        if (top, end) == (0, self.height):
-            return self
-        return replace(
-            self,
-            height=end - top,
-            cy=self.cy - top,
-            raster=None if self.raster is None else self.raster.cropped(top, end),
-            groups=tuple((label, view.rows(top, end)) for label, view in self.groups),
-        )
-
-    def uniform(self, name: str) -> tuple[Any, ...]:
-        """Numbers that an effect asks for (`Effect.blend_uniforms`), in the order of its kernel arguments:
-        floats, or NumPy's integers where the kernel wants them."""
-        around = self.surroundings
-        match name:
-            case "ray" if self.along_ray or self.parallel:
-                # depths are distances already: rays of a length of 1 per metre of depth
-                return math.inf, math.inf, 0.0, 0.0
-            case "ray":
-                return self.fx, self.fy, self.cx, self.cy
-            case "rotation":
-                return tuple(self.rotation.ravel().tolist())
-            case "gradient" if isinstance(around, Gradient):
-                up = np.array(around.up) / np.linalg.norm(around.up)
-                return (*around.top, *around.bottom, *up.tolist())
-            case "panorama_size":
-                height, width = self.array("panorama").shape[:2]
-                return np.int32(width), np.int32(height)
-            case "vignette_center":
-                half_diagonal = math.hypot(self.width, self.height) / 2 / self.samples
-                return self.cx / self.samples, self.cy / self.samples, 1 / half_diagonal
-            case "first_light" | "fog_density":
-                return (getattr(self, name),)
-            case _:
-                return self.sensor.uniform(name)
-
-    def array(self, name: str) -> np.ndarray:
-        """A float32 array that an effect asks for (`Effect.resolve_arrays`, `Effect.backdrop_arrays`)."""
-        if name == "turns":
-            return self.turns_of_rows.astype(np.float32)
-        if name == "panorama" and isinstance(self.surroundings, Panorama):
-            return self.surroundings.image
-        return np.asarray(self.sensor.response, np.float32)
-
-    @classmethod
-    def of(
-        cls,
-        camera: Camera,
-        quality: Quality,
-        origin: np.ndarray,
-        background: Background,
-        sensor: Sensor | None = None,
-        fog: Fog | None = None,
-    ) -> View:
-        """The view of a camera under a quality, for a cloud whose means are relative to `origin` (3,).
-
-        Raises:
-            InputError: the sample grid is too large, or the background is not three finite numbers.
-        """
-        n = quality.samples
-        if max(camera.width, camera.height) * n > MAX_GRID:
-            raise InputError(
-                f"{camera.width} x {camera.height} pixels with {n} x {n} samples each is too large: at most "
-                f"{MAX_GRID} samples along a side; use fewer samples or a smaller picture"
-            )
-        behind = background_of(background)
-        surroundings = None if isinstance(behind, tuple) else behind
-        color = behind if isinstance(behind, tuple) else (0.0, 0.0, 0.0)
-        if fog is not None and fog.density > 0:
-            color, surroundings = fog.color, None
-        rotation = camera.world_to_camera[:3, :3]
-        # the difference first, then the rotation: nothing large is ever rotated (numerics B5)
-        eye = camera.position - np.asarray(origin, dtype=np.float64)
-        lens, grid = camera.lens, (camera.width * n, camera.height * n)
-        intrinsics = camera.fx * n, camera.fy * n, camera.cx * n, camera.cy * n
-        parallel = isinstance(lens, Orthographic)
-        raster = None if lens is None or parallel else raster_of(lens, *grid, *intrinsics)
-        return cls(
-            width=camera.width * n,
-            height=camera.height * n,
-            samples=n,
-            fx=camera.fx * n,
-            fy=camera.fy * n,
-            cx=camera.cx * n,
-            cy=camera.cy * n,
-            rotation=rotation,
-            translation=-rotation @ eye,
-            # colours that depend on the view see parallel rays come from very far away
-            eye=eye - FAR_EYE * rotation[2] if parallel else eye,
-            near=camera.near,
-            far=camera.far,
-            log_cut=float(np.float32(math.log(quality.alpha_cutoff))),
-            ceiling=float(np.float32(quality.opacity_ceiling)),
-            stop=float(np.float32(quality.transmittance_stop)),
-            background=color,
-            first_light=float(np.float32(1 - quality.first_hit)),
-            sensor=sensor or _NO_SENSOR,
-            fog_density=0.0 if fog is None else fog.density,
-            surroundings=surroundings,
-            raster=raster,
-            along_ray=lens is not None and lens.along_ray,
-            parallel=parallel,
-        )
+    @property
+    def memory_bytes(self) -> int:
+        """Device memory that it takes; 0 where the device reads the host's own arrays."""
+        ...
 
 
-class Planes(Protocol):
-    """Finished planes of one picture, on the device until asked for."""
+class Images(Protocol):
+    """Finished output images of one picture, on the device until asked for."""
 
     def read(self, name: str) -> np.ndarray:
-        """The plane as a NumPy array of its own."""
+        """The image as a NumPy array of its own, in the type of `OUTPUTS[name]`."""
         ...
 
     @property
@@ -258,10 +89,28 @@ class Planes(Protocol):
         ...
 
 
+@runtime_checkable
+class GivesArrays(Protocol):
+    """Images that others on the device can use where they were drawn."""
+
+    def device_array(self, name: str) -> Any:
+        """The image as an array of the device, (h, w) or (h, w, channels); no copy."""
+        ...
+
+
+@runtime_checkable
+class GivesFloat64(Protocol):
+    """Images that were computed in float64 and still are."""
+
+    def read_float64(self, name: str) -> np.ndarray:
+        """The image as a NumPy array in float64."""
+        ...
+
+
 class Pipeline(Protocol):
     """The stages compiled for one FeatureSet."""
 
-    def render(self, resident: Any, view: View) -> Planes:
+    def render(self, resident: Any, view: View) -> Images:
         """Draw one picture of an uploaded cloud."""
         ...
 
@@ -274,28 +123,47 @@ class Backend(Protocol):
     """An open device."""
 
     info: DeviceInfo
+    always_float64: bool
+    """whether every picture is computed in float64 throughout, whatever its quality asks for"""
 
     def limit_memory(self, budget: int) -> None:
         """Let a picture and its cloud take at most `budget` bytes of the device."""
         ...
 
-    def upload(self, cloud: SplatCloud) -> Any:
+    def upload(self, cloud: SplatCloud) -> ResidentData:
         """The cloud on the device."""
         ...
 
+    def unsupported(self, features: FeatureSet) -> str:
+        """What of these features the device cannot draw, as the message of the error that drawing them
+        raises; empty if it can draw all."""
+        ...
+
     def pipeline(self, features: FeatureSet) -> Pipeline:
-        """The pipeline for these features, compiled on first use."""
+        """The pipeline for these features, compiled on first use.
+
+        Raises:
+            DeviceError: what is `unsupported`; or the compiler refuses.
+        """
+        ...
+
+
+@runtime_checkable
+class Adopts(Protocol):
+    """A backend that draws splats from arrays that are on the device already."""
+
+    def adopt(self, arrays: Mapping[str, Any], origin: np.ndarray) -> ResidentData:
+        """Arrays (`means`, `quats`, ...) used where they lie. Raises InputError for one that cannot be."""
         ...
 
 
 @runtime_checkable
 class Measurable(Protocol):
-    """A backend that can also be held against its hardware: it has these, and kernels for the effect
-    `overdraw`. Not all have."""
+    """A backend that can be held against its hardware. It also has kernels for the effect `overdraw`."""
 
     @property
     def memory_bytes(self) -> int:
-        """Device memory that scratch buffers hold; clouds and finished planes are not among them."""
+        """Device memory that scratch buffers hold; clouds and finished images are not among them."""
         ...
 
     def release_scratch(self) -> None:
@@ -304,4 +172,87 @@ class Measurable(Protocol):
 
     def rates(self) -> Rates:
         """What the device can do at best; measured anew at each call."""
+        ...
+
+
+@runtime_checkable
+class ProbesArithmetic(Protocol):
+    """A backend that runs the functions of its kernels on given numbers."""
+
+    def run_arithmetic(
+        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Results of the device's functions, as the stages call them.
+
+        Args:
+            exponents, shares, above, below: (n,) float64, n a multiple of 16; they are rounded to float32
+                where float32 is computed.
+
+        Returns:
+            (n,) float32: `exp` of exponents, `log` of shares, `division` above / below, `sqrt` of below,
+            `fma` above * below + above, `fast_exp` of exponents, `fast_log` of shares; (n,) float64 where the
+            device has it: `division64`, `sqrt64`, `log64`; `denormal` (2,) float32: half of the smallest
+            normal number, and twice that.
+
+        Raises:
+            DeviceError: the device cannot compile or run the kernels.
+        """
+        ...
+
+
+class Probe(Protocol):
+    """Looks into an open device: small kernels compiled as the stages are, single stages on made-up input,
+    and memory that is filled with rubbish first."""
+
+    def contraction(self, a: np.ndarray, b: np.ndarray) -> tuple[Sequence[np.ndarray], bool]:
+        """a b - a b; a b + a; the difference in the set-up's precision, of thirds; a b - (a b), fused: each
+        (n,), from a, b (n,) float32. And whether the device fuses where it is asked to."""
+        ...
+
+    def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
+        """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
+        ...
+
+    def options(self) -> list[str]:
+        """What every kernel is compiled with."""
+        ...
+
+    def scan(self, pipeline: Any, lengths: np.ndarray) -> tuple[np.ndarray, int]:
+        """Where lists of these lengths (n,) uint32 start, modulo 2^32, (n + 1,) uint32; and the sum of all in
+        64 bits."""
+        ...
+
+    def poisoned(self) -> AbstractContextManager[None]:
+        """Within it, all memory that a picture takes is filled with 0xFF first: NaN, or the integer -1."""
+        ...
+
+
+@runtime_checkable
+class Probed(Protocol):
+    """A backend that lets tests look into its device."""
+
+    pair_budget: int
+    """most pairs of splats and tiles that are listed at once; tests make it small"""
+
+    def probe(self) -> Probe:
+        """What looks into it."""
+        ...
+
+
+@runtime_checkable
+class Reshapes(Backend, Protocol):
+    """A backend whose build constants (its "shape") tests may replace: sizes of tiles, ways of sorting."""
+
+    def shapes(self, kind: str) -> dict[str, Any]:
+        """Build constants by a name that people read. kind: `tiles`, of other sizes, whose pictures have the
+        same bits; `schedule`, the way in which a GPU walks its tiles (on a GPU: other tiles), whose pictures
+        agree but for rounding; `sorting`, the device's own and others for listing and sorting."""
+        ...
+
+    def pieces(self, shape: Any) -> int:
+        """In how many pieces the sorts cut what they sort."""
+        ...
+
+    def pipeline(self, features: FeatureSet, shape: Any = None) -> Pipeline:
+        """As `Backend.pipeline`, with build constants of `shapes`."""
         ...

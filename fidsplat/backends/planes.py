@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.rotations import quaternion_to_matrix
 from fidsplat.splats import SplatCloud
 

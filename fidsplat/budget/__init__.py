@@ -1,4 +1,4 @@
-"""The cheapest quality that keeps an error, or the most accurate one that keeps a time (`Quality.within`)."""
+"""The cheapest quality that keeps an error, or the most accurate that keeps a time: `fs.quality_within`."""
 
 from fidsplat.budget.choose import Choice, check_bounds, choose
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
-from fidsplat.accuracy import doubt, errors, judge_for, truth
-from fidsplat.cameras import Camera
+from fidsplat.accuracy import error_bound, errors, reference_for, truth
+from fidsplat.capture import Capture
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer
 from fidsplat.splats import SplatCloud
@@ -39,23 +38,19 @@ class Calibration:
     Args:
         renderer: who draws.
         cloud: what.
-        camera: from where.
-        base: whose definition the truth has.
-        around: background, motion, shutter, fog, as `Renderer.render` takes them.
-        tell: is told what is being done.
+        capture: how; its quality has the definition of the truth.
+        tell: called with what is being done.
     """
 
     def __init__(
         self,
         renderer: Renderer,
         cloud: SplatCloud,
-        camera: Camera,
-        base: Quality,
-        around: dict[str, Any],
+        capture: Capture,
         tell: Callable[[str], None],
     ) -> None:
-        self.renderer, self.base = renderer, base
-        self._cloud, self._camera, self._around, self._tell = cloud, camera, around, tell
+        self.renderer, self.base = renderer, capture.quality
+        self._cloud, self._capture, self._tell = cloud, capture, tell
         self._resident = renderer.upload(cloud)
         self._errors: dict[Quality, float] = {}
 
@@ -63,18 +58,16 @@ class Calibration:
     def _truth(self) -> tuple[np.ndarray, float]:
         """The picture (h, w, 3), and how far it may be off itself."""
         self._tell("drawing the picture at full precision")
-        about = self._camera, self._around.get("fog")
-        judge = judge_for(self.renderer, *about)
-        scene = self._resident if judge is self.renderer else self._cloud
-        picture = truth(judge, scene, self._camera, self.base, **self._around)
-        return picture, doubt(judge, *about)
+        reference = reference_for(self.renderer, self._capture)
+        scene = self._resident if reference is self.renderer else self._cloud
+        return truth(reference, scene, self._capture), error_bound(reference, self._capture)
 
     def error(self, quality: Quality) -> float:
         """Largest absolute error of rgb against the truth. What the truth may be off itself is added."""
         if quality not in self._errors:
             want, off = self._truth
             self._tell(f"measuring errors ({len(self._errors) + 1} settings so far)")
-            frame = self.renderer.render(self._resident, self._camera, ("rgb",), quality, **self._around)
+            frame = self.renderer.render(self._resident, self._capture, quality=quality)
             self._errors[quality] = errors(frame["rgb"], want).maximum + off
         return self._errors[quality]
 
@@ -92,5 +85,4 @@ class Calibration:
 
     def timer(self, quality: Quality) -> Timer:
         """Times frames of a quality."""
-        how = {"outputs": ("rgb",), "quality": quality, **self._around}
-        return frame_timer(self.renderer, self._resident, self._camera, **how)
+        return frame_timer(self.renderer, self._resident, self._capture, quality=quality)

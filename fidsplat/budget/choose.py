@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any
 
@@ -13,11 +13,13 @@ from fidsplat.budget.calibrate import Calibration
 from fidsplat.budget.search import Search
 from fidsplat.budget.table import Setting
 from fidsplat.cameras import Camera
+from fidsplat.capture import Capture
 from fidsplat.errors import DeviceError, InputError
 from fidsplat.provenance import code_hash
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer, default_device
 from fidsplat.scenes import Scene
+from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
 
 
@@ -56,46 +58,75 @@ class Choice:
         return f"{knobs}: {how} {self.error:.2g}{took} on {self.device}"
 
 
+def quality_within(
+    error: float | None = None,
+    ms: float | None = None,
+    *,
+    scene: Scene | SplatCloud | None = None,
+    capture: Capture | Camera | None = None,
+    device: str | Renderer | None = None,
+) -> Quality:
+    """The cheapest quality that keeps an error, or the most accurate one that keeps a time.
+
+    The error is the largest absolute difference of rgb, over all pixels and channels and before any sensor,
+    from the same definition at full precision in float64 (`fidsplat.accuracy.truth`). The definition
+    (low-pass, samples, coplanar, marker) is that of the capture's quality.
+
+    With the error alone the answer comes from a table of errors over random scenes. With a scene and a camera
+    it is measured: on this device, in that scene, from there. What was measured is kept in the user's cache
+    folder. docs/budget.md says how often each promise was kept.
+
+    Args:
+        error: largest error allowed.
+        ms: milliseconds that nine frames of ten may take, with the splats on the device and the picture left
+            there; needs a scene and a camera.
+        scene: what is drawn.
+        capture: how; or a camera alone. By default a Scene's own.
+        device: a device's name or a Renderer; by default that of `Renderer()`.
+
+    Raises:
+        InputError: no bound, one that is no finite number, or one that nothing keeps; the message says what
+            the best possible is.
+        DeviceError: the device cannot be used or fails.
+    """
+    return choose(error, ms, scene, capture, device).quality
+
+
 def choose(
     error: float | None = None,
     ms: float | None = None,
-    camera: Camera | None = None,
-    cloud: Scene | SplatCloud | None = None,
+    scene: Scene | SplatCloud | None = None,
+    capture: Capture | Camera | None = None,
     device: str | Renderer | None = None,
-    base: Quality | str | None = None,
     tell: Callable[[str], None] = lambda text: None,
-    **around: Any,
 ) -> Choice:
-    """As `Quality.within`, with what is known about the quality beside it. `tell` is told what is being done.
+    """As `quality_within`, with what is known about the quality beside it. `tell`: called with what is done.
 
     Raises:
-        InputError: as `Quality.within`. DeviceError: the device cannot be used or fails.
+        InputError: as `quality_within`. DeviceError: the device cannot be used or fails.
     """
     check_bounds(error, ms)
-    own = cloud if isinstance(cloud, Scene) else Scene(())
-    definition = Quality.of(own.quality if base is None else base)
-    camera = camera or own.camera
-    for name, given in (("cloud", cloud), ("camera", camera)):
-        if given is None and (ms is not None or cloud is not None or camera is not None):
-            raise InputError(f"this budget needs a {name} to measure with: give camera=... and cloud=...")
-    if cloud is not None and not isinstance(cloud, (Scene, SplatCloud)):
-        raise InputError(f"cloud is a {type(cloud).__name__}; give a SplatCloud or a Scene")
+    if scene is not None and not isinstance(scene, (Scene, SplatCloud)):
+        raise InputError(f"scene is a {type(scene).__name__}; give a SplatCloud or a Scene")
+    own = scene.capture if isinstance(scene, Scene) else Capture()
+    asked = capture if isinstance(capture, Capture) else own.with_(camera=capture)
+    asked = replace(asked, camera=asked.camera or own.camera, outputs=("rgb",), sensor=Sensor())
+    for name, given in (("scene", scene), ("camera", asked.camera)):
+        if given is None and (ms is not None or scene is not None or asked.camera is not None):
+            raise InputError(f"this budget needs a {name} to measure with: give scene=... and capture=...")
     renderer = device if isinstance(device, Renderer) else Renderer(device or default_device())
     settings = table.load(renderer.device.kind)
-    if cloud is None or camera is None:
+    if scene is None:
         assert error is not None
-        return _from_table(error, settings, definition, renderer)
-    for name in ("background", "motion", "shutter", "fog"):
-        if around.get(name) is None:
-            around[name] = getattr(own, name)
-    splats = cloud.cloud() if isinstance(cloud, Scene) else cloud
+        return _from_table(error, settings, asked.quality, renderer)
+    splats = scene.cloud() if isinstance(scene, Scene) else scene
     info = renderer.device
     drawn_by = (info.name, info.title, info.platform, info.version, code_hash())
-    key = store.digest(drawn_by, (error, ms), definition, camera, splats, around)
-    kept = _kept(key, definition, info.name)
+    key = store.digest(drawn_by, (error, ms), asked, splats)
+    kept = _kept(key, asked.quality, info.name)
     if kept is not None:
         return kept
-    search = Search(Calibration(renderer, splats, camera, definition, around, tell), settings)
+    search = Search(Calibration(renderer, splats, asked, tell), settings)
     choice = _measured(search, error, ms)
     numbers = {"error": choice.error, "ms": choice.ms, "ms_late": choice.ms_late}
     store.save(key, {"knobs": choice.knobs, **numbers})
@@ -103,10 +134,10 @@ def choose(
 
 
 def check_bounds(error: float | None, ms: float | None) -> None:
-    """Raises InputError for bounds that are no numbers. Those that nothing can keep are told from the others
-    by measuring what is possible."""
+    """Raises InputError for bounds that are no numbers. Only measuring shows which of the others cannot be
+    kept."""
     if error is None and ms is None:
-        raise InputError("a budget of nothing: give error=1e-3, or ms=20 with camera=... and cloud=...")
+        raise InputError("a budget of nothing: give error=1e-3, or ms=20 with scene=... and capture=...")
     for name, value, example in (("error", error, "1e-3"), ("ms", ms, "20")):
         number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
         if value is not None and not number:
@@ -123,7 +154,7 @@ def _from_table(error: float, settings: tuple[Setting, ...], base: Quality, rend
     best = next(setting.promised for setting in finest if _drawn(setting, base, renderer))
     raise InputError(
         f"no setting promises an error of {error:g} for any scene on {renderer.device.name}: the best is "
-        f"{best:.2g}; allow that, or give camera=... and cloud=... to measure yours"
+        f"{best:.2g}; allow that, or give scene=... and capture=... to measure yours"
     )
 
 

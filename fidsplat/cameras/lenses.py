@@ -310,7 +310,9 @@ def _check(lens) -> None:
 def _first_root(polynomial: np.polynomial.Polynomial) -> float:
     """Smallest root above 0; inf if there is none."""
     coefficients = np.trim_zeros(polynomial.coef, "b")
-    roots = np.polynomial.Polynomial(coefficients).roots() if len(coefficients) > 1 else np.empty(0)
+    # a root that overflows lies beyond all pictures
+    with np.errstate(over="ignore"):
+        roots = np.polynomial.Polynomial(coefficients).roots() if len(coefficients) > 1 else np.empty(0)
     real = roots.real[(np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots))) & (roots.real > 0)]
     return float(real.min()) if len(real) else math.inf
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from fidsplat.errors import InputError
 from fidsplat.rotations import check_similarity, matrix_to_quaternion
-from fidsplat.scalars import own_scalars
+from fidsplat.scalars import PickledByFields, own_scalars, real_array
 
 if TYPE_CHECKING:
     from fidsplat.cameras.pinhole import Camera
@@ -28,16 +28,16 @@ Pose: TypeAlias = Callable[[float], np.ndarray]
 class Shutter:
     """When the rows of a picture are exposed. All 0 is the instant global shutter.
 
-    The middle row's exposure has its middle at `time`. Row i of h is exposed
+    The middle of the middle row's exposure time is `time`. Row i of h is exposed
     `readout` * ((i + 1/2) / h - 1/2) seconds later. Raises InputError for a value out of range.
     """
 
     time: float = 0.0
     """seconds, on the clock of the poses"""
-    exposure: float = 0.0
+    exposure_time: float = 0.0
     """seconds that each row is exposed; the picture is the mean of `sub_poses` pictures"""
     sub_poses: int = 8
-    """n: one pose in the middle of each n-th of the exposure"""
+    """n: one pose in the middle of each n-th of the exposure time"""
     readout: float = 0.0
     """seconds from the first row's exposure to the last's (rolling shutter)"""
     rows_per_band: int = 8
@@ -46,7 +46,7 @@ class Shutter:
 
     def __post_init__(self) -> None:
         own_scalars(self)
-        for name in ("time", "exposure", "readout"):
+        for name in ("time", "exposure_time", "readout"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
                 raise InputError(f"shutter {name} must be a finite number of seconds, not {value!r}")
@@ -59,7 +59,7 @@ class Shutter:
                 raise InputError(f"shutter {name} must be a whole number, {limit}, not {value!r}")
 
     def bands(self, height: int) -> list[tuple[int, int, float]]:
-        """(first row, end row, time of its exposure's middle) of the bands of a picture of `height` rows."""
+        """(first row, end row, middle of its exposure time) of the bands of a picture of `height` rows."""
         rows = self.rows_per_band if self.readout > 0 else height
         cuts = [*range(0, height, rows), height]
         return [
@@ -68,13 +68,13 @@ class Shutter:
         ]
 
     def times(self, middle: float) -> list[float]:
-        """The times of the sub-poses of an exposure with its middle there."""
-        n = self.sub_poses if self.exposure > 0 else 1
-        return [middle + self.exposure * ((k + 0.5) / n - 0.5) for k in range(n)]
+        """The times of the sub-poses of an exposure time with its middle there."""
+        n = self.sub_poses if self.exposure_time > 0 else 1
+        return [middle + self.exposure_time * ((k + 0.5) / n - 0.5) for k in range(n)]
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class Trajectory(PickledByFields):
     """A pose between keyframes: the screw motion from one to the next (a geodesic of SE(3)), at rest before
     the first and after the last. Call it with a time in seconds.
 
@@ -87,10 +87,7 @@ class Trajectory:
     """(k, 4, 4) rigid"""
 
     def __post_init__(self) -> None:
-        try:
-            times = np.array(self.times, np.float64)
-        except (TypeError, ValueError):
-            times = np.empty(0)
+        times = real_array("the times of a trajectory", self.times, "increasing numbers of seconds")
         if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
             raise InputError(
                 "the times of a trajectory must be one or more finite, increasing numbers of seconds, not "
@@ -179,6 +176,9 @@ class Motion:
                     "(SplatCloud.with_labels)"
                 )
         object.__setattr__(self, "groups", MappingProxyType(dict(self.groups)))
+
+    def __reduce__(self):
+        return Motion, (self.camera, dict(self.groups))  # a mapping proxy is not pickled
 
     def camera_at(self, time: float) -> np.ndarray | None:
         """world_to_camera (4, 4) then; None if it does not move."""

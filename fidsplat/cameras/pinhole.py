@@ -9,6 +9,7 @@ import numpy as np
 from fidsplat.cameras.lenses import BrownConrady, Equirectangular, Fisheye, Lens, Orthographic
 from fidsplat.errors import InputError
 from fidsplat.rotations import check_similarity
+from fidsplat.scalars import LARGEST, PickledByFields, real_array
 
 MAX_SIZE = 32767
 """largest width and height in pixels: pixel numbers fit 16 bits on every device"""
@@ -18,7 +19,7 @@ FOCAL_LENGTHS = 1e-6, 1e18
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class Camera(PickledByFields):
     """A camera. Without a lens it is a pinhole: a point (X, Y, Z) of the camera frame falls on
     x = fx X / Z + cx, y = fy Y / Z + cy. A lens says what stands there for X / Z and Y / Z.
 
@@ -138,7 +139,7 @@ class Camera:
         factors = np.ravel(coefficients).tolist()
         if len(factors) != 4:
             raise InputError(f"a fisheye has 4 coefficients, k1 to k4, not {len(factors)}")
-        lens, width = Fisheye(*factors), _size("width", width)
+        lens, width, height = Fisheye(*factors), _size("width", width), _size("height", height)
         f = fisheye_focal_length(width, fov_x, lens)
         pose = np.eye(4) if world_to_camera is None else world_to_camera
         return Camera(width, height, f, f, width / 2, height / 2, pose, near, far, lens=lens)
@@ -184,7 +185,7 @@ class Camera:
     def project(self, points) -> np.ndarray:
         """Pixel coordinates (n, 2) float64 of world points (n, 3), NaN where they cannot be seen: the depth
         is not above 0, or they lie outside the lens."""
-        world = np.asarray(points, dtype=np.float64)
+        world = real_array("points", points)
         if world.ndim != 2 or world.shape[1] != 3:
             raise InputError(f"points must have the shape (n, 3), but the shape is {world.shape}")
         seen = (world - self.position) @ self.world_to_camera[:3, :3].T
@@ -201,7 +202,10 @@ class Camera:
         Scaled to Z = 1, or to unit length for a fisheye or panorama. Raises InputError for an orthographic
         camera, whose rays differ by where they start.
         """
-        image = (np.asarray(pixels, np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
+        image = real_array("pixels", pixels)
+        if image.ndim != 2 or image.shape[1] != 2:
+            raise InputError(f"pixels must have the shape (n, 2), but the shape is {image.shape}")
+        image = (image - (self.cx, self.cy)) / (self.fx, self.fy)
         if self.lens is None:
             return np.concatenate([image, np.ones((len(image), 1))], 1)
         if isinstance(self.lens, Orthographic):
@@ -276,15 +280,12 @@ def _size(name: str, value) -> int:
 def _number(name: str, value) -> float:
     try:
         return float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"camera {name} must be a number, not {value!r}") from None
 
 
 def _vector(name: str, value) -> np.ndarray:
-    try:
-        vector = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        vector = np.empty(0)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise InputError(f"camera {name} must be three finite numbers, not {value!r}")
+    vector = real_array(f"camera {name}", value, "three numbers")
+    if vector.shape != (3,) or not (np.abs(vector) <= LARGEST).all():
+        raise InputError(f"camera {name} must be three numbers, at most {LARGEST:g}, not {value!r}")
     return vector

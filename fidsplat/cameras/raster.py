@@ -17,15 +17,15 @@ _EMPTY = np.array([32767, -1, 32767, -1], np.int16)
 
 @dataclass(frozen=True, eq=False)
 class RayRaster:
-    """The sample grid of one lens, whatever the pose; sizes, fx, fy, cx, cy in samples."""
+    """The sample grid of one lens, whatever the pose; sizes, focal lengths and centre in samples."""
 
     lens: RayLens
     width: int
     height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+    focal_x: float
+    focal_y: float
+    center_x: float
+    center_y: float
     whole: RayRaster | None = None
     """the raster of which this one is a few rows"""
     top: int = 0
@@ -34,7 +34,15 @@ class RayRaster:
     def cropped(self, top: int, end: int) -> RayRaster:
         """Rows [top, end); they share the map of the whole."""
         return RayRaster(
-            self.lens, self.width, end - top, self.fx, self.fy, self.cx, self.cy - top, self, top
+            self.lens,
+            self.width,
+            end - top,
+            self.focal_x,
+            self.focal_y,
+            self.center_x,
+            self.center_y - top,
+            self,
+            top,
         )
 
     @cached_property
@@ -45,9 +53,9 @@ class RayRaster:
             return self.whole.rays[self.top : self.top + self.height]
         rays = np.empty((self.height, self.width, 3), np.float32)
         step = max(1, _ROWS // self.width)
-        a = (np.arange(self.width) + 0.5 - self.cx) / self.fx
+        a = (np.arange(self.width) + 0.5 - self.center_x) / self.focal_x
         for top in range(0, self.height, step):
-            b = (np.arange(top, min(top + step, self.height)) + 0.5 - self.cy) / self.fy
+            b = (np.arange(top, min(top + step, self.height)) + 0.5 - self.center_y) / self.focal_y
             image = np.stack(np.broadcast_arrays(a[None, :], b[:, None]), 2).reshape(-1, 2)
             rays[top : top + step] = self.lens.rays(image).reshape(len(b), self.width, 3)
         rays.flags.writeable = False
@@ -63,7 +71,7 @@ class RayRaster:
         step = max(1, _ROWS // self.width)
         for top in range(0, self.height, step):
             rays = self.rays[top : top + step].reshape(-1, 3).astype(np.float64)
-            by_ray = self.lens.derivative(rays) * np.array([[self.fx], [self.fy]])
+            by_ray = self.lens.derivative(rays) * np.array([[self.focal_x], [self.focal_y]])
             if not self.lens.along_ray:
                 by_ray[:, :, 2] = 0.0  # rays have Z = 1, and so have those beside them
             # the inverse among the rays beside this one: J^T (J J^T)^-1
@@ -92,7 +100,7 @@ class RayRaster:
         if isinstance(self.lens, Fisheye):
             below = z + np.sqrt(x * x + y * y + z * z)
             return x / below, y / below
-        return self.fx * x / z + self.cx, self.fy * y / z + self.cy
+        return self.focal_x * x / z + self.center_x, self.focal_y * y / z + self.center_y
 
     @cached_property
     def map(self) -> tuple[np.ndarray, np.ndarray]:
@@ -143,7 +151,7 @@ class RayRaster:
 
 @lru_cache(maxsize=4)
 def raster_of(
-    lens: RayLens, width: int, height: int, fx: float, fy: float, cx: float, cy: float
+    lens: RayLens, width: int, height: int, focal_x: float, focal_y: float, center_x: float, center_y: float
 ) -> RayRaster:
     """The raster of these numbers; the last few are kept, for pictures from many poses."""
-    return RayRaster(lens, width, height, fx, fy, cx, cy)
+    return RayRaster(lens, width, height, focal_x, focal_y, center_x, center_y)

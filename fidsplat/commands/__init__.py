@@ -13,6 +13,7 @@ from fidsplat.commands.devices import Devices
 from fidsplat.commands.experiment import Experiment
 from fidsplat.commands.marker import Marker
 from fidsplat.commands.render import Render
+from fidsplat.commands.source import Source
 from fidsplat.commands.tradeoff import Tradeoff
 from fidsplat.commands.warm import Warm
 
@@ -27,5 +28,6 @@ COMMANDS = {
     "tradeoff": Tradeoff,
     "warm": Warm,
     "experiment": Experiment,
+    "source": Source,
 }
 """Every command by its name, in the order in which help lists them."""

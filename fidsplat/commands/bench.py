@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 _LEGEND = (
     "ms: median (quartiles) of whole frames, medians of the stages by the device's own clock; splats "
-    "resident, picture left on the device. x floor: how many times what the device would need at its "
-    "measured best (docs/performance.md)."
+    "resident, picture left on the device. x roofline: how many times the least that the device's "
+    "measured best rates allow (docs/roofline.md)."
 )
 
 
@@ -30,9 +30,9 @@ class Bench:
 
 The devices draw the same frames in turn, with the cut-off and stop that all renderers share and in precise
 arithmetic (1/255, 1e-4; `fidsplat tradeoff` prices others). For each scene: milliseconds per frame and per
-stage, what there was to draw, device memory, and how many times the device's measured floor that is. Without
---scenes: tag, r100k_720p, r1m_1080p and tag_in_million, about a minute on two cores. A run that is stopped
-shows what it has.
+stage, what there was to draw, device memory, and how many times the device's roofline that is: the least that
+its measured rates allow. Without --scenes: tag, r100k_720p, r1m_1080p and tag_in_million, about a minute on
+two cores. A run that is stopped shows what it has.
 
   tag             an AprilTag alone, 640 x 480
   r100k_720p      100,000 random splats, 1280 x 720
@@ -102,7 +102,7 @@ Examples:
                 where.print(f"These were {', '.join(scenes)}; more with --scenes NAME... or --scenes all.")
         if interrupted:
             raise KeyboardInterrupt
-        return 1 if any(result.error for result in results) else 0
+        return 1 if any(result.timer.error for result in results) else 0
 
     def _save(self, measuring: "Measuring", scenes: tuple[str, ...], interrupted: bool) -> None:
         if self.json in (None, "-"):
@@ -128,12 +128,14 @@ def _print(results: "list[Result]", where: "Console") -> None:
     for scene in dict.fromkeys(result.scene for result in results):
         drawn = [result for result in results if result.scene == scene]
         for result in drawn:
-            if result.error:
-                where.print(f"{scene} on {result.device.name}: {result.error}", markup=False, soft_wrap=True)
-        drawn = [result for result in drawn if result.frames]
+            if result.timer.error:
+                where.print(
+                    f"{scene} on {result.device.name}: {result.timer.error}", markup=False, soft_wrap=True
+                )
+        drawn = [result for result in drawn if result.timer.ms]
         if drawn:
             _print_scene(scene, drawn, where)
-    if any(result.frames for result in results):
+    if any(result.timer.ms for result in results):
         where.print(_LEGEND, markup=False)
 
 
@@ -141,14 +143,14 @@ def _print_scene(scene: str, drawn: "list[Result]", where: "Console") -> None:
     from fidsplat.experiments.bench.catalogue import BENCH_SCENES
 
     heads, rows = ["ms"], [["frame"]]
-    stages = list(dict.fromkeys(stage for result in drawn for stage in result.stages))
+    stages = list(dict.fromkeys(stage for result in drawn for stage in result.timer.parts))
     rows += [[stage] for stage in stages]
     for result in drawn:
-        heads += [result.device.name, "x floor"]
-        low, middle, high = result.quartiles
+        heads += [result.device.name, "x roofline"]
+        low, middle, high = result.timer.quartiles
         rows[0] += [f"{middle:.2f} ({low:.2f} to {high:.2f})", _times(result, "frame")]
         for row, stage in zip(rows[1:], stages, strict=True):
-            ms = result.stage_ms.get(stage)
+            ms = result.timer.part_medians.get(stage)
             row += ["-" if ms is None else f"{ms:.2f}", _times(result, stage)]
     facts = ("first frame", *drawn[0].counts, "splats/s", "memory")
     for fact in facts:
@@ -157,14 +159,14 @@ def _print_scene(scene: str, drawn: "list[Result]", where: "Console") -> None:
             rows[-1] += [_fact(result, fact), ""]
     print_table(where, f"{scene}: {BENCH_SCENES[scene].about}", heads, rows)
     for result in drawn:
-        device, frames = result.device, len(result.frames)
+        device, frames = result.device, len(result.timer.ms)
         words = f"{device.name}: {device.title}, {device.version}; {frames} frames"
         where.print(words, markup=False, soft_wrap=True)
     where.print()
 
 
 def _times(result: "Result", name: str) -> str:
-    times = result.times_floor.get(name)
+    times = result.times_roofline.get(name)
     return "-" if times is None else f"{times:.1f}"
 
 
@@ -172,7 +174,7 @@ def _fact(result: "Result", fact: str) -> str:
     if fact == "first frame":
         return f"{result.first_frame_ms:.1f}"
     if fact == "splats/s":
-        return f"{1e-3 * result.counts['splats'] / result.quartiles[1]:.2f} M"
+        return f"{1e-3 * result.counts['splats'] / result.timer.quartiles[1]:.2f} M"
     if fact == "memory":
         held = result.memory_bytes
         return "-" if held is None else f"{held / 2**30:.3f} GiB"

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fidsplat.hard_cases.arithmetic import Arithmetic
-    from fidsplat.hard_cases.check import CheckResult, GroupResult
+    from fidsplat.hard_cases.check import CaseResult, CheckResult
     from fidsplat.hard_cases.fuzz_run import FuzzState
     from fidsplat.render import Renderer
 
@@ -55,7 +55,7 @@ Examples:
             renderer = fs.Renderer(self.device)
         if self.fuzz is not None:
             return self._fuzz(renderer, folder, where)
-        from fidsplat.hard_cases import all_cases
+        from fidsplat.hard_cases.catalogue import all_cases
         from fidsplat.hard_cases.check import run_check, worst_picture
         from fidsplat.vision.images import write_png
 
@@ -105,7 +105,7 @@ def _print(result: "CheckResult", where: "Console") -> None:
     where.print(f"Hard cases on {device.title}, {device.version}", markup=False)
     heads = ("group", "cases", "pictures", "colour", "uncertified", "depth", "uncertified", "verdict")
     bounds = ("bound", "", "", "", f"{COLOR_TOLERANCE:.0e}", "", f"{DEPTH_TOLERANCE:.0e}", "")
-    print_table(where, "Largest errors", heads, [bounds, *map(_row, result.groups)])
+    print_table(where, "Largest errors", heads, [bounds, *(_row(*group) for group in result.groups.items())])
     for words in result.failures:
         where.print(f"failed: {words}", markup=False, soft_wrap=True)
     wrong = len(result.failures)
@@ -123,13 +123,17 @@ def _ulps(facts: "Arithmetic") -> list[tuple[str, ...]]:
     return rows
 
 
-def _row(group: "GroupResult") -> tuple[str, ...]:
-    cells = [f"{group.letter} {group.title}", str(len(group.cases)), str(group.pictures)]
+def _row(letter: str, results: "list[CaseResult]") -> tuple[str, ...]:
+    from fidsplat.hard_cases.catalogue import GROUPS
+    from fidsplat.hard_cases.check import rank_of
+
+    cells = [f"{letter} {GROUPS[letter]}", str(len(results)), str(sum(one.pictures for one in results))]
     for outputs in (("rgb", "alpha"), ("depth",)):
         for errors in ("largest", "uncertified"):
-            value = group.error(errors, *outputs)
-            cells.append("-" if value is None else f"{value:.0e}")
-    return (*cells, "ok" if group.passed else "failed")
+            found = [getattr(one, errors) for one in results]
+            values = [one[name] for one in found for name in outputs if name in one]
+            cells.append(f"{max(values, key=rank_of):.0e}" if values else "-")
+    return (*cells, "ok" if all(one.passed for one in results) else "failed")
 
 
 def _print_fuzz(state: "FuzzState", renderer: "Renderer", where: "Console") -> None:

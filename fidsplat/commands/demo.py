@@ -64,7 +64,7 @@ Examples:
                 f"{s.reading.placed.marker.spec} in '{s.view}'" for s in result.sightings if s.passed is False
             ]
             where.print(
-                "failed: " + "; ".join([*missed, *(f"read {s}" for s in result.strangers)]), markup=False
+                "failed: " + "; ".join([*missed, *(f"read {s}" for s in result.unexpected)]), markup=False
             )
         return 0 if result.passed else 1
 

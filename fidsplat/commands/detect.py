@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar
 
 import tyro
 
-from fidsplat.commands.output import Json, console, option, print_json, print_table
+from fidsplat.commands.output import Json, console, late_progress, option, print_json, print_table
 from fidsplat.errors import InputError
 
 
@@ -73,9 +73,9 @@ Examples:
             from fidsplat.experiments.readback import read_back
 
             camera, markers = _standing(scene)
-            readings, strangers = read_back(found, markers, camera)
+            readings, others = read_back(found, markers, camera)
             result["markers"] = [reading.as_dict() for reading in readings]
-            result["not_in_scene"] = [code.name for code in strangers]
+            result["not_in_scene"] = [code.name for code in others]
         if self.json:
             print_json(result)
             return 0
@@ -103,7 +103,8 @@ Examples:
     def _load_scene(self, shape: tuple[int, ...]):
         import fidsplat as fs
 
-        scene = fs.Scene.load(str(self.scene))
+        with late_progress(console(True)) as progress:
+            scene = fs.Scene.load(str(self.scene), progress=progress)
         if scene.camera is None:
             raise InputError(f"{self.scene} has no [camera] table, so the pose of its markers cannot be told")
         size = (scene.camera.width, scene.camera.height)

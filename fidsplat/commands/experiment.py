@@ -15,12 +15,12 @@ class Experiment:
         str
     ] = """The paper's experiments: its tables and figures with our columns, beside the ideal.
 
-Each experiment writes one file of JSON lines; a run that was stopped goes on where it was.
+Each experiment writes one file of results; a run that was stopped goes on where it was.
 
 Examples:
   fidsplat experiment all --quick                   a rough picture of all of it, in minutes
   fidsplat experiment angles --category small       one experiment, one category
-  fidsplat experiment report                        tables, plots and pictures from the results
+  fidsplat experiment report                        tables, charts and pictures from the results
   fidsplat experiment angles --help                 what one of them does, and its options"""
     PARTS: ClassVar[dict[str, type]] = {
         "all": All,

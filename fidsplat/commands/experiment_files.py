@@ -7,16 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
-import tyro
-
 from fidsplat.commands.output import Json, console, option, print_json
+from fidsplat.commands.sweeps import Folders, Names, ReportTo, Seed, need_reports, switch
 from fidsplat.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-Names = tyro.conf.UseAppendAction[tuple[str, ...]]
-"""an option that may be given several times"""
 CATEGORY_HELP = "apriltag, small, medium, large or huge, once more for each (default: all)"
 
 
@@ -47,14 +44,14 @@ Examples:
     blender: Annotated[Path, option("DIR", "Blender's pictures (default: fidsplat-experiments/blender)")] = (
         Path("fidsplat-experiments/blender")
     )
-    seed: Annotated[int, option("N", "of texts and views (default: 0)")] = 0
+    seed: Seed = 0
     json: Json = False
 
     def run(self) -> int:
         from rich.progress import Progress
 
         from fidsplat.experiments.blender import check_pictures
-        from fidsplat.experiments.dataset import dataset_work, write_scene
+        from fidsplat.experiments.dataset import dataset_scenes, write_scene
         from fidsplat.experiments.setup import MARKERS, chosen_categories
         from fidsplat.experiments.views import TRUTHS
         from fidsplat.files import writable_folder
@@ -66,12 +63,12 @@ Examples:
         if self.truth.startswith("blender-"):
             check_pictures(self.blender, self.truth.removeprefix("blender-"), self.seed)
         folder = writable_folder(self.out)
-        work = dataset_work(chosen_categories(self.category), self.markers)
+        wanted = dataset_scenes(chosen_categories(self.category), self.markers)
         where = console(self.json)
         with Progress(console=console(True), transient=True) as bars:
             scenes = [
                 write_scene(part, folder, self.seed, self.truth, self.blender)
-                for part in bars.track(work, description="scenes")
+                for part in bars.track(wanted, description="scenes")
             ]
         if self.json:
             print_json({"folder": str(folder), "scenes": [scene.name for scene in scenes]})
@@ -100,9 +97,7 @@ Examples:
     out: Annotated[
         str, option("DIR", "folder for the pictures (default: fidsplat-experiments/blender)", "-o")
     ] = "fidsplat-experiments/blender"
-    install: Annotated[
-        bool, tyro.conf.arg(help="install Blender instead of rendering", help_behavior_hint="")
-    ] = False
+    install: Annotated[bool, switch("install Blender instead of rendering")] = False
     environment: Annotated[
         Path | None,
         option("DIR", "Blender's virtual environment (default: fidsplat/blender in the user's cache)"),
@@ -110,10 +105,10 @@ Examples:
     view: Annotated[Names, option("NAME", "standard or raw (default: both)")] = ()
     category: Annotated[Names, option("NAME", CATEGORY_HELP)] = ()
     markers: Annotated[int, option("N", "of each category, 1 to 5 (default: 5)")] = 5
-    training: Annotated[bool, tyro.conf.arg(help="the training views as well", help_behavior_hint="")] = False
+    training: Annotated[bool, switch("the training views as well")] = False
     samples: Annotated[int, option("N", "for each pixel (default: 64)")] = 64
     threads: Annotated[int | None, option("N", "of Cycles (default: one for each core)")] = None
-    seed: Annotated[int, option("N", "of texts and views (default: 0)")] = 0
+    seed: Seed = 0
     json: Json = False
 
     def run(self) -> int:
@@ -176,15 +171,15 @@ Examples:
   fidsplat experiment merge shards -o results
   fidsplat experiment merge machine-1 machine-2 -o results"""
 
-    folders: Annotated[tyro.conf.Positional[tuple[str, ...]], option("DIR", "folders with results of shards")]
+    folders: Annotated[Folders, option("DIR", "folders with results of shards")]
     out: Annotated[
         str, option("DIR", "folder for the joined results (default: fidsplat-experiments)", "-o")
     ] = "fidsplat-experiments"
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.experiments.records import merge, missing_shards
         from fidsplat.experiments.run import NAMES
+        from fidsplat.experiments.sweep import merge, missing_shards
 
         result = {}
         for name in NAMES:
@@ -193,7 +188,7 @@ Examples:
             if files:
                 target = Path(self.out) / f"{name}.jsonl"
                 joined = merge(files, target)
-                facts = {"file": str(target), "files": len(files), "lines": joined.lines}
+                facts = {"file": str(target), "files": len(files), "points": joined.points}
                 result[name] = facts | {"repeated": joined.repeated, "missing": missing_shards(files)}
                 if result[name]["missing"]:
                     text = f"{name}: there is no shard {', '.join(result[name]['missing'])}"
@@ -208,33 +203,26 @@ Examples:
         else:
             for facts in result.values():
                 again = f", {facts['repeated']} of them repeated" if facts["repeated"] else ""
-                text = f"{facts['file']}: {facts['lines']} results of {facts['files']} files{again}"
+                text = f"{facts['file']}: {facts['points']} results of {facts['files']} files{again}"
                 console(False).print(text, markup=False, soft_wrap=True)
         return 0
 
 
 @dataclass
 class Report:
-    """Tables, plots and picture sheets from results."""
+    """A page with tables, charts and picture sheets from results."""
 
-    HELP: ClassVar[
-        str
-    ] = """Write report.md and report.html: tables as in the paper, beside the paper's figures.
+    HELP: ClassVar[str] = """Write report.md: tables as in the paper, beside the paper's figures.
 
-Plots and pictures lie in its folder, or for FILE.md in a folder of that name. Tables say what is
-missing.
+Charts, pictures and small tables of all results lie in its folder, or for FILE.md in a folder of that name;
+the report can be made again from those tables. It says what was not measured.
 
 Examples:
   fidsplat experiment report
   fidsplat experiment report results -o docs/results.md"""
 
-    folders: Annotated[
-        tyro.conf.Positional[tuple[str, ...]],
-        option("DIR", "folders with results (default: fidsplat-experiments)"),
-    ] = ()
-    out: Annotated[
-        str | None, option("DIR|FILE.md", "folder or file for the report (default: the first folder)", "-o")
-    ] = None
+    folders: Annotated[Folders, option("DIR", "folders with results (default: fidsplat-experiments)")] = ()
+    out: ReportTo = None
     json: Json = False
 
     def run(self) -> int:
@@ -244,6 +232,7 @@ Examples:
 
 def write_report(folders: list[Path], out: Path, where: Console, as_json: bool = False) -> int:
     """Write the report and say where it is."""
+    need_reports()
     from fidsplat.experiments.report import make_report
 
     files = make_report(folders, out)

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-import tyro
-
-from fidsplat.commands.experiment_files import CATEGORY_HELP, Names, write_report
+from fidsplat.commands.experiment_files import CATEGORY_HELP, write_report
 from fidsplat.commands.output import Json, console, option, print_json
+from fidsplat.commands.sweeps import Names, Overwrite, Seed, need_reports, run_sweeps, switch
 from fidsplat.errors import InputError
 
 if TYPE_CHECKING:
-    from fidsplat.experiments.run import Settings
+    from fidsplat.experiments.run import Options
 
 
 @dataclass
@@ -29,57 +29,30 @@ class Basic:
         ),
     ] = None
     category: Annotated[Names, option("NAME", CATEGORY_HELP)] = ()
-    seed: Annotated[int, option("N", "of texts and views (default: 0)")] = 0
+    seed: Seed = 0
     json: Json = False
 
-    def settings(self) -> Settings:
+    def options(self) -> Options:
         """The options as the experiments take them; those that a word does not have are left out."""
-        from fidsplat.experiments.run import Settings
+        from fidsplat.experiments.run import Options
 
-        given = {name: getattr(self, name) for name in _SETTINGS if getattr(self, name, None) is not None}
-        out = Path(self.out or default_folder(getattr(self, "quick", False)))
-        return Settings(out=out, **{_SETTINGS[name]: value for name, value in given.items()})
-
-
-# option: what it is called in Settings
-_SETTINGS = {
-    "category": "categories",
-    "mixture": "mixtures",
-    "protocol": "protocols",
-    "shard": "part",
-    "ideal": "ideal_only",
-} | {
-    name: name
-    for name in (
-        "device",
-        "quick",
-        "seed",
-        "tilts",
-        "markers",
-        "trained",
-        "blender",
-        "lpips",
-        "workers",
-        "anew",
-    )
-}
+        # rough results and full ones do not mix
+        out = self.out or "fidsplat-experiments" + ("-quick" if getattr(self, "quick", False) else "")
+        given: dict[str, Any] = {field.name: getattr(self, field.name, None) for field in fields(Options)}
+        given["out"] = Path(out)
+        return Options(**{name: value for name, value in given.items() if value is not None})
 
 
 @dataclass
 class Measuring(Basic):
     """Options of the experiments that measure."""
 
-    quick: Annotated[
-        bool,
-        tyro.conf.arg(help="a rough picture in minutes: one marker of each category", help_behavior_hint=""),
-    ] = False
+    quick: Annotated[bool, switch("a rough picture in minutes: one marker of each category")] = False
     markers: Annotated[int | None, option("N", "of each category, 1 to 5 (default: 5, with --quick 1)")] = (
         None
     )
     shard: Annotated[str | None, option("i/n", "measure the i-th of n shares, then see `merge`")] = None
-    anew: Annotated[
-        bool, tyro.conf.arg(help="measure again what is in the results' folder", help_behavior_hint="")
-    ] = False
+    overwrite: Overwrite = False
 
 
 @dataclass
@@ -111,45 +84,28 @@ class Compared(Threaded):
     ] = None
     lpips: Annotated[
         Path | None,
-        option("FILE.npz", "weights for LPIPS in `views`; how to make the file: docs/experiments.md"),
+        option("FILE.npz", "weights for LPIPS in `views`; how to make the file: docs/ground-truth.md"),
     ] = None
 
 
-def default_folder(quick: bool) -> str:
-    """Where results go without -o: rough ones and full ones do not mix."""
-    return "fidsplat-experiments" + ("-quick" if quick else "")
+def measure(names: tuple[str, ...], options: Options, as_json: bool) -> int:
+    """Run experiments, each to its file, and say where."""
+    from fidsplat.experiments.run import prepared
 
-
-def measure(names: tuple[str, ...], settings: Settings, as_json: bool) -> int:
-    """Run experiments with a progress bar, each to its file, and say where."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-    from rich.progress import TimeRemainingColumn as Remaining
-
-    from fidsplat.experiments.run import planned
-
-    files: dict[str, str] = {}
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    columns = (*columns, TimeElapsedColumn(), Remaining())
-    with planned(names, settings) as plans:
-        for name, plan in plans.items():
-            with Progress(*columns, console=console(True)) as bars:
-                bar = bars.add_task(name, total=len(plan.work), completed=len(plan.work) - plan.left)
-                for done, line in plan.run():
-                    bars.update(bar, completed=done, description=f"{name} {_what(line['key'])}")
-                bars.update(bar, description=name)
-            if plan.work:
-                files[name] = str(plan.records.file)
+    with prepared(names, options) as sweeps:
+        run_sweeps(sweeps)
+        files = {sweep.name: str(sweep.results.file) for sweep in sweeps if sweep.points}
     if as_json:
         print_json({"files": files})
     else:
-        for file in files.values():
-            console(False).print(file, markup=False, soft_wrap=True)
+        print_files(files.values())
     return 0
 
 
-def _what(key: dict) -> str:
-    words = (key.get("protocol"), f"{key['category']}-{key['index']}", key.get("method"), key.get("truth"))
-    return " ".join(word for word in words if word)
+def print_files(files: Iterable[str]) -> None:
+    """A name a line."""
+    for file in files:
+        console(False).print(file, markup=False, soft_wrap=True)
 
 
 @dataclass
@@ -171,13 +127,10 @@ Examples:
 
     protocol: Annotated[Names, option("NAME", "fixed-plane or fixed-module (default: both)")] = ()
     tilts: Annotated[str | None, option("A:B:STEP", "degrees, joined by commas (default: 0:89.8:0.2)")] = None
-    ideal: Annotated[
-        bool,
-        tyro.conf.arg(help="only the ideal texture: the ceiling of the detectors", help_behavior_hint=""),
-    ] = False
+    ideal: Annotated[bool, switch("only the ideal texture: the ceiling of the detectors")] = False
 
     def run(self) -> int:
-        return measure(("angles",), self.settings(), self.json)
+        return measure(("angles",), self.options(), self.json)
 
 
 @dataclass
@@ -196,7 +149,7 @@ Examples:
   fidsplat experiment views --blender pictures/blender"""
 
     def run(self) -> int:
-        return measure(("views",), self.settings(), self.json)
+        return measure(("views",), self.options(), self.json)
 
 
 @dataclass
@@ -213,7 +166,7 @@ Examples:
   fidsplat experiment counts --category huge"""
 
     def run(self) -> int:
-        return measure(("counts",), self.settings(), self.json)
+        return measure(("counts",), self.options(), self.json)
 
 
 @dataclass
@@ -234,7 +187,7 @@ Examples:
 
         if self.category and not set(self.category) & set(LOCATED):
             raise InputError(f"localisation is of {' and '.join(LOCATED)}, not of {', '.join(self.category)}")
-        return measure(("localisation",), self.settings(), self.json)
+        return measure(("localisation",), self.options(), self.json)
 
 
 @dataclass
@@ -252,16 +205,15 @@ Examples:
   fidsplat experiment pictures --category huge --mixture fitted"""
 
     def run(self) -> int:
-        files = draw_sheets(self.settings())
+        files = draw_sheets(self.options())
         if self.json:
             print_json({"files": files})
         else:
-            for file in files:
-                console(False).print(file, markup=False, soft_wrap=True)
+            print_files(files)
         return 0
 
 
-def draw_sheets(settings: Settings) -> list[str]:
+def draw_sheets(options: Options) -> list[str]:
     """Draw the sheets with a progress bar; returns the files."""
     from rich.progress import track
 
@@ -271,10 +223,10 @@ def draw_sheets(settings: Settings) -> list[str]:
     from fidsplat.experiments.setup import chosen_categories
     from fidsplat.render import Renderer
 
-    check(settings)
-    categories = chosen_categories(settings.categories)
-    painter = Painter(Renderer(settings.device), settings.trained)
-    sheets = write_sheets(categories, settings.methods, painter, settings.seed, settings.out)
+    check(options)
+    categories = chosen_categories(options.category)
+    painter = Painter(Renderer(options.device), options.trained)
+    sheets = write_sheets(categories, options.methods, painter, options.seed, options.out)
     bars = track(sheets, "pictures", total=len(categories), console=console(True), transient=True)
     return [str(file) for file in bars]
 
@@ -296,10 +248,12 @@ Examples:
     def run(self) -> int:
         from fidsplat.experiments.run import NAMES, check
 
-        settings = self.settings()
-        check(settings)
-        status = measure(NAMES, settings, self.json)
+        options = self.options()
+        check(options)
+        if self.shard is None:
+            need_reports()
+        status = measure(NAMES, options, self.json)
         if self.shard is not None:
             return status
-        draw_sheets(settings)
-        return write_report([settings.out], settings.out, console(True))
+        draw_sheets(options)
+        return write_report([options.out], options.out, console(True))

@@ -31,6 +31,7 @@ SPEC is one of
   qr:TEXT              the smallest code that fits      qr:https://example.org
   qr-vN-L:TEXT         version N, error level L M Q H   qr-v22-L:TEXT
   image:FILE           any one-bit picture              image:logo.png
+  svg:FILE             a drawing's filled shapes        svg:sign.svg, svg-512:sign.svg
   charuco:CxR:FAMILY   columns x rows of squares        charuco:7x5:4x4_50
   gridboard:CxR:FAMILY columns x rows of tags           gridboard:5x7:4x4_50
   aprilgrid:CxR:FAMILY the same with corner squares     aprilgrid:6x6:36h11
@@ -39,7 +40,7 @@ The mixture exact, the default, draws every rectangle as one box with sharp edge
 then writes the Gaussians of fitted, and says so.
 
 Knobs of the mixtures (fs.MarkerQuality) are part of a quality: marker.levels (1 to 8) and marker.density (1
-to 100) of paper, marker.template of fitted (Gaussians of a rectangle: 1, 5, 9, 13, 25 or 41), and
+to 100) of paper, marker.template of fitted (Gaussians of a rectangle: 1, 5, 9, 13, 25, 41 or 562), and
 marker.growth (modules).
 
 A picture of noise becomes tens of millions of splats; more than a million are refused unless --max-splats
@@ -86,7 +87,7 @@ Examples:
         if file is not None:
             fs.save_ply(made.gaussians, file, native_2dgs=self.native_2dgs)
         written = "fitted" if made.mixture == "exact" else made.mixture
-        dark = int(made.grid[made.boxes[:, 1], made.boxes[:, 0]].sum(dtype=int))
+        dark = int(made.is_dark.sum())
         facts = {
             "spec": made.spec,
             "kind": made.kind,

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 
-from fidsplat.commands.output import Json, console, option, print_json, print_table
+from fidsplat.commands.output import Json, console, late_progress, option, print_json, print_table
 from fidsplat.errors import FidsplatError, InputError
 from fidsplat.files import writable_folder
 
 if TYPE_CHECKING:
+    from fidsplat.formats import Progress
     from fidsplat.scenes import Scene
 
 _OTHER_PICTURES = (".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".exr", ".gif", ".npy")
@@ -83,20 +84,20 @@ Examples:
         from fidsplat.budget import check_bounds, choose
         from fidsplat.effects import select
         from fidsplat.quality import Quality
-        from fidsplat.vision.planes import save_plane
+        from fidsplat.vision.output_files import save_output
 
         names = None if self.outputs is None else tuple(n.strip() for n in self.outputs.split(","))
         # what is wrong with the words is said before anything is read or opened
-        select(fs.SplatCloud.empty(), names or (), Quality.of(self.quality))
+        select(fs.SplatCloud.empty(), fs.Capture(outputs=names or "rgb", quality=Quality.of(self.quality)))
         budget = self.max_error is not None or self.max_ms is not None
         if budget:
             check_bounds(self.max_error, self.max_ms)
         name_of = _names(self.out, Path(self.source))
         where = console(self.json)
-        with where.status("reading"):
-            scene = _load(self.source, self.quality)
+        with late_progress(console(True)) as progress:
+            scene = load_source(self.source, self.quality, progress)
         with _named(self.source, "render.outputs", names is None):
-            select(fs.SplatCloud.empty(), scene.outputs, Quality.of(None))
+            select(fs.SplatCloud.empty(), fs.Capture(outputs=scene.outputs))
         of_scene = _named(self.source, "render.device", self.device is None)
         with where.status("opening the device"), of_scene:
             renderer = fs.Renderer(self.device or scene.device)
@@ -106,9 +107,9 @@ Examples:
                 choice = choose(
                     self.max_error,
                     self.max_ms,
-                    cloud=scene,
-                    device=renderer,
-                    base=self.quality,
+                    scene,
+                    scene.capture.with_(quality=self.quality),
+                    renderer,
                     tell=status.update,
                 )
         begun = time.perf_counter()
@@ -119,7 +120,7 @@ Examples:
             planes = {name: frame[name] for name in frame.outputs}
         seconds = time.perf_counter() - begun
         bits = None if scene.sensor is None else scene.sensor.bits
-        files = [file for name, plane in planes.items() for file in save_plane(name, plane, name_of, bits)]
+        files = [file for name, plane in planes.items() for file in save_output(name, plane, name_of, bits)]
         if self.json:
             print_json(
                 {
@@ -177,19 +178,24 @@ def _names(out: str | None, source: Path):
     return lambda plane, suffix: file / f"{plane}{suffix}"
 
 
-def _load(source: str, quality: str | None) -> "Scene":
+def load_source(source: str, quality: str | None, progress: "Progress") -> "Scene":
+    """A scene file, or a splat file as a scene of its own, seen by a camera that fits it.
+
+    Raises:
+        InputError: neither; a scene without a camera.
+    """
     import fidsplat as fs
     from fidsplat.commands.framing import framing_camera
 
     suffix = Path(source).suffix.lower()
     if suffix == ".toml":
-        scene = fs.Scene.load(source, quality)
+        scene = fs.Scene.load(source, quality, progress)
         if scene.camera is None:
             raise InputError(
                 f"{source} has no [camera] table; add one with width, height, fov_x_deg, position, look_at"
             )
         return scene
     if suffix == ".ply":
-        cloud = fs.load_ply(source)
+        cloud = fs.load_ply(source, progress)
         return fs.Scene([cloud], camera=framing_camera(cloud))
     raise InputError(f"cannot draw {source}: give a scene file (.toml) or a splat file (.ply)")

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-import tyro
-
 from fidsplat.commands.output import Json, console, option, print_json
+from fidsplat.commands.sweeps import Folders, Overwrite, ReportTo, need_reports, run_sweeps, switch, words
 from fidsplat.errors import InputError
 
 DEFAULT_FOLDER = "fidsplat-tradeoff"
@@ -16,31 +15,28 @@ DEFAULT_FOLDER = "fidsplat-tradeoff"
 
 @dataclass
 class TradeoffReport:
-    """Plots, tables and a reading from results of `fidsplat tradeoff`."""
+    """A page with charts and tables from results of `fidsplat tradeoff`."""
 
     HELP: ClassVar[
         str
-    ] = """Write a report from results: what each constant costs, Pareto plots, what is worth turning.
+    ] = """Write a report from results: what each constant saves and costs, and what to make of it.
 
 Results of several devices stand side by side; results of the same device in several folders are joined, and
-of a part that was measured twice the first file's stays. All that the text says of the numbers is worked out
-from them. Plots lie in the report's folder, or for FILE.md in a folder of that name.
+of a point that was measured twice the larger measurement counts. Charts and a small table of each device's
+results lie in the report's folder, or for FILE.md in a folder of that name; the report can be made again from
+those tables. What the text says of the numbers is worked out from them.
 
 Examples:
   fidsplat tradeoff report
   fidsplat tradeoff report cpu gpu -o docs/accuracy.md"""
 
-    folders: Annotated[
-        tyro.conf.Positional[tuple[str, ...]],
-        option("DIR", f"folders with results, *.jsonl (default: {DEFAULT_FOLDER})"),
-    ] = ()
-    out: Annotated[
-        str | None, option("DIR|FILE.md", "folder or file for the report (default: the first folder)", "-o")
-    ] = None
+    folders: Annotated[Folders, option("DIR", f"folders with results (default: {DEFAULT_FOLDER})")] = ()
+    out: ReportTo = None
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.experiments.tradeoff.report.page import write_report
+        need_reports()
+        from fidsplat.experiments.tradeoff.report import write_report
 
         folders = [Path(folder) for folder in self.folders or (DEFAULT_FOLDER,)]
         files = write_report(folders, Path(self.out or folders[0]))
@@ -74,7 +70,7 @@ Examples:
   fidsplat tradeoff --quick                              a rough picture, under 3 minutes on two cores
   fidsplat tradeoff -o gpu --device opencl:nvidia        everything
   fidsplat tradeoff --scenes hard --knobs alpha_cutoff transmittance_stop
-  fidsplat tradeoff report cpu gpu -o docs/accuracy.md   plots and tables from results"""
+  fidsplat tradeoff report cpu gpu -o docs/accuracy.md   a page from results"""
     PARTS: ClassVar[dict[str, type]] = {"report": TradeoffReport}
 
     out: Annotated[
@@ -93,43 +89,28 @@ Examples:
         tuple[str, ...],
         option("NAME...", "knobs of Quality, or preset, marker, together (default: all)"),
     ] = ()
-    quick: Annotated[
-        bool, tyro.conf.arg(help="few values, few frames, four scenes", help_behavior_hint="")
-    ] = False
-    anew: Annotated[
-        bool, tyro.conf.arg(help="measure again what is in the results' folder", help_behavior_hint="")
-    ] = False
+    quick: Annotated[bool, switch("few values, few frames, four scenes")] = False
+    overwrite: Overwrite = False
     json: Json = False
 
     def run(self) -> int:
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-        from rich.progress import TimeRemainingColumn as Remaining
-
-        from fidsplat.experiments.tradeoff.run import Settings, planned
+        from fidsplat.experiments.tradeoff.run import Options, prepared
         from fidsplat.render import default_device
 
         folder = Path(self.out or DEFAULT_FOLDER + ("-quick" if self.quick else ""))
         device = default_device() if self.device is None else self.device
         if device == "reference":
             raise InputError("the reference is what others are measured against; give another --device")
-        settings = Settings(folder, device, self.scenes, self.knobs, self.quick, self.anew)
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-        columns = (*columns, TimeElapsedColumn(), Remaining())
-        refused = []
-        with planned(settings) as plan, Progress(*columns, console=console(True)) as bars:
-            bar = bars.add_task("tradeoff", total=len(plan.work), completed=len(plan.work) - plan.left)
-            for line in plan.run():
-                key = line["key"]
-                words = " ".join(str(key[name]) for name in ("scene", "knob", "value") if name in key)
-                bars.update(bar, advance=1, description=words)
-                if "error" in line["result"]:
-                    refused.append(f"{words}: {line['result']['error']}")
-            file = plan.records.file
+        options = Options(folder, device, self.scenes, self.knobs, self.quick, self.overwrite)
+        with prepared(options) as sweep:
+            measured = run_sweeps([sweep])
+            file, points = sweep.results.file, len(sweep.points)
+        refused = [f"{words(record.key)}: {record.result['error']}" for record in measured if record.failed]
         if self.json:
-            print_json({"file": str(file), "parts": len(plan.work), "refused": refused})
+            print_json({"file": str(file), "points": points, "refused": refused})
             return 0
         where = console(False)
-        for words in refused:
-            where.print(f"not measured: {words}", markup=False, soft_wrap=True)
+        for line in refused:
+            where.print(f"not measured: {line}", markup=False, soft_wrap=True)
         where.print(f"{file}; fidsplat tradeoff report {folder}", markup=False, soft_wrap=True)
         return 0

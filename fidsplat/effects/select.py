@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
-from fidsplat.cameras import Camera
-from fidsplat.effects.catalogue import CATALOGUE, Effect, Output
-from fidsplat.effects.together import refuse_strangers
+from fidsplat.cameras import Orthographic
+from fidsplat.cameras.lenses import Lens
+from fidsplat.capture import Capture
+from fidsplat.effects.catalogue import CATALOGUE, Output
 from fidsplat.errors import InputError, unknown
-from fidsplat.quality import Quality
-from fidsplat.sensor import Sensor
-from fidsplat.surroundings import Background, Fog, Gradient, background_of
+from fidsplat.surroundings import Gradient, Panorama
 
 RGB = Output("rgb", 3, "float32")
 OUTPUTS: dict[str, Output] = {
@@ -24,6 +22,8 @@ OUTPUTS: dict[str, Output] = {
         if effect.output and effect.output.public
     },
 }
+
+_KINDS = {Gradient: "gradient", Panorama: "panorama"}
 
 
 @dataclass(frozen=True)
@@ -46,36 +46,17 @@ class FeatureSet:
     """What changes rgb on its way out, in its order: fog, the steps of the sensor."""
 
     @cached_property
-    def effects(self) -> tuple[Effect, ...]:
-        """All effects in the order in which their text is put together: slots, parts, taps, posts."""
-        parts = _parts_of((*self.slots, *self.taps, *self.posts))
-        taps = [tap for tap in self.taps if tap not in parts]
-        return tuple(CATALOGUE[name] for name in (*self.slots, *parts, *taps, *self.posts))
-
-    @cached_property
     def names(self) -> frozenset[str]:
-        """Names of all effects."""
-        return frozenset(effect.name for effect in self.effects)
+        """Names of all effects, those of outputs that others are made from among them."""
+        return frozenset((*self.slots, *(output.name for output in self.outputs[1:]), *self.posts))
 
     @cached_property
     def outputs(self) -> tuple[Output, ...]:
-        """Finished planes, rgb first; with those that other taps are made from."""
-        return (RGB, *(effect.output for effect in self.effects if effect.output))
-
-
-def _parts_of(names: Iterable[str]) -> list[str]:
-    """What effects need, and what that needs, sorted."""
-    parts: set[str] = set()
-    todo = list(names)
-    cameras = [name for name in todo if name.startswith("camera_")]
-    while todo:
-        needed = CATALOGUE[todo.pop()].parts
-        for camera in cameras:
-            needed = [CATALOGUE[part].behind.get(camera, part) for part in needed]
-        fresh = set(needed) - parts
-        parts |= fresh
-        todo += fresh
-    return sorted(parts)
+        """Output images, rgb first, then those that others are made from."""
+        needed = sorted({name for tap in self.taps for name in CATALOGUE[tap].needs})
+        names = (*needed, *(tap for tap in self.taps if tap not in needed))
+        effects = (CATALOGUE[name] for name in names)
+        return (RGB, *(effect.output for effect in effects if effect.output))
 
 
 class Traits(Protocol):
@@ -83,7 +64,7 @@ class Traits(Protocol):
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the colours that depend on the view; -1 for plain colours."""
+        """Degree of the harmonics; -1 for plain colours."""
         ...
 
     @property
@@ -97,67 +78,60 @@ class Traits(Protocol):
         ...
 
 
-def select(
-    cloud: Traits,
-    outputs: Iterable[str],
-    quality: Quality,
-    camera: Camera | None = None,
-    moving: bool = False,
-    exposed: bool = False,
-    *,
-    sensor: Sensor | None = None,
-    fog: Fog | None = None,
-    background: Background = (0.0, 0.0, 0.0),
-) -> FeatureSet:
-    """The features that a cloud, outputs, quality, camera (None: a pinhole) and so on call for. Values that
-    mean nothing call for nothing.
-
-    moving: groups of splats move by themselves. exposed: the picture is made of several poses.
+def select(cloud: Traits, capture: Capture) -> FeatureSet:
+    """The features that a capture of a cloud calls for. Values that mean nothing call for nothing. Without a
+    camera it is a pinhole.
 
     Raises:
         InputError: an output that nobody declares, or two effects that do not go together.
     """
-    if isinstance(outputs, str):
-        outputs = (outputs,)
-    wanted = set(outputs)
-    for name in wanted:
+    for name in capture.outputs:
         if name not in OUTPUTS:
             raise InputError(unknown("output", name, OUTPUTS))
-    foggy = fog is not None and fog.density > 0
+    quality, background = capture.quality, capture.backdrop
+    lens = None if capture.camera is None else capture.camera.lens
     lowpass = "none" if cloud.footprint == "box" else quality.lowpass
-    precision = quality.blend_precision
-    refuse_strangers(foggy, camera, precision)
+    double = quality.blend_precision == "float64"
+    if double:
+        _refuse_float64(lens, capture.foggy)
     layered = cloud.has_planes and quality.coplanar == "blend"
-    pinhole = camera is None or camera.lens is None
-    in_spheres = pinhole and cloud.footprint == "gaussian" and lowpass != "pixel"
+    in_spheres = lens is None and cloud.footprint == "gaussian" and lowpass != "pixel"
+    # harmonics of degree 0 do not depend on the view: they are colours (`SplatCloud.plain_colors`)
+    sh_degree = max(cloud.sh_degree, 0)
     return FeatureSet(
         slots=(
-            f"camera_{camera.lens.kind if camera is not None and camera.lens else 'pinhole'}",
-            "color_rgb" if cloud.sh_degree < 0 else "color_sh",
+            f"camera_{lens.kind if lens else 'pinhole'}",
+            "color_sh" if sh_degree else "color_rgb",
             # boxes are filtered by their own footprint
             f"lowpass_{lowpass}",
             f"stop_{quality.stop_rule}",
             "compose_planes" if layered else "compose_ordered",
             f"footprint_{cloud.footprint}",
-            f"background_{_behind(background, foggy)}",
+            f"background_{_KINDS.get(type(background), 'constant')}",
             # short functions are float32's
-            f"arithmetic_{'precise' if precision == 'float64' else quality.arithmetic}",
-            *(("motion_groups",) if moving else ()),
-            *(("shutter_exposure",) if exposed else ()),
-            *(("shutter_rows",) if exposed and in_spheres else ()),
-            *(("blend_double",) if precision == "float64" else ()),
+            f"arithmetic_{'precise' if double else quality.arithmetic}",
+            *(("motion_groups",) if capture.motion.groups else ()),
+            *(("shutter_exposure",) if capture.exposed else ()),
+            *(("shutter_rows",) if capture.exposed and in_spheres else ()),
+            *(("blend_double",) if double else ()),
         ),
-        taps=tuple(sorted(wanted - {"rgb"})),
-        sh_degree=max(cloud.sh_degree, 0),
+        taps=tuple(sorted({*capture.outputs} - {"rgb"})),
+        sh_degree=sh_degree,
         samples=quality.samples,
         setup_precision=quality.setup_precision,
-        posts=(*(("fog",) if foggy else ()), *(() if sensor is None else sensor.steps)),
+        posts=(*(("fog",) if capture.foggy else ()), *capture.sensor.steps),
     )
 
 
-def _behind(background: Background, foggy: bool) -> str:
-    around = background_of(background)
-    # behind everything fog is all there is
-    if foggy or isinstance(around, tuple):
-        return "constant"
-    return "gradient" if isinstance(around, Gradient) else "panorama"
+def _refuse_float64(lens: Lens | None, foggy: bool) -> None:
+    """Refuse to blend in float64 where rays are float32: better no picture than one that promises too much.
+
+    Raises:
+        InputError: it names both effects and what would do.
+    """
+    if foggy or not (lens is None or isinstance(lens, Orthographic)):
+        what = "the fog's" if foggy or lens is None else f"a {lens.kind} lens's"
+        raise InputError(
+            f"blend_precision='float64' would promise too much: {what} rays are held in float32; take "
+            "blend_precision='float32', or a pinhole without fog"
+        )

@@ -26,9 +26,9 @@ QUICK_TILTS = "0:60:20,64:88:2"
 def parse_tilts(text: str) -> list[float]:
     """Degrees of "first:last:step[,first:last:step...]", rising. Raises InputError for anything else."""
     found: set[float] = set()
-    for part in text.split(","):
+    for span in text.split(","):
         try:
-            first, last, step = (float(number) for number in part.split(":"))
+            first, last, step = (float(number) for number in span.split(":"))
             if not (0 <= first <= last < 90 and 0.01 <= step <= 90):
                 raise ValueError
         except ValueError:
@@ -41,14 +41,14 @@ def parse_tilts(text: str) -> list[float]:
     return sorted(found)
 
 
-def angles_work(
+def angles_points(
     categories: Iterable[Category],
     protocols: Iterable[str],
     methods: Iterable[str],
     tilts: str = FULL_TILTS,
     markers: int = 5,
 ) -> list[dict]:
-    """The parts of the experiment: one scan of one marker by one method under one protocol."""
+    """The points of the experiment: one scan of one marker by one method under one protocol."""
     parse_tilts(tilts)
     return [
         {"protocol": p, "category": c.name, "index": i, "method": m, "tilts": tilts}
@@ -59,20 +59,20 @@ def angles_work(
     ]
 
 
-def measure_angles(part: dict, painter: Painter, seed: int, pool: ThreadPoolExecutor, workers: int) -> dict:
+def measure_angles(point: dict, painter: Painter, seed: int, pool: ThreadPoolExecutor, workers: int) -> dict:
     """Scan one marker.
 
     Returns for each detector two strings of 0 and 1, one sign for each tilt: whether the code was `found`
     (its outline overlaps the code by half), and `read` exactly.
     """
-    category, protocol = CATEGORIES[part["category"]], PROTOCOLS[part["protocol"]]
-    spec = category.spec(part["index"], seed)
+    category, protocol = CATEGORIES[point["category"]], PROTOCOLS[point["protocol"]]
+    spec = category.spec(point["index"], seed)
     made = plain_marker(spec)
     module = protocol.module(made.grid.shape[0])
-    draw = painter.open(part["method"], f"{category.name}-{part['index']}", spec, module)
+    draw = painter.open(point["method"], f"{category.name}-{point['index']}", spec, module)
     names = readers(category.kind)
     outline = made.corners / made.module * module
-    in_pool = part["method"] == IDEAL  # a renderer draws one picture after the other
+    in_pool = point["method"] == IDEAL  # a renderer draws one picture after the other
 
     def look(picture: np.ndarray, tilt: float) -> list[tuple[bool, bool]]:
         target = Target(
@@ -84,7 +84,7 @@ def measure_angles(part: dict, painter: Painter, seed: int, pool: ThreadPoolExec
 
     waiting: deque[Future] = deque()
     seen: list[list[tuple[bool, bool]]] = []
-    for tilt in parse_tilts(part["tilts"]):
+    for tilt in parse_tilts(point["tilts"]):
         camera = protocol.camera(tilt)
         if in_pool:
             waiting.append(pool.submit(lambda c, t: look(draw(c), t), camera, tilt))

@@ -76,11 +76,11 @@ def _note(folder: Path, view: str) -> Path:
 
 
 def default_environment() -> Path:
-    """Where Blender is installed unless told otherwise: the user's cache folder."""
+    """Where Blender is installed by default: the user's cache folder."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fidsplat" / "blender"
 
 
-def install(environment: Path, tell: Callable[[str], None] = lambda text: None) -> Path:
+def install(environment: Path, progress: Callable[[str], None] = lambda text: None) -> Path:
     """Make a virtual environment with bpy, about 1 GB; returns its Python.
 
     Raises InputError when there is no Python 3.11, DeviceError when pip fails.
@@ -89,12 +89,12 @@ def install(environment: Path, tell: Callable[[str], None] = lambda text: None) 
     if python is None:
         raise InputError(f"{BPY} needs Python 3.11, and python3.11 is not on the path; install it first")
     writable_folder(environment.parent)
-    tell(f"making the environment {environment}")
+    progress(f"making the environment {environment}")
     _call([python, "-m", "venv", "--clear", str(environment)])
     own = environment_python(environment)
-    tell(f"installing {BPY}, about 400 MB to fetch")
+    progress(f"installing {BPY}, about 400 MB to fetch")
     _call([str(own), "-m", "pip", "install", "--quiet", BPY, "numpy<2"])
-    tell("starting it once")
+    progress("starting it once")
     _call([str(own), "-c", "import bpy"])
     return own
 

@@ -15,19 +15,19 @@ NAME = "counts"
 FULL_REPEATS, QUICK_REPEATS = 15, 3
 
 
-def counts_work(categories: Iterable[Category], repeats: int, markers: int = 5) -> list[dict]:
-    """The parts of the experiment: one marker each."""
+def counts_points(categories: Iterable[Category], repeats: int, markers: int = 5) -> list[dict]:
+    """The points of the experiment: one marker each."""
     return [{"category": c.name, "index": i, "repeats": repeats} for c in categories for i in range(markers)]
 
 
-def measure_counts(part: dict, seed: int) -> dict:
+def measure_counts(point: dict, seed: int) -> dict:
     """Count one marker's parts, and time its construction.
 
     Returns dark and light (quiet zone included) numbers of `cells`, `runs` (of each row) and `rectangles` of
     the minimum partition, `components`, `gaussians` by mixture and partition, and `seconds` by mixture: one
     for each repeat, from the text to the splats, after one that is not counted.
     """
-    spec = CATEGORIES[part["category"]].spec(part["index"], seed)
+    spec = CATEGORIES[point["category"]].spec(point["index"], seed)
     plain = plain_marker(spec)
     grid = plain.grid
     boxes = {"cells": _cells(grid), "runs": _runs(grid), "rectangles": plain.boxes}
@@ -37,7 +37,7 @@ def measure_counts(part: dict, seed: int) -> dict:
     result["components"] = {"dark": int(first.sum()), "light": int(plain.components - first.sum())}
     result["gaussians"], result["seconds"] = {}, {}
     for mixture in mixtures():
-        made = [marker(spec, mixture=mixture) for _ in range(1 + part["repeats"])]
+        made = [marker(spec, mixture=mixture) for _ in range(1 + point["repeats"])]
         result["seconds"][mixture] = [one.seconds for one in made[1:]]
         result["gaussians"][mixture] = {"rectangles": len(made[0].cloud)} | {
             name: count

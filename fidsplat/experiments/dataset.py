@@ -38,8 +38,8 @@ POINTS = 1000
 """3D points for a trainer to start from: random places on the plane, coloured as it is there"""
 
 
-def dataset_work(categories: Iterable[Category], markers: int = 5) -> list[dict]:
-    """The scenes, one part each."""
+def dataset_scenes(categories: Iterable[Category], markers: int = 5) -> list[dict]:
+    """The scenes that are to be written."""
     return [
         {"category": c.name, "index": i, "views": n}
         for c in categories
@@ -48,41 +48,41 @@ def dataset_work(categories: Iterable[Category], markers: int = 5) -> list[dict]
     ]
 
 
-def scene_name(part: dict) -> str:
+def scene_name(wanted: dict) -> str:
     """E.g. "small-0-views-17"."""
-    return f"{part['category']}-{part['index']}-views-{part['views']}"
+    return f"{wanted['category']}-{wanted['index']}-views-{wanted['views']}"
 
 
-def write_scene(part: dict, folder: Path, seed: int, truth: str, blender: Path) -> Path:
+def write_scene(wanted: dict, folder: Path, seed: int, truth: str, blender: Path) -> Path:
     """Write one scene; a scene that is whole (its marker.json is written last) stays as it is.
 
     Args:
-        part: of `dataset_work`.
+        wanted: of `dataset_scenes`.
         truth: what draws its pictures, one of `fidsplat.experiments.views.TRUTHS`.
         blender: folder of Blender's pictures, for the truths that are Blender's.
 
     Raises InputError when a picture of Blender's is missing or the folder cannot be written.
     """
-    scene = folder / scene_name(part)
-    category = CATEGORIES[part["category"]]
-    spec = category.spec(part["index"], seed)
-    about = _about(spec, part, seed, truth)
+    scene = folder / scene_name(wanted)
+    category = CATEGORIES[wanted["category"]]
+    spec = category.spec(wanted["index"], seed)
+    about = _about(spec, wanted, seed, truth)
     note = scene / "marker.json"
     if _whole(note, about):
         return scene
     # a run that is stopped leaves no note on pictures of two kinds
     note.unlink(missing_ok=True)
-    points, colors = _points(spec, f"{seed} points {category.name} {part['index']}")
+    points, colors = _points(spec, f"{seed} points {category.name} {wanted['index']}")
     sets = (
-        (scene, "view", training_cameras(part["views"]), training_picture),
-        (scene / "test", "test", novel_cameras(category, part["index"], seed), novel_picture),
+        (scene, "view", training_cameras(wanted["views"]), training_picture),
+        (scene / "test", "test", novel_cameras(category, wanted["index"], seed), novel_picture),
     )
     for place, stem, cameras, drawn in sets:
         writable_folder(place / "images")
         names = [f"{stem}-{i:02d}.png" for i in range(len(cameras))]
         for i, (name, camera) in enumerate(zip(names, cameras, strict=True)):
             if truth.startswith("blender-"):
-                file = drawn(blender, truth.removeprefix("blender-"), category.name, part["index"], i)
+                file = drawn(blender, truth.removeprefix("blender-"), category.name, wanted["index"], i)
                 if not file.is_file():
                     raise InputError(f"{file} is missing; run fidsplat experiment blender --training first")
                 picture = read_image(file)
@@ -102,12 +102,12 @@ def _whole(note: Path, about: dict) -> bool:
         return False
 
 
-def _about(spec: str, part: dict, seed: int, truth: str) -> dict:
+def _about(spec: str, wanted: dict, seed: int, truth: str) -> dict:
     plain = plain_marker(spec)
     module = PROTOCOLS["fixed-plane"].module(plain.grid.shape[0])
     return {
         "spec": spec,
-        "views": part["views"],
+        "views": wanted["views"],
         "seed": seed,
         "truth": truth,
         "plane_m": PLANE,

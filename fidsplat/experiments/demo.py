@@ -1,4 +1,4 @@
-"""The main job end to end: markers from text to splats, three views drawn, read back, judged and pictured."""
+"""The main job end to end: markers from text to splats, three views drawn, read back, checked, pictured."""
 
 import json
 import time
@@ -17,14 +17,16 @@ from fidsplat.render import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.vision.detect import detect
 from fidsplat.vision.images import to_uint8, write_png
+from fidsplat.vision.output_files import save_output
 from fidsplat.vision.paint import (
     contact_sheet,
+    depth_key,
     depth_picture,
-    label_picture,
+    depth_span,
+    normal_key,
     normal_picture,
     outlined,
 )
-from fidsplat.vision.planes import save_plane
 
 # a marker counts as wholly visible from this share of its area on; the rest is the soft edge of its quiet
 # zone
@@ -59,10 +61,10 @@ class DemoResult:
     background_splats: int
     marker_splats: dict[str, int]
     sightings: list[Sighting]
-    strangers: list[str]
+    unexpected: list[str]
     """codes that a detector saw and that nobody placed"""
     frame_ms: dict[str, float]
-    """by view: milliseconds on the device for one frame with all planes"""
+    """by view: milliseconds on the device for one frame with all outputs"""
     visible_splats: dict[str, int]
     """by view: splats that were not culled"""
     seconds: float
@@ -73,8 +75,8 @@ class DemoResult:
     def passed(self) -> bool:
         """Every wholly visible marker was found within the limit, there was one, and nothing else was
         seen."""
-        judged = [s.passed for s in self.sightings if s.passed is not None]
-        return bool(judged) and all(judged) and not self.strangers
+        decided = [s.passed for s in self.sightings if s.passed is not None]
+        return bool(decided) and all(decided) and not self.unexpected
 
     def as_dict(self) -> dict:
         """For JSON."""
@@ -86,7 +88,7 @@ class DemoResult:
             "frame_ms": self.frame_ms,
             "visible_splats": self.visible_splats,
             "seconds": self.seconds,
-            "strangers": self.strangers,
+            "unexpected": self.unexpected,
             "sightings": [
                 {"view": s.view, "visible": s.visible, "passed": s.passed, **s.reading.as_dict()}
                 for s in self.sightings
@@ -98,7 +100,7 @@ class DemoResult:
 def run_demo(
     out: str | Path,
     device: str | None = None,
-    tell: Callable[[str], None] = lambda text: None,
+    progress: Callable[[str], None] = lambda text: None,
     mixture: str = "exact",
 ) -> DemoResult:
     """Run the demo and write its pictures, its scene and its figures into the folder ``out``.
@@ -106,7 +108,7 @@ def run_demo(
     Args:
         out: made when it is missing; files of an earlier run are overwritten.
         device: as for `Renderer`.
-        tell: called with what is being done, for a progress display.
+        progress: called with what is being done, for a progress display.
         mixture: of the markers. Those of `exact` stand in scene.ply as `fitted`: a PLY file has no boxes.
 
     Raises InputError when the folder cannot be written or there is no such mixture, DeviceError when the
@@ -114,9 +116,9 @@ def run_demo(
     """
     begun = time.perf_counter()
     folder = writable_folder(out)
-    tell("making three markers and their scene")
+    progress("making three markers and their scene")
     scene = demo_scene(mixture=mixture)
-    tell("opening the device")
+    progress("opening the device")
     renderer = Renderer(device)
     resident = renderer.upload(scene)
     files = [folder / "scene.toml", folder / "scene.ply"]
@@ -124,25 +126,25 @@ def run_demo(
     files += sorted(folder.glob("scene-splats-*.ply"))
     save_ply((scene if mixture != "exact" else demo_scene(mixture="fitted")).cloud(), files[1])
 
-    sightings, strangers, frame_ms, visible, sheet = [], [], {}, {}, []
+    sightings, unexpected, frame_ms, visible, seen = [], [], {}, {}, {}
     for view, camera in demo_views().items():
-        tell(f"drawing and reading: {view}")
-        planes, frame_ms[view], visible[view] = _draw(renderer, resident, scene, camera)
-        image = to_uint8(planes["rgb"])
+        progress(f"drawing and reading: {view}")
+        images, frame_ms[view], visible[view] = _draw(renderer, resident, scene, camera)
+        image = to_uint8(images["rgb"])
         readings, others = read_back(detect(image, families_of(scene.markers)), scene.markers, camera)
-        sightings += [Sighting(view, r, visible_share(r.placed, camera, planes["label"])) for r in readings]
-        strangers += [code.name for code in others]
+        sightings += [Sighting(view, r, visible_share(r.placed, camera, images["label"])) for r in readings]
+        unexpected += [code.name for code in others]
         marked = _marked(image, readings)
-        files += _save(folder, view.replace(" ", "-"), planes, marked)
-        sheet.append(_row(view, planes, image, marked))
-    files.append(write_png(folder / "contact-sheet.png", contact_sheet(sheet)))
+        files += _save(folder, view.replace(" ", "-"), images, marked)
+        seen[view] = (marked, images["depth"], images["normal"])
+    files.append(write_png(folder / "contact-sheet.png", _sheet(seen)))
 
     result = DemoResult(
         device=renderer.device.title,
         background_splats=sum(len(cloud) for cloud in scene.clouds),
         marker_splats={p.marker.spec: len(p.marker.cloud) for p in scene.markers},
         sightings=sightings,
-        strangers=strangers,
+        unexpected=unexpected,
         frame_ms=frame_ms,
         visible_splats=visible,
         seconds=time.perf_counter() - begun,
@@ -156,7 +158,7 @@ def run_demo(
 def _draw(
     renderer: Renderer, resident, scene: Scene, camera: Camera
 ) -> tuple[dict[str, np.ndarray], float, int]:
-    """Planes, milliseconds of a frame once all is compiled, splats that were not culled."""
+    """Output images, milliseconds of a frame once all is compiled, splats that were not culled."""
     times = []
     for _ in range(1 + _FRAMES):
         frame = renderer.render(resident, camera, outputs=OUTPUTS, background=scene.background)
@@ -165,27 +167,26 @@ def _draw(
 
 
 def _marked(image: np.ndarray, readings: list[Reading]) -> np.ndarray:
-    for reading in readings:
-        if reading.detection is not None:
-            image = outlined(image, reading.detection.corners, reading.placed.marker.spec)
-    return image
+    found = [(r.detection.corners, r.placed.marker.spec) for r in readings if r.detection is not None]
+    return outlined(image, found)
 
 
-def _save(folder: Path, stem: str, planes: dict[str, np.ndarray], marked: np.ndarray) -> list[Path]:
+def _save(folder: Path, stem: str, images: dict[str, np.ndarray], marked: np.ndarray) -> list[Path]:
     files = [
         file
-        for name, plane in planes.items()
-        for file in save_plane(name, plane, lambda kind, suffix: folder / f"{stem}-{kind}{suffix}")
+        for name, image in images.items()
+        for file in save_output(name, image, lambda kind, suffix: folder / f"{stem}-{kind}{suffix}")
     ]
     return [*files, write_png(folder / f"{stem}-detection.png", marked)]
 
 
-def _row(view: str, planes: dict[str, np.ndarray], image: np.ndarray, marked: np.ndarray):
-    pictures = {
-        "rgb": image,
-        "depth": depth_picture(planes["depth"]),
-        "normal": normal_picture(planes["normal"]),
-        "label": label_picture(planes["label"]),
-        "detection": marked,
-    }
-    return [(f"{view}: {name}", picture) for name, picture in pictures.items()]
+def _sheet(seen: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:
+    """A column for each view: what was read there, its depth and its normals, with their keys."""
+    span = depth_span(depth for _, depth, _ in seen.values())
+    rows = [
+        [(f"{view}: what was read", marked) for view, (marked, _, _) in seen.items()],
+        [(f"{view}: depth", depth_picture(depth, span)) for view, (_, depth, _) in seen.items()],
+        [(f"{view}: normals", normal_picture(normal)) for view, (_, _, normal) in seen.items()],
+    ]
+    keys = (lambda height: None, lambda height: depth_key(span, height), normal_key)
+    return contact_sheet(rows, width=560, key=lambda row, height: keys[row](height))

@@ -29,14 +29,14 @@ TILTS = (0.0, 20.0, 40.0, 60.0, 70.0)
 QUICK_DISTANCES, QUICK_TILTS = (0.5, 1.0, 2.0), (0.0, 40.0, 60.0)
 
 
-def localisation_work(
+def localisation_points(
     categories: Iterable[Category],
     methods: Iterable[str],
     distances: Iterable[float] = DISTANCES,
     tilts: Iterable[float] = TILTS,
     markers: int = 5,
 ) -> list[dict]:
-    """The parts of the experiment: one marker by one method, at every distance and tilt."""
+    """The points of the experiment: one marker by one method, at every distance and tilt."""
     distances, tilts = list(distances), list(tilts)
     return [
         {"category": c.name, "index": i, "method": m, "distances": distances, "tilts": tilts}
@@ -46,7 +46,7 @@ def localisation_work(
     ]
 
 
-def measure_localisation(part: dict, painter: Painter, seed: int, pool: ThreadPoolExecutor) -> dict:
+def measure_localisation(point: dict, painter: Painter, seed: int, pool: ThreadPoolExecutor) -> dict:
     """Look at one marker from every distance and tilt.
 
     Each camera turns about its axis and looks a little past the marker, by seeded amounts that are the same
@@ -55,14 +55,14 @@ def measure_localisation(part: dict, painter: Painter, seed: int, pool: ThreadPo
     Returns `views`: distance_m, tilt_deg, and position_mm, angle_deg, corners_px (root mean square), all None
     where the marker was not read.
     """
-    category = CATEGORIES[part["category"]]
-    name = f"{category.name}-{part['index']}"
-    spec = category.spec(part["index"], seed)
+    category = CATEGORIES[point["category"]]
+    name = f"{category.name}-{point['index']}"
+    spec = category.spec(point["index"], seed)
     plain = plain_marker(spec)
-    draw = painter.open(part["method"], name, spec, SIZE / plain.bits.shape[1])
+    draw = painter.open(point["method"], name, spec, SIZE / plain.bits.shape[1])
     waiting = []
-    for distance in part["distances"]:
-        for tilt in part["tilts"]:
+    for distance in point["distances"]:
+        for tilt in point["tilts"]:
             camera = camera_at(distance, tilt, f"{seed} pose {name} {distance} {tilt}")
             errors = pool.submit(_errors, plain, camera, draw(camera))
             waiting.append(({"distance_m": distance, "tilt_deg": tilt}, errors))

@@ -1,121 +1,293 @@
-"""The report: every table and figure that the results of a folder allow, in Markdown and HTML."""
+"""The page of the paper's experiments: its tables with ours beside them, charts, what was to be reached."""
 
 from __future__ import annotations
 
-import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-from fidsplat.errors import InputError
-from fidsplat.experiments import angles, counts, localisation, views
-from fidsplat.experiments.document import Document
-from fidsplat.experiments.pictures import sheet_files
-from fidsplat.experiments.records import read_lines
-from fidsplat.experiments.report_angles import Angles, report_angles
-from fidsplat.experiments.report_counts import Counts, report_counts
-from fidsplat.experiments.report_localisation import report_localisation
-from fidsplat.experiments.report_views import Views, report_views
-from fidsplat.experiments.targets import report_targets
-from fidsplat.files import atomic_write, writable_folder
+import pandas as pd
 
-_COMMANDS = "fidsplat experiment {}"
+from fidsplat.experiments import angles, counts, localisation, views
+from fidsplat.experiments.charts import bars, chart, legend_above
+from fidsplat.experiments.methods import FILTERS, IDEAL, mixtures, with_linear_light
+from fidsplat.experiments.pages import NOTHING, fixed, number, places, write_page
+from fidsplat.experiments.paper import ANGLES, CONSTRUCTION_SECONDS, TRAINING_SECONDS, VIEWS
+from fidsplat.experiments.pictures import sheet_files
+from fidsplat.experiments.results import load
+from fidsplat.experiments.setup import CATEGORIES, COLLECTIONS, PROTOCOLS
+from fidsplat.experiments.summary import Frame, Row, provenance
+from fidsplat.experiments.targets import targets
+from fidsplat.experiments.views import LINEAR, TRUTHS
+from fidsplat.files import atomic_write
+
+_FURTHEST = {"apriltag": ("pupil", "aruco"), "qr": ("zxing-tall", "zxing", "cv2")}
+"""the detectors of each kind by how far they read on the ideal texture: the first that is there is shown"""
+_SHOWN_TRUTHS = (("exact", "blender-raw"), ("blender-standard", "exact-linear"))
+"""of display values and of linear light: the first that is there is shown"""
+PAPER, TRAINED = "paper, its own", "paper, 2DGS 17 views"
 
 
 def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
-    """Write a report as Markdown and HTML with its plots and sheets; returns the files, the Markdown first.
+    """Write a report in Markdown with its charts, summaries and sheets; returns the files, the page first.
+    From the folder of the summaries the same page can be made again.
 
     Args:
-        folders: where results lie (`NAME.jsonl`, and sheets in the first that has any; else those
-            that lie beside the plots stay).
-        out: a folder for report.md and all that belongs to it; or a name that ends in .md, and the pictures
-            go into a folder of that name without .md.
+        folders: where results lie, see `fidsplat.experiments.results.load`, and sheets of pictures.
+        out: a folder for report.md and all that belongs to it; or a name that ends in .md, and the rest goes
+            into a folder of that name without .md.
 
     Raises InputError when there are no results or the folder cannot be written.
     """
-    lines = {
-        name: [line for folder in folders for line in read_lines(folder / f"{name}.jsonl")]
-        for name in (counts.NAME, angles.NAME, views.NAME, localisation.NAME)
+    loaded = load(folders)
+    page, folder = places(out)
+    files = [folder / f"{name}.csv" for name in loaded]
+    summaries = {
+        name: summary.write(file) for (name, summary), file in zip(loaded.items(), files, strict=True)
     }
-    if not any(lines.values()):
-        raise InputError(
-            f"no results in {', '.join(map(str, folders))}; run fidsplat experiment all first, or give their "
-            "folder"
-        )
-    page = out if out.suffix == ".md" else out / "report.md"
-    pictures = out.with_suffix("") if out.suffix == ".md" else out
-    writable_folder(pictures)
-    document = Document("Results of the paper's experiments")
-    try:
-        charts = _tables(document, lines)
-    except KeyError as error:
-        raise InputError(
-            f"results in {', '.join(map(str, folders))} are of another version of fidsplat, they lack "
-            f"{error}; measure again with --anew"
-        ) from error
-    sheets = next((found for folder in (*folders, pictures) if (found := sheet_files(folder))), [])
-    if sheets:
-        document.heading("Pictures")
-        document.text("The middle 160 x 160 pixels of 800 x 800, marker 0 of each category.")
-    for sheet in sheets:
-        document.picture(sheet.name, sheet.stem)
-        if sheet.parent.resolve() != pictures.resolve():
-            with atomic_write(pictures / sheet.name) as stream, open(sheet, "rb") as source:
-                shutil.copyfileobj(source, stream)
-    before = "" if pictures == page.parent else f"{pictures.name}/"
-    texts = {page: document.markdown(before), page.with_suffix(".html"): document.html(before)}
-    texts |= {pictures / name: chart for name, chart in charts.items()}
-    for file, text in texts.items():
-        with atomic_write(file) as stream:
-            stream.write(text.encode())
-    return list(texts)
-
-
-def _tables(document: Document, lines: dict[str, list[dict]]) -> dict[str, str]:
-    """Add every table; returns charts, file name -> SVG."""
-    _provenance(document, lines)
-    report_targets(
-        document,
-        Angles(lines[angles.NAME]) if lines[angles.NAME] else None,
-        Views(lines[views.NAME]) if lines[views.NAME] else None,
-        Counts(lines[counts.NAME]) if lines[counts.NAME] else None,
-    )
-    charts: dict[str, str] = {}
-    for name, report in (
-        (counts.NAME, report_counts),
-        (angles.NAME, report_angles),
-        (views.NAME, report_views),
-        (localisation.NAME, report_localisation),
+    reached = targets(summaries)
+    missed = folder / "missed.csv"
+    with atomic_write(missed) as stream:
+        stream.write(reached[~reached["reached"]].drop(columns="reached").to_csv(index=False).encode())
+    rows = {name: summary.rows for name, summary in summaries.items()}
+    context: dict = {name: None for name in (counts.NAME, angles.NAME, views.NAME, localisation.NAME)}
+    for name, tables in (
+        (counts.NAME, _counts),
+        (angles.NAME, _angles),
+        (views.NAME, _views),
+        (localisation.NAME, _localisation),
     ):
-        if lines[name]:
-            charts |= report(document, lines[name])
-        else:
-            document.text(f"Nothing was measured by `{_COMMANDS.format(name)}`.")
-    return charts
+        if name in rows:
+            context[name] = tables(rows[name], folder)
+    sheets = next((found for place in (*folders, folder) if (found := sheet_files(place))), [])
+    for sheet in sheets:
+        if sheet.parent.resolve() != folder.resolve():
+            with atomic_write(folder / sheet.name) as stream, open(sheet, "rb") as source:
+                shutil.copyfileobj(source, stream)
+    context |= {
+        "targets": len(reached),
+        "reached": int(reached["reached"].sum()),
+        "kinds": _kinds(reached),
+        "sheets": [sheet.name for sheet in sheets],
+        "runs": provenance({f"`experiment {name}`": summary for name, summary in summaries.items()}),
+        "training_seconds": TRAINING_SECONDS,
+    }
+    write_page(page, folder, "results.md.j2", context)
+    return [page, *files, missed, *sorted(folder.glob("*.svg"))]
 
 
-def _provenance(document: Document, lines: dict[str, list[dict]]) -> None:
-    """What made the numbers: one line for each experiment and set of circumstances."""
-    rows = []
-    for name, found in lines.items():
-        runs: dict[str, tuple[dict, int]] = {}
-        for line in found:
-            key = json.dumps(line["run"], sort_keys=True)
-            runs[key] = line["run"], runs.get(key, (None, 0))[1] + 1
-        for run, count in runs.values():
-            versions = ", ".join(f"{package} {number}" for package, number in run["versions"].items())
-            rows.append(
-                (
-                    f"{_COMMANDS.format(name)}",
-                    str(count),
-                    run["device"] or "nothing drawn",
-                    run["machine"],
-                    versions,
-                    f"{run['commit']} / {run['code']}",
-                    str(run["seed"]),
-                    run["date"],
-                )
+def _kinds(reached: Frame) -> Frame:
+    """Targets by kind: how many there are, and how many are reached."""
+    table = reached.groupby("kind", sort=False)["reached"].agg(["sum", "size"]).reset_index()
+    return table.set_axis(["target", "reached", "of"], axis=1)
+
+
+def category_order(names: Iterable[str]) -> list[str]:
+    """Those that occur, in the paper's order."""
+    there = set(names)
+    return [name for name in CATEGORIES if name in there]
+
+
+def method_order(names: Iterable[str]) -> list[str]:
+    """Those that occur and are shown: the ideal, mixtures drawn sharp, trained models."""
+    own = with_linear_light(f"{mixture}/{name}" for mixture in mixtures() for name in FILTERS)
+    known = [IDEAL, *(name for name in own if not name.endswith("/screen"))]
+    there = set(names)
+    return [name for name in (*known, *(f"2dgs-{n}" for n in COLLECTIONS)) if name in there]
+
+
+def _titles(categories: Iterable[str]) -> list[str]:
+    return [CATEGORIES[name].title for name in categories]
+
+
+def _counts(rows: Frame, folder: Path) -> dict[str, Frame]:
+    """Tables 1 and 2, and the chart of each."""
+    categories = category_order(rows["category"])
+    made = [name for name in mixtures() if name in set(rows["mixture"])]
+    mean = rows.groupby(["category", "mixture"]).mean(numeric_only=True)
+    first = rows.groupby(["category", "marker"]).first().groupby("category").mean(numeric_only=True)
+    sizes, seconds = [], []
+    for name in categories:
+        category, own = CATEGORIES[name], first.loc[name]
+        side = 8 if category.version is None else 17 + 4 * category.version
+        row = {
+            "category": category.title,
+            "characters": category.length or NOTHING,
+            "QR version": category.version or NOTHING,
+            "modules": f"{side} x {side}",
+        }
+        for column, words in (("components", "components"), ("rectangles", "rectangles")):
+            row[words] = f"{own[f'{column}_dark'] + own[f'{column}_light']:.0f}"
+        sizes.append(row | {f"splats, {m}": fixed(mean["gaussians"].get((name, m)), 0) for m in made})
+        seconds.append(
+            {"category": category.title} | {m: number(mean["seconds"].get((name, m)), 2) for m in made}
+        )
+    every = mean["seconds"].groupby("mixture").mean()
+    seconds.append({"category": "all"} | {m: number(every[m], 2) for m in made})
+    seconds.append({"category": PAPER} | {m: f"{CONSTRUCTION_SECONDS:.2f}" for m in made})
+
+    def of(column: str) -> dict[str, list[float]]:
+        return {
+            f"mixture {m}": [mean[column].get((name, m), float("nan")) for name in categories] for m in made
+        }
+
+    with chart(folder / "counts.svg") as (figure, (axes,)):
+        bars(axes, _titles(categories), of("gaussians"), logarithmic=True)
+        axes.set_ylabel("splats of a marker")
+        legend_above(figure, axes)
+    with chart(folder / "seconds.svg") as (figure, (axes,)):
+        bars(axes, _titles(categories), of("seconds"), logarithmic=True)
+        axes.axhline(CONSTRUCTION_SECONDS, color="#555555", linestyle="--", label="paper, its own, mean")
+        axes.axhline(
+            TRAINING_SECONDS[17], color="#555555", linestyle=":", label="paper, training 2DGS, 17 views"
+        )
+        axes.set_ylabel("seconds from text to splats")
+        legend_above(figure, axes)
+    return {"sizes": pd.DataFrame(sizes), "seconds": pd.DataFrame(seconds)}
+
+
+def _angles(rows: Frame, folder: Path) -> dict[str, Frame]:
+    """Table 3 by protocol, and its chart."""
+    there = set(rows["reader"])
+    furthest = {
+        kind: next((name for name in names if name in there), "") for kind, names in _FURTHEST.items()
+    }
+    kinds = rows["category"].map(lambda name: CATEGORIES[name].kind)
+    rows = rows[rows["reader"] == kinds.map(furthest)]
+    categories, methods = category_order(rows["category"]), method_order(rows["method"])
+    tables, means = {}, {}
+    for protocol in (name for name in PROTOCOLS if name in set(rows["protocol"])):
+        own = rows[rows["protocol"] == protocol].groupby(["category", "method"])
+        means[protocol] = own["read"].mean()
+        tables[protocol] = _beside_paper(
+            categories,
+            methods,
+            lambda place, own=own: (
+                " ".join(_angle(own.get_group(place)[c]) for c in ("found", "read"))
+                if place in own.groups
+                else NOTHING
+            ),
+            {
+                name: {key: "{:.1f} {:.1f}".format(*value) for key, value in row.items()}
+                for name, row in ANGLES.items()
+            },
+        )
+    series = {
+        protocol: _series(
+            categories, methods, mean, {c: {k: v[1] for k, v in row.items()} for c, row in ANGLES.items()}
+        )
+        for protocol, mean in means.items()
+    }
+    _panels(folder / "angles.svg", categories, series, "largest tilt that is read, degrees")
+    return tables
+
+
+def _angle(values: Row) -> str:
+    there = values.dropna()
+    if there.empty:
+        return "never"
+    never = len(values) - len(there)
+    return f"{there.mean():.1f}" + (f" ({never} of {len(values)} never)" if never else "")
+
+
+def _views(rows: Frame, folder: Path) -> dict:
+    """Table 4 against a truth of display values and one of linear light, and its chart."""
+    categories = category_order(rows["category"])
+    there = set(rows["truth"])
+    shown = [name for names in _SHOWN_TRUTHS if (name := next((n for n in names if n in there), ""))]
+    tables, series = {}, {}
+    for truth in shown:
+        own = rows[rows["truth"] == truth]
+        methods = method_order(own["method"])
+        mean = own.groupby(["category", "method"])[["psnr", "ssim"]].mean()
+
+        def cell(place: tuple[str, str], mean: Frame = mean) -> str:
+            if place not in mean.index:
+                return NOTHING
+            return f"{fixed(mean['psnr'][place], 1)} / {fixed(mean['ssim'][place], 3)}"
+
+        paper = {
+            name: {key: f"{value[0]:.1f} / {value[1]:.2f}" for key, value in row.items()}
+            for name, row in VIEWS.items()
+        }
+        tables[truth] = {"title": TRUTHS[truth], "rows": _beside_paper(categories, methods, cell, paper)}
+        # in linear light what blends linear light
+        ending = "/light" if truth in LINEAR else "/best"
+        drawn = [method for method in methods if "/" not in method or method.endswith(ending)]
+        psnr = {c: {k: v[0] for k, v in row.items()} for c, row in VIEWS.items()}
+        series[f"MIXTURE{ending} against {truth}"] = _series(categories, drawn, mean["psnr"], psnr)
+    _panels(folder / "psnr.svg", categories, series, "PSNR, dB")
+    measured = {name: int(rows[name].notna().sum()) for name in ("flip", "lpips")}
+    return {"tables": tables, "views": int(rows["amount"].max()), "rows": len(rows), "measured": measured}
+
+
+def _localisation(rows: Frame, folder: Path) -> Frame:
+    """Median error of position by distance, and how many of the views were read."""
+    methods = method_order(rows["method"])
+    table = []
+    for (category, distance), own in rows.groupby(["category", "distance_m"]):
+        row = {"marker, distance": f"{CATEGORIES[str(category)].title}, {distance:g} m"}
+        for method in methods:
+            one = own[own["method"] == method]
+            read, seen = one["read"].sum(), one["amount"].sum()
+            lost = f" ({read} of {seen})" if read < seen else ""
+            row[method] = (number(one["position_mm"].median()) if read else "not read") + (
+                lost if read else ""
             )
-    heads = ("command", "parts", "device", "machine", "versions", "commit / code", "seed", "date")
-    document.heading("Where the numbers come from")
-    document.table(heads, rows)
+        table.append(row)
+    return pd.DataFrame(table)
+
+
+def _beside_paper(
+    categories: Sequence[str],
+    methods: Sequence[str],
+    cell: Callable[[tuple[str, str]], str],
+    paper: dict[str, dict],
+) -> Frame:
+    """A row for each category: the paper's figures, then ours."""
+    return pd.DataFrame(
+        [
+            {
+                "category": CATEGORIES[category].title,
+                PAPER: paper.get(category, {}).get("ours", NOTHING),
+                TRAINED: paper.get(category, {}).get(17, NOTHING),
+            }
+            | {method: cell((category, method)) for method in methods}
+            for category in categories
+        ]
+    )
+
+
+def _series(
+    categories: Sequence[str], methods: Sequence[str], values: Row, paper: dict[str, dict]
+) -> dict[str, list[float]]:
+    """Ours by method, then the paper's, for `_panels`."""
+    nan = float("nan")
+    own = {_short(m): [values.get((c, m), nan) for c in categories] for m in methods}
+    theirs = {
+        words: [paper.get(c, {}).get(key, nan) for c in categories]
+        for words, key in ((PAPER, "ours"), (TRAINED, 17))
+    }
+    return own | theirs
+
+
+def _short(method: str) -> str:
+    """A method's name in charts: which filter it is drawn with stands above them."""
+    mixture, slash, _ = method.partition("/")
+    return f"mixture {mixture}" if slash else method
+
+
+def _panels(
+    file: Path, categories: Sequence[str], panels: dict[str, dict[str, list[float]]], unit: str
+) -> None:
+    """Bars for each category side by side, one legend for all panels."""
+    names = list(dict.fromkeys(name for series in panels.values() for name in series))
+    names.sort(key=lambda name: (name in (PAPER, TRAINED), name != IDEAL))
+    nothing = [float("nan")] * len(categories)
+    with chart(file, len(panels), (4.5 * len(panels) + 2, 4.2)) as (figure, axes):
+        for one, (title, series) in zip(axes, panels.items(), strict=True):
+            bars(one, _titles(categories), {name: series.get(name, nothing) for name in names})
+            one.set_title(title)
+            one.tick_params(axis="x", labelsize=8)
+        axes[0].set_ylabel(unit)
+        legend_above(figure, axes[0])

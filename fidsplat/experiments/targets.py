@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Iterator
-from itertools import product
 from typing import NamedTuple
 
-from fidsplat.experiments.angles import FULL_TILTS, largest
-from fidsplat.experiments.document import Document
-from fidsplat.experiments.figures import category_order
+import pandas as pd
+
+from fidsplat.experiments import angles, counts, views
 from fidsplat.experiments.methods import IDEAL
 from fidsplat.experiments.paper import ANGLES, VIEWS
-from fidsplat.experiments.report_angles import Angles, gap_text
-from fidsplat.experiments.report_counts import Counts
-from fidsplat.experiments.report_views import Views
-from fidsplat.experiments.setup import CATEGORIES, MARKERS, PROTOCOLS, TEST_VIEWS
-from fidsplat.experiments.views import LINEAR, TRUTHS
+from fidsplat.experiments.results import ALLOWED_GAP, NEVER
+from fidsplat.experiments.summary import Frame, Summary
+from fidsplat.experiments.views import LINEAR
 
-ALLOWED_GAP = {"exact": 0.2, "fitted": 1.0}
-"""degrees by which reading may end below the ideal texture's"""
 EXACT_PSNR, EXACT_SSIM = 38.7, 0.99
 FITTED_GAIN = 3.0
 """dB above the paper's own method"""
@@ -32,161 +26,153 @@ _SLACK = 1e-6
 class Target(NamedTuple):
     """One thing to reach."""
 
+    kind: str
     what: str
     wanted: str
     found: str
     reached: bool
 
 
-def report_targets(
-    document: Document, angles: Angles | None, views: Views | None, counts: Counts | None
-) -> None:
-    """Add the table of targets; those that nothing was measured for are left out."""
-    targets: list[Target] = []
-    if angles is not None:
-        targets += [*_gaps(angles), *_misses(angles), *_paper_angles(angles)]
-    if views is not None:
-        targets += _views(views)
-    if counts is not None:
-        targets += _counts(counts)
-    document.heading("What was to be reached")
-    document.text(
-        f"To be reached by all {MARKERS} markers of a category, at tilts of {FULL_TILTS} and over "
-        f"{TEST_VIEWS} views; what was found is of the markers, tilts and views that were measured: "
-        f"{_measured(angles, views)}. The ideal is the same detector's on the ideal texture. "
-        f"{sum(target.reached for target in targets)} of {len(targets)} are reached."
-    )
-    document.table(
-        ("target", "wanted", "found", "reached"), [(*t[:3], "yes" if t.reached else "no") for t in targets]
-    )
+def targets(summaries: dict[str, Summary]) -> Frame:
+    """A row for each target of which anything was measured."""
+    found: list[Target] = []
+    rows = {name: summary.rows for name, summary in summaries.items()}
+    if angles.NAME in rows:
+        found += [*_gaps(rows[angles.NAME]), *_misses(rows[angles.NAME]), *_paper_angles(rows[angles.NAME])]
+    if views.NAME in rows:
+        found += _views(rows[views.NAME])
+    if counts.NAME in rows:
+        found += _counts(rows[counts.NAME])
+    return pd.DataFrame(found, columns=Target._fields).astype({"reached": bool})
 
 
-def _measured(angles: Angles | None, views: Views | None) -> str:
-    parts = [] if angles is None else [f"tilts of {' and '.join(angles.tilts)}"]
-    parts += [] if views is None else [f"{' or '.join(map(str, sorted(views.views)))} views"]
-    return ", ".join(parts) or "neither tilts nor views"
+def _best(rows: Frame) -> Iterator[tuple[str, str, Frame]]:
+    """Of mixtures that have a target, drawn sharp: mixture, method, rows."""
+    for mixture in ALLOWED_GAP:
+        method = f"{mixture}/best"
+        yield mixture, method, rows[rows["method"] == method]
 
 
-def _gaps(angles: Angles) -> Iterator[Target]:
+def _gaps(rows: Frame) -> Iterator[Target]:
     """The paper's angle is the largest one; what is read without a miss up to it is the stricter question."""
-    for protocol, mixture, category in _scanned(angles):
-        allowed, method = ALLOWED_GAP[mixture], f"{mixture}/best"
-        for reader in sorted(angles.names(4)):
-            gaps = [angles.behind(protocol, category, method, reader, which) for which in (0, 1)]
-            if any(gaps):
+    for mixture, method, own in _best(rows):
+        allowed = ALLOWED_GAP[mixture]
+        for (protocol, category, reader), scans in own.groupby(
+            ["protocol", "category", "reader"], sort=False
+        ):
+            gaps = scans[["behind", "behind_all"]]
+            worst = gaps.max()
+            if worst.notna().any():
                 yield Target(
+                    "angles behind the ideal's",
                     f"{method}, {category}, {reader}, {protocol}: behind the ideal, largest / without a miss",
                     f"<= {allowed} deg",
-                    f"{' / '.join(map(gap_text, gaps))} deg, worst of {max(map(len, gaps))}",
-                    max(gap for both in gaps for gap in both) <= allowed + _SLACK,
+                    f"{' / '.join(map(_gap, worst))} deg, worst of {gaps.count().max()}",
+                    bool(worst.max() <= allowed + _SLACK),
                 )
 
 
-def _misses(angles: Angles) -> Iterator[Target]:
-    for protocol, mixture, category in _scanned(angles):
-        allowed, method = ALLOWED_GAP[mixture], f"{mixture}/best"
-        every = {
-            reader: missed
-            for reader in sorted(angles.names(4))
-            if (missed := angles.missed(protocol, category, method, reader, allowed)) is not None
-        }
-        if every:
-            yield Target(
-                f"{method}, {category}, {protocol}: tilts missed below the ceiling",
-                f"none up to the ideal's less {allowed} deg",
-                ", ".join(f"{reader} {missed} of {total}" for reader, (missed, total) in every.items()),
-                not any(missed for missed, _ in every.values()),
-            )
+def _gap(worst: float) -> str:
+    return "-" if pd.isna(worst) else "not read frontally" if worst >= NEVER else f"{worst:+.1f}"
 
 
-def _scanned(angles: Angles) -> Iterator[tuple[str, str, str]]:
-    """Protocols, mixtures that have a target, categories."""
-    protocols = [name for name in PROTOCOLS if name in angles.names(0)]
-    return product(protocols, ALLOWED_GAP, category_order(angles.names(1)))
+def _misses(rows: Frame) -> Iterator[Target]:
+    for mixture, method, own in _best(rows):
+        for (protocol, category), scans in own.groupby(["protocol", "category"], sort=False):
+            sums = scans.groupby("reader")[["missed", "below"]].sum()
+            sums = sums[sums["below"] > 0]
+            if len(sums):
+                yield Target(
+                    "tilts missed below the ideal's ceiling",
+                    f"{method}, {category}, {protocol}: tilts missed below the ceiling",
+                    f"none up to the ideal's less {ALLOWED_GAP[mixture]} deg",
+                    ", ".join(
+                        f"{reader} {row.missed:.0f} of {row.below:.0f}" for reader, row in sums.iterrows()
+                    ),
+                    not sums["missed"].any(),
+                )
 
 
-def _paper_angles(angles: Angles) -> Iterator[Target]:
-    for which, words in enumerate(("largest tilt that is read", "read without a miss up to")):
+def _paper_angles(rows: Frame) -> Iterator[Target]:
+    rows = rows[(rows["protocol"] == "fixed-module") & (rows["reader"] == "zxing-tall")]
+    for column, words in (("read", "largest tilt that is read"), ("read_all", "read without a miss up to")):
+        means = rows.assign(value=rows[column].fillna(0.0)).groupby(["category", "method"])["value"]
+        mean, count = means.mean(), means.count()
         for category, paper in ANGLES.items():
             wanted = paper["ours"][1]
-            ceiling = _decoding(angles, category, IDEAL, which)
+            ceiling = mean.get((category, IDEAL))
             beside = "" if ceiling is None else f" (ideal: {ceiling:.1f})"
-            for mixture in ALLOWED_GAP:
-                method = f"{mixture}/best"
-                mean = _decoding(angles, category, method, which)
-                if mean is not None:
-                    count = len(angles.of("fixed-module", category, method, "zxing-tall"))
+            for _, method, _ in _best(rows):
+                value = mean.get((category, method))
+                if value is not None:
                     yield Target(
+                        "the paper's angles",
                         f"{method}, {category}, fixed-module: {words}, mean",
                         f">= {wanted} deg (paper)",
-                        f"{mean:.1f} deg{beside}, mean of {count}",
-                        mean >= wanted - _SLACK,
+                        f"{value:.1f} deg{beside}, mean of {count[category, method]}",
+                        bool(value >= wanted - _SLACK),
                     )
 
 
-def _decoding(angles: Angles, category: str, method: str, which: int) -> float | None:
-    scans = angles.of("fixed-module", category, method, "zxing-tall").values()
-    return statistics.fmean(largest(s.tilts, s.read)[which] or 0.0 for s in scans) if scans else None
+def _views(rows: Frame) -> Iterator[Target]:
+    means = rows.groupby(["truth", "category", "method"])[["psnr", "ssim"]].mean()
+
+    def mean(method: str, metric: str = "psnr") -> float | None:
+        value = means[metric].get((truth, category, method))
+        return None if value is None or pd.isna(value) else float(value)
+
+    for truth, category in rows[["truth", "category"]].drop_duplicates().itertuples(index=False):
+        ceiling = mean(IDEAL)
+        beside = "" if ceiling is None else f" (a perfect picture of display values: {ceiling:.2f})"
+        method = "exact/light" if truth in LINEAR else "exact/best"
+        for metric, least, unit in (("psnr", EXACT_PSNR, " dB"), ("ssim", EXACT_SSIM, "")):
+            value = mean(method, metric)
+            if value is not None:
+                yield Target(
+                    "PSNR and SSIM of `exact`",
+                    f"{method}, {category}, {metric} against {truth}",
+                    f">= {least}{unit}",
+                    f"{value:.4f}{unit}{beside if metric == 'psnr' else ''}",
+                    value >= least,
+                )
+        fitted = mean("fitted/best")
+        paper = {"paper/screen": mean("paper/screen"), "the paper's own figure": VIEWS[category]["ours"][0]}
+        for name, theirs in paper.items():
+            if fitted is not None and theirs is not None:
+                yield Target(
+                    f"PSNR of `fitted` above {name}",
+                    f"fitted/best above {name}, {category}, PSNR against {truth}",
+                    f">= {FITTED_GAIN} dB",
+                    f"{fitted - theirs:+.2f} dB ({fitted:.2f} and {theirs:.2f}){beside}",
+                    fitted - theirs >= FITTED_GAIN,
+                )
 
 
-def _views(views: Views) -> Iterator[Target]:
-    truths = [t for t in TRUTHS if t in views.names(0)]
-    for truth in truths:
-        for category in category_order(views.names(1)):
-            ceiling = views.mean(truth, category, IDEAL, "psnr")
-            beside = "" if ceiling is None else f" (a perfect picture of display values: {ceiling:.2f})"
-            method = "exact/light" if truth in LINEAR else "exact/best"
-            for metric, least in (("psnr", EXACT_PSNR), ("ssim", EXACT_SSIM)):
-                value = views.mean(truth, category, method, metric)
-                count = len(views.values(truth, category, method, metric))
-                if value is not None:
-                    unit = " dB" if metric == "psnr" else ""
-                    extra = beside if metric == "psnr" else ""
-                    yield Target(
-                        f"{method}, {category}, {metric} against {truth}",
-                        f">= {least}{unit}",
-                        f"{value:.4f}{unit}{extra}, mean of {count}",
-                        value >= least,
-                    )
-            fitted = views.mean(truth, category, "fitted/best", "psnr")
-            for name, paper in (
-                ("paper/screen", views.mean(truth, category, "paper/screen", "psnr")),
-                ("the paper's own figure", VIEWS[category]["ours"][0]),
-            ):
-                if fitted is not None and paper is not None:
-                    yield Target(
-                        f"fitted/best above {name}, {category}, PSNR against {truth}",
-                        f">= {FITTED_GAIN} dB",
-                        f"{fitted - paper:+.2f} dB ({fitted:.2f} and {paper:.2f}){beside}",
-                        fitted - paper >= FITTED_GAIN,
-                    )
-
-
-def _counts(counts: Counts) -> Iterator[Target]:
-    for category in category_order(counts.markers):
-        if "exact" in counts.mixtures:
-            pairs = list(zip(counts.gaussians(category, "exact"), counts.rectangles(category), strict=True))
+def _counts(rows: Frame) -> Iterator[Target]:
+    for category, own in rows.groupby("category", sort=False):
+        gaussians = own.pivot(index="marker", columns="mixture", values="gaussians")
+        rectangles = own.groupby("marker")[["rectangles_dark", "rectangles_light"]].first().sum(axis=1)
+        if "exact" in gaussians:
+            share = float((gaussians["exact"] / rectangles).max())
+            what = f"exact, {category}: primitives for each rectangle"
             yield Target(
-                f"exact, {category}: primitives for each rectangle",
-                "1",
-                f"{max((n or 0) / r for n, r in pairs):.3f}, worst of {len(pairs)}",
-                all(n == r for n, r in pairs),
+                "numbers of splats", what, "1", f"{share:.3f}, worst of {len(gaussians)}", share == 1
             )
-        if {"fitted", "paper"} <= set(counts.mixtures):
-            ours, theirs = (counts.gaussians(category, name) for name in ("fitted", "paper"))
-            share = max((a or 0) / (b or 1) for a, b in zip(ours, theirs, strict=True))
+        if {"fitted", "paper"} <= set(gaussians):
+            share = float((gaussians["fitted"] / gaussians["paper"]).max())
             yield Target(
+                "numbers of splats",
                 f"fitted, {category}: Gaussians of those of the paper's mixture",
                 f"<= {FITTED_SHARE}",
-                f"{share:.3f}, worst of {len(ours)}",
+                f"{share:.3f}, worst of {len(gaussians)}",
                 share <= FITTED_SHARE,
             )
-    for mixture in counts.mixtures:
-        if "huge" in counts.markers and mixture != "paper":
-            seconds = counts.seconds("huge", mixture)
-            yield Target(
-                f"{mixture}, {CATEGORIES['huge'].title}: construction",
-                f"<= {HUGE_SECONDS} s",
-                f"{max(seconds):.3f} s, median of the slowest of {len(seconds)}",
-                max(seconds) <= HUGE_SECONDS,
-            )
+    huge = rows[(rows["category"] == "huge") & (rows["mixture"] != "paper")]
+    for mixture, seconds in huge.groupby("mixture", sort=False)["seconds"]:
+        yield Target(
+            "seconds of construction",
+            f"{mixture}, QR Huge: construction",
+            f"<= {HUGE_SECONDS} s",
+            f"{seconds.max():.3f} s, median of the slowest of {len(seconds)}",
+            bool(seconds.max() <= HUGE_SECONDS),
+        )

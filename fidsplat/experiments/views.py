@@ -38,7 +38,7 @@ LINEAR = ("exact-linear", "blender-standard")
 Perceptual = Callable[[np.ndarray, np.ndarray], float]
 
 
-def views_work(
+def views_points(
     categories: Iterable[Category],
     methods: Iterable[str],
     blender: Path,
@@ -46,15 +46,15 @@ def views_work(
     views: int = TEST_VIEWS,
     lpips: str | None = None,
 ) -> list[dict]:
-    """The parts of the experiment: one marker by one method against one ground truth.
+    """The points of the experiment: one marker by one method against one ground truth.
 
     Args:
         blender: folder of `fidsplat experiment blender`; its pictures take part where a marker has all of
             them.
         views: how many of the 20.
-        lpips: what tells the weights of LPIPS apart, when it is measured.
+        lpips: what distinguishes the weights of LPIPS, when it is measured.
     """
-    work = []
+    points = []
     for category in categories:
         for index in range(markers):
             truths = ["exact", "exact-linear"]
@@ -65,7 +65,7 @@ def views_work(
             ]
             for method in with_linear_light(methods):
                 for truth in truths:
-                    part = {
+                    point = {
                         "category": category.name,
                         "index": index,
                         "method": method,
@@ -76,12 +76,12 @@ def views_work(
                     }
                     equal = method == IDEAL and truth == "exact"  # by definition
                     if not equal and (truth in LINEAR or not in_linear_light(method)):
-                        work.append(part)
-    return work
+                        points.append(point)
+    return points
 
 
 class Kept:
-    """8-bit pictures that the parts after this one need again."""
+    """8-bit pictures that the points after this one need again."""
 
     def __init__(self) -> None:
         self._about: dict[str, tuple] = {}
@@ -101,7 +101,7 @@ class Kept:
 
 
 def measure_views(
-    part: dict,
+    point: dict,
     painter: Painter,
     seed: int,
     blender: Path,
@@ -112,31 +112,31 @@ def measure_views(
     """Compare one marker's pictures, in 8 bits, with the truth.
 
     Args:
-        kept: the same for all parts of a run: a method's pictures are drawn once for all truths, which follow
-            one another, and a marker's exact truths once for all methods.
+        kept: the same for all points of a run: a method's pictures are drawn once for all truths, which
+            follow one another, and a marker's exact truths once for all methods.
 
     Returns `psnr` (dB), `ssim`, `flip` and `lpips`: a number for each view; None for a metric that cannot be
     measured here, and for the PSNR of equal pictures.
     """
-    category = CATEGORIES[part["category"]]
-    spec = category.spec(part["index"], seed)
+    category = CATEGORIES[point["category"]]
+    spec = category.spec(point["index"], seed)
     module = PROTOCOLS["fixed-plane"].module(plain_marker(spec).grid.shape[0])
     kept = kept or Kept()
-    marker = (part["category"], part["index"], seed)
+    marker = (point["category"], point["index"], seed)
     opened: list[Draw] = []
 
     def draw(camera: Camera) -> np.ndarray:
         if not opened:
-            name = f"{category.name}-{part['index']}"
-            opened.append(painter.open(part["method"], name, spec, module))
+            name = f"{category.name}-{point['index']}"
+            opened.append(painter.open(point["method"], name, spec, module))
         return opened[0](camera)
 
     def true(number: int, camera: Camera) -> np.ndarray:
-        kind = part["truth"]
+        kind = point["truth"]
         if kind.startswith("exact"):
             return kept.get(kind, marker, number, lambda: exact_view(spec, camera, kind == "exact-linear"))
         view = kind.removeprefix("blender-")
-        return read_image(novel_picture(blender, view, category.name, part["index"], number))[:, :, 0]
+        return read_image(novel_picture(blender, view, category.name, point["index"], number))[:, :, 0]
 
     def compare(number: int, camera: Camera, picture: np.ndarray) -> dict[str, float | None]:
         truth = true(number, camera)
@@ -145,14 +145,14 @@ def measure_views(
         ours, theirs = picture / 255.0, to_uint8(truth) / 255.0
         ratio = psnr(ours, theirs)
         found = {"psnr": None if np.isinf(ratio) else ratio, "ssim": ssim(ours, theirs)}
-        if part["flip"]:
+        if point["flip"]:
             found["flip"] = flip(ours, theirs)
         if lpips is not None:
             found["lpips"] = lpips(ours, theirs)
         return found
 
-    cameras = novel_cameras(category, part["index"], seed)[: part["views"]]
-    about = (*marker, part["method"])
+    cameras = novel_cameras(category, point["index"], seed)[: point["views"]]
+    about = (*marker, point["method"])
     waiting = [
         pool.submit(compare, i, camera, kept.get("drawn", about, i, partial(draw, camera)))
         for i, camera in enumerate(cameras)

@@ -14,22 +14,23 @@ An element sh holds the bands above 0, a byte per coefficient in [-4, 4], in the
 import numpy as np
 
 from fidsplat.errors import InputError
+from fidsplat.formats.collect import BLOCK, Rows
 from fidsplat.formats.ply_header import Header
 from fidsplat.harmonics import C0
 
 CHUNK = 256
-_CHUNKS_AT_ONCE = 8
+_CHUNKS_AT_ONCE = BLOCK // CHUNK
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
 
 def is_compressed(header: Header) -> bool:
-    """Whether the file is meant to be a compressed one; ``read_compressed`` checks that it is."""
+    """Whether the file is meant to be a compressed one; ``compressed_rows`` checks that it is."""
     vertex = header.elements.get("vertex")
     return vertex is not None and any(name in vertex.properties for name in _PACKED)
 
 
-def read_compressed(header: Header) -> dict[str, np.ndarray]:
-    """means (n, 3), quats (n, 4), scales (n, 3), opacities (n,), sh (n, k, 3), all float32.
+def compressed_rows(header: Header) -> Rows:
+    """Splats of three scales, all float32.
 
     Raises InputError when an element or a property is missing, of the wrong type or of the wrong length.
     """
@@ -47,27 +48,32 @@ def read_compressed(header: Header) -> dict[str, np.ndarray]:
         if rest not in (9, 24, 45):
             raise InputError(f"{header.path}: the element sh has {rest} properties; not 9, 24 or 45")
 
-    fields = {
-        "means": np.empty((n, 3), np.float32),
-        "quats": np.empty((n, 4), np.float32),
-        "scales": np.empty((n, 3), np.float32),
-        "opacities": np.empty(n, np.float32),
-        "sh": np.empty((n, rest // 3 + 1, 3), np.float32),
+    columns = {
+        "means": ((3,), np.float32),
+        "quats": ((4,), np.float32),
+        "scales": ((3,), np.float32),
+        "opacities": ((), np.float32),
+        "sh": ((rest // 3 + 1, 3), np.float32),
     }
-    rows, chunks = header.rows("vertex"), header.rows("chunk")
-    bands = header.rows("sh") if rest else None
-    # a damaged chunk row gives values that are not finite, and the cloud leaves those splats out
-    with np.errstate(over="ignore", invalid="ignore"):
-        for first in range(0, n, _CHUNKS_AT_ONCE * CHUNK):  # so that the float64 stays small
-            part = slice(first, first + _CHUNKS_AT_ONCE * CHUNK)
-            owners = chunks[first // CHUNK : first // CHUNK + _CHUNKS_AT_ONCE]
+
+    def fill(first: int, arrays: dict[str, np.ndarray]) -> None:
+        end = first + len(arrays["means"])
+        rows, chunks = (
+            header.rows("vertex", first, end),
+            header.rows("chunk", first // CHUNK, -(-end // CHUNK)),
+        )
+        bands = header.rows("sh", first, end) if rest else None
+        for start in range(0, len(rows), BLOCK):  # so that the float64 stays small
+            part = slice(start, start + BLOCK)
+            owners = chunks[start // CHUNK : start // CHUNK + _CHUNKS_AT_ONCE]
             unpacked = _unpack(rows[part], owners, coloured)
-            fields["sh"][part, 0] = unpacked.pop("dc")
+            arrays["sh"][part, 0] = unpacked.pop("dc")
             for name, values in unpacked.items():
-                fields[name][part] = values
+                arrays[name][part] = values
             if bands is not None:
-                fields["sh"][part, 1:] = _bands(bands[part], rest)
-    return fields
+                arrays["sh"][part, 1:] = _bands(bands[part], rest)
+
+    return Rows(header.path, n, columns, fill)
 
 
 def _unpack(rows: np.ndarray, chunks: np.ndarray, coloured: bool) -> dict[str, np.ndarray]:

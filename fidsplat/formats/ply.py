@@ -5,91 +5,91 @@ import warnings
 
 import numpy as np
 
+from fidsplat.defects import drop_report
 from fidsplat.errors import InputError
-from fidsplat.formats.compressed_ply import is_compressed, read_compressed
-from fidsplat.formats.flatten import flatten, not_flat_report
+from fidsplat.formats.collect import BLOCK, Progress, Rows, collect
+from fidsplat.formats.compressed_ply import compressed_rows, is_compressed
+from fidsplat.formats.flatten import not_flat_report
 from fidsplat.formats.ply_header import Element, Header, read_header
 from fidsplat.splats import SplatCloud
 
 ORIGIN_COMMENT = "fidsplat origin"
 """a header comment of this beginning and three numbers holds the origin that x, y, z are relative to"""
-PADDED_LOG_SCALE = np.log(1e-6)
-"""scale_2 of a 2DGS cloud written for tools that want three scales; SuperSplat writes the same"""
 
 _NEEDED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1")
 _NEEDED += ("rot_0", "rot_1", "rot_2", "rot_3")
-# rows that are worked on at a time: their records and results stay in a core's cache, so that walking over
-# them once per property costs no memory traffic
-_BLOCK = 2048
 
 
-def load_ply(path: str | os.PathLike[str]) -> SplatCloud:
+def load_ply(path: str | os.PathLike[str], progress: Progress | None = None) -> SplatCloud:
     """Read a splat file: 2DGS layout (two scales), 3DGS layout (three), or SuperSplat's compressed PLY.
 
     Properties are found by name, in any order and among any others. Three scales become two: the thinnest
     axis of each splat becomes its normal, and one warning says how many splats were not flat. Integer
-    properties ``label`` and ``plane`` are taken up. Colours come as SH of degree 0 to 3.
+    properties ``label`` and ``plane`` are taken up. Colours come as SH of degree 0 to 3. Splats that cannot
+    be drawn are left out while the file is read, as `SplatCloud` does, and one warning counts them.
+
+    progress: called now and then with what is being done and the share of it that is done, 0 to 1.
 
     Raises InputError for a file that is missing, damaged, of another kind, or lacks a property.
     """
     header = read_header(path)
-    fields = read_compressed(header) if is_compressed(header) else _read_plain(header)
-    if fields["scales"].shape[1] == 3:
-        fields = _two_scales(header, fields)
-    for array in fields.values():
-        array.flags.writeable = False  # so that the cloud takes them over without a copy
-    planes = fields.pop("planes", None)
-    if planes is None:
-        return SplatCloud(**fields, source=header.path)
-    # the cloud leaves out splats that cannot be drawn: row numbers in place of labels tell which stayed
-    labels = fields.pop("labels", np.zeros(len(planes), np.int32))
-    cloud = SplatCloud(**fields, labels=np.arange(len(planes), dtype=np.int32), source=header.path)
-    return cloud.with_planes(planes[cloud.labels]).with_labels(labels[cloud.labels])
+    origin = _origin(header)
+    rows = compressed_rows(header) if is_compressed(header) else _plain_rows(header)
+    arrays, dropped = collect(rows, progress)
+    report = not_flat_report(arrays.pop("thickness", np.empty(0)))
+    if dropped:
+        warnings.warn(drop_report(dropped, rows.count, header.path), stacklevel=2)
+    if report:
+        warnings.warn(f"{header.path}: {report}", stacklevel=2)
+    planes = arrays.pop("planes", None)
+    cloud = SplatCloud.of_checked(**arrays, origin=origin, dropped=dropped)
+    return cloud if planes is None else cloud.with_planes(planes)
 
 
-def _read_plain(header: Header) -> dict[str, np.ndarray]:
+def _plain_rows(header: Header) -> Rows:
     element = header.elements.get("vertex")
     if element is None:
         raise InputError(f"{header.path}: the PLY file has no element vertex")
-    degree = _check_properties(header, element)
+    k = (_check_properties(header, element) + 1) ** 2
     names = element.properties
-    n, k = element.count, (degree + 1) ** 2
-    single = np.float32
     wide = any(element.dtype[axis].itemsize == 8 for axis in "xyz")
-    fields = {
-        "means": np.empty((n, 3), np.float64 if wide else single),
-        "quats": np.empty((n, 4), single),
-        "scales": np.empty((n, 3 if "scale_2" in names else 2), single),
-        "opacities": np.empty(n, single),
-        "sh": np.empty((n, k, 3), single),
+    scales = 3 if "scale_2" in names else 2
+    columns = {
+        "means": ((3,), np.float64 if wide else np.float32),
+        "quats": ((4,), np.float32),
+        "scales": ((scales,), np.float32),
+        "opacities": ((), np.float32),
+        "sh": ((k, 3), np.float32),
     }
-    targets = {axis: fields["means"][:, i] for i, axis in enumerate("xyz")}
-    targets |= {f"rot_{i}": fields["quats"][:, i] for i in range(4)}
-    targets |= {f"scale_{i}": fields["scales"][:, i] for i in range(fields["scales"].shape[1])}
-    targets["opacity"] = fields["opacities"]
-    targets |= {f"f_dc_{c}": fields["sh"][:, 0, c] for c in range(3)}
+    # name of a property: the array that it goes to, and where there
+    places: dict[str, tuple] = {axis: ("means", slice(None), i) for i, axis in enumerate("xyz")}
+    places |= {f"rot_{i}": ("quats", slice(None), i) for i in range(4)}
+    places |= {f"scale_{i}": ("scales", slice(None), i) for i in range(scales)}
+    places["opacity"] = ("opacities",)
+    places |= {f"f_dc_{c}": ("sh", slice(None), 0, c) for c in range(3)}
     # the file has all of red's higher bands, then green's, then blue's
-    targets |= {
-        f"f_rest_{c * (k - 1) + i}": fields["sh"][:, 1 + i, c] for c in range(3) for i in range(k - 1)
+    places |= {
+        f"f_rest_{c * (k - 1) + i}": ("sh", slice(None), 1 + i, c) for c in range(3) for i in range(k - 1)
     }
     for name in ("label", "plane"):
         if name in names and np.can_cast(element.dtype[name], np.int32):
-            fields[f"{name}s"] = targets[name] = np.empty(n, np.int32)
-    rows = header.rows("vertex")
-    with np.errstate(over="ignore", invalid="ignore"):
-        for start in range(0, n, _BLOCK):
-            block = rows[start : start + _BLOCK]
-            for name, target in targets.items():
-                target[start : start + _BLOCK] = block[name]
-        np.exp(fields["scales"], out=fields["scales"])
-        _sigmoid(fields["opacities"])
-    if "planes" in fields and fields["planes"].min(initial=-1) < -1:
-        raise InputError(
-            f"{header.path}: the property plane holds {fields['planes'].min()}; it must be an id of at least "
-            "0, or -1 for a splat of no plane"
-        )
-    origin = _origin(header)
-    return fields if origin is None else fields | {"origin": origin}
+            columns[f"{name}s"], places[name] = ((), np.int32), (f"{name}s",)
+
+    def fill(first: int, arrays: dict[str, np.ndarray]) -> None:
+        rows = header.rows("vertex", first, first + len(arrays["means"]))
+        for start in range(0, len(rows), BLOCK):
+            block = rows[start : start + BLOCK]
+            for name, (array, *index) in places.items():
+                arrays[array][start : start + BLOCK][*index] = block[name]
+        np.exp(arrays["scales"], out=arrays["scales"])
+        _sigmoid(arrays["opacities"])
+        if "planes" in arrays and (least := arrays["planes"].min(initial=-1)) < -1:
+            raise InputError(
+                f"{header.path}: the property plane holds {least}; it must be an id of at least 0, or -1 for "
+                "a splat of no plane"
+            )
+
+    return Rows(header.path, element.count, columns, fill)
 
 
 def _check_properties(header: Header, element: Element) -> int:
@@ -117,23 +117,6 @@ def _sigmoid(x: np.ndarray) -> None:
     np.exp(x, out=x)
     x += 1
     np.reciprocal(x, out=x)
-
-
-def _two_scales(header: Header, fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    scales = fields["scales"]
-    # a third scale that is 1e-6 throughout marks a 2DGS cloud: its normal is the third axis even where a
-    # splat's own scales are smaller still
-    if np.allclose(scales[:, 2], np.exp(PADDED_LOG_SCALE), rtol=1e-5, atol=0):
-        return fields | {"scales": scales[:, :2].copy()}
-    quats, two = fields["quats"], np.empty((len(scales), 2), scales.dtype)
-    thickness = np.empty(len(scales), scales.dtype)
-    for start in range(0, len(scales), _BLOCK):
-        part = slice(start, start + _BLOCK)
-        quats[part], two[part], thickness[part] = flatten(quats[part], scales[part])
-    report = not_flat_report(thickness)
-    if report:
-        warnings.warn(f"{header.path}: {report}", stacklevel=3)
-    return fields | {"scales": two}
 
 
 def _origin(header: Header) -> np.ndarray | None:

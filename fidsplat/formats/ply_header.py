@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.errors import InputError
+from fidsplat.files import path_of
 
 MAX_HEADER = 65536
 """bytes; a splat file's header has some 2,000"""
@@ -58,12 +59,13 @@ class Header:
     elements: dict[str, Element]
     comments: tuple[str, ...]
 
-    def rows(self, name: str) -> np.ndarray:
-        """The rows of an element as a read-only structured array (count,), mapped from the file, not read."""
+    def rows(self, name: str, first: int, end: int) -> np.ndarray:
+        """Rows first to end of an element as a read-only structured array, mapped from the file, not read."""
         element = self.elements[name]
-        if element.count == 0:
+        if end <= first:
             return np.zeros(0, element.dtype)
-        mapped = np.memmap(self.path, element.dtype, "r", element.offset, (element.count,))
+        offset = element.offset + first * element.dtype.itemsize
+        mapped = np.memmap(self.path, element.dtype, "r", offset, (end - first,))
         return mapped.view(np.ndarray)  # indexing a memmap costs several times that of an array
 
 
@@ -74,7 +76,7 @@ def read_header(path: str | os.PathLike[str]) -> Header:
     PLY, its header is damaged, longer than 64 KiB or holds a list property, or the file is shorter than its
     header says. Warns when it is longer.
     """
-    file = Path(path)
+    file = path_of(path)
     head, size = _beginning(file)
     lines, start = _lines(file, head)
     counts: dict[str, int] = {}

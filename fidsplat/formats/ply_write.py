@@ -6,7 +6,8 @@ import numpy as np
 
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
-from fidsplat.formats.ply import ORIGIN_COMMENT, PADDED_LOG_SCALE
+from fidsplat.formats.collect import PADDED_LOG_SCALE
+from fidsplat.formats.ply import ORIGIN_COMMENT
 from fidsplat.harmonics import C0
 from fidsplat.splats import SplatCloud
 
@@ -26,6 +27,10 @@ def save_ply(cloud: SplatCloud, path: str | os.PathLike[str], native_2dgs: bool 
     Raises InputError when the file cannot be written, or when the cloud has boxes, which the format does not;
     an older file of that name is then left as it was.
     """
+    if not isinstance(cloud, SplatCloud):
+        raise InputError(f"save_ply writes a SplatCloud, not a {type(cloud).__name__}")
+    if not isinstance(native_2dgs, bool):
+        raise InputError(f"native_2dgs is {native_2dgs!r}; it must be True or False")
     if cloud.boxes is not None:
         raise InputError(
             f"{int(cloud.boxes.sum())} of {len(cloud)} splats are boxes, which a PLY file cannot hold; write "

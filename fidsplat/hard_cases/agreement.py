@@ -13,12 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.base import View
+from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference import ReferenceBackend
+from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
-from fidsplat.effects import select
+from fidsplat.capture import Capture
+from fidsplat.effects import FeatureSet
 from fidsplat.quality import Quality
-from fidsplat.render import Renderer
+from fidsplat.render import Frame, Renderer
 from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
 from fidsplat.surroundings import Background, Fog
@@ -65,10 +67,20 @@ class Picture:
     sensor: Sensor | None = None
     fog: Fog | None = None
 
+    @property
+    def capture(self) -> Capture:
+        """How it is taken."""
+        sensor = self.sensor or Sensor()
+        return Capture(self.camera, self.outputs, self.quality, self.background, sensor=sensor, fog=self.fog)
+
+    def prepared(self, *more: str) -> tuple[FeatureSet, View]:
+        """What a backend draws, with these outputs too."""
+        return prepare(self.cloud, self.capture.with_(outputs=(*self.outputs, *more)))
+
 
 @dataclass(frozen=True)
 class Difference:
-    """One plane of one picture against the reference. Errors are absolute for rgb, alpha and normals,
+    """One output of one picture against the reference. Errors are absolute for rgb, alpha and normals,
     relative for depth; for median depth and labels they are the share of pixels that differ.
     """
 
@@ -88,37 +100,39 @@ class Difference:
 
     @property
     def agrees(self) -> bool:
-        """Whether the plane is as it should be."""
+        """Whether the output is as it should be."""
         return self.finite and self.excess <= 0 and self.risky < RARE
 
 
+def draw(renderer: Renderer, picture: Picture) -> Frame:
+    """The picture on a device."""
+    return renderer.render(picture.cloud, picture.capture)
+
+
 def truth_of(picture: Picture, pixels: tuple[np.ndarray, np.ndarray] | None = None) -> dict[str, np.ndarray]:
-    """The reference's planes with `alpha` and `certificate`: whole, or (k, ...) at pixels (rows, columns)."""
-    judge = ReferenceBackend()
-    around = {"sensor": picture.sensor, "fog": picture.fog, "background": picture.background}
-    outputs = (*picture.outputs, "alpha")
-    features = select(picture.cloud, outputs, picture.quality, picture.camera, **around)
-    view = View.of(picture.camera, picture.quality, picture.cloud.origin, **around)
-    pipeline, resident = judge.pipeline(features), judge.upload(picture.cloud)
+    """The reference's images with `alpha` and `certificate`: whole, or (k, ...) at pixels (rows, columns)."""
+    reference = ReferenceBackend()
+    features, view = picture.prepared("alpha")
+    pipeline, resident = reference.pipeline(features), reference.upload(picture.cloud)
     if pixels is not None:
         return pipeline.pixels(resident, view, *pixels)
-    return pipeline.render(resident, view).planes
+    return pipeline.render(resident, view).images
 
 
-def compare(planes: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], outputs) -> list[Difference]:
-    """Planes of a device against those of `truth_of`, for each of `outputs`."""
+def compare(images: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], outputs) -> list[Difference]:
+    """Images of a device against those of `truth_of`, for each of `outputs`."""
     risk = truth["certificate"]
     brightest = max(1.0, float(np.abs(truth["rgb"]).max(initial=1.0)))
     risky = float((risk > RISKY).mean())
-    differences = []
+    found = []
     for name in outputs:
-        plane, want = planes[name], truth[name]
-        error = np.abs(plane - want)
+        image, want = images[name], truth[name]
+        error = np.abs(image - want)
         if error.ndim > risk.ndim:
             error = error.max(-1)
         if TOLERANCE[name] == 0:
             error = error > (
-                DEPTH_TOLERANCE * want if name.startswith("d") else truth.get(f"{name}_doubt", 0)
+                DEPTH_TOLERANCE * want if name.startswith("d") else truth.get(f"{name}_bound", 0)
             )
             worst = float(error.mean())
             beyond = float((error & ~truth.get(f"{name}_may_flip", np.zeros(error.shape, bool))).mean())
@@ -133,20 +147,11 @@ def compare(planes: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], o
             size = np.maximum(np.abs(want), 1e-30) if name in ("depth", "distance") else 1.0
             worst = float((error / size).max(initial=0.0))
             beyond = float(((error - certified) / size).max(initial=0.0))
-        excess, finite = beyond - TOLERANCE[name], bool(np.isfinite(plane).all())
-        differences.append(Difference(name, worst, excess, risky, finite))
-    return differences
+        excess, finite = beyond - TOLERANCE[name], bool(np.isfinite(image).all())
+        found.append(Difference(name, worst, excess, risky, finite))
+    return found
 
 
-def judge(renderer: Renderer, picture: Picture) -> list[Difference]:
+def against_reference(renderer: Renderer, picture: Picture) -> list[Difference]:
     """Draw a picture on a device and compare every output with the reference."""
-    frame = renderer.render(
-        picture.cloud,
-        picture.camera,
-        outputs=picture.outputs,
-        quality=picture.quality,
-        background=picture.background,
-        sensor=picture.sensor,
-        fog=picture.fog,
-    )
-    return compare(frame, truth_of(picture), picture.outputs)
+    return compare(draw(renderer, picture), truth_of(picture), picture.outputs)

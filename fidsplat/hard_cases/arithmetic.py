@@ -4,10 +4,10 @@ uses: the library's functions, and our own short ones (`Quality.arithmetic`)."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib import import_module
 
 import numpy as np
 
+from fidsplat.backends.base import ProbesArithmetic
 from fidsplat.hard_cases.case import Finding
 from fidsplat.random_clouds import log_uniform
 from fidsplat.render import Renderer
@@ -47,7 +47,8 @@ class Arithmetic:
 
 
 def measure(renderer: Renderer, seed: int = 0) -> Arithmetic | None:
-    """Measure a device on a quarter of a million arguments of each function; None for the reference.
+    """Measure a device on a quarter of a million arguments of each function; None for one that runs no
+    functions alone, as the reference.
 
     exp of -14 to 0 (1e-6, the least cut-off of a preset, to 1), log of 2^-24 to 1 (transmittances), quotients
     of 1e-9 to 1e9 by the same, roots of the same.
@@ -55,18 +56,16 @@ def measure(renderer: Renderer, seed: int = 0) -> Arithmetic | None:
     Raises:
         DeviceError: the device cannot compile or run the kernels.
     """
-    if renderer.device.platform == "reference":
+    backend = renderer.backend
+    if not isinstance(backend, ProbesArithmetic):
         return None
-    family = renderer.device.name.split(":")[0]
-    run_arithmetic = import_module(f"fidsplat.backends.{family}.arithmetic").run_arithmetic
-
     generator = np.random.default_rng(seed)
     exponents = generator.uniform(-14, 0, _COUNT).astype(np.float32).astype(float)
     shares = log_uniform(generator, 2.0**-24, 1.0, _COUNT).astype(np.float32).astype(float)
     above, below = (
         log_uniform(generator, 1e-9, 1e9, _COUNT).astype(np.float32).astype(float) for _ in range(2)
     )
-    got = run_arithmetic(renderer.backend, exponents, shares, above, below)
+    got = backend.run_arithmetic(exponents, shares, above, below)
     wide_above, wide_below = above.astype(np.longdouble), below.astype(np.longdouble)
     truth = {
         "exp": np.exp(exponents),

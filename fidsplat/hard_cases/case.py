@@ -1,10 +1,9 @@
-"""A hard case: a name of the catalogue (numerics.md, A1 to F6), its trigger, and pictures or checks that must
-hold.
-"""
+"""A hard case: a name of the catalogue (numerics.md, A1 to F6), its trigger, and pictures and numbers that
+must hold."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from fidsplat.hard_cases.agreement import Picture
@@ -13,7 +12,7 @@ from fidsplat.render import Renderer
 
 @dataclass(frozen=True)
 class Finding:
-    """One number that a check measured, and what it may be at most."""
+    """One number that a case measured, and what it may be at most."""
 
     what: str
     value: float
@@ -23,6 +22,9 @@ class Finding:
     def holds(self) -> bool:
         """False for a NaN too."""
         return self.value <= self.bound
+
+
+Found = Iterator[Picture | Finding]
 
 
 @dataclass(frozen=True)
@@ -36,11 +38,20 @@ class Case:
     title: str
     trigger: str
     """the values that bring it about, in words"""
-    pictures: Callable[[], Iterable[Picture]] | None = None
-    check: Callable[[Renderer], Iterable[Finding]] | None = None
-    """properties that are no picture against the reference: invariances, counts, monotony"""
+    run: Callable[[Renderer], Found]
+    """pictures to compare with the reference, and properties that are no picture: invariances, counts,
+    monotony"""
 
-    @property
-    def group(self) -> str:
-        """A to F."""
-        return self.name[0]
+
+CASES: list[Case] = []
+"""those of the modules that have been imported; `catalogue` imports all"""
+
+
+def case(name: str, title: str, trigger: str) -> Callable[[Callable[[Renderer], Found]], Callable]:
+    """Enters a function into the catalogue."""
+
+    def enter(run: Callable[[Renderer], Found]) -> Callable[[Renderer], Found]:
+        CASES.append(Case(name, title, trigger, run))
+        return run
+
+    return enter

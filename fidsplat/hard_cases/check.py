@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
 from fidsplat.backends.base import DeviceInfo
 from fidsplat.errors import DeviceError
-from fidsplat.hard_cases import GROUPS
-from fidsplat.hard_cases.agreement import TOLERANCE, Difference, Picture, compare, truth_of
+from fidsplat.hard_cases.agreement import TOLERANCE, Difference, Picture, compare, draw, truth_of
 from fidsplat.hard_cases.arithmetic import Arithmetic, measure
 from fidsplat.hard_cases.case import Case, Finding
-from fidsplat.hard_cases.invariance import draw
 from fidsplat.render import Renderer
 
 
@@ -32,20 +30,20 @@ class Worst:
     """whether it fails, and its largest error"""
 
 
-@dataclass(frozen=True)
+@dataclass
 class CaseResult:
     """One case on one device."""
 
     case: Case
-    pictures: int
-    uncertified: dict[str, float]
+    pictures: int = 0
+    uncertified: dict[str, float] = field(default_factory=dict)
     """output -> largest error beyond the certificate"""
-    largest: dict[str, float]
+    largest: dict[str, float] = field(default_factory=dict)
     """output -> largest error, certified ones included"""
-    findings: tuple[Finding, ...]
-    wrong: tuple[str, ...]
+    findings: list[Finding] = field(default_factory=list)
+    wrong: list[str] = field(default_factory=list)
     """what does not hold, in words; empty when all of it does"""
-    seconds: float
+    seconds: float = 0.0
 
     @property
     def passed(self) -> bool:
@@ -54,52 +52,20 @@ class CaseResult:
 
 
 @dataclass(frozen=True)
-class GroupResult:
-    """The cases of one letter."""
-
-    letter: str
-    cases: tuple[CaseResult, ...]
-
-    @property
-    def title(self) -> str:
-        """What the group is about."""
-        return GROUPS[self.letter]
-
-    @property
-    def pictures(self) -> int:
-        """Pictures compared with the reference."""
-        return sum(case.pictures for case in self.cases)
-
-    @property
-    def passed(self) -> bool:
-        """Whether all its cases do."""
-        return all(case.passed for case in self.cases)
-
-    def error(self, kind: str, *outputs: str) -> float | None:
-        """Largest `uncertified` or `largest` error of these outputs; None without a picture."""
-        errors = [getattr(case, kind) for case in self.cases]
-        values = [case[name] for case in errors for name in outputs if name in case]
-        return max(values, key=_rank) if values else None
-
-
-@dataclass(frozen=True)
 class CheckResult:
     """What a device's self-test found."""
 
     device: DeviceInfo
     arithmetic: Arithmetic | None
-    cases: tuple[CaseResult, ...]
+    cases: list[CaseResult]
     worst: Worst | None
     seconds: float
 
     @property
-    def groups(self) -> list[GroupResult]:
+    def groups(self) -> dict[str, list[CaseResult]]:
         """The cases by letter."""
-        return [
-            GroupResult(letter, chosen)
-            for letter in GROUPS
-            if (chosen := tuple(case for case in self.cases if case.case.group == letter))
-        ]
+        letters = dict.fromkeys(result.case.name[0] for result in self.cases)
+        return {letter: [one for one in self.cases if one.case.name[0] == letter] for letter in letters}
 
     @property
     def failures(self) -> list[str]:
@@ -138,10 +104,7 @@ class CheckResult:
                     "pictures": result.pictures,
                     "uncertified_error": result.uncertified,
                     "largest_error": result.largest,
-                    "findings": [
-                        {"what": f.what, "value": f.value, "bound": f.bound, "holds": f.holds}
-                        for f in result.findings
-                    ],
+                    "findings": [asdict(found) | {"holds": found.holds} for found in result.findings],
                     "seconds": result.seconds,
                 }
                 for result in self.cases
@@ -155,71 +118,56 @@ def run_check(
     """Run cases on a device. What the device cannot do at all fails its case; the others go on.
 
     Args:
-        tell: is told what is being done, before each case.
+        tell: called with what is being done, before each case.
     """
     begun = time.perf_counter()
     tell("arithmetic")
     arithmetic = measure(renderer)
-    results, seen = [], _Seen()
+    results: list[CaseResult] = []
+    worst: Worst | None = None
     for case in cases:
         tell(f"{case.name}: {case.title}")
-        results.append(run_case(renderer, case, seen))
-    seconds = time.perf_counter() - begun
-    return CheckResult(renderer.device, arithmetic, tuple(results), seen.worst, seconds)
+        result, worst = run_case(renderer, case, worst)
+        results.append(result)
+    return CheckResult(renderer.device, arithmetic, results, worst, time.perf_counter() - begun)
 
 
-@dataclass
-class _Seen:
-    """The worst picture so far."""
+def run_case(renderer: Renderer, case: Case, worst: Worst | None = None) -> tuple[CaseResult, Worst | None]:
+    """Run one case on a device; returns what it found, and the worst of `worst` and its own pictures."""
+    begun = time.perf_counter()
+    result = CaseResult(case)
+    try:
+        for found in case.run(renderer):
+            if isinstance(found, Picture):
+                result.pictures += 1
+                worst = _compared(renderer, found, result, worst)
+            else:
+                result.findings.append(found)
+                if not found.holds:
+                    result.wrong.append(f"{found.what} is {found.value:.3g}, above {found.bound:.3g}")
+    except DeviceError as error:
+        result.wrong.append(str(error))
+    result.seconds = time.perf_counter() - begun
+    return result, worst
 
-    worst: Worst | None = None
 
-    def add(self, title: str, frame, truth: dict, difference: Difference) -> None:
-        """A plane of a picture; kept if it is worse than all before."""
-        rank = not difference.agrees, _rank(difference.error)
+def _compared(renderer: Renderer, picture: Picture, result: CaseResult, worst: Worst | None) -> Worst | None:
+    frame, truth = draw(renderer, picture), truth_of(picture)
+    for difference in compare(frame, truth, picture.outputs):
+        name = difference.output
+        raise_to(result.uncertified, name, difference.uncertified)
+        raise_to(result.largest, name, difference.error)
+        if not difference.agrees:
+            result.wrong.append(_in_words(result.pictures, difference))
+        rank = not difference.agrees, rank_of(difference.error)
         # what agrees is shown if it can be seen
-        seen = difference.output in ("rgb", "alpha") or rank[0]
-        if seen and (self.worst is None or rank > self.worst.rank):
-            words = f"{title}, {difference.output}: wrong by {difference.error:.0e}"
+        seen = "rgb" in picture.outputs and (name in ("rgb", "alpha") or rank[0])
+        if seen and (worst is None or rank > worst.rank):
+            words = f"{result.case.name}, picture {result.pictures}, {name}: wrong by {difference.error:.0e}"
             words += f", uncertified {difference.uncertified:.0e}"
             rgb = np.array(frame["rgb"], dtype=np.float64)
-            self.worst = Worst(words, rgb, truth["rgb"], truth["certificate"], rank)
-
-
-def run_case(renderer: Renderer, case: Case, seen: _Seen | None = None) -> CaseResult:
-    """Run one case on a device."""
-    begun = time.perf_counter()
-    uncertified: dict[str, float] = {}
-    largest: dict[str, float] = {}
-    wrong: list[str] = []
-    findings: list[Finding] = []
-    count = 0
-    try:
-        for count, picture in enumerate(case.pictures() if case.pictures else (), start=1):
-            title = f"{case.name}, picture {count}"
-            for difference in _differences(renderer, picture, title, seen):
-                name = difference.output
-                uncertified[name] = max(uncertified.get(name, 0.0), difference.uncertified, key=_rank)
-                largest[name] = max(largest.get(name, 0.0), difference.error, key=_rank)
-                if not difference.agrees:
-                    wrong.append(_in_words(count, difference))
-        for finding in case.check(renderer) if case.check else ():
-            findings.append(finding)
-            if not finding.holds:
-                wrong.append(f"{finding.what} is {finding.value:.3g}, above {finding.bound:.3g}")
-    except DeviceError as error:
-        wrong.append(str(error))
-    seconds = time.perf_counter() - begun
-    return CaseResult(case, count, uncertified, largest, tuple(findings), tuple(wrong), seconds)
-
-
-def _differences(renderer: Renderer, picture: Picture, title: str, seen: _Seen | None) -> list[Difference]:
-    frame, truth = draw(renderer, picture), truth_of(picture)
-    differences = compare(frame, truth, picture.outputs)
-    if seen is not None and "rgb" in picture.outputs:
-        for difference in differences:
-            seen.add(title, frame, truth, difference)
-    return differences
+            worst = Worst(words, rgb, truth["rgb"], truth["certificate"], rank)
+    return worst
 
 
 def worst_picture(worst: Worst) -> np.ndarray:
@@ -243,17 +191,22 @@ def worst_picture(worst: Worst) -> np.ndarray:
 
 
 def _in_words(number: int, difference: Difference) -> str:
-    plane = f"picture {number}, {difference.output}"
+    image = f"picture {number}, {difference.output}"
     if not difference.finite:
-        return f"{plane} holds values that are not finite"
+        return f"{image} holds values that are not finite"
     if difference.excess > 0:
         return (
-            f"{plane} is wrong by {difference.uncertified:.1e} beyond its certificate, above "
+            f"{image} is wrong by {difference.uncertified:.1e} beyond its certificate, above "
             f"{TOLERANCE[difference.output]:.0e}"
         )
-    return f"{plane}: {difference.risky:.1%} of the pixels have certificates above 0.05"
+    return f"{image}: {difference.risky:.1%} of the pixels have certificates above 0.05"
 
 
-def _rank(value: float) -> float:
+def raise_to(largest: dict[str, float], name: str, value: float) -> None:
+    """Keep the larger of what stands under a name and a value."""
+    largest[name] = max(largest.get(name, 0.0), value, key=rank_of)
+
+
+def rank_of(value: float) -> float:
     """A NaN is worse than anything."""
     return float("inf") if np.isnan(value) else value

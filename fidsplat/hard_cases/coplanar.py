@@ -8,9 +8,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.hard_cases.agreement import CATALOGUED, Picture
+from fidsplat.hard_cases.agreement import CATALOGUED, Picture, draw
 from fidsplat.hard_cases.clouds import quaternion, splats, turned
-from fidsplat.hard_cases.invariance import draw
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer
 from fidsplat.rotations import quaternion_to_matrix

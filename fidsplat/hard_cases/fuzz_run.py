@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from collections.abc import Iterator
@@ -11,12 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat import __version__
 from fidsplat.files import atomic_write
 from fidsplat.hard_cases import fuzz
-from fidsplat.hard_cases.agreement import ALL_OUTPUTS, RARE, RISKY, compare, truth_of
-from fidsplat.hard_cases.invariance import draw
-from fidsplat.kernel_files import kernels_folder
+from fidsplat.hard_cases.agreement import ALL_OUTPUTS, RARE, RISKY, compare, draw, truth_of
+from fidsplat.provenance import code_hash
 from fidsplat.render import Renderer
 
 _SAVE_EVERY = 5.0  # seconds
@@ -27,7 +24,7 @@ class FuzzState:
     """Figures over all scenes from seed 0 to `scenes` - 1."""
 
     key: str
-    """device, driver, version, kernels and distribution that they hold for"""
+    """device, driver and sources that they hold for"""
     scenes: int = 0
     splats: int = 0
     pixels: int = 0
@@ -89,11 +86,8 @@ def fuzz_run(renderer: Renderer, splats: int, file: Path | None = None) -> Itera
 
 
 def _key(renderer: Renderer) -> str:
-    code = hashlib.sha256(Path(fuzz.__file__).read_bytes())
-    for path in sorted([*kernels_folder().rglob("*.cl"), *kernels_folder().rglob("*.py")]):
-        code.update(path.read_bytes())
     device = renderer.device
-    return " | ".join((device.title, device.platform, device.version, __version__, code.hexdigest()[:16]))
+    return " | ".join((device.title, device.platform, device.version, code_hash()))
 
 
 def _load(file: Path | None, key: str) -> FuzzState:

@@ -8,9 +8,8 @@ import math
 
 import numpy as np
 
-from fidsplat.hard_cases.agreement import Picture, truth_of
+from fidsplat.hard_cases.agreement import Picture, draw, truth_of
 from fidsplat.hard_cases.clouds import camera, quaternion, splats
-from fidsplat.hard_cases.invariance import draw
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer
 
@@ -69,7 +68,7 @@ def _tilted(generator: np.random.Generator, ray: np.ndarray, tilt: float, flatne
     w = -(along @ ray[:2]) / (ray @ ray)
     tangent = np.array([*(along + ray[:2] * w), w])
     tangent /= np.linalg.norm(tangent)
-    sight = ray / np.linalg.norm(ray)
+    along = ray / np.linalg.norm(ray)
     angle = math.radians(tilt)
-    normal = math.cos(angle) * sight + math.sin(angle) * np.cross(tangent, sight)
+    normal = math.cos(angle) * along + math.sin(angle) * np.cross(tangent, along)
     return quaternion(tangent, np.cross(normal, tangent))

@@ -20,7 +20,7 @@ from fidsplat.markers.mixture import (
     fitted_templates,
     paper_template,
 )
-from fidsplat.markers.partition import least_rectangles, partition
+from fidsplat.markers.partition import least_rectangles, partition_colors
 from fidsplat.markers.printing import (
     MAX_SPLATS,
     Printed,
@@ -32,11 +32,11 @@ from fidsplat.markers.printing import (
 )
 from fidsplat.markers.regions import label_components, polygons
 from fidsplat.quality import MIXTURES, MarkerQuality, whole_number
+from fidsplat.scalars import PickledByFields
 
 if TYPE_CHECKING:
     from shapely import Polygon
-
-    from fidsplat.splats import SplatCloud
+from fidsplat.splats import SplatCloud
 
 MAX_MODULES = 4096
 """Longest edge of a grid with its quiet zone."""
@@ -53,22 +53,22 @@ class Rectangle(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Marker:
+class Marker(PickledByFields):
     """A fiducial marker and the splats that show it, made by `marker`."""
 
     spec: str
     """the text that it was made from"""
     kind: str
-    """name of its kind: "apriltag", "aruco", "qr", "image", "charuco", "gridboard", "aprilgrid", or of one
-    that was registered"""
+    """name of its kind: "apriltag", "aruco", "qr", "image", "svg", "charuco", "gridboard", "aprilgrid", or
+    of one that was registered"""
     family: str | None
-    """tag family, of a board too, e.g. "36h11"; QR version and level, e.g. "v5-L"; None for an image"""
+    """tag family, of a board too, e.g. "36h11"; QR version and level, e.g. "v5-L"; None for pictures"""
     id: int | None
     """tag id, None for all but tags"""
     payload: str | None
-    """text of a QR code, path of an image, None for tags and boards"""
+    """text of a QR code, path of an image or a drawing, None for tags and boards"""
     bits: np.ndarray
-    """(h, w) uint8, 1 = dark, the code alone"""
+    """(h, w) uint8, 1 = dark, the code alone; of a drawing indices into ``palette``"""
     quiet_zone: int
     """modules of white around the code"""
     size: float
@@ -84,7 +84,9 @@ class Marker:
     labels: np.ndarray = field(repr=False)
     """(H, W) int32, the 4-connected component of each module of the grid"""
     components: int
-    """number of components, both colours"""
+    """number of components, all colours"""
+    palette: np.ndarray = field(repr=False)
+    """(k, 3) float32 RGB, colours of the grid's values: white and black, or a drawing's, paper first"""
     cloud: SplatCloud = field(repr=False)
     """the splats in the marker's frame: plane z = 0, x right, y down as printed, origin at the code's
     centre
@@ -117,14 +119,19 @@ class Marker:
         count = int(count_gaussians(aspect_of(self.boxes), templates).sum())
         refuse_more(f"as Gaussians {self.spec}", count, self.max_splats)
         return gaussian_cloud(
-            Printed(self.grid, self.boxes, self.module), templates, fitted_growth(), _unseen
+            Printed(self.grid, self.boxes, self.module, self.palette), templates, fitted_growth(), _unseen
         )
 
     @cached_property
     def rectangles(self) -> list[Rectangle]:
-        """The minimum partition of every component of both colours, in raster order."""
-        dark = self.grid[self.boxes[:, 1], self.boxes[:, 0]] == 1
+        """The minimum partition of every component of each colour, in raster order."""
+        dark = self.is_dark
         return [Rectangle(*row) for row in zip(*self.boxes.T.tolist(), dark.tolist(), strict=True)]
+
+    @property
+    def is_dark(self) -> np.ndarray:
+        """(n,) bool, the rectangles that are nearer to black than to white."""
+        return (self.palette.mean(1) < 0.5)[self.grid[self.boxes[:, 1], self.boxes[:, 0]]]
 
     @cached_property
     def polygons(self) -> list[Polygon]:
@@ -159,16 +166,17 @@ def marker(
     """Make a marker of splats.
 
     Args:
-        spec: apriltag:36h11:5, aruco:4x4_50:7, qr:TEXT, qr-v22-L:TEXT, image:FILE.png, charuco:7x5:4x4_50,
-            gridboard:5x7:4x4_50, aprilgrid:6x6:36h11, or of a kind that was registered.
-        size: metres, edge of the code itself, quiet zone not counted (the width of a board or an image).
+        spec: apriltag:36h11:5, aruco:4x4_50:7, qr:TEXT, qr-v22-L:TEXT, image:FILE.png, svg:FILE.svg,
+            charuco:7x5:4x4_50, gridboard:5x7:4x4_50, aprilgrid:6x6:36h11, or of a kind that was registered.
+        size: metres, edge of the code itself, quiet zone not counted (the width of a board or a picture).
         mixture: "exact" (default), one box for each rectangle, which only this renderer draws
             (`SplatCloud.with_boxes`; `Marker.gaussians` are for others and for files); "fitted" or "paper":
             Gaussians.
-        quiet_zone: modules of white around it; default 1 for tags, 4 for QR, 2 for boards, 0 for images.
+        quiet_zone: modules of white around it; default 1 for tags, 4 for QR, 2 for boards, 0 for images and
+            drawings.
         levels, density, duplicates: of the mixture `paper` only, see `paper_template`; default 4, 3, False.
         template: of the mixtures `fitted` and (for `Marker.gaussians`) `exact` only: Gaussians of a
-            rectangle, 1, 5, 9, 13, 25 or 41; default 25.
+            rectangle, 1, 5, 9, 13, 25, 41 or 562; default 25.
         growth: modules, 0 to 1, by which a rectangle reaches into its own colour beyond a side that is wholly
             shared with it, against seams; default what the fitted templates were optimised with, and 0 for
             paper.
@@ -186,6 +194,8 @@ def marker(
     max_splats = whole_number("max_splats", max_splats, 1, 2**31 - 1)
     parsed = parse_spec(spec)
     given = {"levels": levels, "density": density, "growth": growth, "template": template}
+    if not isinstance(duplicates, bool | None):
+        raise InputError(f"duplicates is {duplicates!r}; it must be True or False")
     chosen = _chosen(MarkerQuality() if quality is None else quality, mixture, duplicates, given)
     exact = chosen.mixture == "exact"
     templates, growth = _mixture(chosen, bool(duplicates))
@@ -201,16 +211,18 @@ def marker(
 
     grid = np.pad(bits, quiet)
     each = 1 if exact else min(len(template.gaussians) for template in templates)
-    refuse_more(spec, least_rectangles(grid) * each, max_splats, "at least ")
+    palette = np.array(parsed.colors or ((1, 1, 1), (0, 0, 0)), np.float32)
+    if len(palette) == 2:
+        refuse_more(spec, least_rectangles(grid) * each, max_splats, "at least ")
     progress("components", 0.0)
     labels, components = label_components(grid)
     progress("rectangles", 0.0)
-    boxes = partition(grid)
+    boxes = partition_colors(grid)
     count = len(boxes) if exact else int(count_gaussians(aspect_of(boxes), templates).sum())
     refuse_more(spec, count, max_splats)
-    printed = Printed(grid, boxes, size / bits.shape[1])
+    printed = Printed(grid, boxes, size / bits.shape[1], palette)
     cloud = box_cloud(printed, progress) if exact else gaussian_cloud(printed, templates, growth, progress)
-    for array in (bits, grid, boxes, labels):
+    for array in (bits, grid, boxes, labels, palette):
         array.flags.writeable = False
     return Marker(
         spec=spec,
@@ -227,6 +239,7 @@ def marker(
         boxes=boxes,
         labels=labels,
         components=components,
+        palette=palette,
         cloud=cloud,
         seconds=time.perf_counter() - start,
         max_splats=max_splats,
@@ -246,7 +259,7 @@ def _chosen(
             f"quality is {quality!r}; it must be an fs.MarkerQuality, e.g. fs.Quality(...).marker"
         )
     name = quality.mixture if mixture is None else mixture
-    if name not in MIXTURES:
+    if not isinstance(name, str) or name not in MIXTURES:
         raise InputError(f"unknown mixture {name!r}; known: {', '.join(MIXTURES)}")
     given = {key: value for key, value in given.items() if value is not None}
     of_paper = [key for key in ("levels", "density") if key in given]

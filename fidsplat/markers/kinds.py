@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.markers import boards, images, qr, tags
+from fidsplat.markers import boards, drawing, images, qr, tags
 from fidsplat.markers.spec import Kind, Spec
 
-_kinds = {kind.name: kind for module in (tags, qr, images, boards) for kind in module.KINDS}
+_kinds = {kind.name: kind for module in (tags, qr, images, drawing, boards) for kind in module.KINDS}
 
 
 def register(kind: Kind) -> None:
@@ -35,7 +35,7 @@ def kind_of(spec: Spec) -> Kind:
 
 def parse_spec(text: str) -> Spec:
     """Take a marker spec apart: apriltag:36h11:5, aruco:4x4_50:7, qr:TEXT, qr-v22-L:TEXT, image:FILE.png,
-    charuco:7x5:4x4_50, gridboard:5x7:4x4_50, aprilgrid:6x6:36h11.
+    svg:FILE.svg, charuco:7x5:4x4_50, gridboard:5x7:4x4_50, aprilgrid:6x6:36h11.
 
     A QR spec may leave out version (the smallest that holds the text) or level (L).
 

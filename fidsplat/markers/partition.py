@@ -152,6 +152,19 @@ def partition(grid: np.ndarray) -> np.ndarray:
     return np.stack([x0, y0, x1, y1], 1)
 
 
+def partition_colors(grid: np.ndarray) -> np.ndarray:
+    """The same as `partition` for an (h, w) uint8 grid of any number of colours."""
+    if grid.max() <= 1:
+        return partition(grid)
+    boxes = []
+    for color in np.unique(grid):
+        own = (grid == color).astype(np.uint8)
+        cut = partition(own)
+        boxes.append(cut[own[cut[:, 1], cut[:, 0]] == 1])
+    found = np.concatenate(boxes)
+    return found[np.lexsort((found[:, 0], found[:, 1]))]
+
+
 def _unit_edges(line: np.ndarray, start: np.ndarray, stop: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The unit edges of segments on grid lines: their lines and their positions along them."""
     length = stop - start

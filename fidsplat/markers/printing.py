@@ -26,11 +26,13 @@ class Printed(NamedTuple):
     """The rectangles of a marker, where they are printed."""
 
     grid: np.ndarray
-    """(H, W) uint8, 1 = dark"""
+    """(H, W) uint8, values of modules"""
     boxes: np.ndarray
     """(n, 4) int64 x0, y0, x1, y1 in modules"""
     module: float
     """metres"""
+    palette: np.ndarray
+    """(k, 3) float32, colours of the values"""
 
 
 def refuse_more(spec: str, least: int, max_splats: int, words: str = "") -> None:
@@ -66,7 +68,7 @@ def gaussian_cloud(
 ) -> SplatCloud:
     """The Gaussians of a mixture."""
     boxes, aspect = printed.boxes, aspect_of(printed.boxes)
-    grown = grow(printed.grid, boxes, growth)
+    grown = _grown(printed, growth)
     ends = np.cumsum(count_gaussians(aspect, templates))
     total = int(ends[-1])
 
@@ -82,6 +84,18 @@ def gaussian_cloud(
     return _cloud(printed, total, parts(), progress)
 
 
+def _grown(printed: Printed, growth: float) -> np.ndarray:
+    """`grow`, which knows one colour and another, for each of a drawing's."""
+    grid, boxes = printed.grid, printed.boxes
+    if len(printed.palette) <= 2:
+        return grow(grid, boxes, growth)
+    values, grown = grid[boxes[:, 1], boxes[:, 0]], boxes.astype(np.float64)
+    for value in np.unique(values):
+        own = values == value
+        grown[own] = grow((grid == value).astype(np.uint8), boxes[own], growth)
+    return grown
+
+
 def _cloud(
     printed: Printed, total: int, parts: Iterator[tuple[np.ndarray, np.ndarray]], progress: Progress
 ) -> SplatCloud:
@@ -90,8 +104,8 @@ def _cloud(
     parts: rows (m, 5) of place and scale in modules and opacity, and (m,) the rectangle of each; ``total`` in
     all. They are filled in part by part, so that memory stays near that of the cloud.
     """
-    grid, boxes, module = printed
-    light = 1 - grid[boxes[:, 1], boxes[:, 0]].astype(np.float32)
+    grid, boxes, module, palette = printed
+    values = grid[boxes[:, 1], boxes[:, 0]]
     means, scales = np.zeros((total, 3), np.float32), np.empty((total, 2), np.float32)
     opacities, colors = np.empty(total, np.float32), np.empty((total, 3), np.float32)
     quats = np.zeros((total, 4), np.float32)
@@ -104,7 +118,7 @@ def _cloud(
         means[at, :2] = (rows[:, :2] - middle) * module
         scales[at] = rows[:, 2:4] * module
         opacities[at] = rows[:, 4]
-        colors[at] = light[owner, None]
+        colors[at] = palette[values[owner]]
         done = at.stop
     arrays = (means, quats, scales, opacities, colors)
     for array in arrays:

@@ -22,7 +22,9 @@ class Spec:
     id: int | None = None
     """tag id"""
     payload: str | None = None
-    """QR text, or the path of an image"""
+    """QR text, or the path of an image or a drawing"""
+    colors: tuple[tuple[float, float, float], ...] | None = None
+    """RGB of modules of the values 0, 1, ..., once they are made; None: white and black"""
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,6 @@ class Kind:
     """called with the spec, what stands before its first colon and what behind it; raises InputError"""
     bits: Callable[[Any], tuple[Spec, np.ndarray]]
     """called with what ``parse`` gave; returns it, its family set, and the modules without quiet zone,
-    (h, w) uint8, 1 = dark; raises InputError"""
+    (h, w) uint8, 1 = dark or an index into the spec's colours; raises InputError"""
     is_file: bool = False
     """whether what stands behind the colon names a file, relative to the scene file that says it"""

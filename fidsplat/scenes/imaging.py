@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 
 from fidsplat.errors import InputError
-from fidsplat.scenes.scene import Scene
+from fidsplat.scenes.parts import SceneParts
 from fidsplat.scenes.table import Table
 from fidsplat.sensor import Sensor
 from fidsplat.surroundings import Fog, Gradient, Panorama
@@ -67,7 +67,7 @@ def read_background(top: Table, folder: Path) -> Gradient | Panorama | None:
         )
 
 
-def imaging_tables(scene: Scene, folder: Path) -> dict[str, dict]:
+def imaging_tables(scene: SceneParts, folder: Path) -> dict[str, dict]:
     """Tables by name that say a scene's sensor, fog and background. Raises InputError for a panorama that
     came from no file.
     """

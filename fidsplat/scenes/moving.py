@@ -10,7 +10,7 @@ from fidsplat.errors import InputError
 from fidsplat.rotations import matrix_to_quaternion
 from fidsplat.scenes.table import Table
 
-SHUTTER = ("time", "exposure_ms", "sub_poses", "readout_ms", "rows_per_band")
+SHUTTER = ("time", "exposure_time_ms", "sub_poses", "readout_ms", "rows_per_band")
 POSE = ("time", "position", "quaternion")
 
 
@@ -22,7 +22,7 @@ def read_shutter(camera: Table) -> Shutter | None:
     with table.at():
         return Shutter(
             time=table.number("time", plain.time),
-            exposure=table.number("exposure_ms", 0.0) / 1e3,
+            exposure_time=table.number("exposure_time_ms", 0.0) / 1e3,
             sub_poses=table.whole("sub_poses", plain.sub_poses),
             readout=table.number("readout_ms", 0.0) / 1e3,
             rows_per_band=table.whole("rows_per_band", plain.rows_per_band),
@@ -33,7 +33,7 @@ def shutter_table(shutter: Shutter) -> dict:
     """What a shutter is written as."""
     return {
         "time": float(shutter.time),
-        "exposure_ms": shutter.exposure * 1e3,
+        "exposure_time_ms": shutter.exposure_time * 1e3,
         "sub_poses": shutter.sub_poses,
         "readout_ms": shutter.readout * 1e3,
         "rows_per_band": shutter.rows_per_band,

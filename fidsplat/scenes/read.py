@@ -1,22 +1,25 @@
-"""Scene files: TOML in, Scene out."""
+"""Scene files: TOML in, the parts of a Scene out."""
 
 import math
 import os
 import re
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fidsplat.cameras import Camera, Trajectory, look_at_matrix
 from fidsplat.errors import InputError
+from fidsplat.files import path_of
+from fidsplat.formats import Progress, load_ply
 from fidsplat.quality import MarkerQuality, Quality, knobs
 from fidsplat.rotations import rigid_matrix
 from fidsplat.scenes.imaging import read_background, read_fog, read_sensor
 from fidsplat.scenes.knobs import quality_of, read_knobs
 from fidsplat.scenes.lens import TABLES, read_focal_lengths, read_lens
 from fidsplat.scenes.moving import POSE, read_keyframes, read_shutter
-from fidsplat.scenes.scene import PlacedMarker, Scene
+from fidsplat.scenes.parts import PlacedMarker
 from fidsplat.scenes.table import Table
 from fidsplat.splats import SplatCloud
 
@@ -46,14 +49,19 @@ _LONG_KEY = re.compile(
 )
 
 
-def read_scene(path: str | os.PathLike[str], quality: Quality | str | None = None) -> Scene:
-    """The scene of a file and of the splat and image files that it names, which are looked for beside it.
+def read_scene(
+    path: str | os.PathLike[str],
+    quality: Quality | str | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """What `SceneParts` takes, from a scene file and from the splat and image files that it names, which are
+    looked for beside it.
 
-    quality: instead of the file's; markers are made with it too.
+    quality: instead of the file's; markers are made with it too. progress: as `load_ply` takes it.
 
     Raises InputError, naming the file and the key, for whatever is wrong.
     """
-    file = Path(path)
+    file = path_of(path)
     top = Table(_parse(file), str(file), "", TOP)
     table = top.table("camera", CAMERA)
     keyframes = read_keyframes(table, ("time", *CAMERA_POSE), lambda frame: _camera_pose(frame)[0])
@@ -67,11 +75,13 @@ def read_scene(path: str | os.PathLike[str], quality: Quality | str | None = Non
         raise render.error("background", "and the table [background] exclude each other")
     quality = quality_of(top, render) if quality is None else quality
     made_with = Quality.of(quality).marker
-    splats = [_splats(table, file.parent) for table in top.tables("splats", SPLATS)]
-    return Scene(
+    splats = [_splats(table, file.parent, progress) for table in top.tables("splats", SPLATS)]
+    return dict(
         clouds=tuple(cloud for cloud, _ in splats),
         camera=camera,
-        markers=tuple(_marker(table, file.parent, made_with) for table in top.tables("markers", MARKERS)),
+        markers=tuple(
+            _marker(table, file.parent, made_with, progress) for table in top.tables("markers", MARKERS)
+        ),
         background=read_background(top, file.parent) or render.numbers("background", 3, (0.0, 0.0, 0.0)),
         outputs=render.texts("outputs", ("rgb",)),
         quality=quality,
@@ -151,10 +161,8 @@ def _pose(table: Table, scale: float = 1.0):
         return rigid_matrix(position, quaternion, scale)
 
 
-def _splats(table: Table, folder: Path) -> tuple[SplatCloud, Trajectory | None]:
+def _splats(table: Table, folder: Path, progress: Progress | None) -> tuple[SplatCloud, Trajectory | None]:
     """A file's splats where they are put, and how they move from there."""
-    from fidsplat.formats import load_ply
-
     name, scale = table.text("file"), table.number("scale", 1.0)
     if not scale > 0:
         raise table.error("scale", f"must be above 0, not {scale!r}")
@@ -162,12 +170,12 @@ def _splats(table: Table, folder: Path) -> tuple[SplatCloud, Trajectory | None]:
     if motion is not None:
         motion = Trajectory(motion.times, motion.poses @ np.linalg.inv(_pose(table)))
     with table.at("file"):
-        cloud = load_ply(folder / name)
+        cloud = load_ply(folder / name, progress)
         moved = any(key in table for key in ("position", "quaternion", "scale"))
         return (cloud.transformed(pose) if moved else cloud), motion
 
 
-def _marker(table: Table, folder: Path, quality: MarkerQuality) -> PlacedMarker:
+def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progress | None) -> PlacedMarker:
     spec, size = table.text("spec"), table.number("size")
     if not size > 0:
         raise table.error("size", f"must be above 0 metres, not {size!r}")
@@ -179,7 +187,8 @@ def _marker(table: Table, folder: Path, quality: MarkerQuality) -> PlacedMarker:
     from fidsplat.markers import marker, with_file  # late: it brings what makes markers
 
     limit = {} if max_splats is None else {"max_splats": max_splats}
+    known = {"quiet_zone": quiet_zone, "quality": quality, "progress": progress, **limit}
     with table.at():
         spec = with_file(spec, lambda name: str(folder / name))
-        made = marker(spec, size=size, quiet_zone=quiet_zone, quality=quality, **limit, **own)
+        made = marker(spec, size, **known, **own)
         return PlacedMarker(made, pose, motion=motion)

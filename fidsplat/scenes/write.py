@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write
+from fidsplat.files import atomic_write, path_of
 from fidsplat.formats import save_ply
 from fidsplat.markers import with_file
 from fidsplat.markers.printing import MAX_SPLATS
@@ -16,16 +16,16 @@ from fidsplat.scenes.imaging import imaging_tables
 from fidsplat.scenes.knobs import marker_knobs, quality_tables
 from fidsplat.scenes.lens import lens_table
 from fidsplat.scenes.moving import keyframe_tables, shutter_table
-from fidsplat.scenes.scene import PlacedMarker, Scene
+from fidsplat.scenes.parts import PlacedMarker, SceneParts
 
 
-def write_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
+def write_scene(scene: SceneParts, path: str | os.PathLike[str]) -> None:
     """Write STEM-splats-I.ply for each cloud, then the scene file, so that it never names a file that is
     missing.
 
     Raises InputError when a file cannot be written, or a marker cannot be said in a scene file.
     """
-    file = Path(path)
+    file = path_of(path)
     render, qualities = _render(scene)
     around = imaging_tables(scene, file.parent)
     markers = [_marker(placed, file.parent, scene.quality) for placed in scene.markers]
@@ -60,7 +60,7 @@ def write_scene(scene: Scene, path: str | os.PathLike[str]) -> None:
         stream.write(content)
 
 
-def _camera(scene: Scene) -> dict:
+def _camera(scene: SceneParts) -> dict:
     camera = scene.camera
     assert camera is not None
     keys = ("width", "height", "fx", "fy", "cx", "cy", "near", "far")
@@ -86,7 +86,7 @@ def _marker(placed: PlacedMarker, folder: Path, quality: Quality | str | None) -
     }
 
 
-def _render(scene: Scene) -> tuple[dict, dict[str, dict]]:
+def _render(scene: SceneParts) -> tuple[dict, dict[str, dict]]:
     table: dict = {"outputs": list(scene.outputs)}
     if isinstance(scene.background, tuple):
         table["background"] = list(scene.background)

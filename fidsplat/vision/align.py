@@ -1,4 +1,4 @@
-"""Corners to a few hundredths of a pixel: the known modules of a code laid over its picture by least squares.
+"""Corners to a few hundredths of a pixel: the known modules of a code fitted to its picture by least squares.
 
 Every dark-light edge inside the code takes part, so a QR code, whose outer edge is mostly broken, gets
 corners as good as a tag's. The model is the box average of the pattern over each pixel, which is what a
@@ -54,7 +54,7 @@ def align(
 
 def fit(grey: np.ndarray, corners: np.ndarray, bits: np.ndarray) -> float:
     """How well the pattern lies over the picture between these corners: their correlation, at most 1; -1
-    where that cannot be told. Arguments as of `align`."""
+    where that cannot be decided. Arguments as of `align`."""
     window = _window(grey, corners, bits, _LARGE)
     if window is None:
         return -1.0

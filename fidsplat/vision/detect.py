@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import zxingcpp
 
+from fidsplat.errors import InputError
 from fidsplat.vision.align import align, fit
 from fidsplat.vision.dictionaries import dictionary_bits, parse_family, predefined
 
@@ -19,6 +20,12 @@ from fidsplat.vision.dictionaries import dictionary_bits, parse_family, predefin
 # when asked for.
 DEFAULT_FAMILIES = ("36h11", "25h9", "4x4_50", "5x5_100", "6x6_250", "7x7_250")
 
+MIN_SIDE = 8
+"""pixels: the smallest tag has six modules"""
+MAX_SIDE = 32767
+"""pixels, of OpenCV's detector"""
+MAX_QR_SIDE = 65535
+"""pixels, of zxing-cpp"""
 # how much taller or wider the picture is made when a plain look finds no QR code: a tilted one has flat
 # modules
 STRETCHES = (1.5, 2.0, 3.0, 4.0)
@@ -60,10 +67,15 @@ def detect(image: np.ndarray, families: Iterable[str] | None = None, qr: bool = 
     """
     pixels = np.asarray(image)
     if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] != 3):
-        raise ValueError(f"detect needs uint8 (h, w) or (h, w, 3), not {pixels.dtype} {pixels.shape}")
+        raise InputError(f"detect needs uint8 (h, w) or (h, w, 3), not {pixels.dtype} {pixels.shape}")
     wanted = [parse_family(name) for name in (DEFAULT_FAMILIES if families is None else families)]
-    if pixels.size == 0:
+    if min(pixels.shape[:2]) < MIN_SIDE:
         return []
+    if max(pixels.shape[:2]) > MAX_SIDE:
+        raise InputError(
+            f"a picture of {pixels.shape[1]} x {pixels.shape[0]} pixels; codes are looked for in at most "
+            f"{MAX_SIDE} a side: cut it up, or make it smaller"
+        )
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY) if pixels.ndim == 3 else np.ascontiguousarray(pixels)
     found: list[Detection] = []
     for kind, family in dict.fromkeys(wanted):
@@ -141,6 +153,8 @@ def _qr_codes(grey: np.ndarray) -> list[Detection]:
 
 def _read_qr(grey: np.ndarray, wider: float, taller: float) -> list[Detection]:
     picture = grey
+    if max(grey.shape[1] * wider, grey.shape[0] * taller) > MAX_QR_SIDE:
+        return []
     if (wider, taller) != (1.0, 1.0):
         picture = cv2.resize(grey, None, fx=wider, fy=taller, interpolation=cv2.INTER_LINEAR)
     scale = np.array([grey.shape[1] / picture.shape[1], grey.shape[0] / picture.shape[0]])

@@ -9,7 +9,10 @@ import cv2
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write
+from fidsplat.files import atomic_write, path_of
+
+MAX_BITS = 2**26
+"""values of a marker image that are looked at: four for each of 4096 x 4096 modules, which are most"""
 
 
 def read_image(path: str | os.PathLike[str], deep: bool = False) -> np.ndarray:
@@ -34,6 +37,10 @@ def read_bits(path: str | os.PathLike[str]) -> np.ndarray:
     Raises InputError when the file cannot be read or has colours or more grey levels.
     """
     image = _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.size > MAX_BITS:
+        raise InputError(
+            f"{path} has {image.shape[1]} x {image.shape[0]} pixels; a marker image has one for each module"
+        )
     if image.ndim == 2:
         image = image[:, :, None]
     if image.dtype not in (np.uint8, np.uint16):
@@ -91,7 +98,7 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> Path:
 
 def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
     try:
-        data = np.fromfile(path, np.uint8)
+        data = np.fromfile(path_of(path), np.uint8)
     except OSError as error:
         raise InputError(f"cannot read the image {path}: {error.strerror or error}") from error
     image = None

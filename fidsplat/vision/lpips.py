@@ -2,7 +2,7 @@
 
 The weights are no part of fidsplat and nothing here fetches them. `load_lpips` reads a NumPy file with the
 five convolutions of torchvision's AlexNet and the five linear layers of LPIPS version 0.1;
-docs/experiments.md says how it is written with PyTorch and the lpips package.
+docs/ground-truth.md says how it is written with PyTorch and the lpips package.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def load_lpips(file: Path) -> Callable[[np.ndarray, np.ndarray], float]:
         }
         for name, shape in shapes.items():
             if name not in weights or weights[name].shape != shape:
-                raise InputError(f"{file} needs an array {name} of shape {shape} (see docs/experiments.md)")
+                raise InputError(f"{file} needs an array {name} of shape {shape} (see docs/ground-truth.md)")
 
     def measure(picture: np.ndarray, truth: np.ndarray) -> float:
         total = 0.0

@@ -62,9 +62,9 @@ static inline void bin_splats(global const uint *restrict order, global const ui
 }
 
 // Reads: order, tallies' number of visible splats, windows, big_bounds. Writes: this chunk's row of table.
-kernel void bin_count(global const uint *restrict order, global const uint *restrict tallies,
-                      global const uint2 *restrict windows, uint big_capacity, global const Bounds *restrict big_bounds,
-                      int width, int height, global uint *restrict table) {
+kernel void bin_count(
+//@@ arguments bin_count
+) {
     if (get_global_id(0) >= CHUNKS) return;
     const Chunk c = chunk_of(tallies[TALLY_VISIBLE], width, height, table);
     for (int tile = 0; tile < c.tiles_x * c.tiles_y; tile++) c.row[tile] = 0;
@@ -72,10 +72,9 @@ kernel void bin_count(global const uint *restrict order, global const uint *rest
 }
 
 // Reads: as bin_count, and starts. Uses up: table, of the tiles in the band. Writes: lists.
-kernel void bin_emit(global const uint *restrict order, global const uint *restrict tallies,
-                     global const uint2 *restrict windows, uint big_capacity, global const Bounds *restrict big_bounds,
-                     int width, int height, global uint *restrict table, global const uint *restrict starts,
-                     int band_first, int band_end, uint capacity, global uint *restrict lists) {
+kernel void bin_emit(
+//@@ arguments bin_emit
+) {
     if (get_global_id(0) >= CHUNKS) return;
     const Chunk c = chunk_of(tallies[TALLY_VISIBLE], width, height, table);
     const Emission e = {band_first, band_end, capacity, starts, lists};

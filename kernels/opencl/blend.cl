@@ -38,15 +38,15 @@ static inline Seen see(const Splat *s, Crossing c, vfloat inverse_d) {
     return seen;
 }
 
-// Lays it over all that follows, where `mask` is set and the pixel still lets light through.
-static inline void lay(Pixel *pixel, const Seen *seen, vfloat opacity, vint mask, const BlendConstants *constants) {
+// Composites it over all that follows, where `mask` is set and the pixel still lets light through.
+static inline void composite(Pixel *pixel, const Seen *seen, vfloat opacity, vint mask, const BlendConstants *constants) {
     vint live = mask & VMASK(pixel->t > constants->stop);
 //@@ stop
     vfloat weight = pixel->t * VSELECT((vfloat)0.0f, opacity, live);
     pixel->r = FMA(weight, seen->r, pixel->r);
     pixel->g = FMA(weight, seen->g, pixel->g);
     pixel->b = FMA(weight, seen->b, pixel->b);
-//@@ lay
+//@@ composite
     pixel->t = pixel->t - weight;
 }
 

@@ -1,16 +1,7 @@
 // What part of the picture a splat can touch: the R-sigma ellipse (or a box where the disk crosses the near plane)
 // and, by hook, the support of the low-pass. Everything here is conservative; the per-pixel test decides.
 
-typedef struct {
-    float ex, ey;           // centre [samples]
-    float hx, hy;           // half extents of the axis-aligned box
-    float slope;            // the chord at height Y around the centre is slope * Y +- half_width * sqrt(1 - Y^2 / hy^2)
-    float half_width;
-    float inverse_hy2;      // 0 makes it a box
-    float tip;              // height at which the ellipse is widest to the right
-//@@ bounds
-} Bounds;
-
+//@@ struct Bounds
 // Room for the rounding of the float fields and of the per-pixel test, in samples.
 #define BOUNDS_PAD 0.02f
 #define BOUNDS_PAD_RELATIVE 2e-4f

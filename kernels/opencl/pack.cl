@@ -3,7 +3,9 @@
 
 // Index space: one work-item per piece. Reads: keys. Writes: held[0 .. CHUNKS): splats of the piece to be kept,
 // held[CHUNKS .. 2 * CHUNKS): splats seen in this picture, if only in another band of it.
-kernel void pack_count(uint count, global const uint *restrict keys, global uint *restrict held) {
+kernel void pack_count(
+//@@ arguments pack_count
+) {
     uint piece = get_global_id(0);
     if (piece >= CHUNKS) return;
     uint each = (count + CHUNKS - 1) / CHUNKS;
@@ -19,9 +21,7 @@ kernel void pack_count(uint count, global const uint *restrict keys, global uint
 // Index space: one work-item per piece. Reads: places (where each piece goes), splats, keys, windows.
 // Writes: splats_out, keys_out, windows_out.
 kernel void pack_move(
-    uint count, global const uint *restrict places, global const Splat *restrict splats,
-    global const uint *restrict keys, global const uint2 *restrict windows, global Splat *restrict splats_out,
-    global uint *restrict keys_out, global uint2 *restrict windows_out
+//@@ arguments pack_move
 ) {
     uint piece = get_global_id(0);
     if (piece >= CHUNKS) return;

@@ -5,11 +5,10 @@
 //   RADIX_BITS     digit width of the depth sort
 //   SCAN_ITEMS     work-items of the one work-group that scans
 //   SETUP_FP64     1: per-splat set-up in double
-//   RECORD_BYTES   size of one Splat record, computed by the host from the effects' declarations
 //   SAMPLES        n of the n x n samples per pixel
 
 // Contraction is chosen by hand (FMA below), never by the compiler: the same pixel must get the same bits in every
-// schedule, tile size and set of taps, and order and culling must not depend on the device (numerics F1).
+// schedule, tile size and set of outputs, and order and culling must not depend on the device (numerics F1).
 #pragma OPENCL FP_CONTRACT OFF
 
 #if SETUP_FP64
@@ -21,18 +20,7 @@ typedef float real;
 #define REAL(x) x##f
 #endif
 
-// indices into the uniform buffer `view`
-enum {
-    VIEW_R = 0,          // 9: world to camera rotation, row-major
-    VIEW_T = 9,          // 3: camera-space position of the cloud's origin [m]
-    VIEW_EYE = 12,       // 3: camera centre relative to the cloud's origin [m]
-    VIEW_FX = 15, VIEW_FY, VIEW_CX, VIEW_CY,  // intrinsics of the sample grid [samples]
-    VIEW_NEAR, VIEW_FAR, // [m]
-    VIEW_LOG_CUT,        // ln(alpha cut-off)
-    VIEW_WIDTH, VIEW_HEIGHT,  // of the sample grid
-    VIEW_FILTER,        // (pixels per sample)^2, for filters that are defined in pixels
-    VIEW_BAND, VIEW_BAND_END  // rows of samples that are drawn now
-};
+//@@ struct View
 
 #define CULLED 0xFFFFFFFFu   // sort key of a splat that is not drawn
 #define OUTSIDE 0xFFFFFFFEu  // of one that is drawn in another band of rows only

@@ -1,5 +1,5 @@
 // Index space: one work-item per splat.
-// Reads:  view, means, quats, scales, opacities, and what the colour slot and the taps ask for.
+// Reads:  view, means, quats, scales, opacities, and what the colour slot and the outputs ask for.
 // Writes: splats[i] of visible splats; keys[i]: depth key, or CULLED or OUTSIDE; windows[i]
 //         of visible splats: the tiles that they touch; big, big_bounds and their number in tallies (numerics A5).
 //
@@ -37,9 +37,10 @@ static inline bool clipped_box(real3_ tu, real3_ tv, real3_ tw, real radius, rea
     return box[0] <= box[1];
 }
 
-static inline real3_ rotate_to_camera(global const real *view, real3_ v) {
-    real3_ c = {view[0] * v.x + view[1] * v.y + view[2] * v.z, view[3] * v.x + view[4] * v.y + view[5] * v.z,
-                view[6] * v.x + view[7] * v.y + view[8] * v.z};
+static inline real3_ rotate_to_camera(global const View *view, real3_ v) {
+    global const real *r = view->rotation;
+    real3_ c = {r[0] * v.x + r[1] * v.y + r[2] * v.z, r[3] * v.x + r[4] * v.y + r[5] * v.z,
+                r[6] * v.x + r[7] * v.y + r[8] * v.z};
     return c;
 }
 
@@ -48,20 +49,7 @@ static inline real3_ rotate_to_camera(global const real *view, real3_ v) {
 //@@ footprint_here
 
 kernel void project(
-    uint count,
-    global const real *restrict view,
-    global const float *restrict means,       // (n, 3) [m], relative to the cloud's origin
-    global const float *restrict quats,       // (n, 4) w x y z
-    global const float *restrict scales,      // (n, 2) [m]
-    global const float *restrict opacities,   // (n)
-    global Splat *restrict splats,            // (n)
-    global uint *restrict keys,               // (n)
-    global uint2 *restrict windows,           // (n): corner and bits, or a place in `big` and 0
-    global uint *restrict tallies,
-    uint big_capacity,
-    global uint *restrict big,                // splats that touch more than a window
-    global Bounds *restrict big_bounds
-//@@ project_args
+//@@ arguments project
 ) {
     uint i = get_global_id(0);
     if (i >= count) return;
@@ -69,7 +57,7 @@ kernel void project(
 //@@ splat_view
 
     wide log_opacity = (wide)log((real)opacities[i]);
-    wide half_r2 = log_opacity - (wide)view[VIEW_LOG_CUT];
+    wide half_r2 = log_opacity - (wide)view->log_cut;
     if (!(half_r2 > 0.0f)) return;
 
     // columns of the splat's rotation, from the quaternion as it is (no unit length assumed)
@@ -81,8 +69,8 @@ kernel void project(
 
     real3_ a = rotate_to_camera(view, tangent_u), b = rotate_to_camera(view, tangent_v);
     real3_ p = rotate_to_camera(view, mean);
-    p.x += view[VIEW_T]; p.y += view[VIEW_T + 1]; p.z += view[VIEW_T + 2];
-    real pz = p.z, near = view[VIEW_NEAR];
+    p.x += view->translation[0]; p.y += view->translation[1]; p.z += view->translation[2];
+    real pz = p.z, near = view->near;
 //@@ camera_depth
     real3_ facet = cross3(a, b);        // unit normal
     real offset = dot3(facet, p);       // of the plane from the camera's centre
@@ -100,14 +88,14 @@ kernel void project(
     real reach = radius * sqrt(a.z * a.z + b.z * b.z);
 //@@ camera_reach
 //@@ footprint_reach
-    if (!(pz + reach >= near) || !(pz - reach <= view[VIEW_FAR])) return;
+    if (!(pz + reach >= near) || !(pz - reach <= view->far)) return;
 
 //@@ footprint_spread
 //@@ camera_bounds
 //@@ camera_box
 //@@ footprint_bounds
 //@@ bounds_make
-    int width = (int)view[VIEW_WIDTH], height = (int)view[VIEW_HEIGHT];
+    int width = (int)view->width, height = (int)view->height;
     int y0, y1;
     bounds_rows(&bounds, height, &y0, &y1);
     float x0, x1;
@@ -116,7 +104,7 @@ kernel void project(
     float first = ceil(x0 - 0.5f), last = floor(x1 - 0.5f);
     if (!(y0 < y1 && first <= (float)(width - 1) && last >= 0.0f && first <= last)) return;
 
-    if (y1 <= (int)view[VIEW_BAND] || y0 >= (int)view[VIEW_BAND_END]) {
+    if (y1 <= (int)view->band || y0 >= (int)view->band_end) {
         keys[i] = OUTSIDE;
         return;
     }

@@ -1,12 +1,7 @@
 // Index space: one work-item per pixel of the picture (x, y).
-// Reads:  raw (4 planes of samples) and the taps' planes. Writes: rgb (h, w, 3) and the outputs asked for.
+// Reads:  raw (4 planes) and the outputs' samples. Writes: rgb (h, w, 3) and the outputs asked for.
 kernel void resolve(
-    int width, int height,                   // of the picture
-    int stride, uint plane,                  // samples per row and per plane of raw
-    float background_r, float background_g, float background_b,
-    global const float *restrict raw,
-    global float *restrict rgb
-//@@ resolve_args
+//@@ arguments resolve
 ) {
     int x = get_global_id(0), y = get_global_id(1);
     if (x >= width || y >= height) return;
@@ -24,9 +19,9 @@ kernel void resolve(
     const float mean = 1.0f / (SAMPLES * SAMPLES);
     t *= mean;
     size_t out = (size_t)y * width + x;
-    rgb[3 * out] = FMA(t, background_r, r * mean);
-    rgb[3 * out + 1] = FMA(t, background_g, g * mean);
-    rgb[3 * out + 2] = FMA(t, background_b, b * mean);
+    rgb_out[3 * out] = FMA(t, background_r, r * mean);
+    rgb_out[3 * out + 1] = FMA(t, background_g, g * mean);
+    rgb_out[3 * out + 2] = FMA(t, background_b, b * mean);
 //@@ resolve_end
 }
 //@@ kernels

@@ -3,7 +3,9 @@
 
 // Index space: one work-item per bin.
 // Reads and writes: table (counts become offsets within the bin). Writes: totals[bins].
-kernel void scan_chunks(uint bins, global uint *restrict table, global uint *restrict totals) {
+kernel void scan_chunks(
+//@@ arguments scan_chunks
+) {
     uint bin = get_global_id(0);
     if (bin >= bins) return;
     uint sum = 0;
@@ -17,8 +19,9 @@ kernel void scan_chunks(uint bins, global uint *restrict table, global uint *res
 
 // Index space: one work-group of SCAN_ITEMS.
 // Reads: totals[bins]. Writes: starts[bins + 1], exclusive prefix; tallies[slot] and tallies[slot + 1], the sum in 64 bits.
-kernel void scan_bins(uint bins, global const uint *restrict totals, global uint *restrict starts,
-                      global uint *restrict tallies, uint slot) {
+kernel void scan_bins(
+//@@ arguments scan_bins
+) {
     local ulong partial[SCAN_ITEMS + 1];
     uint item = get_local_id(0);
     uint each = (bins + SCAN_ITEMS - 1) / SCAN_ITEMS;

@@ -4,8 +4,9 @@
 #define RADIX_BINS (1u << RADIX_BITS)
 
 // Reads: keys, tallies[slot] (length). Writes: this chunk's row of table.
-kernel void sort_count(global const uint *restrict keys, global const uint *restrict tallies, uint slot, uint shift,
-                       global uint *restrict table) {
+kernel void sort_count(
+//@@ arguments sort_count
+) {
     uint chunk = get_global_id(0);
     if (chunk >= CHUNKS) return;
     global uint *row = table + (size_t)chunk * RADIX_BINS;
@@ -18,10 +19,9 @@ kernel void sort_count(global const uint *restrict keys, global const uint *rest
 
 // Reads: keys, indices (or none in the first pass, where the index is the place), starts. Uses up: table.
 // Writes: keys_out, indices_out.
-kernel void sort_scatter(global const uint *restrict keys, global const uint *restrict indices,
-                         global const uint *restrict tallies, uint slot, uint shift, uint first,
-                         global uint *restrict table, global const uint *restrict starts,
-                         global uint *restrict keys_out, global uint *restrict indices_out) {
+kernel void sort_scatter(
+//@@ arguments sort_scatter
+) {
     uint chunk = get_global_id(0);
     if (chunk >= CHUNKS) return;
     global uint *row = table + (size_t)chunk * RADIX_BINS;

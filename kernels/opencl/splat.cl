@@ -6,21 +6,7 @@
 // splat, so that x - anchor is exact and nothing cancels (numerics B1), with a common factor that makes D > 0 in
 // front of the camera, and sqrt(1/2) in the numerators, so that (n_u^2 + n_v^2) / D^2 is rho / 2.
 
-typedef struct __attribute__((aligned(16))) {   // whole vectors of 16 bytes are read and written
-    wide nu0, nux, nuy;     // n_u = nu0 + nux x + nuy y
-    wide nv0, nvx, nvy;
-    wide d0, dx, dy;       // D
-    wide d_near;           // D at depth `near`: a fragment is in front of the near plane if D <= d_near
-    wide log_opacity;
-    wide r, g, b;
-    short ax, ay;           // anchor pixel
-    short y0, y1;           // rows [y0, y1) that the splat can touch
-    short x0, x1;           // columns [x0, x1)
-//@@ record
-} Splat;
-
-typedef char record_size_agrees_with_the_host[(sizeof(Splat) == RECORD_BYTES) ? 1 : -1];
-
+//@@ struct Splat
 typedef struct {
     vfloat d;               // denominator
     vfloat q;               // n_u^2 + n_v^2

@@ -26,8 +26,7 @@ enum { COUNT_BIG = 0, COUNT_PAIRS = 1 };
 // visible splats.
 // If there are more pairs than `capacity` (and that is not 2^32 - 1), all lists are made empty.
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
-    uint tiles, uint capacity, global uint *restrict tallies, global uint *restrict starts, global uint *restrict cursors,
-    global uint *restrict counts
+//@@ arguments tile_starts
 ) {
     local ulong partial[SCAN_ITEMS];
     uint item = get_local_id(0);
@@ -82,7 +81,7 @@ static inline int walk_tile(const Walk *walk, int cell, const Bounds *b, int wid
 // Index space: any number of work-groups; each takes every so many-th splat.
 // Reads: tallies' number of big splats, big_bounds.
 kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void tally_big(
-    int width, int height, uint big_capacity, global const Bounds *restrict big_bounds, global uint *restrict tallies
+//@@ arguments tally_big
 ) {
     uint count = min(tallies[TALLY_BIG], big_capacity);
     for (uint k = get_group_id(0); k < count; k += get_num_groups(0)) {
@@ -113,10 +112,7 @@ static inline void emit_pair(int tile, const Band *band, uint key, uint splat, g
 // Reads: windows, keys, starts, big, big_bounds. Uses up: cursors of the band. Writes: pairs; adds to tallies' number of
 // visible splats.
 kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void emit(
-    uint count, uint splat_groups, uint first_band, int width, int height, int band_first, int band_end, uint capacity,
-    uint big_capacity, global const uint2 *restrict windows, global const uint *restrict keys,
-    global const uint *restrict big, global const Bounds *restrict big_bounds, global const uint *restrict starts,
-    global uint *restrict tallies, global uint *restrict cursors, global uint2 *restrict pairs
+//@@ arguments emit
 ) {
     local uint visible;
     const Band band = {(width + TILE_W - 1) / TILE_W, band_first, band_end, starts[band_first], capacity};
@@ -175,7 +171,7 @@ static inline void comparator(uint t, uint stride, bool mirrored, uint *i, uint 
     barrier(fence)
 
 kernel __attribute__((reqd_work_group_size(SORT_ITEMS, 1, 1))) void sort_tiles(
-    int band_first, global const uint *restrict starts, global ulong *restrict pairs, global uint *restrict lists
+//@@ arguments sort_tiles
 ) {
     local ulong items[SORT_LOCAL];
     uint tile = band_first + get_group_id(0), item = get_local_id(0);

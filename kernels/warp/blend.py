@@ -27,7 +27,7 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
     """
     splats, crossing = make_splat(effects, outputs), make_crossing(effects, outputs)
     pool, stage, touched = splats.staging.pool, splats.staging.stage, splats.staging.touched
-    load, load_staged = splats.load, splats.load_staged
+    load = splats.load
     row_of, cross, cross_ray, cross_slopes = (
         *(crossing.row, crossing.cross),
         *(crossing.cross_ray, crossing.cross_slopes),
@@ -91,7 +91,7 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
                 while bits != NONE:
                     which = 32 * word + lowest(bits)
                     bits = bits & (bits - ONE)
-                    s = load_staged(records, lines, lists, k, which, view)
+                    s = load(records, lines, lists, k, which, view)
                     index = lists[k + which]
                     if unfinished(p, view):
                         x, y = float(x0) - s.d[3], float(y0) - s.c[0]
@@ -136,8 +136,8 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         end = starts[tile + 1]
         while k < end and alive > 0:
             index = lists[k]
+            s = load(wp.uint64(0), lines, lists, k, 0, view)
             k += 1
-            s = load(lines, index, view)
             b = bounds[index]
             top, bottom = limits.rows(b, view.height)
             top, bottom = wp.max(top, y0), wp.min(bottom, y_end)

@@ -1,4 +1,4 @@
-"""Boxes: rectangles |u| <= 1, |v| <= 1 of a splat's plane, whose edges the sample filters (docs/effects.md).
+"""Boxes: rectangles |u| <= 1, |v| <= 1 of a splat's plane, whose edges the sample filters (docs/boxes.md).
 
 D + n_u, D - n_u, D + n_v, D - n_v over their gradients are the sample's distances from the four edges,
 inwards, in samples. Where they are affine in the sample, gradients are the splat's own; where a lens gives
@@ -120,8 +120,8 @@ def make_boxes(real) -> SimpleNamespace:
         """Box x0, x1, y0, y1 of samples that a box may cover at all: up to half a sample outside its edges.
         x0 > x1 if there are none. clear: it lies wholly beyond the near plane.
         """
-        per_fx, per_fy = real(view.per_fx), real(view.per_fy)
-        cx, cy = real(view.cx), real(view.cy)
+        per_fx, per_fy = real(view.per_focal_x), real(view.per_focal_y)
+        cx, cy = real(view.center_x), real(view.center_y)
         normal = wp.cross(tangent_u, tangent_v)
         height = wp.dot(normal, p)
         side = wp.where(height < zero, -one, one)
@@ -158,7 +158,7 @@ def make_boxes(real) -> SimpleNamespace:
         """`extent` where parallel rays show the centre at (x, y): the image of a larger rectangle, whose
         sides are half a sample further out.
         """
-        per_fx, per_fy = real(view.per_fx), real(view.per_fy)
+        per_fx, per_fy = real(view.per_focal_x), real(view.per_focal_y)
         facing = wp.abs(tangent_u[0] * tangent_v[1] - tangent_u[1] * tangent_v[0])
         if not (facing > zero):
             return vec4(one, zero, one, zero)  # edge-on: no ray meets it
@@ -166,8 +166,8 @@ def make_boxes(real) -> SimpleNamespace:
         step_u = wp.length(vec2(tangent_v[1] * per_fx, tangent_v[0] * per_fy)) / facing
         step_v = wp.length(vec2(tangent_u[1] * per_fx, tangent_u[0] * per_fy)) / facing
         u, v = su + half * step_u, sv + half * step_v
-        across = (wp.abs(tangent_u[0]) * u + wp.abs(tangent_v[0]) * v) * real(view.fx)
-        down = (wp.abs(tangent_u[1]) * u + wp.abs(tangent_v[1]) * v) * real(view.fy)
+        across = (wp.abs(tangent_u[0]) * u + wp.abs(tangent_v[0]) * v) * real(view.focal_x)
+        down = (wp.abs(tangent_u[1]) * u + wp.abs(tangent_v[1]) * v) * real(view.focal_y)
         return vec4(x - across, x + across, y - down, y + down)
 
     @wp.func

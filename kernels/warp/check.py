@@ -6,8 +6,10 @@ import warp as wp
 from .common import STRICT, fma
 from .fast import fast_exp, fast_log
 
+wp.set_module_options(STRICT)
 
-@wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+
+@wp.kernel(enable_backward=False)
 def arithmetic(
     exponents: wp.array(dtype=wp.float32),
     shares: wp.array(dtype=wp.float32),
@@ -25,7 +27,7 @@ def arithmetic(
     out[6, i] = fast_log(shares[i])
 
 
-@wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+@wp.kernel(enable_backward=False)
 def arithmetic_wide(
     above: wp.array(dtype=wp.float64),
     below: wp.array(dtype=wp.float64),
@@ -37,14 +39,14 @@ def arithmetic_wide(
     out[2, i] = wp.log(below[i])
 
 
-@wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+@wp.kernel(enable_backward=False)
 def denormal(given: wp.array(dtype=wp.float32), out: wp.array(dtype=wp.float32)):
     half = given[0] * given[1]
     out[0] = half
     out[1] = half + half
 
 
-@wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+@wp.kernel(enable_backward=False)
 def contraction(
     a: wp.array(dtype=wp.float32),
     b: wp.array(dtype=wp.float32),
@@ -65,7 +67,7 @@ def contraction(
     fused[i] = fma(a[i], b[i], -product)
 
 
-@wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+@wp.kernel(enable_backward=False)
 def not_a_number(x: wp.array(dtype=wp.float32), out: wp.array(dtype=wp.int32, ndim=2)):
     """(4, n): x != x, isnan, fails every comparison, isinf."""
     i = wp.tid()

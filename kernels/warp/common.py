@@ -28,14 +28,14 @@ class View:
     rotation: wp.mat33d  # world to camera
     translation: wp.vec3d  # where the cloud's origin lies in the camera frame
     eye: wp.vec3d  # the camera's centre relative to the cloud's origin, world axes
-    fx: wp.float64
-    fy: wp.float64
-    cx: wp.float64
-    cy: wp.float64
+    focal_x: wp.float64  # samples; of parallel rays samples per metre
+    focal_y: wp.float64
+    center_x: wp.float64  # samples
+    center_y: wp.float64
     near: wp.float64
     far: wp.float64
-    per_fx: wp.float64  # 1 / fx, as those below: to divide takes longer
-    per_fy: wp.float64
+    per_focal_x: wp.float64  # 1 / focal_x, as those below: to divide takes longer
+    per_focal_y: wp.float64
     per_near: wp.float64
     width: int
     height: int

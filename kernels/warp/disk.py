@@ -70,7 +70,7 @@ def make_disk(real) -> SimpleNamespace:
                 x1 = wp.max(x1, x)
                 y0 = wp.min(y0, y)
                 y1 = wp.max(y1, y)
-        fx, fy, cx, cy = real(view.fx), real(view.fy), real(view.cx), real(view.cy)
+        fx, fy, cx, cy = real(view.focal_x), real(view.focal_y), real(view.center_x), real(view.center_y)
         return box_bounds(float(x0 * fx + cx), float(x1 * fx + cx), float(y0 * fy + cy), float(y1 * fy + cy))
 
     @wp.func
@@ -78,7 +78,7 @@ def make_disk(real) -> SimpleNamespace:
         """Image of a disk that lies wholly beyond the near plane, from its dual conic about the projected
         centre (numerics A4).
         """
-        fx, fy = real(view.fx), real(view.fy)
+        fx, fy = real(view.focal_x), real(view.focal_y)
         px, py = p[0] / p[2], p[1] / p[2]
         x = vec2(fx * (a[0] - px * a[2]), fx * (b[0] - px * b[2]))
         y = vec2(fy * (a[1] - py * a[2]), fy * (b[1] - py * b[2]))
@@ -89,12 +89,12 @@ def make_disk(real) -> SimpleNamespace:
         qxx = wp.max(mx * mx + h * wp.dot(x, x), zero)
         qyy = wp.max(my * my + h * wp.dot(y, y), zero)
         qxy = mx * my + h * wp.dot(x, y)
-        return conic(fx * px + real(view.cx) + mx, fy * py + real(view.cy) + my, qxx, qyy, qxy)
+        return conic(fx * px + real(view.center_x) + mx, fy * py + real(view.center_y) + my, qxx, qyy, qxy)
 
     @wp.func
     def parallel(a: vec3, b: vec3, x: real, y: real, radius: real, view: View):
         """Bounds of a disk whose centre parallel rays show at (x, y)."""
-        fx, fy = real(view.fx), real(view.fy)
+        fx, fy = real(view.focal_x), real(view.focal_y)
         across, down = vec2(fx * a[0], fx * b[0]) * radius, vec2(fy * a[1], fy * b[1]) * radius
         return conic(x, y, wp.dot(across, across), wp.dot(down, down), wp.dot(across, down))
 

@@ -119,7 +119,11 @@ def make_optics(camera: str, real) -> SimpleNamespace:
         radial = (one + q * (k1 + q * (k2 + q * k3))) / (one + q * (k4 + q * (k5 + q * k6)))
         a = x * radial + two * p1 * x * y + p2 * (q + two * x * x) + q * (s1 + q * s2)
         b = y * radial + two * p2 * x * y + p1 * (q + two * y * y) + q * (s3 + q * s4)
-        return real(view.fx) * a + real(view.cx), real(view.fy) * b + real(view.cy), q < real(lens.limit)
+        return (
+            real(view.focal_x) * a + real(view.center_x),
+            real(view.focal_y) * b + real(view.center_y),
+            q < real(lens.limit),
+        )
 
     @wp.func
     def image_fisheye(p: vec3, view: View, lens: Lens):
@@ -132,8 +136,8 @@ def make_optics(camera: str, real) -> SimpleNamespace:
         if across > zero:
             x = p[0] / across * away
             y = p[1] / across * away
-        x = real(view.fx) * x + real(view.cx)
-        y = real(view.fy) * y + real(view.cy)
+        x = real(view.focal_x) * x + real(view.center_x)
+        y = real(view.focal_y) * y + real(view.center_y)
         return x, y, angle <= real(lens.limit)
 
     @wp.func
@@ -179,7 +183,11 @@ def make_optics(camera: str, real) -> SimpleNamespace:
     def image_panorama(p: vec3, view: View, lens: Lens):
         longitude = wp.atan2(p[0], p[2])
         latitude = wp.atan2(p[1], wp.sqrt(p[0] * p[0] + p[2] * p[2]))
-        return real(view.fx) * longitude + real(view.cx), real(view.fy) * latitude + real(view.cy), True
+        return (
+            real(view.focal_x) * longitude + real(view.center_x),
+            real(view.focal_y) * latitude + real(view.center_y),
+            True,
+        )
 
     @wp.func
     def enclose_panorama(a: vec3, b: vec3, p: vec3, radius: real, view: View, lens: Lens):
@@ -195,7 +203,7 @@ def make_optics(camera: str, real) -> SimpleNamespace:
             if wp.abs(longitude) + aside < pi:
                 west = longitude - aside
                 east = longitude + aside
-        fx, fy, cx, cy = real(view.fx), real(view.fy), real(view.cx), real(view.cy)
+        fx, fy, cx, cy = real(view.focal_x), real(view.focal_y), real(view.center_x), real(view.center_y)
         return box_bounds(
             float(fx * west + cx),
             float(fx * east + cx),

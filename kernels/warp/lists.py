@@ -14,10 +14,12 @@ import warp as wp
 from .bounds import Bounds, make_bounds, window_tile
 from .common import STRICT, View, lowest
 
+# kernels that are the same for all feature sets are one module: the first picture compiles it once
+wp.set_module_options(STRICT)
 NONE, ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 
 
-@wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+@wp.kernel(enable_backward=False)
 def compact(
     first: int,
     keys: wp.array(dtype=wp.uint32),  # (n)
@@ -33,7 +35,7 @@ def compact(
         order[k] = i
 
 
-@wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+@wp.kernel(enable_backward=False)
 def gather(
     first: int,
     order: wp.array(dtype=wp.int32),
@@ -44,7 +46,7 @@ def gather(
     lengths[k] = counts[order[k]]
 
 
-@wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+@wp.kernel(enable_backward=False)
 def find_starts(
     first: int,
     pairs: int,
@@ -57,7 +59,7 @@ def find_starts(
     starts[tile] = wp.lower_bound(tiles, 0, pairs + 1, tile)
 
 
-@wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+@wp.kernel(enable_backward=False)
 def sum_up(
     splats: int,
     places: wp.array(dtype=wp.int32),  # inclusive sums

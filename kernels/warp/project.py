@@ -185,8 +185,8 @@ def make_project(
             return
 
         # where it can be seen
-        fx, fy, cx, cy = real(view.fx), real(view.fy), real(view.cx), real(view.cy)
-        per_fx, per_fy = real(view.per_fx), real(view.per_fy)
+        fx, fy, cx, cy = real(view.focal_x), real(view.focal_y), real(view.center_x), real(view.center_y)
+        per_fx, per_fy = real(view.per_focal_x), real(view.per_focal_y)
         in_front = depth >= near  # or, of a lens, whether it is known where the centre falls
         center_x, center_y = zero, zero
         if wp.static(parallel):

@@ -7,8 +7,8 @@ import warp as wp
 from . import output
 from .buffers import make_images, make_samples, sample_fields
 from .common import STRICT, View, fma
+from .pixel_grid import PixelGrid, sample_at
 from .rays import make_rays
-from .window import Window, sample_at
 
 
 @cache
@@ -42,26 +42,26 @@ def make_resolve(
         pixel = wp.tid() + first_pixel
         x = (pixel % width) * n
         y = (pixel / width) * n
-        window = Window()
-        window.pixel = pixel
-        window.row = pixel / width
-        window.stride = view.tiles_x * view.tile_w
-        window.first = y * window.stride + x
-        window.side = n
-        window.count = wp.static(n * n)
-        window.mean = mean
+        grid = PixelGrid()
+        grid.pixel = pixel
+        grid.row = pixel / width
+        grid.stride = view.tiles_x * view.tile_w
+        grid.first = y * grid.stride + x
+        grid.side = n
+        grid.count = wp.static(n * n)
+        grid.mean = mean
         total = wp.vec4()
         lengths = lengths_type()
-        for k in range(window.count):
-            total += samples.color[sample_at(window, k)]
+        for k in range(grid.count):
+            total += samples.color[sample_at(grid, k)]
             if wp.static(measured):
                 lengths[k] = length_of(x + k % n, y + k / n, rays, view)
         left = total[3] * mean
         for k in range(wp.static(len(hiddens))):
-            left += wp.static(hiddens[k])(window, samples)
+            left += wp.static(hiddens[k])(grid, samples)
         for channel in range(3):
             out.rgb[3 * pixel + channel] = fma(left, background[channel], total[channel] * mean)
         for k in range(wp.static(len(resolves))):
-            wp.static(resolves[k])(window, samples, lengths, out)
+            wp.static(resolves[k])(grid, samples, lengths, out)
 
     return resolve

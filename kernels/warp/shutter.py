@@ -1,4 +1,4 @@
-"""A picture of several poses: their samples are gathered in planes of the whole picture."""
+"""A picture of several poses: their samples are gathered in buffers of the whole picture."""
 
 from functools import cache
 
@@ -9,7 +9,7 @@ from .common import STRICT
 
 @cache
 def make_expose(dtype):
-    """The kernel that adds a plane of light, weighted, to that of its rows."""
+    """The kernel that adds a sample buffer of light, weighted, to that of the picture."""
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def expose(

@@ -5,16 +5,18 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .common import View, line_of, struct_of
+from .common import View, struct_of
 from .records import BOXES, Layout
 from .staging import make_staging
 
 
 @cache
 def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
-    """Splat; load and load_staged; and `staging`, what brings splats to the threads of a GPU block."""
+    """Splat; load, of the splat lists[first + which]; and `staging`, what brings splats to the threads of a
+    GPU block. There `load` finds what was staged; elsewhere it reads records where they lie, whatever the
+    pool.
+    """
     layout = Layout(effects, outputs)
-    each = layout.lines
     staging = make_staging(layout)
     staged_line = staging.line
     screen, bent, parallel = (name in effects for name in ("lowpass_screen", "rays", "camera_orthographic"))
@@ -37,32 +39,7 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
     ray_line, plane_line = layout.place("nuz")[0], layout.place("plane_z0")[0]
 
     @wp.func
-    def load(lines: wp.array(dtype=wp.vec4), index: int, view: View):
-        s = Splat()
-        at = index * each
-        s.u = line_of(lines, at)
-        s.v = line_of(lines, at + 1)
-        s.d = line_of(lines, at + 2)
-        s.c = line_of(lines, at + 3)
-        if wp.static(screen):
-            dot = line_of(lines, at + dot_line)
-            s.dot_x = dot[dot_lane]
-            s.dot_y = dot[dot_y_lane]
-        if wp.static(edged):
-            s.edges = line_of(lines, at + edge_line)
-        if wp.static(flagged):
-            s.boxed = line_of(lines, at + boxed_line)[boxed_lane]
-        if wp.static(bent):
-            s.w = line_of(lines, at + ray_line)
-            rest = line_of(lines, at + ray_line + 1)
-            s.origin = wp.vec3(s.w[3], rest[0], rest[1])
-        if wp.static(parallel):
-            s.plane = line_of(lines, at + plane_line)
-        s.half_r2 = s.u[3] - view.log_cut
-        return s
-
-    @wp.func
-    def load_staged(
+    def load(
         pool: wp.uint64,
         lines: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
@@ -92,4 +69,4 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
         s.half_r2 = s.u[3] - view.log_cut
         return s
 
-    return SimpleNamespace(Splat=Splat, load=load, load_staged=load_staged, staging=staging)
+    return SimpleNamespace(Splat=Splat, load=load, staging=staging)

@@ -1,8 +1,7 @@
 """A scene pays only for what it calls for: the text of the kernels, and what it costs."""
 
 import re
-from dataclasses import dataclass, replace
-from itertools import combinations
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,19 +11,19 @@ from agreement import random_splats
 
 import fidsplat as fs
 from fidsplat.backends.opencl import assemble as assembly
-from fidsplat.backends.opencl.assemble import DeviceShape, assemble
-from fidsplat.effects import CATALOGUE, OUTPUTS, Effect, Output, select
-from fidsplat.effects import catalogue as catalogue_module
+from fidsplat.backends.opencl.assemble import assemble
+from fidsplat.backends.opencl.layout import LAYOUTS
+from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
+from fidsplat.effects import OUTPUTS, select
 
 BACKEND = "opencl"
 
-SHAPE = DeviceShape("lanes", "ordered", 16, 16, 16, 8, 11, 1, True)
-GROUP = DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, 1024, True)
+SHAPE, GROUP = cpu_shape(lanes=16, cores=2), gpu_shape()
 TAPS = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
 DIGESTS = {
-    "none": ["9c907ba55001a9b6", "04793b83405177e4"],
-    "screen": ["5f7775acf70cb8fb", "0f308f456d614509"],
+    "none": ["1746d2a5d2cedc9d", "be842943924e0e73"],
+    "screen": ["4a8c4332caa5dfe9", "b9607e863d3a6160"],
 }
 """of a scene that asks for nothing, by low-pass; `screen` is the default"""
 
@@ -41,11 +40,16 @@ class Cloud:
 COLORS = Cloud()
 
 
+def record_bytes(features):
+    return assemble(features, SHAPE).records["Splat"].itemsize
+
+
 def test_base_text_names_no_effect_that_was_not_asked_for():
-    text = assemble(select(COLORS, ("rgb",), PLAIN), SHAPE).text
+    text = assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE).text
     assert "//" not in text
-    absent = set(CATALOGUE) - {
+    absent = set(LAYOUTS) - {
         "camera_pinhole",
+        "perspective",
         "color_rgb",
         "lowpass_none",
         "stop_inclusive",
@@ -54,22 +58,25 @@ def test_base_text_names_no_effect_that_was_not_asked_for():
         "arithmetic_fast",
     }
     of_knobs = ("wide", "WIDE")
-    of_layers = ("planes", "plane_keys", "layer", "Layer", "open", "waiting", "ink")
+    of_layers = ("planes", "plane_keys", "layer", "Layer", "open", "waiting", "optical_depth")
     for name in (*absent, *TAPS, "sh", "finished", *of_layers, *of_knobs):
         assert not re.search(rf"\b{name}(_|\b)", text), name
 
 
 @pytest.mark.parametrize("tap", TAPS)
 def test_a_tap_brings_its_text_and_nothing_else(tap):
-    base = assemble(select(COLORS, ("rgb",), PLAIN), SHAPE)
-    with_tap = assemble(select(COLORS, (tap,), PLAIN), SHAPE)
+    base = assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE)
+    with_tap = assemble(select(COLORS, fs.Capture(outputs=(tap,), quality=PLAIN)), SHAPE)
     assert with_tap.digest != base.digest
-    base_lines, tap_lines = base.text.splitlines(), with_tap.text.splitlines()
+    # arguments that follow add a comma, fields that follow change a size
+    base_lines, tap_lines = (
+        [line.rstrip(",") for line in re.sub(".*(#line|_has_the_size).*", "", one.text).splitlines() if line]
+        for one in (base, with_tap)
+    )
     remaining = iter(tap_lines)
     for line in base_lines:
-        if not line.startswith("#define RECORD_BYTES"):
-            assert line in remaining, f"{tap} removed or moved: {line}"
-    needed = {tap, *CATALOGUE[tap].parts}
+        assert line in remaining, f"{tap} removed or moved: {line}"
+    needed = {tap, *LAYOUTS[tap].parts}
     others = [
         other for other in TAPS if not any(other.startswith(own) or own.startswith(other) for own in needed)
     ]
@@ -80,9 +87,11 @@ def test_a_tap_brings_its_text_and_nothing_else(tap):
 def test_only_splats_on_planes_bring_layers(taps):
     """What a tap says of layers stays out as well, and layers bring the depth that places them."""
     words = ("Layer", "layer_pick", "layer_gather", "plane_keys", "label_tau", "share")
-    plain = assemble(select(COLORS, taps, PLAIN), SHAPE).text
-    layered = assemble(select(Cloud(has_planes=True), taps, PLAIN), SHAPE).text
-    in_order = assemble(select(Cloud(has_planes=True), taps, PLAIN.with_(coplanar="order")), SHAPE).text
+    plain = assemble(select(COLORS, fs.Capture(outputs=taps, quality=PLAIN)), SHAPE).text
+    layered = assemble(select(Cloud(has_planes=True), fs.Capture(outputs=taps, quality=PLAIN)), SHAPE).text
+    in_order = assemble(
+        select(Cloud(has_planes=True), fs.Capture(outputs=taps, quality=PLAIN.with_(coplanar="order"))), SHAPE
+    ).text
     for word in words:
         assert not re.search(rf"\b{word}\b", plain), word
         assert re.search(rf"\b{word}\b", layered) or (word == "label_tau" and "label" not in taps), word
@@ -91,67 +100,54 @@ def test_only_splats_on_planes_bring_layers(taps):
 
 
 def test_only_a_scene_of_both_footprints_pays_for_the_choice():
-    texts = {
-        kind: assemble(
-            select(Cloud(has_planes=True, footprint=kind), ("depth", "label"), fs.Quality()), SHAPE
-        )
+    features = {
+        kind: select(Cloud(has_planes=True, footprint=kind), fs.Capture(outputs=("depth", "label")))
         for kind in ("gaussian", "box", "mixed")
     }
-    assert "IS_BOX" not in texts["gaussian"].text
-    assert "boxes" not in texts["box"].text
-    assert "#define IS_BOX(s) true" in texts["box"].text
-    assert "boxes[i]" in texts["mixed"].text
-    sizes = [texts[kind].record_bytes for kind in texts]
+    texts = {kind: assemble(each, SHAPE).text for kind, each in features.items()}
+    assert "IS_BOX" not in texts["gaussian"]
+    assert "boxes" not in texts["box"]
+    assert "#define IS_BOX(s) true" in texts["box"]
+    assert "boxes[i]" in texts["mixed"]
+    sizes = [record_bytes(each) for each in features.values()]
     assert sizes == sorted(sizes)
-
-
-def test_an_effect_added_to_the_catalogue_leaves_other_texts_as_they_were(monkeypatch):
-    before = {taps: assemble(select(COLORS, taps, PLAIN), SHAPE).digest for taps in combinations(TAPS, 2)}
-    dummy = Effect("dummy", "tap/alpha.cl", record_lanes=5, output=Output("dummy", 1, "float32"))
-    monkeypatch.setitem(catalogue_module.CATALOGUE, "dummy", dummy)
-    after = {taps: assemble(select(COLORS, taps, PLAIN), SHAPE).digest for taps in combinations(TAPS, 2)}
-    assert before == after
-    features = select(COLORS, ("rgb",), PLAIN)
-    base, chosen = assemble(features, SHAPE), assemble(replace(features, taps=("dummy",)), SHAPE)
-    assert chosen.record_bytes == base.record_bytes + 16
-    assert "alpha_out" in chosen.text
-    assert "alpha_out" not in base.text
 
 
 def test_record_sizes_are_what_the_effects_declare():
     def record(outputs, quality=PLAIN, degree=-1):
-        return assemble(select(Cloud(degree), outputs, quality), SHAPE).record_bytes
+        return record_bytes(select(Cloud(degree), fs.Capture(outputs=outputs, quality=quality)))
 
-    # 68 bytes and 4 for each lane that an effect adds, in whole vectors of 16
+    # 68 bytes and 4 for each word that an effect adds, in whole vectors of 16
     assert record(("rgb",)) == record(("alpha",)) == record(("rgb",), degree=3) == 80
-    assert assemble(select(COLORS, ("rgb",), PLAIN), SHAPE).bounds_bytes == 32
+    assert assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE).records["Bounds"].itemsize == 32
     assert record(("rgb",), fs.Quality()) == record(("label",)) == 80
     assert record(("depth",)) == record(("depth", "depth_median")) == record(("normal",)) == 80
     assert record(("depth", "normal")) == record(("depth", "label"), fs.Quality()) == 96
-    on_planes = select(Cloud(has_planes=True), ("rgb",), PLAIN)
-    assert assemble(on_planes, SHAPE).record_bytes == 96
+    assert record_bytes(select(Cloud(has_planes=True), fs.Capture(quality=PLAIN))) == 96
 
 
 def test_a_section_that_no_stage_has_is_refused(monkeypatch):
-    monkeypatch.setattr(assembly, "sections_of", lambda path: {"no_such_hook": "x"})
+    monkeypatch.setattr(assembly, "sections_of", lambda path: {"no_such_hook": [(1, ("x",))]})
     with pytest.raises(fs.DeviceError, match="no_such_hook"):
-        assemble(select(COLORS, ("rgb",), PLAIN), SHAPE)
+        assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE)
 
 
 def test_text_does_not_depend_on_numbers():
     numbers = fs.Quality(lowpass="none", alpha_cutoff=0.01, transmittance_stop=0.5, opacity_ceiling=0.7)
-    assert select(COLORS, ("rgb",), numbers) == select(COLORS, ("rgb",), PLAIN)
+    assert select(COLORS, fs.Capture(quality=numbers)) == select(COLORS, fs.Capture(quality=PLAIN))
 
 
 def test_features_are_the_same_whatever_the_order_of_outputs():
-    assert select(Cloud(2), ["rgb", "label", "depth"], PLAIN) == select(Cloud(2), ("depth", "label"), PLAIN)
+    assert select(Cloud(2), fs.Capture(outputs=["rgb", "label", "depth"], quality=PLAIN)) == select(
+        Cloud(2), fs.Capture(outputs=("depth", "label"), quality=PLAIN)
+    )
 
 
 def test_the_base_is_what_it_was():
     """A change of the stages themselves records new digests here; an effect must not."""
     digests = {
         lowpass: [
-            assemble(select(COLORS, ("rgb",), fs.Quality(lowpass=lowpass)), shape).digest[:16]
+            assemble(select(COLORS, fs.Capture(quality=fs.Quality(lowpass=lowpass))), shape).digest[:16]
             for shape in (SHAPE, GROUP)
         ]
         for lowpass in DIGESTS
@@ -190,10 +186,10 @@ TAKEN = {
 def test_what_the_kernels_of_the_base_take(renderer, schedule):
     """An effect must not change it, nor registers and private memory, which follow from the text."""
     shape = SHAPE if schedule == "lanes" else GROUP
-    pipeline = renderer.backend.pipeline(select(COLORS, ("rgb",), PLAIN), shape)
+    pipeline = renderer.backend.pipeline(select(COLORS, fs.Capture(quality=PLAIN)), shape)
     local = cl.kernel_work_group_info.LOCAL_MEM_SIZE
     taken = {}
-    for name, kernel in pipeline._kernels.items():
+    for name, kernel in pipeline.program.kernels.items():
         head = re.search(rf"void {name}\(([^{{]*?)\)\s*\{{", pipeline.source.text)
         assert head, name
         taken[name] = kernel.num_args, len(re.findall(r"\bglobal\b", head[1]))
@@ -203,13 +199,15 @@ def test_what_the_kernels_of_the_base_take(renderer, schedule):
     assert taken == {name: numbers[:2] for name, numbers in TAKEN[schedule].items()}
 
 
-def test_the_page_of_the_device_wing_has_every_hook():
+def test_the_page_of_the_kernels_has_every_hook_and_no_other():
     folder = Path(__file__).resolve().parents[2] / "kernels"
     page = (folder / "README.md").read_text("utf-8")
     texts = [file.read_text("utf-8") for file in (folder / "opencl").rglob("*.cl")]
     hooks = {hook for text in texts for hook in re.findall(r"^[ \t]*//@@ (\w+)", text, re.MULTILINE)}
     assert len(hooks) > 50
-    assert {hook for hook in hooks if f"`{hook}`" not in page} == set()
+    rows = page[page.index("| hook |") : page.index("## Dialect rules")].splitlines()[2:]
+    told = {name for row in rows if row for name in re.findall(r"`(\w+)`", row.split("|")[1])}
+    assert told == hooks
 
 
 def test_no_kernel_calls_what_opencl_promises_nothing_of():
@@ -237,6 +235,9 @@ def test_knobs_compile_and_run_with_every_output_and_none(renderer, name, output
     assert all(np.isfinite(frame[each]).all() for each in frame)
 
 
+MOVING = fs.Motion(lambda time: np.eye(4))
+
+
 def test_only_pictures_of_several_poses_seen_by_a_pinhole_are_culled_by_spheres():
     lens = fs.Camera.fisheye(20, 20, 2.0)
     for expected, footprint, quality, camera, exposed in (
@@ -248,11 +249,16 @@ def test_only_pictures_of_several_poses_seen_by_a_pinhole_are_culled_by_spheres(
         (False, "box", PLAIN, None, True),
         (False, "gaussian", fs.Quality(lowpass="pixel"), None, True),
     ):
-        chosen = select(Cloud(footprint=footprint), ("rgb",), quality, camera, exposed=exposed)
+        chosen = select(
+            Cloud(footprint=footprint),
+            fs.Capture(
+                camera, quality=quality, motion=MOVING, shutter=fs.Shutter(exposure_time=0.1 * exposed)
+            ),
+        )
         assert ("shutter_rows" in chosen.names) == expected
         assert ("reach * sqrt(fy" in assemble(chosen, SHAPE).text) == expected
 
 
 def test_pipelines_are_compiled_once(renderer):
-    features = select(COLORS, ("rgb",), PLAIN)
+    features = select(COLORS, fs.Capture(quality=PLAIN))
     assert renderer.backend.pipeline(features) is renderer.backend.pipeline(features)

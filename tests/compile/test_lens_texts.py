@@ -6,11 +6,13 @@ from itertools import product
 import numpy as np
 import pytest
 from agreement import random_splats
-from test_assemble import COLORS, GROUP, PLAIN, SHAPE, Cloud
+from test_assemble import COLORS, GROUP, PLAIN, SHAPE, Cloud, record_bytes
 
 import fidsplat as fs
-from fidsplat.backends.opencl.assemble import DeviceShape, assemble
-from fidsplat.effects import CATALOGUE, select
+from fidsplat.backends.opencl.assemble import assemble
+from fidsplat.backends.opencl.layout import LAYOUTS
+from fidsplat.backends.opencl.shapes import gpu_shape
+from fidsplat.effects import select
 
 BACKEND = "opencl"
 
@@ -25,17 +27,17 @@ CAMERAS = {
 
 # of the texts as they were before there were lenses; a change here changes what every plain picture runs
 BEFORE_LENSES = {
-    ("lanes", ("rgb",)): "4cc27a288d0205d20ec5c7a45b98a133a2717eca5b886431e9cf1285022b54c4",
-    ("lanes", TAPS): "8d129690c0da413037964d0cd200e9ecdb7ae8f50786578cfadfbca70709950a",
-    ("group", ("rgb",)): "13d40946e4e9b01ae005464a37a6d189befed91a4c6e671921e058836d099e24",
-    ("group", TAPS): "74168286aa0335365092b58ac23447d117ceaccc951bac6c381d4ab895729f48",
+    ("lanes", ("rgb",)): "4a500e3ba6dc2d6fcc3102e13452791e8fc436f1994615db268bb01e14b40003",
+    ("lanes", TAPS): "08817447bcd5193c15e7bf96a7a7ecf9600423f146fa97d669498e7adff9cb08",
+    ("group", ("rgb",)): "a9ab5b91a85cf8e7d1f36402cf2aa5c133146040ba8f40645e1fce80f2f8d727",
+    ("group", TAPS): "5bc7e026fcea24b088506537ab911ca15ab5ae4a9325088d2bad96277add6c88",
 }
 
 
 @pytest.mark.parametrize(("schedule", "taps"), BEFORE_LENSES, ids=str)
 def test_plain_pictures_have_the_text_that_they_had_before_there_were_lenses(schedule, taps):
     shape = SHAPE if schedule == "lanes" else GROUP
-    text = assemble(select(Cloud(2, True), taps, fs.Quality()), shape)
+    text = assemble(select(Cloud(2, True), fs.Capture(outputs=taps)), shape)
     assert text.digest == BEFORE_LENSES[schedule, taps]
 
 
@@ -44,30 +46,30 @@ def test_numbers_of_a_lens_are_not_in_its_text():
         fs.Camera.pinhole(64, 48, f, f, 30.0, 20.0, lens=fs.BrownConrady(k))
         for f, k in ((50, 0.1), (60, -0.1))
     ]
-    features = [select(COLORS, ("rgb",), PLAIN, camera) for camera in cameras]
+    features = [select(COLORS, fs.Capture(camera, quality=PLAIN)) for camera in cameras]
     assert features[0] == features[1]
 
 
 def test_values_that_mean_nothing_call_for_nothing(renderer):
     nothing = fs.Camera.pinhole(33, 21, 30.0, 30.0, 16.0, 10.0, lens=fs.BrownConrady())
-    assert select(COLORS, ("rgb",), PLAIN, nothing) == select(COLORS, ("rgb",), PLAIN)
+    assert select(COLORS, fs.Capture(nothing, quality=PLAIN)) == select(COLORS, fs.Capture(quality=PLAIN))
     # a shutter that needs no time is no shutter, and a motion without one is where it is then
     cloud = random_splats(10, seed=1, depth=(1, 4))
     before = set(renderer.backend._pipelines)
     motion = fs.Motion(lambda time: CAMERAS["pinhole"].world_to_camera)
     renderer.render(cloud, nothing, quality=PLAIN, motion=motion, shutter=fs.Shutter(time=0.5, sub_poses=9))
     # nor is one before which nothing moves
-    renderer.render(cloud, nothing, quality=PLAIN, shutter=fs.Shutter(exposure=0.1, readout=0.2))
+    renderer.render(cloud, nothing, quality=PLAIN, shutter=fs.Shutter(exposure_time=0.1, readout=0.2))
     added = set(renderer.backend._pipelines) - before
     assert not any("shutter" in slot or "motion" in slot for features, _ in added for slot in features.slots)
 
 
 @pytest.mark.parametrize("kind", CAMERAS)
 def test_a_lens_brings_its_own_text_alone(kind):
-    text = assemble(select(COLORS, ("rgb",), PLAIN, CAMERAS[kind]), SHAPE).text
+    text = assemble(select(COLORS, fs.Capture(CAMERAS[kind], quality=PLAIN)), SHAPE).text
     words = {
-        "brown_conrady": ("LENS_FOLD",),
-        "fisheye": ("chart_box", "LENS_LIMIT"),
+        "brown_conrady": ("lens_fold",),
+        "fisheye": ("chart_box", "lens_limit"),
         "equirectangular": ("cone_bounds",),
         "orthographic": ("z_near",),
     }
@@ -82,7 +84,7 @@ def test_what_lenses_take():
     """Bytes of a record and words of bounds; the base's are those of test_assemble."""
 
     def record(kind):
-        return assemble(select(COLORS, ("rgb",), PLAIN, CAMERAS[kind]), SHAPE).record_bytes
+        return record_bytes(select(COLORS, fs.Capture(CAMERAS[kind], quality=PLAIN)))
 
     assert {kind: record(kind) for kind in CAMERAS} == {
         "pinhole": 80,
@@ -92,7 +94,7 @@ def test_what_lenses_take():
         "orthographic": 96,
     }
     assert not any(
-        CATALOGUE[name].record_lanes for name in ("shutter_exposure", "motion_groups", "ray_map", "polygon")
+        LAYOUTS[name].splat for name in ("shutter_exposure", "motion_groups", "ray_map", "polygon")
     )
 
 
@@ -100,7 +102,7 @@ def test_what_lenses_take():
 def test_every_lens_builds_with_everything(renderer, kind, exposed):
     """All outputs, layers, colours that depend on the view, moving groups; with and without a shutter."""
     cloud = random_splats(20, seed=1, depth=(1, 4), sh_degree=1).with_planes(np.repeat([-1, 0], 10))
-    shutter = fs.Shutter(exposure=0.1 if exposed else 0.0, sub_poses=2)
+    shutter = fs.Shutter(exposure_time=0.1 if exposed else 0.0, sub_poses=2)
     motion = fs.Motion(None, {1: lambda time: np.eye(4)})
     frame = renderer.render(cloud, CAMERAS[kind], ("rgb", *TAPS), None, motion=motion, shutter=shutter)
     assert all(np.isfinite(frame[name]).all() for name in frame)
@@ -108,14 +110,14 @@ def test_every_lens_builds_with_everything(renderer, kind, exposed):
 
 def test_the_other_schedule_draws_the_same_picture(renderer):
     """The kernels of GPUs on whatever device this is, through every lens."""
-    from fidsplat.backends.exposure import exposed_view
+    from fidsplat.backends.prepare import view_of
 
     cloud = random_splats(60, seed=3, depth=(-2, 4))
     backend = renderer.backend
-    shape = DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, 256, backend.shape.fast_fma)
+    shape = gpu_shape(256, backend.shape.fast_fma)
     for camera in CAMERAS.values():
-        view = exposed_view(camera, fs.Quality(), cloud.origin, (0, 0, 0), fs.Motion(), fs.Shutter())
-        features = select(cloud, ("rgb", "depth"), fs.Quality(), camera)
+        view = view_of(fs.Capture(camera), cloud.origin)
+        features = select(cloud, fs.Capture(camera, ("rgb", "depth")))
         resident = backend.upload(cloud)
         one = backend.pipeline(features).render(resident, view)
         other = backend.pipeline(features, shape).render(resident, view)

@@ -11,6 +11,8 @@ from fidsplat.cameras.pinhole import FOCAL_LENGTHS
 from fidsplat.random_clouds import load_scene
 
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
+SMALL = fs.Camera.look_at(97, 71, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
+"""for what takes the reference long: many splats, many samples"""
 
 
 def one_splat(tilt_deg, turn_deg, scales=(0.3, 0.1), opacity=0.9, center=(0.1, -0.05, 2.0)):
@@ -35,7 +37,7 @@ def test_one_splat_at_twenty_poses(renderer, tilt, turn):
 
 def test_two_thousand_random_splats(renderer):
     cloud = random_splats(2000, seed=8, depth=(1.0, 6.0), scale=(1e-3, 0.3))
-    assert_agrees(renderer, cloud, CAMERA)
+    assert_agrees(renderer, cloud, SMALL)
 
 
 @pytest.mark.parametrize("quality", ["standard", "reference", "gsplat", "surfel"])
@@ -56,7 +58,8 @@ def test_splats_much_smaller_than_a_pixel(renderer):
 )
 def test_lowpass_and_samples(renderer, lowpass, samples):
     quality = fs.Quality(lowpass=lowpass, samples=samples)
-    assert_agrees(renderer, random_splats(100, seed=5), CAMERA, quality=quality)
+    camera = CAMERA if samples < 3 else SMALL
+    assert_agrees(renderer, random_splats(100, seed=5), camera, quality=quality)
 
 
 def test_fast_preset_is_as_accurate_as_its_constants(renderer):
@@ -152,12 +155,12 @@ def rotation_about(axis):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-@pytest.mark.parametrize("samples", [1, 2])
-def test_coplanar_splats_are_one_layer(renderer, seed, samples):
+@pytest.mark.parametrize(("samples", "camera"), [(1, CAMERA), (2, SMALL)], ids=["1 sample", "2 x 2 samples"])
+def test_coplanar_splats_are_one_layer(renderer, seed, samples, camera):
     cloud = coplanar_cloud(seed)
     assert cloud.has_planes
-    assert_agrees(renderer, cloud, CAMERA, quality=fs.Quality(samples=samples))
-    assert_agrees(renderer, cloud, CAMERA, quality=fs.Quality(samples=samples, coplanar="order"))
+    assert_agrees(renderer, cloud, camera, quality=fs.Quality(samples=samples))
+    assert_agrees(renderer, cloud, camera, quality=fs.Quality(samples=samples, coplanar="order"))
 
 
 def test_the_order_of_coplanar_splats_means_nothing(renderer):

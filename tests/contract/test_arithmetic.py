@@ -1,7 +1,6 @@
 """Our own short exponential and logarithm (`Quality.arithmetic`): bounds, bits, pictures."""
 
 from dataclasses import replace
-from importlib import import_module
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ import fidsplat as fs
 from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import Picture
 from fidsplat.hard_cases.arithmetic import BOUNDS, worst
-from fidsplat.hard_cases.invariance import differing, other_schedule, trace
+from fidsplat.hard_cases.invariance import differing, trace
 
 CAMERA = fs.Camera.look_at(83, 61, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 AROUND = random_splats(200, seed=1)
@@ -31,9 +30,7 @@ SHARES = floats(2.0**-24, 1.0)
 
 def functions(renderer, exponents=EXPONENTS, shares=SHARES):
     """Bits of the device's short functions there."""
-    family = renderer.device.name.split(":")[0]
-    run = import_module(f"fidsplat.backends.{family}.arithmetic").run_arithmetic
-    got = run(renderer.backend, exponents, shares, shares, shares)
+    got = renderer.backend.run_arithmetic(exponents, shares, shares, shares)
     return got["fast_exp"], got["fast_log"]
 
 
@@ -101,11 +98,14 @@ def test_faint_fragments_stay_faint(renderer):
 @pytest.mark.parametrize("cloud", [AROUND, coplanar_cloud(1)], ids=["around", "planes"])
 def test_both_schedules_draw_the_same_bits(renderer, cloud):
     picture = Picture(cloud, CAMERA, FAST, ALL_OUTPUTS)
-    own, other = trace(renderer, picture), trace(renderer, picture, other_schedule(renderer))
+    own, other = (
+        trace(renderer, picture),
+        trace(renderer, picture, renderer.backend.shapes("schedule")["groups"]),
+    )
     assert differing(own, other, ALL_OUTPUTS) == 0
 
 
 def test_blending_in_float64_takes_the_library_s():
     double = FAST.with_(blend_precision="float64")
-    assert "arithmetic_precise" in select(AROUND, ("rgb",), double).slots
-    assert "arithmetic_fast" in select(AROUND, ("rgb",), FAST).slots
+    assert "arithmetic_precise" in select(AROUND, fs.Capture(quality=double)).slots
+    assert "arithmetic_fast" in select(AROUND, fs.Capture(quality=FAST)).slots

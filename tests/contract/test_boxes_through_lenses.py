@@ -10,10 +10,8 @@ from test_boxes import EXACT, boxes_of, cut
 from test_lens_pictures import CAMERAS
 
 import fidsplat as fs
-from fidsplat.backends.exposure import exposed_view
+from fidsplat.backends.prepare import prepare
 from fidsplat.cameras.raster import raster_of
-from fidsplat.effects import select
-from fidsplat.hard_cases.invariance import other_schedule
 from fidsplat.rotations import quaternion_to_matrix
 
 SEAM = 1e-3
@@ -140,11 +138,10 @@ def test_the_other_schedule_draws_the_same_boxes(renderer):
     cloud = random_splats(60, seed=3, depth=(-2, 4))
     cloud = cloud.with_boxes(np.arange(60) % 2 == 0)
     backend = renderer.backend
-    shape = other_schedule(renderer)
+    shape = backend.shapes("schedule")["groups"]
     for name in ("distortion", "fisheye", "panorama", "parallel"):
         camera = CAMERAS[name]
-        view = exposed_view(camera, fs.Quality(), cloud.origin, (0, 0, 0), fs.Motion(), fs.Shutter())
-        features = select(cloud, ("rgb", "depth"), fs.Quality(), camera)
+        features, view = prepare(cloud, fs.Capture(camera, ("rgb", "depth")))
         resident = backend.upload(cloud)
         one = backend.pipeline(features).render(resident, view)
         other = backend.pipeline(features, shape).render(resident, view)

@@ -8,10 +8,10 @@ import pytest
 from agreement import random_splats
 
 import fidsplat as fs
-from fidsplat.backends.exposure import exposed_view
+from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.effects import select
-from fidsplat.hard_cases.agreement import Picture, compare, judge
+from fidsplat.hard_cases.agreement import Picture, against_reference, compare
 
 SIZE = (41, 29)
 CLOUD = random_splats(120, 21, depth=(0.5, 5.0), scale=(0.02, 0.4))
@@ -31,9 +31,9 @@ CAMERAS = {
 }
 ALONG = {name: camera for name, camera in CAMERAS.items() if name != "distortion"}
 OUTPUTS = ("depth_first", "normal_world", "splat_id", "blended")
-BLUR = fs.Shutter(exposure=0.4, sub_poses=3)
+BLUR = fs.Shutter(exposure_time=0.4, sub_poses=3)
 WARP = next((info.name for info in fs.devices() if info.usable and info.name.startswith("warp")), None)
-ROLLING = fs.Shutter(time=0.1, exposure=0.2, sub_poses=2, readout=0.4, rows_per_band=8)
+ROLLING = fs.Shutter(time=0.1, exposure_time=0.2, sub_poses=2, readout=0.4, rows_per_band=8)
 
 
 def sliding(time):
@@ -51,7 +51,7 @@ def turning(time):
 
 
 def assert_agrees(renderer, **picture):
-    differences = judge(renderer, Picture(**{"cloud": CLOUD, **picture}))
+    differences = against_reference(renderer, Picture(**{"cloud": CLOUD, **picture}))
     assert all(difference.agrees for difference in differences), differences
 
 
@@ -84,12 +84,9 @@ def test_effects_of_the_picture_under_a_shutter(renderer, around, shutter):
     fog = FOG if around == "fog" else None
     motion = fs.Motion(turning, {0: sliding})
     outputs = ("rgb", "alpha", "distance", "splat_id", "normal_world")
-    frame = renderer.render(
-        cloud, PLAIN, outputs, quality, behind, motion=motion, shutter=shutter, sensor=SENSOR, fog=fog
-    )
-    view = exposed_view(PLAIN, quality, cloud.origin, behind, motion, shutter, SENSOR, fog)
-    how = {"sensor": SENSOR, "fog": fog, "background": behind}
-    features = select(cloud, outputs, quality, PLAIN, moving=True, exposed=True, **how)
+    capture = fs.Capture(PLAIN, outputs, quality, behind, motion, shutter, SENSOR, fog)
+    frame = renderer.render(cloud, capture)
+    features, view = prepare(cloud, capture)
     reference = ReferenceBackend()
     truth = reference.pipeline(features).render(reference.upload(cloud), view).planes
     differences = compare(frame, truth, outputs)
@@ -110,7 +107,7 @@ def test_fog_is_averaged_over_the_poses_of_a_shutter(renderer):
         motion = {} if not when else {"motion": fs.Motion(away), "shutter": fs.Shutter(**when)}
         return renderer.render(wall, camera, fog=FOG, **motion)["rgb"][14, 20].astype(float)
 
-    near, none, both = middle(), np.array(FOG.color), middle(exposure=1.0, sub_poses=2)
+    near, none, both = middle(), np.array(FOG.color), middle(exposure_time=1.0, sub_poses=2)
     assert (near < none - 0.1).all()
     assert np.allclose(both, (near + none) / 2, atol=1e-5)
 
@@ -125,6 +122,6 @@ def test_backgrounds_behind_every_lens(renderer, camera, behind, samples):
 
 @pytest.mark.skipif(WARP is None, reason="no Warp device here")
 def test_warp_names_what_it_lacks():
-    features = replace(select(CLOUD, ("rgb",), fs.Quality(), PLAIN), taps=("overdraw",))
+    features = replace(select(CLOUD, fs.Capture(PLAIN)), taps=("overdraw",))
     with pytest.raises(fs.DeviceError, match=r"warp.*no overdraw; use an OpenCL device"):
         fs.Renderer(WARP).backend.pipeline(features)

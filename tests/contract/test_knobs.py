@@ -87,6 +87,6 @@ def test_a_device_refuses_by_name_what_it_does_not_do(renderer):
 def test_double_promises_nothing_where_rays_are_float32(lens):
     camera = fs.Camera.pinhole(20, 12, 10.0, 10.0, 10.0, 6.0, lens=lens)
     with pytest.raises(fs.InputError, match="float32"):
-        select(AROUND, ("rgb",), DOUBLE, camera)
+        select(AROUND, fs.Capture(camera, quality=DOUBLE))
     with pytest.raises(fs.InputError, match="fog"):
-        select(AROUND, ("rgb",), DOUBLE, fog=fs.Fog(0.1))
+        select(AROUND, fs.Capture(quality=DOUBLE, fog=fs.Fog(0.1)))

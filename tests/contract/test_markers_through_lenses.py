@@ -97,7 +97,7 @@ def test_a_tag_that_moves_is_found_in_blur_and_noise_through_every_lens(renderer
         name,
         math.radians(15),
         motion=fs.Motion(None, {1: around}),
-        shutter=fs.Shutter(exposure=0.01, sub_poses=4),
+        shutter=fs.Shutter(exposure_time=0.01, sub_poses=4),
         sensor=fs.Sensor(vignetting=(-0.3,), full_well=3000, read_noise=10, seed=2),
     )
 
@@ -112,7 +112,7 @@ def test_parallel_rays_show_where_a_tag_is_across_them_and_how_it_is_turned(rend
     effects = {}
     if blurred:  # by 2 px, with a noise of up to 5 of 255 grey levels
         motion = fs.Motion(None, {1: lambda time: pose_of((0.7 * time, 0.0, 0.0), (1, 0, 0, 0))})
-        effects = {"motion": motion, "shutter": fs.Shutter(exposure=0.01, sub_poses=4)}
+        effects = {"motion": motion, "shutter": fs.Shutter(exposure_time=0.01, sub_poses=4)}
         effects["sensor"] = fs.Sensor(full_well=3000, read_noise=10, seed=2)
     errors = []
     for image in pictures(renderer, placed, camera, **effects):
@@ -139,7 +139,7 @@ def test_a_blurred_tag_is_found_wherever_the_ideal_plane_is(renderer, modules):
     placed = tag_at(position, 0.3)
     exposure = modules * placed.marker.module / 0.8
     motion = fs.Motion(None, {1: lambda time: pose_of((0.8 * time, 0.0, 0.0), (1, 0, 0, 0))})
-    shutter = fs.Shutter(exposure=exposure, sub_poses=8)
+    shutter = fs.Shutter(exposure_time=exposure, sub_poses=8)
     errors = []
     for image in pictures(renderer, placed, camera, motion=motion, shutter=shutter):
         corners = corners_in(image)

@@ -10,8 +10,8 @@ import pytest
 from agreement import ALL_OUTPUTS, random_splats
 
 import fidsplat as fs
-from fidsplat.backends.opencl.assemble import DeviceShape
-from fidsplat.backends.opencl.plan import plan_of
+from fidsplat.backends.opencl.memory_plan import plan_of
+from fidsplat.backends.opencl.shapes import gpu_shape
 
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 
@@ -51,7 +51,7 @@ def as_on_a_gpu(renderer, budget=None):
     made = fs.Renderer(renderer.device.name)
     backend = made.backend
     backend.info = replace(backend.info, kind="gpu")
-    backend.shape = DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, 256, backend.shape.fast_fma)
+    backend.shape = gpu_shape(256, backend.shape.fast_fma)
     backend.limit_memory(budget or backend.memory_budget)
     return made
 
@@ -184,7 +184,7 @@ PICTURES = {
     "rolling shutter": {
         "camera": fs.Camera.pinhole(161, 117, 150.0, 150.0, 80.0, 60.0, lens=fs.BrownConrady(-0.1)),
         "motion": fs.Motion(lambda time: np.eye(4)),
-        "shutter": fs.Shutter(readout=0.1, exposure=0.05, sub_poses=2),
+        "shutter": fs.Shutter(readout=0.1, exposure_time=0.05, sub_poses=2),
     },
 }
 
@@ -224,7 +224,7 @@ def test_a_panorama_is_copied_once(opencl, monkeypatch):
     monkeypatch.setattr(
         cl, "enqueue_copy", lambda *args, **more: copied.append(args[2]) or copy(*args, **more)
     )
-    some, shutter = random_splats(20, seed=9), fs.Shutter(exposure=0.1, sub_poses=2)
+    some, shutter = random_splats(20, seed=9), fs.Shutter(exposure_time=0.1, sub_poses=2)
 
     def draw(around, **more):
         copied.clear()
@@ -295,8 +295,8 @@ def test_a_leased_buffer_has_the_size_that_was_asked_for(opencl):
 
 def test_a_plane_that_cannot_be_read_is_an_error_of_the_device(opencl):
     frame = opencl.render(random_splats(10, seed=8), CAMERA)
-    output, _ = frame._planes._outputs["rgb"]
-    frame._planes._outputs["rgb"] = output, opencl.backend.pool.fresh("too small", 16)
+    output, _ = frame._images._images["rgb"]
+    frame._images._images["rgb"] = output, opencl.backend.pool.fresh("too small", 16)
     with pytest.raises(fs.DeviceError, match="failed while drawing rgb"):
         frame["rgb"]
 

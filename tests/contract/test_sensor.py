@@ -10,9 +10,9 @@ from agreement import random_splats
 from ideal_effects import assert_as_good, ideal_picture
 
 import fidsplat as fs
-from fidsplat.backends.base import View
 from fidsplat.backends.reference.post import variates
-from fidsplat.hard_cases.agreement import Picture, judge
+from fidsplat.backends.view import View
+from fidsplat.hard_cases.agreement import Picture, against_reference
 
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.3, -0.2, -0.1), (0.0, 0.1, 3.0))
 CLOUD = random_splats(120, 3)
@@ -72,7 +72,7 @@ def test_backgrounds(renderer, background, samples):
 
 
 def agree(renderer, picture):
-    differences = judge(renderer, picture)
+    differences = against_reference(renderer, picture)
     assert all(difference.agrees for difference in differences), differences
 
 
@@ -171,16 +171,13 @@ def test_values_that_mean_nothing_select_nothing(renderer):
         fs.Sensor(response=(0, 0.25, 0.5, 0.75, 1)),
         None,
     ]
-    plain = select(CLOUD, ("rgb",), fs.Quality())
+    plain = select(CLOUD, fs.Capture())
     for sensor in nothing:
-        assert (
-            select(CLOUD, ("rgb",), fs.Quality(), sensor=sensor, fog=fs.Fog(0.0), background=(1, 2, 3))
-            == plain
-        )
-    assert select(CLOUD, ("rgb",), fs.Quality(), sensor=NOISY) != plain
+        assert select(CLOUD, fs.Capture(background=(1, 2, 3), sensor=sensor, fog=fs.Fog(0.0))) == plain
+    assert select(CLOUD, fs.Capture(sensor=NOISY)) != plain
     grey = fs.Gradient(GREY, GREY, (1, 0, 0))
-    assert select(CLOUD, ("rgb",), fs.Quality(), background=grey) == plain
-    assert select(CLOUD, ("rgb",), fs.Quality(), background=fs.Gradient(GREY, (0, 0, 0))) != plain
+    assert select(CLOUD, fs.Capture(background=grey)) == plain
+    assert select(CLOUD, fs.Capture(background=fs.Gradient(GREY, (0, 0, 0)))) != plain
     frames = [renderer.render(CLOUD, CAMERA, background=behind) for behind in (grey, GREY)]
     assert np.array_equal(frames[0]["rgb"], frames[1]["rgb"])
     around = fs.Scene([CLOUD], CAMERA, background=grey)
@@ -226,5 +223,5 @@ def test_a_tag_is_found_where_it_is_in_fog_and_noise(renderer, mixture):
 
 
 def test_a_view_needs_no_sensor():
-    view = View.of(CAMERA, fs.Quality(), np.zeros(3), (0, 0, 0))
+    view = View.of(fs.Capture(CAMERA), np.zeros(3))
     assert view.sensor.steps == ()

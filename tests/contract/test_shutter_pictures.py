@@ -10,9 +10,8 @@ from agreement import random_splats
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
-from fidsplat.backends.exposure import exposed_view
+from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference import ReferenceBackend
-from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, compare
 from fidsplat.quality import Quality
 
@@ -45,20 +44,19 @@ CAMERAS = {
     "parallel": fs.Camera.orthographic(*SIZE, 4.0),
 }
 SHUTTERS = {
-    "blur": fs.Shutter(exposure=0.3, sub_poses=5),
+    "blur": fs.Shutter(exposure_time=0.3, sub_poses=5),
     "rolling": fs.Shutter(readout=0.5, rows_per_band=7),
-    "both": fs.Shutter(time=0.2, exposure=0.2, sub_poses=2, readout=0.4, rows_per_band=16),
+    "both": fs.Shutter(time=0.2, exposure_time=0.2, sub_poses=2, readout=0.4, rows_per_band=16),
     "instant": fs.Shutter(time=0.4),
 }
 MOTION = fs.Motion(pose_at, {3: turned, 5: lambda time: turned(-time)})
 
 
 def truth(cloud, camera, quality, outputs, motion, shutter):
-    view = exposed_view(camera, quality, cloud.origin, BACKGROUND, motion, shutter)
-    kinds = {"moving": bool(view.groups), "exposed": bool(view.shots)}
-    features = select(cloud, (*outputs, "alpha"), quality, camera, **kinds)
-    judge = ReferenceBackend()
-    return judge.pipeline(features).render(judge.upload(cloud), view).planes
+    capture = fs.Capture(camera, (*outputs, "alpha"), quality, BACKGROUND, motion, shutter)
+    features, view = prepare(cloud, capture)
+    reference = ReferenceBackend()
+    return reference.pipeline(features).render(reference.upload(cloud), view).images
 
 
 def assert_exposed(renderer, cloud, camera, motion, shutter, quality=None, outputs=ALL_OUTPUTS):
@@ -81,7 +79,7 @@ def test_moving_layers(renderer, samples):
     cloud = coplanar_cloud(1)
     labels = np.where(cloud.planes < 0, 0, cloud.planes + 3)
     motion = fs.Motion(None, {3: turned, 4: lambda time: turned(-time)})
-    shutter = fs.Shutter(exposure=0.5, sub_poses=3)
+    shutter = fs.Shutter(exposure_time=0.5, sub_poses=3)
     camera = CAMERAS["pinhole"]
     assert_exposed(renderer, cloud.with_labels(labels), camera, motion, shutter, Quality(samples=samples))
 
@@ -106,7 +104,7 @@ def test_a_moved_group_is_the_transformed_cloud(renderer):
 
 def test_blur_is_the_mean_of_its_poses(renderer):
     cloud, camera = random_splats(100, 5, depth=(1, 5), scale=(0.02, 0.3)), CAMERAS["pinhole"]
-    shutter = fs.Shutter(time=0.1, exposure=0.4, sub_poses=4)
+    shutter = fs.Shutter(time=0.1, exposure_time=0.4, sub_poses=4)
     frame = renderer.render(cloud, camera, ("rgb", "alpha", "depth"), None, BACKGROUND, MOTION, shutter)
     single = [
         renderer.render(
@@ -141,8 +139,8 @@ def test_what_bands_leave_out_by_its_sphere_draws_nothing_there(renderer, lowpas
     cloud = cloud.with_labels(np.arange(3000) % 7)
     quality = Quality(lowpass=lowpass, samples=samples)
     camera, shutter = CAMERAS["pinhole"], fs.Shutter(readout=0.5, rows_per_band=3)
-    view = exposed_view(camera, quality, cloud.origin, BACKGROUND, MOTION, shutter)
-    features = select(cloud, ALL_OUTPUTS, quality, camera, moving=True, exposed=True)
+    capture = fs.Capture(camera, ALL_OUTPUTS, quality, BACKGROUND, MOTION, shutter)
+    features, view = prepare(cloud, capture)
     assert "shutter_rows" in features.names
     without = replace(features, slots=tuple(name for name in features.slots if name != "shutter_rows"))
     backend = renderer.backend

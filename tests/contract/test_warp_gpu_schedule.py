@@ -7,10 +7,9 @@ from agreement import ALL_OUTPUTS, random_splats
 from test_lens_pictures import CAMERAS
 
 import fidsplat as fs
-from fidsplat.backends.base import View
-from fidsplat.effects import OUTPUTS, select
+from fidsplat.backends.prepare import prepare
+from fidsplat.effects import OUTPUTS
 from fidsplat.hard_cases.agreement import Picture, compare, truth_of
-from fidsplat.hard_cases.invariance import other_schedule
 
 BACKEND = "warp"
 
@@ -46,13 +45,12 @@ PICTURES = {
 @pytest.mark.parametrize("name", PICTURES)
 def test_the_schedule_of_gpus_agrees_with_the_reference(renderer, name):
     picture = PICTURES[name]()
-    backend, cloud, behind = renderer.backend, picture.cloud, picture.background
-    features = select(
-        cloud, picture.outputs, picture.quality, picture.camera, fog=picture.fog, background=behind
+    backend, cloud = renderer.backend, picture.cloud
+    features, view = prepare(cloud, picture.capture)
+    images = backend.pipeline(features, backend.shapes("schedule")["groups"]).render(
+        backend.upload(cloud), view
     )
-    view = View.of(picture.camera, picture.quality, cloud.origin, behind, fog=picture.fog)
-    planes = backend.pipeline(features, other_schedule(renderer)).render(backend.upload(cloud), view)
-    drawn = {output: planes.read(output) for output in picture.outputs}
+    drawn = {output: images.read(output) for output in picture.outputs}
     differences = compare(drawn, truth_of(picture), picture.outputs)
     assert all(difference.agrees for difference in differences), differences
     assert drawn["rgb"].std() > 0.05

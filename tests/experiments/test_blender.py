@@ -31,7 +31,7 @@ def test_edges_agree_where_blender_averages_over_the_pixel(name):
 
 
 def test_edges_differ_by_the_pixel_filter_and_by_nothing_else():
-    """Blender's default filter, laid over our finely divided picture, gives Blender's picture again."""
+    """Blender's default filter, put over our finely divided picture, gives Blender's picture again."""
     name = "tag-blackman-harris"
     edges = ~flat(name, 2)
     seen = theirs(name)

@@ -11,8 +11,8 @@ from fidsplat.commands.experiment import Experiment
 from fidsplat.experiments import angles
 from fidsplat.experiments import run as run_module
 from fidsplat.experiments.blender import check_pictures, note_pictures
-from fidsplat.experiments.records import read_lines
-from fidsplat.experiments.run import Settings
+from fidsplat.experiments.run import Options
+from fidsplat.experiments.sweep import read_records
 from fidsplat.vision.images import write_png
 
 SMALL = ["--category", "apriltag", "--markers", "1"]
@@ -59,17 +59,17 @@ def test_an_interrupted_scan_goes_on(capsys, tmp_path, monkeypatch):
     status, out, err = run(capsys, *words)
     assert (status, out) == (130, "")
     assert "interrupted" in err
-    first = read_lines(tmp_path / "angles.jsonl")
+    first = read_records(tmp_path / "angles.jsonl")
     assert len(first) == 1
 
     monkeypatch.setattr(angles, "measure_angles", real)
     status, out, _ = run(capsys, *words)
     assert status == 0
     assert json.loads(out) == {"files": {"angles": str(tmp_path / "angles.jsonl")}}
-    lines = read_lines(tmp_path / "angles.jsonl")
-    assert lines[0] == first[0]
-    assert [line["key"]["protocol"] for line in lines] == ["fixed-plane", "fixed-module"]
-    assert lines[0]["result"]["readers"]["pupil"]["read"] == "111"
+    records = read_records(tmp_path / "angles.jsonl")
+    assert records[0] == first[0]
+    assert [record.key["protocol"] for record in records] == ["fixed-plane", "fixed-module"]
+    assert records[0].result["readers"]["pupil"]["read"] == "111"
 
 
 def test_shards_merge_into_what_one_run_gives(capsys, tmp_path):
@@ -82,12 +82,13 @@ def test_shards_merge_into_what_one_run_gives(capsys, tmp_path):
     )
     assert status == 0
     assert json.loads(out)["angles"] == {
-        "file": str(tmp_path / "both" / "angles.jsonl"), "files": 2, "lines": 2, "repeated": 0, "missing": [],
+        "file": str(tmp_path / "both" / "angles.jsonl"), "files": 2, "points": 2, "repeated": 0,
+        "missing": [],
     }  # fmt: skip
 
     def found(folder):
-        lines = read_lines(tmp_path / folder / "angles.jsonl")
-        return {json.dumps(line["key"], sort_keys=True): line["result"] for line in lines}
+        records = read_records(tmp_path / folder / "angles.jsonl")
+        return {json.dumps(record.key, sort_keys=True): record.result for record in records}
 
     assert found("both") == found("whole")
 
@@ -98,9 +99,9 @@ def test_everything_quick_and_its_report(capsys, tmp_path):
     )
     assert status == 0, err
     for name in ("counts", "localisation", "views", "angles"):
-        assert read_lines(tmp_path / f"{name}.jsonl")
+        assert read_records(tmp_path / f"{name}.jsonl")
     text = (tmp_path / "report.md").read_text()
-    assert "fitted/best, apriltag, pupil, fixed-plane: behind the ideal" in text
+    assert "| AR Tag | - | - | 8" in text
     assert (tmp_path / "sheet-apriltag.png").is_file()
     assert "(sheet-apriltag.png)" in text
     before = {file: file.read_bytes() for file in tmp_path.glob("*.jsonl")}
@@ -160,43 +161,43 @@ def test_wrong_words_are_one_line(capsys, tmp_path, monkeypatch, words, message)
     assert message in err
 
 
-def test_a_folder_that_cannot_be_written_is_told_before_the_work(capsys, tmp_path):
+def test_a_folder_that_cannot_be_written_is_shown_before_the_work(capsys, tmp_path):
     (tmp_path / "file").write_text("x")
     status, _, err = run(capsys, "counts", "-o", tmp_path / "file" / "deeper")
     assert status == 2
     assert "cannot write into the folder" in err
 
 
-def test_what_is_wrong_with_the_last_experiment_is_told_before_the_first(capsys, tmp_path):
+def test_what_is_wrong_with_the_last_experiment_is_shown_before_the_first(capsys, tmp_path):
     """Counts are measured first, tilts last: nothing is measured for a run that would fail after hours."""
     words = ("all", "--quick", *SMALL, "--mixture", "fitted", "-o", tmp_path)
-    old = '{"key": {"tilts": "x"}, "result": {}, "run": {"code": "older"}}\n'
+    old = '{"run": {"code": "older"}}\n{"key": {"tilts": "x"}, "result": {}}\n'
     (tmp_path / "angles.jsonl").write_text(old)
     status, _, err = run(capsys, *words)
     assert status == 2
     assert "angles.jsonl holds results of another versions and code" in err
-    status, _, err = run(capsys, *words, "--lpips", tmp_path / "no.npz", "--anew")
+    status, _, err = run(capsys, *words, "--lpips", tmp_path / "no.npz", "--overwrite")
     assert status == 2
     assert "cannot read the LPIPS weights" in err
     (tmp_path / "cut.npz").write_bytes(b"PK\x03\x04 a download that was cut short")
-    status, _, err = run(capsys, *words, "--lpips", tmp_path / "cut.npz", "--anew")
+    status, _, err = run(capsys, *words, "--lpips", tmp_path / "cut.npz", "--overwrite")
     assert status == 2
     assert "cut.npz is no .npz file with LPIPS weights" in err
-    assert read_lines(tmp_path / "counts.jsonl") == []
-    assert (tmp_path / "angles.jsonl").read_text() == old  # --anew drops nothing for it
+    assert read_records(tmp_path / "counts.jsonl") == []
+    assert (tmp_path / "angles.jsonl").read_text() == old  # --overwrite drops nothing for it
 
 
-def test_trained_models_that_are_missing_are_told_before_the_work(capsys, tmp_path):
+def test_trained_models_that_are_missing_are_shown_before_the_work(capsys, tmp_path):
     (tmp_path / "2dgs-9").mkdir()
     (tmp_path / "2dgs-9" / "apriltag-0.ply").touch()
     words = ("all", "--quick", "--trained", tmp_path, "-o", tmp_path / "out")
     status, _, err = run(capsys, *words)
     assert status == 2
     assert "small-0.ply is missing; --category and --markers leave out" in err
-    run_module.check(Settings(tmp_path, categories=("apriltag",), markers=1, trained=tmp_path))
+    run_module.check(Options(tmp_path, category=("apriltag",), markers=1, trained=tmp_path))
 
 
-def test_merge_tells_of_shards_that_are_missing(capsys, tmp_path):
+def test_merge_names_shards_that_are_missing(capsys, tmp_path):
     words = ("counts", *SMALL, "--shard", "1/3", "-o", tmp_path)
     assert run(capsys, *words)[0] == 0
     status, out, err = run(capsys, "merge", tmp_path, "-o", tmp_path / "out")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.experiments.dataset import POINTS, dataset_work, scene_name, write_scene
+from fidsplat.experiments.dataset import POINTS, dataset_scenes, scene_name, write_scene
 from fidsplat.experiments.methods import plain_marker
 from fidsplat.experiments.setup import CATEGORIES, novel_cameras, training_cameras
 from fidsplat.experiments.views import exact_view
@@ -121,7 +121,7 @@ def test_a_scene_of_one_truth_that_a_stop_left_with_pictures_of_two_is_drawn_aga
 
 
 def test_there_are_a_hundred_scenes():
-    work = dataset_work(CATEGORIES.values())
+    work = dataset_scenes(CATEGORIES.values())
     assert len({scene_name(part) for part in work}) == 100
 
 

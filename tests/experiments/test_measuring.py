@@ -1,4 +1,4 @@
-"""Each experiment on a small part: what it measures is what it says."""
+"""Each experiment on a small point: what it measures is what it says."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -41,9 +41,9 @@ def test_the_largest_tilt_and_the_largest_without_a_miss_below(hits, expected):
 
 
 def test_scans_of_the_ideal_texture_find_its_ceiling(pool):
-    part = angles.angles_work([CATEGORIES["small"]], ["fixed-module"], [IDEAL], "0:60:20,76:89:1", 1)[0]
-    result = angles.measure_angles(part, CEILING, 0, pool, 2)
-    tilts = angles.parse_tilts(part["tilts"])
+    point = angles.angles_points([CATEGORIES["small"]], ["fixed-module"], [IDEAL], "0:60:20,76:89:1", 1)[0]
+    result = angles.measure_angles(point, CEILING, 0, pool, 2)
+    tilts = angles.parse_tilts(point["tilts"])
     ends = {name: angles.largest(tilts, seen["read"]) for name, seen in result["readers"].items()}
     single, unbroken = ends["zxing-tall"]
     # a module of 8 px is 1.1 px high at 82.1 degrees, the limit that the research found
@@ -58,14 +58,14 @@ def test_scans_of_the_ideal_texture_find_its_ceiling(pool):
 
 def test_scans_do_not_hang_on_the_number_of_threads(renderer):
     painter = Painter(renderer)
-    parts = angles.angles_work(
+    parts = angles.angles_points(
         [CATEGORIES["apriltag"]], ["fixed-plane"], [IDEAL, "fitted/best"], "0:88:11", 1
     )
-    for part in parts:
+    for point in parts:
         results = []
         for workers in (1, 4):
             with ThreadPoolExecutor(workers) as threads:
-                results.append(angles.measure_angles(part, painter, 0, threads, workers))
+                results.append(angles.measure_angles(point, painter, 0, threads, workers))
         assert results[0] == results[1]
         assert "1" in results[0]["readers"]["pupil"]["read"]
 
@@ -77,8 +77,8 @@ def test_fitted_markers_are_read_wherever_the_ideal_is(renderer, pool, category,
     """OpenCV's detectors stumble over grey in the quiet zone, which ends of long rectangles would leave."""
     seen = []
     for method in (IDEAL, "fitted/best"):
-        part = angles.angles_work([CATEGORIES[category]], ["fixed-plane"], [method], tilts, 1)[0]
-        found = angles.measure_angles(part, Painter(renderer), 0, pool, 2)["readers"]
+        point = angles.angles_points([CATEGORIES[category]], ["fixed-plane"], [method], tilts, 1)[0]
+        found = angles.measure_angles(point, Painter(renderer), 0, pool, 2)["readers"]
         seen.append({name: one["read"] for name, one in found.items()})
     assert "0" not in seen[0]["aruco" if category == "apriltag" else "cv2"]
     assert seen[1] == seen[0]
@@ -163,16 +163,16 @@ def test_pictures_are_drawn_once_for_all_truths(pool, tmp_path):
     kept = views.Kept()
     for index, truths in ((0, ("exact", "exact-linear", "exact")), (1, ("exact-linear", "exact"))):
         for truth in truths:
-            part = part_of(IDEAL, truth) | {"index": index}
-            alone = views.measure_views(part, CEILING, 0, tmp_path, pool)
-            assert views.measure_views(part, Counting(None), 0, tmp_path, pool, kept=kept) == alone
+            point = part_of(IDEAL, truth) | {"index": index}
+            alone = views.measure_views(point, CEILING, 0, tmp_path, pool)
+            assert views.measure_views(point, Counting(None), 0, tmp_path, pool, kept=kept) == alone
     assert drawn == ["small-0", "small-0", "small-1", "small-1"]
 
 
 def test_views_by_the_renderer_with_every_metric(renderer, pool, tmp_path):
-    part = part_of("fitted/best", "exact")
+    point = part_of("fitted/best", "exact")
     found = views.measure_views(
-        part, Painter(renderer), 0, tmp_path, pool, lambda a, b: float(abs(a - b).max())
+        point, Painter(renderer), 0, tmp_path, pool, lambda a, b: float(abs(a - b).max())
     )
     assert all(27 < value < 40 for value in found["psnr"])
     assert all(0.9 < value < 1 for value in found["ssim"])
@@ -187,18 +187,18 @@ def test_blenders_pictures_take_part_where_a_marker_has_all_of_them(pool, tmp_pa
         file = views.novel_picture(tmp_path, "raw", "small", index, number)
         file.parent.mkdir(parents=True, exist_ok=True)
         write_png(file, to_uint8(views.exact_view(category.spec(0), camera, False)))
-    work = views.views_work([category], [IDEAL], tmp_path, markers=2, views=2)
-    assert [(part["index"], part["truth"]) for part in work] == [
+    points = views.views_points([category], [IDEAL], tmp_path, markers=2, views=2)
+    assert [(point["index"], point["truth"]) for point in points] == [
         (0, "exact-linear"),
         (0, "blender-raw"),
         (1, "exact-linear"),
     ]
-    found = views.measure_views(work[1], CEILING, 0, tmp_path, pool)
+    found = views.measure_views(points[1], CEILING, 0, tmp_path, pool)
     assert found["psnr"][0] is None  # the first view is in its place, the second is another view's picture
     assert found["psnr"][1] < 20
     write_png(views.novel_picture(tmp_path, "raw", "small", 0, 1), np.zeros((10, 10), np.uint8))
     with pytest.raises(fs.InputError, match="have another size"):
-        views.measure_views(work[1], CEILING, 0, tmp_path, pool)
+        views.measure_views(points[1], CEILING, 0, tmp_path, pool)
 
 
 def test_the_srgb_curve_and_its_inverse():
@@ -208,8 +208,8 @@ def test_the_srgb_curve_and_its_inverse():
 
 
 def test_counts_of_a_marker_that_one_can_count():
-    part = counts.counts_work([CATEGORIES["apriltag"]], 2, 1)[0]
-    result = counts.measure_counts(part, 0)
+    point = counts.counts_points([CATEGORIES["apriltag"]], 2, 1)[0]
+    result = counts.measure_counts(point, 0)
     grid = plain_marker("apriltag:36h11:0").grid
     dark = int(grid.sum())
     assert result["cells"] == {"dark": dark, "light": grid.size - dark}
@@ -240,8 +240,8 @@ def test_gaussians_of_the_minimum_partition_by_the_rule_for_others():
 
 @pytest.mark.parametrize("category", localisation.LOCATED)
 def test_localisation_on_the_ideal_texture(category, pool):
-    work = localisation.localisation_work([CATEGORIES[category]], [IDEAL], [0.6, 1.0], [0.0, 50.0], 1)
-    found = localisation.measure_localisation(work[0], CEILING, 0, pool)["views"]
+    points = localisation.localisation_points([CATEGORIES[category]], [IDEAL], [0.6, 1.0], [0.0, 50.0], 1)
+    found = localisation.measure_localisation(points[0], CEILING, 0, pool)["views"]
     assert [(v["distance_m"], v["tilt_deg"]) for v in found] == [(0.6, 0), (0.6, 50), (1, 0), (1, 50)]
     for view in found:
         assert view["position_mm"] < 0.01 * 1000 * view["distance_m"]
@@ -250,8 +250,8 @@ def test_localisation_on_the_ideal_texture(category, pool):
 
 
 def test_a_marker_that_is_not_read_has_no_errors(pool):
-    work = localisation.localisation_work([CATEGORIES["small"]], [IDEAL], [40.0], [0.0], 1)
-    (view,) = localisation.measure_localisation(work[0], CEILING, 0, pool)["views"]
+    points = localisation.localisation_points([CATEGORIES["small"]], [IDEAL], [40.0], [0.0], 1)
+    (view,) = localisation.measure_localisation(points[0], CEILING, 0, pool)["views"]
     assert (view["position_mm"], view["angle_deg"], view["corners_px"]) == (None, None, None)
 
 

@@ -1,30 +1,31 @@
 """Tables, charts and the report from results that are known."""
 
 import re
-import xml.etree.ElementTree as ET
-from html.parser import HTMLParser
+import xml.dom.minidom
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import fidsplat as fs
-from fidsplat.experiments.charts import Bar, bar_chart
-from fidsplat.experiments.document import Document
-from fidsplat.experiments.figures import mean_spread
-from fidsplat.experiments.records import Records
+from fidsplat.experiments import charts, pages
 from fidsplat.experiments.report import make_report
-from fidsplat.experiments.report_angles import Angles
+from fidsplat.experiments.results import load
+from fidsplat.experiments.summary import Summary, read_summary
+from fidsplat.experiments.sweep import Results
+from fidsplat.experiments.targets import targets
 from fidsplat.provenance import run_facts
 from fidsplat.vision.images import write_png
 
 TILTS = "0:80:20,81:84:1"  # 0 20 40 60 80 81 82 83 84
 
 
-def write(folder, name, parts) -> None:
-    records = Records(folder / f"{name}.jsonl", run_facts("a device", 0))
-    keys = [key for key, _ in parts]
-    results = iter([result for _, result in parts])
-    list(records.measure(keys, lambda key: next(results)))
+def write(folder, name, points) -> None:
+    results = Results(folder / f"{name}.jsonl", run_facts("a device", 0))
+    for key, result in points:
+        results.append(key, result)
 
 
 def scan(category, index, method, read, tilts=TILTS) -> tuple[dict, dict]:
@@ -55,14 +56,9 @@ VIEWS = [
     view("fitted/best", "exact", 31.5),
     view("fitted/best", "exact-linear", 28.0),
 ]
-PLACES = {
-    "views": [{"distance_m": 1.0, "tilt_deg": 0.0, "position_mm": 0.5, "angle_deg": 0.1, "corners_px": 0.02}]
-}
-LOST = {
-    "views": [
-        {"distance_m": 1.0, "tilt_deg": 0.0, "position_mm": None, "angle_deg": None, "corners_px": None}
-    ]
-}
+PLACE = {"distance_m": 1.0, "tilt_deg": 0.0}
+SEEN = {"views": [PLACE | {"position_mm": 0.5, "angle_deg": 0.1, "corners_px": 0.02}]}
+LOST = {"views": [PLACE | {"position_mm": None, "angle_deg": None, "corners_px": None}]}
 
 
 def place(index, result) -> tuple[dict, dict]:
@@ -87,126 +83,94 @@ COUNTS = [
 ]  # fmt: skip
 
 
-@pytest.fixture
-def results(tmp_path):
-    write(tmp_path, "angles", SCANS)
-    write(tmp_path, "views", VIEWS)
-    write(tmp_path, "localisation", [place(0, PLACES), place(1, LOST)])
-    write(tmp_path, "counts", COUNTS)
-    return tmp_path
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("results")
+    write(folder, "angles", SCANS)
+    write(folder, "views", VIEWS)
+    write(folder, "localisation", [place(0, SEEN), place(1, LOST)])
+    write(folder, "counts", COUNTS)
+    write_png(folder / "sheet-small.png", np.zeros((4, 4), np.uint8))
+    return folder
 
 
-def rows_of(text: str) -> list[list[str]]:
-    return [
-        [cell.strip() for cell in line.split(" | ")] for line in text.splitlines() if line.startswith("| ")
-    ]
+@pytest.fixture(scope="module")
+def reported(results):
+    files = make_report([results], results / "docs" / "results.md")
+    return results / "docs", files
 
 
-def row_of(text: str, *start: str) -> list[str]:
-    (row,) = [row for row in rows_of(text) if [cell.strip("| ") for cell in row[: len(start)]] == list(start)]
-    return [cell.strip("| ") for cell in row]
+def test_the_report_says_what_was_measured(reported):
+    text = reported[1][0].read_text()
+    for words in (
+        "| QR Huge | 1000 | 22 | 105 x 105 | 15 | 100 | 10700 | 2500 |",
+        "| QR Huge | 0.3 | 0.2 |",
+        "| QR Small | 80.0 80.0 | 81.0 79.0 | 84.0 82.5 | 84.0 82.0 |",
+        "| QR Huge | 84.0 82.2 | 82.6 75.4 | 84.0 83.0 | 84.0 never |",
+        "| QR Small | 25.4 / 0.83 | 37.2 / 0.99 | 31.5 / 0.980 |",
+        "mean over 2 views of each marker",
+        "FLIP was measured in 4 of 4\ncases and LPIPS in 0 (it needs weights",
+        "| QR Small, 1 m | 0.5 (1 of 2) |",
+        "`experiment angles`, 6 points | a device; ",
+    ):
+        assert words in text, words
 
 
-def test_the_report_says_what_was_measured(results):
-    files = make_report([results], results / "out")
-    assert [file.name for file in files[:2]] == ["report.md", "report.html"]
+def test_pictures_and_tables_are_where_the_page_names_them(reported):
+    folder, files = reported
     text = files[0].read_text()
-    assert row_of(text, "QR Small", "80.0 80.0")[:4] == ["QR Small", "80.0 80.0", "84.0 82.5", "84.0 82.0"]
-    assert row_of(text, "small", "fitted/best")[3:] == [
-        "84.0 ± 0.0 / 84.0 ± 0.0",
-        "82.0 ± 1.4 / 40.5 ± 57.3",
-        "+1.0 / +83.0",
-    ]
-    assert row_of(text, "huge", "fitted/best")[4:] == [
-        "never / never",
-        "not read frontally / not read frontally",
-    ]
-    assert row_of(text, "QR Huge", "84.0 82.2")[2:4] == ["84.0 83.0", "84.0 never"]
-    assert "LPIPS was not measured ('-' where not): it needs weights, which the user supplies" in text
-    assert "FLIP was not" not in text
-    assert "31.50 / 0.980 / - / 0.050" in text
-    assert row_of(text, "1 m, 0 deg")[1] == "0.500 / 0.100 / 0.020 (1 of 2)"
-    assert row_of(text, "QR Huge", "7.0 + 8.0")[2:] == ["5000.0 + 6000.0", "300.0 + 200.0", "60.0 + 40.0"]
-    assert "a device" in text
-    assert "(paper 73.8 60.0)" in text  # the columns of the trained baseline wait with the paper's figures
+    named = re.findall(r"\]\((results/[^)]+)\)", text)
+    assert {"results/sheet-small.png", "results/angles.svg", "results/missed.csv"} <= set(named)
+    for name in named:
+        assert (folder / name).is_file(), name
+    for file in folder.rglob("*.svg"):
+        xml.dom.minidom.parse(str(file))
 
 
-def test_targets_are_judged(results):
-    text = make_report([results], results / "out")[0].read_text()
+def test_the_page_can_be_made_again_from_its_tables(reported, tmp_path):
+    folder, files = reported
+    make_report([folder / "results"], tmp_path / "results.md")
+    assert (tmp_path / "results.md").read_bytes() == files[0].read_bytes()
+    for file in (folder / "results").iterdir():
+        assert (tmp_path / "results" / file.name).read_bytes() == file.read_bytes(), file.name
 
-    def verdict(what: str) -> list[str]:
-        return row_of(text, what)[2:]
+
+def test_targets_are_compared_with_what_was_found(results):
+    found = targets(load([results])).set_index("what")
+
+    def verdict(what: str) -> list:
+        return found.loc[what, ["found", "reached"]].tolist()
 
     gap = "zxing-tall, fixed-module: behind the ideal, largest / without a miss"
-    assert verdict(f"fitted/best, small, {gap}") == ["+1.0 / +83.0 deg, worst of 2", "no"]
-    assert verdict(f"fitted/best, huge, {gap}")[-1] == "no"
+    assert verdict(f"fitted/best, small, {gap}") == ["+1.0 / +83.0 deg, worst of 2", False]
+    assert verdict(f"fitted/best, huge, {gap}") == [
+        "not read frontally / not read frontally deg, worst of 1",
+        False,
+    ]
     # the ideal reads to 82 and 83: of the 6 and 7 tilts to one degree below, one is missed
     missed = "fixed-module: tilts missed below the ceiling"
-    assert verdict(f"fitted/best, small, {missed}") == ["zxing-tall 1 of 13", "no"]
-    assert verdict(f"fitted/best, huge, {missed}") == ["zxing-tall 7 of 7", "no"]
-    assert f"tilts of {TILTS}, 2 views" in text
-    verdicts = [row[-1] for row in rows_of(text) if row[-1].strip("| ") in ("yes", "no")]
-    reached = sum("yes" in verdict for verdict in verdicts)
-    assert f"{reached} of {len(verdicts)} are reached." in text
+    assert verdict(f"fitted/best, small, {missed}") == ["zxing-tall 1 of 13", False]
+    assert verdict(f"fitted/best, huge, {missed}") == ["zxing-tall 7 of 7", False]
     best = "fitted/best, small, fixed-module: largest tilt that is read, mean"
-    assert verdict(best) == ["82.0 deg (ideal: 82.5), mean of 2", "yes"]
-    assert verdict("fitted/best above paper/screen, small, PSNR against exact")[-1] == "yes"
-    assert "+5.50 dB (31.50 and 26.00)" in text
+    assert verdict(best) == ["82.0 deg (ideal: 82.5), mean of 2", True]
+    assert verdict("fitted/best above paper/screen, small, PSNR against exact") == [
+        "+5.50 dB (31.50 and 26.00)", True,
+    ]  # fmt: skip
     # 25.41 in the paper's table 4
     own = verdict("fitted/best above the paper's own figure, small, PSNR against exact-linear")
-    assert own == ["+2.59 dB (28.00 and 25.41) (a perfect picture of display values: 33.00)", "no"]
+    assert own == ["+2.59 dB (28.00 and 25.41) (a perfect picture of display values: 33.00)", False]
     share = "fitted, huge: Gaussians of those of the paper's mixture"
-    assert verdict(share) == ["0.234, worst of 2", "yes"]
-    assert verdict("fitted, QR Huge: construction") == ["0.200 s, median of the slowest of 2", "no"]
+    assert verdict(share) == ["0.234, worst of 2", True]
+    assert verdict("fitted, QR Huge: construction") == ["0.200 s, median of the slowest of 2", False]
 
 
-class Tags(HTMLParser):
-    def __init__(self):
-        super().__init__()
-        self.open, self.texts, self.sources = [], [], []
-
-    def handle_starttag(self, tag, attributes):
-        if tag == "img":
-            self.sources.append(dict(attributes)["src"])
-        elif tag not in ("meta", "html"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        if tag != "html":
-            assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        self.texts.append(data)
-
-
-def test_both_forms_say_the_same_and_their_pictures_are_there(results):
-    write_png(results / "sheet-small.png", np.zeros((4, 4), np.uint8))
-    out = results / "out"
-    make_report([results], out)
-    page = Tags()
-    page.feed((out / "report.html").read_text())
-    assert page.open == []
-    text = (out / "report.md").read_text()
-    named = re.findall(r"!\[[^]]*\]\(([^)]+)\)", text)
-    assert page.sources == named
-    assert "sheet-small.png" in named
-    for name in named:
-        assert (out / name).is_file()
-    cells = {cell.strip("| ").replace("\\|", "|") for row in rows_of(text) for cell in row} - {
-        "---",
-        "---:",
-        "",
-    }
-    assert cells <= {piece.strip() for piece in page.texts}
-
-
-def test_a_page_of_its_own_name_has_its_pictures_in_a_folder(results):
-    files = make_report([results], results / "docs" / "results.md")
-    assert files[:2] == [results / "docs" / "results.md", results / "docs" / "results.html"]
-    assert {file.parent.name for file in files[2:]} == {"results"}
-    for name in re.findall(r"!\[[^]]*\]\(([^)]+)\)", files[0].read_text()):
-        assert (results / "docs" / name).is_file()
-        assert f'src="{name}"' in files[1].read_text()
+def test_the_report_counts_the_targets(reported):
+    folder, files = reported
+    text = files[0].read_text()
+    reached, of = map(int, re.search(r"(\d+) of (\d+) targets are reached", text).groups())
+    rows = (folder / "results" / "missed.csv").read_text().splitlines()[1:]
+    assert of - reached == len(rows) > 0
+    assert sum(int(n) for n in re.findall(r"\| \d+ \| (\d+) \|$", text.split("## Tables 1")[0], re.M)) == of
 
 
 def test_a_part_of_the_results_is_enough_and_none_is_an_error(tmp_path):
@@ -217,93 +181,108 @@ def test_a_part_of_the_results_is_enough_and_none_is_an_error(tmp_path):
         make_report([tmp_path / "none"], tmp_path)
 
 
-def test_the_scan_with_more_tilts_counts_and_gaps_use_common_tilts():
-    lines = [
-        {"key": key, "result": result}
-        for key, result in (
-            scan("small", 0, "ideal", "1" * 81 + "0" * 5, "0:85:1"),  # to 80
+def angles_of(tmp_path, scans):
+    write(tmp_path, "angles", scans)
+    rows = load([tmp_path])["angles"].rows
+    return rows.set_index(["category", "marker", "method"])
+
+
+def test_the_scan_with_more_tilts_counts_and_gaps_use_common_tilts(tmp_path):
+    rows = angles_of(
+        tmp_path,
+        [
             scan("small", 0, "ideal", "1", "0:0:1"),
+            scan("small", 0, "ideal", "1" * 81 + "0" * 5, "0:85:1"),  # to 80
             scan("small", 0, "fitted/best", "111", "0:80:40"),  # knows nothing of 79
-        )
-    ]
-    angles = Angles(lines)
-    assert len(angles.of("fixed-module", "small", "ideal", "zxing-tall")[0].tilts) == 86
-    for which in (0, 1):
-        assert angles.behind("fixed-module", "small", "fitted/best", "zxing-tall", which) == [0.0]
+        ],
+    )
+    assert rows.loc[("small", 0, "ideal"), "amount"] == 86
+    assert rows.loc[("small", 0, "fitted/best"), ["behind", "behind_all"]].tolist() == [0, 0]
 
 
-def test_a_hole_is_not_hidden_by_where_reading_ends():
-    lines = [
-        {"key": key, "result": result}
-        for key, result in (
+def test_a_hole_is_not_hidden_by_where_reading_ends(tmp_path):
+    rows = angles_of(
+        tmp_path,
+        [
             scan("small", 0, "ideal", "1111100001", "0:81:9"),  # to 36 without a miss, 81 at most
             scan("small", 0, "exact/best", "1111111110", "0:81:9"),
             scan("small", 1, "ideal", "1111111110", "0:81:9"),
             scan("small", 1, "exact/best", "1110111110", "0:81:9"),
-        )
-    ]
-    angles, about = Angles(lines), ("fixed-module", "small", "exact/best", "zxing-tall")
-    assert angles.behind(*about, 0) == [9, 0]
-    assert angles.behind(*about, 1) == [-36, 54]
-    assert angles.missed(*about, 0.0) == (1, 14)
-    assert angles.missed(*about, 0.2) == (1, 12)
-    assert angles.missed("fixed-plane", *about[1:], 0.2) is None
+            scan("small", 1, "other/best", "1110111110", "0:81:9"),
+        ],
+    )
+    own = rows.xs("exact/best", level="method")
+    assert own["behind"].tolist() == [9, 0]
+    assert own["behind_all"].tolist() == [-36, 54]
+    assert (own["missed"].sum(), own["below"].sum()) == (1, 12)  # up to 0.2 degrees below
+    assert rows.loc[("small", 1, "other/best"), "below"] == 9  # a mixture without a target: up to the ceiling
 
 
 def test_results_of_another_version_are_one_line(tmp_path):
-    (tmp_path / "views.jsonl").write_text('{"key": {"category": "small"}, "result": {}, "run": {}}\n')
+    (tmp_path / "views.jsonl").write_text('{"run": {}}\n{"key": {"category": "small"}, "result": {}}\n')
     with pytest.raises(
         fs.InputError, match=r"of another version of fidsplat, they lack '\w+'; measure again"
     ):
         make_report([tmp_path], tmp_path)
 
 
-def test_without_the_apriltag_library_the_short_table_shows_opencv():
+def test_without_the_apriltag_library_the_table_shows_opencv(tmp_path):
     key, result = scan("apriltag", 0, "ideal", "111111100")
-    seen = {"aruco": result["readers"]["pupil"]}
-    assert Angles([{"key": key, "result": result}]).furthest("apriltag") == "pupil"
-    assert Angles([{"key": key, "result": {"readers": seen}}]).furthest("apriltag") == "aruco"
+    write(tmp_path, "angles", [(key, result | {"readers": {"aruco": result["readers"]["pupil"]}})])
+    assert "| AR Tag | - | - | 84.0 82.0 |" in make_report([tmp_path], tmp_path)[0].read_text()
 
 
-def test_means_with_their_spread():
-    assert mean_spread([1.0, 3.0], 1) == "2.0 ± 1.4"
-    assert mean_spread([2.0], 2) == "2.00"
-    assert mean_spread([], 1) == "-"
-    assert mean_spread([None, None], 1, never=True) == "never"
-    assert mean_spread([80.0, None], 1, never=True) == "80.0 (1 of 2 never)"
+def test_a_summary_is_what_its_file_says(tmp_path):
+    rows = load_rows(tmp_path)
+    summary = Summary(rows, [{"device": "d", "points": 1}], ["a note"])
+    read = summary.write(tmp_path / "a.csv")
+    again = read_summary(tmp_path / "a.csv")
+    assert read.rows.equals(again.rows)
+    assert (again.runs, again.notes) == (summary.runs, summary.notes)
+    assert again.rows["read"].tolist()[:2] == [82, 83]
+
+
+def load_rows(folder: Path):
+    write(folder, "angles", SCANS)
+    return load([folder])["angles"].rows
+
+
+def test_cells_of_a_table(tmp_path):
+    frame = read_summary(write_csv(tmp_path)).rows[["name", "value"]]
+    assert pages.markdown_table(frame).splitlines() == [
+        "| name | value |",
+        "| --- | ---: |",
+        "| x\\|y | 1.5 |",
+    ]
+    assert (pages.number(None), pages.fixed(float("nan")), pages.percent(None)) == ("-", "-", "-")
+    assert (pages.percent(1.123), pages.percent(0.5), pages.percent(1.004)) == ("+12 %", "-50 %", "+0.4 %")
+    assert (pages.number(0.00123), pages.fixed(1.25, 2), pages.listed([])) == ("0.0012", "1.25", "none")
+
+
+def write_csv(folder: Path) -> Path:
+    (folder / "x.csv").write_text('# {"run": {}}\nname,value,run\nx|y,1.5,0\n')
+    return folder / "x.csv"
 
 
 def test_bars_are_as_long_as_their_values():
-    svg = ET.fromstring(
-        bar_chart("a < b & c", "dB", ["g", "h"], {"s": [Bar(10), Bar(5, 1)], "t": [None, Bar(20)]})
-    )
-    space = "{http://www.w3.org/2000/svg}"
-    bars = [
-        r for r in svg.iter(f"{space}rect") if r.get("fill") in ("#777777", "#d1495b") and r.get("y") != "26"
-    ]
-    lengths = [float(bar.get("height")) for bar in bars]
-    by_value = dict(zip((10, 5, 20), lengths, strict=True))
-    assert by_value[10] == pytest.approx(2 * by_value[5], abs=0.2)
-    assert by_value[20] == pytest.approx(4 * by_value[5], abs=0.4)
-    assert "a < b & c" in [text.text for text in svg.iter(f"{space}text")]
-    error = [p for p in svg.iter(f"{space}path") if p.get("stroke") == "#000"]
-    assert len(error) == 1
+    axes = Figure().subplots()
+    charts.bars(axes, ["g", "h"], {"s": [10, 5], "t": [float("nan"), 20]})
+    heights = [[bar.get_height() for bar in bars] for bars in axes.containers]
+    assert heights[0] == [10, 5]
+    assert np.isnan(heights[1][0])
+    assert heights[1][1] == 20
+    edges = sorted((bar.get_x(), bar.get_x() + bar.get_width()) for bars in axes.containers for bar in bars)
+    assert all(end <= start for (_, end), (start, _) in pairwise(edges))
 
 
-def test_a_logarithmic_scale_has_equal_steps_for_equal_factors():
-    svg = ET.fromstring(bar_chart("t", "n", ["a", "b", "c"], {"s": [Bar(10), Bar(100), Bar(1000)]}, True))
-    bars = [r for r in svg.iter("{http://www.w3.org/2000/svg}rect") if r.get("fill") == "#777777"]
-    heights = [float(bar.get("height")) for bar in bars if bar.get("y") != "26"]
-    assert heights[2] - heights[1] == pytest.approx(heights[1] - heights[0], abs=0.2)
-    assert "<rect" in bar_chart("t", "n", ["a"], {"s": [Bar(0)]})
-    with pytest.raises(ValueError, match="at or below 0"):
-        bar_chart("t", "n", ["a"], {"s": [Bar(0)]}, True)
-    with pytest.raises(ValueError, match="at least one bar"):
-        bar_chart("t", "n", ["a"], {"s": [None]})
-
-
-def test_bars_in_a_cell_do_not_break_a_table():
-    document = Document("t")
-    document.table(("a", "b"), [("x|y", "<z>")])
-    assert "| x\\|y | <z> |" in document.markdown()
-    assert "<td>x|y</td><td>&lt;z&gt;</td>" in document.html()
+def test_labels_of_a_chart_do_not_overlap(tmp_path):
+    points = [(10 + 0.1 * i, 1.0 + 0.01 * i, f"a name {i}") for i in range(8)]
+    with charts.chart(tmp_path / "a.svg") as (figure, (axes,)):
+        axes.plot([1, 100], [0.1, 10])
+        charts.label_points(figure, axes, points)
+        boxes = [text.get_bbox_patch() or text for text in axes.texts]
+        assert [text.get_text() for text in axes.texts] == [name for _, _, name in points]
+        renderer = figure.canvas.get_renderer()
+        extents = [super(type(text), text).get_window_extent(renderer) for text in boxes]
+        for i, one in enumerate(extents):
+            assert not any(one.overlaps(other) for other in extents[:i])

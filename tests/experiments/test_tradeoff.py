@@ -1,4 +1,4 @@
-"""`fidsplat tradeoff`: what is measured, how it is judged, how a run survives."""
+"""`fidsplat tradeoff`: what is measured, how it is compared with the truth, how a run survives."""
 
 import dataclasses
 import json
@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.opencl.memory import Resident
+from fidsplat.backends.opencl.resident import Resident
 from fidsplat.cli import main
-from fidsplat.experiments.records import read_lines
-from fidsplat.experiments.tradeoff import judging, run
-from fidsplat.experiments.tradeoff import table as table_module
+from fidsplat.experiments.sweep import read_records
+from fidsplat.experiments.tradeoff import compare, run
+from fidsplat.experiments.tradeoff import session as session_module
 from fidsplat.experiments.tradeoff.hard import CELLS, cell_window, hard_scene
 from fidsplat.experiments.tradeoff.points import ALONE, BASE, EXACT, KNOBS, decode_points, points, quality_of
 from fidsplat.experiments.tradeoff.scenes import NAMES, TradeScene, make, scene_names
-from fidsplat.experiments.tradeoff.table import Table
+from fidsplat.experiments.tradeoff.session import Session
 from fidsplat.experiments.tradeoff.timing import QUICK, memory_of, time_point
 from fidsplat.hard_cases.clouds import camera, splats
 from fidsplat.quality import PRESETS, MarkerQuality
@@ -25,8 +25,8 @@ WORDS = ("tradeoff", "--quick", "--scenes", "apriltag", "--knobs", "opacity_ceil
 
 
 @pytest.fixture(scope="module")
-def table():
-    return Table(fs.Renderer("opencl"))
+def session():
+    return Session(fs.Renderer("opencl"))
 
 
 def faint_rim() -> TradeScene:
@@ -59,7 +59,7 @@ def test_every_knob_is_turned():
     assert {knob.name for knob in dataclasses.fields(fs.Quality)} - set(KNOBS) == {"first_hit"}
 
 
-def test_the_constants_of_other_systems_are_among_the_settings():
+def test_the_constants_of_other_systems_are_among_the_options():
     found = {(point.knob, point.value) for point in points(KNOBS, False)}
     assert {
         ("alpha_cutoff", "3 sigma"), ("opacity_ceiling", "0.99"), ("stop_rule", "exclusive"),
@@ -71,10 +71,10 @@ def test_the_constants_of_other_systems_are_among_the_settings():
 
 def test_parts_are_all_different_and_the_telling_ones_come_first():
     for quick in (False, True):
-        parts = run.all_parts((), (), quick)
+        parts = run.all_points((), (), quick)
         assert len({json.dumps(part, sort_keys=True) for part in parts}) == len(parts)
         assert parts[0]["knob"] == "base"
-    full = run.all_parts((), (), False)
+    full = run.all_points((), (), False)
     assert {part["scene"].partition("@")[0] for part in full} == set(NAMES)
     knobs = [part.get("knob") for part in full]
     assert knobs.index("blend_precision") > max(i for i, knob in enumerate(knobs) if knob == "alpha_cutoff")
@@ -85,21 +85,21 @@ def test_parts_are_all_different_and_the_telling_ones_come_first():
     assert EXACT in again
 
 
-def test_the_hard_scene_is_the_same_each_time_and_fills_its_cells(table):
+def test_the_hard_scene_is_the_same_each_time_and_fills_its_cells(session):
     (one, camera_), (other, _) = hard_scene(), hard_scene()
     assert all(
         np.array_equal(getattr(one, name), getattr(other, name)) for name in ("means", "scales", "quats")
     )
     assert len(one) > 5000
     assert np.linalg.norm(one.origin) > 1e6
-    picture = table.draw("hard", EXACT)["rgb"]
+    picture = session.draw("hard", EXACT)["rgb"]
     assert picture.shape == (camera_.height, camera_.width, 3)
     for number, name in enumerate(CELLS):
         assert picture[cell_window(number)].max() > 0.1, name
     # it hurts what it is to hurt: the haze is lost below 1/255, dropped layers let the lamp through
-    off = np.abs(table.draw("hard", BASE)["rgb"] - picture)
+    off = np.abs(session.draw("hard", BASE)["rgb"] - picture)
     assert off[cell_window(CELLS.index("haze"))].max() > 0.1
-    dropped = table.draw("hard", BASE.with_(stop_rule="exclusive", coplanar="order"))["rgb"]
+    dropped = session.draw("hard", BASE.with_(stop_rule="exclusive", coplanar="order"))["rgb"]
     assert np.abs(dropped - picture)[cell_window(CELLS.index("opaque"))].max() > 0.5
 
 
@@ -107,7 +107,7 @@ def test_errors_are_those_of_the_cut_off():
     renderer, scene = fs.Renderer("opencl"), faint_rim()
     cut = fs.Quality(alpha_cutoff=0.1)
     exact = np.asarray(drawn(renderer, scene, EXACT), np.float64)
-    result = judging.judge_picture(drawn(renderer, scene, cut), exact, scene, cut)
+    result = compare.compare_picture(drawn(renderer, scene, cut), exact, scene, cut)
     # just outside the radius alpha is just below the cut-off
     assert 0.09 < result["maximum"] < 0.1
     assert result["p999"] <= result["maximum"]
@@ -115,41 +115,41 @@ def test_errors_are_those_of_the_cut_off():
     assert result["psnr"] == pytest.approx(-20 * np.log10(result["rmse"]))
     # no pixel's decision hangs on rounding, so certificates take nothing away
     assert result["maximum_sure"] == pytest.approx(result["maximum"], abs=1e-4)
-    same = judging.judge_picture(exact.astype(np.float32), exact, scene, EXACT)
+    same = compare.compare_picture(exact.astype(np.float32), exact, scene, EXACT)
     assert same["psnr"] is None or same["psnr"] > 120
 
 
 def test_a_certified_flip_is_no_error():
     renderer, scene = fs.Renderer("opencl"), faint_rim()
     quality = fs.Quality(alpha_cutoff=0.1)
-    truth_of = judging.truth_of(
-        judging.Picture(scene.cloud, scene.camera, quality, ("rgb",)),
+    truth_of = compare.truth_of(
+        compare.Picture(scene.cloud, scene.camera, quality, ("rgb",)),
         tuple(part.ravel() for part in np.mgrid[0:48, 0:64]),
     )
     certificate = truth_of["certificate"].reshape(48, 64)
     off = np.zeros((48, 64))
     row, column = np.unravel_index(np.argmax(certificate), off.shape)
     off[row, column] = certificate[row, column]
-    assert judging.beyond_certificates(off, scene, quality) == pytest.approx(0.0, abs=1e-12)
+    assert compare.beyond_certificates(off, scene, quality) == pytest.approx(0.0, abs=1e-12)
     # an error that nothing certifies stays
     off[24, 32] = 0.3
     assert certificate[24, 32] < 1e-3
-    assert judging.beyond_certificates(off, scene, quality) == pytest.approx(0.3, abs=1e-3)
+    assert compare.beyond_certificates(off, scene, quality) == pytest.approx(0.3, abs=1e-3)
     assert drawn(renderer, scene, quality)[24, 32].max() > 0.9
 
 
 def test_many_splats_have_no_certificates(monkeypatch):
-    monkeypatch.setattr(judging, "_PAIRS", 5)
-    assert judging.beyond_certificates(np.zeros((48, 64)), faint_rim(), BASE) is None
+    monkeypatch.setattr(compare, "_PAIRS", 5)
+    assert compare.beyond_certificates(np.zeros((48, 64)), faint_rim(), BASE) is None
 
 
-def test_a_marker_is_held_against_the_printed_texture(table):
+def test_a_marker_is_held_against_the_printed_texture(session):
     result = {}
     for mixture in ("fitted", "exact"):
         quality = BASE.with_(marker=MarkerQuality(mixture))
         scene = make("apriltag@60", quality.marker)
-        frame, times = time_point(table, "apriltag@60", quality, QUICK)
-        result[mixture] = times | judging.judge_marker(frame["rgb"], scene)
+        frame, times = time_point(session, "apriltag@60", quality, QUICK)
+        result[mixture] = times | compare.compare_marker(frame["rgb"], scene)
     assert result["exact"]["ideal_psnr"] > 50 > result["fitted"]["ideal_psnr"] > 20
     assert result["exact"]["corners_px"] < 0.1
     assert result["exact"]["splats"] == result["exact"]["rectangles"]
@@ -162,80 +162,80 @@ def test_a_marker_is_held_against_the_printed_texture(table):
         assert found["ratio_quartiles"][0] <= found["ratio"] <= found["ratio_quartiles"][1]
 
 
-def test_memory_is_that_of_the_setting_alone(table):
+def test_memory_is_that_of_the_setting_alone(session):
     def memory(quality):
-        return time_point(table, "apriltag@0", quality, QUICK)[1]["memory_bytes"]
+        return time_point(session, "apriltag@0", quality, QUICK)[1]["memory_bytes"]
 
     small = memory(BASE)
     assert memory(BASE.with_(samples=3, lowpass="none")) > 2 * small
     assert memory(BASE) == small
 
 
-def test_memory_does_not_hang_on_what_was_drawn_before(table, monkeypatch):
+def test_memory_does_not_hang_on_what_was_drawn_before(session, monkeypatch):
     """As on a GPU, where a cloud keeps its colours once a picture has asked for them."""
     held = property(lambda self: sum(buffer.size for buffer in self._buffers.values()))
-    monkeypatch.setattr(Resident, "device_bytes", held)
-    before = memory_of(table, "apriltag@0", BASE)
-    table.draw("apriltag@0", BASE.with_(samples=2))
+    monkeypatch.setattr(Resident, "memory_bytes", held)
+    before = memory_of(session, "apriltag@0", BASE)
+    session.draw("apriltag@0", BASE.with_(samples=2))
     assert before is not None
-    assert memory_of(table, "apriltag@0", BASE) == before
+    assert memory_of(session, "apriltag@0", BASE) == before
 
 
-def test_a_device_without_float64_is_held_against_one_with_it(table, monkeypatch):
+def test_a_device_without_float64_is_held_against_one_with_it(session, monkeypatch):
     """As Warp's."""
-    monkeypatch.setattr(table_module, "judge_for", lambda renderer: table.renderer)
+    monkeypatch.setattr(session_module, "reference_for", lambda *_: session.renderer)
     lacking = fs.Renderer("opencl")
     monkeypatch.setattr(lacking, "render", lambda *_, **__: pytest.fail("it drew its own truth"))
-    want = table.truth("apriltag@0", BASE)
-    assert np.array_equal(Table(lacking).truth("apriltag@0", BASE), want)
+    want = session.truth("apriltag@0", BASE)
+    assert np.array_equal(Session(lacking).truth("apriltag@0", BASE), want)
 
 
-def test_a_definition_has_a_truth_of_its_own(table):
-    assert table.truth("apriltag@0", BASE) is table.truth("apriltag@0", BASE.with_(alpha_cutoff=0.01))
+def test_a_definition_has_a_truth_of_its_own(session):
+    assert session.truth("apriltag@0", BASE) is session.truth("apriltag@0", BASE.with_(alpha_cutoff=0.01))
     order = BASE.with_(coplanar="order")
-    assert np.abs(table.truth("apriltag@0", BASE) - table.truth("apriltag@0", order)).max() > 0.1
+    assert np.abs(session.truth("apriltag@0", BASE) - session.truth("apriltag@0", order)).max() > 0.1
     # only coplanar splats have a rule
-    assert table.truth("hard", BASE) is table.truth("hard", order)
-    full = table.full("hard", BASE)
-    found = judging.check_truth(table.truth("hard", BASE), table.scene("hard", BASE.marker).scene, full)
+    assert session.truth("hard", BASE) is session.truth("hard", order)
+    full = session.full("hard", BASE)
+    found = compare.check_truth(session.truth("hard", BASE), session.scene("hard", BASE.marker).scene, full)
     assert found["pixels"] == 64
     assert found["maximum"] < 2e-6
 
 
-def test_nobody_sees_what_standard_leaves_out(table):
+def test_nobody_sees_what_standard_leaves_out(session):
     """Half a step of 8 bits, on what constants hurt most."""
     standard = PRESETS["standard"]
-    assert np.abs(table.draw("hard", standard)["rgb"] - table.truth("hard", standard)).max() <= 1 / 512
+    assert np.abs(session.draw("hard", standard)["rgb"] - session.truth("hard", standard)).max() <= 1 / 512
 
 
 def test_an_interrupted_run_goes_on(capsys, tmp_path, monkeypatch):
     words = [*WORDS, "-o", str(tmp_path), "--json"]
     real, begun = run._begin, []
 
-    def stopped(table, part, quick):
+    def stopped(session, part, quick):
         begun.append(part)
         if len(begun) > 2:
             raise KeyboardInterrupt
-        return real(table, part, quick)
+        return real(session, part, quick)
 
     monkeypatch.setattr(run, "_begin", stopped)
-    monkeypatch.setattr(run.Settings, "workers", 1)
+    monkeypatch.setattr(run.Options, "workers", 1)
     assert main(words) == 130
     assert "interrupted" in capsys.readouterr().err
     file = tmp_path / run.FILE
     first = file.read_text()
-    assert [line["key"] for line in read_lines(file)] == begun[:2]
+    assert [record.key for record in read_records(file)] == begun[:2]
 
     monkeypatch.setattr(run, "_begin", real)
     assert main(words) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told == {"file": str(file), "parts": len(read_lines(file)), "refused": []}
+    said = json.loads(capsys.readouterr().out)
+    assert said == {"file": str(file), "points": len(read_records(file)), "refused": []}
     assert file.read_text().startswith(first)
-    lines = read_lines(file)
-    assert {line["key"]["what"] for line in lines} == {"point", "decode", "truth"}
+    records = read_records(file)
+    assert {record.key["what"] for record in records} == {"point", "decode", "truth"}
     # an installed package has no commit
-    assert all(line["run"]["device"] and line["run"]["code"] and "commit" in line["run"] for line in lines)
-    read = {line["key"]["knob"]: line["result"]["read"] for line in lines if line["key"]["what"] == "decode"}
+    assert all(record.run["device"] and record.run["code"] and "commit" in record.run for record in records)
+    read = {record.key["knob"]: record.result["read"] for record in records if record.key["what"] == "decode"}
     assert read["ideal"].startswith("111")
     assert read["base"].startswith("111")
 
@@ -249,18 +249,20 @@ def test_what_a_device_refuses_is_a_result(tmp_path, monkeypatch):
         raise fs.InputError("no such thing here")
 
     monkeypatch.setattr(run, "_begin", refuse)
-    settings = run.Settings(tmp_path, "opencl", ("apriltag",), ("samples",), quick=True)
-    with run.planned(settings) as plan:
-        lines = list(plan.run())
-    assert lines
-    assert all(line["result"] == {"error": "no such thing here"} for line in lines)
+    options = run.Options(tmp_path, "opencl", ("apriltag",), ("samples",), quick=True)
+    with run.prepared(options) as sweep:
+        records = list(sweep.run())
+    assert records
+    assert all(record.result == {"error": "no such thing here"} for record in records)
 
     # it may have been the device that failed: another run tries again
     monkeypatch.setattr(run, "_begin", lambda *_: lambda: {"maximum": 0.0})
-    for left in (len(lines), 0):
-        with run.planned(settings) as plan:
-            assert plan.left == len(list(plan.run())) == left
-    assert [line["result"] for line in read_lines(tmp_path / run.FILE)] == [{"maximum": 0.0}] * len(lines)
+    for left in (len(records), 0):
+        with run.prepared(options) as sweep:
+            assert len(sweep.left) == len(list(sweep.run())) == left
+    assert [record.result for record in read_records(tmp_path / run.FILE)] == [{"maximum": 0.0}] * len(
+        records
+    )
 
 
 @pytest.mark.parametrize(

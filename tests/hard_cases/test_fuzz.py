@@ -9,11 +9,12 @@ from fidsplat.hard_cases import fuzz, fuzz_run
 from fidsplat.rotations import quaternion_to_matrix
 
 
-def test_two_thousand_splats(renderer):
-    *_, state = fuzz_run.fuzz_run(renderer, 2000)
+@pytest.mark.parametrize("splats", [2000, pytest.param(50_000, marks=pytest.mark.exhaustive)])
+def test_so_many_splats(renderer, splats):
+    *_, state = fuzz_run.fuzz_run(renderer, splats)
     assert state.failing == []
     assert state.passed
-    assert state.splats >= 2000
+    assert state.splats >= splats
     assert set(state.largest) == {"rgb", "alpha", "depth", "depth_median", "normal", "label"}
     assert state.uncertified["rgb"][0] <= 2e-5
 
@@ -69,18 +70,18 @@ def test_the_scenes_are_hard():
 def test_a_stopped_run_goes_on(renderer, tmp_path, monkeypatch):
     monkeypatch.setattr(fuzz_run, "_SAVE_EVERY", 0.0)
     file = tmp_path / "fuzz.json"
-    whole = list(fuzz_run.fuzz_run(renderer, 700))[-1]
-    run = fuzz_run.fuzz_run(renderer, 700, file)
+    whole = list(fuzz_run.fuzz_run(renderer, 300))[-1]
+    run = fuzz_run.fuzz_run(renderer, 300, file)
     first = next(run)
     run.close()
     saved = json.loads(file.read_text())
     assert (saved["scenes"], saved["splats"]) == (1, first.splats)
-    *_, state = fuzz_run.fuzz_run(renderer, 700, file)
+    *_, state = fuzz_run.fuzz_run(renderer, 300, file)
     assert (state.scenes, state.pixels, state.largest) == (whole.scenes, whole.pixels, whole.largest)
     # more splats go on from there; the same number starts again
-    *_, more = fuzz_run.fuzz_run(renderer, 900, file)
+    *_, more = fuzz_run.fuzz_run(renderer, 450, file)
     assert more.scenes > state.scenes
-    assert next(fuzz_run.fuzz_run(renderer, 700, file)).scenes == 1
+    assert next(fuzz_run.fuzz_run(renderer, 300, file)).scenes == 1
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"key": 3}', '{"key": "%s", "scenes": "a", "new": 1}'])

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
+from fidsplat.backends.base import Reshapes
+from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture, draw
 from fidsplat.hard_cases.clouds import camera, splats, taken, turned
 from fidsplat.hard_cases.coplanar import tag
-from fidsplat.hard_cases.invariance import CULLED, differing, draw, has_tiles, tile_shapes, trace
+from fidsplat.hard_cases.invariance import CULLED, differing, trace
 from fidsplat.random_clouds import random_splats
 
 CLOUDS = {
@@ -36,16 +37,16 @@ def test_run_to_run(renderer, picture):
 
 
 def test_tile_sizes(renderer, picture):
-    if not has_tiles(renderer):
+    if not isinstance(renderer.backend, Reshapes):
         pytest.skip("draws without tiles")
     own = draw(renderer, picture)
-    for shape in tile_shapes(renderer):
+    for shape in renderer.backend.shapes("tiles").values():
         assert differing(own, trace(renderer, picture, shape), ALL_OUTPUTS) == 0, shape
 
 
 def test_one_tile_for_the_whole_picture(renderer):
     """numerics A4 and A5: what a tile lacks, a picture of one tile has."""
-    if not has_tiles(renderer):
+    if not isinstance(renderer.backend, Reshapes):
         pytest.skip("draws without tiles")
     own = renderer.backend.shape
     width, height = (own.lanes, 32) if own.schedule == "lanes" else (32, 32)
@@ -54,7 +55,7 @@ def test_one_tile_for_the_whole_picture(renderer):
         picture = Picture(cloud, camera(width, height, 20.0), outputs=ALL_OUTPUTS)
         traced = trace(renderer, picture, whole)
         assert len(traced["starts"]) == 2
-        for shape in tile_shapes(renderer):
+        for shape in renderer.backend.shapes("tiles").values():
             assert differing(traced, trace(renderer, picture, shape), ALL_OUTPUTS) == 0, shape
 
 

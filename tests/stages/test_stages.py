@@ -8,10 +8,12 @@ import pytest
 from agreement import ALL_OUTPUTS, random_splats
 
 import fidsplat as fs
-from fidsplat.backends.base import View
+from fidsplat.backends.base import Reshapes
 from fidsplat.backends.planes import PlaneTable
+from fidsplat.backends.prepare import prepare
+from fidsplat.backends.view import View
 from fidsplat.effects import select
-from fidsplat.hard_cases.invariance import group_shape, has_tiles, other_schedule, out_of_order
+from fidsplat.hard_cases.invariance import out_of_order
 
 CULLED = np.uint32(0xFFFFFFFF)
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
@@ -19,15 +21,19 @@ CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 
 @pytest.fixture(scope="module")
 def backend(renderer):
-    if not has_tiles(renderer):
+    if not isinstance(renderer.backend, Reshapes):
         pytest.skip("draws in one piece")
     return renderer.backend
 
 
 def traced(backend, cloud, quality, outputs=("rgb",), shape=None):
-    features = select(cloud, outputs, quality)
-    view = View.of(CAMERA, quality, cloud.origin, (0, 0, 0))
+    features, view = prepare(cloud, fs.Capture(CAMERA, outputs, quality))
     return backend.pipeline(features, shape).trace(backend.upload(cloud), view), view
+
+
+def groups(backend, side):
+    """The schedule of a GPU in tiles of side x side."""
+    return replace(backend.shapes("schedule")["groups"], tile_width=side, tile_height=side)
 
 
 def listing(backend, lists, side=16):
@@ -36,7 +42,7 @@ def listing(backend, lists, side=16):
         if lists == "tiled":
             pytest.skip("lists in one way")
         return backend.shape
-    return replace(group_shape(backend.shape, side), lists=lists)
+    return replace(groups(backend, side), lists=lists)
 
 
 def footprint(cloud, view, index, dot=True):
@@ -54,7 +60,10 @@ def footprint(cloud, view, index, dot=True):
     tangents = view.rotation @ rotation[:, :2] * cloud.scales[index].astype(float)
     center = view.rotation @ cloud.means[index].astype(float) + view.translation
     rows, columns = np.mgrid[0 : view.height, 0 : view.width] + 0.5
-    rays = np.stack([(columns - view.cx) / view.fx, (rows - view.cy) / view.fy, np.ones_like(rows)], -1)
+    rays = np.stack(
+        [(columns - view.center_x) / view.focal_x, (rows - view.center_y) / view.focal_y, np.ones_like(rows)],
+        -1,
+    )
     # center + tangents @ (u, v) = depth * ray
     system = np.concatenate([np.broadcast_to(tangents, (*rays.shape[:2], 3, 2)), -rays[..., None]], axis=-1)
     solution = np.linalg.solve(system, np.broadcast_to(-center[:, None], (*rays.shape, 1)))[..., 0]
@@ -62,7 +71,10 @@ def footprint(cloud, view, index, dot=True):
     inside = (solution[..., :2] ** 2).sum(-1) <= 2 * half_r2 * (1 - 1e-6)
     inside &= solution[..., 2] >= view.near
     if dot and center[2] >= view.near:
-        px, py = view.fx * center[0] / center[2] + view.cx, view.fy * center[1] / center[2] + view.cy
+        px, py = (
+            view.focal_x * center[0] / center[2] + view.center_x,
+            view.focal_y * center[1] / center[2] + view.center_y,
+        )
         inside |= (columns - px) ** 2 + (rows - py) ** 2 <= half_r2 * (1 - 1e-6)
     return np.nonzero(inside)
 
@@ -142,7 +154,7 @@ def test_splats_between_the_samples_are_culled(backend, lists):
     cloud = random_splats(20000, seed=3, scale=(1e-5, 3e-4))
     trace, _ = traced(backend, cloud, fs.Quality(lowpass="none"), shape=shape)
     kept = np.flatnonzero(trace["keys"] != CULLED)
-    y0, y1, x0, x1 = trace["records"][kept].view(np.int16)[:, 30:34].T  # of Splat, kernels/opencl/splat.cl
+    y0, y1, x0, x1 = (trace["records"][kept][name] for name in ("y0", "y1", "x0", "x1"))
     assert len(kept) > 5
     assert (x0 < x1).all()
     assert (y0 < y1).all()
@@ -174,8 +186,8 @@ def test_the_box_of_a_record_holds_all_that_the_splat_touches(backend, lowpass):
     """What a block of a GPU passes over, it must not have needed."""
     quality = fs.Quality(lowpass=lowpass)
     cloud = random_splats(200, seed=5, scale=(1e-3, 5.0))
-    features = select(cloud, ("rgb",), quality)
-    view = View.of(CAMERA, quality, cloud.origin, (0, 0, 0))
+    features = select(cloud, fs.Capture(quality=quality))
+    view = View.of(fs.Capture(CAMERA, quality=quality), cloud.origin)
     pipeline = backend.pipeline(features)
     if not hasattr(pipeline, "layout"):
         pytest.skip("not Warp's records")
@@ -197,7 +209,7 @@ def test_layers_are_the_same_in_every_tile_size_and_schedule(backend, renderer):
     planes = np.random.default_rng(9).choice([-1, -1, -1, 0, 1, 2, 3], 300)
     cloud = random_splats(300, seed=9, scale=(0.05, 0.5)).with_planes(planes)
     base, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS)
-    other, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS, other_schedule(renderer))
+    other, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS, backend.shapes("schedule")["groups"])
     for name in ("rgb", "alpha", "normal", "depth"):
         assert np.abs(other[name] - base[name]).max() < 2e-5, name
     width = backend.shape.tile_width if backend.shape.schedule == "lanes" else 32
@@ -226,7 +238,7 @@ def test_splats_of_a_plane_share_its_key(backend):
 def test_both_schedules_draw_the_same_picture(backend, renderer):
     cloud = random_splats(300, seed=9)
     base, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS)
-    other, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS, other_schedule(renderer))
+    other, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS, backend.shapes("schedule")["groups"])
     for name in ("rgb", "alpha", "normal", "depth"):
         assert np.allclose(other[name], base[name], rtol=1e-5, atol=2e-6), name
     assert np.array_equal(other["label"], base["label"])
@@ -253,8 +265,8 @@ def test_lists_that_outgrow_their_buffers_are_made_again(backend):
     """A picture that has far more pairs, or big splats, than the last one."""
     groups = listing(backend, "tiled", 8)
     few, many = random_splats(30, seed=2, scale=(1e-3, 0.05)), random_splats(9000, seed=2, scale=(0.5, 5.0))
-    features, quality = select(few, ALL_OUTPUTS, fs.Quality()), fs.Quality()
-    view = View.of(CAMERA, quality, few.origin, (0, 0, 0))
+    features, quality = select(few, fs.Capture(outputs=ALL_OUTPUTS)), fs.Quality()
+    view = View.of(fs.Capture(CAMERA, quality=quality), few.origin)
     backend = type(backend)(backend.device)  # with buffers that no other test has made larger
     pipeline = backend.pipeline(features, groups)
     fresh = pipeline.render(backend.upload(many), view)
@@ -274,7 +286,7 @@ def test_room_for_exactly_the_pairs_of_a_picture(backend, spare):
     """Lists are made again if and only if there is no room for all of them."""
     cloud, quality = random_splats(3000, seed=5, scale=(1e-3, 0.5)), fs.Quality()
     groups = listing(backend, "tiled")
-    features, view = select(cloud, ALL_OUTPUTS, quality), View.of(CAMERA, quality, cloud.origin, (0, 0, 0))
+    features, view = prepare(cloud, fs.Capture(CAMERA, ALL_OUTPUTS, quality))
     drawn = []
     for room in (None, spare):
         own = type(backend)(backend.device)  # with buffers of its own
@@ -293,7 +305,7 @@ def test_room_for_exactly_the_pairs_of_a_picture(backend, spare):
 def test_a_list_longer_than_local_memory_is_sorted(backend):
     """tiles.cl sorts 2048 pairs at once in local memory, longer lists in global memory as well."""
     cloud = random_splats(11000, seed=8, depth=(1.0, 9.0), scale=(0.2, 0.3), across=0.1)
-    trace, _ = traced(backend, cloud, fs.Quality(), shape=group_shape(backend.shape, 16))
+    trace, _ = traced(backend, cloud, fs.Quality(), shape=groups(backend, 16))
     visible = np.flatnonzero(trace["keys"] != CULLED)
     assert max(np.diff(trace["starts"].astype(int))) > 8192
     assert out_of_order(trace, visible[np.argsort(trace["keys"][visible], kind="stable")]) == 0
@@ -304,8 +316,7 @@ def test_a_list_longer_than_local_memory_is_sorted(backend):
 def test_a_small_pair_budget_gives_the_same_bits(backend, monkeypatch, budget, lists):
     """numerics E3: a picture with more pairs than fit is drawn in bands of tiles."""
     cloud = random_splats(300, seed=12)
-    features = select(cloud, ALL_OUTPUTS, fs.Quality())
-    view = View.of(CAMERA, fs.Quality(), cloud.origin, (0, 0, 0))
+    features, view = prepare(cloud, fs.Capture(CAMERA, ALL_OUTPUTS))
     own = getattr(backend.shape, "lists", lists)
     shape = backend.shape if lists == own == "ordered" else listing(backend, lists, 8)
     pipeline, resident = backend.pipeline(features, shape), backend.upload(cloud)

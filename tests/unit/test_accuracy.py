@@ -56,7 +56,7 @@ def test_truth_keeps_the_definition_and_leaves_nothing_out():
         coplanar="order",
         stop_rule="exclusive",
     )
-    best = full_precision(like, fs.Renderer("reference"))
+    best = full_precision(fs.Capture(quality=like), fs.Renderer("reference")).quality
     assert (best.samples, best.lowpass, best.coplanar) == (2, "pixel", "order")
     assert best.alpha_cutoff <= 1e-6
     assert (best.transmittance_stop, best.opacity_ceiling, best.stop_rule) == (0.0, 1.0, "inclusive")
@@ -64,9 +64,9 @@ def test_truth_keeps_the_definition_and_leaves_nothing_out():
 
 def test_truth_of_a_device_is_that_of_the_reference(renderer):
     cloud = random_splats(60, seed=3, depth=(1.0, 6.0), scale=(0.05, 1.0))
-    best = full_precision(fs.Quality(), fs.Renderer("reference"))
+    best = full_precision(fs.Capture(), fs.Renderer("reference")).quality
     judge = reference_pixels(cloud, CAMERA, ("rgb",), best)
-    ours = truth(renderer, cloud, CAMERA)
+    ours = truth(renderer, cloud, fs.Capture(CAMERA))
     assert ours.dtype == np.float64
     assert ours.shape == (17, 24, 3)
     (difference,) = compare({"rgb": ours}, judge, ("rgb",))
@@ -78,13 +78,15 @@ def test_rays_of_lenses_and_fog_are_float32():
     renderer, cloud = fs.Renderer("opencl"), random_splats(20, seed=1, depth=(1.0, 6.0))
     lens = replace(CAMERA, lens=fs.Fisheye())
     fog = fs.Fog(0.2)
-    assert full_precision(fs.Quality(), renderer).blend_precision == "float64"
-    assert full_precision(fs.Quality(), renderer, fog=fog).blend_precision == "float32"
-    picture = truth(renderer, cloud, lens, fog=fog)
-    assert errors(picture, truth(fs.Renderer("reference"), cloud, lens, fog=fog)).maximum < 1e-4
+    assert full_precision(fs.Capture(), renderer).quality.blend_precision == "float64"
+    assert full_precision(fs.Capture(fog=fog), renderer).quality.blend_precision == "float32"
+    capture = fs.Capture(lens, fog=fog)
+    assert full_precision(capture, renderer).fog == fog
+    picture = truth(renderer, cloud, capture)
+    assert errors(picture, truth(fs.Renderer("reference"), cloud, capture)).maximum < 1e-4
 
 
 def test_the_reference_gives_its_float64():
     cloud = random_splats(20, seed=1, depth=(1.0, 6.0))
-    plane = truth(fs.Renderer("reference"), cloud, CAMERA, background=(0.1, 0.2, 0.3))
+    plane = truth(fs.Renderer("reference"), cloud, fs.Capture(CAMERA, background=(0.1, 0.2, 0.3)))
     assert (plane != plane.astype(np.float32)).any()

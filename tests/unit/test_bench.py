@@ -12,6 +12,7 @@ from fidsplat.experiments.bench import catalogue, measure
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, BenchScene, scene_names
 from fidsplat.experiments.bench.overdraw import overdraw
 from fidsplat.random_clouds import random_cloud, standard_camera
+from fidsplat.timing import WARM_UP, Timer
 
 CAMERA = standard_camera(64, 48)
 # of every record, and of one that has frames
@@ -22,7 +23,7 @@ KEYS = (
 FIGURES = (
     *("frame_ms", "quartiles_ms", "fastest_ms", "first_frame_ms", "stages_ms", "fastest_stages_ms"),
     *("splats", "visible", "pairs", "fragments", "splats_per_second", "memory_bytes", "mean_rgb"),
-    *("rates", "floors_ms", "times_floor"),
+    *("rates", "rooflines_ms", "times_roofline"),
 )
 
 
@@ -53,7 +54,7 @@ def facing(depths, opacity: float) -> fs.SplatCloud:
 def measurable(renderer):
     """Not all backends are."""
     if not isinstance(renderer.backend, Measurable):
-        pytest.skip("this backend is not held against its hardware")
+        pytest.skip("this backend is not compared with its hardware")
     return renderer.backend
 
 
@@ -89,6 +90,16 @@ def test_drawn_fragments_are_counted_exactly(renderer):
     assert count(one, samples=2).sum() == pytest.approx(4 * drawn.sum(), rel=0.02)
 
 
+def test_fragments_are_counted_through_the_lens(renderer):
+    """A lens has kernels of its own."""
+    measurable(renderer)
+    camera = fs.Camera.pinhole(64, 48, CAMERA.fx, CAMERA.fy, 32, 24, lens=fs.BrownConrady(-0.3, 0.1))
+    spread = random_cloud(200, 0.2)
+    counted = overdraw(renderer, renderer.upload(spread), camera, fs.Quality(transmittance_stop=0.0))
+    alpha = renderer.render(spread, camera, ("alpha",), fs.Quality(transmittance_stop=0.0))["alpha"]
+    np.testing.assert_array_equal(counted > 0, alpha > 0)
+
+
 def test_the_count_is_no_output_for_users(renderer):
     with pytest.raises(fs.InputError, match="unknown output 'overdraw'"):
         renderer.render(facing([2.0], 0.5), CAMERA, outputs=("overdraw",))
@@ -111,21 +122,20 @@ def test_devices_take_turns(monkeypatch):
     turns = []
     draw = measure.SceneRun.draw
 
-    def noted(self, counts):
+    def noted(self):
         turns.append(self.renderer.device.name)
-        draw(self, counts)
+        return draw(self)
 
     monkeypatch.setattr(measure.SceneRun, "draw", noted)
-    monkeypatch.setattr(measure, "WARM_UP", 0)
     running = measure.Bench(["reference", "opencl"], lambda words: None, lambda: None)
     running.run("small", 2)
     first, second = (result.device.name for result in running.results)
-    assert turns == [first, second, first, second]
-    assert [len(result.frames) for result in running.results] == [2, 2]
+    assert turns[-4:] == [first, second, second, first]
+    assert [len(result.timer.ms) for result in running.results] == [2, 2]
     reference = running.results[0].as_dict()
     assert reference["rates"] is None
     assert reference["memory_bytes"] is None
-    assert reference["times_floor"] == {}
+    assert reference["times_roofline"] == {}
     assert running.results[1].as_dict()["mean_rgb"] == pytest.approx(reference["mean_rgb"], abs=1e-5)
 
 
@@ -147,9 +157,9 @@ def test_json_on_stdout_is_all_that_stands_there(capsys):
         assert sum(record["fastest_stages_ms"].values()) <= high
         assert 0 < record["visible"] <= record["splats"] == 200
         assert 0 < record["pairs"] < record["fragments"]
-        assert set(record["times_floor"]) == {"frame", *record["stages_ms"]}
-        assert record["times_floor"]["frame"] == pytest.approx(
-            record["frame_ms"] / sum(record["floors_ms"].values())
+        assert set(record["times_roofline"]) == {"frame", *record["stages_ms"]}
+        assert record["times_roofline"]["frame"] == pytest.approx(
+            record["frame_ms"] / sum(record["rooflines_ms"].values())
         )
 
 
@@ -157,7 +167,7 @@ def test_a_table_for_people_and_a_file_for_programs(capsys, tmp_path):
     file = tmp_path / "figures.json"
     assert bench("--scenes", "small", "--json", file) == 0
     out = capsys.readouterr().out
-    for words in ("small: 200 splats", "x floor", "blend", "splats/s", "memory", "3 frames"):
+    for words in ("small: 200 splats", "x roofline", "blend", "splats/s", "memory", "3 frames"):
         assert words in out
     assert json.loads(file.read_text())["results"][0]["scene"] == "small"
 
@@ -165,13 +175,13 @@ def test_a_table_for_people_and_a_file_for_programs(capsys, tmp_path):
 def test_an_interrupt_keeps_what_was_measured(capsys, tmp_path, monkeypatch):
     draws = []
 
-    def stopped(self, counts, draw=measure.SceneRun.draw):
+    def stopped(self, counts=True, run=Timer.run):
         draws.append(counts)
-        if draws.count(True) == 3 + 2:  # the second frame of the second scene
+        if len(draws) == 2 * (1 + WARM_UP) + 3 + 2:  # the second frame of the second scene
             raise KeyboardInterrupt
-        draw(self, counts)
+        return run(self, counts)
 
-    monkeypatch.setattr(measure.SceneRun, "draw", stopped)
+    monkeypatch.setattr(Timer, "run", stopped)
     file = tmp_path / "figures.json"
     assert bench("--scenes", "small", "other", "--json", file) == 130
     out, err = capsys.readouterr()

@@ -6,7 +6,7 @@ import pytest
 
 from fidsplat.backends.base import Rates
 from fidsplat.experiments.bench.growth import exponent, exponents, points
-from fidsplat.experiments.bench.model import FRAGMENT_FMA, RECORD, Counts, Work, floor_ms, floor_work
+from fidsplat.experiments.bench.model import FRAGMENT_FMA, RECORD, Counts, Work, roofline_ms, roofline_work
 
 COUNTS = Counts(splats=1000, visible=600, pairs=4000, fragments=90_000, pixels=64 * 48)
 RATES = Rates(copy_bytes=1e9, fma=1e9, exp=1e8, division=2e8)
@@ -20,39 +20,39 @@ def test_memory_and_arithmetic_overlap_and_kinds_of_arithmetic_add_up():
 
 
 def test_the_blend_stage_by_hand():
-    blend = floor_work(COUNTS)["blend"]
+    blend = roofline_work(COUNTS)["blend"]
     assert blend.bytes == 4 * 4000 + RECORD * 600
     assert (blend.fma, blend.exp, blend.division) == (FRAGMENT_FMA * 90_000, 90_000, 90_000)
     # arithmetic: 2.7 ms of multiply-adds, 0.9 ms of exp, 0.45 ms of divisions
-    assert floor_ms(COUNTS, RATES)["blend"] == pytest.approx(2.7 + 0.9 + 0.45)
+    assert roofline_ms(COUNTS, RATES)["blend"] == pytest.approx(2.7 + 0.9 + 0.45)
 
 
-def test_every_stage_that_a_frame_names_has_a_floor(renderer):
+def test_every_stage_that_a_frame_names_has_a_roofline(renderer):
     import fidsplat as fs
 
     tag = fs.marker("apriltag:36h11:5").gaussians
     timings = renderer.render(tag, fs.Camera.pinhole(8, 8, 8, 8, 4, 4)).timings
-    assert set(floor_work(COUNTS)) >= set(timings)
+    assert set(roofline_work(COUNTS)) >= set(timings)
 
 
 @pytest.mark.parametrize("what", ["splats", "visible", "pairs", "fragments", "pixels"])
 def test_more_to_draw_never_costs_less(what):
     more = dataclasses.replace(COUNTS, **{what: 10 * getattr(COUNTS, what)})
-    before, after = floor_ms(COUNTS, RATES), floor_ms(more, RATES)
+    before, after = roofline_ms(COUNTS, RATES), roofline_ms(more, RATES)
     assert all(after[stage] >= before[stage] for stage in before)
     assert sum(after.values()) > sum(before.values())
 
 
 def test_colours_that_depend_on_the_view_are_read_of_visible_splats_only():
-    degree_3 = floor_work(dataclasses.replace(COUNTS, sh_coefficients=15))["project"]
-    plain = floor_work(COUNTS)["project"]
+    degree_3 = roofline_work(dataclasses.replace(COUNTS, sh_coefficients=15))["project"]
+    plain = roofline_work(COUNTS)["project"]
     assert degree_3.bytes - plain.bytes == 600 * 15 * 12
 
 
 def test_nothing_to_draw_costs_the_picture_alone():
-    floors = floor_ms(Counts(0, 0, 0, 0, 1000), RATES)
-    assert floors.pop("resolve") == pytest.approx(0.012)
-    assert set(floors.values()) == {0.0}
+    least = roofline_ms(Counts(0, 0, 0, 0, 1000), RATES)
+    assert least.pop("resolve") == pytest.approx(0.012)
+    assert set(least.values()) == {0.0}
 
 
 # --- growth

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,9 @@ import pytest
 from fidsplat.experiments.bench.growth import Point
 
 FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
+
+
+sys.path.append(str(FOLDER))  # scripts import what they share
 
 
 def script(name: str):
@@ -40,7 +44,7 @@ RECORD = {
     "splats_per_second": 5.6e5,
     "memory_bytes": 2**30,
     "rates": {"copy_bytes": 45e9, "fma": 250e9, "exp": 12.5e9, "division": 50e9},
-    "times_floor": {"blend": 15.5, "frame": 12.25},
+    "times_roofline": {"blend": 15.5, "frame": 12.25},
 }
 PEER = RECORD | {
     "renderer": "Peer 1",
@@ -137,7 +141,7 @@ def test_growth_goes_on_where_it_was(tmp_path, capsys):
     file.write_text(lines + '{"cut off')  # as a run that is killed leaves it
     again = growth.run({"splats": small}, "opencl", 2, 60.0, file)
     assert [record["x"] for record in again] == [20, 40, 80]
-    assert again[:2] == first  # not measured anew
+    assert again[:2] == first  # not measured again
     assert file.read_text().startswith(lines)
     assert growth.read(file) == again
     (thick,) = growth.run(

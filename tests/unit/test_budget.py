@@ -1,4 +1,4 @@
-"""`Quality.within`: what it promises is kept, on scenes that its table has never seen."""
+"""`fs.quality_within`: what it promises is kept, on scenes that its table has never seen."""
 
 import dataclasses
 import json
@@ -34,7 +34,7 @@ def scene():
 def held_out(judge):
     """Scenes that no table is made of, with their truths."""
     scenes = [random_scene(HELD_OUT + k) for k in range(HELD_OUT_SCENES)]
-    return [(s, truth(judge, s.cloud, s.camera, background=s.background)) for s in scenes]
+    return [(s, truth(judge, s.cloud, fs.Capture(s.camera, background=s.background))) for s in scenes]
 
 
 def error_of(renderer, scene, quality, want):
@@ -43,7 +43,8 @@ def error_of(renderer, scene, quality, want):
 
 
 def within(renderer, scene, error=None, ms=None, **more):
-    return choose(error, ms, scene.camera, scene.cloud, renderer, background=scene.background, **more)
+    capture = fs.Capture(scene.camera, background=scene.background).with_(**more)
+    return choose(error, ms, scene.cloud, capture, renderer)
 
 
 # the table
@@ -60,7 +61,7 @@ def test_the_table_is_a_ladder():
 @pytest.mark.parametrize("error", BOUNDS)
 def test_the_table_keeps_its_promise(renderer, held_out, error):
     """The long form, 200 scenes, is benchmarks/budget_promise.py; docs/budget.md has what it gave."""
-    quality = fs.Quality.within(error=error, device=renderer)
+    quality = fs.quality_within(error=error, device=renderer)
     found = [error_of(renderer, scene, quality, want) for scene, want in held_out]
     assert max(found) <= error, found
 
@@ -97,7 +98,7 @@ def test_a_measured_error_is_the_error(renderer, held_out):
 
 def test_measuring_finds_what_is_cheaper_than_the_table(renderer, held_out):
     """Most scenes need less than the worst of the table does."""
-    cutoff = fs.Quality.within(error=1e-3, device=renderer).alpha_cutoff
+    cutoff = fs.quality_within(error=1e-3, device=renderer).alpha_cutoff
     own = [within(renderer, scene, 1e-3).quality.alpha_cutoff for scene, _ in held_out[:6]]
     assert np.median(own) > cutoff
 
@@ -118,8 +119,8 @@ def test_the_answer_is_kept_and_a_broken_file_is_made_anew(renderer, scene, monk
 def test_what_is_kept_is_for_one_question(renderer, scene):
     within(renderer, scene, 1e-3)
     within(renderer, scene, 1e-2)
-    within(renderer, scene, 1e-3, base="reference")
-    choose(1e-3, camera=scene.camera, cloud=scene.cloud, device=renderer, background=(0.2, 0.2, 0.2))
+    within(renderer, scene, 1e-3, quality="reference")
+    within(renderer, scene, 1e-3, background=(0.2, 0.2, 0.2))
     within(renderer, random_scene(HELD_OUT + 2), 1e-3)
     moved = dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, cx=scene.camera.cx + 1))
     within(renderer, moved, 1e-3)
@@ -141,19 +142,19 @@ def test_a_scene_says_the_rest_itself(renderer, held_out):
     scene, want = held_out[3]
     rest = {"camera": scene.camera, "background": scene.background, "quality": fs.Quality(first_hit=0.2)}
     whole = fs.Scene([scene.cloud], **rest)
-    quality = fs.Quality.within(error=1e-3, cloud=whole, device=renderer)
+    quality = fs.quality_within(error=1e-3, scene=whole, device=renderer)
     assert quality.first_hit == 0.2
     assert errors(renderer.render(whole, quality=quality)["rgb"], want).maximum <= 1e-3
 
 
 def test_a_device_without_a_knob(renderer, held_out, monkeypatch):
-    """Here one that sets up in float64 alone; Warp has no colours in half precision."""
+    """Here one that sets up in float64 alone; Warp has no blending in float64."""
     draw = fs.Renderer.render
 
-    def lacking(self, cloud, camera=None, outputs=None, quality=None, **more):
+    def lacking(self, cloud, capture=None, outputs=None, quality=None, **more):
         if fs.Quality.of(quality).setup_precision == "float32":
             raise fs.DeviceError("no set-up in float32")
-        return draw(self, cloud, camera, outputs, quality, **more)
+        return draw(self, cloud, capture, outputs, quality, **more)
 
     monkeypatch.setattr(fs.Renderer, "render", lacking)
     scene, want = held_out[2]
@@ -215,7 +216,7 @@ def test_frames_are_really_timed(renderer, scene):
 @pytest.mark.parametrize("error", [0, -1e-3, 1e-9])
 def test_an_error_that_nothing_keeps(renderer, scene, error):
     with pytest.raises(InputError, match=r"the best is \d"):
-        fs.Quality.within(error=error, device=renderer)
+        fs.quality_within(error=error, device=renderer)
     with pytest.raises(InputError, match=r"the least is \d.*allow \d"):
         within(renderer, scene, error)
 
@@ -228,16 +229,16 @@ def test_an_error_that_nothing_keeps(renderer, scene, error):
         ({"error": "small"}, "error is 'small'"),
         ({"error": True}, "error is True"),
         ({"ms": float("inf")}, "ms is inf"),
-        ({"ms": 5}, "needs a cloud"),
-        ({"error": 1e-3, "cloud": fs.SplatCloud.empty()}, "needs a camera"),
-        ({"error": 1e-3, "camera": fs.Camera.pinhole(2, 2, 1.0, 1.0, 1.0, 1.0)}, "needs a cloud"),
+        ({"ms": 5}, "needs a scene"),
+        ({"error": 1e-3, "scene": fs.SplatCloud.empty()}, "needs a camera"),
+        ({"error": 1e-3, "capture": fs.Camera.pinhole(2, 2, 1.0, 1.0, 1.0, 1.0)}, "needs a scene"),
         (
-            {"error": 1e-3, "cloud": 7, "camera": fs.Camera.pinhole(2, 2, 1.0, 1.0, 1.0, 1.0)},
-            "cloud is a int",
+            {"error": 1e-3, "scene": 7, "capture": fs.Camera.pinhole(2, 2, 1.0, 1.0, 1.0, 1.0)},
+            "scene is a int",
         ),
-        ({"error": 1e-3, "base": "best"}, "unknown quality"),
+        ({"error": 1e-3, "capture": "best"}, "camera is 'best'"),
     ],
 )
 def test_what_makes_no_budget(words, message):
     with pytest.raises(InputError, match=message):
-        fs.Quality.within(**words)
+        fs.quality_within(**words)

@@ -58,9 +58,9 @@ def test_a_budget_is_measured_and_told(scene, tmp_path, capsys, monkeypatch):
     assert chosen["source"] == "measured"
     assert fs.Quality().with_(**chosen["knobs"])
     assert main(words) == 0
-    told = capsys.readouterr().out
-    assert "chosen: alpha_cutoff" in told
-    assert "measured error" in told
+    printed = capsys.readouterr().out
+    assert "chosen: alpha_cutoff" in printed
+    assert "measured error" in printed
     assert main(["render", scene, "--json"]) == 0
     assert said(capsys)["chosen"] is None
 

@@ -1,4 +1,4 @@
-"""The demo end to end on the best device that is here, and the judging that it rests on."""
+"""The demo end to end on the best device that is here, and the checks that it rests on."""
 
 import json
 
@@ -119,9 +119,9 @@ def test_detections_are_matched_by_what_they_say_and_then_by_nearness(scene):
         seen(twice[0], tag_id=6),
         seen(qr, "qr", "v2-L", None, "something else"),
     ]
-    readings, strangers = read_back(found, twice, camera)
+    readings, others = read_back(found, twice, camera)
     assert [reading.detection for reading in readings] == [found[1], found[0], None]
-    assert strangers == found[2:]
+    assert others == found[2:]
     for reading in readings[:2]:
         assert reading.position_error == pytest.approx(0, abs=1e-6)
         assert reading.corner_error == 0

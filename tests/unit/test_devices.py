@@ -1,12 +1,14 @@
 """Names of devices, and the repair of PoCL's target processor."""
 
 import ctypes
+import os
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.opencl import pocl_target
+from fidsplat.backends.opencl import device, pocl_target, vendors
 from fidsplat.errors import UnknownDeviceError
 
 POCL = "OpenCL 3.0 PoCL HSTR: pthread-x86_64-unknown-linux-gnu-"
@@ -43,39 +45,41 @@ def test_unknown_devices_are_named(name, words):
 
 def test_devices_of_one_name_are_numbered(monkeypatch):
     """Two PoCLs in one process, or two cards of one platform: each can be typed."""
-    from fidsplat.backends.opencl import backend
 
     def card(platform, name, available=True):
         return SimpleNamespace(
-            platform=SimpleNamespace(name=platform), name=name, vendor="", type=0, available=available
+            platform=SimpleNamespace(name=platform),
+            name=name,
+            vendor="",
+            type=0,
+            available=available,
+            version="",
         )
 
     pocl = "Portable Computing Language"
     found = [card(pocl, "a"), card("NVIDIA CUDA", "b"), card(pocl, "c"), card("NVIDIA CUDA", "d")]
     found.append(card("NVIDIA CUDA", "e"))
-    monkeypatch.setattr(backend, "_all_devices", lambda: iter(found))
-    monkeypatch.setattr(backend, "_why_unusable", lambda device: "" if device.available else "broken")
-    monkeypatch.setattr(backend, "OpenCLBackend", lambda device: device.name)
+    monkeypatch.setattr(device, "_all_devices", lambda: iter(found))
+    monkeypatch.setattr(device, "_why_unusable", lambda one: "" if one.available else "broken")
+    monkeypatch.setattr(device, "OpenCLBackend", lambda one: one.name)
     wanted = {"pocl": "a", "nvidia": "b", "pocl-2": "c", "nvidia-2": "d", "NVIDIA-3 ": "e"}
-    assert list(backend._named_devices()) == [
+    assert list(device._named_devices()) == [
         *("opencl:pocl", "opencl:nvidia", "opencl:pocl-2", "opencl:nvidia-2", "opencl:nvidia-3")
     ]
-    assert {name: backend.open_device(name) for name in wanted} == wanted
-    assert [backend._name_of(device) for device in found] == list(backend._named_devices())
+    assert {name: device.open_device(name) for name in wanted} == wanted
+    assert [device._name_of(each) for each in found] == list(device._named_devices())
     with pytest.raises(UnknownDeviceError, match="opencl:nvidia-3: e"):
-        backend.open_device("nvidia-4")
+        device.open_device("nvidia-4")
     # without a number the first that works; with one just that
     found[0] = card(pocl, "a", available=False)
-    assert backend.open_device("pocl") == "c"
+    assert device.open_device("pocl") == "c"
     found[0], found[2] = card(pocl, "a"), card(pocl, "c", available=False)
     with pytest.raises(fs.DeviceError, match="broken"):
-        backend.open_device("pocl-2")
+        device.open_device("pocl-2")
 
 
 def test_no_platform_says_how_to_get_one(monkeypatch):
-    from fidsplat.backends.opencl import backend
-
-    monkeypatch.setattr(backend, "_all_devices", lambda: iter(()))
+    monkeypatch.setattr(device, "_all_devices", lambda: iter(()))
     with pytest.raises(fs.DeviceError, match=r"pip install 'pyopencl\[pocl\]'"):
         fs.Renderer("opencl")
 
@@ -89,6 +93,7 @@ def test_target_is_corrected_only_where_the_record_looks_as_expected():
         return Record(*words)
 
     good = record(1, 2, ctypes.addressof(triplet), ctypes.addressof(generic), 5)
+    assert pocl_target.why_not(ctypes.addressof(good), POCL + "generic") == ""
     name = pocl_target.correct_target(ctypes.addressof(good), POCL + "generic")
     assert name in [level for level, _ in pocl_target._LEVELS]
     assert ctypes.string_at(good[3]) == name.encode()
@@ -101,7 +106,8 @@ def test_target_is_corrected_only_where_the_record_looks_as_expected():
         record(8, 1 << 63),
     ):
         before = list(bad)
-        assert pocl_target.correct_target(ctypes.addressof(bad), POCL + "generic") is None
+        assert "not that of PoCL 3.0" in pocl_target.why_not(ctypes.addressof(bad), POCL + "generic")
+        assert pocl_target.correct_target(ctypes.addressof(bad), POCL + "generic") == "generic"
         assert list(bad) == before
 
 
@@ -118,3 +124,79 @@ def test_only_pocl_that_mistakes_the_processor_is_corrected(monkeypatch, process
     monkeypatch.setattr(pocl_target, "_processor_name", lambda: processor)
     assert pocl_target.needs_correction(POCL + llvm) == needed
     assert not pocl_target.needs_correction("OpenCL 3.0 CUDA")
+
+
+def pocl_that_mistakes(record):
+    return SimpleNamespace(
+        platform=SimpleNamespace(name="Portable Computing Language"), name="a PoCL", vendor="", type=0,
+        available=True, compiler_available=True, endian_little=True, version=POCL + "generic",
+        int_ptr=ctypes.addressof(record),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def record(monkeypatch):
+    """Of a PoCL that has taken the processor for none that it knows; and what it keeps alive."""
+    words = [ctypes.create_string_buffer(text) for text in (b"x86_64-unknown-linux-gnu", b"generic")]
+    made = (ctypes.c_uint64 * 512)(*map(ctypes.addressof, words))
+    made.kept = words
+    monkeypatch.setattr(pocl_target, "_corrected", {})  # of records that had its address before
+    return made
+
+
+def test_what_needs_no_patch_is_preferred(monkeypatch, record):
+    intel = pocl_that_mistakes(record)
+    intel.platform, intel.name = SimpleNamespace(name="Intel(R) OpenCL"), "an Intel"
+    intel.version = "OpenCL 3.1 (Build 0)"
+    monkeypatch.setattr(device, "_all_devices", lambda: iter([pocl_that_mistakes(record), intel]))
+    monkeypatch.setattr(device, "OpenCLBackend", lambda opened: opened.name)
+    assert device.open_device() == "an Intel"
+    assert device.open_device("pocl") == "a PoCL"
+    assert list(device._named_devices()) == ["opencl:pocl", "opencl:intel"]
+
+
+@pytest.mark.parametrize(("way", "told"), [("variable", pocl_target.FORBID), ("hidden", "/proc/self/mem")])
+def test_where_the_patch_may_not_or_cannot_be_made_another_device_is_taken_or_a_remedy_told(
+    monkeypatch, record, way, told
+):
+    pocl, other = pocl_that_mistakes(record), pocl_that_mistakes(record)
+    other.name, other.version = "a newer PoCL", "OpenCL 3.0 PoCL HSTR: cpu-x86_64-pc-linux-gnu-haswell"
+    monkeypatch.setattr(device, "OpenCLBackend", lambda opened: opened.name)
+    if way == "variable":
+        monkeypatch.setenv(pocl_target.FORBID, "1")
+    else:
+
+        def refuse(path, flags):
+            raise PermissionError(13, "Permission denied", path)
+
+        monkeypatch.setattr(pocl_target.os, "open", refuse)
+    before = list(record)
+    monkeypatch.setattr(device, "_all_devices", lambda: iter([pocl]))
+    with pytest.raises(fs.DeviceError, match=rf"a PoCL: .*{told}.*pocl-opencl-icd") as caught:
+        device.open_device()
+    assert "\n" not in str(caught.value)
+    monkeypatch.setattr(device, "_all_devices", lambda: iter([pocl, other]))
+    assert device.open_device() == "a newer PoCL"
+    assert pocl_target.correct_target(pocl.int_ptr, pocl.version) == "generic"
+    assert list(record) == before
+
+
+def test_the_loader_sees_the_runtime_that_pip_installed(monkeypatch, tmp_path):
+    library, system = tmp_path / "lib" / "libintelocl.so", tmp_path / "vendors"
+    system.mkdir()
+    (system / "card.icd").write_text("libcard.so\n")
+    monkeypatch.delenv(vendors._VENDORS, raising=False)
+    monkeypatch.setattr(vendors, "_SYSTEM", system)
+    monkeypatch.setattr(vendors, "intel_library", lambda: library)
+    with vendors.intel_among_them():
+        folder = Path(os.environ[vendors._VENDORS])
+        assert {file.read_text().strip() for file in folder.iterdir()} == {"libcard.so", str(library)}
+    assert vendors._VENDORS not in os.environ
+    assert not folder.exists()
+    monkeypatch.setenv(vendors._VENDORS, str(system))
+    with vendors.intel_among_them():
+        assert os.environ[vendors._VENDORS] == str(system)
+    monkeypatch.delenv(vendors._VENDORS)
+    monkeypatch.setattr(vendors, "intel_library", lambda: None)
+    with vendors.intel_among_them():
+        assert vendors._VENDORS not in os.environ

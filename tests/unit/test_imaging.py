@@ -112,7 +112,7 @@ def test_numbers_of_numpy_are_numbers(tmp_path):
         camera=fs.Camera.pinhole(8, 6, 8.0, 8.0, 4.0, 3.0),
         sensor=fs.Sensor(one, full_well=np.float64(900), seed=np.int64(7), response=one, bits=np.int32(8)),
         fog=fs.Fog(np.float64(0.25)),
-        shutter=fs.Shutter(exposure=np.float64(0.25), sub_poses=np.int64(3), rows_per_band=np.int32(2)),
+        shutter=fs.Shutter(exposure_time=np.float64(0.25), sub_poses=np.int64(3), rows_per_band=np.int32(2)),
         quality=fs.Quality(alpha_cutoff=np.float64(0.125)),
     )
     scene.save(tmp_path / "a.toml")

@@ -7,23 +7,23 @@ import sys
 from pathlib import Path
 
 import pytest
+from networkx import DiGraph, strongly_connected_components
 
 import fidsplat
 
 PACKAGE = Path(fidsplat.__file__).parent
 
 BASE = {"errors", "files", "rotations", "scalars"}
-PLAIN = BASE | {"splats", "harmonics", "cameras", "quality", "sensor", "surroundings"}
-# wing: what of fidsplat it may import, at the top or inside a function
+PLAIN = BASE | {"splats", "harmonics", "cameras", "quality", "sensor", "surroundings", "capture"}
+# package or module of fidsplat: what of fidsplat it may import, at the top or inside a function
 MAY_IMPORT = {
     "errors": set(),
     "files": BASE,
     "rotations": BASE,
-    "scalars": set(),
+    "scalars": {"errors"},
     "harmonics": BASE,
-    # a budget is measured by drawing: `Quality.within` loads what draws when it is called, and its arguments
-    # have the types of those (test_a_quality_loads_nothing_that_draws)
-    "quality": BASE | {"budget", "cameras", "render", "scenes", "splats", "surroundings"},
+    "quality": BASE,
+    "capture": BASE | {"cameras", "quality", "sensor", "surroundings"},
     "sensor": BASE,
     "surroundings": BASE | {"vision.images"},
     "kernel_files": BASE,
@@ -32,22 +32,22 @@ MAY_IMPORT = {
     "splats": BASE | {"harmonics", "defects"},
     "cameras": BASE,
     "vision": BASE | {"cameras"},
-    "formats": BASE | {"splats", "harmonics", "cameras"},
+    "formats": BASE | {"splats", "harmonics", "defects", "cameras"},
     "markers": BASE | {"splats", "quality", "vision.dictionaries", "vision.images"},
     "scenes": PLAIN | {"markers", "formats"},
-    "effects": PLAIN | {"scenes"},
-    "backends": PLAIN | {"scenes", "effects", "kernel_files"},
+    "effects": PLAIN,
+    "backends": PLAIN | {"effects", "kernel_files"},
     "timing": BASE,
     "random_clouds": PLAIN,
     "hard_cases": PLAIN
-    | {"scenes", "effects", "backends", "render", "vision", "kernel_files", "random_clouds"},
+    | {"scenes", "effects", "backends", "render", "vision", "provenance", "random_clouds"},
     "render": PLAIN | {"scenes", "effects", "backends"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
     "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__"}
 
-# third-party module: the wings that alone may import it
+# third-party module: the places that alone may import it
 HOME_OF = {
     "cv2": ("vision",),
     "zxingcpp": ("vision",),
@@ -59,10 +59,25 @@ HOME_OF = {
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
     "warp": ("backends.warp",),
+    "pandas": ("experiments",),
+    "matplotlib": ("experiments.charts",),
+    "jinja2": ("experiments.pages",),
     "tyro": ("cli", "commands"),
     "rich": ("cli", "commands"),
 }
-HEAVY = ("pyopencl", "warp", "shapely", "networkx", "segno", "cv2", "zxingcpp", "tyro", "rich")
+HEAVY = (
+    "pyopencl",
+    "warp",
+    "shapely",
+    "networkx",
+    "pandas",
+    "matplotlib",
+    "segno",
+    "cv2",
+    "zxingcpp",
+    "tyro",
+    "rich",
+)
 
 # A wheel carries the kernels inside the package (`_kernels`), a checkout beside it; Warp's are Python files
 # of another house, which fidsplat loads by path and which import each other by relative names.
@@ -87,23 +102,46 @@ def imported(path: Path) -> set[str]:
     return found
 
 
-def within(name: str, wings) -> bool:
-    return any(name == wing or name.startswith(wing + ".") for wing in wings)
+def within(name: str, places) -> bool:
+    return any(name == place or name.startswith(place + ".") for place in places)
 
 
 @pytest.mark.parametrize("module", sorted(MODULES))
 def test_imports_point_downwards(module):
-    wing = module.split(".")[0]
-    if wing in ANYTHING:
+    place = module.split(".")[0]
+    if place in ANYTHING:
         return
-    assert wing in MAY_IMPORT, f"say in this test what {wing} may import"
+    assert place in MAY_IMPORT, f"say in this test what {place} may import"
     inside = {
         name.removeprefix("fidsplat.") for name in imported(MODULES[module]) if name.startswith("fidsplat.")
     }
     # `from fidsplat.a import b` gives both a and a.b: whatever lies in an allowed module is allowed
-    allowed = MAY_IMPORT[wing] | {wing}
+    allowed = MAY_IMPORT[place] | {place}
     known = {name for name in inside if name in MODULES or f"{name}.__init__" in MODULES}
     assert {name for name in known if not within(name, allowed)} == set()
+
+
+def needed(path: Path, modules) -> set[str]:
+    """The modules that a file's import statements need, wherever they stand: `from fidsplat.a import b` needs
+    fidsplat.a.b if that is a module, else fidsplat.a. That a.b.c brings the `__init__` of a.b with it does
+    not count."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            named = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {name if name in modules else name.rpartition(".")[0] for name in named}
+    return found & set(modules)
+
+
+def test_no_module_imports_itself_by_way_of_others():
+    """Not for types alone either, nor late, inside a function."""
+    modules = {f"fidsplat.{name}".removesuffix(".__init__"): path for name, path in MODULES.items()}
+    edges = [(name, other) for name, path in modules.items() for other in needed(path, modules)]
+    assert len(edges) > len(modules)
+    circles = [sorted(circle) for circle in strongly_connected_components(DiGraph(edges)) if len(circle) > 1]
+    assert circles == []
 
 
 @pytest.mark.parametrize("package", sorted(HOME_OF))
@@ -117,8 +155,8 @@ def within_any(names, package) -> bool:
     return any(within(name, (package,)) for name in names)
 
 
-# modules of the wing that every backend may import
-SHARED = ("base", "registry", "planes", "exposure")
+# modules of the package that every backend may import
+SHARED = ("base", "view", "prepare", "registry", "planes")
 
 
 def test_backends_do_not_import_each_other():

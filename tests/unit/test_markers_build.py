@@ -10,6 +10,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.markers import Marker, Rectangle, marker
+from fidsplat.quality import NESTED
 from fidsplat.vision.images import write_png
 
 
@@ -27,7 +28,7 @@ def coverage(made: Marker, per_module: int = 12) -> tuple[np.ndarray, np.ndarray
     reach = np.sqrt(2 * np.log(255 * cloud.opacities))
     x0, x1 = (np.searchsorted(x, means[:, 0] + side * reach * scales[:, 0]) for side in (-1, 1))
     y0, y1 = (np.searchsorted(y, means[:, 1] + side * reach * scales[:, 1]) for side in (-1, 1))
-    depth, ink = np.full((len(y), len(x)), 1e-12), np.zeros((len(y), len(x)))
+    depth, shone = np.full((len(y), len(x)), 1e-12), np.zeros((len(y), len(x)))
     for i in range(len(cloud)):
         at = np.s_[y0[i] : y1[i], x0[i] : x1[i]]
         gx = np.exp(-0.5 * ((x[at[1]] - means[i, 0]) / scales[i, 0]) ** 2)
@@ -35,9 +36,9 @@ def coverage(made: Marker, per_module: int = 12) -> tuple[np.ndarray, np.ndarray
         alpha = cloud.opacities[i] * np.outer(gy, gx)
         tau = -np.log(np.maximum(1 - np.where(alpha < 1 / 255, 0, alpha), 2.0**-24))
         depth[at] += tau
-        ink[at] += tau * cloud.colors[i, 0]
+        shone[at] += tau * cloud.colors[i, 0]
     left = np.exp(-depth)
-    shown = (1 - left) * ink / depth + left * 0.5
+    shown = (1 - left) * shone / depth + left * 0.5
     return shown, np.kron(1.0 - made.grid, np.ones((per_module, per_module)))
 
 
@@ -111,6 +112,41 @@ def test_fitted_is_nearer_to_the_print_with_a_quarter_of_the_splats(spec):
     assert psnr(fitted) > psnr(marker(spec, mixture="fitted", growth=0.0))
 
 
+def in_order(made: Marker, angle: float, per_module: int = 24) -> tuple[np.ndarray, np.ndarray]:
+    """Light over grey, and alpha, as other renderers composite: one splat after the other by their centres'
+    depth, here along a direction of the plane; alphas at most 0.99, cut off at 1/255.
+    """
+    cloud = made.gaussians
+    h, w = made.grid.shape
+    x = ((np.arange(w * per_module) + 0.37) / per_module - w / 2) * made.module
+    y = ((np.arange(h * per_module) + 0.37) / per_module - h / 2) * made.module
+    means, scales = cloud.means.astype(float), cloud.scales.astype(float)
+    reach = np.sqrt(2 * np.log(255))
+    x0, x1 = (np.searchsorted(x, means[:, 0] + side * reach * scales[:, 0]) for side in (-1, 1))
+    y0, y1 = (np.searchsorted(y, means[:, 1] + side * reach * scales[:, 1]) for side in (-1, 1))
+    light, left = np.zeros((len(y), len(x))), np.ones((len(y), len(x)))
+    for i in np.argsort(means[:, 0] * np.cos(angle) + means[:, 1] * np.sin(angle), kind="stable"):
+        at = np.s_[y0[i] : y1[i], x0[i] : x1[i]]
+        gx = np.exp(-0.5 * ((x[at[1]] - means[i, 0]) / scales[i, 0]) ** 2)
+        gy = np.exp(-0.5 * ((y[at[0]] - means[i, 1]) / scales[i, 1]) ** 2)
+        alpha = np.minimum(cloud.opacities[i] * np.outer(gy, gx), 0.99)
+        alpha = np.where(alpha < 1 / 255, 0.0, alpha)
+        light[at] += left[at] * alpha * cloud.colors[i, 0]
+        left[at] *= 1 - alpha
+    return light + left * 0.5, 1 - left
+
+
+@pytest.mark.parametrize("angle", [0.3, 3.8])
+def test_the_nested_template_is_opaque_and_clean_in_any_order(angle):
+    made = marker("aruco:4x4_50:7", mixture="fitted", template=NESTED)
+    shown, alpha = in_order(made, angle)
+    error = shown - np.kron(1.0 - made.grid, np.ones((24, 24)))
+    assert alpha[1:-1, 1:-1].min() > 0.999  # but for 2 % of a module, less than a sample
+    assert -10 * np.log10(np.mean(error**2)) > 35
+    inside = np.tile(np.arange(24) % 23 > 0, len(error) // 24)  # cells less a sample on each side
+    assert np.abs(error[np.ix_(inside, inside)]).max() < 0.02
+
+
 def test_no_hairs_stand_out_of_the_paper():
     """A line that is much longer than its rectangle gains a few tenths of a decibel and shows as a hair."""
     made = marker("apriltag:36h11:5", mixture="fitted")
@@ -168,7 +204,7 @@ def test_too_many_splats_are_refused_before_the_work(noise, monkeypatch):
     def partition(grid):
         raise AssertionError("cut into rectangles all the same")
 
-    monkeypatch.setattr("fidsplat.markers.build.partition", partition)
+    monkeypatch.setattr("fidsplat.markers.build.partition_colors", partition)
     with pytest.raises(fs.InputError, match=r"at least 1\d\d,\d{3} splats, more than 100,000: .*max_splats"):
         marker(noise, mixture="fitted", max_splats=100_000)
 
@@ -189,14 +225,14 @@ def test_an_exact_marker_may_have_more_boxes_than_gaussians(noise):
 
 def test_clouds_are_filled_part_by_part_with_the_same_bits(noise, monkeypatch):
     for mixture in ("fitted", "exact"):
-        whole, told = marker(noise, mixture=mixture).cloud, []
+        whole, said = marker(noise, mixture=mixture).cloud, []
         with monkeypatch.context() as patched:
             patched.setattr("fidsplat.markers.printing.CHUNK", 4321)
-            parts = marker(noise, mixture=mixture, progress=lambda *now, to=told: to.append(now)).cloud
+            parts = marker(noise, mixture=mixture, progress=lambda *now, to=said: to.append(now)).cloud
         for name in ("means", "scales", "opacities", "colors", "quats"):
             assert np.array_equal(getattr(whole, name), getattr(parts, name))
-        assert [words for words, _ in told[:2]] == ["components", "rectangles"]
-        shares = [share for words, share in told if words == "splats"]
+        assert [words for words, _ in said[:2]] == ["components", "rectangles"]
+        shares = [share for words, share in said if words == "splats"]
         assert shares == sorted(shares)
         assert 0 == shares[0] < shares[-1] < 1
 

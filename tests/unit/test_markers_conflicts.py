@@ -59,7 +59,7 @@ def path(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_a_path_of_200_000_vertices():
-    """Deeper than Python's stack may be, unless it is told; the limit is put back."""
+    """Deeper than Python's stack may be by default; the limit is put back."""
     limit = sys.getrecursionlimit()
     n = 100_000
     keep_left, keep_right = maximum_independent_set(n, n, *path(n))

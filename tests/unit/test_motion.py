@@ -8,7 +8,7 @@ import pytest
 from agreement import random_splats
 
 import fidsplat as fs
-from fidsplat.backends.exposure import exposed_view
+from fidsplat.backends.prepare import view_of
 from fidsplat.cameras.motion import between
 from fidsplat.rotations import quaternion_to_matrix
 from fidsplat.scenes import PlacedMarker
@@ -52,7 +52,7 @@ def test_a_trajectory_rests_before_and_after():
 
 
 def test_when_rows_are_exposed():
-    shutter = fs.Shutter(time=2.0, exposure=0.4, sub_poses=4, readout=1.0, rows_per_band=4)
+    shutter = fs.Shutter(time=2.0, exposure_time=0.4, sub_poses=4, readout=1.0, rows_per_band=4)
     bands = shutter.bands(10)
     assert [(top, end) for top, end, _ in bands] == [(0, 4), (4, 8), (8, 10)]
     assert [time for *_, time in bands] == pytest.approx([1.7, 2.1, 2.4])
@@ -69,23 +69,23 @@ MOVING = fs.Motion(lambda time: np.eye(4), {1: lambda time: np.eye(4)})
     ("motion", "shutter", "shots"),
     [
         (MOVING, fs.Shutter(time=0.3, sub_poses=4, rows_per_band=2), 0),
-        (MOVING, fs.Shutter(exposure=0.1, sub_poses=1), 0),
+        (MOVING, fs.Shutter(exposure_time=0.1, sub_poses=1), 0),
         (MOVING, fs.Shutter(readout=0.1, rows_per_band=48), 0),
-        (fs.Motion(), fs.Shutter(exposure=0.1, readout=0.1), 0),
-        (MOVING, fs.Shutter(exposure=0.1, sub_poses=2, readout=0.1, rows_per_band=40), 4),
+        (fs.Motion(), fs.Shutter(exposure_time=0.1, readout=0.1), 0),
+        (MOVING, fs.Shutter(exposure_time=0.1, sub_poses=2, readout=0.1, rows_per_band=40), 4),
     ],
 )
 def test_a_shutter_that_does_nothing_is_none(motion, shutter, shots):
     """One picture, without the code of several."""
     camera = fs.Camera.pinhole(64, 48, 50, 50, 32, 24)
-    view = exposed_view(camera, fs.Quality(), np.zeros(3), (0.0, 0.0, 0.0), motion, shutter)
+    view = view_of(fs.Capture(camera, motion=motion, shutter=shutter), np.zeros(3))
     assert len(view.shots) == shots
 
 
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: fs.Shutter(exposure=-1.0), "exposure must be 0 or more seconds, not -1.0"),
+        (lambda: fs.Shutter(exposure_time=-1.0), "exposure_time must be 0 or more seconds, not -1.0"),
         (lambda: fs.Shutter(readout=-1e-3), "readout must be 0 or more"),
         (lambda: fs.Shutter(time=math.nan), "time must be a finite number"),
         (lambda: fs.Shutter(sub_poses=0), "sub_poses must be a whole number, 1 to 1024, not 0"),
@@ -121,7 +121,7 @@ height = 48
 fov_x_deg = 60.0
 
 [camera.shutter]
-exposure_ms = 10.0
+exposure_time_ms = 10.0
 sub_poses = 4
 readout_ms = 20.0
 
@@ -147,7 +147,7 @@ def test_scene_files_say_what_moves(tmp_path):
     first = fs.Scene.load(tmp_path / "a.toml")
     first.save(tmp_path / "b.toml")
     for scene in (first, fs.Scene.load(tmp_path / "b.toml")):
-        assert scene.shutter == fs.Shutter(exposure=0.01, sub_poses=4, readout=0.02)
+        assert scene.shutter == fs.Shutter(exposure_time=0.01, sub_poses=4, readout=0.02)
         np.testing.assert_allclose(scene.camera.position, [0, 0, -1], atol=1e-12)
         position = np.linalg.inv(scene.motion.camera_at(0.5))[:3, 3]
         np.testing.assert_allclose(position, [0.5, 0, -1], atol=1e-12)
@@ -169,8 +169,12 @@ def test_a_marker_moves_from_where_it_is_drawn(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("exposure_ms = 10.0", "exposure_ms = -1.0", "camera.shutter: shutter exposure must be 0 or more"),
-        ("exposure_ms", "exposure", "'camera.shutter.exposure' .did you mean 'exposure_ms"),
+        (
+            "exposure_time_ms = 10.0",
+            "exposure_time_ms = -1.0",
+            "camera.shutter: shutter exposure_time must be 0 or more",
+        ),
+        ("exposure_time_ms", "exposure_ms", "'camera.shutter.exposure_ms' .did you mean 'exposure_time_ms"),
         ("time = 0.5", "time = 0.0", r"camera.motion\[1\].time must be above"),
         ("time = 1.0", "time = -1.0", r"markers\[0\].motion\[1\].time must be above"),
         ("fov_x_deg = 60.0", "fov_x_deg = 60.0\nposition = [0, 0, 0]", "position and motion exclude"),

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.base import View
 from fidsplat.backends.planes import PlaneTable
+from fidsplat.backends.view import View
 from fidsplat.hard_cases.clouds import splats, taken, turned
 from fidsplat.rotations import quaternion_to_matrix
 
@@ -13,7 +13,7 @@ CAMERA = fs.Camera.look_at(64, 48, 1.0, (0.4, -0.2, -2.0), (0, 0, 0))
 
 
 def view_of(cloud, camera=CAMERA, quality=None):
-    return View.of(camera, quality or fs.Quality(), cloud.origin, (0, 0, 0))
+    return View.of(fs.Capture(camera, quality=quality or fs.Quality()), cloud.origin)
 
 
 def some_planes(seed=0, ids=(7, 3, 2_000_000_000)):

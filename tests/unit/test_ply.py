@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import fidsplat as fs
-from fidsplat.formats import flatten
+from fidsplat.formats import collect, flatten
 from fidsplat.harmonics import C0
 from fidsplat.rotations import quaternion_to_matrix
 
@@ -252,6 +252,15 @@ def test_a_thin_axis_of_0_is_flat_and_one_of_nan_is_no_splat(tmp_path):
     with pytest.warns(UserWarning, match="2 of 3 splats left out") as caught:
         assert fs.load_ply(path).scales.tolist() == [[1, 1]]
     assert len(caught) == 1
+
+
+@pytest.mark.parametrize("window", [1, 100])
+@pytest.mark.parametrize(("third", "kept"), [(1e-6, [1, 0.5e-6]), (1.005e-6, [1e-6, 1])])
+def test_only_a_third_scale_of_1e_6_throughout_is_padding(tmp_path, monkeypatch, window, third, kept):
+    """Padding is left out even where it is not the thinnest; else the thinnest axis of three is."""
+    monkeypatch.setattr(collect, "WINDOW", window)
+    path = three_scales(tmp_path, np.ones((3, 4)), [[1, 1, 1e-6], [1, 0.5e-6, 1e-6], [1, 1, third]])
+    np.testing.assert_allclose(fs.load_ply(path).scales[1], kept, rtol=1e-5)
 
 
 def test_flatten_ties_leave_the_third_axis_out():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
+from fidsplat.formats import collect
 
 N = 300
 
@@ -132,7 +133,7 @@ def test_pipe_is_not_waited_for(tmp_path):
 
 
 def test_name_that_cannot_be_one():
-    with pytest.raises(fs.InputError, match="cannot read"):
+    with pytest.raises(fs.InputError, match="names no file"):
         fs.load_ply("a\0b.ply")
 
 
@@ -167,7 +168,61 @@ def test_random_data_is_left_out_or_drawn_but_never_a_crash(tmp_path, content):
     noise = np.random.default_rng(0).bytes(len(content) - start)
     path = tmp_path / "noise.ply"
     path.write_bytes(content[:start] + noise)
-    left_out = pytest.warns(UserWarning, match=r"noise\.ply: \d+ of 300 splats left out")
-    with left_out, pytest.warns(UserWarning, match="not flat"):
+    with pytest.warns(UserWarning, match=r"noise\.ply: \d+ of 300 splats left out"):
         cloud = fs.load_ply(path)
     assert len(cloud) + sum(cloud.dropped.values()) == N
+
+
+ROWS = 400_000
+
+
+def sparse(path, content, rows=ROWS, good=0):
+    """A file that says it has that many splats: good ones of `content` at its end, and zeros, of which none
+    stands on the disk."""
+    head, _, data = content.partition(b"end_header\n")
+    head = head.replace(b"vertex 300", b"vertex %d" % rows) + b"end_header\n"
+    with path.open("wb") as stream:
+        stream.write(head)
+        stream.truncate(len(head) + rows * len(data) // N)
+        if good:
+            stream.seek(-good * len(data) // N, os.SEEK_END)
+            stream.write(data[: good * len(data) // N])
+    return path
+
+
+@pytest.mark.parametrize("good", [0, 100])
+def test_memory_follows_what_is_kept(tmp_path, content, good, monkeypatch):
+    """Of rows that are no splats, however many, only a window is in memory at a time."""
+    monkeypatch.setattr(collect, "_FIRST_ROOM", 1000)
+    monkeypatch.setattr(collect, "WINDOW", 20_000)
+    path = sparse(tmp_path / "zeros.ply", content, good=good)
+    tracemalloc.start()
+    try:
+        with pytest.warns(UserWarning, match=f"{ROWS - good} of {ROWS} splats left out .zero quaternion"):
+            cloud = fs.load_ply(path)
+        now, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert len(cloud) == good
+    assert now < 1e5
+    assert peak < path.stat().st_size / 8
+
+
+def test_arrays_that_grow_while_a_file_is_read(tmp_path, content, monkeypatch):
+    path = tmp_path / "good.ply"
+    path.write_bytes(content)
+    whole = fs.load_ply(path)
+    for room in (16, 64, 299):
+        monkeypatch.setattr(collect, "_FIRST_ROOM", room)
+        monkeypatch.setattr(collect, "WINDOW", 16)
+        read = fs.load_ply(path)
+        for name in ("means", "quats", "scales", "opacities", "sh"):
+            assert np.array_equal(getattr(read, name), getattr(whole, name)), name
+
+
+def test_progress_is_told(tmp_path, content, monkeypatch):
+    monkeypatch.setattr(collect, "WINDOW", 128)
+    path, said = tmp_path / "good.ply", []
+    path.write_bytes(content)
+    fs.load_ply(path, progress=lambda *done: said.append(done))
+    assert said == [("reading good.ply", share) for share in (128 / N, 256 / N, 1.0)]

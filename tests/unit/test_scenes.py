@@ -28,7 +28,9 @@ def cloud_of(n=5, seed=0, **changes):
     return fs.SplatCloud(**fields | changes)
 
 
-def fake_marker(spec, size=1.0, mixture=None, quiet_zone=None, quality=None, max_splats=1_000_000, **own):
+def fake_marker(
+    spec, size=1.0, mixture=None, quiet_zone=None, quality=None, max_splats=1_000_000, progress=None, **own
+):
     """What a scene needs of a marker, without partitioning one: two splats and four corners."""
     if "unknown" in spec:
         raise fs.InputError(f"unknown spec {spec!r}")
@@ -353,7 +355,7 @@ def test_a_folder_that_cannot_be_written(tmp_path):
         ({"background": (0, 0)}, "background must be three"),
         ({"background": (0, 0, math.nan)}, "background must be three"),
         ({"background": "black"}, "background must be three"),
-        ({"outputs": ()}, "outputs must be one or more names"),
+        ({"outputs": ()}, "outputs is empty"),
         ({"outputs": (1,)}, "outputs must be one or more names"),
     ],
 )

@@ -197,10 +197,26 @@ def test_dots_that_join_no_keys_are_read(tmp_path):
     assert scene.markers[0].marker.payload == f'"{dots}'
 
 
+@pytest.mark.parametrize("path", [5, None, b"a.toml", "\ud800", [], "a\0b"])
+def test_what_is_no_path(path):
+    from fidsplat.vision.images import read_image
+
+    cloud = fs.SplatCloud.empty()
+    for use in (
+        fs.Scene.load,
+        fs.Scene().save,
+        fs.load_ply,
+        lambda name: fs.save_ply(cloud, name),
+        read_image,
+    ):
+        with pytest.raises(fs.InputError, match="names no file"):
+            use(path)
+
+
 def test_missing_and_unreadable_files(tmp_path):
     with pytest.raises(fs.InputError, match=r"cannot read .*none\.toml: No such file"):
         fs.Scene.load(tmp_path / "none.toml")
     with pytest.raises(fs.InputError, match=r"cannot read .*: Is a directory"):
         fs.Scene.load(tmp_path)
-    with pytest.raises(fs.InputError, match="cannot read"):
+    with pytest.raises(fs.InputError, match="names no file"):
         fs.Scene.load("a\0b")

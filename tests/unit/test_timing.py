@@ -9,7 +9,7 @@ from fidsplat.timing import Clock, Timer, quartiles, ratios, take_turns
 
 
 def timers(order, *seconds):
-    """A timer for each list of seconds, by one clock that they move on; `order` is told who runs."""
+    """A timer for each list of seconds, by one clock that they move on; `order` gets who runs."""
     clock = Clock()
 
     def work(number, left):

@@ -1,18 +1,25 @@
-"""Planes as pictures: what a colour means, what nothing looks like."""
+"""Output images as pictures: what a colour means, what nothing looks like."""
 
 import cv2
 import numpy as np
 import pytest
 
+from fidsplat.vision.output_files import save_output
 from fidsplat.vision.paint import (
+    KEY_WIDTH,
     contact_sheet,
+    count_key,
+    depth_key,
     depth_millimetres,
     depth_picture,
+    depth_span,
     label_picture,
+    normal_key,
     normal_picture,
     outlined,
 )
-from fidsplat.vision.planes import save_plane
+
+SQUARE = np.array([[20.5, 10.5], [60.5, 10.5], [60.5, 40.5], [20.5, 40.5]])
 
 
 def test_near_is_red_far_is_blue_and_nothing_is_black():
@@ -54,13 +61,53 @@ def test_labels_have_colours_of_their_own():
 
 def test_an_outline_stands_on_its_corners_and_leaves_the_picture_alone():
     image = np.zeros((60, 80, 3), np.uint8)
-    corners = np.array([[20.5, 10.5], [60.5, 10.5], [60.5, 40.5], [20.5, 40.5]])
-    drawn = outlined(image, corners, "näme", thickness=1)
+    drawn = outlined(image, [(SQUARE, "")], thickness=1)
     assert not image.any()
     assert drawn[25, 20].any()
     assert drawn[25, 60].any()
     assert not drawn[25, 40].any()
     assert drawn[10, 20].sum() > 400, "the first corner is marked"
+
+
+def test_captions_stand_below_their_outlines_and_not_over_each_other():
+    image = np.zeros((200, 160, 3), np.uint8)
+
+    def captions(*words):
+        drawn = outlined(image, [(SQUARE, word) for word in words], size=0.5)
+        return (drawn.min(axis=2) == 255).any(axis=1)[42:]  # rows with white in them; outlines are not white
+
+    one, two = captions("näme"), captions("näme", "näme")
+    assert one.any()
+    rows = np.flatnonzero(one)
+    assert two.sum() == 2 * one.sum()
+    assert two[rows].all()
+
+
+def test_keys_say_what_the_colours_mean():
+    depth = np.tile(np.linspace(1, 5, 200), (10, 1))
+    span = depth_span([depth, np.zeros((2, 2))])
+    assert span == pytest.approx(np.percentile(depth, (1, 99)))
+    assert depth_span([]) == (0, 0)
+    key = depth_key(span, 200)
+    assert key.shape == (200, KEY_WIDTH, 3)
+    ends = [key[y, 20].astype(int) for y in (9, 190)]
+    assert ends[0][2] > ends[0][0], "the far end is blue"
+    assert ends[1][0] > ends[1][2], "the near end is red"
+    most = count_key(7, 200)
+    assert (most[9, 20] == key[190, 20]).all(), "the greatest count has the colour of the nearest depth"
+    ball = normal_key(200)
+    towards = normal_picture(np.array([[[0.0, 0, -1]]]))[0, 0]
+    assert (ball[100, KEY_WIDTH // 2] == towards).all()
+    assert ball[100, KEY_WIDTH // 2 + 30, 0] > ball[100, KEY_WIDTH // 2 - 30, 0], "red is to the right"
+
+
+def test_a_key_stands_beside_its_row():
+    rows = [[("a", np.full((30, 40, 3), 200, np.uint8))]] * 2
+    strip = np.full((60, KEY_WIDTH, 3), 99, np.uint8)
+    sheet = contact_sheet(rows, width=80, gap=4, key=lambda row, height: strip if row else None)
+    assert sheet.shape[1] == 4 + 84 + KEY_WIDTH + 4
+    assert (sheet[4 + 86 + 22 : 4 + 86 + 82, 88 : 88 + KEY_WIDTH] == 99).all()
+    assert not (sheet[:86, 88:] == 99).any()
 
 
 def test_a_sheet_holds_every_picture_under_its_title():
@@ -86,10 +133,10 @@ def test_a_sheet_holds_every_picture_under_its_title():
         ("label", (4, 5), ["label.npy", "label.png"]),
     ],
 )
-def test_planes_as_files(tmp_path, name, shape, files):
+def test_outputs_as_files(tmp_path, name, shape, files):
     plane = np.random.default_rng(0).uniform(0, 1, shape).astype(np.float32)
     plane = (plane * 5).astype(np.int32) if name == "label" else plane
-    written = save_plane(name, plane, lambda kind, suffix: tmp_path / f"{kind}{suffix}")
+    written = save_output(name, plane, lambda kind, suffix: tmp_path / f"{kind}{suffix}")
     assert [path.name for path in written] == files
     assert {path.name for path in tmp_path.iterdir()} == set(files)
     if name in ("depth", "label"):

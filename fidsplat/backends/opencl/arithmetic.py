@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.opencl.assemble import kernel_text, sections_of, with_scalars
+from fidsplat.backends.opencl.assemble import section_text
+from fidsplat.backends.opencl.program import check_kernels
+from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.errors import DeviceError
-
-if TYPE_CHECKING:
-    from fidsplat.backends.opencl.backend import OpenCLBackend
-
-_FILES = ("prelude.cl", "math.cl", "check/arithmetic.cl")
 
 
 def run_arithmetic(
-    backend: OpenCLBackend, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+    workspace: Workspace, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Results of the device's functions, float32 ones as the blend stage calls them.
 
@@ -34,46 +29,37 @@ def run_arithmetic(
     Raises:
         DeviceError: the device cannot compile or run the kernels.
     """
-    lanes = backend.shape.lanes
-    defines = {
-        "LANES": lanes,
-        "FAST_FMA": int(backend.shape.fast_fma),
-        "SETUP_FP64": int(backend.info.float64),
-    }
-    text = "".join(f"#define {name} {value}\n" for name, value in defines.items())
-    text += "".join(map(kernel_text, _FILES))
-    text = text.replace("//@@ arithmetic", sections_of("slot/arithmetic_fast.cl")["arithmetic"])
-    program = backend.build(with_scalars(text))
-    kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
+    arithmetic = section_text("slot/arithmetic_fast.cl", "arithmetic")
+    kernels = check_kernels(workspace, "check/arithmetic.cl", arithmetic=arithmetic)
     n = len(exponents)
     single = [array.astype(np.float32) for array in (exponents, shares, above, below)]
     try:
-        planes = _run(backend, kernels["arithmetic_float"], n // lanes, n, single, 7)
+        planes = _run(workspace, kernels["arithmetic_float"], n // workspace.shape.lanes, n, single, 7)
         names = ("exp", "log", "division", "sqrt", "fma", "fast_exp", "fast_log")
         results: dict[str, np.ndarray] = dict(zip(names, planes, strict=True))
-        if backend.info.float64:
-            planes = _run(backend, kernels["arithmetic_real"], n, n, [above, below], 3)
+        if workspace.info.float64:
+            planes = _run(workspace, kernels["arithmetic_real"], n, n, [above, below], 3)
             results |= dict(zip(("division64", "sqrt64", "log64"), planes, strict=True))
         smallest = np.array([np.finfo(np.float32).tiny, 0.5], np.float32)
-        given, out = (backend.pool.fresh("arithmetic", 16) for _ in range(2))
-        cl.enqueue_copy(backend.queue, given, smallest)
-        kernels["arithmetic_denormal"](backend.queue, (1,), (1,), given, out)
+        given, out = (workspace.pool.fresh("arithmetic", 16) for _ in range(2))
+        cl.enqueue_copy(workspace.queue, given, smallest)
+        kernels["arithmetic_denormal"](workspace.queue, (1,), (1,), given, out)
         results["denormal"] = np.empty(2, np.float32)
-        cl.enqueue_copy(backend.queue, results["denormal"], out)
+        cl.enqueue_copy(workspace.queue, results["denormal"], out)
     except cl.Error as error:
-        raise DeviceError(f"{backend.info.title} failed in a test of its arithmetic: {error}") from error
+        raise DeviceError(f"{workspace.info.title} failed in a test of its arithmetic: {error}") from error
     return results
 
 
 def _run(
-    backend: OpenCLBackend, kernel: cl.Kernel, items: int, n: int, inputs: list[np.ndarray], outputs: int
+    workspace: Workspace, kernel: cl.Kernel, items: int, n: int, inputs: list[np.ndarray], outputs: int
 ) -> np.ndarray:
     buffers = []
     for array in inputs:
-        buffers.append(backend.pool.fresh("arithmetic", array.nbytes))
-        cl.enqueue_copy(backend.queue, buffers[-1], array)
+        buffers.append(workspace.pool.fresh("arithmetic", array.nbytes))
+        cl.enqueue_copy(workspace.queue, buffers[-1], array)
     planes = np.empty((outputs, n), inputs[0].dtype)
-    out = backend.pool.fresh("arithmetic", planes.nbytes)
-    kernel(backend.queue, (items,), None, np.uint32(n), *buffers, out)
-    cl.enqueue_copy(backend.queue, planes, out)
+    out = workspace.pool.fresh("arithmetic", planes.nbytes)
+    kernel(workspace.queue, (items,), None, np.uint32(n), *buffers, out)
+    cl.enqueue_copy(workspace.queue, planes, out)
     return planes

@@ -1,139 +1,224 @@
-"""One flat source text from a FeatureSet and the shape of a device.
+"""One flat source text from a FeatureSet and the shape of a device. Needs no OpenCL.
 
-A kernel file of an effect is cut at lines `//@ section`; a stage file, or a section, has lines `//@@ section`
-where the sections of the chosen effects go. What nobody fills expands to nothing, so the text names no effect
-that was not asked for.
+A stage's file, or a section of an effect's, has hooks, lines `//@@ name`, where the sections `//@ name` of
+the chosen effects go, and lines `//@@ struct NAME` and `//@@ arguments KERNEL`, where the declarations of
+layout.py are printed. What nobody fills leaves an empty line, so the text names no effect that was not asked
+for; `#line` directives say where each line comes from.
 """
 
 from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 
-from fidsplat.effects import CATALOGUE, Effect, FeatureSet
+import numpy as np
+
+from fidsplat.backends.opencl.declare import Argument, Layout, Record, Samples, Scalars, output_argument
+from fidsplat.backends.opencl.layout import BOUNDS, KERNELS, LAYOUTS, SPLAT, VIEW
+from fidsplat.backends.opencl.shapes import DeviceShape
+from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError
 from fidsplat.kernel_files import kernels_folder
 
-BASE_RECORD_LANES, BASE_RECORD_SHORTS = 14, 6
-RECORD_ALIGNMENT = 16
-BASE_BOUNDS_BYTES = 32
 _LISTS = {"ordered": ("scan", "sort", "bin", "pack"), "tiled": ("tiles",)}
-_HOOK = re.compile(r"^[ \t]*//@@ (\w+)[ \t]*\n", re.MULTILINE)
-_SECTION = re.compile(r"^//@ (\w+)[ \t]*\n", re.MULTILINE)
+_HOOK = re.compile(r"[ \t]*//@@ (\w+)(?: (\w+))?[ \t]*")
+_SECTION = re.compile(r"//@ (\w+)[ \t]*")
 _COMMENT = re.compile(r"[ \t]*//[^\n]*")
-_BLANK = re.compile(r"\n\s*\n+")
+_KERNEL = re.compile(r"^kernel\b.*?\bvoid (\w+)\(", re.MULTILINE)
 _WIDE_CONSTANT = re.compile(r"\bWIDE\(([^()]+)\)")
 _WIDE = re.compile(r"\bwide\b")
-
-
-@dataclass(frozen=True)
-class DeviceShape:
-    """Build constants that follow from the kind of device, not from the scene."""
-
-    schedule: str
-    """`lanes` (a tile per work-item, vectors across pixels) or `group` (a work-group per tile)."""
-    lists: str
-    """`ordered` (sort the splats by depth, then list them per tile in that order) or `tiled` (list them per
-    tile, then sort each list)."""
-    lanes: int
-    tile_width: int
-    tile_height: int
-    chunks: int
-    """pieces of the counting sorts (`ordered`)"""
-    radix_bits: int
-    """of the depth sort (`ordered`)"""
-    scan_items: int
-    fast_fma: bool
-
-    @property
-    def blend_items(self) -> int:
-        """Work-items of a work-group of the blend stage; schedule/group.cl draws two pixels in each."""
-        return 1 if self.schedule == "lanes" else self.tile_width * self.tile_height // 2
+_DECLARED = ("struct", "arguments")
 
 
 @dataclass(frozen=True)
 class Source:
     """A flat kernel source with what the host must know of it."""
 
+    listing: str
+    """with comments, to be read"""
     text: str
-    digest: str
-    """SHA-256 of the text: the cache key."""
-    record_bytes: int
-    bounds_bytes: int
+    """the same without them, line for line, to be compiled"""
+    records: dict[str, np.dtype]
+    """`View`, `Splat` and `Bounds` as the kernels have them"""
+    arguments: dict[str, tuple[Argument, ...]]
+    """of each kernel of the text"""
+    samples: tuple[tuple[Samples, bool], ...]
+    """what passes from blending to resolving, and whether several shots are averaged there"""
+    scalars: Scalars
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the text: the cache key."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+
+def layouts_of(features: FeatureSet) -> dict[str, Layout]:
+    """The layouts of all effects, in the order in which their text is put together: those of which there is
+    one of each kind, parts, outputs, what changes rgb."""
+    chosen = (*features.slots, *features.taps, *features.posts)
+    parts = _parts_of(chosen)
+    taps = [name for name in features.taps if name not in parts]
+    return {name: LAYOUTS[name] for name in (*features.slots, *sorted(parts), *taps, *features.posts)}
+
+
+def _parts_of(names: Iterable[str]) -> set[str]:
+    """What layouts need, and what that needs."""
+    parts: set[str] = set()
+    todo = list(names)
+    cameras = {name for name in todo if name.startswith("camera_")}
+    while todo:
+        needed = LAYOUTS[todo.pop()].parts
+        for camera in cameras:
+            needed = [dict(LAYOUTS[part].behind).get(camera, part) for part in needed]
+        fresh = set(needed) - parts
+        parts |= fresh
+        todo += fresh
+    return parts
 
 
 def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
-    """The source text of all stages for these features on a device of this shape."""
-    effects = features.effects
-    double = "blend_double" in features.names
-    record_bytes = _record_bytes(effects, 8 if double else 4)
-    bounds_bytes = BASE_BOUNDS_BYTES + 4 * sum(effect.bounds_lanes for effect in effects)
+    """The source text of all stages for these features on a device of this shape.
+
+    Raises:
+        DeviceError: an effect's file fills a hook that no file has.
+    """
+    layouts = layouts_of(features)
+    declared = _Declarations(layouts, features)
     defines = {
         "CHUNKS": shape.chunks,
         "FAST_FMA": int(shape.fast_fma),
         "LANES": shape.lanes,
         "RADIX_BITS": shape.radix_bits,
-        "RECORD_BYTES": record_bytes,
         "SAMPLES": features.samples,
         "SCAN_ITEMS": shape.scan_items,
         "SETUP_FP64": int(features.setup_precision == "float64"),
         "TILE_H": shape.tile_height,
         "TILE_W": shape.tile_width,
     }
-    if "color_sh" in features.names:
+    if "color_sh" in layouts:
         defines["SH_DEGREE"] = features.sh_degree
-    files = [effect.file for effect in effects]
+    files = [layout.file for layout in layouts.values() if layout.file]
     if shape.lists == "tiled":
         files.append("list/tiled.cl")
-    sections = [sections_of(file) for file in files]
-
-    def fill(match: re.Match[str]) -> str:
-        return "".join(_HOOK.sub(fill, section.get(match[1], "")) for section in sections)
-
     stages = ["prelude", "math", "splat", "bounds", "project", *_LISTS[shape.lists], "blend"]
     stages = [f"{stage}.cl" for stage in (*stages, f"schedule/{shape.schedule}", "resolve")]
-    body = "\n".join(_HOOK.sub(fill, kernel_text(stage)) for stage in stages)
-    stages += [f"schedule/{schedule}.cl" for schedule in ("lanes", "group")]
-    known = {hook for file in {*stages, *(one.file for one in CATALOGUE.values())} for hook in _hooks(file)}
-    for file, section in zip(files, sections, strict=True):
-        if unknown := set(section) - known:
-            raise DeviceError(f"kernel file {file} fills hooks that no file has: {sorted(unknown)}")
-    text = "".join(f"#define {name} {value}\n" for name, value in sorted(defines.items()))
-    text += _BLANK.sub("\n", with_scalars(_COMMENT.sub("", body), double))
-    return Source(text, hashlib.sha256(text.encode()).hexdigest(), record_bytes, bounds_bytes)
+    _refuse_unknown_hooks(files, stages)
+    sections = [(file, sections_of(file)) for file in files]
+
+    def fill(hook: str, subject: str) -> Iterator[str]:
+        if hook in _DECLARED:
+            yield f'#line 1 "layout.py: {subject}"\n{declared.text(hook, subject)}'
+        for file, by_hook in sections:
+            for first, lines in by_hook.get(hook, ()):
+                yield f"#line {first} {_shown(file)}\n{expand(file, first, lines)}"
+
+    def expand(file: str, first: int, lines: tuple[str, ...]) -> str:
+        made = []
+        for number, line in enumerate(lines, first):
+            hook = _HOOK.fullmatch(line)
+            filled = "".join(fill(hook[1], hook[2] or "")) if hook else ""
+            made.append(f"{filled}#line {number + 1} {_shown(file)}" if filled else "" if hook else line)
+        return "\n".join(made) + "\n"
+
+    body = "".join(f"#line 1 {_shown(stage)}\n{expand(stage, 1, lines_of(stage))}" for stage in stages)
+    head = "".join(f"#define {name} {value}\n" for name, value in sorted(defines.items()))
+    listing = head + with_scalars(body, declared.scalars.wide)
+    text = _COMMENT.sub("", listing)
+    arguments = {kernel: declared.arguments(kernel) for kernel in _KERNEL.findall(text)}
+    return Source(listing, text, declared.records, arguments, declared.samples, declared.scalars)
 
 
-def with_scalars(text: str, double: bool = False) -> str:
+class _Declarations:
+    """What layout.py declares, with what the chosen effects add to it."""
+
+    def __init__(self, layouts: dict[str, Layout], features: FeatureSet) -> None:
+        real = "double" if features.setup_precision == "float64" else "float"
+        self.scalars = Scalars(real, "double" if "blend_double" in layouts else "float")
+        self.samples = tuple((one, layout.averaged) for layout in layouts.values() for one in layout.samples)
+        self._layouts, self._outputs = layouts, features.outputs
+        every = layouts.values()
+        self._structs: dict[str, Record] = {
+            "View": VIEW.with_members(one for layout in every for one in layout.view),
+            "Splat": SPLAT.with_members(one for layout in every for one in layout.splat),
+            "Bounds": BOUNDS.with_members(one for layout in every for one in layout.bounds),
+        }
+        self.records = {name: record.dtype(self.scalars) for name, record in self._structs.items()}
+
+    def arguments(self, kernel: str) -> tuple[Argument, ...]:
+        """Its own, then those of the effects in their order, each name once."""
+        every = self._layouts.values()
+        added: list[Argument] = []
+        if kernel in ("project", "blend", "backdrop", "resolve"):
+            added += (one for layout in every for one in getattr(layout, kernel))
+        if kernel in ("blend", "resolve"):
+            access = "out" if kernel == "blend" else "in"
+            added += (Argument(one.ctype, one.name, access, note=one.note) for one, _ in self.samples)
+        if kernel == "resolve":
+            added += map(output_argument, self._outputs)
+        return tuple({one.name: one for one in (*KERNELS[kernel], *added)}.values())
+
+    def text(self, hook: str, subject: str) -> str:
+        """C for `//@@ struct NAME` or `//@@ arguments KERNEL`."""
+        if hook == "struct":
+            return self._structs[subject].text(self.scalars)
+        arguments = self.arguments(subject)
+        lines = [f"    {one.text}{',' if one is not arguments[-1] else ''}" for one in arguments]
+        notes = [f"  // {one.note}" if one.note else "" for one in arguments]
+        return "".join(f"{line}{note}\n" for line, note in zip(lines, notes, strict=True))
+
+
+def _shown(file: str) -> str:
+    """What `#line` calls a file: its path below kernels/, or its name if it is not from there."""
+    return f'"{Path(file).name}"' if Path(file).is_absolute() else f'"opencl/{file}"'
+
+
+def with_scalars(text: str, wide: str = "float") -> str:
     """Kernel text in which the type `wide` and its constants are those of C."""
-    text = _WIDE_CONSTANT.sub(r"\1" if double else r"\1f", text)
-    return _WIDE.sub("double" if double else "float", text)
+    return _WIDE.sub(wide, _WIDE_CONSTANT.sub(r"\1" if wide == "double" else r"\1f", text))
 
 
-def _record_bytes(effects: tuple[Effect, ...], scalar: int) -> int:
-    """Size of the C struct `Splat` whose numbers take `scalar` bytes."""
-    size = scalar * BASE_RECORD_LANES + 2 * BASE_RECORD_SHORTS
-    for effect in effects:
-        if effect.record_lanes:
-            each = 4 if effect.record_whole else scalar
-            size += -size % each + each * effect.record_lanes
-    return size + -size % RECORD_ALIGNMENT
+def _refuse_unknown_hooks(files: list[str], stages: list[str]) -> None:
+    everywhere = {*stages, "schedule/lanes.cl", "schedule/group.cl"}
+    everywhere |= {layout.file for layout in LAYOUTS.values() if layout.file}
+    known = {hook for file in everywhere for hook in _hooks(file)}
+    for file in files:
+        if unknown := set(sections_of(file)) - known:
+            raise DeviceError(f"kernel file {file} fills hooks that no file has: {sorted(unknown)}")
+
+
+def kernel_text(path: str) -> str:
+    """A file below kernels/opencl/, as it stands."""
+    return "\n".join(lines_of(path)) + "\n"
+
+
+def section_text(path: str, hook: str) -> str:
+    """What an effect's file has for a hook."""
+    return "".join("\n".join(lines) + "\n" for _, lines in sections_of(path)[hook])
 
 
 @cache
-def kernel_text(path: str) -> str:
-    """A file below kernels/opencl/, as it stands."""
-    return (kernels_folder() / "opencl" / path).read_text(encoding="utf-8")
+def lines_of(path: str) -> tuple[str, ...]:
+    """The lines of a file below kernels/opencl/."""
+    return tuple((kernels_folder() / "opencl" / path).read_text(encoding="utf-8").splitlines())
 
 
 @cache
 def _hooks(path: str) -> tuple[str, ...]:
-    return tuple(_HOOK.findall(kernel_text(path)))
+    found = (_HOOK.fullmatch(line) for line in lines_of(path))
+    return tuple(hook[1] for hook in found if hook)
 
 
 @cache
-def sections_of(path: str) -> dict[str, str]:
-    """The sections of an effect's file, by the hook that each fills."""
-    pieces = _SECTION.split(kernel_text(path))
-    return dict(zip(pieces[1::2], pieces[2::2], strict=True))
+def sections_of(path: str) -> dict[str, list[tuple[int, tuple[str, ...]]]]:
+    """The sections of an effect's file, by the hook that each fills: number of the first line, and lines."""
+    lines = lines_of(path)
+    starts = [(k, match[1]) for k, line in enumerate(lines) if (match := _SECTION.fullmatch(line))]
+    ends = [k for k, _ in starts[1:]] + [len(lines)]
+    sections: dict[str, list[tuple[int, tuple[str, ...]]]] = {}
+    for (start, hook), end in zip(starts, ends, strict=True):
+        sections.setdefault(hook, []).append((start + 2, lines[start + 1 : end]))
+    return sections

@@ -1,60 +1,57 @@
-"""The stages compiled for one FeatureSet on one device, and the planes that they make."""
+"""The stages compiled for one FeatureSet on one device, and the output images that they make."""
 
 from __future__ import annotations
 
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.base import View
-from fidsplat.backends.opencl.assemble import DeviceShape, Source
-from fidsplat.backends.opencl.exposed_run import ExposedRun
-from fidsplat.backends.opencl.lists import SPLAT_ARRAYS
-from fidsplat.backends.opencl.memory import DeviceBuffer, Resident
-from fidsplat.backends.opencl.plan import BIG, SMALL, Plan, plan_of, table_bytes
-from fidsplat.backends.opencl.ray_buffers import RayBuffers
-from fidsplat.backends.opencl.run import Run
+from fidsplat.backends.opencl.assemble import Source
+from fidsplat.backends.opencl.drawing import Images, draw
+from fidsplat.backends.opencl.memory_plan import BIG, SMALL, MemoryPlan, plan_of, table_bytes
+from fidsplat.backends.opencl.picture import Picture
+from fidsplat.backends.opencl.program import Program
+from fidsplat.backends.opencl.resident import Resident
+from fidsplat.backends.opencl.shapes import DeviceShape
+from fidsplat.backends.opencl.workspace import RayBuffers, Workspace
+from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
-from fidsplat.effects.catalogue import Output
 from fidsplat.errors import DeviceError
 
-if TYPE_CHECKING:
-    from fidsplat.backends.opencl.backend import OpenCLBackend
 
+class OpenCLImages:
+    """Output images on the device, with the events of the kernels that made them.
 
-class OpenCLPlanes:
-    """Finished planes on the device, with the events of the kernels that made them.
-
-    Their buffers go back to the pool when nobody holds the planes any more.
+    Their buffers go back to the pool when nobody holds the images any more.
     """
 
-    def __init__(self, run: Run, outputs: dict[str, tuple[Output, cl.Buffer]]) -> None:
-        # not the run itself, which holds the cloud and all scratch buffers
-        self._queue, self._outputs, self._events = run.queue, outputs, run.events
-        self._stats, self._title = run.stats, run.backend.info.title
-        self._uploads = run.uploads  # kept until the device has read them
-        self._size = (run.view.height // run.view.samples, run.view.width // run.view.samples)
-        weakref.finalize(self, run.pool.give_back, run.leased)
+    def __init__(self, picture: Picture, images: Images) -> None:
+        # not the picture itself, which holds the cloud and all scratch buffers
+        self._queue, self._images, self._events = picture.queue, images, picture.events
+        self._stats, self._title = picture.stats, picture.workspace.info.title
+        self._uploads = picture.uploads  # kept until the device has read them
+        view = picture.view
+        self._size = (view.height // view.samples, view.width // view.samples)
+        weakref.finalize(self, picture.pool.give_back, picture.leased)
 
     def read(self, name: str) -> np.ndarray:
-        """The plane on the host; waits for the device.
+        """The image on the host; waits for the device.
 
         Raises:
             DeviceError: the device has failed, in this or while it was drawing.
         """
-        output, buffer = self._outputs[name]
+        output, buffer = self._images[name]
         shape = self._size if output.channels == 1 else (*self._size, output.channels)
-        plane = np.empty(shape, output.dtype)
+        image = np.empty(shape, output.dtype)
         try:
-            cl.enqueue_copy(self._queue, plane, buffer)
+            cl.enqueue_copy(self._queue, image, buffer)
         except cl.Error as error:
             raise DeviceError(f"{self._title} failed while drawing {name}: {error}") from error
-        return plane
+        return image
 
     @property
     def timings(self) -> dict[str, float]:
@@ -74,26 +71,18 @@ class OpenCLPipeline:
 
     def __init__(
         self,
-        backend: OpenCLBackend,
+        workspace: Workspace,
         source: Source,
-        program: cl.Program,
         features: FeatureSet,
         shape: DeviceShape,
+        other: Callable[[FeatureSet, DeviceShape], OpenCLPipeline],
     ) -> None:
-        self.source = source
-        self.features = features
-        self.shape = shape
-        self.backend = backend
-        self._kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
-        self._bound: dict[str, list] = {}
-        taken = [
-            name for effect in features.effects for name in effect.inputs if name not in effect.view_inputs
-        ]
-        self._cloud_arrays = {*SPLAT_ARRAYS, *taken}
-        self.real = np.float64 if features.setup_precision == "float64" else np.float32
-        self.wide = np.float64 if "blend_double" in features.names else np.float32
+        self.workspace, self.source, self.features, self.shape = workspace, source, features, shape
+        self.program = Program(workspace, source)
+        self._other = other
+        """gives the pipeline of another shape"""
 
-    def render(self, resident: Resident, view: View) -> OpenCLPlanes:
+    def render(self, resident: Resident, view: View) -> OpenCLImages:
         """Draw one picture.
 
         Raises:
@@ -102,80 +91,65 @@ class OpenCLPipeline:
         plan = self._plan(resident, view)
         if plan.chunk and self.shape.lists != "ordered":
             # one way of drawing in chunks is enough: where memory is short, sorting takes the least time
-            shape = replace(self.shape, lists="ordered")
-            return self.backend.pipeline(self.features, shape).render(resident, view)
-        backend = self.backend
-        way = backend.memory_budget - plan.held
+            return self._other(self.features, replace(self.shape, lists="ordered")).render(resident, view)
+        workspace = self.workspace
+        way = workspace.memory_budget - plan.held
         # what this picture takes anew is planned for; that of its own kind is there already
-        backend.pool.make_way((self, view.width, view.height, resident.count, plan), way)
+        workspace.pool.make_way((self, view.width, view.height, resident.count, plan), way)
         try:
-            run = (ExposedRun if view.shots else Run)(self, resident, view, plan)
-            return OpenCLPlanes(run, run.draw())
+            return OpenCLImages(*self._draw(resident, view, plan))
         except BaseException as error:
             with suppress(cl.Error):
-                self.backend.queue.finish()  # a CPU may be reading the arrays of a cloud that nobody keeps
+                workspace.queue.finish()  # a CPU may be reading the arrays of a cloud that nobody keeps
             if isinstance(error, cl.Error):
-                raise DeviceError(f"{self.backend.info.title} failed while drawing: {error}") from error
+                raise DeviceError(f"{workspace.info.title} failed while drawing: {error}") from error
             raise
 
-    def _plan(self, resident: Resident, view: View) -> Plan:
-        shape, effects = self.shape, self.features.effects
+    def _draw(self, resident: Resident, view: View, plan: MemoryPlan) -> tuple[Picture, Images]:
+        def start(view: View) -> Picture:
+            return Picture(self.workspace, self.program, self.shape, resident, view, plan)
+
+        return draw(start, view, self.features.outputs)
+
+    def _plan(self, resident: Resident, view: View) -> MemoryPlan:
+        shape, source = self.shape, self.source
         tiles_x = -(-view.width // shape.tile_width)
         tiles = tiles_x * -(-view.height // shape.tile_height)
-        stays, upload = resident.bytes_for(self._cloud_arrays)
+        stays, upload = resident.bytes_for(
+            one.name for one in source.arguments["project"] if one.source == "cloud"
+        )
         fixed = stays + SMALL + table_bytes(shape.lists, tiles, shape.chunks, shape.radix_bits)
-        fixed += BIG * (4 + self.source.bounds_bytes)
-        planes = 4 + sum(planes for effect in effects for planes in effect.planes)
+        fixed += BIG * (4 + source.records["Bounds"].itemsize)
+        planes = 4 + sum(one.planes for one, _ in source.samples)
         if view.shots:
             planes *= 2  # the picture's own beside those of a shot
         fixed += 4 * tiles * shape.tile_width * shape.tile_height * planes  # whole tiles
         pixels = view.width * view.height // view.samples**2
         fixed += 4 * pixels * sum(output.channels for output in self.features.outputs)
-        arrays = (name for effect in effects for name in (*effect.resolve_arrays, *effect.backdrop_arrays))
+        arrays = {one.name for each in source.arguments.values() for one in each if one.source == "array"}
         fixed += sum(view.array(name).nbytes for name in arrays)
         if view.raster is not None:
             rasters = {view.raster, *(shot.view.raster for shot in view.shots if shot.view.raster)}
-            columns, slopes = tiles_x * shape.tile_width, "rays_box" in self.features.names
-            fixed += RayBuffers.bytes_of(rasters, shape.tile_height, columns, slopes)
-        backend, record = self.backend, self.source.record_bytes
-        budget, largest = backend.memory_budget, backend.device.max_mem_alloc_size
+            slopes = "ray_slopes" in {one.name for one in source.arguments["blend"]}
+            fixed += RayBuffers.bytes_of(rasters, shape.tile_height, tiles_x * shape.tile_width, slopes)
+        workspace, record = self.workspace, source.records["Splat"].itemsize
+        budget, largest = workspace.memory_budget, workspace.device.max_mem_alloc_size
         return plan_of(resident.count, record, upload, fixed, shape.lists, budget, largest)
-
-    def launch(self, queue: cl.CommandQueue, name: str, size: tuple, group: tuple, args: tuple) -> cl.Event:
-        """Launch a kernel, setting only those arguments that have changed since its last launch: from picture
-        to picture hardly any do, and setting them takes the host longer than a small stage takes a GPU.
-        A buffer is remembered by its token, so that a cloud or a picture that nobody has any more is let go.
-        """
-        kernel = self._kernels[name]
-        bound: list[object] = self._bound.pop(name, None) or [None] * len(args)
-        for index, argument in enumerate(args):
-            if type(argument) is DeviceBuffer:
-                mark: object = argument.token
-            else:  # part of a buffer is made anew for each launch
-                mark = argument if isinstance(argument, np.generic) else object()
-            old = bound[index]
-            if mark is not old and (type(mark) is not type(old) or mark != old):
-                kernel.set_arg(index, argument)
-                bound[index] = mark
-        self._bound[name] = bound
-        return cl.enqueue_nd_range_kernel(queue, kernel, size, group)
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Draw one picture and return what passes between the stages.
 
-        keys (n,) uint32; starts (tiles + 1,) uint32; lists (pairs,) uint32, of the last band; records
-        (n, words) float32 (undefined for culled splats); raw (4, rows, columns) float32: r, g, b,
+        keys (n,) uint32; starts (tiles + 1,) uint32; lists (pairs,) uint32, of the last band; records (n,) of
+        the record `Splat` (undefined for culled splats); raw (4, rows, columns) float32: r, g, b,
         transmittance of the padded sample grid; and the finished outputs by name.
         """
-        run = Run(self, resident, view, Plan(0, resident.count, 0))
-        planes = OpenCLPlanes(run, run.draw())
-        stats = planes.stats
-        words = self.source.record_bytes // 4
+        picture, images = self._draw(resident, view, MemoryPlan(0, resident.count, 0))
+        made = OpenCLImages(picture, images)
         return {
-            "keys": run.read("keys", np.uint32, (resident.count,)),
-            "starts": run.read("starts", np.uint32, (run.tiles + 1,)),
-            "lists": run.read("lists", np.uint32, (stats["pairs"],)),
-            "records": run.read("splats", np.float32, (resident.count, words)),
-            "raw": run.read("raw", np.float32, (4, run.rows, run.stride)),
-            **{output.name: planes.read(output.name) for output in self.features.outputs},
+            "keys": picture.read("keys", np.uint32, (resident.count,)),
+            "starts": picture.read("starts", np.uint32, (picture.tiles + 1,)),
+            "lists": picture.read("lists", np.uint32, (made.stats["pairs"],)),
+            "records": picture.read("splats", self.source.records["Splat"], (resident.count,)),
+            "raw": picture.read("raw", np.float32, (4, picture.rows, picture.stride)),
+            **{output.name: made.read(output.name) for output in self.features.outputs},
         }

@@ -1,4 +1,5 @@
-"""Lets the PoCL that pip installs compile for processors that its LLVM does not know.
+"""Lets the PoCL that pip installs compile for processors that its LLVM does not know: the last resort, for
+which devices that need none are preferred (device.py), and which the variable FIDSPLAT_NO_POCL_PATCH forbids.
 
 PoCL 3.0 from PyPI asks its LLVM 14 for the processor's name. For one that is newer than LLVM 14 (AMD Zen 5,
 say) the answer is "generic", which PoCL then hands to clang as -target-cpu, where it is an error: every build
@@ -28,6 +29,8 @@ _LEVELS = (
     ("haswell", ("avx2", "cx16", "popcnt", "abm", "f16c", "fma", "bmi1", "bmi2")),
     ("skylake-avx512", ("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl")),
 )
+FORBID = "FIDSPLAT_NO_POCL_PATCH"
+"""set to anything but 0, it forbids to write into PoCL's memory"""
 _NAME = re.compile(r"PoCL.*-x86_64-[\w-]*gnu-([\w-]+)$")
 _RECORD_BYTES = 2048
 _corrected: dict[int, ctypes.Array] = {}  # PoCL keeps pointing at these
@@ -41,18 +44,41 @@ def needs_correction(device_version: str) -> bool:
     return name == "generic" or (name.startswith("znver") and _processor_name() == _LEVELS[-1][0])
 
 
-def correct_target(device_address: int, device_version: str) -> str | None:
-    """Give the PoCL device whose record lies at this address the processor name of its kernel library.
-
-    Returns the name, or None if the record does not look as expected (then nothing is changed).
-    """
+def why_not(device_address: int, device_version: str) -> str:
+    """Why the PoCL device whose record lies at this address may not or cannot be corrected; empty if it can.
+    Changes nothing."""
+    if os.environ.get(FORBID, "0") not in ("", "0"):
+        return f"{FORBID} forbids to correct it"
     if device_address in _corrected:
-        return _corrected[device_address].value.decode()
+        return ""
     try:
-        memory = os.open("/proc/self/mem", os.O_RDONLY)
-    except OSError:  # a system that hides it
-        return None
+        return "" if _place(device_address, device_version) else "its record is not that of PoCL 3.0"
+    except OSError as error:
+        return f"/proc/self/mem cannot be read ({error.strerror or error})"
+
+
+def correct_target(device_address: int, device_version: str) -> str:
+    """Give the PoCL device whose record lies at this address the processor name of its kernel library;
+    returns that name. Only where `why_not` has no objection: else nothing is changed, and the name is that of
+    LLVM."""
+    if device_address not in _corrected:
+        place = None if why_not(device_address, device_version) else _place(device_address, device_version)
+        if place is None:
+            return _name_of_llvm(device_version)
+        name = ctypes.create_string_buffer(_processor_name().encode())
+        _corrected[device_address] = name
+        ctypes.c_uint64.from_address(place).value = ctypes.addressof(name)
+    return _corrected[device_address].value.decode()
+
+
+def _place(device_address: int, device_version: str) -> int | None:
+    """The address of the field `llvm_cpu` of a device's record; None if the record is not as expected.
+
+    Raises:
+        OSError: the system hides the process's memory.
+    """
     wrong = _name_of_llvm(device_version).encode()
+    memory = os.open("/proc/self/mem", os.O_RDONLY)
     try:
         record = _read(memory, device_address, _RECORD_BYTES)
         words = struct.unpack(f"<{len(record) // 8}Q", record[: len(record) // 8 * 8])
@@ -63,13 +89,7 @@ def correct_target(device_address: int, device_version: str) -> str | None:
         ]
     finally:
         os.close(memory)
-    if len(places) != 1:
-        return None
-    name = ctypes.create_string_buffer(_processor_name().encode())
-    _corrected[device_address] = name
-    field = ctypes.c_uint64.from_address(device_address + 8 * places[0])
-    field.value = ctypes.addressof(name)
-    return name.value.decode()
+    return device_address + 8 * places[0] if len(places) == 1 else None
 
 
 def _name_of_llvm(device_version: str) -> str:

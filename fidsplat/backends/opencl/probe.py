@@ -10,14 +10,13 @@ from contextlib import contextmanager
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.opencl.assemble import kernel_text, with_scalars
-from fidsplat.backends.opencl.backend import OpenCLBackend
-from fidsplat.backends.opencl.memory import BufferPool
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
+from fidsplat.backends.opencl.program import build_options, check_kernels
+from fidsplat.backends.opencl.workspace import BufferPool, Workspace
 
 
 def evaluate(
-    backend: OpenCLBackend, text: str, inputs: Sequence[np.ndarray], outputs: Sequence[np.dtype | type]
+    workspace: Workspace, text: str, inputs: Sequence[np.ndarray], outputs: Sequence[np.dtype | type]
 ) -> list[np.ndarray]:
     """Run `kernel void probe(...)` of `text`, compiled as the stages are: after prelude.cl and math.cl.
 
@@ -28,58 +27,20 @@ def evaluate(
     Raises:
         DeviceError: the compiler refuses.
     """
-    defines = {
-        "LANES": 1,
-        "FAST_FMA": int(backend.shape.fast_fma),
-        "SETUP_FP64": int(backend.info.float64),
-    }
-    head = "".join(f"#define {name} {value}\n" for name, value in defines.items())
-    stages = kernel_text("prelude.cl") + kernel_text("math.cl")
-    program = backend.build(with_scalars(head + stages) + text)
-    given = [buffer_of(backend, array) for array in inputs]
+    kernel = check_kernels(workspace, text=text, lanes=1)["probe"]
+    given = [buffer_of(workspace, array) for array in inputs]
     made = [np.empty(len(inputs[0]), dtype) for dtype in outputs]
-    taken = [buffer_of(backend, array) for array in made]
-    program.probe(backend.queue, (len(inputs[0]),), None, *given, *taken)
+    taken = [buffer_of(workspace, array) for array in made]
+    kernel(workspace.queue, (len(inputs[0]),), None, *given, *taken)
     for array, buffer in zip(made, taken, strict=True):
-        cl.enqueue_copy(backend.queue, array, buffer)
+        cl.enqueue_copy(workspace.queue, array, buffer)
     return made
 
 
-def scan(pipeline: OpenCLPipeline, lengths: np.ndarray) -> tuple[np.ndarray, int]:
-    """What the device makes of lengths of lists (n,) uint32: where each list starts (n + 1,) uint32,
-    and the sum of all in 64 bits.
-    """
-    backend, items = pipeline.backend, (pipeline.shape.scan_items,)
-    count, starts = np.uint32(len(lengths)), buffer_of(backend, np.empty(len(lengths) + 1, np.uint32))
-    sums = buffer_of(backend, np.zeros(8, np.uint32))
-    if pipeline.shape.lists == "tiled":
-        tallies = buffer_of(backend, np.concatenate([np.zeros(8, np.uint32), lengths]))
-        cursors = buffer_of(backend, lengths)
-        args, kernel, place = (count, np.uint32(2**32 - 1), tallies, starts, cursors, sums), "tile_starts", 1
-    else:
-        totals = buffer_of(backend, lengths)
-        args, kernel, place = (count, totals, starts, sums, np.uint32(4)), "scan_bins", 4
-    pipeline.launch(backend.queue, kernel, items, items, args)
-    places = contents(backend, starts).view(np.uint32)
-    words = contents(backend, sums).view(np.uint32)
-    return places, int(words[place]) | int(words[place + 1]) << 32
-
-
-@contextmanager
-def poisoned(backend: OpenCLBackend) -> Iterator[None]:
-    """Within it, every buffer that a picture takes is filled with 0xFF first: NaN, or the integer -1."""
-    pool = backend.pool
-    backend.pool = _PoisonedPool(backend)
-    try:
-        yield
-    finally:
-        backend.pool = pool
-
-
 class _PoisonedPool(BufferPool):
-    def __init__(self, backend: OpenCLBackend) -> None:
-        super().__init__(backend.context, backend.device)
-        self._queue = backend.queue
+    def __init__(self, workspace: Workspace) -> None:
+        super().__init__(workspace.context, workspace.device)
+        self._queue = workspace.queue
 
     def scratch(self, name: str, size: int) -> cl.Buffer:
         return self._filled(super().scratch(name, size))
@@ -95,17 +56,17 @@ class _PoisonedPool(BufferPool):
         return buffer
 
 
-def contents(backend: OpenCLBackend, buffer: cl.Buffer) -> np.ndarray:
+def contents(workspace: Workspace, buffer: cl.Buffer) -> np.ndarray:
     """The bytes of a buffer (size,) uint8."""
     array = np.empty(buffer.size, np.uint8)
-    cl.enqueue_copy(backend.queue, array, buffer)
+    cl.enqueue_copy(workspace.queue, array, buffer)
     return array
 
 
-def buffer_of(backend: OpenCLBackend, array: np.ndarray) -> cl.Buffer:
+def buffer_of(workspace: Workspace, array: np.ndarray) -> cl.Buffer:
     """An array in a buffer of its own."""
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
-    return cl.Buffer(backend.context, flags, hostbuf=np.ascontiguousarray(array))
+    return cl.Buffer(workspace.context, flags, hostbuf=np.ascontiguousarray(array))
 
 
 CONTRACTION = """
@@ -131,21 +92,62 @@ kernel void probe(global const float *x, global int *unequal, global int *named,
 """
 
 
-def contraction(backend: OpenCLBackend, a: np.ndarray, b: np.ndarray) -> tuple[list[np.ndarray], bool]:
-    """a b - a b; a b + a; the difference in the set-up's precision, of thirds; a b - (a b), fused: each (n,),
-    from a, b (n,)
-    float32. And whether the device fuses where it is asked to.
-    """
-    real = np.float64 if backend.info.float64 else np.float32
-    types = (np.float32, np.float32, real, np.float32)
-    return evaluate(backend, CONTRACTION, (a, b, a), types), backend.shape.fast_fma
+class OpenCLProbe:
+    """Small kernels under the build options and the pragmas of the stages, single stages on made-up input,
+    and buffers that are filled with rubbish first: `Probe` of fidsplat/backends/base.py."""
 
+    def __init__(self, workspace: Workspace) -> None:
+        self._workspace = workspace
 
-def not_a_number(backend: OpenCLBackend, x: np.ndarray) -> Sequence[np.ndarray]:
-    """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
-    return evaluate(backend, NOT_A_NUMBER, (x,), (np.int32,) * 4)
+    def contraction(self, a: np.ndarray, b: np.ndarray) -> tuple[list[np.ndarray], bool]:
+        """a b - a b; a b + a; the difference in the set-up's precision, of thirds; a b - (a b), fused: each
+        (n,), from a, b (n,) float32. And whether the device fuses where it is asked to.
+        """
+        real = np.float64 if self._workspace.info.float64 else np.float32
+        types = (np.float32, np.float32, real, np.float32)
+        return evaluate(self._workspace, CONTRACTION, (a, b, a), types), self._workspace.shape.fast_fma
 
+    def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
+        """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
+        return evaluate(self._workspace, NOT_A_NUMBER, (x,), (np.int32,) * 4)
 
-def options(backend: OpenCLBackend) -> list[str]:
-    """What every program is compiled with."""
-    return backend.build_options
+    def options(self) -> list[str]:
+        """What every program is compiled with."""
+        return build_options(self._workspace.device)
+
+    def scan(self, pipeline: OpenCLPipeline, lengths: np.ndarray) -> tuple[np.ndarray, int]:
+        """What the device makes of lengths of lists (n,) uint32: where each list starts (n + 1,) uint32,
+        and the sum of all in 64 bits.
+        """
+        workspace, items = pipeline.workspace, (pipeline.shape.scan_items,)
+        starts = buffer_of(workspace, np.empty(len(lengths) + 1, np.uint32))
+        sums = buffer_of(workspace, np.zeros(8, np.uint32))
+        given = {"starts": starts}
+        if pipeline.shape.lists == "tiled":
+            kernel, place = "tile_starts", 1
+            given |= {"tiles": len(lengths), "capacity": 2**32 - 1, "counts": sums}
+            tallies = buffer_of(workspace, np.concatenate([np.zeros(8, np.uint32), lengths]))
+            given |= {"tallies": tallies, "cursors": buffer_of(workspace, lengths)}
+        else:
+            kernel, place = "scan_bins", 4
+            given |= {
+                "bins": len(lengths),
+                "totals": buffer_of(workspace, lengths),
+                "tallies": sums,
+                "slot": 4,
+            }
+        arguments = pipeline.source.arguments[kernel]
+        pipeline.program.launch(kernel, items, items, [given[one.name] for one in arguments])
+        places = contents(workspace, starts).view(np.uint32)
+        words = contents(workspace, sums).view(np.uint32)
+        return places, int(words[place]) | int(words[place + 1]) << 32
+
+    @contextmanager
+    def poisoned(self) -> Iterator[None]:
+        """Within it, every buffer that a picture takes is filled with 0xFF first: NaN, or the integer -1."""
+        pool = self._workspace.pool
+        self._workspace.pool = _PoisonedPool(self._workspace)
+        try:
+            yield
+        finally:
+            self._workspace.pool = pool

@@ -1,16 +1,74 @@
-"""Build constants of a device for one picture: its own, changed where the picture's knobs ask for it."""
+"""Build constants of a device: what its kind decides, what a picture's features change, and others that tests
+compare with them."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
-from fidsplat.backends.opencl.assemble import DeviceShape
 from fidsplat.effects import FeatureSet
 
 
+@dataclass(frozen=True)
+class DeviceShape:
+    """Build constants that follow from the kind of device, not from the scene."""
+
+    schedule: str
+    """`lanes` (a tile per work-item, vectors across pixels) or `group` (a work-group per tile)."""
+    lists: str
+    """`ordered` (sort the splats by depth, then list them per tile in that order) or `tiled` (list them per
+    tile, then sort each list)."""
+    lanes: int
+    tile_width: int
+    tile_height: int
+    chunks: int
+    """pieces of the counting sorts (`ordered`)"""
+    radix_bits: int
+    """of the depth sort (`ordered`)"""
+    scan_items: int
+    fast_fma: bool
+
+    @property
+    def blend_items(self) -> int:
+        """Work-items of a work-group of the blend stage; schedule/group.cl draws two pixels in each."""
+        return 1 if self.schedule == "lanes" else self.tile_width * self.tile_height // 2
+
+
+def cpu_shape(lanes: int = 16, cores: int = 8, fast_fma: bool = True) -> DeviceShape:
+    """For CPUs: a tile per work-item, in the widest vectors."""
+    return DeviceShape("lanes", "ordered", lanes, lanes, 16, min(max(4 * cores, 8), 256), 11, 1, fast_fma)
+
+
+def gpu_shape(scan_items: int = 1024, fast_fma: bool = True) -> DeviceShape:
+    """For GPUs: a work-group per tile of 16 x 16 pixels."""
+    return DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, scan_items, fast_fma)
+
+
 def shape_for(features: FeatureSet, shape: DeviceShape) -> DeviceShape:
-    """`shape` with the schedule and the tiles that these features ask for."""
+    """`shape` with the tiles and the schedule that these features ask for."""
     if "blend_double" in features.slots and shape.schedule == "lanes":
         # doubles are drawn one by one
         shape = replace(shape, schedule="group", lanes=1, tile_width=16, tile_height=16)
     return shape
+
+
+def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
+    """Build constants by name, for tests: `Reshapes.shapes` of fidsplat/backends/base.py."""
+    if kind == "schedule":
+        return {"groups": _groups(own, 8)}
+    if kind == "sorting":
+        return {"own": own, "in 7 pieces": replace(own, chunks=7, radix_bits=5), "groups": _groups(own, 16)}
+    sizes = [(8, 8), (32, 32)]
+    if own.schedule == "lanes":
+        # a tile is as wide as the vector
+        sizes = [(8, 8), (own.lanes, 32), (4, 16)]
+    lanes = [{"lanes": width} if own.schedule == "lanes" else {} for width, _ in sizes]
+    return {
+        f"{width} x {height}": replace(own, tile_width=width, tile_height=height, **lane)
+        for (width, height), lane in zip(sizes, lanes, strict=True)
+    }
+
+
+def _groups(own: DeviceShape, side: int) -> DeviceShape:
+    """The schedule of a GPU in tiles of side x side."""
+    groups = replace(own, schedule="group", tile_width=side, tile_height=side)
+    return replace(groups, lists="tiled", lanes=1, scan_items=64)

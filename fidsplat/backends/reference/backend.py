@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.base import DeviceInfo, View
+from fidsplat.backends.base import DeviceInfo
 from fidsplat.backends.reference.blend import composite
 from fidsplat.backends.reference.resolve import resolve
 from fidsplat.backends.reference.setup import Setup
+from fidsplat.backends.view import View
 from fidsplat.effects import OUTPUTS, FeatureSet
 from fidsplat.errors import InputError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
@@ -55,6 +56,8 @@ def open_device(selector: str = "") -> ReferenceBackend:
 class ReferenceBackend:
     """NumPy in float64."""
 
+    always_float64 = True
+
     def __init__(self) -> None:
         self.info = devices()[0]
 
@@ -70,6 +73,10 @@ class ReferenceBackend:
         """The cloud itself."""
         return ReferenceCloud(cloud)
 
+    def unsupported(self, features: FeatureSet) -> str:
+        """Nothing."""
+        return ""
+
     def pipeline(self, features: FeatureSet) -> ReferencePipeline:
         """Nothing to compile."""
         return ReferencePipeline(features)
@@ -80,23 +87,29 @@ class ReferenceCloud:
 
     def __init__(self, cloud: SplatCloud) -> None:
         self.cloud = cloud
+        self.count = len(cloud)
         self.origin = cloud.origin
+        self.memory_bytes = 0  # it reads the cloud's own arrays
         self.sh_degree = cloud.sh_degree
         self.has_planes = cloud.planes is not None
         self.footprint = cloud.footprint
 
 
 @dataclass
-class ReferencePlanes:
-    """Finished planes in memory."""
+class ReferenceImages:
+    """Finished output images in memory."""
 
-    planes: dict[str, np.ndarray]
+    images: dict[str, np.ndarray]
     timings: Mapping[str, float]
     stats: Mapping[str, int]
 
     def read(self, name: str) -> np.ndarray:
-        """The plane in the type that every device gives; `planes` keeps float64."""
-        return self.planes[name].astype(OUTPUTS[name].dtype)
+        """The image in the type that every device gives."""
+        return self.images[name].astype(OUTPUTS[name].dtype)
+
+    def read_float64(self, name: str) -> np.ndarray:
+        """The image as it was computed; label and splat_id are integers all the same."""
+        return self.images[name]
 
 
 class ReferencePipeline:
@@ -105,26 +118,26 @@ class ReferencePipeline:
     def __init__(self, features: FeatureSet) -> None:
         self.features = features
 
-    def render(self, resident: ReferenceCloud, view: View) -> ReferencePlanes:
-        """Draw every pixel; planes in float64."""
+    def render(self, resident: ReferenceCloud, view: View) -> ReferenceImages:
+        """Draw every pixel, in float64."""
         height, width = view.height // view.samples, view.width // view.samples
         rows, columns = np.mgrid[0:height, 0:width]
         start = time.perf_counter()
         flat = self.pixels(resident, view, rows.ravel(), columns.ravel())
-        planes = {name: plane.reshape(height, width, *plane.shape[1:]) for name, plane in flat.items()}
+        images = {name: image.reshape(height, width, *image.shape[1:]) for name, image in flat.items()}
         took = (time.perf_counter() - start) * 1e3
         count = len(resident.cloud)
-        return ReferencePlanes(planes, {"reference": took}, {"splats": count, "visible": count, "pairs": 0})
+        return ReferenceImages(images, {"reference": took}, {"splats": count, "visible": count, "pairs": 0})
 
     def trace(self, resident: ReferenceCloud, view: View) -> dict[str, np.ndarray]:
-        """The depth order, the float32 keys, and the finished planes with the certificate."""
+        """The depth order, the float32 keys, and the finished images with the certificate."""
         splats = Setup(resident.cloud, view, self.features)
-        return {"order": splats.order, "keys": splats.key, **self.render(resident, view).planes}
+        return {"order": splats.order, "keys": splats.key, **self.render(resident, view).images}
 
     def pixels(
         self, resident: ReferenceCloud, view: View, rows: np.ndarray, columns: np.ndarray
     ) -> dict[str, np.ndarray]:
-        """Planes at pixels (row, column), each (k,) or (k, 3) float64; `certificate` (k,) beside those asked
+        """Outputs at pixels (row, column), each (k,) or (k, 3) float64; `certificate` (k,) beside those asked
         for.
         """
         n = view.samples
@@ -160,7 +173,7 @@ class ReferencePipeline:
             seen["certificate_planes"] = seen["certificate"]
             for name, values in seen.items():
                 plane = out.setdefault(name, np.zeros((len(x), *values.shape[1:]), values.dtype))
-                if name in ("rgb", "t", "fogged", "certificate", "behind_doubt"):
+                if name in ("rgb", "t", "fogged", "certificate", "behind_bound"):
                     plane[mine] += shot.weight * values
                 elif shot.middle:
                     plane[mine] = values

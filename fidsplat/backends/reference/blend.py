@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from fidsplat.backends.base import View
-from fidsplat.backends.reference import doubt
+from fidsplat.backends.reference import error_bounds
 from fidsplat.backends.reference.fragments import fragments_of, shifted
 from fidsplat.backends.reference.layers import in_layers, in_order
 from fidsplat.backends.reference.optics import ray_lengths
 from fidsplat.backends.reference.post import background_at
 from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.reference.shown import LEAST_ALPHA, median_of
+from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 
 
@@ -20,22 +20,22 @@ def composite(
 ) -> dict[str, np.ndarray]:
     """Samples (k,) at grid positions x, y against all splats: what blending leaves, before resolving."""
     f = fragments_of(s, view, x, y)
-    span = doubt.span_of(s, view, f)
-    laid = in_order(s, f, span) if s.planes is None else in_layers(s, f, span, s.planes)
-    alpha, z, span = laid.alpha, laid.z, laid.span
+    span = error_bounds.span_of(s, view, f)
+    stack = in_order(s, f, span) if s.planes is None else in_layers(s, f, span, s.planes)
+    alpha, z, span = stack.alpha, stack.z, stack.span
     before, live, final = _transmittance(alpha, view.stop, s.exclusive)
     weight = np.where(live, before * alpha, 0.0)
     out = {
-        "rgb": _sum(weight, laid.colors),
+        "rgb": _sum(weight, stack.colors),
         "t": final,
-        "certificate": doubt.of_color(s, view, span, before, laid.moved) + laid.reordered,
+        "certificate": error_bounds.of_color(s, view, span, before, stack.moved) + stack.reordered,
     }
     out["shown"] = 1 - final >= LEAST_ALPHA
-    out["shown_may_flip"] = np.abs(1 - final - LEAST_ALPHA) <= out["certificate"] + doubt.STOP
+    out["shown_may_flip"] = np.abs(1 - final - LEAST_ALPHA) <= out["certificate"] + error_bounds.STOP
     if "fog" in features.posts:
         reach = -view.fog_density * ray_lengths(x, y, view)[:, None]
         left = np.exp(reach * z)
-        out["rgb"] = _sum(weight * left, laid.colors)
+        out["rgb"] = _sum(weight * left, stack.colors)
         out["fogged"] = (weight * (1 - left)).sum(1)
         with np.errstate(invalid="ignore"):
             moved = np.abs(np.exp(reach * np.maximum(span.z_low, 0)) - np.exp(reach * span.z_high))
@@ -43,13 +43,13 @@ def composite(
     if view.surroundings is not None:
         behind, moved = background_at(view, x, y)
         out["rgb"] = out["rgb"] + final[:, None] * behind
-        out["behind_doubt"] = final * moved
+        out["behind_bound"] = final * moved
     drawn = live & (alpha > 0)
-    uncertain = laid.reordered > 0
+    uncertain = stack.reordered > 0
     if {"depth", "depth_median", "depth_first"} & features.names:
         out["weight"] = weight.sum(1)
         out["depth"] = (weight * z).sum(1)
-        out |= doubt.of_depth(span, weight, z)
+        out |= error_bounds.of_depth(span, weight, z)
         last, seen, may_flip = median_of(before, alpha, drawn, span)
         out["depth_median"] = _pick(z, last, seen, 0.0)
         out["depth_median_may_flip"] = (
@@ -59,26 +59,28 @@ def composite(
         )
         first = drawn & (before * (1 - alpha) <= view.first_light)
         out["depth_first"] = _pick(z, _first(first), np.asarray(first.any(1)), 0.0)
-        out["depth_first_may_flip"] = doubt.of_first(span, view.first_light) | uncertain
+        out["depth_first_may_flip"] = error_bounds.of_first(span, view.first_light) | uncertain
         out["depth_first_may_flip"] |= (
             _pick(span.z_high - span.z_low, _first(first), np.asarray(first.any(1)), 0.0)
             > 1e-5 * out["depth_first"]
         )
     if "normal" in features.names:
-        out["normal"] = _sum(weight, laid.normal)
-    ids = {"label": laid.labels, "splat_id": laid.ids}
-    flips = {"label": laid.label_may_flip, "splat_id": laid.id_may_flip}
+        out["normal"] = _sum(weight, stack.normal)
+    ids = {"label": stack.labels, "splat_id": stack.ids}
+    flips = {"label": stack.label_may_flip, "splat_id": stack.id_may_flip}
     for name in sorted(ids.keys() & features.names):
         heaviest = _first(weight)
         out["heaviest"] = _pick(weight, heaviest, out["shown"], 0.0)
         out[name] = _pick(ids[name], heaviest, out["shown"], -1)
-        flip = doubt.of_label(span, ids[name], out[name]) | flips[name].any(1) | uncertain
+        flip = error_bounds.of_label(span, ids[name], out[name]) | flips[name].any(1) | uncertain
         out[f"{name}_may_flip"] = (flip & out["shown"]) | out["shown_may_flip"]
     if "splat_id" in features.names and len(s.order):
         out["splat_id"] = np.where(out["splat_id"] >= 0, s.order[out["splat_id"].astype(int)], -1)
     if "blended" in features.names:
-        out["blended"] = np.where(drawn, laid.count, 0).sum(1)
-        out["blended_doubt"] = doubt.of_count(span, laid.count, laid.count_doubt, view.stop, uncertain)
+        out["blended"] = np.where(drawn, stack.count, 0).sum(1)
+        out["blended_bound"] = error_bounds.of_count(
+            span, stack.count, stack.count_bound, view.stop, uncertain
+        )
     return out
 
 

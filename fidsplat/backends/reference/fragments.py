@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.base import View
 from fidsplat.backends.reference.optics import away_of, edges_of, samples_of
 from fidsplat.backends.reference.setup import Setup
+from fidsplat.backends.view import View
 
 _NO_EDGES = np.zeros((4, 0))
 DARKEST = 24 * math.log(2)

@@ -1,4 +1,4 @@
-"""The splats of a plane as one layer per sample, placed by its own depth (docs/rendering.md).
+"""The splats of a plane as one layer per sample, placed by its own depth (docs/coplanar.md).
 
 Columns are what arrives in the depth order: splats of no plane one by one, the splats of a plane together,
 where their common key puts them. A layer is pending from there until a fragment of no plane arrives that lies
@@ -11,15 +11,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.reference import doubt
-from fidsplat.backends.reference.doubt import Span
+from fidsplat.backends.reference import error_bounds
+from fidsplat.backends.reference.error_bounds import Span
 from fidsplat.backends.reference.fragments import Fragments, optical_depth
 from fidsplat.backends.reference.setup import Setup
 
 
 @dataclass
-class Laid:
-    """What k samples see, m things each in the order in which they are laid: fragments, or layers as one."""
+class Stack:
+    """What k samples see, m things each in the order in which they are composited: fragments, or layers as
+    one."""
 
     alpha: np.ndarray
     """(k, m), as z [m], labels, moved, label_may_flip"""
@@ -33,7 +34,7 @@ class Laid:
     """places in the depth order of the splats that stand for the layers"""
     count: np.ndarray
     """splats that are blended in each"""
-    count_doubt: np.ndarray
+    count_bound: np.ndarray
     """how many more or less they may be, if it is drawn at all"""
     moved: np.ndarray
     """what may change in a layer's mean colour, per unit of light in front of it"""
@@ -41,9 +42,9 @@ class Laid:
     """bool: whether another label may be the layer's"""
     id_may_flip: np.ndarray
     reordered: np.ndarray
-    """(k,) what may change in colour because things may be laid in another order"""
+    """(k,) what may change in colour because things may be composited in another order"""
 
-    def take(self, rank: np.ndarray) -> Laid:
+    def take(self, rank: np.ndarray) -> Stack:
         """The same in another order: rank (k, m)."""
 
         def of(array: np.ndarray) -> np.ndarray:
@@ -51,7 +52,7 @@ class Laid:
 
         s = self.span
         span = Span.of(of(s.low), of(s.high), of(s.z_low), of(s.z_high))
-        return Laid(
+        return Stack(
             span=span, reordered=self.reordered, **{name: of(getattr(self, name)) for name in _COLUMNS}
         )
 
@@ -64,19 +65,19 @@ _COLUMNS = (
     "labels",
     "ids",
     "count",
-    "count_doubt",
+    "count_bound",
     "moved",
     "label_may_flip",
     "id_may_flip",
 )
-"""fields of Laid that have a value for each of the m things"""
+"""fields of Stack that have a value for each of the m things"""
 
 
-def in_order(s: Setup, f: Fragments, span: Span) -> Laid:
+def in_order(s: Setup, f: Fragments, span: Span) -> Stack:
     """Every fragment by itself, in the depth order of the splats."""
     shape = f.alpha.shape
     nothing = np.zeros(shape)
-    return Laid(
+    return Stack(
         alpha=f.alpha,
         z=f.z,
         span=span,
@@ -85,7 +86,7 @@ def in_order(s: Setup, f: Fragments, span: Span) -> Laid:
         labels=np.broadcast_to(s.labels, shape),
         ids=np.broadcast_to(np.arange(shape[1]), shape),
         count=nothing + 1,
-        count_doubt=nothing,
+        count_bound=nothing,
         moved=nothing,
         label_may_flip=nothing > 0,
         id_may_flip=nothing > 0,
@@ -93,7 +94,7 @@ def in_order(s: Setup, f: Fragments, span: Span) -> Laid:
     )
 
 
-def in_layers(s: Setup, f: Fragments, span: Span, planes: np.ndarray) -> Laid:
+def in_layers(s: Setup, f: Fragments, span: Span, planes: np.ndarray) -> Stack:
     """The fragments of each plane as one layer, each where the rule lays it. planes (n,): -1 for none."""
     plain = np.flatnonzero(planes < 0)
     members = [np.flatnonzero(planes == plane) for plane in np.unique(planes[planes >= 0])]
@@ -104,7 +105,7 @@ def in_layers(s: Setup, f: Fragments, span: Span, planes: np.ndarray) -> Laid:
     columns = _side_by_side([rest, *layers]).take(np.broadcast_to(arrival, (len(f.alpha), len(arrival))))
     is_layer = arrival >= len(plain)
     place = _places(columns, is_layer)
-    columns.reordered = doubt.of_places(columns.span, is_layer)
+    columns.reordered = error_bounds.of_places(columns.span, is_layer)
     # before the fragment at a place, its layers, the nearest first
     count = len(arrival)
     nearness = np.where(is_layer, columns.z, 0.0)
@@ -112,10 +113,10 @@ def in_layers(s: Setup, f: Fragments, span: Span, planes: np.ndarray) -> Laid:
     return columns.take(np.lexsort((nearness, behind, place), axis=1))
 
 
-def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Laid:
+def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Stack:
     k, m = len(f.alpha), len(splats)
     nothing = np.zeros((k, m))
-    return Laid(
+    return Stack(
         alpha=f.alpha[:, splats],
         z=f.z[:, splats],
         span=Span.of(
@@ -126,7 +127,7 @@ def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Laid:
         labels=np.broadcast_to(s.labels[splats], (k, m)),
         ids=np.broadcast_to(splats, (k, m)),
         count=nothing + 1,
-        count_doubt=nothing,
+        count_bound=nothing,
         moved=nothing,
         label_may_flip=nothing > 0,
         id_may_flip=nothing > 0,
@@ -134,7 +135,7 @@ def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Laid:
     )
 
 
-def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Laid:
+def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Stack:
     """The layer (k, 1) of the splats (indices) of a plane."""
     alpha, z = f.alpha[:, splats], f.z[:, splats]
     low, high = span.low[:, splats], span.high[:, splats]
@@ -151,11 +152,13 @@ def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Laid:
     label = labels[heaviest]
     as_heavy = (high > 0) & (thick >= np.take_along_axis(thin, heaviest, 1))
     drawn = alpha > 0
-    z_low, z_high = doubt.of_layer_depth(span.z_low[:, splats], span.z_high[:, splats], share, thin, thick)
+    z_low, z_high = error_bounds.of_layer_depth(
+        span.z_low[:, splats], span.z_high[:, splats], share, thin, thick
+    )
     depth = np.where(total > 0, (share * z).sum(1, keepdims=True), (z_low + z_high) / 2)
     covered = (_covered(each, boxes) for each in (alpha, low, high))
     opacity, least, most = covered
-    return Laid(
+    return Stack(
         alpha=opacity,
         z=depth,
         span=Span.of(least, most, z_low, z_high),
@@ -164,8 +167,8 @@ def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Laid:
         labels=label,
         ids=splats[heaviest],
         count=drawn.sum(1, keepdims=True),
-        count_doubt=((low > 0) != (high > 0)).sum(1, keepdims=True),
-        moved=doubt.of_box_color(low, high) if boxes else doubt.of_layer_color(thin, thick),
+        count_bound=((low > 0) != (high > 0)).sum(1, keepdims=True),
+        moved=error_bounds.of_box_color(low, high) if boxes else error_bounds.of_layer_color(thin, thick),
         label_may_flip=(as_heavy & (labels != label)).any(1, keepdims=True),
         id_may_flip=as_heavy.sum(1, keepdims=True) > 1,
         reordered=np.zeros(len(alpha)),
@@ -179,7 +182,7 @@ def _covered(opacity: np.ndarray, boxes: bool) -> np.ndarray:
     return 1 - (1 - opacity).prod(1, keepdims=True)
 
 
-def _side_by_side(parts: list[Laid]) -> Laid:
+def _side_by_side(parts: list[Stack]) -> Stack:
     def joined(name: str) -> np.ndarray:
         return np.concatenate([getattr(part, name) for part in parts], axis=1)
 
@@ -187,13 +190,13 @@ def _side_by_side(parts: list[Laid]) -> Laid:
         np.concatenate([getattr(part.span, name) for part in parts], axis=1)
         for name in ("low", "high", "z_low", "z_high")
     )
-    return Laid(
+    return Stack(
         span=Span.of(*spans), reordered=parts[0].reordered, **{name: joined(name) for name in _COLUMNS}
     )
 
 
-def _places(columns: Laid, is_layer: np.ndarray) -> np.ndarray:
-    """Before which column (k, m) each is laid; a fragment at its own, m for what is laid at the end."""
+def _places(columns: Stack, is_layer: np.ndarray) -> np.ndarray:
+    """Before which column (k, m) each is composited; a fragment at its own, m for what comes at the end."""
     k, m = columns.alpha.shape
     place = np.tile(np.arange(m), (k, 1))
     drawn = columns.alpha > 0
@@ -202,7 +205,7 @@ def _places(columns: Laid, is_layer: np.ndarray) -> np.ndarray:
     waiting, opened = np.full(k, -1), np.full(k, -1)
     for column in np.flatnonzero(is_layer).tolist():
         behind = columns.z[:, column + 1 :] > columns.z[:, column, None]
-        place[:, column] = doubt.first_column(
+        place[:, column] = error_bounds.first_column(
             behind & drawn[:, column + 1 :] & ~is_layer[column + 1 :], column + 1
         )
         begins = drawn[:, column]

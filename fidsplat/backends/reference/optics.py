@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 
 ROUND = 4 * 2.0**-24
 """of a form, relative to its terms: its coefficients' rounding, and its sums'"""
@@ -48,7 +48,11 @@ def rays_of(view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.nd
         rays = view.raster.rays[y.astype(int), x.astype(int)].astype(np.float64)
         return rays, np.isfinite(rays[:, 0])
     one = np.ones_like(x)
-    across = (0 * x, 0 * y) if view.parallel else ((x - view.cx) / view.fx, (y - view.cy) / view.fy)
+    across = (
+        (0 * x, 0 * y)
+        if view.parallel
+        else ((x - view.center_x) / view.focal_x, (y - view.center_y) / view.focal_y)
+    )
     return np.stack([*across, one], 1), one > 0
 
 
@@ -73,10 +77,10 @@ def forms_of(view: View, a: np.ndarray, b: np.ndarray, p: np.ndarray) -> tuple[n
         return np.moveaxis(forms, 1, 0), np.zeros((3, len(p))), 1.0
     rows = np.stack([a, b, p], axis=2)  # (n, xyz, uv1)
     tw = np.broadcast_to([0.0, 0.0, 1.0], rows[:, 2].shape) if view.parallel else rows[:, 2]
-    tu = view.fx * rows[:, 0] + view.cx * tw
-    tv = view.fy * rows[:, 1] + view.cy * tw
+    tu = view.focal_x * rows[:, 0] + view.center_x * tw
+    tv = view.focal_y * rows[:, 1] + view.center_y * tw
     forms = np.stack([np.cross(tu, tv), np.cross(tv, tw), np.cross(tw, tu)])
-    return forms, np.einsum("inc,nc->in", forms, rows[:, 2]), view.fx * view.fy
+    return forms, np.einsum("inc,nc->in", forms, rows[:, 2]), view.focal_x * view.focal_y
 
 
 def centers_of(view: View, p: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -84,12 +88,12 @@ def centers_of(view: View, p: np.ndarray, known: np.ndarray) -> tuple[np.ndarray
     it."""
     if view.raster is not None or view.parallel:
         image = p[:, :2] if view.raster is None else view.raster.lens.image(p)
-        x, y = (image * (view.fx, view.fy) + (view.cx, view.cy)).T
+        x, y = (image * (view.focal_x, view.focal_y) + (view.center_x, view.center_y)).T
         known = known & np.isfinite(x)
     else:
         with np.errstate(divide="ignore", invalid="ignore"):
-            x = (view.fx * p[:, 0] + view.cx * p[:, 2]) / p[:, 2]
-            y = (view.fy * p[:, 1] + view.cy * p[:, 2]) / p[:, 2]
+            x = (view.focal_x * p[:, 0] + view.center_x * p[:, 2]) / p[:, 2]
+            y = (view.focal_y * p[:, 1] + view.center_y * p[:, 2]) / p[:, 2]
     return np.where(known, x, np.inf), np.where(known, y, np.inf)
 
 
@@ -104,7 +108,7 @@ def derivatives_of(view: View, p: np.ndarray) -> np.ndarray:
     else:
         seen = np.isfinite(view.lens.image(p)[:, 0])[:, None, None]
         slopes = np.where(seen, view.lens.derivative(p), np.nan)
-    return slopes * np.array([[view.fx], [view.fy]])
+    return slopes * np.array([[view.focal_x], [view.focal_y]])
 
 
 def edges_of(view: View, forms: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

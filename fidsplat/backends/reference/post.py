@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fidsplat.backends.base import View
 from fidsplat.backends.reference.optics import rays_of
+from fidsplat.backends.view import View
 from fidsplat.surroundings import Gradient, Panorama
 
 _ROUND = 2e-6
@@ -22,13 +22,13 @@ def background_at(view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray,
     if isinstance(around, Gradient):
         up = np.array(around.up) / np.linalg.norm(around.up)
         share = np.clip(0.5 + 0.5 * (rays @ up) / np.linalg.norm(rays, axis=1), 0, 1)[:, None]
-        colors, doubt = (
+        colors, bound = (
             np.add(around.bottom, share * np.subtract(around.top, around.bottom)),
             np.zeros(len(x)),
         )
     else:
-        colors, doubt = _panorama_at(around, rays)
-    return np.where(seen[:, None], colors, 0.0), np.where(seen, doubt, 0.0)
+        colors, bound = _panorama_at(around, rays)
+    return np.where(seen[:, None], colors, 0.0), np.where(seen, bound, 0.0)
 
 
 def brightest(around: Gradient | Panorama | None) -> float:
@@ -60,13 +60,13 @@ def _panorama_at(panorama: Panorama, rays: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def developed(
-    light: np.ndarray, doubt: np.ndarray, steps: tuple[str, ...], view: View, x: np.ndarray, y: np.ndarray
+    light: np.ndarray, bound: np.ndarray, steps: tuple[str, ...], view: View, x: np.ndarray, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Values (k, 3) after the sensor's steps for light (k, 3) at pixels (column x, row y), and what may
     change in
-    them (k,) where the light may be off by `doubt` (k,): each step is followed from both ends.
+    them (k,) where the light may be off by `bound` (k,): each step is followed from both ends.
     """
-    low, high = light - doubt[:, None], light + doubt[:, None]
+    low, high = light - bound[:, None], light + bound[:, None]
     for step in steps:
         slack = _ROUND * np.maximum(np.abs(low), np.abs(high))
         low, light, high = (_step(step, value, view, x, y) for value in (low - slack, light, high + slack))

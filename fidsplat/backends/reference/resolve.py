@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from fidsplat.backends.base import View
 from fidsplat.backends.reference.optics import ray_lengths
 from fidsplat.backends.reference.post import brightest, developed
+from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 
 _ROUND = 1e-6  # relative, of a sum of weights
@@ -19,11 +19,11 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
 
     `certificate`: colour per unit of colour, and alpha; `certificate_depth`, `certificate_distance` metres;
     `certificate_normal` difference of unit vectors; `depth_median_may_flip`, `label_may_flip` and so on bool;
-    `blended_doubt` splats. samples: with `x`, `y`, positions on the sample grid.
+    `blended_bound` splats. samples: with `x`, `y`, positions on the sample grid.
     """
-    t, doubt = samples["t"].mean(1), samples["certificate"]
+    t, bound = samples["t"].mean(1), samples["certificate"]
     center_x, center_y = samples["x"].mean(1), samples["y"].mean(1)
-    out = {"rgb": samples["rgb"].mean(1) + t[:, None] * view.background, "certificate": doubt.mean(1)}
+    out = {"rgb": samples["rgb"].mean(1) + t[:, None] * view.background, "certificate": bound.mean(1)}
     if "fogged" in samples:
         out["rgb"] += samples["fogged"].mean(1)[:, None] * view.background
     if features.posts or view.surroundings is not None:
@@ -31,56 +31,58 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
         most = max(1.0, float(np.abs(out["rgb"]).max(initial=1.0)), float(np.abs(view.background).max()))
         unsure = out["certificate"] * max(most, brightest(view.surroundings))
         if view.surroundings is not None:
-            unsure = unsure + samples["behind_doubt"].mean(1)
+            unsure = unsure + samples["behind_bound"].mean(1)
         columns, rows = (np.floor(center / view.samples).astype(int) for center in (center_x, center_y))
         out["rgb"], out["certificate_rgb"] = developed(out["rgb"], unsure, steps, view, columns, rows)
-    doubt = samples.get("certificate_planes", doubt)  # the other planes show one shot
+    bound = samples.get("certificate_planes", bound)  # the other planes show one shot
     if "alpha" in features.names:
         out["alpha"] = 1 - t
-    told, unsure = samples["shown"], np.asarray(samples["shown_may_flip"].any(1))
-    doubt_told = np.where(told, doubt, 0.0).sum(1)
+    covered, unsure = samples["shown"], np.asarray(samples["shown_may_flip"].any(1))
+    bound_covered = np.where(covered, bound, 0.0).sum(1)
     # of the ray through each sample, per metre of depth
     length = ray_lengths(samples["x"], samples["y"], view)
     if "depth" in features.names:
         # samples whose rays differ in length share out what moves, too
         for name, along in (("depth", 1.0), ("distance", length)):
             depth, off, weight = (
-                np.where(told, samples[key], 0.0) for key in ("depth", "depth_moved", "weight")
+                np.where(covered, samples[key], 0.0) for key in ("depth", "depth_moved", "weight")
             )
             out[name] = _ratio((depth * along).sum(1), weight.sum(1), 0.0)
             # light that moves from the nearest to the furthest fragment, in a mean over at least `least`
-            spread = np.where(told, samples["furthest"] * along, -math.inf).max(1)
-            spread -= np.where(told, samples["nearest"] * along, math.inf).min(1)
-            moved = doubt_told * np.where(doubt_told > 0, np.maximum(spread, 0), 0)
+            spread = np.where(covered, samples["furthest"] * along, -math.inf).max(1)
+            spread -= np.where(covered, samples["nearest"] * along, math.inf).min(1)
+            moved = bound_covered * np.where(bound_covered > 0, np.maximum(spread, 0), 0)
             moved += (off * along).sum(1)
-            least = weight.sum(1) - doubt_told
-            out[f"certificate_{name}"] = _told(_ratio(moved, least, math.inf), told, unsure)
+            least = weight.sum(1) - bound_covered
+            out[f"certificate_{name}"] = _where_covered(_ratio(moved, least, math.inf), covered, unsure)
     for name, along in (("depth_median", "distance_median"), ("depth_first", "distance_first")):
         if name in features.names:
             place = _median if name == "depth_median" else _nearest
             out[name], out[along] = place(samples[name]), place(samples[name] * length)
             out[f"{name}_may_flip"] = out[f"{along}_may_flip"] = samples[f"{name}_may_flip"].any(1)
     if "normal" in features.names:
-        total = np.where(told[..., None], samples["normal"], 0.0).sum(1)
+        total = np.where(covered[..., None], samples["normal"], 0.0).sum(1)
         length = np.linalg.norm(total, axis=1)
         out["normal"] = total / np.where(length > 0, length, 1)[:, None]
         turns = view.turns_of_rows[np.floor(center_y / view.samples).astype(int)]
         out["normal_world"] = np.einsum("ki,kij->kj", out["normal"], turns)
-        moved = 2 * doubt_told + _ROUND * (1 - samples["t"]).sum(1)
-        out["certificate_normal"] = _told(_ratio(moved, length - doubt_told, math.inf), told, unsure)
+        moved = 2 * bound_covered + _ROUND * (1 - samples["t"]).sum(1)
+        out["certificate_normal"] = _where_covered(
+            _ratio(moved, length - bound_covered, math.inf), covered, unsure
+        )
         out["certificate_normal_world"] = out["certificate_normal"]
     for name in sorted({"label", "splat_id"} & features.names):
         heaviest = np.argmax(samples["heaviest"], axis=1)
         weights = np.sort(samples["heaviest"], axis=1)
         out[name] = np.take_along_axis(samples[name], heaviest[:, None], 1)[:, 0].astype(np.int32)
         # of samples that weigh the same the first wins, by rounding
-        close = (samples["heaviest"] >= weights[:, -1:] * (1 - 5e-5) - doubt) & (
+        close = (samples["heaviest"] >= weights[:, -1:] * (1 - 5e-5) - bound) & (
             samples[name] != out[name][:, None]
         )
         out[f"{name}_may_flip"] = samples[f"{name}_may_flip"].any(1) | (close & (weights[:, -1:] > 0)).any(1)
     if "blended" in features.names:
         out["blended"] = samples["blended"].max(1)
-        out["blended_doubt"] = samples["blended_doubt"].max(1)
+        out["blended_bound"] = samples["blended_bound"].max(1)
     return out
 
 
@@ -98,9 +100,9 @@ def _nearest(values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(nearest), nearest, 0.0)
 
 
-def _told(doubt: np.ndarray, told: np.ndarray, unsure: np.ndarray) -> np.ndarray:
-    """What may change (k,) in a plane that is 0 where no sample (k, n) is told of, which may flip."""
-    return np.where(unsure, math.inf, np.where(told.any(1), doubt, 0.0))
+def _where_covered(bound: np.ndarray, covered: np.ndarray, unsure: np.ndarray) -> np.ndarray:
+    """What may change (k,) in a plane that is 0 where no sample (k, n) is covered of, which may flip."""
+    return np.where(unsure, math.inf, np.where(covered.any(1), bound, 0.0))
 
 
 def _ratio(above: np.ndarray, below: np.ndarray, otherwise: float) -> np.ndarray:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fidsplat.backends.base import View
 from fidsplat.backends.planes import PlaneTable
 from fidsplat.backends.reference import optics
+from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 from fidsplat.splats import SplatCloud, sh_basis
 

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from fidsplat.backends.reference.doubt import STOP, Span
+from fidsplat.backends.reference.error_bounds import STOP, Span
 
 LEAST_ALPHA = 1 / 255
 """less of a sample than this is nothing to them, however low the cut-off"""
-_ROUND = 2.0**-24  # of a transmittance when a fragment is laid
+_ROUND = 2.0**-24  # of a transmittance when a fragment is composited
 
 
 def median_of(
     before: np.ndarray, alpha: np.ndarray, drawn: np.ndarray, span: Span
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Place (k,) among the m things laid of the last in front of which more than half of the light remains,
+    """Place (k,) among the m things of the last in front of which more than half of the light remains,
     whether there is one, and whether single precision may see another.
 
     Things that take less than `LEAST_ALPHA` count together: the one with which they have taken it stands for

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from fidsplat.backends.warp.probe import run
-
-if TYPE_CHECKING:
-    from fidsplat.backends.warp.device import WarpBackend
+from fidsplat.backends.warp.workspace import Workspace
 
 
 def run_arithmetic(
-    backend: WarpBackend, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+    workspace: Workspace, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Results of the device's functions, as the stages call them.
 
@@ -30,11 +26,11 @@ def run_arithmetic(
     """
     n = len(exponents)
     single = [array.astype(np.float32) for array in (exponents, shares, above, below)]
-    (planes,) = run(backend, "arithmetic", n, single, [np.zeros((7, n), np.float32)])
+    (found,) = run(workspace, "arithmetic", n, single, [np.zeros((7, n), np.float32)])
     names = ("exp", "log", "division", "sqrt", "fma", "fast_exp", "fast_log")
-    results: dict[str, np.ndarray] = dict(zip(names, planes, strict=True))
-    (planes,) = run(backend, "arithmetic_wide", n, [above, below], [np.zeros((3, n))])
-    results |= dict(zip(("division64", "sqrt64", "log64"), planes, strict=True))
+    results: dict[str, np.ndarray] = dict(zip(names, found, strict=True))
+    (found,) = run(workspace, "arithmetic_wide", n, [above, below], [np.zeros((3, n))])
+    results |= dict(zip(("division64", "sqrt64", "log64"), found, strict=True))
     smallest = np.array([np.finfo(np.float32).tiny, 0.5], np.float32)
-    (results["denormal"],) = run(backend, "denormal", 1, [smallest], [np.zeros(2, np.float32)])
+    (results["denormal"],) = run(workspace, "denormal", 1, [smallest], [np.zeros(2, np.float32)])
     return results

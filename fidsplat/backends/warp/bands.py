@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.backends.warp import lens, surroundings
 from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.resident import Resident

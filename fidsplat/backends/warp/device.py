@@ -10,10 +10,13 @@ import numpy as np
 
 from fidsplat.backends.base import DeviceInfo
 from fidsplat.backends.warp import runtime
+from fidsplat.backends.warp.arithmetic import run_arithmetic
 from fidsplat.backends.warp.launch import Commands
 from fidsplat.backends.warp.pipeline import WarpPipeline
-from fidsplat.backends.warp.program import Program, WarpShape
+from fidsplat.backends.warp.probe import WarpProbe
+from fidsplat.backends.warp.program import Program, unsupported
 from fidsplat.backends.warp.resident import Resident
+from fidsplat.backends.warp.shapes import WarpShape, other_shapes, shape_for
 from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError, UnknownDeviceError
@@ -50,25 +53,17 @@ def open_device(selector: str = "") -> WarpBackend:
     return WarpBackend(min(matching, key=lambda device: not device.is_cuda))
 
 
-class WarpBackend:
+class WarpBackend(Workspace):
     """An open Warp device with what its pictures share, and compiled pipelines."""
+
+    always_float64 = False
 
     def __init__(self, device: Any) -> None:
         self.info = _describe(device)
-        self.device = device
-        self.shape = WarpShape("group" if device.is_cuda else "tiles", 16, 16)
-        self.workspace = Workspace(device, self.info.memory_bytes // 10 * 9)
+        super().__init__(device, self.info.name, self.info.memory_bytes // 10 * 9)
+        self.shape = shape_for(device)
         self._commands = Commands(device, 1 if device.is_cuda else self.info.compute_units)
         self._pipelines: dict[tuple[FeatureSet, WarpShape], WarpPipeline] = {}
-
-    @property
-    def pair_budget(self) -> int:
-        """Most pairs of splats and tiles that are listed at once; tests make it small."""
-        return self.workspace.pair_budget
-
-    @pair_budget.setter
-    def pair_budget(self, pairs: int) -> None:
-        self.workspace.pair_budget = pairs
 
     def limit_memory(self, budget: int) -> None:
         """Let a picture and its cloud take at most `budget` bytes of the device.
@@ -76,27 +71,49 @@ class WarpBackend:
         Pictures that need more for their lists are drawn in bands of tiles, with the same bits; a cloud that
         does not fit is an error.
         """
-        self.workspace.memory_budget = budget
+        self.memory_budget = budget
 
     def upload(self, cloud: SplatCloud) -> Resident:
         """The cloud in arrays on the device."""
-        return Resident.of(cloud, self.workspace.pool)
+        return Resident.of(cloud, self.pool)
 
     def adopt(self, arrays: Mapping[str, Any], origin: np.ndarray) -> Resident:
         """Arrays (`means`, `quats`, ...) that are on the device already, used where they lie."""
-        return Resident.around(arrays, origin, self.workspace.pool)
+        return Resident.around(arrays, origin, self.pool)
+
+    def unsupported(self, features: FeatureSet) -> str:
+        """The effects that the Warp kernels have not; empty if they have all."""
+        return unsupported(features, self.info.name)
 
     def pipeline(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpPipeline:
         """The stages compiled for these features; `shape` replaces the device's own tiles (tests).
 
         Raises:
-            DeviceError: an effect that the Warp kernels have not, or the compiler refuses.
+            DeviceError: what is `unsupported`, or the compiler refuses.
         """
         key = (features, shape or self.shape)
         if key not in self._pipelines:
             program = Program(self.device, self.info.name, *key)
-            self._pipelines[key] = WarpPipeline(program, self.workspace, self._commands, self.info.name)
+            self._pipelines[key] = WarpPipeline(program, self, self._commands)
         return self._pipelines[key]
+
+    def run_arithmetic(
+        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """As `ProbesArithmetic` (fidsplat/backends/base.py)."""
+        return run_arithmetic(self, exponents, shares, above, below)
+
+    def probe(self) -> WarpProbe:
+        """What tests look into the device with."""
+        return WarpProbe(self)
+
+    def shapes(self, kind: str) -> dict[str, WarpShape]:
+        """As `Reshapes` (fidsplat/backends/base.py)."""
+        return other_shapes(self.shape, kind)
+
+    def pieces(self, shape: WarpShape) -> int:
+        """Warp's sorts take everything at once."""
+        return 1
 
 
 def _describe(device: Any) -> DeviceInfo:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fidsplat.backends.exposure import Shot
+from fidsplat.backends.view import Shot
 from fidsplat.backends.warp.launch import Launcher
 from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.runtime import load

@@ -89,7 +89,7 @@ class Launcher:
         """
         pieces = min(self.pieces, end - first)
         cuts = [first + (end - first) * k // pieces for k in range(pieces + 1)]
-        args = _bound(kernel, given | {"state_first": 0}, 1)[:-1]
+        args = _bound(kernel, {**given, "state_first": 0}, 1)[:-1]
         spans = enumerate(pairwise(cuts))
         self._each(kernel, [(k, b - a, [a, *args, k * area]) for k, (a, b) in spans])
 

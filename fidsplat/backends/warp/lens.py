@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.backends.warp.runtime import kernels, load
 from fidsplat.backends.warp.workspace import ArrayPool, Workspace, nbytes
 from fidsplat.cameras.raster import RayRaster

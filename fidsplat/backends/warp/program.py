@@ -8,6 +8,7 @@ from typing import Any
 from fidsplat.backends.warp.launch import BLOCK
 from fidsplat.backends.warp.runtime import kernels, load, quiet
 from fidsplat.backends.warp.sensor import SensorKernel
+from fidsplat.backends.warp.shapes import WarpShape
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError
 
@@ -34,25 +35,52 @@ _PROJECT = (
 _SAMPLE = (*_RECORD, "stop_exclusive", "arithmetic_fast", "rays_length")
 
 
-@dataclass(frozen=True)
-class WarpShape:
-    """How pictures are cut for a device."""
-
-    schedule: str
-    """`tiles`: a thread draws a tile (CPU). `group`: a block of threads draws a tile (CUDA)."""
-    tile_width: int
-    """samples, a multiple of 4"""
-    tile_height: int
-
-
 def known() -> frozenset[str]:
     """All effects that the Warp kernels have."""
     return SLOTS | kernels("output").known() | kernels("post").known()
 
 
-def lacking(features: FeatureSet) -> list[str]:
-    """What of these features the Warp kernels have not, sorted."""
-    return sorted({*features.slots, *features.taps, *features.posts} - known())
+def unsupported(features: FeatureSet, name: str) -> str:
+    """What of these features the Warp kernels have not, as the message of an error; empty if they have all.
+    name: of the device."""
+    lacking = ", ".join(sorted({*features.slots, *features.taps, *features.posts} - known()))
+    return f"{name} (NVIDIA Warp) has no {lacking}; use an OpenCL device for it" if lacking else ""
+
+
+@dataclass(frozen=True)
+class _Needs:
+    """What the stages of a feature set depend on."""
+
+    effects: frozenset[str]
+    """slots, and what the kernels call for because of them and of outputs"""
+    outputs: tuple[str, ...]
+    """files of kernels/warp/output: the images', and all that these need"""
+    blending: tuple[str, ...]
+    """those that blending has to do with"""
+    steps: tuple[str, ...]
+    """files of kernels/warp/post, in their order"""
+
+    @classmethod
+    def of(cls, features: FeatureSet) -> _Needs:
+        output = kernels("output")
+        posts = set(features.posts)
+        outputs = output.with_needed((*features.taps, *(posts & output.known())))
+        measured = output.having(output.having(outputs, "start"), "length")
+        effects = set(features.slots)
+        if not effects.isdisjoint(kernels("lens").LENSES):
+            effects.add("rays")
+        # rays of other lenses have a length of 1
+        if "camera_brown_conrady" in effects and measured:
+            effects.add("rays_length")
+        if "compose_planes" in effects or output.having(outputs, "depth"):
+            effects.add("ray_depth")
+        steps = tuple(name for name in features.posts if name in kernels("post").known())
+        blending = output.having(outputs, "seen", "state", "samples")
+        return cls(frozenset(effects), outputs, blending, steps)
+
+    def among(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        """Those of these effects that are needed."""
+        return tuple(name for name in names if name in self.effects)
 
 
 class Program:
@@ -62,78 +90,73 @@ class Program:
         """name: of the device, for errors.
 
         Raises:
-            DeviceError: an effect that the Warp kernels have not, or the compiler refuses.
+            DeviceError: what is `unsupported`, or the compiler refuses.
         """
-        if lacks := lacking(features):
-            raise DeviceError(f"{name} (NVIDIA Warp) has no {', '.join(lacks)}; use an OpenCL device for it")
+        if why := unsupported(features, name):
+            raise DeviceError(why)
         self.device, self.shape, self._name = device, shape, name
         self.images = tuple(each for each in features.outputs if each.name in {"rgb", *features.taps})
         """the output images"""
+        self.project_block = kernels("project").BLOCK
         self.block_dim = shape.tile_width * shape.tile_height
         """threads that draw a tile on a GPU"""
-        self.project_block = kernels("project").BLOCK
+        needs = _Needs.of(features)
         with quiet():
-            self._make(features)
+            self._make_lists(features, needs)
+            self._make_blend(needs)
+            self._make_resolve(features, needs)
             made = (self.project, self.lists.emit, self.blend, self.resolve, *self.expose.values())
             common = (self.sort.compact, self.sort.gather, self.sort.find_starts, self.sort.sum_up)
             further = (self.backdrop, self.sensor and self.sensor.kernel)
             for kernel in (*made, *common, *filter(None, further)):
                 self._compile(kernel)
 
-    def _make(self, features: FeatureSet) -> None:
-        output, buffers, wanted = kernels("output"), kernels("buffers"), set(features.slots)
-        images = [image.name for image in self.images[1:]]
-        outputs = output.with_needed([*images, *(set(features.posts) & output.known())])
-        lens = not wanted.isdisjoint(kernels("lens").LENSES)
-        # rays of other lenses have a length of 1
-        long_rays = "camera_brown_conrady" in wanted
-        blending = output.having(outputs, "seen", "state", "samples")
-        measured = output.having(output.having(outputs, "start"), "length")
-        wanted |= {"rays"} if lens else set()
-        wanted |= {"rays_length"} if long_rays and measured else set()
-        wanted |= {"ray_depth"} if "compose_planes" in wanted or output.having(outputs, "depth") else set()
-        record, project, sample = (
-            tuple(name for name in names if name in wanted) for names in (_RECORD, _PROJECT, _SAMPLE)
-        )
-        boxes = not wanted.isdisjoint(kernels("records").BOXES)
-
-        self.layout = kernels("records").Layout(record, blending)
-        self.layered = "compose_planes" in wanted
-        self.sloped = lens and boxes
-        """whether blending reads the derivatives of a lens's rays"""
+    def _make_lists(self, features: FeatureSet, needs: _Needs) -> None:
         self.project = kernels("project").make_project(
-            project,
-            output.having(outputs, "record"),
-            (features.sh_degree + 1) ** 2 if "color_sh" in wanted else 0,
+            needs.among(_PROJECT),
+            kernels("output").having(needs.outputs, "record"),
+            (features.sh_degree + 1) ** 2 if "color_sh" in needs.effects else 0,
             features.setup_precision,
             self.shape.schedule == "tiles",
         )
         self.sort = kernels("lists")
-        self.lists = self.sort.make_lists("lowpass_screen" in wanted)
+        self.lists = self.sort.make_lists("lowpass_screen" in needs.effects)
+
+    def _make_blend(self, needs: _Needs) -> None:
+        buffers, blending = kernels("buffers"), needs.blending
+        self.layout = kernels("records").Layout(needs.among(_RECORD), blending)
+        self.layered = "compose_planes" in needs.effects
+        boxes = not needs.effects.isdisjoint(kernels("records").BOXES)
+        self.sloped = boxes and "rays" in needs.effects
+        """whether blending reads the derivatives of a lens's rays"""
         self.blend, self.state = kernels("blend").make_blend(
-            sample, blending, self.shape.schedule == "group", self.block_dim
+            needs.among(_SAMPLE), blending, self.shape.schedule == "group", self.block_dim
         )
         self.sample_fields = buffers.sample_fields(blending)
         """sample buffers: type of an element"""
         self.samples_type = buffers.make_samples(tuple(self.sample_fields.items()))
-        kinds = tuple((image.name, getattr(load(), image.dtype)) for image in self.images)
-        self.images_type = buffers.make_images(kinds, outputs)
-        self.cloud_arrays, self.view_arrays = (
-            output.fields(outputs, part) for part in ("cloud_arrays", "view_arrays")
-        )
-        """what resolving reads besides: type of an element"""
-        self.stretched = long_rays and bool(output.having(images, "length"))
-        """whether resolving reads the lengths of a lens's rays"""
-        self.resolve = kernels("resolve").make_resolve(kinds, outputs, self.stretched, features.samples)
-        behind = kernels("surroundings")
-        kinds_behind = [kind for kind in behind.KINDS if f"background_{kind}" in wanted]
-        self.backdrop = behind.make_backdrop(kinds_behind[0], lens) if kinds_behind else None
-        """the kernel of what is seen behind everything; None where that is of one colour"""
-        steps = tuple(name for name in features.posts if name in kernels("post").known())
-        self.sensor = SensorKernel(steps) if steps else None
-        light = buffers.light_of(blending) if "shutter_exposure" in wanted else ()
+        light = buffers.light_of(blending) if "shutter_exposure" in needs.effects else ()
         self.expose = {name: kernels("shutter").make_expose(self.sample_fields[name]) for name in light}
         """kernels that gather sample buffers of several poses, by the buffer's name"""
+
+    def _make_resolve(self, features: FeatureSet, needs: _Needs) -> None:
+        output, behind = kernels("output"), kernels("surroundings")
+        kinds = [kind for kind in behind.KINDS if f"background_{kind}" in needs.effects]
+        self.backdrop = behind.make_backdrop(kinds[0], "rays" in needs.effects) if kinds else None
+        """the kernel of what is seen behind everything; None where that is of one colour"""
+        images = tuple((image.name, getattr(load(), image.dtype)) for image in self.images)
+        self.images_type = kernels("buffers").make_images(images, needs.outputs)
+        self.cloud_arrays = output.fields(needs.outputs, "cloud_arrays")
+        self.view_arrays = output.fields(needs.outputs, "view_arrays")
+        """what resolving reads besides: type of an element"""
+        self.stretched = "camera_brown_conrady" in needs.effects and bool(
+            output.having(features.taps, "length")
+        )
+        """whether resolving reads the lengths of a lens's rays"""
+        self.resolve = kernels("resolve").make_resolve(
+            images, needs.outputs, self.stretched, features.samples
+        )
+        self.sensor = SensorKernel(needs.steps) if needs.steps else None
 
     def _compile(self, kernel: Any) -> None:
         # here rather than at the first launch: several threads launch it

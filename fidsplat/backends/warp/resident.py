@@ -11,12 +11,12 @@ from fidsplat.backends.planes import PlaneTable
 from fidsplat.backends.warp.runtime import load
 from fidsplat.backends.warp.workspace import ArrayPool, nbytes
 from fidsplat.errors import DeviceError, InputError
-from fidsplat.harmonics import C0, MAX_DEGREE
+from fidsplat.harmonics import MAX_DEGREE
 from fidsplat.splats import SplatCloud
 
 
 class Resident:
-    """Splats on the device. SH of degree 0 does not depend on the view and becomes plain colours."""
+    """Splats on the device."""
 
     def __init__(
         self,
@@ -39,11 +39,9 @@ class Resident:
     @classmethod
     def of(cls, cloud: SplatCloud, pool: ArrayPool) -> Resident:
         """The cloud on the device."""
-        colors = cloud.colors
-        if cloud.sh is not None:
+        colors = cloud.plain_colors
+        if colors is None and cloud.sh is not None:
             colors = cloud.sh.reshape(-1, 3)
-            if cloud.sh_degree == 0:
-                colors = np.maximum(np.float32(C0) * colors + np.float32(0.5), np.float32(0))
         arrays = {
             "means": cloud.means,
             "quats": cloud.quats,
@@ -58,8 +56,7 @@ class Resident:
         if cloud.footprint == "mixed" and cloud.boxes is not None:
             arrays["boxes"] = cloud.boxes.astype(np.int32)
         device = {name: _uploaded(name, array, pool) for name, array in arrays.items()}
-        degree = cloud.sh_degree if cloud.sh_degree > 0 else -1
-        return cls(device, len(cloud), cloud.origin, degree, planes, cloud.footprint)
+        return cls(device, len(cloud), cloud.origin, cloud.sh_degree, planes, cloud.footprint)
 
     @classmethod
     def around(cls, given: Mapping[str, Any], origin: np.ndarray, pool: ArrayPool) -> Resident:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fidsplat.backends.base import View
+from fidsplat.backends.view import View
 from fidsplat.backends.warp.runtime import kernels, load
 from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.errors import DeviceError

@@ -70,8 +70,9 @@ class ArrayPool:
 class Workspace:
     """Of one open device."""
 
-    def __init__(self, device: Any, memory_budget: int) -> None:
-        self.device = device
+    def __init__(self, device: Any, name: str, memory_budget: int) -> None:
+        """name: of the device, for errors."""
+        self.device, self.name = device, name
         self.pool = ArrayPool(device)
         self.memory_budget = memory_budget
         """bytes of the device that a picture and its cloud may take"""

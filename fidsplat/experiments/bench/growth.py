@@ -11,10 +11,11 @@ import numpy as np
 from fidsplat.backends.base import Rates
 from fidsplat.cameras import Camera
 from fidsplat.experiments.bench.catalogue import TIMED
-from fidsplat.experiments.bench.measure import WARM_UP, SceneRun
+from fidsplat.experiments.bench.measure import SceneRun
 from fidsplat.experiments.bench.overdraw import overdraw
 from fidsplat.random_clouds import random_cloud, standard_camera
 from fidsplat.splats import SplatCloud
+from fidsplat.timing import take_turns
 
 MILLION = 1_000_000
 
@@ -66,8 +67,7 @@ def measure(point: Point, device: str, rates: Rates | None, repeats: int) -> dic
     cloud, camera = point.make()
     run = SceneRun(f"{point.series} {point.x:g}", device, rates, cloud, camera)
     del cloud
-    for number in range(WARM_UP + repeats):
-        run.draw(counts=number >= WARM_UP)
+    take_turns([run.result.timer], repeats)
     record = run.result.as_dict() | {"series": point.series, "x": point.x}
     if point.series == "overdraw" and "fragments" in record:
         layers = overdraw(run.renderer, run.resident, camera, TIMED.with_(transmittance_stop=0.0))

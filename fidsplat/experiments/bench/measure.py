@@ -1,8 +1,7 @@
-"""Times frames on several devices, turn by turn, and holds them against what each device can do."""
+"""Times frames on several devices, turn by turn, beside what each device can do at best."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import date
@@ -13,13 +12,11 @@ from fidsplat.backends.base import DeviceInfo, Measurable, Rates
 from fidsplat.cameras import Camera
 from fidsplat.errors import FidsplatError
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED
-from fidsplat.experiments.bench.model import Counts, floor_ms
+from fidsplat.experiments.bench.model import Counts, roofline_ms
 from fidsplat.experiments.bench.overdraw import overdraw
 from fidsplat.render import Frame, Renderer
 from fidsplat.splats import SplatCloud
-
-WARM_UP = 2
-"""Frames that are drawn before those that count."""
+from fidsplat.timing import Timer, take_turns
 
 
 @dataclass
@@ -30,6 +27,8 @@ class Result:
     device: DeviceInfo
     width: int
     height: int
+    timer: Timer
+    """wall times of frames, from the call until the device is done; its parts are the stages"""
     rates: Rates | None = None
     renderer: str = "fidsplat"
     """who draws; benchmarks/peers has others"""
@@ -40,31 +39,15 @@ class Result:
     mean_rgb: float = 0.0
     memory_bytes: int | None = None
     """held on the device: cloud, scratch buffers and the finished picture"""
-    frames: list[float] = field(default_factory=list)
-    """wall time of each: from the call until the device is done"""
-    stages: dict[str, list[float]] = field(default_factory=dict)
-    """the same frames stage by stage, by the device's own clock"""
-    floors: dict[str, float] = field(default_factory=dict)
+    rooflines: dict[str, float] = field(default_factory=dict)
     """least milliseconds by stage, where the device's rates are known"""
-    error: str = ""
 
     @property
-    def quartiles(self) -> tuple[float, float, float]:
-        """First quartile, median and third quartile of the frames; needs at least one."""
-        low, middle, high = np.percentile(self.frames, (25, 50, 75))
-        return float(low), float(middle), float(high)
-
-    @property
-    def stage_ms(self) -> dict[str, float]:
-        """Medians by stage."""
-        return {stage: float(np.median(times)) for stage, times in self.stages.items()}
-
-    @property
-    def times_floor(self) -> dict[str, float]:
-        """How many times its floor each stage takes, and `frame`; without what the model does not know."""
-        taken = self.stage_ms | {"frame": self.quartiles[1]}
-        floors = self.floors | ({"frame": sum(self.floors.values())} if self.floors else {})
-        return {name: taken[name] / floors[name] for name in taken if floors.get(name, 0.0) > 0}
+    def times_roofline(self) -> dict[str, float]:
+        """How many times its least each stage takes, and `frame`; without what the model does not know."""
+        taken = self.timer.part_medians | {"frame": self.timer.median}
+        least = self.rooflines | ({"frame": sum(self.rooflines.values())} if self.rooflines else {})
+        return {name: taken[name] / least[name] for name in taken if least.get(name, 0.0) > 0}
 
     def as_dict(self) -> dict:
         """For JSON: one flat record."""
@@ -79,26 +62,26 @@ class Result:
             "date": date.today().isoformat(),
             "width": self.width,
             "height": self.height,
-            "repeats": len(self.frames),
-            "error": self.error or None,
+            "repeats": len(self.timer.ms),
+            "error": self.timer.error or None,
         }
-        if not self.frames:
+        if not self.timer.ms:
             return record
-        low, middle, high = self.quartiles
+        low, middle, high = self.timer.quartiles
         return record | {
             "frame_ms": middle,
             "quartiles_ms": [low, high],
-            "fastest_ms": min(self.frames),
+            "fastest_ms": min(self.timer.ms),
             "first_frame_ms": self.first_frame_ms,
-            "stages_ms": self.stage_ms,
-            "fastest_stages_ms": {stage: min(times) for stage, times in self.stages.items()},
+            "stages_ms": self.timer.part_medians,
+            "fastest_stages_ms": {stage: min(times) for stage, times in self.timer.parts.items()},
             **self.counts,
             "splats_per_second": 1e3 * self.counts["splats"] / middle,
             "memory_bytes": self.memory_bytes,
             "mean_rgb": self.mean_rgb,
             "rates": self.rates and asdict(self.rates),
-            "floors_ms": self.floors,
-            "times_floor": self.times_floor,
+            "rooflines_ms": self.rooflines,
+            "times_roofline": self.times_roofline,
         }
 
 
@@ -113,7 +96,7 @@ class Bench:
 
         Args:
             devices: names as `Renderer` takes them.
-            tell: is told what is being done.
+            tell: called with what is being done.
             tick: is called after each frame that counts.
 
         Raises:
@@ -137,11 +120,7 @@ class Bench:
             runs.append(SceneRun(scene, name, rates, cloud, camera))
             self.results.append(runs[-1].result)
         self._tell(scene)
-        for number in range(WARM_UP + repeats):
-            for run in runs:
-                run.draw(counts=number >= WARM_UP)
-                if number >= WARM_UP:
-                    self._tick()
+        take_turns([run.result.timer for run in runs], repeats, tick=self._tick)
 
 
 class SceneRun:
@@ -152,47 +131,34 @@ class SceneRun:
     ) -> None:
         self.renderer = Renderer(device)
         self.camera = camera
-        self.result = Result(scene, self.renderer.device, camera.width, camera.height, rates)
         self.picture = np.zeros((camera.height, camera.width, 3), np.float32)
         """what was drawn, (h, w, 3)"""
+        timer = Timer(lambda: self.draw().timings, drops_out=True)  # reading the timings waits for the device
+        self.result = Result(scene, self.renderer.device, camera.width, camera.height, timer, rates)
         try:
             self.resident = self.renderer.upload(cloud)
-            start = time.perf_counter()
-            frame = self.renderer.render(self.resident, camera, quality=TIMED)
-            self.picture = frame["rgb"]
-            self.result.first_frame_ms = 1e3 * (time.perf_counter() - start)
-            self.result.mean_rgb = float(self.picture.mean(dtype=np.float64))
-            self._count(frame, cloud)
+            self.result.first_frame_ms = Timer(self._first).run()
+            self._count(cloud)
         except FidsplatError as error:
-            self.result.error = str(error)
+            timer.error = str(error)
 
-    def _count(self, frame: Frame, cloud: SplatCloud) -> None:
+    def draw(self) -> Frame:
+        """One frame."""
+        return self.renderer.render(self.resident, self.camera, quality=TIMED)
+
+    def _first(self) -> None:
+        frame = self.draw()
+        self.picture, self.result.counts = frame["rgb"], dict(frame.stats)
+
+    def _count(self, cloud: SplatCloud) -> None:
         result, backend = self.result, self.renderer.backend
-        result.counts = dict(frame.stats)
+        result.mean_rgb = float(self.picture.mean(dtype=np.float64))
         if not isinstance(backend, Measurable) or result.rates is None:
             return
         pixels = result.width * result.height
         result.memory_bytes = backend.memory_bytes + self.resident.memory_bytes + 12 * pixels
-        result.counts["fragments"] = int(
-            overdraw(self.renderer, self.resident, self.camera, TIMED).sum(dtype=np.int64)
-        )
+        drawn = overdraw(self.renderer, self.resident, self.camera, TIMED)
+        result.counts["fragments"] = int(drawn.sum(dtype=np.int64))
         further = max(cloud.sh_degree + 1, 1) ** 2 - 1
         counts = Counts(pixels=pixels, sh_coefficients=further, **result.counts)
-        result.floors = floor_ms(counts, result.rates)
-
-    def draw(self, counts: bool) -> None:
-        """Draw one frame and time it; it goes into the result if it counts."""
-        if self.result.error:
-            return
-        try:
-            start = time.perf_counter()
-            frame = self.renderer.render(self.resident, self.camera, quality=TIMED)
-            timings = frame.timings  # waits for the device
-            took = 1e3 * (time.perf_counter() - start)
-        except FidsplatError as error:
-            self.result.error = str(error)
-            return
-        if counts:
-            self.result.frames.append(took)
-            for stage, ms in timings.items():
-                self.result.stages.setdefault(stage, []).append(ms)
+        result.rooflines = roofline_ms(counts, result.rates)

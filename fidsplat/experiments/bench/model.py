@@ -1,6 +1,6 @@
 """What a frame must at least cost: bytes and operations of each stage, counted from what there is to draw.
 
-docs/performance.md derives the numbers. They are of the method (2D splats, exact crossing, float32), not of
+docs/roofline.md derives the numbers. They are of the method (2D splats, exact crossing, float32), not of
 our kernels: what one frame reads once is counted once, and of the fragments only those that are drawn.
 """
 
@@ -53,7 +53,7 @@ class Work:
         return 1e3 * max(memory, arithmetic)
 
 
-def floor_work(counts: Counts) -> dict[str, Work]:
+def roofline_work(counts: Counts) -> dict[str, Work]:
     """The least work by stage, in the order of the stages."""
     n, visible, colors = counts.splats, counts.visible, 1 + counts.sh_coefficients
     return {
@@ -74,6 +74,6 @@ def floor_work(counts: Counts) -> dict[str, Work]:
     }
 
 
-def floor_ms(counts: Counts, rates: Rates) -> dict[str, float]:
+def roofline_ms(counts: Counts, rates: Rates) -> dict[str, float]:
     """The least milliseconds by stage on a device of these rates."""
-    return {stage: work.ms(rates) for stage, work in floor_work(counts).items()}
+    return {stage: work.ms(rates) for stage, work in roofline_work(counts).items()}

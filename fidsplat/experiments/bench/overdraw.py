@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from fidsplat.backends.base import View
+from fidsplat.backends.prepare import prepare
 from fidsplat.cameras import Camera
-from fidsplat.effects import select
+from fidsplat.capture import Capture
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer, ResidentCloud
 
@@ -20,6 +20,6 @@ def overdraw(renderer: Renderer, resident: ResidentCloud, camera: Camera, qualit
         FidsplatError: the device fails, or its backend has no such count.
     """
     data = resident._data
-    features = replace(select(data, ("rgb",), quality), taps=("overdraw",))
-    view = View.of(camera, quality, data.origin, (0.0, 0.0, 0.0))
+    features, view = prepare(data, Capture(camera, quality=quality))
+    features = replace(features, taps=("overdraw",))
     return renderer.backend.pipeline(features).render(data, view).read("overdraw")

@@ -4,23 +4,23 @@ work-items."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-
-import numpy as np
+from functools import partial
 
 from fidsplat.cameras import Camera
 from fidsplat.quality import Quality
+from fidsplat.random_clouds import random_splats
 from fidsplat.render import Renderer
 from fidsplat.splats import SplatCloud
+from fidsplat.timing import Timer
 
 COUNTS = (2, 70_000)
 """Splats of the pictures that are drawn: launches of few and of many work-items."""
 
-_PLANES = (("rgb",), ("rgb", "depth"), ("rgb", "depth", "normal", "label"))
+_OUTPUTS = (("rgb",), ("rgb", "depth"), ("rgb", "depth", "normal", "label"))
 _STANDARD = Quality()
-_SHARP = Quality(lowpass="none", samples=3)  # what docs/rendering.md advises for dense codes
+_SHARP = Quality(lowpass="none", samples=3)  # what docs/quality.md advises for dense codes
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def recipes() -> list[Recipe]:
     common = [
         Recipe(degree, markers, outputs)
         for degree in (-1, 3)
-        for outputs in _PLANES
+        for outputs in _OUTPUTS
         for markers in (True, False)
     ]
     sharp = [Recipe(degree, True, ("rgb",), _SHARP) for degree in (-1, 3)]
@@ -63,23 +63,19 @@ def warm(renderer: Renderer, wanted: list[Recipe]) -> Iterator[tuple[Recipe, flo
         DeviceError: the compiler refuses, or the device fails.
     """
     camera = Camera.pinhole(64, 48, 60.0, 60.0, 32.0, 24.0)
-    for recipe in wanted:
-        begun = time.perf_counter()
+
+    def draw(recipe: Recipe) -> None:
         for count in COUNTS:
             frame = renderer.render(_cloud(recipe, count), camera, recipe.outputs, recipe.quality)
             for name in recipe.outputs:
                 frame[name]
-        yield recipe, time.perf_counter() - begun
+
+    for recipe in wanted:
+        yield recipe, Timer(partial(draw, recipe)).run() / 1e3
 
 
 def _cloud(recipe: Recipe, count: int) -> SplatCloud:
-    """`count` small faint splats that are all in view."""
-    random = np.random.default_rng(0)
-    means = random.uniform((-0.4, -0.3, 1.0), (0.4, 0.3, 2.0), (count, 3))
-    quats = np.tile((1.0, 0.0, 0.0, 0.0), (count, 1))
-    scales = np.full((count, 2), 0.002)
-    given: dict = {"colors": np.full((count, 3), 0.5)}
-    if recipe.sh_degree >= 0:
-        given = {"sh": np.full((count, (recipe.sh_degree + 1) ** 2, 3), 0.1)}
-    cloud = SplatCloud(means, quats, scales, np.full(count, 0.1), **given)
+    """`count` small splats that are all in view."""
+    degree = None if recipe.sh_degree < 0 else recipe.sh_degree
+    cloud = random_splats(count, 0, depth=(1.0, 2.0), scale=(0.002, 0.003), across=0.3, sh_degree=degree)
     return cloud.with_planes(0) if recipe.markers else cloud

@@ -10,7 +10,7 @@ from fidsplat.experiments.angles import parse_tilts
 from fidsplat.experiments.plane import plane_picture
 from fidsplat.experiments.setup import BACKGROUND
 from fidsplat.experiments.tradeoff.scenes import GREY, PROTOCOL, made_marker
-from fidsplat.experiments.tradeoff.table import Table
+from fidsplat.experiments.tradeoff.session import Session
 from fidsplat.quality import MarkerQuality, Quality
 from fidsplat.vision.images import to_uint8
 from fidsplat.vision.readers import Target, attempt
@@ -20,7 +20,7 @@ READERS = {"apriltag": "aruco", "qr": "zxing"}
 """one detector of each kind, those that fidsplat installs"""
 
 
-def scan(table: Table, name: str, quality: Quality | None, tilts: str) -> Callable[[], dict]:
+def scan(session: Session, name: str, quality: Quality | None, tilts: str) -> Callable[[], dict]:
     """Draw a marker at every tilt; what is returned looks at the pictures.
 
     quality: None for the ideal area-sampled texture, the ceiling that the detector has. The result: `reader`,
@@ -30,9 +30,9 @@ def scan(table: Table, name: str, quality: Quality | None, tilts: str) -> Callab
     cameras = [PROTOCOL.camera(tilt) for tilt in parse_tilts(tilts)]
     pictures: list[np.ndarray] = []
     if quality is not None:
-        resident = table.renderer.upload(made.cloud)
+        resident = session.renderer.upload(made.cloud)
         for camera in cameras:
-            frame = table.renderer.render(resident, camera, ("rgb",), quality, background=GREY)
+            frame = session.renderer.render(resident, camera, ("rgb",), quality, background=GREY)
             pictures.append(to_uint8(frame["rgb"][:, :, 0]))
 
     def look() -> dict:

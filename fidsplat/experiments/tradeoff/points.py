@@ -11,6 +11,7 @@ from typing import Any
 from fidsplat.errors import InputError, unknown
 from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.quality import (
+    NESTED,
     PRESETS,
     TEMPLATE_SIZES,
     MarkerQuality,
@@ -50,7 +51,7 @@ _QUICK = {
 _MARKER_LADDER = (
     *(MarkerQuality("paper", levels=levels, density=1) for levels in (1, 2, 3, 4, 5)),
     MarkerQuality("paper"),
-    *(MarkerQuality("fitted", template=size) for size in TEMPLATE_SIZES),
+    *(MarkerQuality("fitted", template=size) for size in TEMPLATE_SIZES if size != NESTED),
     *(MarkerQuality("fitted", growth=growth) for growth in (0.0, 0.2)),
 )
 _QUICK_MARKERS = (MarkerQuality("paper"), MarkerQuality("fitted"))

@@ -1,5 +1,3 @@
 // The light that the sensor gathers, times a factor.
-//@ resolve_args
-    , float exposure
 //@ resolve_end
-    for (int channel = 0; channel < 3; channel++) rgb[3 * out + channel] *= exposure;
+    for (int channel = 0; channel < 3; channel++) rgb_out[3 * out + channel] *= exposure;

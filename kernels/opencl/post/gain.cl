@@ -1,5 +1,3 @@
 // Amplification of what the sensor read, its noise included.
-//@ resolve_args
-    , float gain
 //@ resolve_end
-    for (int channel = 0; channel < 3; channel++) rgb[3 * out + channel] *= gain;
+    for (int channel = 0; channel < 3; channel++) rgb_out[3 * out + channel] *= gain;

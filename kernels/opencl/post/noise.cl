@@ -17,11 +17,9 @@ static inline float normal_variate(uint x, uint y, uint channel, uint seed) {
                + (first.w & 0xFFFFu) + (first.w >> 16) + (second.x & 0xFFFFu) + (second.x >> 16) + (second.y & 0xFFFFu) + (second.y >> 16);
     return (float)((int)sum - 393210) * (1.0f / 65536.0f);
 }
-//@ resolve_args
-    , float shot_variance, float read_variance, uint noise_seed   // at value 1, and at every value
 //@ resolve_end
     for (uint channel = 0; channel < 3; channel++) {
-        float light = rgb[3 * out + channel];
+        float light = rgb_out[3 * out + channel];
         float deviation = sqrt(FMA(fmax(light, 0.0f), shot_variance, read_variance));
-        rgb[3 * out + channel] = FMA(deviation, normal_variate((uint)x, (uint)y, channel, noise_seed), light);
+        rgb_out[3 * out + channel] = FMA(deviation, normal_variate((uint)x, (uint)y, channel, noise_seed), light);
     }

@@ -1,6 +1,4 @@
 // The nearest of the whole steps that the converter has.
-//@ resolve_args
-    , float quantise_steps
 //@ resolve_end
     for (int channel = 0; channel < 3; channel++)
-        rgb[3 * out + channel] = rint(clamp(rgb[3 * out + channel], 0.0f, 1.0f) * quantise_steps) / quantise_steps;
+        rgb_out[3 * out + channel] = rint(clamp(rgb_out[3 * out + channel], 0.0f, 1.0f) * quantise_steps) / quantise_steps;

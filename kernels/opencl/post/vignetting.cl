@@ -1,9 +1,6 @@
 // Light falls off from the principal point: 1 + a r^2 + b r^4 + c r^6, at least 0, r = 1 at half of the picture's diagonal.
-//@ resolve_args
-    , float vignette_x, float vignette_y, float vignette_scale   // principal point [px], 1 / (half diagonal [px])
-    , float vignette_a, float vignette_b, float vignette_c
 //@ resolve_end
     float vignette_dx = ((float)x + 0.5f - vignette_x) * vignette_scale, vignette_dy = ((float)y + 0.5f - vignette_y) * vignette_scale;
     float vignette_r2 = FMA(vignette_dx, vignette_dx, vignette_dy * vignette_dy);
     float fall_off = FMA(vignette_r2, FMA(vignette_r2, FMA(vignette_r2, vignette_c, vignette_b), vignette_a), 1.0f);
-    for (int channel = 0; channel < 3; channel++) rgb[3 * out + channel] *= fmax(fall_off, 0.0f);
+    for (int channel = 0; channel < 3; channel++) rgb_out[3 * out + channel] *= fmax(fall_off, 0.0f);

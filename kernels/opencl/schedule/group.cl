@@ -1,7 +1,7 @@
 // For GPUs: one work-group draws one tile, ROWS pixels of a column per work-item; splats are staged in local memory.
 // Barriers stand in loops whose bounds are the same for the whole group (numerics F5).
 // Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile.
-// Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 planes: r, g, b, transmittance) and the taps' planes, whole tiles.
+// Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 planes: r, g, b, transmittance) and the outputs' samples, whole tiles.
 #define ROWS 2
 #define GROUP (TILE_W * TILE_H / ROWS)
 // Neighbours in a group draw a block of BLOCK_W x BLOCK_H pixels, so that a splat that misses it costs it nothing.
@@ -9,21 +9,15 @@
 #define BLOCK_H (4 * ROWS)
 #define BLOCKS (TILE_W * TILE_H / (BLOCK_W * BLOCK_H))
 #define STAGED 128
+enum { VECTORS = sizeof(Splat) / 16 };       // of 16 bytes, in a record
 
 typedef union {              // what is staged of a splat, as vectors for fewer reads
     Splat splat;
-    float4 words[RECORD_BYTES / 16];
+    float4 words[VECTORS];
 } Staged;
 
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
-    global const Splat *restrict splats,
-    global const uint *restrict lists,
-    global const uint *restrict starts,
-    uint band_first,                         // the first tile of this launch; lists begin with its list
-    int width, int height,
-    wide log_cut, wide ceiling, wide stop, wide filter,
-    global float *restrict raw
-//@@ blend_args
+//@@ arguments blend
 ) {
     local Staged staged[STAGED];
     local uint touched[BLOCKS][STAGED / 32]; // bits: which staged splats can touch a block
@@ -49,8 +43,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
         for (uint word = item; word < BLOCKS * (STAGED / 32); word += GROUP) touched[word / (STAGED / 32)][word % (STAGED / 32)] = 0;
         barrier(CLK_LOCAL_MEM_FENCE);
         // vector by vector, so that neighbours in the group read neighbours in memory
-        for (uint word = item; word < length * (RECORD_BYTES / 16); word += GROUP) {
-            uint which = word / (RECORD_BYTES / 16), part = word % (RECORD_BYTES / 16);
+        for (uint word = item; word < length * VECTORS; word += GROUP) {
+            uint which = word / VECTORS, part = word % VECTORS;
             staged[which].words[part] = ((global const float4 *)(splats + lists[batch + which]))[part];
         }
         for (int row = 0; row < ROWS; row++)
@@ -69,7 +63,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
         for (uint word = 0; word < STAGED / 32; word++)
             for (uint bits = touched[block][word]; bits != 0; bits &= bits - 1) {
                 Staged copy;
-                for (int part = 0; part < RECORD_BYTES / 16; part++)
+                for (int part = 0; part < VECTORS; part++)
                     copy.words[part] = staged[word * 32 + 31 - clz(bits & -bits)].words[part];
                 const Splat s = copy.splat;
                 wide half_r2 = s.log_opacity - constants.log_cut;

@@ -1,18 +1,11 @@
 // For CPUs: one work-item draws one tile, a row of LANES pixels at a time; no barriers, no local memory.
 // Index space: one work-item (and work-group) per tile.
-// Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 planes: r, g, b, transmittance) and the taps' planes, whole tiles.
+// Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 planes: r, g, b, transmittance) and the outputs' samples, whole tiles.
 // Splats of a tile lie anywhere in memory; the ones to come are fetched ahead.
 #define AHEAD_SPLATS 8
 
 kernel void blend(
-    global const Splat *restrict splats,
-    global const uint *restrict lists,
-    global const uint *restrict starts,
-    uint band_first,                         // the first tile of this launch; lists begin with its list
-    int width, int height,
-    wide log_cut, wide ceiling, wide stop, wide filter,
-    global float *restrict raw
-//@@ blend_args
+//@@ arguments blend
 ) {
     const BlendConstants constants = {log_cut, ceiling, stop, filter};
     uint tile = band_first + get_global_id(0);

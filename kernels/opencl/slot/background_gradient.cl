@@ -1,7 +1,4 @@
 // Behind everything a blend of two colours by the sine of the ray's height above the horizon.
-//@ backdrop_args
-    , float sky_r, float sky_g, float sky_b, float ground_r, float ground_g, float ground_b
-    , float up_x, float up_y, float up_z
 //@ backdrop
     float climb = FMA(world_x, up_x, FMA(world_y, up_y, world_z * up_z))
                    / sqrt(FMA(world_x, world_x, FMA(world_y, world_y, world_z * world_z)));

@@ -1,27 +1,25 @@
 // Perspective with OpenCV's distortion: radial k1 to k6, tangential p1, p2, thin prism s1 to s4. A splat is enclosed on the
 // ideal pinhole picture, which is the chart of the ray map.
 //@ camera
-enum { LENS = VIEW_BAND_END + 1, LENS_FOLD = LENS + 12, LENS_MAP };
-
 // Where (x, y) = (X / Z, Y / Z) falls [samples]. Returns whether it is seen: not beyond the fold.
-static inline bool lens_image(global const real *view, real x, real y, real *image_x, real *image_y) {
-    global const real *k = view + LENS, *p = k + 6, *s = k + 8;
+static inline bool lens_image(global const View *view, real x, real y, real *image_x, real *image_y) {
+    global const real *k = view->lens, *p = k + 6, *s = k + 8;
     real q = x * x + y * y;
     real radial = (1 + q * (k[0] + q * (k[1] + q * k[2]))) / (1 + q * (k[3] + q * (k[4] + q * k[5])));
     real a = x * radial + 2 * p[0] * x * y + p[1] * (q + 2 * x * x) + q * (s[0] + q * s[1]);
     real b = y * radial + p[0] * (q + 2 * y * y) + 2 * p[1] * x * y + q * (s[2] + q * s[3]);
-    *image_x = view[VIEW_FX] * a + view[VIEW_CX];
-    *image_y = view[VIEW_FY] * b + view[VIEW_CY];
-    return q < view[LENS_FOLD];
+    *image_x = view->focal_x * a + view->center_x;
+    *image_y = view->focal_y * b + view->center_y;
+    return q < view->lens_fold;
 }
 //@ camera_box
-    bounds = mapped_bounds(view + LENS_MAP, ray_map, bounds.ex - bounds.hx, bounds.ex + bounds.hx,
+    bounds = mapped_bounds(view->map, ray_map, bounds.ex - bounds.hx, bounds.ex + bounds.hx,
                            bounds.ey - bounds.hy, bounds.ey + bounds.hy);
     if (!(pz >= near && lens_image(view, p.x / pz, p.y / pz, &center_x, &center_y))) center_x = center_y = NAN;   // no dot of a low-pass
 //@ camera_derivative_functions
 // Derivatives of the image coordinates at (x, y) = (X / Z, Y / Z): a_x, a_y, b_x, b_y.
-static inline void lens_slopes(global const real *view, real x, real y, real *slopes) {
-    global const real *k = view + LENS, *p = k + 6, *s = k + 8;
+static inline void lens_slopes(global const View *view, real x, real y, real *slopes) {
+    global const real *k = view->lens, *p = k + 6, *s = k + 8;
     real q = x * x + y * y;
     real above = 1 + q * (k[0] + q * (k[1] + q * k[2])), below = 1 + q * (k[3] + q * (k[4] + q * k[5]));
     real radial = above / below;
@@ -38,8 +36,8 @@ static inline void lens_slopes(global const real *view, real x, real y, real *sl
         lens_slopes(view, at_x, at_y, slopes);
         real x_u = ahead * (a.x - at_x * a.z), x_v = ahead * (b.x - at_x * b.z);
         real y_u = ahead * (a.y - at_y * a.z), y_v = ahead * (b.y - at_y * b.z);
-        gx.x = view[VIEW_FX] * (slopes[0] * x_u + slopes[1] * y_u);
-        gx.y = view[VIEW_FX] * (slopes[0] * x_v + slopes[1] * y_v);
-        gy.x = view[VIEW_FY] * (slopes[2] * x_u + slopes[3] * y_u);
-        gy.y = view[VIEW_FY] * (slopes[2] * x_v + slopes[3] * y_v);
-        filtered = at_x * at_x + at_y * at_y < view[LENS_FOLD];
+        gx.x = view->focal_x * (slopes[0] * x_u + slopes[1] * y_u);
+        gx.y = view->focal_x * (slopes[0] * x_v + slopes[1] * y_v);
+        gy.x = view->focal_y * (slopes[2] * x_u + slopes[3] * y_u);
+        gy.y = view->focal_y * (slopes[2] * x_v + slopes[3] * y_v);
+        filtered = at_x * at_x + at_y * at_y < view->lens_fold;

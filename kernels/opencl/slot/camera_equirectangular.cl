@@ -2,7 +2,7 @@
 // about its centre's direction; one that reaches a pole or the edge of longitudes is listed in whole rows.
 //@ camera
 // Box [samples] of the polygon around the disk.
-static inline Bounds cone_bounds(global const real *view, real3_ a, real3_ b, real3_ p, real radius, real longitude,
+static inline Bounds cone_bounds(global const View *view, real3_ a, real3_ b, real3_ p, real radius, real longitude,
                                  real latitude) {
     real pi = REAL(3.14159265358979323846), around = radius / POLYGON_INNER, widest = 0, cu = around, cv = 0;
     bool known = true;
@@ -23,8 +23,8 @@ static inline Bounds cone_bounds(global const real *view, real3_ a, real3_ b, re
     }
     bool round = across >= pi;
     real west = round ? -pi : longitude - across, east = round ? pi : longitude + across;
-    return box_bounds(view[VIEW_FX] * west + view[VIEW_CX], view[VIEW_FX] * east + view[VIEW_CX],
-                      view[VIEW_FY] * low + view[VIEW_CY], view[VIEW_FY] * high + view[VIEW_CY]);
+    return box_bounds(view->focal_x * west + view->center_x, view->focal_x * east + view->center_x,
+                      view->focal_y * low + view->center_y, view->focal_y * high + view->center_y);
 }
 //@ camera_depth
     pz = sqrt(dot3(p, p));
@@ -33,13 +33,13 @@ static inline Bounds cone_bounds(global const real *view, real3_ a, real3_ b, re
 //@ camera_bounds
     real longitude = atan2(p.x, p.z), latitude = atan2(p.y, sqrt(p.x * p.x + p.z * p.z));
     Bounds bounds = cone_bounds(view, a, b, p, radius, longitude, latitude);
-    real center_x = view[VIEW_FX] * longitude + view[VIEW_CX], center_y = view[VIEW_FY] * latitude + view[VIEW_CY];
+    real center_x = view->focal_x * longitude + view->center_x, center_y = view->focal_y * latitude + view->center_y;
     if (!(pz >= near)) center_x = center_y = NAN;   // no dot of a low-pass
 //@ camera_derivative
         real polar = p.x * p.x + p.z * p.z < REAL(1e-12) * pz * pz ? 1 : 0;   // where the longitude jumps
         real around_x = polar > 0 ? 0 : p.x, around_z = polar > 0 ? REAL(1e-6) * pz : p.z;
         real flat = sqrt(around_x * around_x + around_z * around_z);
-        real across = view[VIEW_FX] / (flat * flat), up = view[VIEW_FY] / (pz * pz);
+        real across = view->focal_x / (flat * flat), up = view->focal_y / (pz * pz);
         real sink = p.y / flat;
         gx.x = across * (around_z * a.x - around_x * a.z);
         gx.y = across * (around_z * b.x - around_x * b.z);

@@ -2,17 +2,15 @@
 // t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) from the middle. Depths are distances along the ray. The chart of the ray map is the
 // stereographic picture (X, Y) / (|r| + Z), in which arcs of great circles are arcs of circles of radius 1 or more.
 //@ camera
-enum { LENS = VIEW_BAND_END + 1, LENS_LIMIT = LENS + 4, LENS_MAP };
-
 // Where a point falls [samples]. Returns whether it is seen.
-static inline bool lens_image(global const real *view, real3_ p, real *image_x, real *image_y) {
-    global const real *k = view + LENS;
+static inline bool lens_image(global const View *view, real3_ p, real *image_x, real *image_y) {
+    global const real *k = view->lens;
     real across = sqrt(p.x * p.x + p.y * p.y), angle = atan2(across, p.z), q = angle * angle;
     real distance = angle * (1 + q * (k[0] + q * (k[1] + q * (k[2] + q * k[3]))));
     real factor = across > 0 ? distance / across : 0;
-    *image_x = view[VIEW_FX] * (factor * p.x) + view[VIEW_CX];
-    *image_y = view[VIEW_FY] * (factor * p.y) + view[VIEW_CY];
-    return angle <= view[LENS_LIMIT];
+    *image_x = view->focal_x * (factor * p.x) + view->center_x;
+    *image_y = view->focal_y * (factor * p.y) + view->center_y;
+    return angle <= view->lens_limit;
 }
 
 // The disk's part of the chart: the corners of a polygon around it, and the sagitta of the arcs between them. Everything
@@ -54,23 +52,23 @@ static inline void chart_box(real3_ a, real3_ b, real3_ p, real radius, real awa
 //@ camera_bounds
     real chart[4], center_x, center_y;
     chart_box(a, b, p, radius, pz, chart);
-    Bounds bounds = mapped_bounds(view + LENS_MAP, ray_map, chart[0], chart[1], chart[2], chart[3]);
+    Bounds bounds = mapped_bounds(view->map, ray_map, chart[0], chart[1], chart[2], chart[3]);
     if (!(pz >= near && lens_image(view, p, &center_x, &center_y))) center_x = center_y = NAN;   // no dot of a low-pass
 //@ camera_derivative
         // outwards and around, then turned into the picture's axes
         real across = sqrt(p.x * p.x + p.y * p.y), angle = atan2(across, p.z), q = angle * angle;
         real cosine = across > 0 ? p.x / across : 1, sine = across > 0 ? p.y / across : 0;
-        global const real *k = view + LENS;
+        global const real *k = view->lens;
         real slope = (1 + q * (3 * k[0] + q * (5 * k[1] + q * (7 * k[2] + q * 9 * k[3])))) / (pz * pz);
         real distance = angle * (1 + q * (k[0] + q * (k[1] + q * (k[2] + q * k[3]))));
         real around = across > 0 ? distance / across : 1 / p.z;
         real out_u = slope * (p.z * (cosine * a.x + sine * a.y) - across * a.z);
         real out_v = slope * (p.z * (cosine * b.x + sine * b.y) - across * b.z);
         real round_u = around * (cosine * a.y - sine * a.x), round_v = around * (cosine * b.y - sine * b.x);
-        gx.x = view[VIEW_FX] * (cosine * out_u - sine * round_u);
-        gx.y = view[VIEW_FX] * (cosine * out_v - sine * round_v);
-        gy.x = view[VIEW_FY] * (sine * out_u + cosine * round_u);
-        gy.y = view[VIEW_FY] * (sine * out_v + cosine * round_v);
-        filtered = angle <= view[LENS_LIMIT];
+        gx.x = view->focal_x * (cosine * out_u - sine * round_u);
+        gx.y = view->focal_x * (cosine * out_v - sine * round_v);
+        gy.x = view->focal_y * (sine * out_u + cosine * round_u);
+        gy.y = view->focal_y * (sine * out_v + cosine * round_v);
+        filtered = angle <= view->lens_limit;
 //@ camera_box_reach
         reach = su + sv;

@@ -1,8 +1,5 @@
 // Parallel rays along z: x = fx X + cx, so the projection's last row is (0, 0, 1) instead of the depths. D is constant, and
 // the depth of a fragment is its own affine form of the pixel, times D.
-//@ record
-    wide z0, zx, zy;        // depth times D = z0 + zx x + zy y
-    wide z_near;
 //@ crossing
     vfloat z;               // depth times d
 //@ camera
@@ -15,17 +12,17 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
     offset = facet.z;       // which side is seen: the camera is infinitely far away
 //@ camera_bounds
     real3_ row_x = {a.x, b.x, p.x}, row_y = {a.y, b.y, p.y}, tw = {0, 0, 1};
-    real3_ tu = image_row(view[VIEW_FX], view[VIEW_CX], row_x, tw);
-    real3_ tv = image_row(view[VIEW_FY], view[VIEW_CY], row_y, tw);
+    real3_ tu = image_row(view->focal_x, view->center_x, row_x, tw);
+    real3_ tv = image_row(view->focal_y, view->center_y, row_y, tw);
     real center_x = tu.z, center_y = tv.z;
-    real3_ cu = image_row(view[VIEW_FX], view[VIEW_CX] - center_x, row_x, tw);
-    real3_ cv = image_row(view[VIEW_FY], view[VIEW_CY] - center_y, row_y, tw);
+    real3_ cu = image_row(view->focal_x, view->center_x - center_x, row_x, tw);
+    real3_ cv = image_row(view->focal_y, view->center_y - center_y, row_y, tw);
     Bounds bounds = ellipse_bounds(cu, cv, tw, center_x, center_y, radius * radius);
 //@ camera_forms
-    tu = image_row(view[VIEW_FX], view[VIEW_CX] - anchor_x, row_x, tw);
-    tv = image_row(view[VIEW_FY], view[VIEW_CY] - anchor_y, row_y, tw);
+    tu = image_row(view->focal_x, view->center_x - anchor_x, row_x, tw);
+    tv = image_row(view->focal_y, view->center_y - anchor_y, row_y, tw);
     real3_ k0 = cross3(tu, tv), kx = cross3(tv, tw), ky = cross3(tw, tu);   // (n_u, n_v, D): constant, per x, per y
-    real determinant = view[VIEW_FX] * view[VIEW_FY] * su * sv * offset;
+    real determinant = view->focal_x * view->focal_y * su * sv * offset;
     k0.z = determinant;
 //@ camera_facing
     facing = fabs(offset) > (SETUP_FP64 ? REAL(1e-13) : REAL(1e-6)) ? scale : 0;
@@ -43,7 +40,7 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
                      clamp(c.z * inverse_d, (vfloat)(s->z_center - s->z_reach), (vfloat)(s->z_center + s->z_reach)),
                      VMASK(c.d > 0.0f));
 //@ camera_derivative
-        gx.x = view[VIEW_FX] * a.x; gx.y = view[VIEW_FX] * b.x;
-        gy.x = view[VIEW_FY] * a.y; gy.y = view[VIEW_FY] * b.y;
+        gx.x = view->focal_x * a.x; gx.y = view->focal_x * b.x;
+        gy.x = view->focal_y * a.y; gy.y = view->focal_y * b.y;
 //@ camera_box_near
         d_near = INFINITY;                   // depths have a form of their own

@@ -1,7 +1,5 @@
 // Real spherical harmonics of degree SH_DEGREE, in the convention of gsplat and the 2DGS authors:
 // colour = max(0, 1/2 + sum_k Y_k(direction) f_k), direction = normalised(centre - camera) in the world frame.
-//@ project_args
-    , global const float *restrict sh       // (n, (SH_DEGREE + 1)^2, 3)
 //@ functions
 #define SH_TERMS ((SH_DEGREE + 1) * (SH_DEGREE + 1))
 static inline void sh_basis(real3_ d, wide *y) {
@@ -31,7 +29,7 @@ static inline void sh_basis(real3_ d, wide *y) {
 #endif
 }
 //@ color
-    real3_ ray = {mean.x - view[VIEW_EYE], mean.y - view[VIEW_EYE + 1], mean.z - view[VIEW_EYE + 2]};
+    real3_ ray = {mean.x - view->eye[0], mean.y - view->eye[1], mean.z - view->eye[2]};
     real length = sqrt(dot3(ray, ray));
     real inverse = length > 0 ? 1 / length : 0;
     ray.x *= inverse; ray.y *= inverse; ray.z *= inverse;

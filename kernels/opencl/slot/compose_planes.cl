@@ -5,12 +5,7 @@
 //
 // The splats of a plane arrive together (plane_keys), before anything that the layer is compared with. It is pending until
 // a fragment of no plane (-1) arrives whose own depth at the pixel lies behind the layer's, or nothing more arrives. Of
-// more than two pending layers the nearer of the first two is laid when the third begins.
-//@ record
-    int plane;
-//@ project_args
-    , global const int *restrict planes      // (n) index of the splat's plane; -1: none
-    , global const float *restrict plane_keys // (planes) depth at which its splats are sorted in [m]
+// more than two pending layers the nearer of the first two is composited when the third begins.
 //@ project
     record.plane = planes[i];
 //@ key
@@ -19,7 +14,7 @@
 typedef struct {
     vint plane;             // -1: no layer
     vfloat opacity;         // 1 - the product of its fragments' transmittances; itself, so that a faint one stays exact
-    vfloat ink;             // sum of optical depths
+    vfloat optical_depth;   // sum of its fragments'
     Seen mean;              // of its fragments by optical depth
 //@@ layer
 } Layer;
@@ -38,7 +33,7 @@ static inline Layer no_layer(void) {
 static inline void layer_pick(Layer *layer, const Layer *other, vint mask) {
     layer->plane = VSELECT(layer->plane, other->plane, mask);
     layer->opacity = VSELECT(layer->opacity, other->opacity, mask);
-    layer->ink = VSELECT(layer->ink, other->ink, mask);
+    layer->optical_depth = VSELECT(layer->optical_depth, other->optical_depth, mask);
     layer->mean.r = VSELECT(layer->mean.r, other->mean.r, mask);
     layer->mean.g = VSELECT(layer->mean.g, other->mean.g, mask);
     layer->mean.b = VSELECT(layer->mean.b, other->mean.b, mask);
@@ -53,36 +48,36 @@ static inline void layer_gather(Layer *layer, const Splat *s, const Seen *seen, 
 //@@ footprint_tau
     layer->plane = VSELECT(layer->plane, (vint)s->plane, mask);
     layer->opacity = FMA(opacity, 1.0f - layer->opacity, layer->opacity);
-    layer->ink += tau;
+    layer->optical_depth += tau;
 //@@ footprint_gather
-    vfloat share = VSELECT((vfloat)0.0f, tau / layer->ink, VMASK(tau > 0.0f));
+    vfloat share = VSELECT((vfloat)0.0f, tau / layer->optical_depth, VMASK(tau > 0.0f));
     layer->mean.r = FMA(share, seen->r - layer->mean.r, layer->mean.r);
     layer->mean.g = FMA(share, seen->g - layer->mean.g, layer->mean.g);
     layer->mean.b = FMA(share, seen->b - layer->mean.b, layer->mean.b);
 //@@ gather
 }
 
-static inline void layer_lay(Pixel *pixel, Layer *layer, vint mask, const BlendConstants *constants) {
+static inline void layer_composite(Pixel *pixel, Layer *layer, vint mask, const BlendConstants *constants) {
     if (!VANY(mask)) return;
     const Layer none = no_layer();
-    lay(pixel, &layer->mean, layer->opacity, mask, constants);
+    composite(pixel, &layer->mean, layer->opacity, mask, constants);
     layer_pick(layer, &none, mask);
 }
 
-// Lays the pending layers `open` and `waiting` (masks), the nearer first.
-static inline void layers_lay(Pixel *pixel, vint open, vint waiting, const BlendConstants *constants) {
+// Composites the pending layers `open` and `waiting` (masks), the nearer first.
+static inline void layers_composite(Pixel *pixel, vint open, vint waiting, const BlendConstants *constants) {
     vint nearer = open & waiting & VMASK(pixel->open.mean.z < pixel->waiting.mean.z);
-    layer_lay(pixel, &pixel->open, nearer, constants);
-    layer_lay(pixel, &pixel->waiting, waiting, constants);
-    layer_lay(pixel, &pixel->open, open & ~nearer, constants);
+    layer_composite(pixel, &pixel->open, nearer, constants);
+    layer_composite(pixel, &pixel->waiting, waiting, constants);
+    layer_composite(pixel, &pixel->open, open & ~nearer, constants);
 }
 
-// A layer of another plane begins: the open one waits, and of two that would wait the nearer is laid.
+// A layer of another plane begins: the open one waits, and of two that would wait the nearer is composited.
 static inline void layers_shift(Pixel *pixel, vint begins, const BlendConstants *constants) {
     vint both = begins & VMASK(pixel->waiting.plane >= 0);
     vint nearer = both & VMASK(pixel->open.mean.z < pixel->waiting.mean.z);
-    layer_lay(pixel, &pixel->open, nearer, constants);
-    layer_lay(pixel, &pixel->waiting, both & ~nearer, constants);
+    layer_composite(pixel, &pixel->open, nearer, constants);
+    layer_composite(pixel, &pixel->waiting, both & ~nearer, constants);
     const Layer none = no_layer();
     vint moves = begins & ~nearer;
     layer_pick(&pixel->waiting, &pixel->open, moves);
@@ -92,12 +87,12 @@ static inline void layers_shift(Pixel *pixel, vint begins, const BlendConstants 
     if (s->plane < 0) {
         vint open = mask & VMASK(pixel->open.plane >= 0) & VMASK(pixel->open.mean.z < seen.z);
         vint waiting = mask & VMASK(pixel->waiting.plane >= 0) & VMASK(pixel->waiting.mean.z < seen.z);
-        if (VANY(open | waiting)) layers_lay(pixel, open, waiting, constants);
-        lay(pixel, &seen, opacity, mask, constants);
+        if (VANY(open | waiting)) layers_composite(pixel, open, waiting, constants);
+        composite(pixel, &seen, opacity, mask, constants);
     } else {
         vint begins = mask & VMASK(pixel->open.plane >= 0) & VMASK(pixel->open.plane != (vint)s->plane);
         if (VANY(begins)) layers_shift(pixel, begins, constants);
         layer_gather(&pixel->open, s, &seen, opacity, mask);
     }
 //@ finish
-    layers_lay(pixel, VMASK(pixel->open.plane >= 0), VMASK(pixel->waiting.plane >= 0), constants);
+    layers_composite(pixel, VMASK(pixel->open.plane >= 0), VMASK(pixel->waiting.plane >= 0), constants);

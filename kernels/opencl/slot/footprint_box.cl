@@ -1,4 +1,4 @@
-// Every splat is a box (slot/box_edges.cl).
+// Every splat is a box (part/box_edges.cl).
 //@ footprint
 #define IS_BOX(s) true
 //@ footprint_here

@@ -20,7 +20,7 @@
         real area = gx.x * gy.y - gx.y * gy.x, area2 = area * area;
         real grown = 1 + variance * (m11 + m22 + variance) / area2;      // (area after / area before)^2
         log_opacity -= (wide)(REAL(0.5) * log(grown));
-        half_r2 = log_opacity - (wide)view[VIEW_LOG_CUT];
+        half_r2 = log_opacity - (wide)view->log_cut;
         if (!(half_r2 > 0.0f)) return;                                  // edge-on too: infinitely thin, infinitely faint
         real c11 = 1 + variance * m22 / area2, c12 = -variance * m12 / area2;
         real l11 = sqrt(c11), l21 = c12 / l11, l22 = sqrt(grown) / l11;    // L L^T = 1 + s^2 (G^T G)^-1

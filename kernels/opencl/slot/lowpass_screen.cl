@@ -1,14 +1,10 @@
 // The screen-space low-pass of 2DGS (Huang et al. 2024, eq. 11, sigma = sqrt(1/2) px): rho = min(rho_3d, 2 d^2) with d
 // the distance in pixels from the projected centre (numerics A6). The dot belongs to the centre: it is drawn if the centre
 // lies beyond the near plane, whatever the ray through the pixel does (numerics B2).
-//@ record
-    wide fx, fy;            // projected centre relative to the anchor's centre; far away if it is not drawn
-//@ bounds
-    float px, py, pr;       // the filter's support: centre and radius [samples]; radius < 0: none
 //@ bounds_make
         bounds.px = (float)center_x;
         bounds.py = (float)center_y;
-        bounds.pr = pz >= near ? sqrt(half_r2 / (float)view[VIEW_FILTER]) * (1.0f + BOUNDS_PAD_RELATIVE) + BOUNDS_PAD : -1.0f;
+        bounds.pr = pz >= near ? sqrt(half_r2 / (float)view->filter) * (1.0f + BOUNDS_PAD_RELATIVE) + BOUNDS_PAD : -1.0f;
 //@@ footprint_dot_bounds
 //@ bounds_span
     float dot_low = fmax(y0 - b->py, -b->pr), dot_high = fmin(y1 - b->py, b->pr);
@@ -24,14 +20,14 @@
         high = fmax(high, b->py + b->pr);
     }
 //@ project
-        record.fx = pz >= near ? (wide)(center_x - anchor_x) : 1e18f;
-        record.fy = pz >= near ? (wide)(center_y - anchor_y) : 1e18f;
+        record.dot_x = pz >= near ? (wide)(center_x - anchor_x) : 1e18f;
+        record.dot_y = pz >= near ? (wide)(center_y - anchor_y) : 1e18f;
 //@@ camera_dot
 //@@ footprint_dot
 //@ fragment_mask
 // Vectors of pixels pass over a dot that is far away; to single pixels the question costs what it saves.
 #if LANES > 1
-#define HAS_DOT(s) ((s)->fx < 1e17f)
+#define HAS_DOT(s) ((s)->dot_x < 1e17f)
 #else
 #define HAS_DOT(s) true
 #endif
@@ -40,8 +36,8 @@ static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, wide y, w
                                  vfloat *screen) {
     *screen = 0.0f;
     if (!HAS_DOT(s)) return c.inside;
-    vfloat ex = x - s->fx;
-    wide ey = y - s->fy;
+    vfloat ex = x - s->dot_x;
+    wide ey = y - s->dot_y;
     *screen = FMA(ex, ex, (vfloat)(ey * ey)) * filter;
     return c.inside | VMASK(*screen <= half_r2);
 }

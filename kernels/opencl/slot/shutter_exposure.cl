@@ -3,11 +3,7 @@
 // Adds a sub-picture's light (colours and transmittances, or a plane of fog), weighted, to that of its rows.
 // Index space: one work-item per sample of the sub-picture (x, y). Reads: raw. Writes: exposed.
 kernel void expose(
-    int width, int height,
-    int stride, uint plane,                  // of raw: samples per row and per plane
-    int whole_stride, uint whole_plane, int top, int planes, float weight, int first,
-    global const float *restrict raw,
-    global float *restrict exposed
+//@@ arguments expose
 ) {
     int x = get_global_id(0), y = get_global_id(1);
     if (x >= width || y >= height) return;
@@ -19,14 +15,12 @@ kernel void expose(
 }
 
 // Copies the planes that are not averaged. Index space as above; 32 bits of any kind each.
-kernel void expose_planes(
-    int width, int height, int stride, uint plane, int whole_stride, uint whole_plane, int top, int planes,
-    global const uint *restrict from,
-    global uint *restrict to
+kernel void expose_middle(
+//@@ arguments expose_middle
 ) {
     int x = get_global_id(0), y = get_global_id(1);
     if (x >= width || y >= height) return;
     for (int k = 0; k < planes; k++)
-        to[k * (size_t)whole_plane + (size_t)(top + y) * whole_stride + x] =
-            from[k * (size_t)plane + (size_t)y * stride + x];
+        exposed[k * (size_t)whole_plane + (size_t)(top + y) * whole_stride + x] =
+            raw[k * (size_t)plane + (size_t)y * stride + x];
 }

@@ -5,12 +5,13 @@
 //@ splat_view
     {
         // the furthest that any opacity reaches, in scales and in samples
-        real most = -view[VIEW_LOG_CUT], dot = sqrt(most / view[VIEW_FILTER]) + 2;
-        real reach = sqrt(2 * most) * fmax(scales[2 * i], scales[2 * i + 1]), fy = view[VIEW_FY];
+        real most = -view->log_cut, dot = sqrt(most / view->filter) + 2;
+        real reach = sqrt(2 * most) * fmax(scales[2 * i], scales[2 * i + 1]), fy = view->focal_y;
         real x = means[3 * i], y = means[3 * i + 1], z = means[3 * i + 2];
-        real down = view[3] * x + view[4] * y + view[5] * z + view[VIEW_T + 1];
-        real ahead = view[6] * x + view[7] * y + view[8] * z + view[VIEW_T + 2];
-        real above = view[VIEW_CY] + dot, below = view[VIEW_CY] - view[VIEW_HEIGHT] - dot;
+        global const real *r = view->rotation;
+        real down = r[3] * x + r[4] * y + r[5] * z + view->translation[1];
+        real ahead = r[6] * x + r[7] * y + r[8] * z + view->translation[2];
+        real above = view->center_y + dot, below = view->center_y - view->height - dot;
         // roundings, also of float32 where there is no double; written so that a NaN culls nothing
         real slack = REAL(1e-5) * (fabs(fy * down) + (fabs(above) + fabs(below)) * fabs(ahead));
         if (fy * down + above * ahead + reach * sqrt(fy * fy + above * above) + slack < 0) return;

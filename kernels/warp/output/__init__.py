@@ -68,9 +68,9 @@ class Output:
     view_arrays: Mapping[str, Any] = field(default_factory=dict)
     """the same of the view (`View.array`)"""
     hidden: Any = None
-    """(window, samples): share of the background that shows besides what is transmitted"""
+    """(grid, samples): share of the background that shows besides what is transmitted"""
     resolve: Any = None
-    """(window, samples, lengths, out): a pixel of the output image out.NAME from its samples; lengths: a
+    """(grid, samples, lengths, out): a pixel of the output image out.NAME from its samples; lengths: a
     vector with a float for each of them, of rays if `length`"""
 
 

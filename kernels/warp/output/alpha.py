@@ -4,16 +4,16 @@ from typing import Any
 
 import warp as wp
 
-from ..window import Window, sample_at
+from ..pixel_grid import PixelGrid, sample_at
 from . import Output
 
 
 @wp.func
-def resolve(window: Window, samples: Any, lengths: Any, out: Any):
+def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
     t = float(0.0)
-    for k in range(window.count):
-        t += samples.color[sample_at(window, k)][3]
-    out.alpha[window.pixel] = 1.0 - t * window.mean
+    for k in range(grid.count):
+        t += samples.color[sample_at(grid, k)][3]
+    out.alpha[grid.pixel] = 1.0 - t * grid.mean
 
 
 OUTPUT = Output(resolve=resolve)

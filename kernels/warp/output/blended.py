@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from ..common import View
-from ..window import Window, sample_at
+from ..pixel_grid import PixelGrid, sample_at
 from . import Output
 
 
@@ -36,11 +36,11 @@ def store(pixel: Any, at: int, samples: Any):
 
 
 @wp.func
-def resolve(window: Window, samples: Any, lengths: Any, out: Any):
+def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
     count = int(0)
-    for k in range(window.count):
-        count = wp.max(count, samples.blended[sample_at(window, k)])
-    out.blended[window.pixel] = count
+    for k in range(grid.count):
+        count = wp.max(count, samples.blended[sample_at(grid, k)])
+    out.blended[grid.pixel] = count
 
 
 OUTPUT = Output(

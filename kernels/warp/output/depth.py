@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from ..common import View, fma
-from ..window import Window, sample_at
+from ..pixel_grid import PixelGrid, sample_at
 from . import Output
 
 
@@ -31,11 +31,11 @@ def store(pixel: Any, at: int, samples: Any):
 
 
 @wp.func
-def resolve(window: Window, samples: Any, lengths: Any, out: Any):
+def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
     z = wp.vec2()
-    for k in range(window.count):
-        z += samples.depth[sample_at(window, k)]
-    out.depth[window.pixel] = wp.where(z[1] > 0.0, z[0] / z[1], 0.0)
+    for k in range(grid.count):
+        z += samples.depth[sample_at(grid, k)]
+    out.depth[grid.pixel] = wp.where(z[1] > 0.0, z[0] / z[1], 0.0)
 
 
 OUTPUT = Output(

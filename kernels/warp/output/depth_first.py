@@ -6,7 +6,7 @@ from typing import Any
 import warp as wp
 
 from ..common import View
-from ..window import Window, sample_at
+from ..pixel_grid import PixelGrid, sample_at
 from . import Output
 
 
@@ -24,13 +24,13 @@ def store(pixel: Any, at: int, samples: Any):
 
 
 @wp.func
-def resolve(window: Window, samples: Any, lengths: Any, out: Any):
+def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
     nearest = float(wp.inf)
-    for k in range(window.count):
-        hit = samples.depth_first[sample_at(window, k)]
+    for k in range(grid.count):
+        hit = samples.depth_first[sample_at(grid, k)]
         if hit > 0.0:
             nearest = wp.min(nearest, hit)
-    out.depth_first[window.pixel] = wp.where(nearest < wp.inf, nearest, 0.0)
+    out.depth_first[grid.pixel] = wp.where(nearest < wp.inf, nearest, 0.0)
 
 
 OUTPUT = Output(

@@ -6,7 +6,7 @@ from typing import Any
 import warp as wp
 
 from ..common import LEAST_ALPHA, View
-from ..window import Window, sample_at
+from ..pixel_grid import PixelGrid, sample_at
 from . import Output
 
 
@@ -53,15 +53,15 @@ def middle_of(values: Any, count: int) -> float:
 
 
 @wp.func
-def resolve(window: Window, samples: Any, lengths: Any, out: Any):
+def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
     medians = type(lengths)()
     hits = int(0)
-    for k in range(window.count):
-        half = samples.depth_median[sample_at(window, k)]
+    for k in range(grid.count):
+        half = samples.depth_median[sample_at(grid, k)]
         if half > 0.0:
             medians = sorted_in(medians, hits, half)
             hits += 1
-    out.depth_median[window.pixel] = middle_of(medians, hits)
+    out.depth_median[grid.pixel] = middle_of(medians, hits)
 
 
 OUTPUT = Output(

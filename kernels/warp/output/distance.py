@@ -5,19 +5,19 @@ from typing import Any
 import warp as wp
 
 from ..common import fma
-from ..window import Window, sample_at
+from ..pixel_grid import PixelGrid, sample_at
 from . import Output
 
 
 @wp.func
-def resolve(window: Window, samples: Any, lengths: Any, out: Any):
+def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
     along = float(0.0)
     weight = float(0.0)
-    for k in range(window.count):
-        here = samples.depth[sample_at(window, k)]
+    for k in range(grid.count):
+        here = samples.depth[sample_at(grid, k)]
         along = fma(here[0], lengths[k], along)
         weight += here[1]
-    out.distance[window.pixel] = wp.where(weight > 0.0, along / weight, 0.0)
+    out.distance[grid.pixel] = wp.where(weight > 0.0, along / weight, 0.0)
 
 
 OUTPUT = Output(needs=("depth",), length=True, resolve=resolve)

@@ -6,7 +6,7 @@ from typing import Any
 import warp as wp
 
 from ..common import View
-from ..window import Window, sample_at
+from ..pixel_grid import PixelGrid, sample_at
 from . import Output
 
 
@@ -35,12 +35,12 @@ def store(pixel: Any, at: int, samples: Any):
 
 
 @wp.func
-def hidden(window: Window, samples: Any) -> float:
+def hidden(grid: PixelGrid, samples: Any) -> float:
     """Fog is of one colour with what lies behind everything."""
     fogged = float(0.0)
-    for k in range(window.count):
-        fogged += samples.fogged[sample_at(window, k)]
-    return fogged * window.mean
+    for k in range(grid.count):
+        fogged += samples.fogged[sample_at(grid, k)]
+    return fogged * grid.mean
 
 
 OUTPUT = Output(

@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from ..common import View
-from ..window import Window, sample_at
+from ..pixel_grid import PixelGrid, sample_at
 from . import Output
 
 
@@ -55,12 +55,12 @@ def store(pixel: Any, at: int, samples: Any):
 
 
 @wp.func
-def heaviest_of(window: Window, samples: Any) -> int:
+def heaviest_of(grid: PixelGrid, samples: Any) -> int:
     """Of all samples of the pixel."""
     weight = float(0.0)
     which = int(-1)
-    for k in range(window.count):
-        at = sample_at(window, k)
+    for k in range(grid.count):
+        at = sample_at(grid, k)
         if samples.weight[at] > weight:
             weight = samples.weight[at]
             which = samples.heaviest[at]

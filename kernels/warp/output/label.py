@@ -4,18 +4,18 @@ from typing import Any
 
 import warp as wp
 
-from ..window import Window
+from ..pixel_grid import PixelGrid
 from . import Output
 from .heaviest import heaviest_of
 
 
 @wp.func
-def resolve(window: Window, samples: Any, lengths: Any, out: Any):
-    which = heaviest_of(window, samples)
+def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
+    which = heaviest_of(grid, samples)
     label = int(-1)
     if which >= 0:
         label = out.labels[which]
-    out.label[window.pixel] = label
+    out.label[grid.pixel] = label
 
 
 OUTPUT = Output(needs=("heaviest",), cloud_arrays={"labels": wp.int32}, resolve=resolve)

@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from ..common import View
-from ..window import Window, sample_at
+from ..pixel_grid import PixelGrid, sample_at
 from . import Output
 
 
@@ -62,11 +62,11 @@ def store(pixel: Any, at: int, samples: Any):
 
 
 @wp.func
-def unit_of(window: Window, samples: Any) -> wp.vec3:
+def unit_of(grid: PixelGrid, samples: Any) -> wp.vec3:
     """The pixel's normal, of length 1 or 0."""
     sum = wp.vec3()
-    for k in range(window.count):
-        sum += samples.normal[sample_at(window, k)]
+    for k in range(grid.count):
+        sum += samples.normal[sample_at(grid, k)]
     length = wp.length(sum)
     unit = wp.vec3()
     if length > 0.0:
@@ -75,10 +75,10 @@ def unit_of(window: Window, samples: Any) -> wp.vec3:
 
 
 @wp.func
-def resolve(window: Window, samples: Any, lengths: Any, out: Any):
-    unit = unit_of(window, samples)
+def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
+    unit = unit_of(grid, samples)
     for channel in range(3):
-        out.normal[3 * window.pixel + channel] = unit[channel]
+        out.normal[3 * grid.pixel + channel] = unit[channel]
 
 
 OUTPUT = Output(

@@ -4,16 +4,16 @@ from typing import Any
 
 import warp as wp
 
-from ..window import Window
+from ..pixel_grid import PixelGrid
 from . import Output
 from .normal import unit_of
 
 
 @wp.func
-def resolve(window: Window, samples: Any, lengths: Any, out: Any):
-    turned = wp.transpose(out.turns[window.row]) * unit_of(window, samples)
+def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
+    turned = wp.transpose(out.turns[grid.row]) * unit_of(grid, samples)
     for channel in range(3):
-        out.normal_world[3 * window.pixel + channel] = turned[channel]
+        out.normal_world[3 * grid.pixel + channel] = turned[channel]
 
 
 OUTPUT = Output(

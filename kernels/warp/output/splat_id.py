@@ -4,14 +4,14 @@ from typing import Any
 
 import warp as wp
 
-from ..window import Window
+from ..pixel_grid import PixelGrid
 from . import Output
 from .heaviest import heaviest_of
 
 
 @wp.func
-def resolve(window: Window, samples: Any, lengths: Any, out: Any):
-    out.splat_id[window.pixel] = heaviest_of(window, samples)
+def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
+    out.splat_id[grid.pixel] = heaviest_of(grid, samples)
 
 
 OUTPUT = Output(needs=("heaviest",), resolve=resolve)

@@ -1,0 +1,237 @@
+"""OpenCL devices: listing, choosing, opening."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pyopencl as cl
+
+from fidsplat.backends.base import DeviceInfo, Rates
+from fidsplat.backends.opencl import pocl_cache, pocl_target
+from fidsplat.backends.opencl.arithmetic import run_arithmetic
+from fidsplat.backends.opencl.assemble import Source, assemble
+from fidsplat.backends.opencl.pipeline import OpenCLPipeline
+from fidsplat.backends.opencl.probe import OpenCLProbe
+from fidsplat.backends.opencl.resident import Resident
+from fidsplat.backends.opencl.roofline import measure_rates
+from fidsplat.backends.opencl.shapes import DeviceShape, cpu_shape, gpu_shape, other_shapes, shape_for
+from fidsplat.backends.opencl.vendors import intel_among_them
+from fidsplat.backends.opencl.workspace import Workspace
+from fidsplat.effects import FeatureSet
+from fidsplat.errors import DeviceError, UnknownDeviceError
+from fidsplat.splats import SplatCloud
+
+_NO_PATCH_NEEDED = (
+    "a newer PoCL (Debian: pocl-opencl-icd; conda: pocl) or Intel's runtime for CPUs needs no patch "
+    "(docs/backends.md)"
+)
+_PATCHED = f"PoCL 3.0 mistakes this processor, and is patched in memory where it is used; {_NO_PATCH_NEEDED}"
+_NO_PLATFORM = (
+    "no OpenCL platform found; install a CPU one with: pip install 'pyopencl[pocl]' "
+    "(GPUs bring theirs with the driver; its path belongs in a file under /etc/OpenCL/vendors)"
+)
+
+
+def devices() -> list[DeviceInfo]:
+    """Every OpenCL device here, usable or not. An empty list if there is no platform."""
+    return [_describe(device, name) for name, device in _named_devices().items()]
+
+
+def open_device(selector: str = "") -> OpenCLBackend:
+    """The best usable device (GPU before CPU, and last what must be patched) of those whose platform, name or
+    vendor contains `selector`, or the one that `devices` lists as opencl:`selector` where that ends with a
+    number.
+
+    Raises:
+        DeviceError: no OpenCL at all, or none of the devices can be used.
+        UnknownDeviceError: nothing matches the selector.
+    """
+    found = _named_devices()
+    if not found:
+        raise DeviceError(_NO_PLATFORM)
+    wanted = selector.strip().lower()
+    numbered = found.get(f"opencl:{wanted}") if wanted[-1:].isdigit() else None
+    matching = [numbered] if numbered else [device for device in found.values() if _matches(device, wanted)]
+    if not matching:
+        known = "; ".join(f"{name}: {device.name}" for name, device in found.items())
+        raise UnknownDeviceError(f"no OpenCL device matches {selector!r}; there are: {known}")
+    usable = [device for device in matching if not _why_unusable(device)]
+    if not usable:
+        reasons = "; ".join(f"{device.name}: {_why_unusable(device)}" for device in matching)
+        raise DeviceError(f"no usable OpenCL device ({reasons})")
+    return OpenCLBackend(
+        min(usable, key=lambda device: (not device.type & cl.device_type.GPU, _needs_patch(device)))
+    )
+
+
+class OpenCLBackend(Workspace):
+    """An open OpenCL device, and what is compiled for it."""
+
+    always_float64 = False
+
+    def __init__(self, device: cl.Device) -> None:
+        if "Portable Computing Language" in device.platform.name:
+            pocl_cache.check_once()
+        super().__init__(device, _describe(device, _name_of(device)), _shape(device))
+        self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
+
+    def upload(self, cloud: SplatCloud) -> Resident:
+        """The cloud in device buffers."""
+        return Resident(self, cloud)
+
+    def unsupported(self, features: FeatureSet) -> str:
+        """Blending in float64 where the device has none; empty for all else."""
+        if self.info.float64 or "blend_double" not in features.slots:
+            return ""
+        return (
+            f"{self.info.title} has no float64 (cl_khr_fp64) for blend_precision='float64'; use "
+            "blend_precision='float32', or another device"
+        )
+
+    def pipeline(self, features: FeatureSet, shape: DeviceShape | None = None) -> OpenCLPipeline:
+        """The stages compiled for these features; `shape` replaces the device's own build constants (tests).
+
+        Raises:
+            DeviceError: the compiler refuses; its log is in the message. Or what is `unsupported`.
+        """
+        if why := self.unsupported(features):
+            raise DeviceError(why)
+        key = self._key(features, shape)
+        if key[1].blend_items > self.device.max_work_group_size:
+            raise DeviceError(
+                f"{self.info.title} has work-groups of at most {self.device.max_work_group_size}, and "
+                f"tiles of {key[1].tile_width} x {key[1].tile_height} need {key[1].blend_items}"
+            )
+        if key not in self._pipelines:
+            self._pipelines[key] = OpenCLPipeline(self, assemble(*key), *key, self.pipeline)
+        return self._pipelines[key]
+
+    def _key(self, features: FeatureSet, shape: DeviceShape | None) -> tuple[FeatureSet, DeviceShape]:
+        if not self.info.float64 and features.setup_precision != "float32":
+            features = replace(features, setup_precision="float32")
+        return features, shape or shape_for(features, self.shape)
+
+    def source(self, features: FeatureSet) -> Source:
+        """The program for these features on this device, not compiled."""
+        return assemble(*self._key(features, None))
+
+    @property
+    def memory_bytes(self) -> int:
+        """Device memory that scratch buffers hold, and finished planes that nobody has any more."""
+        return self.pool.memory_bytes
+
+    def release_scratch(self) -> None:
+        """Lets go of the scratch buffers; the next picture takes what it needs."""
+        self.pool.clear()
+
+    def rates(self) -> Rates:
+        """What the device can do at best; measured anew at each call."""
+        return measure_rates(self)
+
+    def run_arithmetic(
+        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """As `ProbesArithmetic` (fidsplat/backends/base.py)."""
+        return run_arithmetic(self, exponents, shares, above, below)
+
+    def probe(self) -> OpenCLProbe:
+        """What tests look into the device with."""
+        return OpenCLProbe(self)
+
+    def shapes(self, kind: str) -> dict[str, DeviceShape]:
+        """As `Reshapes` (fidsplat/backends/base.py)."""
+        return other_shapes(self.shape, kind)
+
+    def pieces(self, shape: DeviceShape) -> int:
+        """Chunks of the sorts."""
+        return shape.chunks
+
+
+def _all_devices() -> Iterator[cl.Device]:
+    try:
+        with intel_among_them():
+            platforms = cl.get_platforms()
+    except cl.Error:  # the loader's way to say that there is none
+        return
+    for platform in platforms:
+        try:
+            yield from platform.get_devices()
+        except cl.Error:  # a platform without devices
+            continue
+
+
+def _named_devices() -> dict[str, cl.Device]:
+    """Devices by what to type for them; of several with the platform's name the later ones have a number."""
+    named: dict[str, cl.Device] = {}
+    for device in _all_devices():
+        platform = device.platform.name
+        short = (
+            "pocl" if "Portable Computing Language" in platform else platform.split()[0].split("(")[0].lower()
+        )
+        name, number = f"opencl:{short}", 1
+        while name in named:
+            number += 1
+            name = f"opencl:{short}-{number}"
+        named[name] = device
+    return named
+
+
+def _name_of(device: cl.Device) -> str:
+    return next(name for name, known in _named_devices().items() if known == device)
+
+
+def _matches(device: cl.Device, selector: str) -> bool:
+    aliases = {"pocl": "portable computing language"}
+    named = f"{device.platform.name} {device.name} {device.vendor}".lower()
+    if selector in ("cpu", "gpu"):
+        return bool(device.type & getattr(cl.device_type, selector.upper()))
+    return selector in named or aliases.get(selector, "\0") in named
+
+
+def _why_unusable(device: cl.Device) -> str:
+    if not device.available:
+        return "the driver says that it is not available"
+    if not device.compiler_available:
+        return "it has no compiler for OpenCL C"
+    if not device.endian_little:
+        return "it is big-endian"
+    if _needs_patch(device) and (why := pocl_target.why_not(device.int_ptr, device.version)):
+        return f"this PoCL's compiler does not know the processor, and {why}; {_NO_PATCH_NEEDED}"
+    return ""
+
+
+def _needs_patch(device: cl.Device) -> bool:
+    return pocl_target.needs_correction(device.version)
+
+
+def _describe(device: cl.Device, name: str) -> DeviceInfo:
+    why = _why_unusable(device)
+    kind = (
+        "gpu" if device.type & cl.device_type.GPU else "cpu" if device.type & cl.device_type.CPU else "other"
+    )
+    float64 = "cl_khr_fp64" in device.extensions
+    remarks = ["no float64: per-splat set-up in float32"] * (not float64) + [_PATCHED] * _needs_patch(device)
+    return DeviceInfo(
+        name=name,
+        title=device.name.strip(),
+        platform=device.platform.name.strip(),
+        version=device.version.strip(),
+        kind=kind,
+        compute_units=device.max_compute_units,
+        memory_bytes=device.global_mem_size,
+        largest_allocation_bytes=device.max_mem_alloc_size,
+        float64=float64,
+        usable=not why,
+        reason=why or "; ".join(remarks),
+    )
+
+
+def _shape(device: cl.Device) -> DeviceShape:
+    """Build constants for this device."""
+    fast_fma = bool(device.single_fp_config & cl.device_fp_config.FMA)
+    if device.type & cl.device_type.CPU:
+        lanes = 16 if device.native_vector_width_float >= 16 else 8
+        return cpu_shape(lanes, device.max_compute_units, fast_fma)
+    return gpu_shape(min(1024, device.max_work_group_size), fast_fma)

@@ -1,0 +1,124 @@
+"""The stages of a picture on an in-order queue: project, lists, blend, expose, resolve.
+
+Nothing passes through the host between the stages but the number of (splat, tile) pairs, which sizes one
+buffer. A picture with more pairs than the device's budget is listed and blended in bands of tiles, with the
+same bits. One of several poses is blended pose by pose, and resolved once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import pyopencl as cl
+
+from fidsplat.backends.opencl.lists import LISTS
+from fidsplat.backends.opencl.picture import Picture
+from fidsplat.backends.view import Shot, View
+from fidsplat.effects.catalogue import Output
+
+Images = dict[str, tuple[Output, cl.Buffer]]
+_RAW = ("raw", 4, True)
+"""what every picture blends: name, planes of samples, whether it is light"""
+
+
+def draw(start: Callable[[View], Picture], view: View, outputs: tuple[Output, ...]) -> tuple[Picture, Images]:
+    """All stages; the picture, and its output images by name. `start` begins a picture."""
+    picture = start(view)
+    images = _room_for(outputs, picture)
+    if view.shots:
+        _expose(start, picture)
+        _resolve(picture)
+        return picture, images
+    for _ in _blended(picture):
+        _resolve(picture)
+    return picture, images
+
+
+def _room_for(outputs: tuple[Output, ...], picture: Picture) -> Images:
+    view = picture.view
+    pixels = (view.height // view.samples) * (view.width // view.samples)
+    return {
+        output.name: (output, picture.lease(f"{output.name}_out", 4 * pixels * output.channels))
+        for output in outputs
+    }
+
+
+def _buffers_of(picture: Picture) -> list[tuple[str, int, bool]]:
+    """Of each buffer of samples the name, its planes, and whether it is light."""
+    return [_RAW, *((one.name, one.planes, averaged) for one, averaged in picture.program.source.samples)]
+
+
+def _blended(picture: Picture) -> Iterator[None]:
+    """All stages but the last: yields when all tiles are blended.
+
+    Where lists were made before the host knew their length it may do so twice: what is launched then is under
+    way while the host waits, and what comes last counts.
+    """
+    view, shape = picture.view, picture.shape
+    for name, planes, _ in _buffers_of(picture):
+        picture.take(name, 4 * picture.rows * picture.stride * planes)
+    constants = {
+        **{"log_cut": view.log_cut, "ceiling": view.ceiling, "stop": view.stop},
+        "filter": 1.0 / view.samples**2,
+    }
+    # not an attribute: in a cycle, all that this picture holds would wait for the garbage collector
+    lists = LISTS["chunked" if picture.plan.chunk else shape.lists](picture)
+    group = shape.blend_items
+    for first, end in lists.bands():
+        picture.launch("blend", "blend", (end - first) * group, group, band_first=first, **constants)
+        if end == picture.tiles:
+            if "backdrop" in picture.program.source.arguments:
+                picture.launch_grid("resolve", "backdrop", view.width, view.height)
+            yield
+    picture.stats = lists.stats()
+
+
+def _resolve(picture: Picture) -> None:
+    """The last stage: pixels from samples."""
+    view = picture.view
+    behind = dict(zip(("background_r", "background_g", "background_b"), view.background, strict=True))
+    size = view.width // view.samples, view.height // view.samples
+    picture.launch_grid("resolve", "resolve", *size, **behind)
+
+
+def _expose(start: Callable[[View], Picture], picture: Picture) -> None:
+    """Blends the shots of a picture of several poses one after another, and gathers their samples."""
+    plane, arguments = picture.rows * picture.stride, picture.program.source.arguments
+    for name, planes, _ in _buffers_of(picture):
+        # names of scratch buffers that no shot's own have
+        picture.held[name] = picture.pool.scratch(f"exposed {name}", 4 * plane * planes)
+    counts = {"splats": picture.resident.count, "visible": 0, "pairs": 0}
+    # what is around is the same for all shots
+    around = {
+        one.name: picture.put(one.name, picture.view.array(one.name))
+        for one in arguments.get("backdrop", ())
+        if one.source == "array"
+    }
+    for shot in picture.view.shots:
+        own = start(shot.view)
+        own.held |= around
+        for _ in _blended(own):
+            pass
+        picture.events += own.events
+        _gather(picture, own, shot)
+        for name, value in own.stats().items():
+            counts[name] = max(counts[name], value)
+        picture.uploads += own.uploads
+        picture.pool.give_back(own.leased)
+    if any(one.name == "rays" for one in arguments["resolve"]):
+        picture.put_rays()
+    picture.stats = lambda: counts
+
+
+def _gather(picture: Picture, own: Picture, shot: Shot) -> None:
+    """Adds a shot's samples to the picture's."""
+    whole = {"whole_stride": picture.stride, "whole_plane": picture.rows * picture.stride, "top": shot.top}
+    whole |= {"stride": own.stride, "plane": own.rows * own.stride}
+    size = shot.view.width, shot.view.height
+    for name, planes, averaged in _buffers_of(picture):
+        if not (averaged or shot.middle):
+            continue
+        given = whole | {"planes": planes, "raw": own.held[name], "exposed": picture.held[name]}
+        if averaged:
+            given |= {"weight": shot.weight, "first": shot.first}
+        picture.launch_grid("expose", "expose" if averaged else "expose_middle", *size, **given)

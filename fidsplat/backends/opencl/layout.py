@@ -1,0 +1,372 @@
+"""What host and kernels both know, declared once: records, arguments of kernels, and what effects add to
+them.
+
+The C structs and signatures of kernels/opencl/ are printed from this (assemble.py), and the host binds
+arguments by these names (program.py). Buffers are of planes: (k, rows, columns) of the padded grid of
+samples, unless they say otherwise.
+"""
+
+from __future__ import annotations
+
+from fidsplat.backends.opencl.declare import Argument, Layout, Record, Samples, member, takes, uniforms
+
+VIEW = Record(
+    "View",
+    (
+        member("real rotation[9]", "world to camera, row-major"),
+        member("real translation[3]", "camera-space position of the cloud's origin [m]"),
+        member("real eye[3]", "camera centre relative to the cloud's origin [m]"),
+        member("real focal_x focal_y center_x center_y", "intrinsics of the sample grid [samples]"),
+        member("real near far", "[m]"),
+        member("real log_cut", "ln(alpha cut-off)"),
+        member("real width height", "of the sample grid"),
+        member("real filter", "(pixels per sample)^2, for filters that are defined in pixels"),
+        member("real band band_end", "rows of samples that are drawn now"),
+    ),
+)
+"""The uniforms of the projection; one for the picture, then one for each group of splats that moves by
+itself."""
+
+SPLAT = Record(
+    "Splat",
+    (
+        member("wide nu0 nux nuy", "n_u = nu0 + nux x + nuy y"),
+        member("wide nv0 nvx nvy"),
+        member("wide d0 dx dy", "D"),
+        member("wide d_near", "D at depth `near`: a fragment is in front of the near plane if D <= d_near"),
+        member("wide log_opacity"),
+        member("wide r g b"),
+        member("short ax ay", "anchor pixel"),
+        member("short y0 y1", "rows [y0, y1) that the splat can touch"),
+        member("short x0 x1", "columns [x0, x1)"),
+    ),
+    alignment=16,  # whole vectors of 16 bytes are read and written
+)
+
+BOUNDS = Record(
+    "Bounds",
+    (
+        member("float ex ey", "centre [samples]"),
+        member("float hx hy", "half extents of the axis-aligned box"),
+        member("float slope", "the chord at height Y around the centre is"),
+        member("float half_width", "slope * Y +- half_width * sqrt(1 - Y^2 / hy^2)"),
+        member("float inverse_hy2", "0 makes it a box"),
+        member("float tip", "height at which the ellipse is widest to the right"),
+    ),
+)
+
+_SIZE = takes("int width height  // of the sample grid")
+_BIG = takes("uint big_capacity", "in Bounds big_bounds")
+_DIGIT = takes("in uint tallies", "uint slot shift")
+_WALK = takes("in uint order tallies", "in uint2 windows", _BIG, _SIZE, "out uint table")
+_EXPOSED = takes(
+    _SIZE,
+    "int stride  // samples per row of a shot",
+    "uint plane  // samples per plane of a shot",
+    *("int whole_stride", "uint whole_plane", "int top planes"),
+)
+_RAY = uniforms(
+    "ray",
+    "float ray_focal_x ray_focal_y ray_center_x ray_center_y",
+    note="of the sample grid; infinite where depths are distances",
+)
+
+KERNELS: dict[str, tuple[Argument, ...]] = {
+    "project": takes(
+        "uint count",
+        "in View view",
+        "cloud float means  // (n, 3) [m], relative to the cloud's origin",
+        "cloud float quats  // (n, 4) w x y z",
+        "cloud float scales  // (n, 2) [m]",
+        "cloud float opacities  // (n)",
+        "out Splat splats  // (n)",
+        "out uint keys  // (n)",
+        "out uint2 windows  // (n): corner and bits, or a place in `big` and 0",
+        "out uint tallies",
+        "uint big_capacity",
+        "out uint big  // splats that touch more than a window",
+        "out Bounds big_bounds",
+    ),
+    "pack_count": takes("uint count", "in uint keys", "out uint held"),
+    "pack_move": takes(
+        *("uint count", "in uint places", "in Splat splats", "in uint keys", "in uint2 windows"),
+        *("out Splat splats_out", "out uint keys_out", "out uint2 windows_out"),
+    ),
+    "scan_chunks": takes("uint bins", "out uint table totals"),
+    "scan_bins": takes("uint bins", "in uint totals", "out uint starts tallies", "uint slot"),
+    "sort_count": takes("in uint keys", _DIGIT, "out uint table"),
+    "sort_scatter": takes(
+        *("in uint keys indices", _DIGIT, "uint first"),
+        *("out uint table", "in uint starts", "out uint keys_out indices_out"),
+    ),
+    "bin_count": _WALK,
+    "bin_emit": takes(
+        *(_WALK, "in uint starts", "int band_first band_end", "uint capacity", "out uint lists"),
+    ),
+    "tile_starts": takes("uint tiles capacity", "out uint tallies starts cursors counts"),
+    "tally_big": takes(_SIZE, _BIG, "out uint tallies"),
+    "emit": takes(
+        *(
+            "uint count splat_groups first_band",
+            _SIZE,
+            "int band_first band_end",
+            "uint capacity big_capacity",
+        ),
+        *("in uint2 windows", "in uint keys big", "in Bounds big_bounds", "in uint starts"),
+        *("out uint tallies cursors", "out uint2 pairs"),
+    ),
+    "sort_tiles": takes("int band_first", "in uint starts", "out ulong pairs", "out uint lists"),
+    "blend": takes(
+        *("in Splat splats", "in uint lists starts"),
+        "uint band_first  // the first tile of this launch; lists begin with its list",
+        *(_SIZE, "wide log_cut ceiling stop filter"),
+        "out float raw  // 4 planes: r, g, b, transmittance",
+    ),
+    "expose": takes(_EXPOSED, "float weight", "int first", "in float raw", "out float exposed"),
+    "expose_middle": takes(_EXPOSED, "in uint raw", "out uint exposed"),
+    "backdrop": takes(
+        *(_SIZE, "int stride", "uint plane", _RAY),
+        uniforms(
+            "rotation",
+            "float turn_00 turn_01 turn_02 turn_10 turn_11 turn_12 turn_20 turn_21 turn_22",
+            note="world to camera",
+        ),
+        "out float raw",
+    ),
+    "resolve": takes(
+        "int width height  // of the picture",
+        "int stride  // samples per row of raw",
+        "uint plane  // samples per plane of raw",
+        *("float background_r background_g background_b", "in float raw"),
+    ),
+}
+"""The arguments of each kernel; those of effects and outputs follow them."""
+
+_RAYS = takes("in float rays  // 3 planes X, Y, Z; NaN where nothing is seen")
+_OWN_RAYS = ("camera_brown_conrady", "camera_fisheye", "camera_equirectangular")
+
+LAYOUTS: dict[str, Layout] = {
+    # one of each kind
+    "camera_pinhole": Layout("slot/camera_pinhole.cl", parts=("perspective",)),
+    "camera_brown_conrady": Layout(
+        "slot/camera_brown_conrady.cl",
+        parts=("perspective", "ray_map", "rays"),
+        view=(
+            member("real lens[12]", "k1 to k6, p1, p2, s1 to s4"),
+            member("real lens_fold", "square of the radius where the polynomial turns back"),
+        ),
+    ),
+    "camera_fisheye": Layout(
+        "slot/camera_fisheye.cl",
+        parts=("polygon", "ray_map", "rays"),
+        view=(
+            member("real lens[4]", "k1 to k4"),
+            member("real lens_limit", "largest angle that is seen [rad]"),
+        ),
+    ),
+    "camera_equirectangular": Layout("slot/camera_equirectangular.cl", parts=("polygon", "rays")),
+    "camera_orthographic": Layout(
+        "slot/camera_orthographic.cl",
+        splat=(member("wide z0 zx zy", "depth times D = z0 + zx x + zy y"), member("wide z_near")),
+    ),
+    "color_rgb": Layout("slot/color_rgb.cl", project=takes("cloud float colors  // (n, 3)")),
+    "color_sh": Layout("slot/color_sh.cl", project=takes("cloud float sh  // (n, (SH_DEGREE + 1)^2, 3)")),
+    "lowpass_none": Layout("slot/lowpass_none.cl"),
+    "lowpass_pixel": Layout("slot/lowpass_pixel.cl", parts=("lowpass_none",)),
+    "lowpass_screen": Layout(
+        "slot/lowpass_screen.cl",
+        splat=(
+            member(
+                "wide dot_x dot_y", "projected centre relative to the anchor's; far away if it is not drawn"
+            ),
+        ),
+        bounds=(
+            member("float px py pr", "the filter's support: centre and radius [samples]; radius < 0: none"),
+        ),
+    ),
+    "stop_inclusive": Layout(),
+    "stop_exclusive": Layout("slot/stop_exclusive.cl"),
+    "compose_ordered": Layout("slot/compose_ordered.cl"),
+    "compose_planes": Layout(
+        "slot/compose_planes.cl",
+        parts=("ray_depth",),
+        splat=(member("int plane"),),
+        project=takes(
+            "cloud int planes  // (n) index of the splat's plane; -1: none",
+            "in float plane_keys  // (planes) depth at which its splats are sorted in [m]",
+        ),
+    ),
+    "footprint_gaussian": Layout(),
+    "footprint_box": Layout("slot/footprint_box.cl", parts=("box_edges",)),
+    "footprint_mixed": Layout(
+        "slot/footprint_mixed.cl",
+        parts=("box_edges",),
+        splat=(member("int box"),),
+        project=takes("cloud int boxes  // (n) 1: box, 0: Gaussian"),
+    ),
+    "background_constant": Layout(),
+    "background_gradient": Layout(
+        "slot/background_gradient.cl",
+        parts=("world_ray",),
+        backdrop=uniforms(
+            "gradient", "float sky_r sky_g sky_b", "float ground_r ground_g ground_b", "float up_x up_y up_z"
+        ),
+    ),
+    "background_panorama": Layout(
+        "slot/background_panorama.cl",
+        parts=("world_ray",),
+        backdrop=takes(
+            uniforms("panorama_size", "int panorama_width panorama_height"),
+            "array float panorama  // (panorama_height, panorama_width, 3)",
+        ),
+    ),
+    "arithmetic_precise": Layout("slot/arithmetic_precise.cl"),
+    "arithmetic_fast": Layout("slot/arithmetic_fast.cl"),
+    "motion_groups": Layout(
+        "slot/motion_groups.cl",
+        project=takes("cloud int labels  // (n)", "in int moving  // number of groups, then their labels"),
+    ),
+    "shutter_exposure": Layout("slot/shutter_exposure.cl"),
+    "shutter_rows": Layout("slot/shutter_rows.cl"),
+    "blend_double": Layout(),
+    # what several of them share
+    "perspective": Layout("part/perspective.cl"),
+    "polygon": Layout("part/polygon.cl"),
+    "ray_map": Layout(
+        "part/ray_map.cl",
+        view=(member("real map[6]", "low corner, cells per unit along x and y, cells a side, first row"),),
+        project=takes("in short4 ray_map"),
+    ),
+    "rays": Layout(
+        "part/rays.cl",
+        splat=(
+            member("wide nuz nvz dz", "n_u = nu0 + nux X + nuy Y + nuz Z, likewise n_v and D"),
+            member("wide ray_x ray_y ray_z", "X, Y, Z are relative to this ray"),
+        ),
+        project=_RAYS,
+        blend=_RAYS,
+        backdrop=_RAYS,
+    ),
+    "box_cover": Layout("part/box_cover.cl"),
+    "box_edges": Layout(
+        "part/box_edges.cl",
+        parts=("box_cover",),
+        splat=(
+            member(
+                "wide edge_u0 edge_u1 edge_v0 edge_v1",
+                "1 / |grad| of the forms D + n_u, D - n_u, D + n_v, D - n_v",
+            ),
+        ),
+        behind=tuple((camera, "rays_box") for camera in _OWN_RAYS),
+    ),
+    "rays_box": Layout(
+        "part/rays_box.cl",
+        parts=("box_cover",),
+        project=takes("in float ray_step  // (1) how far a ray turns from a sample to the next, at most"),
+        blend=takes("in float ray_slopes  // 6 planes dX/dx, dY/dx, dZ/dx, dX/dy, dY/dy, dZ/dy"),
+    ),
+    "ray_depth": Layout(
+        "part/ray_depth.cl",
+        splat=(member("wide z_numerator", "depth = z_numerator / D"), member("wide z_center z_reach")),
+    ),
+    "shown": Layout("part/shown.cl"),
+    "ray": Layout(resolve=_RAY),
+    "turn": Layout("part/turn.cl", resolve=takes("array float turns  // (h, 3, 3)")),
+    # rays of fisheyes and panoramas have a length of 1
+    "ray_length": Layout("part/ray_length.cl", behind=(("camera_brown_conrady", "rays_length"),)),
+    "rays_length": Layout("part/rays_length.cl"),
+    "sample_length": Layout(
+        "part/sample_length.cl",
+        parts=("ray", "ray_length"),
+        behind=(("camera_brown_conrady", "rays_sample_length"),),
+    ),
+    "rays_sample_length": Layout("part/rays_sample_length.cl", parts=("rays_length",), resolve=_RAYS),
+    "world_ray": Layout("part/world_ray.cl"),
+    # outputs
+    "alpha": Layout("output/alpha.cl"),
+    "depth": Layout(
+        "output/depth.cl",
+        parts=("ray_depth", "shown"),
+        samples=(Samples("float", "depth_raw", 2, "sum w z, sum w"),),
+    ),
+    "depth_median": Layout(
+        "output/depth_median.cl",
+        parts=("ray_depth", "shown"),
+        samples=(Samples("float", "depth_median_raw"),),
+    ),
+    "depth_first": Layout(
+        "output/depth_first.cl",
+        parts=("ray_depth",),
+        blend=uniforms("first_light", "float first_light"),
+        samples=(Samples("float", "depth_first_raw"),),
+    ),
+    "distance": Layout("output/distance.cl", parts=("depth", "sample_length")),
+    "distance_median": Layout("output/distance_median.cl", parts=("depth_median", "sample_length")),
+    "distance_first": Layout("output/distance_first.cl", parts=("depth_first", "sample_length")),
+    "normal": Layout(
+        "output/normal.cl",
+        parts=("shown",),
+        splat=(member("wide nx ny nz"),),
+        samples=(Samples("float", "normal_raw", 3),),
+    ),
+    "normal_world": Layout("output/normal_world.cl", parts=("normal", "turn")),
+    "label": Layout(
+        "output/label.cl",
+        parts=("shown",),
+        splat=(member("int label"),),
+        project=takes("cloud int labels  // (n)"),
+        samples=(Samples("float", "label_raw"), Samples("int", "label_id_raw")),
+    ),
+    "splat_id": Layout(
+        "output/splat_id.cl",
+        parts=("shown",),
+        splat=(member("int splat_id"),),
+        project=takes("cloud int splat_ids  // (n)"),
+        samples=(Samples("float", "splat_id_raw"), Samples("int", "splat_id_index_raw")),
+    ),
+    "overdraw": Layout("output/overdraw.cl", samples=(Samples("int", "overdraw_raw"),)),
+    "blended": Layout("output/blended.cl", samples=(Samples("int", "blended_raw"),)),
+    # what changes rgb on its way out
+    "fog": Layout(
+        "output/fog.cl",
+        parts=("ray_depth", "ray_length"),
+        blend=takes(uniforms("fog_density", "float fog_density"), _RAY),
+        samples=(Samples("float", "fog_raw"),),
+        averaged=True,
+    ),
+    "exposure": Layout("post/exposure.cl", resolve=uniforms("exposure", "float exposure")),
+    "vignetting": Layout(
+        "post/vignetting.cl",
+        resolve=takes(
+            uniforms(
+                "vignette_center",
+                "float vignette_x vignette_y vignette_scale",
+                note="principal point [px], 1 / (half diagonal [px])",
+            ),
+            uniforms("vignetting", "float vignette_a vignette_b vignette_c"),
+        ),
+    ),
+    "noise": Layout(
+        "post/noise.cl",
+        resolve=uniforms(
+            "noise",
+            "float shot_variance read_variance",
+            "uint noise_seed",
+            note="at value 1, and at every value",
+        ),
+    ),
+    "gain": Layout("post/gain.cl", resolve=uniforms("gain", "float gain")),
+    "response_gamma": Layout(
+        "post/response_gamma.cl", resolve=uniforms("inverse_gamma", "float inverse_gamma")
+    ),
+    "response_srgb": Layout("post/response_srgb.cl"),
+    "response_table": Layout(
+        "post/response_table.cl",
+        resolve=takes(
+            uniforms("response_count", "int response_count"),
+            "array float response  // (response_count)",
+        ),
+    ),
+    "quantise": Layout("post/quantise.cl", resolve=uniforms("quantise_steps", "float quantise_steps")),
+}
+"""How each effect is laid out, and the parts that several share."""

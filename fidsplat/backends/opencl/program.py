@@ -1,0 +1,126 @@
+"""Kernels that are compiled, and launched with arguments bound by the names that layout.py declares."""
+
+from __future__ import annotations
+
+import importlib
+import sqlite3
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import pyopencl as cl
+
+from fidsplat.backends.opencl.assemble import Source, kernel_text, with_scalars
+from fidsplat.backends.opencl.pocl_target import correct_target, needs_correction
+from fidsplat.backends.opencl.workspace import DeviceBuffer, Workspace
+from fidsplat.errors import DeviceError
+
+
+def load_invoker() -> None:
+    """Imports the part of pyopencl that sets arguments, which opens a database in the user's cache folder.
+
+    Where that is damaged this process does without it, and makes anew what it holds.
+    """
+    try:
+        importlib.import_module("pyopencl.invoker")
+    except sqlite3.DatabaseError:
+        cl._PYOPENCL_NO_CACHE = True
+        importlib.import_module("pyopencl.invoker")
+
+
+def build_options(device: cl.Device) -> list[str]:
+    """What every program is compiled with: no option that lets go of IEEE arithmetic."""
+    version, target = device.version, device.version
+    if needs_correction(version):
+        target = correct_target(device.int_ptr, version)
+    # the target's name is part of pyopencl's cache key: PoCL's own version string does not tell processors
+    # apart
+    target = "".join(c if c.isalnum() else "_" for c in target)
+    options = ["-cl-std=CL1.2", "-w", f"-DTARGET_{target}"]
+    if device.platform.name == "NVIDIA CUDA":
+        # the projection wants 98 registers; two fewer let a quarter more work-items run at once
+        options.append("-cl-nv-maxrregcount=96")
+    return options
+
+
+def build(workspace: Workspace, text: str, *options: str) -> cl.Program:
+    """A program from OpenCL C.
+
+    Raises:
+        DeviceError: the compiler refuses; its log is in the message.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", cl.CompilerWarning)
+            program = cl.Program(workspace.context, text)
+            return program.build(options=[*build_options(workspace.device), *options])
+    except cl.Error as error:
+        raise DeviceError(f"{workspace.info.title} cannot compile the kernels: {error}") from error
+
+
+class Program:
+    """The kernels of one source on one device."""
+
+    def __init__(self, workspace: Workspace, source: Source) -> None:
+        self.source = source
+        built = build(workspace, source.text)
+        self._queue = workspace.queue
+        load_invoker()
+        self._kernels = {kernel.function_name: kernel for kernel in built.all_kernels()}
+        self._types = {
+            kernel: [None if one.access else source.scalars.dtype(one.ctype).type for one in arguments]
+            for kernel, arguments in source.arguments.items()
+        }
+        self._bound: dict[str, list[object]] = {}
+
+    @property
+    def kernels(self) -> dict[str, cl.Kernel]:
+        """All of them, by name."""
+        return self._kernels
+
+    def launch(
+        self, name: str, size: tuple[int, ...], group: tuple[int, ...], values: Sequence[Any]
+    ) -> cl.Event:
+        """Launches a kernel with buffers and numbers in the order of its arguments.
+
+        Only those are set that have changed since its last launch: from picture to picture hardly any do, and
+        setting them takes the host longer than a small stage takes a GPU. A buffer is remembered by its
+        token, so that a cloud or a picture that nobody has any more is let go.
+        """
+        kernel, types = self._kernels[name], self._types[name]
+        nothing: list[object] = [None] * len(types)
+        bound = self._bound.pop(name, nothing)
+        for index, (value, scalar) in enumerate(zip(values, types, strict=True)):
+            if scalar is not None:
+                mark: object = value
+            else:  # part of a buffer is made anew for each launch
+                mark = value.token if type(value) is DeviceBuffer else object()
+            if mark is not bound[index] and (type(mark) is not type(bound[index]) or mark != bound[index]):
+                kernel.set_arg(index, value if scalar is None else scalar(value))
+                bound[index] = mark
+        self._bound[name] = bound
+        return cl.enqueue_nd_range_kernel(self._queue, kernel, size, group)
+
+
+def check_kernels(
+    workspace: Workspace, file: str = "", text: str = "", lanes: int = 0, **sections: str
+) -> dict[str, cl.Kernel]:
+    """The kernels of a file below kernels/opencl/, or of a text, compiled as the stages are: after prelude.cl
+    and math.cl, whose hooks `sections` fill. lanes: 0 for the device's own.
+
+    Raises:
+        DeviceError: the compiler refuses.
+    """
+    defines = {
+        "LANES": lanes or workspace.shape.lanes,
+        "FAST_FMA": int(workspace.shape.fast_fma),
+        "SETUP_FP64": int(workspace.info.float64),
+    }
+    head = "".join(f"#define {name} {value}\n" for name, value in defines.items())
+    files = ("prelude.cl", "math.cl", *([file] if file else ()))
+    head += "".join(map(kernel_text, files))
+    for name, section in sections.items():
+        head = head.replace(f"//@@ {name}\n", section)
+    built = build(workspace, with_scalars(head) + text)
+    load_invoker()
+    return {kernel.function_name: kernel for kernel in built.all_kernels()}

@@ -1,0 +1,114 @@
+"""Clouds in device buffers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import pyopencl as cl
+
+from fidsplat.backends.opencl.workspace import DeviceBuffer, Workspace
+from fidsplat.backends.planes import PlaneTable
+from fidsplat.errors import DeviceError
+from fidsplat.splats import SplatCloud
+
+
+class Resident:
+    """A SplatCloud on the device.
+
+    A CPU reads the cloud's own arrays, without a copy. On other devices they are copied, labels and colours
+    when a picture first asks for them, or, where they would take more than half of the memory budget, a chunk
+    at a time for every picture (`streamed`).
+    """
+
+    def __init__(self, workspace: Workspace, cloud: SplatCloud) -> None:
+        self._workspace = workspace
+        self.count = len(cloud)
+        self.origin = cloud.origin
+        self.sh_degree = cloud.sh_degree
+        self.has_planes = cloud.planes is not None
+        self.footprint = cloud.footprint
+        self.planes = PlaneTable(cloud) if self.has_planes else None
+        self._arrays = {
+            "means": cloud.means,
+            "quats": cloud.quats,
+            "scales": cloud.scales,
+            "opacities": cloud.opacities,
+            "labels": cloud.labels,
+        }
+        if self.planes is not None:
+            self._arrays["planes"] = self.planes.index
+        if cloud.boxes is not None:
+            self._arrays["boxes"] = cloud.boxes.astype(np.int32)
+        plain = cloud.plain_colors
+        if plain is not None:
+            self._arrays["colors"] = plain
+        elif cloud.sh is not None:  # always: a cloud has one of the two
+            self._arrays["sh"] = cloud.sh
+        self._buffers: dict[str, cl.Buffer] = {}
+        total = self.count * self._bytes_of(self._arrays)
+        widest = max(array.nbytes for array in self._arrays.values())
+        device = workspace.device
+        self._shared = workspace.info.kind == "cpu" and bool(device.host_unified_memory)
+        self.streamed = not self._shared and (
+            total > workspace.memory_budget // 2 or widest > device.max_mem_alloc_size
+        )
+        if not self._shared and not self.streamed:
+            try:
+                for name in self._arrays.keys() - {"labels", "colors", "sh"}:
+                    self._whole(name)
+                workspace.queue.finish()
+            except cl.Error as error:
+                raise DeviceError(f"{workspace.info.title} failed while taking the cloud: {error}") from error
+
+    def _bytes_of(self, names: Iterable[str]) -> int:
+        """Bytes of a splat in these arrays."""
+        return sum(self._array(name).nbytes // max(self.count, 1) for name in names)
+
+    def bytes_for(self, names: Iterable[str]) -> tuple[int, int]:
+        """What a picture that asks for these arrays makes of the cloud: bytes that stay on the device, and
+        bytes per splat that each picture copies there."""
+        if self._shared:
+            return 0, 0
+        if self.streamed:
+            return 0, self._bytes_of(names)
+        return self.count * self._bytes_of({*names, *self._buffers}), 0
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes that the cloud holds on the device; a CPU's are the host's."""
+        return 0 if self._shared else sum(buffer.size for buffer in self._buffers.values())
+
+    def part(self, name: str, first: int, end: int) -> cl.Buffer:
+        """The array of splats [first, end)."""
+        if self.streamed:
+            piece = np.ascontiguousarray(self._array(name)[first:end])
+            buffer = self._workspace.pool.scratch(f"chunk of {name}", piece.nbytes)
+            cl.enqueue_copy(self._workspace.queue, buffer, piece)
+            return buffer
+        whole = self._whole(name)
+        if end - first == self.count:
+            return whole
+        row = self._array(name).nbytes // self.count
+        return whole.get_sub_region(first * row, (end - first) * row)
+
+    def _array(self, name: str) -> np.ndarray:
+        """The array on the host; ids are made when a picture first asks for them."""
+        if name == "splat_ids" and name not in self._arrays:
+            self._arrays[name] = np.arange(self.count, dtype=np.int32)
+        return self._arrays[name]
+
+    def _whole(self, name: str) -> cl.Buffer:
+        if name not in self._buffers:
+            array = np.ascontiguousarray(self._array(name))
+            flags = cl.mem_flags
+            if array.size == 0:
+                buffer = self._workspace.pool.fresh(f"the cloud's {name}", 16)
+            elif self._shared:
+                flags = flags.READ_ONLY | flags.USE_HOST_PTR
+                buffer = DeviceBuffer(self._workspace.context, flags, hostbuf=array)
+            else:
+                buffer = self._workspace.pool.fresh(f"the cloud's {name}", array.nbytes)
+                cl.enqueue_copy(self._workspace.queue, buffer, array)
+            self._buffers[name] = buffer
+        return self._buffers[name]

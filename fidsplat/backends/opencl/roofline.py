@@ -1,0 +1,76 @@
+"""Times the kernels of kernels/opencl/check/roofline.cl: what this device can do at best."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pyopencl as cl
+
+from fidsplat.backends.base import Rates
+from fidsplat.backends.opencl.program import check_kernels
+from fidsplat.backends.opencl.workspace import Workspace
+from fidsplat.errors import DeviceError
+
+_CHAINS = 8  # as in roofline.cl
+_REPEATS = 7
+_SHORTEST = 8e-3  # seconds that a timed launch lasts at least
+_GROUP = 64
+
+
+def measure_rates(workspace: Workspace) -> Rates:
+    """The best of several launches each, with the vectors that the blend stage uses. Under a second.
+
+    Raises:
+        DeviceError: the device cannot compile or run the kernels.
+    """
+    kernels = check_kernels(workspace, "check/roofline.cl")
+    try:
+        return Rates(
+            copy_bytes=_copy_rate(workspace, kernels["roofline_copy"]),
+            fma=_operation_rate(workspace, kernels["roofline_fma"], 0.999, 0.001),
+            exp=_operation_rate(workspace, kernels["roofline_exp"], 0.0, 0.0),
+            division=_operation_rate(workspace, kernels["roofline_division"], 1.5, 0.0),
+        )
+    except cl.Error as error:
+        raise DeviceError(f"{workspace.info.title} failed while its rates were measured: {error}") from error
+
+
+def _copy_rate(workspace: Workspace, kernel: cl.Kernel) -> float:
+    """Bytes per second, those read and those written together; buffers that no cache holds."""
+    wanted = 2**29 if workspace.info.kind == "gpu" else 2**27
+    share = min(workspace.info.largest_allocation_bytes, workspace.info.memory_bytes) // 8
+    size = min(wanted, share) // (16 * _GROUP) * 16 * _GROUP
+    source, target = (workspace.pool.fresh("copied", size) for _ in range(2))
+    cl.enqueue_fill_buffer(workspace.queue, source, np.zeros(1, np.float32), 0, size)
+    items = size // 16
+    best = _best(lambda: kernel(workspace.queue, (items,), (_GROUP,), source, target))
+    return 2 * size / best
+
+
+def _operation_rate(workspace: Workspace, kernel: cl.Kernel, a: float, b: float) -> float:
+    """Results per second."""
+    # a GPU needs many work-items to hide its latencies; on a CPU a few groups per core are plenty
+    groups = workspace.info.compute_units * (32 if workspace.info.kind == "gpu" else 4)
+    items = groups * _GROUP
+    out = workspace.pool.fresh("sums", 4 * items * workspace.shape.lanes)
+
+    def launch(rounds: int) -> cl.Event:
+        return kernel(
+            workspace.queue, (items,), (_GROUP,), np.uint32(rounds), np.float32(a), np.float32(b), out
+        )
+
+    rounds = 16
+    while _seconds(launch(rounds)) < _SHORTEST and rounds < 2**24:
+        rounds *= 2
+    best = _best(lambda: launch(rounds))
+    return items * workspace.shape.lanes * _CHAINS * rounds / best
+
+
+def _best(launch: Callable[[], cl.Event]) -> float:
+    return min(_seconds(launch()) for _ in range(_REPEATS))
+
+
+def _seconds(event: cl.Event) -> float:
+    event.wait()
+    return max(event.profile.end - event.profile.start, 1) * 1e-9

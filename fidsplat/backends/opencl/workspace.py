@@ -1,0 +1,189 @@
+"""What an open device holds for all pictures: its queues, a pool of scratch buffers, the rays of lenses, and
+how much memory a picture may take.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Collection, Hashable
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import pyopencl as cl
+
+from fidsplat.backends.base import DeviceInfo
+from fidsplat.backends.opencl.memory_plan import PAIR
+from fidsplat.backends.opencl.shapes import DeviceShape
+from fidsplat.cameras.raster import RayRaster
+from fidsplat.errors import DeviceError
+
+_LEAST = 16  # bytes; OpenCL has no empty buffers
+
+
+class DeviceBuffer(cl.Buffer):
+    """A buffer with a token of its own: to remember that is not to keep the buffer."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.token = object()
+
+
+class BufferPool:
+    """Scratch buffers by name, kept from frame to frame and replaced only when one is too small."""
+
+    def __init__(self, context: cl.Context, device: cl.Device) -> None:
+        self._context = context
+        self._device = device
+        self._buffers: dict[str, cl.Buffer] = {}
+        self._contents: dict[str, weakref.ref[np.ndarray]] = {}
+        self._spare: dict[str, list[cl.Buffer]] = {}
+        self._kind: Hashable = None
+
+    def size(self, name: str) -> int:
+        """Bytes of the scratch buffer of that name; 0 if there is none yet."""
+        return self._buffers[name].size if name in self._buffers else 0
+
+    def lease(self, name: str, size: int) -> cl.Buffer:
+        """A buffer for somebody who gives it back (`give_back`) when it is not needed any more."""
+        # taken before it is looked at: planes that die meanwhile may give back others
+        spare = self._spare.get(name, [])
+        while spare:
+            buffer = spare.pop()
+            if buffer.size == max(size, _LEAST):
+                return buffer  # else it was of a picture of another size
+        return self.fresh(name, size)
+
+    def give_back(self, buffers: list[tuple[str, cl.Buffer]]) -> None:
+        """Keeps one or two leased buffers of a name for the next picture of the same size."""
+        for name, buffer in buffers:
+            spare = self._spare.setdefault(name, [])
+            if not spare or (len(spare) == 1 and spare[0].size == buffer.size):
+                spare.append(buffer)
+
+    @property
+    def memory_bytes(self) -> int:
+        """What the scratch buffers hold, and leased ones that were given back."""
+        spare = (buffer for buffers in self._spare.values() for buffer in buffers)
+        return sum(buffer.size for buffer in (*self._buffers.values(), *spare))
+
+    def make_way(self, kind: Hashable, size: int) -> None:
+        """Before a picture: lets go of what pictures of another kind have left, if that is more than `size`
+        bytes. Pictures of one kind take buffers of the same sizes."""
+        if kind != self._kind and self.memory_bytes > size:
+            self.clear()
+        self._kind = kind
+
+    def clear(self) -> None:
+        """Lets go of all that it holds."""
+        self._spare.clear()
+        self._buffers.clear()
+        self._contents.clear()
+
+    def holding(self, name: str, array: np.ndarray) -> cl.Buffer | None:
+        """The scratch buffer of that name, if what it has still is this array (`now_holds`)."""
+        content = self._contents.get(name)
+        return self._buffers[name] if content is not None and content() is array else None
+
+    def now_holds(self, name: str, array: np.ndarray) -> None:
+        """Remembers that the scratch buffer of that name has this array, if the array stays as it is."""
+        if not array.flags.writeable and array.flags.owndata:
+            self._contents[name] = weakref.ref(array)
+
+    def scratch(self, name: str, size: int) -> cl.Buffer:
+        """A buffer of at least `size` bytes whose content is undefined."""
+        self._contents.pop(name, None)
+        held = self._buffers.get(name)
+        if held is None or held.size < size:
+            self._buffers.pop(name, None)
+            held = self._buffers[name] = self.fresh(name, size)
+        return held
+
+    def fresh(self, name: str, size: int) -> cl.Buffer:
+        """A buffer that nobody else holds.
+
+        Raises:
+            DeviceError: the device cannot give that much at once.
+        """
+        limit = self._device.max_mem_alloc_size
+        if size > limit:
+            raise DeviceError(
+                f"{name} needs {size / 2**20:.0f} MiB in one piece, but {self._device.name.strip()} gives at "
+                f"most {limit / 2**20:.0f} MiB; use fewer splats or a smaller picture"
+            )
+        try:
+            return DeviceBuffer(self._context, cl.mem_flags.READ_WRITE, max(size, _LEAST))
+        except cl.Error as error:
+            raise DeviceError(f"no memory for {name} ({size / 2**20:.0f} MiB): {error}") from error
+
+
+class Workspace:
+    """An open device: its queues and buffers."""
+
+    def __init__(self, device: cl.Device, info: DeviceInfo, shape: DeviceShape) -> None:
+        self.device, self.info, self.shape = device, info, shape
+        self.context = cl.Context([device])
+        self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
+        self.side_queue = cl.CommandQueue(self.context)
+        """for what the host reads while the stages run"""
+        self.pool = BufferPool(self.context, device)
+        self.ray_buffers = RayBuffers(self)
+        self.limit_memory(info.memory_bytes * 9 // 10)
+
+    def limit_memory(self, budget: int) -> None:
+        """Lets a picture and the cloud take at most `budget` bytes of the device.
+
+        Pictures that need more are drawn in bands of tiles and chunks of splats, with the same bits.
+        """
+        self.memory_budget = budget
+        largest = self.device.max_mem_alloc_size // 8
+        self.pair_budget = max(1, min(largest, budget // 8 // PAIR[self.shape.lists], 2**32 - 1))
+        """most pairs of splats and tiles that are listed at once"""
+
+
+class RayBuffers:
+    """The buffers `rays`, `ray_map` and so on (kernels/opencl/slot) of the rasters that were drawn last."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self._workspace = workspace
+        self._held: WeakKeyDictionary[RayRaster, dict[tuple[int, int], dict[str, cl.Buffer]]] = (
+            WeakKeyDictionary()
+        )
+
+    def of(self, raster: RayRaster, rows: int, columns: int, slopes: bool = False) -> dict[str, cl.Buffer]:
+        """Buffers by name, for a sample grid that is padded to rows x columns. slopes: those of boxes too."""
+        sizes = self._held.setdefault(raster, {})
+        if (rows, columns) not in sizes:
+            sizes[rows, columns] = {"rays": self._planes("rays", raster.rays, rows, columns)}
+            if raster.lens.kind != "equirectangular":
+                sizes[rows, columns]["ray_map"] = self._map(raster.whole or raster)
+        held = sizes[rows, columns]
+        if slopes and "ray_slopes" not in held:
+            flat = raster.slopes.reshape(raster.height, raster.width, 6)
+            held["ray_slopes"] = self._planes("ray_slopes", flat, rows, columns)
+            held["ray_step"] = self._put("ray_step", np.array([raster.step], np.float32))
+        return held
+
+    def _planes(self, name: str, array: np.ndarray, rows: int, columns: int) -> cl.Buffer:
+        planes = np.full((array.shape[2], rows, columns), np.nan, np.float32)
+        planes[:, : array.shape[0], : array.shape[1]] = np.moveaxis(array, 2, 0)
+        return self._put(name, planes)
+
+    @staticmethod
+    def bytes_of(rasters: Collection[RayRaster], tile_height: int, columns: int, slopes: bool) -> int:
+        """What the buffers of the rasters of one picture take, for grids that are padded to whole tiles."""
+        rows = sum(-(-raster.height // tile_height) * tile_height for raster in rasters)
+        one = next(iter(rasters))
+        each = 36 if slopes else 12
+        return each * rows * columns + (one.map[0].nbytes if one.lens.kind != "equirectangular" else 0)
+
+    def _map(self, raster: RayRaster) -> cl.Buffer:
+        maps = self._held.setdefault(raster, {}).setdefault((0, 0), {})
+        if "ray_map" not in maps:
+            maps["ray_map"] = self._put("ray_map", raster.map[0])
+        return maps["ray_map"]
+
+    def _put(self, name: str, array: np.ndarray) -> cl.Buffer:
+        buffer = self._workspace.pool.fresh(name, array.nbytes)
+        cl.enqueue_copy(self._workspace.queue, buffer, array)
+        return buffer

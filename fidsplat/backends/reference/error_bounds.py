@@ -1,0 +1,247 @@
+"""What single precision may change: the certificates that go with the reference's planes.
+
+A device evaluates the affine forms n_u, n_v, D of a pixel in float32, about the pixel nearest to the splat's
+centre. Interval arithmetic over their rounding gives for each fragment the least and the greatest opacity
+that it may be drawn with: far apart where a decision lies on its threshold (a rim, the near plane, the
+horizon) or where the splat is thinner than the rounding of its distance (needles, grazing disks). A pixel's
+certificate adds up what that can change in it, to first order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fidsplat.backends.reference.fragments import Fragments, cover, shifted
+from fidsplat.backends.reference.optics import ROUND
+from fidsplat.backends.reference.setup import Setup
+from fidsplat.backends.view import View
+
+_ROUND = ROUND
+_WEIGHT = 2 * _ROUND  # relative, of half rho and of an opacity: a division, two products, exp
+STOP = 5e-5
+"""relative, of a transmittance at a threshold"""
+
+
+@dataclass
+class Span:
+    """Between which values fragments or layers (k, n) may lie."""
+
+    low: np.ndarray
+    """opacity"""
+    high: np.ndarray
+    z_low: np.ndarray
+    """metres"""
+    z_high: np.ndarray
+    front_low: np.ndarray
+    """transmittance in front of the fragment"""
+    front_high: np.ndarray
+
+    @classmethod
+    def of(cls, low: np.ndarray, high: np.ndarray, z_low: np.ndarray, z_high: np.ndarray) -> Span:
+        """With the transmittances that follow, for things in the order in which they are composited."""
+        fronts = shifted(np.cumprod(1 - high, axis=1)), shifted(np.cumprod(1 - low, axis=1))
+        return cls(low, high, z_low, z_high, *fronts)
+
+
+def span_of(s: Setup, view: View, f: Fragments) -> Span:
+    """The span of fragments whose forms are computed in float32."""
+    terms = [s.forms[:, :, c] for c in range(3)]
+    e_u, e_v, e_d = (
+        _rounding(s, f, form, term) for form, term in zip((f.n_u, f.n_v, f.d), terms, strict=True)
+    )
+    # one rounding where it is the splat's; a form of its own for parallel rays
+    e_dz = _ROUND * f.dz if s.depth_forms is None else _rounding(s, f, f.dz, s.depth_forms)
+    d_low, d_high = f.d - e_d, f.d + e_d
+    q_low = np.maximum(np.abs(f.n_u) - e_u, 0) ** 2 + np.maximum(np.abs(f.n_v) - e_v, 0) ** 2
+    q_high = (np.abs(f.n_u) + e_u) ** 2 + (np.abs(f.n_v) + e_v) ** 2
+    slack = _ROUND * (np.abs(s.log_opacity) + s.half_r2)  # the squared radius is a difference of float32
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        may = (d_high > 0) & (d_low * view.near <= f.dz + e_dz)
+        must = (d_low > 0) & (d_high * view.near <= f.dz - e_dz)
+        nearest, furthest = q_low / (2 * d_high**2), q_high / (2 * d_low**2)
+        nearest = np.where(may & (nearest <= s.half_r2 + slack), nearest, np.inf)
+        furthest = np.where(must & (furthest <= s.half_r2 - slack), furthest, np.inf)
+        near_dz, far_dz = (f.dz, f.dz) if s.depth_forms is None else (f.dz - e_dz, f.dz + e_dz)
+        z_low = np.where(d_high > 0, near_dz / np.where(near_dz < 0, d_low, d_high), np.inf)
+        z_high = np.where(d_low > 0, far_dz / np.where(far_dz < 0, d_high, d_low), np.inf)
+    if s.screen:
+        away, off = np.sqrt(f.offset), _ROUND * (1 + f.dx + f.dy)
+        dot_low, dot_high = np.maximum(away - off, 0) ** 2, (away + off) ** 2
+        nearest = np.minimum(nearest, np.where(dot_low <= s.half_r2 + slack, dot_low, np.inf))
+        furthest = np.minimum(furthest, np.where(dot_high <= s.half_r2 - slack, dot_high, np.inf))
+    low = np.exp(s.log_opacity - furthest * (1 + _WEIGHT)) * (1 - _WEIGHT)
+    high = np.exp(s.log_opacity - nearest * (1 - _WEIGHT)) * (1 + _WEIGHT)
+    low, high = np.minimum(low, view.ceiling), np.minimum(high, view.ceiling)
+    if s.box.any():
+        # of an edge's distance: its two forms', one of them multiplied once more, the sum's, and near it the
+        # gradient's
+        off = np.stack(
+            [
+                (e_d + 1.5 * e) * edge + _ROUND * terms
+                for e, edge, terms in zip((e_u, e_u, e_v, e_v), f.edges, f.edge_terms, strict=True)
+            ]
+        )
+        whole = np.minimum(np.exp(s.log_opacity), view.ceiling)
+        least = whole * cover(f.edges, f.n_u, f.n_v, f.d, -off - _ROUND) * (1 - _WEIGHT)
+        most = whole * cover(f.edges, f.n_u, f.n_v, f.d, off + _ROUND) * (1 + _WEIGHT)
+        low = np.where(s.box, np.where(must, least, 0.0), low)
+        high = np.where(s.box, np.where(may, most, 0.0), high)
+    # no ray to the plane: the centre's depth
+    z_low = np.where(d_low > 0, np.clip(z_low, s.pz - s.reach, s.pz + s.reach), s.pz - s.reach)
+    z_high = np.clip(z_high, s.pz - s.reach, s.pz + s.reach)
+    missed = d_high <= 0
+    z_low, z_high = np.where(missed, s.pz, z_low), np.where(missed, s.pz, z_high)
+    return Span.of(low, high, z_low, z_high)
+
+
+def _rounding(s: Setup, f: Fragments, form: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """What rounding may change (k, n) in forms (k, n) with factors (3, n)."""
+    total = np.abs(form)
+    for away, term in zip(f.away, terms, strict=True):
+        total = total + away * np.abs(term)
+    return s.round * total
+
+
+def of_color(s: Setup, view: View, span: Span, before: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """What may change (k,) in colour and alpha, per unit of colour; moved (k, m): in each thing itself."""
+    bound = (before * (span.high - span.low)).sum(1)
+    t_low = span.front_low * (1 - span.high) * (1 - STOP)
+    t_high = span.front_high * (1 - span.low) * (1 + STOP)
+    may_stop = (span.high > 0) & (t_low <= view.stop) & (t_high >= view.stop)
+    # an exclusive stop drops a fragment, an inclusive one only what follows
+    lost = span.front_high * span.high if s.exclusive else np.full_like(before, view.stop)
+    bound += np.where(may_stop, lost, 0.0).max(1, initial=0.0)
+    return bound + (span.front_high * moved).sum(1)
+
+
+def of_layer_color(thin: np.ndarray, thick: np.ndarray) -> np.ndarray:
+    """What may change (k, 1) in the colour of a layer, per unit of light in front of it, whose n splats have
+    optical depths (k, n) between `thin` and `thick`.
+    """
+    least = thin.sum(1, keepdims=True)
+    others = thick.sum(1, keepdims=True) - thick
+    # slope of the layer's colour over one splat's depth, at most: by the light left and the others' share
+    slope = np.exp(-least) + np.minimum(1.0, others / np.maximum(least, 1e-9)) / np.maximum(least, 1.0)
+    moved = np.minimum(1.0, slope * (thick - thin)).sum(1, keepdims=True)
+    return np.where((thick > 0).sum(1, keepdims=True) > 1, moved, 0.0)
+
+
+def of_box_color(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """The same (k, 1) of a layer of n boxes whose opacities lie between `low` and `high` (k, n): its colour
+    times its opacity is their sum, and where they cover more than all, their mean.
+    """
+    return np.where((high > 0).sum(1, keepdims=True) > 1, (high - low).sum(1, keepdims=True), 0.0)
+
+
+def of_layer_depth(
+    z_low: np.ndarray, z_high: np.ndarray, share: np.ndarray, thin: np.ndarray, thick: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Between which depths (k, 1) the mean by optical depth of n fragments (k, n) may lie."""
+    may = thick > 0
+    count = may.sum(1, keepdims=True)
+    none = count == 0
+    nearest = np.where(may, z_low, np.inf).min(1, keepdims=True, initial=np.inf)
+    furthest = np.where(may, z_high, -np.inf).max(1, keepdims=True, initial=-np.inf)
+    nearest, furthest = np.where(none, 0.0, nearest), np.where(none, 0.0, furthest)
+    least = thin.sum(1, keepdims=True)
+    spread = furthest - nearest
+    moved = spread * np.minimum(1.0, 2 * (thick - thin).sum(1, keepdims=True) / np.maximum(least, 1e-9))
+    low = np.where(share > 0, share * z_low, 0.0).sum(1, keepdims=True) - moved
+    high = np.where(share > 0, share * z_high, 0.0).sum(1, keepdims=True) + moved
+    drawn = share.any(1, keepdims=True)
+    low = np.where(drawn, np.maximum(low, nearest), nearest)
+    high = np.where(drawn, np.minimum(high, furthest), furthest)
+    # a running mean rounds at every fragment
+    off = (2 + count) * 2.0**-24 * np.maximum(np.abs(nearest), np.abs(furthest))
+    return low - off, high + off
+
+
+def first_column(mask: np.ndarray, start: int) -> np.ndarray:
+    """The first column (k,) where mask (k, m) is set, counted from `start`; start + m where none is."""
+    k, m = mask.shape
+    return start + np.where(mask.any(1), np.argmax(mask, axis=1), m) if m else np.full(k, start)
+
+
+def of_places(span: Span, is_layer: np.ndarray) -> np.ndarray:
+    """What may change (k,) in colour where it is not certain in which order layers and fragments
+    are composited.
+
+    Columns (k, m) in the order in which they arrive. Two that are composited the other way round change a
+    colour by the product of their opacities and the light in front of them, at most.
+    """
+    bound = np.zeros(len(span.low))
+    layers = np.flatnonzero(is_layer).tolist()
+    fragment = ~is_layer
+    may, must = (span.high > 0) & fragment, (span.low > 0) & fragment
+    light = shifted(np.cumprod(np.where(fragment, 1 - span.low, 1.0), axis=1), last=True)
+    rows = np.arange(len(bound))
+    earliest, latest = (np.zeros((len(bound), len(layers)), int) for _ in range(2))
+    for number, c in enumerate(layers):
+        after = np.s_[:, c + 1 :]
+        earliest[:, number] = first_column(may[after] & (span.z_high[after] > span.z_low[:, c, None]), c + 1)
+        latest[:, number] = first_column(must[after] & (span.z_low[after] > span.z_high[:, c, None]), c + 1)
+    drawn, present = span.high[:, layers] > 0, span.low[:, layers] > 0
+    uncertain = drawn & (earliest < latest)
+    for number, c in enumerate(layers):
+        unsure = np.flatnonzero(uncertain[:, number])
+        columns = np.arange(span.low.shape[1])
+        first, end = earliest[unsure, number], latest[unsure, number]
+        between = fragment & (columns >= first[:, None]) & (columns < end[:, None])
+        others = 1 - np.where(between, 1 - span.high[unsure], 1.0).prod(1)
+        bound[unsure] += light[unsure, first] * span.high[unsure, c] * others
+    wrong = uncertain.any(1) | (drawn & ~present).any(1)
+    for number, c in enumerate(layers):
+        for second, d in enumerate(layers[:number]):
+            meet = (earliest[:, number] <= latest[:, second]) & (earliest[:, second] <= latest[:, number])
+            level = (span.z_low[:, c] <= span.z_high[:, d]) & (span.z_low[:, d] <= span.z_high[:, c])
+            # what lies behind the further one lies behind the nearer too and lays both, unless that is late
+            apart = span.z_low[:, d] > span.z_high[:, c]
+            late = apart & (earliest[:, second] < c) & (latest[:, second] > c)
+            unsure = drawn[:, number] & drawn[:, second] & ((level & meet) | late)
+            front = light[rows, np.minimum(earliest[:, number], earliest[:, second])]
+            bound += np.where(unsure, front * span.high[:, c] * span.high[:, d], 0.0)
+            wrong |= unsure
+    # of three layers the first may be composited early, and which one it is hangs on all of them
+    crowded = (drawn.sum(1) > 2) & wrong
+    return np.where(crowded, 1.0, bound)
+
+
+def of_depth(span: Span, weight: np.ndarray, z: np.ndarray) -> dict[str, np.ndarray]:
+    """Nearest and furthest depth (k,) that may be seen; sum of weights times what each may move."""
+    seen = span.front_high * span.high > 0
+    return {
+        "nearest": np.where(seen, span.z_low, np.inf).min(1, initial=np.inf),
+        "furthest": np.where(seen, span.z_high, -np.inf).max(1, initial=-np.inf),
+        "depth_moved": (weight * np.maximum(span.z_high - z, z - span.z_low)).sum(1),
+    }
+
+
+def of_first(span: Span, light: float) -> np.ndarray:
+    """Whether another fragment (k,) may be the first behind which no more than `light` is left."""
+    high, low = span.high, span.low
+    may = (high > 0) & (span.front_low * (1 - high) * (1 - STOP) <= light)
+    sure = (low > 0) & (span.front_high * (1 - low) * (1 + STOP) <= light)
+    return first_column(may, 0) != first_column(sure, 0)
+
+
+def of_count(
+    span: Span, count: np.ndarray, bound: np.ndarray, stop: float, reordered: np.ndarray
+) -> np.ndarray:
+    """By how much (k,) the number of splats blended may differ. count, bound (k, m): in each thing that is
+    composited."""
+    may, must = span.high > 0, span.low > 0
+    off = np.where(may, bound + np.where(must, 0, count), 0)
+    # from where the light may have reached the stop to where it must have, whatever comes may be drawn or not
+    open_to = (span.front_high >= stop * (1 - STOP)) & (span.front_low * (1 - span.high) <= stop * (1 + STOP))
+    off = np.where(may & open_to & (stop > 0), count + bound, off)
+    return np.where(reordered, np.inf, off.sum(1))
+
+
+def of_label(span: Span, labels: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """Whether a fragment of another label (k,), or none at all, may be the heaviest."""
+    own = labels == label[:, None]
+    heaviest = np.where(own, span.front_low * span.low, 0.0).max(1, initial=0.0)
+    other = np.where(own, 0.0, span.front_high * span.high).max(1, initial=0.0)
+    return ((other > 0) | (label >= 0)) & (other * (1 + STOP) >= heaviest)

@@ -1,0 +1,209 @@
+"""The numbers of one picture: what a camera, a quality and a scene's surroundings mean to the kernels."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fidsplat.cameras import Camera, Orthographic
+from fidsplat.cameras.lenses import Lens
+from fidsplat.cameras.raster import RayRaster, raster_of
+from fidsplat.capture import Capture
+from fidsplat.errors import InputError
+from fidsplat.sensor import Sensor
+from fidsplat.surroundings import Gradient, Panorama
+
+FAR_EYE = 1e9
+"""metres: where the eye of a parallel projection is taken to be"""
+NO_CAMERA = "no camera: pass camera=fs.Camera... or give the scene a [camera] table"
+MAX_GRID = 32767
+"""Largest side of the sample grid: anchors and rows are kept in 16 bits."""
+_NO_SENSOR = Sensor()
+
+
+@dataclass(frozen=True)
+class View:
+    """The uniforms of one picture: numbers that change from view to view, in float64.
+
+    The sample grid is the picture with `samples` x `samples` samples in each pixel.
+    """
+
+    width: int
+    """samples"""
+    height: int
+    """samples"""
+    samples: int
+    """per pixel and axis"""
+    focal_x: float
+    """samples per unit of what the lens makes of a direction: of x / z for a pinhole, of radians for a
+    panorama, of metres where rays are parallel. A camera's fx is that in pixels"""
+    focal_y: float
+    center_x: float
+    """samples: where the optical axis meets the picture, as center_y"""
+    center_y: float
+    rotation: np.ndarray
+    """(3, 3) world to camera"""
+    translation: np.ndarray
+    """(3,) metres: where the cloud's origin lies in the camera frame"""
+    eye: np.ndarray
+    """(3,) metres: the camera's centre relative to the cloud's origin, world axes; far behind it for parallel
+    rays"""
+    near: float
+    far: float
+    log_cut: float
+    """natural logarithm of the alpha cut-off, rounded to float32"""
+    ceiling: float
+    stop: float
+    background: tuple[float, float, float]
+    """the fog's colour where there is fog"""
+    first_light: float
+    """transmittance that is left behind a first hit"""
+    sensor: Sensor = _NO_SENSOR
+    fog_density: float = 0.0
+    """1 / metres"""
+    surroundings: Gradient | Panorama | None = None
+    """a background that is not one colour"""
+    raster: RayRaster | None = None
+    """the samples' rays behind a lens; None for a pinhole and for parallel rays"""
+    along_ray: bool = False
+    """whether near, far, sort keys and depths are distances from the camera's centre; else along z"""
+    parallel: bool = False
+    """whether all rays are parallel to z; focal_x and focal_y are samples per metre then"""
+    groups: tuple[tuple[int, View], ...] = ()
+    """(label, the view that its splats have), for splats that move by themselves"""
+    shots: tuple[Shot, ...] = ()
+    """the sub-pictures of which this picture is made; none: it is one"""
+
+    @property
+    def lens(self) -> Lens | None:
+        """What stands before a pinhole; None for a pinhole."""
+        if self.raster is not None:
+            return self.raster.lens
+        return Orthographic() if self.parallel else None
+
+    @property
+    def turns_of_rows(self) -> np.ndarray:
+        """(h, 3, 3) world to camera, for each row of pixels that of the pose which normals show there."""
+        turns = np.tile(self.rotation, (self.height // self.samples, 1, 1))
+        for shot in self.shots:
+            if shot.middle:
+                top = shot.top // self.samples
+                turns[top : top + shot.view.height // self.samples] = shot.view.rotation
+        return turns
+
+    def rows(self, top: int, end: int) -> View:
+        """The view of rows of samples [top, end) alone."""
+        if (top, end) == (0, self.height):
+            return self
+        return replace(
+            self,
+            height=end - top,
+            center_y=self.center_y - top,
+            raster=None if self.raster is None else self.raster.cropped(top, end),
+            groups=tuple((label, view.rows(top, end)) for label, view in self.groups),
+        )
+
+    def uniform(self, name: str) -> tuple[Any, ...]:
+        """Numbers of an effect, by the name of their group, in an order that all kernels know."""
+        around = self.surroundings
+        match name:
+            case "ray" if self.along_ray or self.parallel:
+                # depths are distances already: rays of a length of 1 per metre of depth
+                return math.inf, math.inf, 0.0, 0.0
+            case "ray":
+                return self.focal_x, self.focal_y, self.center_x, self.center_y
+            case "rotation":
+                return tuple(self.rotation.ravel().tolist())
+            case "gradient" if isinstance(around, Gradient):
+                up = np.array(around.up) / np.linalg.norm(around.up)
+                return (*around.top, *around.bottom, *up.tolist())
+            case "panorama_size":
+                height, width = self.array("panorama").shape[:2]
+                return np.int32(width), np.int32(height)
+            case "vignette_center":
+                half_diagonal = math.hypot(self.width, self.height) / 2 / self.samples
+                return self.center_x / self.samples, self.center_y / self.samples, 1 / half_diagonal
+            case "first_light" | "fog_density":
+                return (getattr(self, name),)
+            case _:
+                return self.sensor.uniform(name)
+
+    def array(self, name: str) -> np.ndarray:
+        """A float32 array of an effect, by its name."""
+        if name == "turns":
+            return self.turns_of_rows.astype(np.float32)
+        if name == "panorama" and isinstance(self.surroundings, Panorama):
+            return self.surroundings.image
+        return np.asarray(self.sensor.response, np.float32)
+
+    @classmethod
+    def of(cls, capture: Capture, origin: np.ndarray, camera: Camera | None = None) -> View:
+        """The view of a capture's camera, or of another in its place, for a cloud whose means are relative to
+        `origin` (3,). Nothing moves in it.
+
+        Raises:
+            InputError: there is no camera, or the sample grid is too large.
+        """
+        camera = camera or capture.camera
+        if camera is None:
+            raise InputError(NO_CAMERA)
+        quality, backdrop = capture.quality, capture.backdrop
+        n = quality.samples
+        if max(camera.width, camera.height) * n > MAX_GRID:
+            raise InputError(
+                f"{camera.width} x {camera.height} pixels with {n} x {n} samples each is too large: at most "
+                f"{MAX_GRID} samples along a side; use fewer samples or a smaller picture"
+            )
+        plain = isinstance(backdrop, tuple)
+        rotation = camera.world_to_camera[:3, :3]
+        # the difference first, then the rotation: nothing large is ever rotated (numerics B5)
+        eye = camera.position - np.asarray(origin, dtype=np.float64)
+        lens, grid = camera.lens, (camera.width * n, camera.height * n)
+        intrinsics = camera.fx * n, camera.fy * n, camera.cx * n, camera.cy * n
+        parallel = isinstance(lens, Orthographic)
+        raster = None if lens is None or parallel else raster_of(lens, *grid, *intrinsics)
+        return cls(
+            width=camera.width * n,
+            height=camera.height * n,
+            samples=n,
+            focal_x=intrinsics[0],
+            focal_y=intrinsics[1],
+            center_x=intrinsics[2],
+            center_y=intrinsics[3],
+            rotation=rotation,
+            translation=-rotation @ eye,
+            # colours that depend on the view see parallel rays come from very far away
+            eye=eye - FAR_EYE * rotation[2] if parallel else eye,
+            near=camera.near,
+            far=camera.far,
+            log_cut=float(np.float32(math.log(quality.alpha_cutoff))),
+            ceiling=float(np.float32(quality.opacity_ceiling)),
+            stop=float(np.float32(quality.transmittance_stop)),
+            background=backdrop if plain else (0.0, 0.0, 0.0),
+            first_light=float(np.float32(1 - quality.first_hit)),
+            sensor=capture.sensor,
+            fog_density=0.0 if capture.fog is None else capture.fog.density,
+            surroundings=None if plain else backdrop,
+            raster=raster,
+            along_ray=lens is not None and lens.along_ray,
+            parallel=parallel,
+        )
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One sub-picture of a picture that is made of several poses."""
+
+    view: View
+    """of its rows alone"""
+    top: int
+    """its first row of samples in the picture"""
+    weight: float
+    """in the mean of its rows' sub-pictures"""
+    first: bool
+    """whether it is the first of its rows"""
+    middle: bool
+    """whether the outputs beside rgb and alpha show it: the sub-pose n // 2 of n"""

@@ -1,0 +1,215 @@
+"""One picture on a Warp device: the stages project, sort, bin, blend, resolve.
+
+The host reads two numbers between the stages, how many splats are drawn and how many pairs of splats and
+tiles there are: they size arrays and launches. A picture with more pairs than the device's budget is drawn in
+bands of tiles, with the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from fidsplat.backends.view import View
+from fidsplat.backends.warp import bands
+from fidsplat.backends.warp.exposure import gather
+from fidsplat.backends.warp.images import WarpImages
+from fidsplat.backends.warp.launch import BLOCK, Launcher
+from fidsplat.backends.warp.lens import lens_of, rays_of
+from fidsplat.backends.warp.motion import moving_of
+from fidsplat.backends.warp.program import Program
+from fidsplat.backends.warp.resident import Resident
+from fidsplat.backends.warp.runtime import kernels, load
+from fidsplat.backends.warp.surroundings import surroundings_of
+from fidsplat.backends.warp.uniforms import uniforms
+from fidsplat.backends.warp.workspace import Workspace
+
+
+class Picture:
+    """One picture: the stages in order, each a method."""
+
+    def __init__(
+        self,
+        program: Program,
+        workspace: Workspace,
+        resident: Resident,
+        view: View,
+        launcher: Launcher,
+        beside: int = 0,
+    ) -> None:
+        """beside: bytes on the device that belong to the picture of which this one is a part."""
+        self.program, self.workspace, self.pool = program, workspace, workspace.pool
+        self.resident, self.view, self.launcher, self.beside = resident, view, launcher, beside
+        self.wp = load()
+        u = uniforms(view, program.shape, program.sloped)
+        self.tiles = u.tiles_x * u.tiles_y
+        self.grid = u.tiles_y * u.tile_h, u.tiles_x * u.tile_w
+        self.held: dict[str, Any] = {"view": u}
+        """arrays and structs by the names that kernels' signatures have for them"""
+        self.stats: dict[str, int] = {"splats": resident.count, "visible": 0, "pairs": 0}
+
+    def draw(self) -> None:
+        """All stages; `images` are the finished ones."""
+        samples = self._exposed() if self.view.shots else self._drawn()
+        self.launcher.stage("resolve")
+        self.images = self._resolve(samples)
+        self.launcher.stage(None)
+
+    def _exposed(self) -> Any:
+        """All stages but the last of each shot, and what their samples are together."""
+        whole = self._samples("exposed")
+        beside = bands.image_bytes(self.program, self.view, self.grid)
+        for shot in self.view.shots:
+            part = Picture(self.program, self.workspace, self.resident, shot.view, self.launcher, beside)
+            samples = part._drawn()
+            self.launcher.stage("expose")
+            gather(self.program, self.launcher, shot, samples, whole, self.grid[1])
+            self.stats = {name: max(value, part.stats[name]) for name, value in self.stats.items()}
+        return whole
+
+    def _drawn(self) -> Any:
+        """All stages but the last; sample buffers."""
+        wp, n, program = self.wp, self.resident.count, self.program
+        self._take("starts", self.tiles + 1, wp.int32)
+        self._take("lists", 1, wp.int32)
+        self._take("order", 1, wp.int32)
+        self._take("bounds", n, kernels("bounds").Bounds)
+        self._take("lines", n * program.layout.lines, wp.vec4)
+        self.launcher.stage("project")
+        self.held["lens"] = lens_of(self.view, self.workspace)
+        rays = rays_of(self.view, self.workspace, sloped=program.sloped)
+        visible, pairs = self._project() if n else (0, 0)
+        self.launcher.stage("sort")
+        if pairs:
+            self._sort(visible)
+        samples = self._samples("raw")
+        for first, end, listed in self._bands(visible, pairs):
+            self.launcher.stage("bin")
+            self._list(visible, first, end, listed, whole=listed == pairs)
+            self.launcher.stage("blend")
+            self._blend(first, end, rays, samples)
+        if program.backdrop:
+            # here, as shots may look in different directions
+            self.launcher.stage("resolve")
+            given = {"surroundings": surroundings_of(self.view, self.workspace), "color": samples.color}
+            # without the derivatives that blending may have: a struct of another type
+            given["rays"] = rays_of(self.view, self.workspace)
+            self._launch(program.backdrop, self.view.width * self.view.height, **given)
+        self.stats |= {"visible": visible, "pairs": pairs}
+        return samples
+
+    # stages
+
+    def _project(self) -> tuple[int, int]:
+        wp, n, sort = self.wp, self.resident.count, self.program.sort
+        self._take("windows", n, wp.uint64)
+        self._take("keys", n, wp.uint32)
+        counts, ends = self._exact("counts", n, wp.int64), self._exact("ends_by_index", n, wp.int64)
+        drawn, places = self._exact("drawn", n, wp.int32), self._exact("places", n, wp.int32)
+        cloud = {"boxes": drawn} | self.resident.arrays  # not read where all are of one kind
+        cloud |= {"moving": moving_of(self.resident, self.view, self.pool)} | self._planes()
+        self._launch(self.program.project, n, block=self.program.project_block, **cloud)
+        wp.utils.array_scan(drawn, places, inclusive=True)
+        wp.utils.array_scan(counts, ends, inclusive=True)
+        totals = self._take("totals", 2, wp.int64)
+        self.launcher.once(sort.sum_up, 1, {**self.held, "splats": n})
+        visible, pairs = self.launcher.read_back(totals, self.pool.host("totals", 2, wp.int64))
+        return visible, pairs
+
+    def _planes(self) -> dict[str, Any]:
+        """Each splat's plane, and the planes' sort keys in this view."""
+        wp, table = self.wp, self.resident.planes
+        if table is None or not self.program.layered:
+            none = self._take("no planes", 1, wp.int32), self._take("no plane keys", 1, wp.float32)
+            return dict(zip(("planes", "plane_keys"), none, strict=True))
+        keys = self.pool.filled("plane keys", table.keys(self.view), wp.float32)
+        return {"planes": self.resident.arrays["planes"], "plane_keys": keys}
+
+    def _sort(self, visible: int) -> None:
+        """Splats that are drawn by depth, ties by index."""
+        # the sort takes the second half as its scratch
+        keys = self._take("sorted_keys", 2 * visible, self.wp.uint32)
+        order = self._take("order", 2 * visible, self.wp.int32)
+        self._launch(self.program.sort.compact, self.resident.count)
+        self.wp.utils.radix_sort_pairs(keys, order, visible)
+
+    def _bands(self, visible: int, pairs: int) -> Iterator[tuple[int, int, int]]:
+        """Ranges of tiles (first, end, pairs) whose lists fit the budgets; one, unless they are long."""
+        images = bands.image_bytes(self.program, self.view, self.grid) + self.beside
+        most = bands.room(self.program, self.workspace, self.resident, self.view, visible, images)
+        if pairs <= most:
+            return iter([(0, self.tiles, pairs)])
+        totals = self._take("tile_totals", self.tiles, self.wp.int32)
+        totals.zero_()
+        self.program.load_banding()
+        # in one piece: on the CPU its sums are plain additions
+        self.launcher.once(self.program.lists.histogram, visible, {**self.held, "first": 0})
+        return bands.cut(totals.numpy()[: self.tiles], most)
+
+    def _list(self, visible: int, first: int, end: int, pairs: int, whole: bool) -> None:
+        """The lists of the tiles of one band, each in depth order."""
+        wp, lists, sort = self.wp, self.program.lists, self.program.sort
+        tiles = self._take("tiles", 2 * pairs, wp.int32)
+        listed = self._take("lists", 2 * pairs, wp.int32)
+        band = {"band_first": first, "band_end": end}
+        if pairs:
+            lengths, ends = (self._exact(name, visible, wp.int64) for name in ("lengths", "ends"))
+            self._launch(sort.gather if whole else lists.count, visible, **band)
+            wp.utils.array_scan(lengths, ends, inclusive=True)
+            self._launch(lists.emit, visible, **band)
+            wp.utils.radix_sort_pairs(tiles, listed, pairs, 0, max(self.tiles - 1, 1).bit_length())
+        self._launch(sort.find_starts, end - first + 1, **band, pairs=pairs)
+
+    def _samples(self, kind: str) -> Any:
+        """Sample buffers that blending fills, as one struct; those of another kind are others."""
+        samples = self.program.samples_type()
+        for name, dtype in self.program.sample_fields.items():
+            setattr(samples, name, self._take(f"{kind} {name}", self.grid[0] * self.grid[1], dtype))
+        return samples
+
+    def _blend(self, first: int, end: int, rays: Any, samples: Any) -> None:
+        """Draws the tiles of one band."""
+        program, shape = self.program, self.program.shape
+        planes = self.resident.arrays.get("planes", self.held["lists"])  # not read where there are none
+        given = {**self.held, "rays": rays, "samples": samples, "planes": planes}
+        area = shape.tile_width * shape.tile_height
+        if shape.schedule == "group":
+            count = (end - first) * program.block_dim
+            self.launcher.once(program.blend, count, given | {"band_first": first}, program.block_dim)
+            return
+        given["state"] = self._take("state", self.launcher.pieces * area, program.state)
+        self.launcher.tiles(program.blend, first, end, area, given)
+
+    def _resolve(self, samples: Any) -> WarpImages:
+        view, wp, program = self.view, self.wp, self.program
+        height, width = view.height // view.samples, view.width // view.samples
+        images, out = {}, program.images_type()
+        for output in program.images:
+            # a fresh one: the caller keeps it
+            array = self.pool.fresh(output.name, height * width * output.channels, getattr(wp, output.dtype))
+            images[output.name] = output, array
+            setattr(out, output.name, array)
+        for name in program.cloud_arrays:
+            setattr(out, name, self.resident.arrays[name])
+        for name, dtype in program.view_arrays.items():
+            setattr(out, name, self.pool.filled(name, view.array(name), dtype))
+        given = {"width": width, "background": wp.vec3(*view.background), "samples": samples, "out": out}
+        given["rays"] = rays_of(view, self.workspace, bent=program.stretched)
+        self._launch(program.resolve, height * width, **given)
+        if program.sensor:
+            given = {"settings": program.sensor.settings(view, self.pool), "rgb": out.rgb}
+            self._launch(program.sensor.kernel, height * width, **given, width=width)
+        return WarpImages(images, (height, width), self.launcher, self.stats)
+
+    # helpers
+
+    def _launch(self, kernel: Any, count: int, block: int = BLOCK, **given: Any) -> None:
+        self.launcher.launch(kernel, count, {**self.held, **given}, block)
+
+    def _take(self, name: str, size: int, dtype: Any) -> Any:
+        self.held[name] = array = self.pool.scratch(name, size, dtype)
+        return array
+
+    def _exact(self, name: str, size: int, dtype: Any) -> Any:
+        self.held[name] = array = self.pool.exact(name, size, dtype)
+        return array

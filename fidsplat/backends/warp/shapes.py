@@ -1,0 +1,31 @@
+"""How pictures are cut for a device, and other ways that tests compare with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class WarpShape:
+    """How pictures are cut for a device."""
+
+    schedule: str
+    """`tiles`: a thread draws a tile (CPU). `group`: a block of threads draws a tile (CUDA)."""
+    tile_width: int
+    """samples, a multiple of 4"""
+    tile_height: int
+
+
+def shape_for(device: Any) -> WarpShape:
+    """The device's own."""
+    return WarpShape("group" if device.is_cuda else "tiles", 16, 16)
+
+
+def other_shapes(own: WarpShape, kind: str) -> dict[str, WarpShape]:
+    """As `Reshapes.shapes` (fidsplat/backends/base.py)."""
+    if kind == "schedule":
+        return {"groups": WarpShape("group", 8, 8)}
+    if kind == "sorting":
+        return {"own": own}
+    return {f"{side} x {side}": WarpShape(own.schedule, side, side) for side in (8, 32)}

@@ -1,0 +1,205 @@
+"""What the paper's experiments found, as tables: a summary for each, which gives the rows of every page."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from fidsplat.errors import InputError
+from fidsplat.experiments import angles, counts, localisation, views
+from fidsplat.experiments.methods import IDEAL
+from fidsplat.experiments.summary import Summary, join, read_summary, records_of, summarise
+from fidsplat.experiments.sweep import Record
+
+ALLOWED_GAP = {"exact": 0.2, "fitted": 1.0}
+"""degrees by which reading may end below the ideal texture's, by mixture"""
+NEVER = 90.0
+"""degrees behind the ideal of what is not read at all"""
+Rows = Iterator[dict[str, Any]]
+
+
+class Kind(NamedTuple):
+    """How the results of one experiment become rows."""
+
+    about: tuple[str, ...]
+    """columns that say what a row is of"""
+    columns: tuple[str, ...]
+    rows: Callable[[Sequence[Record]], Callable[[Record], Rows]]
+    """all records -> the rows of one: what a method reads is compared with what the ideal texture gives"""
+
+
+def load(folders: Sequence[Path]) -> dict[str, Summary]:
+    """The results in folders, raw (NAME.jsonl) or summarised (NAME.csv), by experiment; those that there are.
+
+    Of a thing that was measured twice the larger measurement counts.
+
+    Raises InputError when there are none, or they are of another version.
+    """
+    where, found = ", ".join(map(str, folders)), {}
+    for name, kind in KINDS.items():
+        records = [record for folder in folders for record in records_of(folder, name)]
+        there = [read_summary(file) for folder in folders if (file := folder / f"{name}.csv").is_file()]
+        try:
+            if records:
+                there.insert(
+                    0, summarise(records, kind.rows(records), (*kind.about, "amount", *kind.columns))
+                )
+            if there:
+                found[name] = join(there, kind.about)
+        except (KeyError, TypeError) as error:
+            raise InputError(
+                f"results in {where} are of another version of fidsplat, they lack {error}; "
+                "measure again with --overwrite"
+            ) from error
+    if not found:
+        raise InputError(f"no results in {where}; run fidsplat experiment all first, or give their folder")
+    return found
+
+
+def _counts_rows(_: Sequence[Record]) -> Callable[[Record], Rows]:
+    def rows(record: Record) -> Rows:
+        key, found = record.key, record.result
+        for mixture, numbers in found["gaussians"].items():
+            seconds = found["seconds"][mixture]
+            row = {"category": key["category"], "marker": key["index"], "mixture": mixture}
+            row |= {"amount": len(seconds), "gaussians": numbers["rectangles"]}
+            row |= {f"gaussians_of_{name}": numbers.get(name) for name in ("runs", "cells")}
+            for name in ("components", "cells", "runs", "rectangles"):
+                row |= {f"{name}_{colour}": found[name][colour] for colour in ("dark", "light")}
+            spread = statistics.stdev(seconds) if len(seconds) > 1 else 0.0
+            yield row | {"seconds": statistics.median(seconds), "seconds_spread": spread}
+
+    return rows
+
+
+class _Scan(NamedTuple):
+    tilts: list[float]
+    found: str
+    read: str
+
+
+def _angles_rows(records: Sequence[Record]) -> Callable[[Record], Rows]:
+    def place(key: dict, method: str) -> tuple:
+        return key["protocol"], key["category"], key["index"], method
+
+    def scans(record: Record) -> dict[str, _Scan]:
+        tilts = angles.parse_tilts(record.key["tilts"])
+        return {
+            name: _Scan(tilts, seen["found"], seen["read"]) for name, seen in record.result["readers"].items()
+        }
+
+    ideals: dict[tuple, dict[str, _Scan]] = {}
+    for record in records:
+        if record.key["method"] == IDEAL:
+            known = ideals.setdefault(place(record.key, IDEAL), {})
+            for name, scan in scans(record).items():
+                known[name] = max((scan, known.get(name, scan)), key=lambda one: len(one.tilts))
+
+    def rows(record: Record) -> Rows:
+        key = record.key
+        ceilings = ideals.get(place(key, IDEAL), {})
+        for reader, scan in scans(record).items():
+            row = {"protocol": key["protocol"], "category": key["category"], "marker": key["index"]}
+            row |= {
+                "method": key["method"],
+                "reader": reader,
+                "amount": len(scan.tilts),
+                "tilts": key["tilts"],
+            }
+            row["found"], row["found_all"] = angles.largest(scan.tilts, scan.found)
+            row["read"], row["read_all"] = angles.largest(scan.tilts, scan.read)
+            if reader in ceilings:
+                row |= _beside_ideal(scan, ceilings[reader], key["method"])
+            yield row
+
+    return rows
+
+
+def _beside_ideal(scan: _Scan, ideal: _Scan, method: str) -> dict[str, float | None]:
+    """How far a scan stays behind that of the ideal texture, on the tilts that both have.
+
+    `behind`, `behind_all`: degrees by which the largest tilt that is read, and the largest without a miss,
+    lie below the ideal's; `NEVER` where there is none, None where the ideal has none. `missed` of `below`:
+    tilts that are not read, up to the allowed gap below the one to which the ideal is read without a miss.
+    """
+    both = sorted(set(scan.tilts) & set(ideal.tilts))
+    ours, theirs = _at(scan, both), _at(ideal, both)
+    row: dict[str, float | None] = {}
+    for name, own, ceiling in zip(
+        ("behind", "behind_all"), angles.largest(both, ours), angles.largest(both, theirs), strict=True
+    ):
+        row[name] = None if ceiling is None else NEVER if own is None else ceiling - own
+    ceiling = angles.largest(both, theirs)[1]
+    if ceiling is not None:
+        least = ceiling - ALLOWED_GAP.get(method.partition("/")[0], 0.0) + 1e-6
+        hits = [hit for tilt, hit in zip(both, ours, strict=True) if tilt <= least]
+        row |= {"missed": hits.count("0"), "below": len(hits)}
+    return row
+
+
+def _at(scan: _Scan, tilts: Iterable[float]) -> str:
+    read = dict(zip(scan.tilts, scan.read, strict=True))
+    return "".join(read[tilt] for tilt in tilts)
+
+
+def _views_rows(_: Sequence[Record]) -> Callable[[Record], Rows]:
+    def rows(record: Record) -> Rows:
+        key = record.key
+        row = {
+            "truth": key["truth"],
+            "category": key["category"],
+            "method": key["method"],
+            "marker": key["index"],
+        }
+        # of equally many views, the record with more metrics
+        row["amount"] = key["views"] + 0.1 * bool(key["flip"]) + 0.2 * bool(key["lpips"])
+        for name in ("psnr", "ssim", "flip", "lpips"):
+            there = [value for value in record.result[name] or () if value is not None]
+            row[name] = statistics.fmean(there) if there else None
+        yield row
+
+    return rows
+
+
+def _localisation_rows(_: Sequence[Record]) -> Callable[[Record], Rows]:
+    def rows(record: Record) -> Rows:
+        """A row for each distance: means over the tilts at which the marker was read."""
+        key = record.key
+        for distance in key["distances"]:
+            seen = [view for view in record.result["views"] if view["distance_m"] == distance]
+            read = [view for view in seen if view["position_mm"] is not None]
+            row = {"category": key["category"], "method": key["method"], "marker": key["index"]}
+            row |= {"distance_m": distance, "amount": len(seen), "read": len(read)}
+            for name in ("position_mm", "angle_deg", "corners_px"):
+                row[name] = statistics.median(view[name] for view in read) if read else None
+            yield row
+
+    return rows
+
+
+KINDS = {
+    counts.NAME: Kind(
+        ("category", "marker", "mixture"),
+        (
+            "gaussians", "gaussians_of_runs", "gaussians_of_cells",
+            *(f"{n}_{c}" for n in ("components", "cells", "runs", "rectangles") for c in ("dark", "light")),
+            "seconds", "seconds_spread",
+        ),
+        _counts_rows,
+    ),
+    angles.NAME: Kind(
+        ("protocol", "category", "marker", "method", "reader"),
+        ("found", "found_all", "read", "read_all", "behind", "behind_all", "missed", "below"),
+        _angles_rows,
+    ),
+    views.NAME: Kind(
+        ("truth", "category", "method", "marker"), ("psnr", "ssim", "flip", "lpips"), _views_rows
+    ),
+    localisation.NAME: Kind(
+        ("category", "method", "marker", "distance_m"),
+        ("read", "position_mm", "angle_deg", "corners_px"),
+        _localisation_rows,
+    ),
+}  # fmt: skip

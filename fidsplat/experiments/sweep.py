@@ -1,0 +1,250 @@
+"""The runner of all that is measured point by point: it goes on after a kill, takes shares of the work, and
+joins what several machines found.
+
+Results are JSON lines. A line {"run": ...} holds the facts of a run (`fidsplat.provenance.run_facts`) for the
+lines after it, each of which is {"key": ..., "result": ...}: what was measured, and what was found.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from fidsplat.errors import InputError
+from fidsplat.files import atomic_write, ordinary_file, writable_folder
+
+Key = dict[str, Any]
+"""a point of a sweep: plain data that names what is measured"""
+
+
+class Record(NamedTuple):
+    """One point that was measured."""
+
+    key: Key
+    result: dict[str, Any]
+    run: dict[str, Any]
+    """facts of its run"""
+
+    @property
+    def name(self) -> str:
+        """The key as one string."""
+        return name_of(self.key)
+
+    @property
+    def failed(self) -> bool:
+        """Whether the device refused the point: its result is then the reason, as `error`."""
+        return "error" in self.result
+
+
+def name_of(key: Key) -> str:
+    """A key as one string, whatever the order of its parts."""
+    return json.dumps(key, sort_keys=True)
+
+
+class Results:
+    """The results of a sweep in a file to which each is added as soon as it is there.
+
+    Args:
+        file: made with its folder when it is missing.
+        run: facts of this run.
+        overwrite: drop what the file holds.
+
+    Raises InputError when the file cannot be written, is none of ours, or holds results of another device,
+    version, code or seed.
+    """
+
+    def __init__(self, file: Path, run: dict[str, Any], overwrite: bool = False) -> None:
+        writable_folder(file.parent)
+        self.file, self.run = ordinary_file(file), run
+        records = [] if overwrite else read_records(file)
+        for record in records:
+            if differ := _differences(record.run, run):
+                raise InputError(
+                    f"{file} holds results of another {' and '.join(differ)}; give another folder with -o, "
+                    "or --overwrite to measure again"
+                )
+        # a device that failed may be there again
+        self.done = {record.name: record for record in records if not record.failed}
+        if overwrite or file.exists():  # what a killed run left half written goes
+            _write(file, self.done.values())
+        self._last_run = next((record.run for record in reversed(self.done.values())), None)
+
+    def left(self, points: Iterable[Key]) -> list[Key]:
+        """The points that are not measured yet, in their order."""
+        return [key for key in points if name_of(key) not in self.done]
+
+    def append(self, key: Key, result: dict[str, Any]) -> Record:
+        """Keep what was found at a point, numbers to six digits: no measurement has more.
+
+        Raises ValueError for a result that JSON cannot hold, as NaN.
+        """
+        record = Record(key, rounded(result), self.run)
+        text = _line(record) if self.run == self._last_run else _header(self.run) + _line(record)
+        with open(self.file, "a", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        self._last_run = self.run
+        self.done[record.name] = record
+        return record
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """Points that are ready to be measured."""
+
+    name: str
+    results: Results
+    points: list[Key]
+    begin: Callable[[Key], Callable[[], dict[str, Any]]]
+    """does the device's share of a point; what it returns does the host's share and gives the result"""
+    batch: int = 1
+    """points whose shares on the device are done before those on the host, so that neither disturbs the
+    timing of the other"""
+    pool: Executor | None = None
+    """does the host's shares of a batch at the same time"""
+
+    @property
+    def left(self) -> list[Key]:
+        """Points that are still to be measured."""
+        return self.results.left(self.points)
+
+    def run(self) -> Iterator[Record]:
+        """Measure what is left; yields each record when it is in the file."""
+        left = self.left
+        for first in range(0, len(left), self.batch):
+            keys = left[first : first + self.batch]
+            rest = [self.begin(key) for key in keys]
+            found = map(_call, rest) if self.pool is None else self.pool.map(_call, rest)
+            for key, result in zip(keys, found, strict=True):
+                yield self.results.append(key, result)
+
+
+def read_records(file: Path) -> list[Record]:
+    """Every record of a file, none when it is missing; a last line that was cut short is left out.
+
+    Raises InputError when another line is none of ours.
+    """
+    try:
+        text = file.read_text("utf-8")
+    except FileNotFoundError:
+        return []
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read {file}: {error}") from error
+    found: list[Record] = []
+    run: dict[str, Any] | None = None
+    for number, line in enumerate(text.split("\n")[:-1], 1):
+        try:
+            value = json.loads(line)
+            if set(value) == {"run"}:
+                run = value["run"]
+                continue
+            key, result = value["key"], value["result"]
+            if not (isinstance(key, dict) and isinstance(result, dict) and isinstance(run, dict)):
+                raise TypeError
+        except (ValueError, KeyError, TypeError):
+            raise InputError(
+                f"{file}, line {number}: not a result of this version of fidsplat; give another folder"
+            ) from None
+        found.append(Record(key, result, run))
+    return found
+
+
+def shard(points: list[Key], text: str | None) -> list[Key]:
+    """Every n-th point, from the i-th on, of "i/n"; all of them for None.
+
+    Raises InputError for anything but i/n with 1 <= i <= n.
+    """
+    if text is None:
+        return points
+    first, _, of = text.partition("/")
+    if not (first.isdecimal() and of.isdecimal() and 1 <= int(first) <= int(of)):
+        raise InputError(f"--shard is {text!r}; write i/n with 1 <= i <= n, e.g. 1/4")
+    return points[int(first) - 1 :: int(of)]
+
+
+class Merged(NamedTuple):
+    """What `merge` found."""
+
+    points: int
+    repeated: int
+    """points that more than one file had"""
+    differ: tuple[str, ...]
+    """facts on which numbers depend and that are not the same in all runs"""
+
+
+def merge(files: list[Path], target: Path) -> Merged:
+    """Join files of shards into one; of a point that several have the first stays.
+
+    What the target holds already and the files do not stays in it.
+
+    Raises InputError when a file is missing or none of ours.
+    """
+    found: dict[str, Record] = {}
+    repeated = 0
+    for file in files:
+        if not file.is_file():
+            raise InputError(f"{file} is not a file; give the .jsonl files of the shards")
+        for record in read_records(file):
+            repeated += record.name in found
+            found.setdefault(record.name, record)
+    for record in read_records(target):
+        found.setdefault(record.name, record)
+    runs = [record.run for record in found.values()]
+    # one that draws nothing has no device to differ from
+    first = next((run for run in runs if run.get("device")), runs[0] if runs else {})
+    differ = {name for run in runs for name in _differences(run, first)}
+    writable_folder(target.parent)
+    _write(target, found.values())
+    return Merged(len(found), repeated, tuple(sorted(differ)))
+
+
+def missing_shards(files: Iterable[Path]) -> list[str]:
+    """The "i/n" that are not among files named as `--shard i/n` names them."""
+    there: dict[int, set[int]] = {}
+    for file in files:
+        if match := re.fullmatch(r".*-(\d+)-of-(\d+)\.jsonl", file.name):
+            there.setdefault(int(match[2]), set()).add(int(match[1]))
+    return [f"{i}/{n}" for n, found in sorted(there.items()) for i in range(1, n + 1) if i not in found]
+
+
+def _differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+    """The facts on which numbers depend and that are not the same. A run that draws nothing has no device."""
+    names = [name for name in ("versions", "code", "seed") if old.get(name) != new.get(name)]
+    devices = (old.get("device"), new.get("device"))
+    return names + (["device"] if None not in devices and devices[0] != devices[1] else [])
+
+
+def _write(file: Path, records: Iterable[Record]) -> None:
+    with atomic_write(file) as stream:
+        for run, group in groupby(records, key=lambda record: record.run):
+            stream.write((_header(run) + "".join(map(_line, group))).encode())
+
+
+def _header(run: dict[str, Any]) -> str:
+    return json.dumps({"run": run}) + "\n"
+
+
+def _line(record: Record) -> str:
+    # NaN and infinities are not JSON: a result that has them is a fault, found here
+    return json.dumps({"key": record.key, "result": record.result}, allow_nan=False) + "\n"
+
+
+def rounded(value: Any) -> Any:
+    """Plain data with its numbers to six digits."""
+    if isinstance(value, dict):
+        return {name: rounded(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [rounded(item) for item in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
+
+
+def _call(function: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    return function()

@@ -1,0 +1,128 @@
+"""How wrong a picture is, and how much of that single precision may have decided."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import numpy as np
+
+from fidsplat.accuracy import errors
+from fidsplat.errors import FidsplatError
+from fidsplat.experiments.plane import plane_picture
+from fidsplat.experiments.setup import BACKGROUND
+from fidsplat.experiments.tradeoff.hard import CELLS, cell_window
+from fidsplat.experiments.tradeoff.scenes import HARD, SEED, TradeScene
+from fidsplat.hard_cases.agreement import Picture, truth_of
+from fidsplat.quality import Quality
+from fidsplat.vision.detect import detect
+from fidsplat.vision.images import to_uint8
+from fidsplat.vision.metrics import flip, has_flip, psnr
+
+FLIP_SIDE = 256
+"""pixels: FLIP is taken of the middle square of this size; of the scene of hard cases all is taken"""
+NO_FLIP = "flip-evaluator is not installed; pip install 'fidsplat[experiments]'"
+_PAIRS = 2_000_000
+"""pixels times splats that the reference may look at for one picture"""
+_MOST, _LEAST = 64, 12
+"""pixels whose certificates are asked for; where fewer could be, none is"""
+_SAMPLED = 64
+
+
+def compare_picture(picture: np.ndarray, truth: np.ndarray, scene: TradeScene, quality: Quality) -> dict:
+    """Errors of rgb (h, w, 3) against the truth of the same definition.
+
+    Returns `maximum`, `p999`, `rmse`, `psnr` (None for equal pictures), `maximum_sure` (see
+    `beyond_certificates`), `flip`; for the hard cases `cells`, the largest error in each; for markers what
+    `compare_marker` gives.
+    """
+    found = errors(picture, truth)
+    off = np.abs(picture - truth).max(-1)
+    result = {
+        "maximum": found.maximum,
+        "p999": found.p999,
+        "rmse": found.rmse,
+        "psnr": found.psnr if math.isfinite(found.psnr) else None,
+        "maximum_sure": beyond_certificates(off, scene, quality),
+        **_flip(picture, truth, whole=scene.name == HARD),
+    }
+    if scene.name == HARD:
+        result["cells"] = {name: float(off[cell_window(i)].max()) for i, name in enumerate(CELLS)}
+    return result if scene.made is None else result | compare_marker(picture, scene)
+
+
+def beyond_certificates(off: np.ndarray, scene: TradeScene, quality: Quality) -> float | None:
+    """At most how large an error is that the reference does not certify, over all pixels.
+
+    A pixel's certificate bounds what float32 may change in it because a decision of `quality` lies within
+    rounding of its threshold. Certificates are asked for at the pixels of the largest errors; every other
+    pixel counts with its whole error. None where the scene has too many splats for that, or the reference
+    does not draw this.
+
+    Args:
+        off: (h, w) the largest error of each pixel.
+    """
+    count = min(_MOST, _PAIRS // max(1, len(scene.cloud) * quality.samples**2), off.size)
+    if count < min(_LEAST, off.size):
+        return None
+    worst = np.argsort(off, axis=None)[::-1][: count + 1]
+    rows, columns = np.unravel_index(worst[:count], off.shape)
+    # the reference knows no rounding: what only rounds is nothing to it
+    plain = quality.with_(arithmetic="precise", blend_precision="float32")
+    picture = Picture(scene.cloud, scene.camera, plain, ("rgb",), scene.background)
+    try:
+        certified = truth_of(picture, (rows, columns))["certificate"]
+    except FidsplatError:
+        return None
+    # a certificate is per unit of colour
+    brightest = max(1.0, 0.0 if scene.cloud.colors is None else float(np.abs(scene.cloud.colors).max()))
+    sure = float((off.flat[worst[:count]] - certified * brightest).max())
+    return max(sure, float(off.flat[worst[count]]) if len(worst) > count else 0.0, 0.0)
+
+
+def compare_marker(picture: np.ndarray, scene: TradeScene) -> dict:
+    """A marker against the ideal area-sampled texture: `ideal_psnr` dB, `ideal_maximum`; `corners_px`, root
+    mean square of the detected corners' errors in pixels, None where `fidsplat detect` does not read it;
+    `rectangles` of its partition."""
+    made = scene.made
+    assert made is not None
+    ideal = plane_picture(made.grid, made.module, scene.camera, background=BACKGROUND)
+    grey = np.asarray(picture[:, :, 0], np.float64)
+    families = (f"{made.kind}:{made.family}",) if made.kind == "apriltag" else ()
+    corners = None
+    for code in detect(to_uint8(grey), families, qr=made.kind == "qr"):
+        if (code.kind, code.id, code.payload) == (made.kind, made.id, made.payload):
+            apart = code.corners - scene.camera.project(made.corners)
+            corners = float(np.sqrt((apart**2).sum(1).mean()))
+    ratio = psnr(grey, ideal)
+    return {
+        "ideal_psnr": ratio if math.isfinite(ratio) else None,
+        "ideal_maximum": float(np.abs(grey - ideal).max()),
+        "corners_px": corners,
+        "rectangles": len(made.boxes),
+    }
+
+
+def check_truth(truth: np.ndarray, scene: TradeScene, full: Quality) -> dict:
+    """The truth against the NumPy reference at pixels chosen at random: `pixels`, `maximum`, the largest
+    difference of their colours."""
+    height, width = truth.shape[:2]
+    count = max(4, min(_SAMPLED, _PAIRS // max(1, len(scene.cloud) * full.samples**2)))
+    chosen = random.Random(SEED).sample(range(height * width), min(count, height * width))
+    rows, columns = np.unravel_index(chosen, (height, width))
+    plain = full.with_(blend_precision="float32")
+    picture = Picture(scene.cloud, scene.camera, plain, ("rgb",), scene.background)
+    wanted = truth_of(picture, (rows, columns))["rgb"]
+    return {"pixels": len(rows), "maximum": float(np.abs(truth[rows, columns] - wanted).max())}
+
+
+def _flip(picture: np.ndarray, truth: np.ndarray, whole: bool) -> dict:
+    """FLIP of display values, and of which part of the picture."""
+    if not has_flip():
+        return {"flip": None, "flip_of": NO_FLIP}
+    height, width = truth.shape[:2]
+    side = (height, width) if whole else (min(FLIP_SIDE, height), min(FLIP_SIDE, width))
+    top, left = (height - side[0]) // 2, (width - side[1]) // 2
+    window = slice(top, top + side[0]), slice(left, left + side[1])
+    a, b = (np.clip(image[window], 0.0, 1.0) for image in (picture, truth))
+    return {"flip": flip(a, b), "flip_of": f"{side[1]} x {side[0]} px in the middle"}

@@ -1,0 +1,113 @@
+"""A file's rows made splats, window by window: rows that are no splats are left out on the way, so that
+memory follows what is kept and not what the file says it holds."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fidsplat.defects import find_defects
+from fidsplat.formats.flatten import flatten
+
+PADDED_LOG_SCALE = np.log(1e-6)
+"""scale_2 of a 2DGS cloud written for tools that want three scales; SuperSplat writes the same"""
+WINDOW = 65536
+"""rows at a time: less lets the checks cost more than reading"""
+BLOCK = 2048
+"""rows that are worked on at a time within a window: their records and results stay in a core's cache, so
+that walking over them once per property costs no memory traffic"""
+_FIRST_ROOM = 1_000_000  # splats; only a file of more rows makes its arrays grow
+
+Progress = Callable[[str, float], Any]
+"""called now and then with what is being done and the share of it that is done, 0 to 1"""
+_CHECKED = ("means", "quats", "scales", "opacities", "sh")
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The rows of a file that are meant as splats."""
+
+    path: Path
+    count: int
+    columns: dict[str, tuple[tuple[int, ...], type]]
+    """shape and type of a splat's part of each array: means, quats, scales (2 or 3), opacities, sh, and where
+    the file has them labels and planes"""
+    fill: Callable[[int, dict[str, np.ndarray]], None]
+    """reads the rows from the given one on into arrays, as many as these have"""
+
+
+def collect(rows: Rows, progress: Progress | None = None) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    """The arrays of the splats that can be drawn, and how many others there are for each reason.
+
+    Three scales become two, as `flatten` does it, with its thickness as one more array; unless the third is
+    1e-6 throughout, which marks a 2DGS cloud: its normal is the third axis even where a splat's own scales
+    are smaller still.
+    """
+    if rows.columns["scales"][0] == (2,):
+        found = _collect(rows, progress, "two")
+    else:
+        found = _collect(rows, progress, "padded") or _collect(rows, progress, "three")
+    assert found is not None
+    return found
+
+
+def _collect(rows: Rows, progress: Progress | None, scales: str):
+    """`collect` for two scales, for a third that is padding (None as soon as it is not), or for three."""
+    columns = rows.columns | {"scales": ((2,), np.float32)}
+    kept = _Kept(columns | ({"thickness": ((), np.float32)} if scales == "three" else {}), rows.count)
+    scratch = np.empty((min(WINDOW, rows.count), 3), np.float32)
+    dropped: dict[str, int] = {}
+    for first in range(0, rows.count, WINDOW):
+        part = kept.room(min(WINDOW, rows.count - first), first)
+        three = part if scales == "two" else part | {"scales": scratch[: len(part["scales"])]}
+        with np.errstate(over="ignore", invalid="ignore"):
+            rows.fill(first, three)
+        if scales == "padded":
+            if not np.allclose(three["scales"][:, 2], np.exp(PADDED_LOG_SCALE), rtol=1e-5, atol=0):
+                return None
+            part["scales"][:] = three["scales"][:, :2]
+        elif scales == "three":
+            for start in range(0, len(three["scales"]), BLOCK):
+                block = slice(start, start + BLOCK)
+                flat = flatten(part["quats"][block], three["scales"][block])
+                part["quats"][block], part["scales"][block], part["thickness"][block] = flat
+        good, reasons = find_defects({name: part[name] for name in _CHECKED})
+        kept.keep(part, good)
+        for reason, count in reasons.items():
+            dropped[reason] = dropped.get(reason, 0) + count
+        if progress is not None:
+            progress(f"reading {rows.path.name}", min(1.0, (first + WINDOW) / rows.count))
+    return kept.finished(), dropped
+
+
+class _Kept:
+    """Arrays that grow with the splats that are kept in them."""
+
+    def __init__(self, columns: dict[str, tuple[tuple[int, ...], type]], most: int) -> None:
+        self._most, self._count, self._room = most, 0, min(most, _FIRST_ROOM)
+        self._arrays = {name: np.empty((self._room, *shape), kind) for name, (shape, kind) in columns.items()}
+
+    def room(self, count: int, seen: int) -> dict[str, np.ndarray]:
+        """The places of the next splats, as many as that; seen: rows of the file so far."""
+        if self._count + count > self._room:
+            # of a file that is mostly splats, all of what is left is expected
+            self._room = self._most if 2 * self._count > seen else min(self._most, 2 * self._room + count)
+            for name, old in self._arrays.items():
+                self._arrays[name] = np.empty((self._room, *old.shape[1:]), old.dtype)
+                self._arrays[name][: self._count] = old[: self._count]
+        return {name: array[self._count : self._count + count] for name, array in self._arrays.items()}
+
+    def keep(self, part: dict[str, np.ndarray], good: np.ndarray | None) -> None:
+        """Keep those of the last places that are good, (n,) bool; None: all."""
+        count = len(part["means"]) if good is None else int(good.sum())
+        for array in part.values() if good is not None else ():
+            array[:count] = array[good]
+        self._count += count
+
+    def finished(self) -> dict[str, np.ndarray]:
+        """The arrays, as long as what is kept. Nothing may use a part of `room` after this."""
+        for array in self._arrays.values():
+            array.resize((self._count, *array.shape[1:]), refcheck=False)  # gives its end back without a copy
+        return self._arrays

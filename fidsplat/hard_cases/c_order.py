@@ -1,0 +1,207 @@
+"""C: the order of splats: ties, keys, and what must not depend on order at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from fidsplat.backends.base import Reshapes
+from fidsplat.backends.prepare import view_of
+from fidsplat.cameras import Camera
+from fidsplat.hard_cases.agreement import ALL_OUTPUTS, COLOR_TOLERANCE, Picture, draw
+from fidsplat.hard_cases.case import Finding, Found, case
+from fidsplat.hard_cases.clouds import camera, splats, taken, turned
+from fidsplat.hard_cases.coplanar import (
+    WALL_STEP,
+    beside_a_big_splat,
+    faint_between,
+    largest_jump,
+    layered,
+    tag,
+    turning,
+    wall,
+)
+from fidsplat.hard_cases.invariance import CULLED, differing, out_of_order, trace
+from fidsplat.quality import Quality
+from fidsplat.random_clouds import random_splats
+from fidsplat.render import Renderer
+from fidsplat.rotations import quaternion_to_matrix
+from fidsplat.splats import SplatCloud
+
+
+def fronto_parallel(away: float, count: int = 200) -> Picture:
+    """Splats at depth 5 facing a camera that is turned, `away` metres from the origin: many tie."""
+    generator = np.random.default_rng(int(away) + 1)
+    turn = generator.normal(size=4)
+    turn /= np.linalg.norm(turn)
+    pose = np.eye(4)
+    pose[:3, :3] = quaternion_to_matrix(turn)
+    pose[:3, 3] = -pose[:3, :3] @ np.array([0.6, -0.64, 0.48]) * away
+    means = np.column_stack([generator.uniform(-2, 2, (count, 2)), np.full(count, 5.0)]) - pose[:3, 3]
+    facing = turn * [1, -1, -1, -1]
+    grey = np.repeat(generator.integers(0, 2, (count, 1)), 3, axis=1)
+    world = (means @ pose[:3, :3]).astype(np.float32)
+    return Picture(splats(world, facing, 0.25, 0.9, grey), camera(world_to_camera=pose), outputs=ALL_OUTPUTS)
+
+
+ON_TAGS = Camera.look_at(96, 80, 0.8, (0.05, -0.03, -1.6), (0, 0, 0))
+SIDES = ("before", "behind", "through")
+
+
+def crossing_tags() -> list[SplatCloud]:
+    """Two tilted tags that cross."""
+    pose = np.eye(4)
+    pose[:3, :3] = quaternion_to_matrix(turned((0.2, 1, 0), 50))
+    return [tag(6), tag(6, seed=1).transformed(pose)]
+
+
+def _tilted_planes(quality: Quality) -> Picture:
+    """Two tags that cross, and splats of no plane between."""
+    others = random_splats(30, seed=10, depth=(-0.6, 0.6), scale=(0.02, 0.2), across=0.6)
+    cloud = SplatCloud.concatenate([*crossing_tags(), others])
+    view = Camera.look_at(100, 80, 0.8, (0.9, -0.4, -1.4), (0, 0, 0))
+    return Picture(cloud, view, quality, ALL_OUTPUTS)
+
+
+def _three_tags() -> Picture:
+    """Three tags that cross, of which no more than two wait at a pixel, and splats of no plane between."""
+    pose = np.eye(4)
+    pose[:3, :3] = quaternion_to_matrix(turned((1, 0.3, 0), -35))
+    pose[2, 3] = 0.1
+    others = random_splats(30, seed=13, depth=(-0.6, 0.6), scale=(0.02, 0.2), across=0.6)
+    cloud = SplatCloud.concatenate([*crossing_tags(), others, tag(6, seed=2).transformed(pose)])
+    return Picture(cloud, ON_TAGS, outputs=ALL_OUTPUTS)
+
+
+def before_a_wall(count: int) -> SplatCloud:
+    """A tag 5 cm before a wall of splats of no plane."""
+    return SplatCloud.concatenate([tag(), wall(count)])
+
+
+def _shuffled(cloud: SplatCloud) -> SplatCloud:
+    return taken(cloud, np.random.default_rng(3).permutation(len(cloud)))
+
+
+def _c1_order(renderer: Renderer) -> Iterator[Finding]:
+    wrong_keys = wrong_order = 0
+    for away in (0.0, 1.0, 1000.0):
+        picture = fronto_parallel(away)
+        keys, unsorted = _keys_and_order(renderer, picture)
+        wrong_keys += keys
+        wrong_order += unsorted
+    yield Finding("keys beyond 2 ulp of their depth", wrong_keys, 0)
+    yield Finding("splats out of the order by key and index", wrong_order, 0)
+
+    cloud = tag()
+    yield Finding(
+        "jump of a tag in steps of 1e-4 deg", largest_jump(renderer, turning(cloud, "blend", 2))[0], 2e-3
+    )
+    tilted = next(turning(before_a_wall(150), "blend", 0, 30))
+    for what, picture in (
+        ("a tag's splats", next(turning(cloud, "blend", 0))),
+        ("a tag's splats among others", tilted),
+    ):
+        again = Picture(_shuffled(picture.cloud), picture.camera, picture.quality, ("rgb",))
+        change = np.abs(draw(renderer, again)["rgb"] - draw(renderer, picture)["rgb"]).max()
+        yield Finding(f"change when {what} are re-ordered", float(change), COLOR_TOLERANCE)
+
+
+def _c1_layers(renderer: Renderer) -> Iterator[Finding]:
+    for tilt in (0.0, 30.0, 60.0):
+        ordered, blended = (
+            largest_jump(renderer, turning(before_a_wall(150), mode, 2, tilt, step=WALL_STEP))[0]
+            for mode in ("order", "blend")
+        )
+        yield Finding(f"jump before a wall, share of that in order, {tilt:g} deg", blended / ordered, 0.5)
+    # a splat that is just drawn, and one that is just not, with its own opacity between
+    with_it, without = (draw(renderer, faint_between(n / 255))["rgb"] for n in (1.01, 0.99))
+    change = float(np.abs(with_it - without).max())
+    yield Finding("change when a faint splat comes between", change, 1.01 / 255)
+    for title, parts in (
+        *((f"tag with a big splat {side} it", beside_a_big_splat(side)) for side in SIDES),
+        ("tags that cross", crossing_tags()),
+    ):
+        got, wanted = layered(renderer, parts, ON_TAGS)
+        yield Finding(f"{title}, from pictures of each", float(np.abs(got - wanted).max()), COLOR_TOLERANCE)
+
+
+@case("C1", "coplanar splats and ties", "200 at depth 5, 0 to 1000 m from the origin; tags")
+def c1(renderer: Renderer) -> Found:
+    for away in (0.0, 1.0, 1000.0):
+        yield fronto_parallel(away)
+    yield _tilted_planes(Quality())
+    yield _tilted_planes(Quality(coplanar="order"))
+    yield _three_tags()
+    for side in SIDES:
+        cloud = SplatCloud.concatenate(beside_a_big_splat(side))
+        yield Picture(cloud, ON_TAGS, outputs=ALL_OUTPUTS)
+    at_wall = next(turning(before_a_wall(150), "blend", 0, 30))
+    yield Picture(at_wall.cloud, at_wall.camera, outputs=ALL_OUTPUTS)
+    yield from _c1_order(renderer)
+    yield from _c1_layers(renderer)
+
+
+def _keys_and_order(renderer: Renderer, picture: Picture) -> tuple[int, int]:
+    """How many keys are not their splat's depth to 2 ulp, and how many splats stand where they should not."""
+    traced = trace(renderer, picture)
+    view = view_of(picture.capture, picture.cloud.origin)
+    depth = (picture.cloud.means.astype(float) @ view.rotation.T + view.translation)[:, 2]
+    keys = traced["keys"]
+    if keys.dtype == np.uint32:
+        visible = np.flatnonzero(keys != CULLED)
+        bits = keys[visible]
+        decoded = np.where(bits & 0x80000000, bits & 0x7FFFFFFF, ~bits).view(np.float32)
+    else:  # the reference keeps depths
+        visible = np.sort(traced["order"])
+        decoded = keys[visible]
+    off = np.abs(decoded - depth[visible]) > 2 * np.spacing(np.abs(depth[visible]).astype(np.float32))
+    wanted = visible[np.argsort(decoded, kind="stable")]
+    return int(off.sum()), out_of_order(traced, wanted)
+
+
+def _depths(values) -> Picture:
+    """Splats that cover the middle at these depths, in shuffled order; half of them show."""
+    generator = np.random.default_rng(11)
+    depths = generator.permutation(np.asarray(values, np.float32))
+    means = np.column_stack([np.zeros((len(depths), 2)), depths])
+    # wide enough to reach the camera from behind
+    quats = generator.normal(size=(len(depths), 4))
+    scales = np.maximum(np.abs(depths), 0.3)[:, None]
+    colors = generator.random((len(depths), 3))
+    return Picture(splats(means, quats, scales, 0.5, colors), camera(), outputs=ALL_OUTPUTS)
+
+
+def _key_pictures() -> Iterator[Picture]:
+    ulp = np.float32(5) + np.arange(12, dtype=np.float32) * np.spacing(np.float32(5))
+    yield _depths(ulp)  # neighbours of float32
+    yield _depths([-2.0, -1.0, -0.5, -1e-3, -0.0, 0.0, 1e-3, 0.5, 1.0])  # centres behind the camera
+    yield _depths([*np.linspace(1, 2, 10), 1e6, 1e12])  # far outliers
+    yield _depths([*np.geomspace(0.02, 1e6, 40)])
+
+
+@case("C2", "precision and sign of keys", "depths 1 ulp apart, below 0, 1e12 m")
+def c2(renderer: Renderer) -> Found:
+    yield from _key_pictures()
+    found = [_keys_and_order(renderer, picture) for picture in _key_pictures()]
+    yield Finding("keys beyond 2 ulp of their depth", sum(pair[0] for pair in found), 0)
+    yield Finding("splats out of the order by depth and index", sum(pair[1] for pair in found), 0)
+    keys = trace(renderer, next(_key_pictures()))["keys"]
+    yield Finding("neighbouring depths with one key", len(keys) - len(np.unique(keys)), 0)
+
+
+@case("C3", "the same bits every time", "300 splats, again and in other tiles")
+def c3(renderer: Renderer) -> Found:
+    picture = Picture(random_splats(300, seed=12), camera(), outputs=ALL_OUTPUTS)
+    first = draw(renderer, picture)
+    kept = {name: first[name].copy() for name in first}
+    changed = max(differing(kept, draw(renderer, picture), ALL_OUTPUTS) for _ in range(3))
+    yield Finding("pixels that change when drawn again", changed, 0)
+    if isinstance(renderer.backend, Reshapes):
+        tiles = next(iter(renderer.backend.shapes("tiles").values()))
+        changed = differing(kept, trace(renderer, picture, tiles), ALL_OUTPUTS)
+        yield Finding("pixels that change in other tiles", changed, 0)
+    plain = Picture(taken(picture.cloud, np.arange(300)), picture.camera, outputs=("rgb",))
+    yield Finding(
+        "pixels that change without other outputs", differing(kept, draw(renderer, plain), ("rgb",)), 0
+    )

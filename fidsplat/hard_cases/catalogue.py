@@ -1,0 +1,28 @@
+"""Every case, by the letters of the groups."""
+
+from __future__ import annotations
+
+from fidsplat.hard_cases import (  # noqa: F401  each enters its cases
+    a_bounds,
+    b_homography,
+    c_order,
+    d_alpha,
+    e_inputs,
+    f_arithmetic,
+)
+from fidsplat.hard_cases.case import CASES, Case
+
+GROUPS = {
+    "A": "bounds, near plane",
+    "B": "homography",
+    "C": "order, ties",
+    "D": "alpha, depth",
+    "E": "inputs, sizes",
+    "F": "arithmetic",
+}
+"""Letter of each group of the catalogue -> what it is about."""
+
+
+def all_cases(groups: str = "ABCDEF") -> tuple[Case, ...]:
+    """Every case of the groups named by their letters, in the catalogue's order."""
+    return tuple(sorted((case for case in CASES if case.name[0] in groups), key=lambda case: case.name))

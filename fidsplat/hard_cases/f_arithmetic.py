@@ -1,0 +1,181 @@
+"""Group F of the catalogue: the device's own arithmetic, barriers, sorting."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fidsplat.backends.base import Probed, Reshapes
+from fidsplat.backends.prepare import prepare
+from fidsplat.capture import Capture
+from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
+from fidsplat.hard_cases.arithmetic import measure
+from fidsplat.hard_cases.case import Finding, Found, case
+from fidsplat.hard_cases.clouds import camera, splats
+from fidsplat.hard_cases.invariance import out_of_order
+from fidsplat.quality import Quality
+from fidsplat.random_clouds import random_splats
+from fidsplat.render import Renderer
+from fidsplat.splats import SplatCloud
+
+CULLED = np.uint32(0xFFFFFFFF)
+VIEW = camera(60, 45, 48.0)
+UNSAFE = ("fast", "unsafe", "finite", "denorms", "mad-enable", "signed-zeros")
+"""words of build options that let go of IEEE arithmetic"""
+
+
+@case(
+    "F1",
+    "products are rounded before they are subtracted",
+    "a b - a b in float32 and in the set-up's precision; FMA where it is asked for",
+)
+def f1(renderer: Renderer) -> Found:
+    # products that are subtracted round alike, and FMA fuses where the device is said to
+    if not isinstance(renderer.backend, Probed):
+        return
+    probe = renderer.backend.probe()
+    generator = np.random.default_rng(61)
+    a, b = generator.uniform(0.5, 2.0, (2, 4096)).astype(np.float32)
+    (difference, total, wide, fused), fuses = probe.contraction(a, b)
+    yield Finding("a b - a b that is not 0", int(np.count_nonzero(difference)), 0)
+    yield Finding("the same in the set-up's precision", int(np.count_nonzero(wide)), 0)
+    yield Finding("a b + c that is not rounded twice", int(np.count_nonzero(total != a * b + a)), 0)
+    product = a.astype(float) * b.astype(float)  # exact, and so is its rounding error
+    wanted = (product - (a * b)) if fuses else np.zeros(len(a))
+    yield Finding(
+        "FMA(a, b, c) that is not rounded as it should be", int(np.count_nonzero(fused != wanted)), 0
+    )
+
+
+@case(
+    "F2",
+    "precision of exp, log, division and square root",
+    "a quarter of a million arguments each: exp of -14 to 0, quotients and roots of 1e-9 to 1e9",
+)
+def f2(renderer: Renderer) -> Found:
+    # exp, log, division and square root against float64, by what OpenCL promises
+    measured = measure(renderer)
+    yield from measured.findings if measured else ()
+
+
+@case("F3", "NaN and infinity are no numbers", "quiet, negative and signalling NaN; the build options")
+def f3(renderer: Renderer) -> Found:
+    # no build option lets go of NaN, and the compiler does not by itself
+    if not isinstance(renderer.backend, Probed):
+        return
+    probe = renderer.backend.probe()
+    unsafe = [option for option in probe.options() if any(word in option for word in UNSAFE)]
+    yield Finding("build options that let go of IEEE arithmetic", len(unsafe), 0)
+    bits = [
+        0x7FC00000,
+        0xFFC00000,
+        0x7F800001,
+        0x7F800000,
+        0xFF800000,
+        0,
+        0x80000000,
+        0x3F800000,
+        0xBF800000,
+        1,
+    ]
+    x = np.array(bits, np.uint32).view(np.float32)
+    unequal, named, survives, infinite = probe.not_a_number(x)
+    is_nan = np.isnan(x)
+    for name, seen in (("x != x", unequal), ("isnan(x)", named), ("a comparison that fails", survives)):
+        yield Finding(f"NaN taken wrongly by {name}", int((seen.astype(bool) != is_nan).sum()), 0)
+    yield Finding("infinities taken wrongly", int((infinite.astype(bool) != np.isinf(x)).sum()), 0)
+
+
+@case("F4", "denormals", "opacities, scales, colours and backgrounds of 1e-45 to 1e-30")
+def f4(renderer: Renderer) -> Found:
+    # weights, scales, colours and positions at and below the smallest normal number
+    quality = Quality(alpha_cutoff=1e-30, transmittance_stop=0.0)
+    means = [[0.1 * k - 0.4, 0.05 * k - 0.2, 1.0 + 0.2 * k] for k in range(9)]
+    opacities = [1e-38, 1e-40, 1e-30, 1e-20, 1e-10, 1e-5, 0.5, 1.0, 0.9]
+    faint = splats(means, (1, 0.2, 0.1, 0), (0.2, 0.3), opacities)
+    yield Picture(faint, VIEW, quality)
+    thin = splats(means, (1, 0.2, 0.1, 0), [[1e-38, 0.3]] * 4 + [[0.3, 1e-42]] * 5, 0.8)
+    yield Picture(thin, VIEW, outputs=ALL_OUTPUTS)
+    dark = splats(means, (1, 0.2, 0.1, 0), (0.2, 0.3), 0.7, (1e-39, 1e-44, 1e-38))
+    yield Picture(dark, VIEW, background=(1e-40, 0.0, 1e-45))
+    measured = measure(renderer)
+    if measured:
+        # either will do: nothing that is drawn is as small (the cut-off of the presets is at least 1e-6)
+        yield Finding("denormals are flushed to 0 (1) or kept (0)", float(not measured.denormals), 1)
+
+
+@case(
+    "F5",
+    "barriers",
+    "tile lists of 0 to 300 splats with 64 staged at a time, pixels that finish at different times",
+)
+def f5(renderer: Renderer) -> Found:
+    # the schedule with barriers against the one without; on a GPU, against other sizes of its groups
+    backend = renderer.backend
+    if not isinstance(backend, Reshapes):
+        return
+    # lists from none to several times what a group stages at once (128), and pixels that finish early
+    crowded = random_splats(260, 65, depth=(0.8, 1.5), scale=(0.02, 0.25), across=0.25)
+    cloud = SplatCloud.concatenate([crowded, random_splats(60, 66, depth=(1.5, 6.0), scale=(0.05, 0.5))])
+    features, view = prepare(cloud, Capture(VIEW, ALL_OUTPUTS, background=(0.1, 0.2, 0.3)))
+    resident = backend.upload(cloud)
+    base = backend.pipeline(features).render(resident, view)
+    (schedule,) = backend.shapes("schedule").values()
+    other = backend.pipeline(features, schedule).render(resident, view)
+    for name in ("rgb", "alpha", "depth"):
+        error = np.abs(other.read(name) - base.read(name)).max()
+        yield Finding(f"{name}: difference between schedules", float(error), 5e-6)
+    labels = (other.read("label") != base.read("label")).mean()
+    yield Finding("share of pixels with another label", float(labels), 1e-3)
+
+
+def in_a_row(depths) -> SplatCloud:
+    """One splat on the axis for each depth."""
+    means = np.zeros((len(depths), 3))
+    means[:, 2] = depths
+    return splats(means, (1, 0, 0, 0), (0.05, 0.05), 0.05)
+
+
+@case(
+    "F6",
+    "sorting and prefix sums",
+    "1 to 4097 splats around the number of chunks; ties, one depth, descending, half of them culled",
+)
+def f6(renderer: Renderer) -> Found:
+    # depth order, tile lists and their starts at awkward lengths, against NumPy's stable sort
+    backend = renderer.backend
+    if not isinstance(backend, Reshapes):
+        return
+    generator = np.random.default_rng(67)
+    features, view = prepare(in_a_row([1.0]), Capture(VIEW))
+    unsorted = unlisted = tried = 0
+    for shape in backend.shapes("sorting").values():
+        pipeline = backend.pipeline(features, shape)
+        c = backend.pieces(shape)
+        for n in sorted({1, 2, 3, c - 1, c, c + 1, 2 * c + 1, 255, 256, 257, 1000, 4097} - {0}):
+            for kind in ("random", "few values", "one value", "descending", "half culled"):
+                depths = generator.uniform(1.0, 9.0, n)
+                if kind == "few values":
+                    depths = np.round(depths)
+                elif kind == "one value":
+                    depths[:] = 3.0
+                elif kind == "descending":
+                    depths = np.sort(depths)[::-1]
+                elif kind == "half culled":
+                    depths[::2] *= -1
+                trace = pipeline.trace(backend.upload(in_a_row(depths)), view)
+                keys = trace["keys"]
+                visible = np.flatnonzero(keys != CULLED)
+                wanted = visible[np.argsort(keys[visible], kind="stable")]
+                unsorted += out_of_order(trace, wanted) > 0
+                unsorted += not np.array_equal(visible, np.flatnonzero(depths > 0))
+                unlisted += not _lists_are_whole(trace, len(wanted))
+                tried += 1
+    yield Finding(f"of {tried} depth orders, those that are not the stable one", unsorted, 0)
+    yield Finding("sets of tile lists that lack a splat, or whose starts are wrong", unlisted, 0)
+
+
+def _lists_are_whole(trace: dict[str, np.ndarray], visible: int) -> bool:
+    starts = trace["starts"].astype(np.int64)
+    whole = starts[0] == 0 and starts[-1] == len(trace["lists"]) and bool((np.diff(starts) >= 0).all())
+    # all lie on the axis: the tiles around the middle have every one of them
+    return whole and int(np.diff(starts).max()) == visible

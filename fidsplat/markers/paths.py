@@ -1,0 +1,126 @@
+"""Outlines of SVG shapes as closed rings of points."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import numpy as np
+
+Rings = list[np.ndarray]
+"""closed outlines, each (n, 2) float64 x, y, the last point joined to the first"""
+
+PIECES = 64
+"""Straight pieces of a curve."""
+
+_TOKEN = re.compile(r"([MmLlHhVvCcSsQqTtAaZz])|([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)")
+_NUMBERS = {"M": 2, "L": 2, "H": 1, "V": 1, "C": 6, "S": 4, "Q": 4, "T": 2, "A": 7, "Z": 0}
+
+
+def polygon_rings(points: str) -> Rings:
+    """The ring of a polygon's ``points``. Raises ValueError for an odd number of them."""
+    numbers = [float(text) for _, text in _TOKEN.findall(points)]
+    if len(numbers) % 2:
+        raise ValueError("an odd number of coordinates")
+    return [np.array(numbers).reshape(-1, 2)] if len(numbers) >= 6 else []
+
+
+def circle_rings(cx: float, cy: float, rx: float, ry: float) -> Rings:
+    """The ring of an ellipse."""
+    turn = np.linspace(0, 2 * np.pi, 4 * PIECES, endpoint=False)
+    return [np.column_stack([cx + rx * np.cos(turn), cy + ry * np.sin(turn)])]
+
+
+def path_rings(text: str) -> Rings:
+    """The rings of a path's ``d``: every subpath closed, as filling does, curves in straight pieces.
+
+    Raises ValueError where a command lacks numbers, or the path does not begin with a move.
+    """
+    left = re.sub(r"[\s,]", "", _TOKEN.sub("", text))
+    if left:
+        raise ValueError(f"{left[:10]!r} in a path")
+    rings: Rings = []
+    points: list[np.ndarray] = []
+    here, control, before = np.zeros(2), np.zeros(2), ""
+    for command, v in _commands(text):
+        kind, base = command.upper(), here if command.islower() else np.zeros(2)
+        if not before and kind != "M":
+            raise ValueError("a path must begin with M")
+        if kind in "MZ":
+            if len(points) > 2:
+                rings.append(np.array(points))
+            start = v + base if kind == "M" else points[0] if points else here
+            points, here = [start], start
+        elif kind == "A":
+            end = v[5:] + base
+            points += _arc(here, end, abs(v[0]), abs(v[1]), np.radians(v[2]), bool(v[3]), bool(v[4]))
+            here = end
+        elif kind in "LHV":
+            end = here.copy()
+            if kind == "L":
+                end = v + base
+            else:
+                axis = "HV".index(kind)
+                end[axis] = v[0] + base[axis]
+            points.append(end)
+            here = end
+        else:
+            given = v.reshape(-1, 2) + base
+            if kind in "ST":  # the control point that mirrors the one before
+                smooth = before in ("CS" if kind == "S" else "QT")
+                given = np.vstack([2 * here - control if smooth else here, given])
+            curve = np.vstack([here, given])
+            points += list(_bezier(curve))
+            control, here = curve[-2], curve[-1]
+        before = kind
+    return [*rings, np.array(points)] if len(points) > 2 else rings
+
+
+def _commands(text: str) -> Iterator[tuple[str, np.ndarray]]:
+    """Each command with as many numbers as one of its kind takes; a move's further pairs are lines."""
+    command, numbers = "", []
+    for letter, number in [*_TOKEN.findall(text), ("Z", "")]:
+        if not letter:
+            numbers.append(float(number))
+            continue
+        if command:
+            size = _NUMBERS[command.upper()]
+            if (len(numbers) % size if size else numbers) or (size and not numbers):
+                raise ValueError(f"{command} with {len(numbers)} numbers")
+            if not size:
+                yield command, np.zeros(0)
+            for i in range(0, len(numbers), size or 1):
+                yield command, np.array(numbers[i : i + size])
+                command = "L" if command == "M" else "l" if command == "m" else command
+        elif numbers:
+            raise ValueError("numbers before a command")
+        command, numbers = letter, []
+
+
+def _bezier(control: np.ndarray) -> np.ndarray:
+    """Points (PIECES, 2) along a curve of 3 or 4 control points, its start left out."""
+    t = np.linspace(0, 1, PIECES + 1)[1:, None, None]
+    points = np.repeat(control[None], PIECES, 0)
+    while points.shape[1] > 1:
+        points = points[:, :-1] * (1 - t) + points[:, 1:] * t
+    return points[:, 0]
+
+
+def _arc(
+    start: np.ndarray, end: np.ndarray, rx: float, ry: float, turn: float, large: bool, sweep: bool
+) -> list[np.ndarray]:
+    """Points along an elliptical arc, its start left out (SVG 1.1, appendix F.6)."""
+    if not (rx and ry) or np.array_equal(start, end):
+        return [end]
+    to_axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    half = to_axes @ (start - end) / 2
+    grown = max(1.0, np.sqrt((half[0] / rx) ** 2 + (half[1] / ry) ** 2))
+    radii = np.array([rx, ry]) * grown
+    x, y = half / radii
+    aside = np.sqrt(max(1 / (x * x + y * y) - 1, 0.0)) * (-1 if large == sweep else 1)
+    middle = aside * np.array([y, -x])
+    first, last = (np.arctan2(*(way * np.array([x, y]) - middle)[::-1]) for way in (1, -1))
+    span = (last - first) % (2 * np.pi) - (0 if sweep else 2 * np.pi)
+    angles = first + span * np.linspace(0, 1, PIECES + 1)[1:]
+    circle = np.column_stack([np.cos(angles), np.sin(angles)]) + middle
+    return list((circle * radii) @ to_axes + (start + end) / 2)

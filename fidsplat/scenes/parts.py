@@ -1,0 +1,181 @@
+"""What a scene holds: markers with poses, splats, and how they are looked at."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fidsplat.cameras import Camera, Motion, Shutter
+from fidsplat.capture import Capture, output_names
+from fidsplat.errors import InputError
+from fidsplat.quality import Quality
+from fidsplat.rotations import check_similarity
+from fidsplat.scalars import PickledByFields
+from fidsplat.sensor import Sensor
+from fidsplat.splats import SplatCloud
+from fidsplat.surroundings import Background, Fog, background_of
+
+if TYPE_CHECKING:
+    from fidsplat.cameras.motion import Pose
+    from fidsplat.markers import Marker
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedMarker(PickledByFields):
+    """A marker somewhere in the world. Raises InputError when the pose is not rigid, or the motion is no
+    function."""
+
+    marker: Marker
+    pose: np.ndarray = field(default_factory=lambda: np.eye(4))
+    """(4, 4) float64, world_from_marker, rigid, read-only"""
+    label: int = 1
+    """label of its splats; a Scene numbers its markers 1, 2, ..."""
+    motion: Pose | None = None
+    """its pose at a time in seconds; None: it stays at `pose`"""
+
+    def __post_init__(self) -> None:
+        check_similarity(self.pose, "a marker's pose", rigid=True)
+        if self.motion is not None and not callable(self.motion):
+            raise InputError(
+                f"a marker's motion is a {type(self.motion).__name__}; it must be an fs.Trajectory or a "
+                "function of the time"
+            )
+        if not isinstance(getattr(self.marker, "cloud", None), SplatCloud):
+            raise InputError(
+                f"marker is {self.marker!r}; it must be an fs.Marker, e.g. fs.marker('apriltag:36h11:5')"
+            )
+        pose = np.array(self.pose, dtype=np.float64)
+        pose.flags.writeable = False
+        object.__setattr__(self, "pose", pose)
+
+    @property
+    def corners(self) -> np.ndarray:
+        """Corners (4, 3) float64 of the code's outer edge in the world: top left, top right, bottom right,
+        bottom left."""
+        return np.asarray(self.marker.corners, np.float64) @ self.pose[:3, :3].T + self.pose[:3, 3]
+
+    def cloud(self) -> SplatCloud:
+        """The marker's splats in the world, all with its label."""
+        return self.marker.cloud.transformed(self.pose).with_labels(self.label)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneParts(PickledByFields):
+    """What is drawn and how. Raises InputError for a part of the wrong kind."""
+
+    clouds: tuple[SplatCloud, ...] = ()
+    """splats in the world, with labels of their own (0 unless given)"""
+    camera: Camera | None = None
+    markers: tuple[PlacedMarker, ...] = ()
+    """marker i has the label i + 1, whatever label it came with"""
+    background: Background = (0.0, 0.0, 0.0)
+    """RGB in display space, a Gradient or a Panorama"""
+    outputs: tuple[str, ...] = ("rgb",)
+    """names of the planes that are rendered"""
+    quality: Quality | str | None = None
+    """a Quality, text (`Quality.of`), or None for the default"""
+    device: str | None = None
+    """a device's name, or None for the default"""
+    shutter: Shutter | None = None
+    """when the picture is taken, and how long that takes; None: at time 0, at once"""
+    camera_motion: Pose | None = None
+    """world_to_camera at a time in seconds; None: the camera stands still"""
+    sensor: Sensor | None = None
+    """what becomes of rgb on its way out"""
+    fog: Fog | None = None
+    """between the camera and what it sees"""
+    cloud_motions: Mapping[int, Pose] = field(default_factory=dict)
+    """number of a cloud that moves: the rigid motion of the world, at a time in seconds, that it makes from
+    where it is. Its splats have one label for all, above the markers', that no other splat has"""
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__
+        put(self, "clouds", _all_of(self.clouds, SplatCloud, "clouds"))
+        Motion(self.camera_motion)  # which is refused here rather than when the scene is drawn
+        moving = self.cloud_motions
+        if not isinstance(moving, Mapping) or not all(map(callable, moving.values())):
+            raise InputError(
+                "cloud_motions must be {number of the cloud: fs.Trajectory or function of the time}"
+            )
+        for number in moving:
+            if isinstance(number, bool) or number not in range(len(self.clouds)):
+                raise InputError(
+                    f"cloud_motions: there is no cloud {number!r}; this scene has {len(self.clouds)}, "
+                    "counted from 0"
+                )
+        put(self, "cloud_motions", dict(moving))
+        placed = _all_of(self.markers, PlacedMarker, "markers")
+        put(self, "markers", tuple(replace(marker, label=i + 1) for i, marker in enumerate(placed)))
+        if not isinstance(self.shutter, Shutter | None):
+            raise InputError(f"shutter must be a Shutter, not {self.shutter!r}")
+        if not isinstance(self.camera, Camera | None):
+            raise InputError(f"camera must be a Camera, not {self.camera!r}")
+        put(self, "background", background_of(self.background))
+        for name, kind in (("sensor", Sensor), ("fog", Fog)):
+            if not isinstance(getattr(self, name), kind | None):
+                raise InputError(f"{name} must be a {kind.__name__}, not {getattr(self, name)!r}")
+        put(self, "outputs", output_names(self.outputs))
+
+    @cached_property
+    def motion(self) -> Motion:
+        """What moves: the camera, markers by their labels (and whatever else has these), and clouds."""
+        groups = {
+            marker.label: partial(_moved_from, marker.pose, marker.motion)
+            for marker in self.markers
+            if marker.motion is not None
+        }
+        groups |= {self._labels[number]: motion for number, motion in self.cloud_motions.items()}
+        return Motion(self.camera_motion, groups)
+
+    @cached_property
+    def capture(self) -> Capture:
+        """How the scene's picture is taken. Raises InputError for a quality that does not exist."""
+        return Capture(
+            self.camera, self.outputs, Quality.of(self.quality), self.background, self.motion,
+            self.shutter or Shutter(), self.sensor or Sensor(), self.fog,
+        )  # fmt: skip
+
+    def cloud(self) -> SplatCloud:
+        """All splats in one cloud: the clouds' in their order, with their own labels if they do not move by
+        themselves, then each marker's."""
+        return self._merged
+
+    @cached_property
+    def _merged(self) -> SplatCloud:
+        labels = self._labels
+        clouds = [
+            cloud.with_labels(labels[i]) if i in labels else cloud for i, cloud in enumerate(self.clouds)
+        ]
+        return SplatCloud.concatenate([*clouds, *(marker.cloud() for marker in self.markers)])
+
+    @cached_property
+    def _labels(self) -> dict[int, int]:
+        """The labels of clouds that move, by their numbers."""
+        still = [cloud.labels for i, cloud in enumerate(self.clouds) if i not in self.cloud_motions]
+        taken = (
+            {int(label) for labels in still for label in np.unique(labels)} if self.cloud_motions else set()
+        )
+        free = (label for label in itertools.count(len(self.markers) + 1) if label not in taken)
+        return dict(zip(sorted(self.cloud_motions), free, strict=False))
+
+
+def _moved_from(start: np.ndarray, motion: Pose, time: float) -> np.ndarray:
+    """The motion of the world that takes a marker from its pose to where it is then."""
+    pose = motion(time)
+    check_similarity(pose, f"a marker's pose at {time:g} s", rigid=True)
+    return np.asarray(pose, np.float64) @ np.linalg.inv(start)
+
+
+def _all_of(values: Iterable, kind: type, name: str) -> tuple:
+    try:
+        found = tuple(values)
+    except TypeError:
+        found = (None,)
+    if not all(isinstance(value, kind) for value in found):
+        raise InputError(f"{name} must be a list of {kind.__name__}")
+    return found

@@ -1,0 +1,52 @@
+"""The output images of a frame as files."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.files import atomic_write
+from fidsplat.vision.images import write_png
+from fidsplat.vision.paint import (
+    count_picture,
+    depth_millimetres,
+    depth_picture,
+    label_picture,
+    normal_picture,
+)
+
+
+def save_output(
+    name: str, image: np.ndarray, name_of: Callable[[str, str], Path], bits: int | None = None
+) -> list[Path]:
+    """Write one output image and return the files.
+
+    Args:
+        name: "rgb", "depth", ...
+        image: (h, w) or (h, w, 3).
+        bits: 16 writes rgb as a 16-bit PNG.
+        name_of: gives the file for an output's name and a suffix such as ".png" or "-turbo.png".
+    """
+    if name.startswith(("depth", "distance")):
+        return [
+            _write_array(name_of(name, ".npy"), image),
+            write_png(name_of(name, ".png"), depth_millimetres(image)),
+            write_png(name_of(name, "-turbo.png"), depth_picture(image)),
+        ]
+    if name in ("label", "splat_id", "blended"):
+        picture = count_picture if name == "blended" else label_picture
+        return [
+            _write_array(name_of(name, ".npy"), image),
+            write_png(name_of(name, ".png"), picture(image)),
+        ]
+    if name == "rgb" and bits == 16:
+        deep = np.rint(np.clip(np.nan_to_num(image, nan=0.0), 0, 1) * 65535).astype(np.uint16)
+        return [write_png(name_of(name, ".png"), deep)]
+    is_normal = name in ("normal", "normal_world")
+    return [write_png(name_of(name, ".png"), normal_picture(image) if is_normal else image)]
+
+
+def _write_array(path: Path, array: np.ndarray) -> Path:
+    with atomic_write(path) as stream:
+        np.save(stream, array)
+    return path

@@ -1,0 +1,23 @@
+// blended (h, w) int: number of splats that were blended, those of a layer each by itself; of several samples the most.
+//@ state
+    vint blended;
+//@ start
+    pixel->blended = 0;
+//@ seen
+    vint blended;
+//@ see
+    seen.blended = 1;
+//@ pick
+    layer->mean.blended = VSELECT(layer->mean.blended, other->mean.blended, mask);
+//@ gather
+    layer->mean.blended += VSELECT((vint)0, (vint)1, VMASK(opacity > 0.0f));
+//@ composite
+    pixel->blended += live & seen->blended;
+//@ store
+        VSTORE(pixel->blended, blended_raw + at);
+//@ resolve_start
+    int blended = 0;
+//@ resolve_sample
+            blended = max(blended, blended_raw[at]);
+//@ resolve_end
+    blended_out[out] = blended;

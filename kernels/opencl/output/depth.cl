@@ -1,0 +1,19 @@
+// depth (h, w): expected depth along z [m], sum w z / sum w; 0 where less than 1/255 is covered.
+//@ state
+    vfloat depth, depth_weight;
+//@ start
+    pixel->depth = 0.0f;
+    pixel->depth_weight = 0.0f;
+//@ composite
+    pixel->depth = FMA(weight, seen->z, pixel->depth);
+    pixel->depth_weight += weight;
+//@ store
+        VSTORE(VSELECT((vfloat)0.0f, pixel->depth, pixel_shown(pixel)), depth_raw + at);
+        VSTORE(VSELECT((vfloat)0.0f, pixel->depth_weight, pixel_shown(pixel)), depth_raw + plane + at);
+//@ resolve_start
+    float depth = 0, depth_weight = 0;
+//@ resolve_sample
+            depth += depth_raw[at];
+            depth_weight += depth_raw[plane + at];
+//@ resolve_end
+    depth_out[out] = depth_weight > 0 ? depth / depth_weight : 0.0f;

@@ -1,0 +1,19 @@
+// depth_first (h, w): depth [m] of the first fragment or layer behind which no more light than `first_light` is left; 0 where
+// there is none. Of several samples the nearest.
+//@ state
+    vfloat depth_first, first_light;
+//@ start
+    pixel->depth_first = 0.0f;
+//@ pixels_start
+    for (int row = 0; row < (int)(sizeof(pixels) / sizeof(pixels[0])); row++) pixels[row].first_light = first_light;
+//@ composite
+    pixel->depth_first = VSELECT(pixel->depth_first, seen->z,
+                                 live & VMASK(pixel->depth_first == 0.0f) & VMASK(pixel->t - weight <= pixel->first_light));
+//@ store
+        VSTORE(pixel->depth_first, depth_first_raw + at);
+//@ resolve_start
+    float depth_first = INFINITY;
+//@ resolve_sample
+            if (depth_first_raw[at] > 0.0f) depth_first = fmin(depth_first, depth_first_raw[at]);
+//@ resolve_end
+    depth_first_out[out] = depth_first < INFINITY ? depth_first : 0.0f;

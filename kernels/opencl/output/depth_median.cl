@@ -1,0 +1,29 @@
+// depth_median (h, w): depth [m] of the last fragment in front of which more than half of the light remains; 0 where less than
+// 1/255 is covered. Fragments that take less light than that count together: the one with which they have taken it stands for
+// them. Of several samples per pixel the lower median of those that hit something.
+//@ state
+    vfloat depth_median;
+    vfloat median_light;    // left behind the fragment that counted last
+//@ start
+    pixel->depth_median = 0.0f;
+    pixel->median_light = 1.0f;
+//@ composite
+    vfloat behind = pixel->t - weight;
+    vint counts = live & VMASK(pixel->t > 0.5f) & VMASK(pixel->median_light - behind >= LEAST_ALPHA);
+    pixel->depth_median = VSELECT(pixel->depth_median, seen->z, counts);
+    pixel->median_light = VSELECT(pixel->median_light, behind, counts);
+//@ store
+        VSTORE(pixel->depth_median, depth_median_raw + at);
+//@ resolve_start
+    float depth_medians[SAMPLES * SAMPLES];
+    int depth_median_hits = 0;
+//@ resolve_sample
+            float median_here = depth_median_raw[at];
+            if (median_here > 0.0f) {
+                int place = depth_median_hits++;
+                for (; place > 0 && depth_medians[place - 1] > median_here; place--)
+                    depth_medians[place] = depth_medians[place - 1];
+                depth_medians[place] = median_here;
+            }
+//@ resolve_end
+    depth_median_out[out] = depth_median_hits > 0 ? depth_medians[(depth_median_hits - 1) / 2] : 0.0f;

@@ -1,0 +1,13 @@
+// distance_median (h, w): distance along the ray [m] of what depth_median sees; of several samples the lower median.
+//@ resolve_start
+    float medians_along[SAMPLES * SAMPLES];
+    int medians_hit = 0;
+//@ resolve_sample
+            float along_here = depth_median_raw[at] * length_here;
+            if (along_here > 0.0f) {
+                int place = medians_hit++;
+                for (; place > 0 && medians_along[place - 1] > along_here; place--) medians_along[place] = medians_along[place - 1];
+                medians_along[place] = along_here;
+            }
+//@ resolve_end
+    distance_median_out[out] = medians_hit > 0 ? medians_along[(medians_hit - 1) / 2] : 0.0f;

@@ -1,0 +1,39 @@
+// label (h, w) int: label of the fragment or layer with the largest weight, the nearest of equals; -1 where less
+// than 1/255 is covered.
+//@ project
+    record.label = labels[i];
+//@ state
+    vfloat label_weight;
+    vint label;
+//@ start
+    pixel->label_weight = 0.0f;
+    pixel->label = -1;
+//@ seen
+    vint label;
+//@ see
+    seen.label = s->label;
+//@ layer
+    vfloat label_tau;       // greatest optical depth of its fragments: that one's label is the layer's
+//@ pick
+    layer->label_tau = VSELECT(layer->label_tau, other->label_tau, mask);
+    layer->mean.label = VSELECT(layer->mean.label, other->mean.label, mask);
+//@ gather
+    layer->mean.label = VSELECT(layer->mean.label, seen->label, VMASK(tau > layer->label_tau));
+    layer->label_tau = fmax(layer->label_tau, tau);
+//@ composite
+    vint heavier = VMASK(weight > pixel->label_weight);
+    pixel->label = VSELECT(pixel->label, seen->label, heavier);
+    pixel->label_weight = fmax(pixel->label_weight, weight);
+//@ store
+        VSTORE(VSELECT((vfloat)0.0f, pixel->label_weight, pixel_shown(pixel)), label_raw + at);
+        VSTORE(pixel->label, label_id_raw + at);
+//@ resolve_start
+    float label_weight = 0;
+    int label = -1;
+//@ resolve_sample
+            if (label_raw[at] > label_weight) {
+                label_weight = label_raw[at];
+                label = label_id_raw[at];
+            }
+//@ resolve_end
+    label_out[out] = label;

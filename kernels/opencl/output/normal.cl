@@ -1,0 +1,48 @@
+// normal (h, w, 3): unit normal in the camera frame, towards the camera, of the mean of the splats' normals by weight; 0 where
+// less than 1/255 is covered.
+//@ project
+    // the camera is on one side of the whole plane, so the sign is the splat's (numerics B7)
+    real towards = offset > 0 ? -1 : 1;
+    record.nx = (wide)(facet.x * towards);
+    record.ny = (wide)(facet.y * towards);
+    record.nz = (wide)(facet.z * towards);
+//@ state
+    vfloat normal_x, normal_y, normal_z;
+//@ start
+    pixel->normal_x = 0.0f;
+    pixel->normal_y = 0.0f;
+    pixel->normal_z = 0.0f;
+//@ seen
+    vfloat nx, ny, nz;
+//@ see
+    seen.nx = s->nx;
+    seen.ny = s->ny;
+    seen.nz = s->nz;
+//@ pick
+    layer->mean.nx = VSELECT(layer->mean.nx, other->mean.nx, mask);
+    layer->mean.ny = VSELECT(layer->mean.ny, other->mean.ny, mask);
+    layer->mean.nz = VSELECT(layer->mean.nz, other->mean.nz, mask);
+//@ gather
+    layer->mean.nx = FMA(share, seen->nx - layer->mean.nx, layer->mean.nx);
+    layer->mean.ny = FMA(share, seen->ny - layer->mean.ny, layer->mean.ny);
+    layer->mean.nz = FMA(share, seen->nz - layer->mean.nz, layer->mean.nz);
+//@ composite
+    pixel->normal_x = FMA(weight, seen->nx, pixel->normal_x);
+    pixel->normal_y = FMA(weight, seen->ny, pixel->normal_y);
+    pixel->normal_z = FMA(weight, seen->nz, pixel->normal_z);
+//@ store
+        VSTORE(VSELECT((vfloat)0.0f, pixel->normal_x, pixel_shown(pixel)), normal_raw + at);
+        VSTORE(VSELECT((vfloat)0.0f, pixel->normal_y, pixel_shown(pixel)), normal_raw + plane + at);
+        VSTORE(VSELECT((vfloat)0.0f, pixel->normal_z, pixel_shown(pixel)), normal_raw + 2 * plane + at);
+//@ resolve_start
+    float normal_x = 0, normal_y = 0, normal_z = 0;
+//@ resolve_sample
+            normal_x += normal_raw[at];
+            normal_y += normal_raw[plane + at];
+            normal_z += normal_raw[2 * (size_t)plane + at];
+//@ resolve_end
+    float normal_length = sqrt(normal_x * normal_x + normal_y * normal_y + normal_z * normal_z);
+    float normal_scale = normal_length > 0 ? 1.0f / normal_length : 0.0f;
+    normal_out[3 * out] = normal_x * normal_scale;
+    normal_out[3 * out + 1] = normal_y * normal_scale;
+    normal_out[3 * out + 2] = normal_z * normal_scale;

@@ -1,0 +1,5 @@
+// normal_world (h, w, 3): the normal in the axes of the world.
+//@ resolve_end
+    for (int axis = 0; axis < 3; axis++)
+        normal_world_out[3 * out + axis] =
+            normal_scale * FMA(turn[axis], normal_x, FMA(turn[3 + axis], normal_y, turn[6 + axis] * normal_z));

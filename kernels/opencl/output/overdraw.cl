@@ -1,0 +1,24 @@
+// overdraw (h, w) int: fragments that the samples of a pixel draw, those of a layer when it is composited. No output for users:
+// `fidsplat bench` counts with it what a frame must blend.
+//@ state
+    vint overdraw;
+//@ start
+    pixel->overdraw = 0;
+//@ seen
+    vint fragments;         // that it is made of
+//@ see
+    seen.fragments = 1;
+//@ pick
+    layer->mean.fragments = VSELECT(layer->mean.fragments, other->mean.fragments, mask);
+//@ gather
+    layer->mean.fragments -= mask;
+//@ composite
+    pixel->overdraw += seen->fragments & live;
+//@ store
+        VSTORE(pixel->overdraw, overdraw_raw + at);
+//@ resolve_start
+    int overdraw = 0;
+//@ resolve_sample
+            overdraw += overdraw_raw[at];
+//@ resolve_end
+    overdraw_out[out] = overdraw;

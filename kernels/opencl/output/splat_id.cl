@@ -1,0 +1,39 @@
+// splat_id (h, w) int: index in the cloud of the fragment with the largest weight, of a layer its splat of greatest optical
+// depth, the nearest of equals; -1 where less than 1/255 is covered.
+//@ project
+    record.splat_id = splat_ids[i];
+//@ state
+    vfloat splat_id_weight;
+    vint splat_id;
+//@ start
+    pixel->splat_id_weight = 0.0f;
+    pixel->splat_id = -1;
+//@ seen
+    vint splat_id;
+//@ see
+    seen.splat_id = s->splat_id;
+//@ layer
+    vfloat splat_id_tau;    // greatest optical depth of its fragments: that one stands for the layer
+//@ pick
+    layer->splat_id_tau = VSELECT(layer->splat_id_tau, other->splat_id_tau, mask);
+    layer->mean.splat_id = VSELECT(layer->mean.splat_id, other->mean.splat_id, mask);
+//@ gather
+    layer->mean.splat_id = VSELECT(layer->mean.splat_id, seen->splat_id, VMASK(tau > layer->splat_id_tau));
+    layer->splat_id_tau = fmax(layer->splat_id_tau, tau);
+//@ composite
+    vint heavier_id = VMASK(weight > pixel->splat_id_weight);
+    pixel->splat_id = VSELECT(pixel->splat_id, seen->splat_id, heavier_id);
+    pixel->splat_id_weight = fmax(pixel->splat_id_weight, weight);
+//@ store
+        VSTORE(VSELECT((vfloat)0.0f, pixel->splat_id_weight, pixel_shown(pixel)), splat_id_raw + at);
+        VSTORE(pixel->splat_id, splat_id_index_raw + at);
+//@ resolve_start
+    float splat_id_weight = 0;
+    int splat_id = -1;
+//@ resolve_sample
+            if (splat_id_raw[at] > splat_id_weight) {
+                splat_id_weight = splat_id_raw[at];
+                splat_id = splat_id_index_raw[at];
+            }
+//@ resolve_end
+    splat_id_out[out] = splat_id;

@@ -1,0 +1,86 @@
+// Edges of boxes (part/box_cover.cl) where forms are affine in the sample: straight lines, whose distances in samples need
+// one number for each edge of a splat.
+//@ footprint_functions
+static inline vfloat between(vfloat d, vfloat n, wide edge_0, wide edge_1) {
+    vfloat above = clamp(FMA(FMA((vfloat)SQRT_2, n, d), (vfloat)edge_0, (vfloat)0.5f), (vfloat)0.0f, (vfloat)1.0f);
+    vfloat below = clamp(FMA(FMA((vfloat)-SQRT_2, n, d), (vfloat)edge_1, (vfloat)0.5f), (vfloat)0.0f, (vfloat)1.0f);
+    return fmax(above + below - 1.0f, (vfloat)0.0f);
+}
+//@ footprint_cross
+    if (IS_BOX(s)) {
+        c.cover = between(c.d, nu, s->edge_u0, s->edge_u1) * between(c.d, nv, s->edge_v0, s->edge_v1);
+        c.inside = VMASK(c.cover > 0.0f) & VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);
+    }
+//@ functions
+#define BOX_SIDES 6
+#define BOX_CORNERS (4 + BOX_SIDES)
+static inline real box_edge(real3_ k0, real3_ kx, real3_ ky, real facing, real turn, bool along_v, real *line) {
+    real n0 = along_v ? k0.y : k0.x, nx = along_v ? kx.y : kx.x, ny = along_v ? ky.y : ky.x;
+    line[1] = facing * kx.z + turn * nx;
+    line[2] = facing * ky.z + turn * ny;
+    real inverse = 1 / fmax(sqrt(line[1] * line[1] + line[2] * line[2]), REAL(1e-30));
+    line[0] = (facing * k0.z + turn * n0) * inverse + REAL(0.5);
+    line[1] *= inverse;
+    line[2] *= inverse;
+    return inverse;
+}
+
+// What of the picture a box can touch: the picture's rectangle, cut at the lines half a sample outside the four edges, at the
+// plane's horizon and at the near plane. Forms, rectangle and result are relative to one point. False if nothing is left.
+static inline bool box_touches(real3_ k0, real3_ kx, real3_ ky, real facing, real d_near, real *box) {
+    real line[3], x[BOX_CORNERS] = {box[0], box[1], box[1], box[0]}, y[BOX_CORNERS] = {box[2], box[2], box[3], box[3]};
+    int count = 4;
+    for (int side = 0; side < BOX_SIDES; side++) {
+        if (side < 4) {
+            box_edge(k0, kx, ky, facing, side & 1 ? -facing : facing, side >= 2, line);
+        } else {
+            real turn = side == 4 ? facing : -facing;
+            line[0] = turn * k0.z + (side == 4 ? 0 : d_near);
+            line[1] = turn * kx.z;
+            line[2] = turn * ky.z;
+        }
+        real kept_x[BOX_CORNERS], kept_y[BOX_CORNERS];
+        int kept = 0;
+        for (int k = 0; k < count; k++) {
+            int next = k + 1 < count ? k + 1 : 0;
+            real here = line[0] + line[1] * x[k] + line[2] * y[k], there = line[0] + line[1] * x[next] + line[2] * y[next];
+            if (here >= 0 && kept < BOX_CORNERS) {
+                kept_x[kept] = x[k];
+                kept_y[kept++] = y[k];
+            }
+            if ((here >= 0) != (there >= 0) && kept < BOX_CORNERS) {
+                real share = here / (here - there);
+                kept_x[kept] = x[k] + share * (x[next] - x[k]);
+                kept_y[kept++] = y[k] + share * (y[next] - y[k]);
+            }
+        }
+        count = kept;
+        for (int k = 0; k < count; k++) x[k] = kept_x[k], y[k] = kept_y[k];
+    }
+    box[0] = box[2] = INFINITY;
+    box[1] = box[3] = -INFINITY;
+    for (int k = 0; k < count; k++) {
+        box[0] = fmin(box[0], x[k]);
+        box[1] = fmax(box[1], x[k]);
+        box[2] = fmin(box[2], y[k]);
+        box[3] = fmax(box[3], y[k]);
+    }
+    return count > 0;
+}
+//@ footprint_bounds
+    if (BOX_HERE) {
+        real3_ cu = image_row(view->focal_x, view->center_x - center_x, row_x, tw);
+        real3_ cv = image_row(view->focal_y, view->center_y - center_y, row_y, tw);
+        real box[4] = {-1 - center_x, view->width + 1 - center_x, -1 - center_y, view->height + 1 - center_y};
+        real d_near = fabs(view->focal_x * view->focal_y * su * sv * offset) / near;
+//@@ camera_box_near
+        real towards_box = offset < 0 ? -1 : 1;
+        if (!box_touches(cross3(cu, cv), cross3(cv, tw), cross3(tw, cu), towards_box, d_near, box)) return;
+        bounds = box_bounds(center_x + box[0], center_x + box[1], center_y + box[2], center_y + box[3]);
+    }
+//@ project
+    real edge_line[3];
+    record.edge_u0 = (wide)box_edge(k0, kx, ky, scale, scale, false, edge_line);
+    record.edge_u1 = (wide)box_edge(k0, kx, ky, scale, -scale, false, edge_line);
+    record.edge_v0 = (wide)box_edge(k0, kx, ky, scale, scale, true, edge_line);
+    record.edge_v1 = (wide)box_edge(k0, kx, ky, scale, -scale, true, edge_line);

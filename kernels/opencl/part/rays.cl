@@ -1,0 +1,64 @@
+// Lenses whose samples each have a ray of their own, in the buffer `rays`: 3 planes X, Y, Z of the padded sample grid, NaN
+// where nothing is seen. A ray r meets the splat's plane at (u, v) with (u, v, 1) D = (n_u, n_v, D) = r . (b x p, p x a, a x b),
+// at the depth det[a b p] / D in units of r's length: along z if rays have Z = 1, else along the ray. The forms are kept
+// relative to the ray of the sample nearest to the centre, so that nothing cancels (numerics B1).
+//@ cross_functions
+static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfloat ray_z, float half_r2
+//@@ ray_cross_parameters
+) {
+    vfloat x = ray_x - s->ray_x, y = ray_y - s->ray_y, z = ray_z - s->ray_z;
+    vfloat nu = FMA((vfloat)s->nuz, z, FMA((vfloat)s->nuy, y, FMA((vfloat)s->nux, x, (vfloat)s->nu0)));
+    vfloat nv = FMA((vfloat)s->nvz, z, FMA((vfloat)s->nvy, y, FMA((vfloat)s->nvx, x, (vfloat)s->nv0)));
+    vfloat d = FMA((vfloat)s->dz, z, FMA((vfloat)s->dy, y, FMA((vfloat)s->dx, x, (vfloat)s->d0)));
+    Crossing c = cross_row(s, nu, nv, d, 0.0f, half_r2);
+//@@ ray_cross
+    return c;
+}
+//@ camera_forms
+    // any ray will do for an anchor; where that sample sees nothing it is the centre's
+    size_t ray_stride = (width + TILE_W - 1) / TILE_W * TILE_W;
+    size_t ray_plane = ray_stride * ((height + TILE_H - 1) / TILE_H * TILE_H);
+    float near_x = center_x == center_x ? (float)center_x : bounds.ex, near_y = center_y == center_y ? (float)center_y : bounds.ey;
+    size_t ray_at = (size_t)clamp(floor(near_y), 0.0f, (float)(height - 1)) * ray_stride + (size_t)clamp(floor(near_x), 0.0f, (float)(width - 1));
+    float anchor_ray[3] = {rays[ray_at], rays[ray_plane + ray_at], rays[2 * ray_plane + ray_at]};
+    if (!(anchor_ray[0] == anchor_ray[0])) {
+        real away = sqrt(dot3(p, p));
+        away = away > 0 ? 1 / away : 0;
+        anchor_ray[0] = (float)(p.x * away);
+        anchor_ray[1] = (float)(p.y * away);
+        anchor_ray[2] = (float)(p.z * away);
+    }
+    real3_ of_u = cross3(b, p), of_v = cross3(p, a), of_d = {facet.x * su * sv, facet.y * su * sv, facet.z * su * sv};
+    real3_ anchor = {anchor_ray[0], anchor_ray[1], anchor_ray[2]};
+    real3_ k0 = {dot3(of_u, anchor), dot3(of_v, anchor), dot3(of_d, anchor)};
+    real3_ kx = {of_u.x, of_v.x, of_d.x}, ky = {of_u.y, of_v.y, of_d.y}, kz = {of_u.z, of_v.z, of_d.z};
+    real determinant = su * sv * offset;
+//@ camera_steepest
+    steepest = fmax(steepest, fmax(fabs(kz.x), fabs(kz.y)));
+//@ project
+    record.nuz = (wide)(kz.x * n_scale);
+    record.nvz = (wide)(kz.y * n_scale);
+    record.dz = (wide)(kz.z * facing);
+    record.ray_x = anchor_ray[0];
+    record.ray_y = anchor_ray[1];
+    record.ray_z = anchor_ray[2];
+//@ lanes_start
+    size_t ray_stride = (size_t)tiles_x * TILE_W, ray_plane = ray_stride * tiles_y * TILE_H;
+#define RAY(k) VLOAD(rays + (k) * ray_plane + (y0 + row) * ray_stride + x0)
+//@ group_start
+    size_t ray_stride = (size_t)tiles_x * TILE_W, ray_plane = ray_stride * tiles_y * TILE_H;
+    float own_rays[3][ROWS];
+    for (int row = 0; row < ROWS; row++)
+        for (int k = 0; k < 3; k++) own_rays[k][row] = rays[k * ray_plane + (py + row) * ray_stride + px];
+#define RAY(k) own_rays[k][row]
+//@ cross
+    c = cross_ray(&s, RAY(0), RAY(1), RAY(2), half_r2
+//@@ ray_cross_arguments
+    );
+//@ backdrop_ray
+    ray_x = rays[at];
+    ray_y = rays[plane + at];
+    ray_z = rays[2 * (size_t)plane + at];
+    if (!(ray_x == ray_x)) return;           // nothing is seen there
+//@ mask
+    mask &= VMASK(c.d == c.d);               // the low-pass draws nothing where there is no ray

@@ -1,0 +1,63 @@
+// Edges of boxes (part/box_cover.cl) where samples have rays of their own: curves, which within a sample are straight. The
+// gradients of the forms come from the ray's derivatives by the sample's position, in the buffer `ray_slopes`: 6 planes
+// dX/dx, dY/dx, dZ/dx, dX/dy, dY/dy, dZ/dy.
+//@ footprint_functions
+// 1 where a form is half a sample above 0, 0 where it is as much below, by its derivatives along x and y.
+static inline vfloat edge_ramp(vfloat form, vfloat by_x, vfloat by_y) {
+    vfloat steep = sqrt(fmax(FMA(by_x, by_x, by_y * by_y), (vfloat)1e-36f));
+    return clamp(form / steep + 0.5f, (vfloat)0.0f, (vfloat)1.0f);
+}
+
+static inline vfloat between(vfloat d, vfloat n, vfloat d_x, vfloat d_y, vfloat n_x, vfloat n_y) {
+    const vfloat root = SQRT_2;
+    vfloat above = edge_ramp(FMA(root, n, d), FMA(root, n_x, d_x), FMA(root, n_y, d_y));
+    vfloat below = edge_ramp(FMA(-root, n, d), FMA(-root, n_x, d_x), FMA(-root, n_y, d_y));
+    return fmax(above + below - 1.0f, (vfloat)0.0f);
+}
+
+static inline vfloat along(wide x, wide y, wide z, vfloat to_x, vfloat to_y, vfloat to_z) {
+    return FMA((vfloat)z, to_z, FMA((vfloat)y, to_y, (vfloat)x * to_x));
+}
+//@ ray_cross_parameters
+    , vfloat xx, vfloat yx, vfloat zx, vfloat xy, vfloat yy, vfloat zy   // the ray's derivatives along x, along y
+//@ ray_cross
+    if (IS_BOX(s)) {
+        vfloat d_x = along(s->dx, s->dy, s->dz, xx, yx, zx), d_y = along(s->dx, s->dy, s->dz, xy, yy, zy);
+        vfloat u_x = along(s->nux, s->nuy, s->nuz, xx, yx, zx), u_y = along(s->nux, s->nuy, s->nuz, xy, yy, zy);
+        vfloat v_x = along(s->nvx, s->nvy, s->nvz, xx, yx, zx), v_y = along(s->nvx, s->nvy, s->nvz, xy, yy, zy);
+        c.cover = between(d, nu, d_x, d_y, u_x, u_y) * between(d, nv, d_x, d_y, v_x, v_y);
+        c.inside = VMASK(c.cover > 0.0f) & VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);
+    }
+//@ ray_cross_arguments
+                              , SLOPE(0), SLOPE(1), SLOPE(2), SLOPE(3), SLOPE(4), SLOPE(5)
+//@ lanes_start
+#define SLOPE(k) VLOAD(ray_slopes + (k) * ray_plane + (y0 + row) * ray_stride + x0)
+//@ group_start
+    float own_slopes[6][ROWS];
+    for (int row = 0; row < ROWS; row++)
+        for (int k = 0; k < 6; k++) own_slopes[k][row] = ray_slopes[k * ray_plane + (py + row) * ray_stride + px];
+#define SLOPE(k) own_slopes[k][row]
+//@ footprint_spread
+    // A sample that is partly covered meets the plane at |u| <= 1 + |grad F| / 2 D for the forms F = D -+ n_u, likewise v. With
+    // |grad F| <= |F| ray_step (|F| of its three factors) and D >= su sv |offset| / |P|, the point P on the plane is no further
+    // than |p| + |u| su + |v| sv: a linear inequality, whose solution is a larger box. Without one, near the plane's own horizon,
+    // all of the plane is taken.
+    real3_ box_a = a, box_b = b;
+    real box_reach = reach;
+    if (BOX_HERE) {
+        real3_ of_u = cross3(b, p), of_v = cross3(p, a);
+        real half_step = REAL(0.5) * ray_step[0] / (su * sv * fabs(offset)), far_off = sqrt(dot3(p, p));
+        real wider_u = half_step * (su * sv + sqrt(dot3(of_u, of_u))), wider_v = half_step * (su * sv + sqrt(dot3(of_v, of_v)));
+        real share = wider_u * su + wider_v * sv;
+        bool ends = share < REAL(0.9);
+        real furthest = ends ? far_off + (su + sv + share * far_off) / (1 - share) : 0;
+        real to_u = ends ? 1 + wider_u * furthest : REAL(1e6) * (1 + (far_off + sv) / su);
+        real to_v = ends ? 1 + wider_v * furthest : REAL(1e6) * (1 + (far_off + su) / sv);
+        a.x *= to_u; a.y *= to_u; a.z *= to_u;
+        b.x *= to_v; b.y *= to_v; b.z *= to_v;
+        reach = radius * sqrt(a.z * a.z + b.z * b.z);
+    }
+//@ footprint_bounds
+    a = box_a;
+    b = box_b;
+    reach = box_reach;

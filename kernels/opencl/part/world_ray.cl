@@ -1,0 +1,22 @@
+// What is seen behind everything by each sample's own ray: added to the samples of one pose before they become pixels.
+// A lens with rays of its own gives them (part/rays.cl); others have x, y, 1, or parallel rays for an infinite focal length.
+//@ kernels
+// Index space: one work-item per sample (x, y). Reads: raw's transmittances. Writes: raw's colours.
+kernel void backdrop(
+//@@ arguments backdrop
+) {
+    int x = get_global_id(0), y = get_global_id(1);
+    if (x >= width || y >= height) return;
+    size_t at = (size_t)y * stride + x;
+    float ray_x = ((float)x + 0.5f - ray_center_x) / ray_focal_x;
+    float ray_y = ((float)y + 0.5f - ray_center_y) / ray_focal_y, ray_z = 1.0f;
+//@@ backdrop_ray
+    float world_x = FMA(turn_00, ray_x, FMA(turn_10, ray_y, turn_20 * ray_z));
+    float world_y = FMA(turn_01, ray_x, FMA(turn_11, ray_y, turn_21 * ray_z));
+    float world_z = FMA(turn_02, ray_x, FMA(turn_12, ray_y, turn_22 * ray_z));
+    float behind[3];
+//@@ backdrop
+    float let_through = raw[3 * (size_t)plane + at];
+    for (int channel = 0; channel < 3; channel++)
+        raw[channel * (size_t)plane + at] = FMA(let_through, behind[channel], raw[channel * (size_t)plane + at]);
+}

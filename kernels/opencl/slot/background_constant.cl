@@ -1,1 +1,0 @@
-// One colour behind everything: the background that resolving is given.

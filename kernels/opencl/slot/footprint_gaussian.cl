@@ -1,1 +1,0 @@
-// Every splat is a Gaussian, as 2DGS has them.

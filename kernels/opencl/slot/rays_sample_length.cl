@@ -1,5 +1,0 @@
-// The length of each sample's ray while pixels are resolved, of the ray that the lens gives it.
-//@ resolve_args
-    , global const float *restrict rays      // (3, rows, columns) of the padded grid
-//@ resolve_sample
-            float length_here = length_of_ray(rays, plane, at);

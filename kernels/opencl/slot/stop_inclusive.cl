@@ -1,1 +1,0 @@
-// The fragment that takes the transmittance to the stop or below is still drawn (numerics D1).

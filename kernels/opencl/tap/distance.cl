@@ -1,9 +1,0 @@
-// distance (h, w): expected distance along the ray [m], sum w r / sum w; 0 where less than 1/255 is covered.
-//@ resolve_args
-    , global float *restrict distance_out
-//@ resolve_start
-    float along_ray = 0;
-//@ resolve_sample
-            along_ray = FMA(depth_raw[at], length_here, along_ray);
-//@ resolve_end
-    distance_out[out] = depth_weight > 0 ? along_ray / depth_weight : 0.0f;

@@ -1,0 +1,22 @@
+"""The samples of a pixel of the picture, and where they lie in sample buffers."""
+
+import warp as wp
+
+
+@wp.struct
+class PixelGrid:
+    """The samples of one pixel."""
+
+    pixel: int  # of the picture, row by row
+    row: int  # of the picture
+    first: int  # place of the first sample in a buffer
+    stride: int  # samples of a row of a buffer, its padding included
+    side: int  # samples along a side
+    count: int  # side^2
+    mean: float  # 1 / count
+
+
+@wp.func
+def sample_at(grid: PixelGrid, k: int) -> int:
+    """Where sample k, 0 to count - 1, lies in a buffer."""
+    return grid.first + k / grid.side * grid.stride + k % grid.side

@@ -1,0 +1,243 @@
+"""What layout.py declares, compared with what the device's compiler makes of it; effects from elsewhere."""
+
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pyopencl as cl
+import pytest
+from agreement import random_splats
+from combined import LENSES, combination, everything
+
+import fidsplat as fs
+from fidsplat.backends.opencl.assemble import Source, assemble, layouts_of
+from fidsplat.backends.opencl.declare import Layout, Samples, member, uniforms
+from fidsplat.backends.opencl.layout import LAYOUTS
+from fidsplat.backends.opencl.program import build
+from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
+from fidsplat.effects import CATALOGUE, OUTPUTS, Effect, Output, select
+
+BACKEND = "opencl"
+SETS = {
+    "nothing": (),
+    **{str(lens): everything(lens) for lens in (None, *LENSES)},
+    "double": ("boxes and Gaussians", "planes", "output normal", "output label"),
+}
+
+
+def offsets_on(backend, source: Source) -> dict[str, dict[str, int]]:
+    """By record and field where the device has it, and under "" the record's size."""
+    structs = re.findall(r"typedef struct[^{]*\{[^}]*\} (?:View|Splat|Bounds);", source.text)
+    assert len(structs) == len(source.records)
+    asked, lines = [], []
+    for record, dtype in source.records.items():
+        for field in ("", *(dtype.names or ())):
+            place = f"(char *)&of_{record}.{field} - (char *)&of_{record}" if field else f"sizeof({record})"
+            lines.append(f"    out[{len(asked)}] = (int)({place});\n")
+            asked.append((record, field))
+    variables = "".join(f"    {record} of_{record};\n" for record in source.records)
+    real = f"typedef {source.scalars.real} real;\n#pragma OPENCL EXTENSION cl_khr_fp64 : enable\n"
+    body = f"kernel void places(global int *out) {{\n{variables}{''.join(lines)}}}\n"
+    program = build(backend, real + "\n".join(structs) + "\n" + body)
+    found = np.empty(len(asked), np.int32)
+    out = cl.Buffer(backend.context, cl.mem_flags.READ_WRITE, found.nbytes)
+    program.places(backend.queue, (1,), None, out)
+    cl.enqueue_copy(backend.queue, found, out)
+    places: dict[str, dict[str, int]] = {record: {} for record in source.records}
+    for (record, field), place in zip(asked, found.tolist(), strict=True):
+        places[record][field] = place
+    return places
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_records_lie_on_the_device_as_the_host_has_them(renderer, name):
+    asked = combination(SETS[name])
+    if not renderer.device.float64:
+        pytest.skip("records of a device without float64 are those of `setup_precision` float32")
+    features = asked.features()
+    if name == "double":
+        quality = asked.capture.quality.with_(blend_precision="float64")
+        features = select(asked.cloud, asked.capture.with_(quality=quality))
+    source = assemble(features, gpu_shape())
+    places = offsets_on(renderer.backend, source)
+    for record, dtype in source.records.items():
+        fields = dtype.fields or {}
+        assert places[record] == {"": dtype.itemsize, **{name: fields[name][1] for name in dtype.names or ()}}
+
+
+@pytest.mark.parametrize("shape", [cpu_shape(), gpu_shape(256)], ids=["lanes", "group"])
+def test_kernels_take_what_is_declared(renderer, shape):
+    """Names, types and address spaces of all arguments, as the compiler has understood them."""
+    asked = combination(everything("fisheye") if shape.schedule == "lanes" else everything(None))
+    source = assemble(asked.features(), shape)
+    program = build(renderer.backend, source.text, "-cl-kernel-arg-info")
+    info, spaces = cl.kernel_arg_info, cl.kernel_arg_address_qualifier
+    kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
+    assert kernels.keys() == source.arguments.keys()
+    for name, kernel in kernels.items():
+        found = [
+            (
+                kernel.get_arg_info(k, info.TYPE_NAME),
+                kernel.get_arg_info(k, info.NAME),
+                kernel.get_arg_info(k, info.ADDRESS_QUALIFIER) == spaces.GLOBAL,
+            )
+            for k in range(kernel.num_args)
+        ]
+        declared = [
+            (source.scalars.of(one.ctype) + ("*" if one.access else ""), one.name, bool(one.access))
+            for one in source.arguments[name]
+        ]
+        assert found == declared, name
+
+
+def test_every_effect_is_laid_out_and_brings_what_its_output_needs():
+    assert set(CATALOGUE) <= set(LAYOUTS)
+    for name, effect in CATALOGUE.items():
+        assert set(effect.needs) <= set(LAYOUTS[name].parts), name
+
+
+TOY_OUTPUT = """// nearest (h, w): depth [m] of the nearest fragment that is drawn; 0 where there is none.
+//@ state
+    vfloat nearest;
+//@ start
+    pixel->nearest = INFINITY;
+//@ composite
+    pixel->nearest = fmin(pixel->nearest, VSELECT((vfloat)INFINITY, seen->z, live & VMASK(weight > 0.0f)));
+//@ store
+        VSTORE(pixel->nearest, nearest_raw + at);
+//@ resolve_start
+    float nearest = 0.0f;
+//@ resolve_sample
+            nearest = nearest_raw[at];
+//@ resolve_end
+    nearest_out[out] = nearest < INFINITY ? nearest : 0.0f;
+"""
+TOY_STEP = """// The negative of what the sensor gives.
+//@ resolve_end
+    for (size_t k = 3 * out; k < 3 * out + 3; k++) rgb_out[k] = white - rgb_out[k];
+"""
+
+
+class Negative(fs.Sensor):
+    """A sensor with a step that this package does not have."""
+
+    @property
+    def steps(self):
+        return (*super().steps, "negative")
+
+    def uniform(self, name):
+        return (2.0,) if name == "negative" else super().uniform(name)
+
+
+@pytest.fixture
+def toys(monkeypatch, tmp_path):
+    """An output and a sensor's step: for each a line in the catalogue, one in the layouts, and a file."""
+    (tmp_path / "nearest.cl").write_text(TOY_OUTPUT)
+    (tmp_path / "negative.cl").write_text(TOY_STEP)
+    output = Output("nearest", 1, "float32")
+    monkeypatch.setitem(CATALOGUE, "nearest", Effect("nearest", output))
+    monkeypatch.setitem(OUTPUTS, "nearest", output)
+    monkeypatch.setitem(CATALOGUE, "negative", Effect("negative"))
+    nearest = Layout(
+        str(tmp_path / "nearest.cl"), parts=("ray_depth",), samples=(Samples("float", "nearest_raw"),)
+    )
+    monkeypatch.setitem(LAYOUTS, "nearest", nearest)
+    negative = Layout(str(tmp_path / "negative.cl"), resolve=uniforms("negative", "float white"))
+    monkeypatch.setitem(LAYOUTS, "negative", negative)
+    return tmp_path
+
+
+def test_an_output_and_a_step_from_elsewhere_are_drawn(renderer, toys):
+    cloud = random_splats(60, seed=4, depth=(1, 4))
+    camera = fs.Camera.pinhole(33, 21, 30.0, 30.0, 16.0, 10.0)
+    plain = renderer.render(cloud, camera, ("rgb", "depth", "depth_first"), fs.Quality(first_hit=1e-3))
+    toy = renderer.render(cloud, camera, ("rgb", "nearest", "depth"), sensor=Negative())
+    np.testing.assert_array_equal(toy["rgb"], np.float32(2) - plain["rgb"])
+    np.testing.assert_array_equal(toy["depth"], plain["depth"])
+    assert ((toy["nearest"] > 0) >= (plain["depth"] > 0)).all()
+    seen = plain["depth_first"] > 0
+    assert (toy["nearest"][seen] <= plain["depth_first"][seen]).all()
+    assert seen.any()
+
+
+def test_effects_from_elsewhere_leave_other_texts_as_they_were(request):
+    asked = [select(random_splats(3, seed=1), fs.Capture(outputs=(name,))) for name in OUTPUTS]
+    before = [assemble(features, cpu_shape()).digest for features in asked]
+    request.getfixturevalue("toys")
+    assert [assemble(features, cpu_shape()).digest for features in asked] == before
+    assert "nearest" not in layouts_of(asked[0])
+
+
+def test_a_mistake_in_a_kernel_is_told_with_its_file_and_line(renderer, toys):
+    (toys / "wrong.cl").write_text("// wrong\n//@ resolve_end\n    nearest_out[out] = no_such_name;\n")
+    layout = Layout(str(toys / "wrong.cl"), splat=(member("int wrong"),))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(LAYOUTS, "nearest", layout)
+        features = select(random_splats(3, seed=1), fs.Capture(outputs=("nearest",)))
+        with pytest.raises(fs.DeviceError, match=r"wrong\.cl:3:\d+: .*no_such_name"):
+            renderer.backend.pipeline(features)
+
+
+def test_line_directives_lead_to_the_lines_of_the_files():
+    from fidsplat.kernel_files import kernels_folder
+
+    source = assemble(combination(everything("distortion")).features(), cpu_shape())
+    assert source.listing.count("\n") == source.text.count("\n")
+    file, number, told = "", 0, 0
+    for line in source.listing.splitlines():
+        if directive := re.fullmatch(r'#line (\d+) "(.*)"', line):
+            number, file = int(directive[1]), directive[2]
+            continue
+        if file.startswith("opencl/") and line.strip():
+            written = (kernels_folder() / file).read_text("utf-8").splitlines()[number - 1]
+            assert re.sub(r"WIDE\(([^()]+)\)", r"\1f", written).replace("wide ", "float ")[:4] == line[:4]
+            told += 1
+        number += 1
+    assert told > 800
+
+
+def test_the_text_needs_no_opencl():
+    code = (
+        "import sys; sys.modules['pyopencl'] = None\n"
+        "import fidsplat as fs\n"
+        "from fidsplat.backends.opencl.assemble import assemble\n"
+        "from fidsplat.backends.opencl.shapes import cpu_shape\n"
+        "from fidsplat.effects import select\n"
+        "features = select(fs.SplatCloud.empty(), fs.Capture(outputs=('rgb', 'depth')))\n"
+        "print(assemble(features, cpu_shape()).digest)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert len(done.stdout.strip()) == 64
+
+
+def source(*words, block=""):
+    code = f"import sys\n{block}\nfrom fidsplat.cli import main\nsys.exit(main(sys.argv[1:]))"
+    return subprocess.run([sys.executable, "-c", code, "source", *words], capture_output=True, text=True)
+
+
+def test_a_scene_s_program_is_printed_without_opencl(tmp_path):
+    cloud, file = random_splats(5, seed=1, depth=(1, 3)), tmp_path / "cloud.ply"
+    fs.save_ply(cloud, str(file))
+    blocked = "sys.modules['pyopencl'] = None"
+    lanes = source(str(file), "--outputs", "rgb,depth", block=blocked)
+    assert (lanes.returncode, lanes.stderr) == (0, "")
+    assert '"opencl/output/depth.cl"' in lanes.stdout
+    assert "// depth = z_numerator / D" in lanes.stdout
+    assert "output/normal.cl" not in lanes.stdout
+    group = source(str(file), "--schedule", "group", block=blocked)
+    assert "schedule/group.cl" in group.stdout
+    assert "schedule/group.cl" not in lanes.stdout
+    without = source(str(file), "--device", "reference")
+    assert without.returncode == 2
+    assert "reference is no OpenCL device" in without.stderr
+
+
+def test_the_program_of_a_device_is_what_it_compiles(renderer, tmp_path):
+    cloud, file = random_splats(5, seed=1, depth=(1, 3)), tmp_path / "cloud.ply"
+    fs.save_ply(cloud, str(file))
+    frame = renderer.render(cloud, fs.Camera.pinhole(8, 8, 8.0, 8.0, 4.0, 4.0))
+    assert frame["rgb"].shape == (8, 8, 3)
+    compiled = {pipeline.source.listing for pipeline in renderer.backend._pipelines.values()}
+    assert source(str(file), "--device", renderer.device.name).stdout in compiled

@@ -1,0 +1,92 @@
+"""Capture: what it takes, and what it says of values that it cannot have."""
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+
+CAMERA = fs.Camera.pinhole(16, 12, 16.0, 16.0, 8.0, 6.0)
+GREY = (0.5, 0.5, 0.5)
+MOVING = fs.Motion(camera=lambda time: np.eye(4))
+
+
+def test_parts_may_be_words_and_left_out():
+    capture = fs.Capture(CAMERA, "depth", "fast", [0, 0.5, 1])
+    assert (capture.outputs, capture.background) == (("depth",), (0.0, 0.5, 1.0))
+    assert capture.quality == fs.Quality.named("fast")
+    plain = fs.Capture(quality=None, motion=None, shutter=None, sensor=None)
+    assert (plain.quality, plain.shutter, plain.sensor) == (fs.Quality(), fs.Shutter(), fs.Sensor())
+    assert fs.Capture(outputs=["rgb", "alpha", "rgb"]).outputs == ("rgb", "alpha")
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"camera": "front"}, "camera is 'front'; it must be a Camera"),
+        ({"outputs": ()}, "outputs is empty; name at least one"),
+        ({"outputs": (1, 2)}, "outputs must be one or more names"),
+        ({"outputs": 7}, "outputs must be one or more names"),
+        ({"quality": "fats"}, "did you mean 'fast'"),
+        ({"background": (1, 2)}, "background must be three finite numbers"),
+        ({"motion": 3}, "motion is 3; it must be a Motion"),
+        ({"shutter": "slow"}, "shutter is 'slow'; it must be a Shutter"),
+        ({"sensor": 8}, "sensor is 8; it must be a Sensor"),
+        ({"fog": 0.1}, "fog is 0.1; it must be a Fog"),
+    ],
+)
+def test_a_part_of_the_wrong_kind_is_named_with_what_would_do(parts, message):
+    with pytest.raises(fs.InputError, match=message):
+        fs.Capture(**parts)
+    with pytest.raises(fs.InputError, match=message):
+        fs.Capture().with_(**parts)
+
+
+def test_a_copy_keeps_what_is_not_changed():
+    capture = fs.Capture(CAMERA, ("rgb", "depth"), "fast", GREY)
+    other = capture.with_(outputs=None, background=(0, 0, 0), fog=fs.Fog(0.1))
+    assert (other.camera, other.outputs, other.quality) == (CAMERA, capture.outputs, capture.quality)
+    assert (other.background, other.fog) == ((0.0, 0.0, 0.0), fs.Fog(0.1))
+    with pytest.raises(fs.InputError, match=r"part of a capture 'qualty' \(did you mean 'quality'\?\)"):
+        capture.with_(qualty="fast")
+
+
+@pytest.mark.parametrize(
+    ("fog", "backdrop"),
+    [(None, GREY), (fs.Fog(0.0, (1, 0, 0)), GREY), (fs.Fog(0.1, (1, 0, 0)), (1.0, 0.0, 0.0))],
+)
+def test_fog_hides_the_background(fog, backdrop):
+    assert fs.Capture(background=GREY, fog=fog).backdrop == backdrop
+
+
+def test_a_scene_and_its_resident_cloud_have_the_same_capture():
+    sky = fs.Gradient((0.2, 0.4, 0.9), (0.4, 0.3, 0.1))
+    parts = {
+        "outputs": ("rgb", "alpha"),
+        "background": sky,
+        "sensor": fs.Sensor(gain=0.5),
+        "fog": fs.Fog(0.2),
+    }
+    cloud = fs.SplatCloud([[0, 0, 2]], [[1, 0, 0, 0]], [[0.3, 0.3]], [0.9], colors=[[1.0, 0.5, 0.25]])
+    scene = fs.Scene([cloud], CAMERA, quality="fast,samples=2", camera_motion=lambda time: np.eye(4), **parts)
+    renderer = fs.Renderer("reference")
+    resident = renderer.upload(scene)
+    assert resident.capture.quality == fs.Quality.of("fast,samples=2")
+    own, kept = renderer.render(scene), renderer.render(resident, CAMERA)
+    assert own.outputs == kept.outputs == ("rgb", "alpha")
+    assert all(np.array_equal(own[name], kept[name]) for name in own)
+    plain = renderer.render(resident, fs.Capture(CAMERA))
+    assert not np.array_equal(plain["rgb"], own["rgb"])
+    (view,) = renderer.render_views(resident, [CAMERA])
+    assert np.array_equal(view["rgb"], own["rgb"])
+
+
+def test_a_capture_and_its_parts_draw_the_same():
+    cloud = fs.SplatCloud([[0, 0, 2]], [[1, 0, 0, 0]], [[0.3, 0.3]], [0.9], colors=[[1.0, 0.5, 0.25]])
+    renderer = fs.Renderer("reference")
+    capture = fs.Capture(CAMERA, ("rgb", "depth"), "fast", GREY, fog=fs.Fog(0.1))
+    long = renderer.render(cloud, capture)
+    short = renderer.render(cloud, CAMERA, ("rgb", "depth"), "fast", GREY, fog=fs.Fog(0.1))
+    words = {"outputs": ("rgb", "depth"), "quality": "fast", "background": GREY, "fog": fs.Fog(0.1)}
+    named = renderer.render(cloud, camera=CAMERA, **words)
+    frames = [short, named, *renderer.render_views(cloud, [capture])]
+    assert all(np.array_equal(frame[name], long[name]) for frame in frames for name in long)

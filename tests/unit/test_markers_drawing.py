@@ -1,0 +1,170 @@
+"""Drawings: SVG outlines, which modules they cover, their colours, and what is refused."""
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import fidsplat as fs
+from fidsplat.markers import marker
+from fidsplat.markers.drawing import inside
+from fidsplat.markers.kinds import parse_spec
+from fidsplat.markers.paths import circle_rings, path_rings
+from fidsplat.scenes import PlacedMarker
+
+
+def svg(folder, body: str, view: str = "0 0 40 20"):
+    file = folder / "sign.svg"
+    file.write_text(f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{view}">{body}</svg>')
+    return file
+
+
+def drawn(folder, body: str, modules: int = 40, view: str = "0 0 40 20", **options):
+    return marker(f"svg-{modules}:{svg(folder, body, view)}", **options)
+
+
+def test_shapes_are_painted_one_over_the_other(tmp_path):
+    made = drawn(
+        tmp_path,
+        '<rect x="2" y="3" width="10" height="8" fill="#ff0000"/>'
+        '<g fill="blue" transform="translate(20 2)"><rect width="5" height="4"/><g transform="scale(2)">'
+        '<rect x="3" y="1" width="2" height="2" style="fill: rgb(255, 0, 0)"/></g></g>'
+        '<path d="M4 5h4v4h-4z" fill="white"/>',
+    )
+    expected = np.zeros((20, 40), int)
+    expected[3:11, 2:12] = 1
+    expected[2:6, 20:25] = 2
+    expected[4:8, 26:30] = 1
+    expected[5:9, 4:8] = 0
+    assert np.array_equal(made.bits, expected)
+    assert made.palette.tolist() == [[1, 1, 1], [1, 0, 0], [0, 0, 1]]
+    assert (made.kind, made.quiet_zone, made.module) == ("svg", 0, 1 / 40)
+
+
+def test_every_rectangle_has_one_colour_and_the_splats_have_it(tmp_path):
+    body = '<circle cx="12" cy="9" r="7" fill="#f80"/><ellipse cx="26" cy="10" rx="9" ry="6" fill="teal"/>'
+    made = drawn(tmp_path, body, mixture="exact", quiet_zone=2)
+    cover = np.zeros(made.grid.shape, int)
+    for x0, y0, x1, y1 in made.boxes.tolist():
+        cover[y0:y1, x0:x1] += 1
+        assert (made.grid[y0:y1, x0:x1] == made.grid[y0, x0]).all()
+    assert (cover == 1).all()
+    assert made.boxes.tolist() == sorted(made.boxes.tolist(), key=lambda box: (box[1], box[0]))
+    values = made.grid[made.boxes[:, 1], made.boxes[:, 0]]
+    assert np.array_equal(made.cloud.colors, made.palette[values])
+    assert sum(polygon.area for polygon in made.polygons) == made.grid.size
+    # growth stays within the own colour, whatever the others are
+    fitted = made.gaussians
+    x, y = (fitted.means[:, :2] / made.module + np.array(made.grid.shape[::-1]) / 2).T
+    held = made.grid[y.astype(int), x.astype(int)]
+    assert np.array_equal(fitted.colors, made.palette[held])
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.floats(-3, 15), st.floats(-3, 15)), min_size=3, max_size=8), st.booleans())
+def test_modules_whose_centre_lies_inside(points, evenodd):
+    """Against shapely: the winding number is the sum over triangles from one corner to each edge."""
+    ring = np.array(points)
+    found = inside([ring], "evenodd" if evenodd else "nonzero", (12, 12))
+    y, x = np.indices((12, 12)) + 0.5
+    winding = np.zeros((12, 12), int)
+    near = np.zeros((12, 12), bool)
+    for a, b, c in zip([ring[0]] * len(ring), ring, np.roll(ring, -1, 0), strict=True):
+        triangle = shapely.Polygon([a, b, c])
+        if not triangle.area:
+            continue
+        near |= shapely.distance(triangle.exterior, shapely.points(x, y)) < 1e-6
+        turn = np.sign(np.cross(np.append(b - a, 0), np.append(c - a, 0))[2])
+        winding += (turn * shapely.contains_xy(triangle, x, y)).astype(int)
+    expected = winding % 2 == 1 if evenodd else winding != 0
+    assert np.array_equal(found[~near], expected[~near])
+
+
+def test_fill_rules():
+    outer, inner = path_rings("M1 1H9V9H1Z M3 3H7V7H3Z")
+    assert inside([outer, inner], "nonzero", (10, 10)).sum() == 64
+    assert inside([outer, inner], "evenodd", (10, 10)).sum() == 64 - 16
+    assert inside([outer, inner[::-1]], "nonzero", (10, 10)).sum() == 64 - 16
+
+
+@pytest.mark.parametrize(
+    ("path", "area"),
+    [
+        ("M0 0 10 0 10 10z", 50),
+        ("m1,1 l10,0 0,10 -10,0", 100),
+        ("M0 0H10V10H0ZM20 0h10v10h-10", 200),
+        ("M-5 0A5 5 0 0 1 5 0A5 5 0 0 1-5 0", np.pi * 25),
+        ("M-5 0A5 5 0 1 1 0 5L0 0", np.pi * 25 * 3 / 4),
+        ("M0 0a10 5 90 0 0 0 20", np.pi * 25),
+        ("M0 0Q5 10 10 0", 100 / 3),
+        ("M0 0Q5 10 10 0T20 0", 0),
+        ("M0 0C0 10 10 10 10 0", 60),
+        ("M0 0c0 10 10 10 10 0s10-10 10 0", 0),
+    ],
+)
+def test_areas_of_paths(path, area):
+    total = sum(
+        np.sum(ring[:, 0] * np.roll(ring[:, 1], -1) - ring[:, 1] * np.roll(ring[:, 0], -1)) / 2
+        for ring in path_rings(path)
+    )
+    assert abs(total) == pytest.approx(area, rel=3e-3, abs=1e-9)
+
+
+def test_circles():
+    (ring,) = circle_rings(3, 4, 2, 2)
+    assert np.allclose(np.linalg.norm(ring - [3, 4], axis=1), 2)
+
+
+@pytest.mark.parametrize(
+    ("body", "says"),
+    [
+        ("<text>STOP</text>", "<text> is no filled shape"),
+        ('<rect width="5" height="5" stroke="red"/>', "<rect> has a stroke"),
+        ('<rect width="5" height="5" rx="1"/>', "convert it to a path"),
+        ('<rect width="5" height="5" fill="url(#a)"/>', "no plain colour"),
+        ('<rect width="5" height="5" opacity="0.5"/>', "translucent"),
+        ('<g clip-path="url(#a)"/>', "has a clip-path"),
+        ('<g transform="skewX(5)"/>', "skewX"),
+        ('<path d="L5 5"/>', "must begin with M"),
+        ('<path d="M0 0 L5"/>', "L with 1 numbers"),
+        ('<path d="M0 0 # 5"/>', "'#' in a path"),
+        ('<rect width="wide" height="5"/>', "<rect> cannot be read"),
+        ('<path d="M0 0H1e300V5"/>', "too far"),
+        ('<circle r="nan"/>', "too far"),
+        ('<rect width="5" height="5" opacity="50%"/>', "translucent"),
+        ("<g>" * 200 + "</g>" * 200, "deeper than 100"),
+    ],
+)
+def test_what_cannot_be_drawn_as_it_looks_is_refused(tmp_path, body, says):
+    with pytest.raises(fs.InputError) as error:
+        drawn(tmp_path, body)
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_files_that_are_no_drawings(tmp_path):
+    file = tmp_path / "a.svg"
+    for text, says in (
+        ("", "no SVG file"),
+        ("<html/>", "begins with <html>"),
+        ("<svg/>", "no viewBox"),
+        ('<svg viewBox="0 0 0 5"/>', "above 0"),
+        ('<svg viewBox="0 0 1 100000"/>', "rows of modules"),
+    ):
+        file.write_text(text)
+        with pytest.raises(fs.InputError, match=says):
+            marker(f"svg:{file}")
+    with pytest.raises(fs.InputError, match="cannot read the drawing"):
+        marker(f"svg:{tmp_path / 'missing.svg'}")
+    for text, says in (("svg:", "names no file"), ("svg-0:a", "1 to 2048"), ("svg-x:a", "svg-512:FILE")):
+        with pytest.raises(fs.InputError, match=says):
+            parse_spec(text)
+
+
+def test_a_drawing_in_a_scene_file_is_beside_it(tmp_path):
+    made = drawn(tmp_path, '<rect width="20" height="20" fill="red"/>')
+    fs.Scene(markers=[PlacedMarker(made)]).save(tmp_path / "scene.toml")
+    assert 'spec = "svg-40:sign.svg"' in (tmp_path / "scene.toml").read_text()
+    again = fs.Scene.load(tmp_path / "scene.toml").markers[0].marker
+    assert np.array_equal(again.cloud.colors, made.cloud.colors)

@@ -1,0 +1,107 @@
+"""A backend from outside the tree: one line in the registry, and everything that people use draws with it."""
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.accuracy import draws_float64
+from fidsplat.backends import registry
+
+CAMERA = fs.Camera.pinhole(6, 4, 6.0, 6.0, 3.0, 2.0)
+CLOUD = fs.SplatCloud([[0, 0, 2]], [[1, 0, 0, 0]], [[0.3, 0.3]], [0.9], colors=[[1.0, 0.5, 0.25]])
+TOY = '''
+"""Draws the background, and nothing else."""
+import numpy as np
+from fidsplat.backends.base import DeviceInfo
+from fidsplat.effects import OUTPUTS
+from fidsplat.errors import DeviceError
+
+INFO = DeviceInfo("toy", "Toy", "Toys", "1", "other", 1, 1, 1, False, True, "")
+
+
+def devices():
+    return [INFO]
+
+
+def open_device(selector):
+    return Backend()
+
+
+class Cloud:
+    memory_bytes = 0
+
+    def __init__(self, cloud):
+        self.count, self.origin, self.sh_degree = len(cloud), cloud.origin, cloud.sh_degree
+        self.has_planes, self.footprint = cloud.has_planes, cloud.footprint
+
+
+class Backend:
+    info, always_float64 = INFO, False
+
+    def limit_memory(self, budget):
+        pass
+
+    def upload(self, cloud):
+        return Cloud(cloud)
+
+    def unsupported(self, features):
+        lacking = {*features.taps, *features.posts, *features.slots[8:]} - {"alpha"}
+        return f"toy has no {', '.join(sorted(lacking))}" if lacking else ""
+
+    def pipeline(self, features):
+        if why := self.unsupported(features):
+            raise DeviceError(why)
+        return Pipeline(features)
+
+
+class Pipeline:
+    def __init__(self, features):
+        self.features = features
+
+    def render(self, resident, view):
+        return Images(view, resident.count)
+
+    def trace(self, resident, view):
+        return {name: self.render(resident, view).read(name) for name in ("rgb", *self.features.taps)}
+
+
+class Images:
+    def __init__(self, view, count):
+        self.view, self.timings, self.stats = view, {"toy": 0.0}, {"splats": count, "visible": 0, "pairs": 0}
+
+    def read(self, name):
+        shape = self.view.height // self.view.samples, self.view.width // self.view.samples
+        if name == "rgb":
+            return np.full((*shape, 3), self.view.background, OUTPUTS[name].dtype)
+        return np.zeros(shape, OUTPUTS[name].dtype)
+'''
+
+
+@pytest.fixture
+def toy(tmp_path, monkeypatch):
+    (tmp_path / "fidsplat_toy.py").write_text(TOY)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(registry.FAMILIES, "toy", "fidsplat_toy")
+    return fs.Renderer("toy")
+
+
+def test_it_is_listed_and_draws(toy):
+    assert "toy" in [info.name for info in registry.devices()]
+    capture = fs.Capture(CAMERA, ("rgb", "alpha"), "fast,samples=2", (0.25, 0.5, 1.0))
+    resident = toy.upload(CLOUD)
+    frame = toy.render(resident, capture)
+    assert frame["rgb"].shape == (4, 6, 3)
+    assert (frame["rgb"] == np.float32([0.25, 0.5, 1.0])).all()
+    assert (frame["alpha"] == 0).all()
+    assert (frame.stats["splats"], resident.memory_bytes, len(resident)) == (1, 0, 1)
+    assert [one["rgb"].shape for one in toy.render_views(CLOUD, [CAMERA, capture])] == [(4, 6, 3)] * 2
+
+
+def test_what_it_lacks_is_an_error_that_says_so(toy):
+    with pytest.raises(fs.DeviceError, match="toy has no depth"):
+        toy.render(CLOUD, CAMERA, "depth")
+    with pytest.raises(fs.InputError, match="toy takes no arrays of a device"):
+        toy.adopt(means=1, quats=1, scales=1, opacities=1, colors=1)
+    with pytest.raises(fs.InputError, match="keeps rgb in no array"):
+        toy.render(CLOUD, CAMERA).device_array("rgb")
+    assert not draws_float64(toy, fs.Capture(CAMERA))

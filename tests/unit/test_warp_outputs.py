@@ -1,0 +1,127 @@
+"""What an output and a step after blending cost on Warp: one file each. Toys of both stand in a folder that
+the kernels' own do not know."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.backends.view import View
+from fidsplat.backends.warp import runtime
+from fidsplat.effects import CATALOGUE, FeatureSet, Output
+
+wp = pytest.importorskip("warp")
+STRONGEST = '''"""The largest weight of a fragment: of a pixel the mean of its samples."""
+from typing import Any
+
+import warp as wp
+
+from ..common import View
+from ..pixel_grid import PixelGrid, sample_at
+from . import Output
+
+
+@wp.func
+def composite(pixel: Any, seen: Any, weight: float, shown: float, view: View):
+    p = pixel
+    p.strongest = wp.max(p.strongest, weight)
+    return p
+
+
+@wp.func
+def store(pixel: Any, at: int, samples: Any):
+    samples.strongest[at] = pixel.strongest
+
+
+@wp.func
+def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
+    total = float(0.0)
+    for k in range(grid.count):
+        total += samples.strongest[sample_at(grid, k)]
+    out.strongest[grid.pixel] = total * grid.mean
+
+
+OUTPUT = Output(
+    state={"strongest": wp.float32},
+    composite=composite,
+    samples={"strongest": wp.float32},
+    store=store,
+    resolve=resolve,
+)
+'''
+NEGATIVE = '''"""Light becomes dark."""
+from typing import Any
+
+import warp as wp
+
+from . import Step
+
+
+@wp.func
+def apply(v: float, x: int, y: int, channel: int, s: Any) -> float:
+    return 1.0 - v
+
+
+STEP = Step(apply=apply)
+'''
+SLOTS = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "compose_ordered")
+CAMERA = fs.Camera.pinhole(25, 17, 20.0, 20.0, 12.5, 8.5)
+
+
+def two_splats():
+    """One behind the other in the middle of the picture."""
+    one = np.ones((2, 1), np.float32)
+    means = np.float32([[0, 0, 1], [0, 0, 2]])
+    return fs.SplatCloud(
+        means, one * [1, 0, 0, 0], one * [0.2, 0.2], [0.25, 0.5], colors=np.float32([[1, 0, 0], [0, 1, 0]])
+    )
+
+
+@pytest.fixture
+def beside(tmp_path, monkeypatch):
+    """Puts a file beside those of a package of the kernels."""
+
+    def put(package, name, text):
+        folder, home = tmp_path / package, runtime.kernels(package)
+        folder.mkdir()
+        (folder / f"{name}.py").write_text(text, "utf-8")
+        monkeypatch.setattr(home, "__path__", [*home.__path__, str(folder)])
+
+    return put
+
+
+def drawn(taps, posts):
+    """rgb and these outputs."""
+    backend = fs.Renderer("warp:cpu").backend
+    cloud = two_splats()
+    pipeline = backend.pipeline(FeatureSet(SLOTS, taps, 0, 1, "float64", posts))
+    view = View.of(fs.Capture(CAMERA), cloud.origin)
+    images = pipeline.render(backend.upload(cloud), view)
+    return {name: images.read(name) for name in ("rgb", *taps)}
+
+
+def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch):
+    features = FeatureSet(SLOTS, ("strongest",), 0, 1, "float64", ("negative",))
+    backend = fs.Renderer("warp:cpu").backend
+    output = Output("strongest", 1, "float32")
+    monkeypatch.setitem(CATALOGUE, "strongest", replace(CATALOGUE["alpha"], name="strongest", output=output))
+    monkeypatch.setitem(CATALOGUE, "negative", replace(CATALOGUE["gain"], name="negative"))
+    with pytest.raises(fs.DeviceError, match=r"warp:cpu .* has no negative, strongest; use an OpenCL device"):
+        backend.pipeline(features)
+    beside("output", "strongest", STRONGEST)
+    beside("post", "negative", NEGATIVE)
+    assert not backend.unsupported(features)
+    plain, toys = drawn((), ()), drawn(("strongest",), ("negative",))
+    assert np.array_equal(toys["rgb"], np.float32(1) - plain["rgb"])
+    # the nearer splat lets three quarters through, of which the other takes up to a half
+    assert np.array_equal(toys["strongest"], plain["rgb"][..., :2].max(-1))
+    assert toys["strongest"].max() == pytest.approx(0.375)
+
+
+def test_two_outputs_that_keep_a_field_of_one_name_are_told_apart(beside):
+    text = "import warp as wp\nfrom . import Output\nOUTPUT = Output(state={'normal': wp.float32})\n"
+    beside("output", "taken", text)
+    output = runtime.kernels("output")
+    with pytest.raises(ValueError, match="output taken declares state 'normal', which another has too"):
+        output.fields(output.with_needed(("normal", "taken")), "state")
