@@ -15,8 +15,11 @@ from __future__ import annotations
 import argparse
 import json
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
+from itertools import pairwise
 from pathlib import Path
+
+import pandas as pd
 
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES
 from fidsplat.experiments.bench.growth import exponents
@@ -47,162 +50,148 @@ def load(files: Iterable[Path]) -> dict[str, list[dict]]:
     return found
 
 
-def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table; empty if there are no rows."""
-    lines = ["| " + " | ".join(row) + " |" for row in rows]
-    if not lines:
+def markdown(rows: Iterable[dict[str, str]]) -> str:
+    """Rows, each with its cells by their heads, as a Markdown table; a dash where a row has none."""
+    frame = pd.DataFrame(list(rows)).fillna("-")
+    if frame.empty:
         return ""
-    return "\n".join(["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads), *lines])
+    lines = ["| " + " | ".join(row) + " |" for row in (frame.columns, *frame.to_numpy())]
+    return "\n".join([lines[0], "|" + "---|" * len(frame.columns), *lines[1:]])
 
 
-def rates(records: dict[str, list[dict]]) -> str:
+def rates(record: dict) -> dict[str, str]:
     """What each device can do at best."""
-    rows = {}
-    for record in records["frames"]:
-        if record.get("rates"):
-            best = record["rates"]
-            copy = f"{best['copy_bytes'] / 1e9:.0f} GB/s"
-            operations = (f"{best[name] / 1e9:.3g} G/s" for name in ("fma", "exp", "division"))
-            rows[record["title"]] = (record["title"], copy, *operations)
-    return table(("device", "copy, read + write", "multiply-add", "exp", "division"), rows.values())
+    best = record["rates"]
+    return {
+        "device": record["title"],
+        "copy, read + write": f"{best['copy_bytes'] / 1e9:.0f} GB/s",
+        "multiply-add": f"{best['fma'] / 1e9:.3g} G/s",
+        "exp": f"{best['exp'] / 1e9:.3g} G/s",
+        "division": f"{best['division'] / 1e9:.3g} G/s",
+    }
 
 
-def frames(records: dict[str, list[dict]]) -> str:
+def frames(record: dict) -> dict[str, str]:
     """Whole frames."""
-    rows = []
-    for record in records["frames"]:
-        low, high = record["quartiles_ms"]
-        memory = record["memory_bytes"]
-        rows.append(
-            (
-                record["scene"],
-                f"{record['device']}: {record['title']}",
-                f"{ms(record['frame_ms'])} ({ms(low)} to {ms(high)})",
-                times(record, "frame"),
-                f"{record['splats_per_second'] / 1e6:.{0 if record['splats_per_second'] > 1e8 else 2}f} M",
-                "-" if memory is None else f"{memory / 2**30:.3g} GiB",
-                record["date"],
-            )
-        )
-    return table(("scene", "device", "ms per frame", "x roofline", "splats/s", "memory", "date"), rows)
+    low, high = record["quartiles_ms"]
+    memory, rate = record["memory_bytes"], record["splats_per_second"]
+    return {
+        "scene": record["scene"],
+        "device": f"{record['device']}: {record['title']}",
+        "ms per frame": f"{ms(record['frame_ms'])} ({ms(low)} to {ms(high)})",
+        "x roofline": times(record, "frame"),
+        "splats/s": f"{rate / 1e6:.{0 if rate > 1e8 else 2}f} M",
+        "memory": "-" if memory is None else f"{memory / 2**30:.3g} GiB",
+        "date": record["date"],
+    }
 
 
-def stages(records: dict[str, list[dict]]) -> str:
+def stages(record: dict) -> dict[str, str]:
     """Stages, each with how many times its roofline it takes."""
-    names = list(dict.fromkeys(stage for record in records["frames"] for stage in record["stages_ms"]))
-    rows = []
-    for record in records["frames"]:
-        cells = (
-            f"{ms(record['stages_ms'][name])} ({times(record, name)})" if name in record["stages_ms"] else "-"
-            for name in names
-        )
-        rows.append((record["scene"], f"{record['device']}: {record['title']}", *cells))
-    return table(("scene", "device", *names), rows)
+    cells = {name: f"{ms(taken)} ({times(record, name)})" for name, taken in record["stages_ms"].items()}
+    return {"scene": record["scene"], "device": f"{record['device']}: {record['title']}"} | cells
 
 
-def counts(records: dict[str, list[dict]]) -> str:
+def counts(record: dict) -> dict[str, str]:
     """What there is to draw in each scene."""
-    rows = {}
-    for record in records["frames"]:
-        facts = (record.get(name) for name in ("splats", "visible", "fragments"))
-        size = f"{record['width']} x {record['height']}"
-        cells = ("-" if fact is None else f"{fact:,}" for fact in facts)
-        rows.setdefault(record["scene"], (record["scene"], size, *cells))
-    return table(("scene", "picture", "splats", "visible", "drawn fragments"), rows.values())
+    heads = {"splats": "splats", "visible": "visible", "drawn fragments": "fragments"}
+    cells = {head: f"{record[name]:,}" for head, name in heads.items() if name in record}
+    return {"scene": record["scene"], "picture": f"{record['width']} x {record['height']}"} | cells
 
 
-def peers(records: dict[str, list[dict]]) -> str:
-    """Others beside us in one run: the record before a peer's is ours."""
-    rows, ours = [], {}
-    for record in records["peers"]:
-        if record["renderer"] == "fidsplat":
-            ours = record
-            continue
-        rows.append(
-            (
-                record["scene"],
-                f"{record['renderer']}, {record['title']}",
-                ms(record["frame_ms"]),
-                f"{ours['title']}: {ms(ours['frame_ms'])}",
-                f"{record['times_ours']:.3g}",
-                f"{record['psnr_db']:.1f} dB",
-                record["date"],
-            )
-        )
-    heads = ("scene", "peer", "its ms", "our ms", "its / ours", "PSNR of the two pictures", "date")
-    return table(heads, rows)
+def peers(pair: tuple[dict, dict]) -> dict[str, str]:
+    """Another beside us in one run."""
+    ours, its = pair
+    return {
+        "scene": its["scene"],
+        "peer": f"{its['renderer']}, {its['title']}",
+        "its ms": ms(its["frame_ms"]),
+        "our ms": f"{ours['title']}: {ms(ours['frame_ms'])}",
+        "its / ours": f"{its['times_ours']:.3g}",
+        "PSNR of the two pictures": f"{its['psnr_db']:.1f} dB",
+        "date": its["date"],
+    }
 
 
-def first(records: dict[str, list[dict]]) -> str:
+def first(record: dict) -> dict[str, str]:
     """First frames of new processes."""
-    rows = []
-    for record in records["first"]:
-        seconds, (low, high) = record["seconds"], record["range"]
-        total = f"{seconds['total']:.2f} s ({low:.2f} to {high:.2f})"
-        parts = (f"{seconds[part]:.2f}" for part in seconds if part != "total")
-        rows.append((record["scene"], record["device"], record["caches"], total, *parts, record["date"]))
-    parts = [part for part in records["first"][0]["seconds"] if part != "total"] if rows else []
-    return table(("scene", "device", "caches", "first frame", *parts, "date"), rows)
+    low, high = record["range"]
+    heads = {"scene": "scene made", "device": "device opened"}
+    seconds = {heads.get(part, part): f"{taken:.2f}" for part, taken in record["seconds"].items()}
+    del seconds["total"]
+    return {
+        "scene": record["scene"],
+        "device": record["device"],
+        "caches": record["caches"],
+        "first frame": f"{record['seconds']['total']:.2f} s ({low:.2f} to {high:.2f})",
+        **seconds,
+        "date": record["date"],
+    }
 
 
-def ways(records: dict[str, list[dict]]) -> str:
+def ways(record: dict) -> dict[str, str]:
     """Both ways of listing, sort and bin together."""
-    rows = []
-    for record in records["ways"]:
-        parts = record["stages_ms"]["sort"], record["stages_ms"]["bin"]
-        cells = (ms(value) for value in (*parts, sum(parts)))
-        rows.append((record["scene"], record["device"], record["way"], *cells, record["date"]))
-    return table(("scene", "device", "lists", "sort", "bin", "both, ms", "date"), rows)
+    sort, bins = record["stages_ms"]["sort"], record["stages_ms"]["bin"]
+    return {
+        "scene": record["scene"],
+        "device": record["device"],
+        "lists": record["way"],
+        "sort": ms(sort),
+        "bin": ms(bins),
+        "both, ms": ms(sort + bins),
+        "date": record["date"],
+    }
 
 
-def large(records: dict[str, list[dict]]) -> str:
+def large(record: dict) -> dict[str, str]:
     """Tens of millions of splats."""
-    rows = []
-    for record in records["large"]:
-        held = (f"{record[name] / 2**30:.3g} GiB" for name in ("device_bytes", "peak_bytes"))
-        seconds = (f"{record[name]:.3g}" for name in ("first_s", "next_s"))
-        facts = ("yes" if record["chunks"] else "no", f"{record['visible']:,}", f"{record['pairs']:,}")
-        budget = "" if record["budget_gib"] is None else f", budget {record['budget_gib']:g} GiB"
-        rows.append(
-            (f"{record['millions']} M", record["device"] + budget, *seconds, *held, *facts, record["date"])
-        )
-    heads = (
-        "splats",
-        "device",
-        "first, s",
-        "next, s",
-        "device memory",
-        "process",
-        "chunks",
-        "visible",
-        "pairs",
-        "date",
-    )
-    return table(heads, rows)
+    budget = "" if record["budget_gib"] is None else f", budget {record['budget_gib']:g} GiB"
+    return {
+        "splats": f"{record['millions']} M",
+        "device": record["device"] + budget,
+        "first, s": f"{record['first_s']:.3g}",
+        "next, s": f"{record['next_s']:.3g}",
+        "device memory": f"{record['device_bytes'] / 2**30:.3g} GiB",
+        "process": f"{record['peak_bytes'] / 2**30:.3g} GiB",
+        "chunks": "yes" if record["chunks"] else "no",
+        "visible": f"{record['visible']:,}",
+        "pairs": f"{record['pairs']:,}",
+        "date": record["date"],
+    }
 
 
-def growth(records: dict[str, list[dict]]) -> str:
-    """Exponents of the growth curves."""
-    drawn = records["growth"]
-    names = list(dict.fromkeys(stage for record in drawn for stage in record.get("stages_ms", ())))
-    rows = []
-    for title, series, found in exponents(drawn):
-        cells = (found.get(name) for name in ("frame", *names))
-        rows.append((title, series, *("-" if cell is None else f"{cell:.2f}" for cell in cells)))
-    return table(("device", "over", "frame", *names), rows)
+def growth(curve: tuple[str, str, dict[str, float | None]]) -> dict[str, str]:
+    """Exponents of a growth curve."""
+    title, series, found = curve
+    cells = {name: "-" if cell is None else f"{cell:.2f}" for name, cell in found.items()}
+    return {"device": title, "over": series} | cells
 
 
-TABLES: dict[str, Callable[[dict[str, list[dict]]], str]] = {
-    "counts": counts,
-    "rates": rates,
-    "frames": frames,
-    "stages": stages,
-    "peers": peers,
-    "first": first,
-    "ways": ways,
-    "large": large,
-    "growth": growth,
-}
+def first_of_each_scene(records: list[dict]) -> list[dict]:
+    """One record of each scene, in their order."""
+    scenes = dict.fromkeys(record["scene"] for record in records)
+    return [next(record for record in records if record["scene"] == scene) for scene in scenes]
+
+
+def tables(records: dict[str, list[dict]]) -> dict[str, str]:
+    """Every table for which something was measured, by its name."""
+    drawn = records["frames"]
+    pairs = [pair for pair in pairwise(records["peers"]) if pair[1]["renderer"] != "fidsplat"]
+    rows = {
+        "counts": map(counts, first_of_each_scene(drawn)),
+        "rates": map(rates, {record["title"]: record for record in drawn if record.get("rates")}.values()),
+        "frames": map(frames, drawn),
+        "stages": map(stages, drawn),
+        "peers": map(peers, pairs),
+        "first": map(first, records["first"]),
+        "ways": map(ways, records["ways"]),
+        "large": map(large, records["large"]),
+        "growth": map(growth, exponents(records["growth"])),
+    }
+    return {name: text for name in TABLES if (text := markdown(rows[name]))}
+
+
+TABLES = ("counts", "rates", "frames", "stages", "peers", "first", "ways", "large", "growth")
 
 
 def insert(page: str, name: str, text: str) -> str:
@@ -230,7 +219,7 @@ def main() -> None:
     parser.add_argument("--into", nargs="+", type=Path, metavar="PAGE")
     options = parser.parse_args()
     records = load(options.files)
-    made = {name: text for name, make in TABLES.items() if (text := make(records))}
+    made = tables(records)
     if options.into is None:
         print("\n\n".join(f"## {name}\n{text}" for name, text in made.items()))
         return

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
@@ -20,7 +19,7 @@ class Capture(PickledByFields):
     """How a picture is taken: from where, of what, and how well.
 
     The same object works on every device. Raises InputError for a value of the wrong kind; whether an output
-    exists is told when it is drawn.
+    exists is checked when it is drawn.
     """
 
     camera: Camera | None = None
@@ -86,7 +85,10 @@ class Capture(PickledByFields):
 def output_names(outputs: Any) -> tuple[str, ...]:
     """Names of outputs, each once, from one or several. Raises InputError for anything else, and for none."""
     names = (outputs,) if isinstance(outputs, str) else outputs
-    names = tuple(names) if isinstance(names, Iterable) else (names,)
+    try:
+        names = tuple(names)
+    except TypeError:  # an array of no dimension, too, passes for an Iterable
+        names = (names,)
     if not names:
         raise InputError("outputs is empty; name at least one, e.g. 'rgb'")
     if not all(isinstance(name, str) for name in names):

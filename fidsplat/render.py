@@ -131,7 +131,7 @@ class ResidentCloud:
     def __init__(self, renderer: Renderer, data: ResidentData, capture: Capture) -> None:
         self._renderer, self._data = renderer, data
         self.capture = capture
-        """how its pictures are taken unless `render` is told otherwise: that of the scene it came from"""
+        """how its pictures are taken unless `render` is given another: that of the scene it came from"""
 
     def __len__(self) -> int:
         return self._data.count

@@ -22,5 +22,5 @@ def renderer(request):
 
 
 @pytest.fixture(scope="session")
-def judge():
+def reference():
     return fs.Renderer("reference")

@@ -10,7 +10,7 @@ import numpy as np
 import fidsplat as fs
 from fidsplat.backends.prepare import view_of
 from fidsplat.backends.reference.optics import ray_lengths, rays_of
-from fidsplat.backends.reference.post import background_at, developed
+from fidsplat.backends.reference.post import apply_sensor, background_at
 from fidsplat.backends.view import View
 from fidsplat.scenes import PlacedMarker
 
@@ -53,7 +53,7 @@ def ideal_picture(
     pixels = light.reshape(height, samples, width, samples, 3).mean((1, 3)).reshape(-1, 3)
     y, x = (grid.ravel() for grid in np.mgrid[:height, :width])
     steps = () if sensor is None else sensor.steps
-    return developed(pixels, np.zeros(len(x)), steps, view, x, y)[0].reshape(height, width, 3)
+    return apply_sensor(pixels, np.zeros(len(x)), steps, view, x, y)[0].reshape(height, width, 3)
 
 
 def assert_as_good(error, ideal, distance):

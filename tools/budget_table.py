@@ -87,13 +87,13 @@ def main() -> int:
     parser.add_argument("--out", default=str(FILE))
     args = parser.parse_args()
     renderer = fs.Renderer(args.device)
-    judge = reference_for(renderer, fs.Capture())
+    reference = reference_for(renderer, fs.Capture())
 
-    say(f"truths of {args.scenes} scenes by {judge.device.name}")
+    say(f"truths of {args.scenes} scenes by {reference.device.name}")
     scenes = [random_scene(seed) for seed in range(args.scenes)]
     truths = []
     for k, scene in enumerate(scenes):
-        truths.append(truth(judge, scene.cloud, fs.Capture(scene.camera, background=scene.background)))
+        truths.append(truth(reference, scene.cloud, fs.Capture(scene.camera, background=scene.background)))
         say(f"truths: {k + 1} of {args.scenes}", end="\r")
 
     def measure(settings: list[dict]) -> Measurement:
@@ -119,7 +119,7 @@ def main() -> int:
         "driver": info.version,
         "date": date.today().isoformat(),
         "scenes": args.scenes,
-        "truth": judge.device.name,
+        "truth": reference.device.name,
         "fidsplat": fs.__version__,
     }
     with atomic_write(args.out) as stream:

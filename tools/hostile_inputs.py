@@ -99,7 +99,7 @@ def scene_text(rng: Random) -> str:
     parts = [
         f"[camera]\nwidth = 24\nheight = 16\n{view}near = 0.1\n{'' if moves else pose}",
         lens,
-        rng.choice(["", "[camera.shutter]\nexposure_ms = 5.0\nsub_poses = 2\nreadout_ms = 3.0\nrows_per_band = 8\n"]),
+        rng.choice(["", "[camera.shutter]\nexposure_time_ms = 5.0\nsub_poses = 2\nreadout_ms = 3.0\nrows_per_band = 8\n"]),
         f"[[camera.motion]]\ntime = 0.0\n{pose}" if moves else "",
         '[[splats]]\nfile = "good.ply"\nposition = [0.0, 0.0, 1.0]\nquaternion = [1.0, 0.0, 0.0, 0.0]\nscale = 1.0\n',
         rng.choice(["", '[[markers]]\nspec = "aruco:4x4_50:7"\nsize = 0.1\nquiet_zone = 1\nmixture = "exact"\n']),
@@ -192,6 +192,8 @@ def words(rng: Random, folder: Path) -> int:
                     ["", ",", "=", *NUMBERS]
                 )
         given = given or [""]
+    if slow:  # which would work for minutes, were its words good after all
+        given.append("--debugg")
     with _inside(folder):
         return cli.main([word for word in given if word != "--debug"])
 

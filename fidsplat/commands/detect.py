@@ -106,7 +106,7 @@ Examples:
         with late_progress(console(True)) as progress:
             scene = fs.Scene.load(str(self.scene), progress=progress)
         if scene.camera is None:
-            raise InputError(f"{self.scene} has no [camera] table, so the pose of its markers cannot be told")
+            raise InputError(f"{self.scene} has no [camera] table, so the pose of its markers is unknown")
         size = (scene.camera.width, scene.camera.height)
         if size != (shape[1], shape[0]):
             raise InputError(

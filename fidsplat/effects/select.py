@@ -38,7 +38,7 @@ class FeatureSet:
     """One effect per kind, in the fixed order camera, color, lowpass, stop, compose, footprint, background,
     arithmetic; then motion, shutter and double blending, if any."""
     taps: tuple[str, ...]
-    """Sorted names of the planes beside rgb."""
+    """Sorted names of the outputs beside rgb."""
     sh_degree: int
     samples: int
     setup_precision: str

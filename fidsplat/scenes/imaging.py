@@ -1,52 +1,33 @@
 """The tables [sensor], [fog] and [background] of a scene file, in and out."""
 
-import math
 import os
 from pathlib import Path
 
 from fidsplat.errors import InputError
 from fidsplat.scenes.parts import SceneParts
-from fidsplat.scenes.table import Table
+from fidsplat.scenes.table import Table, names_of
 from fidsplat.sensor import Sensor
 from fidsplat.surroundings import Fog, Gradient, Panorama
 
-SENSOR = ("exposure", "vignetting", "full_well", "read_noise", "seed", "gain", "response", "bits")
-FOG = ("density", "color")
-BACKGROUND = ("top", "bottom", "up", "image")
+BACKGROUND = (*names_of(Gradient), "image")
 
 
 def read_sensor(top: Table) -> Sensor | None:
     """The sensor of a scene file; None if it has none. Raises InputError, naming the key."""
     if "sensor" not in top:
         return None
-    table = top.table("sensor", SENSOR)
+    table = top.table("sensor", names_of(Sensor))
     with table.at():
-        return Sensor(
-            exposure=table.number("exposure", 1.0),
-            vignetting=table.any_numbers("vignetting", ()),
-            full_well=table.number("full_well", math.inf, infinite=True),
-            read_noise=table.number("read_noise", 0.0),
-            seed=table.whole("seed", 0),
-            gain=table.number("gain", 1.0),
-            response=_response(table),
-            bits=table.whole("bits", None),
-        )
-
-
-def _response(table: Table) -> str | float | tuple[float, ...]:
-    kind = table.kind("response")
-    if kind is list:
-        return table.any_numbers("response", ())
-    return table.text("response", "linear") if kind in (str, None) else table.number("response")
+        return Sensor(**table.values(Sensor))
 
 
 def read_fog(top: Table) -> Fog | None:
     """The fog of a scene file; None if it has none. Raises InputError, naming the key."""
     if "fog" not in top:
         return None
-    table = top.table("fog", FOG)
+    table = top.table("fog", names_of(Fog))
     with table.at():
-        return Fog(table.number("density"), table.numbers("color", 3, Fog.color))
+        return Fog(**table.values(Fog))
 
 
 def read_background(top: Table, folder: Path) -> Gradient | Panorama | None:
@@ -55,16 +36,14 @@ def read_background(top: Table, folder: Path) -> Gradient | Panorama | None:
         return None
     table = top.table("background", BACKGROUND)
     if "image" in table:
-        for key in ("top", "bottom", "up"):
+        for key in names_of(Gradient):
             if key in table:
                 raise table.error(key, "and image exclude each other")
         name = table.text("image")
         with table.at("image"):
             return Panorama.load(folder / name)
     with table.at():
-        return Gradient(
-            table.numbers("top", 3), table.numbers("bottom", 3), table.numbers("up", 3, Gradient.up)
-        )
+        return Gradient(**table.values(Gradient))
 
 
 def imaging_tables(scene: SceneParts, folder: Path) -> dict[str, dict]:
@@ -74,7 +53,7 @@ def imaging_tables(scene: SceneParts, folder: Path) -> dict[str, dict]:
     tables: dict[str, dict] = {}
     around = scene.background
     if isinstance(around, Gradient):
-        tables["background"] = {name: list(getattr(around, name)) for name in ("top", "bottom", "up")}
+        tables["background"] = {name: list(getattr(around, name)) for name in names_of(Gradient)}
     elif isinstance(around, Panorama):
         if around.file is None:
             raise InputError(

@@ -5,15 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from fidsplat.quality import PRESETS, MarkerQuality, Quality, knobs
-from fidsplat.scenes.table import Table
+from fidsplat.scenes.table import Table, names_of
 
 _OF_RENDER = ("samples", "lowpass", "first_hit")
-
-
-def read_knobs(table: Table, kind: type[Quality] | type[MarkerQuality]) -> dict[str, Any]:
-    """Those knobs that a table says, in their types; their ranges are checked by whoever takes them."""
-    readers = {"float": table.number, "int": table.whole, "str": table.text}
-    return {name: readers[wanted.split()[0]](name) for name, wanted in knobs(kind).items() if name in table}
 
 
 def quality_of(top: Table, render: Table) -> Quality | str | None:
@@ -25,9 +19,9 @@ def quality_of(top: Table, render: Table) -> Quality | str | None:
         table = top.table("quality", ("preset", *knobs(Quality), "marker"))
         with table.at("preset"):
             plain = Quality.named(table.text("preset", "standard"))
-        changes = read_knobs(table, Quality)
+        changes = table.values(Quality)
         if "marker" in table:
-            changes["marker"] = read_knobs(table.table("marker", tuple(knobs(MarkerQuality))), MarkerQuality)
+            changes["marker"] = table.table("marker", names_of(MarkerQuality)).values(MarkerQuality)
         with table.at():
             return plain.with_(**changes)
     text = render.text("quality", None)

@@ -1,7 +1,6 @@
 """Lenses in scene files: the tables of [camera] that switch one on."""
 
 import math
-from dataclasses import fields
 
 from fidsplat.cameras import (
     BrownConrady,
@@ -13,10 +12,8 @@ from fidsplat.cameras import (
     fisheye_focal_length,
     focal_length,
 )
-from fidsplat.scenes.table import Table
+from fidsplat.scenes.table import Table, names_of
 
-DISTORTION = tuple(field.name for field in fields(BrownConrady))
-FISHEYE = tuple(field.name for field in fields(Fisheye))
 ORTHOGRAPHIC = ("metres_wide",)
 TABLES = ("distortion", "fisheye", "equirectangular", "orthographic")
 _NAME = {BrownConrady: "distortion", Fisheye: "fisheye"}
@@ -30,9 +27,8 @@ def read_lens(camera: Table) -> Lens | None:
     if not named:
         return None
     if named[0] in ("distortion", "fisheye"):
-        kind, known = (BrownConrady, DISTORTION) if named[0] == "distortion" else (Fisheye, FISHEYE)
-        table = camera.table(named[0], known)
-        return kind(**{name: table.number(name, 0.0) for name in known})
+        kind = BrownConrady if named[0] == "distortion" else Fisheye
+        return kind(**camera.table(named[0], names_of(kind)).values(kind))
     if named[0] == "equirectangular":
         camera.table("equirectangular", ())
         return Equirectangular()
@@ -80,6 +76,6 @@ def lens_table(camera: Camera) -> tuple[str, dict[str, float]] | None:
     if lens is None:
         return None
     if isinstance(lens, BrownConrady | Fisheye):
-        values = {field.name: getattr(lens, field.name) for field in fields(lens)}
+        values = {name: getattr(lens, name) for name in names_of(type(lens))}
         return _NAME[type(lens)], {name: value for name, value in values.items() if value}
     return lens.kind, {}

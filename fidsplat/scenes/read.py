@@ -16,7 +16,7 @@ from fidsplat.formats import Progress, load_ply
 from fidsplat.quality import MarkerQuality, Quality, knobs
 from fidsplat.rotations import rigid_matrix
 from fidsplat.scenes.imaging import read_background, read_fog, read_sensor
-from fidsplat.scenes.knobs import quality_of, read_knobs
+from fidsplat.scenes.knobs import quality_of
 from fidsplat.scenes.lens import TABLES, read_focal_lengths, read_lens
 from fidsplat.scenes.moving import POSE, read_keyframes, read_shutter
 from fidsplat.scenes.parts import PlacedMarker
@@ -181,7 +181,7 @@ def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progre
         raise table.error("size", f"must be above 0 metres, not {size!r}")
     pose, motion = _pose(table), read_keyframes(table, POSE, _pose)
     quiet_zone, max_splats = table.whole("quiet_zone", None), table.whole("max_splats", None)
-    own = read_knobs(table, MarkerQuality)
+    own = table.values(MarkerQuality)
     if quiet_zone is not None and quiet_zone < 0:
         raise table.error("quiet_zone", f"must be 0 or more modules, not {quiet_zone}")
     from fidsplat.markers import marker, with_file  # late: it brings what makes markers

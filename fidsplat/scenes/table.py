@@ -1,13 +1,19 @@
 """A table of a scene file whose keys, types and lengths are checked, with errors that name the key."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import MISSING, fields
 from typing import Any
 
 from fidsplat.errors import InputError, unknown
 
 _MISSING = object()
+
+
+def names_of(kind: type) -> tuple[str, ...]:
+    """The keys of a table that says a dataclass."""
+    return tuple(field.name for field in fields(kind))
 
 
 class Table:
@@ -99,16 +105,38 @@ class Table:
             raise self.error(key, f"must be a list of numbers, not {_kind(value)}")
         return self._vector(key, value, len(value))
 
-    def kind(self, key: str) -> type | None:
-        """The Python type of a value; None where there is none."""
-        return type(self._values[key]) if key in self._values else None
-
     def matrix(self, key: str) -> list[tuple[float, ...]]:
         """Four rows of four finite floats."""
         value = self._get(key, _MISSING)
         if not isinstance(value, list) or len(value) != 4:
             raise self.error(key, f"must be a list of 4 rows of 4 numbers, not {_kind(value)}")
         return [self._vector(f"{key}[{i}]", row, 4) for i, row in enumerate(value)]
+
+    def values(self, kind: type) -> dict[str, Any]:
+        """What the table says of a dataclass, in the types of its fields; their ranges it checks itself.
+
+        A field without a default must be said, and one that is infinite by default may be. One with a default
+        factory has a table of its own, and is left out.
+        """
+        readers: dict[str, Callable[[str], Any]] = {
+            "int": self.whole,
+            "str": self.text,
+            "tuple[float, float, float]": lambda key: self.numbers(key, 3),
+            "tuple[float, ...]": self.any_numbers,
+        }
+        said = {}
+        for field in fields(kind):
+            said_elsewhere = field.default_factory is not MISSING
+            if said_elsewhere or (field.name not in self and field.default is not MISSING):
+                continue
+            wanted = str(field.type).removesuffix(" | None")
+            if " | " in wanted:  # the reader is that of what is there
+                found = type(self._get(field.name, _MISSING))
+                wanted = {str: "str", list: "tuple[float, ...]"}.get(found, "float")
+            infinite = field.default == math.inf
+            read = readers.get(wanted, lambda key, infinite=infinite: self.number(key, infinite=infinite))
+            said[field.name] = read(field.name)
+        return said
 
     def table(self, key: str, known: tuple[str, ...]) -> "Table":
         """The table under a key; an empty one when there is none."""

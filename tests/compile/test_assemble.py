@@ -206,8 +206,8 @@ def test_the_page_of_the_kernels_has_every_hook_and_no_other():
     hooks = {hook for text in texts for hook in re.findall(r"^[ \t]*//@@ (\w+)", text, re.MULTILINE)}
     assert len(hooks) > 50
     rows = page[page.index("| hook |") : page.index("## Dialect rules")].splitlines()[2:]
-    told = {name for row in rows if row for name in re.findall(r"`(\w+)`", row.split("|")[1])}
-    assert told == hooks
+    listed = {name for row in rows if row for name in re.findall(r"`(\w+)`", row.split("|")[1])}
+    assert listed == hooks
 
 
 def test_no_kernel_calls_what_opencl_promises_nothing_of():

@@ -184,7 +184,7 @@ def test_line_directives_lead_to_the_lines_of_the_files():
 
     source = assemble(combination(everything("distortion")).features(), cpu_shape())
     assert source.listing.count("\n") == source.text.count("\n")
-    file, number, told = "", 0, 0
+    file, number, compared = "", 0, 0
     for line in source.listing.splitlines():
         if directive := re.fullmatch(r'#line (\d+) "(.*)"', line):
             number, file = int(directive[1]), directive[2]
@@ -192,9 +192,9 @@ def test_line_directives_lead_to_the_lines_of_the_files():
         if file.startswith("opencl/") and line.strip():
             written = (kernels_folder() / file).read_text("utf-8").splitlines()[number - 1]
             assert re.sub(r"WIDE\(([^()]+)\)", r"\1f", written).replace("wide ", "float ")[:4] == line[:4]
-            told += 1
+            compared += 1
         number += 1
-    assert told > 800
+    assert compared > 800
 
 
 def test_the_text_needs_no_opencl():

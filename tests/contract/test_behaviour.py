@@ -139,9 +139,9 @@ def test_scene_without_camera_is_named(renderer):
         renderer.render(random_splats(3, seed=1))
 
 
-def test_cloud_of_another_renderer_is_refused(renderer, judge):
+def test_cloud_of_another_renderer_is_refused(renderer, reference):
     with pytest.raises(fs.InputError, match="another Renderer"):
-        renderer.render(judge.upload(random_splats(3, seed=1)), CAMERA)
+        renderer.render(reference.upload(random_splats(3, seed=1)), CAMERA)
 
 
 @pytest.mark.parametrize(
@@ -152,10 +152,10 @@ def test_no_camera_and_no_outputs_are_named(renderer, arguments, word):
         renderer.render(random_splats(3, seed=1), **arguments)
 
 
-def test_the_reference_gives_the_types_of_a_device(renderer, judge):
+def test_the_reference_gives_the_types_of_a_device(renderer, reference):
     cloud = random_splats(3, seed=1)
     camera = fs.Camera.pinhole(4, 3, 4.0, 4.0, 2.0, 1.5)
-    planes, truth = (r.render(cloud, camera, outputs=ALL_OUTPUTS) for r in (renderer, judge))
+    planes, truth = (r.render(cloud, camera, outputs=ALL_OUTPUTS) for r in (renderer, reference))
     for name in ALL_OUTPUTS:
         assert planes[name].dtype == truth[name].dtype, name
         assert not planes[name].flags.writeable

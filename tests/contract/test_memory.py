@@ -216,7 +216,7 @@ def test_a_plan_counts_all_that_a_picture_takes(opencl, monkeypatch, machine, me
 
 
 def test_a_panorama_is_copied_once(opencl, monkeypatch):
-    """As long as it is the one that was drawn last; pictures show theirs, whatever lay there before."""
+    """As long as it is the one that was drawn last; pictures show theirs, whatever was there before."""
     own = fs.Renderer(opencl.device.name)
     rng = np.random.default_rng(0)
     one, other = (fs.Panorama(rng.random((33, 70, 3))) for _ in range(2))

@@ -106,11 +106,20 @@ def test_splat_ids_are_indices_of_the_cloud_in_chunks_too(renderer):
     assert "packed splats" in small.backend.pool._buffers
 
 
-TOLD = ("label", "splat_id", "depth", "depth_median", "distance", "distance_median", "normal", "normal_world")
+MASKED = (
+    "label",
+    "splat_id",
+    "depth",
+    "depth_median",
+    "distance",
+    "distance_median",
+    "normal",
+    "normal_world",
+)
 NOTHING = {"label": -1, "splat_id": -1}
 
 
-def told(frame, name):
+def covered(frame, name):
     plane = frame[name] != NOTHING.get(name, 0)
     return plane.any(-1) if plane.ndim == 3 else plane
 
@@ -122,10 +131,10 @@ def test_masks_do_not_grow_with_a_low_cutoff(renderer, samples):
     masks = {}
     for cutoff in (1 / 255, 1e-3, 1e-5):
         quality = fs.Quality(alpha_cutoff=cutoff, samples=samples)
-        frame = renderer.render(splat, CAMERA, ("alpha", *TOLD), quality)
-        masks[cutoff] = told(frame, "label")
-        for name in TOLD:
-            assert np.array_equal(told(frame, name), masks[cutoff]), name
+        frame = renderer.render(splat, CAMERA, ("alpha", *MASKED), quality)
+        masks[cutoff] = covered(frame, "label")
+        for name in MASKED:
+            assert np.array_equal(covered(frame, name), masks[cutoff]), name
         if samples == 1:
             assert np.array_equal(masks[cutoff], frame["alpha"] >= np.float32(1 / 255))
     assert 100 < masks[1e-5].sum() < (frame["alpha"] > 0).sum() - 100
@@ -139,8 +148,8 @@ def test_haze_is_told_of_once_it_covers_enough(renderer, opacity, count, seen):
     count together.
     """
     camera = fs.Camera.pinhole(5, 5, 50.0, 50.0, 2.5, 2.5)
-    frame = renderer.render(layers_of([opacity] * count), camera, TOLD)
-    assert {name: bool(told(frame, name)[2, 2]) for name in TOLD} == dict.fromkeys(TOLD, seen)
+    frame = renderer.render(layers_of([opacity] * count), camera, MASKED)
+    assert {name: bool(covered(frame, name)[2, 2]) for name in MASKED} == dict.fromkeys(MASKED, seen)
     if count > 100:
         half = math.log(0.5) / math.log(1 - opacity)
         assert 2 + half - 4 < frame["depth_median"][2, 2] < 2 + half + 1

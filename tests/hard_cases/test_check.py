@@ -136,16 +136,16 @@ def test_too_many_uncertain_pixels_fail(renderer, monkeypatch):
     assert "certificates above 0.05" in failures[0]
 
 
-def test_arithmetic(renderer, judge):
+def test_arithmetic(renderer, reference):
     facts = measure(renderer)
     assert set(BOUNDS) <= set(facts.ulp) or not facts.float64
     assert all(finding.holds for finding in facts.findings), facts.findings
     assert facts.ulp["division"] > 0.3  # it does measure
-    assert measure(judge) is None
+    assert measure(reference) is None
 
 
-def test_the_reference_agrees_with_itself(judge):
-    assert check.run_check(judge, catalogue.all_cases("A")[:2]).passed
+def test_the_reference_agrees_with_itself(reference):
+    assert check.run_check(reference, catalogue.all_cases("A")[:2]).passed
 
 
 def test_the_command(renderer, tmp_path, capsys, monkeypatch):

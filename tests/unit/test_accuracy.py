@@ -65,11 +65,11 @@ def test_truth_keeps_the_definition_and_leaves_nothing_out():
 def test_truth_of_a_device_is_that_of_the_reference(renderer):
     cloud = random_splats(60, seed=3, depth=(1.0, 6.0), scale=(0.05, 1.0))
     best = full_precision(fs.Capture(), fs.Renderer("reference")).quality
-    judge = reference_pixels(cloud, CAMERA, ("rgb",), best)
+    reference = reference_pixels(cloud, CAMERA, ("rgb",), best)
     ours = truth(renderer, cloud, fs.Capture(CAMERA))
     assert ours.dtype == np.float64
     assert ours.shape == (17, 24, 3)
-    (difference,) = compare({"rgb": ours}, judge, ("rgb",))
+    (difference,) = compare({"rgb": ours}, reference, ("rgb",))
     assert difference.agrees, difference
 
 

@@ -102,7 +102,8 @@ def rows(text: str) -> list[str]:
 
 
 def test_each_kind_of_figures_becomes_its_table(files):
-    made = {name: make(tables.load(files)) for name, make in tables.TABLES.items()}
+    made = tables.tables(tables.load(files))
+    assert list(made) == [name for name in tables.TABLES if name not in ("ways", "large")]
     assert rows(made["counts"]) == ["| tag | 640 x 480 | 691 | 690 | 202,902 |"]
     assert rows(made["rates"]) == ["| a CPU | 45 GB/s | 250 G/s | 12.5 G/s | 50 G/s |"]
     assert rows(made["frames"]) == [

@@ -31,10 +31,10 @@ def scene():
 
 
 @pytest.fixture(scope="module")
-def held_out(judge):
+def held_out(reference):
     """Scenes that no table is made of, with their truths."""
     scenes = [random_scene(HELD_OUT + k) for k in range(HELD_OUT_SCENES)]
-    return [(s, truth(judge, s.cloud, fs.Capture(s.camera, background=s.background))) for s in scenes]
+    return [(s, truth(reference, s.cloud, fs.Capture(s.camera, background=s.background))) for s in scenes]
 
 
 def error_of(renderer, scene, quality, want):

@@ -155,9 +155,9 @@ def test_what_needs_no_patch_is_preferred(monkeypatch, record):
     assert list(device._named_devices()) == ["opencl:pocl", "opencl:intel"]
 
 
-@pytest.mark.parametrize(("way", "told"), [("variable", pocl_target.FORBID), ("hidden", "/proc/self/mem")])
+@pytest.mark.parametrize(("way", "named"), [("variable", pocl_target.FORBID), ("hidden", "/proc/self/mem")])
 def test_where_the_patch_may_not_or_cannot_be_made_another_device_is_taken_or_a_remedy_told(
-    monkeypatch, record, way, told
+    monkeypatch, record, way, named
 ):
     pocl, other = pocl_that_mistakes(record), pocl_that_mistakes(record)
     other.name, other.version = "a newer PoCL", "OpenCL 3.0 PoCL HSTR: cpu-x86_64-pc-linux-gnu-haswell"
@@ -172,7 +172,7 @@ def test_where_the_patch_may_not_or_cannot_be_made_another_device_is_taken_or_a_
         monkeypatch.setattr(pocl_target.os, "open", refuse)
     before = list(record)
     monkeypatch.setattr(device, "_all_devices", lambda: iter([pocl]))
-    with pytest.raises(fs.DeviceError, match=rf"a PoCL: .*{told}.*pocl-opencl-icd") as caught:
+    with pytest.raises(fs.DeviceError, match=rf"a PoCL: .*{named}.*pocl-opencl-icd") as caught:
         device.open_device()
     assert "\n" not in str(caught.value)
     monkeypatch.setattr(device, "_all_devices", lambda: iter([pocl, other]))

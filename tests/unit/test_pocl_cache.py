@@ -92,3 +92,12 @@ def test_the_cache_is_where_pocl_looks(monkeypatch, tmp_path):
     assert cache_folder() == tmp_path / "pocl" / "kcache"
     monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path / "mine"))
     assert cache_folder() == tmp_path / "mine"
+
+
+def test_what_another_process_is_about_to_finish_is_left_alone(tmp_path):
+    unfinished, broken = tmp_path / "tempfile_ab12cd.so", tmp_path / "blend.so"
+    for file in (unfinished, broken):
+        file.write_bytes(b"")
+    assert remove_broken(tmp_path) == 1
+    assert unfinished.exists()
+    assert not broken.exists()

@@ -189,11 +189,11 @@ def test_dots_that_join_no_keys_are_read(tmp_path):
     dots = "a." * 1000
     path.write_text(
         f'[[markers]] # {dots}\nspec = "qr:\\"{dots}"\nsize = 0.1\nposition = [{"1.5, " * 3}]\n'
-        f"[render]\ndevice = \"\"\"\n\"\" {dots}\"\"\"\noutputs = ['{dots}', '''{dots}''']\n"
+        f"[render]\ndevice = \"\"\"\n\"\" {dots}\"\"\"\noutputs = ['{dots}', '''{dots}b''']\n"
     )
     scene = fs.Scene.load(path)
     assert scene.device == f'"" {dots}'
-    assert scene.outputs == (dots, dots)
+    assert scene.outputs == (dots, f"{dots}b")
     assert scene.markers[0].marker.payload == f'"{dots}'
 
 

@@ -150,12 +150,12 @@ def test_a_frame_keeps_its_arrays_when_the_next_is_drawn(renderer):
     assert np.array_equal(kept.numpy(), before)
 
 
-def test_other_backends_say_that_they_share_nothing(judge):
-    frame = judge.render(CLOUD, CAMERA)
+def test_other_backends_say_that_they_share_nothing(reference):
+    frame = reference.render(CLOUD, CAMERA)
     with pytest.raises(fs.InputError, match="warp:cpu"):
         frame.device_array("rgb")
     with pytest.raises(fs.InputError, match="reference takes no arrays"):
-        judge.adopt(means=0, quats=0, scales=0, opacities=0, colors=0)
+        reference.adopt(means=0, quats=0, scales=0, opacities=0, colors=0)
 
 
 def test_adopted_arrays_draw_what_the_cloud_draws(renderer):

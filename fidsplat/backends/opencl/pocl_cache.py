@@ -3,8 +3,9 @@
 PoCL 3 loads what it finds there without a look: a bitcode file or a shared object that is cut off, empty or
 noise ends the process ("LLVM ERROR", SIGBUS, abort) or gives a program without kernels, on that run and on
 every later one. So files that are not whole are removed before PoCL is first asked for a program; it then
-compiles them again. PoCL gives a file its name when it is written: none of these is one that another process
-is about to finish.
+compiles them again. PoCL gives a file its name when it is written; what another process is about to finish is
+called tempfile_*, and is left alone: without it that process would end ("Final linking of kernel ...
+failed").
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import BinaryIO
 
 _BITCODE, _ELF = b"BC\xc0\xde", b"\x7fELF\x02\x01"
 _ENTER_SUBBLOCK = 1
+_UNFINISHED = "tempfile_"
 
 
 def cache_folder() -> Path:
@@ -51,7 +53,9 @@ def remove_broken(folder: Path) -> int:
         for name in names:
             path = Path(place, name)
             with suppress(OSError):  # it is another's cache too: what is not there any more is no error
-                if name.endswith((".so", ".bc")) and path.stat().st_mtime >= last - 1 and not is_whole(path):
+                if not name.endswith((".so", ".bc")) or name.startswith(_UNFINISHED):
+                    continue
+                if path.stat().st_mtime >= last - 1 and not is_whole(path):
                     path.unlink()
                     removed += 1
     with suppress(OSError):  # a folder that cannot be written is looked through every time

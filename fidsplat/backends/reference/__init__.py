@@ -2,7 +2,7 @@
 splat, no tiles, no boxes.
 
 It starts from the same float32 inputs and takes the same decisions (numerics.md, section 3). Beside the
-planes it gives certificates: how much a pixel may differ because single precision may decide or round
+outputs it gives certificates: how much a pixel may differ because single precision may decide or round
 otherwise.
 """
 

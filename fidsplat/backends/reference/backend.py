@@ -165,12 +165,12 @@ class ReferencePipeline:
         self, resident: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray
     ) -> dict[str, np.ndarray]:
         """The same of a picture of several shots: the mean of colours, fog and transmittances, all else from
-        the middle one; `certificate_planes` is that one's certificate."""
+        the middle one; `certificate_middle` is that one's certificate."""
         out: dict[str, np.ndarray] = {}
         for shot in view.shots:
             mine = (y > shot.top) & (y < shot.top + shot.view.height)
             seen = self._samples(resident, shot.view, x[mine], y[mine] - shot.top)
-            seen["certificate_planes"] = seen["certificate"]
+            seen["certificate_middle"] = seen["certificate"]
             for name, values in seen.items():
                 plane = out.setdefault(name, np.zeros((len(x), *values.shape[1:]), values.dtype))
                 if name in ("rgb", "t", "fogged", "certificate", "behind_bound"):

@@ -1,4 +1,4 @@
-"""What single precision may change: the certificates that go with the reference's planes.
+"""What single precision may change: the certificates that go with the reference's outputs.
 
 A device evaluates the affine forms n_u, n_v, D of a pixel in float32, about the pixel nearest to the splat's
 centre. Interval arithmetic over their rounding gives for each fragment the least and the greatest opacity

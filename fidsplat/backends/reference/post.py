@@ -59,7 +59,7 @@ def _panorama_at(panorama: Panorama, rays: np.ndarray) -> tuple[np.ndarray, np.n
     return above * (1 - bottom) + below * bottom, contrast * np.minimum(off, 1)
 
 
-def developed(
+def apply_sensor(
     light: np.ndarray, bound: np.ndarray, steps: tuple[str, ...], view: View, x: np.ndarray, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Values (k, 3) after the sensor's steps for light (k, 3) at pixels (column x, row y), and what may

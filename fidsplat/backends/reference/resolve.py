@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from fidsplat.backends.reference.optics import ray_lengths
-from fidsplat.backends.reference.post import brightest, developed
+from fidsplat.backends.reference.post import apply_sensor, brightest
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 
@@ -33,8 +33,8 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
         if view.surroundings is not None:
             unsure = unsure + samples["behind_bound"].mean(1)
         columns, rows = (np.floor(center / view.samples).astype(int) for center in (center_x, center_y))
-        out["rgb"], out["certificate_rgb"] = developed(out["rgb"], unsure, steps, view, columns, rows)
-    bound = samples.get("certificate_planes", bound)  # the other planes show one shot
+        out["rgb"], out["certificate_rgb"] = apply_sensor(out["rgb"], unsure, steps, view, columns, rows)
+    bound = samples.get("certificate_middle", bound)  # the other outputs show one shot
     if "alpha" in features.names:
         out["alpha"] = 1 - t
     covered, unsure = samples["shown"], np.asarray(samples["shown_may_flip"].any(1))

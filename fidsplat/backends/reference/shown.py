@@ -1,4 +1,4 @@
-"""What the planes tell of that name or measure what is seen: label, splat id, depth, median depth, normal."""
+"""Outputs that name or measure what is seen, where enough is covered: label, splat id, depths, normal."""
 
 from __future__ import annotations
 
