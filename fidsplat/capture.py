@@ -79,7 +79,8 @@ class Capture(PickledByFields):
         for name in changes:
             if name not in known:
                 raise InputError(unknown("part of a capture", name, known))
-        return replace(self, **{name: value for name, value in changes.items() if value is not None})
+        given = {name: value for name, value in changes.items() if value is not None}
+        return replace(self, **given) if given else self
 
 
 def output_names(outputs: Any) -> tuple[str, ...]:

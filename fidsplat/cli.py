@@ -8,10 +8,12 @@ import functools
 import io
 import operator
 import os
+import signal
 import sys
+import threading
 import traceback
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Any
 
 ABOUT = """Fiducial markers made of 2D Gaussian splats: make them, set them in scenes, draw them, read them
@@ -31,7 +33,8 @@ says which fidsplat this is."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit status: 0 done, 1 failed, 2 bad input, 130 interrupted."""
+    """Run the command line and return its exit status: 0 done, 1 failed, 2 bad input, 130 interrupted, 143
+    terminated."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -39,13 +42,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), _sigterm_raises():
             warnings.showwarning = _show_warning
             status = _parse(words).run()
         sys.stdout.flush()
         return status
     except SystemExit as stop:  # help, or words that could not be parsed
         return stop.code if isinstance(stop.code, int) else 2
+    except _Terminated:
+        return _fail("terminated", 143)
     except KeyboardInterrupt:
         return _fail("interrupted", 130)
     except BrokenPipeError:
@@ -62,6 +67,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(error, MemoryError):
             return _fail("not enough memory for this; use a smaller picture or fewer splats", 1)
         return _fail(f"{type(error).__name__}: {error} (a fault of fidsplat; --debug shows where)", 1)
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM, which stops a command where it stands as Ctrl-C does: half-written files are removed."""
+
+
+@contextlib.contextmanager
+def _sigterm_raises() -> Iterator[None]:
+    def stop(*_: object) -> None:
+        raise _Terminated
+
+    if threading.current_thread() is not threading.main_thread():  # only that one may handle signals
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _parse(words: list[str]):

@@ -76,7 +76,7 @@ class MarkerQuality:
     template: int = 25
     """Of `fitted`: Gaussians of a rectangle up to an aspect ratio of 6, one of `TEMPLATE_SIZES`: 1, 5, 9,
     13, 25, 41 or 562. Fewer are drawn faster and leave edges blurred and corners round; 562 are opaque and
-    look printed in every renderer."""
+    clean, under a low-pass from 24 px a module on."""
 
     def __post_init__(self) -> None:
         _one_of("marker quality: mixture", self.mixture, MIXTURES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -151,6 +152,9 @@ class ResidentCloud:
 class Renderer:
     """Draws splats on one device. Compiled pipelines and scratch buffers are kept from picture to picture.
 
+    Threads may share one, whose pictures are then drawn one after another; a process that was forked opens
+    its own.
+
     Args:
         device: "opencl" (the best OpenCL device), "opencl:NAME" (part of a platform's or device's name, or
             cpu or gpu), "warp:cpu", "warp:cuda" (NVIDIA Warp), or "reference" (NumPy, float64, slow).
@@ -166,7 +170,7 @@ class Renderer:
 
     def __init__(self, device: str | None = None, memory_budget: int | None = None) -> None:
         self.backend = open_backend(default_device() if device is None else device)
-        self._process = os.getpid()
+        self._process, self._lock = os.getpid(), threading.Lock()
         if memory_budget is not None:
             if isinstance(memory_budget, bool) or not isinstance(memory_budget, int) or memory_budget <= 0:
                 raise InputError(
@@ -192,7 +196,8 @@ class Renderer:
         if not isinstance(cloud, SplatCloud):
             raise InputError(f"cannot render a {type(scene).__name__}; give a Scene or a SplatCloud")
         capture = scene.capture if isinstance(scene, Scene) else _PLAIN
-        return ResidentCloud(self, self.backend.upload(cloud), capture)
+        with self._lock:
+            return ResidentCloud(self, self.backend.upload(cloud), capture)
 
     def adopt(
         self,
@@ -227,7 +232,8 @@ class Renderer:
         given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
         given |= {"colors": colors} if sh is None else {"sh": sh}
         given |= {} if labels is None else {"labels": labels}
-        data = self.backend.adopt(given, np.asarray(tuple(origin), dtype=np.float64))
+        with self._lock:
+            data = self.backend.adopt(given, np.asarray(tuple(origin), dtype=np.float64))
         return ResidentCloud(self, data, _PLAIN)
 
     def render(
@@ -317,7 +323,8 @@ class Renderer:
 
     def _draw(self, resident: ResidentCloud, capture: Capture) -> Frame:
         features, view = prepare(resident._data, capture)
-        return Frame(self.backend.pipeline(features).render(resident._data, view), capture.outputs)
+        with self._lock:  # scratch buffers and kernels' arguments belong to one picture at a time
+            return Frame(self.backend.pipeline(features).render(resident._data, view), capture.outputs)
 
 
 def _asked(

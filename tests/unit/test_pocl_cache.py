@@ -68,6 +68,34 @@ def test_a_damaged_cache_is_compiled_again(full_cache, tmp_path):
     assert all(map(is_whole, compiled(folder)))
 
 
+def test_a_program_without_kernels_is_built_again(monkeypatch):
+    """As PoCL gives it where another process has not finished writing."""
+    pytest.importorskip("pyopencl")
+    import fidsplat as fs
+    from fidsplat.backends.opencl import program
+
+    renderer, builds, build = fs.Renderer("opencl:pocl"), [], program.build
+
+    class Empty:
+        def all_kernels(self):
+            return []
+
+    def first_in_vain(workspace, text, *options):
+        builds.append(options)
+        return Empty() if len(builds) <= failures else build(workspace, text, *options)
+
+    monkeypatch.setattr(program, "build", first_in_vain)
+    cloud = fs.SplatCloud([[0, 0, 2]], [[1, 0, 0, 0]], [[0.3, 0.3]], [0.5], colors=[[1, 1, 1]])
+    camera = fs.Camera.pinhole(8, 8, 8, 8, 4, 4)
+    failures = 3
+    with pytest.raises(fs.DeviceError, match="cache of compiled kernels"):
+        renderer.render(cloud, camera)
+    builds.clear()
+    failures = 1
+    assert renderer.render(cloud, camera)["rgb"].sum() > 0
+    assert builds == [(), ("-DATTEMPT_1",)]
+
+
 def test_a_damaged_cache_of_pyopencl_is_done_without(full_cache, tmp_path):
     folder = tmp_path / "cache"
     shutil.copytree(full_cache[0], folder)

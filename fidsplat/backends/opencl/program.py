@@ -11,6 +11,7 @@ from typing import Any
 import pyopencl as cl
 
 from fidsplat.backends.opencl.assemble import Source, kernel_text, with_scalars
+from fidsplat.backends.opencl.pocl_cache import cache_folder
 from fidsplat.backends.opencl.pocl_target import correct_target, needs_correction
 from fidsplat.backends.opencl.workspace import DeviceBuffer, Workspace
 from fidsplat.errors import DeviceError
@@ -63,10 +64,8 @@ class Program:
 
     def __init__(self, workspace: Workspace, source: Source) -> None:
         self.source = source
-        built = build(workspace, source.text)
         self._queue = workspace.queue
-        load_invoker()
-        self._kernels = {kernel.function_name: kernel for kernel in built.all_kernels()}
+        self._kernels = _kernels_of(workspace, source)
         self._types = {
             kernel: [None if one.access else source.scalars.dtype(one.ctype).type for one in arguments]
             for kernel, arguments in source.arguments.items()
@@ -100,6 +99,28 @@ class Program:
                 bound[index] = mark
         self._bound[name] = bound
         return cl.enqueue_nd_range_kernel(self._queue, kernel, size, group)
+
+
+def _kernels_of(workspace: Workspace, source: Source) -> dict[str, cl.Kernel]:
+    """The kernels of a source.
+
+    PoCL's cache may give a program without kernels, where another process has died while it wrote or writes
+    just now. Another option makes another entry.
+
+    Raises:
+        DeviceError: the compiler refuses, or gives no kernels again and again.
+    """
+    load_invoker()
+    for attempt in range(3):
+        again = [f"-DATTEMPT_{attempt}"] if attempt else []
+        built = build(workspace, source.text, *again)
+        kernels = {kernel.function_name: kernel for kernel in built.all_kernels()}
+        if source.arguments.keys() <= kernels.keys():
+            return kernels
+    raise DeviceError(
+        f"{workspace.info.title} gives a program without its kernels; its cache of compiled kernels may be "
+        f"damaged: remove {cache_folder()}"
+    )
 
 
 def check_kernels(
