@@ -9,6 +9,9 @@ from typing import BinaryIO
 
 from fidsplat.errors import InputError
 
+MAX_NAME, MAX_PATH = 255, 4095
+"""bytes of a file's name and of a path to it, on Linux"""
+
 
 def path_of(path: str | os.PathLike[str]) -> Path:
     """The path that is meant. Raises InputError for anything but text or a path that a file can have."""
@@ -21,6 +24,10 @@ def path_of(path: str | os.PathLike[str]) -> Path:
             raise ValueError
     except ValueError:  # or half of a surrogate pair, which no name has
         raise InputError(f"{path!r} names no file; give a path as text or a pathlib.Path") from None
+    if len(os.fsencode(name)) > MAX_PATH or any(
+        len(os.fsencode(part)) > MAX_NAME for part in Path(name).parts
+    ):
+        raise InputError(f"{name!r} is too long for the name of a file; a name has at most {MAX_NAME} bytes")
     return Path(name)
 
 

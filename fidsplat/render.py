@@ -15,7 +15,7 @@ from fidsplat.backends.prepare import prepare
 from fidsplat.backends.registry import open_backend
 from fidsplat.backends.view import NO_CAMERA
 from fidsplat.cameras import Camera, Motion, Shutter
-from fidsplat.capture import Capture
+from fidsplat.capture import Capture, output_names
 from fidsplat.errors import InputError, MissingOutputError
 from fidsplat.quality import Quality
 from fidsplat.scenes import Scene
@@ -286,8 +286,7 @@ class Renderer:
         (a motion of the camera takes the place of each camera's pose); an error comes after the pictures of
         the captures before it.
         """
-        if isinstance(outputs, Iterable) and not isinstance(outputs, str):
-            outputs = tuple(outputs)
+        outputs = None if outputs is None else output_names(outputs)
         if not isinstance(captures, Iterable):
             raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera")
         resident = self._resident(scene)
@@ -346,7 +345,7 @@ def _asked(
         InputError: a part of the wrong kind, or no camera.
     """
     if not isinstance(capture, Capture):
-        camera = capture or camera
+        camera = camera if capture is None else capture
         capture = scene.capture if isinstance(scene, (Scene, ResidentCloud)) else _PLAIN
     asked = capture.with_(
         camera=camera, outputs=outputs, quality=quality, background=background, motion=motion,

@@ -129,6 +129,6 @@ def three_numbers(name: str, value: Any) -> tuple[float, float, float]:
         numbers = tuple(float(number) for number in value)
     except (TypeError, ValueError):
         numbers = ()
-    if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
-        raise InputError(f"{name} must be three finite numbers, not {value!r}")
+    if len(numbers) != 3 or not all(abs(number) <= LARGEST for number in numbers):
+        raise InputError(f"{name} must be three finite numbers, at most {LARGEST:g}, not {value!r}")
     return numbers  # type: ignore[return-value]

@@ -93,7 +93,7 @@ class Trajectory(PickledByFields):
                 "the times of a trajectory must be one or more finite, increasing numbers of seconds, not "
                 f"{self.times!r}"
             )
-        count = len(self.poses) if isinstance(self.poses, Sequence | np.ndarray) else 0
+        count = len(self.poses) if isinstance(self.poses, Sequence) or np.ndim(self.poses) else 0
         if count != len(times):
             raise InputError(f"a trajectory has {len(times)} times but {count} poses; give one for each time")
         for k, pose in enumerate(self.poses):

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from fidsplat.errors import InputError
-from fidsplat.files import ordinary_file, writable_folder
+from fidsplat.files import ordinary_file, path_of, writable_folder
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -95,7 +95,7 @@ def late_progress(where: Console, after: float = 1.0) -> Iterator[Callable[[str,
 
 def writable_file(path: str | Path) -> Path:
     """The path, after a proof that a file can be written beside it. Raises InputError."""
-    file = Path(path)
+    file = path_of(path)
     if file.is_dir():
         raise InputError(f"{file} is a folder; give the name of a file")
     writable_folder(file.parent)

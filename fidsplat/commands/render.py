@@ -11,7 +11,7 @@ import tyro
 
 from fidsplat.commands.output import Json, console, late_progress, option, print_json, print_table
 from fidsplat.errors import FidsplatError, InputError
-from fidsplat.files import writable_folder
+from fidsplat.files import path_of, writable_folder
 
 if TYPE_CHECKING:
     from fidsplat.formats import Progress
@@ -92,7 +92,7 @@ Examples:
         budget = self.max_error is not None or self.max_ms is not None
         if budget:
             check_bounds(self.max_error, self.max_ms)
-        name_of = _names(self.out, Path(self.source))
+        name_of = _names(self.out, path_of(self.source))
         where = console(self.json)
         with late_progress(console(True)) as progress:
             scene = load_source(self.source, self.quality, progress)
@@ -166,7 +166,7 @@ def _names(out: str | None, source: Path):
         raise InputError(
             "an empty name; give a scene (.toml) or splat file (.ply), and a PNG file or a folder"
         )
-    file = Path(out) if out is not None else Path(source.name).with_suffix(".png")
+    file = path_of(out) if out is not None else Path(source.name).with_suffix(".png")
     if file.suffix.lower() in _OTHER_PICTURES:
         raise InputError(f"pictures are written as PNG: name {file.with_suffix('.png')}, or a folder")
     if file.suffix.lower() == ".png" and not file.is_dir():
