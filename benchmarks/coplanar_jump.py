@@ -38,7 +38,7 @@ SIZE = {"width": 240, "height": 192}
 
 def measure(renderer: fs.Renderer, name: str, panels: dict) -> list[dict]:
     """Jumps of one marker; the worst face to face goes to `panels`."""
-    cloud, step = fs.marker(SPECS[name], size=1.0).cloud, STEP
+    cloud, step = fs.marker(SPECS[name], size=1.0, mixture="fitted").cloud, STEP
     if name.endswith("wall"):
         cloud, step = fs.SplatCloud.concatenate([cloud, wall()]), WALL_STEP
     shuffled = taken(cloud, np.random.default_rng(0).permutation(len(cloud)))

@@ -22,7 +22,7 @@ SETUP_PRECISIONS = ("float64", "float32")
 ARITHMETIC = ("precise", "fast")
 BLEND_PRECISIONS = ("float32", "float64")
 MAX_SAMPLES = 8
-MIXTURES = ("fitted", "paper", "exact")
+MIXTURES = ("exact", "fitted", "paper")
 NESTED = 562
 TEMPLATE_SIZES = (1, 5, 9, 13, 25, 41, NESTED)
 """Gaussians of a rectangle in the templates that are shipped (fidsplat/markers/templates.json), and in the
@@ -57,9 +57,10 @@ class MarkerQuality:
         InputError: a value lies outside its range; the message names the range.
     """
 
-    mixture: str = "fitted"
-    """`fitted`: templates optimised for whole markers. `paper`: the construction of the paper's section 3.2.
-    `exact`: one box per rectangle, with edges that the pixel filters."""
+    mixture: str = "exact"
+    """`exact`: one box per rectangle, with edges that the pixel filters; opaque and clean at any distance.
+    `fitted`: Gaussians by templates optimised for whole markers, which files hold and other renderers draw.
+    `paper`: Gaussians by the construction of the paper's section 3.2."""
 
     levels: int = 4
     """Of `paper`: L, 1 to 8; 2^(L+2) - 7 Gaussians a rectangle at density 1, edges blurred over 2^-L half
@@ -74,9 +75,9 @@ class MarkerQuality:
     (0.4 for fitted, 0 for paper)."""
 
     template: int = 25
-    """Of `fitted`: Gaussians of a rectangle up to an aspect ratio of 6, one of `TEMPLATE_SIZES`: 1, 5, 9,
-    13, 25, 41 or 562. Fewer are drawn faster and leave edges blurred and corners round; 562 are opaque and
-    clean, under a low-pass from 24 px a module on."""
+    """Of `fitted`, and of the Gaussians that stand for `exact` in files: Gaussians of a rectangle up to an
+    aspect ratio of 6, one of `TEMPLATE_SIZES`: 1, 5, 9, 13, 25, 41 or 562. Fewer are drawn faster and leave
+    edges blurred and corners round; 562 are opaque and clean, under a low-pass from 24 px a module on."""
 
     def __post_init__(self) -> None:
         _one_of("marker quality: mixture", self.mixture, MIXTURES)

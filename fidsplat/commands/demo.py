@@ -22,7 +22,7 @@ that is wholly visible is not found within 1 % of its distance.
 
 Examples:
   fidsplat demo
-  fidsplat demo --mixture exact --out sharp
+  fidsplat demo --mixture fitted --out soft
   fidsplat demo --out pictures --json"""
 
     out: Annotated[
@@ -32,8 +32,8 @@ Examples:
         str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")
     ] = None
     mixture: Annotated[
-        str, option("NAME", "of the markers: fitted, paper or exact, as `fidsplat marker` (default: fitted)")
-    ] = "fitted"
+        str, option("NAME", "of the markers: exact, fitted or paper, as `fidsplat marker` (default: exact)")
+    ] = "exact"
     json: Json = False
 
     def run(self) -> int:

@@ -36,8 +36,8 @@ SPEC is one of
   gridboard:CxR:FAMILY columns x rows of tags           gridboard:5x7:4x4_50
   aprilgrid:CxR:FAMILY the same with corner squares     aprilgrid:6x6:36h11
 
-The mixture exact draws every rectangle as one box with sharp edges. A PLY file has no boxes: -o then writes
-the Gaussians of fitted, and says so.
+The mixture exact, the default, draws every rectangle as one box with sharp edges. A PLY file has no boxes: -o
+then writes the Gaussians of fitted, and says so.
 
 Knobs of the mixtures (fs.MarkerQuality) are part of a quality: marker.levels (1 to 8) and marker.density (1
 to 100) of paper, marker.template of fitted (Gaussians of a rectangle: 1, 5, 9, 13, 25, 41 or 562), and
@@ -58,7 +58,7 @@ Examples:
         option("M", "edge of the code (a board's width) in metres, quiet zone not counted (default: 1)"),
     ] = 1.0
     mixture: Annotated[
-        str | None, option("NAME", "how rectangles become splats: fitted, paper or exact (default: fitted)")
+        str | None, option("NAME", "how rectangles become splats: exact, fitted or paper (default: exact)")
     ] = None
     quality: Annotated[
         str | None, option("Q", "as `fidsplat render` takes it; what it says of markers, as above, holds")

@@ -101,7 +101,7 @@ def run_demo(
     out: str | Path,
     device: str | None = None,
     progress: Callable[[str], None] = lambda text: None,
-    mixture: str = "fitted",
+    mixture: str = "exact",
 ) -> DemoResult:
     """Run the demo and write its pictures, its scene and its figures into the folder ``out``.
 
@@ -124,7 +124,7 @@ def run_demo(
     files = [folder / "scene.toml", folder / "scene.ply"]
     scene.save(files[0])
     files += sorted(folder.glob("scene-splats-*.ply"))
-    save_ply((scene if mixture != "exact" else demo_scene()).cloud(), files[1])
+    save_ply((scene if mixture != "exact" else demo_scene(mixture="fitted")).cloud(), files[1])
 
     sightings, unexpected, frame_ms, visible, seen = [], [], {}, {}, {}
     for view, camera in demo_views().items():

@@ -28,7 +28,7 @@ SIGNS = (
 OUTPUTS = ("rgb", "depth", "normal", "label")
 
 
-def demo_scene(seed: int = 0, mixture: str = "fitted") -> Scene:
+def demo_scene(seed: int = 0, mixture: str = "exact") -> Scene:
     """Signs, ground, wall and plants: about ten thousand background splats, label 0, and the splats of the
     signs, of that mixture."""
     random = np.random.default_rng(seed)

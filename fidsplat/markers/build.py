@@ -74,7 +74,7 @@ class Marker(PickledByFields):
     size: float
     """metres, the code's edge; its width where it is not square"""
     mixture: str
-    """"fitted", "paper" or "exact\""""
+    """"exact", "fitted" or "paper\""""
     quality: MarkerQuality
     """all knobs that it was made with; `growth` is None where the mixture's own was taken"""
     grid: np.ndarray = field(repr=False)
@@ -169,8 +169,9 @@ def marker(
         spec: apriltag:36h11:5, aruco:4x4_50:7, qr:TEXT, qr-v22-L:TEXT, image:FILE.png, svg:FILE.svg,
             charuco:7x5:4x4_50, gridboard:5x7:4x4_50, aprilgrid:6x6:36h11, or of a kind that was registered.
         size: metres, edge of the code itself, quiet zone not counted (the width of a board or a picture).
-        mixture: "fitted" (default), "paper", or "exact": one box for each rectangle, which only this renderer
-            draws (`SplatCloud.with_boxes`, `Marker.gaussians`).
+        mixture: "exact" (default), one box for each rectangle, which only this renderer draws
+            (`SplatCloud.with_boxes`; `Marker.gaussians` are for others and for files); "fitted" or "paper":
+            Gaussians.
         quiet_zone: modules of white around it; default 1 for tags, 4 for QR, 2 for boards, 0 for images and
             drawings.
         levels, density, duplicates: of the mixture `paper` only, see `paper_template`; default 4, 3, False.
@@ -268,7 +269,9 @@ def _chosen(
     if "template" in given and name == "paper":
         raise InputError("template: the mixture 'paper' has levels and density instead")
     if "growth" in given and name == "exact":
-        raise InputError("growth: the boxes of mixture='exact' meet without seams; leave it out")
+        raise InputError(
+            "growth: the boxes of mixture='exact' meet without seams; leave it out, or write mixture='fitted'"
+        )
     return replace(quality, mixture=name, **given)
 
 

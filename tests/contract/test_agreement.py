@@ -84,7 +84,7 @@ def test_spherical_harmonics(renderer, degree):
 @pytest.mark.parametrize("spec", ["apriltag:36h11:5", "qr-v5-L:" + "fidsplat " * 10], ids=["apriltag", "qr5"])
 def test_markers_at_five_tilts(renderer, spec, tilt):
     """At 400 pixels around the marker, against all of its splats."""
-    cloud = fs.marker(spec, size=1.0).cloud
+    cloud = fs.marker(spec, size=1.0, mixture="fitted").cloud
     angle = math.radians(tilt)
     position = (0.0, -2.2 * math.sin(angle), -2.2 * math.cos(angle))
     camera = fs.Camera.look_at(320, 240, 0.7, position, (0.0, 0.0, 0.0))

@@ -176,7 +176,7 @@ def test_markers_of_boxes_between_splats(renderer, tilt):
     pose[:3, 3] = (0.1, 0, 2)
     tag = fs.marker("apriltag:36h11:5", size=0.8, mixture="exact").cloud.transformed(pose)
     pose[:3, 3] = (-0.3, 0.1, 2.4)
-    other = fs.marker("aruco:4x4_50:7", size=0.7).cloud.transformed(pose)
+    other = fs.marker("aruco:4x4_50:7", size=0.7, mixture="fitted").cloud.transformed(pose)
     around = random_splats(40, seed=3, depth=(1.2, 3.5), scale=(0.02, 0.2), across=0.8)
     scene = fs.SplatCloud.concatenate([tag.with_labels(1), other.with_labels(2), around])
     assert_agrees(renderer, scene, SMALL)

@@ -22,7 +22,7 @@ def tag_at(position, turn):
     x, _, z = position
     half = (math.atan2(x, z) + turn) / 2
     return fs.scenes.PlacedMarker(
-        fs.marker(SPEC, size=SIZE),
+        fs.marker(SPEC, size=SIZE, mixture="fitted"),
         np.array(pose_of(position, [math.cos(half), 0.0, math.sin(half), 0.0])),
     )
 

@@ -51,7 +51,9 @@ def test_the_sensor_sees_pixels_not_samples(renderer, name):
 @pytest.mark.parametrize("samples", [1, 2])
 @pytest.mark.parametrize("density", [0.05, 1.0, 30.0])
 def test_fog(renderer, density, samples):
-    tag = fs.marker("aruco:4x4_50:7", size=1.0).cloud.transformed(np.diag([1, 1, 1, 1.0]) + shift(0, 0, 2))
+    tag = fs.marker("aruco:4x4_50:7", size=1.0, mixture="fitted").cloud.transformed(
+        np.diag([1, 1, 1, 1.0]) + shift(0, 0, 2)
+    )
     fog = fs.Fog(density, (0.6, 0.7, 0.8))
     for cloud in (CLOUD, fs.SplatCloud.concatenate([tag, random_splats(30, 4)])):
         agree(

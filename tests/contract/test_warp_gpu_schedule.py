@@ -25,7 +25,7 @@ def scene_of_layers():
     pose[:3, 3] = (0.1, 0, 2.2)
     exact = fs.marker("aruco:4x4_50:7", size=0.8, mixture="exact").cloud.transformed(pose)
     pose[:3, 3] = (-0.4, 0.1, 2.5)
-    fitted = fs.marker("aruco:4x4_50:7", size=0.8).cloud.transformed(pose)
+    fitted = fs.marker("aruco:4x4_50:7", size=0.8, mixture="fitted").cloud.transformed(pose)
     return fs.SplatCloud.concatenate([exact, fitted, AROUND.with_boxes(np.arange(90) % 3 == 0)])
 
 

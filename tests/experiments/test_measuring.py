@@ -115,7 +115,7 @@ def test_trained_models_are_rows_where_they_are(renderer, tmp_path):
     made = fs.marker(spec, 2.0 * 8 / 10)
     folder = tmp_path / "2dgs-9"
     folder.mkdir()
-    fs.save_ply(made.cloud, folder / "apriltag-2.ply")
+    fs.save_ply(made.gaussians, folder / "apriltag-2.ply")
     assert method_names(("fitted",), tmp_path)[-1] == "2dgs-9"
     painter = Painter(renderer, tmp_path)
     for name in ("fixed-plane", "fixed-module"):

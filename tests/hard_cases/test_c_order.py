@@ -74,7 +74,7 @@ def test_of_three_layers_the_nearer_of_the_first_two_is_laid(renderer):
 
 
 def test_a_real_marker_does_not_jump(renderer):
-    cloud = fs.marker("apriltag:36h11:5", size=1.0).cloud
+    cloud = fs.marker("apriltag:36h11:5", size=1.0, mixture="fitted").cloud
     for tilt in (0.0, 40.0):
         # what enters at a splat's rim enters with 1/255
         assert largest_jump(renderer, turning(cloud, "blend", steps=3, tilt=tilt))[0] < 1.1 / 255

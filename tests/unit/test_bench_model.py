@@ -30,7 +30,7 @@ def test_the_blend_stage_by_hand():
 def test_every_stage_that_a_frame_names_has_a_roofline(renderer):
     import fidsplat as fs
 
-    tag = fs.marker("apriltag:36h11:5").cloud
+    tag = fs.marker("apriltag:36h11:5").gaussians
     timings = renderer.render(tag, fs.Camera.pinhole(8, 8, 8, 8, 4, 4)).timings
     assert set(roofline_work(COUNTS)) >= set(timings)
 

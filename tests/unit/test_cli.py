@@ -236,8 +236,10 @@ def test_marker_says_what_it_is_made_of(capsys, tmp_path):
     assert facts["shape"] == [8, 8]
     assert facts["components"] == made.components
     assert sum(facts["rectangles"].values()) == len(made.rectangles)
-    assert facts["splats"] == len(made.cloud) == len(fs.load_ply(file))
-    assert facts["mixture"] == "fitted"
+    assert facts["splats"] == len(made.cloud) == len(made.boxes)
+    assert facts["mixture"] == "exact"
+    assert facts["written"] == {"mixture": "fitted", "splats": len(made.gaussians)}
+    assert len(made.gaussians) == len(fs.load_ply(file))
     assert facts["size_m"] == 0.16
     assert 0 < facts["seconds"] < 30
     assert main(["marker", "apriltag:36h11:5"]) == 0
@@ -247,7 +249,7 @@ def test_marker_says_what_it_is_made_of(capsys, tmp_path):
 def test_a_marker_of_more_splats_than_allowed(capsys, tmp_path):
     bits = np.random.default_rng(0).random((350, 350)) < 0.5
     spec = f"image:{write_png(tmp_path / 'noise.png', bits)}"
-    status, line = fails(capsys, "marker", spec)
+    status, line = fails(capsys, "marker", spec, "--mixture", "fitted")
     assert status == 2
     assert "more than 1,000,000" in line
     assert "--max-splats" in line

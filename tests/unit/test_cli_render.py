@@ -37,7 +37,7 @@ def scene(tmp_path, monkeypatch):
 
 
 def tag_cloud() -> fs.SplatCloud:
-    return fs.marker("apriltag:36h11:5", size=0.4).cloud
+    return fs.marker("apriltag:36h11:5", size=0.4).gaussians
 
 
 def said(capsys) -> dict:

@@ -64,7 +64,7 @@ def test_an_exact_marker_is_its_partition():
 
 def test_an_exact_marker_has_gaussians_for_others():
     made = fs.marker("qr:hello", mixture="exact")
-    fitted = fs.marker("qr:hello")
+    fitted = fs.marker("qr:hello", mixture="fitted")
     assert made.gaussians.boxes is None
     assert np.array_equal(made.gaussians.means, fitted.cloud.means)
     assert np.array_equal(made.gaussians.opacities, fitted.cloud.opacities)

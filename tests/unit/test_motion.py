@@ -61,7 +61,7 @@ def test_when_rows_are_exposed():
     assert fs.Shutter().times(1.0) == [1.0]
 
 
-TAG = fs.marker("aruco:4x4_50:7", size=0.2)
+TAG = fs.marker("aruco:4x4_50:7", size=0.2, mixture="fitted")
 MOVING = fs.Motion(lambda time: np.eye(4), {1: lambda time: np.eye(4)})
 
 

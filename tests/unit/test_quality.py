@@ -83,7 +83,7 @@ def test_shipped_templates_are_those_that_quality_knows():
     for size in TEMPLATE_SIZES:
         square = fitted_templates(size)[0].gaussians
         assert len(square) == size
-    made = {size: fs.marker("apriltag:36h11:5", template=size) for size in TEMPLATE_SIZES}
+    made = {size: fs.marker("apriltag:36h11:5", mixture="fitted", template=size) for size in TEMPLATE_SIZES}
     counts = [len(one.cloud) for one in made.values()]
     assert counts == sorted(counts)
     assert len(made[1].cloud) == len(made[1].boxes)

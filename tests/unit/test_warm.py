@@ -16,7 +16,7 @@ def test_recipes_are_what_scenes_call_for():
     wanted = warming.recipes()
     assert len(set(wanted)) == len(wanted)
     assert len({recipe.words for recipe in wanted}) == len(wanted)
-    tag = fs.marker("apriltag:36h11:5").cloud
+    tag = fs.marker("apriltag:36h11:5").gaussians
     assert (tag.sh_degree, tag.planes is not None) == (-1, True)
     assert warming.Recipe(-1, True, ("rgb",)) in wanted
     assert warming.Recipe(-1, True, ("rgb", "depth", "normal", "label")) in wanted  # the demo's

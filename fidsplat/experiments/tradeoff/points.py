@@ -51,15 +51,10 @@ _QUICK = {
 _MARKER_LADDER = (
     *(MarkerQuality("paper", levels=levels, density=1) for levels in (1, 2, 3, 4, 5)),
     MarkerQuality("paper"),
-    *(
-        MarkerQuality(template=size)
-        for size in TEMPLATE_SIZES
-        if size not in (MarkerQuality().template, NESTED)
-    ),
-    *(MarkerQuality(growth=growth) for growth in (0.0, 0.2)),
-    MarkerQuality("exact"),
+    *(MarkerQuality("fitted", template=size) for size in TEMPLATE_SIZES if size != NESTED),
+    *(MarkerQuality("fitted", growth=growth) for growth in (0.0, 0.2)),
 )
-_QUICK_MARKERS = (MarkerQuality("paper"), MarkerQuality("exact"))
+_QUICK_MARKERS = (MarkerQuality("paper"), MarkerQuality("fitted"))
 _COMBINED_CUTOFFS, _COMBINED_STOPS = (1e-4, 1 / 4096, 1 / 2048, 1 / 1024, 1 / 255), (1e-4, 1e-3, 1 / 512)
 _FAST, _FASTEST = {"arithmetic": "fast"}, {"arithmetic": "fast", "setup_precision": "float32"}
 _FASTEST_STOP = 1e-3
