@@ -68,7 +68,8 @@ def check_similarity(matrix, name: str, rigid: bool = False) -> tuple[np.ndarray
     if not np.array_equal(m[3], [0.0, 0.0, 0.0, 1.0]):
         raise InputError(f"{name} must have the last row (0, 0, 0, 1), not {tuple(m[3].tolist())}")
     linear = m[:3, :3]
-    scale = float(np.linalg.norm(linear)) / np.sqrt(3.0)
+    with np.errstate(over="ignore"):  # as of a quaternion
+        scale = float(np.linalg.norm(linear)) / np.sqrt(3.0)
     if not scale > 0 or not np.isfinite(scale):
         raise InputError(f"{name} must be a rotation with a positive scale, but its scale is {scale:g}")
     rotation = linear / scale

@@ -2,13 +2,14 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import fidsplat as fs
 from fidsplat.accuracy import errors, truth
-from fidsplat.budget import calibrate, choose, store, table
+from fidsplat.budget import calibrate, choose, search, store, table
 from fidsplat.errors import InputError
 from fidsplat.random_clouds import HELD_OUT, random_scene
 from fidsplat.timing import Clock, Timer
@@ -94,6 +95,19 @@ def test_a_measured_error_is_the_error(renderer, held_out):
             assert found <= bound
             assert choice.error == pytest.approx(found, abs=1e-6)  # the device's truth is rounded to float32
             assert choice.source == "measured"
+
+
+def test_what_the_truth_may_be_off_is_added(renderer, held_out, monkeypatch):
+    scene, _ = held_out[0]
+    capture = fs.Capture(scene.camera, background=scene.background)
+
+    def measured():
+        return calibrate.Calibration(renderer, scene.cloud, capture, lambda text: None).error(fs.Quality())
+
+    monkeypatch.setattr(calibrate, "error_bound", lambda *_: 0.0)
+    plain = measured()
+    monkeypatch.setattr(calibrate, "error_bound", lambda *_: 0.25)
+    assert measured() == plain + 0.25
 
 
 def test_measuring_finds_what_is_cheaper_than_the_table(renderer, held_out):
@@ -196,6 +210,27 @@ def test_error_and_time_together(renderer, scene, clock):
     assert choice.error <= 1e-2
     with pytest.raises(InputError, match=r"an error of 0\.0001 takes \d+.*; the least error in that"):
         within(renderer, scene, 1e-4, 25)
+
+
+def test_a_time_is_kept_by_nine_frames_of_ten():
+    """A setting whose median frame is in time and whose late ones are not is not taken."""
+    late = {1e-2: 2.0, 1e-4: 9.0}
+
+    class Known:
+        base, renderer = fs.Quality(), SimpleNamespace(device=SimpleNamespace(name="known"))
+
+        def error(self, quality):
+            return quality.alpha_cutoff
+
+        def time(self, quality):
+            return 1.0
+
+        def times(self, qualities, repeats=9):
+            return [calibrate.Times(1.0, late[quality.alpha_cutoff]) for quality in qualities]
+
+    settings = tuple(table.Setting({"alpha_cutoff": cutoff}, 0, 0, 0, 1.0) for cutoff in late)
+    assert search.Search(Known(), settings).most_accurate_in(5.0).error == 1e-2
+    assert search.Search(Known(), settings).most_accurate_in(10.0).error == 1e-4
 
 
 @pytest.mark.parametrize("ms", [0, -3, 1e-6])

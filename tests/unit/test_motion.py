@@ -82,6 +82,19 @@ def test_a_shutter_that_does_nothing_is_none(motion, shutter, shots):
     assert len(view.shots) == shots
 
 
+def test_a_group_moves_about_the_worlds_origin_wherever_the_clouds_is():
+    """A splat's place in the camera frame: its own in the world, moved, then seen; and whence it is seen."""
+    generator = np.random.default_rng(3)
+    pose, moved, origin = random_pose(generator), random_pose(generator), np.array([100.0, -20.0, 7.0])
+    camera = fs.Camera.pinhole(8, 6, 5, 5, 4, 3, world_to_camera=pose)
+    capture = fs.Capture(camera, motion=fs.Motion(groups={1: lambda time: moved}))
+    ((_, view),) = view_of(capture, origin).groups
+    local = np.array([0.3, 0.2, -0.1])
+    seen = (pose @ moved @ np.append(origin + local, 1))[:3]
+    np.testing.assert_allclose(view.rotation @ local + view.translation, seen, atol=1e-12)
+    np.testing.assert_allclose(view.rotation @ (local - view.eye), seen, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [

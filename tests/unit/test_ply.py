@@ -263,6 +263,17 @@ def test_only_a_third_scale_of_1e_6_throughout_is_padding(tmp_path, monkeypatch,
     np.testing.assert_allclose(fs.load_ply(path).scales[1], kept, rtol=1e-5)
 
 
+def test_a_third_scale_that_is_nearly_that_of_padding_is_a_scale(tmp_path):
+    """A half per cent off 1e-6 is no rounding: such a splat is flattened along its thinnest axis."""
+    scales = {"scale_0": np.log(2e-7), "scale_1": np.log(1e-3), "scale_2": np.log(1.005e-6)}
+    write(tmp_path / "a.ply", dict.fromkeys(PLAIN, 0.5) | scales, 3)
+    np.testing.assert_allclose(
+        np.sort(fs.load_ply(tmp_path / "a.ply").scales), [[1.005e-6, 1e-3]] * 3, rtol=1e-5
+    )
+    write(tmp_path / "b.ply", dict.fromkeys(PLAIN, 0.5) | scales | {"scale_2": np.log(1e-6)}, 3)
+    np.testing.assert_allclose(fs.load_ply(tmp_path / "b.ply").scales, [[2e-7, 1e-3]] * 3, rtol=1e-5)
+
+
 def test_flatten_ties_leave_the_third_axis_out():
     quats, scales, thickness = flatten(np.array([[1.0, 0, 0, 0]]), np.array([[1.0, 1, 1]]))
     assert quats.tolist() == [[1, 0, 0, 0]]
