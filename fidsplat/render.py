@@ -21,7 +21,7 @@ from fidsplat.quality import Quality
 from fidsplat.scenes import Scene
 from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
-from fidsplat.surroundings import Fog, Gradient, Panorama
+from fidsplat.surroundings import Fog, Gradient, Panorama, background_of
 
 _PLAIN = Capture()
 
@@ -287,6 +287,7 @@ class Renderer:
         the captures before it.
         """
         outputs = None if outputs is None else output_names(outputs)
+        background = None if background is None else background_of(background)  # an iterator ends at once
         if not isinstance(captures, Iterable):
             raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera")
         resident = self._resident(scene)

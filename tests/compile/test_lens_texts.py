@@ -11,7 +11,6 @@ from test_assemble import COLORS, GROUP, PLAIN, SHAPE, Cloud, record_bytes
 import fidsplat as fs
 from fidsplat.backends.opencl.assemble import assemble
 from fidsplat.backends.opencl.layout import LAYOUTS
-from fidsplat.backends.opencl.shapes import gpu_shape
 from fidsplat.effects import select
 
 BACKEND = "opencl"
@@ -106,20 +105,3 @@ def test_every_lens_builds_with_everything(renderer, kind, exposed):
     motion = fs.Motion(None, {1: lambda time: np.eye(4)})
     frame = renderer.render(cloud, CAMERAS[kind], ("rgb", *TAPS), None, motion=motion, shutter=shutter)
     assert all(np.isfinite(frame[name]).all() for name in frame)
-
-
-def test_the_other_schedule_draws_the_same_picture(renderer):
-    """The kernels of GPUs on whatever device this is, through every lens."""
-    from fidsplat.backends.prepare import view_of
-
-    cloud = random_splats(60, seed=3, depth=(-2, 4))
-    backend = renderer.backend
-    shape = gpu_shape(256, backend.shape.fast_fma)
-    for camera in CAMERAS.values():
-        view = view_of(fs.Capture(camera), cloud.origin)
-        features = select(cloud, fs.Capture(camera, ("rgb", "depth")))
-        resident = backend.upload(cloud)
-        one = backend.pipeline(features).render(resident, view)
-        other = backend.pipeline(features, shape).render(resident, view)
-        for name in ("rgb", "depth"):
-            np.testing.assert_allclose(other.read(name), one.read(name), atol=1e-6, rtol=1e-6)

@@ -10,7 +10,6 @@ from test_boxes import EXACT, boxes_of, cut
 from test_lens_pictures import CAMERAS
 
 import fidsplat as fs
-from fidsplat.backends.prepare import prepare
 from fidsplat.cameras.raster import raster_of
 from fidsplat.rotations import quaternion_to_matrix
 
@@ -131,22 +130,6 @@ def test_light_is_that_of_the_image(renderer, camera, size):
         moved = replace(looking, cx=looking.cx + shift[0], cy=looking.cy + shift[1])
         areas.append(float(renderer.render(box, moved, "alpha", EXACT)["alpha"].sum()))
     assert np.mean(areas) == pytest.approx(area, rel=0.03)
-
-
-def test_the_other_schedule_draws_the_same_boxes(renderer):
-    """The kernels of GPUs on whatever device this is."""
-    cloud = random_splats(60, seed=3, depth=(-2, 4))
-    cloud = cloud.with_boxes(np.arange(60) % 2 == 0)
-    backend = renderer.backend
-    shape = backend.shapes("schedule")["groups"]
-    for name in ("distortion", "fisheye", "panorama", "parallel"):
-        camera = CAMERAS[name]
-        features, view = prepare(cloud, fs.Capture(camera, ("rgb", "depth")))
-        resident = backend.upload(cloud)
-        one = backend.pipeline(features).render(resident, view)
-        other = backend.pipeline(features, shape).render(resident, view)
-        for plane in ("rgb", "depth"):
-            np.testing.assert_allclose(other.read(plane), one.read(plane), atol=1e-6, rtol=1e-6)
 
 
 def test_boxes_through_lenses_in_single_precision(renderer):

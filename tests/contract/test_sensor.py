@@ -156,6 +156,8 @@ def test_curves_at_their_own_points(renderer):
     assert value(0.25, response=2.0) == pytest.approx(0.5, abs=1e-6)
     assert value(0.25, response=(0, 0.5, 1, 1, 1)) == pytest.approx(0.5, abs=1e-6)
     assert value(9.0, response="srgb") == pytest.approx(1)
+    assert value(9.0, response=2.0) == pytest.approx(1)
+    assert value(-1.0, response=2.0) == 0
     assert value(9.0, response=(0.2, 1)) == 1
     assert value(0.3, exposure=2, gain=1.5) == pytest.approx(0.9, abs=1e-6)
     # a device's division may round otherwise

@@ -1,21 +1,21 @@
-"""Warp's schedule for GPUs, wherever Warp runs, with lenses and the effects of samples and pixels: against
-the reference, as its own schedule is by the other tests."""
+"""The schedule for GPUs of each backend, on whatever device this is, with lenses and the effects of samples
+and pixels: against the reference, as a CPU's schedule is by the other tests. Where these run there is no GPU.
+"""
 
 import numpy as np
 import pytest
-from agreement import ALL_OUTPUTS, random_splats
+from agreement import random_splats, truth_of
 from test_lens_pictures import CAMERAS
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
 from fidsplat.effects import OUTPUTS
-from fidsplat.hard_cases.agreement import Picture, compare, truth_of
-
-BACKEND = "warp"
+from fidsplat.hard_cases.agreement import Picture, compare
 
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.3, -0.2, -0.1), (0.0, 0.1, 3.0))
 EVERYTHING = tuple(OUTPUTS)
 AROUND = random_splats(90, seed=3, depth=(-0.5, 5.0))
+MIXED = AROUND.with_boxes(np.arange(90) % 3 == 0)
 
 
 def scene_of_layers():
@@ -26,7 +26,7 @@ def scene_of_layers():
     exact = fs.marker("aruco:4x4_50:7", size=0.8, mixture="exact").cloud.transformed(pose)
     pose[:3, 3] = (-0.4, 0.1, 2.5)
     fitted = fs.marker("aruco:4x4_50:7", size=0.8, mixture="fitted").cloud.transformed(pose)
-    return fs.SplatCloud.concatenate([exact, fitted, AROUND.with_boxes(np.arange(90) % 3 == 0)])
+    return fs.SplatCloud.concatenate([exact, fitted, MIXED])
 
 
 PICTURES = {
@@ -35,8 +35,9 @@ PICTURES = {
     "pixel": lambda: Picture(
         AROUND, CAMERA, fs.Quality(lowpass="pixel", samples=2), background=fs.Gradient((0, 0, 1), (1, 0, 0))
     ),
+    "gsplat": lambda: Picture(AROUND, CAMERA, fs.Quality.of("gsplat"), outputs=EVERYTHING),
     **{
-        name: lambda camera=CAMERAS[name]: Picture(AROUND, camera, outputs=ALL_OUTPUTS)
+        name: lambda camera=CAMERAS[name]: Picture(MIXED, camera, outputs=EVERYTHING, fog=fs.Fog(0.3))
         for name in ("distortion", "fisheye 200", "panorama", "parallel")
     },
 }
