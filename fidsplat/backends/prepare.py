@@ -13,7 +13,6 @@ from fidsplat.capture import Capture
 from fidsplat.effects import FeatureSet, select
 from fidsplat.splats import SplatCloud
 
-
 _Prepared = tuple[FeatureSet, View]
 _prepared: WeakKeyDictionary[Capture, WeakKeyDictionary[ResidentData, _Prepared]] = WeakKeyDictionary()
 """of captures in which nothing moves: a motion's functions may answer otherwise the next time"""
