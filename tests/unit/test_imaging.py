@@ -96,6 +96,7 @@ def test_a_scene_file_keeps_them(tmp_path):
         assert (read.sensor, read.fog) == (sensor, fs.Fog(0.2, (0.5, 0.6, 0.7)))
         if isinstance(background, fs.Panorama):
             assert np.array_equal(read.background.image, background.image)
+            assert 'image = "sky.png"' in (tmp_path / "a.toml").read_text()  # a folder can be moved
         else:
             assert read.background == background
     for response in ("srgb", 1.8):

@@ -174,19 +174,19 @@ HEAD = "[camera]\nwidth = 64\nheight = 48\nposition = [0, 0, -1]\nlook_at = [0, 
 
 
 @pytest.mark.parametrize(
-    ("text", "fx"),
+    ("text", "fx", "fy"),
     [
-        ("fov_x_deg = 90\n[camera.distortion]\nk1 = -0.1\n", 32.0),
-        ("fov_x_deg = 180\n[camera.fisheye]\n", 64 / math.pi),
-        ("[camera.equirectangular]\n", 32 / math.pi),
-        ("[camera.orthographic]\nmetres_wide = 16.0\n", 4.0),
+        ("fov_x_deg = 90\n[camera.distortion]\nk1 = -0.1\n", 32.0, 32.0),
+        ("fov_x_deg = 180\n[camera.fisheye]\n", 64 / math.pi, 64 / math.pi),
+        ("[camera.equirectangular]\n", 32 / math.pi, 48 / math.pi),
+        ("[camera.orthographic]\nmetres_wide = 16.0\n", 4.0, 4.0),
     ],
 )
-def test_scene_files_switch_lenses_on(tmp_path, text, fx):
+def test_scene_files_switch_lenses_on(tmp_path, text, fx, fy):
     (tmp_path / "scene.toml").write_text(HEAD + text)
     camera = fs.Scene.load(tmp_path / "scene.toml").camera
     assert camera.lens is not None
-    assert camera.fx == pytest.approx(fx)
+    assert (camera.fx, camera.fy) == pytest.approx((fx, fy))
 
 
 @pytest.mark.parametrize(

@@ -140,6 +140,8 @@ def test_everything_that_a_scene_file_can_say(load):
         background = [1, 0.5, 0]
         quality = "fast"
         samples = 2
+        lowpass = "pixel"
+        first_hit = 0.25
         device = "reference"
     """)
     camera = scene.camera
@@ -152,7 +154,7 @@ def test_everything_that_a_scene_file_can_say(load):
         (1, "paper", 0),
         (2, "exact", 1),
     ]
-    assert scene.quality == fs.Quality.named("fast").with_(samples=2)
+    assert scene.quality == fs.Quality.named("fast").with_(samples=2, lowpass="pixel", first_hit=0.25)
     assert (scene.background, scene.device) == ((1, 0.5, 0), "reference")
     assert scene.cloud().labels.tolist() == [0] * 10 + [1, 1, 2, 2]
 

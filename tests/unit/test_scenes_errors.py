@@ -58,6 +58,7 @@ CHANGES = [
     ("[[splats]]", "[[splat]]", "unknown key 'splat' (did you mean 'splats'?)"),
     ("[camera]", "[camera.distorsion]\nk1 = 0.1\n[camera]", "unknown table 'camera.distorsion' (did"),
     ("width = 64\n", "", "camera.width is missing"),
+    ("width = 64\n", f"width = {2**63}\n", "camera.width must be a whole number of at most 64 bits"),
     ("fov_x_deg = 60.0\n", "", "camera.fov_x_deg is missing (or fx and fy)"),
     ("fov_x_deg = 60.0\n", "fx = 60.0\n", "camera.fy is missing"),
     (

@@ -273,6 +273,21 @@ def test_concatenate_different_origins():
     assert np.array_equal(same.origin, given.origin)
 
 
+def test_planes_of_different_clouds_stay_different():
+    one = fs.SplatCloud(**parts())
+    printed = one.with_planes([0, 0, 2, 2, -1, -1])
+    joined = fs.SplatCloud.concatenate([printed, one, printed])
+    assert joined.planes.tolist() == [0, 0, 2, 2, -1, -1, *[-1] * 6, 3, 3, 5, 5, -1, -1]
+
+
+@pytest.mark.parametrize(("away", "own"), [(50.0, False), (100.0, True)])
+def test_a_cloud_far_from_0_for_its_size_has_an_origin(away, own):
+    """From 64 times its reach on; only then float32 would lose bits that count."""
+    means = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, 1 / 3]]) + away
+    scales = np.full((6, 2), 1e-3)
+    assert fs.SplatCloud(**parts(means=means, scales=scales)).origin.any() == own
+
+
 def test_concatenate_near_clouds_keeps_their_bits():
     near = fs.SplatCloud(**parts())
     aside = fs.SplatCloud(**parts(), origin=[3.0, 0, 0])

@@ -58,6 +58,18 @@ def test_half_turns_have_quaternions(axis):
     np.testing.assert_allclose(quaternion_to_matrix(matrix_to_quaternion(turn)), turn, atol=1e-15)
 
 
+def test_an_origin_is_scaled_turned_and_moved():
+    local = cloud_of()
+    cloud = fs.SplatCloud(
+        local.means, local.quats, local.scales, local.opacities, sh=local.sh, origin=[9, 0, -4]
+    )
+    matrix = rigid_matrix((1.0, 2.0, 3.0), (1.0, 0.5, 0.0, 0.2), 3.0)
+    after = cloud.transformed(matrix)
+    np.testing.assert_allclose(after.origin, matrix[:3, :3] @ [9, 0, -4] + [1, 2, 3], atol=1e-12)
+    expected = cloud.world_means() @ matrix[:3, :3].T + [1, 2, 3]
+    np.testing.assert_allclose(after.world_means(), expected, atol=1e-5)
+
+
 @given(quaternion, vector, st.floats(0.01, 100))
 @settings(max_examples=40, deadline=None)
 def test_transform_moves_centres_and_covariances(turn, move, scale):

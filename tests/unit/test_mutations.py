@@ -1,0 +1,90 @@
+"""tools/mutations.toml: bugs that can still be planted, and tools/mutate.py, which plants them."""
+
+import dataclasses
+import importlib.util
+import sys
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def mutate():
+    specification = importlib.util.spec_from_file_location("mutate", ROOT / "tools" / "mutate.py")
+    module = importlib.util.module_from_spec(specification)
+    sys.modules["mutate"] = module  # where its dataclass looks for its own annotations
+    specification.loader.exec_module(module)
+    yield module
+    del sys.modules["mutate"]
+
+
+@pytest.fixture(scope="module")
+def plants(mutate):
+    return mutate.read_plants()
+
+
+def test_every_bug_can_still_be_planted(mutate, plants):
+    """Its text stands exactly once in its file, and the tests that are to see it exist."""
+    texts = {plant.path: (ROOT / plant.path).read_text("utf-8") for plant in plants}
+    for plant in plants:
+        assert mutate.planted(texts[plant.path], plant) != texts[plant.path]
+        files = [test for test in plant.tests if test.startswith("tests/")]
+        assert files
+        assert all((ROOT / test).exists() for test in files), plant.name
+    assert len(plants) >= 150
+    assert max(Counter(plant.name for plant in plants).values()) == 1
+    assert len({plant.key for plant in plants}) == len(plants)
+
+
+def test_what_has_changed_is_not_planted(mutate, plants):
+    for text in ("", plants[0].old * 2):
+        with pytest.raises(ValueError, match=f"stands {2 if text else 0} times"):
+            mutate.planted(text, plants[0])
+
+
+def test_a_sample_is_that_of_its_seed(mutate, plants):
+    some = mutate.chosen(plants, ["formats", "scenes"], 9, 1)
+    assert some == mutate.chosen(plants, ["formats", "scenes"], 9, 1)
+    assert some != mutate.chosen(plants, ["formats", "scenes"], 9, 2)
+    assert len(some) == 9
+    assert {plant.area for plant in some} <= {"formats", "scenes"}
+    assert mutate.chosen(plants, [], None, 0) == plants
+
+
+def test_bugs_are_caught_survive_or_are_not_tested(mutate, tmp_path, monkeypatch):
+    """In a tree of three files; a second run knows what the first found."""
+    (tmp_path / "sum.py").write_text("def plus(a, b):\n    return a + b\n")
+    (tmp_path / "test_sum.py").write_text(
+        "from sum import plus\n\ndef test_it():\n    assert plus(2, 2) == 4\n"
+    )
+    (tmp_path / "test_bad.py").write_text("def test_it():\n    assert False\n")
+    monkeypatch.setattr(mutate, "ROOT", tmp_path)
+    listed = "\0".join(["sum.py", "test_sum.py", "test_bad.py", ""])
+    run = mutate.subprocess.run
+    monkeypatch.setattr(
+        mutate.subprocess,
+        "run",
+        lambda words, **more: (
+            type("Done", (), {"stdout": listed}) if words[0] == "git" else run(words, **more)
+        ),
+    )
+    caught = mutate.Plant("sum.py", "sums", ("test_sum.py",), "a + b", "a - b", "sign")
+    bugs = {
+        "caught": caught,
+        "survived": dataclasses.replace(caught, new="a * b", wrong="product"),
+        "untested": dataclasses.replace(caught, tests=("test_bad.py",)),
+    }
+    garden, results = mutate.Garden(tmp_path / "copies", 1), mutate.Results(tmp_path / "found.jsonl")
+    for expected, plant in bugs.items():
+        result, seconds, by = garden.try_plant(plant)
+        assert result == expected
+        assert by.startswith("test_sum.py::test_it") == (expected == "caught")
+        results.add(plant, result, seconds, by)
+    known = mutate.Results(tmp_path / "found.jsonl")
+    assert [known.of(plant) for plant in bugs.values()] == list(bugs)
+    assert known.of(dataclasses.replace(caught, new="b")) is None
+    assert "| sums | 3 | 2 | 1 | 1 |" in mutate.table(list(bugs.values()), known)
+    assert (tmp_path / "copies" / "0" / "sum.py").read_text() == (tmp_path / "sum.py").read_text()
