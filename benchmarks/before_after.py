@@ -38,10 +38,11 @@ renderer = fs.Renderer(sys.argv[2])
 resident = renderer.upload(cloud)
 knobs = {"arithmetic": "precise"} if "arithmetic" in fs.Quality.__dataclass_fields__ else {}
 quality = fs.Quality(alpha_cutoff=1 / 255, transmittance_stop=1e-4, **knobs)
+how = (fs.Capture(camera, quality=quality),) if "Capture" in fs.__all__ else (camera, ("rgb",), quality)
 print(renderer.device.title, "|", renderer.device.version, flush=True)
 for line in sys.stdin:
     start = time.perf_counter()
-    frame = renderer.render(resident, camera, quality=quality)
+    frame = renderer.render(resident, *how)
     frame.timings
     spent = time.perf_counter() - start
     print(spent * 1e3, hashlib.sha256(frame["rgb"].tobytes()).hexdigest()[:16], flush=True)

@@ -64,7 +64,7 @@ class Capture(PickledByFields):
     @cached_property
     def exposed(self) -> bool:
         """Whether the picture is made of several poses."""
-        if self.motion.camera is None and not self.motion.groups:
+        if self.motion.is_still:
             return False
         rows = self.shutter.rows_per_band + 1 if self.camera is None else self.camera.height
         return len(self.shutter.bands(rows)) > 1 or len(self.shutter.times(0.0)) > 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -12,16 +13,26 @@ from fidsplat.capture import Capture
 from fidsplat.effects import FeatureSet, select
 from fidsplat.splats import SplatCloud
 
+_Prepared = tuple[FeatureSet, View]
+_prepared: WeakKeyDictionary[Capture, WeakKeyDictionary[ResidentData, _Prepared]] = WeakKeyDictionary()
+"""of captures in which nothing moves: a motion's functions may answer otherwise the next time"""
 
-def prepare(cloud: ResidentData | SplatCloud, capture: Capture) -> tuple[FeatureSet, View]:
-    """What a capture of a cloud calls for, and its view.
+
+def prepare(cloud: ResidentData | SplatCloud, capture: Capture) -> _Prepared:
+    """What a capture of a cloud calls for, and its view; kept for a resident cloud that is drawn again.
 
     Raises:
         InputError: no camera, an output that nobody declares, effects that do not go together, a picture that
             is too large, or a pose that is not rigid.
     """
-    view = view_of(capture, cloud.origin)
-    return select(cloud, capture), view
+    if isinstance(cloud, SplatCloud) or not capture.motion.is_still:
+        view = view_of(capture, cloud.origin)
+        return select(cloud, capture), view
+    held = _prepared.setdefault(capture, WeakKeyDictionary())
+    if cloud not in held:
+        view = view_of(capture, cloud.origin)
+        held[cloud] = select(cloud, capture), view
+    return held[cloud]
 
 
 def view_of(capture: Capture, origin: np.ndarray) -> View:

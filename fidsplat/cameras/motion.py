@@ -180,6 +180,11 @@ class Motion:
     def __reduce__(self):
         return Motion, (self.camera, dict(self.groups))  # a mapping proxy is not pickled
 
+    @property
+    def is_still(self) -> bool:
+        """Whether nothing moves."""
+        return self.camera is None and not self.groups
+
     def camera_at(self, time: float) -> np.ndarray | None:
         """world_to_camera (4, 4) then; None if it does not move."""
         return None if self.camera is None else _checked(self.camera(time), "the camera", time)

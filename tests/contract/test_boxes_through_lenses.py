@@ -31,6 +31,17 @@ def test_small_boxes_of_all_shapes(renderer, camera):
 
 
 @each_camera
+@pytest.mark.parametrize("narrow", [0, 1])
+def test_narrow_boxes(renderer, camera, narrow):
+    """Lines far thinner than a pixel: samples beside them see them, whichever side is the short one."""
+    cloud = random_splats(60, 4, depth=(-2.0, 3.0), scale=(0.05, 0.3), across=2.0)
+    scales = cloud.scales.copy()
+    scales[:, narrow] = 1e-5
+    lines = fs.SplatCloud(cloud.means, cloud.quats, scales, cloud.opacities, colors=cloud.colors)
+    assert_agrees(renderer, lines.with_boxes(), camera, ("rgb", "alpha"), EXACT)
+
+
+@each_camera
 def test_boxes_much_larger_than_the_picture(renderer, camera):
     cloud = random_splats(40, 5, depth=(-4.0, 4.0), scale=(0.1, 30.0))
     assert_agrees(renderer, cloud.with_boxes(), camera, quality=EXACT)

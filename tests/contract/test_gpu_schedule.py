@@ -2,6 +2,10 @@
 and pixels: against the reference, as a CPU's schedule is by the other tests. Where these run there is no GPU.
 """
 
+import ctypes
+import mmap
+import multiprocessing
+
 import numpy as np
 import pytest
 from agreement import random_splats, truth_of
@@ -55,3 +59,36 @@ def test_the_schedule_of_gpus_agrees_with_the_reference(renderer, name):
     differences = compare(drawn, truth_of(picture), picture.outputs)
     assert all(difference.agrees for difference in differences), differences
     assert drawn["rgb"].std() > 0.05
+
+
+def test_warp_reads_no_ray_beyond_the_picture():
+    """A tile has samples there too. The rays end at a page that nobody may read, in a process of its own."""
+    pytest.importorskip("warp")
+    process = multiprocessing.get_context("spawn").Process(target=draw_with_guarded_rays)
+    process.start()
+    process.join()
+    assert process.exitcode == 0
+
+
+def draw_with_guarded_rays():
+    """The picture "distortion" on Warp's CPU."""
+    import warp as wp
+
+    backend = fs.Renderer("warp:cpu").backend
+    kept = []
+
+    def before_a_guard(name, size, dtype):
+        length = size * wp.types.type_size_in_bytes(dtype)
+        room = -(-length // mmap.PAGESIZE) * mmap.PAGESIZE
+        memory = mmap.mmap(-1, room + mmap.PAGESIZE)
+        kept.append(memory)
+        guard = ctypes.addressof(ctypes.c_char.from_buffer(memory)) + room
+        nobody = 0
+        assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(guard), mmap.PAGESIZE, nobody) == 0
+        return wp.array(ptr=guard - length, dtype=dtype, shape=(size,), device="cpu")
+
+    backend.pool.fresh = before_a_guard
+    picture = PICTURES["distortion"]()
+    features, view = prepare(picture.cloud, picture.capture)
+    pipeline = backend.pipeline(features, backend.shapes("schedule")["groups"])
+    pipeline.render(backend.upload(picture.cloud), view).read("rgb")

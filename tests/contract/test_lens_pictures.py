@@ -18,8 +18,12 @@ def seen_through(lens, width=75, height=62, f=50.0):
     return fs.Camera.pinhole(width, height, f, 1.02 * f, 0.47 * width, 0.52 * height, POSE, lens=lens)
 
 
+# each coefficient has its own term in the kernels, and in their derivatives
+EVERY_TERM = BrownConrady(
+    -0.3, 0.1, 0.02, 0.05, 0.03, 0.04, p1=0.01, p2=-0.005, s1=0.01, s2=0.02, s3=-0.01, s4=-0.015
+)
 CAMERAS = {
-    "distortion": seen_through(BrownConrady(-0.3, 0.1, 0.0, 0.01, p1=0.01, p2=-0.005, s1=0.01, s4=-0.01)),
+    "distortion": seen_through(EVERY_TERM),
     "pincushion": seen_through(BrownConrady(0.4, 0.1)),
     # the corners lie beyond the fold
     "fold": seen_through(BrownConrady(-0.35)),

@@ -5,17 +5,14 @@ import math
 import numpy as np
 import pytest
 from agreement import assert_agrees, random_splats
+from test_lens_pictures import EVERY_TERM
 
 import fidsplat as fs
 from fidsplat.rotations import quaternion_to_matrix
 
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 PIXEL = fs.Quality(lowpass="pixel")
-EVERY_TERM = fs.BrownConrady(
-    -0.3, 0.1, 0.02, 0.05, 0.03, 0.04, p1=0.01, p2=-0.005, s1=0.01, s2=0.02, s3=-0.01, s4=-0.015
-)
 LENSES = {
-    # every coefficient: each has its own term in the derivative
     "distortion": fs.Camera.pinhole(75, 62, 50.0, 51.0, 35.0, 32.0, lens=EVERY_TERM),
     "fisheye": fs.Camera.fisheye(70, 66, math.radians(200), coefficients=(0.02, -0.004, 0.001, -1e-4)),
     "panorama": fs.Camera.equirectangular(110, 55),

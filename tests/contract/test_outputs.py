@@ -67,23 +67,69 @@ def layers_of(opacities, first=2.0):
     n = len(opacities)
     means = np.column_stack([np.zeros((n, 2)), first + np.arange(n)])
     return fs.SplatCloud(
-        means, np.tile([1.0, 0, 0, 0], (n, 1)), np.full((n, 2), 50.0), opacities, colors=np.ones((n, 3))
+        means,
+        np.tile([1.0, 0, 0, 0], (n, 1)),
+        np.full((n, 2), 50.0),
+        opacities,
+        colors=np.ones((n, 3)),
+        labels=7 + np.arange(n),
     )
+
+
+POINT = fs.Camera.pinhole(5, 5, 50.0, 50.0, 2.5, 2.5)
+
+
+def test_ties_go_to_what_is_nearer(renderer):
+    """Thresholds met exactly, by opacities that float32 has: half of the light, equal weights, the stop."""
+    half = fs.Quality(opacity_ceiling=0.5)
+    frame = renderer.render(layers_of([1, 1, 1]), POINT, ("alpha", "depth_median"), half)
+    assert frame["alpha"][2, 2] == 0.875
+    assert frame["depth_median"][2, 2] == pytest.approx(2, rel=1e-6)  # half is left in front of the next
+    frame = renderer.render(layers_of([0.5, 1.0]), POINT, ("label", "splat_id"))
+    assert renderer.render(layers_of([0.5]), POINT, "alpha")["alpha"][2, 2] == 0.5
+    assert (frame["label"][2, 2], frame["splat_id"][2, 2]) == (7, 0)
+    gsplat = half.with_(stop_rule="exclusive", coplanar="order", transmittance_stop=0.25)
+    frame = renderer.render(layers_of([1, 1, 1]), POINT, ("alpha", "blended"), gsplat)
+    assert (frame["alpha"][2, 2], frame["blended"][2, 2]) == (0.5, 1)
+
+
+def test_a_layer_of_a_thousand_faint_splats(renderer):
+    """Each adds its optical depth, -ln(1 - opacity), not its opacity: the mix of colours shows it."""
+    count = 1000
+    opacities = np.append(np.full(count, 9.9e-4), 0.6)
+    colors = np.append(np.tile([1.0, 0, 0], (count, 1)), [[0, 1.0, 0]], 0)
+    wall = fs.SplatCloud(
+        np.tile([0.0, 0, 2], (count + 1, 1)),
+        np.tile([1.0, 0, 0, 0], (count + 1, 1)),
+        np.full((count + 1, 2), 50.0),
+        opacities,
+        colors=colors,
+    )
+    rgb = renderer.render(wall.with_planes(np.zeros(count + 1, int)), POINT)["rgb"][2, 2]
+    red, green = -count * math.log1p(-9.9e-4), -math.log(0.4)
+    assert rgb[0] / rgb[1] == pytest.approx(red / green, rel=1e-4)
+    assert rgb[0] + rgb[1] == pytest.approx(1 - math.exp(-red - green), rel=1e-4)
+
+
+def test_a_wall_that_the_camera_almost_lies_in(renderer):
+    """Its centre 10^9 m ahead, its plane 0.1 m aside: it covers all that lies on that side."""
+    wall = fs.SplatCloud([(-0.1, 0, 1e9)], [(0.5, 0.5, 0.5, 0.5)], [(1e9, 1e9)], [1.0], colors=[(1, 1, 1)])
+    frame = renderer.render(wall, fs.Camera.pinhole(9, 9, 9.0, 9.0, 4.5, 4.5), ("alpha", "depth"))
+    assert frame["alpha"][:, :4] == pytest.approx(math.exp(-0.5), rel=1e-5)
+    assert frame["depth"][4, :4] == pytest.approx(0.9 / (4.5 - np.arange(0.5, 4)), rel=1e-5)
 
 
 @pytest.mark.parametrize(("first_hit", "depth"), [(0.15, 2), (0.25, 3), (0.4, 4), (0.6, 0)])
 def test_the_first_hit_is_where_the_opacity_reaches_the_threshold(renderer, first_hit, depth):
     """Three layers of opacity 0.2 cover 0.2, 0.36 and 0.488."""
-    camera = fs.Camera.pinhole(5, 5, 50.0, 50.0, 2.5, 2.5)
     quality = fs.Quality(first_hit=first_hit)
-    frame = renderer.render(layers_of([0.2, 0.2, 0.2]), camera, ("depth_first", "blended"), quality)
+    frame = renderer.render(layers_of([0.2, 0.2, 0.2]), POINT, ("depth_first", "blended"), quality)
     assert frame["depth_first"][2, 2] == pytest.approx(depth, rel=1e-6)
     assert frame["blended"][2, 2] == 3
 
 
 def test_an_opaque_layer_ends_the_count(renderer):
-    camera = fs.Camera.pinhole(5, 5, 50.0, 50.0, 2.5, 2.5)
-    frame = renderer.render(layers_of([0.2, 1.0, 0.2, 0.2]), camera, ("blended", "splat_id"))
+    frame = renderer.render(layers_of([0.2, 1.0, 0.2, 0.2]), POINT, ("blended", "splat_id"))
     assert (frame["blended"][2, 2], frame["splat_id"][2, 2]) == (2, 1)
     assert frame["blended"].dtype == frame["splat_id"].dtype == np.int32
 
@@ -147,8 +193,7 @@ def test_haze_is_told_of_once_it_covers_enough(renderer, opacity, count, seen):
     """However little each layer is; the median lies where half of the light is left, within the layers that
     count together.
     """
-    camera = fs.Camera.pinhole(5, 5, 50.0, 50.0, 2.5, 2.5)
-    frame = renderer.render(layers_of([opacity] * count), camera, MASKED)
+    frame = renderer.render(layers_of([opacity] * count), POINT, MASKED)
     assert {name: bool(covered(frame, name)[2, 2]) for name in MASKED} == dict.fromkeys(MASKED, seen)
     if count > 100:
         half = math.log(0.5) / math.log(1 - opacity)
@@ -157,9 +202,8 @@ def test_haze_is_told_of_once_it_covers_enough(renderer, opacity, count, seen):
 
 def test_faint_fragments_behind_do_not_move_the_median(renderer):
     """Of half-transparent things the last that shows is the median, not a rim of 1/1000 far behind it."""
-    camera = fs.Camera.pinhole(5, 5, 50.0, 50.0, 2.5, 2.5)
     cloud = layers_of([0.2, 0.1, 1e-3, 1e-3])
-    frame = renderer.render(cloud, camera, ("depth_median", "blended"))
+    frame = renderer.render(cloud, POINT, ("depth_median", "blended"))
     assert frame["blended"][2, 2] == 4
     assert frame["depth_median"][2, 2] == pytest.approx(3, rel=1e-6)
     for seed in range(3):

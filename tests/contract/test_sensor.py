@@ -165,6 +165,15 @@ def test_curves_at_their_own_points(renderer):
     assert value(-3.0, bits=16) == 0
 
 
+def test_nothing_is_read_beyond_the_end_of_a_table(renderer, monkeypatch):
+    """Where light is 1 the last two values count; what stands behind them would show, times 0 too."""
+    array_of = View.array
+    monkeypatch.setattr(View, "array", lambda view, name: np.append(array_of(view, name), np.float32("nan")))
+    camera = fs.Camera.pinhole(3, 3, 3.0, 3.0, 1.5, 1.5)
+    frame = renderer.render(EMPTY, camera, background=(1, 1, 1), sensor=fs.Sensor(response=(0.2, 1)))
+    assert (frame["rgb"] == 1).all()
+
+
 def test_values_that_mean_nothing_select_nothing(renderer):
     from fidsplat.effects import select
 

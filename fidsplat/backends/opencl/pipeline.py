@@ -79,6 +79,10 @@ class OpenCLPipeline:
     ) -> None:
         self.workspace, self.source, self.features, self.shape = workspace, source, features, shape
         self.program = Program(workspace, source)
+        arguments = source.arguments
+        self._cloud_arrays = [one.name for one in arguments["project"] if one.source == "cloud"]
+        self._view_arrays = {one.name for each in arguments.values() for one in each if one.source == "array"}
+        self._slopes = any(one.name == "ray_slopes" for one in arguments["blend"])
         self._other = other
         """gives the pipeline of another shape"""
 
@@ -115,9 +119,7 @@ class OpenCLPipeline:
         shape, source = self.shape, self.source
         tiles_x = -(-view.width // shape.tile_width)
         tiles = tiles_x * -(-view.height // shape.tile_height)
-        stays, upload = resident.bytes_for(
-            one.name for one in source.arguments["project"] if one.source == "cloud"
-        )
+        stays, upload = resident.bytes_for(self._cloud_arrays)
         fixed = stays + SMALL + table_bytes(shape.lists, tiles, shape.chunks, shape.radix_bits)
         fixed += BIG * (4 + source.records["Bounds"].itemsize)
         planes = 4 + sum(one.planes for one, _ in source.samples)
@@ -126,12 +128,11 @@ class OpenCLPipeline:
         fixed += 4 * tiles * shape.tile_width * shape.tile_height * planes  # whole tiles
         pixels = view.width * view.height // view.samples**2
         fixed += 4 * pixels * sum(output.channels for output in self.features.outputs)
-        arrays = {one.name for each in source.arguments.values() for one in each if one.source == "array"}
-        fixed += sum(view.array(name).nbytes for name in arrays)
+        fixed += sum(view.array(name).nbytes for name in self._view_arrays)
         if view.raster is not None:
             rasters = {view.raster, *(shot.view.raster for shot in view.shots if shot.view.raster)}
-            slopes = "ray_slopes" in {one.name for one in source.arguments["blend"]}
-            fixed += RayBuffers.bytes_of(rasters, shape.tile_height, tiles_x * shape.tile_width, slopes)
+            columns = tiles_x * shape.tile_width
+            fixed += RayBuffers.bytes_of(rasters, shape.tile_height, columns, self._slopes)
         workspace, record = self.workspace, source.records["Splat"].itemsize
         budget, largest = workspace.memory_budget, workspace.device.max_mem_alloc_size
         return plan_of(resident.count, record, upload, fixed, shape.lists, budget, largest)
