@@ -3,6 +3,7 @@
     python tools/mutate.py --list                        the plants of tools/mutations.toml, by area
     python tools/mutate.py --area formats --area scenes  plants of some areas; all without it
     python tools/mutate.py --sample 30 --seed 1          some of them, the same for the same seed
+    python tools/mutate.py --survived                    what is not known, and again what survived
     python tools/mutate.py --table                       what is known so far, without running anything
 
 What was found stands in mutations.jsonl, a line for each plant, and is not run again (but with --again), so
@@ -224,6 +225,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=1, help="copies of the tree that are worked in at once")
     parser.add_argument("--results", type=Path, default=Path(RESULTS), help=f"file (default {RESULTS})")
     parser.add_argument("--again", action="store_true", help="run what is known, too")
+    parser.add_argument("--survived", action="store_true", help="of what is known run what survived, too")
     parser.add_argument("--list", action="store_true", help="print the plants and end")
     parser.add_argument("--table", action="store_true", help="print what is known and end")
     words = parser.parse_args()
@@ -233,7 +235,8 @@ def main() -> int:
         return 0
     results = Results(words.results)
     if not words.table:
-        waiting = [plant for plant in wanted if words.again or results.of(plant) in (None, "untested")]
+        still_open = (None, "untested", "survived") if words.survived else (None, "untested")
+        waiting = [plant for plant in wanted if words.again or results.of(plant) in still_open]
 
         def run(plant: Plant) -> None:
             result, seconds, by = garden.try_plant(plant)
@@ -242,8 +245,11 @@ def main() -> int:
 
         with tempfile.TemporaryDirectory(prefix="mutate-") as folder:
             garden = Garden(Path(folder), words.jobs)
-            with ThreadPoolExecutor(words.jobs) as pool:
+            pool = ThreadPoolExecutor(words.jobs)
+            try:
                 list(pool.map(run, waiting))
+            finally:
+                pool.shutdown(cancel_futures=True)  # Ctrl-C ends after what is under way
     print(table(wanted, results))
     return 1 if any(results.of(plant) == "survived" for plant in wanted) else 0
 

@@ -161,6 +161,12 @@ LENSES = [
 ]
 
 
+@pytest.mark.parametrize("name", ["k1", "k2", "k3", "k4"])
+def test_a_fisheye_sees_as_far_as_distances_grow(name):
+    lens, angles = Fisheye(**{name: -0.2}), np.linspace(0, math.radians(100), 100_001)
+    assert lens.limit == pytest.approx(angles[lens.distance(angles).argmax()], abs=2e-5)
+
+
 @pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.kind)
 def test_scene_files_keep_lenses(tmp_path, lens):
     camera = fs.Camera.pinhole(64, 48, 40.0, 41.0, 30.0, 25.0, POSE, lens=lens)
