@@ -23,9 +23,8 @@ static inline Chunk chunk_of(uint length, int width, int height, global uint *re
     return c;
 }
 
-typedef struct {             // of bin_emit; lists of the tiles of the band [first, end), from 0; never beyond `capacity`
+typedef struct {             // of bin_emit; lists of the tiles of the band [first, end), from 0
     int first, end;
-    uint capacity;
     global const uint *starts;
     global uint *lists;
 } Emission;
@@ -36,7 +35,7 @@ static inline void bin_tile(int tile, uint index, const Chunk *c, const Emission
         if (tile < e->first || tile >= e->end) return;
         // modulo 2^32: a place within the band is right even where the picture has more pairs than that
         uint place = e->starts[tile] - e->starts[e->first] + c->row[tile];
-        if (place < e->capacity) e->lists[place] = index;
+        e->lists[place] = index;
     }
     c->row[tile]++;
 }
@@ -77,6 +76,6 @@ kernel void bin_emit(
 ) {
     if (get_global_id(0) >= CHUNKS) return;
     const Chunk c = chunk_of(tallies[TALLY_VISIBLE], width, height, table);
-    const Emission e = {band_first, band_end, capacity, starts, lists};
+    const Emission e = {band_first, band_end, starts, lists};
     bin_splats(order, windows, big_capacity, big_bounds, &c, &e);
 }

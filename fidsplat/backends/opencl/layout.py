@@ -101,7 +101,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     "bin_count": _WALK,
     "bin_emit": takes(
-        *(_WALK, "in uint starts", "int band_first band_end", "uint capacity", "out uint lists"),
+        *(_WALK, "in uint starts", "int band_first band_end", "out uint lists"),
     ),
     "tile_starts": takes("uint tiles capacity", "out uint tallies starts cursors counts"),
     "tally_big": takes(_SIZE, _BIG, "out uint tallies"),

@@ -107,7 +107,7 @@ class OrderedLists(Lists):
             bands = self._bands_of(totals, first)
         for start, stop, listed in bands:
             picture.take("lists", 4 * listed)
-            band = {"band_first": start, "band_end": stop, "capacity": listed}
+            band = {"band_first": start, "band_end": stop}
             picture.launch("bin", "bin_emit", self.shape.chunks, 1, table=picture.held["bin table"], **band)
             yield start, stop
 
