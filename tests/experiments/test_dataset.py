@@ -24,6 +24,7 @@ model = pycolmap.Reconstruction(sys.argv[1])
 lenses = {i: (c.model.name, c.width, c.height, *c.params) for i, c in model.cameras.items()}
 images = {i.name: (i.cam_from_world().matrix().tolist(), *lenses[i.camera_id]) for i in model.images.values()}
 points = [(*p.xyz.tolist(), *p.color.tolist()) for _, p in sorted(model.points3D.items())]
+assert sorted(model.points3D) == list(range(1, len(points) + 1))
 print(json.dumps({"images": images, "points": points, "cameras": len(lenses)}))
 """
 

@@ -269,3 +269,10 @@ def test_importing_markers_is_light():
     code = f"import sys, fidsplat.markers; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_corners_of_a_marker_that_is_not_square():
+    made = fs.marker("gridboard:2x1:4x4_50", size=0.7, mixture="exact")
+    half = 0.35, 0.35 * made.bits.shape[0] / made.bits.shape[1]
+    np.testing.assert_allclose(made.corners[:, :2], half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]))
+    assert half[1] < half[0]

@@ -151,6 +151,7 @@ def test_long_rectangles_are_cut_into_equal_pieces_that_overlap():
     boxes = np.array([[0, 0, 24, 2], [5, 1, 6, 5], [0, 0, 2, 10], [0, 0, 9, 2]], float)
     pieces, aspect, owner = in_pieces(boxes, np.array([12, 0.25, 0.2, 4.5]), 4.0)
     assert owner.tolist() == [0, 0, 0, 1, 2, 2, 3, 3]
+    assert OVERLAP == 0.2  # as docs/markers.md says; the shipped templates were fitted with it
     reach = 2 * OVERLAP
     lying = [[0, 0, 8 + reach, 2], [8 - reach, 0, 16 + reach, 2], [16 - reach, 0, 24, 2]]
     upright = [[0, 0, 2, 5 + reach], [0, 5 - reach, 2, 10]]

@@ -51,6 +51,15 @@ def test_a_trajectory_rests_before_and_after():
     np.testing.assert_allclose(path(2.5), between(poses[1], poses[2], 0.75), atol=1e-12)
 
 
+def test_a_camera_that_moves_is_elsewhere():
+    pose = random_pose(np.random.default_rng(4))
+    camera = fs.Camera.look_at(8, 6, 1.0, (0, 0, -1), (0, 0, 0))
+    moved = fs.Motion(camera=lambda time: pose if time == 2.0 else np.eye(4)).moved(camera, 2.0)
+    assert (moved.world_to_camera == pose).all()
+    np.testing.assert_allclose(moved.position, np.linalg.inv(pose)[:3, 3], atol=1e-12)
+    assert fs.Motion().moved(camera, 2.0) is camera
+
+
 def test_when_rows_are_exposed():
     shutter = fs.Shutter(time=2.0, exposure_time=0.4, sub_poses=4, readout=1.0, rows_per_band=4)
     bands = shutter.bands(10)
