@@ -10,7 +10,16 @@ from fidsplat.cli import main
 from fidsplat.experiments.summary import summarise
 from fidsplat.experiments.sweep import Record
 from fidsplat.experiments.tradeoff import report
-from fidsplat.experiments.tradeoff.points import ALONE, BASE, EXACT, KNOBS, Point, decode_points, points
+from fidsplat.experiments.tradeoff.points import (
+    ALONE,
+    BASE,
+    EXACT,
+    KNOBS,
+    Point,
+    decode_points,
+    points,
+    preset,
+)
 from fidsplat.experiments.tradeoff.summary import COLUMNS, Device, front, load, quality_text, rows_of
 from fidsplat.quality import PRESETS
 
@@ -129,7 +138,7 @@ def test_times_within_the_noise_of_the_base_do_not_differ():
 def test_what_was_measured_twice_shows_the_noise():
     records = plain_records("hard")
     assert device(records).noise("hard") == 0.02
-    twice = Point(ALONE, "reference again", PRESETS["reference"])
+    twice = Point(ALONE, "reference again", preset("reference"))
     records.append(record("hard", twice, result(2.14, 1e-6)))
     assert device(records).noise("hard") == pytest.approx(0.07)
 

@@ -18,10 +18,10 @@ from fidsplat.quality import (
     Quality,
 )
 
-BASE = TIMED
+BASE = TIMED.with_(marker=MarkerQuality("fitted"))
 """what every other setting is measured beside, turn by turn: the cut-off and the stop that other systems
-share, and our rules; pinned, so that presets may change"""
-EXACT = Quality(alpha_cutoff=1e-6, transmittance_stop=0.0, arithmetic="precise")
+share, and our rules; pinned, so that presets and defaults may change"""
+EXACT = Quality(alpha_cutoff=1e-6, transmittance_stop=0.0, arithmetic="precise", marker=BASE.marker)
 """what leaves nothing out that float32 can show; a constant put into this alone shows the error it makes"""
 SHARP = {"lowpass": "none", "samples": 3}
 """for markers: exact splats, the mean of 3 x 3 samples"""
@@ -51,10 +51,11 @@ _QUICK = {
 _MARKER_LADDER = (
     *(MarkerQuality("paper", levels=levels, density=1) for levels in (1, 2, 3, 4, 5)),
     MarkerQuality("paper"),
-    *(MarkerQuality("fitted", template=size) for size in TEMPLATE_SIZES if size != NESTED),
-    *(MarkerQuality("fitted", growth=growth) for growth in (0.0, 0.2)),
+    *(replace(BASE.marker, template=k) for k in TEMPLATE_SIZES if k not in (BASE.marker.template, NESTED)),
+    *(replace(BASE.marker, growth=growth) for growth in (0.0, 0.2)),
+    MarkerQuality("exact"),
 )
-_QUICK_MARKERS = (MarkerQuality("paper"), MarkerQuality("fitted"))
+_QUICK_MARKERS = (MarkerQuality("paper"), MarkerQuality("exact"))
 _COMBINED_CUTOFFS, _COMBINED_STOPS = (1e-4, 1 / 4096, 1 / 2048, 1 / 1024, 1 / 255), (1e-4, 1e-3, 1 / 512)
 _FAST, _FASTEST = {"arithmetic": "fast"}, {"arithmetic": "fast", "setup_precision": "float32"}
 _FASTEST_STOP = 1e-3
@@ -141,7 +142,7 @@ def points(
     found = [Point("base", "base", BASE)]
     if PRESETS_KNOB in chosen:
         # surfel has the same constants as gsplat
-        found += [Point(PRESETS_KNOB, name, PRESETS[name]) for name in PRESETS if name != "surfel"]
+        found += [Point(PRESETS_KNOB, name, preset(name)) for name in PRESETS if name != "surfel"]
     if ALONE in chosen and not on_marker:
         found.append(Point(ALONE, "exact", EXACT))
         found += [alone(changes) for changes in (_ALONE[:6] if quick else _ALONE)]
@@ -161,13 +162,18 @@ def decode_points(knobs: Iterable[str], quick: bool = False) -> list[Point]:
     chosen = tuple(knobs)
     found = [Point("base", "base", BASE)]
     if PRESETS_KNOB in chosen:
-        found.append(Point(PRESETS_KNOB, "gsplat", PRESETS["gsplat"]))
+        found.append(Point(PRESETS_KNOB, "gsplat", preset("gsplat")))
     if MARKER_KNOB in chosen:
         found += _marker_points(quick)
     for knob in ("lowpass", "samples"):
         if knob in chosen and not quick:
             found += [_turned(knob, value) for value in _LADDERS[knob][0]]
     return found
+
+
+def preset(name: str) -> Quality:
+    """A preset, with markers as the base has them."""
+    return PRESETS[name].with_(marker=BASE.marker)
 
 
 def marker_words(knobs: MarkerQuality) -> str:
@@ -203,9 +209,9 @@ def value_words(value: Any) -> str:
 
 def _marker_points(quick: bool) -> Iterator[Point]:
     """Every way of making a marker, drawn as the base and by `SHARP`."""
-    for knobs in (MarkerQuality(), *(_QUICK_MARKERS if quick else _MARKER_LADDER)):
+    for knobs in (BASE.marker, *(_QUICK_MARKERS if quick else _MARKER_LADDER)):
         words = marker_words(knobs)
-        if knobs != MarkerQuality():
+        if knobs != BASE.marker:
             yield Point(MARKER_KNOB, words, BASE.with_(marker=knobs))
         if knobs.mixture != "exact":  # boxes filter themselves
             yield Point(MARKER_KNOB, f"{words}, 3 x 3", BASE.with_(marker=knobs, **SHARP))

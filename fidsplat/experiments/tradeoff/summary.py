@@ -15,7 +15,7 @@ from fidsplat.errors import InputError
 from fidsplat.experiments.angles import largest, parse_tilts
 from fidsplat.experiments.summary import Frame, Row, Summary, join, read_summary, records_of, summarise
 from fidsplat.experiments.sweep import Record
-from fidsplat.experiments.tradeoff.points import KNOBS, PRESETS_KNOB, Point
+from fidsplat.experiments.tradeoff.points import KNOBS, PRESETS_KNOB, Point, preset
 from fidsplat.experiments.tradeoff.run import DECODE, NAME, POINT, TRUTH
 from fidsplat.experiments.tradeoff.scenes import NAMES, is_marker, views_of
 from fidsplat.experiments.tradeoff.session import DEFINITION
@@ -217,6 +217,4 @@ def quality_text(changes: dict[str, Any]) -> str:
 
 def _today(name: str) -> str | None:
     """What a preset changes in the base; None where there is none of that name any more."""
-    return (
-        quality_text(Point(PRESETS_KNOB, name, PRESETS[name]).key()["quality"]) if name in PRESETS else None
-    )
+    return quality_text(Point(PRESETS_KNOB, name, preset(name)).key()["quality"]) if name in PRESETS else None
