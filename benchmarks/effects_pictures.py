@@ -113,14 +113,14 @@ def shining(degree: int) -> fs.Scene:
 
 def all_effects(renderer: fs.Renderer) -> list[tuple[str, np.ndarray]]:
     """A titled picture of each of twelve effects, all of one shape."""
-    gaussians, boxes = room("fitted"), room("exact")
-    camera = boxes.camera
+    marked = room("exact")
+    camera = marked.camera
     assert camera is not None
 
     def through(lens=None, **focal) -> fs.Camera:
         return replace(camera, lens=lens, **focal)
 
-    def seen(scene: fs.Scene = boxes, **call) -> np.ndarray:
+    def seen(scene: fs.Scene = marked, **call) -> np.ndarray:
         return to_uint8(renderer.render(scene, **call)["rgb"])
 
     def example(name: str) -> fs.Scene:
@@ -130,11 +130,11 @@ def all_effects(renderer: fs.Renderer) -> list[tuple[str, np.ndarray]]:
     wide = fs.Camera.orthographic(WIDTH, HEIGHT, 4.0, world_to_camera=camera.world_to_camera)
     turn = fs.Motion(turned(150))
     panels = {
-        "pinhole": lambda: seen(gaussians),
-        "distortion (Brown-Conrady)": lambda: seen(gaussians, camera=through(fs.BrownConrady(-0.4, 0.12))),
+        "pinhole": seen,
+        "distortion (Brown-Conrady)": lambda: seen(camera=through(fs.BrownConrady(-0.4, 0.12))),
         "fisheye, 200 degrees": lambda: seen(example("lens-fisheye"), camera=fisheye),
         "panorama": lambda: seen(example("lens-panorama"), camera=fs.Camera.equirectangular(WIDTH, HEIGHT)),
-        "parallel rays": lambda: seen(gaussians, camera=wide),
+        "parallel rays": lambda: seen(camera=wide),
         "motion blur": lambda: seen(motion=turn, shutter=fs.Shutter(exposure_time=0.03, sub_poses=16)),
         "rolling shutter": lambda: seen(motion=turn, shutter=fs.Shutter(readout=0.1, rows_per_band=4)),
         "fog": lambda: seen(fog=fs.Fog(0.15, (0.75, 0.78, 0.8))),

@@ -85,11 +85,10 @@ class Capture(PickledByFields):
 
 def output_names(outputs: Any) -> tuple[str, ...]:
     """Names of outputs, each once, from one or several. Raises InputError for anything else, and for none."""
-    names = (outputs,) if isinstance(outputs, str) else outputs
     try:
-        names = tuple(names)
+        names: tuple[Any, ...] = (outputs,) if isinstance(outputs, str) else tuple(outputs)
     except TypeError:  # an array of no dimension, too, passes for an Iterable
-        names = (names,)
+        names = (outputs,)
     if not names:
         raise InputError("outputs is empty; name at least one, e.g. 'rgb'")
     if not all(isinstance(name, str) for name in names):

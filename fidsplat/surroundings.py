@@ -75,7 +75,7 @@ class Panorama(PickledByFields):
 
     def __post_init__(self) -> None:
         try:
-            given = np.asarray(self.image)
+            given: np.ndarray = np.asarray(self.image)
         except ValueError:  # rows that differ in length
             given = np.empty(0)
         if given.ndim != 3 or given.shape[2] != 3 or given.dtype.kind not in "fiu":

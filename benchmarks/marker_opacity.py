@@ -1,0 +1,68 @@
+"""Whether a marker is opaque and clean: an AprilTag seen frontally over grey, its modules along the pixels.
+
+    python benchmarks/marker_opacity.py [--device opencl]
+
+For each way of making it, pixels a module and quality: PSNR over the sheet from the ideal picture in dB; the
+least alpha inside the outline less 2 % of a module; the largest error inside cells, an eighth of a module and
+a pixel from their edges.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import fidsplat as fs
+from fidsplat.markers import Marker, marker
+from fidsplat.quality import NESTED, MarkerQuality
+
+MADE = (MarkerQuality("fitted"), MarkerQuality("fitted", template=NESTED), MarkerQuality("exact"))
+QUALITIES = {
+    "no low-pass, 3 x 3": fs.Quality(lowpass="none", samples=3),
+    "standard": fs.Quality(),
+    "gsplat, surfel": fs.Quality.of("gsplat"),
+}
+BORDER, FOCAL = 20, 1000.0
+"""pixels around the sheet; focal length in pixels per pixel of a module"""
+
+
+def figures(
+    renderer: fs.Renderer, tag: Marker, pixels: int, quality: fs.Quality
+) -> tuple[float, float, float]:
+    """PSNR, least alpha, largest error inside cells."""
+    side, focal = len(tag.grid) * pixels + 2 * BORDER, FOCAL * pixels * tag.size
+    distance = focal * tag.module / pixels
+    pose = fs.Camera.look_at(side, side, 1.0, (0, 0, -distance), (0, 0, 0)).world_to_camera
+    camera = fs.Camera.pinhole(side, side, focal, focal, side / 2, side / 2, pose)
+    frame = renderer.render(tag.cloud, camera, ("rgb", "alpha"), quality, (0.5, 0.5, 0.5))
+    shown, alpha = (frame[name][BORDER:-BORDER, BORDER:-BORDER] for name in ("rgb", "alpha"))
+    error = shown.mean(2) - np.kron(1.0 - tag.grid, np.ones((pixels, pixels)))
+    edge, rim = max(1, math.ceil(0.02 * pixels)), pixels // 8 + 1
+    cells = error.reshape(len(tag.grid), pixels, len(tag.grid), pixels)[:, rim:-rim, :, rim:-rim]
+    psnr = -10 * math.log10(float((error**2).mean()))
+    return psnr, float(alpha[edge:-edge, edge:-edge].min()), float(np.abs(cells).max())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--device", default="opencl")
+    renderer = fs.Renderer(parser.parse_args().device)
+    table = Table("marker", "px a module", "quality", "PSNR", "alpha", "error", title=renderer.device.title)
+    for made in MADE:
+        tag = marker("apriltag:36h11:0", quality=made)
+        name = f"fitted {made.template}" if made.mixture == "fitted" else made.mixture
+        for pixels in (8, 24):
+            for words, quality in QUALITIES.items():
+                psnr, alpha, error = figures(renderer, tag, pixels, quality)
+                table.add_row(name, str(pixels), words, f"{psnr:.1f}", f"{alpha:.3f}", f"{error:.3f}")
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
