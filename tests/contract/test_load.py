@@ -1,29 +1,15 @@
 """Threads and processes: the short form of tools/load.py."""
 
-import sys
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
+import load
 import pytest
 
 import fidsplat as fs
 
-TOOLS = Path(__file__).resolve().parents[2] / "tools"
-
-
-@pytest.fixture(scope="module")
-def load():
-    sys.path.insert(0, str(TOOLS))
-    try:
-        import load
-
-        yield load
-    finally:
-        sys.path.remove(str(TOOLS))
-
 
 @pytest.mark.parametrize("device", ["opencl", "warp:cpu"])
-def test_threads_share_a_renderer_or_have_their_own(load, device):
+def test_threads_share_a_renderer_or_have_their_own(device):
     seeds = range(6)
     truth = [load.pictures(fs.Renderer(device), seed) for seed in seeds]
     shared = fs.Renderer(device)
@@ -32,6 +18,6 @@ def test_threads_share_a_renderer_or_have_their_own(load, device):
         assert list(pool.map(lambda seed: load.pictures(fs.Renderer(device), seed), seeds)) == truth
 
 
-def test_processes_share_an_empty_kernel_cache(load, monkeypatch):
+def test_processes_share_an_empty_kernel_cache(monkeypatch):
     monkeypatch.setattr(load, "PROCESSES", 3)
     assert load.processes("opencl") == {"wrong of 3 processes": 0}

@@ -2,28 +2,15 @@
 
 import os
 import random
-import sys
-from pathlib import Path
 
+import interrupt
 import pytest
 
-TOOLS = Path(__file__).resolve().parents[2] / "tools"
 NOTHING_LOST = {"broken": 0, "unclear": 0, "changed": 0}
 
 
 @pytest.fixture(scope="module")
-def interrupt():
-    sys.path.insert(0, str(TOOLS))
-    try:
-        import interrupt
-
-        yield interrupt
-    finally:
-        sys.path.remove(str(TOOLS))
-
-
-@pytest.fixture(scope="module")
-def trial(interrupt, tmp_path_factory):
+def trial(tmp_path_factory):
     return interrupt.Trial("render", tmp_path_factory.mktemp("interrupted"))
 
 
@@ -31,14 +18,14 @@ def lost(tally):
     return {name: getattr(tally, name) for name in NOTHING_LOST}
 
 
-def test_an_interrupted_command_loses_nothing(interrupt, trial, tmp_path):
+def test_an_interrupted_command_loses_nothing(trial, tmp_path):
     tally = interrupt.kills(trial, tmp_path, 6, random.Random(3))
     assert tally.interrupted >= 1
     assert lost(tally) == NOTHING_LOST
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a small file system")
-def test_a_full_disk_loses_nothing(interrupt, trial, tmp_path):
+def test_a_full_disk_loses_nothing(trial, tmp_path):
     probe = tmp_path / "probe"
     try:
         with interrupt.small_disk(probe, 2**20):
@@ -50,7 +37,7 @@ def test_a_full_disk_loses_nothing(interrupt, trial, tmp_path):
     assert lost(tally) == NOTHING_LOST
 
 
-def test_what_is_cut_off_is_seen(interrupt, tmp_path):
+def test_what_is_cut_off_is_seen(tmp_path):
     whole = tmp_path / "figures.json"
     whole.write_text('{"a": 1}\n')
     assert interrupt.is_whole(whole)

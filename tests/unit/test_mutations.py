@@ -1,32 +1,21 @@
 """tools/mutations.toml: bugs that can still be planted, and tools/mutate.py, which plants them."""
 
 import dataclasses
-import importlib.util
-import sys
 from collections import Counter
 from pathlib import Path
 
+import mutate
 import pytest
 
 ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
-def mutate():
-    specification = importlib.util.spec_from_file_location("mutate", ROOT / "tools" / "mutate.py")
-    module = importlib.util.module_from_spec(specification)
-    sys.modules["mutate"] = module  # where its dataclass looks for its own annotations
-    specification.loader.exec_module(module)
-    yield module
-    del sys.modules["mutate"]
-
-
-@pytest.fixture(scope="module")
-def plants(mutate):
+def plants():
     return mutate.read_plants()
 
 
-def test_every_bug_can_still_be_planted(mutate, plants):
+def test_every_bug_can_still_be_planted(plants):
     """Its text stands exactly once in its file, and the tests that are to see it exist."""
     texts = {plant.path: (ROOT / plant.path).read_text("utf-8") for plant in plants}
     for plant in plants:
@@ -39,13 +28,13 @@ def test_every_bug_can_still_be_planted(mutate, plants):
     assert len({plant.key for plant in plants}) == len(plants)
 
 
-def test_what_has_changed_is_not_planted(mutate, plants):
+def test_what_has_changed_is_not_planted(plants):
     for text in ("", plants[0].old * 2):
         with pytest.raises(ValueError, match=f"stands {2 if text else 0} times"):
             mutate.planted(text, plants[0])
 
 
-def test_a_sample_is_that_of_its_seed(mutate, plants):
+def test_a_sample_is_that_of_its_seed(plants):
     some = mutate.chosen(plants, ["formats", "scenes"], 9, 1)
     assert some == mutate.chosen(plants, ["formats", "scenes"], 9, 1)
     assert some != mutate.chosen(plants, ["formats", "scenes"], 9, 2)
@@ -54,7 +43,7 @@ def test_a_sample_is_that_of_its_seed(mutate, plants):
     assert mutate.chosen(plants, [], None, 0) == plants
 
 
-def test_bugs_are_caught_survive_or_are_not_tested(mutate, tmp_path, monkeypatch):
+def test_bugs_are_caught_survive_or_are_not_tested(tmp_path, monkeypatch):
     """In a tree of three files; a second run knows what the first found."""
     (tmp_path / "sum.py").write_text("def plus(a, b):\n    return a + b\n")
     (tmp_path / "test_sum.py").write_text(
