@@ -246,7 +246,8 @@ class Reshapes(Backend, Protocol):
     def shapes(self, kind: str) -> dict[str, Any]:
         """Build constants by a name that people read. kind: `tiles`, of other sizes, whose pictures have the
         same bits; `schedule`, the way in which a GPU walks its tiles (on a GPU: other tiles), whose pictures
-        agree but for rounding; `sorting`, the device's own and others for listing and sorting."""
+        agree but for rounding; `sorting`, the device's own and others for listing and sorting; `waiting`,
+        less room for fragments that wait for nearer ones, whose pictures have the same bits."""
         ...
 
     def pieces(self, shape: Any) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -13,9 +14,10 @@ from fidsplat.hard_cases.agreement import ALL_OUTPUTS, COLOR_TOLERANCE, Picture,
 from fidsplat.hard_cases.case import Finding, Found, case
 from fidsplat.hard_cases.clouds import camera, splats, taken, turned
 from fidsplat.hard_cases.coplanar import (
-    WALL_STEP,
+    SMOOTH,
     beside_a_big_splat,
     faint_between,
+    fan,
     largest_jump,
     layered,
     tag,
@@ -65,7 +67,7 @@ def _tilted_planes(quality: Quality) -> Picture:
 
 
 def _three_tags() -> Picture:
-    """Three tags that cross, of which no more than two wait at a pixel, and splats of no plane between."""
+    """Three tags that cross, and splats of no plane between."""
     pose = np.eye(4)
     pose[:3, :3] = quaternion_to_matrix(turned((1, 0.3, 0), -35))
     pose[2, 3] = 0.1
@@ -95,11 +97,11 @@ def _c1_order(renderer: Renderer) -> Iterator[Finding]:
 
     cloud = tag()
     yield Finding(
-        "jump of a tag in steps of 1e-4 deg", largest_jump(renderer, turning(cloud, "blend", 2))[0], 2e-3
+        "jump of a tag in steps of 1e-4 deg", largest_jump(renderer, turning(cloud, "auto", 2))[0], SMOOTH
     )
-    tilted = next(turning(before_a_wall(150), "blend", 0, 30))
+    tilted = next(turning(before_a_wall(150), "auto", 0, 30))
     for what, picture in (
-        ("a tag's splats", next(turning(cloud, "blend", 0))),
+        ("a tag's splats", next(turning(cloud, "auto", 0))),
         ("a tag's splats among others", tilted),
     ):
         again = Picture(_shuffled(picture.cloud), picture.camera, picture.quality, ("rgb",))
@@ -109,11 +111,8 @@ def _c1_order(renderer: Renderer) -> Iterator[Finding]:
 
 def _c1_layers(renderer: Renderer) -> Iterator[Finding]:
     for tilt in (0.0, 30.0, 60.0):
-        ordered, blended = (
-            largest_jump(renderer, turning(before_a_wall(150), mode, 2, tilt, step=WALL_STEP))[0]
-            for mode in ("order", "blend")
-        )
-        yield Finding(f"jump before a wall, share of that in order, {tilt:g} deg", blended / ordered, 0.5)
+        jump = largest_jump(renderer, turning(before_a_wall(150), "auto", 2, tilt))[0]
+        yield Finding(f"jump of a tag before a wall, {tilt:g} deg", jump, SMOOTH)
     # a splat that is just drawn, and one that is just not, with its own opacity between
     with_it, without = (draw(renderer, faint_between(n / 255))["rgb"] for n in (1.01, 0.99))
     change = float(np.abs(with_it - without).max())
@@ -131,12 +130,12 @@ def c1(renderer: Renderer) -> Found:
     for away in (0.0, 1.0, 1000.0):
         yield fronto_parallel(away)
     yield _tilted_planes(Quality())
-    yield _tilted_planes(Quality(coplanar="order"))
+    yield _tilted_planes(Quality(order="centre"))
     yield _three_tags()
     for side in SIDES:
         cloud = SplatCloud.concatenate(beside_a_big_splat(side))
         yield Picture(cloud, ON_TAGS, outputs=ALL_OUTPUTS)
-    at_wall = next(turning(before_a_wall(150), "blend", 0, 30))
+    at_wall = next(turning(before_a_wall(150), "auto", 0, 30))
     yield Picture(at_wall.cloud, at_wall.camera, outputs=ALL_OUTPUTS)
     yield from _c1_order(renderer)
     yield from _c1_layers(renderer)
@@ -205,3 +204,37 @@ def c3(renderer: Renderer) -> Found:
     yield Finding(
         "pixels that change without other outputs", differing(kept, draw(renderer, plain), ("rgb",)), 0
     )
+
+
+def crossing(count: int = 120) -> SplatCloud:
+    """Large splats through one another."""
+    return random_splats(count, seed=15, depth=(0.5, 4.0), scale=(0.2, 0.8))
+
+
+def _pixel_pictures() -> Iterator[Picture]:
+    by_pixel = Quality(order="pixel")
+    yield Picture(crossing(), camera(), by_pixel, ALL_OUTPUTS)
+    yield Picture(fan(), camera(), by_pixel, ALL_OUTPUTS)
+    yield Picture(crossing(60), Camera.fisheye(90, 70, math.radians(160)), by_pixel, ALL_OUTPUTS)
+    yield _tilted_planes(Quality())
+    yield Picture(SplatCloud.concatenate([fan(), tag().transformed(_ahead())]), camera(), outputs=ALL_OUTPUTS)
+
+
+def _ahead() -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = quaternion_to_matrix(turned((0.3, 1, 0), 30))
+    pose[2, 3] = 2.9
+    return pose
+
+
+@case("C4", "fragments by their own depth", "splats and printed planes that cross; a fan of 40")
+def c4(renderer: Renderer) -> Found:
+    if renderer.backend.unsupported(next(_pixel_pictures()).prepared()[0]):
+        return
+    yield from _pixel_pictures()
+    jump = largest_jump(renderer, turning(crossing(), "pixel", 2))[0]
+    yield Finding("jump of splats that cross in steps of 1e-4 deg", jump, SMOOTH)
+    picture = Picture(crossing(), camera(), Quality(order="pixel"), ("rgb",))
+    again = Picture(_shuffled(picture.cloud), picture.camera, picture.quality, ("rgb",))
+    change = np.abs(draw(renderer, again)["rgb"] - draw(renderer, picture)["rgb"]).max()
+    yield Finding("change when they are shuffled", float(change), COLOR_TOLERANCE)

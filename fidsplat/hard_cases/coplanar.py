@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.hard_cases.agreement import CATALOGUED, Picture, draw
+from fidsplat.hard_cases.agreement import Picture, draw
 from fidsplat.hard_cases.clouds import quaternion, splats, turned
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer
@@ -18,6 +18,8 @@ from fidsplat.splats import SplatCloud
 STEP = math.radians(1e-4)
 WALL_STEP = math.radians(1e-3)
 """radians per picture; larger before a wall, whose splats change places more seldom"""
+SMOOTH = 1e-3
+"""largest change of a pixel in a step of 1e-4 degrees that is none of order: edges move"""
 
 
 def tag(side: int = 8, seed: int = 0) -> SplatCloud:
@@ -43,7 +45,7 @@ def wall(count: int = 2000, away: float = 0.05, seed: int = 1) -> SplatCloud:
 
 def turning(
     cloud: SplatCloud,
-    coplanar: str,
+    order: str,
     steps: int = 8,
     tilt: float = 0.0,
     width: int = 96,
@@ -55,7 +57,7 @@ def turning(
     It goes round it and rises with it, and is level with its middle halfway. tilt: degrees about the vertical
     axis halfway; 0 is face to face.
     """
-    quality = CATALOGUED.with_(coplanar=coplanar)
+    quality = Quality(order=order)
     for number in range(-steps, steps + 1):
         rise = (number + 0.5) * step
         round_it, level = math.radians(tilt) + rise, 1.6 * math.cos(rise)
@@ -75,12 +77,23 @@ def beside_a_big_splat(where: str) -> tuple[SplatCloud, SplatCloud]:
     return tag(6), big
 
 
-def layered(renderer: Renderer, parts: Sequence[SplatCloud], camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def fan(count: int = 40, seed: int = 5) -> SplatCloud:
+    """Splats 2 m wide that all pass through one line, 3 m away: each is in front of every other somewhere."""
+    generator = np.random.default_rng(seed)
+    quats = np.array([turned((0, 1, 0), angle) for angle in np.linspace(-75, 75, count)])
+    means = np.tile([0.0, 0.0, 3.0], (count, 1))
+    return splats(means, quats, (0.35, 0.5), generator.uniform(0.1, 0.9, count), generator.random((count, 3)))
+
+
+def layered(
+    renderer: Renderer, parts: Sequence[SplatCloud], camera: Camera, order: str = "auto"
+) -> tuple[np.ndarray, np.ndarray]:
     """Clouds of one plane or one splat each, drawn together, and composited pixel by pixel from pictures of
     each alone, by their depths there (both (h, w, 3)). 0 where two depths agree to 1e-4.
     """
     # with a cut-off above 1/255 all that is drawn has a depth
-    quality, outputs = Quality(alpha_cutoff=1 / 250, transmittance_stop=0.0), ("rgb", "alpha", "depth")
+    quality = Quality(alpha_cutoff=1 / 250, transmittance_stop=0.0, order=order)
+    outputs = ("rgb", "alpha", "depth")
     alone = [draw(renderer, Picture(part, camera, quality, outputs, (0, 0, 0))) for part in parts]
     whole = Picture(SplatCloud.concatenate(parts), camera, quality, outputs, (0, 0, 0))
     rgb, alpha, depth = (np.stack([frame[name] for frame in alone]) for name in outputs)

@@ -22,8 +22,8 @@ SHAPE, GROUP = cpu_shape(lanes=16, cores=2), gpu_shape()
 TAPS = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
 DIGESTS = {
-    "none": ["c2c0a6cba6097714", "be842943924e0e73"],
-    "screen": ["2394b2b80cb4097c", "b9607e863d3a6160"],
+    "none": ["df6d3da04f4af691", "c7b98b85bafb5edc"],
+    "screen": ["c4ab6b672dbe08b6", "b6182eda68645733"],
 }
 """of a scene that asks for nothing, by low-pass; `screen` is the default"""
 
@@ -58,8 +58,19 @@ def test_base_text_names_no_effect_that_was_not_asked_for():
         "arithmetic_fast",
     }
     of_knobs = ("wide", "WIDE")
-    of_layers = ("planes", "plane_keys", "layer", "Layer", "open", "waiting", "optical_depth")
-    for name in (*absent, *TAPS, "sh", "finished", *of_layers, *of_knobs):
+    of_order = (
+        "planes",
+        "plane_keys",
+        "layer",
+        "Layer",
+        "open",
+        "waiting",
+        "Waiting",
+        "WAITING",
+        "nearest",
+        "optical_depth",
+    )
+    for name in (*absent, *TAPS, "sh", "finished", *of_order, *of_knobs):
         assert not re.search(rf"\b{name}(_|\b)", text), name
 
 
@@ -86,11 +97,11 @@ def test_a_tap_brings_its_text_and_nothing_else(tap):
 @pytest.mark.parametrize("taps", [("rgb",), tuple(TAPS)])
 def test_only_splats_on_planes_bring_layers(taps):
     """What a tap says of layers stays out as well, and layers bring the depth that places them."""
-    words = ("Layer", "layer_pick", "layer_gather", "plane_keys", "label_tau", "share")
+    words = ("Layer", "layer_close", "layer_gather", "plane_keys", "label_tau", "share")
     plain = assemble(select(COLORS, fs.Capture(outputs=taps, quality=PLAIN)), SHAPE).text
     layered = assemble(select(Cloud(has_planes=True), fs.Capture(outputs=taps, quality=PLAIN)), SHAPE).text
     in_order = assemble(
-        select(Cloud(has_planes=True), fs.Capture(outputs=taps, quality=PLAIN.with_(coplanar="order"))), SHAPE
+        select(Cloud(has_planes=True), fs.Capture(outputs=taps, quality=PLAIN.with_(order="centre"))), SHAPE
     ).text
     for word in words:
         assert not re.search(rf"\b{word}\b", plain), word

@@ -88,7 +88,7 @@ def test_ties_go_to_what_is_nearer(renderer):
     frame = renderer.render(layers_of([0.5, 1.0]), POINT, ("label", "splat_id"))
     assert renderer.render(layers_of([0.5]), POINT, "alpha")["alpha"][2, 2] == 0.5
     assert (frame["label"][2, 2], frame["splat_id"][2, 2]) == (7, 0)
-    gsplat = half.with_(stop_rule="exclusive", coplanar="order", transmittance_stop=0.25)
+    gsplat = half.with_(stop_rule="exclusive", order="centre", transmittance_stop=0.25)
     frame = renderer.render(layers_of([1, 1, 1]), POINT, ("alpha", "blended"), gsplat)
     assert (frame["alpha"][2, 2], frame["blended"][2, 2]) == (0.5, 1)
 

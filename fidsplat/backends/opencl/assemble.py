@@ -101,9 +101,13 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     }
     if "color_sh" in layouts:
         defines["SH_DEGREE"] = features.sh_degree
+    if "compose_pixel" in layouts:
+        defines["WAITING"] = shape.waiting
     files = [layout.file for layout in layouts.values() if layout.file]
     if shape.lists == "tiled":
         files.append("list/tiled.cl")
+    if "compose_pixel" in layouts:
+        files.append(LAYOUTS[f"waiting_{shape.schedule}"].file)
     stages = ["prelude", "math", "splat", "bounds", "project", *_LISTS[shape.lists], "blend"]
     stages = [f"{stage}.cl" for stage in (*stages, f"schedule/{shape.schedule}", "resolve")]
     _refuse_unknown_hooks(files, stages)

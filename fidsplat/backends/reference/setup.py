@@ -43,11 +43,6 @@ class Setup:
             area = area * grown
             with np.errstate(divide="ignore"):
                 log_opacity = log_opacity - np.log(grown)
-        planes = None
-        if "compose_planes" in features.slots:
-            table = PlaneTable(cloud)
-            planes = table.index
-            self.key = np.where(planes < 0, self.key, np.append(table.keys(view), 0)[planes])
         half_r2 = log_opacity - view.log_cut
         if view.along_ray:
             long_a, long_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
@@ -56,6 +51,16 @@ class Setup:
             reach, box_reach = np.hypot(a[:, 2], b[:, 2]), np.abs(a[:, 2]) + np.abs(b[:, 2])
         reach = np.where(box, box_reach, np.sqrt(np.maximum(2 * half_r2, 0)) * reach)
         drawn = (half_r2 > 0) & (depth + reach >= view.near) & (depth - reach <= view.far)
+        self.by_depth = "compose_ordered" not in features.slots
+        """whether fragments are composited by their own depth"""
+        planes, nearest = None, np.full(len(cloud), -np.inf)
+        if self.by_depth:
+            self.key = self.key - reach.astype(np.float32)
+        if "compose_planes" in features.slots:
+            table = PlaneTable(cloud)
+            planes = table.index
+            nearest = np.where(planes < 0, nearest, np.append(table.keys(view), 0)[planes])
+            self.key = np.where(planes < 0, self.key, nearest.astype(np.float32))
         order = np.flatnonzero(drawn)
         order = order[np.argsort(self.key[order], kind="stable")]
         self.order = order
@@ -94,6 +99,8 @@ class Setup:
         self.screen = "lowpass_screen" in features.slots
         self.exclusive = "stop_exclusive" in features.slots
         self.planes = None if planes is None else planes[order]
+        self.nearest = nearest[order]
+        """depth before which none of a printed plane lies; -inf for splats of none"""
 
 
 def _posed(

@@ -28,4 +28,6 @@ def other_shapes(own: WarpShape, kind: str) -> dict[str, WarpShape]:
         return {"groups": WarpShape("group", 8, 8)}
     if kind == "sorting":
         return {"own": own}
+    if kind == "waiting":
+        return {}
     return {f"{side} x {side}": WarpShape(own.schedule, side, side) for side in (8, 32)}

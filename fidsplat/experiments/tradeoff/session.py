@@ -18,7 +18,7 @@ from fidsplat.render import Frame, Renderer, ResidentCloud
 
 _SCENES, _TRUTHS = 12, 6
 """kept at a time"""
-DEFINITION = ("lowpass", "samples", "coplanar")
+DEFINITION = ("lowpass", "samples", "order")
 """knobs that say what a picture is; the others say how well it is drawn"""
 
 
@@ -70,10 +70,8 @@ class Session:
         return _kept(self._truths, (view, like), draw, _TRUTHS)
 
     def definition(self, view: str, quality: Quality) -> Quality:
-        """The base with what `quality` says of the definition; without coplanar splats there is one rule."""
+        """The base with what `quality` says of the definition."""
         asked = {name: getattr(quality, name) for name in DEFINITION}
-        if self.scene(view, quality.marker).scene.cloud.planes is None:
-            asked["coplanar"] = BASE.coplanar
         return BASE.with_(**asked, marker=quality.marker)
 
     def full(self, view: str, quality: Quality) -> Quality:
