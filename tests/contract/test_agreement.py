@@ -104,8 +104,9 @@ def test_principal_point_outside_the_picture_and_odd_sizes(renderer):
 
 
 def test_no_sample_that_a_rim_just_reaches_is_lost(renderer):
-    """Twenty disks whose lowest point lies 2e-5 samples below the centre of a sample, in row 12,000 of a tall
-    picture, where float32 rounds a place to a thousandth: more than the relative room of bounds makes up for."""
+    """Twenty disks whose lowest point lies 2e-5 samples below the centre of a sample, in row 12,000 of a
+    picture, where float32 rounds a place to a thousandth: more than the relative room of bounds makes up for.
+    """
     quality, top = fs.Quality(lowpass="none", alpha_cutoff=1 / 255), 12_000
     samples = 5.0 * np.arange(20) - 46.5  # rows of their centres, from there
     radii = np.random.default_rng(1).uniform(0.15, 0.45, 20)
