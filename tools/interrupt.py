@@ -3,11 +3,12 @@
     python tools/interrupt.py trials.jsonl [--commands demo,render,...] [--most 20] [--seed 0]
 
 Each command runs twice undisturbed: what agrees is its result, bit for bit (of figures and logs each value
-and each line), and the rest (times, durations) need only parse. Then it is started again and again in an empty
-folder and sent SIGINT, SIGTERM or SIGKILL at a random moment, or writes to a file system (tmpfs, which only
-root can mount) that is full after a part of what it writes. Every file that has its final name is looked at,
-and the same command runs once more, with room. A trial is a line of the file; a run that was stopped goes on
-where it was, and ends with a table of all trials. The exit status is 1 if anything was lost.
+and each line), and the rest (times, durations) need only parse. Then it is started again and again in an
+empty folder and sent SIGINT, SIGTERM or SIGKILL at a random moment, or writes to a file system (tmpfs,
+which only root can mount) that is full after a part of what it writes. Every file that has its final name
+is looked at, and the same command runs once more, with room. A trial is a line of the file; a run that was
+stopped goes on where it was, and ends with a table of all trials. The exit status is 1 if anything was
+lost.
 """
 
 from __future__ import annotations
