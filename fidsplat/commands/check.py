@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated
 
 from fidsplat.commands.output import Json, console, option, print_json, print_table
 from fidsplat.errors import InputError
@@ -19,21 +19,20 @@ if TYPE_CHECKING:
 
 @dataclass
 class Check:
-    """Test a device with the hard cases."""
+    """Test a device with the hard cases of splat rendering.
 
-    HELP: ClassVar[str] = """Test a device with the hard cases of splat rendering.
+    Draws scenes that are known to break renderers and compares them with a float64 reference, pixel by pixel;
+    measures the device's own arithmetic; and says what does not hold. Under two minutes on two cores. Writes
+    a picture of the worst case to DIR/worst.png. Exit status 1 when anything does not hold.
 
-Draws scenes that are known to break renderers and compares them with a float64 reference, pixel by pixel;
-measures the device's own arithmetic; and says what does not hold. Under two minutes on two cores. Writes a
-picture of the worst case to DIR/worst.png. Exit status 1 when anything does not hold.
+    --fuzz draws random scenes of up to 200 splats instead, until they hold N splats. A run that was stopped
+    goes on where it was (DIR/fuzz.json).
 
---fuzz draws random scenes of up to 200 splats instead, until they hold N splats. A run that was stopped goes
-on where it was (DIR/fuzz.json).
-
-Examples:
-  fidsplat check
-  fidsplat check --device opencl:nvidia --json
-  fidsplat check --fuzz 100000"""
+    Examples:
+      fidsplat check
+      fidsplat check --device opencl:nvidia --json
+      fidsplat check --fuzz 100000
+    """
 
     device: Annotated[
         str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")

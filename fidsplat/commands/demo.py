@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated
 
 from fidsplat.commands.output import Json, console, option, print_json, print_table
 
@@ -12,18 +12,17 @@ if TYPE_CHECKING:
 
 @dataclass
 class Demo:
-    """The main job, end to end, with pictures and a table."""
+    """The main job, end to end, with pictures and a table.
 
-    HELP: ClassVar[str] = """The main job, end to end, with pictures and a table.
+    Makes an AprilTag, an ArUco tag and a QR code of splats, sets them in a yard of some ten thousand splats,
+    draws three views with colour, depth, normals and labels, and reads them back. Exit status 1 when a marker
+    that is wholly visible is not found within 1 % of its distance.
 
-Makes an AprilTag, an ArUco tag and a QR code of splats, sets them in a yard of some ten thousand splats,
-draws three views with colour, depth, normals and labels, and reads them back. Exit status 1 when a marker
-that is wholly visible is not found within 1 % of its distance.
-
-Examples:
-  fidsplat demo
-  fidsplat demo --mixture fitted --out soft
-  fidsplat demo --out pictures --json"""
+    Examples:
+      fidsplat demo
+      fidsplat demo --mixture fitted --out soft
+      fidsplat demo --out pictures --json
+    """
 
     out: Annotated[
         str, option("DIR", "folder for pictures, scene and figures (default: fidsplat-demo)", "-o")

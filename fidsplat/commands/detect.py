@@ -1,7 +1,7 @@
 """`fidsplat detect`."""
 
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import tyro
 
@@ -11,19 +11,18 @@ from fidsplat.errors import InputError
 
 @dataclass
 class Detect:
-    """Find tags and QR codes in a picture."""
+    """Find AprilTag, ArUco and QR codes in a picture.
 
-    HELP: ClassVar[str] = """Find AprilTag, ArUco and QR codes in a picture.
+    Prints what they say and the corners of each, in pixels: top left, top right, bottom right, bottom left as
+    printed, the centre of the first pixel at (0.5, 0.5). With --scene also where each marker of that scene
+    was seen from its camera, and how far that is from the truth: of a scene that moves, from where things are
+    at its shutter's time, when the middle row is exposed.
 
-Prints what they say and the corners of each, in pixels: top left, top right, bottom right, bottom left as
-printed, the centre of the first pixel at (0.5, 0.5). With --scene also where each marker of that scene was
-seen from its camera, and how far that is from the truth: of a scene that moves, from where things are at its
-shutter's time, when the middle row is exposed.
-
-Examples:
-  fidsplat detect photo.jpg
-  fidsplat detect photo.png --family 16h5 --family 7x7_1000
-  fidsplat detect scene.png --scene scene.toml --json"""
+    Examples:
+      fidsplat detect photo.jpg
+      fidsplat detect photo.png --family 16h5 --family 7x7_1000
+      fidsplat detect scene.png --scene scene.toml --json
+    """
 
     image: Annotated[tyro.conf.Positional[str], option("IMAGE", "PNG, JPEG, BMP, TIFF or WebP")]
     family: Annotated[

@@ -9,19 +9,17 @@ from fidsplat.commands.experiment_measure import All, Angles, Counts, Localisati
 
 @dataclass
 class Experiment:
-    """The paper's experiments: tables, figures, data set."""
+    """The paper's experiments: its tables and figures with our columns, beside the ideal.
 
-    HELP: ClassVar[
-        str
-    ] = """The paper's experiments: its tables and figures with our columns, beside the ideal.
+    Each experiment writes one file of results; a run that was stopped goes on where it was.
 
-Each experiment writes one file of results; a run that was stopped goes on where it was.
+    Examples:
+      fidsplat experiment all --quick                   a rough picture of all of it, in minutes
+      fidsplat experiment angles --category small       one experiment, one category
+      fidsplat experiment report                        tables, charts and pictures from the results
+      fidsplat experiment angles --help                 what one of them does, and its options
+    """
 
-Examples:
-  fidsplat experiment all --quick                   a rough picture of all of it, in minutes
-  fidsplat experiment angles --category small       one experiment, one category
-  fidsplat experiment report                        tables, charts and pictures from the results
-  fidsplat experiment angles --help                 what one of them does, and its options"""
     PARTS: ClassVar[dict[str, type]] = {
         "all": All,
         "angles": Angles,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated
 
 from fidsplat.commands.output import Json, console, option, print_json
 from fidsplat.commands.sweeps import Folders, Names, ReportTo, Seed, need_reports, switch
@@ -19,18 +19,15 @@ CATEGORY_HELP = "apriltag, small, medium, large or huge, once more for each (def
 
 @dataclass
 class Dataset:
-    """The paper's 100 scenes in COLMAP format."""
+    """Write the data set of section 4.1: 100 scenes for COLMAP, 25 markers x 4 collections.
 
-    HELP: ClassVar[
-        str
-    ] = """Write the data set of section 4.1: 100 scenes for COLMAP, 25 markers x 4 collections.
+    Each scene has training views (3, 5, 9 or 17), 20 test views, and models as text and binary. Scenes that
+    are there stay. About 300 MB.
 
-Each scene has training views (3, 5, 9 or 17), 20 test views, and models as text and binary. Scenes that are
-there stay. About 300 MB.
-
-Examples:
-  fidsplat experiment dataset -o dataset
-  fidsplat experiment dataset --truth blender-standard --blender fidsplat-experiments/blender"""
+    Examples:
+      fidsplat experiment dataset -o dataset
+      fidsplat experiment dataset --truth blender-standard --blender fidsplat-experiments/blender
+    """
 
     out: Annotated[str, option("DIR", "folder for the scenes (default: fidsplat-dataset)", "-o")] = (
         "fidsplat-dataset"
@@ -79,20 +76,17 @@ Examples:
 
 @dataclass
 class Blender:
-    """Ground truth by Blender: install it, render with it."""
+    """Draw every marker's views with Blender (Cycles on the CPU), the paper's ground truth.
 
-    HELP: ClassVar[
-        str
-    ] = """Draw every marker's views with Blender (Cycles on the CPU), the paper's ground truth.
+    --install makes a virtual environment of its own (about 1 GB, Python 3.11 needed) with bpy. Without it,
+    pictures are rendered; those that are there stay. About 3 s a picture on two cores; 20 test views for each
+    of 25 markers, with --training 17 more.
 
---install makes a virtual environment of its own (about 1 GB, Python 3.11 needed) with bpy. Without it,
-pictures are rendered; those that are there stay. About 3 s a picture on two cores; 20 test views for each of
-25 markers, with --training 17 more.
-
-Examples:
-  fidsplat experiment blender --install
-  fidsplat experiment blender
-  fidsplat experiment blender --view raw --category small --markers 1 --samples 16"""
+    Examples:
+      fidsplat experiment blender --install
+      fidsplat experiment blender
+      fidsplat experiment blender --view raw --category small --markers 1 --samples 16
+    """
 
     out: Annotated[
         str, option("DIR", "folder for the pictures (default: fidsplat-experiments/blender)", "-o")
@@ -158,18 +152,15 @@ Examples:
 
 @dataclass
 class Merge:
-    """Join the results of shards."""
+    """Join results of shards: NAME-1-of-4.jsonl and so on in the folders become NAME.jsonl.
 
-    HELP: ClassVar[
-        str
-    ] = """Join results of shards: NAME-1-of-4.jsonl and so on in the folders become NAME.jsonl.
+    What NAME.jsonl holds beside them stays. Warns of shards that are missing, and where the results are not
+    of one device, version or code.
 
-What NAME.jsonl holds beside them stays. Warns of shards that are missing, and where the results are not of
-one device, version or code.
-
-Examples:
-  fidsplat experiment merge shards -o results
-  fidsplat experiment merge machine-1 machine-2 -o results"""
+    Examples:
+      fidsplat experiment merge shards -o results
+      fidsplat experiment merge machine-1 machine-2 -o results
+    """
 
     folders: Annotated[Folders, option("DIR", "folders with results of shards")]
     out: Annotated[
@@ -210,16 +201,15 @@ Examples:
 
 @dataclass
 class Report:
-    """A page with tables, charts and picture sheets from results."""
+    """Write report.md: tables as in the paper, beside the paper's figures.
 
-    HELP: ClassVar[str] = """Write report.md: tables as in the paper, beside the paper's figures.
+    Charts, pictures and small tables of all results lie in its folder, or for FILE.md in a folder of that
+    name; the report can be made again from those tables. It says what was not measured.
 
-Charts, pictures and small tables of all results lie in its folder, or for FILE.md in a folder of that name;
-the report can be made again from those tables. It says what was not measured.
-
-Examples:
-  fidsplat experiment report
-  fidsplat experiment report results -o docs/results.md"""
+    Examples:
+      fidsplat experiment report
+      fidsplat experiment report results -o docs/results.md
+    """
 
     folders: Annotated[Folders, option("DIR", "folders with results (default: fidsplat-experiments)")] = ()
     out: ReportTo = None

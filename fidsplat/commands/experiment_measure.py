@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 from fidsplat.commands.experiment_files import CATEGORY_HELP, write_report
 from fidsplat.commands.output import Json, console, option, print_json
@@ -110,20 +110,19 @@ def print_files(files: Iterable[str]) -> None:
 
 @dataclass
 class Angles(Threaded):
-    """Table 3: how far markers may tilt and still be found and read."""
+    """The largest tilt at which each detector finds and reads each marker (table 3).
 
-    HELP: ClassVar[str] = """The largest tilt at which each detector finds and reads each marker (table 3).
+    Every tilt from 0 to 89.8 degrees in steps of 0.2 is drawn and shown to every detector: for tags OpenCV's
+    aruco and the AprilTag library (if pupil-apriltags is installed), for QR codes OpenCV's, zxing-cpp, and
+    zxing-cpp after the picture was made taller. Protocols: fixed-plane (2 x 2 plane, 800 x 800) and
+    fixed-module (8 px a module, 1600 x 1600). A run that was stopped goes on where it was.
 
-Every tilt from 0 to 89.8 degrees in steps of 0.2 is drawn and shown to every detector: for tags OpenCV's
-aruco and the AprilTag library (if pupil-apriltags is installed), for QR codes OpenCV's, zxing-cpp, and
-zxing-cpp after the picture was made taller. Protocols: fixed-plane (2 x 2 plane, 800 x 800) and fixed-module
-(8 px a module, 1600 x 1600). A run that was stopped goes on where it was.
-
-Examples:
-  fidsplat experiment angles --quick
-  fidsplat experiment angles --ideal                     only the detectors' ceiling; no device needed
-  fidsplat experiment angles --protocol fixed-plane --category small --tilts 60:89.8:0.2
-  fidsplat experiment angles --shard 1/4 --device opencl:nvidia"""
+    Examples:
+      fidsplat experiment angles --quick
+      fidsplat experiment angles --ideal                     only the detectors' ceiling; no device needed
+      fidsplat experiment angles --protocol fixed-plane --category small --tilts 60:89.8:0.2
+      fidsplat experiment angles --shard 1/4 --device opencl:nvidia
+    """
 
     protocol: Annotated[Names, option("NAME", "fixed-plane or fixed-module (default: both)")] = ()
     tilts: Annotated[str | None, option("A:B:STEP", "degrees, joined by commas (default: 0:89.8:0.2)")] = None
@@ -135,18 +134,17 @@ Examples:
 
 @dataclass
 class Views(Compared):
-    """Table 4: PSNR, SSIM, FLIP and LPIPS of 20 novel views."""
+    """PSNR, SSIM, FLIP and LPIPS of 20 random views of each marker (table 4).
 
-    HELP: ClassVar[str] = """PSNR, SSIM, FLIP and LPIPS of 20 random views of each marker (table 4).
+    Ground truth: the exact renderer (a pixel is the mean of its square), the same with means of linear light,
+    and Blender's pictures where `fidsplat experiment blender` has made them. FLIP needs flip-evaluator, LPIPS
+    weights. A run that was stopped goes on where it was.
 
-Ground truth: the exact renderer (a pixel is the mean of its square), the same with means of linear light,
-and Blender's pictures where `fidsplat experiment blender` has made them. FLIP needs flip-evaluator, LPIPS
-weights. A run that was stopped goes on where it was.
-
-Examples:
-  fidsplat experiment views --quick
-  fidsplat experiment views --category huge --mixture fitted
-  fidsplat experiment views --blender pictures/blender"""
+    Examples:
+      fidsplat experiment views --quick
+      fidsplat experiment views --category huge --mixture fitted
+      fidsplat experiment views --blender pictures/blender
+    """
 
     def run(self) -> int:
         return measure(("views",), self.options(), self.json)
@@ -154,16 +152,15 @@ Examples:
 
 @dataclass
 class Counts(Measuring):
-    """Table 2 and the figure: components, rectangles, Gaussians, seconds."""
+    """Components, rectangles, Gaussians and seconds of each marker (table 2, figure).
 
-    HELP: ClassVar[str] = """Components, rectangles, Gaussians and seconds of each marker (table 2, figure).
+    Squares of modules, runs of rows and the minimum partition, for every mixture. The time is that from the
+    text to the splats in a process that has made the marker before; keep the machine quiet.
 
-Squares of modules, runs of rows and the minimum partition, for every mixture. The time is that from the
-text to the splats in a process that has made the marker before; keep the machine quiet.
-
-Examples:
-  fidsplat experiment counts
-  fidsplat experiment counts --category huge"""
+    Examples:
+      fidsplat experiment counts
+      fidsplat experiment counts --category huge
+    """
 
     def run(self) -> int:
         return measure(("counts",), self.options(), self.json)
@@ -171,16 +168,16 @@ Examples:
 
 @dataclass
 class Localisation(Threaded):
-    """Pose errors by distance and tilt."""
+    """Pose errors of AprilTags and small QR codes by distance and tilt.
 
-    HELP: ClassVar[str] = """Pose errors of AprilTags and small QR codes by distance and tilt.
+    Codes of 0.16 m; 1280 x 720, 60 degrees; 0.5 to 4 m, 0 to 70 degrees; corners by `fidsplat detect`. The
+    same cameras for every method, the ideal texture's errors beside them. A run that was stopped goes on
+    where it was.
 
-Codes of 0.16 m; 1280 x 720, 60 degrees; 0.5 to 4 m, 0 to 70 degrees; corners by `fidsplat detect`. The same
-cameras for every method, the ideal texture's errors beside them. A run that was stopped goes on where it was.
-
-Examples:
-  fidsplat experiment localisation --quick
-  fidsplat experiment localisation --mixture fitted"""
+    Examples:
+      fidsplat experiment localisation --quick
+      fidsplat experiment localisation --mixture fitted
+    """
 
     def run(self) -> int:
         from fidsplat.experiments.localisation import LOCATED
@@ -192,17 +189,14 @@ Examples:
 
 @dataclass
 class Pictures(Drawn, Basic):
-    """Picture sheets: every method beside the ideal."""
+    """Draw sheets of marker 0 of each category, by every method, at tilts of 0, 45 and 70 degrees.
 
-    HELP: ClassVar[
-        str
-    ] = """Draw sheets of marker 0 of each category, by every method, at tilts of 0, 45 and 70 degrees.
+    The report takes them in.
 
-The report takes them in.
-
-Examples:
-  fidsplat experiment pictures
-  fidsplat experiment pictures --category huge --mixture fitted"""
+    Examples:
+      fidsplat experiment pictures
+      fidsplat experiment pictures --category huge --mixture fitted
+    """
 
     def run(self) -> int:
         files = draw_sheets(self.options())
@@ -233,17 +227,16 @@ def draw_sheets(options: Options) -> list[str]:
 
 @dataclass
 class All(Compared):
-    """Every experiment, then the report."""
+    """Counts, localisation, views and angles, then the report.
 
-    HELP: ClassVar[str] = """Counts, localisation, views and angles, then the report.
+    --quick takes under five minutes on two cores. A run that was stopped loses nothing that was finished: the
+    same command goes on. Many machines share the work by --shard, and `merge` joins their results.
 
---quick takes under five minutes on two cores. A run that was stopped loses nothing that was finished: the
-same command goes on. Many machines share the work by --shard, and `merge` joins their results.
-
-Examples:
-  fidsplat experiment all --quick
-  fidsplat experiment all -o results --device opencl:nvidia
-  fidsplat experiment all --shard 2/8 -o shards"""
+    Examples:
+      fidsplat experiment all --quick
+      fidsplat experiment all -o results --device opencl:nvidia
+      fidsplat experiment all --shard 2/8 -o shards
+    """
 
     def run(self) -> int:
         from fidsplat.experiments.run import NAMES, check

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -22,36 +22,35 @@ _OTHER_PICTURES = (".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".exr", ".
 
 @dataclass
 class Render:
-    """Draw a scene or a splat file."""
+    """Draw a scene file or a bare splat file.
 
-    HELP: ClassVar[str] = """Draw a scene file or a bare splat file.
+    A splat file without a scene is seen from -z, as large as fits a picture of 1280 x 720. OUT.png names the
+    colour picture; other outputs stand beside it as OUT-depth.png and so on. Any other OUT is a folder for
+    rgb.png, depth.png and so on. Depth comes as .npy (metres), .png (16-bit millimetres) and -turbo.png
+    (colours); labels, ids and counts as .npy and .png (colours).
 
-A splat file without a scene is seen from -z, as large as fits a picture of 1280 x 720.
-OUT.png names the colour picture; other planes stand beside it as OUT-depth.png and so on. Any other OUT is a
-folder for rgb.png, depth.png and so on. Depth comes as .npy (metres), .png (16-bit millimetres) and
--turbo.png (colours); labels, ids and counts as .npy and .png (colours).
+    Outputs:
+      rgb alpha label splat_id            splat_id: index of the heaviest splat; label: its label
+      depth depth_median depth_first      metres along z; first: where opacity reaches the quality's first_hit
+      distance distance_median distance_first            the same along the ray
+      normal normal_world                 towards the camera, in its axes or the world's
+      blended                             number of splats that made the pixel
 
-Planes:
-  rgb alpha label splat_id            splat_id: index of the heaviest splat; label: its label
-  depth depth_median depth_first      metres along z; first: where the opacity reaches the quality's first_hit
-  distance distance_median distance_first            the same along the ray
-  normal normal_world                 towards the camera, in its axes or the world's
-  blended                             number of splats that made the pixel
+    Quality: standard fast reference gsplat surfel; any knob of fs.Quality may follow, or stand alone and
+    change standard: fast,samples=2,alpha_cutoff=1e-3. Markers of a scene file that do not say how they are
+    made take marker.mixture, marker.levels, marker.density, marker.growth and marker.template from it.
 
-Quality: standard fast reference gsplat surfel; any knob of fs.Quality may follow, or stand alone and change
-standard: fast,samples=2,alpha_cutoff=1e-3. Markers of a scene file that do not say how they are made take
-marker.mixture, marker.levels, marker.density, marker.growth and marker.template from it.
+    Lenses, shutters and motion, fog, backgrounds, sensors and boxes are tables of a scene file
+    (docs/scene-files.md); they go together.
 
-Lenses, shutters and motion, fog, backgrounds, sensors and boxes are tables of a scene file
-(docs/scene-files.md); they go together.
-
-Examples:
-  fidsplat render scene.toml
-  fidsplat render scene.toml --quality standard,alpha_cutoff=1e-3,samples=2
-  fidsplat render scene.toml -o frames --outputs rgb,depth,normal,label
-  fidsplat render tag.ply -o tag.png --device reference --quality gsplat
-  fidsplat render scene.toml --max-error 1e-3        measures first, and keeps what it found for the next time
-  fidsplat render scene.toml --max-ms 20"""
+    Examples:
+      fidsplat render scene.toml
+      fidsplat render scene.toml --quality standard,alpha_cutoff=1e-3,samples=2
+      fidsplat render scene.toml -o frames --outputs rgb,depth,normal,label
+      fidsplat render tag.ply -o tag.png --device reference --quality gsplat
+      fidsplat render scene.toml --max-error 1e-3        measures first, and keeps what it found
+      fidsplat render scene.toml --max-ms 20
+    """
 
     source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply", "what to draw")]
     out: Annotated[
@@ -59,7 +58,7 @@ Examples:
     ] = None
     outputs: Annotated[
         str | None,
-        option("A,B,...", "planes, named above (default: the scene's, or rgb)"),
+        option("A,B,...", "output images, named above (default: the scene's, or rgb)"),
     ] = None
     device: Annotated[
         str | None,

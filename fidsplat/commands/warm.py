@@ -2,25 +2,24 @@
 
 import time
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from fidsplat.commands.output import Json, console, option, print_json
 
 
 @dataclass
 class Warm:
-    """Compile what scenes commonly call for, so that first pictures come at once."""
+    """Compile what scenes commonly call for, so that first pictures come at once.
 
-    HELP: ClassVar[str] = """Compile what scenes commonly call for, so that first pictures come at once.
+    The kernels of a scene are compiled when it is first drawn, which takes a second or more, and kept in the
+    caches of pyopencl, of Warp and of the driver. This fills them: plain colours and spherical harmonics,
+    with and without markers, the usual outputs. Worth it once after an installation, an update or a change of
+    the driver. What is there already takes no time.
 
-The kernels of a scene are compiled when it is first drawn, which takes a second or more, and kept in the
-caches of pyopencl, of Warp and of the driver. This fills them: plain colours and spherical harmonics, with
-and without markers, the usual outputs. Worth it once after an installation, an update or a change of the
-driver. What is there already takes no time.
-
-Examples:
-  fidsplat warm
-  fidsplat warm --device opencl:nvidia --json"""
+    Examples:
+      fidsplat warm
+      fidsplat warm --device opencl:nvidia --json
+    """
 
     device: Annotated[
         str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")

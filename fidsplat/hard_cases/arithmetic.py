@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.base import ProbesArithmetic
+from fidsplat.backends.base import Probed
 from fidsplat.hard_cases.case import Finding
 from fidsplat.random_clouds import log_uniform
 from fidsplat.render import Renderer
@@ -57,7 +57,7 @@ def measure(renderer: Renderer, seed: int = 0) -> Arithmetic | None:
         DeviceError: the device cannot compile or run the kernels.
     """
     backend = renderer.backend
-    if not isinstance(backend, ProbesArithmetic):
+    if not isinstance(backend, Probed):
         return None
     generator = np.random.default_rng(seed)
     exponents = generator.uniform(-14, 0, _COUNT).astype(np.float32).astype(float)
@@ -65,7 +65,7 @@ def measure(renderer: Renderer, seed: int = 0) -> Arithmetic | None:
     above, below = (
         log_uniform(generator, 1e-9, 1e9, _COUNT).astype(np.float32).astype(float) for _ in range(2)
     )
-    got = backend.run_arithmetic(exponents, shares, above, below)
+    got = backend.probe().arithmetic(exponents, shares, above, below)
     wide_above, wide_below = above.astype(np.longdouble), below.astype(np.longdouble)
     truth = {
         "exp": np.exp(exponents),

@@ -30,7 +30,7 @@ SHARES = floats(2.0**-24, 1.0)
 
 def functions(renderer, exponents=EXPONENTS, shares=SHARES):
     """Bits of the device's short functions there."""
-    got = renderer.backend.run_arithmetic(exponents, shares, shares, shares)
+    got = renderer.backend.probe().arithmetic(exponents, shares, shares, shares)
     return got["fast_exp"], got["fast_log"]
 
 

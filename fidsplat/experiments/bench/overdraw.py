@@ -21,5 +21,5 @@ def overdraw(renderer: Renderer, resident: ResidentCloud, camera: Camera, qualit
     """
     data = resident._data
     features, view = prepare(data, Capture(camera, quality=quality))
-    features = replace(features, taps=("overdraw",))
+    features = replace(features, outputs=("overdraw",))
     return renderer.backend.pipeline(features).render(data, view).read("overdraw")
