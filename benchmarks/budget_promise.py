@@ -19,6 +19,7 @@ from functools import partial
 
 import numpy as np
 from measuring import PROGRESS, facts, keep, options, show
+from random_scenes import HELD_OUT, RandomScene, random_scene
 from rich.progress import track
 
 import fidsplat as fs
@@ -26,7 +27,6 @@ from fidsplat.accuracy import errors, truth
 from fidsplat.budget import choose
 from fidsplat.errors import InputError
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED
-from fidsplat.random_clouds import HELD_OUT, RandomScene, random_scene
 from fidsplat.timing import Timer, frame_timer, take_turns
 
 BOUNDS = (1e-2, 1e-3, 1e-4)

@@ -1,5 +1,5 @@
 """The settings that a budget chooses among, with what each was measured to give (table.json, made by
-tools/budget_table.py)."""
+benchmarks/budget_table.py)."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from fidsplat.commands.output import console, json_text, option, print_table, writable_file
+from fidsplat.commands.output import console, json_text, option, print_table, say, writable_file
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
 
@@ -128,9 +128,7 @@ def _print(results: "list[Result]", where: "Console") -> None:
         drawn = [result for result in results if result.scene == scene]
         for result in drawn:
             if result.timer.error:
-                where.print(
-                    f"{scene} on {result.device.name}: {result.timer.error}", markup=False, soft_wrap=True
-                )
+                say(where, f"{scene} on {result.device.name}: {result.timer.error}")
         drawn = [result for result in drawn if result.timer.ms]
         if drawn:
             _print_scene(scene, drawn, where)
@@ -159,8 +157,7 @@ def _print_scene(scene: str, drawn: "list[Result]", where: "Console") -> None:
     print_table(where, f"{scene}: {BENCH_SCENES[scene].about}", heads, rows)
     for result in drawn:
         device, frames = result.device, len(result.timer.ms)
-        words = f"{device.name}: {device.title}, {device.version}; {frames} frames"
-        where.print(words, markup=False, soft_wrap=True)
+        say(where, f"{device.name}: {device.title}, {device.version}; {frames} frames")
     where.print()
 
 

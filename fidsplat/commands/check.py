@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from fidsplat.commands.output import Json, console, option, print_json, print_table
+from fidsplat.commands.output import Device, Json, console, option, print_json, print_table, say
 from fidsplat.errors import InputError
 from fidsplat.files import writable_folder
 
@@ -34,9 +34,7 @@ class Check:
       fidsplat check --fuzz 100000
     """
 
-    device: Annotated[
-        str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")
-    ] = None
+    device: Device = None
     out: Annotated[
         str, option("DIR", "folder for the picture and the fuzzer's state (default: fidsplat-check)", "-o")
     ] = "fidsplat-check"
@@ -66,7 +64,7 @@ class Check:
         else:
             _print(result, where)
             if file is not None:
-                where.print(f"worst case in {file}", markup=False, soft_wrap=True)
+                say(where, f"worst case in {file}")
         return 0 if result.passed else 1
 
     def _fuzz(self, renderer: "Renderer", folder: Path, where: "Console") -> int:
@@ -96,20 +94,16 @@ def _print(result: "CheckResult", where: "Console") -> None:
         facts = result.arithmetic
         heads = ("function", "error [ulp]", "promised", "")
         print_table(where, f"Arithmetic of {device.title}", heads, _ulps(facts))
-        where.print(
-            f"float64: {'yes' if facts.float64 else 'no'}; "
-            f"float32 below 1.2e-38: {'kept' if facts.denormals else 'flushed to 0'}\n",
-            markup=False,
-        )
-    where.print(f"Hard cases on {device.title}, {device.version}", markup=False)
+        kept = "kept" if facts.denormals else "flushed to 0"
+        say(where, f"float64: {'yes' if facts.float64 else 'no'}; float32 below 1.2e-38: {kept}\n")
+    say(where, f"Hard cases on {device.title}, {device.version}")
     heads = ("group", "cases", "pictures", "colour", "uncertified", "depth", "uncertified", "verdict")
     bounds = ("bound", "", "", "", f"{COLOR_TOLERANCE:.0e}", "", f"{DEPTH_TOLERANCE:.0e}", "")
     print_table(where, "Largest errors", heads, [bounds, *(_row(*group) for group in result.groups.items())])
-    for words in result.failures:
-        where.print(f"failed: {words}", markup=False, soft_wrap=True)
+    say(where, *(f"failed: {words}" for words in result.failures))
     wrong = len(result.failures)
     verdict = f"{wrong} check{' does' if wrong == 1 else 's do'} not hold" if wrong else "everything holds"
-    where.print(f"{verdict}; {result.seconds:.0f} s", markup=False)
+    say(where, f"{verdict}; {result.seconds:.0f} s")
 
 
 def _ulps(facts: "Arithmetic") -> list[tuple[str, ...]]:
@@ -148,10 +142,9 @@ def _print_fuzz(state: "FuzzState", renderer: "Renderer", where: "Console") -> N
     ]
     heads = ("output", "beyond the certificate", "seed", "with it", "seed")
     print_table(where, f"Largest errors of random scenes on {renderer.device.title}", heads, rows)
-    where.print(
+    say(
+        where,
         f"{state.splats:,} splats in {state.scenes:,} scenes, {state.pixels:,} pixels, "
         f"{state.risky / max(state.pixels, 1):.2%} with certificates above 0.05; {state.seconds:.0f} s\n"
         f"failing seeds: {' '.join(map(str, state.failing)) or 'none'}",
-        markup=False,
-        soft_wrap=True,
     )

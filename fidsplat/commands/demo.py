@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
-from fidsplat.commands.output import Json, console, option, print_json, print_table
+from fidsplat.commands.output import Device, Json, console, option, print_json, print_table, say
 
 if TYPE_CHECKING:
     from fidsplat.experiments.demo import DemoResult, Sighting
@@ -27,9 +27,7 @@ class Demo:
     out: Annotated[
         str, option("DIR", "folder for pictures, scene and figures (default: fidsplat-demo)", "-o")
     ] = "fidsplat-demo"
-    device: Annotated[
-        str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")
-    ] = None
+    device: Device = None
     mixture: Annotated[
         str, option("NAME", "of the markers: exact, fitted or paper, as `fidsplat marker` (default: exact)")
     ] = "exact"
@@ -52,19 +50,16 @@ class Demo:
                 "degrees. ms: a frame with colour, depth, normals and labels."
             )
             markers = sum(result.marker_splats.values())
-            where.print(
+            say(
+                where,
                 f"{result.background_splats:,} background and {markers:,} marker splats; "
                 f"{result.seconds:.1f} s in all; pictures in {self.out}/contact-sheet.png",
-                markup=False,
-                soft_wrap=True,
             )
         if not result.passed:
             missed = [
                 f"{s.reading.placed.marker.spec} in '{s.view}'" for s in result.sightings if s.passed is False
             ]
-            where.print(
-                "failed: " + "; ".join([*missed, *(f"read {s}" for s in result.unexpected)]), markup=False
-            )
+            say(where, "failed: " + "; ".join([*missed, *(f"read {s}" for s in result.unexpected)]))
         return 0 if result.passed else 1
 
 

@@ -5,14 +5,11 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
-from fidsplat.commands.output import Json, console, option, print_json
-from fidsplat.commands.sweeps import Folders, Names, ReportTo, Seed, need_reports, switch
+from fidsplat.commands.output import Json, console, option, switch, tell
+from fidsplat.commands.sweeps import Folders, Names, ReportTo, Seed, need_reports
 from fidsplat.errors import InputError
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 CATEGORY_HELP = "apriltag, small, medium, large or huge, once more for each (default: all)"
 
@@ -61,17 +58,13 @@ class Dataset:
             check_pictures(self.blender, self.truth.removeprefix("blender-"), self.seed)
         folder = writable_folder(self.out)
         wanted = dataset_scenes(chosen_categories(self.category), self.markers)
-        where = console(self.json)
         with Progress(console=console(True), transient=True) as bars:
             scenes = [
                 write_scene(part, folder, self.seed, self.truth, self.blender)
                 for part in bars.track(wanted, description="scenes")
             ]
-        if self.json:
-            print_json({"folder": str(folder), "scenes": [scene.name for scene in scenes]})
-        else:
-            where.print(f"{len(scenes)} scenes in {folder}", markup=False, soft_wrap=True)
-        return 0
+        names = [scene.name for scene in scenes]
+        return tell(self.json, {"folder": str(folder), "scenes": names}, f"{len(names)} scenes in {folder}")
 
 
 @dataclass
@@ -111,16 +104,11 @@ class Blender:
         from fidsplat.experiments import blender
         from fidsplat.experiments.setup import MARKERS, chosen_categories
 
-        where = console(self.json)
         environment = self.environment or blender.default_environment()
         if self.install:
-            with where.status("") as status:
+            with console(self.json).status("") as status:
                 python = blender.install(environment, status.update)
-            if self.json:
-                print_json({"python": str(python)})
-            else:
-                where.print(f"Blender is in {environment}", markup=False, soft_wrap=True)
-            return 0
+            return tell(self.json, {"python": str(python)}, f"Blender is in {environment}")
         if not (1 <= self.markers <= MARKERS and self.samples >= 1):
             raise InputError(f"--markers must be 1 to {MARKERS} and --samples at least 1")
         if self.threads is not None and self.threads < 1:
@@ -143,11 +131,7 @@ class Blender:
                 for _ in blender.render(jobs, view, environment, self.samples, threads=self.threads):
                     bars.advance(bar)
                     done += 1
-        if self.json:
-            print_json({"folder": str(folder), "pictures": done})
-        else:
-            where.print(f"{done} pictures in {folder}", markup=False, soft_wrap=True)
-        return 0
+        return tell(self.json, {"folder": str(folder), "pictures": done}, f"{done} pictures in {folder}")
 
 
 @dataclass
@@ -189,14 +173,11 @@ class Merge:
                     warnings.warn(f"{text}; the report lists them", stacklevel=2)
         if not result:
             raise InputError(f"no results of shards in {', '.join(self.folders) or 'no folder'}")
-        if self.json:
-            print_json(result)
-        else:
-            for facts in result.values():
-                again = f", {facts['repeated']} of them repeated" if facts["repeated"] else ""
-                text = f"{facts['file']}: {facts['points']} results of {facts['files']} files{again}"
-                console(False).print(text, markup=False, soft_wrap=True)
-        return 0
+        lines = []
+        for facts in result.values():
+            again = f", {facts['repeated']} of them repeated" if facts["repeated"] else ""
+            lines.append(f"{facts['file']}: {facts['points']} results of {facts['files']} files{again}")
+        return tell(self.json, result, *lines)
 
 
 @dataclass
@@ -217,17 +198,13 @@ class Report:
 
     def run(self) -> int:
         folders = [Path(folder) for folder in self.folders or ("fidsplat-experiments",)]
-        return write_report(folders, Path(self.out or folders[0]), console(self.json), self.json)
+        files = write_report(folders, Path(self.out or folders[0]))
+        return tell(self.json, {"files": files}, f"report in {files[0]}")
 
 
-def write_report(folders: list[Path], out: Path, where: Console, as_json: bool = False) -> int:
-    """Write the report and say where it is."""
+def write_report(folders: list[Path], out: Path) -> list[str]:
+    """Write the report; returns its files, the page first."""
     need_reports()
     from fidsplat.experiments.report import make_report
 
-    files = make_report(folders, out)
-    if as_json:
-        print_json({"files": [str(file) for file in files]})
-    else:
-        where.print(f"report in {files[0]}", markup=False, soft_wrap=True)
-    return 0
+    return [str(file) for file in make_report(folders, out)]

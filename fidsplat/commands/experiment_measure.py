@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from fidsplat.commands.experiment_files import CATEGORY_HELP, write_report
-from fidsplat.commands.output import Json, console, option, print_json
-from fidsplat.commands.sweeps import Names, Overwrite, Seed, need_reports, run_sweeps, switch
+from fidsplat.commands.output import Json, console, option, say, switch, tell
+from fidsplat.commands.sweeps import Names, Overwrite, Seed, need_reports, run_sweeps
 from fidsplat.errors import InputError
 
 if TYPE_CHECKING:
@@ -95,17 +94,7 @@ def measure(names: tuple[str, ...], options: Options, as_json: bool) -> int:
     with prepared(names, options) as sweeps:
         run_sweeps(sweeps)
         files = {sweep.name: str(sweep.results.file) for sweep in sweeps if sweep.points}
-    if as_json:
-        print_json({"files": files})
-    else:
-        print_files(files.values())
-    return 0
-
-
-def print_files(files: Iterable[str]) -> None:
-    """A name a line."""
-    for file in files:
-        console(False).print(file, markup=False, soft_wrap=True)
+    return tell(as_json, {"files": files}, *files.values())
 
 
 @dataclass
@@ -200,11 +189,7 @@ class Pictures(Drawn, Basic):
 
     def run(self) -> int:
         files = draw_sheets(self.options())
-        if self.json:
-            print_json({"files": files})
-        else:
-            print_files(files)
-        return 0
+        return tell(self.json, {"files": files}, *files)
 
 
 def draw_sheets(options: Options) -> list[str]:
@@ -249,4 +234,5 @@ class All(Compared):
         if self.shard is not None:
             return status
         draw_sheets(options)
-        return write_report([options.out], options.out, console(True))
+        say(console(True), f"report in {write_report([options.out], options.out)[0]}")
+        return status

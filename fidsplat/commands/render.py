@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.output import Json, console, late_progress, option, print_json, print_table
+from fidsplat.commands.output import Json, console, late_progress, option, print_json, print_table, say
 from fidsplat.errors import FidsplatError, InputError
 from fidsplat.files import path_of, writable_folder
 
@@ -141,9 +141,8 @@ class Render:
         rows += [("with compilation and transfer", f"{seconds:.2f} s")]
         print_table(where, f"{self.source} on {renderer.device.title}", ("", ""), rows)
         if choice is not None:
-            where.print(f"chosen: {choice.summary}", markup=False, soft_wrap=True)
-        for file in files:
-            where.print(str(file), markup=False, soft_wrap=True)
+            say(where, f"chosen: {choice.summary}")
+        say(where, *map(str, files))
         return 0
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from fidsplat.commands.output import Json, console, option, print_json
-from fidsplat.commands.sweeps import Folders, Overwrite, ReportTo, need_reports, run_sweeps, switch, words
+from fidsplat.commands.output import Device, Json, option, switch, tell
+from fidsplat.commands.sweeps import Folders, Overwrite, ReportTo, need_reports, run_sweeps, words
 from fidsplat.errors import InputError
 
 DEFAULT_FOLDER = "fidsplat-tradeoff"
@@ -37,11 +37,7 @@ class TradeoffReport:
 
         folders = [Path(folder) for folder in self.folders or (DEFAULT_FOLDER,)]
         files = write_report(folders, Path(self.out or folders[0]))
-        if self.json:
-            print_json({"files": [str(file) for file in files]})
-        else:
-            console(False).print(f"report in {files[0]}", markup=False, soft_wrap=True)
-        return 0
+        return tell(self.json, {"files": [str(file) for file in files]}, f"report in {files[0]}")
 
 
 @dataclass
@@ -76,9 +72,7 @@ class Tradeoff:
             "-o",
         ),
     ] = None
-    device: Annotated[
-        str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")
-    ] = None
+    device: Device = None
     scenes: Annotated[tuple[str, ...], option("NAME...", "scenes (default: all; --quick: four)")] = ()
     knobs: Annotated[
         tuple[str, ...],
@@ -101,11 +95,5 @@ class Tradeoff:
             measured = run_sweeps([sweep])
             file, points = sweep.results.file, len(sweep.points)
         refused = [f"{words(record.key)}: {record.result['error']}" for record in measured if record.failed]
-        if self.json:
-            print_json({"file": str(file), "points": points, "refused": refused})
-            return 0
-        where = console(False)
-        for line in refused:
-            where.print(f"not measured: {line}", markup=False, soft_wrap=True)
-        where.print(f"{file}; fidsplat tradeoff report {folder}", markup=False, soft_wrap=True)
-        return 0
+        lines = [*(f"not measured: {line}" for line in refused), f"{file}; fidsplat tradeoff report {folder}"]
+        return tell(self.json, {"file": str(file), "points": points, "refused": refused}, *lines)

@@ -6,12 +6,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from random_scenes import HELD_OUT, random_scene
 
 import fidsplat as fs
 from fidsplat.accuracy import errors, truth
 from fidsplat.budget import calibrate, choose, search, store, table
 from fidsplat.errors import InputError
-from fidsplat.random_clouds import HELD_OUT, random_scene
 from fidsplat.timing import Clock, Timer
 
 BACKEND = "opencl"

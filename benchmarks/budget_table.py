@@ -1,10 +1,10 @@
 """Makes fidsplat/budget/table.json: the settings that `fs.quality_within` chooses among, with their errors
 over random scenes and what they cost.
 
-    python tools/budget_table.py --device opencl:pocl       about 15 minutes on two busy cores
-    python tools/budget_table.py --device opencl:nvidia     adds the settings of GPUs
+    python benchmarks/budget_table.py --device opencl:pocl       about 15 minutes on two busy cores
+    python benchmarks/budget_table.py --device opencl:nvidia     adds the settings of GPUs
 
-Each scene of `fidsplat/random_clouds.py` is drawn with every setting and compared with the same
+Each scene of `random_scenes.py` is drawn with every setting and compared with the same
 definition at full precision, which the device draws in float64 (`fidsplat.accuracy.reference_for`). Costs are
 medians of frames of the scenes of TIMED, drawn in turn; on CPUs those of the processor's time. In a second
 round the settings on the front of error and cost are drawn with every set of MODIFIERS, and FINEST beside
@@ -21,13 +21,14 @@ import time
 from datetime import date
 
 import numpy as np
+from random_scenes import random_scene
 
 import fidsplat as fs
 from fidsplat.accuracy import error_bound, errors, reference_for, truth
 from fidsplat.budget.table import FILE, Setting
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
-from fidsplat.random_clouds import random_cloud, random_scene, standard_camera
+from fidsplat.random_clouds import random_cloud, standard_camera
 from fidsplat.timing import Timer, frame_timer, take_turns
 
 CUTOFFS = (0.03, 0.015, 2 / 255, 1 / 255, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 1e-7)
