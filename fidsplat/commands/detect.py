@@ -1,6 +1,6 @@
 """`fidsplat detect`."""
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Annotated
 
 import tyro
@@ -49,23 +49,13 @@ class Detect:
         if scene is not None and families is None:
             from fidsplat.experiments.readback import families_of
 
-            families = families_of(scene.markers)
+            families = families_of(placed.marker for placed in scene.markers)
         found = detect(image, families)
         result = {
             "image": self.image,
             "width": image.shape[1],
             "height": image.shape[0],
-            "detections": [
-                {
-                    "name": code.name,
-                    "kind": code.kind,
-                    "family": code.family,
-                    "id": code.id,
-                    "payload": code.payload,
-                    "corners": code.corners,
-                }
-                for code in found
-            ],
+            "detections": [{"name": code.name, **asdict(code)} for code in found],
         }
         readings = []
         if scene is not None:
@@ -86,17 +76,9 @@ class Detect:
             rows = [(code.name, at) for code, at in zip(found, corner, strict=True)]
             print_table(where, self.image, ("code", "corners [px]"), rows)
         if readings:
-            heads = (
-                "marker",
-                "found",
-                "distance [m]",
-                "position [mm]",
-                "angle [deg]",
-                "corners [px]",
-            )
-            print_table(
-                where, f"Against {self.scene}: distance, and errors", heads, map(reading_row, readings)
-            )
+            heads = ("marker", "found", "distance [m]", "position [mm]", "angle [deg]", "corners [px]")
+            title = f"Against {self.scene}: distance, and errors"
+            print_table(where, title, heads, map(reading_row, readings))
         return 0
 
     def _load_scene(self, shape: tuple[int, ...]):
