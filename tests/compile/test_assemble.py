@@ -206,7 +206,7 @@ def test_the_page_of_the_kernels_has_every_hook_and_no_other():
     folder = Path(__file__).resolve().parents[2] / "kernels"
     page = (folder / "README.md").read_text("utf-8")
     texts = [file.read_text("utf-8") for file in (folder / "opencl").rglob("*.cl")]
-    hooks = {hook for text in texts for hook in re.findall(r"^[ \t]*//OUTPUTS (\w+)", text, re.MULTILINE)}
+    hooks = {hook for text in texts for hook in re.findall(r"^[ \t]*//@@ (\w+)", text, re.MULTILINE)}
     assert len(hooks) > 50
     rows = page[page.index("| hook |") : page.index("## Dialect rules")].splitlines()[2:]
     listed = {name for row in rows if row for name in re.findall(r"`(\w+)`", row.split("|")[1])}
