@@ -1,5 +1,5 @@
 """Small random scenes of as many kinds as can be, the same on every machine for the same seed: the table of
-budgets is made from them (budget_table.py), and its promise is checked with others (budget_promise.py)."""
+budgets is made from them (budget_prices.py), and its promise is checked with others (budget_promise.py)."""
 
 from __future__ import annotations
 

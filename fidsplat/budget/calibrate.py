@@ -66,7 +66,7 @@ class Calibration:
         """Largest absolute error of rgb against the truth. What the truth may be off itself is added."""
         if quality not in self._errors:
             want, off = self._truth
-            self._tell(f"measuring errors ({len(self._errors) + 1} settings so far)")
+            self._tell(f"measuring errors ({len(self._errors) + 1} candidates so far)")
             frame = self.renderer.render(self._resident, self._capture, quality=quality)
             self._errors[quality] = errors(frame["rgb"], want).maximum + off
         return self._errors[quality]
@@ -79,7 +79,7 @@ class Calibration:
         """Times of qualities that this device draws. Frames take turns; one of each goes before those that
         count."""
         timers = [self.timer(quality) for quality in qualities]
-        self._tell(f"timing {len(timers)} settings")
+        self._tell(f"timing {len(timers)} candidates")
         take_turns(timers, repeats, least=min(FEWEST, repeats), seconds=PATIENCE, warm_up=1)
         return [Times(timer.median, float(np.quantile(timer.ms, 0.9))) for timer in timers]
 

@@ -116,10 +116,10 @@ class Render:
             frame = renderer.render(
                 scene, outputs=names, quality=self.quality if choice is None else choice.quality
             )
-            planes = {name: frame[name] for name in frame.outputs}
+            images = {name: frame[name] for name in frame.outputs}
         seconds = time.perf_counter() - begun
         bits = None if scene.sensor is None else scene.sensor.bits
-        files = [file for name, plane in planes.items() for file in save_output(name, plane, name_of, bits)]
+        files = [file for name, image in images.items() for file in save_output(name, image, name_of, bits)]
         if self.json:
             print_json(
                 {
@@ -158,7 +158,7 @@ def _named(source: str, key: str, of_scene: bool) -> Iterator[None]:
 
 
 def _names(out: str | None, source: Path):
-    """A function from a plane's name and a suffix to the file that it goes to, in a folder known to be
+    """A function from an output's name and a suffix to the file that it goes to, in a folder known to be
     writable."""
     if out == "" or not source.name:
         raise InputError(
@@ -169,11 +169,11 @@ def _names(out: str | None, source: Path):
         raise InputError(f"pictures are written as PNG: name {file.with_suffix('.png')}, or a folder")
     if file.suffix.lower() == ".png" and not file.is_dir():
         writable_folder(file.parent)
-        return lambda plane, suffix: file.with_name(
-            f"{file.stem}{'' if plane == 'rgb' else '-' + plane}{suffix}"
+        return lambda name, suffix: file.with_name(
+            f"{file.stem}{'' if name == 'rgb' else '-' + name}{suffix}"
         )
     writable_folder(file)
-    return lambda plane, suffix: file / f"{plane}{suffix}"
+    return lambda name, suffix: file / f"{name}{suffix}"
 
 
 def load_source(source: str, quality: str | None, progress: "Progress") -> "Scene":

@@ -104,7 +104,7 @@ def visible_share(placed: PlacedMarker, camera: Camera, label: np.ndarray) -> fl
     0 to 1.
 
     Args:
-        label: (h, w) int32, the label plane of the picture.
+        label: (h, w) int32, the output `label` of the picture.
     """
     rows, columns = placed.marker.bits.shape
     grow = np.array([1 + 2 * MARGIN / columns, 1 + 2 * MARGIN / rows, 1.0])

@@ -117,7 +117,7 @@ class OpenCLBackend(Workspace):
 
     @property
     def memory_bytes(self) -> int:
-        """Device memory that scratch buffers hold, and finished planes that nobody has any more."""
+        """Device memory that scratch buffers hold, and finished images that nobody has any more."""
         return self.pool.memory_bytes
 
     def release_scratch(self) -> None:

@@ -122,10 +122,10 @@ class OpenCLPipeline:
         stays, upload = resident.bytes_for(self._cloud_arrays)
         fixed = stays + SMALL + table_bytes(shape.lists, tiles, shape.chunks, shape.radix_bits)
         fixed += BIG * (4 + source.records["Bounds"].itemsize)
-        planes = 4 + sum(one.planes for one, _ in source.samples)
+        channels = 4 + sum(one.channels for one, _ in source.samples)
         if view.shots:
-            planes *= 2  # the picture's own beside those of a shot
-        fixed += 4 * tiles * shape.tile_width * shape.tile_height * planes  # whole tiles
+            channels *= 2  # the picture's own beside those of a shot
+        fixed += 4 * tiles * shape.tile_width * shape.tile_height * channels  # whole tiles
         pixels = view.width * view.height // view.samples**2
         fixed += 4 * pixels * sum(output.channels for output in self.features.images)
         fixed += sum(view.array(name).nbytes for name in self._view_arrays)
