@@ -9,9 +9,8 @@ from numbers import Real
 from typing import Any
 
 from fidsplat.budget import prices, store
-from fidsplat.budget.calibrate import Calibration
 from fidsplat.budget.prices import Candidate
-from fidsplat.budget.search import Search
+from fidsplat.budget.search import Calibration, Search
 from fidsplat.cameras import Camera
 from fidsplat.capture import Capture
 from fidsplat.errors import DeviceError, InputError

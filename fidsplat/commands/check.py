@@ -11,9 +11,9 @@ from fidsplat.files import writable_folder
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fidsplat.hard_cases.arithmetic import Arithmetic
     from fidsplat.hard_cases.check import CaseResult, CheckResult
-    from fidsplat.hard_cases.fuzz_run import FuzzState
+    from fidsplat.hard_cases.f_arithmetic import Arithmetic
+    from fidsplat.hard_cases.fuzz import FuzzState
     from fidsplat.render import Renderer
 
 
@@ -70,7 +70,7 @@ class Check:
     def _fuzz(self, renderer: "Renderer", folder: Path, where: "Console") -> int:
         from rich.progress import Progress
 
-        from fidsplat.hard_cases.fuzz_run import fuzz_run
+        from fidsplat.hard_cases.fuzz import fuzz_run
 
         wanted = self.fuzz or 0
         state = None
@@ -107,7 +107,7 @@ def _print(result: "CheckResult", where: "Console") -> None:
 
 
 def _ulps(facts: "Arithmetic") -> list[tuple[str, ...]]:
-    from fidsplat.hard_cases.arithmetic import BOUNDS
+    from fidsplat.hard_cases.f_arithmetic import BOUNDS
 
     rows = []
     for name, ulp in facts.ulp.items():

@@ -10,7 +10,7 @@ from random_scenes import HELD_OUT, random_scene
 
 import fidsplat as fs
 from fidsplat.accuracy import errors, truth
-from fidsplat.budget import calibrate, choose, prices, search, store
+from fidsplat.budget import choose, prices, search, store
 from fidsplat.errors import InputError
 from fidsplat.timing import Clock, Timer
 
@@ -102,11 +102,11 @@ def test_what_the_truth_may_be_off_is_added(renderer, held_out, monkeypatch):
     capture = fs.Capture(scene.camera, background=scene.background)
 
     def measured():
-        return calibrate.Calibration(renderer, scene.cloud, capture, lambda text: None).error(fs.Quality())
+        return search.Calibration(renderer, scene.cloud, capture, lambda text: None).error(fs.Quality())
 
-    monkeypatch.setattr(calibrate, "error_bound", lambda *_: 0.0)
+    monkeypatch.setattr(search, "error_bound", lambda *_: 0.0)
     plain = measured()
-    monkeypatch.setattr(calibrate, "error_bound", lambda *_: 0.25)
+    monkeypatch.setattr(search, "error_bound", lambda *_: 0.25)
     assert measured() == plain + 0.25
 
 
@@ -121,7 +121,7 @@ def test_the_answer_is_kept_and_a_broken_file_is_made_anew(renderer, scene, monk
     first = within(renderer, scene, 1e-3)
     (file,) = store.folder().iterdir()
     with monkeypatch.context() as patch:
-        patch.setattr(calibrate.Calibration, "error", lambda *_: pytest.fail("it was measured again"))
+        patch.setattr(search.Calibration, "error", lambda *_: pytest.fail("it was measured again"))
         again = within(renderer, scene, 1e-3)
     assert dataclasses.replace(again, source="measured") == first
     for broken in (b"", b"{", b"[1]", b'{"knobs": {"alpha_cutoff": 7}, "error": 0, "ms": 0, "ms_late": 0}'):
@@ -194,7 +194,7 @@ def clock(monkeypatch):
 
         return Timer(frame, clock)
 
-    monkeypatch.setattr(calibrate.Calibration, "timer", timer)
+    monkeypatch.setattr(search.Calibration, "timer", timer)
 
 
 def test_the_most_accurate_in_time(renderer, scene, clock):
@@ -226,7 +226,7 @@ def test_a_time_is_kept_by_nine_frames_of_ten():
             return 1.0
 
         def times(self, qualities, repeats=9):
-            return [calibrate.Times(1.0, late[quality.alpha_cutoff]) for quality in qualities]
+            return [search.Times(1.0, late[quality.alpha_cutoff]) for quality in qualities]
 
     candidates = tuple(prices.Candidate({"alpha_cutoff": cutoff}, 0, 0, 0, 1.0) for cutoff in late)
     assert search.Search(Known(), candidates).most_accurate_in(5.0).error == 1e-2
