@@ -12,7 +12,7 @@ import json
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,7 @@ from fidsplat.files import atomic_write
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, RARE, RISKY, Picture, compare, draw, truth_of
 from fidsplat.hard_cases.clouds import quaternion
 from fidsplat.provenance import code_hash
-from fidsplat.quality import Quality
+from fidsplat.quality import ELLIPSOID, Quality
 from fidsplat.random_clouds import log_uniform
 from fidsplat.render import Renderer
 from fidsplat.rotations import quaternion_multiply, quaternion_to_matrix
@@ -93,6 +93,26 @@ def scene_of(seed: int) -> Picture:
     camera = Camera.pinhole(width, height, focal, focal, cx, cy, pose, near=near)
     quality = QUALITIES[int(generator.choice(len(QUALITIES), p=SHARES))]
     return Picture(cloud, camera, quality, ALL_OUTPUTS)
+
+
+def thick_scene_of(seed: int) -> Picture:
+    """The same with 3D Gaussians for most splats of no plane, drawn in one of the ways: a third standard
+    deviation from 1e-6 of the first two, needles and balls among them, to 100 times as large."""
+    flat, generator = scene_of(seed), np.random.default_rng([seed, 2])
+    cloud, count = flat.cloud, len(flat.cloud)
+    third = cloud.scales.max(axis=1) * log_uniform(generator, 1e-6, 1e2, count)
+    needle = generator.random(count) < 0.2
+    third[needle] = cloud.scales.min(axis=1)[needle]
+    chosen = generator.random(count) < 0.8
+    if cloud.planes is not None:
+        chosen &= cloud.planes < 0
+    scales = np.column_stack([cloud.scales, np.where(chosen, np.clip(third, 1e-7, 1e3), 0)])
+    arrays = (cloud.means, cloud.quats, scales, cloud.opacities)
+    thick = SplatCloud(*arrays, colors=cloud.colors, labels=cloud.labels, origin=cloud.origin)
+    if cloud.planes is not None:
+        thick = thick.with_planes(cloud.planes)
+    way = str(generator.choice(ELLIPSOID))
+    return replace(flat, cloud=thick, quality=flat.quality.with_(ellipsoid=way))
 
 
 def _edge_on(generator: np.random.Generator, mean: np.ndarray) -> np.ndarray:
