@@ -8,13 +8,14 @@ tenth in a coplanar group, half of those that are known as planes tilted, opacit
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
 from fidsplat.hard_cases.clouds import quaternion
-from fidsplat.quality import Quality
+from fidsplat.quality import ELLIPSOID, Quality
 from fidsplat.random_clouds import log_uniform
 from fidsplat.rotations import quaternion_multiply, quaternion_to_matrix
 from fidsplat.splats import SplatCloud
@@ -84,6 +85,26 @@ def scene_of(seed: int) -> Picture:
     camera = Camera.pinhole(width, height, focal, focal, cx, cy, pose, near=near)
     quality = QUALITIES[int(generator.choice(len(QUALITIES), p=SHARES))]
     return Picture(cloud, camera, quality, ALL_OUTPUTS)
+
+
+def thick_scene_of(seed: int) -> Picture:
+    """The same with 3D Gaussians for most splats of no plane, drawn in one of the ways: a third standard
+    deviation from 1e-6 of the first two, needles and balls among them, to 100 times as large."""
+    flat, generator = scene_of(seed), np.random.default_rng([seed, 2])
+    cloud, count = flat.cloud, len(flat.cloud)
+    third = cloud.scales.max(axis=1) * log_uniform(generator, 1e-6, 1e2, count)
+    needle = generator.random(count) < 0.2
+    third[needle] = cloud.scales.min(axis=1)[needle]
+    chosen = generator.random(count) < 0.8
+    if cloud.planes is not None:
+        chosen &= cloud.planes < 0
+    scales = np.column_stack([cloud.scales, np.where(chosen, np.clip(third, 1e-7, 1e3), 0)])
+    arrays = (cloud.means, cloud.quats, scales, cloud.opacities)
+    thick = SplatCloud(*arrays, colors=cloud.colors, labels=cloud.labels, origin=cloud.origin)
+    if cloud.planes is not None:
+        thick = thick.with_planes(cloud.planes)
+    way = str(generator.choice(ELLIPSOID))
+    return replace(flat, cloud=thick, quality=flat.quality.with_(ellipsoid=way))
 
 
 def _edge_on(generator: np.random.Generator, mean: np.ndarray) -> np.ndarray:

@@ -35,6 +35,7 @@ class Cloud:
     sh_degree: int = -1
     has_planes: bool = False
     footprint: str = "gaussian"
+    ellipsoids: str = "none"
 
 
 COLORS = Cloud()

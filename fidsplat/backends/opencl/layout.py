@@ -204,6 +204,17 @@ LAYOUTS: dict[str, Layout] = {
         splat=(member("int box"),),
         project=takes("cloud int boxes  // (n) 1: box, 0: Gaussian"),
     ),
+    "ellipsoid_exact": Layout(
+        "slot/ellipsoid_exact.cl",
+        parts=("thickness",),
+        splat=(member("wide bulge", "2 / m^2 of a 3D Gaussian, 0 of a disk"),),
+    ),
+    "ellipsoid_ewa": Layout(
+        "slot/ellipsoid_ewa.cl",
+        parts=("thickness",),
+        view=(member("real slopes[4]", "of rays, -x, x, -y, y: where derivatives are taken at most"),),
+    ),
+    "ellipsoid_ewa_antialiased": Layout("slot/ellipsoid_ewa_antialiased.cl", parts=("ellipsoid_ewa",)),
     "background_constant": Layout(),
     "background_gradient": Layout(
         "slot/background_gradient.cl",
@@ -247,6 +258,7 @@ LAYOUTS: dict[str, Layout] = {
         blend=_RAYS,
         backdrop=_RAYS,
     ),
+    "thickness": Layout("part/thickness.cl", project=takes("cloud float thickness  // (n) [m]; 0: a disk")),
     "box_cover": Layout("part/box_cover.cl"),
     "box_edges": Layout(
         "part/box_edges.cl",
