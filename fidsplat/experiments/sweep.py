@@ -83,14 +83,20 @@ class Results:
     def append(self, key: Key, result: dict[str, Any]) -> Record:
         """Keep what was found at a point, numbers to six digits: no measurement has more.
 
-        Raises ValueError for a result that JSON cannot hold, as NaN.
+        Raises ValueError for a result that JSON cannot hold, as NaN, InputError when the file cannot grow.
         """
         record = Record(key, rounded(result), self.run)
         text = _line(record) if self.run == self._last_run else _header(self.run) + _line(record)
-        with open(self.file, "a", encoding="utf-8") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
+        try:
+            with open(self.file, "a", encoding="utf-8") as stream:
+                stream.write(text)
+                stream.flush()
+                os.fsync(stream.fileno())
+        except OSError as error:
+            raise InputError(
+                f"cannot write {self.file}: {error.strerror or error}; what it holds stays, and the same "
+                "command goes on from there"
+            ) from error
         self._last_run = self.run
         self.done[record.name] = record
         return record

@@ -114,6 +114,20 @@ def test_another_commit_or_day_does_not_matter(tmp_path):
     assert sweep(file, commit="other", date="2030-01-01").left == []
 
 
+def test_a_disk_that_is_full_is_no_fault_of_ours(tmp_path):
+    file = tmp_path / "counts.jsonl"
+    running = sweep(file)
+    running.results.append(POINTS[0], {"value": 1.0})
+    kept = file.read_bytes()
+    file.unlink()
+    file.symlink_to("/dev/full")
+    with pytest.raises(fs.InputError, match=r"counts.jsonl: No space left on device; .* goes on from there"):
+        running.results.append(POINTS[1], {"value": 2.0})
+    file.unlink()
+    file.write_bytes(kept + b'{"key": {"category":')  # as far as there was room
+    assert sweep(file).left == POINTS[1:]
+
+
 def test_a_result_that_is_no_json_is_a_fault_and_not_written(tmp_path):
     file = tmp_path / "counts.jsonl"
     with pytest.raises(ValueError, match="not JSON compliant"):

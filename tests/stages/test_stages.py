@@ -13,7 +13,7 @@ from fidsplat.backends.planes import PlaneTable
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.view import View
 from fidsplat.effects import select
-from fidsplat.hard_cases.invariance import out_of_order
+from fidsplat.hard_cases.agreement import out_of_order
 
 CULLED = np.uint32(0xFFFFFFFF)
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
