@@ -130,6 +130,15 @@ def test_keys_are_depths_and_the_order_is_total(backend):
     assert set(trace["lists"]) <= set(visible)
 
 
+def test_quaternions_of_any_length_turn_a_splat(backend):
+    """To the bit, where all are twice as long."""
+    cloud, longer = random_splats(100, seed=6), random_splats(100, seed=6)
+    object.__setattr__(longer, "quats", 2 * longer.quats)
+    pictures = [traced(backend, each, fs.Quality())[0]["rgb"] for each in (cloud, longer)]
+    assert np.array_equal(*pictures)
+    assert pictures[0].any()
+
+
 def test_culled_splats_change_nothing(backend):
     cloud = random_splats(400, seed=6)
     trace, _ = traced(backend, cloud, fs.Quality())
