@@ -6,6 +6,7 @@
 import contextlib
 import errno
 import functools
+import inspect
 import io
 import operator
 import os
@@ -142,7 +143,8 @@ def _parse(words: list[str]):
     kind: Any = None
     about, program = ABOUT, "fidsplat"
     while words and words[0] in known:
-        kind, about, program = known[words[0]], known[words[0]].HELP, f"{program} {words[0]}"
+        kind, program = known[words[0]], f"{program} {words[0]}"
+        about = inspect.cleandoc(kind.__doc__)
         known, words = getattr(kind, "PARTS", {}), words[1:]
     if known and not hasattr(kind, "run"):  # a group, and no word that leads on
         kind = _any_of(known)
@@ -166,7 +168,7 @@ def _any_of(commands: dict[str, type]) -> Any:
     return functools.reduce(
         operator.or_,
         (
-            Annotated[kind, tyro.conf.subcommand(name, description=kind.__doc__)]
+            Annotated[kind, tyro.conf.subcommand(name, description=str(kind.__doc__).partition("\n")[0])]
             for name, kind in commands.items()
         ),
     )

@@ -1,8 +1,8 @@
-"""Drawings: the filled shapes of an SVG file in their colours, cut into modules.
+"""Drawings: the filled shapes of an SVG file in their colours, as polygons with holes.
 
-What a module shows is the topmost shape that holds its centre. Everything that is filled in one colour is
-understood; what would have to be left out (text, strokes, gradients, pictures) is an error, so that no
-drawing comes out other than it looks.
+What is drawn are the polygons themselves; `Marker.bits` have in each module the topmost shape that holds its
+centre. Everything that is filled in one colour is understood; what would have to be left out (text, strokes,
+gradients, pictures) is an error, so that no drawing comes out other than it looks.
 """
 
 from __future__ import annotations
@@ -22,10 +22,7 @@ from fidsplat.markers.spec import Kind, Spec
 MODULES = 256
 """Modules across a drawing unless its spec says otherwise."""
 
-MOST_MODULES, MOST_BYTES, MOST_COLORS = 2048, 2_000_000, 64
-
-EDGES = 1024
-"""Edges of an outline that are looked at together."""
+MOST_MODULES, MOST_BYTES, MOST_COLORS, MOST_POINTS = 2048, 2_000_000, 64, 200_000
 
 _HEAD = re.compile(r"svg(?:-(?P<modules>[0-9]{1,5}))?", re.IGNORECASE)
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -69,6 +66,8 @@ def _parse(text: str, head: str, rest: str) -> DrawingSpec:
 
 def _modules(spec: DrawingSpec) -> tuple[Spec, np.ndarray]:
     """Indices (h, w) uint8 into the spec's colours, the first of which is the paper's white."""
+    from fidsplat.markers.shapes import filled, is_whole, modules, visible  # late, as shapely is
+
     root, name = _root(Path(spec.payload or "")), spec.payload
     x, y, width, height = _view(root, name)
     scale = spec.modules / width
@@ -76,39 +75,19 @@ def _modules(spec: DrawingSpec) -> tuple[Spec, np.ndarray]:
     if not 1 <= rows <= MOST_MODULES:
         raise InputError(f"{name} would have {rows} rows of modules; 1 to {MOST_MODULES} are made")
     to_modules = np.array([[scale, 0, -x * scale], [0, scale, -y * scale], [0, 0, 1]])
-    grid = np.zeros((rows, spec.modules), np.uint8)
-    colors = [(1.0, 1.0, 1.0)]
+    colors, shapes, points = [(1.0, 1.0, 1.0)], [], 0
     for rings, color, rule in _shapes(root, to_modules, _Style(), name):
         if color not in colors:
             colors.append(color)
-        if len(colors) > MOST_COLORS:
-            raise InputError(f"{name} has more than {MOST_COLORS} colours")
-        grid[inside(rings, rule, grid.shape)] = colors.index(color)
-    return replace(spec, colors=tuple(colors)), grid
-
-
-def inside(rings: Rings, rule: str, shape: tuple[int, int]) -> np.ndarray:
-    """Which cells of a grid have their centre inside closed rings of (n, 2) points x, y: ``shape`` bool.
-
-    rule: "nonzero" (the winding number) or "evenodd" (the number of crossings).
-    """
-    h, w = shape
-    winding = np.zeros((h, w + 1), np.int32)
-    for ring in rings:
-        a, b = ring, np.roll(ring, -1, 0)
-        low, high = np.minimum(a[:, 1], b[:, 1]), np.maximum(a[:, 1], b[:, 1])
-        first, stop = (np.clip(np.ceil(v - 0.5), 0, h).astype(np.int64) for v in (low, high))
-        for part in range(0, len(a), EDGES):  # each may cross every row
-            some = slice(part, part + EDGES)
-            count = (stop - first)[some]
-            edge = np.repeat(np.arange(len(count)), count)
-            row = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count) + first[some][edge]
-            (ax, ay), (bx, by) = a[some][edge].T, b[some][edge].T
-            x = ax + (row + 0.5 - ay) / (by - ay) * (bx - ax)
-            column = np.clip(np.ceil(x - 0.5), 0, w).astype(np.int64)
-            np.add.at(winding, (row, column), 1 if rule == "evenodd" else np.where(by > ay, 1, -1))
-    crossed = np.cumsum(winding, 1)[:, :w]
-    return crossed % 2 == 1 if rule == "evenodd" else crossed != 0
+        points += sum(map(len, rings))
+        if len(colors) > MOST_COLORS or points > MOST_POINTS:
+            raise InputError(
+                f"{name} has more than {MOST_COLORS} colours or {MOST_POINTS} points: simplify the drawing"
+            )
+        shapes.append((filled(rings, rule), colors.index(color)))
+    regions = visible(shapes, (rows, spec.modules))
+    finer = None if is_whole(regions) else regions
+    return replace(spec, colors=tuple(colors), regions=finer), modules(regions, (rows, spec.modules))
 
 
 def _root(path: Path) -> ElementTree.Element:
