@@ -19,7 +19,7 @@ from fidsplat.effects import OUTPUTS, FeatureSet
 from fidsplat.errors import InputError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
 
-_BLOCK = 1 << 19  # (sample, splat) pairs that are evaluated at once
+_BLOCK = 1 << 16  # (sample, splat) pairs that are evaluated at once: half a megabyte each, which caches hold
 
 
 def devices() -> list[DeviceInfo]:
