@@ -26,10 +26,10 @@ CAMERAS = {
 
 # of the texts as they were before there were lenses; a change here changes what every plain picture runs
 BEFORE_LENSES = {
-    ("lanes", ("rgb",)): "8073534855baa37bbca36be8feb0bd26068d6cc13f1e6f0bed231354ac15a630",
-    ("lanes", TAPS): "42b1b5b58ae20627f9c45782ec868a0cb55ba6a2332df3a781c68c092417745d",
-    ("group", ("rgb",)): "a9ab5b91a85cf8e7d1f36402cf2aa5c133146040ba8f40645e1fce80f2f8d727",
-    ("group", TAPS): "5bc7e026fcea24b088506537ab911ca15ab5ae4a9325088d2bad96277add6c88",
+    ("lanes", ("rgb",)): "1f69d7d3d3a927191c9d5f970787ac37cb05fcc64ff2ec755f7a379dfb1eade9",
+    ("lanes", TAPS): "779cdc8a2bbca093504230c89d520fd785c1c47da3882b73211950c4d7a154c6",
+    ("group", ("rgb",)): "7f0b14f8bf53705c8cc248062018dbd25234dbfbbbbb63906e6c0d0dbe704d25",
+    ("group", TAPS): "5d6408894f0dbaa52133d991100bf99a5fe975eefb74933e5fa974f8aa4413c9",
 }
 
 
