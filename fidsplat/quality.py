@@ -17,6 +17,7 @@ from fidsplat.errors import InputError, unknown
 
 LOWPASS = ("screen", "pixel", "none")
 STOP_RULES = ("inclusive", "exclusive")
+ELLIPSOID = ("exact", "ewa", "ewa_antialiased")
 COPLANAR = ("blend", "order")
 SETUP_PRECISIONS = ("float64", "float32")
 ARITHMETIC = ("precise", "fast")
@@ -122,6 +123,14 @@ class Quality:
     scaled by the ratio of the areas, so that it conserves energy; for splats far below a pixel. `none`: the
     exact splat; for markers of Gaussians, with several samples per pixel. Boxes filter themselves."""
 
+    ellipsoid: str = "ewa"
+    """How 3D Gaussians are drawn. `ewa`: as 3DGS and gsplat draw them, an ellipse around the centre's image,
+    widened by 0.3 square pixels, at the centre's depth; captures look as they did to their trainers.
+    `ewa_antialiased`: their opacity falls as they are widened (Mip-Splatting), for captures trained so.
+    `exact`: the largest value along each ray and the depth where it is, under `lowpass`; true near the camera
+    and at wide angles, as 3DGUT and ray tracers have it (docs/ellipsoids.md). Lenses with distortion,
+    fisheyes and panoramas have `exact` always."""
+
     coplanar: str = "blend"
     """Splats that are printed on one plane (markers). `blend`: one layer whose colour does not depend on
     their order, placed by its own depth at each pixel. `order`: by the depth of their centres, as any other
@@ -180,6 +189,7 @@ class Quality:
         for name, known in (
             ("stop_rule", STOP_RULES),
             ("lowpass", LOWPASS),
+            ("ellipsoid", ELLIPSOID),
             ("coplanar", COPLANAR),
             ("setup_precision", SETUP_PRECISIONS),
             ("arithmetic", ARITHMETIC),

@@ -175,31 +175,6 @@ class Measurable(Protocol):
         ...
 
 
-@runtime_checkable
-class ProbesArithmetic(Protocol):
-    """A backend that runs the functions of its kernels on given numbers."""
-
-    def run_arithmetic(
-        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
-    ) -> dict[str, np.ndarray]:
-        """Results of the device's functions, as the stages call them.
-
-        Args:
-            exponents, shares, above, below: (n,) float64, n a multiple of 16; they are rounded to float32
-                where float32 is computed.
-
-        Returns:
-            (n,) float32: `exp` of exponents, `log` of shares, `division` above / below, `sqrt` of below,
-            `fma` above * below + above, `fast_exp` of exponents, `fast_log` of shares; (n,) float64 where the
-            device has it: `division64`, `sqrt64`, `log64`; `denormal` (2,) float32: half of the smallest
-            normal number, and twice that.
-
-        Raises:
-            DeviceError: the device cannot compile or run the kernels.
-        """
-        ...
-
-
 class Probe(Protocol):
     """Looks into an open device: small kernels compiled as the stages are, single stages on made-up input,
     and memory that is filled with rubbish first."""
@@ -216,6 +191,26 @@ class Probe(Protocol):
 
     def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
         """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
+        ...
+
+    def arithmetic(
+        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Results of the device's functions, float32 ones as the stages call them.
+
+        Args:
+            exponents, shares, above, below: (n,) float64, n a multiple of 16; they are rounded to float32
+                where float32 is computed.
+
+        Returns:
+            (n,) float32: `exp` of exponents, `log` of shares, `division` above / below, `sqrt` of below,
+            `fma` above * below + above, `fast_exp` of exponents, `fast_log` of shares; (n,) float64 where the
+            device has it: `division64`, `sqrt64`, `log64`; `denormal` (2,) float32: half of the smallest
+            normal number, and twice that.
+
+        Raises:
+            DeviceError: the device cannot compile or run the kernels.
+        """
         ...
 
     def options(self) -> list[str]:
@@ -261,7 +256,7 @@ class Reshapes(Backend, Protocol):
         same bits; `schedule`, the way in which a GPU walks its tiles (on a GPU: other tiles), whose pictures
         agree but for rounding; `listing`, the ways of listing splats per tile, under the schedule of a GPU
         where the device has several; `sorting`, the device's own and others for listing and sorting;
-        `arithmetic`, the ways of compiling the functions of `ProbesArithmetic`, fused or not, in vectors or
+        `arithmetic`, the ways of compiling the functions of `Probe.arithmetic`, fused or not, in vectors or
         one by one, the device's own among them."""
         ...
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -11,6 +11,9 @@ from fidsplat.errors import InputError
 from fidsplat.markers.mixture import Template, count_gaussians, place
 from fidsplat.markers.seams import grow
 from fidsplat.splats import SplatCloud
+
+if TYPE_CHECKING:
+    from shapely import MultiPolygon
 
 MAX_SPLATS = 1_000_000
 """Most splats of a marker unless the caller allows more."""
@@ -28,7 +31,13 @@ class Printed(NamedTuple):
     grid: np.ndarray
     """(H, W) uint8, values of modules"""
     boxes: np.ndarray
-    """(n, 4) int64 x0, y0, x1, y1 in modules"""
+    """(n, 4) x0, y0, x1, y1 in modules"""
+    values: np.ndarray
+    """(n,) uint8, the value of each"""
+    turns: np.ndarray | None
+    """(n,) radians by which each is turned about its middle; None: not at all"""
+    regions: tuple[MultiPolygon, ...] | None
+    """of each value what it covers, where that is more than whole modules"""
     module: float
     """metres"""
     palette: np.ndarray
@@ -86,10 +95,14 @@ def gaussian_cloud(
 
 def _grown(printed: Printed, growth: float) -> np.ndarray:
     """`grow`, which knows one colour and another, for each of a drawing's."""
-    grid, boxes = printed.grid, printed.boxes
+    grid, boxes, values = printed.grid, printed.boxes, printed.values
+    if printed.regions is not None and printed.turns is not None:
+        from fidsplat.markers.cover import grow_turned  # late, as shapely is
+
+        return grow_turned(printed.regions, values, boxes, printed.turns, growth)
     if len(printed.palette) <= 2:
         return grow(grid, boxes, growth)
-    values, grown = grid[boxes[:, 1], boxes[:, 0]], boxes.astype(np.float64)
+    grown = boxes.astype(np.float64)
     for value in np.unique(values):
         own = values == value
         grown[own] = grow((grid == value).astype(np.uint8), boxes[own], growth)
@@ -104,21 +117,25 @@ def _cloud(
     parts: rows (m, 5) of place and scale in modules and opacity, and (m,) the rectangle of each; ``total`` in
     all. They are filled in part by part, so that memory stays near that of the cloud.
     """
-    grid, boxes, module, palette = printed
-    values = grid[boxes[:, 1], boxes[:, 0]]
+    module, turns = printed.module, printed.turns
     means, scales = np.zeros((total, 3), np.float32), np.empty((total, 2), np.float32)
     opacities, colors = np.empty(total, np.float32), np.empty((total, 3), np.float32)
     quats = np.zeros((total, 4), np.float32)
     quats[:, 0] = 1
-    middle = np.array(grid.shape[::-1]) / 2
+    middle = np.array(printed.grid.shape[::-1]) / 2
     done = 0
     for rows, owner in parts:
         progress("splats", done / total)
         at = slice(done, done + len(rows))
+        if turns is not None:
+            place, angle = (printed.boxes[owner, :2] + printed.boxes[owner, 2:]) / 2, turns[owner]
+            (x, y), c, s = (rows[:, :2] - place).T, np.cos(angle), np.sin(angle)
+            rows[:, :2] = place + np.column_stack([c * x - s * y, s * x + c * y])
+            quats[at, 0], quats[at, 3] = np.cos(angle / 2), np.sin(angle / 2)
         means[at, :2] = (rows[:, :2] - middle) * module
         scales[at] = rows[:, 2:4] * module
         opacities[at] = rows[:, 4]
-        colors[at] = palette[values[owner]]
+        colors[at] = printed.palette[printed.values[owner]]
         done = at.stop
     arrays = (means, quats, scales, opacities, colors)
     for array in arrays:

@@ -16,14 +16,16 @@ LOWPASSES = ("none", "screen", "pixel")
 
 
 def clouds():
-    """From below a pixel to across the picture, around the camera; thin boxes; planes."""
+    """From below a pixel to across the picture, around the camera; ellipsoids, thin boxes, planes."""
     cloud = random_splats(90, 3, depth=(-5.0, 6.0), scale=(1e-4, 5.0))
     scales = cloud.scales.copy()
     scales[::4, 0] = 1e-5
     lines = fs.SplatCloud(cloud.means, cloud.quats, scales, cloud.opacities, colors=cloud.colors)
     group = np.arange(90) // 3
+    thick = np.column_stack([cloud.scales, cloud.scales.mean(1) * (group % 3)])
     return {
         "splats": cloud,
+        "ellipsoids": fs.SplatCloud(cloud.means, cloud.quats, thick, cloud.opacities, colors=cloud.colors),
         "boxes": lines.with_boxes(),
         "planes": cloud.with_boxes(group % 2 == 0).with_planes(np.maximum(group % 8 - 2, -1)),
     }
@@ -42,7 +44,8 @@ def test_a_splat_that_is_left_out_of_a_tile_is_not_seen_there(monkeypatch, camer
     choose = backend.may_see
     monkeypatch.setattr(backend, "_BLOCK", 1 << 15)
     for lowpass in LOWPASSES:
-        picture = Picture(clouds()[kind], camera, fs.Quality(lowpass=lowpass), tuple(OUTPUTS))
+        quality = fs.Quality(lowpass=lowpass, ellipsoid="exact")
+        picture = Picture(clouds()[kind], camera, quality, tuple(OUTPUTS))
         monkeypatch.setattr(backend, "may_see", counted)
         fewer = truth_of(picture)
         monkeypatch.setattr(backend, "may_see", lambda setup, view, x, y: np.ones(len(setup.order), bool))

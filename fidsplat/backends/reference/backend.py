@@ -94,7 +94,7 @@ class ReferenceCloud:
         self.memory_bytes = 0  # it reads the cloud's own arrays
         self.sh_degree = cloud.sh_degree
         self.has_planes = cloud.planes is not None
-        self.footprint = cloud.footprint
+        self.footprint, self.ellipsoids = cloud.footprint, cloud.ellipsoids
 
 
 @dataclass

@@ -37,32 +37,29 @@ def may_see(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         largest = np.abs(middle @ form) + half @ np.abs(form)
         return _SPARE * s.round * (largest + (away * np.abs(form)).sum(0))
 
-    u, v, d = (s.forms[:, :, c] for c in range(3))
-    errors = [rounding(form) for form in (u, v, d)]
-    d_high = middle @ d + half @ np.abs(d) + errors[2]
-    q_low = sum(
-        np.maximum(np.abs(middle @ form) - half @ np.abs(form) - error, 0) ** 2
-        for form, error in zip((u, v), errors, strict=False)
-    )
-    seen = ~s.box & (q_low <= 2 * d_high**2 * (s.half_r2 + slack) * _SPARE)
-    if s.box.any():
-        reach = _steps(view, x, y)
-        meets = s.box.copy()
-        for form, error in zip((u, v), errors, strict=False):
-            # an edge shows half a sample beyond it, and the gradient's terms are rounded
-            off = errors[2] + 1.5 * error + 2 * ROUND * (reach @ (np.abs(d) + np.abs(form)))
-            for side in (d + form, d - form):
-                meets &= middle @ side + (half + reach) @ np.abs(side) + _SPARE * off > 0
-        seen |= meets
-    seen &= d_high > 0
+    d = s.forms[:, :, 2]
+    d_error = rounding(d)
+    d_high = middle @ d + half @ np.abs(d) + d_error
+    reach = _steps(view, x, y) if s.box.any() else np.zeros(3)
+    q_low, meets = np.zeros(len(s.order)), np.ones(len(s.order), bool)
+    for form in (s.forms[:, :, 0], s.forms[:, :, 1]):
+        error = rounding(form)
+        q_low += np.maximum(np.abs(middle @ form) - half @ np.abs(form) - error, 0) ** 2
+        # an edge of a box shows half a sample beyond it, and the gradient's terms are rounded
+        off = d_error + 1.5 * error + 2 * ROUND * (reach @ (np.abs(d) + np.abs(form)))
+        for side in (d + form, d - form):
+            meets &= middle @ side + (half + reach) @ np.abs(side) + _SPARE * off > 0
+    r2 = 2 * (s.half_r2 + slack) * _SPARE
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # of a 3D Gaussian rho falls by 1 + rho / m^2: below r2 everywhere, if m^2 is
+        r2_of_disk = np.where(s.inverse_m2 * r2 < 1, r2 / (1 - s.inverse_m2 * r2), np.inf)
+        seen = (d_high > 0) & np.where(s.box, meets, q_low <= d_high**2 * r2_of_disk)
     if s.screen:
         across, down = _outside(x, s.center_x), _outside(y, s.center_y)
         off = ROUND * (
             1 + sum(np.abs(_ends(at) - to).max(0) for at, to in ((x, s.anchor_x), (y, s.anchor_y)))
         )
-        seen |= (
-            np.maximum(np.hypot(across, down) / view.samples - off, 0) ** 2 <= (s.half_r2 + slack) * _SPARE
-        )
+        seen |= np.maximum(np.hypot(across, down) / view.samples - off, 0) ** 2 <= r2 / 2
     if s.planes is not None:
         planes, first = np.unique(s.planes, return_index=True)
         seen[first[(planes >= 0) & np.isin(planes, s.planes[seen])]] = True
