@@ -76,7 +76,7 @@ def run(file: str, folder: Path, device: str) -> int:
         times = [timings(renderer, resident, camera) for _ in range(FRAMES)]
         best = min(times, key=lambda stages: sum(stages.values()))
         begun = time.perf_counter()
-        found = detect(image, families_of(scene.markers))
+        found = detect(image, families_of(placed.marker for placed in scene.markers))
         reading_ms = 1e3 * (time.perf_counter() - begun)
         readings, _ = read_back(found, scene.markers, camera)
         missed += sum(reading.detection is None for reading in readings)
