@@ -20,8 +20,8 @@ from rich.progress import track
 
 import fidsplat as fs
 from fidsplat.hard_cases.agreement import draw
+from fidsplat.hard_cases.c_order import STEP, WALL_STEP, largest_jump, turning, wall
 from fidsplat.hard_cases.clouds import taken
-from fidsplat.hard_cases.coplanar import STEP, WALL_STEP, largest_jump, turning, wall
 from fidsplat.vision.images import to_uint8, write_png
 from fidsplat.vision.paint import contact_sheet
 
@@ -32,7 +32,7 @@ SPECS = {
     "AprilTag, wall": "apriltag:36h11:5",
 }
 TILTS = (0.0, 30.0, 60.0)
-MODES = ("order", "blend")
+MODES = ("centre", "pixel")
 SIZE = {"width": 240, "height": 192}
 
 
@@ -63,7 +63,7 @@ def picture(panels: dict) -> np.ndarray:
     for mode in MODES:
         jump, before, after = panels["QR 5", mode]
         titled = (
-            (f"coplanar={mode}", before),
+            (f"order={mode}", before),
             ("turned by 0.0001 degrees", after),
             (f"difference, at most {jump:.2g}", np.abs(after - before)),
         )

@@ -4,7 +4,9 @@
 """
 
 import contextlib
+import errno
 import functools
+import inspect
 import io
 import operator
 import os
@@ -36,6 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status: 0 done, 1 failed, 2 bad input, 130 interrupted, 143
     terminated."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    _open_missing_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal that lacks a sign is no reason to stop
@@ -49,13 +52,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return status
     except SystemExit as stop:  # help, or words that could not be parsed
         return stop.code if isinstance(stop.code, int) else 2
-    except _Terminated:
-        return _fail("terminated", 143)
-    except KeyboardInterrupt:
-        return _fail("interrupted", 130)
+    except KeyboardInterrupt as stop:
+        if not debug:  # what was stopped while it was made may complain when it is thrown away
+            sys.unraisablehook = lambda _: None
+        return _fail(*(("terminated", 143) if isinstance(stop, _Terminated) else ("interrupted", 130)))
     except BrokenPipeError:
-        # whoever read our output has gone; nothing is left to say to them, not even by Python at its end
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_output()  # whoever read it has gone; nothing is left to say to them
         return 1
     except Exception as error:
         if debug:
@@ -64,9 +66,40 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         if isinstance(error, FidsplatError):
             return _fail(str(error), error.exit_status)
-        if isinstance(error, MemoryError):
+        if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
             return _fail("not enough memory for this; use a smaller picture or fewer splats", 1)
+        if isinstance(error, OSError) and error.errno in _SHORTAGES:
+            _drop_output()
+            where = f" ({error.filename})" if error.filename else ""
+            return _fail(f"{error.strerror}{where}; {_SHORTAGES[error.errno]}", 1)
         return _fail(f"{type(error).__name__}: {error} (a fault of fidsplat; --debug shows where)", 1)
+
+
+_SHORTAGES = {
+    errno.ENOSPC: "make room there, or on what the output goes to",
+    errno.EDQUOT: "make room there, or on what the output goes to",
+    errno.EFBIG: "files may not be larger here; see ulimit -f",
+    errno.EROFS: "give a folder that can be written",
+    errno.EMFILE: "a process may not have more files open here; see ulimit -n",
+    errno.ENFILE: "the system may not have more files open",
+    errno.EIO: "the disk or the terminal fails",
+}
+"""what a machine may lack anywhere, and what would help"""
+
+
+def _open_missing_streams() -> None:
+    """Where stdin, stdout or stderr was closed, the next file that is opened would take its place, and what
+    is printed would go into that."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            # the lowest descriptor that is free, which is the one that is missing
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 it stays open
+
+
+def _drop_output() -> None:
+    """Say no more on stdout, not even by Python at its end."""
+    with contextlib.suppress(OSError, ValueError):  # what has no descriptor is not flushed there either
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class _Terminated(KeyboardInterrupt):
@@ -110,7 +143,8 @@ def _parse(words: list[str]):
     kind: Any = None
     about, program = ABOUT, "fidsplat"
     while words and words[0] in known:
-        kind, about, program = known[words[0]], known[words[0]].HELP, f"{program} {words[0]}"
+        kind, program = known[words[0]], f"{program} {words[0]}"
+        about = inspect.cleandoc(kind.__doc__)
         known, words = getattr(kind, "PARTS", {}), words[1:]
     if known and not hasattr(kind, "run"):  # a group, and no word that leads on
         kind = _any_of(known)
@@ -134,7 +168,7 @@ def _any_of(commands: dict[str, type]) -> Any:
     return functools.reduce(
         operator.or_,
         (
-            Annotated[kind, tyro.conf.subcommand(name, description=kind.__doc__)]
+            Annotated[kind, tyro.conf.subcommand(name, description=str(kind.__doc__).partition("\n")[0])]
             for name, kind in commands.items()
         ),
     )
@@ -162,7 +196,8 @@ def _one_line(box: str) -> str:
 
 
 def _fail(message: str, status: int) -> int:
-    print("fidsplat: " + " ".join(message.split()), file=sys.stderr)
+    with contextlib.suppress(OSError):  # stderr may be full or closed too
+        print("fidsplat: " + " ".join(message.split()), file=sys.stderr)
     return status
 
 

@@ -30,7 +30,7 @@ def find_defects(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, dict
     with np.errstate(over="ignore", invalid="ignore"):
         defects += [
             ("zero quaternion", square_of(arrays["quats"]) < 1e-30),
-            ("scale not above 0", (s <= 0).any(axis=1)),
+            ("scale not above 0", (s[:, :2] <= 0).any(axis=1) | (s[:, 2:] < 0).any(axis=1)),
             ("opacity outside [0, 1]", (o < 0) | (o > 1)),
         ]
     for reason, rows in defects:

@@ -17,6 +17,7 @@ from fidsplat.errors import InputError, unknown
 
 LOWPASS = ("screen", "pixel", "none")
 STOP_RULES = ("inclusive", "exclusive")
+ELLIPSOID = ("exact", "ewa", "ewa_antialiased")
 ORDERS = ("auto", "pixel", "centre")
 SETUP_PRECISIONS = ("float64", "float32")
 ARITHMETIC = ("precise", "fast")
@@ -122,12 +123,20 @@ class Quality:
     scaled by the ratio of the areas, so that it conserves energy; for splats far below a pixel. `none`: the
     exact splat; for markers of Gaussians, with several samples per pixel. Boxes filter themselves."""
 
+    ellipsoid: str = "ewa"
+    """How 3D Gaussians are drawn. `ewa`: as 3DGS and gsplat draw them, an ellipse around the centre's image,
+    widened by 0.3 square pixels, at the centre's depth; captures look as they did to their trainers.
+    `ewa_antialiased`: their opacity falls as they are widened (Mip-Splatting), for captures trained so.
+    `exact`: the largest value along each ray and the depth where it is, under `lowpass`; true near the camera
+    and at wide angles, as 3DGUT and ray tracers have it (docs/ellipsoids.md). Lenses with distortion,
+    fisheyes and panoramas have `exact` always."""
+
     order: str = "auto"
     """By which depth what overlaps is composited. `pixel`: each fragment by its own, where the ray meets its
     splat; splats that are printed on one plane (markers) are one layer, whose colour depends on no order.
     `centre`: every splat by the depth of its centre, as other renderers do and captured scenes were trained;
     large splats swap places as the camera turns. `auto`: `pixel` where splats are printed on planes, `centre`
-    elsewhere (docs/numerics.md says why)."""
+    elsewhere (docs/order.md says why)."""
 
     samples: int = 1
     """n, 1 to 8, default 1: each pixel is the mean of n x n samples on a regular grid. More smooth edges, and
@@ -182,6 +191,7 @@ class Quality:
         for name, known in (
             ("stop_rule", STOP_RULES),
             ("lowpass", LOWPASS),
+            ("ellipsoid", ELLIPSOID),
             ("order", ORDERS),
             ("setup_precision", SETUP_PRECISIONS),
             ("arithmetic", ARITHMETIC),

@@ -35,6 +35,16 @@ def sliding(time: float) -> np.ndarray:
     return pose
 
 
+def with_thick(cloud: fs.SplatCloud) -> fs.SplatCloud:
+    """The cloud with as many 3D Gaussians among its splats."""
+    flat = random_splats(len(cloud), 22, depth=(0.8, 4.0), scale=(0.05, 0.5), across=1.2)
+    scales = np.column_stack([flat.scales, flat.scales[::-1, 0]])
+    thick = fs.SplatCloud(
+        flat.means, flat.quats, scales, flat.opacities, colors=flat.colors, labels=flat.labels
+    )
+    return fs.SplatCloud.concatenate([cloud, thick])
+
+
 @dataclass(frozen=True)
 class Switch:
     """One effect. Of a `kind` a picture has one at most; fog is a background, since nothing else is seen
@@ -66,6 +76,11 @@ _FIXED = {
     "boxes": Switch("footprint", cloud=lambda cloud: cloud.with_boxes()),
     "boxes and Gaussians": Switch(
         "footprint", cloud=lambda cloud: cloud.with_boxes(np.arange(len(cloud)) // 4 % 2 == 0)
+    ),
+    "ellipsoids": Switch("ellipsoids", cloud=with_thick),
+    "exact ellipsoids": Switch("ellipsoids", cloud=with_thick, quality={"ellipsoid": "exact"}),
+    "antialiased ellipsoids": Switch(
+        "ellipsoids", cloud=with_thick, quality={"ellipsoid": "ewa_antialiased"}
     ),
     "low-pass none": Switch("lowpass", quality={"lowpass": "none"}),
     "low-pass pixel": Switch("lowpass", quality={"lowpass": "pixel"}),

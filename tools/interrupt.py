@@ -1,13 +1,14 @@
 """Interrupts and full disks: whether anything whole is lost, and whether the next run has the same bits.
 
-    python tools/interrupt.py kills [--moments 50] [--commands demo,render,...] [--seed 0] [--json FILE]
-    python tools/interrupt.py disks [--sizes 8] [--commands ...] [--json FILE]
+    python tools/interrupt.py trials.jsonl [--commands demo,render,...] [--most 20] [--seed 0]
 
-Each command runs twice undisturbed, into two folders: what agrees in both is its result, bit for bit; the
-rest (times of day, durations) must only parse. `kills` then starts it again and again in an empty folder,
-sends SIGINT, SIGTERM and SIGKILL in turn at random moments, looks at every file that has its final name, and
-runs the command once more in the same folder. `disks` does the same on a file system (tmpfs, which only root
-can mount) that is full after a part of what the command writes, and gives it room for the second run.
+Each command runs twice undisturbed: what agrees is its result, bit for bit (of figures and logs each value
+and each line), and the rest (times, durations) need only parse. Then it is started again and again in an
+empty folder and sent SIGINT, SIGTERM or SIGKILL at a random moment, or writes to a file system (tmpfs,
+which only root can mount) that is full after a part of what it writes. Every file that has its final name
+is looked at, and the same command runs once more, with room. A trial is a line of the file; a run that was
+stopped goes on where it was, and ends with a table of all trials. The exit status is 1 if anything was
+lost.
 """
 
 from __future__ import annotations
@@ -23,22 +24,22 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from rich.console import Console
-from rich.progress import track
 from rich.table import Table
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
+SIGNALS = ("SIGINT", "SIGTERM", "SIGKILL")
+DISK = "full disk"
 FIDSPLAT = (sys.executable, "-c", "import sys; from fidsplat.cli import main; sys.exit(main())")
 SCENE = """\
 [camera]
-width = 640
-height = 480
+width = 320
+height = 240
 fov_x_deg = 60.0
 position = [0.3, 0.1, -0.8]
 look_at = [0.0, 0.0, 0.0]
@@ -46,144 +47,164 @@ look_at = [0.0, 0.0, 0.0]
 [[markers]]
 spec = "apriltag:36h11:5"
 size = 0.16
-
-[render]
-outputs = ["rgb", "depth", "normal", "label"]
 """
+
+
+class Command(NamedTuple):
+    """A command that writes into the folder in which it runs."""
+
+    words: str
+    kills: int
+    """trials with a signal"""
+    disks: int
+    """trials with a full disk"""
+    own_cache: bool = False
+    """compiles its kernels, into a cache in its folder"""
+
+
+RENDER = "render ../scene.toml -o picture.png --outputs rgb,depth,normal,label"
 COMMANDS = {
-    "demo": ("demo", "--out", "{out}"),
-    "render": ("render", "{scene}", "-o", "{out}/picture.png", "--outputs", "rgb,depth,normal,label"),
-    "marker": ("marker", "qr-v22-L:a long text", "-o", "{out}/marker.ply"),
-    "counts": ("experiment", "counts", "--quick", "-o", "{out}"),
-    "angles": ("experiment", "angles", "--quick", "-o", "{out}"),
-    "experiment": ("experiment", "all", "--quick", "-o", "{out}"),
-    "tradeoff": ("tradeoff", "--quick", "-o", "{out}"),
+    "render": Command(RENDER, 66, 12),
+    "marker": Command("marker qr-v22-L:text -o marker.ply", 39, 6),
+    "demo": Command("demo --out .", 36, 8),
+    "counts": Command("experiment counts --quick --category small --category medium -o .", 48, 8),
+    "dataset": Command("experiment dataset --category apriltag --markers 1 -o .", 18, 6),
+    "tradeoff": Command("tradeoff --quick --scenes apriltag --knobs transmittance_stop -o .", 18, 6),
+    "experiment": Command("experiment all --quick --category apriltag --mixture fitted -o .", 9, 4),
+    "compiling": Command(RENDER, 12, 4, own_cache=True),
 }
-USUAL = ("demo", "render", "marker", "counts")
-
-
-@dataclass
-class Tally:
-    """What happened to one command."""
-
-    trials: int = 0
-    interrupted: int = 0
-    """trials in which the first run did not end by itself"""
-    broken: int = 0
-    """files under their final names that were not whole"""
-    unclear: int = 0
-    """runs that ended in something else than one line"""
-    changed: int = 0
-    """second runs that failed or whose result has other bits"""
-
-
-def words(name: str, out: Path, scene: Path) -> list[str]:
-    """A command's words."""
-    return [*FIDSPLAT, *(word.format(out=out, scene=scene) for word in COMMANDS[name])]
+Facts = dict[Any, Any]
 
 
 def files_below(folder: Path) -> dict[str, Path]:
-    """Files with their final names, by their names below the folder; temporary ones begin with a dot."""
-    found = sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
-    return {str(path.relative_to(folder)): path for path in found}
+    """Files with their final names, by their names below the folder; what is temporary begins with a dot."""
+    names = (path.relative_to(folder) for path in sorted(folder.rglob("*")) if path.is_file())
+    return {str(name): folder / name for name in names if not any(part[0] == "." for part in name.parts)}
 
 
-def digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def facts(path: Path) -> Facts:
+    """What a file says: values of figures and logs by their places, lines of texts, else its digest.
 
-
-def is_whole(path: Path) -> bool:
-    """Whether a file can be read to its end as what its name says."""
+    Raises ValueError, OSError or EOFError for a file that is not whole. A log may end within a line, which
+    the run that goes on drops.
+    """
     content = path.read_bytes()
-    try:
-        match path.suffix:
-            case ".json":
-                json.loads(content)
-            case ".jsonl":
-                # a log grows by whole lines; a cut last line is repaired by the run that goes on
-                for line in content.split(b"\n")[:-1]:
-                    json.loads(line)
-            case ".png" | ".jpg":
-                return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) is not None
-            case ".npy" | ".npz":
-                np.load(path)
-            case ".html" | ".svg":
-                return content.rstrip().endswith((b"</html>", b"</svg>"))
-    except (ValueError, OSError, EOFError):
-        return False
-    return len(content) > 0
+    match path.suffix:
+        case ".json":
+            return dict(_leaves(json.loads(content)))
+        case ".jsonl":
+            rows = [json.loads(line) for line in content.split(b"\n")[:-1]]
+            return {
+                (json.dumps(row["key"]), *place): value
+                for row in rows
+                if "key" in row  # and not the facts of a run
+                for place, value in _leaves(row["result"])
+            }
+        case ".png" | ".jpg":
+            if cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) is None:
+                raise ValueError("no picture")
+        case ".npy":
+            np.load(path)
+        case ".md" | ".csv" | ".svg" | ".html":
+            if not content.endswith(b"\n"):
+                raise ValueError("cut off")
+            return dict(enumerate(content.splitlines()))
+    if not content:
+        raise ValueError("empty")
+    return {"digest": hashlib.sha256(content).hexdigest()}
+
+
+def _leaves(value: Any, *place: Any) -> Iterator[tuple[Any, Any]]:
+    if isinstance(value, dict | list):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _leaves(item, *place, key)
+    else:
+        yield place, value
 
 
 class Trial:
     """A command with its undisturbed result."""
 
-    def __init__(self, name: str, work: Path) -> None:
-        self.name, self.scene = name, work / "scene.toml"
-        self.scene.write_text(SCENE)
-        folders = [work / f"{name}-whole-{k}" for k in range(2)]
-        for folder in folders:
+    def __init__(self, command: Command, work: Path) -> None:
+        self.command, self.work = command, work
+        (work / "scene.toml").write_text(SCENE)
+        found = []
+        for name in ("first", "second"):
             start = time.monotonic()
-            done = self.run(folder)
+            status, said = self.run(self.folder(name))
             self.seconds = time.monotonic() - start
-            if done.returncode != 0:
-                raise SystemExit(f"{name} fails undisturbed: {done.stderr.strip()}")
-        first, second = ({n: digest(p) for n, p in files_below(folder).items()} for folder in folders)
-        self.result = {n: value for n, value in first.items() if second.get(n) == value}
-        self.names = set(first)
-        self.bytes = sum(path.stat().st_size for path in files_below(folders[0]).values())
+            if status != 0:
+                raise SystemExit(f"{command.words} fails undisturbed: {said}")
+            found.append({name: facts(path) for name, path in files_below(work / name).items()})
+        first, second = found
+        self.result = {
+            name: {place: value for place, value in known.items() if second[name].get(place) == value}
+            for name, known in first.items()
+        }
+        self.bytes = sum(path.stat().st_size for path in (work / "second").rglob("*") if path.is_file())
 
-    def run(self, folder: Path, **options) -> subprocess.CompletedProcess[str]:
-        """To its end."""
-        folder.mkdir(exist_ok=True)
-        return subprocess.run(words(self.name, folder, self.scene), capture_output=True, text=True, **options)
+    def folder(self, name: str) -> Path:
+        """An empty one."""
+        (self.work / name).mkdir()
+        return self.work / name
 
-    def look(self, folder: Path, tally: Tally) -> None:
-        """Counts what is broken among the files that have their final names."""
+    def start(self, folder: Path) -> subprocess.Popen[str]:
+        """The command in a folder."""
+        cache = {"POCL_CACHE_DIR": str(folder / ".cache")} if self.command.own_cache else {}
+        (folder / ".cache").mkdir(exist_ok=True)
+        words, pipe = (*FIDSPLAT, *self.command.words.split()), subprocess.PIPE
+        env = os.environ | cache
+        return subprocess.Popen(words, cwd=folder, env=env, stdout=pipe, stderr=pipe, text=True)
+
+    def run(self, folder: Path) -> tuple[int, str]:
+        """To its end: exit status, and what was said on stderr."""
+        child = self.start(folder)
+        return _end(child)
+
+    def lost(self, folder: Path, status: int, said: str) -> Iterator[str]:
+        """What a run that was disturbed has broken, and what the next does not mend."""
+        if not is_clear(status, said):
+            yield f"ended with {status}: {said}"
+        if status != -signal.SIGKILL:
+            yield from (f"left {path.name}" for path in folder.rglob(".*.part"))
+        yield from self._different(folder, growing=(".jsonl",))
+        if folder.is_mount():
+            subprocess.run(["mount", "-o", f"remount,size={4 * self.bytes + 2**24}", folder], check=True)
+        status, said = self.run(folder)
+        if status != 0:
+            yield f"the next run ended with {status}: {said}"
+        yield from self._different(folder)
+        yield from (f"no {name}" for name in sorted(set(self.result) - set(files_below(folder))))
+
+    def _different(self, folder: Path, growing: tuple[str, ...] = ()) -> Iterator[str]:
         for name, path in files_below(folder).items():
-            good = digest(path) == self.result[name] if name in self.result else is_whole(path)
-            # a log of results is whole line by line before it is whole
-            tally.broken += not (good or (path.suffix == ".jsonl" and is_whole(path)))
-
-    def go_on(self, folder: Path, tally: Tally) -> None:
-        """Runs it once more and compares."""
-        done = self.run(folder)
-        now = {name: digest(path) for name, path in files_below(folder).items()}
-        same = all(now.get(name) == value for name, value in self.result.items())
-        tally.changed += done.returncode != 0 or not same or not self.names <= set(now)
-
-
-def is_clear(done: subprocess.CompletedProcess[str] | subprocess.Popen[str], said: str) -> bool:
-    """Whether a run that did not succeed ended in one line, or was killed outright."""
-    if done.returncode in (0, -signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT):
-        return "Traceback" not in said
-    lines = [line for line in said.splitlines() if line.startswith("fidsplat: ")]
-    return len(lines) >= 1 and "Traceback" not in said and "a fault of fidsplat" not in said
+            try:
+                found = facts(path)
+            except (ValueError, OSError, EOFError) as error:
+                yield f"{name} is not whole: {error}"
+                continue
+            for place, value in self.result.get(name, {}).items():
+                if found.get(place) != value and (place in found or path.suffix not in growing):
+                    yield f"{name} differs: {place}"
+                    break
 
 
-def kills(trial: Trial, work: Path, moments: int, chance: random.Random) -> Tally:
-    """Interrupts at random moments."""
-    tally = Tally()
-    for k in track(range(moments), description=f"{trial.name}, kills", transient=True):
-        folder = work / f"{trial.name}-kill-{k}"
-        folder.mkdir()
-        child = subprocess.Popen(
-            words(trial.name, folder, trial.scene), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        time.sleep(chance.uniform(0.0, trial.seconds))
-        tally.interrupted += child.poll() is None
-        child.send_signal(SIGNALS[k % len(SIGNALS)])
-        said = child.communicate()[1]
-        tally.trials += 1
-        tally.unclear += not is_clear(child, said)
-        trial.look(folder, tally)
-        trial.go_on(folder, tally)
-    return tally
+def _end(child: subprocess.Popen[str]) -> tuple[int, str]:
+    said = child.communicate()[1]
+    return child.returncode, said.strip()[-500:]
+
+
+def is_clear(status: int, said: str) -> bool:
+    """Whether a run ended well, in one line, or was killed outright."""
+    if status in [-getattr(signal, name) for name in SIGNALS] and ", in main" not in said:
+        return True  # by Python, before our first line
+    known = status == 0 or any(line.startswith("fidsplat: ") for line in said.splitlines())
+    return known and "Traceback" not in said and "a fault of fidsplat" not in said
 
 
 @contextmanager
 def small_disk(folder: Path, size: int) -> Iterator[None]:
     """A file system of `size` bytes at a folder."""
-    folder.mkdir()
     subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", folder], check=True)
     try:
         yield
@@ -191,60 +212,76 @@ def small_disk(folder: Path, size: int) -> Iterator[None]:
         subprocess.run(["umount", folder], check=True)
 
 
-def disks(trial: Trial, work: Path, sizes: int) -> Tally:
-    """Disks that are full after a part of what is written."""
-    tally = Tally()
-    for k in track(range(sizes), description=f"{trial.name}, full disks", transient=True):
-        folder = work / f"{trial.name}-disk-{k}"
-        with small_disk(folder, max(4096, trial.bytes * (k + 1) // (sizes + 1) // 4096 * 4096)):
-            done = trial.run(folder)
-            tally.trials += 1
-            tally.interrupted += done.returncode != 0
-            tally.unclear += not is_clear(done, done.stderr)
-            trial.look(folder, tally)
-            room = f"remount,size={4 * trial.bytes + 2**20}"
-            subprocess.run(["mount", "-o", room, folder], check=True)
-            trial.go_on(folder, tally)
-    return tally
+def disturb(trial: Trial, name: str, how: str, at: float) -> dict[str, Any]:
+    """A signal at a share of the command's time, or a disk with room for a share of what it writes: whether
+    that stopped it, and what was lost."""
+    folder = trial.folder(name)
+    full = how == DISK
+    with small_disk(folder, max(1, int(trial.bytes * at) // 4096) * 4096) if full else nullcontext():
+        child = trial.start(folder)
+        if not full:
+            time.sleep(at * trial.seconds)
+            child.send_signal(getattr(signal, how))
+        status, said = _end(child)
+        return {"stopped": status != 0, "lost": list(trial.lost(folder, status, said))}
+
+
+def planned(name: str, seed: int) -> list[tuple[str, float]]:
+    """How each trial of a command is disturbed, and where."""
+    command, chance = COMMANDS[name], random.Random(f"{seed} {name}")
+    how = [SIGNALS[k % 3] for k in range(command.kills)] + [DISK] * command.disks
+    return [(kind, chance.random()) for kind in how]
+
+
+def read(file: Path) -> list[dict[str, Any]]:
+    """The trials that a file has."""
+    return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+
+
+def table_of(done: list[dict[str, Any]]) -> Table:
+    """By command: how many trials of each kind, how many of them stopped it, and in how many something was
+    lost."""
+    table = Table("command", *SIGNALS, DISK, "of these, stopped it", "lost something")
+    for name in [*dict.fromkeys(row["command"] for row in done), None]:
+        rows = [row for row in done if name in (None, row["command"])]
+        kinds = [sum(row["how"] == how for row in rows) for how in (*SIGNALS, DISK)]
+        counts = [*kinds, sum(row["stopped"] for row in rows), sum(bool(row["lost"]) for row in rows)]
+        table.add_row(name or "all", *map(str, counts))
+    return table
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=("kills", "disks"))
-    parser.add_argument("--moments", type=int, default=50, help="kills of each command (default: 50)")
-    parser.add_argument("--sizes", type=int, default=8, help="sizes of the full disk (default: 8)")
-    parser.add_argument("--commands", default=",".join(USUAL), help=f"of {', '.join(COMMANDS)}")
+    parser.add_argument("file", type=Path, help="the trials, a line each")
+    parser.add_argument("--commands", default=",".join(COMMANDS), help=f"of {', '.join(COMMANDS)}")
+    parser.add_argument("--most", type=int, default=10**6, help="trials in this run (default: all)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path, help="the figures as a file")
     given = parser.parse_args()
     names = given.commands.split(",")
     if unknown := set(names) - set(COMMANDS):
         parser.error(f"unknown commands {', '.join(sorted(unknown))}; known: {', '.join(COMMANDS)}")
-    if given.what == "disks" and os.geteuid() != 0:
-        parser.error("disks mounts small file systems, which only root may do")
-    tallies: dict[str, Tally] = {}
-    chance = random.Random(given.seed)
+    done = read(given.file)
     for name in names:
+        there = {row["number"] for row in done if row["command"] == name}
+        left = [(k, *plan) for k, plan in enumerate(planned(name, given.seed)) if k not in there]
+        left = [part for part in left if part[1] != DISK or os.geteuid() == 0][: given.most]
+        given.most -= len(left)
+        if not left:
+            continue
         with tempfile.TemporaryDirectory() as temporary:
-            work = Path(temporary)
-            trial = Trial(name, work)
-            tallies[name] = (
-                kills(trial, work, given.moments, chance)
-                if given.what == "kills"
-                else disks(trial, work, given.sizes)
-            )
-    columns = tuple(Tally.__dataclass_fields__)
-    table = Table("command", *columns)
-    for name, tally in tallies.items():
-        table.add_row(name, *(str(getattr(tally, column)) for column in columns))
-    Console().print(table)
-    if given.json:
-        given.json.write_text(
-            json.dumps({name: vars(tally) for name, tally in tallies.items()}, indent=1) + "\n"
-        )
-    return int(any(tally.broken + tally.unclear + tally.changed for tally in tallies.values()))
+            trial = Trial(COMMANDS[name], Path(temporary))
+            for number, how, at in left:
+                found = disturb(trial, f"trial-{number}", how, at)
+                done.append({"command": name, "number": number, "how": how, "at": round(at, 3), **found})
+                with given.file.open("a") as stream:
+                    stream.write(json.dumps(done[-1]) + "\n")
+    for row in done:
+        for words in row["lost"]:
+            print(f"{row['command']} {row['number']}, {row['how']} at {row['at']}: {words}")
+    Console().print(table_of(done))
+    return int(any(row["lost"] for row in done))
 
 
 if __name__ == "__main__":

@@ -70,6 +70,8 @@ class View:
     """the samples' rays behind a lens; None for a pinhole and for parallel rays"""
     along_ray: bool = False
     """whether near, far, sort keys and depths are distances from the camera's centre; else along z"""
+    slopes: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """of rays, -x, x, -y, y: EWA takes a pinhole's derivatives there where a centre lies further out"""
     parallel: bool = False
     """whether all rays are parallel to z; focal_x and focal_y are samples per metre then"""
     groups: tuple[tuple[int, View], ...] = ()
@@ -164,6 +166,14 @@ class View:
         lens, grid = camera.lens, (camera.width * n, camera.height * n)
         intrinsics = camera.fx * n, camera.fy * n, camera.cx * n, camera.cy * n
         parallel = isinstance(lens, Orthographic)
+        # 3DGS and gsplat: 0.3 half pictures outside the picture
+        beyond = [0.15 * size / f for size, f in zip(grid, intrinsics[:2], strict=True)]
+        slopes = (
+            intrinsics[2] / intrinsics[0] + beyond[0],
+            (grid[0] - intrinsics[2]) / intrinsics[0] + beyond[0],
+            intrinsics[3] / intrinsics[1] + beyond[1],
+            (grid[1] - intrinsics[3]) / intrinsics[1] + beyond[1],
+        )
         raster = None if lens is None or parallel else raster_of(lens, *grid, *intrinsics)
         return cls(
             width=camera.width * n,
@@ -188,6 +198,7 @@ class View:
             fog_density=0.0 if capture.fog is None else capture.fog.density,
             surroundings=None if plain else backdrop,
             raster=raster,
+            slopes=slopes,
             along_ray=lens is not None and lens.along_ray,
             parallel=parallel,
         )

@@ -1,6 +1,6 @@
 """One module for each command: a dataclass of its options, whose ``run`` does the work and returns the exit
-status. Its docstring is the line in the list of commands, its HELP what `fidsplat COMMAND --help` says.
-A group of commands has PARTS instead, or as well: its commands by the word that follows.
+status. Its docstring is what `fidsplat COMMAND --help` says, and the first line of that stands in the list of
+commands. A group of commands has PARTS instead, or as well: its commands by the word that follows.
 
 Nothing heavy is imported before ``run``, so that help and errors come at once.
 """

@@ -1,7 +1,7 @@
 """`fidsplat detect`."""
 
-from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar
+from dataclasses import asdict, dataclass, replace
+from typing import Annotated
 
 import tyro
 
@@ -11,19 +11,18 @@ from fidsplat.errors import InputError
 
 @dataclass
 class Detect:
-    """Find tags and QR codes in a picture."""
+    """Find AprilTag, ArUco and QR codes in a picture.
 
-    HELP: ClassVar[str] = """Find AprilTag, ArUco and QR codes in a picture.
+    Prints what they say and the corners of each, in pixels: top left, top right, bottom right, bottom left as
+    printed, the centre of the first pixel at (0.5, 0.5). With --scene also where each marker of that scene
+    was seen from its camera, and how far that is from the truth: of a scene that moves, from where things are
+    at its shutter's time, when the middle row is exposed.
 
-Prints what they say and the corners of each, in pixels: top left, top right, bottom right, bottom left as
-printed, the centre of the first pixel at (0.5, 0.5). With --scene also where each marker of that scene was
-seen from its camera, and how far that is from the truth: of a scene that moves, from where things are at its
-shutter's time, when the middle row is exposed.
-
-Examples:
-  fidsplat detect photo.jpg
-  fidsplat detect photo.png --family 16h5 --family 7x7_1000
-  fidsplat detect scene.png --scene scene.toml --json"""
+    Examples:
+      fidsplat detect photo.jpg
+      fidsplat detect photo.png --family 16h5 --family 7x7_1000
+      fidsplat detect scene.png --scene scene.toml --json
+    """
 
     image: Annotated[tyro.conf.Positional[str], option("IMAGE", "PNG, JPEG, BMP, TIFF or WebP")]
     family: Annotated[
@@ -50,23 +49,13 @@ Examples:
         if scene is not None and families is None:
             from fidsplat.experiments.readback import families_of
 
-            families = families_of(scene.markers)
+            families = families_of(placed.marker for placed in scene.markers)
         found = detect(image, families)
         result = {
             "image": self.image,
             "width": image.shape[1],
             "height": image.shape[0],
-            "detections": [
-                {
-                    "name": code.name,
-                    "kind": code.kind,
-                    "family": code.family,
-                    "id": code.id,
-                    "payload": code.payload,
-                    "corners": code.corners,
-                }
-                for code in found
-            ],
+            "detections": [{"name": code.name, **asdict(code)} for code in found],
         }
         readings = []
         if scene is not None:
@@ -87,17 +76,9 @@ Examples:
             rows = [(code.name, at) for code, at in zip(found, corner, strict=True)]
             print_table(where, self.image, ("code", "corners [px]"), rows)
         if readings:
-            heads = (
-                "marker",
-                "found",
-                "distance [m]",
-                "position [mm]",
-                "angle [deg]",
-                "corners [px]",
-            )
-            print_table(
-                where, f"Against {self.scene}: distance, and errors", heads, map(reading_row, readings)
-            )
+            heads = ("marker", "found", "distance [m]", "position [mm]", "angle [deg]", "corners [px]")
+            title = f"Against {self.scene}: distance, and errors"
+            print_table(where, title, heads, map(reading_row, readings))
         return 0
 
     def _load_scene(self, shape: tuple[int, ...]):

@@ -5,7 +5,6 @@ import math
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.rotations import quaternion_to_matrix
 from fidsplat.splats import SplatCloud
 
 WIDTH, HEIGHT = 1280, 720
@@ -30,8 +29,7 @@ def framing_camera(cloud: SplatCloud) -> Camera:
 def _extent(cloud: SplatCloud) -> tuple[np.ndarray, np.ndarray]:
     if len(cloud) == 0:
         return -np.ones(3), np.ones(3)
-    tangents = quaternion_to_matrix(cloud.quats)[:, :, :2]
-    reach = REACH * np.sqrt(((tangents * cloud.scales[:, None, :]) ** 2).sum(2))
+    reach = REACH * cloud.reach(1.0)
     share = 0.5 if len(cloud) >= MANY else 0.0
     low = np.percentile(cloud.means - reach, share, axis=0)
     high = np.percentile(cloud.means + reach, 100 - share, axis=0)

@@ -1,7 +1,7 @@
 """Every effect that a picture may call for, by name; how each backend draws it is the backend's own.
 
 Of some kinds a picture has exactly one (camera, color, lowpass, stop, compose, footprint, background,
-arithmetic); of outputs and of steps after blending any number.
+arithmetic), of ellipsoids one where there are any; of outputs and of steps after blending any number.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ _PLAIN = (
     *("camera_orthographic", "color_rgb", "color_sh", "lowpass_none", "lowpass_pixel", "lowpass_screen"),
     *("stop_inclusive", "stop_exclusive", "compose_ordered", "compose_pixel", "compose_planes"),
     *("footprint_gaussian", "footprint_box", "footprint_mixed"),
+    *("ellipsoid_exact", "ellipsoid_ewa", "ellipsoid_ewa_antialiased", "ellipsoids_alone"),
     *("background_constant", "background_gradient", "background_panorama"),
     *("arithmetic_precise", "arithmetic_fast"),
     # where a picture needs them

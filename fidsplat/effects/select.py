@@ -11,6 +11,7 @@ from fidsplat.cameras.lenses import Lens
 from fidsplat.capture import Capture
 from fidsplat.effects.catalogue import CATALOGUE, Output
 from fidsplat.errors import InputError, unknown
+from fidsplat.quality import Quality
 from fidsplat.surroundings import Gradient, Panorama
 
 RGB = Output("rgb", 3, "float32")
@@ -35,9 +36,9 @@ class FeatureSet:
     """
 
     slots: tuple[str, ...]
-    """One effect per kind, in the fixed order camera, color, lowpass, stop, compose, footprint, background,
-    arithmetic; then motion, shutter and double blending, if any."""
-    taps: tuple[str, ...]
+    """One effect per kind, in the fixed order camera, color, ellipsoids if any, lowpass, stop, compose,
+    footprint, background, arithmetic; then motion, shutter and double blending, if any."""
+    outputs: tuple[str, ...]
     """Sorted names of the outputs beside rgb."""
     sh_degree: int
     samples: int
@@ -48,13 +49,13 @@ class FeatureSet:
     @cached_property
     def names(self) -> frozenset[str]:
         """Names of all effects, those of outputs that others are made from among them."""
-        return frozenset((*self.slots, *(output.name for output in self.outputs[1:]), *self.posts))
+        return frozenset((*self.slots, *(image.name for image in self.images[1:]), *self.posts))
 
     @cached_property
-    def outputs(self) -> tuple[Output, ...]:
+    def images(self) -> tuple[Output, ...]:
         """Output images, rgb first, then those that others are made from."""
-        needed = sorted({name for tap in self.taps for name in CATALOGUE[tap].needs})
-        names = (*needed, *(tap for tap in self.taps if tap not in needed))
+        needed = sorted({name for output in self.outputs for name in CATALOGUE[output].needs})
+        names = (*needed, *(name for name in self.outputs if name not in needed))
         effects = (CATALOGUE[name] for name in names)
         return (RGB, *(effect.output for effect in effects if effect.output))
 
@@ -77,6 +78,11 @@ class Traits(Protocol):
         """`gaussian`, `box`, or `mixed` where there are splats of both kinds."""
         ...
 
+    @property
+    def ellipsoids(self) -> str:
+        """Which splats are 3D Gaussians: `none`, `some` or `all`."""
+        ...
+
 
 def select(cloud: Traits, capture: Capture) -> FeatureSet:
     """The features that a capture of a cloud calls for. Values that mean nothing call for nothing. Without a
@@ -90,18 +96,24 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
             raise InputError(unknown("output", name, OUTPUTS))
     quality, background = capture.quality, capture.backdrop
     lens = None if capture.camera is None else capture.camera.lens
-    lowpass = "none" if cloud.footprint == "box" else quality.lowpass
+    ellipsoid = _ellipsoid(cloud, quality, lens)
+    # what filters itself needs no low-pass
+    alone = cloud.ellipsoids == "all" and ellipsoid != "exact"
+    filtered = cloud.footprint == "box" or alone
+    lowpass = "none" if filtered else quality.lowpass
     double = quality.blend_precision == "float64"
     if double:
         _refuse_float64(lens, capture.foggy)
-    in_spheres = lens is None and cloud.footprint == "gaussian" and lowpass != "pixel"
+    flat = cloud.footprint == "gaussian" and not ellipsoid
+    in_spheres = lens is None and flat and lowpass != "pixel"
     # harmonics of degree 0 do not depend on the view: they are colours (`SplatCloud.plain_colors`)
     sh_degree = max(cloud.sh_degree, 0)
     return FeatureSet(
         slots=(
             f"camera_{lens.kind if lens else 'pinhole'}",
             "color_sh" if sh_degree else "color_rgb",
-            # boxes are filtered by their own footprint
+            *((f"ellipsoid_{ellipsoid}",) if ellipsoid else ()),
+            *(("ellipsoids_alone",) if alone else ()),
             f"lowpass_{lowpass}",
             f"stop_{quality.stop_rule}",
             _composing(cloud, quality.order),
@@ -114,7 +126,7 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
             *(("shutter_rows",) if capture.exposed and in_spheres else ()),
             *(("blend_double",) if double else ()),
         ),
-        taps=tuple(sorted({*capture.outputs} - {"rgb"})),
+        outputs=tuple(sorted({*capture.outputs} - {"rgb"})),
         sh_degree=sh_degree,
         samples=quality.samples,
         setup_precision=quality.setup_precision,
@@ -127,6 +139,14 @@ def _composing(cloud: Traits, order: str) -> str:
     if order == "centre" or (order == "auto" and not cloud.has_planes):
         return "compose_ordered"
     return "compose_planes" if cloud.has_planes else "compose_pixel"
+
+
+def _ellipsoid(cloud: Traits, quality: Quality, lens: Lens | None) -> str:
+    """How 3D Gaussians are drawn; empty if there are none."""
+    if cloud.ellipsoids == "none":
+        return ""
+    # 3DGS knows pinholes and parallel rays alone
+    return quality.ellipsoid if lens is None or isinstance(lens, Orthographic) else "exact"
 
 
 def _refuse_float64(lens: Lens | None, foggy: bool) -> None:

@@ -80,21 +80,11 @@ class DemoResult:
 
     def as_dict(self) -> dict:
         """For JSON."""
-        return {
-            "passed": self.passed,
-            "device": self.device,
-            "background_splats": self.background_splats,
-            "marker_splats": self.marker_splats,
-            "frame_ms": self.frame_ms,
-            "visible_splats": self.visible_splats,
-            "seconds": self.seconds,
-            "unexpected": self.unexpected,
-            "sightings": [
-                {"view": s.view, "visible": s.visible, "passed": s.passed, **s.reading.as_dict()}
-                for s in self.sightings
-            ],
-            "files": [str(file) for file in self.files],
-        }
+        seen = [
+            {"view": s.view, "visible": s.visible, "passed": s.passed, **s.reading.as_dict()}
+            for s in self.sightings
+        ]
+        return {"passed": self.passed} | vars(self) | {"sightings": seen, "files": [*map(str, self.files)]}
 
 
 def run_demo(
@@ -126,12 +116,13 @@ def run_demo(
     files += sorted(folder.glob("scene-splats-*.ply"))
     save_ply((scene if mixture != "exact" else demo_scene(mixture="fitted")).cloud(), files[1])
 
+    families = families_of(placed.marker for placed in scene.markers)
     sightings, unexpected, frame_ms, visible, seen = [], [], {}, {}, {}
     for view, camera in demo_views().items():
         progress(f"drawing and reading: {view}")
         images, frame_ms[view], visible[view] = _draw(renderer, resident, scene, camera)
         image = to_uint8(images["rgb"])
-        readings, others = read_back(detect(image, families_of(scene.markers)), scene.markers, camera)
+        readings, others = read_back(detect(image, families), scene.markers, camera)
         sightings += [Sighting(view, r, visible_share(r.placed, camera, images["label"])) for r in readings]
         unexpected += [code.name for code in others]
         marked = _marked(image, readings)

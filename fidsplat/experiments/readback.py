@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fidsplat.cameras import Camera
+from fidsplat.markers import Marker
 from fidsplat.scenes import PlacedMarker
-from fidsplat.vision.detect import Detection
+from fidsplat.vision.detect import Detection, detect
+from fidsplat.vision.images import to_uint8
 from fidsplat.vision.pose import marker_pose, pose_error
 
 # modules of ground around a code without which no detector need find it
@@ -55,6 +57,18 @@ class Reading:
         }
 
 
+def own_code(made: Marker, picture: np.ndarray) -> Detection | None:
+    """A marker's code in a picture, (h, w) or (h, w, 3) display values; None where it is not read."""
+    families = families_of([made])
+    found = detect(to_uint8(picture), families, qr=made.kind == "qr")
+    return next((code for code in found if _same(code, made)), None)
+
+
+def corner_error(code: Detection, corners: np.ndarray) -> float:
+    """Pixels between a code's corners and where they are, (4, 2): root mean square over the four."""
+    return float(np.sqrt(((code.corners - corners) ** 2).sum(1).mean()))
+
+
 def read_back(
     detections: Iterable[Detection], markers: Sequence[PlacedMarker], camera: Camera
 ) -> tuple[list[Reading], list[Detection]]:
@@ -69,7 +83,7 @@ def read_back(
         (_apart(found.corners, seen[i]), i, found)
         for i, placed in enumerate(markers)
         for found in left
-        if _same(found, placed)
+        if _same(found, placed.marker)
     ]
     chosen: dict[int, Detection] = {}
     for _, i, found in sorted(pairs, key=lambda pair: pair[0]):
@@ -79,9 +93,9 @@ def read_back(
     return [_reading(placed, seen[i], chosen.get(i), camera) for i, placed in enumerate(markers)], left
 
 
-def families_of(markers: Iterable[PlacedMarker]) -> tuple[str, ...]:
-    """Tag families in a scene, each once, for `detect`."""
-    tags = (placed.marker for placed in markers if placed.marker.kind in ("apriltag", "aruco"))
+def families_of(markers: Iterable[Marker]) -> tuple[str, ...]:
+    """Families of those that are tags, each once, for `detect`."""
+    tags = (made for made in markers if made.kind in ("apriltag", "aruco"))
     return tuple(dict.fromkeys(f"{tag.kind}:{tag.family}" for tag in tags))
 
 
@@ -90,7 +104,7 @@ def visible_share(placed: PlacedMarker, camera: Camera, label: np.ndarray) -> fl
     0 to 1.
 
     Args:
-        label: (h, w) int32, the label plane of the picture.
+        label: (h, w) int32, the output `label` of the picture.
     """
     rows, columns = placed.marker.bits.shape
     grow = np.array([1 + 2 * MARGIN / columns, 1 + 2 * MARGIN / rows, 1.0])
@@ -112,13 +126,10 @@ def visible_share(placed: PlacedMarker, camera: Camera, label: np.ndarray) -> fl
     return float(own.sum() / within.sum())
 
 
-def _same(found: Detection, placed: PlacedMarker) -> bool:
-    marker = placed.marker
-    if found.kind != marker.kind:
-        return False
-    if found.kind == "qr":
-        return found.payload == marker.payload
-    return (found.family, found.id) == (marker.family, marker.id)
+def _same(found: Detection, made: Marker) -> bool:
+    if found.kind == "qr":  # whose family is its version
+        return (found.kind, found.payload) == (made.kind, made.payload)
+    return (found.kind, found.family, found.id) == (made.kind, made.family, made.id)
 
 
 def _apart(one: np.ndarray, other: np.ndarray) -> float:
@@ -132,5 +143,4 @@ def _reading(placed: PlacedMarker, corners: np.ndarray, found: Detection | None,
         return Reading(placed, truth, corners, None, None, None, None, None)
     pose = marker_pose(found.corners, placed.marker.size, camera)
     position, angle = pose_error(pose, truth)
-    offset = float(np.sqrt(((found.corners - corners) ** 2).sum(1).mean()))
-    return Reading(placed, truth, corners, found, pose, position, angle, offset)
+    return Reading(placed, truth, corners, found, pose, position, angle, corner_error(found, corners))

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.cloud_arrays import with_thinnest_last
 from fidsplat.defects import find_defects
-from fidsplat.formats.flatten import flatten
 
 PADDED_LOG_SCALE = np.log(1e-6)
-"""scale_2 of a 2DGS cloud written for tools that want three scales; SuperSplat writes the same"""
+"""scale_2 of a disk written for tools that want three scales; SuperSplat writes the same"""
 WINDOW = 65536
 """rows at a time: less lets the checks cost more than reading"""
 BLOCK = 2048
@@ -41,45 +41,38 @@ class Rows:
 def collect(rows: Rows, progress: Progress | None = None) -> tuple[dict[str, np.ndarray], dict[str, int]]:
     """The arrays of the splats that can be drawn, and how many others there are for each reason.
 
-    Three scales become two, as `flatten` does it, with its thickness as one more array; unless the third is
-    1e-6 throughout, which marks a 2DGS cloud: its normal is the third axis even where a splat's own scales
-    are smaller still.
+    A third scale becomes `thickness`, which is 0 for a disk: where the third scale is 1e-6, as it is padded
+    with, or where one of the three is 0.
     """
-    if rows.columns["scales"][0] == (2,):
-        found = _collect(rows, progress, "two")
-    else:
-        found = _collect(rows, progress, "padded") or _collect(rows, progress, "three")
-    assert found is not None
-    return found
-
-
-def _collect(rows: Rows, progress: Progress | None, scales: str):
-    """`collect` for two scales, for a third that is padding (None as soon as it is not), or for three."""
+    thick = rows.columns["scales"][0] == (3,)
     columns = rows.columns | {"scales": ((2,), np.float32)}
-    kept = _Kept(columns | ({"thickness": ((), np.float32)} if scales == "three" else {}), rows.count)
+    kept = _Kept(columns | ({"thickness": ((), np.float32)} if thick else {}), rows.count)
     scratch = np.empty((min(WINDOW, rows.count), 3), np.float32)
     dropped: dict[str, int] = {}
     for first in range(0, rows.count, WINDOW):
         part = kept.room(min(WINDOW, rows.count - first), first)
-        three = part if scales == "two" else part | {"scales": scratch[: len(part["scales"])]}
+        given = part | {"scales": scratch[: len(part["scales"])]} if thick else part
         with np.errstate(over="ignore", invalid="ignore"):
-            rows.fill(first, three)
-        if scales == "padded":
-            if not np.allclose(three["scales"][:, 2], np.exp(PADDED_LOG_SCALE), rtol=1e-5, atol=0):
-                return None
-            part["scales"][:] = three["scales"][:, :2]
-        elif scales == "three":
-            for start in range(0, len(three["scales"]), BLOCK):
-                block = slice(start, start + BLOCK)
-                flat = flatten(part["quats"][block], three["scales"][block])
-                part["quats"][block], part["scales"][block], part["thickness"][block] = flat
-        good, reasons = find_defects({name: part[name] for name in _CHECKED})
+            rows.fill(first, given)
+        if thick:
+            _split(given["quats"], given["scales"], part)
+        good, reasons = find_defects({name: given[name] for name in _CHECKED})
         kept.keep(part, good)
         for reason, count in reasons.items():
             dropped[reason] = dropped.get(reason, 0) + count
         if progress is not None:
             progress(f"reading {rows.path.name}", min(1.0, (first + WINDOW) / rows.count))
     return kept.finished(), dropped
+
+
+def _split(quats: np.ndarray, three: np.ndarray, part: dict[str, np.ndarray]) -> None:
+    """Puts three scales (n, 3) where two and the thickness belong. Splats of no extent along an axis get
+    frames, quats (n, 4), in which it is the third; NaN stays where it is."""
+    flat = (three[:, :2] == 0).any(axis=1) & ~np.isnan(three).any(axis=1)
+    if flat.any():
+        quats[flat], three[flat] = with_thinnest_last(quats[flat], three[flat])
+    three[np.isclose(three[:, 2], np.exp(PADDED_LOG_SCALE), rtol=1e-5, atol=0), 2] = 0
+    part["scales"][:], part["thickness"][:] = three[:, :2], three[:, 2]
 
 
 class _Kept:

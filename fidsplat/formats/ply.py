@@ -9,7 +9,6 @@ from fidsplat.defects import drop_report
 from fidsplat.errors import InputError
 from fidsplat.formats.collect import BLOCK, Progress, Rows, collect
 from fidsplat.formats.compressed_ply import compressed_rows, is_compressed
-from fidsplat.formats.flatten import not_flat_report
 from fidsplat.formats.ply_header import Element, Header, read_header
 from fidsplat.splats import SplatCloud
 
@@ -23,10 +22,11 @@ _NEEDED += ("rot_0", "rot_1", "rot_2", "rot_3")
 def load_ply(path: str | os.PathLike[str], progress: Progress | None = None) -> SplatCloud:
     """Read a splat file: 2DGS layout (two scales), 3DGS layout (three), or SuperSplat's compressed PLY.
 
-    Properties are found by name, in any order and among any others. Three scales become two: the thinnest
-    axis of each splat becomes its normal, and one warning says how many splats were not flat. Integer
-    properties ``label`` and ``plane`` are taken up. Colours come as SH of degree 0 to 3. Splats that cannot
-    be drawn are left out while the file is read, as `SplatCloud` does, and one warning counts them.
+    Properties are found by name, in any order and among any others. Splats of three scales are 3D Gaussians
+    (`SplatCloud.thickness`; `SplatCloud.flattened` makes disks of them), but those whose third is 1e-6, which
+    marks a disk. Integer properties ``label`` and ``plane`` are taken up. Colours come as SH of degree 0 to
+    3. Splats that cannot be drawn are left out while the file is read, as `SplatCloud` does, and one warning
+    counts them.
 
     progress: called now and then with what is being done and the share of it that is done, 0 to 1.
 
@@ -36,11 +36,8 @@ def load_ply(path: str | os.PathLike[str], progress: Progress | None = None) -> 
     origin = _origin(header)
     rows = compressed_rows(header) if is_compressed(header) else _plain_rows(header)
     arrays, dropped = collect(rows, progress)
-    report = not_flat_report(arrays.pop("thickness", np.empty(0)))
     if dropped:
         warnings.warn(drop_report(dropped, rows.count, header.path), stacklevel=2)
-    if report:
-        warnings.warn(f"{header.path}: {report}", stacklevel=2)
     planes = arrays.pop("planes", None)
     cloud = SplatCloud.of_checked(**arrays, origin=origin, dropped=dropped)
     return cloud if planes is None else cloud.with_planes(planes)

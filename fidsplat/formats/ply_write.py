@@ -19,13 +19,14 @@ MAX_LOGIT = 100.0
 def save_ply(cloud: SplatCloud, path: str | os.PathLike[str], native_2dgs: bool = False) -> None:
     """Write binary little-endian PLY, all float32: x y z nx ny nz f_dc_* f_rest_* opacity scale_* rot_*.
 
-    A third scale of log(1e-6) is added so that 3DGS tools open the file; ``native_2dgs`` leaves it out.
+    The third scale is a 3D Gaussian's thickness, and log(1e-6) for a disk, so that 3DGS tools open the file;
+    ``native_2dgs`` leaves it out.
     Plain colours are written as SH of degree 0. An int property label follows when any label is not 0, and an
     int property plane when the cloud has planes. An origin other than 0 is kept in a comment, and x, y, z are
     relative to it.
 
-    Raises InputError when the file cannot be written, or when the cloud has boxes, which the format does not;
-    an older file of that name is then left as it was.
+    Raises InputError when the file cannot be written, when the cloud has boxes, which the format does not, or
+    3D Gaussians and ``native_2dgs`` is asked for; an older file of that name is then left as it was.
     """
     if not isinstance(cloud, SplatCloud):
         raise InputError(f"save_ply writes a SplatCloud, not a {type(cloud).__name__}")
@@ -35,6 +36,11 @@ def save_ply(cloud: SplatCloud, path: str | os.PathLike[str], native_2dgs: bool 
         raise InputError(
             f"{int(cloud.boxes.sum())} of {len(cloud)} splats are boxes, which a PLY file cannot hold; write "
             "the marker's Gaussians instead (Marker.gaussians), or make it with mixture='fitted'"
+        )
+    if native_2dgs and cloud.thickness is not None:
+        raise InputError(
+            f"{int((cloud.thickness > 0).sum())} of {len(cloud)} splats are 3D Gaussians, which two scales "
+            "cannot hold; write three, or the cloud's flattened()"
         )
     rest = 0 if cloud.sh is None else 3 * (cloud.sh.shape[1] - 1)
     names = [
@@ -78,11 +84,18 @@ def save_ply(cloud: SplatCloud, path: str | os.PathLike[str], native_2dgs: bool 
             first = column["scale_0"]
             rows[:, first : first + 2] = np.log(cloud.scales[part].astype(np.float64))
             if not native_2dgs:
-                rows[:, first + 2] = PADDED_LOG_SCALE
+                rows[:, first + 2] = _log_thickness(cloud, part)
             rows[:, column["rot_0"] : column["rot_0"] + 4] = cloud.quats[part]
             for place, numbers in enumerate(whole.values(), len(names)):
                 rows.view("<i4")[:, place] = numbers[part]
             stream.write(rows.data)
+
+
+def _log_thickness(cloud: SplatCloud, part: slice) -> np.ndarray | float:
+    if cloud.thickness is None:
+        return PADDED_LOG_SCALE
+    thickness = cloud.thickness[part].astype(np.float64)
+    return np.where(thickness > 0, np.log(np.where(thickness > 0, thickness, 1.0)), PADDED_LOG_SCALE)
 
 
 def _logit(opacities: np.ndarray) -> np.ndarray:

@@ -35,7 +35,7 @@ from fidsplat.quality import MIXTURES, MarkerQuality, whole_number
 from fidsplat.scalars import PickledByFields
 
 if TYPE_CHECKING:
-    from shapely import Polygon
+    from shapely import MultiPolygon, Polygon
 from fidsplat.splats import SplatCloud
 
 MAX_MODULES = 4096
@@ -45,10 +45,10 @@ MAX_MODULES = 4096
 class Rectangle(NamedTuple):
     """One rectangle of a partition, in modules of the grid with quiet zone: x right, y down, half-open."""
 
-    x0: int
-    y0: int
-    x1: int
-    y1: int
+    x0: float
+    y0: float
+    x1: float
+    y1: float
     dark: bool
 
 
@@ -80,7 +80,14 @@ class Marker(PickledByFields):
     grid: np.ndarray = field(repr=False)
     """(H, W) uint8, the code with its quiet zone"""
     boxes: np.ndarray = field(repr=False)
-    """(n, 4) int64 x0, y0, x1, y1: the minimum partition of the grid, in modules"""
+    """(n, 4) int64 x0, y0, x1, y1: the minimum partition of the grid, in modules; float64 of a drawing that
+    is more than whole modules, which rectangles cover, turned as its edges are"""
+    values: np.ndarray = field(repr=False)
+    """(n,) uint8, the value (index into ``palette``) of each rectangle"""
+    turns: np.ndarray | None = field(repr=False)
+    """(n,) radians by which each is turned about its middle, from x to y; None: not at all"""
+    regions: tuple[MultiPolygon, ...] | None = field(repr=False)
+    """what such a drawing covers with each value, in modules of the grid; None for other markers"""
     labels: np.ndarray = field(repr=False)
     """(H, W) int32, the 4-connected component of each module of the grid"""
     components: int
@@ -118,24 +125,28 @@ class Marker(PickledByFields):
         templates = fitted_templates(self.quality.template)
         count = int(count_gaussians(aspect_of(self.boxes), templates).sum())
         refuse_more(f"as Gaussians {self.spec}", count, self.max_splats)
-        return gaussian_cloud(
-            Printed(self.grid, self.boxes, self.module, self.palette), templates, fitted_growth(), _unseen
+        printed = Printed(
+            self.grid, self.boxes, self.values, self.turns, self.regions, self.module, self.palette
         )
+        return gaussian_cloud(printed, templates, fitted_growth(), _unseen)
 
     @cached_property
     def rectangles(self) -> list[Rectangle]:
-        """The minimum partition of every component of each colour, in raster order."""
+        """The minimum partition of every component of each colour, in raster order; of a drawing with slanted
+        edges what covers it, before ``turns``."""
         dark = self.is_dark
         return [Rectangle(*row) for row in zip(*self.boxes.T.tolist(), dark.tolist(), strict=True)]
 
     @property
     def is_dark(self) -> np.ndarray:
         """(n,) bool, the rectangles that are nearer to black than to white."""
-        return (self.palette.mean(1) < 0.5)[self.grid[self.boxes[:, 1], self.boxes[:, 0]]]
+        return (self.palette.mean(1) < 0.5)[self.values]
 
     @cached_property
     def polygons(self) -> list[Polygon]:
         """Each component as a shapely polygon with holes, in modules of the grid (needs shapely)."""
+        if self.regions is not None:
+            return [polygon for region in self.regions for polygon in region.geoms]
         return polygons(self.grid, self.labels, self.components)
 
     @property
@@ -217,13 +228,24 @@ def marker(
     progress("components", 0.0)
     labels, components = label_components(grid)
     progress("rectangles", 0.0)
-    boxes = partition_colors(grid)
+    regions, turns = parsed.regions, None
+    if regions is None:
+        boxes = partition_colors(grid)
+        values = grid[boxes[:, 1], boxes[:, 0]]
+    else:
+        from fidsplat.markers.cover import cover_all  # late, as shapely is
+        from fidsplat.markers.shapes import with_margin
+
+        regions = with_margin(regions, quiet, grid.shape)
+        components = sum(len(region.geoms) for region in regions)
+        boxes, turns, values = cover_all(regions, grid.shape)
     count = len(boxes) if exact else int(count_gaussians(aspect_of(boxes), templates).sum())
     refuse_more(spec, count, max_splats)
-    printed = Printed(grid, boxes, size / bits.shape[1], palette)
+    printed = Printed(grid, boxes, values, turns, regions, size / bits.shape[1], palette)
     cloud = box_cloud(printed, progress) if exact else gaussian_cloud(printed, templates, growth, progress)
-    for array in (bits, grid, boxes, labels, palette):
-        array.flags.writeable = False
+    for array in (bits, grid, boxes, values, turns, labels, palette):
+        if array is not None:
+            array.flags.writeable = False
     return Marker(
         spec=spec,
         kind=parsed.kind,
@@ -237,6 +259,9 @@ def marker(
         quality=chosen,
         grid=grid,
         boxes=boxes,
+        values=values,
+        turns=turns,
+        regions=regions,
         labels=labels,
         components=components,
         palette=palette,

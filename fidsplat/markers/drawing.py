@@ -1,8 +1,8 @@
-"""Drawings: the filled shapes of an SVG file in their colours, cut into modules.
+"""Drawings: the filled shapes of an SVG file in their colours, as polygons with holes.
 
-What a module shows is the topmost shape that holds its centre. Everything that is filled in one colour is
-understood; what would have to be left out (text, strokes, gradients, pictures) is an error, so that no
-drawing comes out other than it looks.
+What is drawn are the polygons themselves; `Marker.bits` have in each module the topmost shape that holds its
+centre. Everything that is filled in one colour is understood; what would have to be left out (text, strokes,
+gradients, pictures) is an error, so that no drawing comes out other than it looks.
 """
 
 from __future__ import annotations
@@ -16,16 +16,13 @@ from xml.etree import ElementTree
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.markers.paths import Rings, circle_rings, path_rings, polygon_rings
+from fidsplat.markers.paths import FARTHEST, Rings, circle_rings, number, path_rings, polygon_rings
 from fidsplat.markers.spec import Kind, Spec
 
 MODULES = 256
 """Modules across a drawing unless its spec says otherwise."""
 
-MOST_MODULES, MOST_BYTES, MOST_COLORS = 2048, 2_000_000, 64
-
-EDGES = 1024
-"""Edges of an outline that are looked at together."""
+MOST_MODULES, MOST_BYTES, MOST_COLORS, MOST_POINTS = 2048, 2_000_000, 64, 200_000
 
 _HEAD = re.compile(r"svg(?:-(?P<modules>[0-9]{1,5}))?", re.IGNORECASE)
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -69,6 +66,8 @@ def _parse(text: str, head: str, rest: str) -> DrawingSpec:
 
 def _modules(spec: DrawingSpec) -> tuple[Spec, np.ndarray]:
     """Indices (h, w) uint8 into the spec's colours, the first of which is the paper's white."""
+    from fidsplat.markers.shapes import filled, is_whole, modules, visible  # late, as shapely is
+
     root, name = _root(Path(spec.payload or "")), spec.payload
     x, y, width, height = _view(root, name)
     scale = spec.modules / width
@@ -76,39 +75,19 @@ def _modules(spec: DrawingSpec) -> tuple[Spec, np.ndarray]:
     if not 1 <= rows <= MOST_MODULES:
         raise InputError(f"{name} would have {rows} rows of modules; 1 to {MOST_MODULES} are made")
     to_modules = np.array([[scale, 0, -x * scale], [0, scale, -y * scale], [0, 0, 1]])
-    grid = np.zeros((rows, spec.modules), np.uint8)
-    colors = [(1.0, 1.0, 1.0)]
+    colors, shapes, points = [(1.0, 1.0, 1.0)], [], 0
     for rings, color, rule in _shapes(root, to_modules, _Style(), name):
         if color not in colors:
             colors.append(color)
-        if len(colors) > MOST_COLORS:
-            raise InputError(f"{name} has more than {MOST_COLORS} colours")
-        grid[inside(rings, rule, grid.shape)] = colors.index(color)
-    return replace(spec, colors=tuple(colors)), grid
-
-
-def inside(rings: Rings, rule: str, shape: tuple[int, int]) -> np.ndarray:
-    """Which cells of a grid have their centre inside closed rings of (n, 2) points x, y: ``shape`` bool.
-
-    rule: "nonzero" (the winding number) or "evenodd" (the number of crossings).
-    """
-    h, w = shape
-    winding = np.zeros((h, w + 1), np.int32)
-    for ring in rings:
-        a, b = ring, np.roll(ring, -1, 0)
-        low, high = np.minimum(a[:, 1], b[:, 1]), np.maximum(a[:, 1], b[:, 1])
-        first, stop = (np.clip(np.ceil(v - 0.5), 0, h).astype(np.int64) for v in (low, high))
-        for part in range(0, len(a), EDGES):  # each may cross every row
-            some = slice(part, part + EDGES)
-            count = (stop - first)[some]
-            edge = np.repeat(np.arange(len(count)), count)
-            row = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count) + first[some][edge]
-            (ax, ay), (bx, by) = a[some][edge].T, b[some][edge].T
-            x = ax + (row + 0.5 - ay) / (by - ay) * (bx - ax)
-            column = np.clip(np.ceil(x - 0.5), 0, w).astype(np.int64)
-            np.add.at(winding, (row, column), 1 if rule == "evenodd" else np.where(by > ay, 1, -1))
-    crossed = np.cumsum(winding, 1)[:, :w]
-    return crossed % 2 == 1 if rule == "evenodd" else crossed != 0
+        points += sum(map(len, rings))
+        if len(colors) > MOST_COLORS or points > MOST_POINTS:
+            raise InputError(
+                f"{name} has more than {MOST_COLORS} colours or {MOST_POINTS} points: simplify the drawing"
+            )
+        shapes.append((filled(rings, rule), colors.index(color)))
+    regions = visible(shapes, (rows, spec.modules))
+    finer = None if is_whole(regions) else regions
+    return replace(spec, colors=tuple(colors), regions=finer), modules(regions, (rows, spec.modules))
 
 
 def _root(path: Path) -> ElementTree.Element:
@@ -127,12 +106,14 @@ def _root(path: Path) -> ElementTree.Element:
 
 def _view(root: ElementTree.Element, name: str | None) -> tuple[float, float, float, float]:
     """The part of the plane that the drawing shows: x, y, width, height."""
-    box = [float(number) for number in re.findall(_NUMBER, root.get("viewBox", ""))]
+    box = [float(side) for side in re.findall(_NUMBER, root.get("viewBox", ""))]
     if not box:
         sides = [re.match(_NUMBER, root.get(side, "")) for side in ("width", "height")]
         box = [0.0, 0.0, *(float(side[0]) for side in sides if side)]
-    if len(box) != 4 or not (box[2] > 0 and box[3] > 0 and np.isfinite(box).all()):
-        raise InputError(f"{name}: it has no viewBox, nor a width and height, above 0")
+    if len(box) != 4 or not (min(box[2:]) >= 1 / FARTHEST and np.abs(box).max() <= FARTHEST):
+        raise InputError(
+            f"{name}: it has no viewBox, nor a width and height, above 0 (and no number beyond {FARTHEST:g})"
+        )
     return box[0], box[1], box[2], box[3]
 
 
@@ -152,7 +133,8 @@ def _shapes(
             raise InputError(f"{name}: <{tag}> has a {what}; convert it to filled paths")
     if any(look.get(what, "1") not in ("1", "1.0", "100%") for what in ("opacity", "fill-opacity")):
         raise InputError(f"{name}: <{tag}> is translucent; a print is opaque")
-    to_modules = to_modules @ _transform(element.get("transform", ""), name)
+    with np.errstate(all="ignore"):  # what reaches too far is refused below
+        to_modules = to_modules @ _transform(element.get("transform", ""), name)
     if tag in _GROUPS:
         for child in element:
             yield from _shapes(child, to_modules, style, name, depth + 1)
@@ -161,26 +143,26 @@ def _shapes(
     if style.fill != "none":
         with np.errstate(all="ignore"):
             moved = [ring @ to_modules[:2, :2].T + to_modules[:2, 2] for ring in rings]
-        if not all((np.abs(ring) < 1e9).all() for ring in moved):
+        if not all((np.abs(ring) <= FARTHEST).all() for ring in moved):
             raise InputError(f"{name}: <{tag}> reaches too far beyond the drawing")
         yield moved, _color(style.fill, name), style.rule
 
 
 def _rings(element: ElementTree.Element, tag: str, name: str | None) -> Rings:
-    def number(key: str, default: float = 0.0) -> float:
-        return float(element.get(key) or default)
+    def side(key: str, default: float = 0.0) -> float:
+        return number(element.get(key) or str(default))
 
     try:
         if tag == "path":
             return path_rings(element.get("d", ""))
         if tag in ("polygon", "polyline"):
             return polygon_rings(element.get("points", ""))
-        if tag == "rect" and not (number("rx") or number("ry")):
-            x, y, w, h = (number(key) for key in ("x", "y", "width", "height"))
+        if tag == "rect" and not (side("rx") or side("ry")):
+            x, y, w, h = (side(key) for key in ("x", "y", "width", "height"))
             return [np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]])]
         if tag in ("circle", "ellipse"):
-            rx, ry = number("rx", number("r")), number("ry", number("r"))
-            return circle_rings(number("cx"), number("cy"), rx, ry)
+            rx, ry = side("rx", side("r")), side("ry", side("r"))
+            return circle_rings(side("cx"), side("cy"), rx, ry)
     except ValueError as error:
         raise InputError(f"{name}: <{tag}> cannot be read: {error}") from None
     raise InputError(f"{name}: <{tag}> is no filled shape; convert it to a path")
@@ -198,7 +180,7 @@ def _color(text: str, name: str | None) -> tuple[float, float, float]:
         digits = word[1:] if len(word) == 7 else "".join(2 * digit for digit in word[1:])
         r, g, b = (int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4))
         return r, g, b
-    if found := re.fullmatch(r"rgb\(\s*(\d+)[\s,]+(\d+)[\s,]+(\d+)\s*\)", word):
+    if found := re.fullmatch(r"rgb\(\s*(\d{1,9})[\s,]+(\d{1,9})[\s,]+(\d{1,9})\s*\)", word):
         r, g, b = (min(int(part), 255) / 255 for part in found.groups())
         return r, g, b
     raise InputError(f"{name}: the fill {text!r} is no plain colour; write #rrggbb, rgb(r, g, b) or a name")
@@ -207,7 +189,9 @@ def _color(text: str, name: str | None) -> tuple[float, float, float]:
 def _transform(text: str, name: str | None) -> np.ndarray:
     matrix = np.eye(3)
     for word, inner in re.findall(r"(\w+)\s*\(([^)]*)\)", text):
-        v = [float(number) for number in re.findall(_NUMBER, inner)]
+        v = [float(value) for value in re.findall(_NUMBER, inner)]
+        if any(abs(value) > FARTHEST for value in v):
+            raise InputError(f"{name}: the transform {word}({inner}) has a number beyond {FARTHEST:g}")
         if word == "matrix" and len(v) == 6:
             step = np.array([[v[0], v[2], v[4]], [v[1], v[3], v[5]], [0, 0, 1]])
         elif word == "translate" and len(v) in (1, 2):

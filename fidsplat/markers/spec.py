@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from shapely import MultiPolygon
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +28,8 @@ class Spec:
     """QR text, or the path of an image or a drawing"""
     colors: tuple[tuple[float, float, float], ...] | None = None
     """RGB of modules of the values 0, 1, ..., once they are made; None: white and black"""
+    regions: tuple[MultiPolygon, ...] | None = None
+    """of each value what it covers, in modules from the top left, where it is more than whole modules"""
 
 
 @dataclass(frozen=True)

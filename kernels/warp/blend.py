@@ -37,7 +37,7 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
     blend_one, finish = pixels.blend, pixels.finish
     limits = make_bounds("lowpass_screen" in effects)
     Samples = make_samples(tuple(sample_fields(outputs).items()))
-    stores = output.functions(outputs, "store")
+    stores, mark = output.functions(outputs, "store"), output.digest(outputs)
     bent, curved = "rays" in effects, cross_slopes is not None
 
     @wp.func
@@ -46,7 +46,9 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         for k in range(wp.static(len(stores))):
             wp.static(stores[k])(p, at, samples)
 
-    @wp.kernel(module="unique", module_options=STRICT, enable_backward=False, launch_bounds=threads)
+    options = {"module": "unique", "module_options": STRICT, "enable_backward": False}
+
+    @wp.kernel(name=f"blend_gpu_{mark}", launch_bounds=threads, **options)
     def blend_gpu(
         band_first: int,  # tile of block 0
         view: View,
@@ -108,7 +110,7 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         at = y0 * view.tiles_x * view.tile_w + x0
         store(finish(p, view), at, samples)
 
-    @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+    @wp.kernel(name=f"blend_cpu_{mark}", **options)
     def blend_cpu(
         band_first: int,  # tile of thread 0
         view: View,

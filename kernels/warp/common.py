@@ -95,10 +95,10 @@ def store_line(lines: wp.array(dtype=wp.vec4), at: int, value: wp.vec4):
 
 @wp.func
 def sortable(x: float) -> wp.uint32:
-    """Bits of a float in an order that unsigned comparison keeps, negative values and zeros included
-    (numerics C2).
+    """Bits of a float in an order that unsigned comparison keeps, negative values included (numerics C2). No
+    depth is -0: it is a sum with a term of the view's, which is not.
     """
-    bits = wp.cast(x + 0.0, wp.uint32)  # -0 becomes +0
+    bits = wp.cast(x, wp.uint32)
     if (bits & _SIGN) != _NONE:
         return ~bits
     return bits | _SIGN

@@ -37,7 +37,7 @@ def assert_well_formed(names):
             declared = [one.text.replace("wide", source.scalars.wide) for one in arguments]
             assert lines == declared, kernel
         taken = {one.name for one in source.arguments["resolve"]}
-        assert {f"{output.name}_out" for output in features.outputs} <= taken
+        assert {f"{output.name}_out" for output in features.images} <= taken
         assert {one.name for one, _ in source.samples} <= taken
         assert {one.name for one, _ in source.samples} <= {one.name for one in source.arguments["blend"]}
 
@@ -46,6 +46,13 @@ def test_texts_of_each_effect_and_of_every_pair():
     assert len(SWITCHES) > 35
     for names in [(), *((name,) for name in SWITCHES), *PAIRS]:
         assert_well_formed(names)
+
+
+def test_most_pictures_list_their_splats_by_the_same_program():
+    """What a driver keeps by its text is compiled once for all of them."""
+    for shape in SHAPES:
+        texts = [assemble(combination((name,)).features(), shape).programs["lists"] for name in SWITCHES]
+        assert max(map(texts.count, texts)) > 0.8 * len(SWITCHES)
 
 
 @pytest.mark.parametrize("lens", [None, *LENSES])

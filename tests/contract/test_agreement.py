@@ -45,6 +45,17 @@ def test_splats_around_and_behind_the_camera(renderer, quality):
     assert_agrees(renderer, random_splats(200, seed=1), CAMERA, quality=quality)
 
 
+def test_near_and_far_planes_amid_the_splats(renderer):
+    """Whole disks end at the far plane, fragments at the near one, where disks that cross it are wide."""
+    camera = fs.Camera.look_at(97, 71, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0), near=1.0, far=4.0)
+    for seed in (1, 2):
+        assert_agrees(renderer, random_splats(200, seed), camera)
+    wall = fs.SplatCloud(
+        [(0, 0, 5), (0, 0, 9)], [(1, 0, 0, 0)] * 2, [(5, 5)] * 2, [1, 1], colors=np.eye(3)[:2]
+    )
+    assert not renderer.render(wall, camera, ALL_OUTPUTS)["alpha"].any()
+
+
 def test_splats_much_larger_than_the_picture(renderer):
     assert_agrees(renderer, random_splats(200, seed=7, scale=(1e-3, 50.0)), CAMERA)
 
@@ -101,6 +112,28 @@ def test_markers_at_five_tilts(renderer, spec, tilt):
 def test_principal_point_outside_the_picture_and_odd_sizes(renderer):
     camera = fs.Camera.pinhole(53, 31, 60.0, 75.0, -20.5, 44.25)
     assert_agrees(renderer, random_splats(300, seed=2, depth=(0.5, 5), scale=(0.01, 0.5)), camera)
+
+
+def test_no_sample_that_a_rim_just_reaches_is_lost(renderer):
+    """Twenty disks whose lowest point lies 2e-5 samples below the centre of a sample, in row 12,000 of a
+    picture, where float32 rounds a place to a thousandth: more than the relative room of bounds makes up for.
+    """
+    quality, top = fs.Quality(lowpass="none", alpha_cutoff=1 / 255), 12_000
+    samples = 5.0 * np.arange(20) - 46.5  # rows of their centres, from there
+    radii = np.random.default_rng(1).uniform(0.15, 0.45, 20)
+    places, focal, reach = samples - radii + 2e-5, 100.0, math.sqrt(2 * math.log(0.9 * 255))
+    cloud = fs.SplatCloud(
+        np.column_stack([0 * places, places / focal, 0 * places + 1]),
+        np.tile([1.0, 0, 0, 0], (20, 1)),
+        np.tile(radii[:, None] / focal / reach, (1, 2)),
+        np.full(20, 0.9),
+        colors=np.ones((20, 3)),
+    )
+    camera = fs.Camera.pinhole(1, 12_100, focal, focal, 0.5, top)
+    alpha = renderer.render(cloud, camera, ALL_OUTPUTS, quality)["alpha"][:, 0]
+    rows = np.flatnonzero(alpha)
+    assert np.array_equal(rows, top + np.floor(samples).astype(int))
+    assert alpha[rows] == pytest.approx(1 / 255, rel=1e-2)
 
 
 @pytest.mark.parametrize("focal", FOCAL_LENGTHS)

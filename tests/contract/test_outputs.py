@@ -62,10 +62,10 @@ def test_normals_in_the_world_are_the_cameras_turned(renderer):
     assert normals[30, 40] == pytest.approx([0, 0, -1], abs=1e-6)
 
 
-def layers_of(opacities, first=2.0):
-    """Wide splats one metre behind the other."""
+def layers_of(opacities, first=2.0, step=1.0):
+    """Wide splats one metre (`step`) behind the other."""
     n = len(opacities)
-    means = np.column_stack([np.zeros((n, 2)), first + np.arange(n)])
+    means = np.column_stack([np.zeros((n, 2)), first + step * np.arange(n)])
     return fs.SplatCloud(
         means,
         np.tile([1.0, 0, 0, 0], (n, 1)),
@@ -88,9 +88,54 @@ def test_ties_go_to_what_is_nearer(renderer):
     frame = renderer.render(layers_of([0.5, 1.0]), POINT, ("label", "splat_id"))
     assert renderer.render(layers_of([0.5]), POINT, "alpha")["alpha"][2, 2] == 0.5
     assert (frame["label"][2, 2], frame["splat_id"][2, 2]) == (7, 0)
+    first = half.with_(first_hit=0.5)
+    assert renderer.render(layers_of([1, 1]), POINT, "depth_first", first)["depth_first"][2, 2] == 2
     gsplat = half.with_(stop_rule="exclusive", order="centre", transmittance_stop=0.25)
-    frame = renderer.render(layers_of([1, 1, 1]), POINT, ("alpha", "blended"), gsplat)
-    assert (frame["alpha"][2, 2], frame["blended"][2, 2]) == (0.5, 1)
+    for last in (1, 0.1):  # the pixel is finished, whatever comes behind the fragment that was dropped
+        frame = renderer.render(layers_of([1, 1, last]), POINT, ("alpha", "blended"), gsplat)
+        assert (frame["alpha"][2, 2], frame["blended"][2, 2]) == (0.5, 1)
+
+
+def test_a_pixel_ends_at_the_stop_whatever_its_neighbours_do(renderer):
+    """Of three layers that take half of the light each, the second covers the middle alone, which ends there
+    with exactly a quarter; the others go on to the third."""
+    quality = fs.Quality(opacity_ceiling=0.5, transmittance_stop=0.25, lowpass="none", alpha_cutoff=0.4)
+    wide = layers_of([1, 1, 1])
+    scales = wide.scales.copy()
+    scales[1] = 0.5 * 3 / 50  # half a pixel
+    layers = fs.SplatCloud(wide.means, wide.quats, scales, wide.opacities, colors=np.eye(3))
+    frame = renderer.render(layers, POINT, ("rgb", "alpha", "blended"), quality)
+    assert (frame["alpha"][2] == [0.75] * 5).all()
+    assert (frame["blended"][2] == [2] * 5).all()
+    assert frame["rgb"][2, 2].tolist() == [0.5, 0.25, 0]
+    assert frame["rgb"][2, 0].tolist() == [0.5, 0, 0.25]
+
+
+def test_of_equal_splats_in_a_layer_and_equal_samples_of_a_pixel_the_first_is_named(renderer):
+    """Two copies in one plane; and two disks that each cover two of a pixel's four samples, with exactly half
+    of the light: the left one's are read first. Of its samples a pixel takes the nearest first hit, and of
+    their medians the lower."""
+    twice = layers_of([0.5, 0.5, 0.5], step=0.0).with_planes([0, 0, 0])
+    frame = renderer.render(twice, POINT, ("label", "splat_id"))
+    assert (frame["label"][2, 2], frame["splat_id"][2, 2]) == (7, 0)
+
+    # columns 2.75 and 2.25 of the picture, row 2.5; within 1.2 sigma they are as opaque as the ceiling allows
+    depths, sigma = np.array([2.0, 3.0]), 0.25 / 50
+    sides = fs.SplatCloud(
+        np.column_stack([np.array([0.25, -0.25]) / 50, [0, 0], [1, 1]]) * depths[:, None],
+        np.tile([1.0, 0, 0, 0], (2, 1)),
+        np.tile(depths[:, None] * sigma, (1, 2)),
+        [1.0, 1.0],
+        colors=np.ones((2, 3)),
+        labels=[7, 8],
+    )
+    quality = fs.Quality(samples=2, lowpass="none", alpha_cutoff=0.4, opacity_ceiling=0.5, first_hit=0.4)
+    frame = renderer.render(sides, POINT, ALL, quality)
+    found = {name: frame[name][2, 2] for name in ALL}
+    assert (found["alpha"], found["label"], found["splat_id"], found["blended"]) == (0.5, 8, 1, 1)
+    assert (found["depth_first"], found["depth_median"]) == pytest.approx((2, 2), rel=1e-6)
+    assert found["depth"] == pytest.approx(2.5, rel=1e-6)
+    assert 2 < found["distance_median"] == pytest.approx(found["distance_first"], rel=1e-6)
 
 
 def test_a_layer_of_a_thousand_faint_splats(renderer):

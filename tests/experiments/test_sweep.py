@@ -114,6 +114,20 @@ def test_another_commit_or_day_does_not_matter(tmp_path):
     assert sweep(file, commit="other", date="2030-01-01").left == []
 
 
+def test_a_disk_that_is_full_is_no_fault_of_ours(tmp_path):
+    file = tmp_path / "counts.jsonl"
+    running = sweep(file)
+    running.results.append(POINTS[0], {"value": 1.0})
+    kept = file.read_bytes()
+    file.unlink()
+    file.symlink_to("/dev/full")
+    with pytest.raises(fs.InputError, match=r"counts.jsonl: No space left on device; .* goes on from there"):
+        running.results.append(POINTS[1], {"value": 2.0})
+    file.unlink()
+    file.write_bytes(kept + b'{"key": {"category":')  # as far as there was room
+    assert sweep(file).left == POINTS[1:]
+
+
 def test_a_result_that_is_no_json_is_a_fault_and_not_written(tmp_path):
     file = tmp_path / "counts.jsonl"
     with pytest.raises(ValueError, match="not JSON compliant"):
@@ -133,6 +147,8 @@ def test_numbers_are_kept_to_six_digits(tmp_path):
         ('{"run": {}}\nmilk, bread\n', 2),
         ('{"key": {}, "result": {}}\n', 1),
         ('{"run": 1}\n{"key": {}, "result": {}}\n', 2),
+        ('{"run": {}}\n{"key": {}, "result": {"a": 1e999}}\n', 2),
+        ('{"run": {}}\n{"key": {}, "result": {"a": NaN}}\n', 2),
     ],
 )
 def test_files_that_are_not_ours_are_refused_and_left_alone(tmp_path, text, line):

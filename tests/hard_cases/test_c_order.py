@@ -6,9 +6,8 @@ import pytest
 import fidsplat as fs
 from fidsplat.cameras import Camera
 from fidsplat.hard_cases import c_order, clouds
-from fidsplat.hard_cases.agreement import Picture, draw
-from fidsplat.hard_cases.clouds import splats, taken
-from fidsplat.hard_cases.coplanar import (
+from fidsplat.hard_cases.agreement import Picture, differing, draw, trace
+from fidsplat.hard_cases.c_order import (
     SMOOTH,
     WALL_STEP,
     beside_a_big_splat,
@@ -18,7 +17,7 @@ from fidsplat.hard_cases.coplanar import (
     tag,
     turning,
 )
-from fidsplat.hard_cases.invariance import differing, trace
+from fidsplat.hard_cases.clouds import splats, taken
 
 
 @pytest.mark.parametrize("away", [0.0, 1.0])

@@ -170,13 +170,11 @@ def test_elements_are_found_by_name(tmp_path):
     assert np.array_equal(a.sh, b.sh)
 
 
-def test_a_3d_capture_is_flattened_with_a_warning(tmp_path):
+def test_a_3d_capture_keeps_its_three_scales(tmp_path):
     true = splats(300, thin=0.2)
-    path = pack(tmp_path / "a.ply", **true)
-    with pytest.warns(UserWarning, match=r"\d+ of 300 have a thinnest axis above 0.1"):
-        read = fs.load_ply(path)
-    kept = np.sort(true["scales"], axis=1)[:, 1:]
-    np.testing.assert_allclose(np.sort(read.scales, axis=1), kept, rtol=0.01)
+    read = fs.load_ply(pack(tmp_path / "a.ply", **true))
+    scales = np.column_stack([read.scales, read.thickness])
+    np.testing.assert_allclose(scales, true["scales"], rtol=0.01)
 
 
 def test_no_splats(tmp_path):

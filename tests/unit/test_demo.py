@@ -126,4 +126,7 @@ def test_detections_are_matched_by_what_they_say_and_then_by_nearness(scene):
         assert reading.position_error == pytest.approx(0, abs=1e-6)
         assert reading.corner_error == 0
     assert readings[2].as_dict()["found"] is False
-    assert families_of((tag, aruco, qr, tag)) == ("apriltag:36h11", "aruco:4x4_50")
+    assert families_of(placed.marker for placed in (tag, aruco, qr, tag)) == (
+        "apriltag:36h11",
+        "aruco:4x4_50",
+    )

@@ -1,50 +1,77 @@
 """Signals and full disks: the short form of tools/interrupt.py."""
 
+import json
 import os
-import random
+import subprocess
 
 import interrupt
 import pytest
 
-NOTHING_LOST = {"broken": 0, "unclear": 0, "changed": 0}
-
 
 @pytest.fixture(scope="module")
 def trial(tmp_path_factory):
-    return interrupt.Trial("render", tmp_path_factory.mktemp("interrupted"))
+    return interrupt.Trial(interrupt.COMMANDS["render"], tmp_path_factory.mktemp("interrupted"))
 
 
-def lost(tally):
-    return {name: getattr(tally, name) for name in NOTHING_LOST}
-
-
-def test_an_interrupted_command_loses_nothing(trial, tmp_path):
-    tally = interrupt.kills(trial, tmp_path, 6, random.Random(3))
-    assert tally.interrupted >= 1
-    assert lost(tally) == NOTHING_LOST
+def test_an_interrupted_command_loses_nothing(trial):
+    found = [interrupt.disturb(trial, how, how, 0.8) for how in interrupt.SIGNALS]
+    assert [row["lost"] for row in found] == [[]] * 3
+    assert any(row["stopped"] for row in found)
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a small file system")
 def test_a_full_disk_loses_nothing(trial, tmp_path):
-    probe = tmp_path / "probe"
     try:
-        with interrupt.small_disk(probe, 2**20):
+        with interrupt.small_disk(tmp_path, 2**20):
             pass
-    except interrupt.subprocess.CalledProcessError:
+    except subprocess.CalledProcessError:
         pytest.skip("no file system can be mounted here")
-    tally = interrupt.disks(trial, tmp_path, 2)
-    assert tally.interrupted == 2
-    assert lost(tally) == NOTHING_LOST
+    assert interrupt.disturb(trial, "full", interrupt.DISK, 0.6) == {"stopped": True, "lost": []}
 
 
-def test_what_is_cut_off_is_seen(tmp_path):
-    whole = tmp_path / "figures.json"
-    whole.write_text('{"a": 1}\n')
-    assert interrupt.is_whole(whole)
-    whole.write_text('{"a": ')
-    assert not interrupt.is_whole(whole)
+def test_what_is_lost_is_seen(trial):
+    folder = trial.folder("damaged")
+    assert trial.run(folder) == (0, "")
+    (folder / ".picture.png.x.part").touch()
+    pictures = sorted(name for name in interrupt.files_below(folder) if name.endswith(".png"))
+    (folder / pictures[0]).write_bytes((folder / pictures[1]).read_bytes())
+    (folder / pictures[-1]).write_bytes((folder / pictures[-1]).read_bytes()[:-9])
+    assert [words.partition(":")[0] for words in trial.lost(folder, 1, "Traceback")] == [
+        "ended with 1",
+        "left .picture.png.x.part",
+        f"{pictures[0]} differs",
+        f"{pictures[-1]} is not whole",
+    ]
+
+
+def test_logs_and_figures_by_their_values(tmp_path):
     log = tmp_path / "rows.jsonl"
-    log.write_text('{"a": 1}\n{"a": ')
-    assert interrupt.is_whole(log)
-    log.write_text('{"a": 1\n{"a": 2}\n')
-    assert not interrupt.is_whole(log)
+    log.write_text('{"run": {}}\n{"key": {"n": 1}, "result": {"a": [1, 2]}}\n{"key": {')
+    assert interrupt.facts(log) == {('{"n": 1}', "a", 0): 1, ('{"n": 1}', "a", 1): 2}
+    log.write_text('{"key": {"n": 1\n{"key": {"n": 2}, "result": {}}\n')
+    with pytest.raises(json.JSONDecodeError):
+        interrupt.facts(log)
+    figures = tmp_path / "figures.json"
+    figures.write_text('{"a": {"b": 1}}\n')
+    assert interrupt.facts(figures) == {("a", "b"): 1}
+    figures.write_text('{"a": ')
+    with pytest.raises(json.JSONDecodeError):
+        interrupt.facts(figures)
+
+
+def test_how_a_run_may_end():
+    assert interrupt.is_clear(0, "")
+    assert interrupt.is_clear(143, "half of a bar\nfidsplat: terminated")
+    assert interrupt.is_clear(-2, "Traceback ...\n  File site.py, line 3, in getpath\nKeyboardInterrupt")
+    assert not interrupt.is_clear(-2, "Traceback ...\n  File cli.py, line 3, in main\nKeyboardInterrupt")
+    assert not interrupt.is_clear(143, "fidsplat: terminated\nException ignored in\nTraceback")
+    assert not interrupt.is_clear(1, "OSError: [Errno 28]")
+    assert not interrupt.is_clear(
+        1, "fidsplat: OSError: [Errno 28] (a fault of fidsplat; --debug shows where)"
+    )
+
+
+def test_the_trials_are_planned_alike_each_time():
+    plans = {name: interrupt.planned(name, 0) for name in interrupt.COMMANDS}
+    assert plans == {name: interrupt.planned(name, 0) for name in interrupt.COMMANDS}
+    assert sum(map(len, plans.values())) == 300

@@ -1,4 +1,4 @@
-"""Drawings: SVG outlines, which modules they cover, their colours, and what is refused."""
+"""Drawings: SVG outlines, the rectangles that cover them, their colours, and what is refused."""
 
 import numpy as np
 import pytest
@@ -8,9 +8,10 @@ from hypothesis import strategies as st
 
 import fidsplat as fs
 from fidsplat.markers import marker
-from fidsplat.markers.drawing import inside
+from fidsplat.markers.cover import turned
 from fidsplat.markers.kinds import parse_spec
 from fidsplat.markers.paths import circle_rings, path_rings
+from fidsplat.markers.shapes import filled
 from fidsplat.scenes import PlacedMarker
 
 
@@ -42,31 +43,53 @@ def test_shapes_are_painted_one_over_the_other(tmp_path):
     assert (made.kind, made.quiet_zone, made.module) == ("svg", 0, 1 / 40)
 
 
-def test_every_rectangle_has_one_colour_and_the_splats_have_it(tmp_path):
-    body = '<circle cx="12" cy="9" r="7" fill="#f80"/><ellipse cx="26" cy="10" rx="9" ry="6" fill="teal"/>'
-    made = drawn(tmp_path, body, mixture="exact", quiet_zone=2)
-    cover = np.zeros(made.grid.shape, int)
-    for x0, y0, x1, y1 in made.boxes.tolist():
-        cover[y0:y1, x0:x1] += 1
-        assert (made.grid[y0:y1, x0:x1] == made.grid[y0, x0]).all()
-    assert (cover == 1).all()
-    assert made.boxes.tolist() == sorted(made.boxes.tolist(), key=lambda box: (box[1], box[0]))
-    values = made.grid[made.boxes[:, 1], made.boxes[:, 0]]
-    assert np.array_equal(made.cloud.colors, made.palette[values])
-    assert sum(polygon.area for polygon in made.polygons) == made.grid.size
-    # growth stays within the own colour, whatever the others are
+def test_rectangles_of_whole_modules_are_as_few_as_can_be(tmp_path):
+    made = drawn(tmp_path, '<path d="M10 5h20v10h-20z" fill="red"/>', quiet_zone=2)
+    assert (made.regions, made.turns, made.boxes.dtype) == (None, None, np.int64)
+    assert len(made.boxes) == 5
+
+
+CURVED = (
+    '<circle cx="12" cy="9" r="7" fill="#f80"/><ellipse cx="22" cy="10" rx="9" ry="6" fill="teal"/>'
+    '<path d="M1 1L39 2 30 18 28 6Z" fill="navy"/><path d="M33 19L39 5" /><path d="M3 18.6L30 19 3 19.2z"/>'
+)
+
+
+def test_rectangles_cover_what_is_drawn_and_no_more(tmp_path):
+    """Circles, obtuse and acute corners, a sliver thinner than a module, of either colour at an edge."""
+    made = drawn(tmp_path, CURVED, quiet_zone=2)
+    rectangles = np.array(shapely.polygons(turned(made.boxes, made.boxes, made.turns)))
+    assert made.palette.tolist()[0] == [1, 1, 1]
+    assert len(made.regions) == len(made.palette) == 5
+    assert sum(region.area for region in made.regions) == pytest.approx(made.grid.size, abs=1e-4)
+    for value, region in enumerate(made.regions):
+        union = shapely.union_all(rectangles[made.values == value])
+        assert (region - union).area < 1e-6
+        assert (union - region).area < 1e-3
+        assert sum(shapely.area(rectangles[made.values == value])) < 1.5 * region.area + 1
+    assert np.array_equal(made.cloud.colors, made.palette[made.values])
+    assert made.components == len(made.polygons)
+    y, x = np.indices(made.grid.shape) + 0.5
+    for value, region in enumerate(made.regions):
+        sure = shapely.distance(region.boundary, shapely.points(x, y)) > 1e-3
+        assert np.array_equal((made.grid == value)[sure], shapely.contains_xy(region, x, y)[sure])
+
+
+def test_gaussians_stay_within_their_colour(tmp_path):
+    made = drawn(tmp_path, CURVED)
     fitted = made.gaussians
-    x, y = (fitted.means[:, :2] / made.module + np.array(made.grid.shape[::-1]) / 2).T
-    held = made.grid[y.astype(int), x.astype(int)]
-    assert np.array_equal(fitted.colors, made.palette[held])
+    x, y = (fitted.means[:, :2] / made.module + np.array(made.grid.shape[::-1]) / 2).T.astype(np.float64)
+    for value, region in enumerate(made.regions):
+        own = (fitted.colors == made.palette[value]).all(1)
+        assert shapely.distance(region, shapely.points(x[own], y[own])).max() < 0.05
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.floats(-3, 15), st.floats(-3, 15)), min_size=3, max_size=8), st.booleans())
-def test_modules_whose_centre_lies_inside(points, evenodd):
-    """Against shapely: the winding number is the sum over triangles from one corner to each edge."""
+def test_what_rings_enclose(points, evenodd):
+    """Against the winding number as the sum over triangles from one corner to each edge."""
     ring = np.array(points)
-    found = inside([ring], "evenodd" if evenodd else "nonzero", (12, 12))
+    found = filled([ring], "evenodd" if evenodd else "nonzero")
     y, x = np.indices((12, 12)) + 0.5
     winding = np.zeros((12, 12), int)
     near = np.zeros((12, 12), bool)
@@ -74,18 +97,25 @@ def test_modules_whose_centre_lies_inside(points, evenodd):
         triangle = shapely.Polygon([a, b, c])
         if not triangle.area:
             continue
-        near |= shapely.distance(triangle.exterior, shapely.points(x, y)) < 1e-6
+        near |= shapely.distance(triangle.exterior, shapely.points(x, y)) < 0.02
         turn = np.sign(np.cross(np.append(b - a, 0), np.append(c - a, 0))[2])
         winding += (turn * shapely.contains_xy(triangle, x, y)).astype(int)
     expected = winding % 2 == 1 if evenodd else winding != 0
-    assert np.array_equal(found[~near], expected[~near])
+    assert np.array_equal(shapely.contains_xy(found, x, y)[~near], expected[~near])
 
 
 def test_fill_rules():
     outer, inner = path_rings("M1 1H9V9H1Z M3 3H7V7H3Z")
-    assert inside([outer, inner], "nonzero", (10, 10)).sum() == 64
-    assert inside([outer, inner], "evenodd", (10, 10)).sum() == 64 - 16
-    assert inside([outer, inner[::-1]], "nonzero", (10, 10)).sum() == 64 - 16
+    assert filled([outer, inner], "nonzero").area == 64
+    assert filled([outer, inner], "evenodd").area == 64 - 16
+    assert filled([outer, inner[::-1]], "nonzero").area == 64 - 16
+
+
+@pytest.mark.parametrize("body", ["", '<circle r="0"/>', '<rect x="50" width="9" height="9"/>'])
+def test_a_sheet_on_which_nothing_is_seen(tmp_path, body):
+    assert len(drawn(tmp_path, body).boxes) == 1
+    hidden = '<circle cx="9" cy="9" r="5" fill="red"/><rect width="40" height="20" fill="blue"/>'
+    assert len(drawn(tmp_path, hidden).boxes) == 1
 
 
 @pytest.mark.parametrize(
@@ -131,7 +161,14 @@ def test_circles():
         ('<path d="M0 0 # 5"/>', "'#' in a path"),
         ('<rect width="wide" height="5"/>', "<rect> cannot be read"),
         ('<path d="M0 0H1e300V5"/>', "too far"),
+        ('<path d="M1 1h5 1e400 5C1 2 3 4 5 6"/>', "too far"),
         ('<circle r="nan"/>', "too far"),
+        ('<g transform="rotate(1e400)"/>', "a number beyond 1e+09"),
+        (
+            5 * '<g transform="scale(1e9)">' + 40 * "<g>" + '<rect width="9" height="9"/>' + 45 * "</g>",
+            "too far",
+        ),
+        ('<rect width="5" height="5" fill="rgb(%s,0,0)"/>' % ("9" * 5000), "no plain colour"),
         ('<rect width="5" height="5" opacity="50%"/>', "translucent"),
         ("<g>" * 200 + "</g>" * 200, "deeper than 100"),
     ],
@@ -151,6 +188,7 @@ def test_files_that_are_no_drawings(tmp_path):
         ("<svg/>", "no viewBox"),
         ('<svg viewBox="0 0 0 5"/>', "above 0"),
         ('<svg viewBox="0 0 1 100000"/>', "rows of modules"),
+        ('<svg viewBox="0 0 1e-300 1e300"/>', "above 0"),
     ):
         file.write_text(text)
         with pytest.raises(fs.InputError, match=says):

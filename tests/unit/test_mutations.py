@@ -50,28 +50,24 @@ def test_bugs_are_caught_survive_or_are_not_tested(tmp_path, monkeypatch):
         "from sum import plus\n\ndef test_it():\n    assert plus(2, 2) == 4\n"
     )
     (tmp_path / "test_bad.py").write_text("def test_it():\n    assert False\n")
-    monkeypatch.setattr(mutate, "ROOT", tmp_path)
-    listed = "\0".join(["sum.py", "test_sum.py", "test_bad.py", ""])
-    run = mutate.subprocess.run
-    monkeypatch.setattr(
-        mutate.subprocess,
-        "run",
-        lambda words, **more: (
-            type("Done", (), {"stdout": listed}) if words[0] == "git" else run(words, **more)
-        ),
+    (tmp_path / "pyproject.toml").write_text(
+        '[tool.hatch.build.targets.sdist]\ninclude = ["/sum.py", "/test_sum.py", "/test_bad.py"]\n'
+        "[tool.pytest.ini_options]\naddopts = '-ra'\n"
     )
+    monkeypatch.setattr(mutate, "ROOT", tmp_path)
     caught = mutate.Plant("sum.py", "sums", ("test_sum.py",), "a + b", "a - b", "sign")
     bugs = {
         "caught": caught,
         "survived": dataclasses.replace(caught, new="a * b", wrong="product"),
-        "untested": dataclasses.replace(caught, tests=("test_bad.py",)),
+        "untested": dataclasses.replace(caught, tests=("test_bad.py",), new="a / b"),
     }
     garden, results = mutate.Garden(tmp_path / "copies", 1), mutate.Results(tmp_path / "found.jsonl")
     for expected, plant in bugs.items():
-        result, seconds, by = garden.try_plant(plant)
-        assert result == expected
-        assert by.startswith("test_sum.py::test_it") == (expected == "caught")
-        results.add(plant, result, seconds, by)
+        found = garden.try_plant(plant)
+        assert found is not None
+        assert found.result == expected
+        assert found.test == ("test_sum.py::test_it" if expected == "caught" else "")
+        results.add(plant, found)
     known = mutate.Results(tmp_path / "found.jsonl")
     assert [known.of(plant) for plant in bugs.values()] == list(bugs)
     assert known.of(dataclasses.replace(caught, new="b")) is None

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import fidsplat as fs
-from fidsplat.formats import collect, flatten
+from fidsplat.formats import collect
 from fidsplat.harmonics import C0
 from fidsplat.rotations import quaternion_to_matrix
 
@@ -221,6 +221,14 @@ def test_reading_needs_little_more_memory_than_the_cloud(tmp_path):
     assert peak < 1.25 * size + 1e6
 
 
+def thick_cloud(n: int) -> fs.SplatCloud:
+    r = np.random.default_rng(n)
+    scales = r.uniform(0.1, 1, (n, 3))
+    return fs.SplatCloud(
+        r.normal(size=(n, 3)), r.normal(size=(n, 4)), scales, r.random(n), sh=r.random((n, 4, 3))
+    )
+
+
 def three_scales(tmp_path, quats, scales):
     columns = {name: 1.0 for name in PLAIN}
     columns |= {f"rot_{i}": np.asarray(quats)[:, i] for i in range(4)}
@@ -230,7 +238,7 @@ def three_scales(tmp_path, quats, scales):
 
 
 @pytest.mark.parametrize("thin", range(3))
-def test_3dgs_splats_keep_their_flat_shape_in_a_right_handed_frame(tmp_path, thin):
+def test_3dgs_splats_are_ellipsoids_as_the_file_has_them(tmp_path, thin):
     r = np.random.default_rng(thin)
     scales = np.exp(r.uniform(-1, 1, (40, 3)))
     scales[:, thin] = 1e-4
@@ -240,44 +248,54 @@ def test_3dgs_splats_keep_their_flat_shape_in_a_right_handed_frame(tmp_path, thi
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         read = fs.load_ply(path)
-    old, new = quaternion_to_matrix(quats), quaternion_to_matrix(read.quats)
-    np.testing.assert_allclose(np.linalg.det(new), 1, atol=1e-6)
-    np.testing.assert_allclose(new[:, :, 2], old[:, :, thin], atol=1e-6)
-    kept = np.delete(np.arange(3), thin)
-    before = old[:, :, kept] * scales[:, None, kept]
-    after = new[:, :, :2] * read.scales[:, None, :]
-    np.testing.assert_allclose(
-        after @ after.transpose(0, 2, 1), before @ before.transpose(0, 2, 1), atol=1e-5
-    )
+    np.testing.assert_allclose(np.column_stack([read.scales, read.thickness]), scales, rtol=1e-5)
+    np.testing.assert_allclose(read.quats, quats, atol=1e-6)
 
 
-def test_thick_3dgs_splats_are_reported(tmp_path):
-    path = three_scales(tmp_path, np.ones((4, 4)), [[1, 1, 0.01], [1, 0.5, 2], [0.3, 1, 1], [1, 1, 1]])
-    with pytest.warns(UserWarning, match=r"a\.ply: .*3 of 4 have a thinnest axis above 0\.1.*0\.4\)"):
-        assert len(fs.load_ply(path)) == 4
+def test_ellipsoids_and_disks_come_back_together(tmp_path):
+    cloud = fs.SplatCloud.concatenate([cloud_of(3, 1), thick_cloud(4), cloud_of(2, 1)])
+    assert cloud.thickness.tolist()[:3] == [0, 0, 0]
+    assert (cloud.thickness[3:7] > 0).all()
+    fs.save_ply(cloud, tmp_path / "a.ply")
+    read = fs.load_ply(tmp_path / "a.ply")
+    assert_same(read, cloud)
+    np.testing.assert_allclose(read.thickness, cloud.thickness, rtol=1e-5)
+    assert read.thickness.tolist()[:3] == [0, 0, 0]
 
 
-def test_a_thin_axis_of_0_is_flat_and_one_of_nan_is_no_splat(tmp_path):
-    path = three_scales(tmp_path, np.ones((3, 4)), [[1, 1, 0], [1, np.nan, 1], [1, 1, np.inf]])
-    with pytest.warns(UserWarning, match="2 of 3 splats left out") as caught:
-        assert fs.load_ply(path).scales.tolist() == [[1, 1]]
+def test_two_scales_cannot_hold_an_ellipsoid(tmp_path):
+    with pytest.raises(fs.InputError, match=r"4 of 4 splats are 3D Gaussians.*flattened"):
+        fs.save_ply(thick_cloud(4), tmp_path / "a.ply", native_2dgs=True)
+    fs.save_ply(thick_cloud(4).flattened(), tmp_path / "a.ply", native_2dgs=True)
+    assert fs.load_ply(tmp_path / "a.ply").thickness is None
+
+
+@pytest.mark.parametrize("thin", range(3))
+def test_an_axis_of_0_is_flat_and_one_of_nan_is_no_splat(tmp_path, thin):
+    scales = np.array([[1, 1, 1], [1, np.nan, 1], [1, 1, np.inf], [np.nan, 0, 1], [1, 1, 1]], float)
+    scales[0, thin] = 0
+    path = three_scales(tmp_path, np.ones((5, 4)), scales)
+    with pytest.warns(UserWarning, match="3 of 5 splats left out") as caught:
+        read = fs.load_ply(path)
     assert len(caught) == 1
+    assert read.scales.tolist() == [[1, 1], [1, 1]]
+    assert read.thickness.tolist() == [0, 1]
+    normal = quaternion_to_matrix(read.quats)[0, :, 2]
+    np.testing.assert_allclose(normal, quaternion_to_matrix(np.ones((1, 4)) / 2)[0, :, thin], atol=1e-6)
 
 
 @pytest.mark.parametrize("window", [1, 100])
-@pytest.mark.parametrize(("third", "kept"), [(1e-6, [1, 0.5e-6]), (1.005e-6, [1e-6, 1])])
-def test_only_a_third_scale_of_1e_6_throughout_is_padding(tmp_path, monkeypatch, window, third, kept):
-    """Padding is left out even where it is not the thinnest; else the thinnest axis of three is."""
+@pytest.mark.parametrize(("third", "thickness"), [(1e-6, None), (1.005e-6, [0, 0, 1.005e-6])])
+def test_a_third_scale_of_1e_6_is_padding(tmp_path, monkeypatch, window, third, thickness):
+    """Even where it is not the thinnest."""
     monkeypatch.setattr(collect, "WINDOW", window)
     path = three_scales(tmp_path, np.ones((3, 4)), [[1, 1, 1e-6], [1, 0.5e-6, 1e-6], [1, 1, third]])
-    np.testing.assert_allclose(fs.load_ply(path).scales[1], kept, rtol=1e-5)
-
-
-def test_flatten_ties_leave_the_third_axis_out():
-    quats, scales, thickness = flatten(np.array([[1.0, 0, 0, 0]]), np.array([[1.0, 1, 1]]))
-    assert quats.tolist() == [[1, 0, 0, 0]]
-    assert scales.tolist() == [[1, 1]]
-    assert thickness.tolist() == [1]
+    read = fs.load_ply(path)
+    np.testing.assert_allclose(read.scales[1], [1, 0.5e-6], rtol=1e-5)
+    if thickness is None:
+        assert read.thickness is None
+    else:
+        np.testing.assert_allclose(read.thickness, thickness, rtol=1e-5)
 
 
 @pytest.mark.parametrize("labels", [0, 7])

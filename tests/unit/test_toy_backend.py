@@ -33,6 +33,7 @@ class Cloud:
     def __init__(self, cloud):
         self.count, self.origin, self.sh_degree = len(cloud), cloud.origin, cloud.sh_degree
         self.has_planes, self.footprint = cloud.has_planes, cloud.footprint
+        self.ellipsoids = cloud.ellipsoids
 
 
 class Backend:
@@ -45,7 +46,7 @@ class Backend:
         return Cloud(cloud)
 
     def unsupported(self, features):
-        lacking = {*features.taps, *features.posts, *features.slots[8:]} - {"alpha"}
+        lacking = {*features.outputs, *features.posts, *features.slots[8:]} - {"alpha"}
         return f"toy has no {', '.join(sorted(lacking))}" if lacking else ""
 
     def pipeline(self, features):
@@ -62,7 +63,7 @@ class Pipeline:
         return Images(view, resident.count)
 
     def trace(self, resident, view):
-        return {name: self.render(resident, view).read(name) for name in ("rgb", *self.features.taps)}
+        return {name: self.render(resident, view).read(name) for name in ("rgb", *self.features.outputs)}
 
 
 class Images:

@@ -32,7 +32,7 @@ def test_a_recipe_compiles_what_its_words_say(renderer, recipe):
     assert cloud.sh_degree == recipe.sh_degree
 
     class Traits:
-        sh_degree, has_planes, footprint = recipe.sh_degree, recipe.markers, "gaussian"
+        sh_degree, has_planes, footprint, ellipsoids = recipe.sh_degree, recipe.markers, "gaussian", "none"
 
     # a device without float64 has these in float32
     wanted = replace(

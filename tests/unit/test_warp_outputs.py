@@ -1,6 +1,7 @@
 """What an output and a step after blending cost on Warp: one file each. Toys of both stand in a folder that
 the kernels' own do not know."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -91,17 +92,17 @@ def beside(tmp_path, monkeypatch):
     return put
 
 
-def drawn(taps, posts):
+def drawn(outputs, posts):
     """rgb and these outputs."""
     backend = fs.Renderer("warp:cpu").backend
     cloud = two_splats()
-    pipeline = backend.pipeline(FeatureSet(SLOTS, taps, 0, 1, "float64", posts))
+    pipeline = backend.pipeline(FeatureSet(SLOTS, outputs, 0, 1, "float64", posts))
     view = View.of(fs.Capture(CAMERA), cloud.origin)
     images = pipeline.render(backend.upload(cloud), view)
-    return {name: images.read(name) for name in ("rgb", *taps)}
+    return {name: images.read(name) for name in ("rgb", *outputs)}
 
 
-def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch):
+def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch, tmp_path):
     features = FeatureSet(SLOTS, ("strongest",), 0, 1, "float64", ("negative",))
     backend = fs.Renderer("warp:cpu").backend
     output = Output("strongest", 1, "float32")
@@ -117,6 +118,16 @@ def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch):
     # the nearer splat lets three quarters through, of which the other takes up to a half
     assert np.array_equal(toys["strongest"], plain["rgb"][..., :2].max(-1))
     assert toys["strongest"].max() == pytest.approx(0.375)
+
+    # an output whose file has changed, which Warp's cache would not see, is compiled again
+    largest, sum_of_all = "wp.max(p.strongest, weight)", "p.strongest + weight"
+    (tmp_path / "output" / "strongest.py").write_text(STRONGEST.replace(largest, sum_of_all), "utf-8")
+    del sys.modules[f"{runtime.kernels('output').__name__}.strongest"]
+    for stage in ("pixel", "blend", "resolve"):
+        getattr(runtime.kernels(stage), f"make_{stage}").cache_clear()
+    changed = drawn(("strongest",), ())["strongest"]
+    assert np.array_equal(changed, plain["rgb"][..., :2].sum(-1))
+    assert not np.array_equal(changed, toys["strongest"])
 
 
 def test_two_outputs_that_keep_a_field_of_one_name_are_told_apart(beside):

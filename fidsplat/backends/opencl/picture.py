@@ -145,6 +145,8 @@ def _uniforms(view: View, row: int, end: int, record: np.dtype) -> np.ndarray:
         **{"width": view.width, "height": view.height, "filter": 1.0 / view.samples**2},
         **{"band": row, "band_end": end},
     }
+    if "slopes" in (record.names or ()):
+        values["slopes"] = view.slopes
     if view.raster is not None:
         # lens, then map, as the record has them behind its own
         own = [name for name in record.names or () if name not in values]

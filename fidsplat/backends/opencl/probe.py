@@ -4,15 +4,18 @@ stages on made-up input, and buffers that are filled with rubbish first.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
 
+from fidsplat.backends.opencl.assemble import section_text
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.program import build_options, check_kernels
 from fidsplat.backends.opencl.workspace import BufferPool, Workspace
+from fidsplat.errors import DeviceError
 
 
 def evaluate(
@@ -99,17 +102,52 @@ class OpenCLProbe:
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace
 
-    def contraction(self, a: np.ndarray, b: np.ndarray) -> tuple[list[np.ndarray], bool]:
+    @property
+    def fuses(self) -> bool:
+        """Whether the device fuses multiply-adds where it is asked to."""
+        return self._workspace.shape.fast_fma
+
+    def contraction(self, a: np.ndarray, b: np.ndarray) -> Sequence[np.ndarray]:
         """a b - a b; a b + a; the difference in the set-up's precision, of thirds; a b - (a b), fused: each
-        (n,), from a, b (n,) float32. And whether the device fuses where it is asked to.
-        """
+        (n,), from a, b (n,) float32."""
         real = np.float64 if self._workspace.info.float64 else np.float32
         types = (np.float32, np.float32, real, np.float32)
-        return evaluate(self._workspace, CONTRACTION, (a, b, a), types), self._workspace.shape.fast_fma
+        return evaluate(self._workspace, CONTRACTION, (a, b, a), types)
 
     def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
         """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
         return evaluate(self._workspace, NOT_A_NUMBER, (x,), (np.int32,) * 4)
+
+    def arithmetic(
+        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Kernels of check/arithmetic.cl."""
+        workspace, n = self._workspace, len(exponents)
+        fast = section_text("slot/arithmetic_fast.cl", "arithmetic")
+        kernels = check_kernels(workspace, "check/arithmetic.cl", arithmetic=fast)
+
+        def run(kernel: str, items: int, made: np.ndarray, *given: Any) -> np.ndarray:
+            values = [buffer_of(workspace, one) if isinstance(one, np.ndarray) else one for one in given]
+            out = buffer_of(workspace, made)
+            kernels[kernel](workspace.queue, (items,), None, *values, out)
+            cl.enqueue_copy(workspace.queue, made, out)
+            return made
+
+        single = [array.astype(np.float32) for array in (exponents, shares, above, below)]
+        names = ("exp", "log", "division", "sqrt", "fma", "fast_exp", "fast_log")
+        made, count, items = np.empty((7, n), np.float32), np.uint32(n), n // workspace.shape.lanes
+        try:
+            planes = run("arithmetic_float", items, made, count, *single)
+            results: dict[str, np.ndarray] = dict(zip(names, planes, strict=True))
+            if workspace.info.float64:
+                planes = run("arithmetic_real", n, np.empty((3, n)), count, above, below)
+                results |= dict(zip(("division64", "sqrt64", "log64"), planes, strict=True))
+            smallest = np.array([np.finfo(np.float32).tiny, 0.5], np.float32)
+            results["denormal"] = run("arithmetic_denormal", 1, np.empty(2, np.float32), smallest)
+        except cl.Error as error:
+            title = workspace.info.title
+            raise DeviceError(f"{title} failed in a test of its arithmetic: {error}") from error
+        return results
 
     def options(self) -> list[str]:
         """What every program is compiled with."""
@@ -141,6 +179,11 @@ class OpenCLProbe:
         places = contents(workspace, starts).view(np.uint32)
         words = contents(workspace, sums).view(np.uint32)
         return places, int(words[place]) | int(words[place + 1]) << 32
+
+    def boxes(self, pipeline: OpenCLPipeline, trace: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Of what `pipeline.trace` gave: the samples that each splat can touch, (n, 4) int, columns [x0, x1)
+        and rows [y0, y1); undefined for culled splats."""
+        return np.stack([trace["records"][name].astype(int) for name in ("x0", "x1", "y0", "y1")], 1)
 
     @contextmanager
     def poisoned(self) -> Iterator[None]:

@@ -27,7 +27,7 @@ class Resident:
         self.origin = cloud.origin
         self.sh_degree = cloud.sh_degree
         self.has_planes = cloud.planes is not None
-        self.footprint = cloud.footprint
+        self.footprint, self.ellipsoids = cloud.footprint, cloud.ellipsoids
         self.planes = PlaneTable(cloud) if self.has_planes else None
         self._arrays = {
             "means": cloud.means,
@@ -40,6 +40,8 @@ class Resident:
             self._arrays["planes"] = self.planes.index
         if cloud.boxes is not None:
             self._arrays["boxes"] = cloud.boxes.astype(np.int32)
+        if cloud.thickness is not None:
+            self._arrays["thickness"] = cloud.thickness
         plain = cloud.plain_colors
         if plain is not None:
             self._arrays["colors"] = plain

@@ -27,7 +27,8 @@ class DeviceShape:
     scan_items: int
     fast_fma: bool
     waiting: int
-    """fragments for which there is room where they are composited by their own depth, at most 254; 31 in `group`"""
+    """fragments for which there is room where they are composited by their own depth, at most 254, or 31 in
+    `group`"""
 
     @property
     def blend_items(self) -> int:
@@ -63,6 +64,12 @@ def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
             **{f"own, room for {room}": replace(own, waiting=room) for room in (1, 3)},
             **{f"groups, room for {shape.waiting}": shape for shape in few},
         }
+    if kind == "listing":
+        return {lists: replace(_groups(own, 8), lists=lists) for lists in ("ordered", "tiled")}
+    if kind == "arithmetic":
+        plain = replace(own, fast_fma=False)
+        scalar = {"one by one": replace(own, lanes=1), "not fused, one by one": replace(plain, lanes=1)}
+        return {"own": own, "not fused": plain, **scalar}
     if kind == "sorting":
         return {"own": own, "in 7 pieces": replace(own, chunks=7, radix_bits=5), "groups": _groups(own, 16)}
     sizes = [(8, 8), (32, 32)]

@@ -59,9 +59,18 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
     q_high = (np.abs(f.n_u) + e_u) ** 2 + (np.abs(f.n_v) + e_v) ** 2
     slack = _ROUND * (np.abs(s.log_opacity) + s.half_r2)  # the squared radius is a difference of float32
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        nearest, furthest = q_low / (2 * d_high**2), q_high / (2 * d_low**2)
+        weight = _WEIGHT
+        if s.inverse_m2.any():
+            thick, ahead = s.inverse_m2 > 0, d_low > 0
+            nearest = np.where(thick, 1 / (1 / nearest + 2 * s.inverse_m2), nearest)
+            furthest = np.where(thick, 1 / (1 / furthest + 2 * s.inverse_m2), furthest)
+            least, most = s.inverse_m2 * q_low / d_high, s.inverse_m2 * q_high / d_low
+            d_high = np.where(thick & (d_high > 0), d_high + np.where(ahead, most, np.inf), d_high)
+            d_low = np.where(thick & ahead, d_low + least, d_low)
+            weight = np.where(thick, 2 * _WEIGHT, _WEIGHT)  # twice the roundings
         may = (d_high > 0) & (d_low * view.near <= f.dz + e_dz)
         must = (d_low > 0) & (d_high * view.near <= f.dz - e_dz)
-        nearest, furthest = q_low / (2 * d_high**2), q_high / (2 * d_low**2)
         nearest = np.where(may & (nearest <= s.half_r2 + slack), nearest, np.inf)
         furthest = np.where(must & (furthest <= s.half_r2 - slack), furthest, np.inf)
         near_dz, far_dz = (f.dz, f.dz) if s.depth_forms is None else (f.dz - e_dz, f.dz + e_dz)
@@ -72,8 +81,8 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
         dot_low, dot_high = np.maximum(away - off, 0) ** 2, (away + off) ** 2
         nearest = np.minimum(nearest, np.where(dot_low <= s.half_r2 + slack, dot_low, np.inf))
         furthest = np.minimum(furthest, np.where(dot_high <= s.half_r2 - slack, dot_high, np.inf))
-    low = np.exp(s.log_opacity - furthest * (1 + _WEIGHT)) * (1 - _WEIGHT)
-    high = np.exp(s.log_opacity - nearest * (1 - _WEIGHT)) * (1 + _WEIGHT)
+    low = np.exp(s.log_opacity - furthest * (1 + weight)) * (1 - weight)
+    high = np.exp(s.log_opacity - nearest * (1 - weight)) * (1 + weight)
     low, high = np.minimum(low, view.ceiling), np.minimum(high, view.ceiling)
     if s.box.any():
         # of an edge's distance: its two forms', one of them multiplied once more, the sum's, and near it the

@@ -48,13 +48,13 @@ def fragments_of(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Fragment
     dz = s.z_numerator
     if s.depth_forms is not None:
         dz = c0 * s.depth_forms[0] + c1 * s.depth_forms[1] + c2 * s.depth_forms[2]
-    q = n_u * n_u + n_v * n_v
-    inside = (q <= 2 * s.half_r2 * d * d) & (d > 0) & (d * view.near <= dz)
+    drawn_d, q = bulged(s.inverse_m2, d, n_u * n_u + n_v * n_v)
+    inside = (q <= 2 * s.half_r2 * drawn_d * drawn_d) & (drawn_d > 0) & (drawn_d * view.near <= dz)
     offset = ((x - s.center_x) ** 2 + (y - s.center_y) ** 2) / view.samples**2
     offset = np.where(samples.seen, offset, np.inf)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        half_rho = np.where(inside, q / (2 * d * d), np.inf)
-        z = dz / d
+        half_rho = np.where(inside, q / (2 * drawn_d * drawn_d), np.inf)
+        z = dz / drawn_d
     if s.screen:
         half_rho = np.minimum(half_rho, np.where(offset <= s.half_r2, offset, np.inf))
     alpha = np.minimum(np.exp(s.log_opacity - half_rho), view.ceiling)
@@ -65,6 +65,16 @@ def fragments_of(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Fragment
     z = np.where(d > 0, np.clip(z, s.pz - s.reach, s.pz + s.reach), s.pz)
     dx, dy, away = np.abs(x - s.anchor_x), np.abs(y - s.anchor_y), away_of(view, samples, s.anchors)
     return Fragments(dx, dy, away, n_u, n_v, d, dz, offset, alpha, z, edges, edge_terms)
+
+
+def bulged(inverse_m2: np.ndarray, d: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """D and n_u^2 + n_v^2 (k, n) of 3D Gaussians, from those of the disks that stand for them: rho = q / D^2
+    falls, and D, by which depths are divided, grows by 1 + rho / m^2. inverse_m2 (n,): 0 for disks."""
+    if not inverse_m2.any():
+        return d, q
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        growth = np.where((inverse_m2 > 0) & (d > 0), 1 + inverse_m2 * (q / (d * d)), 1.0)
+        return d * growth, q * growth
 
 
 def cover(edges: np.ndarray, n_u: np.ndarray, n_v: np.ndarray, d: np.ndarray, shift) -> np.ndarray:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 
 from fidsplat.backends.planes import PlaneTable
-from fidsplat.backends.reference import optics
+from fidsplat.backends.reference import ellipsoids, optics
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 from fidsplat.splats import SplatCloud, sh_basis
@@ -30,15 +32,17 @@ class Setup:
                 np.where(mine, there, here)
                 for there, here in zip(moved, (unit_a, unit_b, p, outward), strict=True)
             )
-        a, b = unit_a * scale[:, :1], unit_b * scale[:, 1:]
+        shape = _shapes(unit_a, unit_b, scale, p, cloud, view, features)
+        a, b, area = shape.a, shape.b, shape.area
         depth = np.linalg.norm(p, axis=1) if view.along_ray else p[:, 2]
         self.key = depth.astype(np.float32)
         with np.errstate(divide="ignore"):
-            log_opacity = np.log(cloud.opacities.astype(np.float64))
+            log_opacity = np.log(cloud.opacities.astype(np.float64)) + shape.faint
         box = np.zeros(len(cloud), bool) if cloud.boxes is None else cloud.boxes
-        area = scale.prod(axis=1)
+        thick = np.zeros(len(cloud), bool) if cloud.thickness is None else cloud.thickness > 0
+        unfiltered = box | (thick & ("ellipsoid_exact" not in features.slots))
         if "lowpass_pixel" in features.slots:
-            filtered = ~box & (depth >= view.near)
+            filtered = ~unfiltered & (depth >= view.near)
             a, b, grown = _filtered(a, b, p, view, filtered)
             area = area * grown
             with np.errstate(divide="ignore"):
@@ -47,8 +51,11 @@ class Setup:
         if view.along_ray:
             long_a, long_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
             reach, box_reach = np.maximum(long_a, long_b), long_a + long_b
+            all_three = np.hypot(np.hypot(long_a, long_b), np.linalg.norm(shape.third, axis=1))
+            reach = np.where(thick, all_three, reach)
         else:
             reach, box_reach = np.hypot(a[:, 2], b[:, 2]), np.abs(a[:, 2]) + np.abs(b[:, 2])
+            reach = np.hypot(reach, shape.third[:, 2])
         reach = np.where(box, box_reach, np.sqrt(np.maximum(2 * half_r2, 0)) * reach)
         drawn = (half_r2 > 0) & (depth + reach >= view.near) & (depth - reach <= view.far)
         self.by_depth = "compose_ordered" not in features.slots
@@ -61,11 +68,14 @@ class Setup:
             planes = table.index
             nearest = np.where(planes < 0, nearest, np.append(table.keys(view), 0)[planes])
             self.key = np.where(planes < 0, self.key, nearest.astype(np.float32))
+        drawn &= np.isfinite(shape.inverse_m2)  # else the camera is at its centre: nothing is ahead
         order = np.flatnonzero(drawn)
         order = order[np.argsort(self.key[order], kind="stable")]
         self.order = order
 
-        normal = np.cross(unit_a, unit_b)[order]
+        normal = shape.normal[order]
+        self.inverse_m2 = shape.inverse_m2[order]
+        """above 0 for 3D Gaussians that are drawn exactly"""
         a, b, p, area = a[order], b[order], p[order], area[order]
         self.log_opacity, self.half_r2, self.reach = log_opacity[order], half_r2[order], reach[order]
         self.labels = cloud.labels[order]
@@ -86,7 +96,7 @@ class Setup:
         ahead = self.pz >= view.near
         middle_x, middle_y = optics.centers_of(view, p, ahead)
         ahead &= np.isfinite(middle_x)
-        self.dot = ahead & ~self.box  # the low-pass dot belongs to the centre of a Gaussian
+        self.dot = ahead & ~unfiltered[order]  # the low-pass dot belongs to the centre of a Gaussian
         self.center_x, self.center_y = (np.where(self.dot, at, np.inf) for at in (middle_x, middle_y))
         # devices keep the forms about the pixel nearest to the centre; unknown here where that is behind
         self.anchor_x = _anchor(middle_x, ahead, view.width)
@@ -101,6 +111,61 @@ class Setup:
         self.planes = None if planes is None else planes[order]
         self.nearest = nearest[order]
         """depth before which none of a printed plane lies; -inf for splats of none"""
+
+    def among(self, chosen: np.ndarray) -> Setup:
+        """The set-up of those of the splats alone, chosen (n,) bool, in the same order."""
+        if chosen.all():
+            return self
+        part = copy(self)
+        for name in _OF_SPLATS:
+            setattr(part, name, getattr(self, name)[chosen])
+        for name in _OF_COORDINATES:
+            setattr(part, name, getattr(self, name)[:, chosen])
+        if self.depth_forms is not None:
+            part.depth_forms = self.depth_forms[:, chosen]
+        if self.planes is not None:
+            part.planes = self.planes[chosen]
+        return part
+
+
+_OF_SPLATS = (
+    *("order", "log_opacity", "half_r2", "reach", "labels", "pz", "z_numerator", "inverse_m2"),
+    *("box", "dot", "center_x", "center_y", "anchor_x", "anchor_y", "colors", "normal", "nearest"),
+)
+"""arrays (n, ...) of a Setup"""
+_OF_COORDINATES = ("forms", "anchors")
+"""arrays (3, n, ...) of a Setup"""
+
+
+def _shapes(
+    unit_a: np.ndarray,
+    unit_b: np.ndarray,
+    scale: np.ndarray,
+    p: np.ndarray,
+    cloud: SplatCloud,
+    view: View,
+    features: FeatureSet,
+) -> ellipsoids.Axes:
+    """The disks that are drawn, of 3D Gaussians those that have their picture.
+
+    unit_a, unit_b, p (n, 3) in the camera frame, scale (n, 2).
+    """
+    found = ellipsoids.disks(unit_a, unit_b, scale)
+    if cloud.thickness is None:
+        return found
+    thick = cloud.thickness > 0
+    third = np.maximum(cloud.thickness[thick].astype(np.float64), np.float32(1e-20))
+    scales = np.column_stack([scale[thick], third])
+    axes = np.stack([unit_a, unit_b, np.cross(unit_a, unit_b)], axis=1)[thick]
+    if "ellipsoid_exact" in features.slots:
+        own = ellipsoids.exact(axes, scales, p[thick], view)
+    else:
+        own = ellipsoids.ewa(axes, scales, p[thick], view, "ellipsoid_ewa_antialiased" in features.slots)
+        # of no use otherwise
+        own.faint = np.where(p[thick, 2] >= view.near, own.faint, -np.inf)
+    for name, values in vars(own).items():
+        getattr(found, name)[thick] = values
+    return found
 
 
 def _posed(

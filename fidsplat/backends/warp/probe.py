@@ -4,12 +4,13 @@ first.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
+from fidsplat.backends.warp.pipeline import WarpPipeline
 from fidsplat.backends.warp.runtime import kernels, load, quiet
 from fidsplat.backends.warp.workspace import ArrayPool, Workspace, nbytes
 from fidsplat.errors import DeviceError
@@ -21,18 +22,35 @@ class WarpProbe:
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace
 
-    def contraction(self, a: np.ndarray, b: np.ndarray) -> tuple[list[np.ndarray], bool]:
+    fuses = True
+    """Warp's devices fuse multiply-adds where they are asked to"""
+
+    def contraction(self, a: np.ndarray, b: np.ndarray) -> Sequence[np.ndarray]:
         """a b - a b; a b + a; (a / 3) (b / 3) - (a / 3) (b / 3) in float64; a b - (a b), fused: each (n,),
-        from a, b (n,) float32. And whether the device fuses where it is asked to.
-        """
+        from a, b (n,) float32."""
         n = len(a)
         types = (np.float32, np.float32, np.float64, np.float32)
-        return run(self._workspace, "contraction", n, (a, b, a), [np.zeros(n, each) for each in types]), True
+        return run(self._workspace, "contraction", n, (a, b, a), [np.zeros(n, each) for each in types])
 
     def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
         """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
         (found,) = run(self._workspace, "not_a_number", len(x), (x,), [np.zeros((4, len(x)), np.int32)])
         return list(found)
+
+    def arithmetic(
+        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Kernels of check.py."""
+        workspace, n = self._workspace, len(exponents)
+        single = [array.astype(np.float32) for array in (exponents, shares, above, below)]
+        (found,) = run(workspace, "arithmetic", n, single, [np.zeros((7, n), np.float32)])
+        names = ("exp", "log", "division", "sqrt", "fma", "fast_exp", "fast_log")
+        results: dict[str, np.ndarray] = dict(zip(names, found, strict=True))
+        (found,) = run(workspace, "arithmetic_wide", n, [above, below], [np.zeros((3, n))])
+        results |= dict(zip(("division64", "sqrt64", "log64"), found, strict=True))
+        smallest = np.array([np.finfo(np.float32).tiny, 0.5], np.float32)
+        (results["denormal"],) = run(workspace, "denormal", 1, [smallest], [np.zeros(2, np.float32)])
+        return results
 
     def options(self) -> list[str]:
         """What every kernel is compiled with, switches that are on."""
@@ -49,6 +67,13 @@ class WarpProbe:
             wp.utils.array_scan(given, ends, inclusive=True)
         places = np.concatenate([[0], ends.numpy()])
         return places.astype(np.uint32), int(places[-1])
+
+    def boxes(self, pipeline: WarpPipeline, trace: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Of what `pipeline.trace` gave: the samples that each splat can touch, (n, 4) int, columns [x0, x1)
+        and rows [y0, y1); undefined for culled splats."""
+        words = [pipeline.program.layout.word(name) for name in ("columns", "rows")]
+        spans = trace["records"].view(np.uint32)[:, words].astype(int)
+        return np.stack([spans & 0xFFFF, spans >> 16], 2).reshape(-1, 4)
 
     @contextmanager
     def poisoned(self) -> Iterator[None]:

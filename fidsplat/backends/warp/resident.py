@@ -26,10 +26,11 @@ class Resident:
         sh_degree: int,
         planes: PlaneTable | None = None,
         footprint: str = "gaussian",
+        ellipsoids: str = "none",
     ) -> None:
         self.arrays, self.count, self.origin = arrays, count, origin
         self.sh_degree, self.planes, self.has_planes = sh_degree, planes, planes is not None
-        self.footprint = footprint
+        self.footprint, self.ellipsoids = footprint, ellipsoids
 
     @property
     def memory_bytes(self) -> int:
@@ -56,7 +57,8 @@ class Resident:
         if cloud.footprint == "mixed" and cloud.boxes is not None:
             arrays["boxes"] = cloud.boxes.astype(np.int32)
         device = {name: _uploaded(name, array, pool) for name, array in arrays.items()}
-        return cls(device, len(cloud), cloud.origin, cloud.sh_degree, planes, cloud.footprint)
+        kinds = cloud.footprint, cloud.ellipsoids
+        return cls(device, len(cloud), cloud.origin, cloud.sh_degree, planes, *kinds)
 
     @classmethod
     def around(cls, given: Mapping[str, Any], origin: np.ndarray, pool: ArrayPool) -> Resident:

@@ -47,3 +47,5 @@ static inline Bounds cone_bounds(global const View *view, real3_ a, real3_ b, re
         gy.y = up * (flat * b.y - sink * (around_x * b.x + around_z * b.z));
 //@ camera_box_reach
         reach = su + sv;
+//@ camera_ellipsoid_reach
+        reach = radius * sqrt(dot3(a, a) + dot3(b, b) + dot3(third, third));

@@ -72,3 +72,5 @@ static inline void chart_box(real3_ a, real3_ b, real3_ p, real radius, real awa
         filtered = angle <= view->lens_limit;
 //@ camera_box_reach
         reach = su + sv;
+//@ camera_ellipsoid_reach
+        reach = radius * sqrt(dot3(a, a) + dot3(b, b) + dot3(third, third));

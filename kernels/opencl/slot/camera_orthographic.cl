@@ -44,3 +44,11 @@ static inline real3_ image_row(real focal, real offset, real3_ axis_row, real3_ 
         gy.x = view->focal_y * a.y; gy.y = view->focal_y * b.y;
 //@ camera_box_near
         d_near = INFINITY;                   // depths have a form of their own
+//@ camera_ellipsoid
+        towards.x = towards.y = 0; towards.z = 1;
+        parallel = true;
+//@ camera_image
+        per_x = view->focal_x;
+        per_y = view->focal_y;
+        across.x = per_x * a.x; across.y = per_x * b.x; across.z = per_x * c.x;
+        down.x = per_y * a.y; down.y = per_y * b.y; down.z = per_y * c.y;

@@ -19,3 +19,30 @@
         real3_ in_x = {a.x, b.x, p.x}, in_y = {a.y, b.y, p.y}, in_z = {a.z, b.z, p.z};
         gx = image_row(view->focal_x * ahead, -view->focal_x * p.x * ahead * ahead, in_x, in_z);
         gy = image_row(view->focal_y * ahead, -view->focal_y * p.y * ahead * ahead, in_y, in_z);
+//@ camera_image
+        // the derivative at most 0.3 half pictures outside the picture
+        real ahead = 1 / pz, slope_x = fmin(fmax(p.x * ahead, -view->slopes[0]), view->slopes[1]);
+        real slope_y = fmin(fmax(p.y * ahead, -view->slopes[2]), view->slopes[3]);
+        per_x = view->focal_x * ahead;
+        per_y = view->focal_y * ahead;
+        across.x = per_x * (a.x - slope_x * a.z); across.y = per_x * (b.x - slope_x * b.z); across.z = per_x * (c.x - slope_x * c.z);
+        down.x = per_y * (a.y - slope_y * a.z); down.y = per_y * (b.y - slope_y * b.z); down.z = per_y * (c.y - slope_y * c.z);
+//@ camera_ellipsoid_box
+        // All that rays see of an ellipsoid lies on one of half its size, which goes through the camera's centre and its own: what
+        // is beyond the near plane is seen through that one's section at `near`.
+        real3_ along_x = {a.x, b.x, third.x}, along_y = {a.y, b.y, third.y}, along_z = {a.z, b.z, third.z};
+        real zz = dot3(along_z, along_z), ahead = near - pz * REAL(0.5);
+        real room = REAL(0.25) / inverse_m2 * (1 + (SETUP_FP64 ? REAL(1e-12) : REAL(1e-4))) - ahead * ahead / zz;
+        if (!(room > 0)) return;
+        real3_ across_x = cross3(along_x, along_z), across_y = cross3(along_y, along_z);
+        real half_x = sqrt(room * dot3(across_x, across_x) / zz), half_y = sqrt(room * dot3(across_y, across_y) / zz);
+        real middle_x = p.x * REAL(0.5) + dot3(along_x, along_z) / zz * ahead;
+        real middle_y = p.y * REAL(0.5) + dot3(along_y, along_z) / zz * ahead;
+        bounds = box_bounds(fmax((real)(bounds.ex - bounds.hx), view->focal_x * (middle_x - half_x) / near + view->center_x),
+                            fmin((real)(bounds.ex + bounds.hx), view->focal_x * (middle_x + half_x) / near + view->center_x),
+                            fmax((real)(bounds.ey - bounds.hy), view->focal_y * (middle_y - half_y) / near + view->center_y),
+                            fmin((real)(bounds.ey + bounds.hy), view->focal_y * (middle_y + half_y) / near + view->center_y));
+        if (pz < near) {
+            center_x = bounds.ex;
+            center_y = bounds.ey;
+        }

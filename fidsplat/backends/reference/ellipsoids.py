@@ -1,0 +1,89 @@
+"""3D Gaussians as the disks that have their picture (docs/ellipsoids.md).
+
+`exact`: with W the map that makes the covariance the unit matrix, the disk through the centre p that is
+perpendicular to W p there. A ray's least squared distance is rho / (1 + rho / |W p|^2) of that disk's rho.
+`ewa`: a disk that faces the camera, whose image has the covariance of 3DGS.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fidsplat.backends.view import View
+
+EWA_SPREAD = 0.3
+"""square pixels, by which 3DGS widens the covariance of every image"""
+
+
+@dataclass
+class Axes:
+    """Disks in the camera frame, (n, 3) or (n,)."""
+
+    a: np.ndarray
+    """scaled tangents, as b"""
+    b: np.ndarray
+    normal: np.ndarray
+    """unit"""
+    area: np.ndarray
+    """|a x b|"""
+    third: np.ndarray
+    """half axis of the ellipsoid that is conjugate to a and b; 0 of disks"""
+    inverse_m2: np.ndarray
+    """1 / |W p|^2; 0 of disks"""
+    faint: np.ndarray
+    """what is added to the logarithm of the opacity"""
+
+
+def disks(unit_a: np.ndarray, unit_b: np.ndarray, scale: np.ndarray) -> Axes:
+    """Of disks with unit tangents (n, 3) and standard deviations (n, 2)."""
+    n, area = len(scale), scale.prod(axis=1)
+    a, b, normal = unit_a * scale[:, :1], unit_b * scale[:, 1:], np.cross(unit_a, unit_b)
+    return Axes(a, b, normal, area, np.zeros((n, 3)), np.zeros(n), np.zeros(n))
+
+
+def exact(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View) -> Axes:
+    """Of 3D Gaussians with unit axes (n, 3, 3), in rows, standard deviations (n, 3) and centres p (n, 3)."""
+    towards = np.broadcast_to([0.0, 0.0, 1.0], p.shape) if view.parallel else p
+    white = np.einsum("nkc,nc->nk", axes, towards) / scales
+    m = np.linalg.norm(white, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        e3 = white / m[:, None]
+        # perpendicular to the longest axis, so that none of it is in there
+        e2 = np.cross(e3, np.eye(3)[np.argmax(scales, axis=1)])
+        length = np.linalg.norm(e2, axis=1)
+        e2 = np.where((length > 0)[:, None], e2 / length[:, None], np.roll(e3, 1, axis=1))
+        e1 = np.cross(e2, e3)
+        a, b = (np.einsum("nk,nkc->nc", e * scales, axes) for e in (e1, e2))
+        normal = np.einsum("nk,nkc->nc", white / scales * scales.min(axis=1)[:, None] ** 2, axes)
+        normal /= np.linalg.norm(normal, axis=1)[:, None]
+        area = scales.prod(axis=1) * m / np.einsum("nc,nc->n", normal, towards)
+        none = np.zeros(len(p))
+        return Axes(a, b, normal, area, towards / m[:, None], none if view.parallel else 1 / m**2, none)
+
+
+def ewa(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View, antialiased: bool) -> Axes:
+    """The same as 3DGS draws them. Those whose centre lies behind the near plane are of no use."""
+    scaled = axes * scales[:, :, None]
+    z = p[:, 2]
+    ahead = np.ones_like(z) if view.parallel else np.where(z > 0, z, 1.0)
+    slope_x, slope_y = np.zeros_like(z), np.zeros_like(z)
+    if not view.parallel:
+        left, right, up, down = view.slopes
+        slope_x, slope_y = np.clip(p[:, 0] / ahead, -left, right), np.clip(p[:, 1] / ahead, -up, down)
+    per_x, per_y = view.focal_x / ahead, view.focal_y / ahead
+    x = (scaled[:, :, 0] - slope_x[:, None] * scaled[:, :, 2]) * per_x[:, None]
+    y = (scaled[:, :, 1] - slope_y[:, None] * scaled[:, :, 2]) * per_y[:, None]
+    spread = EWA_SPREAD * view.samples**2
+    xx, xy, yy = (x * x).sum(1), (x * y).sum(1), (y * y).sum(1)
+    before = (np.cross(x, y) ** 2).sum(1)
+    after = before + spread * (xx + yy + spread)
+    l11 = np.sqrt(xx + spread)
+    none, one = np.zeros_like(z), np.ones_like(z)
+    a = np.stack([l11 / per_x, xy / l11 / per_y, none], 1)
+    b = np.stack([none, np.sqrt(after) / l11 / per_y, none], 1)
+    normal = np.stack([none, none, one], 1)
+    with np.errstate(divide="ignore"):
+        faint = 0.5 * np.log(before / after) if antialiased else none
+    return Axes(a, b, normal, a[:, 0] * b[:, 1], np.zeros_like(a), none, faint)

@@ -1,0 +1,118 @@
+"""What the arrays of a SplatCloud are made of: checks of what users give, types, origins, quaternions."""
+
+import numpy as np
+
+from fidsplat.defects import rows_beyond, square_of
+from fidsplat.errors import InputError
+from fidsplat.rotations import quaternion_multiply
+from fidsplat.scalars import LARGEST
+
+F32 = np.dtype(np.float32)
+
+# Turning the frame cyclically keeps it right-handed. Row i makes axis i the third: its new axes are
+# (y, z, x) for i = 0 and (z, x, y) for i = 1, a third of a turn about (1, 1, 1) and back.
+_TURNS = np.array([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1.0, 0.0, 0.0, 0.0]])
+_CYCLES = np.array([[1, 2, 0], [2, 0, 1], [0, 1, 2]])
+
+
+def real_numbers(name: str, value) -> np.ndarray:
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        raise InputError(f"{name} must be an array, but its rows differ in length") from None
+    if array.dtype.kind not in "fiu" or array.dtype.itemsize > 8:
+        raise InputError(f"{name} must be an array of real numbers, not of {array.dtype}")
+    return array
+
+
+def check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
+    if array.shape == shape:
+        return
+    wanted = "(n, 3)" if name == "means" else str(shape)
+    if name == "scales":
+        wanted += f" or {(shape[0], 3)}"
+    raise InputError(f"{name} must have the shape {wanted}, but its shape is {array.shape}")
+
+
+def whole_numbers(labels, n: int, name: str = "labels") -> np.ndarray:
+    array = real_numbers(name, 0 if labels is None else labels)
+    if array.dtype.kind == "f" and array.size:
+        raise InputError(f"{name} must be ints, not {array.dtype}")
+    if array.shape not in ((), (n,)):
+        raise InputError(f"{name} must be one int or have the shape ({n},), but its shape is {array.shape}")
+    limits = np.iinfo(np.int32)
+    if array.size and (int(array.min()) < limits.min or int(array.max()) > limits.max):
+        raise InputError(f"{name} must lie in {limits.min} to {limits.max}")
+    return np.full(n, array, np.int32) if array.ndim == 0 else array.astype(np.int32)
+
+
+def check_origin(origin) -> np.ndarray:
+    array = real_numbers("origin", origin).astype(np.float64)
+    if array.shape != (3,) or rows_beyond(array, LARGEST) is not None:
+        raise InputError(f"origin must be three numbers, at most {LARGEST:g} metres, not {origin!r}")
+    return array
+
+
+def _is_frozen(array) -> bool:
+    while isinstance(array, np.ndarray):
+        if array.flags.writeable or isinstance(array, np.memmap):
+            return False
+        array = array.base
+    return array is None
+
+
+def as_single(array: np.ndarray) -> np.ndarray:
+    """As C-ordered float32 that nobody else can write to; what float32 cannot hold becomes inf."""
+    if array.dtype == F32 and array.flags.c_contiguous and _is_frozen(array):
+        return array
+    with np.errstate(over="ignore"):
+        return np.array(array, dtype=F32, order="C")
+
+
+def choose_origin(means: np.ndarray, single: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(means (n, 3) float32 relative to the origin, origin (3,) float64) for finite means (n, 3) in the
+    world.
+
+    ``single`` is the means as float32. The origin is 0 unless the means are not all float32 numbers and lie
+    further from 0 than 64 times the cloud's reach, so that float32 would lose at least 6 of its 24 bits.
+    Then it is the centre of the bounding box, rounded to a power of two near the reach, which keeps it a
+    short number.
+    """
+    zero = np.zeros(3)
+    if means.dtype == F32 or not len(means) or np.array_equal(single, means):
+        return single, zero
+    low, high = means.min(axis=0), means.max(axis=0)
+    reach = max(float((high - low).max()) / 2, 3.0 * float(scales.max()))
+    if max(np.abs(low).max(), np.abs(high).max()) <= 64 * reach:
+        return single, zero
+    step = 2.0 ** np.floor(np.log2(reach))
+    origin = np.round((low / 2 + high / 2) / step) * step
+    return as_single(means - origin), origin
+
+
+def unit_quaternions(quats: np.ndarray) -> np.ndarray:
+    """Quaternions of length 1. Those that are so to float32 rounding keep their bits: twice is the same as
+    once."""
+    unit = quats  # only a cloud's own array can be written to
+    for start in range(0, len(quats), 4096):  # so that millions of them need no copy in float64
+        part = slice(start, start + 4096)
+        square = square_of(quats[part])
+        off = np.abs(square - 1.0) > 2.4e-7
+        if off.any():
+            unit = unit if unit.flags.writeable else unit.copy()
+            unit[part][off] = quats[part][off] / np.sqrt(square[off])[:, None]
+    return unit
+
+
+def with_thinnest_last(quats: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same 3D Gaussians in frames whose third axis is the thinnest; the third wins ties.
+
+    quats (n, 4) wxyz, scales (n, 3), none of them NaN -> both anew.
+    """
+    thin = 2 - np.argmin(scales[:, ::-1], axis=1)
+    turned = thin != 2
+    if turned.any():
+        quats = quats.copy()
+        with np.errstate(over="ignore", invalid="ignore"):
+            quats[turned] = quaternion_multiply(quats[turned], _TURNS[thin[turned]])
+    return quats, np.take_along_axis(scales, _CYCLES[thin], axis=1)

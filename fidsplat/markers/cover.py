@@ -1,0 +1,197 @@
+"""Rectangles that cover regions with slanted and curved edges: bands along the edges, turned as they are, and
+whole modules in what the bands leave.
+
+The bands of two colours meet at the edge between them, so it is drawn as sharply as a box's own. A band is as
+wide as the points are far to which the edge is nearest (the medial axis), `BAND` at most. Rectangles of one
+colour overlap within it; at its edges only at corners.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+
+from fidsplat.markers.partition import partition
+
+BAND = 2.5
+"""Modules, the widest. A whole module that reaches out of such bands is a module or more from any edge."""
+
+LEAST = 1 / 64
+"""Modules: edges are not cut into shorter pieces."""
+
+SHARP = np.radians(10)
+"""Smaller turns around a corner are left to one rectangle."""
+
+SLACK = 1e-6
+"""Modules by which a rectangle may stand out of its region."""
+
+
+class _Sides(NamedTuple):
+    """Pieces of edges, and around corners that stand into a region the turns from one edge to the next."""
+
+    start: np.ndarray
+    """(n, 2) modules"""
+    stop: np.ndarray
+    """(n, 2); the same as ``start`` for a turn alone"""
+    inward: np.ndarray
+    """(n,) radians, direction of the normal into the region, which lies to the left from start to stop"""
+    turn: np.ndarray
+    """(n,) radians that the normal turns to the right at ``stop``, up to a quarter turn"""
+
+
+def cover_all(
+    regions: tuple[shapely.MultiPolygon, ...], shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What `cover` returns for several regions, and (n,) uint8, the number of each rectangle's region."""
+    seen = {value: cover(region, shape) for value, region in enumerate(regions) if not region.is_empty}
+    boxes, turns = (np.concatenate(parts) for parts in zip(*seen.values(), strict=True))
+    values = np.repeat(np.array(list(seen), np.uint8), [len(own) for _, own in seen.values()])
+    return boxes, turns, values
+
+
+def cover(region: shapely.MultiPolygon, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Rectangles whose union is a region, a polygon or several, of a grid of (h, w) modules.
+
+    Returns (n, 4) float64 x0, y0, x1, y1 in modules, each as it lies before it is turned about its middle,
+    and (n,) the turns in radians, from x to y.
+    """
+    corners = np.concatenate([_bands(region), _modules(region, shape)])
+    # the tips of corners, for which edges would be cut ever shorter
+    left = shapely.get_parts(region - shapely.union_all(shapely.polygons(corners)))
+    left = shapely.oriented_envelope(left[shapely.area(left) > LEAST**3])
+    rest = [shapely.get_coordinates(part)[:4] for part in left if isinstance(part, shapely.Polygon)]
+    corners = np.concatenate([corners, np.reshape(rest, (-1, 4, 2))])
+    along, across = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
+    half = np.column_stack([np.hypot(*along.T), np.hypot(*across.T)]) / 2
+    middle = corners.mean(1)
+    return np.hstack([middle - half, middle + half]), np.arctan2(along[:, 1], along[:, 0])
+
+
+def _modules(region: shapely.MultiPolygon, shape: tuple[int, int]) -> np.ndarray:
+    """Whole modules over what lies further inside than bands reach, in rectangles: (n, 4, 2) corners."""
+    inner = shapely.buffer(region, -BAND)
+    shapely.prepare(inner)
+    y, x = np.indices(shape)
+    wanted = shapely.intersects(inner, shapely.box(x, y, x + 1, y + 1)).astype(np.uint8)
+    boxes = partition(wanted)
+    x0, y0, x1, y1 = boxes[wanted[boxes[:, 1], boxes[:, 0]] == 1].T.astype(np.float64)
+    return np.stack([x0, y0, x1, y0, x1, y1, x0, y1], 1).reshape(-1, 4, 2)
+
+
+def _bands(region: shapely.MultiPolygon) -> np.ndarray:
+    """Rectangles over what lies within BAND of the edges: (n, 4, 2) corners."""
+    edges, sides = _sides(region)
+    tree = shapely.STRtree(list(shapely.get_parts(shapely.linestrings(edges))))
+    within = shapely.buffer(region, SLACK, join_style="mitre")
+    shapely.prepare(within)
+    found = []
+    while len(sides.start):
+        rectangles = _rectangles(sides, _widths(sides, edges, tree))
+        long = np.linalg.norm(sides.stop - sides.start, axis=1) > LEAST
+        done = shapely.covers(within, shapely.polygons(rectangles))
+        found.append(rectangles[done])
+        rest = ~done & (long | (sides.turn > SHARP))
+        sides = _halves(_Sides(*(values[rest] for values in sides)), long[rest])
+    return np.concatenate(found)
+
+
+def _sides(region: shapely.MultiPolygon) -> tuple[np.ndarray, _Sides]:
+    """A region's edges, (n, 2, 2), and what bands are laid along."""
+    starts, stops, inward, turns = [], [], [], []
+    for polygon in region.geoms:
+        rings = [polygon.exterior, *polygon.interiors]
+        for number, ring in enumerate(rings):
+            points = shapely.get_coordinates(ring)[:-1]
+            if shapely.is_ccw(ring) != (number == 0):
+                points = points[::-1]
+            step = np.roll(points, -1, 0) - points
+            angle = np.arctan2(step[:, 1], step[:, 0])
+            starts.append(points)
+            stops.append(np.roll(points, -1, 0))
+            inward.append(angle + np.pi / 2)
+            turns.append((angle - np.roll(angle, -1) + np.pi) % (2 * np.pi) - np.pi)
+    start, stop, normal, turn = (np.concatenate(parts) for parts in (starts, stops, inward, turns))
+    turn = np.maximum(turn, 0)
+    gentle = turn <= SHARP
+    sides = [_Sides(start, stop, normal, np.where(gentle, turn, 0))]
+    for part in (0, np.pi / 2):
+        some = ~gentle & (turn > part)
+        rest = np.minimum(turn[some] - part, np.pi / 2)
+        sides.append(_Sides(stop[some], stop[some], normal[some] - part, rest))
+    return np.stack([start, stop], 1), _Sides(*(np.concatenate(parts) for parts in zip(*sides, strict=True)))
+
+
+def _widths(sides: _Sides, edges: np.ndarray, tree: shapely.STRtree) -> np.ndarray:
+    """How far the points are to which a side is nearest, at most BAND: the largest of some places, (n,).
+
+    At each of them a ball that touches it from inside shrinks until it holds no other part of the edges.
+    """
+    share = (1 - np.cos(np.pi * (np.arange(9) + 0.5) / 9)) / 2  # more of them near corners, where it varies
+    share = np.append(share, (1, 1))
+    bend = np.append(np.zeros(9), (0.5, 1))
+    at = sides.start[:, None] + share[:, None] * (sides.stop - sides.start)[:, None]
+    angle = sides.inward[:, None] - bend * sides.turn[:, None]
+    normal = np.stack([np.cos(angle), np.sin(angle)], -1).reshape(-1, 2)
+    at, radius = at.reshape(-1, 2), np.full(angle.size, BAND)
+    left = np.arange(angle.size)
+    while len(left):
+        middle = at[left] + radius[left, None] * normal[left]
+        nearest = tree.query_nearest(shapely.points(middle), all_matches=False)[1]
+        a, step = edges[nearest, 0], edges[nearest, 1] - edges[nearest, 0]
+        along = np.clip(((middle - a) * step).sum(1) / (step * step).sum(1), 0, 1)
+        gap = a + along[:, None] * step - at[left]
+        inside = np.linalg.norm(gap + at[left] - middle, axis=1) < radius[left] - 1e-4
+        left, gap = left[inside], gap[inside]
+        before, radius[left] = radius[left], (gap * gap).sum(1) / (2 * (gap * normal[left]).sum(1))
+        left = left[radius[left] < 0.99 * before]
+    return 1.02 * radius.reshape(angle.shape).max(1)
+
+
+def _rectangles(sides: _Sides, width: np.ndarray) -> np.ndarray:
+    """Corners (n, 4, 2) of a rectangle over each side, of that width and over the sector of its turn."""
+    inward = width[:, None] * np.column_stack([np.cos(sides.inward), np.sin(sides.inward)])
+    ahead = np.sin(sides.turn)[:, None] * np.column_stack([inward[:, 1], -inward[:, 0]])
+    stop = sides.stop + ahead
+    return np.stack([sides.start, stop, stop + inward, sides.start + inward], 1)
+
+
+def _halves(sides: _Sides, long: np.ndarray) -> _Sides:
+    """Edges cut in two, and of those that are short their turns."""
+    start, stop, inward, turn = sides
+    middle = np.where(long[:, None], (start + stop) / 2, stop)
+    bend = np.where(long, 0, turn / 2)
+    first = _Sides(start, middle, inward, bend)
+    second = _Sides(middle, stop, inward - bend, turn - bend)
+    return _Sides(*(np.concatenate(pair) for pair in zip(first, second, strict=True)))
+
+
+def grow_turned(
+    regions: tuple[shapely.MultiPolygon, ...],
+    values: np.ndarray,
+    boxes: np.ndarray,
+    turns: np.ndarray,
+    growth: float,
+) -> np.ndarray:
+    """Rectangles of `cover_all` that reach further across sides where that stays in their region: by growth
+    modules, or as much of their width."""
+    grown = boxes.copy()
+    for value, region in enumerate(regions):
+        shapely.prepare(region)
+        own = np.flatnonzero(values == value)
+        reach = growth * np.minimum(1, (boxes[own, 2:] - boxes[own, :2]).min(1))
+        for side in range(4):
+            tried = grown[own]
+            tried[:, side] += np.where(side < 2, -reach, reach)
+            free = shapely.covers(region, shapely.polygons(turned(tried, boxes[own], turns[own])))
+            grown[own[free]] = tried[free]
+    return grown
+
+
+def turned(boxes: np.ndarray, about: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """Corners (n, 4, 2) of boxes, each turned about the middle of another."""
+    middle = (about[:, None, :2] + about[:, None, 2:]) / 2
+    x, y = np.moveaxis(boxes[:, [[0, 1], [2, 1], [2, 3], [0, 3]]] - middle, -1, 0)
+    c, s = np.cos(turns)[:, None], np.sin(turns)[:, None]
+    return middle + np.stack([c * x - s * y, s * x + c * y], -1)

@@ -1,0 +1,83 @@
+"""Shapes that are painted one over the other, as polygons with holes: one region for each colour."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+
+from fidsplat.markers.paths import Rings
+
+FLAT = 0.005
+"""Modules by which straight pieces may miss a curve."""
+
+GRID = 1e-6
+"""Modules to which cuts between shapes are rounded."""
+
+
+def filled(rings: Rings, rule: str) -> shapely.MultiPolygon:
+    """What closed rings of (n, 2) points x, y enclose.
+
+    rule: "nonzero" (the winding number) or "evenodd" (the number of crossings).
+    """
+    lines = [shapely.LinearRing(ring).simplify(FLAT) for ring in rings if len(ring) > 2]
+    faces = shapely.get_parts(shapely.polygonize(shapely.get_parts(shapely.union_all(lines))))
+    winding = np.zeros(len(faces), np.int64)
+    x, y = shapely.get_coordinates(shapely.point_on_surface(faces)).T[..., None]
+    for line in lines:
+        ring = shapely.get_coordinates(line)
+        (ax, ay), (bx, by) = ring[:-1].T, ring[1:].T
+        down, up = (ay <= y) & (y < by), (by <= y) & (y < ay)
+        with np.errstate(all="ignore"):
+            right = x < ax + (y - ay) / (by - ay) * (bx - ax)
+        winding += (down & right).sum(1) - (up & right).sum(1)
+    return _polygons(shapely.union_all(faces[winding % 2 == 1 if rule == "evenodd" else winding != 0]))
+
+
+def visible(
+    shapes: list[tuple[shapely.Geometry, int]], shape: tuple[int, int]
+) -> tuple[shapely.MultiPolygon, ...]:
+    """What is seen on a sheet of (h, w) modules of shapes that are painted one over the other: the region of
+    each value, the sheet's own being 0."""
+    geometries = np.array([painted for painted, _ in shapes], object)
+    tree, sheet = shapely.STRtree(geometries), shapely.box(0, 0, shape[1], shape[0])
+    parts: list[list[shapely.Geometry]] = [[] for _ in range(1 + max((v for _, v in shapes), default=0))]
+    for number, (painted, value) in enumerate(shapes):
+        above = tree.query(painted)
+        over = shapely.union_all(geometries[above[above > number]], grid_size=GRID)
+        parts[value].append(shapely.difference(painted, over, grid_size=GRID) & sheet)
+    seen = [shapely.union_all(some, grid_size=GRID) for some in parts]
+    seen[0] = shapely.difference(sheet, shapely.union_all(seen[1:]), grid_size=GRID)
+    return tuple(map(_polygons, seen))
+
+
+def with_margin(
+    regions: tuple[shapely.MultiPolygon, ...], modules: int, shape: tuple[int, int]
+) -> tuple[shapely.MultiPolygon, ...]:
+    """The same regions on a sheet of (h, w) modules that shows that many more of value 0 on each side."""
+    h, w = shape
+    moved = [shapely.transform(region, lambda points: points + modules) for region in regions]
+    frame = shapely.box(0, 0, w, h) - shapely.box(modules, modules, w - modules, h - modules)
+    moved[0] = _polygons(shapely.union_all([moved[0], frame], grid_size=GRID))
+    return tuple(moved)
+
+
+def is_whole(regions: tuple[shapely.MultiPolygon, ...]) -> bool:
+    """Whether all edges lie on the lines between modules."""
+    rings = shapely.get_rings(shapely.get_parts(regions))
+    points, ring = shapely.get_coordinates(rings, return_index=True)
+    step = np.abs(np.diff(points, axis=0))[np.diff(ring) == 0]
+    return bool((np.abs(points - np.rint(points)) <= GRID).all() and (step.min(1) <= GRID).all())
+
+
+def modules(regions: tuple[shapely.Geometry, ...], shape: tuple[int, int]) -> np.ndarray:
+    """Which region holds the centre of each of (h, w) modules, uint8; of several the last."""
+    grid, middle = np.zeros(shape, np.uint8), np.indices(shape) + 0.5
+    for value, region in enumerate(regions):
+        shapely.prepare(region)
+        grid[shapely.intersects_xy(region, middle[1], middle[0])] = value
+    return grid
+
+
+def _polygons(region: shapely.Geometry) -> shapely.MultiPolygon:
+    """A region without the points and lines that cuts may leave."""
+    return shapely.MultiPolygon([part for part in shapely.get_parts(region) if part.area])

@@ -1,0 +1,32 @@
+// 3D Gaussians as 3DGS draws them (EWA splatting, Zwicker et al. 2001; Kerbl et al. 2023): the covariance of the Gaussian's image under
+// the camera's derivative at its centre, widened by 0.3 square pixels, and the centre's depth. Constants of gsplat and the authors'
+// rasterizer. What has that image is a disk that faces the camera: so nothing after the set-up knows of it.
+//@ lowpass_make
+    if (THICK_HERE) {
+        if (!(pz >= near)) return;
+        real sw = THICKNESS_HERE;
+        real3_ c = {facet.x * sw, facet.y * sw, facet.z * sw}, across, down;    // the axes' images [samples]
+        real per_x, per_y;                                           // samples per metre at the centre
+//@@ camera_image
+        const real spread = REAL(0.3) / view->filter;
+        real xx = dot3(across, across), xy = dot3(across, down), yy = dot3(down, down);
+        real3_ turned = cross3(across, down);                        // so that the determinant does not cancel
+        real determinant2 = dot3(turned, turned), grown = determinant2 + spread * (xx + yy + spread);
+//@@ ewa_opacity
+        real l11 = sqrt(xx + spread), l21 = xy / l11, l22 = sqrt(grown) / l11;
+        a.x = l11 / per_x; a.y = l21 / per_y; a.z = 0;
+        b.x = 0; b.y = l22 / per_y; b.z = 0;
+        facet.x = facet.y = 0; facet.z = 1;
+        offset = pz;
+//@@ camera_offset
+        su = a.x;
+        sv = b.y;
+    }
+//@ camera_derivative
+        if (THICK_HERE) filtered = false;   // it has a low-pass of its own
+//@ camera_steepest
+    if (THICK_HERE) steepest = fabs(k0.z);  // which makes D 1, that of all samples
+//@ footprint_dot_bounds
+        if (THICK_HERE) bounds.pr = -1.0f;
+//@ footprint_dot
+        if (THICK_HERE) record.dot_x = record.dot_y = 1e18f;

@@ -1,0 +1,123 @@
+"""3D Gaussians on devices, beside disks and boxes in one picture, against the reference."""
+
+import math
+
+import numpy as np
+import pytest
+from agreement import assert_agrees, random_splats
+
+import fidsplat as fs
+from fidsplat.hard_cases import fuzz
+from fidsplat.hard_cases.agreement import against_reference
+
+BACKEND = "opencl"
+CAMERA = fs.Camera.pinhole(97, 71, 70.0, 70.0, 48.0, 36.0, near=0.05)
+
+
+def thick(seed, low=(-1.5, -1.5, -1.0), high=(1.5, 1.5, 3.0), spread=1.2, count=40):
+    """3D Gaussians of every shape, some around the camera."""
+    generator = np.random.default_rng(seed)
+    return fs.SplatCloud(
+        generator.uniform(low, high, (count, 3)),
+        generator.normal(size=(count, 4)),
+        np.exp(generator.normal(-1.8, spread, (count, 3))),
+        generator.uniform(0.2, 1, count),
+        colors=generator.random((count, 3)),
+        labels=np.arange(count),
+    )
+
+
+def mixed(seed):
+    """Disks, boxes, boxes on a plane, and 3D Gaussians."""
+    disks = random_splats(20, seed, depth=(0.5, 4.0), scale=(0.05, 0.5), across=1.2)
+    boxes = random_splats(20, seed + 1, depth=(0.5, 4.0), scale=(0.02, 0.3), across=1.2).with_boxes()
+    marker = fs.marker("apriltag:36h11:5", size=0.4).cloud
+    pose = np.eye(4)
+    pose[2, 3] = 1.5
+    return fs.SplatCloud.concatenate([disks, thick(seed), boxes, marker.transformed(pose)])
+
+
+@pytest.mark.parametrize("way", ["exact", "ewa"])
+def test_all_kinds_of_splats_in_one_picture(renderer, way):
+    """Around the camera and across its plane, with every output."""
+    assert_agrees(renderer, mixed(5), CAMERA, quality=fs.Quality(ellipsoid=way))
+
+
+def test_alone_or_among_others_they_have_the_same_bits(renderer):
+    """Clouds of nothing else have kernels without what disks need (`ellipsoids_alone`)."""
+    alone, quality = thick(3), fs.Quality(lowpass="none")
+    behind = fs.SplatCloud([[0, 0, -5]], [[1, 0, 0, 0]], [[0.1, 0.1]], [1.0], colors=[[1, 1, 1]])
+    both = fs.SplatCloud.concatenate([alone, behind])
+    images = [renderer.render(cloud, CAMERA, quality=quality)["rgb"] for cloud in (alone, both)]
+    assert images[0].any()
+    assert np.array_equal(*images)
+
+
+def test_exact_behind_a_fisheye(renderer):
+    camera = fs.Camera.fisheye(61, 61, math.radians(170), near=0.05)
+    assert_agrees(renderer, mixed(7), camera, quality=fs.Quality())
+
+
+@pytest.mark.parametrize("anisotropy", [1e3, 1e6])
+def test_needles_and_pancakes(renderer, anisotropy):
+    """Also straight along a needle and edge-on to a pancake."""
+    generator = np.random.default_rng(2)
+    scales = np.full((30, 3), 0.3)
+    scales[:15, :2] /= anisotropy
+    scales[15:, 2] /= anisotropy
+    means = np.column_stack([generator.uniform(-1, 1, (30, 2)), generator.uniform(1, 4, 30)])
+    quats = generator.normal(size=(30, 4))
+    means[[0, 15]] = (0, 0, 2)
+    quats[0] = (1, 0, 0, 0)
+    quats[15] = (1, 1, 0, 0)
+    cloud = fs.SplatCloud(
+        means, quats, scales, np.full(30, 0.7), colors=generator.random((30, 3)), labels=np.arange(30)
+    )
+    assert_agrees(
+        renderer, fs.SplatCloud.concatenate([cloud, mixed(5)]), CAMERA, quality=fs.Quality(ellipsoid="exact")
+    )
+
+
+def test_antialiased_splats_fade_where_they_are_widened(renderer):
+    cloud = fs.SplatCloud(
+        [[-1, 0, 2], [1, 0, 2]],
+        [[1, 0, 0, 0]] * 2,
+        [[1e-3] * 3, [0.2] * 3],
+        [0.9, 0.9],
+        colors=np.ones((2, 3)),
+    )
+    plain, faded = (
+        renderer.render(cloud, CAMERA, ("alpha",), fs.Quality(ellipsoid=way))["alpha"]
+        for way in ("ewa", "ewa_antialiased")
+    )
+    left = np.s_[:, :24]
+    assert faded[left].sum() < 0.02 * plain[left].sum()
+    assert faded.max() == pytest.approx(plain.max(), abs=0.01)
+
+
+def test_a_flat_ellipsoid_is_a_disk(renderer):
+    """80 dB at a third scale of 1e-6 of the others."""
+    cloud = random_splats(300, 4, depth=(0.5, 5.0), scale=(0.02, 0.4))
+    third = 1e-6 * cloud.scales.min(axis=1)
+    thick = fs.SplatCloud(
+        cloud.means,
+        cloud.quats,
+        np.column_stack([cloud.scales, third]),
+        cloud.opacities,
+        colors=cloud.colors,
+    )
+    quality = fs.Quality(ellipsoid="exact")
+    error = (
+        renderer.render(thick, CAMERA, quality=quality)["rgb"]
+        - renderer.render(cloud, CAMERA, quality=quality)["rgb"]
+    )
+    assert -10 * math.log10(max(float((error**2).mean()), 1e-20)) > 80
+
+
+@pytest.mark.parametrize("scenes", [6, pytest.param(1000, marks=pytest.mark.exhaustive)])
+def test_random_hard_scenes(renderer, scenes):
+    """The fuzzer's splats with a third scale; 1000 scenes have 100,000."""
+    for seed in range(scenes):
+        picture = fuzz.thick_scene_of(seed)
+        wrong = [one for one in against_reference(renderer, picture) if not one.agrees]
+        assert not wrong, (seed, wrong)

@@ -1,0 +1,48 @@
+"""The command line where the machine lacks something: a stream, room, files, folders of its own."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+FIDSPLAT = f"{sys.executable} -m fidsplat.cli"
+NO_ROOM = "fidsplat: No space left on device; make room there, or on what the output goes to"
+
+
+def shell(text, folder, **environment):
+    """Exit status, stdout and stderr of a shell's line; `fidsplat` is ours."""
+    done = subprocess.run(
+        ["bash", "-c", f'fidsplat() {{ {FIDSPLAT} "$@"; }}; {text}'],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
+    )
+    return done.returncode, done.stdout, done.stderr.strip()
+
+
+@pytest.mark.parametrize(
+    ("line", "status", "says"),
+    [
+        ("fidsplat --version > /dev/full", 1, NO_ROOM),
+        ("fidsplat marker --help > /dev/full", 1, NO_ROOM),
+        ("fidsplat marker nothing 2> /dev/full", 2, ""),
+        ("fidsplat --version >&-", 0, ""),
+    ],
+)
+def test_output_that_goes_nowhere(line, status, says, tmp_path):
+    found, out, err = shell(line, tmp_path)
+    assert (found, err) == (status, says)
+    assert out == ""
+
+
+def test_no_file_takes_the_place_of_a_closed_stream(tmp_path):
+    """What is printed does not go into the file that is written."""
+    words = "marker aruco:4x4_50:7 --mixture fitted"
+    assert shell(f"fidsplat {words} -o whole.ply", tmp_path)[0] == 0
+    status, _, err = shell(f"fidsplat {words} -o closed.ply <&- >&-", tmp_path)
+    assert (status, err) == (0, "")
+    assert (tmp_path / "closed.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
