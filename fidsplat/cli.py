@@ -52,10 +52,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return status
     except SystemExit as stop:  # help, or words that could not be parsed
         return stop.code if isinstance(stop.code, int) else 2
-    except _Terminated:
-        return _fail("terminated", 143)
-    except KeyboardInterrupt:
-        return _fail("interrupted", 130)
+    except KeyboardInterrupt as stop:
+        if not debug:  # what was stopped while it was made may complain when it is thrown away
+            sys.unraisablehook = lambda _: None
+        return _fail(*(("terminated", 143) if isinstance(stop, _Terminated) else ("interrupted", 130)))
     except BrokenPipeError:
         _drop_output()  # whoever read it has gone; nothing is left to say to them
         return 1

@@ -170,10 +170,16 @@ def test_a_failed_run_is_1_and_a_fault_of_ours_says_so(capsys, monkeypatch):
     assert status == 1
     assert "--debug" in line
 
+    class HalfMade:
+        def __del__(self):
+            raise AttributeError("what its constructor had not come to")
+
     def interrupted(self):
+        half = HalfMade()  # noqa: F841
         raise KeyboardInterrupt
 
     monkeypatch.setattr(COMMANDS["devices"], "run", interrupted)
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
     assert fails(capsys, "devices") == (130, "fidsplat: interrupted\n")
 
 
