@@ -1,12 +1,12 @@
-"""How often `fs.quality_within` keeps what it promises, on scenes that its table was not made of.
+"""How often `fs.quality_within` keeps what it promises, on scenes that its price list was not made of.
 
     python benchmarks/budget_promise.py [--device opencl:pocl] [--scenes 200] [--json FILE]
 
 Errors: random scenes with held-out seeds, each with every bound of BOUNDS, against the float64 reference.
-`table` is the setting that the table gives for the bound; `measured` the one that was calibrated on the scene
+`prices` is what the price list gives for the bound; `measured` the one that was calibrated on the scene
 and camera; `elsewhere` the same from another camera (turned by 5 degrees, moved by a tenth of the distance);
-`crossing` the table's setting in scenes whose loose splats cross a printed plane. Times: budgets of TIMES
-times what TIMED takes in each scene; then FRAMES frames are drawn, and those in time counted.
+`crossing` the price list's quality in scenes whose loose splats cross a printed plane. Times: budgets of
+TIMES times what TIMED takes in each scene; then FRAMES frames are drawn, and those in time counted.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from functools import partial
 
 import numpy as np
 from measuring import PROGRESS, facts, keep, options, show
+from random_scenes import HELD_OUT, RandomScene, random_scene
 from rich.progress import track
 
 import fidsplat as fs
@@ -26,7 +27,6 @@ from fidsplat.accuracy import errors, truth
 from fidsplat.budget import choose
 from fidsplat.errors import InputError
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED
-from fidsplat.random_clouds import HELD_OUT, RandomScene, random_scene
 from fidsplat.timing import Timer, frame_timer, take_turns
 
 BOUNDS = (1e-2, 1e-3, 1e-4)
@@ -73,9 +73,9 @@ def capture_of(scene: RandomScene) -> fs.Capture:
 def errors_kept(renderer: fs.Renderer, count: int, measured: int) -> list[dict]:
     """A row for each way of asking and each bound: of `count` scenes, and of the first `measured` of them."""
     reference = fs.Renderer("reference")
-    ways = ("table", "crossing", "measured", "elsewhere")
+    ways = ("prices", "crossing", "measured", "elsewhere")
     kept = {(way, bound): Kept() for way in ways for bound in BOUNDS}
-    table = {bound: fs.quality_within(error=bound, device=renderer) for bound in BOUNDS}
+    listed = {bound: fs.quality_within(error=bound, device=renderer) for bound in BOUNDS}
 
     def hold(way: str, bound: float, scene: RandomScene, quality: fs.Quality, want: np.ndarray) -> None:
         frame = renderer.render(scene.cloud, scene.camera, quality=quality, background=scene.background)
@@ -87,13 +87,13 @@ def errors_kept(renderer: fs.Renderer, count: int, measured: int) -> list[dict]:
     for k in track(range(count), "errors", console=PROGRESS):
         scene = random_scene(HELD_OUT + k)
         want = truth_of(scene)
-        for bound, quality in table.items():
-            hold("table", bound, scene, quality, want)
+        for bound, quality in listed.items():
+            hold("prices", bound, scene, quality, want)
         if k >= measured:
             continue
         crossing, elsewhere = random_scene(HELD_OUT + k, crossing=True), moved(scene)
         mixed, there = truth_of(crossing), truth_of(elsewhere)
-        for bound, quality in table.items():
+        for bound, quality in listed.items():
             hold("crossing", bound, crossing, quality, mixed)
             place = {"scene": scene.cloud, "capture": capture_of(scene)}
             try:

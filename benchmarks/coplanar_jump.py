@@ -20,8 +20,8 @@ from rich.progress import track
 
 import fidsplat as fs
 from fidsplat.hard_cases.agreement import draw
+from fidsplat.hard_cases.c_order import STEP, WALL_STEP, largest_jump, turning, wall
 from fidsplat.hard_cases.clouds import taken
-from fidsplat.hard_cases.coplanar import STEP, WALL_STEP, largest_jump, turning, wall
 from fidsplat.vision.images import to_uint8, write_png
 from fidsplat.vision.paint import contact_sheet
 

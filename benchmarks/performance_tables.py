@@ -20,9 +20,10 @@ from itertools import pairwise
 from pathlib import Path
 
 import pandas as pd
+from growth import exponents
 
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES
-from fidsplat.experiments.bench.growth import exponents
+from fidsplat.experiments.sweep import read_records
 from fidsplat.files import atomic_write
 
 
@@ -31,11 +32,10 @@ def load(files: Iterable[Path]) -> dict[str, list[dict]]:
     kinds = ("frames", "peers", "first", "ways", "large", "growth")
     found: dict[str, list[dict]] = {kind: [] for kind in kinds}
     for file in files:
-        text = file.read_text("utf-8")
         if file.suffix == ".jsonl":
-            found["growth"] += [json.loads(line) for line in text.splitlines()]
+            found["growth"] += [record.result for record in read_records(file)]
             continue
-        content = json.loads(text)
+        content = json.loads(file.read_text("utf-8"))
         if isinstance(content, list):
             kinds = {"way": "ways", "millions": "large", "caches": "first"}
             for kind in (kinds[key] for key in kinds if key in content[0]):

@@ -27,7 +27,7 @@ TRUTH_CUTOFF = 1e-8
 FLOAT32_OUTPUT = 1e-7
 """what a truth of colours up to 1 is off that a device hands out in float32"""
 FLOAT32_TRUTH = 1e-5
-"""what one is off that is drawn in float32: more than any picture at full precision in budget/table.json"""
+"""what one is off that is drawn in float32: more than any picture at full precision in budget/prices.json"""
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@
 import contextlib
 import errno
 import functools
+import inspect
 import io
 import operator
 import os
@@ -51,10 +52,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return status
     except SystemExit as stop:  # help, or words that could not be parsed
         return stop.code if isinstance(stop.code, int) else 2
-    except _Terminated:
-        return _fail("terminated", 143)
-    except KeyboardInterrupt:
-        return _fail("interrupted", 130)
+    except KeyboardInterrupt as stop:
+        if not debug:  # what was stopped while it was made may complain when it is thrown away
+            sys.unraisablehook = lambda _: None
+        return _fail(*(("terminated", 143) if isinstance(stop, _Terminated) else ("interrupted", 130)))
     except BrokenPipeError:
         _drop_output()  # whoever read it has gone; nothing is left to say to them
         return 1
@@ -142,7 +143,8 @@ def _parse(words: list[str]):
     kind: Any = None
     about, program = ABOUT, "fidsplat"
     while words and words[0] in known:
-        kind, about, program = known[words[0]], known[words[0]].HELP, f"{program} {words[0]}"
+        kind, program = known[words[0]], f"{program} {words[0]}"
+        about = inspect.cleandoc(kind.__doc__)
         known, words = getattr(kind, "PARTS", {}), words[1:]
     if known and not hasattr(kind, "run"):  # a group, and no word that leads on
         kind = _any_of(known)
@@ -166,7 +168,7 @@ def _any_of(commands: dict[str, type]) -> Any:
     return functools.reduce(
         operator.or_,
         (
-            Annotated[kind, tyro.conf.subcommand(name, description=kind.__doc__)]
+            Annotated[kind, tyro.conf.subcommand(name, description=str(kind.__doc__).partition("\n")[0])]
             for name, kind in commands.items()
         ),
     )

@@ -18,9 +18,9 @@ import numpy as np
 from rich.progress import track
 
 import fidsplat as fs
-from fidsplat.backends.base import ProbesArithmetic
+from fidsplat.backends.base import Probed
 from fidsplat.backends.opencl.device import OpenCLBackend
-from fidsplat.hard_cases.arithmetic import worst
+from fidsplat.hard_cases.f_arithmetic import worst
 
 AT_ONCE = 1 << 22
 EXPONENTS, SHARES = (2.0**-26, 87.0), (2.0**-24, 1.0)
@@ -50,7 +50,7 @@ def main() -> None:
     options = parser.parse_args()
     renderer = fs.Renderer(options.device)
     backend = renderer.backend
-    if not isinstance(backend, ProbesArithmetic):
+    if not isinstance(backend, Probed):
         parser.error(f"{renderer.device.name} runs no functions alone")
     if options.no_fma:
         if not isinstance(backend, OpenCLBackend):
@@ -59,7 +59,7 @@ def main() -> None:
     most = dict.fromkeys(NAMES, 0.0)
     pairs = zip_longest(every(*EXPONENTS), every(*SHARES), fillvalue=np.ones(AT_ONCE))
     for x, share in track(pairs, "every float32", total=len(range(*_bits(*EXPONENTS), AT_ONCE))):
-        got = backend.run_arithmetic(-x, share, share, share)
+        got = backend.probe().arithmetic(-x, share, share, share)
         for name, function in NAMES.items():
             truth = function(share if name.endswith("log") else -x)
             most[name] = max(most[name], worst(got[name], truth))

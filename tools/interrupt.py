@@ -196,8 +196,9 @@ def _end(child: subprocess.Popen[str]) -> tuple[int, str]:
 
 def is_clear(status: int, said: str) -> bool:
     """Whether a run ended well, in one line, or was killed outright."""
-    killed = status in (0, *(-getattr(signal, name) for name in SIGNALS))
-    known = killed or any(line.startswith("fidsplat: ") for line in said.splitlines())
+    if status in [-getattr(signal, name) for name in SIGNALS] and ", in main" not in said:
+        return True  # by Python, before our first line
+    known = status == 0 or any(line.startswith("fidsplat: ") for line in said.splitlines())
     return known and "Traceback" not in said and "a fault of fidsplat" not in said
 
 

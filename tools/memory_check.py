@@ -151,7 +151,7 @@ def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
             view = View.of(fs.Capture(view_from, quality=chosen, background=(0.1, 0.2, 0.3)), cloud.origin)
             backend.pair_budget, kept = budget or backend.pair_budget, backend.pair_budget
             planes = backend.pipeline(features, shape).render(backend.upload(cloud), view)
-            drawn = {name: planes.read(name) for name in ("rgb", *features.taps)}
+            drawn = {name: planes.read(name) for name in ("rgb", *features.outputs)}
             backend.pair_budget = kept
             truth = truth_of(Picture(cloud, view_from, chosen, outputs))
             worst = 0.0
@@ -165,7 +165,7 @@ def pictures(renderer) -> Iterator[tuple[str, Callable[[], float]]]:
 
     def arithmetic() -> float:
         numbers = np.linspace(0.5, 1.0, 64)
-        results = backend.run_arithmetic(-numbers, numbers, numbers, numbers)
+        results = backend.probe().arithmetic(-numbers, numbers, numbers, numbers)
         return float(np.abs(results["exp"] - np.exp(-numbers)).max())
 
     yield "the self-test's arithmetic", arithmetic

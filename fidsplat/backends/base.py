@@ -175,14 +175,23 @@ class Measurable(Protocol):
         ...
 
 
-@runtime_checkable
-class ProbesArithmetic(Protocol):
-    """A backend that runs the functions of its kernels on given numbers."""
+class Probe(Protocol):
+    """Looks into an open device: small kernels compiled as the stages are, single stages on made-up input,
+    and memory that is filled with rubbish first."""
 
-    def run_arithmetic(
+    def contraction(self, a: np.ndarray, b: np.ndarray) -> tuple[Sequence[np.ndarray], bool]:
+        """a b - a b; a b + a; the difference in the set-up's precision, of thirds; a b - (a b), fused: each
+        (n,), from a, b (n,) float32. And whether the device fuses where it is asked to."""
+        ...
+
+    def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
+        """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
+        ...
+
+    def arithmetic(
         self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
     ) -> dict[str, np.ndarray]:
-        """Results of the device's functions, as the stages call them.
+        """Results of the device's functions, float32 ones as the stages call them.
 
         Args:
             exponents, shares, above, below: (n,) float64, n a multiple of 16; they are rounded to float32
@@ -197,20 +206,6 @@ class ProbesArithmetic(Protocol):
         Raises:
             DeviceError: the device cannot compile or run the kernels.
         """
-        ...
-
-
-class Probe(Protocol):
-    """Looks into an open device: small kernels compiled as the stages are, single stages on made-up input,
-    and memory that is filled with rubbish first."""
-
-    def contraction(self, a: np.ndarray, b: np.ndarray) -> tuple[Sequence[np.ndarray], bool]:
-        """a b - a b; a b + a; the difference in the set-up's precision, of thirds; a b - (a b), fused: each
-        (n,), from a, b (n,) float32. And whether the device fuses where it is asked to."""
-        ...
-
-    def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
-        """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
         ...
 
     def options(self) -> list[str]:

@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any
 
-from fidsplat.budget import store, table
-from fidsplat.budget.calibrate import Calibration
-from fidsplat.budget.search import Search
-from fidsplat.budget.table import Setting
+from fidsplat.budget import prices, store
+from fidsplat.budget.prices import Candidate
+from fidsplat.budget.search import Calibration, Search
 from fidsplat.cameras import Camera
 from fidsplat.capture import Capture
 from fidsplat.errors import DeviceError, InputError
@@ -29,17 +28,17 @@ class Choice:
 
     quality: Quality
     error: float
-    """largest absolute error of rgb: measured on the scene, or else promised by the table"""
+    """largest absolute error of rgb: measured on the scene, or else promised by the price list"""
     ms: float | None
     """median time of a frame, milliseconds; None where nothing was timed"""
     ms_late: float | None
     """90th percentile"""
     source: str
-    """`table`, `measured`, or `kept`: measured before, and read from the user's cache folder"""
+    """`prices`, `measured`, or `kept`: measured before, and read from the user's cache folder"""
     device: str
     """name of the device"""
     knobs: dict[str, Any]
-    """where it differs from the settings that a budget starts from (`table.FREE`)"""
+    """where it differs from what a budget starts from (`prices.FREE`)"""
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON: all but the quality itself, and what it takes to make it again."""
@@ -53,7 +52,7 @@ class Choice:
             f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}"
             for name, value in ({"alpha_cutoff": self.quality.alpha_cutoff} | self.knobs).items()
         )
-        how = "promised error" if self.source == "table" else "measured error"
+        how = "promised error" if self.source == "prices" else "measured error"
         took = "" if self.ms is None else f", {self.ms:.3g} ms a frame"
         return f"{knobs}: {how} {self.error:.2g}{took} on {self.device}"
 
@@ -72,7 +71,7 @@ def quality_within(
     from the same definition at full precision in float64 (`fidsplat.accuracy.truth`). The definition
     (low-pass, samples, coplanar, marker) is that of the capture's quality.
 
-    With the error alone the answer comes from a table of errors over random scenes. With a scene and a camera
+    With the error alone the answer comes from a list of errors over random scenes. With a scene and a camera
     it is measured: on this device, in that scene, from there. What was measured is kept in the user's cache
     folder. docs/budget.md says how often each promise was kept.
 
@@ -115,10 +114,10 @@ def choose(
         if given is None and (ms is not None or scene is not None or asked.camera is not None):
             raise InputError(f"this budget needs a {name} to measure with: give scene=... and capture=...")
     renderer = device if isinstance(device, Renderer) else Renderer(device or default_device())
-    settings = table.load(renderer.device.kind)
+    candidates = prices.load(renderer.device.kind)
     if scene is None:
         assert error is not None
-        return _from_table(error, settings, asked.quality, renderer)
+        return _from_list(error, candidates, asked.quality, renderer)
     splats = scene.cloud() if isinstance(scene, Scene) else scene
     info = renderer.device
     drawn_by = (info.name, info.title, info.platform, info.version, code_hash())
@@ -126,7 +125,7 @@ def choose(
     kept = _kept(key, asked.quality, info.name)
     if kept is not None:
         return kept
-    search = Search(Calibration(renderer, splats, asked, tell), settings)
+    search = Search(Calibration(renderer, splats, asked, tell), candidates)
     choice = _measured(search, error, ms)
     numbers = {"error": choice.error, "ms": choice.ms, "ms_late": choice.ms_late}
     store.save(key, {"knobs": choice.knobs, **numbers})
@@ -144,30 +143,30 @@ def check_bounds(error: float | None, ms: float | None) -> None:
             raise InputError(f"{name} is {value!r}; it must be a finite number, e.g. {name}={example}")
 
 
-def _from_table(error: float, settings: tuple[Setting, ...], base: Quality, renderer: Renderer) -> Choice:
-    for setting in settings:
-        drawn = _drawn(setting, base, renderer) if setting.promised <= error else None
+def _from_list(error: float, candidates: tuple[Candidate, ...], base: Quality, renderer: Renderer) -> Choice:
+    for candidate in candidates:
+        drawn = _drawn(candidate, base, renderer) if candidate.promised <= error else None
         if drawn is not None:
             name = renderer.device.name
-            return Choice(drawn.of(base), drawn.promised, None, None, "table", name, drawn.knobs)
-    finest = sorted(settings, key=lambda setting: setting.promised)
-    best = next(setting.promised for setting in finest if _drawn(setting, base, renderer))
+            return Choice(drawn.of(base), drawn.promised, None, None, "prices", name, drawn.knobs)
+    finest = sorted(candidates, key=lambda candidate: candidate.promised)
+    best = next(candidate.promised for candidate in finest if _drawn(candidate, base, renderer))
     raise InputError(
-        f"no setting promises an error of {error:g} for any scene on {renderer.device.name}: the best is "
+        f"no quality promises an error of {error:g} for any scene on {renderer.device.name}: the best is "
         f"{best:.2g}; allow that, or give scene=... and capture=... to measure yours"
     )
 
 
-def _drawn(setting: Setting, base: Quality, renderer: Renderer) -> Setting | None:
-    """The setting, or what keeps its promise without the knobs that the device lacks, or None."""
-    if setting == setting.everywhere:
-        return setting
+def _drawn(candidate: Candidate, base: Quality, renderer: Renderer) -> Candidate | None:
+    """The candidate, or what keeps its promise without the knobs that the device lacks, or None."""
+    if candidate == candidate.everywhere:
+        return candidate
     pixel = Camera.pinhole(1, 1, 1.0, 1.0, 0.5, 0.5)
     try:
-        renderer.render(SplatCloud.empty(), pixel, quality=setting.of(base))
+        renderer.render(SplatCloud.empty(), pixel, quality=candidate.of(base))
     except (InputError, DeviceError):
-        return None if "blend_precision" in setting.knobs else setting.everywhere
-    return setting
+        return None if "blend_precision" in candidate.knobs else candidate.everywhere
+    return candidate
 
 
 def _kept(key: str | None, base: Quality, device: str) -> Choice | None:
@@ -176,9 +175,9 @@ def _kept(key: str | None, base: Quality, device: str) -> Choice | None:
     try:
         if kept is None:
             return None
-        setting = Setting(kept["knobs"], 0, 0, 0, 0)
+        candidate = Candidate(kept["knobs"], 0, 0, 0, 0)
         error, ms, late = (float(kept[name]) for name in ("error", "ms", "ms_late"))
-        return Choice(setting.of(base), error, ms, late, "kept", device, setting.knobs)
+        return Choice(candidate.of(base), error, ms, late, "kept", device, candidate.knobs)
     except (KeyError, TypeError, ValueError, AttributeError):
         return None
 
@@ -194,9 +193,9 @@ def _measured(search: Search, error: float | None, ms: float | None) -> Choice:
                 f"an error of {error:g} takes {found.times.late:.3g} ms a frame on {search.device}, not "
                 f"{ms:g}; {_best_in(search, ms)}"
             )
-    times, setting = found.times, found.setting
+    times, candidate = found.times, found.candidate
     return Choice(
-        found.quality, found.error, times.median, times.late, "measured", search.device, setting.knobs
+        found.quality, found.error, times.median, times.late, "measured", search.device, candidate.knobs
     )
 
 

@@ -1,32 +1,113 @@
-"""Which of the table's settings to take, by measuring them."""
+"""Which candidates of the price list to take, by measuring their errors and times on the user's own device
+and scene."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
-from fidsplat.budget.calibrate import FEWEST, Calibration, Times
-from fidsplat.budget.table import Setting
+import numpy as np
+
+from fidsplat.accuracy import error_bound, errors, reference_for, truth
+from fidsplat.budget.prices import Candidate
+from fidsplat.capture import Capture
 from fidsplat.errors import DeviceError, InputError
 from fidsplat.quality import Quality
+from fidsplat.render import Renderer
+from fidsplat.splats import SplatCloud
+from fidsplat.timing import Timer, frame_timer, take_turns
+
+REPEATS = 9
+"""frames of each quality that are timed, in turn with those of the others"""
+FEWEST = 3
+PATIENCE = 10.0
+"""seconds that timing several qualities may take in all; where it would take longer, fewer frames are timed,
+but `FEWEST` of each"""
+
+
+@dataclass(frozen=True)
+class Times:
+    """Milliseconds of a frame whose splats are on the device and whose picture stays there."""
+
+    median: float
+    late: float
+    """90th percentile"""
+
+
+class Calibration:
+    """One scene on one device.
+
+    Args:
+        renderer: who draws.
+        cloud: what.
+        capture: how; its quality has the definition of the truth.
+        tell: called with what is being done.
+    """
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        cloud: SplatCloud,
+        capture: Capture,
+        tell: Callable[[str], None],
+    ) -> None:
+        self.renderer, self.base = renderer, capture.quality
+        self._cloud, self._capture, self._tell = cloud, capture, tell
+        self._resident = renderer.upload(cloud)
+        self._errors: dict[Quality, float] = {}
+
+    @cached_property
+    def _truth(self) -> tuple[np.ndarray, float]:
+        """The picture (h, w, 3), and how far it may be off itself."""
+        self._tell("drawing the picture at full precision")
+        reference = reference_for(self.renderer, self._capture)
+        scene = self._resident if reference is self.renderer else self._cloud
+        return truth(reference, scene, self._capture), error_bound(reference, self._capture)
+
+    def error(self, quality: Quality) -> float:
+        """Largest absolute error of rgb against the truth. What the truth may be off itself is added."""
+        if quality not in self._errors:
+            want, off = self._truth
+            self._tell(f"measuring errors ({len(self._errors) + 1} candidates so far)")
+            frame = self.renderer.render(self._resident, self._capture, quality=quality)
+            self._errors[quality] = errors(frame["rgb"], want).maximum + off
+        return self._errors[quality]
+
+    def time(self, quality: Quality) -> float:
+        """Milliseconds of one frame, now."""
+        return self.timer(quality).run()
+
+    def times(self, qualities: Iterable[Quality], repeats: int = REPEATS) -> list[Times]:
+        """Times of qualities that this device draws. Frames take turns; one of each goes before those that
+        count."""
+        timers = [self.timer(quality) for quality in qualities]
+        self._tell(f"timing {len(timers)} candidates")
+        take_turns(timers, repeats, least=min(FEWEST, repeats), seconds=PATIENCE, warm_up=1)
+        return [Times(timer.median, float(np.quantile(timer.ms, 0.9))) for timer in timers]
+
+    def timer(self, quality: Quality) -> Timer:
+        """Times frames of a quality."""
+        return frame_timer(self.renderer, self._resident, self._capture, quality=quality)
+
 
 ENOUGH = 4
-"""settings that are timed together before one is taken"""
+"""candidates that are timed together before one is taken"""
 TOO_LONG = 1.5
-"""times of the allowed time: a setting whose first frame takes longer is timed no further"""
+"""times of the allowed time: a candidate whose first frame takes longer is timed no further"""
 SHORT = 0.5
-"""times of the allowed time: settings that should take less by the table are tried last"""
+"""times of the allowed time: candidates that should take less by the list are tried last"""
 LUCK = 4.0
-"""how many times better than in proportion to the table a setting may do in this scene"""
+"""how many times better than in proportion to the list a candidate may do in this scene"""
 
 
 @dataclass(frozen=True)
 class Found:
-    """A setting that keeps its bound."""
+    """A candidate that keeps its bound."""
 
-    setting: Setting
+    candidate: Candidate
     quality: Quality
     error: float
     """largest absolute error of rgb"""
@@ -36,48 +117,48 @@ class Found:
 class Search:
     """Settings, the cheapest first, and a scene on a device to measure them with."""
 
-    def __init__(self, calibration: Calibration, settings: tuple[Setting, ...]) -> None:
-        self.calibration, self._settings = calibration, settings
+    def __init__(self, calibration: Calibration, candidates: tuple[Candidate, ...]) -> None:
+        self.calibration, self._candidates = calibration, candidates
         self.device = calibration.renderer.device.name
 
     def cheapest_within(self, error: float) -> Found:
-        """The fastest here of the first few settings within the error.
+        """The fastest here of the first few candidates within the error.
 
         Raises:
             InputError: none is; it says which error is the least.
         """
-        hits: list[tuple[Setting, float]] = []
-        missed: tuple[Setting, float] | None = None
-        for setting in self._settings:
+        hits: list[tuple[Candidate, float]] = []
+        missed: tuple[Candidate, float] | None = None
+        for candidate in self._candidates:
             # what does not come near the error in the easiest scenes is not tried, nor what is hardly better
             # than the last that missed it
-            if setting.easy > LUCK * error or (missed and not _much_better(setting, *missed)):
+            if candidate.easy > LUCK * error or (missed and not _much_better(candidate, *missed)):
                 continue
-            for drawn, measured in self._measured([setting]):
+            for drawn, measured in self._measured([candidate]):
                 if measured <= error:
                     hits.append((drawn, measured))
                 else:
-                    missed = setting, error / measured
+                    missed = candidate, error / measured
             if len(hits) == ENOUGH:
                 break
         if hits:
             return min(self._timed(hits), key=lambda found: found.times.median)
-        best = sorted(self._settings, key=lambda setting: setting.median)[:ENOUGH]
+        best = sorted(self._candidates, key=lambda candidate: candidate.median)[:ENOUGH]
         least = min(measured for _, measured in self._measured(best))
         raise InputError(
-            f"no setting keeps an error of {error:g} for this scene on {self.device}: the least is "
+            f"no quality keeps an error of {error:g} for this scene on {self.device}: the least is "
             f"{least:.2g}; allow {least * 1.1:.2g} or more"
         )
 
     def most_accurate_in(self, ms: float) -> Found:
-        """The setting with the least error of those whose frames take at most `ms` milliseconds, nine of ten.
+        """The candidate with the least error of those that draw nine frames of ten in `ms` milliseconds.
 
         Raises:
             InputError: none does; it says how long the fastest takes.
         """
         seen: list[Found] = []
         start = self._start(ms)
-        for group in (self._settings[start:], self._settings[:start]):
+        for group in (self._candidates[start:], self._candidates[:start]):
             likely = self._likely(group, ms)
             for at in range(0, len(likely), ENOUGH):
                 seen += self._timed(likely[at : at + ENOUGH])
@@ -85,56 +166,56 @@ class Search:
                 if in_time:
                     return min(in_time, key=lambda found: found.error)
         # a second look at what was the fastest: on a busy machine the first may have been unlucky
-        pairs = [(found.setting, found.error) for found in sorted(seen, key=_late)]
+        pairs = [(found.candidate, found.error) for found in sorted(seen, key=_late)]
         if not pairs:
-            pairs = list(itertools.islice(self._measured(self._settings), ENOUGH))
+            pairs = list(itertools.islice(self._measured(self._candidates), ENOUGH))
         best = min(self._timed(pairs[:ENOUGH]), key=_late)
         if best.times.late <= ms:
             return best
         raise InputError(
-            f"no setting draws this scene in {ms:g} ms on {self.device}; the fastest takes "
+            f"no quality draws this scene in {ms:g} ms on {self.device}; the fastest takes "
             f"{best.times.late:.3g} ms, with an error of {best.error:.2g}"
         )
 
     def _start(self, ms: float) -> int:
-        """Which setting to begin with: the first that should take more than a `SHORT` part of the time."""
-        usual = min(self._settings, key=lambda setting: abs(math.log(setting.cost))).everywhere
+        """Which candidate to begin with: the first that should take more than a `SHORT` part of the time."""
+        usual = min(self._candidates, key=lambda candidate: abs(math.log(candidate.cost))).everywhere
         (taken,) = self.calibration.times([usual.of(self.calibration.base)], FEWEST)
-        costs = [setting.cost * taken.median / usual.cost for setting in self._settings]
+        costs = [candidate.cost * taken.median / usual.cost for candidate in self._candidates]
         start = next((k for k, cost in enumerate(costs) if cost >= SHORT * ms), len(costs))
         return max(0, min(start, len(costs) - 2 * ENOUGH))
 
-    def _likely(self, group: Iterable[Setting], ms: float) -> list[tuple[Setting, float]]:
-        """Of settings, the cheapest first, those whose first frame is not much too late; the most accurate
+    def _likely(self, group: Iterable[Candidate], ms: float) -> list[tuple[Candidate, float]]:
+        """Of candidates, the cheapest first, those whose first frame is not much too late; the most accurate
         first."""
         likely, late = [], 0
-        for setting, measured in self._measured(group):
-            if self.calibration.time(setting.of(self.calibration.base)) <= TOO_LONG * ms:
-                likely.append((setting, measured))
+        for candidate, measured in self._measured(group):
+            if self.calibration.time(candidate.of(self.calibration.base)) <= TOO_LONG * ms:
+                likely.append((candidate, measured))
             else:
                 late += 1
             if late == ENOUGH:
                 break
         return sorted(likely, key=lambda pair: pair[1])
 
-    def _measured(self, settings: Iterable[Setting]):
+    def _measured(self, candidates: Iterable[Candidate]):
         """Settings with their errors, as they are asked for; without the knobs that the device lacks."""
-        for setting in settings:
+        for candidate in candidates:
             try:
-                measured = self.calibration.error(setting.of(self.calibration.base))
+                measured = self.calibration.error(candidate.of(self.calibration.base))
             except (InputError, DeviceError):
-                if setting == setting.everywhere:
+                if candidate == candidate.everywhere:
                     raise
-                setting = setting.everywhere
-                measured = self.calibration.error(setting.of(self.calibration.base))
-            yield setting, measured
+                candidate = candidate.everywhere
+                measured = self.calibration.error(candidate.of(self.calibration.base))
+            yield candidate, measured
 
-    def _timed(self, pairs: list[tuple[Setting, float]]) -> list[Found]:
-        qualities = [setting.of(self.calibration.base) for setting, _ in pairs]
+    def _timed(self, pairs: list[tuple[Candidate, float]]) -> list[Found]:
+        qualities = [candidate.of(self.calibration.base) for candidate, _ in pairs]
         times = self.calibration.times(qualities)
         return [
-            Found(setting, quality, measured, taken)
-            for (setting, measured), quality, taken in zip(pairs, qualities, times, strict=True)
+            Found(candidate, quality, measured, taken)
+            for (candidate, measured), quality, taken in zip(pairs, qualities, times, strict=True)
         ]
 
 
@@ -142,8 +223,8 @@ def _late(found: Found) -> float:
     return found.times.late
 
 
-def _much_better(setting: Setting, missed: Setting, wanted: float) -> bool:
-    """Whether a setting can have `wanted` times the error of one that missed: by the table's median, which
+def _much_better(candidate: Candidate, missed: Candidate, wanted: float) -> bool:
+    """Whether a candidate can have `wanted` times the error of one that missed: by the list's median, which
     the cut-off decides, or by its largest error, which the stop does."""
     enough = LUCK * wanted
-    return setting.median <= enough * missed.median or setting.most <= enough * missed.most
+    return candidate.median <= enough * missed.median or candidate.most <= enough * missed.most

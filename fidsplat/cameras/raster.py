@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -33,17 +33,7 @@ class RayRaster:
 
     def cropped(self, top: int, end: int) -> RayRaster:
         """Rows [top, end); they share the map of the whole."""
-        return RayRaster(
-            self.lens,
-            self.width,
-            end - top,
-            self.focal_x,
-            self.focal_y,
-            self.center_x,
-            self.center_y - top,
-            self,
-            top,
-        )
+        return replace(self, height=end - top, center_y=self.center_y - top, whole=self, top=top)
 
     @cached_property
     def rays(self) -> np.ndarray:

@@ -1,6 +1,6 @@
 """One module for each command: a dataclass of its options, whose ``run`` does the work and returns the exit
-status. Its docstring is the line in the list of commands, its HELP what `fidsplat COMMAND --help` says.
-A group of commands has PARTS instead, or as well: its commands by the word that follows.
+status. Its docstring is what `fidsplat COMMAND --help` says, and the first line of that stands in the list of
+commands. A group of commands has PARTS instead, or as well: its commands by the word that follows.
 
 Nothing heavy is imported before ``run``, so that help and errors come at once.
 """
@@ -11,6 +11,7 @@ from fidsplat.commands.demo import Demo
 from fidsplat.commands.detect import Detect
 from fidsplat.commands.devices import Devices
 from fidsplat.commands.experiment import Experiment
+from fidsplat.commands.info import Info
 from fidsplat.commands.marker import Marker
 from fidsplat.commands.render import Render
 from fidsplat.commands.source import Source
@@ -20,6 +21,7 @@ from fidsplat.commands.warm import Warm
 COMMANDS = {
     "demo": Demo,
     "devices": Devices,
+    "info": Info,
     "marker": Marker,
     "render": Render,
     "detect": Detect,

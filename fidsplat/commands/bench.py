@@ -1,11 +1,11 @@
 """`fidsplat bench`."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from fidsplat.commands.output import console, json_text, option, print_table, writable_file
+from fidsplat.commands.output import console, json_text, option, print_table, say, writable_file
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
 
@@ -24,29 +24,28 @@ _LEGEND = (
 
 @dataclass
 class Bench:
-    """Time frames of standard scenes, several devices side by side."""
+    """Time frames of standard scenes on one device, or on several side by side.
 
-    HELP: ClassVar[str] = """Time frames of standard scenes on one device, or on several side by side.
+    The devices draw the same frames in turn, with the cut-off and stop that all renderers share and in
+    precise arithmetic (1/255, 1e-4; `fidsplat tradeoff` prices others). For each scene: milliseconds per
+    frame and per stage, what there was to draw, device memory, and how many times the device's roofline that
+    is: the least that its measured rates allow. Without --scenes: tag, r100k_720p, r1m_1080p and
+    tag_in_million, about a minute on two cores. A run that is stopped shows what it has.
 
-The devices draw the same frames in turn, with the cut-off and stop that all renderers share and in precise
-arithmetic (1/255, 1e-4; `fidsplat tradeoff` prices others). For each scene: milliseconds per frame and per
-stage, what there was to draw, device memory, and how many times the device's roofline that is: the least that
-its measured rates allow. Without --scenes: tag, r100k_720p, r1m_1080p and tag_in_million, about a minute on
-two cores. A run that is stopped shows what it has.
+      tag             an AprilTag alone, 640 x 480
+      r100k_720p      100,000 random splats, 1280 x 720
+      r1m_1080p       1,000,000, 1920 x 1080
+      r5m_1080p       5,000,000, 1920 x 1080
+      r20m_4k         20,000,000, 3840 x 2160
+      qr_wall         200 QR codes of version 22 on a wall, 1920 x 1080
+      tag_in_million  an AprilTag before 1,000,000 random splats, 1920 x 1080
 
-  tag             an AprilTag alone, 640 x 480
-  r100k_720p      100,000 random splats, 1280 x 720
-  r1m_1080p       1,000,000, 1920 x 1080
-  r5m_1080p       5,000,000, 1920 x 1080
-  r20m_4k         20,000,000, 3840 x 2160
-  qr_wall         200 QR codes of version 22 on a wall, 1920 x 1080
-  tag_in_million  an AprilTag before 1,000,000 random splats, 1920 x 1080
-
-Examples:
-  fidsplat bench
-  fidsplat bench --scenes r100k_720p r1m_1080p --repeats 50
-  fidsplat bench --device opencl:nvidia --device opencl:pocl --json figures.json
-  fidsplat bench --scenes all --json -"""
+    Examples:
+      fidsplat bench
+      fidsplat bench --scenes r100k_720p r1m_1080p --repeats 50
+      fidsplat bench --device opencl:nvidia --device opencl:pocl --json figures.json
+      fidsplat bench --scenes all --json -
+    """
 
     scenes: Annotated[
         tuple[str, ...],
@@ -129,9 +128,7 @@ def _print(results: "list[Result]", where: "Console") -> None:
         drawn = [result for result in results if result.scene == scene]
         for result in drawn:
             if result.timer.error:
-                where.print(
-                    f"{scene} on {result.device.name}: {result.timer.error}", markup=False, soft_wrap=True
-                )
+                say(where, f"{scene} on {result.device.name}: {result.timer.error}")
         drawn = [result for result in drawn if result.timer.ms]
         if drawn:
             _print_scene(scene, drawn, where)
@@ -160,8 +157,7 @@ def _print_scene(scene: str, drawn: "list[Result]", where: "Console") -> None:
     print_table(where, f"{scene}: {BENCH_SCENES[scene].about}", heads, rows)
     for result in drawn:
         device, frames = result.device, len(result.timer.ms)
-        words = f"{device.name}: {device.title}, {device.version}; {frames} frames"
-        where.print(words, markup=False, soft_wrap=True)
+        say(where, f"{device.name}: {device.title}, {device.version}; {frames} frames")
     where.print()
 
 

@@ -2,42 +2,39 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated
 
-from fidsplat.commands.output import Json, console, option, print_json, print_table
+from fidsplat.commands.output import Device, Json, console, option, print_json, print_table, say
 from fidsplat.errors import InputError
 from fidsplat.files import writable_folder
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fidsplat.hard_cases.arithmetic import Arithmetic
     from fidsplat.hard_cases.check import CaseResult, CheckResult
-    from fidsplat.hard_cases.fuzz_run import FuzzState
+    from fidsplat.hard_cases.f_arithmetic import Arithmetic
+    from fidsplat.hard_cases.fuzz import FuzzState
     from fidsplat.render import Renderer
 
 
 @dataclass
 class Check:
-    """Test a device with the hard cases."""
+    """Test a device with the hard cases of splat rendering.
 
-    HELP: ClassVar[str] = """Test a device with the hard cases of splat rendering.
+    Draws scenes that are known to break renderers and compares them with a float64 reference, pixel by pixel;
+    measures the device's own arithmetic; and says what does not hold. Under two minutes on two cores. Writes
+    a picture of the worst case to DIR/worst.png. Exit status 1 when anything does not hold.
 
-Draws scenes that are known to break renderers and compares them with a float64 reference, pixel by pixel;
-measures the device's own arithmetic; and says what does not hold. Under two minutes on two cores. Writes a
-picture of the worst case to DIR/worst.png. Exit status 1 when anything does not hold.
+    --fuzz draws random scenes of up to 200 splats instead, until they hold N splats. A run that was stopped
+    goes on where it was (DIR/fuzz.json).
 
---fuzz draws random scenes of up to 200 splats instead, until they hold N splats. A run that was stopped goes
-on where it was (DIR/fuzz.json).
+    Examples:
+      fidsplat check
+      fidsplat check --device opencl:nvidia --json
+      fidsplat check --fuzz 100000
+    """
 
-Examples:
-  fidsplat check
-  fidsplat check --device opencl:nvidia --json
-  fidsplat check --fuzz 100000"""
-
-    device: Annotated[
-        str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")
-    ] = None
+    device: Device = None
     out: Annotated[
         str, option("DIR", "folder for the picture and the fuzzer's state (default: fidsplat-check)", "-o")
     ] = "fidsplat-check"
@@ -67,13 +64,13 @@ Examples:
         else:
             _print(result, where)
             if file is not None:
-                where.print(f"worst case in {file}", markup=False, soft_wrap=True)
+                say(where, f"worst case in {file}")
         return 0 if result.passed else 1
 
     def _fuzz(self, renderer: "Renderer", folder: Path, where: "Console") -> int:
         from rich.progress import Progress
 
-        from fidsplat.hard_cases.fuzz_run import fuzz_run
+        from fidsplat.hard_cases.fuzz import fuzz_run
 
         wanted = self.fuzz or 0
         state = None
@@ -97,24 +94,20 @@ def _print(result: "CheckResult", where: "Console") -> None:
         facts = result.arithmetic
         heads = ("function", "error [ulp]", "promised", "")
         print_table(where, f"Arithmetic of {device.title}", heads, _ulps(facts))
-        where.print(
-            f"float64: {'yes' if facts.float64 else 'no'}; "
-            f"float32 below 1.2e-38: {'kept' if facts.denormals else 'flushed to 0'}\n",
-            markup=False,
-        )
-    where.print(f"Hard cases on {device.title}, {device.version}", markup=False)
+        kept = "kept" if facts.denormals else "flushed to 0"
+        say(where, f"float64: {'yes' if facts.float64 else 'no'}; float32 below 1.2e-38: {kept}\n")
+    say(where, f"Hard cases on {device.title}, {device.version}")
     heads = ("group", "cases", "pictures", "colour", "uncertified", "depth", "uncertified", "verdict")
     bounds = ("bound", "", "", "", f"{COLOR_TOLERANCE:.0e}", "", f"{DEPTH_TOLERANCE:.0e}", "")
     print_table(where, "Largest errors", heads, [bounds, *(_row(*group) for group in result.groups.items())])
-    for words in result.failures:
-        where.print(f"failed: {words}", markup=False, soft_wrap=True)
+    say(where, *(f"failed: {words}" for words in result.failures))
     wrong = len(result.failures)
     verdict = f"{wrong} check{' does' if wrong == 1 else 's do'} not hold" if wrong else "everything holds"
-    where.print(f"{verdict}; {result.seconds:.0f} s", markup=False)
+    say(where, f"{verdict}; {result.seconds:.0f} s")
 
 
 def _ulps(facts: "Arithmetic") -> list[tuple[str, ...]]:
-    from fidsplat.hard_cases.arithmetic import BOUNDS
+    from fidsplat.hard_cases.f_arithmetic import BOUNDS
 
     rows = []
     for name, ulp in facts.ulp.items():
@@ -149,10 +142,9 @@ def _print_fuzz(state: "FuzzState", renderer: "Renderer", where: "Console") -> N
     ]
     heads = ("output", "beyond the certificate", "seed", "with it", "seed")
     print_table(where, f"Largest errors of random scenes on {renderer.device.title}", heads, rows)
-    where.print(
+    say(
+        where,
         f"{state.splats:,} splats in {state.scenes:,} scenes, {state.pixels:,} pixels, "
         f"{state.risky / max(state.pixels, 1):.2%} with certificates above 0.05; {state.seconds:.0f} s\n"
         f"failing seeds: {' '.join(map(str, state.failing)) or 'none'}",
-        markup=False,
-        soft_wrap=True,
     )

@@ -2,9 +2,9 @@
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated
 
-from fidsplat.commands.output import Json, console, option, print_json, print_table
+from fidsplat.commands.output import Device, Json, console, option, print_json, print_table, say
 
 if TYPE_CHECKING:
     from fidsplat.experiments.demo import DemoResult, Sighting
@@ -12,25 +12,22 @@ if TYPE_CHECKING:
 
 @dataclass
 class Demo:
-    """The main job, end to end, with pictures and a table."""
+    """The main job, end to end, with pictures and a table.
 
-    HELP: ClassVar[str] = """The main job, end to end, with pictures and a table.
+    Makes an AprilTag, an ArUco tag and a QR code of splats, sets them in a yard of some ten thousand splats,
+    draws three views with colour, depth, normals and labels, and reads them back. Exit status 1 when a marker
+    that is wholly visible is not found within 1 % of its distance.
 
-Makes an AprilTag, an ArUco tag and a QR code of splats, sets them in a yard of some ten thousand splats,
-draws three views with colour, depth, normals and labels, and reads them back. Exit status 1 when a marker
-that is wholly visible is not found within 1 % of its distance.
-
-Examples:
-  fidsplat demo
-  fidsplat demo --mixture fitted --out soft
-  fidsplat demo --out pictures --json"""
+    Examples:
+      fidsplat demo
+      fidsplat demo --mixture fitted --out soft
+      fidsplat demo --out pictures --json
+    """
 
     out: Annotated[
         str, option("DIR", "folder for pictures, scene and figures (default: fidsplat-demo)", "-o")
     ] = "fidsplat-demo"
-    device: Annotated[
-        str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")
-    ] = None
+    device: Device = None
     mixture: Annotated[
         str, option("NAME", "of the markers: exact, fitted or paper, as `fidsplat marker` (default: exact)")
     ] = "exact"
@@ -53,19 +50,16 @@ Examples:
                 "degrees. ms: a frame with colour, depth, normals and labels."
             )
             markers = sum(result.marker_splats.values())
-            where.print(
+            say(
+                where,
                 f"{result.background_splats:,} background and {markers:,} marker splats; "
                 f"{result.seconds:.1f} s in all; pictures in {self.out}/contact-sheet.png",
-                markup=False,
-                soft_wrap=True,
             )
         if not result.passed:
             missed = [
                 f"{s.reading.placed.marker.spec} in '{s.view}'" for s in result.sightings if s.passed is False
             ]
-            where.print(
-                "failed: " + "; ".join([*missed, *(f"read {s}" for s in result.unexpected)]), markup=False
-            )
+            say(where, "failed: " + "; ".join([*missed, *(f"read {s}" for s in result.unexpected)]))
         return 0 if result.passed else 1
 
 

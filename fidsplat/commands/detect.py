@@ -1,7 +1,7 @@
 """`fidsplat detect`."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -17,20 +17,19 @@ if TYPE_CHECKING:
 
 @dataclass
 class Detect:
-    """Find tags and QR codes in pictures."""
+    """Find AprilTag, ArUco and QR codes in pictures, folders of pictures and videos.
 
-    HELP: ClassVar[str] = """Find AprilTag, ArUco and QR codes in pictures, folders of pictures and videos.
+    Prints what they say and the corners of each, in pixels: top left, top right, bottom right, bottom left as
+    printed, the centre of the first pixel at (0.5, 0.5). With --scene also where each marker and board of
+    that scene was seen from its camera, how far that is from the truth, and the means: of a scene that moves,
+    from where things are at its shutter's time, when the middle row is exposed.
 
-Prints what they say and the corners of each, in pixels: top left, top right, bottom right, bottom left as
-printed, the centre of the first pixel at (0.5, 0.5). With --scene also where each marker and board of that
-scene was seen from its camera, how far that is from the truth, and the means: of a scene that moves, from
-where things are at its shutter's time, when the middle row is exposed.
-
-Examples:
-  fidsplat detect photo.jpg
-  fidsplat detect photo.png --family 16h5 --family 7x7_1000
-  fidsplat detect flight.mp4 stills/ --json
-  fidsplat detect scene.png --scene scene.toml --json"""
+    Examples:
+      fidsplat detect photo.jpg
+      fidsplat detect photo.png --family 16h5 --family 7x7_1000
+      fidsplat detect flight.mp4 stills/ --json
+      fidsplat detect scene.png --scene scene.toml --json
+    """
 
     images: Annotated[
         tyro.conf.Positional[tuple[str, ...]],
@@ -143,12 +142,13 @@ _ERRORS = (("position_error_mm", 2), ("angle_error_deg", 3), ("corner_error_px",
 def reading_row(reading: "Reading") -> tuple[str, ...]:
     """One row of a table of readings."""
     facts = reading.as_dict()
-    seen, found = f"{100 * facts['visible']:.0f} %", "yes" if facts["found"] else "no"
-    return (facts["marker"], found, seen, f"{facts['distance_m']:.3f}", *_errors(facts))
+    found, share = "yes" if facts["found"] else "no", facts["visible"]
+    found += "" if share > 0.995 else f", {100 * share:.0f} % in view"
+    return (facts["marker"], found, f"{facts['distance_m']:.3f}", *_errors(facts))
 
 
 def _mean_row(mean: dict[str, Any]) -> tuple[str, ...]:
-    return ("mean", f"{mean['found']} of {mean['markers']}", "", "", *_errors(mean))
+    return ("mean", f"{mean['found']} of {mean['markers']}", "", *_errors(mean))
 
 
 def _errors(facts: dict[str, Any]) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """`fidsplat devices`."""
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from fidsplat.commands.output import Json, console, print_json, print_table
 
@@ -11,15 +11,14 @@ if TYPE_CHECKING:
 
 @dataclass
 class Devices:
-    """List the devices that can draw here."""
+    """List the devices that can draw here, and why the others cannot.
 
-    HELP: ClassVar[str] = """List the devices that can draw here, and why the others cannot.
+    The first column is what --device takes.
 
-The first column is what --device takes.
-
-Examples:
-  fidsplat devices
-  fidsplat devices --json"""
+    Examples:
+      fidsplat devices
+      fidsplat devices --json
+    """
 
     json: Json = False
 

@@ -1,27 +1,259 @@
-"""`fidsplat experiment ...`: the words that may follow."""
+"""`fidsplat experiment`: the experiments that measure."""
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from fidsplat.commands.experiment_files import CATEGORY_HELP, write_report
+from fidsplat.commands.output import Json, console, option, say, switch, tell
+from fidsplat.commands.sweeps import Names, Overwrite, Seed, need_reports, run_sweeps
+from fidsplat.errors import InputError
+
+if TYPE_CHECKING:
+    from fidsplat.experiments.run import Options
 from typing import ClassVar
 
 from fidsplat.commands.experiment_files import Blender, Dataset, Merge, Report
-from fidsplat.commands.experiment_measure import All, Angles, Counts, Localisation, Pictures, Views
+
+
+@dataclass
+class Basic:
+    """Options of every word that works on markers."""
+
+    out: Annotated[
+        str | None,
+        option(
+            "DIR",
+            "folder for results (default: fidsplat-experiments, with --quick fidsplat-experiments-quick)",
+            "-o",
+        ),
+    ] = None
+    category: Annotated[Names, option("NAME", CATEGORY_HELP)] = ()
+    seed: Seed = 0
+    json: Json = False
+
+    def options(self) -> Options:
+        """The options as the experiments take them; those that a word does not have are left out."""
+        from fidsplat.experiments.run import Options
+
+        # rough results and full ones do not mix
+        out = self.out or "fidsplat-experiments" + ("-quick" if getattr(self, "quick", False) else "")
+        given: dict[str, Any] = {field.name: getattr(self, field.name, None) for field in fields(Options)}
+        given["out"] = Path(out)
+        return Options(**{name: value for name, value in given.items() if value is not None})
+
+
+@dataclass
+class Measuring(Basic):
+    """Options of the experiments that measure."""
+
+    quick: Annotated[bool, switch("a rough picture in minutes: one marker of each category")] = False
+    markers: Annotated[int | None, option("N", "of each category, 1 to 5 (default: 5, with --quick 1)")] = (
+        None
+    )
+    shard: Annotated[str | None, option("i/n", "measure the i-th of n shares, then see `merge`")] = None
+    overwrite: Overwrite = False
+
+
+@dataclass
+class Drawn:
+    """Options of what draws splats."""
+
+    device: Annotated[str, option("D", "see `fidsplat devices` (default: opencl)")] = "opencl"
+    mixture: Annotated[Names, option("NAME", "mixture of Gaussians, once more for each (default: all)")] = ()
+    trained: Annotated[
+        Path | None, option("DIR", "trained models for the 2DGS columns, as 2dgs-17/small-0.ply")
+    ] = None
+
+
+@dataclass
+class Threaded(Drawn, Measuring):
+    """Options of experiments that look at pictures in several threads."""
+
+    workers: Annotated[
+        int | None, option("N", "threads that look at pictures (default: one for each core)")
+    ] = None
+
+
+@dataclass
+class Compared(Threaded):
+    """Options of experiments that compare pictures."""
+
+    blender: Annotated[
+        Path | None, option("DIR", "Blender's pictures for `views` (default: blender in the results' folder)")
+    ] = None
+    lpips: Annotated[
+        Path | None,
+        option("FILE.npz", "weights for LPIPS in `views`; how to make the file: docs/ground-truth.md"),
+    ] = None
+
+
+def measure(names: tuple[str, ...], options: Options, as_json: bool) -> int:
+    """Run experiments, each to its file, and say where."""
+    from fidsplat.experiments.run import prepared
+
+    with prepared(names, options) as sweeps:
+        run_sweeps(sweeps)
+        files = {sweep.name: str(sweep.results.file) for sweep in sweeps if sweep.points}
+    return tell(as_json, {"files": files}, *files.values())
+
+
+@dataclass
+class Angles(Threaded):
+    """The largest tilt at which each detector finds and reads each marker (table 3).
+
+    Every tilt from 0 to 89.8 degrees in steps of 0.2 is drawn and shown to every detector: for tags OpenCV's
+    aruco and the AprilTag library (if pupil-apriltags is installed), for QR codes OpenCV's, zxing-cpp, and
+    zxing-cpp after the picture was made taller. Protocols: fixed-plane (2 x 2 plane, 800 x 800) and
+    fixed-module (8 px a module, 1600 x 1600). A run that was stopped goes on where it was.
+
+    Examples:
+      fidsplat experiment angles --quick
+      fidsplat experiment angles --ideal                     only the detectors' ceiling; no device needed
+      fidsplat experiment angles --protocol fixed-plane --category small --tilts 60:89.8:0.2
+      fidsplat experiment angles --shard 1/4 --device opencl:nvidia
+    """
+
+    protocol: Annotated[Names, option("NAME", "fixed-plane or fixed-module (default: both)")] = ()
+    tilts: Annotated[str | None, option("A:B:STEP", "degrees, joined by commas (default: 0:89.8:0.2)")] = None
+    ideal: Annotated[bool, switch("only the ideal texture: the ceiling of the detectors")] = False
+
+    def run(self) -> int:
+        return measure(("angles",), self.options(), self.json)
+
+
+@dataclass
+class Views(Compared):
+    """PSNR, SSIM, FLIP and LPIPS of 20 random views of each marker (table 4).
+
+    Ground truth: the exact renderer (a pixel is the mean of its square), the same with means of linear light,
+    and Blender's pictures where `fidsplat experiment blender` has made them. FLIP needs flip-evaluator, LPIPS
+    weights. A run that was stopped goes on where it was.
+
+    Examples:
+      fidsplat experiment views --quick
+      fidsplat experiment views --category huge --mixture fitted
+      fidsplat experiment views --blender pictures/blender
+    """
+
+    def run(self) -> int:
+        return measure(("views",), self.options(), self.json)
+
+
+@dataclass
+class Counts(Measuring):
+    """Components, rectangles, Gaussians and seconds of each marker (table 2, figure).
+
+    Squares of modules, runs of rows and the minimum partition, for every mixture. The time is that from the
+    text to the splats in a process that has made the marker before; keep the machine quiet.
+
+    Examples:
+      fidsplat experiment counts
+      fidsplat experiment counts --category huge
+    """
+
+    def run(self) -> int:
+        return measure(("counts",), self.options(), self.json)
+
+
+@dataclass
+class Localisation(Threaded):
+    """Pose errors of AprilTags and small QR codes by distance and tilt.
+
+    Codes of 0.16 m; 1280 x 720, 60 degrees; 0.5 to 4 m, 0 to 70 degrees; corners by `fidsplat detect`. The
+    same cameras for every method, the ideal texture's errors beside them. A run that was stopped goes on
+    where it was.
+
+    Examples:
+      fidsplat experiment localisation --quick
+      fidsplat experiment localisation --mixture fitted
+    """
+
+    def run(self) -> int:
+        from fidsplat.experiments.localisation import LOCATED
+
+        if self.category and not set(self.category) & set(LOCATED):
+            raise InputError(f"localisation is of {' and '.join(LOCATED)}, not of {', '.join(self.category)}")
+        return measure(("localisation",), self.options(), self.json)
+
+
+@dataclass
+class Pictures(Drawn, Basic):
+    """Draw sheets of marker 0 of each category, by every method, at tilts of 0, 45 and 70 degrees.
+
+    The report takes them in.
+
+    Examples:
+      fidsplat experiment pictures
+      fidsplat experiment pictures --category huge --mixture fitted
+    """
+
+    def run(self) -> int:
+        files = draw_sheets(self.options())
+        return tell(self.json, {"files": files}, *files)
+
+
+def draw_sheets(options: Options) -> list[str]:
+    """Draw the sheets with a progress bar; returns the files."""
+    from rich.progress import track
+
+    from fidsplat.experiments.methods import Painter
+    from fidsplat.experiments.pictures import write_sheets
+    from fidsplat.experiments.run import check
+    from fidsplat.experiments.setup import chosen_categories
+    from fidsplat.render import Renderer
+
+    check(options)
+    categories = chosen_categories(options.category)
+    painter = Painter(Renderer(options.device), options.trained)
+    sheets = write_sheets(categories, options.methods, painter, options.seed, options.out)
+    bars = track(sheets, "pictures", total=len(categories), console=console(True), transient=True)
+    return [str(file) for file in bars]
+
+
+@dataclass
+class All(Compared):
+    """Counts, localisation, views and angles, then the report.
+
+    --quick takes under five minutes on two cores. A run that was stopped loses nothing that was finished: the
+    same command goes on. Many machines share the work by --shard, and `merge` joins their results.
+
+    Examples:
+      fidsplat experiment all --quick
+      fidsplat experiment all -o results --device opencl:nvidia
+      fidsplat experiment all --shard 2/8 -o shards
+    """
+
+    def run(self) -> int:
+        from fidsplat.experiments.run import NAMES, check
+
+        options = self.options()
+        check(options)
+        if self.shard is None:
+            need_reports()
+        status = measure(NAMES, options, self.json)
+        if self.shard is not None:
+            return status
+        draw_sheets(options)
+        say(console(True), f"report in {write_report([options.out], options.out)[0]}")
+        return status
 
 
 @dataclass
 class Experiment:
-    """The paper's experiments: tables, figures, data set."""
+    """The paper's experiments: its tables and figures with our columns, beside the ideal.
 
-    HELP: ClassVar[
-        str
-    ] = """The paper's experiments: its tables and figures with our columns, beside the ideal.
+    Each experiment writes one file of results; a run that was stopped goes on where it was.
 
-Each experiment writes one file of results; a run that was stopped goes on where it was.
+    Examples:
+      fidsplat experiment all --quick                   a rough picture of all of it, in minutes
+      fidsplat experiment angles --category small       one experiment, one category
+      fidsplat experiment report                        tables, charts and pictures from the results
+      fidsplat experiment angles --help                 what one of them does, and its options
+    """
 
-Examples:
-  fidsplat experiment all --quick                   a rough picture of all of it, in minutes
-  fidsplat experiment angles --category small       one experiment, one category
-  fidsplat experiment report                        tables, charts and pictures from the results
-  fidsplat experiment angles --help                 what one of them does, and its options"""
     PARTS: ClassVar[dict[str, type]] = {
         "all": All,
         "angles": Angles,

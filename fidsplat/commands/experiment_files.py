@@ -5,32 +5,26 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated
 
-from fidsplat.commands.output import Json, console, option, print_json
-from fidsplat.commands.sweeps import Folders, Names, ReportTo, Seed, need_reports, switch
+from fidsplat.commands.output import Json, console, option, switch, tell
+from fidsplat.commands.sweeps import Folders, Names, ReportTo, Seed, need_reports
 from fidsplat.errors import InputError
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 CATEGORY_HELP = "apriltag, small, medium, large or huge, once more for each (default: all)"
 
 
 @dataclass
 class Dataset:
-    """The paper's 100 scenes in COLMAP format."""
+    """Write the data set of section 4.1: 100 scenes for COLMAP, 25 markers x 4 collections.
 
-    HELP: ClassVar[
-        str
-    ] = """Write the data set of section 4.1: 100 scenes for COLMAP, 25 markers x 4 collections.
+    Each scene has training views (3, 5, 9 or 17), 20 test views, and models as text and binary. Scenes that
+    are there stay. About 300 MB.
 
-Each scene has training views (3, 5, 9 or 17), 20 test views, and models as text and binary. Scenes that are
-there stay. About 300 MB.
-
-Examples:
-  fidsplat experiment dataset -o dataset
-  fidsplat experiment dataset --truth blender-standard --blender fidsplat-experiments/blender"""
+    Examples:
+      fidsplat experiment dataset -o dataset
+      fidsplat experiment dataset --truth blender-standard --blender fidsplat-experiments/blender
+    """
 
     out: Annotated[str, option("DIR", "folder for the scenes (default: fidsplat-dataset)", "-o")] = (
         "fidsplat-dataset"
@@ -64,35 +58,28 @@ Examples:
             check_pictures(self.blender, self.truth.removeprefix("blender-"), self.seed)
         folder = writable_folder(self.out)
         wanted = dataset_scenes(chosen_categories(self.category), self.markers)
-        where = console(self.json)
         with Progress(console=console(True), transient=True) as bars:
             scenes = [
                 write_scene(part, folder, self.seed, self.truth, self.blender)
                 for part in bars.track(wanted, description="scenes")
             ]
-        if self.json:
-            print_json({"folder": str(folder), "scenes": [scene.name for scene in scenes]})
-        else:
-            where.print(f"{len(scenes)} scenes in {folder}", markup=False, soft_wrap=True)
-        return 0
+        names = [scene.name for scene in scenes]
+        return tell(self.json, {"folder": str(folder), "scenes": names}, f"{len(names)} scenes in {folder}")
 
 
 @dataclass
 class Blender:
-    """Ground truth by Blender: install it, render with it."""
+    """Draw every marker's views with Blender (Cycles on the CPU), the paper's ground truth.
 
-    HELP: ClassVar[
-        str
-    ] = """Draw every marker's views with Blender (Cycles on the CPU), the paper's ground truth.
+    --install makes a virtual environment of its own (about 1 GB, Python 3.11 needed) with bpy. Without it,
+    pictures are rendered; those that are there stay. About 3 s a picture on two cores; 20 test views for each
+    of 25 markers, with --training 17 more.
 
---install makes a virtual environment of its own (about 1 GB, Python 3.11 needed) with bpy. Without it,
-pictures are rendered; those that are there stay. About 3 s a picture on two cores; 20 test views for each of
-25 markers, with --training 17 more.
-
-Examples:
-  fidsplat experiment blender --install
-  fidsplat experiment blender
-  fidsplat experiment blender --view raw --category small --markers 1 --samples 16"""
+    Examples:
+      fidsplat experiment blender --install
+      fidsplat experiment blender
+      fidsplat experiment blender --view raw --category small --markers 1 --samples 16
+    """
 
     out: Annotated[
         str, option("DIR", "folder for the pictures (default: fidsplat-experiments/blender)", "-o")
@@ -117,16 +104,11 @@ Examples:
         from fidsplat.experiments import blender
         from fidsplat.experiments.setup import MARKERS, chosen_categories
 
-        where = console(self.json)
         environment = self.environment or blender.default_environment()
         if self.install:
-            with where.status("") as status:
+            with console(self.json).status("") as status:
                 python = blender.install(environment, status.update)
-            if self.json:
-                print_json({"python": str(python)})
-            else:
-                where.print(f"Blender is in {environment}", markup=False, soft_wrap=True)
-            return 0
+            return tell(self.json, {"python": str(python)}, f"Blender is in {environment}")
         if not (1 <= self.markers <= MARKERS and self.samples >= 1):
             raise InputError(f"--markers must be 1 to {MARKERS} and --samples at least 1")
         if self.threads is not None and self.threads < 1:
@@ -149,27 +131,20 @@ Examples:
                 for _ in blender.render(jobs, view, environment, self.samples, threads=self.threads):
                     bars.advance(bar)
                     done += 1
-        if self.json:
-            print_json({"folder": str(folder), "pictures": done})
-        else:
-            where.print(f"{done} pictures in {folder}", markup=False, soft_wrap=True)
-        return 0
+        return tell(self.json, {"folder": str(folder), "pictures": done}, f"{done} pictures in {folder}")
 
 
 @dataclass
 class Merge:
-    """Join the results of shards."""
+    """Join results of shards: NAME-1-of-4.jsonl and so on in the folders become NAME.jsonl.
 
-    HELP: ClassVar[
-        str
-    ] = """Join results of shards: NAME-1-of-4.jsonl and so on in the folders become NAME.jsonl.
+    What NAME.jsonl holds beside them stays. Warns of shards that are missing, and where the results are not
+    of one device, version or code.
 
-What NAME.jsonl holds beside them stays. Warns of shards that are missing, and where the results are not of
-one device, version or code.
-
-Examples:
-  fidsplat experiment merge shards -o results
-  fidsplat experiment merge machine-1 machine-2 -o results"""
+    Examples:
+      fidsplat experiment merge shards -o results
+      fidsplat experiment merge machine-1 machine-2 -o results
+    """
 
     folders: Annotated[Folders, option("DIR", "folders with results of shards")]
     out: Annotated[
@@ -198,28 +173,24 @@ Examples:
                     warnings.warn(f"{text}; the report lists them", stacklevel=2)
         if not result:
             raise InputError(f"no results of shards in {', '.join(self.folders) or 'no folder'}")
-        if self.json:
-            print_json(result)
-        else:
-            for facts in result.values():
-                again = f", {facts['repeated']} of them repeated" if facts["repeated"] else ""
-                text = f"{facts['file']}: {facts['points']} results of {facts['files']} files{again}"
-                console(False).print(text, markup=False, soft_wrap=True)
-        return 0
+        lines = []
+        for facts in result.values():
+            again = f", {facts['repeated']} of them repeated" if facts["repeated"] else ""
+            lines.append(f"{facts['file']}: {facts['points']} results of {facts['files']} files{again}")
+        return tell(self.json, result, *lines)
 
 
 @dataclass
 class Report:
-    """A page with tables, charts and picture sheets from results."""
+    """Write report.md: tables as in the paper, beside the paper's figures.
 
-    HELP: ClassVar[str] = """Write report.md: tables as in the paper, beside the paper's figures.
+    Charts, pictures and small tables of all results lie in its folder, or for FILE.md in a folder of that
+    name; the report can be made again from those tables. It says what was not measured.
 
-Charts, pictures and small tables of all results lie in its folder, or for FILE.md in a folder of that name;
-the report can be made again from those tables. It says what was not measured.
-
-Examples:
-  fidsplat experiment report
-  fidsplat experiment report results -o docs/results.md"""
+    Examples:
+      fidsplat experiment report
+      fidsplat experiment report results -o docs/results.md
+    """
 
     folders: Annotated[Folders, option("DIR", "folders with results (default: fidsplat-experiments)")] = ()
     out: ReportTo = None
@@ -227,17 +198,13 @@ Examples:
 
     def run(self) -> int:
         folders = [Path(folder) for folder in self.folders or ("fidsplat-experiments",)]
-        return write_report(folders, Path(self.out or folders[0]), console(self.json), self.json)
+        files = write_report(folders, Path(self.out or folders[0]))
+        return tell(self.json, {"files": files}, f"report in {files[0]}")
 
 
-def write_report(folders: list[Path], out: Path, where: Console, as_json: bool = False) -> int:
-    """Write the report and say where it is."""
+def write_report(folders: list[Path], out: Path) -> list[str]:
+    """Write the report; returns its files, the page first."""
     need_reports()
     from fidsplat.experiments.report import make_report
 
-    files = make_report(folders, out)
-    if as_json:
-        print_json({"files": [str(file) for file in files]})
-    else:
-        where.print(f"report in {files[0]}", markup=False, soft_wrap=True)
-    return 0
+    return [str(file) for file in make_report(folders, out)]

@@ -1,7 +1,7 @@
 """`fidsplat marker`."""
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import tyro
 
@@ -19,37 +19,34 @@ from fidsplat.errors import InputError
 
 @dataclass
 class Marker:
-    """Make a marker of splats."""
+    """Make a marker of splats, say what it is made of, and write it as a PLY file with -o.
 
-    HELP: ClassVar[
-        str
-    ] = """Make a marker of splats, say what it is made of, and write it as a PLY file with -o.
+    SPEC is one of
+      apriltag:FAMILY:ID   16h5, 25h9, 36h10, 36h11         apriltag:36h11:5
+      aruco:FAMILY:ID      4x4_50 ... 7x7_1000, original    aruco:4x4_50:7
+      qr:TEXT              the smallest code that fits      qr:https://example.org
+      qr-vN-L:TEXT         version N, error level L M Q H   qr-v22-L:TEXT
+      image:FILE           any one-bit picture              image:logo.png
+      svg:FILE             a drawing's filled shapes        svg:sign.svg, svg-512:sign.svg
+      charuco:CxR:FAMILY   columns x rows of squares        charuco:7x5:4x4_50
+      gridboard:CxR:FAMILY columns x rows of tags           gridboard:5x7:4x4_50
+      aprilgrid:CxR:FAMILY the same with corner squares     aprilgrid:6x6:36h11
 
-SPEC is one of
-  apriltag:FAMILY:ID   16h5, 25h9, 36h10, 36h11         apriltag:36h11:5
-  aruco:FAMILY:ID      4x4_50 ... 7x7_1000, original    aruco:4x4_50:7
-  qr:TEXT              the smallest code that fits      qr:https://example.org
-  qr-vN-L:TEXT         version N, error level L M Q H   qr-v22-L:TEXT
-  image:FILE           any one-bit picture              image:logo.png
-  svg:FILE             a drawing's filled shapes        svg:sign.svg, svg-512:sign.svg
-  charuco:CxR:FAMILY   columns x rows of squares        charuco:7x5:4x4_50
-  gridboard:CxR:FAMILY columns x rows of tags           gridboard:5x7:4x4_50
-  aprilgrid:CxR:FAMILY the same with corner squares     aprilgrid:6x6:36h11
+    The mixture exact, the default, draws every rectangle as one box with sharp edges. A PLY file has no
+    boxes: -o then writes the Gaussians of fitted, and says so.
 
-The mixture exact, the default, draws every rectangle as one box with sharp edges. A PLY file has no boxes: -o
-then writes the Gaussians of fitted, and says so.
+    Knobs of the mixtures (fs.MarkerQuality) are part of a quality: marker.levels (1 to 8) and marker.density
+    (1 to 100) of paper, marker.template of fitted (Gaussians of a rectangle: 1, 5, 9, 13, 25, 41 or 562), and
+    marker.growth (modules).
 
-Knobs of the mixtures (fs.MarkerQuality) are part of a quality: marker.levels (1 to 8) and marker.density (1
-to 100) of paper, marker.template of fitted (Gaussians of a rectangle: 1, 5, 9, 13, 25, 41 or 562), and
-marker.growth (modules).
+    A picture of noise becomes tens of millions of splats; more than a million are refused unless --max-splats
+    allows them.
 
-A picture of noise becomes tens of millions of splats; more than a million are refused unless --max-splats
-allows them.
-
-Examples:
-  fidsplat marker apriltag:36h11:5 --size 0.16 -o tag.ply
-  fidsplat marker qr:hello --quality marker.template=9
-  fidsplat marker "qr:hello" --mixture paper --json"""
+    Examples:
+      fidsplat marker apriltag:36h11:5 --size 0.16 -o tag.ply
+      fidsplat marker qr:hello --quality marker.template=9
+      fidsplat marker "qr:hello" --mixture paper --json
+    """
 
     spec: Annotated[tyro.conf.Positional[str], option("SPEC", "what to make, as above")]
     out: Annotated[str | None, option("FILE.ply", "write the splats there", "-o")] = None

@@ -26,11 +26,15 @@ def option(metavar: str, text: str, short: str | None = None):
     return tyro.conf.arg(metavar=metavar, help=text, aliases=aliases, help_behavior_hint="")
 
 
-Json = Annotated[
-    bool,
-    tyro.conf.arg(help="print one JSON object on stdout and nothing else there", help_behavior_hint=""),
-]
-"""the --json switch"""
+Device = Annotated[str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")]
+
+
+def switch(text: str):
+    """tyro's description of an option that is given or not."""
+    return tyro.conf.arg(help=text, help_behavior_hint="")
+
+
+Json = Annotated[bool, switch("print one JSON object on stdout and nothing else there")]
 
 
 def console(as_json: bool) -> Console:
@@ -48,6 +52,21 @@ def print_json(value: dict[str, Any]) -> None:
 def json_text(value: dict[str, Any]) -> str:
     """An object as JSON; a number that JSON does not have becomes null."""
     return json.dumps(_plain(value), indent=2, allow_nan=False)
+
+
+def say(where: Console, *lines: str) -> None:
+    """Print lines as they are: not as markup, and not broken."""
+    for line in lines:
+        where.print(line, markup=False, soft_wrap=True)
+
+
+def tell(as_json: bool, facts: dict[str, Any], *lines: str) -> int:
+    """Print what a command found, as JSON or as lines; returns the exit status 0."""
+    if as_json:
+        print_json(facts)
+    else:
+        say(console(False), *lines)
+    return 0
 
 
 def print_table(where: Console, title: str, heads: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

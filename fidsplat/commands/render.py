@@ -5,11 +5,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.output import Json, console, late_progress, option, print_json, print_table
+from fidsplat.commands.output import Json, console, late_progress, option, print_json, print_table, say
 from fidsplat.errors import FidsplatError, InputError
 from fidsplat.files import path_of, writable_folder
 
@@ -22,36 +22,35 @@ _OTHER_PICTURES = (".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".exr", ".
 
 @dataclass
 class Render:
-    """Draw a scene or a splat file."""
+    """Draw a scene file or a bare splat file.
 
-    HELP: ClassVar[str] = """Draw a scene file or a bare splat file.
+    A splat file without a scene is seen from -z, as large as fits a picture of 1280 x 720. OUT.png names the
+    colour picture; other outputs stand beside it as OUT-depth.png and so on. Any other OUT is a folder for
+    rgb.png, depth.png and so on. Depth comes as .npy (metres), .png (16-bit millimetres) and -turbo.png
+    (colours); labels, ids and counts as .npy and .png (colours).
 
-A splat file without a scene is seen from -z, as large as fits a picture of 1280 x 720.
-OUT.png names the colour picture; other planes stand beside it as OUT-depth.png and so on. Any other OUT is a
-folder for rgb.png, depth.png and so on. Depth comes as .npy (metres), .png (16-bit millimetres) and
--turbo.png (colours); labels, ids and counts as .npy and .png (colours).
+    Outputs:
+      rgb alpha label splat_id            splat_id: index of the heaviest splat; label: its label
+      depth depth_median depth_first      metres along z; first: where opacity reaches the quality's first_hit
+      distance distance_median distance_first            the same along the ray
+      normal normal_world                 towards the camera, in its axes or the world's
+      blended                             number of splats that made the pixel
 
-Planes:
-  rgb alpha label splat_id            splat_id: index of the heaviest splat; label: its label
-  depth depth_median depth_first      metres along z; first: where the opacity reaches the quality's first_hit
-  distance distance_median distance_first            the same along the ray
-  normal normal_world                 towards the camera, in its axes or the world's
-  blended                             number of splats that made the pixel
+    Quality: standard fast reference gsplat surfel; any knob of fs.Quality may follow, or stand alone and
+    change standard: fast,samples=2,alpha_cutoff=1e-3. Markers of a scene file that do not say how they are
+    made take marker.mixture, marker.levels, marker.density, marker.growth and marker.template from it.
 
-Quality: standard fast reference gsplat surfel; any knob of fs.Quality may follow, or stand alone and change
-standard: fast,samples=2,alpha_cutoff=1e-3. Markers of a scene file that do not say how they are made take
-marker.mixture, marker.levels, marker.density, marker.growth and marker.template from it.
+    Lenses, shutters and motion, fog, backgrounds, sensors and boxes are tables of a scene file
+    (docs/scene-files.md); they go together.
 
-Lenses, shutters and motion, fog, backgrounds, sensors and boxes are tables of a scene file
-(docs/scene-files.md); they go together.
-
-Examples:
-  fidsplat render scene.toml
-  fidsplat render scene.toml --quality standard,alpha_cutoff=1e-3,samples=2
-  fidsplat render scene.toml -o frames --outputs rgb,depth,normal,label
-  fidsplat render tag.ply -o tag.png --device reference --quality gsplat
-  fidsplat render scene.toml --max-error 1e-3        measures first, and keeps what it found for the next time
-  fidsplat render scene.toml --max-ms 20"""
+    Examples:
+      fidsplat render scene.toml
+      fidsplat render scene.toml --quality standard,alpha_cutoff=1e-3,samples=2
+      fidsplat render scene.toml -o frames --outputs rgb,depth,normal,label
+      fidsplat render tag.ply -o tag.png --device reference --quality gsplat
+      fidsplat render scene.toml --max-error 1e-3        measures first, and keeps what it found
+      fidsplat render scene.toml --max-ms 20
+    """
 
     source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply", "what to draw")]
     out: Annotated[
@@ -59,7 +58,7 @@ Examples:
     ] = None
     outputs: Annotated[
         str | None,
-        option("A,B,...", "planes, named above (default: the scene's, or rgb)"),
+        option("A,B,...", "output images, named above (default: the scene's, or rgb)"),
     ] = None
     device: Annotated[
         str | None,
@@ -117,10 +116,10 @@ Examples:
             frame = renderer.render(
                 scene, outputs=names, quality=self.quality if choice is None else choice.quality
             )
-            planes = {name: frame[name] for name in frame.outputs}
+            images = {name: frame[name] for name in frame.outputs}
         seconds = time.perf_counter() - begun
         bits = None if scene.sensor is None else scene.sensor.bits
-        files = [file for name, plane in planes.items() for file in save_output(name, plane, name_of, bits)]
+        files = [file for name, image in images.items() for file in save_output(name, image, name_of, bits)]
         if self.json:
             print_json(
                 {
@@ -142,9 +141,8 @@ Examples:
         rows += [("with compilation and transfer", f"{seconds:.2f} s")]
         print_table(where, f"{self.source} on {renderer.device.title}", ("", ""), rows)
         if choice is not None:
-            where.print(f"chosen: {choice.summary}", markup=False, soft_wrap=True)
-        for file in files:
-            where.print(str(file), markup=False, soft_wrap=True)
+            say(where, f"chosen: {choice.summary}")
+        say(where, *map(str, files))
         return 0
 
 
@@ -160,7 +158,7 @@ def _named(source: str, key: str, of_scene: bool) -> Iterator[None]:
 
 
 def _names(out: str | None, source: Path):
-    """A function from a plane's name and a suffix to the file that it goes to, in a folder known to be
+    """A function from an output's name and a suffix to the file that it goes to, in a folder known to be
     writable."""
     if out == "" or not source.name:
         raise InputError(
@@ -171,11 +169,11 @@ def _names(out: str | None, source: Path):
         raise InputError(f"pictures are written as PNG: name {file.with_suffix('.png')}, or a folder")
     if file.suffix.lower() == ".png" and not file.is_dir():
         writable_folder(file.parent)
-        return lambda plane, suffix: file.with_name(
-            f"{file.stem}{'' if plane == 'rgb' else '-' + plane}{suffix}"
+        return lambda name, suffix: file.with_name(
+            f"{file.stem}{'' if name == 'rgb' else '-' + name}{suffix}"
         )
     writable_folder(file)
-    return lambda plane, suffix: file / f"{plane}{suffix}"
+    return lambda name, suffix: file / f"{name}{suffix}"
 
 
 def load_source(source: str, quality: str | None, progress: "Progress") -> "Scene":

@@ -2,7 +2,7 @@
 
 import sys
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -17,25 +17,23 @@ if TYPE_CHECKING:
 
 @dataclass
 class Source:
-    """Print the OpenCL program that a scene calls for."""
+    """Print the OpenCL program that a scene calls for, put together of the files of kernels/opencl.
 
-    HELP: ClassVar[str] = """Print the OpenCL program that a scene calls for, put together of the files of
-kernels/opencl.
+    Comments are kept, and #line directives say from which file and line each piece comes; "layout.py: NAME"
+    is what fidsplat/backends/opencl/layout.py declares: structs, and the arguments of kernels. What is
+    compiled is this text without its comments, line for line, so a compiler's messages name the same places.
+    Only what the scene asks for is there: compare two scenes, or two sets of outputs, with diff.
 
-Comments are kept, and #line directives say from which file and line each piece comes; "layout.py: NAME" is
-what fidsplat/backends/opencl/layout.py declares: structs, and the arguments of kernels. What is compiled is
-this text without its comments, line for line, so a compiler's messages name the same places. Only what the
-scene asks for is there: compare two scenes, or two sets of outputs, with diff.
+    No device is opened and no OpenCL is needed, unless --device asks for the program of one device, with its
+    vectors and tiles.
 
-No device is opened and no OpenCL is needed, unless --device asks for the program of one device, with its
-vectors and tiles.
-
-Examples:
-  fidsplat source scene.toml
-  fidsplat source scene.toml --schedule group            as a GPU has it
-  fidsplat source scene.toml --device opencl:pocl
-  fidsplat source scene.toml --outputs rgb,depth | grep -n '^#line.*depth'
-  diff <(fidsplat source a.toml) <(fidsplat source b.toml)"""
+    Examples:
+      fidsplat source scene.toml
+      fidsplat source scene.toml --schedule group            as a GPU has it
+      fidsplat source scene.toml --device opencl:pocl
+      fidsplat source scene.toml --outputs rgb,depth | grep -n '^#line.*depth'
+      diff <(fidsplat source a.toml) <(fidsplat source b.toml)
+    """
 
     source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply", "what would be drawn")]
     outputs: Annotated[

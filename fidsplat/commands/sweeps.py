@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.output import console, option
+from fidsplat.commands.output import console, option, switch
 from fidsplat.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,17 +18,10 @@ Names = tyro.conf.UseAppendAction[tuple[str, ...]]
 """an option that may be given several times"""
 Folders = tyro.conf.Positional[tuple[str, ...]]
 Seed = Annotated[int, option("N", "of texts and views (default: 0)")]
-Overwrite = Annotated[
-    bool, tyro.conf.arg(help="measure again what is in the results' folder", help_behavior_hint="")
-]
+Overwrite = Annotated[bool, switch("measure again what is in the results' folder")]
 ReportTo = Annotated[
     str | None, option("DIR|FILE.md", "folder or file for the report (default: the first folder)", "-o")
 ]
-
-
-def switch(text: str):
-    """tyro's description of an option that is given or not."""
-    return tyro.conf.arg(help=text, help_behavior_hint="")
 
 
 def need_reports() -> None:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from fidsplat.commands.output import Json, console, option, print_json
-from fidsplat.commands.sweeps import Folders, Overwrite, ReportTo, need_reports, run_sweeps, switch, words
+from fidsplat.commands.output import Device, Json, option, switch, tell
+from fidsplat.commands.sweeps import Folders, Overwrite, ReportTo, need_reports, run_sweeps, words
 from fidsplat.errors import InputError
 
 DEFAULT_FOLDER = "fidsplat-tradeoff"
@@ -15,20 +15,17 @@ DEFAULT_FOLDER = "fidsplat-tradeoff"
 
 @dataclass
 class TradeoffReport:
-    """A page with charts and tables from results of `fidsplat tradeoff`."""
+    """Write a report from results: what each constant saves and costs, and what to make of it.
 
-    HELP: ClassVar[
-        str
-    ] = """Write a report from results: what each constant saves and costs, and what to make of it.
+    Results of several devices stand side by side; results of the same device in several folders are joined,
+    and of a point that was measured twice the larger measurement counts. Charts and a small table of each
+    device's results lie in the report's folder, or for FILE.md in a folder of that name; the report can be
+    made again from those tables. What the text says of the numbers is worked out from them.
 
-Results of several devices stand side by side; results of the same device in several folders are joined, and
-of a point that was measured twice the larger measurement counts. Charts and a small table of each device's
-results lie in the report's folder, or for FILE.md in a folder of that name; the report can be made again from
-those tables. What the text says of the numbers is worked out from them.
-
-Examples:
-  fidsplat tradeoff report
-  fidsplat tradeoff report cpu gpu -o docs/accuracy.md"""
+    Examples:
+      fidsplat tradeoff report
+      fidsplat tradeoff report cpu gpu -o docs/accuracy.md
+    """
 
     folders: Annotated[Folders, option("DIR", f"folders with results (default: {DEFAULT_FOLDER})")] = ()
     out: ReportTo = None
@@ -40,37 +37,31 @@ Examples:
 
         folders = [Path(folder) for folder in self.folders or (DEFAULT_FOLDER,)]
         files = write_report(folders, Path(self.out or folders[0]))
-        if self.json:
-            print_json({"files": [str(file) for file in files]})
-        else:
-            console(False).print(f"report in {files[0]}", markup=False, soft_wrap=True)
-        return 0
+        return tell(self.json, {"files": [str(file) for file in files]}, f"report in {files[0]}")
 
 
 @dataclass
 class Tradeoff:
-    """Measure what accuracy costs in time: every knob alone, then combinations."""
+    """Measure what each constant of a splat renderer costs in time and buys in accuracy.
 
-    HELP: ClassVar[
-        str
-    ] = """Measure what each constant of a splat renderer costs in time and buys in accuracy.
+    Each knob of Quality is turned alone (the constants of gsplat and of the 2DGS authors among its values),
+    then several together. A setting draws in turn with the base, frame by frame, and its picture is compared
+    with a float64 one that leaves nothing out. Markers are also compared with the ideal printed texture, and
+    tilted until nobody reads them. Results are JSON lines, written as they come; a run that was stopped goes
+    on where it was. Keep the machine quiet.
 
-Each knob of Quality is turned alone (the constants of gsplat and of the 2DGS authors among its values), then
-several together. A setting draws in turn with the base, frame by frame, and its picture is compared with a
-float64 one that leaves nothing out. Markers are also compared with the ideal printed texture, and tilted
-until nobody reads them. Results are JSON lines, written as they come; a run that was stopped goes on where
-it was. Keep the machine quiet.
+      r100k_720p, r1m_1080p            random splats, as in `fidsplat bench`
+      hard                             haze, veils, opaque stacks, edge-on, tiny, needles, near, far away
+      apriltag, qr2, qr5, qr10, qr22   markers at 0, 60 and 80 degrees: presets and ways of making them;
+                                       of qr10 every knob
 
-  r100k_720p, r1m_1080p            random splats, as in `fidsplat bench`
-  hard                             haze, veils, opaque stacks, edge-on, tiny, needles, near plane, far away
-  apriltag, qr2, qr5, qr10, qr22   markers at 0, 60 and 80 degrees: presets and ways of making them; of qr10
-                                   every knob
+    Examples:
+      fidsplat tradeoff --quick                              a rough picture, under 3 minutes on two cores
+      fidsplat tradeoff -o gpu --device opencl:nvidia        everything
+      fidsplat tradeoff --scenes hard --knobs alpha_cutoff transmittance_stop
+      fidsplat tradeoff report cpu gpu -o docs/accuracy.md   a page from results
+    """
 
-Examples:
-  fidsplat tradeoff --quick                              a rough picture, under 3 minutes on two cores
-  fidsplat tradeoff -o gpu --device opencl:nvidia        everything
-  fidsplat tradeoff --scenes hard --knobs alpha_cutoff transmittance_stop
-  fidsplat tradeoff report cpu gpu -o docs/accuracy.md   a page from results"""
     PARTS: ClassVar[dict[str, type]] = {"report": TradeoffReport}
 
     out: Annotated[
@@ -81,9 +72,7 @@ Examples:
             "-o",
         ),
     ] = None
-    device: Annotated[
-        str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")
-    ] = None
+    device: Device = None
     scenes: Annotated[tuple[str, ...], option("NAME...", "scenes (default: all; --quick: four)")] = ()
     knobs: Annotated[
         tuple[str, ...],
@@ -106,11 +95,5 @@ Examples:
             measured = run_sweeps([sweep])
             file, points = sweep.results.file, len(sweep.points)
         refused = [f"{words(record.key)}: {record.result['error']}" for record in measured if record.failed]
-        if self.json:
-            print_json({"file": str(file), "points": points, "refused": refused})
-            return 0
-        where = console(False)
-        for line in refused:
-            where.print(f"not measured: {line}", markup=False, soft_wrap=True)
-        where.print(f"{file}; fidsplat tradeoff report {folder}", markup=False, soft_wrap=True)
-        return 0
+        lines = [*(f"not measured: {line}" for line in refused), f"{file}; fidsplat tradeoff report {folder}"]
+        return tell(self.json, {"file": str(file), "points": points, "refused": refused}, *lines)

@@ -2,29 +2,25 @@
 
 import time
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
 
-from fidsplat.commands.output import Json, console, option, print_json
+from fidsplat.commands.output import Device, Json, console, tell
 
 
 @dataclass
 class Warm:
-    """Compile what scenes commonly call for, so that first pictures come at once."""
+    """Compile what scenes commonly call for, so that first pictures come at once.
 
-    HELP: ClassVar[str] = """Compile what scenes commonly call for, so that first pictures come at once.
+    The kernels of a scene are compiled when it is first drawn, which takes a second or more, and kept in the
+    caches of pyopencl, of Warp and of the driver. This fills them: plain colours and spherical harmonics,
+    with and without markers, the usual outputs. Worth it once after an installation, an update or a change of
+    the driver. What is there already takes no time.
 
-The kernels of a scene are compiled when it is first drawn, which takes a second or more, and kept in the
-caches of pyopencl, of Warp and of the driver. This fills them: plain colours and spherical harmonics, with
-and without markers, the usual outputs. Worth it once after an installation, an update or a change of the
-driver. What is there already takes no time.
+    Examples:
+      fidsplat warm
+      fidsplat warm --device opencl:nvidia --json
+    """
 
-Examples:
-  fidsplat warm
-  fidsplat warm --device opencl:nvidia --json"""
-
-    device: Annotated[
-        str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")
-    ] = None
+    device: Device = None
     json: Json = False
 
     def run(self) -> int:
@@ -48,13 +44,8 @@ Examples:
                     progress.update(task, advance=1, now=following)
         finally:  # what a run that is stopped has compiled stays compiled
             device, took = renderer.device, time.perf_counter() - begun
-            if self.json:
-                record = {"device": device.name, "title": device.title, "version": device.version}
-                sets = [{"set": words, "seconds": seconds} for words, seconds in done]
-                print_json(record | {"sets": sets, "of": len(wanted), "seconds": took})
-            else:
-                words = (
-                    f"{len(done)} of {len(wanted)} sets of kernels are ready on {device.title}; {took:.1f} s"
-                )
-                where.print(words, markup=False, soft_wrap=True)
+            record: dict = {"device": device.name, "title": device.title, "version": device.version}
+            record["sets"] = [{"set": words, "seconds": seconds} for words, seconds in done]
+            words = f"{len(done)} of {len(wanted)} sets of kernels are ready on {device.title}; {took:.1f} s"
+            tell(self.json, record | {"of": len(wanted), "seconds": took}, words)
         return 0

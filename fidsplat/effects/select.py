@@ -38,7 +38,7 @@ class FeatureSet:
     slots: tuple[str, ...]
     """One effect per kind, in the fixed order camera, color, ellipsoids if any, lowpass, stop, compose,
     footprint, background, arithmetic; then motion, shutter and double blending, if any."""
-    taps: tuple[str, ...]
+    outputs: tuple[str, ...]
     """Sorted names of the outputs beside rgb."""
     sh_degree: int
     samples: int
@@ -49,13 +49,13 @@ class FeatureSet:
     @cached_property
     def names(self) -> frozenset[str]:
         """Names of all effects, those of outputs that others are made from among them."""
-        return frozenset((*self.slots, *(output.name for output in self.outputs[1:]), *self.posts))
+        return frozenset((*self.slots, *(image.name for image in self.images[1:]), *self.posts))
 
     @cached_property
-    def outputs(self) -> tuple[Output, ...]:
+    def images(self) -> tuple[Output, ...]:
         """Output images, rgb first, then those that others are made from."""
-        needed = sorted({name for tap in self.taps for name in CATALOGUE[tap].needs})
-        names = (*needed, *(tap for tap in self.taps if tap not in needed))
+        needed = sorted({name for output in self.outputs for name in CATALOGUE[output].needs})
+        names = (*needed, *(name for name in self.outputs if name not in needed))
         effects = (CATALOGUE[name] for name in names)
         return (RGB, *(effect.output for effect in effects if effect.output))
 
@@ -125,7 +125,7 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
             *(("shutter_rows",) if capture.exposed and in_spheres else ()),
             *(("blend_double",) if double else ()),
         ),
-        taps=tuple(sorted({*capture.outputs} - {"rgb"})),
+        outputs=tuple(sorted({*capture.outputs} - {"rgb"})),
         sh_degree=sh_degree,
         samples=quality.samples,
         setup_precision=quality.setup_precision,

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from fidsplat.experiments.methods import mixtures, plain_marker
+from fidsplat.experiments.plane import runs
 from fidsplat.experiments.setup import CATEGORIES, Category
 from fidsplat.markers import marker
 from fidsplat.markers.mixture import fitted_templates, paper_template, place
@@ -23,14 +24,16 @@ def counts_points(categories: Iterable[Category], repeats: int, markers: int = 5
 def measure_counts(point: dict, seed: int) -> dict:
     """Count one marker's parts, and time its construction.
 
-    Returns dark and light (quiet zone included) numbers of `cells`, `runs` (of each row) and `rectangles` of
-    the minimum partition, `components`, `gaussians` by mixture and partition, and `seconds` by mixture: one
-    for each repeat, from the text to the splats, after one that is not counted.
+    Returns dark and light (quiet zone included) numbers of `cells`, `runs` (of one colour in each row) and
+    `rectangles` of the minimum partition, `components`, `gaussians` by mixture and partition, and `seconds`
+    by mixture: one for each repeat, from the text to the splats, after one that is not counted.
     """
     spec = CATEGORIES[point["category"]].spec(point["index"], seed)
     plain = plain_marker(spec)
     grid = plain.grid
-    boxes = {"cells": _cells(grid), "runs": _runs(grid), "rectangles": plain.boxes}
+    y, x0, x1, _ = runs(grid)
+    by_runs = np.stack([x0, y, x1, y + 1], 1)
+    boxes = {"cells": _cells(grid), "runs": by_runs, "rectangles": plain.boxes}
     result: dict = {name: _by_colour(grid, found) for name, found in boxes.items()}
     first = np.zeros(plain.components, int)
     first[plain.labels.ravel()] = grid.ravel()
@@ -50,15 +53,6 @@ def measure_counts(point: dict, seed: int) -> dict:
 def _cells(grid: np.ndarray) -> np.ndarray:
     y, x = np.indices(grid.shape).reshape(2, -1)
     return np.stack([x, y, x + 1, y + 1], 1)
-
-
-def _runs(grid: np.ndarray) -> np.ndarray:
-    """Runs of one colour in each row."""
-    ends = np.ones((grid.shape[0], grid.shape[1] + 1), bool)
-    ends[:, 1:-1] = grid[:, 1:] != grid[:, :-1]
-    y, x0 = np.nonzero(ends[:, :-1])
-    x1 = np.nonzero(ends[:, 1:])[1] + 1
-    return np.stack([x0, y, x1, y + 1], 1)
 
 
 def _by_colour(grid: np.ndarray, boxes: np.ndarray) -> dict[str, int]:

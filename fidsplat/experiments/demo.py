@@ -77,20 +77,8 @@ class DemoResult:
 
     def as_dict(self) -> dict:
         """For JSON."""
-        return {
-            "passed": self.passed,
-            "device": self.device,
-            "background_splats": self.background_splats,
-            "marker_splats": self.marker_splats,
-            "frame_ms": self.frame_ms,
-            "visible_splats": self.visible_splats,
-            "seconds": self.seconds,
-            "unexpected": self.unexpected,
-            "sightings": [
-                {"view": s.view, "passed": s.passed, **s.reading.as_dict()} for s in self.sightings
-            ],
-            "files": [str(file) for file in self.files],
-        }
+        seen = [{"view": s.view, "passed": s.passed, **s.reading.as_dict()} for s in self.sightings]
+        return {"passed": self.passed} | vars(self) | {"sightings": seen, "files": [*map(str, self.files)]}
 
 
 def run_demo(

@@ -10,7 +10,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.markers import marker
-from fidsplat.rotations import matrix_to_quaternion
+from fidsplat.rotations import matrix_to_quaternion, rigid_matrix
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.splats import SplatCloud
 
@@ -33,7 +33,8 @@ def demo_scene(seed: int = 0, mixture: str = "exact") -> Scene:
     signs, of that mixture."""
     random = np.random.default_rng(seed)
     placed = tuple(
-        PlacedMarker(marker(spec, size=size, mixture=mixture), _at(place)) for spec, size, place in SIGNS
+        PlacedMarker(marker(spec, size=size, mixture=mixture), rigid_matrix(place))
+        for spec, size, place in SIGNS
     )
     parts = [
         _ground(random),
@@ -64,12 +65,6 @@ def demo_views() -> dict[str, Camera]:
         "60 degrees": around(60.0, 2.3, 0.15, (0.0, 0.05, 0.0)),
         "hidden": around(-45.0, 2.5, 0.1, (0.05, 0.05, 0.0)),
     }
-
-
-def _at(place) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, 3] = place
-    return pose
 
 
 def _ground(random: np.random.Generator) -> SplatCloud:

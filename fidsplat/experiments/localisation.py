@@ -13,9 +13,8 @@ from fidsplat.cameras import Camera
 from fidsplat.experiments.methods import Painter, plain_marker
 from fidsplat.experiments.setup import CATEGORIES, Category
 from fidsplat.markers import Marker
-from fidsplat.vision.detect import detect
-from fidsplat.vision.images import to_uint8
 from fidsplat.vision.pose import marker_pose, pose_error
+from fidsplat.vision.readback import corner_error, own_code
 
 NAME = "localisation"
 LOCATED = ("apriltag", "small")
@@ -70,18 +69,12 @@ def measure_localisation(point: dict, painter: Painter, seed: int, pool: ThreadP
 
 
 def _errors(plain: Marker, camera: Camera, picture: np.ndarray) -> dict[str, float | None]:
-    families = (f"{plain.kind}:{plain.family}",) if plain.kind == "apriltag" else ()
-    corners = plain.corners * (SIZE / plain.size)
-    for code in detect(to_uint8(picture), families, qr=plain.kind == "qr"):
-        if (code.kind, code.id, code.payload) == (plain.kind, plain.id, plain.payload):
-            away, turn = pose_error(marker_pose(code.corners, SIZE, camera), camera.world_to_camera)
-            off = code.corners - camera.project(corners)
-            return {
-                "position_mm": away * 1e3,
-                "angle_deg": math.degrees(turn),
-                "corners_px": float(np.sqrt((off**2).sum(1).mean())),
-            }
-    return {"position_mm": None, "angle_deg": None, "corners_px": None}
+    code = own_code(plain, picture)
+    if code is None:
+        return {"position_mm": None, "angle_deg": None, "corners_px": None}
+    away, turn = pose_error(marker_pose(code.corners, SIZE, camera), camera.world_to_camera)
+    off = corner_error(code, camera.project(plain.corners * (SIZE / plain.size)))
+    return {"position_mm": away * 1e3, "angle_deg": math.degrees(turn), "corners_px": off}
 
 
 def camera_at(distance: float, tilt: float, seed: str) -> Camera:

@@ -58,7 +58,8 @@ def _edges(grid: np.ndarray, contrast: float, paper: float) -> tuple[np.ndarray,
     parts = []
     for jumps, swapped in ((across, False), (down, True)):
         # runs along each line: columns of `jumps` are lines
-        line, first, last, size = _runs(jumps.T)
+        found = runs(jumps.T)
+        line, first, last, size = (each[found[3] != 0] for each in found)
         a, b = np.stack([line, first], 1), np.stack([line, last], 1)
         # an edge that has the larger value to the right of "downwards" has it on the left of "rightwards"
         parts.append((a[:, ::-1], b[:, ::-1], -size) if swapped else (a, b, size))
@@ -66,14 +67,12 @@ def _edges(grid: np.ndarray, contrast: float, paper: float) -> tuple[np.ndarray,
     return start.astype(np.float64), stop.astype(np.float64), jump
 
 
-def _runs(jumps: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Runs of equal values other than 0 in the rows of an array: row, first, last + 1, value."""
-    ends = np.ones((jumps.shape[0], jumps.shape[1] + 1), bool)
-    ends[:, 1:-1] = jumps[:, 1:] != jumps[:, :-1]
-    there = jumps != 0
-    row, first = np.nonzero(ends[:, :-1] & there)
-    last = np.nonzero(ends[:, 1:] & there)[1] + 1
-    return row, first, last, jumps[row, first]
+def runs(values: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Runs of equal values in the rows of an array: row, first, last + 1, value."""
+    ends = np.ones((values.shape[0], values.shape[1] + 1), bool)
+    ends[:, 1:-1] = values[:, 1:] != values[:, :-1]
+    row, first = np.nonzero(ends[:, :-1])
+    return row, first, np.nonzero(ends[:, 1:])[1] + 1, values[row, first]
 
 
 def _project(points: np.ndarray, camera: Camera) -> np.ndarray:

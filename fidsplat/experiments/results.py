@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
+
+import pandas as pd
 
 from fidsplat.errors import InputError
 from fidsplat.experiments import angles, counts, localisation, views
@@ -20,14 +23,24 @@ NEVER = 90.0
 Rows = Iterator[dict[str, Any]]
 
 
+class _Scan(NamedTuple):
+    tilts: list[float]
+    found: str
+    read: str
+
+
+Ideals = dict[tuple, dict[str, _Scan]]
+"""protocol and marker -> what each detector reads of the ideal texture"""
+
+
 class Kind(NamedTuple):
     """How the results of one experiment become rows."""
 
     about: tuple[str, ...]
     """columns that say what a row is of"""
     columns: tuple[str, ...]
-    rows: Callable[[Sequence[Record]], Callable[[Record], Rows]]
-    """all records -> the rows of one: what a method reads is compared with what the ideal texture gives"""
+    rows: Callable[[Ideals, Record], Rows]
+    """the rows of a record; what a method reads is compared with what the ideal texture gives"""
 
 
 def load(folders: Sequence[Path]) -> dict[str, Summary]:
@@ -43,78 +56,71 @@ def load(folders: Sequence[Path]) -> dict[str, Summary]:
         there = [read_summary(file) for folder in folders if (file := folder / f"{name}.csv").is_file()]
         try:
             if records:
-                there.insert(
-                    0, summarise(records, kind.rows(records), (*kind.about, "amount", *kind.columns))
-                )
+                ideals = _ideals(records) if name == angles.NAME else {}
+                columns = (*kind.about, "amount", *kind.columns)
+                there.insert(0, summarise(records, partial(kind.rows, ideals), columns))
             if there:
                 found[name] = join(there, kind.about)
-        except (KeyError, TypeError) as error:
+                rows = found[name].rows
+                rows[list(kind.columns)] = rows[list(kind.columns)].apply(pd.to_numeric)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            if isinstance(error, InputError):
+                raise
             raise InputError(
-                f"results in {where} are of another version of fidsplat, they lack {error}; "
-                "measure again with --overwrite"
+                f"results of {name} in {where} are damaged or of another version of fidsplat "
+                f"({type(error).__name__}: {error}); measure again with --overwrite"
             ) from error
     if not found:
         raise InputError(f"no results in {where}; run fidsplat experiment all first, or give their folder")
     return found
 
 
-def _counts_rows(_: Sequence[Record]) -> Callable[[Record], Rows]:
-    def rows(record: Record) -> Rows:
-        key, found = record.key, record.result
-        for mixture, numbers in found["gaussians"].items():
-            seconds = found["seconds"][mixture]
-            row = {"category": key["category"], "marker": key["index"], "mixture": mixture}
-            row |= {"amount": len(seconds), "gaussians": numbers["rectangles"]}
-            row |= {f"gaussians_of_{name}": numbers.get(name) for name in ("runs", "cells")}
-            for name in ("components", "cells", "runs", "rectangles"):
-                row |= {f"{name}_{colour}": found[name][colour] for colour in ("dark", "light")}
-            spread = statistics.stdev(seconds) if len(seconds) > 1 else 0.0
-            yield row | {"seconds": statistics.median(seconds), "seconds_spread": spread}
-
-    return rows
+def _counts_rows(ideals: Ideals, record: Record) -> Rows:
+    key, found = record.key, record.result
+    for mixture, numbers in found["gaussians"].items():
+        seconds = found["seconds"][mixture]
+        row = {"category": key["category"], "marker": key["index"], "mixture": mixture}
+        row |= {"amount": len(seconds), "gaussians": numbers["rectangles"]}
+        row |= {f"gaussians_of_{name}": numbers.get(name) for name in ("runs", "cells")}
+        for name in ("components", "cells", "runs", "rectangles"):
+            row |= {f"{name}_{colour}": found[name][colour] for colour in ("dark", "light")}
+        spread = statistics.stdev(seconds) if len(seconds) > 1 else 0.0
+        yield row | {"seconds": statistics.median(seconds), "seconds_spread": spread}
 
 
-class _Scan(NamedTuple):
-    tilts: list[float]
-    found: str
-    read: str
+def _scans(record: Record) -> dict[str, _Scan]:
+    """By detector."""
+    tilts = angles.parse_tilts(record.key["tilts"])
+    found = record.result["readers"].items()
+    return {name: _Scan(tilts, seen["found"], seen["read"]) for name, seen in found}
 
 
-def _angles_rows(records: Sequence[Record]) -> Callable[[Record], Rows]:
-    def place(key: dict, method: str) -> tuple:
-        return key["protocol"], key["category"], key["index"], method
-
-    def scans(record: Record) -> dict[str, _Scan]:
-        tilts = angles.parse_tilts(record.key["tilts"])
-        return {
-            name: _Scan(tilts, seen["found"], seen["read"]) for name, seen in record.result["readers"].items()
-        }
-
-    ideals: dict[tuple, dict[str, _Scan]] = {}
+def _ideals(records: Iterable[Record]) -> Ideals:
+    """What the ideal texture gives, for each protocol and marker: of several scans the longest."""
+    found: Ideals = {}
     for record in records:
         if record.key["method"] == IDEAL:
-            known = ideals.setdefault(place(record.key, IDEAL), {})
-            for name, scan in scans(record).items():
+            known = found.setdefault(_marker_of(record.key), {})
+            for name, scan in _scans(record).items():
                 known[name] = max((scan, known.get(name, scan)), key=lambda one: len(one.tilts))
+    return found
 
-    def rows(record: Record) -> Rows:
-        key = record.key
-        ceilings = ideals.get(place(key, IDEAL), {})
-        for reader, scan in scans(record).items():
-            row = {"protocol": key["protocol"], "category": key["category"], "marker": key["index"]}
-            row |= {
-                "method": key["method"],
-                "reader": reader,
-                "amount": len(scan.tilts),
-                "tilts": key["tilts"],
-            }
-            row["found"], row["found_all"] = angles.largest(scan.tilts, scan.found)
-            row["read"], row["read_all"] = angles.largest(scan.tilts, scan.read)
-            if reader in ceilings:
-                row |= _beside_ideal(scan, ceilings[reader], key["method"])
-            yield row
 
-    return rows
+def _marker_of(key: dict) -> tuple:
+    return key["protocol"], key["category"], key["index"]
+
+
+def _angles_rows(ideals: Ideals, record: Record) -> Rows:
+    key = record.key
+    ceilings = ideals.get(_marker_of(key), {})
+    for reader, scan in _scans(record).items():
+        row = {"protocol": key["protocol"], "category": key["category"], "marker": key["index"]}
+        row |= {"method": key["method"], "reader": reader, "amount": len(scan.tilts), "tilts": key["tilts"]}
+        row["found"], row["found_all"] = angles.largest(scan.tilts, scan.found)
+        row["read"], row["read_all"] = angles.largest(scan.tilts, scan.read)
+        if reader in ceilings:
+            row |= _beside_ideal(scan, ceilings[reader], key["method"])
+        yield row
 
 
 def _beside_ideal(scan: _Scan, ideal: _Scan, method: str) -> dict[str, float | None]:
@@ -144,39 +150,28 @@ def _at(scan: _Scan, tilts: Iterable[float]) -> str:
     return "".join(read[tilt] for tilt in tilts)
 
 
-def _views_rows(_: Sequence[Record]) -> Callable[[Record], Rows]:
-    def rows(record: Record) -> Rows:
-        key = record.key
-        row = {
-            "truth": key["truth"],
-            "category": key["category"],
-            "method": key["method"],
-            "marker": key["index"],
-        }
-        # of equally many views, the record with more metrics
-        row["amount"] = key["views"] + 0.1 * bool(key["flip"]) + 0.2 * bool(key["lpips"])
-        for name in ("psnr", "ssim", "flip", "lpips"):
-            there = [value for value in record.result[name] or () if value is not None]
-            row[name] = statistics.fmean(there) if there else None
+def _views_rows(ideals: Ideals, record: Record) -> Rows:
+    key = record.key
+    row = {name: key[name] for name in ("truth", "category", "method")} | {"marker": key["index"]}
+    # of equally many views, the record with more metrics
+    row["amount"] = key["views"] + 0.1 * bool(key["flip"]) + 0.2 * bool(key["lpips"])
+    for name in ("psnr", "ssim", "flip", "lpips"):
+        there = [value for value in record.result[name] or () if value is not None]
+        row[name] = statistics.fmean(there) if there else None
+    yield row
+
+
+def _localisation_rows(ideals: Ideals, record: Record) -> Rows:
+    """A row for each distance: medians over the tilts at which the marker was read."""
+    key = record.key
+    for distance in key["distances"]:
+        seen = [view for view in record.result["views"] if view["distance_m"] == distance]
+        read = [view for view in seen if view["position_mm"] is not None]
+        row = {"category": key["category"], "method": key["method"], "marker": key["index"]}
+        row |= {"distance_m": distance, "amount": len(seen), "read": len(read)}
+        for name in ("position_mm", "angle_deg", "corners_px"):
+            row[name] = statistics.median(view[name] for view in read) if read else None
         yield row
-
-    return rows
-
-
-def _localisation_rows(_: Sequence[Record]) -> Callable[[Record], Rows]:
-    def rows(record: Record) -> Rows:
-        """A row for each distance: means over the tilts at which the marker was read."""
-        key = record.key
-        for distance in key["distances"]:
-            seen = [view for view in record.result["views"] if view["distance_m"] == distance]
-            read = [view for view in seen if view["position_mm"] is not None]
-            row = {"category": key["category"], "method": key["method"], "marker": key["index"]}
-            row |= {"distance_m": distance, "amount": len(seen), "read": len(read)}
-            for name in ("position_mm", "angle_deg", "corners_px"):
-                row[name] = statistics.median(view[name] for view in read) if read else None
-            yield row
-
-    return rows
 
 
 KINDS = {

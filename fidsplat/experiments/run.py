@@ -20,8 +20,7 @@ from fidsplat.experiments.sweep import shard as share_of
 from fidsplat.files import writable_folder
 from fidsplat.provenance import run_facts
 from fidsplat.render import Renderer
-from fidsplat.vision.lpips import load_lpips, weights_name
-from fidsplat.vision.metrics import metric_versions
+from fidsplat.vision.metrics import load_lpips, metric_versions, weights_name
 from fidsplat.vision.readers import reader_versions
 
 NAMES = (counts.NAME, localisation.NAME, views.NAME, angles.NAME)

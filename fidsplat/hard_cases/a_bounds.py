@@ -7,10 +7,9 @@ import math
 import numpy as np
 
 from fidsplat.backends.base import Reshapes
-from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture, draw
+from fidsplat.hard_cases.agreement import ALL_OUTPUTS, CULLED, Picture, differing, draw, trace
 from fidsplat.hard_cases.case import Finding, Found, case
 from fidsplat.hard_cases.clouds import camera, quaternion, splats, taken, turned
-from fidsplat.hard_cases.invariance import CULLED, differing, trace
 from fidsplat.random_clouds import log_uniform, random_splats
 from fidsplat.render import Renderer
 from fidsplat.splats import SplatCloud

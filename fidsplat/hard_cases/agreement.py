@@ -13,12 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fidsplat.backends.base import Reshapes
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
 from fidsplat.capture import Capture
-from fidsplat.effects import FeatureSet
+from fidsplat.effects import OUTPUTS, FeatureSet
 from fidsplat.quality import Quality
 from fidsplat.render import Frame, Renderer
 from fidsplat.sensor import Sensor
@@ -29,21 +30,11 @@ ALL_OUTPUTS = ("rgb", "alpha", "depth", "depth_median", "normal", "label")
 COLOR_TOLERANCE = 2e-5
 DEPTH_TOLERANCE = 1e-4
 """relative"""
-TOLERANCE = {
-    "rgb": COLOR_TOLERANCE,
-    "alpha": COLOR_TOLERANCE,
-    "depth": DEPTH_TOLERANCE,
-    "depth_median": 0.0,
-    "depth_first": 0.0,
-    "distance": DEPTH_TOLERANCE,
-    "distance_median": 0.0,
-    "distance_first": 0.0,
-    "normal": COLOR_TOLERANCE,
-    "normal_world": COLOR_TOLERANCE,
-    "label": 0.0,
-    "splat_id": 0.0,
-    "blended": 0.0,
-}
+TOLERANCE = (
+    dict.fromkeys(OUTPUTS, 0.0)
+    | dict.fromkeys(("rgb", "alpha", "normal", "normal_world"), COLOR_TOLERANCE)
+    | dict.fromkeys(("depth", "distance"), DEPTH_TOLERANCE)
+)
 """What each output may be wrong beyond its certificate."""
 RARE = 1e-3
 """share of pixels whose certificate may exceed `RISKY`"""
@@ -155,3 +146,43 @@ def compare(images: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], o
 def against_reference(renderer: Renderer, picture: Picture) -> list[Difference]:
     """Draw a picture on a device and compare every output with the reference."""
     return compare(draw(renderer, picture), truth_of(picture), picture.outputs)
+
+
+CULLED = 0xFFFFFFFF
+"""depth key of a splat that is not drawn, on devices"""
+
+
+def trace(renderer: Renderer, picture: Picture, shape=None) -> dict[str, np.ndarray]:
+    """What passes between the stages of a device, with the outputs; `shape` replaces its build constants."""
+    features, view = picture.prepared()
+    backend = renderer.backend
+    if shape is not None and isinstance(backend, Reshapes):
+        pipeline = backend.pipeline(features, shape)
+    else:
+        pipeline = backend.pipeline(features)
+    return pipeline.trace(backend.upload(picture.cloud), view)
+
+
+def differing(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray], outputs) -> int:
+    """Number of pixels whose bits differ in any of the outputs; all of them where the shapes differ."""
+    different = np.zeros((), bool)
+    for name in outputs:
+        one, other = (np.ascontiguousarray(images[name]) for images in (first, second))
+        if one.shape != other.shape:
+            return max(one.size, other.size)
+        bits = f"u{one.itemsize}"
+        unlike = one.view(bits) != other.view(bits)
+        different = different | (unlike.any(-1) if unlike.ndim == 3 else unlike)
+    return int(different.sum())
+
+
+def out_of_order(traced: Mapping[str, np.ndarray], wanted: np.ndarray) -> int:
+    """How many splats of a trace do not follow the order `wanted` (visible,), in tiles' lists or at all."""
+    if "lists" not in traced:
+        return int((traced["order"] != wanted).sum())
+    rank = np.full(len(traced["keys"]), -1)
+    rank[wanted] = np.arange(len(wanted))
+    places, starts = rank[traced["lists"]], traced["starts"].astype(np.int64)
+    follows = np.ones(len(places), bool)  # the one before it in the same list
+    follows[starts[:-1][starts[:-1] < len(places)]] = False
+    return int((places < 0).sum() + (follows[1:] & (np.diff(places) <= 0)).sum())

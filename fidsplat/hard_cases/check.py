@@ -11,8 +11,8 @@ import numpy as np
 from fidsplat.backends.base import DeviceInfo
 from fidsplat.errors import DeviceError
 from fidsplat.hard_cases.agreement import TOLERANCE, Difference, Picture, compare, draw, truth_of
-from fidsplat.hard_cases.arithmetic import Arithmetic, measure
 from fidsplat.hard_cases.case import Case, Finding
+from fidsplat.hard_cases.f_arithmetic import Arithmetic, measure
 from fidsplat.render import Renderer
 
 

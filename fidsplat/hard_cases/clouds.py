@@ -50,14 +50,7 @@ def splats(
 
 def taken(cloud: SplatCloud, index) -> SplatCloud:
     """The splats at an index array, in its order."""
-    chosen = SplatCloud(
-        cloud.means[index],
-        cloud.quats[index],
-        cloud.scales[index],
-        cloud.opacities[index],
-        colors=None if cloud.colors is None else cloud.colors[index],
-        sh=None if cloud.sh is None else cloud.sh[index],
-        labels=cloud.labels[index],
-        origin=cloud.origin,
-    )
+    names = ("means", "quats", "scales", "opacities", "colors", "sh", "labels")
+    arrays = {name: array[index] for name in names if (array := getattr(cloud, name)) is not None}
+    chosen = SplatCloud(**arrays, origin=cloud.origin)
     return chosen if cloud.planes is None else chosen.with_planes(cloud.planes[index])

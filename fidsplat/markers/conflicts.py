@@ -1,5 +1,9 @@
-"""Maximum independent set of the chords' conflict graph, by networkx: Hopcroft-Karp matching, then Koenig's
-minimum vertex cover."""
+"""Maximum independent set of the chords' conflict graph: a maximum matching, then Koenig's theorem.
+
+Pictures of noise have a million chords, nearly all in small groups that hang together like trees. A vertex
+with one neighbour left is matched to it, which some maximum matching does too; whole rounds of them at once
+solve the trees. What is left holds cycles, and networkx's Hopcroft-Karp matches it.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,9 @@ from contextlib import contextmanager
 
 import numpy as np
 
-_SOURCE = -1
+ROUNDS = 64
+"""Steps along a path that are taken for all paths at once; few are longer."""
+
 _limit = threading.Lock()
 
 
@@ -21,33 +27,75 @@ def maximum_independent_set(
 
     left, right: (e,) the ends of each edge. Returns masks (n_left,) and (n_right,) bool.
 
-    By Koenig's theorem the vertices reached from unmatched left vertices along alternating paths tell a
-    minimum cover: the left ones not reached and the right ones reached; the set is the rest. It is the same
-    for every maximum matching. One search from all unmatched vertices finds them; networkx's
-    `to_vertex_cover` searches from each vertex anew, which takes quadratic time.
+    By Koenig's theorem it is the left vertices that alternating paths from unmatched left vertices reach,
+    and the right ones that none of these is joined to. It is the same for every maximum matching.
     """
-    keep = np.ones(n_left + n_right, bool)
+    order = np.argsort(left, kind="stable")
+    left, right = left[order], right[order]
+    keep_left = _reached(left, right, *_matching(n_left, n_right, left, right))
+    keep_right = np.ones(n_right, bool)
+    keep_right[right[keep_left[left]]] = False
+    return keep_left, keep_right
+
+
+def _matching(
+    n_left: int, n_right: int, left: np.ndarray, right: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """A maximum matching: the partner of each left and of each right vertex, -1 for none."""
+    of_left, of_right = np.full(n_left, -1), np.full(n_right, -1)
+    for _ in range(ROUNDS):
+        alone_left = np.bincount(left, minlength=n_left)[left] == 1
+        alone = np.flatnonzero(alone_left | (np.bincount(right, minlength=n_right)[right] == 1))
+        if not len(alone):
+            break
+        # of those that hang on one vertex, one is matched to it
+        shared = np.where(alone_left, right + n_left, left)[alone]
+        matched = alone[np.unique(shared, return_index=True)[1]]
+        of_left[left[matched]], of_right[right[matched]] = right[matched], left[matched]
+        free = (of_left[left] < 0) & (of_right[right] < 0)
+        left, right = left[free], right[free]
     if len(left):
-        cover = _minimum_cover(list(zip(left.tolist(), (right + n_left).tolist(), strict=True)), n_left)
-        keep[list(cover)] = False
-    return keep[:n_left], keep[n_left:]
+        for u, v in _hopcroft_karp(left, right + n_left):
+            of_left[u], of_right[v - n_left] = v - n_left, u
+    return of_left, of_right
 
 
-def _minimum_cover(edges: list[tuple[int, int]], n_left: int) -> set[int]:
-    """Koenig's cover of a bipartite graph whose left vertices are those below ``n_left``."""
+def _reached(left: np.ndarray, right: np.ndarray, of_left: np.ndarray, of_right: np.ndarray) -> np.ndarray:
+    """Left vertices at the ends of alternating paths from those without a partner: (n_left,) bool.
+
+    left is sorted, so that the edges of a vertex follow one another.
+    """
+    first = np.searchsorted(left, np.arange(len(of_left) + 1))
+    reached = of_left < 0
+    now = np.flatnonzero(reached)
+    for _ in range(ROUNDS):
+        count = first[now + 1] - first[now]
+        edge = np.arange(count.sum()) + np.repeat(first[now] - (np.cumsum(count) - count), count)
+        now = np.unique(of_right[right[edge]])  # none is without a partner, or the matching were not maximum
+        now = now[~reached[now]]
+        if not len(now):
+            return reached
+        reached[now] = True
+    todo = now.tolist()
+    while todo:
+        u = todo.pop()
+        for v in of_right[right[first[u] : first[u + 1]]].tolist():
+            if not reached[v]:
+                reached[v] = True
+                todo.append(v)
+    return reached
+
+
+def _hopcroft_karp(left: np.ndarray, right: np.ndarray) -> list[tuple[int, int]]:
+    """Pairs of a maximum matching; the numbers of left and right vertices differ."""
     import networkx as nx  # late: it takes longer to load than most markers to make
 
-    graph = nx.Graph(edges)
-    lefts = {vertex for vertex in graph if vertex < n_left}
+    graph = nx.Graph(zip(left.tolist(), right.tolist(), strict=True))
+    lefts = set(left.tolist())
     # it recurses once for each matched pair on an augmenting path, which stays within a component
     with _recursion(max(map(len, nx.connected_components(graph)))):
         partner = nx.bipartite.hopcroft_karp_matching(graph, lefts)
-    # alternating paths are the directed ones: rightwards by unmatched edges, back by matched ones
-    alternating = nx.DiGraph((b, a) if partner.get(a) == b else (a, b) for a, b in edges)
-    alternating.add_edges_from((_SOURCE, vertex) for vertex in lefts - partner.keys())
-    alternating.add_node(_SOURCE)
-    reached = nx.descendants(alternating, _SOURCE)
-    return (lefts - reached) | (reached - lefts)
+    return [(u, v) for u, v in partner.items() if u in lefts]
 
 
 @contextmanager

@@ -45,25 +45,6 @@ def label_components(grid: np.ndarray) -> tuple[np.ndarray, int]:
     return labels.astype(np.int32)[run], len(names)
 
 
-def count_holes(grid: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
-    """8-connected holes of each component, (count,) int64, from its corners.
-
-    A rectilinear boundary turns four times more one way than the other around each of its loops, so
-    convex - concave = 4 (1 - holes), a checkerboard vertex counting as two convex ones.
-    """
-    padded = np.full((labels.shape[0] + 2, labels.shape[1] + 2), -1, np.int64)
-    padded[1:-1, 1:-1] = labels
-    # the four cells around every grid vertex: top left, top right, bottom left, bottom right
-    cells = [padded[:-1, :-1], padded[:-1, 1:], padded[1:, :-1], padded[1:, 1:]]
-    turns = np.zeros(count, np.int64)
-    for i, own in enumerate(cells):
-        beside, over, across = (cells[i ^ 1] == own), (cells[i ^ 2] == own), (cells[i ^ 3] == own)
-        inside = own >= 0
-        turns += np.bincount(own[inside & ~beside & ~over], minlength=count)
-        turns -= np.bincount(own[inside & beside & over & ~across], minlength=count)
-    return 1 - turns // 4
-
-
 def polygons(grid: np.ndarray, labels: np.ndarray, count: int) -> list[Polygon]:
     """Each component of an (h, w) grid as a shapely polygon with holes, in cells: x right, y down, from the
     top left.

@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import TypeVar
 
 from fidsplat.errors import InputError
 from fidsplat.scenes.parts import SceneParts
@@ -12,22 +13,16 @@ from fidsplat.surroundings import Fog, Gradient, Panorama
 BACKGROUND = (*names_of(Gradient), "image")
 
 
-def read_sensor(top: Table) -> Sensor | None:
-    """The sensor of a scene file; None if it has none. Raises InputError, naming the key."""
-    if "sensor" not in top:
-        return None
-    table = top.table("sensor", names_of(Sensor))
-    with table.at():
-        return Sensor(**table.values(Sensor))
+_Part = TypeVar("_Part", Sensor, Fog)
 
 
-def read_fog(top: Table) -> Fog | None:
-    """The fog of a scene file; None if it has none. Raises InputError, naming the key."""
-    if "fog" not in top:
+def read_part(top: Table, name: str, kind: type[_Part]) -> _Part | None:
+    """The sensor or the fog of a scene file; None if it has none. Raises InputError, naming the key."""
+    if name not in top:
         return None
-    table = top.table("fog", names_of(Fog))
+    table = top.table(name, names_of(kind))
     with table.at():
-        return Fog(**table.values(Fog))
+        return kind(**table.values(kind))
 
 
 def read_background(top: Table, folder: Path) -> Gradient | Panorama | None:

@@ -76,7 +76,7 @@ class SceneParts(PickledByFields):
     background: Background = (0.0, 0.0, 0.0)
     """RGB in display space, a Gradient or a Panorama"""
     outputs: tuple[str, ...] = ("rgb",)
-    """names of the planes that are rendered"""
+    """names of the output images"""
     quality: Quality | str | None = None
     """a Quality, text (`Quality.of`), or None for the default"""
     device: str | None = None

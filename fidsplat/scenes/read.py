@@ -15,13 +15,15 @@ from fidsplat.files import path_of
 from fidsplat.formats import Progress, load_ply
 from fidsplat.quality import MarkerQuality, Quality, knobs
 from fidsplat.rotations import rigid_matrix
-from fidsplat.scenes.imaging import read_background, read_fog, read_sensor
+from fidsplat.scenes.imaging import read_background, read_part
 from fidsplat.scenes.knobs import quality_of
 from fidsplat.scenes.lens import TABLES, read_focal_lengths, read_lens
 from fidsplat.scenes.moving import POSE, read_keyframes, read_shutter
 from fidsplat.scenes.parts import PlacedMarker
 from fidsplat.scenes.table import Table
+from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
+from fidsplat.surroundings import Fog
 
 MAX_BYTES = 16 * 2**20
 MAX_PARTS = 8
@@ -88,8 +90,8 @@ def read_scene(
         device=render.text("device", None),
         shutter=read_shutter(table),
         camera_motion=keyframes,
-        sensor=read_sensor(top),
-        fog=read_fog(top),
+        sensor=read_part(top, "sensor", Sensor),
+        fog=read_part(top, "fog", Fog),
         cloud_motions={i: motion for i, (_, motion) in enumerate(splats) if motion is not None},
     )
 

@@ -9,13 +9,14 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.errors import InputError
+from fidsplat.markers import Marker
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.vision.boards import BOARDS, board_pose
 from fidsplat.vision.detect import Detection, detect
 from fidsplat.vision.dictionaries import parse_family
 from fidsplat.vision.images import to_uint8
 from fidsplat.vision.pose import marker_pose, pose_error
-from fidsplat.vision.visible import visible_part, visible_share
+from fidsplat.vision.visible import visible
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +109,7 @@ def read_back(
     if camera is scene.camera:
         camera = scene.motion.moved(camera, time)
     markers = [m if m.motion is None else replace(m, pose=m.motion(time)) for m in scene.markers]
-    found = detect(image, families_of(markers) if families is None else families)
+    found = detect(image, families_of(placed.marker for placed in markers) if families is None else families)
     codes, left = match(found, markers, camera)
     for number, placed in enumerate(markers):
         if placed.marker.kind in BOARDS:
@@ -131,7 +132,7 @@ def match(
         (_apart(found.corners, seen[i]), i, found)
         for i, placed in enumerate(markers)
         for found in left
-        if _same(found, placed)
+        if _same(found, placed.marker)
     ]
     chosen: dict[int, Detection] = {}
     for _, i, found in sorted(pairs, key=lambda pair: pair[0]):
@@ -145,9 +146,20 @@ def match(
     return codes, left
 
 
-def families_of(markers: Iterable[PlacedMarker]) -> tuple[str, ...]:
-    """Tag families in a scene, boards' included, each once, for `detect`."""
-    tags = (placed.marker for placed in markers if placed.marker.kind in ("apriltag", "aruco", *BOARDS))
+def own_code(made: Marker, picture: np.ndarray) -> Detection | None:
+    """A marker's code in a picture, (h, w) or (h, w, 3) display values; None where it is not read."""
+    found = detect(to_uint8(picture), families_of([made]), qr=made.kind == "qr")
+    return next((code for code in found if _same(code, made)), None)
+
+
+def corner_error(code: Detection, corners: np.ndarray) -> float:
+    """Pixels between a code's corners and where they are, (4, 2): root mean square over the four."""
+    return float(np.sqrt(((code.corners - corners) ** 2).sum(1).mean()))
+
+
+def families_of(markers: Iterable[Marker]) -> tuple[str, ...]:
+    """Families of those that are tags or boards of tags, each once, for `detect`."""
+    tags = (made for made in markers if made.kind in ("apriltag", "aruco", *BOARDS))
     return tuple(dict.fromkeys(":".join(parse_family(str(tag.family))) for tag in tags))
 
 
@@ -160,13 +172,10 @@ def means(readings: Sequence[Reading]) -> dict[str, Any]:
     return {"markers": len(readings), "found": len(facts), **mean}
 
 
-def _same(found: Detection, placed: PlacedMarker) -> bool:
-    marker = placed.marker
-    if found.kind != marker.kind:
-        return False
-    if found.kind == "qr":
-        return found.payload == marker.payload
-    return (found.family, found.id) == (marker.family, marker.id)
+def _same(found: Detection, made: Marker) -> bool:
+    if found.kind == "qr":  # whose family is its version
+        return (found.kind, found.payload) == (made.kind, made.payload)
+    return (found.kind, found.family, found.id) == (made.kind, made.family, made.id)
 
 
 def _apart(one: np.ndarray, other: np.ndarray) -> float:
@@ -178,18 +187,16 @@ def _reading(
     placed: PlacedMarker, code: tuple[Detection, np.ndarray] | None, camera: Camera, label: np.ndarray | None
 ) -> Reading:
     truth, corners = camera.world_to_camera @ placed.pose, camera.project(placed.corners)
-    share, part = visible_share(placed, camera, label), visible_part(placed, camera)[1]
-    seen = Reading(placed, truth, corners, share, None if part.is_empty else part.bounds)
+    seen = Reading(placed, truth, corners, *visible(placed, camera, label))
     if code is None:
         return seen
     found, pose = code
     position, angle = pose_error(pose, truth)
-    offset = float(np.sqrt(((found.corners - corners) ** 2).sum(1).mean()))
     return replace(
         seen,
         detection=found,
         pose=pose,
         position_error=position,
         angle_error=angle,
-        corner_error=offset,
+        corner_error=corner_error(found, corners),
     )

@@ -1,5 +1,7 @@
 """What of a marker lies in a picture."""
 
+from typing import NamedTuple
+
 import numpy as np
 import shapely
 
@@ -11,6 +13,15 @@ MARGIN = 1
 
 POINTS = 16
 """Places along a side, which a lens makes a curve."""
+
+
+class Visible(NamedTuple):
+    """What of a marker is in a picture."""
+
+    share: float
+    """0 to 1, of its outline in an endless picture"""
+    box: tuple[float, float, float, float] | None
+    """pixels x0, y0, x1, y1 around it, without regard to what stands in front; None for a share of 0"""
 
 
 def visible_part(placed: PlacedMarker, camera: Camera) -> tuple[shapely.Geometry, shapely.Geometry]:
@@ -37,24 +48,22 @@ def visible_part(placed: PlacedMarker, camera: Camera) -> tuple[shapely.Geometry
     return whole, whole & shapely.box(0, 0, camera.width, camera.height)
 
 
-def visible_share(placed: PlacedMarker, camera: Camera, label: np.ndarray | None = None) -> float:
-    """How much of a marker's outline (`visible_part`) is in the picture, with nothing in front: 0 to 1.
+def visible(placed: PlacedMarker, camera: Camera, label: np.ndarray | None = None) -> Visible:
+    """What of a marker's outline (`visible_part`) is in the picture.
 
     label: (h, w) int32, the labels of the picture; None: nothing stands in front.
     """
     whole, part = visible_part(placed, camera)
-    if not part.area:
-        return 0.0
-    share = min(part.area / whole.area, 1.0)
-    if label is None:
-        return share
-    x0, y0, x1, y1 = (int(edge) for edge in part.bounds)
-    y, x = np.mgrid[y0 : y1 + 1, x0 : x1 + 1] + 0.5
-    shapely.prepare(part)
-    inside = shapely.contains_xy(part, x, y)
-    own = label[y0 : y1 + 1, x0 : x1 + 1]
-    inside = inside[: own.shape[0], : own.shape[1]]
-    return share * float((own[inside] == placed.label).mean()) if inside.any() else 0.0
+    if shapely.is_empty(part):
+        return Visible(0.0, None)
+    share = min(float(shapely.area(part) / shapely.area(whole)), 1.0)
+    x0, y0, x1, y1 = shapely.bounds(part).tolist()
+    if label is not None:
+        y, x = np.mgrid[int(y0) : min(int(y1) + 1, camera.height), int(x0) : min(int(x1) + 1, camera.width)]
+        inside = shapely.contains_xy(part, x + 0.5, y + 0.5)
+        own = label[y[inside], x[inside]] == placed.label
+        share *= float(own.mean()) if own.size else 0.0
+    return Visible(share, (x0, y0, x1, y1))
 
 
 def _before(points: np.ndarray, ahead: np.ndarray) -> np.ndarray:

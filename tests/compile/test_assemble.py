@@ -19,11 +19,11 @@ from fidsplat.effects import OUTPUTS, select
 BACKEND = "opencl"
 
 SHAPE, GROUP = cpu_shape(lanes=16, cores=2), gpu_shape()
-TAPS = [name for name in OUTPUTS if name != "rgb"]
+FURTHER = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
 DIGESTS = {
-    "none": ["c2c0a6cba6097714", "be842943924e0e73"],
-    "screen": ["2394b2b80cb4097c", "b9607e863d3a6160"],
+    "none": ["19b4e84aa1cd9886", "33930847ebc66047"],
+    "screen": ["173478de422e4001", "966cfc5b9f97aa28"],
 }
 """of a scene that asks for nothing, by low-pass; `screen` is the default"""
 
@@ -60,42 +60,45 @@ def test_base_text_names_no_effect_that_was_not_asked_for():
     }
     of_knobs = ("wide", "WIDE")
     of_layers = ("planes", "plane_keys", "layer", "Layer", "open", "waiting", "optical_depth")
-    for name in (*absent, *TAPS, "sh", "finished", *of_layers, *of_knobs):
+    for name in (*absent, *FURTHER, "sh", "finished", *of_layers, *of_knobs):
         assert not re.search(rf"\b{name}(_|\b)", text), name
 
 
-@pytest.mark.parametrize("tap", TAPS)
-def test_a_tap_brings_its_text_and_nothing_else(tap):
+@pytest.mark.parametrize("output", FURTHER)
+def test_an_output_brings_its_text_and_nothing_else(output):
     base = assemble(select(COLORS, fs.Capture(quality=PLAIN)), SHAPE)
-    with_tap = assemble(select(COLORS, fs.Capture(outputs=(tap,), quality=PLAIN)), SHAPE)
-    assert with_tap.digest != base.digest
+    with_output = assemble(select(COLORS, fs.Capture(outputs=(output,), quality=PLAIN)), SHAPE)
+    assert with_output.digest != base.digest
     # arguments that follow add a comma, fields that follow change a size
-    base_lines, tap_lines = (
+    base_lines, output_lines = (
         [line.rstrip(",") for line in re.sub(".*(#line|_has_the_size).*", "", one.text).splitlines() if line]
-        for one in (base, with_tap)
+        for one in (base, with_output)
     )
-    remaining = iter(tap_lines)
+    remaining = iter(output_lines)
     for line in base_lines:
-        assert line in remaining, f"{tap} removed or moved: {line}"
-    needed = {tap, *LAYOUTS[tap].parts}
+        assert line in remaining, f"{output} removed or moved: {line}"
+    needed = {output, *LAYOUTS[output].parts}
     others = [
-        other for other in TAPS if not any(other.startswith(own) or own.startswith(other) for own in needed)
+        other
+        for other in FURTHER
+        if not any(other.startswith(own) or own.startswith(other) for own in needed)
     ]
-    assert not any(re.search(rf"\b{other}_(out|raw)", with_tap.text) for other in others)
+    assert not any(re.search(rf"\b{other}_(out|raw)", with_output.text) for other in others)
 
 
-@pytest.mark.parametrize("taps", [("rgb",), tuple(TAPS)])
-def test_only_splats_on_planes_bring_layers(taps):
-    """What a tap says of layers stays out as well, and layers bring the depth that places them."""
+@pytest.mark.parametrize("outputs", [("rgb",), tuple(FURTHER)])
+def test_only_splats_on_planes_bring_layers(outputs):
+    """What an output says of layers stays out as well, and layers bring the depth that places them."""
     words = ("Layer", "layer_pick", "layer_gather", "plane_keys", "label_tau", "share")
-    plain = assemble(select(COLORS, fs.Capture(outputs=taps, quality=PLAIN)), SHAPE).text
-    layered = assemble(select(Cloud(has_planes=True), fs.Capture(outputs=taps, quality=PLAIN)), SHAPE).text
+    plain = assemble(select(COLORS, fs.Capture(outputs=outputs, quality=PLAIN)), SHAPE).text
+    layered = assemble(select(Cloud(has_planes=True), fs.Capture(outputs=outputs, quality=PLAIN)), SHAPE).text
     in_order = assemble(
-        select(Cloud(has_planes=True), fs.Capture(outputs=taps, quality=PLAIN.with_(coplanar="order"))), SHAPE
+        select(Cloud(has_planes=True), fs.Capture(outputs=outputs, quality=PLAIN.with_(coplanar="order"))),
+        SHAPE,
     ).text
     for word in words:
         assert not re.search(rf"\b{word}\b", plain), word
-        assert re.search(rf"\b{word}\b", layered) or (word == "label_tau" and "label" not in taps), word
+        assert re.search(rf"\b{word}\b", layered) or (word == "label_tau" and "label" not in outputs), word
     assert in_order == plain
     assert layered.count("float z_numerator;") == 1
 
@@ -224,7 +227,7 @@ KNOBS = {
 
 
 @pytest.mark.parametrize("name", KNOBS)
-@pytest.mark.parametrize("outputs", [("rgb",), ("rgb", *TAPS)], ids=["rgb", "all"])
+@pytest.mark.parametrize("outputs", [("rgb",), ("rgb", *FURTHER)], ids=["rgb", "all"])
 def test_knobs_compile_and_run_with_every_output_and_none(renderer, name, outputs):
     cloud = random_splats(20, seed=1, depth=(1, 4)).with_planes(np.arange(20) // 2 - 1)
     if name == "double" and not renderer.device.float64:

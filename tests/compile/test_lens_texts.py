@@ -33,11 +33,11 @@ BEFORE_LENSES = {
 }
 
 
-@pytest.mark.parametrize(("schedule", "taps"), BEFORE_LENSES, ids=str)
-def test_plain_pictures_have_the_text_that_they_had_before_there_were_lenses(schedule, taps):
+@pytest.mark.parametrize(("schedule", "outputs"), BEFORE_LENSES, ids=str)
+def test_plain_pictures_have_the_text_that_they_had_before_there_were_lenses(schedule, outputs):
     shape = SHAPE if schedule == "lanes" else GROUP
-    text = assemble(select(Cloud(2, True), fs.Capture(outputs=taps)), shape)
-    assert text.digest == BEFORE_LENSES[schedule, taps]
+    text = assemble(select(Cloud(2, True), fs.Capture(outputs=outputs)), shape)
+    assert text.digest == BEFORE_LENSES[schedule, outputs]
 
 
 def test_numbers_of_a_lens_are_not_in_its_text():

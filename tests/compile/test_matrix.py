@@ -37,7 +37,7 @@ def assert_well_formed(names):
             declared = [one.text.replace("wide", source.scalars.wide) for one in arguments]
             assert lines == declared, kernel
         taken = {one.name for one in source.arguments["resolve"]}
-        assert {f"{output.name}_out" for output in features.outputs} <= taken
+        assert {f"{output.name}_out" for output in features.images} <= taken
         assert {one.name for one, _ in source.samples} <= taken
         assert {one.name for one, _ in source.samples} <= {one.name for one in source.arguments["blend"]}
 

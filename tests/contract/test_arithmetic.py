@@ -9,9 +9,8 @@ from test_agreement import coplanar_cloud
 
 import fidsplat as fs
 from fidsplat.effects import select
-from fidsplat.hard_cases.agreement import Picture
-from fidsplat.hard_cases.arithmetic import BOUNDS, worst
-from fidsplat.hard_cases.invariance import differing, trace
+from fidsplat.hard_cases.agreement import Picture, differing, trace
+from fidsplat.hard_cases.f_arithmetic import BOUNDS, worst
 
 CAMERA = fs.Camera.look_at(83, 61, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 AROUND = random_splats(200, seed=1)
@@ -30,7 +29,7 @@ SHARES = floats(2.0**-24, 1.0)
 
 def functions(renderer, exponents=EXPONENTS, shares=SHARES):
     """Bits of the device's short functions there."""
-    got = renderer.backend.run_arithmetic(exponents, shares, shares, shares)
+    got = renderer.backend.probe().arithmetic(exponents, shares, shares, shares)
     return got["fast_exp"], got["fast_log"]
 
 

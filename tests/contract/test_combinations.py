@@ -122,6 +122,6 @@ def test_backgrounds_behind_every_lens(renderer, camera, behind, samples):
 
 @pytest.mark.skipif(WARP is None, reason="no Warp device here")
 def test_warp_names_what_it_lacks():
-    features = replace(select(CLOUD, fs.Capture(PLAIN)), taps=("overdraw",))
+    features = replace(select(CLOUD, fs.Capture(PLAIN)), outputs=("overdraw",))
     with pytest.raises(fs.DeviceError, match=r"warp.*no overdraw; use an OpenCL device"):
         fs.Renderer(WARP).backend.pipeline(features)

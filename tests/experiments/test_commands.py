@@ -29,7 +29,7 @@ def test_help_teaches(capsys, word):
     assert (status, err) == (0, "")
     assert f"usage: fidsplat experiment {word}" in out
     assert f"  fidsplat experiment {word}" in out
-    assert Experiment.PARTS[word].HELP.splitlines()[0] in out
+    assert Experiment.PARTS[word].__doc__.splitlines()[0] in out
 
 
 def test_the_group_lists_its_words(capsys):

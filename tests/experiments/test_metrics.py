@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.vision.lpips import load_lpips, weights_name
-from fidsplat.vision.metrics import flip, has_flip, psnr, ssim
+from fidsplat.vision.metrics import flip, has_flip, load_lpips, psnr, ssim, weights_name
 
 RANDOM = np.random.default_rng(11)
 TRUTH = RANDOM.uniform(size=(40, 53))

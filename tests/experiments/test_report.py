@@ -221,9 +221,16 @@ def test_a_hole_is_not_hidden_by_where_reading_ends(tmp_path):
 def test_results_of_another_version_are_one_line(tmp_path):
     (tmp_path / "views.jsonl").write_text('{"run": {}}\n{"key": {"category": "small"}, "result": {}}\n')
     with pytest.raises(
-        fs.InputError, match=r"of another version of fidsplat, they lack '\w+'; measure again"
+        fs.InputError, match=r"of another version of fidsplat \(KeyError: '\w+'\); measure again"
     ):
         make_report([tmp_path], tmp_path)
+
+
+def test_a_table_with_words_for_numbers_is_one_line(tmp_path):
+    whole = (Path(__file__).parents[2] / "docs" / "results" / "counts.csv").read_text().splitlines()
+    (tmp_path / "counts.csv").write_text("\n".join([*whole[:2], whole[2].replace(",48,52,", ",x,52,")]))
+    with pytest.raises(fs.InputError, match=r"results of counts .* are damaged .* measure again"):
+        load([tmp_path])
 
 
 def test_without_the_apriltag_library_the_table_shows_opencv(tmp_path):

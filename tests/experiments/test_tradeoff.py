@@ -15,8 +15,7 @@ from fidsplat.experiments.tradeoff import session as session_module
 from fidsplat.experiments.tradeoff.hard import CELLS, cell_window, hard_scene
 from fidsplat.experiments.tradeoff.points import ALONE, BASE, EXACT, KNOBS, decode_points, points, quality_of
 from fidsplat.experiments.tradeoff.scenes import NAMES, TradeScene, make, scene_names
-from fidsplat.experiments.tradeoff.session import Session
-from fidsplat.experiments.tradeoff.timing import QUICK, memory_of, time_point
+from fidsplat.experiments.tradeoff.session import QUICK, Session, memory_of, time_point
 from fidsplat.hard_cases.clouds import camera, splats
 from fidsplat.quality import PRESETS, MarkerQuality
 
@@ -197,7 +196,7 @@ def test_a_definition_has_a_truth_of_its_own(session):
     # only coplanar splats have a rule
     assert session.truth("hard", BASE) is session.truth("hard", order)
     full = session.full("hard", BASE)
-    found = compare.check_truth(session.truth("hard", BASE), session.scene("hard", BASE.marker).scene, full)
+    found = compare.check_truth(session.truth("hard", BASE), session.scene("hard", BASE.marker), full)
     assert found["pixels"] == 64
     assert found["maximum"] < 2e-6
 

@@ -6,9 +6,8 @@ import pytest
 import fidsplat as fs
 from fidsplat.cameras import Camera
 from fidsplat.hard_cases import c_order
-from fidsplat.hard_cases.agreement import draw
-from fidsplat.hard_cases.clouds import splats
-from fidsplat.hard_cases.coplanar import (
+from fidsplat.hard_cases.agreement import draw, trace
+from fidsplat.hard_cases.c_order import (
     WALL_STEP,
     beside_a_big_splat,
     faint_between,
@@ -17,7 +16,7 @@ from fidsplat.hard_cases.coplanar import (
     tag,
     turning,
 )
-from fidsplat.hard_cases.invariance import trace
+from fidsplat.hard_cases.clouds import splats
 
 
 @pytest.mark.parametrize("away", [0.0, 1.0])

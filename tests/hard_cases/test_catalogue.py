@@ -2,9 +2,9 @@
 
 import pytest
 
+from fidsplat.hard_cases.b_homography import QUALITY, grazing_errors
 from fidsplat.hard_cases.catalogue import GROUPS, all_cases
 from fidsplat.hard_cases.check import run_case
-from fidsplat.hard_cases.homography import QUALITY, grazing_errors
 
 SIZES = {"A": 7, "B": 8, "C": 3, "D": 5, "E": 5, "F": 6}
 

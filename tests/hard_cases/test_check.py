@@ -10,9 +10,9 @@ from fidsplat.cli import main
 from fidsplat.errors import DeviceError
 from fidsplat.hard_cases import catalogue, check
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture
-from fidsplat.hard_cases.arithmetic import BOUNDS, measure
 from fidsplat.hard_cases.case import Case, Finding
 from fidsplat.hard_cases.clouds import camera, splats, turned
+from fidsplat.hard_cases.f_arithmetic import BOUNDS, measure
 from fidsplat.random_clouds import random_splats
 from fidsplat.vision.images import read_image
 

@@ -5,13 +5,13 @@ import json
 import numpy as np
 import pytest
 
-from fidsplat.hard_cases import fuzz, fuzz_run
+from fidsplat.hard_cases import fuzz
 from fidsplat.rotations import quaternion_to_matrix
 
 
 @pytest.mark.parametrize("splats", [2000, pytest.param(50_000, marks=pytest.mark.exhaustive)])
 def test_so_many_splats(renderer, splats):
-    *_, state = fuzz_run.fuzz_run(renderer, splats)
+    *_, state = fuzz.fuzz_run(renderer, splats)
     assert state.failing == []
     assert state.passed
     assert state.splats >= splats
@@ -22,7 +22,7 @@ def test_so_many_splats(renderer, splats):
 @pytest.mark.parametrize("seed", [12, 45, 68, 94, 174, 194, 223, 229, 248])
 def test_seeds_that_failed_once(renderer, seed):
     """Tiny splats called edge-on; opacities at the cut-off in depth and labels; optical depth near 1."""
-    state = fuzz_run.FuzzState("")
+    state = fuzz.FuzzState("")
     state.add(seed, renderer)
     assert state.failing == []
 
@@ -68,27 +68,27 @@ def test_the_scenes_are_hard():
 
 
 def test_a_stopped_run_goes_on(renderer, tmp_path, monkeypatch):
-    monkeypatch.setattr(fuzz_run, "_SAVE_EVERY", 0.0)
+    monkeypatch.setattr(fuzz, "_SAVE_EVERY", 0.0)
     file = tmp_path / "fuzz.json"
-    whole = list(fuzz_run.fuzz_run(renderer, 300))[-1]
-    run = fuzz_run.fuzz_run(renderer, 300, file)
+    whole = list(fuzz.fuzz_run(renderer, 300))[-1]
+    run = fuzz.fuzz_run(renderer, 300, file)
     first = next(run)
     run.close()
     saved = json.loads(file.read_text())
     assert (saved["scenes"], saved["splats"]) == (1, first.splats)
-    *_, state = fuzz_run.fuzz_run(renderer, 300, file)
+    *_, state = fuzz.fuzz_run(renderer, 300, file)
     assert (state.scenes, state.pixels, state.largest) == (whole.scenes, whole.pixels, whole.largest)
     # more splats go on from there; the same number starts again
-    *_, more = fuzz_run.fuzz_run(renderer, 450, file)
+    *_, more = fuzz.fuzz_run(renderer, 450, file)
     assert more.scenes > state.scenes
-    assert next(fuzz_run.fuzz_run(renderer, 300, file)).scenes == 1
+    assert next(fuzz.fuzz_run(renderer, 300, file)).scenes == 1
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"key": 3}', '{"key": "%s", "scenes": "a", "new": 1}'])
 def test_a_file_of_something_else_is_no_hindrance(renderer, tmp_path, content):
     file = tmp_path / "fuzz.json"
-    file.write_text(content.replace("%s", fuzz_run._key(renderer)))
-    assert next(fuzz_run.fuzz_run(renderer, 50, file)).scenes == 1
+    file.write_text(content.replace("%s", fuzz._key(renderer)))
+    assert next(fuzz.fuzz_run(renderer, 50, file)).scenes == 1
 
 
 def test_a_failing_seed_is_named(renderer, monkeypatch):
@@ -99,9 +99,9 @@ def test_a_failing_seed_is_named(renderer, monkeypatch):
         frame = draw(one, picture)
         return Wrong({name: frame[name] + (1e-3 if name == "alpha" else 0) for name in frame})
 
-    draw = fuzz_run.draw
-    monkeypatch.setattr(fuzz_run, "draw", wrong)
-    state = fuzz_run.FuzzState("")
+    draw = fuzz.draw
+    monkeypatch.setattr(fuzz, "draw", wrong)
+    state = fuzz.FuzzState("")
     state.add(3, renderer)
     assert state.failing == [3]
     assert not state.passed

@@ -7,10 +7,9 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.backends.base import Reshapes
-from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture, draw
+from fidsplat.hard_cases.agreement import ALL_OUTPUTS, CULLED, Picture, differing, draw, trace
+from fidsplat.hard_cases.c_order import tag
 from fidsplat.hard_cases.clouds import camera, splats, taken, turned
-from fidsplat.hard_cases.coplanar import tag
-from fidsplat.hard_cases.invariance import CULLED, differing, trace
 from fidsplat.random_clouds import random_splats
 
 CLOUDS = {

@@ -13,7 +13,7 @@ from fidsplat.backends.planes import PlaneTable
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.view import View
 from fidsplat.effects import select
-from fidsplat.hard_cases.invariance import out_of_order
+from fidsplat.hard_cases.agreement import out_of_order
 
 CULLED = np.uint32(0xFFFFFFFF)
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
@@ -128,6 +128,15 @@ def test_keys_are_depths_and_the_order_is_total(backend):
     assert out_of_order(trace, order) == 0
     assert len(set(trace["lists"])) > 0
     assert set(trace["lists"]) <= set(visible)
+
+
+def test_quaternions_of_any_length_turn_a_splat(backend):
+    """To the bit, where all are twice as long."""
+    cloud, longer = random_splats(100, seed=6), random_splats(100, seed=6)
+    object.__setattr__(longer, "quats", 2 * longer.quats)
+    pictures = [traced(backend, each, fs.Quality())[0]["rgb"] for each in (cloud, longer)]
+    assert np.array_equal(*pictures)
+    assert pictures[0].any()
 
 
 def test_culled_splats_change_nothing(backend):

@@ -10,7 +10,7 @@ from fidsplat.backends.base import Measurable
 from fidsplat.cli import main
 from fidsplat.experiments.bench import catalogue, measure
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, BenchScene, scene_names
-from fidsplat.experiments.bench.overdraw import overdraw
+from fidsplat.experiments.bench.measure import overdraw
 from fidsplat.random_clouds import random_cloud, standard_camera
 from fidsplat.timing import WARM_UP, Timer
 

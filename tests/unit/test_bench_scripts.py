@@ -1,31 +1,16 @@
 """The measuring scripts: tables from figures, and a growth run that goes on where it was."""
 
-import importlib.util
 import json
-import sys
 from pathlib import Path
 
+import growth
+import performance_tables as tables
 import pytest
+from growth import Point
 
-from fidsplat.experiments.bench.growth import Point
+from fidsplat.experiments.sweep import read_records
 
-FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
-
-
-sys.path.append(str(FOLDER))  # scripts import what they share
-
-
-def script(name: str):
-    spec = importlib.util.spec_from_file_location(f"benchmarks_{name}", FOLDER / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-tables, growth = script("performance_tables"), script("growth")
-
+PAGES = Path(__file__).resolve().parents[2] / "docs"
 RECORD = {
     "scene": "tag",
     "renderer": "fidsplat",
@@ -93,7 +78,8 @@ def files(tmp_path):
         times | {"x": x, "fastest_ms": x**0.5, "fastest_stages_ms": {"blend": x}}
         for x in (10.0, 100.0, 1000.0)
     ]
-    (tmp_path / "growth.jsonl").write_text("".join(json.dumps(record) + "\n" for record in curve))
+    lines = [{"run": {}}, *({"key": {"x": record["x"]}, "result": record} for record in curve)]
+    (tmp_path / "growth.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     return sorted(tmp_path.iterdir())
 
 
@@ -128,7 +114,7 @@ def test_a_table_replaces_what_stands_between_its_marks():
 
 
 def test_one_page_has_a_place_for_each_table():
-    pages = [page.read_text("utf-8") for page in (FOLDER.parent / "docs").glob("*.md")]
+    pages = [page.read_text("utf-8") for page in PAGES.glob("*.md")]
     for name in tables.TABLES:
         assert sum(page != tables.insert(page, name, "new") for page in pages) == 1, name
 
@@ -144,7 +130,7 @@ def test_growth_goes_on_where_it_was(tmp_path, capsys):
     assert [record["x"] for record in again] == [20, 40, 80]
     assert again[:2] == first  # not measured again
     assert file.read_text().startswith(lines)
-    assert growth.read(file) == again
+    assert [record.result for record in read_records(file)] == again
     (thick,) = growth.run(
         {"overdraw": [Point("overdraw", 2, 400, 1.0, 64, 48)]}, "opencl", 1, 60.0, tmp_path / "o"
     )

@@ -1,4 +1,4 @@
-"""`fs.quality_within`: what it promises is kept, on scenes that its table has never seen."""
+"""`fs.quality_within`: what it promises is kept, on scenes that its price list has never seen."""
 
 import dataclasses
 import json
@@ -6,12 +6,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from random_scenes import HELD_OUT, random_scene
 
 import fidsplat as fs
 from fidsplat.accuracy import errors, truth
-from fidsplat.budget import calibrate, choose, search, store, table
+from fidsplat.budget import choose, prices, search, store
 from fidsplat.errors import InputError
-from fidsplat.random_clouds import HELD_OUT, random_scene
 from fidsplat.timing import Clock, Timer
 
 BACKEND = "opencl"
@@ -33,7 +33,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def held_out(reference):
-    """Scenes that no table is made of, with their truths."""
+    """Scenes that no price list is made of, with their truths."""
     scenes = [random_scene(HELD_OUT + k) for k in range(HELD_OUT_SCENES)]
     return [(s, truth(reference, s.cloud, fs.Capture(s.camera, background=s.background))) for s in scenes]
 
@@ -48,19 +48,19 @@ def within(renderer, scene, error=None, ms=None, **more):
     return choose(error, ms, scene.cloud, capture, renderer)
 
 
-# the table
+# the price list
 
 
-def test_the_table_is_a_ladder():
-    settings = table.load("cpu")
-    assert [s.cost for s in settings] == sorted(s.cost for s in settings)
-    assert all(0 < s.easy <= s.median <= s.most for s in settings)
-    assert all(isinstance(s.of(fs.Quality()), fs.Quality) for s in settings)
-    assert table.load("a kind that nobody measured") == settings
+def test_the_price_list_is_a_ladder():
+    candidates = prices.load("cpu")
+    assert [s.cost for s in candidates] == sorted(s.cost for s in candidates)
+    assert all(0 < s.easy <= s.median <= s.most for s in candidates)
+    assert all(isinstance(s.of(fs.Quality()), fs.Quality) for s in candidates)
+    assert prices.load("a kind that nobody measured") == candidates
 
 
 @pytest.mark.parametrize("error", BOUNDS)
-def test_the_table_keeps_its_promise(renderer, held_out, error):
+def test_the_price_list_keeps_its_promise(renderer, held_out, error):
     """The long form, 200 scenes, is benchmarks/budget_promise.py; docs/budget.md has what it gave."""
     quality = fs.quality_within(error=error, device=renderer)
     found = [error_of(renderer, scene, quality, want) for scene, want in held_out]
@@ -68,7 +68,7 @@ def test_the_table_keeps_its_promise(renderer, held_out, error):
 
 
 def test_less_error_is_never_cheaper(renderer):
-    cost = {json.dumps(s.knobs): s.cost for s in table.load(renderer.device.kind)}
+    cost = {json.dumps(s.knobs): s.cost for s in prices.load(renderer.device.kind)}
     chosen = [choose(error, device=renderer) for error in (0.3, *BOUNDS)]
     costs = [cost[json.dumps(choice.knobs)] for choice in chosen]
     assert costs == sorted(costs)
@@ -78,9 +78,9 @@ def test_less_error_is_never_cheaper(renderer):
 def test_the_definition_stays():
     base = fs.Quality(lowpass="pixel", samples=3, coplanar="order", first_hit=0.3)
     kept = ("lowpass", "samples", "coplanar", "first_hit", "marker")
-    for setting in table.load("cpu"):
-        assert all(getattr(setting.of(base), name) == getattr(base, name) for name in kept)
-        parity = setting.of(fs.Quality.named("gsplat"))
+    for candidate in prices.load("cpu"):
+        assert all(getattr(candidate.of(base), name) == getattr(base, name) for name in kept)
+        parity = candidate.of(fs.Quality.named("gsplat"))
         assert (parity.opacity_ceiling, parity.stop_rule, parity.coplanar) == (1.0, "inclusive", "order")
 
 
@@ -102,16 +102,16 @@ def test_what_the_truth_may_be_off_is_added(renderer, held_out, monkeypatch):
     capture = fs.Capture(scene.camera, background=scene.background)
 
     def measured():
-        return calibrate.Calibration(renderer, scene.cloud, capture, lambda text: None).error(fs.Quality())
+        return search.Calibration(renderer, scene.cloud, capture, lambda text: None).error(fs.Quality())
 
-    monkeypatch.setattr(calibrate, "error_bound", lambda *_: 0.0)
+    monkeypatch.setattr(search, "error_bound", lambda *_: 0.0)
     plain = measured()
-    monkeypatch.setattr(calibrate, "error_bound", lambda *_: 0.25)
+    monkeypatch.setattr(search, "error_bound", lambda *_: 0.25)
     assert measured() == plain + 0.25
 
 
-def test_measuring_finds_what_is_cheaper_than_the_table(renderer, held_out):
-    """Most scenes need less than the worst of the table does."""
+def test_measuring_finds_what_is_cheaper_than_the_price_list(renderer, held_out):
+    """Most scenes need less than the worst of the list does."""
     cutoff = fs.quality_within(error=1e-3, device=renderer).alpha_cutoff
     own = [within(renderer, scene, 1e-3).quality.alpha_cutoff for scene, _ in held_out[:6]]
     assert np.median(own) > cutoff
@@ -121,7 +121,7 @@ def test_the_answer_is_kept_and_a_broken_file_is_made_anew(renderer, scene, monk
     first = within(renderer, scene, 1e-3)
     (file,) = store.folder().iterdir()
     with monkeypatch.context() as patch:
-        patch.setattr(calibrate.Calibration, "error", lambda *_: pytest.fail("it was measured again"))
+        patch.setattr(search.Calibration, "error", lambda *_: pytest.fail("it was measured again"))
         again = within(renderer, scene, 1e-3)
     assert dataclasses.replace(again, source="measured") == first
     for broken in (b"", b"{", b"[1]", b'{"knobs": {"alpha_cutoff": 7}, "error": 0, "ms": 0, "ms_late": 0}'):
@@ -179,7 +179,7 @@ def test_a_device_without_a_knob(renderer, held_out, monkeypatch):
         within(renderer, scene, 1e-12)
 
 
-# times: a clock that knows what each setting costs, so that nothing hangs on how busy the machine is
+# times: a clock that knows what each candidate costs, so that nothing hangs on how busy the machine is
 
 
 @pytest.fixture
@@ -194,12 +194,12 @@ def clock(monkeypatch):
 
         return Timer(frame, clock)
 
-    monkeypatch.setattr(calibrate.Calibration, "timer", timer)
+    monkeypatch.setattr(search.Calibration, "timer", timer)
 
 
 def test_the_most_accurate_in_time(renderer, scene, clock):
     choice = within(renderer, scene, ms=31)
-    cutoffs = {s.of(fs.Quality()).alpha_cutoff for s in table.load(renderer.device.kind)}
+    cutoffs = {s.of(fs.Quality()).alpha_cutoff for s in prices.load(renderer.device.kind)}
     assert choice.quality.alpha_cutoff == min(cutoff for cutoff in cutoffs if -10 * np.log10(cutoff) <= 31)
     assert (choice.ms, choice.ms_late) == pytest.approx((-10 * np.log10(choice.quality.alpha_cutoff),) * 2)
     assert within(renderer, scene, ms=45).error < choice.error
@@ -213,7 +213,7 @@ def test_error_and_time_together(renderer, scene, clock):
 
 
 def test_a_time_is_kept_by_nine_frames_of_ten():
-    """A setting whose median frame is in time and whose late ones are not is not taken."""
+    """A candidate whose median frame is in time and whose late ones are not is not taken."""
     late = {1e-2: 2.0, 1e-4: 9.0}
 
     class Known:
@@ -226,11 +226,11 @@ def test_a_time_is_kept_by_nine_frames_of_ten():
             return 1.0
 
         def times(self, qualities, repeats=9):
-            return [calibrate.Times(1.0, late[quality.alpha_cutoff]) for quality in qualities]
+            return [search.Times(1.0, late[quality.alpha_cutoff]) for quality in qualities]
 
-    settings = tuple(table.Setting({"alpha_cutoff": cutoff}, 0, 0, 0, 1.0) for cutoff in late)
-    assert search.Search(Known(), settings).most_accurate_in(5.0).error == 1e-2
-    assert search.Search(Known(), settings).most_accurate_in(10.0).error == 1e-4
+    candidates = tuple(prices.Candidate({"alpha_cutoff": cutoff}, 0, 0, 0, 1.0) for cutoff in late)
+    assert search.Search(Known(), candidates).most_accurate_in(5.0).error == 1e-2
+    assert search.Search(Known(), candidates).most_accurate_in(10.0).error == 1e-4
 
 
 @pytest.mark.parametrize("ms", [0, -3, 1e-6])

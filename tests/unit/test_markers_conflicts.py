@@ -67,6 +67,25 @@ def test_a_path_of_200_000_vertices():
     assert sys.getrecursionlimit() == limit
 
 
+def test_long_alternating_paths_are_followed_to_their_end():
+    """A path with one more left vertex: the largest set is the left ones, whichever of them is unmatched."""
+    n = 5000
+    left, right = path(n)
+    keep_left, keep_right = maximum_independent_set(n + 1, n, np.append(left, n), np.append(right, n - 1))
+    assert keep_left.all()
+    assert not keep_right.any()
+
+
+def test_trees_need_no_search(monkeypatch):
+    """Random forests and stars are matched from their leaves, thousands at once."""
+    monkeypatch.setattr("fidsplat.markers.conflicts._hopcroft_karp", None)
+    n = 3000
+    right = np.arange(n) // 3  # stars of three
+    keep_left, keep_right = maximum_independent_set(n, n, np.arange(n), right)
+    assert keep_left.all()
+    assert keep_right.sum() == n - n // 3
+
+
 def test_threads_leave_the_limit_alone():
     limit = sys.getrecursionlimit()
     with ThreadPoolExecutor(4) as pool:

@@ -161,7 +161,14 @@ def test_circles():
         ('<path d="M0 0 # 5"/>', "'#' in a path"),
         ('<rect width="wide" height="5"/>', "<rect> cannot be read"),
         ('<path d="M0 0H1e300V5"/>', "too far"),
+        ('<path d="M1 1h5 1e400 5C1 2 3 4 5 6"/>', "too far"),
         ('<circle r="nan"/>', "too far"),
+        ('<g transform="rotate(1e400)"/>', "a number beyond 1e+09"),
+        (
+            5 * '<g transform="scale(1e9)">' + 40 * "<g>" + '<rect width="9" height="9"/>' + 45 * "</g>",
+            "too far",
+        ),
+        ('<rect width="5" height="5" fill="rgb(%s,0,0)"/>' % ("9" * 5000), "no plain colour"),
         ('<rect width="5" height="5" opacity="50%"/>', "translucent"),
         ("<g>" * 200 + "</g>" * 200, "deeper than 100"),
     ],
@@ -181,6 +188,7 @@ def test_files_that_are_no_drawings(tmp_path):
         ("<svg/>", "no viewBox"),
         ('<svg viewBox="0 0 0 5"/>', "above 0"),
         ('<svg viewBox="0 0 1 100000"/>', "rows of modules"),
+        ('<svg viewBox="0 0 1e-300 1e300"/>', "above 0"),
     ):
         file.write_text(text)
         with pytest.raises(fs.InputError, match=says):

@@ -7,6 +7,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from holes import count_holes
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -19,7 +20,7 @@ from fidsplat.markers.partition import (
     least_rectangles,
     partition,
 )
-from fidsplat.markers.regions import count_holes, label_components
+from fidsplat.markers.regions import label_components
 from fidsplat.vision.dictionaries import dictionary_bits
 
 SMALL = arrays(np.uint8, st.tuples(st.integers(1, 8), st.integers(1, 8)), elements=st.integers(0, 1))
@@ -88,7 +89,7 @@ def check_formula(grid: np.ndarray, boxes: np.ndarray) -> None:
     """Per component: rectangles = concave vertices - independent chords - holes + 1, counted from scratch."""
     labels, count = label_components(grid)
     found = np.bincount(labels[boxes[:, 1], boxes[:, 0]], minlength=count)
-    holes = count_holes(grid, labels, count)
+    holes = count_holes(labels, count)
     order = np.argsort(labels.ravel(), kind="stable")
     parts = np.split(order, np.searchsorted(labels.ravel()[order], np.arange(1, count)))
     for i, part in enumerate(parts):

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 import shapely
+from holes import count_holes
 
-from fidsplat.markers.regions import count_holes, label_components, polygons
+from fidsplat.markers.regions import label_components, polygons
 
 FOUR = ((0, 1), (1, 0), (0, -1), (-1, 0))
 EIGHT = (*FOUR, (1, 1), (1, -1), (-1, 1), (-1, -1))
@@ -52,7 +53,7 @@ def test_components_holes_and_polygons(grid):
     labels, count = label_components(grid)
     parts = sorted(flood(grid == 0, FOUR) + flood(grid == 1, FOUR), key=min)
     assert count == len(parts)
-    number = count_holes(grid, labels, count)
+    number = count_holes(labels, count)
     shapes = polygons(grid, labels, count)
     assert len(shapes) == count
     for i, part in enumerate(parts):  # raster order of the first cell

@@ -46,7 +46,7 @@ class Backend:
         return Cloud(cloud)
 
     def unsupported(self, features):
-        lacking = {*features.taps, *features.posts, *features.slots[8:]} - {"alpha"}
+        lacking = {*features.outputs, *features.posts, *features.slots[8:]} - {"alpha"}
         return f"toy has no {', '.join(sorted(lacking))}" if lacking else ""
 
     def pipeline(self, features):
@@ -63,7 +63,7 @@ class Pipeline:
         return Images(view, resident.count)
 
     def trace(self, resident, view):
-        return {name: self.render(resident, view).read(name) for name in ("rgb", *self.features.taps)}
+        return {name: self.render(resident, view).read(name) for name in ("rgb", *self.features.outputs)}
 
 
 class Images:

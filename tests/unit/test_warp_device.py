@@ -283,7 +283,8 @@ def test_warp_pipelines_share_kernels_that_mean_the_same():
     backend = warp_device.open_device("cpu")
     slots = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "compose_ordered")
     one, two = (
-        backend.pipeline(FeatureSet(slots, taps, 0, n, "float64")) for taps, n in (((), 1), (("alpha",), 2))
+        backend.pipeline(FeatureSet(slots, outputs, 0, n, "float64"))
+        for outputs, n in (((), 1), (("alpha",), 2))
     )
     assert one.program.project is two.program.project
     assert one.program.blend is two.program.blend

@@ -92,14 +92,14 @@ def beside(tmp_path, monkeypatch):
     return put
 
 
-def drawn(taps, posts):
+def drawn(outputs, posts):
     """rgb and these outputs."""
     backend = fs.Renderer("warp:cpu").backend
     cloud = two_splats()
-    pipeline = backend.pipeline(FeatureSet(SLOTS, taps, 0, 1, "float64", posts))
+    pipeline = backend.pipeline(FeatureSet(SLOTS, outputs, 0, 1, "float64", posts))
     view = View.of(fs.Capture(CAMERA), cloud.origin)
     images = pipeline.render(backend.upload(cloud), view)
-    return {name: images.read(name) for name in ("rgb", *taps)}
+    return {name: images.read(name) for name in ("rgb", *outputs)}
 
 
 def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch, tmp_path):

@@ -59,10 +59,10 @@ class Source:
 def layouts_of(features: FeatureSet) -> dict[str, Layout]:
     """The layouts of all effects, in the order in which their text is put together: those of which there is
     one of each kind, parts, outputs, what changes rgb."""
-    chosen = (*features.slots, *features.taps, *features.posts)
+    chosen = (*features.slots, *features.outputs, *features.posts)
     parts = _parts_of(chosen)
-    taps = [name for name in features.taps if name not in parts]
-    return {name: LAYOUTS[name] for name in (*features.slots, *sorted(parts), *taps, *features.posts)}
+    outputs = [name for name in features.outputs if name not in parts]
+    return {name: LAYOUTS[name] for name in (*features.slots, *sorted(parts), *outputs, *features.posts)}
 
 
 def _parts_of(names: Iterable[str]) -> set[str]:
@@ -139,7 +139,7 @@ class _Declarations:
         real = "double" if features.setup_precision == "float64" else "float"
         self.scalars = Scalars(real, "double" if "blend_double" in layouts else "float")
         self.samples = tuple((one, layout.averaged) for layout in layouts.values() for one in layout.samples)
-        self._layouts, self._outputs = layouts, features.outputs
+        self._layouts, self._outputs = layouts, features.images
         every = layouts.values()
         self._structs: dict[str, Record] = {
             "View": VIEW.with_members(one for layout in every for one in layout.view),

@@ -135,7 +135,7 @@ def takes(*declared: str | tuple[Argument, ...]) -> tuple[Argument, ...]:
 
     A line is a type, names that have it, and a remark behind `//`. Alone it declares numbers that the stage
     gives (`int width height`); behind `in` buffers of the stage that the kernel reads (`in float raw  // 4
-    planes`), behind `out` those that it changes, behind `cloud` arrays with a row for each splat, behind
+    channels`), behind `out` those that it changes, behind `cloud` arrays with a row for each splat, behind
     `array` those that the view has on the host and that are copied to the device for the picture.
     """
     found: list[Argument] = []
@@ -163,11 +163,11 @@ def uniforms(group: str, *declarations: str, note: str = "") -> tuple[Argument, 
 
 @dataclass(frozen=True)
 class Samples:
-    """Planes of samples that pass from blending to resolving for an effect: one buffer."""
+    """A sample buffer: channels, one after the other, that pass from blending to resolving for an effect."""
 
     ctype: str
     name: str
-    planes: int = 1
+    channels: int = 1
     note: str = ""
 
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.base import DeviceInfo, Rates
 from fidsplat.backends.opencl import pocl_cache, pocl_target
-from fidsplat.backends.opencl.arithmetic import run_arithmetic
 from fidsplat.backends.opencl.assemble import Source, assemble
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.probe import OpenCLProbe
@@ -119,7 +117,7 @@ class OpenCLBackend(Workspace):
 
     @property
     def memory_bytes(self) -> int:
-        """Device memory that scratch buffers hold, and finished planes that nobody has any more."""
+        """Device memory that scratch buffers hold, and finished images that nobody has any more."""
         return self.pool.memory_bytes
 
     def release_scratch(self) -> None:
@@ -129,12 +127,6 @@ class OpenCLBackend(Workspace):
     def rates(self) -> Rates:
         """What the device can do at best; measured anew at each call."""
         return measure_rates(self)
-
-    def run_arithmetic(
-        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
-    ) -> dict[str, np.ndarray]:
-        """As `ProbesArithmetic` (fidsplat/backends/base.py)."""
-        return run_arithmetic(self, exponents, shares, above, below)
 
     def probe(self) -> OpenCLProbe:
         """What tests look into the device with."""

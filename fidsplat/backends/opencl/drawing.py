@@ -18,7 +18,7 @@ from fidsplat.effects.catalogue import Output
 
 Images = dict[str, tuple[Output, cl.Buffer]]
 _RAW = ("raw", 4, True)
-"""what every picture blends: name, planes of samples, whether it is light"""
+"""the sample buffer of every picture: name, channels, whether it is light"""
 
 
 def draw(start: Callable[[View], Picture], view: View, outputs: tuple[Output, ...]) -> tuple[Picture, Images]:
@@ -44,8 +44,8 @@ def _room_for(outputs: tuple[Output, ...], picture: Picture) -> Images:
 
 
 def _buffers_of(picture: Picture) -> list[tuple[str, int, bool]]:
-    """Of each buffer of samples the name, its planes, and whether it is light."""
-    return [_RAW, *((one.name, one.planes, averaged) for one, averaged in picture.program.source.samples)]
+    """Of each sample buffer the name, its channels, and whether it is light."""
+    return [_RAW, *((one.name, one.channels, averaged) for one, averaged in picture.program.source.samples)]
 
 
 def _blended(picture: Picture) -> Iterator[None]:
@@ -55,8 +55,8 @@ def _blended(picture: Picture) -> Iterator[None]:
     way while the host waits, and what comes last counts.
     """
     view, shape = picture.view, picture.shape
-    for name, planes, _ in _buffers_of(picture):
-        picture.take(name, 4 * picture.rows * picture.stride * planes)
+    for name, channels, _ in _buffers_of(picture):
+        picture.take(name, 4 * picture.rows * picture.stride * channels)
     constants = {
         **{"log_cut": view.log_cut, "ceiling": view.ceiling, "stop": view.stop},
         "filter": 1.0 / view.samples**2,
@@ -84,9 +84,9 @@ def _resolve(picture: Picture) -> None:
 def _expose(start: Callable[[View], Picture], picture: Picture) -> None:
     """Blends the shots of a picture of several poses one after another, and gathers their samples."""
     plane, arguments = picture.rows * picture.stride, picture.program.source.arguments
-    for name, planes, _ in _buffers_of(picture):
+    for name, channels, _ in _buffers_of(picture):
         # names of scratch buffers that no shot's own have
-        picture.held[name] = picture.pool.scratch(f"exposed {name}", 4 * plane * planes)
+        picture.held[name] = picture.pool.scratch(f"exposed {name}", 4 * plane * channels)
     counts = {"splats": picture.resident.count, "visible": 0, "pairs": 0}
     # what is around is the same for all shots
     around = {
@@ -115,10 +115,10 @@ def _gather(picture: Picture, own: Picture, shot: Shot) -> None:
     whole = {"whole_stride": picture.stride, "whole_plane": picture.rows * picture.stride, "top": shot.top}
     whole |= {"stride": own.stride, "plane": own.rows * own.stride}
     size = shot.view.width, shot.view.height
-    for name, planes, averaged in _buffers_of(picture):
+    for name, channels, averaged in _buffers_of(picture):
         if not (averaged or shot.middle):
             continue
-        given = whole | {"planes": planes, "raw": own.held[name], "exposed": picture.held[name]}
+        given = whole | {"planes": channels, "raw": own.held[name], "exposed": picture.held[name]}
         if averaged:
             given |= {"weight": shot.weight, "first": shot.first}
         picture.launch_grid("expose", "expose" if averaged else "expose_middle", *size, **given)

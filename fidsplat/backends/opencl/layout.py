@@ -2,8 +2,8 @@
 them.
 
 The C structs and signatures of kernels/opencl/ are printed from this (assemble.py), and the host binds
-arguments by these names (program.py). Buffers are of planes: (k, rows, columns) of the padded grid of
-samples, unless they say otherwise.
+arguments by these names (program.py). Buffers are (channels, rows, columns) of the padded grid of samples,
+unless they say otherwise.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ _WALK = takes("in uint order tallies", "in uint2 windows", _BIG, _SIZE, "out uin
 _EXPOSED = takes(
     _SIZE,
     "int stride  // samples per row of a shot",
-    "uint plane  // samples per plane of a shot",
+    "uint plane  // samples per channel of a shot",
     *("int whole_stride", "uint whole_plane", "int top planes"),
 )
 _RAY = uniforms(
@@ -120,7 +120,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("in Splat splats", "in uint lists starts"),
         "uint band_first  // the first tile of this launch; lists begin with its list",
         *(_SIZE, "wide log_cut ceiling stop filter"),
-        "out float raw  // 4 planes: r, g, b, transmittance",
+        "out float raw  // 4 channels: r, g, b, transmittance",
     ),
     "expose": takes(_EXPOSED, "float weight", "int first", "in float raw", "out float exposed"),
     "expose_middle": takes(_EXPOSED, "in uint raw", "out uint exposed"),
@@ -136,13 +136,13 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "resolve": takes(
         "int width height  // of the picture",
         "int stride  // samples per row of raw",
-        "uint plane  // samples per plane of raw",
+        "uint plane  // samples per channel of raw",
         *("float background_r background_g background_b", "in float raw"),
     ),
 }
 """The arguments of each kernel; those of effects and outputs follow them."""
 
-_RAYS = takes("in float rays  // 3 planes X, Y, Z; NaN where nothing is seen")
+_RAYS = takes("in float rays  // 3 channels X, Y, Z; NaN where nothing is seen")
 _OWN_RAYS = ("camera_brown_conrady", "camera_fisheye", "camera_equirectangular")
 
 LAYOUTS: dict[str, Layout] = {
@@ -275,7 +275,7 @@ LAYOUTS: dict[str, Layout] = {
         "part/rays_box.cl",
         parts=("box_cover",),
         project=takes("in float ray_step  // (1) how far a ray turns from a sample to the next, at most"),
-        blend=takes("in float ray_slopes  // 6 planes dX/dx, dY/dx, dZ/dx, dX/dy, dY/dy, dZ/dy"),
+        blend=takes("in float ray_slopes  // 6 channels dX/dx, dY/dx, dZ/dx, dX/dy, dY/dy, dZ/dy"),
     ),
     "ray_depth": Layout(
         "part/ray_depth.cl",

@@ -47,7 +47,7 @@ def plan_of(
     Args:
         record_bytes: of a splat's record.
         upload_bytes: per splat, where the cloud itself does not stay on the device; else 0.
-        fixed_bytes: sample planes, outputs, tables, and the cloud if it stays.
+        fixed_bytes: sample buffers, outputs, tables, and the cloud if it stays.
         budget: bytes that everything may take together. largest: bytes that one buffer may take.
 
     Raises:

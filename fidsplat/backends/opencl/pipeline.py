@@ -113,7 +113,7 @@ class OpenCLPipeline:
         def start(view: View) -> Picture:
             return Picture(self.workspace, self.program, self.shape, resident, view, plan)
 
-        return draw(start, view, self.features.outputs)
+        return draw(start, view, self.features.images)
 
     def _plan(self, resident: Resident, view: View) -> MemoryPlan:
         shape, source = self.shape, self.source
@@ -122,12 +122,12 @@ class OpenCLPipeline:
         stays, upload = resident.bytes_for(self._cloud_arrays)
         fixed = stays + SMALL + table_bytes(shape.lists, tiles, shape.chunks, shape.radix_bits)
         fixed += BIG * (4 + source.records["Bounds"].itemsize)
-        planes = 4 + sum(one.planes for one, _ in source.samples)
+        channels = 4 + sum(one.channels for one, _ in source.samples)
         if view.shots:
-            planes *= 2  # the picture's own beside those of a shot
-        fixed += 4 * tiles * shape.tile_width * shape.tile_height * planes  # whole tiles
+            channels *= 2  # the picture's own beside those of a shot
+        fixed += 4 * tiles * shape.tile_width * shape.tile_height * channels  # whole tiles
         pixels = view.width * view.height // view.samples**2
-        fixed += 4 * pixels * sum(output.channels for output in self.features.outputs)
+        fixed += 4 * pixels * sum(output.channels for output in self.features.images)
         fixed += sum(view.array(name).nbytes for name in self._view_arrays)
         if view.raster is not None:
             rasters = {view.raster, *(shot.view.raster for shot in view.shots if shot.view.raster)}
@@ -152,5 +152,5 @@ class OpenCLPipeline:
             "lists": picture.read("lists", np.uint32, (made.stats["pairs"],)),
             "records": picture.read("splats", self.source.records["Splat"], (resident.count,)),
             "raw": picture.read("raw", np.float32, (4, picture.rows, picture.stride)),
-            **{output.name: made.read(output.name) for output in self.features.outputs},
+            **{output.name: made.read(output.name) for output in self.features.images},
         }

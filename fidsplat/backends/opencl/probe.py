@@ -6,13 +6,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
 
+from fidsplat.backends.opencl.assemble import section_text
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.program import build_options, check_kernels
 from fidsplat.backends.opencl.workspace import BufferPool, Workspace
+from fidsplat.errors import DeviceError
 
 
 def evaluate(
@@ -110,6 +113,37 @@ class OpenCLProbe:
     def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
         """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
         return evaluate(self._workspace, NOT_A_NUMBER, (x,), (np.int32,) * 4)
+
+    def arithmetic(
+        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Kernels of check/arithmetic.cl."""
+        workspace, n = self._workspace, len(exponents)
+        fast = section_text("slot/arithmetic_fast.cl", "arithmetic")
+        kernels = check_kernels(workspace, "check/arithmetic.cl", arithmetic=fast)
+
+        def run(kernel: str, items: int, made: np.ndarray, *given: Any) -> np.ndarray:
+            values = [buffer_of(workspace, one) if isinstance(one, np.ndarray) else one for one in given]
+            out = buffer_of(workspace, made)
+            kernels[kernel](workspace.queue, (items,), None, *values, out)
+            cl.enqueue_copy(workspace.queue, made, out)
+            return made
+
+        single = [array.astype(np.float32) for array in (exponents, shares, above, below)]
+        names = ("exp", "log", "division", "sqrt", "fma", "fast_exp", "fast_log")
+        made, count, items = np.empty((7, n), np.float32), np.uint32(n), n // workspace.shape.lanes
+        try:
+            planes = run("arithmetic_float", items, made, count, *single)
+            results: dict[str, np.ndarray] = dict(zip(names, planes, strict=True))
+            if workspace.info.float64:
+                planes = run("arithmetic_real", n, np.empty((3, n)), count, above, below)
+                results |= dict(zip(("division64", "sqrt64", "log64"), planes, strict=True))
+            smallest = np.array([np.finfo(np.float32).tiny, 0.5], np.float32)
+            results["denormal"] = run("arithmetic_denormal", 1, np.empty(2, np.float32), smallest)
+        except cl.Error as error:
+            title = workspace.info.title
+            raise DeviceError(f"{title} failed in a test of its arithmetic: {error}") from error
+        return results
 
     def options(self) -> list[str]:
         """What every program is compiled with."""

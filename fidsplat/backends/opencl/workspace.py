@@ -46,7 +46,7 @@ class BufferPool:
 
     def lease(self, name: str, size: int) -> cl.Buffer:
         """A buffer for somebody who gives it back (`give_back`) when it is not needed any more."""
-        # taken before it is looked at: planes that die meanwhile may give back others
+        # taken before it is looked at: images that die meanwhile may give back others
         spare = self._spare.get(name, [])
         while spare:
             buffer = spare.pop()

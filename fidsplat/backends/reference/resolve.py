@@ -15,7 +15,7 @@ _ROUND = 1e-6  # relative, of a sum of weights
 
 
 def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) -> dict[str, np.ndarray]:
-    """Planes of pixels (k, ...) from their samples (k, n * n, ...), and their certificates.
+    """Images of pixels (k, ...) from their samples (k, n * n, ...), and their certificates.
 
     `certificate`: colour per unit of colour, and alpha; `certificate_depth`, `certificate_distance` metres;
     `certificate_normal` difference of unit vectors; `depth_median_may_flip`, `label_may_flip` and so on bool;

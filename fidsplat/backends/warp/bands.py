@@ -8,10 +8,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from fidsplat.backends.view import View
-from fidsplat.backends.warp import lens, surroundings
 from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import load
+from fidsplat.backends.warp.structs import memory_bytes
 from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.errors import DeviceError
 
@@ -39,7 +39,7 @@ def room(
     # as the stages take them; the sorts have as much again
     each = 16 * program.layout.lines + _BOUNDS + _PROJECTED
     fixed = resident.memory_bytes + each * resident.count + _VISIBLE * visible + images
-    fixed += lens.memory_bytes(view, workspace) + surroundings.memory_bytes(view)
+    fixed += memory_bytes(view, workspace)
     pairs = (workspace.memory_budget - fixed) // _PAIR
     if pairs < 1:
         raise DeviceError(

@@ -10,7 +10,6 @@ import numpy as np
 
 from fidsplat.backends.base import DeviceInfo
 from fidsplat.backends.warp import runtime
-from fidsplat.backends.warp.arithmetic import run_arithmetic
 from fidsplat.backends.warp.launch import Commands
 from fidsplat.backends.warp.pipeline import WarpPipeline
 from fidsplat.backends.warp.probe import WarpProbe
@@ -96,12 +95,6 @@ class WarpBackend(Workspace):
             program = Program(self.device, self.info.name, *key)
             self._pipelines[key] = WarpPipeline(program, self, self._commands)
         return self._pipelines[key]
-
-    def run_arithmetic(
-        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
-    ) -> dict[str, np.ndarray]:
-        """As `ProbesArithmetic` (fidsplat/backends/base.py)."""
-        return run_arithmetic(self, exponents, shares, above, below)
 
     def probe(self) -> WarpProbe:
         """What tests look into the device with."""

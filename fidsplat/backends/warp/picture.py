@@ -7,22 +7,49 @@ bands of tiles, with the same bits.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
-from fidsplat.backends.view import View
+import numpy as np
+
+from fidsplat.backends.view import Shot, View
 from fidsplat.backends.warp import bands
-from fidsplat.backends.warp.exposure import gather
-from fidsplat.backends.warp.images import WarpImages
 from fidsplat.backends.warp.launch import BLOCK, Launcher
-from fidsplat.backends.warp.lens import lens_of, rays_of
-from fidsplat.backends.warp.motion import moving_of
 from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import kernels, load
-from fidsplat.backends.warp.surroundings import surroundings_of
-from fidsplat.backends.warp.uniforms import uniforms
+from fidsplat.backends.warp.structs import lens_of, moving_of, rays_of, surroundings_of, uniforms
 from fidsplat.backends.warp.workspace import Workspace
+from fidsplat.effects import Output
+
+
+class WarpImages:
+    """The output images of one picture, on the device until asked for."""
+
+    def __init__(
+        self,
+        images: dict[str, tuple[Output, Any]],
+        size: tuple[int, int],
+        launcher: Launcher,
+        stats: dict[str, int],
+    ) -> None:
+        self._images, self._size, self._launcher = images, size, launcher
+        self.stats: Mapping[str, int] = stats
+
+    def device_array(self, name: str) -> Any:
+        """The image as a wp.array (h, w) or (h, w, 3) on the device; no copy."""
+        output, array = self._images[name]
+        return array.reshape(self._size if output.channels == 1 else (*self._size, output.channels))
+
+    def read(self, name: str) -> np.ndarray:
+        """The image as a NumPy array of its own."""
+        # a CPU array's numpy() is its own memory, which device_array gives away
+        return np.array(self.device_array(name).numpy())
+
+    @property
+    def timings(self) -> dict[str, float]:
+        """Milliseconds on the device by stage, in the order in which they ran."""
+        return self._launcher.timings()
 
 
 class Picture:
@@ -63,9 +90,22 @@ class Picture:
             part = Picture(self.program, self.workspace, self.resident, shot.view, self.launcher, beside)
             samples = part._drawn()
             self.launcher.stage("expose")
-            gather(self.program, self.launcher, shot, samples, whole, self.grid[1])
+            self._gather(shot, samples, whole)
             self.stats = {name: max(value, part.stats[name]) for name, value in self.stats.items()}
         return whole
+
+    def _gather(self, shot: Shot, samples: Any, whole: Any) -> None:
+        """Adds a shot's samples to the picture's: light is averaged, other buffers are those of one pose."""
+        start, count = shot.top * self.grid[1], shot.view.height * self.grid[1]
+        for name in self.program.sample_fields:
+            mine, every = getattr(samples, name), getattr(whole, name)
+            if name in self.program.expose:
+                given = {"weight": shot.weight, "fresh": int(shot.first), "start": start}
+                self.launcher.launch(
+                    self.program.expose[name], count, {**given, "raw": mine, "exposed": every}
+                )
+            elif shot.middle:
+                self.wp.copy(every, mine, dest_offset=start, count=count)
 
     def _drawn(self) -> Any:
         """All stages but the last; sample buffers."""
@@ -107,7 +147,7 @@ class Picture:
         counts, ends = self._exact("counts", n, wp.int64), self._exact("ends_by_index", n, wp.int64)
         drawn, places = self._exact("drawn", n, wp.int32), self._exact("places", n, wp.int32)
         cloud = {"boxes": drawn} | self.resident.arrays  # not read where all are of one kind
-        cloud |= {"moving": moving_of(self.resident, self.view, self.pool)} | self._planes()
+        cloud |= {"moving": moving_of(self.resident, self.view, self.workspace)} | self._planes()
         self._launch(self.program.project, n, block=self.program.project_block, **cloud)
         wp.utils.array_scan(drawn, places, inclusive=True)
         wp.utils.array_scan(counts, ends, inclusive=True)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from fidsplat.backends.view import View
-from fidsplat.backends.warp.images import WarpImages
 from fidsplat.backends.warp.launch import Commands, Launcher
-from fidsplat.backends.warp.picture import Picture
+from fidsplat.backends.warp.picture import Picture, WarpImages
 from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import load

@@ -34,6 +34,21 @@ class WarpProbe:
         (found,) = run(self._workspace, "not_a_number", len(x), (x,), [np.zeros((4, len(x)), np.int32)])
         return list(found)
 
+    def arithmetic(
+        self, exponents: np.ndarray, shares: np.ndarray, above: np.ndarray, below: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Kernels of check.py."""
+        workspace, n = self._workspace, len(exponents)
+        single = [array.astype(np.float32) for array in (exponents, shares, above, below)]
+        (found,) = run(workspace, "arithmetic", n, single, [np.zeros((7, n), np.float32)])
+        names = ("exp", "log", "division", "sqrt", "fma", "fast_exp", "fast_log")
+        results: dict[str, np.ndarray] = dict(zip(names, found, strict=True))
+        (found,) = run(workspace, "arithmetic_wide", n, [above, below], [np.zeros((3, n))])
+        results |= dict(zip(("division64", "sqrt64", "log64"), found, strict=True))
+        smallest = np.array([np.finfo(np.float32).tiny, 0.5], np.float32)
+        (results["denormal"],) = run(workspace, "denormal", 1, [smallest], [np.zeros(2, np.float32)])
+        return results
+
     def options(self) -> list[str]:
         """What every kernel is compiled with, switches that are on."""
         return [name for name, value in kernels("common").STRICT.items() if value is True]

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from fidsplat.backends.view import View
 from fidsplat.backends.warp.launch import BLOCK
 from fidsplat.backends.warp.runtime import kernels, load, quiet
-from fidsplat.backends.warp.sensor import SensorKernel
 from fidsplat.backends.warp.shapes import WarpShape
+from fidsplat.backends.warp.workspace import ArrayPool
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError
 
@@ -43,7 +44,7 @@ def known() -> frozenset[str]:
 def unsupported(features: FeatureSet, name: str) -> str:
     """What of these features the Warp kernels have not, as the message of an error; empty if they have all.
     name: of the device."""
-    lacking = ", ".join(sorted({*features.slots, *features.taps, *features.posts} - known()))
+    lacking = ", ".join(sorted({*features.slots, *features.outputs, *features.posts} - known()))
     return f"{name} (NVIDIA Warp) has no {lacking}; use an OpenCL device for it" if lacking else ""
 
 
@@ -64,7 +65,7 @@ class _Needs:
     def of(cls, features: FeatureSet) -> _Needs:
         output = kernels("output")
         posts = set(features.posts)
-        outputs = output.with_needed((*features.taps, *(posts & output.known())))
+        outputs = output.with_needed((*features.outputs, *(posts & output.known())))
         measured = output.having(output.having(outputs, "start"), "length")
         effects = set(features.slots)
         if not effects.isdisjoint(kernels("lens").LENSES):
@@ -95,7 +96,7 @@ class Program:
         if why := unsupported(features, name):
             raise DeviceError(why)
         self.device, self.shape, self._name = device, shape, name
-        self.images = tuple(each for each in features.outputs if each.name in {"rgb", *features.taps})
+        self.images = tuple(each for each in features.images if each.name in {"rgb", *features.outputs})
         """the output images"""
         self.project_block = kernels("project").BLOCK
         self.block_dim = shape.tile_width * shape.tile_height
@@ -150,7 +151,7 @@ class Program:
         self.view_arrays = output.fields(needs.outputs, "view_arrays")
         """what resolving reads besides: type of an element"""
         self.stretched = "camera_brown_conrady" in needs.effects and bool(
-            output.having(features.taps, "length")
+            output.having(features.outputs, "length")
         )
         """whether resolving reads the lengths of a lens's rays"""
         self.resolve = kernels("resolve").make_resolve(
@@ -173,3 +174,22 @@ class Program:
         with quiet():
             self._compile(self.lists.histogram)
             self._compile(self.lists.count)
+
+
+class SensorKernel:
+    """The kernel of the sensor's steps, which runs after resolving, and what it reads."""
+
+    def __init__(self, steps: tuple[str, ...]) -> None:
+        self._steps = [kernels("post").declared(name) for name in steps]
+        self.kernel, self._settings = kernels("sensor").make_sensor(steps)
+
+    def settings(self, view: View, pool: ArrayPool) -> Any:
+        """The struct `Settings` of a view."""
+        filled = self._settings()
+        for step in self._steps:
+            numbers = [number for name in step.uniforms for number in view.uniform(name)]
+            for field, number in zip(step.numbers, numbers, strict=True):
+                setattr(filled, field, number)
+            for name, dtype in step.arrays.items():
+                setattr(filled, name, pool.filled(name, view.array(name), dtype))
+        return filled

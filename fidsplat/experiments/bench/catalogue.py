@@ -7,13 +7,12 @@ import string
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-import numpy as np
-
 from fidsplat.cameras import Camera
 from fidsplat.errors import InputError, unknown
 from fidsplat.markers import marker
 from fidsplat.quality import Quality
 from fidsplat.random_clouds import SCENES, load_scene, standard_camera
+from fidsplat.rotations import rigid_matrix
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.splats import SplatCloud
 
@@ -36,14 +35,14 @@ class BenchScene:
 def tag() -> tuple[SplatCloud, Camera]:
     """A single AprilTag, a third of the picture's height: what a frame costs when there is next to nothing to
     draw."""
-    placed = PlacedMarker(marker("apriltag:36h11:5", size=0.16), _at(0.0, 0.0, 0.55))
+    placed = PlacedMarker(marker("apriltag:36h11:5", size=0.16), rigid_matrix((0.0, 0.0, 0.55)))
     return Scene((), markers=(placed,)).cloud(), standard_camera(640, 480)
 
 
 def tag_in_million() -> tuple[SplatCloud, Camera]:
     """An AprilTag of 0.4 m, 3 m from the camera, before the million splats of r1m_1080p."""
     background, camera = load_scene("r1m_1080p")
-    placed = PlacedMarker(marker("apriltag:36h11:5", size=0.4), _at(0.0, 0.0, 3.0))
+    placed = PlacedMarker(marker("apriltag:36h11:5", size=0.4), rigid_matrix((0.0, 0.0, 3.0)))
     return Scene((background,), markers=(placed,)).cloud(), camera
 
 
@@ -58,7 +57,7 @@ def qr_wall() -> tuple[SplatCloud, Camera]:
     for number in range(WALL_COLUMNS * WALL_ROWS):
         row, column = divmod(number, WALL_COLUMNS)
         x, y = (column - (WALL_COLUMNS - 1) / 2) * pitch, (row - (WALL_ROWS - 1) / 2) * pitch
-        placed.append(PlacedMarker(codes[number % _WALL_CODES], _at(x, y, 2.0)))
+        placed.append(PlacedMarker(codes[number % _WALL_CODES], rigid_matrix((x, y, 2.0))))
     return Scene((), markers=tuple(placed)).cloud(), standard_camera(1920, 1080)
 
 
@@ -93,9 +92,3 @@ def scene_names(words: Iterable[str]) -> tuple[str, ...]:
         if name not in BENCH_SCENES:
             raise InputError(unknown("scene", name, ("all", *BENCH_SCENES)))
     return tuple(dict.fromkeys(names)) or DEFAULT_SCENES
-
-
-def _at(x: float, y: float, z: float) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, 3] = x, y, z
-    return pose

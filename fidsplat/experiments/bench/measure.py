@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import date
 
 import numpy as np
 
 from fidsplat.backends.base import DeviceInfo, Measurable, Rates
+from fidsplat.backends.prepare import prepare
 from fidsplat.cameras import Camera
+from fidsplat.capture import Capture
 from fidsplat.errors import FidsplatError
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED
 from fidsplat.experiments.bench.model import Counts, roofline_ms
-from fidsplat.experiments.bench.overdraw import overdraw
-from fidsplat.render import Frame, Renderer
+from fidsplat.quality import Quality
+from fidsplat.render import Frame, Renderer, ResidentCloud
 from fidsplat.splats import SplatCloud
 from fidsplat.timing import Timer, take_turns
 
@@ -162,3 +164,16 @@ class SceneRun:
         further = max(cloud.sh_degree + 1, 1) ** 2 - 1
         counts = Counts(pixels=pixels, sh_coefficients=further, **result.counts)
         result.rooflines = roofline_ms(counts, result.rates)
+
+
+def overdraw(renderer: Renderer, resident: ResidentCloud, camera: Camera, quality: Quality) -> np.ndarray:
+    """Fragments that each pixel draws, (h, w) int32, of all its samples together, as the kernels that draw
+    them count them.
+
+    Raises:
+        FidsplatError: the device fails, or its backend has no such count.
+    """
+    data = resident._data
+    features, view = prepare(data, Capture(camera, quality=quality))
+    features = replace(features, outputs=("overdraw",))
+    return renderer.backend.pipeline(features).render(data, view).read("overdraw")

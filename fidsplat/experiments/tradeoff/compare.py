@@ -15,9 +15,8 @@ from fidsplat.experiments.tradeoff.hard import CELLS, cell_window
 from fidsplat.experiments.tradeoff.scenes import HARD, SEED, TradeScene
 from fidsplat.hard_cases.agreement import Picture, truth_of
 from fidsplat.quality import Quality
-from fidsplat.vision.detect import detect
-from fidsplat.vision.images import to_uint8
 from fidsplat.vision.metrics import flip, has_flip, psnr
+from fidsplat.vision.readback import corner_error, own_code
 
 FLIP_SIDE = 256
 """pixels: FLIP is taken of the middle square of this size; of the scene of hard cases all is taken"""
@@ -88,17 +87,12 @@ def compare_marker(picture: np.ndarray, scene: TradeScene) -> dict:
     assert made is not None
     ideal = plane_picture(made.grid, made.module, scene.camera, background=BACKGROUND)
     grey = np.asarray(picture[:, :, 0], np.float64)
-    families = (f"{made.kind}:{made.family}",) if made.kind == "apriltag" else ()
-    corners = None
-    for code in detect(to_uint8(grey), families, qr=made.kind == "qr"):
-        if (code.kind, code.id, code.payload) == (made.kind, made.id, made.payload):
-            apart = code.corners - scene.camera.project(made.corners)
-            corners = float(np.sqrt((apart**2).sum(1).mean()))
+    code = own_code(made, grey)
     ratio = psnr(grey, ideal)
     return {
         "ideal_psnr": ratio if math.isfinite(ratio) else None,
         "ideal_maximum": float(np.abs(grey - ideal).max()),
-        "corners_px": corners,
+        "corners_px": None if code is None else corner_error(code, scene.camera.project(made.corners)),
         "rectangles": len(made.boxes),
     }
 

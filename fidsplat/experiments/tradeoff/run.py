@@ -16,8 +16,7 @@ from fidsplat.experiments.sweep import Key, Results, Sweep
 from fidsplat.experiments.tradeoff import decoding, points, scenes
 from fidsplat.experiments.tradeoff.compare import check_truth, compare_picture
 from fidsplat.experiments.tradeoff.points import ALONE, BASE, MARKER_KNOB, PRESETS_KNOB
-from fidsplat.experiments.tradeoff.session import DEFINITION, Session
-from fidsplat.experiments.tradeoff.timing import FULL, QUICK, time_point
+from fidsplat.experiments.tradeoff.session import DEFINITION, FULL, QUICK, Session, time_point
 from fidsplat.files import writable_folder
 from fidsplat.provenance import run_facts
 from fidsplat.render import Renderer
@@ -120,11 +119,11 @@ def _begin(session: Session, key: Key, quick: bool) -> Callable[[], dict]:
     if key["what"] == TRUTH:
         asked = BASE.with_(**{name: key[name] for name in DEFINITION})
         full, truth = session.full(view, asked), session.truth(view, asked)
-        scene = session.scene(view, asked.marker).scene
+        scene = session.scene(view, asked.marker)
         facts = {"blend_precision": full.blend_precision, "alpha_cutoff": TRUTH_CUTOFF}
         return lambda: facts | check_truth(truth, scene, full)
     quality = points.quality_of(key["quality"])
     frame, times = time_point(session, view, quality, QUICK if quick else FULL)
     picture, truth = frame["rgb"], session.truth(view, quality)
-    scene = session.scene(view, quality.marker).scene
+    scene = session.scene(view, quality.marker)
     return lambda: times | compare_picture(picture, truth, scene, quality)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 from fidsplat.cameras import Camera
+from fidsplat.capture import Capture
 from fidsplat.errors import InputError, unknown
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS
 from fidsplat.experiments.tradeoff.hard import hard_scene
@@ -32,7 +33,7 @@ GREY = (BACKGROUND, BACKGROUND, BACKGROUND)
 SEED = 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TradeScene:
     """One picture to be drawn."""
 
@@ -43,6 +44,11 @@ class TradeScene:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     made: Marker | None = None
     """the marker, in modules of `PROTOCOL`"""
+
+    @cached_property
+    def capture(self) -> Capture:
+        """How it is taken."""
+        return Capture(self.camera, background=self.background)
 
 
 def scene_names(words: Iterable[str], quick: bool = False) -> tuple[str, ...]:

@@ -1,33 +1,26 @@
-"""What is open while points are measured: a renderer, the scenes on its device, their truths."""
+"""What is open while points are measured: a renderer, the scenes on its device, their truths; and how long a
+setting takes beside the base, turn by turn."""
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache
 
 import numpy as np
 
 from fidsplat.accuracy import full_precision, reference_for, truth
+from fidsplat.backends.base import Measurable
 from fidsplat.capture import Capture
 from fidsplat.experiments.tradeoff.points import BASE
-from fidsplat.experiments.tradeoff.scenes import TradeScene, make
+from fidsplat.experiments.tradeoff.scenes import make
 from fidsplat.quality import MarkerQuality, Quality
 from fidsplat.render import Frame, Renderer, ResidentCloud
+from fidsplat.timing import frame_timer, quartiles, ratios, take_turns
 
 _SCENES, _TRUTHS = 12, 6
 """kept at a time"""
 DEFINITION = ("lowpass", "samples", "coplanar")
 """knobs that say what a picture is; the others say how well it is drawn"""
-
-
-@dataclass(frozen=True, eq=False)
-class OnDevice:
-    """A scene whose splats lie on the device."""
-
-    scene: TradeScene
-    resident: ResidentCloud
 
 
 class Session:
@@ -38,41 +31,33 @@ class Session:
 
     def __init__(self, renderer: Renderer) -> None:
         self.renderer, self._reference = renderer, reference_for(renderer, Capture())
-        self._scenes: OrderedDict[Hashable, OnDevice] = OrderedDict()
-        self._truths: OrderedDict[Hashable, np.ndarray] = OrderedDict()
+        self.scene = lru_cache(_SCENES)(make)
+        """(view, knobs of markers) -> a picture's scene"""
+        self.resident = lru_cache(_SCENES)(self._resident)
+        """(view, knobs of markers) -> its splats on the device"""
+        self._truth = lru_cache(_TRUTHS)(self._draw_truth)
 
-    def scene(self, view: str, knobs: MarkerQuality) -> OnDevice:
-        """A picture's scene (`scenes.make`)."""
-
-        def load() -> OnDevice:
-            scene = make(view, knobs)
-            return OnDevice(scene, self.renderer.upload(scene.cloud))
-
-        return _kept(self._scenes, (view, knobs), load, _SCENES)
+    def _resident(self, view: str, knobs: MarkerQuality) -> ResidentCloud:
+        return self.renderer.upload(self.scene(view, knobs).cloud)
 
     def draw(self, view: str, quality: Quality) -> Frame:
         """The picture at a setting, not waited for."""
-        on = self.scene(view, quality.marker)
-        return self.renderer.render(
-            on.resident, on.scene.camera, ("rgb",), quality, background=on.scene.background
-        )
+        capture = self.scene(view, quality.marker).capture
+        return self.renderer.render(self.resident(view, quality.marker), capture, quality=quality)
 
     def truth(self, view: str, quality: Quality) -> np.ndarray:
         """(h, w, 3) float64: the same splats by the same definition at full precision."""
-        like = self.definition(view, quality)
+        return self._truth(view, self.definition(view, quality))
 
-        def draw() -> np.ndarray:
-            on, reference = self.scene(view, quality.marker), self._reference
-            what = on.resident if reference is self.renderer else on.scene.cloud
-            capture = Capture(on.scene.camera, quality=like, background=on.scene.background)
-            return truth(reference, what, capture)
-
-        return _kept(self._truths, (view, like), draw, _TRUTHS)
+    def _draw_truth(self, view: str, like: Quality) -> np.ndarray:
+        scene, own = self.scene(view, like.marker), self._reference is self.renderer
+        what = self.resident(view, like.marker) if own else scene.cloud
+        return truth(self._reference, what, scene.capture.with_(quality=like))
 
     def definition(self, view: str, quality: Quality) -> Quality:
         """The base with what `quality` says of the definition; without coplanar splats there is one rule."""
         asked = {name: getattr(quality, name) for name in DEFINITION}
-        if self.scene(view, quality.marker).scene.cloud.planes is None:
+        if self.scene(view, quality.marker).cloud.planes is None:
             asked["coplanar"] = BASE.coplanar
         return BASE.with_(**asked, marker=quality.marker)
 
@@ -82,11 +67,52 @@ class Session:
         return full_precision(like, self._reference).quality
 
 
-def _kept(cache: OrderedDict[Hashable, Any], key: Hashable, make: Callable[[], Any], most: int) -> Any:
-    """A value of a cache, made if it is not there; the cache keeps the `most` that were asked for last."""
-    if key not in cache:
-        cache[key] = make()
-        if len(cache) > most:
-            cache.popitem(last=False)
-    cache.move_to_end(key)
-    return cache[key]
+@dataclass(frozen=True)
+class Effort:
+    """How long is measured: pairs of frames until `seconds` have passed, within limits."""
+
+    least: int = 5
+    most: int = 30
+    seconds: float = 0.3
+
+
+FULL, QUICK = Effort(), Effort(3, 5, 0.2)
+
+
+def time_point(session: Session, view: str, quality: Quality, effort: Effort) -> tuple[Frame, dict]:
+    """Draw a picture at a setting and at the base in turn; splats lie on the device, the picture stays there.
+
+    Returns the picture, and `ms`, `base_ms` (medians), their quartiles, `ratio` (median of the pairs' ratios,
+    and its quartiles), `repeats`, `stages_ms` by the device's own clock, `memory_bytes` (scratch, cloud and
+    picture; None where the backend cannot tell), `splats`, `pairs`.
+    """
+    memory = memory_of(session, view, quality)
+    frame = session.draw(view, quality)
+    own, base = (
+        frame_timer(
+            session.renderer,
+            session.resident(view, drawn.marker),
+            session.scene(view, drawn.marker).capture,
+            quality=drawn,
+        )
+        for drawn in (quality, BASE)
+    )
+    take_turns([own, base], effort.most, least=effort.least, seconds=effort.seconds, warm_up=1)
+    result: dict = {"repeats": len(own.ms), "stages_ms": own.part_medians, "memory_bytes": memory}
+    for name, values in (("ms", own.ms), ("base_ms", base.ms), ("ratio", ratios(own, base))):
+        low, result[name], high = quartiles(values)
+        result[f"{name.removesuffix('_ms')}_quartiles"] = [low, high]
+    return frame, result | {name: frame.stats[name] for name in ("splats", "pairs")}
+
+
+def memory_of(session: Session, view: str, quality: Quality) -> int | None:
+    """Bytes on the device of a picture at a setting: scratch, cloud and picture; None where the backend
+    cannot tell."""
+    backend, scene = session.renderer.backend, session.scene(view, quality.marker)
+    if not isinstance(backend, Measurable):
+        return None
+    backend.release_scratch()
+    # a cloud keeps every form of its colours that was ever asked for; this one has been asked for nothing yet
+    resident = session.renderer.upload(scene.cloud)
+    session.renderer.render(resident, scene.capture, quality=quality)
+    return backend.memory_bytes + resident.memory_bytes + 12 * scene.camera.width * scene.camera.height

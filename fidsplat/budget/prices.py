@@ -1,5 +1,5 @@
-"""The settings that a budget chooses among, with what each was measured to give (table.json, made by
-tools/budget_table.py)."""
+"""The price list: the candidates that a budget chooses among, with what each was measured to give
+(prices.json, made by benchmarks/budget_prices.py)."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import Any
 
 from fidsplat.quality import Quality
 
-FILE = Path(__file__).with_name("table.json")
+FILE = Path(__file__).with_name("prices.json")
 MARGIN = 1.5
-"""how many times below the bound the largest error of a setting over the table's scenes must lie: the largest
-over other scenes is a little larger"""
+"""how many times below the bound the largest error of a candidate over the list's scenes must lie: that over
+other scenes is a little larger"""
 
 FREE: dict[str, Any] = {
     "alpha_cutoff": 1.0 / 255.0,
@@ -23,7 +23,7 @@ FREE: dict[str, Any] = {
     "arithmetic": "precise",
     "blend_precision": "float32",
 }
-"""The knobs that a budget turns, and where they stand unless a setting says otherwise. Of the other knobs
+"""The knobs that a budget turns, and where they stand unless a candidate says otherwise. Of the other knobs
 those that only make a picture wrong are off (opacity ceiling, exclusive stop); the rest are its definition
 and stay as the base quality has them."""
 COMMON = ("alpha_cutoff", "transmittance_stop", "arithmetic")
@@ -31,26 +31,26 @@ COMMON = ("alpha_cutoff", "transmittance_stop", "arithmetic")
 
 
 @dataclass(frozen=True)
-class Setting:
+class Candidate:
     """One choice of the knobs, and what it was measured to give."""
 
     knobs: dict[str, Any]
     """those of `FREE` that differ from it"""
     easy: float
-    """the largest error of a picture, in the easiest twentieth of the table's scenes"""
+    """the largest error of a picture, in the easiest twentieth of the list's scenes"""
     median: float
     """the same, in the median scene"""
     most: float
     """and in the hardest"""
     cost: float
-    """time of a frame, in that of the setting without any knobs (on CPUs the processor's time)"""
+    """time of a frame, in that of the candidate without any knobs (on CPUs the processor's time)"""
 
     def of(self, base: Quality) -> Quality:
-        """The quality with the definition of `base` and the accuracy of this setting."""
+        """The quality with the definition of `base` and the accuracy of this candidate."""
         return base.with_(**(FREE | {"opacity_ceiling": 1.0, "stop_rule": "inclusive"} | self.knobs))
 
     @property
-    def everywhere(self) -> Setting:
+    def everywhere(self) -> Candidate:
         """What is drawn instead where a device lacks its other knobs: those that all have, no less accurate
         but for float64 blending."""
         common = {name: value for name, value in self.knobs.items() if name in COMMON}
@@ -63,12 +63,12 @@ class Setting:
 
 
 @cache
-def load(kind: str) -> tuple[Setting, ...]:
-    """The settings for a kind of device (cpu, gpu), the cheapest first.
+def load(kind: str) -> tuple[Candidate, ...]:
+    """The candidates for a kind of device (cpu, gpu), the cheapest first.
 
-    A kind for which nothing has been measured has the settings of CPUs: the errors are those of float32
+    A kind for which nothing has been measured has the candidates of CPUs: the errors are those of float32
     everywhere, and costs rank alike.
     """
     classes = json.loads(FILE.read_text("utf-8"))["classes"]
-    rows = classes.get(kind, classes["cpu"])["settings"]
-    return tuple(sorted((Setting(**row) for row in rows), key=lambda setting: setting.cost))
+    rows = classes.get(kind, classes["cpu"])["candidates"]
+    return tuple(sorted((Candidate(**row) for row in rows), key=lambda candidate: candidate.cost))

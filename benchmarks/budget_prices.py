@@ -1,13 +1,13 @@
-"""Makes fidsplat/budget/table.json: the settings that `fs.quality_within` chooses among, with their errors
+"""Makes fidsplat/budget/prices.json: the candidates that `fs.quality_within` chooses among, with their errors
 over random scenes and what they cost.
 
-    python tools/budget_table.py --device opencl:pocl       about 15 minutes on two busy cores
-    python tools/budget_table.py --device opencl:nvidia     adds the settings of GPUs
+    python benchmarks/budget_prices.py --device opencl:pocl       about 15 minutes on two busy cores
+    python benchmarks/budget_prices.py --device opencl:nvidia     adds the candidates of GPUs
 
-Each scene of `fidsplat/random_clouds.py` is drawn with every setting and compared with the same
+Each scene of `random_scenes.py` is drawn with every candidate and compared with the same
 definition at full precision, which the device draws in float64 (`fidsplat.accuracy.reference_for`). Costs are
 medians of frames of the scenes of TIMED, drawn in turn; on CPUs those of the processor's time. In a second
-round the settings on the front of error and cost are drawn with every set of MODIFIERS, and FINEST beside
+round the candidates on the front of error and cost are drawn with every set of MODIFIERS, and FINEST beside
 them; what is on that front then is kept. Knobs that the device does not have are left out. What the file
 says of another kind of device stays.
 """
@@ -21,13 +21,14 @@ import time
 from datetime import date
 
 import numpy as np
+from random_scenes import random_scene
 
 import fidsplat as fs
 from fidsplat.accuracy import error_bound, errors, reference_for, truth
-from fidsplat.budget.table import FILE, Setting
+from fidsplat.budget.prices import FILE, Candidate
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
-from fidsplat.random_clouds import random_cloud, random_scene, standard_camera
+from fidsplat.random_clouds import random_cloud, standard_camera
 from fidsplat.timing import Timer, frame_timer, take_turns
 
 CUTOFFS = (0.03, 0.015, 2 / 255, 1 / 255, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6, 1e-7)
@@ -48,29 +49,29 @@ SLACK = 1.02
 
 
 class Measurement:
-    """Settings as knobs, with errors (scenes, settings) and costs (settings,)."""
+    """Settings as knobs, with errors (scenes, candidates) and costs (candidates,)."""
 
-    def __init__(self, settings: list[dict], errors_: np.ndarray, costs: np.ndarray) -> None:
-        self.settings, self.errors, self.costs = settings, errors_, costs
+    def __init__(self, candidates: list[dict], errors_: np.ndarray, costs: np.ndarray) -> None:
+        self.candidates, self.errors, self.costs = candidates, errors_, costs
 
     def front(self) -> list[int]:
         """Settings that no other equals or betters in cost, in median and in largest error, but for SLACK."""
-        what = np.log([self.costs, np.median(self.errors, 0), self.errors.max(0)]).T  # (settings, 3)
+        what = np.log([self.costs, np.median(self.errors, 0), self.errors.max(0)]).T  # (candidates, 3)
         total, slack = what.sum(1), np.log(SLACK)
         return [
             k for k in range(len(what)) if not ((what <= what[k] + slack).all(1) & (total < total[k])).any()
         ]
 
     def of(self, chosen: list[int]) -> Measurement:
-        """The chosen settings alone."""
-        return Measurement([self.settings[k] for k in chosen], self.errors[:, chosen], self.costs[chosen])
+        """The chosen candidates alone."""
+        return Measurement([self.candidates[k] for k in chosen], self.errors[:, chosen], self.costs[chosen])
 
     def rows(self) -> list[dict]:
-        """As table.json has them, the cheapest first."""
+        """As prices.json has them, the cheapest first."""
         rows = []
-        for knobs, off, cost in zip(self.settings, self.errors.T, self.costs.tolist(), strict=True):
+        for knobs, off, cost in zip(self.candidates, self.errors.T, self.costs.tolist(), strict=True):
             sizes = (round_up(size) for size in (np.quantile(off, 0.05), np.median(off), off.max()))
-            rows.append(vars(Setting(knobs, *sizes, cost=round(cost, 3))))
+            rows.append(vars(Candidate(knobs, *sizes, cost=round(cost, 3))))
         return sorted(rows, key=lambda row: row["cost"])
 
 
@@ -96,24 +97,24 @@ def main() -> int:
         truths.append(truth(reference, scene.cloud, fs.Capture(scene.camera, background=scene.background)))
         say(f"truths: {k + 1} of {args.scenes}", end="\r")
 
-    def measure(settings: list[dict]) -> Measurement:
-        found = all_errors(renderer, scenes, truths, settings)
-        return Measurement(settings, found, all_costs(renderer, settings, args.repeats))
+    def measure(candidates: list[dict]) -> Measurement:
+        found = all_errors(renderer, scenes, truths, candidates)
+        return Measurement(candidates, found, all_costs(renderer, candidates, args.repeats))
 
     grid = [{"alpha_cutoff": cut, "transmittance_stop": stop} for cut in CUTOFFS for stop in STOPS]
     plain = measure(grid)
     plain = plain.of(plain.front())
-    say(f"{len(plain.settings)} of {len(grid)} are on the front")
+    say(f"{len(plain.candidates)} of {len(grid)} are on the front")
     modifiers = [more for more in MODIFIERS if draws(renderer, scenes[0], more)]
     finest = [knobs for knobs in FINEST if draws(renderer, scenes[0], knobs)]
-    combined = [knobs | more for knobs in plain.settings for more in modifiers]
-    both = measure(plain.settings + combined + finest)
+    combined = [knobs | more for knobs in plain.candidates for more in modifiers]
+    both = measure(plain.candidates + combined + finest)
     final = both.of(both.front())
-    say(f"{len(final.settings)} of {len(both.settings)} are kept")
+    say(f"{len(final.candidates)} of {len(both.candidates)} are kept")
 
     out = json.loads(FILE.read_text("utf-8")) if FILE.exists() else {"made": {}, "classes": {}}
     info = renderer.device
-    out["classes"][info.kind] = {"settings": final.rows()}
+    out["classes"][info.kind] = {"candidates": final.rows()}
     out["made"][info.kind] = {
         "device": info.title,
         "driver": info.version,
@@ -132,7 +133,7 @@ def say(text: str, end: str = "\n") -> None:
 
 
 def quality(knobs: dict) -> fs.Quality:
-    return Setting(knobs, 0, 0, 0, 0).of(fs.Quality())
+    return Candidate(knobs, 0, 0, 0, 0).of(fs.Quality())
 
 
 def draws(renderer: fs.Renderer, scene, knobs: dict) -> bool:
@@ -144,24 +145,24 @@ def draws(renderer: fs.Renderer, scene, knobs: dict) -> bool:
     return True
 
 
-def all_errors(renderer: fs.Renderer, scenes, truths, settings: list[dict]) -> np.ndarray:
-    """Largest absolute error of rgb (scenes, settings)."""
-    qualities = [quality(knobs) for knobs in settings]
-    found = np.empty((len(scenes), len(settings)))
+def all_errors(renderer: fs.Renderer, scenes, truths, candidates: list[dict]) -> np.ndarray:
+    """Largest absolute error of rgb (scenes, candidates)."""
+    qualities = [quality(knobs) for knobs in candidates]
+    found = np.empty((len(scenes), len(candidates)))
     off = error_bound(reference_for(renderer, fs.Capture()), fs.Capture())
     for k, (scene, want) in enumerate(zip(scenes, truths, strict=True)):
         resident = renderer.upload(scene.cloud)
         for j, each in enumerate(qualities):
             frame = renderer.render(resident, scene.camera, quality=each, background=scene.background)
             found[k, j] = errors(frame["rgb"], want).maximum + off
-        say(f"errors: {k + 1} of {len(scenes)} scenes, {len(settings)} settings", end="\r")
+        say(f"errors: {k + 1} of {len(scenes)} scenes, {len(candidates)} candidates", end="\r")
     say("")
     return found
 
 
-def all_costs(renderer: fs.Renderer, settings: list[dict], repeats: int) -> np.ndarray:
-    """Time of a frame over that of the settings' base (settings,): the mean over the timed scenes."""
-    qualities = [quality({}), *(quality(knobs) for knobs in settings)]
+def all_costs(renderer: fs.Renderer, candidates: list[dict], repeats: int) -> np.ndarray:
+    """Time of a frame over that of the candidates' base (candidates,): the mean over the timed scenes."""
+    qualities = [quality({}), *(quality(knobs) for knobs in candidates)]
     # a processor's own time does not hang on what else runs there
     clock = time.process_time if renderer.device.kind == "cpu" else time.perf_counter
     ratios = []

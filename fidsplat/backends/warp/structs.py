@@ -1,0 +1,173 @@
+"""The structs of kernels/warp that a picture's view fills: its numbers, its lens, what moves, and what lies
+behind the splats. Arrays of lenses and panoramas are kept as long as these are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends.view import View
+from fidsplat.backends.warp.resident import Resident
+from fidsplat.backends.warp.runtime import kernels, load
+from fidsplat.backends.warp.shapes import WarpShape
+from fidsplat.backends.warp.workspace import Workspace, nbytes
+from fidsplat.cameras.raster import RayRaster
+from fidsplat.errors import DeviceError
+from fidsplat.surroundings import Gradient, Panorama
+
+
+def _ray(view: View) -> tuple[float, ...]:
+    focal_x, focal_y, center_x, center_y = view.uniform("ray")
+    return 1 / focal_x, 1 / focal_y, center_x, center_y
+
+
+_DERIVED: dict[str, Callable[[View, WarpShape], Any]] = {
+    "per_focal_x": lambda view, shape: 1.0 / view.focal_x,
+    "per_focal_y": lambda view, shape: 1.0 / view.focal_y,
+    "per_near": lambda view, shape: 1.0 / view.near,
+    "tile_w": lambda view, shape: shape.tile_width,
+    "tile_h": lambda view, shape: shape.tile_height,
+    "tiles_x": lambda view, shape: -(-view.width // shape.tile_width),
+    "tiles_y": lambda view, shape: -(-view.height // shape.tile_height),
+    "per_pixel": lambda view, shape: 1.0 / view.samples**2,
+    "ray_step": lambda view, shape: 0.0,
+    "ray": lambda view, shape: _ray(view),
+}
+"""fields that a view does not have by their names"""
+
+
+@cache
+def _fields() -> tuple[tuple[str, Any, Any], ...]:
+    """Name of each field, where it comes from if it is derived, and its type if it is a vector or matrix."""
+    types = load().types
+    kinds = {name: field.type for name, field in kernels("common").View.vars.items()}
+    wide = {name for name, kind in kinds.items() if types.type_is_vector(kind) or types.type_is_matrix(kind)}
+    return tuple((name, _DERIVED.get(name), kind if name in wide else None) for name, kind in kinds.items())
+
+
+def uniforms(view: View, shape: WarpShape, sloped: bool) -> Any:
+    """The struct `View` of a picture in tiles of this shape; sloped: its kernels read rays' derivatives."""
+    filled = kernels("common").View()
+    for name, derive, wide in _fields():
+        value: Any = derive(view, shape) if derive else getattr(view, name)
+        if wide:
+            value = wide(*(value.ravel().tolist() if isinstance(value, np.ndarray) else value))
+        setattr(filled, name, value)
+    if sloped and view.raster:
+        filled.ray_step = view.raster.step  # of which it takes long to ask
+    return filled
+
+
+def rays_of(view: View, workspace: Workspace, bent: bool = True, sloped: bool = False) -> Any:
+    """The struct `Rays` of a view, with derivatives if `sloped`; an empty one if it has no raster, or unless
+    `bent`.
+
+    Raises:
+        DeviceError: the device has no memory for them.
+    """
+    struct_of_rays, raster = kernels("rays").struct_of_rays, view.raster
+    if raster is None or not bent:
+        return struct_of_rays(False)()
+    rays, arrays = struct_of_rays(True, sloped)(), _arrays(raster, workspace)
+    first = raster.top * raster.width
+    rays.rays = arrays["rays"][first:]
+    if sloped:
+        if "slopes" not in arrays:
+            slopes = (raster.whole or raster).slopes.reshape(-1, 2, 3)
+            arrays["slopes"] = _fresh("ray slopes", slopes, kernels("rays").SLOPES, workspace)
+        rays.slopes = arrays["slopes"][first:]
+    return rays
+
+
+def lens_of(view: View, workspace: Workspace) -> Any:
+    """The struct `Lens` of a view; an empty one if it has no raster.
+
+    Raises:
+        DeviceError: the device has no memory for its arrays.
+    """
+    wp, declared, raster = load(), kernels("lens"), view.raster
+    if raster is None:
+        return declared.make_lens(None)()
+    camera, arrays = f"camera_{raster.lens.kind}", _arrays(raster, workspace)
+    lens = declared.make_lens(camera)()
+    lens.rays = arrays["rays"][raster.top * raster.width :]
+    if camera in declared.COEFFICIENTS:
+        *k, lens.limit = raster.lens.uniforms
+        low_x, low_y, per_x, per_y, side, top = raster.uniforms[-6:]
+        lens.k = declared.COEFFICIENTS[camera](*k)
+        lens.low, lens.per_unit = wp.vec2d(low_x, low_y), wp.vec2d(per_x, per_y)
+        lens.cells, lens.side, lens.top = arrays["cells"], int(side), int(top)
+    return lens
+
+
+def moving_of(resident: Resident, view: View, workspace: Workspace) -> Any:
+    """The struct `Moving` of a picture; an empty one if nothing moves."""
+    declared, pool = kernels("motion"), workspace.pool
+    held = declared.make_motion(bool(view.groups)).Moving()
+    if view.groups:
+        labels = np.array([label for label, _ in view.groups], np.int32)
+        poses = [(own.rotation, own.translation, own.eye) for _, own in view.groups]
+        held.labels = resident.arrays["labels"]
+        held.groups = pool.filled("groups", labels, load().int32)
+        held.poses = pool.filled("poses", np.array(poses, declared.Pose.numpy_dtype()), declared.Pose)
+    return held
+
+
+def surroundings_of(view: View, workspace: Workspace) -> Any:
+    """The struct `Surroundings` of a view whose background is not of one colour. A panorama stays on the
+    device as long as it lives.
+
+    Raises:
+        DeviceError: there is no room for the panorama.
+    """
+    wp, behind = load(), view.surroundings
+    kind = "gradient" if isinstance(behind, Gradient) else "panorama"
+    filled = kernels("surroundings").struct_of_surroundings(kind)()
+    if isinstance(behind, Gradient):
+        numbers = view.uniform("gradient")
+        filled.top, filled.bottom, filled.up = (wp.vec3(*numbers[k : k + 3]) for k in (0, 3, 6))
+    elif isinstance(behind, Panorama):
+        filled.image = _panorama(behind, workspace)
+    return filled
+
+
+def memory_bytes(view: View, workspace: Workspace) -> int:
+    """Bytes that the arrays of a view's lens and panorama take on the device."""
+    around, raster = view.surroundings, view.raster
+    held = {} if raster is None else workspace.lenses.get(raster.whole or raster, {})
+    return sum(map(nbytes, held.values())) + (around.image.nbytes if isinstance(around, Panorama) else 0)
+
+
+def _arrays(raster: RayRaster, workspace: Workspace) -> dict[str, Any]:
+    """Of the whole raster."""
+    wp, raster = load(), raster.whole or raster
+    held = workspace.lenses.setdefault(raster, {})
+    if not held:
+        held["rays"] = _fresh("rays", raster.rays.reshape(-1, 3), wp.vec3, workspace)
+        if raster.lens.kind != "equirectangular":
+            held["cells"] = _fresh("ray map", raster.map[0], wp.vec4s, workspace)
+    return held
+
+
+def _fresh(name: str, array: np.ndarray, dtype: Any, workspace: Workspace) -> Any:
+    wp = load()
+    held = workspace.pool.fresh(name, len(array), dtype)
+    wp.copy(held, wp.array(array, dtype=dtype, device="cpu"))
+    return held
+
+
+def _panorama(panorama: Panorama, workspace: Workspace) -> Any:
+    wp, held = load(), workspace.panoramas
+    if panorama not in held:
+        image = panorama.image
+        try:
+            held[panorama] = wp.array(image, dtype=wp.vec3, device=workspace.device)
+        except (RuntimeError, MemoryError) as error:
+            raise DeviceError(
+                f"the panorama needs {image.nbytes / 2**20:.0f} MiB, which {workspace.device} has not; use a "
+                "smaller one"
+            ) from error
+    return held[panorama]
