@@ -84,7 +84,6 @@ class Detect:
             heads = (
                 "marker",
                 "found",
-                "seen",
                 "distance [m]",
                 "position [mm]",
                 "angle [deg]",
