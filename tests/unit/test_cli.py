@@ -180,8 +180,10 @@ def test_a_failed_run_is_1_and_a_fault_of_ours_says_so(capsys, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(COMMANDS["devices"], "run", interrupted)
-    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
+    heard = []
+    monkeypatch.setattr(sys, "unraisablehook", heard.append)
     assert fails(capsys, "devices") == (130, "fidsplat: interrupted\n")
+    assert heard == []
 
 
 @pytest.mark.parametrize(
