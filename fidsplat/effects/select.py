@@ -98,7 +98,8 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
     lens = None if capture.camera is None else capture.camera.lens
     ellipsoid = _ellipsoid(cloud, quality, lens)
     # what filters itself needs no low-pass
-    filtered = cloud.footprint == "box" or (cloud.ellipsoids == "all" and ellipsoid != "exact")
+    alone = cloud.ellipsoids == "all" and ellipsoid != "exact"
+    filtered = cloud.footprint == "box" or alone
     lowpass = "none" if filtered else quality.lowpass
     double = quality.blend_precision == "float64"
     if double:
@@ -113,6 +114,7 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
             f"camera_{lens.kind if lens else 'pinhole'}",
             "color_sh" if sh_degree else "color_rgb",
             *((f"ellipsoid_{ellipsoid}",) if ellipsoid else ()),
+            *(("ellipsoids_alone",) if alone else ()),
             f"lowpass_{lowpass}",
             f"stop_{quality.stop_rule}",
             "compose_planes" if layered else "compose_ordered",

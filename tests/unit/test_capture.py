@@ -103,6 +103,7 @@ class Cloud:
     sh_degree: int = -1
     has_planes: bool = False
     footprint: str = "gaussian"
+    ellipsoids: str = "none"
 
 
 ROLLING = {"motion": MOVING, "shutter": fs.Shutter(readout=0.1, rows_per_band=4)}

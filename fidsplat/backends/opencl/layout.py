@@ -215,6 +215,7 @@ LAYOUTS: dict[str, Layout] = {
         view=(member("real slopes[4]", "of rays, -x, x, -y, y: where derivatives are taken at most"),),
     ),
     "ellipsoid_ewa_antialiased": Layout("slot/ellipsoid_ewa_antialiased.cl", parts=("ellipsoid_ewa",)),
+    "ellipsoids_alone": Layout("slot/ellipsoids_alone.cl"),
     "background_constant": Layout(),
     "background_gradient": Layout(
         "slot/background_gradient.cl",

@@ -113,8 +113,8 @@ def _kernels_of(workspace: Workspace, source: Source) -> dict[str, cl.Kernel]:
     load_invoker()
     for attempt in range(3):
         again = [f"-DATTEMPT_{attempt}"] if attempt else []
-        built = build(workspace, source.text, *again)
-        kernels = {kernel.function_name: kernel for kernel in built.all_kernels()}
+        built = [build(workspace, program.compiled, *again) for program in source.programs.values()]
+        kernels = {kernel.function_name: kernel for each in built for kernel in each.all_kernels()}
         if source.arguments.keys() <= kernels.keys():
             return kernels
     raise DeviceError(

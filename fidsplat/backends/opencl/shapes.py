@@ -55,6 +55,12 @@ def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
     """Build constants by name, for tests: `Reshapes.shapes` of fidsplat/backends/base.py."""
     if kind == "schedule":
         return {"groups": _groups(own, 8)}
+    if kind == "listing":
+        return {lists: replace(_groups(own, 8), lists=lists) for lists in ("ordered", "tiled")}
+    if kind == "arithmetic":
+        plain = replace(own, fast_fma=False)
+        scalar = {"one by one": replace(own, lanes=1), "not fused, one by one": replace(plain, lanes=1)}
+        return {"own": own, "not fused": plain, **scalar}
     if kind == "sorting":
         return {"own": own, "in 7 pieces": replace(own, chunks=7, radix_bits=5), "groups": _groups(own, 16)}
     sizes = [(8, 8), (32, 32)]

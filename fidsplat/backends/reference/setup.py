@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 
 from fidsplat.backends.planes import PlaneTable
@@ -102,6 +104,30 @@ class Setup:
         self.screen = "lowpass_screen" in features.slots
         self.exclusive = "stop_exclusive" in features.slots
         self.planes = None if planes is None else planes[order]
+
+    def among(self, chosen: np.ndarray) -> Setup:
+        """The set-up of those of the splats alone, chosen (n,) bool, in the same order."""
+        if chosen.all():
+            return self
+        part = copy(self)
+        for name in _OF_SPLATS:
+            setattr(part, name, getattr(self, name)[chosen])
+        for name in _OF_COORDINATES:
+            setattr(part, name, getattr(self, name)[:, chosen])
+        if self.depth_forms is not None:
+            part.depth_forms = self.depth_forms[:, chosen]
+        if self.planes is not None:
+            part.planes = self.planes[chosen]
+        return part
+
+
+_OF_SPLATS = (
+    *("order", "log_opacity", "half_r2", "reach", "labels", "pz", "z_numerator", "inverse_m2"),
+    *("box", "dot", "center_x", "center_y", "anchor_x", "anchor_y", "colors", "normal"),
+)
+"""arrays (n, ...) of a Setup"""
+_OF_COORDINATES = ("forms", "anchors")
+"""arrays (3, n, ...) of a Setup"""
 
 
 def _shapes(
