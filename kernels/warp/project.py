@@ -46,8 +46,9 @@ def make_project(
     """
     layout = Layout(effects, outputs)
     lines_each = layout.lines
-    has_depth, screen, filtered, layers = (
-        name in effects for name in ("ray_depth", "lowpass_screen", "lowpass_pixel", "compose_planes")
+    has_depth, screen, filtered, waits, layers = (
+        name in effects
+        for name in ("ray_depth", "lowpass_screen", "lowpass_pixel", "compose_pixel", "compose_planes")
     )
     recorded = output.having(outputs, "project")
     projects = output.functions(recorded, "project")
@@ -79,6 +80,7 @@ def make_project(
         layout.word(name)
         for name in ("dot_x", "z_numerator", "edge_u0", "nuz", "plane_z0", "boxed", "columns")
     )
+    at_nearest = layout.word("nearest")
 
     @wp.func
     def seen(a: vec3, b: vec3, p: vec3, radius: real, reach: real, x: real, y: real, view: View, lens: Lens):
@@ -362,6 +364,13 @@ def make_project(
             record[at_depth] = float(height * facing)
             record[at_depth + 1] = float(depth)
             record[at_depth + 2] = float(reach)
+        key = float(depth)
+        if wp.static(waits):
+            key = float(depth) - float(reach)  # as blending bounds depths
+            if wp.static(layers):
+                if planes[i] >= 0:
+                    key = plane_keys[planes[i]]
+            record[at_nearest] = key
         for k in range(wp.static(len(projects))):
             record = wp.static(projects[k])(record, wp.static(places[k]), normal, height)
         for line in range(wp.static(lines_each)):
@@ -373,10 +382,6 @@ def make_project(
             bounds[i] = box
         corner = wp.uint64(top * view.tiles_x + left)
         windows[i] = (corner << BITS) | wp.uint64(bits)
-        key = float(depth)
-        if wp.static(layers):
-            if planes[i] >= 0:
-                key = plane_keys[planes[i]]
         keys[i] = sortable(key)
         counts[i] = wp.int64(tiles)
         drawn[i] = 1
