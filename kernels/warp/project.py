@@ -17,7 +17,7 @@ from . import output
 from .bounds import PAD, PAD_RELATIVE, Bounds, box_bounds, make_bounds
 from .boxes import make_boxes
 from .color import make_color
-from .common import CULLED, STRICT, View, as_bits, population, sortable, store_line
+from .common import CULLED, STRICT, View, as_bits, sortable, store_line
 from .disk import make_disk
 from .ellipsoids import EWA, EXACT, make_ellipsoids
 from .lens import LENSES, make_lens, make_optics
@@ -145,8 +145,7 @@ def make_project(
         center = means[i]
         mean = vec3(real(center[0]), real(center[1]), real(center[2]))
         p = turn * mean + shift
-        a = tangent_u * su
-        b = tangent_v * sv
+        a, b = tangent_u * su, tangent_v * sv
         depth = p[2]
         if wp.static(ray_depths):
             depth = wp.length(p)
@@ -173,8 +172,7 @@ def make_project(
                 # of unit area, as a disk's
                 sv = wp.length(b)
                 su = spanned / sv
-                tangent_u = a / su
-                tangent_v = b / sv
+                tangent_u, tangent_v = a / su, b / sv
                 itself = wp.static(drawn_ewa)
         if wp.static(filtered):
             if depth >= near and not itself:
@@ -215,8 +213,7 @@ def make_project(
         in_front = depth >= near  # or, of a lens, whether it is known where the centre falls
         center_x, center_y = zero, zero
         if wp.static(parallel):
-            center_x = fx * p[0] + cx
-            center_y = fy * p[1] + cy
+            center_x, center_y = fx * p[0] + cx, fy * p[1] + cy
         elif wp.static(not bent):
             if in_front:
                 center_x = fx * (p[0] / p[2]) + cx
@@ -257,8 +254,7 @@ def make_project(
                 center_x, center_y, in_front = optics.image(p, view, lens)
         if wp.static(not parallel):
             if not in_front:
-                center_x = real(box.x)
-                center_y = real(box.y)
+                center_x, center_y = real(box.x), real(box.y)
         if wp.static(screen):
             if in_front:
                 box.dot_x = float(center_x)
@@ -274,20 +270,14 @@ def make_project(
         columns = (end_column - 1) / view.tile_w - left + 1
         top = row_first / view.tile_h
         tile_rows = (row_end - 1) / view.tile_h - top + 1
-        bits = limits.window_bits(box, left, columns, top, tile_rows, view)
-        tiles = population(bits)
-        if tiles == 0:
-            for row in range(top, top + tile_rows):
-                begin, end = limits.tile_span(box, row, view)
-                tiles += end - begin
+        bits, tiles = limits.touched(box, left, columns, top, tile_rows, view)
         if tiles == 0:
             return
 
         # affine forms about the sample of the picture that is nearest to the centre (numerics B1)
         ax = wp.clamp(wp.floor(float(center_x)), 0.0, float(view.width - 1))
         ay = wp.clamp(wp.floor(float(center_y)), 0.0, float(view.height - 1))
-        anchor_x = real(ax) + half
-        anchor_y = real(ay) + half
+        anchor_x, anchor_y = real(ax) + half, real(ay) + half
         normal = wp.cross(tangent_u, tangent_v)
         height = wp.dot(normal, p)  # of the camera's centre above the plane, with its side
         ray = vec3((anchor_x - cx) * per_fx, (anchor_y - cy) * per_fy, one)
@@ -309,8 +299,7 @@ def make_project(
             steepest = wp.max(steepest, wp.max(wp.abs(form_u[2]), wp.abs(form_v[2])))
         if not (steepest > zero and steepest < real(wp.inf)):
             return
-        nu0 = wp.dot(form_u, ray)
-        nv0 = wp.dot(form_v, ray)
+        nu0, nv0 = wp.dot(form_u, ray), wp.dot(form_v, ray)
         if wp.static(not bent):
             if wp.static(parallel) or in_front:
                 # both vanish at the projected centre
