@@ -120,7 +120,8 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> Path:
     pixels = array if array.dtype == np.uint16 else to_uint8(array)
     if pixels.ndim == 3:
         pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-    done, data = cv2.imencode(".png", np.ascontiguousarray(pixels))
+    # OpenCV 5's own level makes files of flat colours four times as large
+    done, data = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 3])
     if not done:
         raise ValueError(f"OpenCV could not encode an image of shape {array.shape} as PNG")
     with atomic_write(path) as stream:
