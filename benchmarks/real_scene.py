@@ -21,10 +21,9 @@ from rich.table import Table
 
 import fidsplat as fs
 from fidsplat.errors import FidsplatError
-from fidsplat.experiments.readback import families_of, read_back
 from fidsplat.files import writable_folder
 from fidsplat.scenes import PlacedMarker
-from fidsplat.vision.detect import detect
+from fidsplat.vision import read_back
 from fidsplat.vision.images import to_uint8, write_png
 from fidsplat.vision.paint import contact_sheet, outlined
 
@@ -81,9 +80,8 @@ def run(file: str, folder: Path, device: str) -> int:
             busy.append(1e3 * (time.process_time() - begun))
         best = min(times, key=lambda stages: sum(stages.values()))
         begun = time.perf_counter()
-        found = detect(image, families_of(placed.marker for placed in scene.markers))
+        readings, _ = read_back(image, scene, camera)
         reading_ms = 1e3 * (time.perf_counter() - begun)
-        readings, _ = read_back(found, scene.markers, camera)
         missed += sum(reading.detection is None for reading in readings)
         marked = outlined(
             image, [(r.detection.corners, r.placed.marker.spec) for r in readings if r.detection is not None]
