@@ -10,7 +10,6 @@ import fidsplat as fs
 from fidsplat.hard_cases import fuzz
 from fidsplat.hard_cases.agreement import against_reference
 
-BACKEND = "opencl"
 CAMERA = fs.Camera.pinhole(97, 71, 70.0, 70.0, 48.0, 36.0, near=0.05)
 
 
@@ -41,6 +40,16 @@ def mixed(seed):
 def test_all_kinds_of_splats_in_one_picture(renderer, way):
     """Around the camera and across its plane, with every output."""
     assert_agrees(renderer, mixed(5), CAMERA, quality=fs.Quality(ellipsoid=way))
+
+
+def test_alone_or_among_others_they_have_the_same_bits(renderer):
+    """Clouds of nothing else have kernels without what disks need (`ellipsoids_alone`)."""
+    alone, quality = thick(3), fs.Quality(lowpass="none")
+    behind = fs.SplatCloud([[0, 0, -5]], [[1, 0, 0, 0]], [[0.1, 0.1]], [1.0], colors=[[1, 1, 1]])
+    both = fs.SplatCloud.concatenate([alone, behind])
+    images = [renderer.render(cloud, CAMERA, quality=quality)["rgb"] for cloud in (alone, both)]
+    assert images[0].any()
+    assert np.array_equal(*images)
 
 
 def test_exact_behind_a_fisheye(renderer):

@@ -32,7 +32,7 @@ MAY_IMPORT = {
     "cloud_arrays": BASE | {"defects"},
     "splats": BASE | {"harmonics", "defects", "cloud_arrays"},
     "cameras": BASE,
-    "vision": BASE | {"cameras"},
+    "vision": BASE | {"cameras", "scenes", "markers"},
     "formats": BASE | {"splats", "harmonics", "defects", "cloud_arrays", "cameras"},
     "markers": BASE | {"splats", "quality", "vision.dictionaries", "vision.images"},
     "scenes": PLAIN | {"markers", "formats"},
@@ -55,7 +55,7 @@ HOME_OF = {
     "pupil_apriltags": ("vision",),
     "flip_evaluator": ("vision",),
     "bpy": ("experiments.blender_worker",),
-    "shapely": ("markers",),
+    "shapely": ("markers", "vision.visible"),
     "networkx": ("markers",),
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
@@ -157,7 +157,7 @@ def within_any(names, package) -> bool:
 
 
 # modules of the package that every backend may import
-SHARED = ("base", "view", "prepare", "registry", "planes")
+SHARED = ("base", "caches", "view", "prepare", "registry", "planes")
 
 
 def test_backends_do_not_import_each_other():

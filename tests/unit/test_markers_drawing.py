@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 import fidsplat as fs
 from fidsplat.markers import marker
-from fidsplat.markers.cover import turned
+from fidsplat.markers.cover import _met, turned
 from fidsplat.markers.kinds import parse_spec
 from fidsplat.markers.paths import circle_rings, path_rings
 from fidsplat.markers.shapes import filled
@@ -206,3 +206,25 @@ def test_a_drawing_in_a_scene_file_is_beside_it(tmp_path):
     assert 'spec = "svg-40:sign.svg"' in (tmp_path / "scene.toml").read_text()
     again = fs.Scene.load(tmp_path / "scene.toml").markers[0].marker
     assert np.array_equal(again.cloud.colors, made.cloud.colors)
+
+
+def test_shapes_that_touch_the_sheet_leave_no_lines(tmp_path):
+    """The first lies beside the sheet and shares an edge with it."""
+    made = drawn(tmp_path, '<rect x="-5" width="5" height="9" fill="red"/><circle cx="9" cy="9" r="5"/>')
+    assert set(map(tuple, made.cloud.colors[:, :3])) == {(0, 0, 0), (1, 1, 1)}
+
+
+def test_which_modules_a_region_meets():
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        h, w = map(int, rng.integers(1, 40, 2))
+        region = shapely.union_all([shapely.Polygon(p).buffer(0) for p in rng.uniform(-5, 45, (3, 5, 2))])
+        y, x = np.indices((h, w))
+        assert np.array_equal(
+            _met(region, (h, w)), shapely.intersects(region, shapely.box(x, y, x + 1, y + 1))
+        )
+
+
+def test_heaps_of_shapes_are_refused(tmp_path):
+    with pytest.raises(fs.InputError, match="50000 pairs of shapes overlap: simplify"):
+        drawn(tmp_path, 400 * '<rect width="9" height="9"/>')

@@ -10,13 +10,13 @@ import numpy as np
 from fidsplat.accuracy import errors
 from fidsplat.errors import FidsplatError
 from fidsplat.experiments.plane import plane_picture
-from fidsplat.experiments.readback import corner_error, own_code
 from fidsplat.experiments.setup import BACKGROUND
 from fidsplat.experiments.tradeoff.hard import CELLS, cell_window
 from fidsplat.experiments.tradeoff.scenes import HARD, SEED, TradeScene
 from fidsplat.hard_cases.agreement import Picture, truth_of
 from fidsplat.quality import Quality
 from fidsplat.vision.metrics import flip, has_flip, psnr
+from fidsplat.vision.readback import corner_error, own_code
 
 FLIP_SIDE = 256
 """pixels: FLIP is taken of the middle square of this size; of the scene of hard cases all is taken"""

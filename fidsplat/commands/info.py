@@ -1,0 +1,131 @@
+"""`fidsplat info`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from fidsplat.commands.output import Json, console, late_progress, option, print_json, print_table
+
+if TYPE_CHECKING:
+    from fidsplat.splats import SplatCloud
+
+SHARES = (1, 50, 99)
+"""percent"""
+
+FLAT = 0.94
+"""Cosine of 20 degrees: a splat is level when its normal is nearer than this to the axis."""
+
+
+@dataclass
+class Info:
+    """Say what a splat file holds, where, and how large it is.
+
+    Bounds are of all splats, and of the middle 99 % of their centres along each axis: captures have strays
+    far away. Which way is up is a guess: away from where most of the area is level, or along a side that is
+    by far the longest. From these come a size for a first marker, and a place where it is seen from -z, as
+    `fidsplat render FILE.ply` looks.
+
+    Examples:
+      fidsplat info scene.ply
+      fidsplat info scene.ply --json
+    """
+
+    file: Annotated[tyro.conf.Positional[str], option("FILE.ply", "a splat file")]
+    json: Json = False
+
+    def run(self) -> int:
+        import fidsplat as fs
+
+        with late_progress(console(True)) as progress:
+            cloud = fs.load_ply(self.file, progress)
+        facts = {"file": self.file, "bytes": Path(self.file).stat().st_size, **describe(cloud)}
+        if self.json:
+            print_json(facts)
+            return 0
+        print_table(console(False), self.file, ("", ""), _rows(facts))
+        return 0
+
+
+def describe(cloud: SplatCloud) -> dict[str, Any]:
+    """A cloud in figures: metres as the file has them, percentiles of `SHARES`."""
+    import numpy as np
+
+    facts: dict[str, Any] = {
+        "splats": len(cloud),
+        "kind": "2D" if cloud.thickness is None else "3D",
+        "sh_degree": max(cloud.sh_degree, 0),
+        "left_out": dict(cloud.dropped),
+    }
+    if not len(cloud):
+        return facts
+    low, high = cloud.bounds()
+    inner = np.percentile(cloud.means.astype(np.float64), (0.5, 99.5), axis=0) + cloud.origin
+    extent = inner[1] - inner[0]
+    up, why = guess_up(cloud)
+    axis = "xyz".index(up[1])
+    scales = cloud.scales.astype(np.float64)
+    return facts | {
+        "bounds": [low, high],
+        "middle_bounds": list(inner),
+        "marker_position": [*inner.mean(0)[:2], inner[0, 2]],
+        "up": up,
+        "up_because": why,
+        "height": float(extent[axis]),
+        "marker_size": float(f"{0.1 * max(extent.max(), 1e-9):.1g}"),
+        "scales": np.percentile(scales.max(1), SHARES),
+        "aspect": float(np.median(scales.max(1) / scales.min(1))),
+        "opacities": np.percentile(cloud.opacities, SHARES),
+    }
+
+
+def guess_up(cloud: SplatCloud) -> tuple[str, str]:
+    """Which way is up, e.g. "-y", and why: away from where most of the area is level; else along a side that
+    is by far the longest, as a thing stands."""
+    import numpy as np
+
+    from fidsplat.rotations import quaternion_to_matrix
+
+    level = np.abs(quaternion_to_matrix(cloud.quats)[:, :, 2]) > FLAT
+    area = cloud.scales.prod(1).astype(np.float64) * cloud.opacities
+    area = np.minimum(area, np.percentile(area, 99)) + 1e-30  # a sky of few huge splats is no ground
+    low, high = np.percentile(cloud.means.astype(np.float64), (0.5, 99.5), axis=0)
+    shares, sides = area @ level / area.sum(), np.sort(high - low)
+    axis = int(np.argmax(shares))
+    if shares[axis] < 0.5 and sides[2] > 1.5 * sides[1]:
+        axis = int(np.argmax(high - low))
+        return ("+x", "-y", "+z")[axis], "the longest side"
+    some = level[:, axis] if level[:, axis].any() else np.ones(len(cloud), bool)
+    place = np.clip(cloud.means[some, axis], low[axis], high[axis])
+    below = np.average(place, weights=area[some]) <= (low[axis] + high[axis]) / 2
+    return ("+" if below else "-") + "xyz"[axis], f"{100 * shares[axis]:.0f} % of the area is level"
+
+
+def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
+    rows = [
+        ("splats", f"{facts['splats']:,} ({facts['kind']}), SH degree {facts['sh_degree']}"),
+        ("file", f"{facts['bytes'] / 2**20:.1f} MiB"),
+    ]
+    rows += [("left out", f"{count:,}: {why}") for why, count in facts["left_out"].items()]
+    if not facts["splats"]:
+        return rows
+
+    def point(values) -> str:
+        return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
+
+    scales, opacities = (" / ".join(f"{v:.3g}" for v in facts[key]) for key in ("scales", "opacities"))
+    shares = " / ".join(map(str, SHARES))
+    low, high = facts["middle_bounds"]
+    place = f"position = {point(facts['marker_position'])}: a tenth of the whole, before its middle from -z"
+    return [
+        *rows,
+        ("bounds", " to ".join(map(point, facts["bounds"])) + " m"),
+        ("middle 99 %", f"{point(low)} to {point(high)} m"),
+        ("up", f"{facts['up']}? ({facts['up_because']}), {facts['height']:.3g} m high"),
+        ("longer scale", f"{scales} m at {shares} %; {facts['aspect']:.2g} times the shorter (median)"),
+        ("opacity", f"{opacities} at {shares} %"),
+        ("a first marker", f"size = {facts['marker_size']:g}, {place}"),
+    ]
