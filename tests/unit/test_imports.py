@@ -28,7 +28,6 @@ MAY_IMPORT = {
     "surroundings": BASE | {"vision.images"},
     "kernel_files": BASE,
     "provenance": BASE | {"kernel_files"},
-    "defects": BASE,
     "cloud_arrays": BASE | {"defects"},
     "splats": BASE | {"harmonics", "defects", "cloud_arrays"},
     "cameras": BASE,

@@ -3,10 +3,6 @@ the same bits."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
-import numpy as np
-
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.resident import Resident
@@ -48,15 +44,3 @@ def room(
             "memory_budget, or use an OpenCL device, which draws a cloud in chunks"
         )
     return min(workspace.pair_budget, pairs)
-
-
-def cut(totals: np.ndarray, most: int) -> Iterator[tuple[int, int, int]]:
-    """Ranges of tiles (first, end, pairs) with lists of these lengths, of at most so many pairs together; at
-    least one tile, whatever its list.
-    """
-    ends = np.cumsum(totals, dtype=np.int64)
-    first, done = 0, 0
-    while first < len(ends):
-        end = max(int(np.searchsorted(ends, done + most, side="right")), first + 1)
-        yield first, end, int(ends[end - 1]) - done
-        first, done = end, int(ends[end - 1])

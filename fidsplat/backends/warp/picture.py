@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.backends.bands import cut
 from fidsplat.backends.view import Shot, View
 from fidsplat.backends.warp import bands
 from fidsplat.backends.warp.launch import BLOCK, Launcher
@@ -184,7 +185,7 @@ class Picture:
         self.program.load_banding()
         # in one piece: on the CPU its sums are plain additions
         self.launcher.once(self.program.lists.histogram, visible, {**self.held, "first": 0})
-        return bands.cut(totals.numpy()[: self.tiles], most)
+        return cut(totals.numpy()[: self.tiles], most)
 
     def _list(self, visible: int, first: int, end: int, pairs: int, whole: bool) -> None:
         """The lists of the tiles of one band, each in depth order."""
