@@ -25,6 +25,8 @@ from fidsplat.scenes.table import Table, names_of
 ORTHOGRAPHIC = ("metres_wide",)
 TABLES = ("distortion", "fisheye", "equirectangular", "orthographic")
 _NAME = {BrownConrady: "distortion", Fisheye: "fisheye"}
+SHUTTER = ("time", "exposure_time_ms", "sub_poses", "readout_ms", "rows_per_band")
+POSE = ("time", "position", "quaternion")
 
 
 def read_lens(camera: Table) -> Lens | None:
@@ -87,10 +89,6 @@ def lens_table(camera: Camera) -> tuple[str, dict[str, float]] | None:
         values = {name: getattr(lens, name) for name in names_of(type(lens))}
         return _NAME[type(lens)], {name: value for name, value in values.items() if value}
     return lens.kind, {}
-
-
-SHUTTER = ("time", "exposure_time_ms", "sub_poses", "readout_ms", "rows_per_band")
-POSE = ("time", "position", "quaternion")
 
 
 def read_shutter(camera: Table) -> Shutter | None:

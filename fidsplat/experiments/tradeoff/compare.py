@@ -27,6 +27,14 @@ from fidsplat.vision.readers import Target, attempt
 FULL_TILTS, QUICK_TILTS = "0:40:20,46:88:1", "0:40:40,48:88:4"
 READERS = {"apriltag": "aruco", "qr": "zxing"}
 """one detector of each kind, those that fidsplat installs"""
+FLIP_SIDE = 256
+"""pixels: FLIP is taken of the middle square of this size; of the scene of hard cases all is taken"""
+NO_FLIP = "flip-evaluator is not installed; pip install 'fidsplat[experiments]'"
+_PAIRS = 2_000_000
+"""pixels times splats that the reference may look at for one picture"""
+_MOST, _LEAST = 64, 12
+"""pixels whose certificates are asked for; where fewer could be, none is"""
+_SAMPLED = 64
 
 
 def scan(session: Session, name: str, quality: Quality | None, tilts: str) -> Callable[[], dict]:
@@ -58,16 +66,6 @@ def scan(session: Session, name: str, quality: Quality | None, tilts: str) -> Ca
         return {"reader": reader, "read": read, "splats": splats, "rectangles": len(made.boxes)}
 
     return look
-
-
-FLIP_SIDE = 256
-"""pixels: FLIP is taken of the middle square of this size; of the scene of hard cases all is taken"""
-NO_FLIP = "flip-evaluator is not installed; pip install 'fidsplat[experiments]'"
-_PAIRS = 2_000_000
-"""pixels times splats that the reference may look at for one picture"""
-_MOST, _LEAST = 64, 12
-"""pixels whose certificates are asked for; where fewer could be, none is"""
-_SAMPLED = 64
 
 
 def compare_picture(picture: np.ndarray, truth: np.ndarray, scene: TradeScene, quality: Quality) -> dict:
