@@ -156,7 +156,7 @@ def within_any(names, package) -> bool:
 
 
 # modules of the package that every backend may import
-SHARED = ("base", "view", "prepare", "registry", "planes")
+SHARED = ("base", "view", "prepare", "registry", "planes", "bands")
 
 
 def test_backends_do_not_import_each_other():
