@@ -1,5 +1,5 @@
-"""Makes the pictures of the pages again: docs/images/demo.jpg, and real-scene.jpg when a captured scene is
-given.
+"""Makes the pictures of the pages again: docs/images/demo.jpg, and real-scene.jpg and ellipsoids.jpg when a
+captured scene is given.
 
 python benchmarks/docs_images.py [biker.compressed.ply]
 """
@@ -36,6 +36,7 @@ def main() -> None:
             script = str(HERE / "real_scene.py")
             subprocess.run([sys.executable, script, scene, "-o", folder], check=True)
             save(Path(folder) / "sheet.png", "real-scene.jpg")
+            save(Path(folder) / "ways.png", "ellipsoids.jpg")
 
 
 if __name__ == "__main__":

@@ -52,10 +52,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return status
     except SystemExit as stop:  # help, or words that could not be parsed
         return stop.code if isinstance(stop.code, int) else 2
-    except _Terminated:
-        return _fail("terminated", 143)
-    except KeyboardInterrupt:
-        return _fail("interrupted", 130)
+    except KeyboardInterrupt as stop:
+        if not debug:  # what was stopped while it was made may complain when it is thrown away
+            sys.unraisablehook = lambda _: None
+        return _fail(*(("terminated", 143) if isinstance(stop, _Terminated) else ("interrupted", 130)))
     except BrokenPipeError:
         _drop_output()  # whoever read it has gone; nothing is left to say to them
         return 1
@@ -66,7 +66,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         if isinstance(error, FidsplatError):
             return _fail(str(error), error.exit_status)
-        if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
+        if (
+            isinstance(error, MemoryError)
+            or getattr(error, "errno", None) == errno.ENOMEM
+            or (isinstance(error, ImportError) and "failed to map segment" in str(error))
+        ):
             return _fail("not enough memory for this; use a smaller picture or fewer splats", 1)
         if isinstance(error, OSError) and error.errno in _SHORTAGES:
             _drop_output()

@@ -26,6 +26,8 @@ class StandardScene:
     """metres"""
     width: int
     height: int
+    thick: bool = False
+    """whether the splats are 3D Gaussians, as those of captures are, and no disks"""
 
 
 SCENES = {
@@ -33,6 +35,9 @@ SCENES = {
     "r1m_1080p": StandardScene(1_000_000, 0.012, 1920, 1080),
     "r5m_1080p": StandardScene(5_000_000, 0.006, 1920, 1080),
     "r20m_4k": StandardScene(20_000_000, 0.004, 3840, 2160),
+    "r100k_720p_3d": StandardScene(100_000, 0.03, 1280, 720, thick=True),
+    "r1m_1080p_3d": StandardScene(1_000_000, 0.012, 1920, 1080, thick=True),
+    "r5m_1080p_3d": StandardScene(5_000_000, 0.006, 1920, 1080, thick=True),
 }
 """What is timed. The camera stands at the origin and looks down +z, x right, y down, 60 degrees across,
 before black."""
@@ -41,7 +46,7 @@ before black."""
 def load_scene(name: str, seed: int = 0) -> tuple[SplatCloud, Camera]:
     """A scene of `SCENES` by name, with its camera."""
     scene = SCENES[name]
-    cloud = random_cloud(scene.count, scene.median_scale, seed)
+    cloud = random_cloud(scene.count, scene.median_scale, seed, thick=scene.thick)
     return cloud, standard_camera(scene.width, scene.height)
 
 
@@ -51,9 +56,11 @@ def standard_camera(width: int, height: int, fov_x: float = math.radians(60.0)) 
     return Camera.pinhole(width, height, focal, focal, width / 2, height / 2)
 
 
-def random_cloud(count: int, median_scale: float, seed: int = 0, extent: float = 4.0) -> SplatCloud:
+def random_cloud(
+    count: int, median_scale: float, seed: int = 0, extent: float = 4.0, thick: bool = False
+) -> SplatCloud:
     """`count` splats: centres uniform in a cube, orientations uniform, scales log-normal, opacities beta(1.2,
-    1)."""
+    1). thick: the same with a third scale."""
     generator = np.random.default_rng(seed)
     means = generator.uniform(-extent, extent, (count, 3)).astype(np.float32)
     means[:, 2] += extent * 2.0
@@ -62,6 +69,9 @@ def random_cloud(count: int, median_scale: float, seed: int = 0, extent: float =
     scales = np.exp(generator.normal(np.log(median_scale), 0.6, (count, 2))).astype(np.float32)
     opacities = generator.beta(1.2, 1.0, count).astype(np.float32)
     colors = generator.uniform(0, 1, (count, 3)).astype(np.float32)
+    if thick:
+        third = np.exp(generator.normal(np.log(median_scale), 0.6, (count, 1))).astype(np.float32)
+        scales = np.concatenate([scales, third], axis=1)
     return SplatCloud(means, quats, scales, opacities, colors=colors)
 
 

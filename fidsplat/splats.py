@@ -126,15 +126,26 @@ class SplatCloud(PickledByFields):
 
     @classmethod
     def of_checked(
-        cls, means, quats, scales, opacities, sh, labels=None, thickness=None, *, origin, dropped
+        cls,
+        means,
+        quats,
+        scales,
+        opacities,
+        sh=None,
+        labels=None,
+        thickness=None,
+        *,
+        colors=None,
+        origin,
+        dropped,
     ) -> "SplatCloud":
-        """A cloud that takes over arrays of splats that can all be drawn, as a reader of files has found.
+        """A cloud that takes over arrays of splats that can all be drawn, as their maker knows.
 
-        means (n, 3) float32 or float64, all else as the attributes are, but quats of any length above 0.
-        dropped: what the reader left out.
+        means (n, 3) float32 or float64, all else as the attributes are, but quats of any length above 0; one
+        of sh and colors is None. dropped: what a reader left out.
         """
         cloud = object.__new__(cls)
-        single = {"quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
+        single = {"quats": quats, "scales": scales, "opacities": opacities, "colors": colors, "sh": sh}
         single["means"] = means if means.dtype == F32 else as_single(means)
         if thickness is not None:
             single["thickness"] = thickness

@@ -1,6 +1,12 @@
 """Every device that can be opened here, the reference excepted: contract tests run on each."""
 
 import pytest
+from certificates import (  # noqa: F401 (hooks)
+    pytest_addoption,
+    pytest_configure,
+    pytest_sessionfinish,
+    pytest_terminal_summary,
+)
 
 import fidsplat as fs
 

@@ -62,7 +62,13 @@ def measure(backend: OpenCLBackend) -> Numbers:
     features = select(fs.SplatCloud.empty(), fs.Capture(quality=fs.Quality(lowpass="none")))
     # the driver keeps what it has compiled, and has no log of what it kept: a kernel that is new each time
     name = f"unlike_{secrets.token_hex(8)}"
-    text = assemble(features, backend.shape).text + f"kernel void {name}(global int *out) {{ out[0] = 1; }}\n"
+    unlike = f"kernel void {name}(global int *out) {{ out[0] = 1; }}\n"
+    texts = [program.compiled + unlike for program in assemble(features, backend.shape).programs.values()]
+    return dict(sorted(one for text in texts for one in _of_text(backend, text, name).items()))
+
+
+def _of_text(backend: OpenCLBackend, text: str, name: str) -> Numbers:
+    """The same of the kernels of a text; `name` is the one that makes it new."""
     program = build(backend, text, "-cl-nv-verbose")
     log = program.get_build_info(backend.device, cl.program_build_info.LOG)
     numbers = of_log(log)
@@ -77,7 +83,7 @@ def measure(backend: OpenCLBackend) -> Numbers:
                 "private": kernel.get_work_group_info(info.PRIVATE_MEM_SIZE, backend.device),
                 "local": kernel.get_work_group_info(info.LOCAL_MEM_SIZE, backend.device),
             }
-    return dict(sorted(numbers.items()))
+    return numbers
 
 
 def main() -> None:

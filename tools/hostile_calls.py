@@ -9,7 +9,11 @@ from typing import Any
 import numpy as np
 
 import fidsplat as fs
+from fidsplat.markers.kinds import parse_spec
 from fidsplat.scenes import PlacedMarker
+from fidsplat.vision import images
+from fidsplat.vision.detect import detect
+from fidsplat.vision.pose import marker_pose
 
 Call = tuple[Callable[..., Any], dict[str, Any], Callable[[Any], Any] | None]
 """a function, arguments by name, and a use of what it gives"""
@@ -129,7 +133,7 @@ CALLS: dict[str, Callable[[Path], Call]] = {
         fs.Quality,
         {
             "alpha_cutoff": 1e-3, "transmittance_stop": 0.0, "stop_rule": "inclusive", "opacity_ceiling": 1.0,
-            "lowpass": "screen", "coplanar": "blend", "samples": 1, "first_hit": 0.1, "arithmetic": "fast",
+            "lowpass": "screen", "order": "auto", "samples": 1, "first_hit": 0.1, "arithmetic": "fast",
             "marker": fs.MarkerQuality(),
         },
         lambda quality: RENDERER.render(CLOUD, CAMERA, quality=quality),
@@ -181,6 +185,18 @@ CALLS: dict[str, Callable[[Path], Call]] = {
         lambda capture: RENDERER.render(CLOUD, capture),
     ),
     "Capture.with_": lambda _: (fs.Capture(CAMERA).with_, {"outputs": ("rgb",), "fog": fs.Fog(0.1)}, None),
+    "quality_within": lambda _: (fs.quality_within, {"error": 0.01, "ms": None, "scene": None, "capture": None}, None),
+    "parse_spec": lambda _: (parse_spec, {"text": "charuco:3x3:4x4_50"}, None),
+    "detect": lambda _: (detect, {"image": np.zeros((16, 24, 3), np.uint8), "families": ("36h11",), "qr": True}, None),
+    "to_uint8": lambda _: (images.to_uint8, {"image": np.zeros((4, 4, 3))}, None),
+    "write_png": lambda folder: (images.write_png, {"path": folder / "out.png", "image": np.zeros((4, 4, 3), np.uint8)}, None),
+    "marker_pose": lambda _: (
+        marker_pose, {"corners": np.array([[9, 6], [15, 6], [15, 12], [9, 12.0]]), "size": 0.1, "camera": CAMERA}, None
+    ),
+    "Shutter": lambda _: (
+        fs.Shutter, {"exposure_time": 0.01, "sub_poses": 2, "readout": 0.01, "rows_per_band": 4},
+        lambda shutter: RENDERER.render(CLOUD, CAMERA, shutter=shutter),
+    ),
     "Frame[]": lambda _: (lambda key: _frame()[key], {"key": "rgb"}, None),
     "Frame.get": lambda _: (lambda key: _frame().get(key), {"key": "rgb"}, None),
     "Frame.device_array": lambda _: (_frame().device_array, {"name": "rgb"}, None),

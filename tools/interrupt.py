@@ -35,6 +35,8 @@ from rich.table import Table
 
 SIGNALS = ("SIGINT", "SIGTERM", "SIGKILL")
 DISK = "full disk"
+TIMED = ("repeats",)
+"""values that depend on the time that something takes, and may agree by chance"""
 FIDSPLAT = (sys.executable, "-c", "import sys; from fidsplat.cli import main; sys.exit(main())")
 SCENE = """\
 [camera]
@@ -99,6 +101,7 @@ def facts(path: Path) -> Facts:
                 for row in rows
                 if "key" in row  # and not the facts of a run
                 for place, value in _leaves(row["result"])
+                if place[-1] not in TIMED
             }
         case ".png" | ".jpg":
             if cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) is None:
@@ -196,8 +199,9 @@ def _end(child: subprocess.Popen[str]) -> tuple[int, str]:
 
 def is_clear(status: int, said: str) -> bool:
     """Whether a run ended well, in one line, or was killed outright."""
-    killed = status in (0, *(-getattr(signal, name) for name in SIGNALS))
-    known = killed or any(line.startswith("fidsplat: ") for line in said.splitlines())
+    if status in [-getattr(signal, name) for name in SIGNALS] and ", in main" not in said:
+        return True  # by Python, before our first line
+    known = status == 0 or any(line.startswith("fidsplat: ") for line in said.splitlines())
     return known and "Traceback" not in said and "a fault of fidsplat" not in said
 
 

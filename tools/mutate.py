@@ -166,7 +166,7 @@ def run_tests(tree: Path, tests: Sequence[str], deadline: float = float("inf")) 
         output.seek(0)
         said = output.read()
     failed = re.search(r"^(?:FAILED|ERROR) (\S.*?)(?: - .*)?$", said, re.MULTILINE)
-    begun = re.findall(r"^(\S+\.py::.*?)(?: (?:PASSED|SKIPPED|FAILED|ERROR)\b.*)?$", said, re.MULTILINE)
+    begun = re.findall(r"^(\S+\.py::.*?)(?: (?:PASSED|SKIPPED|FAILED|ERROR|Fatal)\b.*)?$", said, re.MULTILINE)
     return Run(how, failed[1] if failed else begun[-1].strip() if begun else "")
 
 

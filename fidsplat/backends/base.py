@@ -179,9 +179,14 @@ class Probe(Protocol):
     """Looks into an open device: small kernels compiled as the stages are, single stages on made-up input,
     and memory that is filled with rubbish first."""
 
-    def contraction(self, a: np.ndarray, b: np.ndarray) -> tuple[Sequence[np.ndarray], bool]:
+    @property
+    def fuses(self) -> bool:
+        """Whether the device fuses multiply-adds where it is asked to."""
+        ...
+
+    def contraction(self, a: np.ndarray, b: np.ndarray) -> Sequence[np.ndarray]:
         """a b - a b; a b + a; the difference in the set-up's precision, of thirds; a b - (a b), fused: each
-        (n,), from a, b (n,) float32. And whether the device fuses where it is asked to."""
+        (n,), from a, b (n,) float32."""
         ...
 
     def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
@@ -217,6 +222,11 @@ class Probe(Protocol):
         64 bits."""
         ...
 
+    def boxes(self, pipeline: Any, trace: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Of what `pipeline.trace` gave: the samples that each splat can touch, (n, 4) int, columns [x0, x1)
+        and rows [y0, y1); undefined for culled splats."""
+        ...
+
     def poisoned(self) -> AbstractContextManager[None]:
         """Within it, all memory that a picture takes is filled with 0xFF first: NaN, or the integer -1."""
         ...
@@ -238,10 +248,17 @@ class Probed(Protocol):
 class Reshapes(Backend, Protocol):
     """A backend whose build constants (its "shape") tests may replace: sizes of tiles, ways of sorting."""
 
+    shape: Any
+    """the device's own"""
+
     def shapes(self, kind: str) -> dict[str, Any]:
         """Build constants by a name that people read. kind: `tiles`, of other sizes, whose pictures have the
         same bits; `schedule`, the way in which a GPU walks its tiles (on a GPU: other tiles), whose pictures
-        agree but for rounding; `sorting`, the device's own and others for listing and sorting."""
+        agree but for rounding; `listing`, the ways of listing splats per tile, under the schedule of a GPU
+        where the device has several; `sorting`, the device's own and others for listing and sorting;
+        `arithmetic`, the ways of compiling the functions of `Probe.arithmetic`, fused or not, in vectors or
+        one by one, the device's own among them; `waiting`, less room for fragments that wait for nearer ones,
+        whose pictures have the same bits."""
         ...
 
     def pieces(self, shape: Any) -> int:

@@ -11,6 +11,7 @@ from fidsplat.commands.demo import Demo
 from fidsplat.commands.detect import Detect
 from fidsplat.commands.devices import Devices
 from fidsplat.commands.experiment import Experiment
+from fidsplat.commands.info import Info
 from fidsplat.commands.marker import Marker
 from fidsplat.commands.render import Render
 from fidsplat.commands.source import Source
@@ -20,6 +21,7 @@ from fidsplat.commands.warm import Warm
 COMMANDS = {
     "demo": Demo,
     "devices": Devices,
+    "info": Info,
     "marker": Marker,
     "render": Render,
     "detect": Detect,

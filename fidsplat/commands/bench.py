@@ -37,6 +37,7 @@ class Bench:
       r1m_1080p       1,000,000, 1920 x 1080
       r5m_1080p       5,000,000, 1920 x 1080
       r20m_4k         20,000,000, 3840 x 2160
+      r100k_720p_3d   the same of 3D Gaussians; likewise r1m_1080p_3d, r5m_1080p_3d
       qr_wall         200 QR codes of version 22 on a wall, 1920 x 1080
       tag_in_million  an AprilTag before 1,000,000 random splats, 1920 x 1080
 

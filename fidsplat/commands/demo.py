@@ -74,7 +74,7 @@ def _row(sighting: "Sighting", result: "DemoResult") -> tuple[str, ...]:
     return (
         sighting.view,
         spec,
-        f"{100 * sighting.visible:.0f} %",
+        f"{100 * reading.visible:.0f} %",
         "no" if reading.detection is None else "yes",
         *errors,
         str(result.marker_splats[spec]),

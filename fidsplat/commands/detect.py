@@ -1,30 +1,40 @@
 """`fidsplat detect`."""
 
-from dataclasses import asdict, dataclass, replace
-from typing import Annotated
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from fidsplat.commands.output import Json, console, late_progress, option, print_json, print_table
 from fidsplat.errors import InputError
 
+if TYPE_CHECKING:
+    import numpy as np
+
+    from fidsplat.scenes import Scene
+    from fidsplat.vision.readback import Reading
+
 
 @dataclass
 class Detect:
-    """Find AprilTag, ArUco and QR codes in a picture.
+    """Find AprilTag, ArUco and QR codes in pictures, folders of pictures and videos.
 
     Prints what they say and the corners of each, in pixels: top left, top right, bottom right, bottom left as
-    printed, the centre of the first pixel at (0.5, 0.5). With --scene also where each marker of that scene
-    was seen from its camera, and how far that is from the truth: of a scene that moves, from where things are
-    at its shutter's time, when the middle row is exposed.
+    printed, the centre of the first pixel at (0.5, 0.5). With --scene also where each marker and board of
+    that scene was seen from its camera, how far that is from the truth, and the means: of a scene that moves,
+    from where things are at its shutter's time, when the middle row is exposed.
 
     Examples:
       fidsplat detect photo.jpg
       fidsplat detect photo.png --family 16h5 --family 7x7_1000
+      fidsplat detect flight.mp4 stills/ --json
       fidsplat detect scene.png --scene scene.toml --json
     """
 
-    image: Annotated[tyro.conf.Positional[str], option("IMAGE", "PNG, JPEG, BMP, TIFF or WebP")]
+    images: Annotated[
+        tyro.conf.Positional[tuple[str, ...]],
+        option("IMAGE", "PNG, JPEG, BMP, TIFF or WebP, a folder of them, or a video"),
+    ]
     family: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
         option(
@@ -33,92 +43,112 @@ class Detect:
             "6x6_250 7x7_250)",
         ),
     ] = ()
-    scene: Annotated[str | None, option("SCENE.toml", "the scene that the picture shows")] = None
+    scene: Annotated[str | None, option("SCENE.toml", "the scene that the pictures show")] = None
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.vision.detect import detect
         from fidsplat.vision.dictionaries import parse_family
-        from fidsplat.vision.images import read_image
+        from fidsplat.vision.images import pictures
+        from fidsplat.vision.readback import means
 
+        if not self.images:
+            raise InputError("give at least one IMAGE: a picture, a folder of them, or a video")
         for name in self.family:
             parse_family(name)
-        image = read_image(self.image)
-        scene = self._load_scene(image.shape) if self.scene is not None else None
-        families = self.family or None
-        if scene is not None and families is None:
-            from fidsplat.experiments.readback import families_of
-
-            families = families_of(placed.marker for placed in scene.markers)
-        found = detect(image, families)
-        result = {
-            "image": self.image,
-            "width": image.shape[1],
-            "height": image.shape[0],
-            "detections": [{"name": code.name, **asdict(code)} for code in found],
-        }
-        readings = []
-        if scene is not None:
-            from fidsplat.experiments.readback import read_back
-
-            camera, markers = _standing(scene)
-            readings, others = read_back(found, markers, camera)
-            result["markers"] = [reading.as_dict() for reading in readings]
-            result["not_in_scene"] = [code.name for code in others]
+        scene = None if self.scene is None else _load_scene(self.scene)
+        results: list[dict[str, Any]] = []
+        readings: list[Reading] = []
+        for path in self.images:
+            for name, image in pictures(path):
+                result, read = self._one(name, image, scene)
+                results.append(result)
+                readings += read
+        single = len(results) == 1
+        mean = {} if scene is None else {"means": means(readings)}
         if self.json:
-            print_json(result)
+            print_json((results[0] if single else {"pictures": results}) | mean)
             return 0
         where = console(False)
-        if not found:
-            where.print(f"no code found in {self.image}; --family looks for other tags", markup=False)
+        rows = [
+            (*(() if single else (result["image"],)), code["name"], _corners(code["corners"]))
+            for result in results
+            for code in result["detections"]
+        ]
+        title = results[0]["image"] if single else f"{len(results)} pictures"
+        if not rows:
+            where.print(f"no code found in {title}; --family looks for other tags", markup=False)
         else:
-            corner = [" ".join(f"({x:.2f}, {y:.2f})" for x, y in code.corners) for code in found]
-            rows = [(code.name, at) for code, at in zip(found, corner, strict=True)]
-            print_table(where, self.image, ("code", "corners [px]"), rows)
-        if readings:
-            heads = ("marker", "found", "distance [m]", "position [mm]", "angle [deg]", "corners [px]")
-            title = f"Against {self.scene}: distance, and errors"
-            print_table(where, title, heads, map(reading_row, readings))
+            heads = ("code", "corners [px]") if single else ("picture", "code", "corners [px]")
+            print_table(where, title, heads, rows)
+        if scene is not None:
+            heads = (
+                "marker",
+                "found",
+                "distance [m]",
+                "position [mm]",
+                "angle [deg]",
+                "corners [px]",
+            )
+            against = [reading_row(reading) for reading in readings]
+            if len(readings) > 1:
+                against.append(_mean_row(mean["means"]))
+            print_table(where, f"Against {self.scene}: distance, and errors", heads, against)
         return 0
 
-    def _load_scene(self, shape: tuple[int, ...]):
-        import fidsplat as fs
+    def _one(
+        self, name: str, image: "np.ndarray", scene: "Scene | None"
+    ) -> tuple[dict[str, Any], list["Reading"]]:
+        """What one picture shows, for JSON, and the readings of the scene's markers."""
+        from fidsplat.vision.detect import detect
+        from fidsplat.vision.readback import read_back
 
-        with late_progress(console(True)) as progress:
-            scene = fs.Scene.load(str(self.scene), progress=progress)
-        if scene.camera is None:
-            raise InputError(f"{self.scene} has no [camera] table, so the pose of its markers is unknown")
-        size = (scene.camera.width, scene.camera.height)
-        if size != (shape[1], shape[0]):
-            raise InputError(
-                f"{self.image} has {shape[1]} x {shape[0]} pixels and the camera of {self.scene} {size[0]} x "
-                f"{size[1]}; give the picture that this scene was rendered to"
-            )
-        return scene
-
-
-def _standing(scene):
-    """The camera and the markers of a scene where they are at its shutter's time."""
-    time = 0.0 if scene.shutter is None else scene.shutter.time
-    markers = [
-        marker if marker.motion is None else replace(marker, pose=marker.motion(time))
-        for marker in scene.markers
-    ]
-    return scene.motion.moved(scene.camera, time), markers
+        families = self.family or None
+        facts: dict[str, Any] = {"image": name, "width": image.shape[1], "height": image.shape[0]}
+        if scene is None:
+            return facts | {"detections": [_said(code) for code in detect(image, families)]}, []
+        try:
+            readings, others = read_back(image, scene, families=families)
+        except InputError as error:
+            raise InputError(f"{name} and {self.scene}: {error}") from None
+        found = [reading.detection for reading in readings if reading.detection is not None]
+        facts["detections"] = [_said(code) for code in (*found, *others)]
+        facts["markers"] = [reading.as_dict() for reading in readings]
+        facts["not_in_scene"] = [code.name for code in others]
+        return facts, readings
 
 
-def reading_row(reading) -> tuple[str, ...]:
+def _load_scene(path: str) -> "Scene":
+    import fidsplat as fs
+
+    with late_progress(console(True)) as progress:
+        scene = fs.Scene.load(path, progress=progress)
+    if scene.camera is None:
+        raise InputError(f"{path} has no [camera] table, so the pose of its markers is unknown")
+    return scene
+
+
+def _said(code) -> dict[str, Any]:
+    return {key: getattr(code, key) for key in ("name", "kind", "family", "id", "payload", "corners")}
+
+
+def _corners(corners) -> str:
+    return " ".join(f"({x:.2f}, {y:.2f})" for x, y in corners)
+
+
+_ERRORS = (("position_error_mm", 2), ("angle_error_deg", 3), ("corner_error_px", 3))
+
+
+def reading_row(reading: "Reading") -> tuple[str, ...]:
     """One row of a table of readings."""
     facts = reading.as_dict()
+    found, share = "yes" if facts["found"] else "no", facts["visible"]
+    found += "" if share > 0.995 else f", {100 * share:.0f} % in view"
+    return (facts["marker"], found, f"{facts['distance_m']:.3f}", *_errors(facts))
 
-    def number(key: str, digits: int) -> str:
-        return "-" if facts[key] is None else f"{facts[key]:.{digits}f}"
 
-    return (
-        facts["marker"],
-        "yes" if facts["found"] else "no",
-        number("distance_m", 3),
-        number("position_error_mm", 2),
-        number("angle_error_deg", 3),
-        number("corner_error_px", 3),
-    )
+def _mean_row(mean: dict[str, Any]) -> tuple[str, ...]:
+    return ("mean", f"{mean['found']} of {mean['markers']}", "", *_errors(mean))
+
+
+def _errors(facts: dict[str, Any]) -> tuple[str, ...]:
+    return tuple("-" if facts[key] is None else f"{facts[key]:.{digits}f}" for key, digits in _ERRORS)

@@ -10,12 +10,10 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.experiments.demo_scene import OUTPUTS, demo_scene, demo_views
-from fidsplat.experiments.readback import Reading, families_of, read_back, visible_share
 from fidsplat.files import atomic_write, writable_folder
 from fidsplat.formats import save_ply
 from fidsplat.render import Renderer
 from fidsplat.scenes import Scene
-from fidsplat.vision.detect import detect
 from fidsplat.vision.images import to_uint8, write_png
 from fidsplat.vision.output_files import save_output
 from fidsplat.vision.paint import (
@@ -27,6 +25,7 @@ from fidsplat.vision.paint import (
     normal_picture,
     outlined,
 )
+from fidsplat.vision.readback import Reading, read_back
 
 # a marker counts as wholly visible from this share of its area on; the rest is the soft edge of its quiet
 # zone
@@ -41,13 +40,11 @@ class Sighting:
 
     view: str
     reading: Reading
-    visible: float
-    """share of the marker that can be seen, 0 to 1"""
 
     @property
     def passed(self) -> bool | None:
         """Found where it is; None for a marker that is not wholly visible, which nobody has to find."""
-        if self.visible < WHOLE:
+        if self.reading.visible < WHOLE:
             return None
         error = self.reading.position_error
         return error is not None and error < MAX_POSITION_ERROR * self.reading.distance
@@ -80,10 +77,7 @@ class DemoResult:
 
     def as_dict(self) -> dict:
         """For JSON."""
-        seen = [
-            {"view": s.view, "visible": s.visible, "passed": s.passed, **s.reading.as_dict()}
-            for s in self.sightings
-        ]
+        seen = [{"view": s.view, "passed": s.passed, **s.reading.as_dict()} for s in self.sightings]
         return {"passed": self.passed} | vars(self) | {"sightings": seen, "files": [*map(str, self.files)]}
 
 
@@ -116,14 +110,13 @@ def run_demo(
     files += sorted(folder.glob("scene-splats-*.ply"))
     save_ply((scene if mixture != "exact" else demo_scene(mixture="fitted")).cloud(), files[1])
 
-    families = families_of(placed.marker for placed in scene.markers)
     sightings, unexpected, frame_ms, visible, seen = [], [], {}, {}, {}
     for view, camera in demo_views().items():
         progress(f"drawing and reading: {view}")
         images, frame_ms[view], visible[view] = _draw(renderer, resident, scene, camera)
         image = to_uint8(images["rgb"])
-        readings, others = read_back(detect(image, families), scene.markers, camera)
-        sightings += [Sighting(view, r, visible_share(r.placed, camera, images["label"])) for r in readings]
+        readings, others = read_back(images, scene, camera)
+        sightings += [Sighting(view, reading) for reading in readings]
         unexpected += [code.name for code in others]
         marked = _marked(image, readings)
         files += _save(folder, view.replace(" ", "-"), images, marked)

@@ -11,10 +11,10 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.experiments.methods import Painter, plain_marker
-from fidsplat.experiments.readback import corner_error, own_code
 from fidsplat.experiments.setup import CATEGORIES, Category
 from fidsplat.markers import Marker
 from fidsplat.vision.pose import marker_pose, pose_error
+from fidsplat.vision.readback import corner_error, own_code
 
 NAME = "localisation"
 LOCATED = ("apriltag", "small")

@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pandas as pd
+
 from fidsplat.errors import InputError
 from fidsplat.experiments import angles, counts, localisation, views
 from fidsplat.experiments.methods import IDEAL
@@ -59,10 +61,14 @@ def load(folders: Sequence[Path]) -> dict[str, Summary]:
                 there.insert(0, summarise(records, partial(kind.rows, ideals), columns))
             if there:
                 found[name] = join(there, kind.about)
-        except (KeyError, TypeError) as error:
+                rows = found[name].rows
+                rows[list(kind.columns)] = rows[list(kind.columns)].apply(pd.to_numeric)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            if isinstance(error, InputError):
+                raise
             raise InputError(
-                f"results in {where} are of another version of fidsplat, they lack {error}; "
-                "measure again with --overwrite"
+                f"results of {name} in {where} are damaged or of another version of fidsplat "
+                f"({type(error).__name__}: {error}); measure again with --overwrite"
             ) from error
     if not found:
         raise InputError(f"no results in {where}; run fidsplat experiment all first, or give their folder")

@@ -8,6 +8,7 @@ lines after it, each of which is {"key": ..., "result": ...}: what was measured,
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -148,7 +149,7 @@ def read_records(file: Path) -> list[Record]:
     run: dict[str, Any] | None = None
     for number, line in enumerate(text.split("\n")[:-1], 1):
         try:
-            value = json.loads(line)
+            value = json.loads(line, parse_float=_finite, parse_constant=_finite)
             if set(value) == {"run"}:
                 run = value["run"]
                 continue
@@ -241,6 +242,13 @@ def _header(run: dict[str, Any]) -> str:
 def _line(record: Record) -> str:
     # NaN and infinities are not JSON: a result that has them is a fault, found here
     return json.dumps({"key": record.key, "result": record.result}, allow_nan=False) + "\n"
+
+
+def _finite(text: str) -> float:
+    """A number of a result, which is neither NaN nor infinite. Raises ValueError."""
+    if not math.isfinite(value := float(text)):
+        raise ValueError(text)
+    return value
 
 
 def rounded(value: Any) -> Any:

@@ -113,12 +113,12 @@ def f1(renderer: Renderer) -> Found:
     probe = renderer.backend.probe()
     generator = np.random.default_rng(61)
     a, b = generator.uniform(0.5, 2.0, (2, 4096)).astype(np.float32)
-    (difference, total, wide, fused), fuses = probe.contraction(a, b)
+    difference, total, wide, fused = probe.contraction(a, b)
     yield Finding("a b - a b that is not 0", int(np.count_nonzero(difference)), 0)
     yield Finding("the same in the set-up's precision", int(np.count_nonzero(wide)), 0)
     yield Finding("a b + c that is not rounded twice", int(np.count_nonzero(total != a * b + a)), 0)
     product = a.astype(float) * b.astype(float)  # exact, and so is its rounding error
-    wanted = (product - (a * b)) if fuses else np.zeros(len(a))
+    wanted = (product - (a * b)) if probe.fuses else np.zeros(len(a))
     yield Finding(
         "FMA(a, b, c) that is not rounded as it should be", int(np.count_nonzero(fused != wanted)), 0
     )

@@ -40,59 +40,46 @@ def _parse(text: str, head: str, rest: str) -> BoardSpec:
     return BoardSpec(text=text, kind=kind, family=found[3].lower(), columns=columns, rows=rows)
 
 
-def _tags(spec: BoardSpec, count: int) -> list[np.ndarray]:
-    """The first tags of the board's family."""
+def tag_places(spec: BoardSpec, side: int) -> list[tuple[int, int]]:
+    """Row and column, in modules, of the top left corner of each tag of ``side`` modules, in order of ids.
+
+    ChArUco: in the white squares, row by row. Grids: row by row from the top left, AprilGrids from the bottom
+    left, with a corner square around them.
+    """
+    cells = [(y, x) for y in range(spec.rows) for x in range(spec.columns)]
+    step = side + GAP
+    if spec.kind == "charuco":
+        return [(step * y + GAP // 2, step * x + GAP // 2) for y, x in cells if (x + y) % 2]
+    if spec.kind == "aprilgrid":
+        return [(step * (spec.rows - 1 - y) + GAP, step * x + GAP) for y, x in cells]
+    return [(step * y, step * x) for y, x in cells]
+
+
+def _bits(spec: BoardSpec) -> tuple[Spec, np.ndarray]:
+    """A board's modules: its tags, over dark squares in turn with white ones (the top left one dark), none,
+    or one at each corner of a tag."""
     from fidsplat.vision.dictionaries import dictionary_bits, families, parse_family
 
     kind, family = parse_family(spec.family or "")
     if kind != "apriltag" and spec.kind == "aprilgrid":
         raise InputError(f"{spec.text!r}: an AprilGrid has AprilTags, e.g. {_EXAMPLES['aprilgrid']}")
-    known = families(kind)[family].count
-    if count > known:
-        raise InputError(f"{spec.text!r} needs {count} tags, but {family} has {known}: take a smaller board")
-    return [dictionary_bits(kind, family, number) for number in range(count)]
-
-
-def _charuco(spec: BoardSpec) -> tuple[Spec, np.ndarray]:
-    """Squares in turn dark and white, the top left one dark, tags in the white ones row by row."""
-    white = [(y, x) for y in range(spec.rows) for x in range(spec.columns) if (x + y) % 2]
-    tags = _tags(spec, len(white))
-    square = len(tags[0]) + GAP
-    bits = np.kron(1 - np.indices((spec.rows, spec.columns)).sum(0) % 2, np.ones((square, square), int))
-    for (y, x), tag in zip(white, tags, strict=True):
-        _put(bits, tag, square * y + GAP // 2, square * x + GAP // 2)
-    return spec, bits.astype(np.uint8)
-
-
-def _grid(spec: BoardSpec) -> tuple[Spec, np.ndarray]:
-    """Tags row by row from the top left, apart by the gap."""
-    tags = _tags(spec, spec.columns * spec.rows)
-    step = len(tags[0]) + GAP
-    bits = np.zeros((spec.rows * step - GAP, spec.columns * step - GAP), np.uint8)
-    for number, tag in enumerate(tags):
-        y, x = divmod(number, spec.columns)
-        _put(bits, tag, step * y, step * x)
+    side, known = families(kind)[family]
+    places, step = tag_places(spec, side), side + GAP
+    if len(places) > known:
+        raise InputError(
+            f"{spec.text!r} needs {len(places)} tags, but {family} has {known}: take a smaller board"
+        )
+    beyond = {"charuco": 0, "gridboard": -GAP, "aprilgrid": GAP}[spec.kind]
+    y, x = np.indices((spec.rows * step + beyond, spec.columns * step + beyond))
+    bits = np.zeros(y.shape, np.uint8)
+    if spec.kind == "charuco":
+        bits[(y // step + x // step) % 2 == 0] = 1
+    elif spec.kind == "aprilgrid":
+        bits[(y % step < GAP) & (x % step < GAP)] = 1
+    for number, (row, column) in enumerate(places):
+        bits[row : row + side, column : column + side] = dictionary_bits(kind, family, number)
     return spec, bits
-
-
-def _april_grid(spec: BoardSpec) -> tuple[Spec, np.ndarray]:
-    """Tags row by row from the bottom left, a dark square of the gap's size at each of their corners."""
-    tags = _tags(spec, spec.columns * spec.rows)
-    step = len(tags[0]) + GAP
-    bits = np.zeros((spec.rows * step + GAP, spec.columns * step + GAP), np.uint8)
-    for y in range(GAP):
-        for x in range(GAP):
-            bits[y::step, x::step] = 1
-    for number, tag in enumerate(tags):
-        y, x = divmod(number, spec.columns)
-        _put(bits, tag, step * (spec.rows - 1 - y) + GAP, step * x + GAP)
-    return spec, bits
-
-
-def _put(bits: np.ndarray, tag: np.ndarray, y: int, x: int) -> None:
-    bits[y : y + len(tag), x : x + len(tag)] = tag
 
 
 _EXAMPLES = {"charuco": "7x5:4x4_50", "gridboard": "5x7:4x4_50", "aprilgrid": "6x6:36h11"}
-_MAKERS = {"charuco": _charuco, "gridboard": _grid, "aprilgrid": _april_grid}
-KINDS = tuple(Kind(name, f"{name}:CxR:FAMILY", GAP, _parse, _MAKERS[name]) for name in _EXAMPLES)
+KINDS = tuple(Kind(name, f"{name}:CxR:FAMILY", GAP, _parse, _bits) for name in _EXAMPLES)

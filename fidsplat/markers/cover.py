@@ -71,13 +71,29 @@ def cover(region: shapely.MultiPolygon, shape: tuple[int, int]) -> tuple[np.ndar
 
 def _modules(region: shapely.MultiPolygon, shape: tuple[int, int]) -> np.ndarray:
     """Whole modules over what lies further inside than bands reach, in rectangles: (n, 4, 2) corners."""
-    inner = shapely.buffer(region, -BAND)
-    shapely.prepare(inner)
-    y, x = np.indices(shape)
-    wanted = shapely.intersects(inner, shapely.box(x, y, x + 1, y + 1)).astype(np.uint8)
+    wanted = _met(shapely.buffer(region, -BAND), shape)
     boxes = partition(wanted)
     x0, y0, x1, y1 = boxes[wanted[boxes[:, 1], boxes[:, 0]] == 1].T.astype(np.float64)
     return np.stack([x0, y0, x1, y0, x1, y1, x0, y1], 1).reshape(-1, 4, 2)
+
+
+def _met(region: shapely.Geometry, shape: tuple[int, int]) -> np.ndarray:
+    """Which of (h, w) modules a region meets, 0 or 1: of squares that it neither covers nor leaves out, each
+    quarter in turn."""
+    shapely.prepare(region)
+    grid, side = np.zeros(shape, np.uint8), 1 << max(shape).bit_length()
+    x = y = np.zeros(1, int)
+    while len(x):
+        squares = shapely.box(x, y, x + side, y + side)
+        met = shapely.intersects(region, squares)
+        done = met & (shapely.covers(region, squares) if side > 1 else True)
+        for x0, y0 in zip(x[done], y[done], strict=True):
+            grid[y0 : y0 + side, x0 : x0 + side] = 1
+        side //= 2
+        rest = met & ~done
+        x = np.concatenate([x[rest], x[rest] + side] * 2)
+        y = np.concatenate([y[rest], y[rest], y[rest] + side, y[rest] + side])
+    return grid
 
 
 def _bands(region: shapely.MultiPolygon) -> np.ndarray:

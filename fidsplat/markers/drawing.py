@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.markers.paths import Rings, circle_rings, path_rings, polygon_rings
+from fidsplat.markers.paths import FARTHEST, Rings, circle_rings, number, path_rings, polygon_rings
 from fidsplat.markers.spec import Kind, Spec
 
 MODULES = 256
@@ -106,12 +106,14 @@ def _root(path: Path) -> ElementTree.Element:
 
 def _view(root: ElementTree.Element, name: str | None) -> tuple[float, float, float, float]:
     """The part of the plane that the drawing shows: x, y, width, height."""
-    box = [float(number) for number in re.findall(_NUMBER, root.get("viewBox", ""))]
+    box = [float(side) for side in re.findall(_NUMBER, root.get("viewBox", ""))]
     if not box:
         sides = [re.match(_NUMBER, root.get(side, "")) for side in ("width", "height")]
         box = [0.0, 0.0, *(float(side[0]) for side in sides if side)]
-    if len(box) != 4 or not (box[2] > 0 and box[3] > 0 and np.isfinite(box).all()):
-        raise InputError(f"{name}: it has no viewBox, nor a width and height, above 0")
+    if len(box) != 4 or not (min(box[2:]) >= 1 / FARTHEST and np.abs(box).max() <= FARTHEST):
+        raise InputError(
+            f"{name}: it has no viewBox, nor a width and height, above 0 (and no number beyond {FARTHEST:g})"
+        )
     return box[0], box[1], box[2], box[3]
 
 
@@ -131,7 +133,8 @@ def _shapes(
             raise InputError(f"{name}: <{tag}> has a {what}; convert it to filled paths")
     if any(look.get(what, "1") not in ("1", "1.0", "100%") for what in ("opacity", "fill-opacity")):
         raise InputError(f"{name}: <{tag}> is translucent; a print is opaque")
-    to_modules = to_modules @ _transform(element.get("transform", ""), name)
+    with np.errstate(all="ignore"):  # what reaches too far is refused below
+        to_modules = to_modules @ _transform(element.get("transform", ""), name)
     if tag in _GROUPS:
         for child in element:
             yield from _shapes(child, to_modules, style, name, depth + 1)
@@ -140,26 +143,26 @@ def _shapes(
     if style.fill != "none":
         with np.errstate(all="ignore"):
             moved = [ring @ to_modules[:2, :2].T + to_modules[:2, 2] for ring in rings]
-        if not all((np.abs(ring) < 1e9).all() for ring in moved):
+        if not all((np.abs(ring) <= FARTHEST).all() for ring in moved):
             raise InputError(f"{name}: <{tag}> reaches too far beyond the drawing")
         yield moved, _color(style.fill, name), style.rule
 
 
 def _rings(element: ElementTree.Element, tag: str, name: str | None) -> Rings:
-    def number(key: str, default: float = 0.0) -> float:
-        return float(element.get(key) or default)
+    def side(key: str, default: float = 0.0) -> float:
+        return number(element.get(key) or str(default))
 
     try:
         if tag == "path":
             return path_rings(element.get("d", ""))
         if tag in ("polygon", "polyline"):
             return polygon_rings(element.get("points", ""))
-        if tag == "rect" and not (number("rx") or number("ry")):
-            x, y, w, h = (number(key) for key in ("x", "y", "width", "height"))
+        if tag == "rect" and not (side("rx") or side("ry")):
+            x, y, w, h = (side(key) for key in ("x", "y", "width", "height"))
             return [np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]])]
         if tag in ("circle", "ellipse"):
-            rx, ry = number("rx", number("r")), number("ry", number("r"))
-            return circle_rings(number("cx"), number("cy"), rx, ry)
+            rx, ry = side("rx", side("r")), side("ry", side("r"))
+            return circle_rings(side("cx"), side("cy"), rx, ry)
     except ValueError as error:
         raise InputError(f"{name}: <{tag}> cannot be read: {error}") from None
     raise InputError(f"{name}: <{tag}> is no filled shape; convert it to a path")
@@ -177,7 +180,7 @@ def _color(text: str, name: str | None) -> tuple[float, float, float]:
         digits = word[1:] if len(word) == 7 else "".join(2 * digit for digit in word[1:])
         r, g, b = (int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4))
         return r, g, b
-    if found := re.fullmatch(r"rgb\(\s*(\d+)[\s,]+(\d+)[\s,]+(\d+)\s*\)", word):
+    if found := re.fullmatch(r"rgb\(\s*(\d{1,9})[\s,]+(\d{1,9})[\s,]+(\d{1,9})\s*\)", word):
         r, g, b = (min(int(part), 255) / 255 for part in found.groups())
         return r, g, b
     raise InputError(f"{name}: the fill {text!r} is no plain colour; write #rrggbb, rgb(r, g, b) or a name")
@@ -186,7 +189,9 @@ def _color(text: str, name: str | None) -> tuple[float, float, float]:
 def _transform(text: str, name: str | None) -> np.ndarray:
     matrix = np.eye(3)
     for word, inner in re.findall(r"(\w+)\s*\(([^)]*)\)", text):
-        v = [float(number) for number in re.findall(_NUMBER, inner)]
+        v = [float(value) for value in re.findall(_NUMBER, inner)]
+        if any(abs(value) > FARTHEST for value in v):
+            raise InputError(f"{name}: the transform {word}({inner}) has a number beyond {FARTHEST:g}")
         if word == "matrix" and len(v) == 6:
             step = np.array([[v[0], v[2], v[4]], [v[1], v[3], v[5]], [0, 0, 1]])
         elif word == "translate" and len(v) in (1, 2):

@@ -129,19 +129,21 @@ def place(
     counts = np.array([len(t.gaussians) for t in templates])
     # every template twice: as it is, and turned for upright rectangles
     lying = np.concatenate([t.gaussians for t in templates])
-    table = np.concatenate([lying, lying[:, [1, 0, 3, 2, 4]]])
+    table = np.concatenate([lying, lying[:, [1, 0, 3, 2, 4]]]).T.copy()
     first = np.cumsum(counts) - counts
 
     n = counts[which]
     start = first[which] + np.where(upright, len(lying), 0)
-    owner = np.repeat(np.arange(len(n)), n)
-    row = np.arange(len(owner)) + np.repeat(start - (np.cumsum(n) - n), n)
-    centre = (pieces[:, :2] + pieces[:, 2:]) / 2
-    half = (pieces[:, 2:] - pieces[:, :2]) / 2
-    out = table[row]
-    out[:, 0:2] = centre[owner] + half[owner] * out[:, 0:2]
-    out[:, 2:4] *= half[owner]
-    return out, source[owner]
+    row = np.arange(n.sum()) + np.repeat(start - (np.cumsum(n) - n), n)
+    out = np.empty((5, len(row)))  # a column at a time: of a hundred million rows nothing is held twice
+    for axis in (0, 1):
+        low, high = pieces[:, axis], pieces[:, axis + 2]
+        half = np.repeat((high - low) / 2, n)
+        np.multiply(half, table[axis][row], out=out[axis])
+        out[axis] += np.repeat((low + high) / 2, n)
+        np.multiply(half, table[axis + 2][row], out=out[axis + 2])
+    out[4] = table[4][row]
+    return out.T, np.repeat(source, n)
 
 
 def in_pieces(

@@ -13,13 +13,24 @@ Rings = list[np.ndarray]
 PIECES = 64
 """Straight pieces of a curve."""
 
+FARTHEST = 1e9
+"""No number of a drawing is larger."""
+
 _TOKEN = re.compile(r"([MmLlHhVvCcSsQqTtAaZz])|([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)")
 _NUMBERS = {"M": 2, "L": 2, "H": 1, "V": 1, "C": 6, "S": 4, "Q": 4, "T": 2, "A": 7, "Z": 0}
 
 
+def number(text: str) -> float:
+    """A number of a drawing. Raises ValueError for another text, or one beyond `FARTHEST`."""
+    value = float(text)
+    if not abs(value) <= FARTHEST:
+        raise ValueError(f"{text[:20]} is too far out; a number is at most {FARTHEST:g}")
+    return value
+
+
 def polygon_rings(points: str) -> Rings:
     """The ring of a polygon's ``points``. Raises ValueError for an odd number of them."""
-    numbers = [float(text) for _, text in _TOKEN.findall(points)]
+    numbers = [number(text) for _, text in _TOKEN.findall(points)]
     if len(numbers) % 2:
         raise ValueError("an odd number of coordinates")
     return [np.array(numbers).reshape(-1, 2)] if len(numbers) >= 6 else []
@@ -79,9 +90,9 @@ def path_rings(text: str) -> Rings:
 def _commands(text: str) -> Iterator[tuple[str, np.ndarray]]:
     """Each command with as many numbers as one of its kind takes; a move's further pairs are lines."""
     command, numbers = "", []
-    for letter, number in [*_TOKEN.findall(text), ("Z", "")]:
+    for letter, digits in [*_TOKEN.findall(text), ("Z", "")]:
         if not letter:
-            numbers.append(float(number))
+            numbers.append(number(digits))
             continue
         if command:
             size = _NUMBERS[command.upper()]

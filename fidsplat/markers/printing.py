@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -57,14 +58,12 @@ def box_cloud(printed: Printed, progress: Progress) -> SplatCloud:
     """One box for each rectangle."""
     boxes = printed.boxes
 
-    def parts() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        for start in range(0, len(boxes), CHUNK):
-            corners = boxes[start : start + CHUNK].astype(np.float64)
-            middle, half = (corners[:, :2] + corners[:, 2:]) / 2, (corners[:, 2:] - corners[:, :2]) / 2
-            owner = np.arange(start, start + len(corners))
-            yield np.column_stack([middle, half, np.ones(len(corners))]), owner
+    def make(start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
+        corners = boxes[start:stop].astype(np.float64)
+        middle, half = (corners[:, :2] + corners[:, 2:]) / 2, (corners[:, 2:] - corners[:, :2]) / 2
+        return np.column_stack([middle, half, np.ones(stop - start)]), np.arange(start, stop)
 
-    return _cloud(printed, len(boxes), parts(), progress).with_boxes()
+    return _cloud(printed, np.arange(1, len(boxes) + 1), make, progress).with_boxes()
 
 
 def aspect_of(boxes: np.ndarray) -> np.ndarray:
@@ -76,21 +75,15 @@ def gaussian_cloud(
     printed: Printed, templates: tuple[Template, ...], growth: float, progress: Progress
 ) -> SplatCloud:
     """The Gaussians of a mixture."""
-    boxes, aspect = printed.boxes, aspect_of(printed.boxes)
+    aspect = aspect_of(printed.boxes)
     grown = _grown(printed, growth)
     ends = np.cumsum(count_gaussians(aspect, templates))
-    total = int(ends[-1])
 
-    def parts() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        start = 0
-        while start < len(boxes):
-            before = int(ends[start - 1]) if start else 0
-            stop = max(int(np.searchsorted(ends, before + CHUNK, "right")), start + 1)
-            gaussians, owner = place(grown[start:stop], aspect[start:stop], templates)
-            yield gaussians, owner + start
-            start = stop
+    def make(start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
+        gaussians, owner = place(grown[start:stop], aspect[start:stop], templates)
+        return gaussians, owner + start
 
-    return _cloud(printed, total, parts(), progress)
+    return _cloud(printed, ends, make, progress)
 
 
 def _grown(printed: Printed, growth: float) -> np.ndarray:
@@ -110,35 +103,61 @@ def _grown(printed: Printed, growth: float) -> np.ndarray:
 
 
 def _cloud(
-    printed: Printed, total: int, parts: Iterator[tuple[np.ndarray, np.ndarray]], progress: Progress
+    printed: Printed,
+    ends: np.ndarray,
+    make: Callable[[int, int], tuple[np.ndarray, np.ndarray]],
+    progress: Progress,
 ) -> SplatCloud:
     """Splats in the colours of their rectangles.
 
-    parts: rows (m, 5) of place and scale in modules and opacity, and (m,) the rectangle of each; ``total`` in
-    all. They are filled in part by part, so that memory stays near that of the cloud.
+    ends: (n,) splats of each rectangle and all before it. make: the splats of the rectangles from one to
+    another: rows (m, 5) of place and scale in modules and opacity, and (m,) the rectangle of each. They are
+    filled in part by part, two at a time, so that memory stays near that of the cloud.
     """
     module, turns = printed.module, printed.turns
+    total = int(ends[-1])
     means, scales = np.zeros((total, 3), np.float32), np.empty((total, 2), np.float32)
     opacities, colors = np.empty(total, np.float32), np.empty((total, 3), np.float32)
     quats = np.zeros((total, 4), np.float32)
     quats[:, 0] = 1
     middle = np.array(printed.grid.shape[::-1]) / 2
-    done = 0
-    for rows, owner in parts:
-        progress("splats", done / total)
-        at = slice(done, done + len(rows))
+
+    def fill(part: tuple[int, int]) -> int:
+        rows, owner = make(*part)
+        done = int(ends[part[1] - 1])
+        at = slice(done - len(rows), done)
         if turns is not None:
             place, angle = (printed.boxes[owner, :2] + printed.boxes[owner, 2:]) / 2, turns[owner]
             (x, y), c, s = (rows[:, :2] - place).T, np.cos(angle), np.sin(angle)
             rows[:, :2] = place + np.column_stack([c * x - s * y, s * x + c * y])
             quats[at, 0], quats[at, 3] = np.cos(angle / 2), np.sin(angle / 2)
-        means[at, :2] = (rows[:, :2] - middle) * module
-        scales[at] = rows[:, 2:4] * module
+        for axis in (0, 1):
+            means[at, axis] = (rows[:, axis] - middle[axis]) * module
+            scales[at, axis] = rows[:, 2 + axis] * module
         opacities[at] = rows[:, 4]
-        colors[at] = printed.palette[printed.values[owner]]
-        done = at.stop
+        np.take(printed.palette, printed.values[owner], axis=0, out=colors[at], mode="clip")
+        return done
+
+    progress("splats", 0.0)
+    with ThreadPoolExecutor(2) as pool:
+        for done in pool.map(fill, _parts(ends)):
+            if done < total:
+                progress("splats", done / total)
     arrays = (means, quats, scales, opacities, colors)
     for array in arrays:
         array.flags.writeable = False  # a cloud takes these as they are
     # one sheet of paper: where its splats meet, their order means nothing
-    return SplatCloud(means, quats, scales, opacities, colors=colors).with_planes(0)
+    cloud = SplatCloud.of_checked(
+        means, quats, scales, opacities, colors=colors, origin=np.zeros(3), dropped={}
+    )
+    return cloud.with_planes(0)
+
+
+def _parts(ends: np.ndarray) -> Iterator[tuple[int, int]]:
+    """Rectangles from one to another that have some `CHUNK` splats together."""
+    start = 0
+    while start < len(ends):
+        before = int(ends[start - 1]) if start else 0
+        stop = max(int(np.searchsorted(ends, before + CHUNK, "right")), start + 1)
+        yield start, stop
+        start = stop

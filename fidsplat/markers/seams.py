@@ -30,10 +30,13 @@ def grow(grid: np.ndarray, rectangles: np.ndarray, growth: float) -> np.ndarray:
     cells = rectangles + 1  # that a rectangle covers wholly or in part, in the padded grid
     grown = rectangles.astype(np.float64)
     first = (size[:, 1] > size[:, 0]).astype(np.int64)
+    every = np.arange(len(size))
     for axis in (first, 1 - first):
         for end, way in ((0, -1), (2, 1)):
-            left = wanted[np.arange(len(size)), axis]
-            moving = np.flatnonzero(left > 0)
+            left = wanted[every, axis]
+            corner = cells[:, :2].copy()  # of the first strip beyond; most strips end there already
+            corner[every, axis] = cells[every, axis + end] - (end == 0)
+            moving = np.flatnonzero((left > 0) & (padded[corner[:, 1], corner[:, 0]] == color))
             while len(moving):
                 side = axis[moving] + end
                 each = np.arange(len(moving))

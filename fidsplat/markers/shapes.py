@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import shapely
 
+from fidsplat.errors import InputError
 from fidsplat.markers.paths import Rings
 
 FLAT = 0.005
@@ -12,6 +13,10 @@ FLAT = 0.005
 
 GRID = 1e-6
 """Modules to which cuts between shapes are rounded."""
+
+
+MOST_OVERLAPS = 50_000
+"""Pairs of shapes whose bounds overlap."""
 
 
 def filled(rings: Rings, rule: str) -> shapely.MultiPolygon:
@@ -37,17 +42,22 @@ def visible(
     shapes: list[tuple[shapely.Geometry, int]], shape: tuple[int, int]
 ) -> tuple[shapely.MultiPolygon, ...]:
     """What is seen on a sheet of (h, w) modules of shapes that are painted one over the other: the region of
-    each value, the sheet's own being 0."""
+    each value, the sheet's own being 0.
+
+    Raises InputError where too many shapes overlap."""
     geometries = np.array([painted for painted, _ in shapes], object)
     tree, sheet = shapely.STRtree(geometries), shapely.box(0, 0, shape[1], shape[0])
+    if tree.query(geometries).shape[1] > 2 * MOST_OVERLAPS:
+        raise InputError(f"more than {MOST_OVERLAPS} pairs of shapes overlap: simplify the drawing")
     parts: list[list[shapely.Geometry]] = [[] for _ in range(1 + max((v for _, v in shapes), default=0))]
     for number, (painted, value) in enumerate(shapes):
         above = tree.query(painted)
         over = shapely.union_all(geometries[above[above > number]], grid_size=GRID)
-        parts[value].append(shapely.difference(painted, over, grid_size=GRID) & sheet)
-    seen = [shapely.union_all(some, grid_size=GRID) for some in parts]
-    seen[0] = shapely.difference(sheet, shapely.union_all(seen[1:]), grid_size=GRID)
-    return tuple(map(_polygons, seen))
+        # a shape that only touches the sheet, or what lies over it, leaves lines, which cannot be cut further
+        parts[value].append(_polygons(shapely.difference(painted, over, grid_size=GRID) & sheet))
+    seen = [_polygons(shapely.union_all(some, grid_size=GRID)) for some in parts]
+    seen[0] = _polygons(shapely.difference(sheet, shapely.union_all(seen[1:]), grid_size=GRID))
+    return tuple(seen)
 
 
 def with_margin(
@@ -69,12 +79,17 @@ def is_whole(regions: tuple[shapely.MultiPolygon, ...]) -> bool:
     return bool((np.abs(points - np.rint(points)) <= GRID).all() and (step.min(1) <= GRID).all())
 
 
-def modules(regions: tuple[shapely.Geometry, ...], shape: tuple[int, int]) -> np.ndarray:
+def modules(regions: tuple[shapely.MultiPolygon, ...], shape: tuple[int, int]) -> np.ndarray:
     """Which region holds the centre of each of (h, w) modules, uint8; of several the last."""
-    grid, middle = np.zeros(shape, np.uint8), np.indices(shape) + 0.5
+    grid = np.zeros(shape, np.uint8)
     for value, region in enumerate(regions):
+        if region.is_empty:
+            continue
+        x0, y0, x1, y1 = np.clip(region.bounds, 0, (shape[1], shape[0]) * 2).astype(int)
+        part = grid[y0 : y1 + 1, x0 : x1 + 1]
+        y, x = np.indices(part.shape)
         shapely.prepare(region)
-        grid[shapely.intersects_xy(region, middle[1], middle[0])] = value
+        part[shapely.intersects_xy(region, x + x0 + 0.5, y + y0 + 0.5)] = value
     return grid
 
 

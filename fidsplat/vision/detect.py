@@ -37,13 +37,13 @@ class Detection:
     """One code found in a picture."""
 
     kind: str
-    """"apriltag", "aruco" or "qr" """
+    """"apriltag", "aruco" or "qr"; of `read_back` also a kind of board"""
     family: str
     """the tag's dictionary, e.g. "36h11"; of a QR code its version and error level, e.g. "v2-L" """
     id: int | None
-    """of a tag; None for a QR code"""
+    """of a tag; None for QR codes and boards"""
     payload: str | None
-    """text of a QR code; None for a tag"""
+    """text of a QR code, "7x5:4x4_50" of a board; None for a tag"""
     corners: np.ndarray
     """(4, 2) float64, pixels: TL, TR, BR, BL as printed, on the code's outer edge; pixel (i, j) has its
     centre at (j + 0.5, i + 0.5)"""
@@ -51,7 +51,7 @@ class Detection:
     @property
     def name(self) -> str:
         """As a marker spec says it: "apriltag:36h11:5", "qr:some text"."""
-        return f"qr:{self.payload}" if self.kind == "qr" else f"{self.kind}:{self.family}:{self.id}"
+        return f"{self.kind}:{self.payload if self.id is None else f'{self.family}:{self.id}'}"
 
 
 def detect(image: np.ndarray, families: Iterable[str] | None = None, qr: bool = True) -> list[Detection]:

@@ -11,6 +11,9 @@ import numpy as np
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write, path_of
 
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+VIDEOS = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm")
+
 MAX_BITS = 2**26
 """values of a marker image that are looked at: four for each of 4096 x 4096 modules, which are most"""
 
@@ -26,6 +29,35 @@ def read_image(path: str | os.PathLike[str], deep: bool = False) -> np.ndarray:
     if image.dtype not in (np.uint8, np.uint16, np.float32):
         raise InputError(f"{path} holds {image.dtype} pixels; give 8 or 16 bits, or floats of 32")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def pictures(path: str | os.PathLike[str]) -> Iterator[tuple[str, np.ndarray]]:
+    """Names and pictures (h, w, 3) uint8 RGB: of a file, of a folder's files by their names, of a video.
+
+    Raises InputError where there is none, or one cannot be read.
+    """
+    file = path_of(path)
+    if file.is_dir():
+        names = sorted(name for name in file.iterdir() if name.suffix.lower() in PICTURES)
+        if not names:
+            raise InputError(f"{file} holds no picture; known are {', '.join(PICTURES)}")
+        for name in names:
+            yield str(name), read_image(name)
+    elif file.suffix.lower() in VIDEOS and file.is_file():
+        with _silent_opencv():
+            video = cv2.VideoCapture(str(file))
+            done, frame = video.read()
+        if not done:
+            raise InputError(
+                f"{file} is not a video that OpenCV can read; convert it to MP4 (H.264), or to pictures"
+            )
+        number = 0
+        while done:
+            yield f"{file}:{number}", cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+            number += 1
+            done, frame = video.read()
+    else:
+        yield str(path), read_image(file)
 
 
 def read_bits(path: str | os.PathLike[str]) -> np.ndarray:
@@ -88,7 +120,8 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> Path:
     pixels = array if array.dtype == np.uint16 else to_uint8(array)
     if pixels.ndim == 3:
         pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-    done, data = cv2.imencode(".png", np.ascontiguousarray(pixels))
+    # OpenCV 5's own level makes files of flat colours four times as large
+    done, data = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 3])
     if not done:
         raise ValueError(f"OpenCV could not encode an image of shape {array.shape} as PNG")
     with atomic_write(path) as stream:

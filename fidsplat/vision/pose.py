@@ -1,4 +1,4 @@
-"""Where a square code is, from its four corners in a picture."""
+"""Where a flat marker is, from its corners in a picture."""
 
 import math
 
@@ -27,17 +27,30 @@ def marker_pose(corners: np.ndarray, size: float, camera: Camera) -> np.ndarray:
     """
     half = size / 2
     square = np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]], np.float64)
+    return _pose(square, corners, camera, cv2.SOLVEPNP_IPPE_SQUARE)
+
+
+def plane_pose(points: np.ndarray, corners: np.ndarray, camera: Camera) -> np.ndarray:
+    """`marker_pose` from any points of a marker's plane, at least four that do not lie on a line: (n, 2)
+    metres x right, y down as printed, and (n, 2) pixels."""
+    return _pose(
+        np.column_stack([points * [1, -1], np.zeros(len(points))]), corners, camera, cv2.SOLVEPNP_IPPE
+    )
+
+
+def _pose(points: np.ndarray, corners: np.ndarray, camera: Camera, method: int) -> np.ndarray:
+    """camera_from_marker from points (n, 3) in OpenCV's axes."""
     seen, matrix, turned = np.ascontiguousarray(corners, np.float64), camera.matrix, np.eye(4)
     if camera.lens is not None:
         seen, matrix, turned = _flattened(seen, camera)
     if not np.isfinite(seen).all():
         return np.full((4, 4), np.nan)
-    count, turns, moves, _ = cv2.solvePnPGeneric(square, seen, matrix, None, flags=cv2.SOLVEPNP_IPPE_SQUARE)
+    count, turns, moves, _ = cv2.solvePnPGeneric(points, seen, matrix, None, flags=method)
     best, least = np.full((4, 4), np.nan), math.inf
     for turn, move in zip(turns[:count], moves[:count], strict=True):
-        turn, move = cv2.solvePnPRefineLM(square, seen, matrix, None, turn, move)
-        drawn, _ = cv2.projectPoints(square, turn, move, matrix, None)
-        error = float(np.linalg.norm(drawn.reshape(4, 2) - seen))
+        turn, move = cv2.solvePnPRefineLM(points, seen, matrix, None, turn, move)
+        drawn, _ = cv2.projectPoints(points, turn, move, matrix, None)
+        error = float(np.linalg.norm(drawn.reshape(-1, 2) - seen))
         if error < least and move[2, 0] > 0:
             least, best = error, np.eye(4)
             best[:3, :3], best[:3, 3] = cv2.Rodrigues(turn)[0], move[:, 0]

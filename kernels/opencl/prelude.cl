@@ -20,8 +20,6 @@ typedef float real;
 #define REAL(x) x##f
 #endif
 
-//@@ struct View
-
 #define CULLED 0xFFFFFFFFu   // sort key of a splat that is not drawn
 #define OUTSIDE 0xFFFFFFFEu  // of one that is drawn in another band of rows only
 

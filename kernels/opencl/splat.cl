@@ -6,6 +6,7 @@
 // splat, so that x - anchor is exact and nothing cancels (numerics B1), with a common factor that makes D > 0 in
 // front of the camera, and sqrt(1/2) in the numerators, so that (n_u^2 + n_v^2) / D^2 is rho / 2.
 
+//@@ struct View
 //@@ struct Splat
 typedef struct {
     vfloat d;               // denominator

@@ -28,7 +28,9 @@ SETS = {
 
 def offsets_on(backend, source: Source) -> dict[str, dict[str, int]]:
     """By record and field where the device has it, and under "" the record's size."""
-    structs = re.findall(r"typedef struct[^{]*\{[^}]*\} (?:View|Splat|Bounds);", source.text)
+    structs = re.findall(
+        r"typedef struct[^{]*\{[^}]*\} (?:View|Splat|Bounds);", source.programs["picture"].compiled
+    )
     assert len(structs) == len(source.records)
     asked, lines = [], []
     for record, dtype in source.records.items():
@@ -71,9 +73,12 @@ def test_kernels_take_what_is_declared(renderer, shape):
     """Names, types and address spaces of all arguments, as the compiler has understood them."""
     asked = combination(everything("fisheye") if shape.schedule == "lanes" else everything(None))
     source = assemble(asked.features(), shape)
-    program = build(renderer.backend, source.text, "-cl-kernel-arg-info")
+    programs = [
+        build(renderer.backend, program.compiled, "-cl-kernel-arg-info")
+        for program in source.programs.values()
+    ]
     info, spaces = cl.kernel_arg_info, cl.kernel_arg_address_qualifier
-    kernels = {kernel.function_name: kernel for kernel in program.all_kernels()}
+    kernels = {kernel.function_name: kernel for program in programs for kernel in program.all_kernels()}
     assert kernels.keys() == source.arguments.keys()
     for name, kernel in kernels.items():
         found = [
@@ -184,16 +189,18 @@ def test_line_directives_lead_to_the_lines_of_the_files():
 
     source = assemble(combination(everything("distortion")).features(), cpu_shape())
     assert source.listing.count("\n") == source.text.count("\n")
-    file, number, compared = "", 0, 0
-    for line in source.listing.splitlines():
-        if directive := re.fullmatch(r'#line (\d+) "(.*)"', line):
-            number, file = int(directive[1]), directive[2]
-            continue
-        if file.startswith("opencl/") and line.strip():
-            written = (kernels_folder() / file).read_text("utf-8").splitlines()[number - 1]
-            assert re.sub(r"WIDE\(([^()]+)\)", r"\1f", written).replace("wide ", "float ")[:4] == line[:4]
-            compared += 1
-        number += 1
+    compared = 0
+    for program in source.programs.values():
+        file, number = "", 0
+        for line in program.listing.splitlines():
+            if directive := re.fullmatch(r'#line (\d+) "(.*)"', line):
+                number, file = int(directive[1]), directive[2]
+                continue
+            if file.startswith("opencl/") and line.strip():
+                written = (kernels_folder() / file).read_text("utf-8").splitlines()[number - 1]
+                assert re.sub(r"WIDE\(([^()]+)\)", r"\1f", written).replace("wide ", "float ")[:4] == line[:4]
+                compared += 1
+            number += 1
     assert compared > 800
 
 

@@ -48,6 +48,13 @@ def test_texts_of_each_effect_and_of_every_pair():
         assert_well_formed(names)
 
 
+def test_most_pictures_list_their_splats_by_the_same_program():
+    """What a driver keeps by its text is compiled once for all of them."""
+    for shape in SHAPES:
+        texts = [assemble(combination((name,)).features(), shape).programs["lists"] for name in SWITCHES]
+        assert max(map(texts.count, texts)) > 0.8 * len(SWITCHES)
+
+
 @pytest.mark.parametrize("lens", [None, *LENSES])
 def test_texts_of_all_effects_and_of_all_but_one(lens):
     names = everything(lens)

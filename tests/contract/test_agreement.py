@@ -45,6 +45,17 @@ def test_splats_around_and_behind_the_camera(renderer, quality):
     assert_agrees(renderer, random_splats(200, seed=1), CAMERA, quality=quality)
 
 
+def test_near_and_far_planes_amid_the_splats(renderer):
+    """Whole disks end at the far plane, fragments at the near one, where disks that cross it are wide."""
+    camera = fs.Camera.look_at(97, 71, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0), near=1.0, far=4.0)
+    for seed in (1, 2):
+        assert_agrees(renderer, random_splats(200, seed), camera)
+    wall = fs.SplatCloud(
+        [(0, 0, 5), (0, 0, 9)], [(1, 0, 0, 0)] * 2, [(5, 5)] * 2, [1, 1], colors=np.eye(3)[:2]
+    )
+    assert not renderer.render(wall, camera, ALL_OUTPUTS)["alpha"].any()
+
+
 def test_splats_much_larger_than_the_picture(renderer):
     assert_agrees(renderer, random_splats(200, seed=7, scale=(1e-3, 50.0)), CAMERA)
 
@@ -182,7 +193,7 @@ def test_coplanar_splats_are_one_layer(renderer, seed, samples, camera):
     cloud = coplanar_cloud(seed)
     assert cloud.has_planes
     assert_agrees(renderer, cloud, camera, quality=fs.Quality(samples=samples))
-    assert_agrees(renderer, cloud, camera, quality=fs.Quality(samples=samples, coplanar="order"))
+    assert_agrees(renderer, cloud, camera, quality=fs.Quality(samples=samples, order="centre"))
 
 
 def test_the_order_of_coplanar_splats_means_nothing(renderer):

@@ -1,7 +1,5 @@
 """Our own short exponential and logarithm (`Quality.arithmetic`): bounds, bits, pictures."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, assert_agrees, random_splats
@@ -33,18 +31,10 @@ def functions(renderer, exponents=EXPONENTS, shares=SHARES):
     return got["fast_exp"], got["fast_log"]
 
 
-def compilations(renderer, monkeypatch):
-    """The device as it is; where the choice is ours also one value at a time, and nothing fused."""
-    yield True
-    own = renderer.backend.shape
-    if hasattr(own, "fast_fma"):
-        for fused, lanes in ((own.fast_fma, 1), (False, own.lanes), (False, 1)):
-            monkeypatch.setattr(renderer.backend, "shape", replace(own, fast_fma=fused, lanes=lanes))
-            yield fused
-
-
 def test_short_functions_keep_their_bounds_on_every_device(renderer, monkeypatch):
-    for _ in compilations(renderer, monkeypatch):
+    """As the device compiles them; where the choice is ours also one value at a time, and nothing fused."""
+    for shape in renderer.backend.shapes("arithmetic").values():
+        monkeypatch.setattr(renderer.backend, "shape", shape)
         exponential, logarithm = functions(renderer)
         assert 0.5 < worst(exponential, np.exp(EXPONENTS)) <= BOUNDS["fast_exp"]
         assert 0.5 < worst(logarithm, np.log(SHARES)) <= BOUNDS["fast_log"]
@@ -63,7 +53,7 @@ def test_the_bits_are_the_same_on_every_device():
     for info in fs.devices():
         if info.usable and info.name != "reference":
             renderer = fs.Renderer(info.name)
-            if getattr(renderer.backend.shape, "fast_fma", True):
+            if renderer.backend.probe().fuses:
                 found.append(functions(renderer))
     for exponential, logarithm in found[1:]:
         assert np.array_equal(exponential, found[0][0])

@@ -91,6 +91,15 @@ def test_boxes_of_a_sheet_add_up_to_it(renderer, tilt, spin, distance, shift):
     assert np.abs(parts["rgb"] - parts["alpha"][..., None]).max() < SEAM
 
 
+def test_boxes_of_one_plane_that_overlap_are_no_more_than_opaque(renderer):
+    """Their areas add up, but not beyond the whole."""
+    twice = boxes_of(np.zeros((2, 2)), np.full((2, 2), 0.5))
+    camera = fs.Camera.look_at(123, 97, 0.9, (0, 0, -3), (0, 0, 0))
+    frame = renderer.render(twice, camera, ("rgb", "alpha"), EXACT.with_(transmittance_stop=0.0))
+    assert frame["alpha"].max() == frame["rgb"].max() == 1
+    assert frame["alpha"].min() == 0
+
+
 def cut(shape, generator):
     """A partition (x0, y0, x1, y1) of a grid with T-junctions: halves at random, down to single cells."""
     todo, done = [(0, 0, shape[1], shape[0])], []

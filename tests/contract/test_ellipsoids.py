@@ -43,6 +43,16 @@ def test_all_kinds_of_splats_in_one_picture(renderer, way):
     assert_agrees(renderer, mixed(5), CAMERA, quality=fs.Quality(ellipsoid=way))
 
 
+def test_alone_or_among_others_they_have_the_same_bits(renderer):
+    """Clouds of nothing else have kernels without what disks need (`ellipsoids_alone`)."""
+    alone, quality = thick(3), fs.Quality(lowpass="none")
+    behind = fs.SplatCloud([[0, 0, -5]], [[1, 0, 0, 0]], [[0.1, 0.1]], [1.0], colors=[[1, 1, 1]])
+    both = fs.SplatCloud.concatenate([alone, behind])
+    images = [renderer.render(cloud, CAMERA, quality=quality)["rgb"] for cloud in (alone, both)]
+    assert images[0].any()
+    assert np.array_equal(*images)
+
+
 def test_exact_behind_a_fisheye(renderer):
     camera = fs.Camera.fisheye(61, 61, math.radians(170), near=0.05)
     assert_agrees(renderer, mixed(7), camera, quality=fs.Quality())

@@ -2,10 +2,11 @@
 shows."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from agreement import assert_agrees, random_splats, reference_pixels
+from agreement import ALL_OUTPUTS, assert_agrees, random_splats, reference_pixels
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
@@ -30,7 +31,7 @@ CAMERAS = {
     "fisheye 200": fs.Camera.fisheye(70, 66, math.radians(200), POSE),
     "fisheye": seen_through(Fisheye(0.1, -0.05, 0.01), f=35.0),
     "panorama": fs.Camera.equirectangular(110, 55, POSE),
-    "parallel": fs.Camera.orthographic(75, 62, 4.0, POSE),
+    "parallel": fs.Camera.pinhole(75, 62, 19.0, 24.0, 36.0, 32.5, POSE, lens=fs.Orthographic()),
 }
 each_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 
@@ -39,6 +40,16 @@ each_camera = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_splats_all_around_the_camera(renderer, camera, seed):
     assert_agrees(renderer, random_splats(200, seed, depth=(-5.0, 6.0)), camera)
+
+
+@pytest.mark.parametrize("name", ["distortion", "fisheye 200", "panorama", "parallel"])
+def test_near_and_far_planes_amid_the_splats(renderer, name):
+    """Whole disks end at the far plane, fragments at the near one."""
+    camera = replace(CAMERAS[name], near=1.0, far=3.0)
+    cloud = random_splats(100, 2, depth=(-3.0, 6.0))
+    frame = assert_agrees(renderer, cloud, camera)
+    whole = renderer.render(cloud, CAMERAS[name], ALL_OUTPUTS)
+    assert np.abs(frame["rgb"] - whole["rgb"]).max() > 0.1
 
 
 @each_camera

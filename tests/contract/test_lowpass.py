@@ -16,7 +16,7 @@ LENSES = {
     "distortion": fs.Camera.pinhole(75, 62, 50.0, 51.0, 35.0, 32.0, lens=EVERY_TERM),
     "fisheye": fs.Camera.fisheye(70, 66, math.radians(200), coefficients=(0.02, -0.004, 0.001, -1e-4)),
     "panorama": fs.Camera.equirectangular(110, 55),
-    "parallel": fs.Camera.orthographic(75, 62, 4.0),
+    "parallel": fs.Camera.pinhole(75, 62, 19.0, 24.0, 37.0, 31.0, lens=fs.Orthographic()),
 }
 
 

@@ -88,9 +88,27 @@ def test_ties_go_to_what_is_nearer(renderer):
     frame = renderer.render(layers_of([0.5, 1.0]), POINT, ("label", "splat_id"))
     assert renderer.render(layers_of([0.5]), POINT, "alpha")["alpha"][2, 2] == 0.5
     assert (frame["label"][2, 2], frame["splat_id"][2, 2]) == (7, 0)
-    gsplat = half.with_(stop_rule="exclusive", coplanar="order", transmittance_stop=0.25)
-    frame = renderer.render(layers_of([1, 1, 1]), POINT, ("alpha", "blended"), gsplat)
-    assert (frame["alpha"][2, 2], frame["blended"][2, 2]) == (0.5, 1)
+    first = half.with_(first_hit=0.5)
+    assert renderer.render(layers_of([1, 1]), POINT, "depth_first", first)["depth_first"][2, 2] == 2
+    gsplat = half.with_(stop_rule="exclusive", order="centre", transmittance_stop=0.25)
+    for last in (1, 0.1):  # the pixel is finished, whatever comes behind the fragment that was dropped
+        frame = renderer.render(layers_of([1, 1, last]), POINT, ("alpha", "blended"), gsplat)
+        assert (frame["alpha"][2, 2], frame["blended"][2, 2]) == (0.5, 1)
+
+
+def test_a_pixel_ends_at_the_stop_whatever_its_neighbours_do(renderer):
+    """Of three layers that take half of the light each, the second covers the middle alone, which ends there
+    with exactly a quarter; the others go on to the third."""
+    quality = fs.Quality(opacity_ceiling=0.5, transmittance_stop=0.25, lowpass="none", alpha_cutoff=0.4)
+    wide = layers_of([1, 1, 1])
+    scales = wide.scales.copy()
+    scales[1] = 0.5 * 3 / 50  # half a pixel
+    layers = fs.SplatCloud(wide.means, wide.quats, scales, wide.opacities, colors=np.eye(3))
+    frame = renderer.render(layers, POINT, ("rgb", "alpha", "blended"), quality)
+    assert (frame["alpha"][2] == [0.75] * 5).all()
+    assert (frame["blended"][2] == [2] * 5).all()
+    assert frame["rgb"][2, 2].tolist() == [0.5, 0.25, 0]
+    assert frame["rgb"][2, 0].tolist() == [0.5, 0, 0.25]
 
 
 def test_of_equal_splats_in_a_layer_and_equal_samples_of_a_pixel_the_first_is_named(renderer):

@@ -28,6 +28,7 @@ def panorama(width=40, height=20):
 SENSORS = {
     "exposure": fs.Sensor(exposure=1.7),
     "vignetting": fs.Sensor(vignetting=(-0.3, -0.1, 0.02)),
+    "dark corners": fs.Sensor(vignetting=(-2.5, 1.2, -0.9)),
     "noise": NOISY,
     "gain": fs.Sensor(gain=0.4),
     "gamma": fs.Sensor(response=2.2),
@@ -172,6 +173,19 @@ def test_nothing_is_read_beyond_the_end_of_a_table(renderer, monkeypatch):
     camera = fs.Camera.pinhole(3, 3, 3.0, 3.0, 1.5, 1.5)
     frame = renderer.render(EMPTY, camera, background=(1, 1, 1), sensor=fs.Sensor(response=(0.2, 1)))
     assert (frame["rgb"] == 1).all()
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+def test_light_falls_off_from_the_principal_point(renderer, samples):
+    """By the formula, at the centres of pixels; black, not negative, in the corners."""
+    camera = fs.Camera.pinhole(61, 41, 50.0, 50.0, 20.0, 25.0)
+    sensor = fs.Sensor(vignetting=(-1.5, 0.3, -0.1))
+    frame = renderer.render(EMPTY, camera, None, fs.Quality(samples=samples), GREY, sensor=sensor)
+    rows, columns = np.mgrid[0:41, 0:61] + 0.5
+    squared = ((columns - 20) ** 2 + (rows - 25) ** 2) / (math.hypot(61, 41) / 2) ** 2
+    light = np.maximum(1 - 1.5 * squared + 0.3 * squared**2 - 0.1 * squared**3, 0)
+    assert light.min() == 0
+    assert frame["rgb"] == pytest.approx(0.4 * np.repeat(light[..., None], 3, 2), abs=2e-6)
 
 
 def test_values_that_mean_nothing_select_nothing(renderer):

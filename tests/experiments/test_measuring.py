@@ -253,6 +253,13 @@ def test_localisation_on_the_ideal_texture(category, pool):
         assert view["corners_px"] < 0.1
 
 
+def test_errors_of_poses_are_millimetres_and_degrees(pool, monkeypatch):
+    monkeypatch.setattr(localisation, "pose_error", lambda found, true: (0.0015, np.radians(2.0)))
+    points = localisation.localisation_points([CATEGORIES["small"]], [IDEAL], [0.6], [0.0], 1)
+    (view,) = localisation.measure_localisation(points[0], CEILING, 0, pool)["views"]
+    assert (view["position_mm"], view["angle_deg"]) == pytest.approx((1.5, 2.0))
+
+
 def test_a_marker_that_is_not_read_has_no_errors(pool):
     points = localisation.localisation_points([CATEGORIES["small"]], [IDEAL], [40.0], [0.0], 1)
     (view,) = localisation.measure_localisation(points[0], CEILING, 0, pool)["views"]

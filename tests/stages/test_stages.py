@@ -1,6 +1,5 @@
 """What passes between the stages of each backend that has them, against brute force."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -31,18 +30,12 @@ def traced(backend, cloud, quality, outputs=("rgb",), shape=None):
     return backend.pipeline(features, shape).trace(backend.upload(cloud), view), view
 
 
-def groups(backend, side):
-    """The schedule of a GPU in tiles of side x side."""
-    return replace(backend.shapes("schedule")["groups"], tile_width=side, tile_height=side)
-
-
-def listing(backend, lists, side=16):
-    """The shape with one of the two ways of listing; Warp's own has one."""
-    if not hasattr(backend.shape, "lists"):
-        if lists == "tiled":
-            pytest.skip("lists in one way")
-        return backend.shape
-    return replace(groups(backend, side), lists=lists)
+def listing(backend, lists):
+    """The shape with one of the two ways of listing."""
+    shapes = backend.shapes("listing")
+    if lists not in shapes:
+        pytest.skip("lists in one way")
+    return shapes[lists]
 
 
 def footprint(cloud, view, index, dot=True):
@@ -130,6 +123,15 @@ def test_keys_are_depths_and_the_order_is_total(backend):
     assert set(trace["lists"]) <= set(visible)
 
 
+def test_quaternions_of_any_length_turn_a_splat(backend):
+    """To the bit, where all are twice as long."""
+    cloud, longer = random_splats(100, seed=6), random_splats(100, seed=6)
+    object.__setattr__(longer, "quats", 2 * longer.quats)
+    pictures = [traced(backend, each, fs.Quality())[0]["rgb"] for each in (cloud, longer)]
+    assert np.array_equal(*pictures)
+    assert pictures[0].any()
+
+
 def test_culled_splats_change_nothing(backend):
     cloud = random_splats(400, seed=6)
     trace, _ = traced(backend, cloud, fs.Quality())
@@ -148,14 +150,13 @@ def test_culled_splats_change_nothing(backend):
 @pytest.mark.parametrize("lists", ["ordered", "tiled"])
 def test_splats_between_the_samples_are_culled(backend, lists):
     """Without a low-pass a splat that is smaller than a sample mostly meets no ray; it costs no list."""
-    shape = listing(backend, lists)
-    if not hasattr(shape, "lists"):
-        pytest.skip("reads the records of the OpenCL backend")
     cloud = random_splats(20000, seed=3, scale=(1e-5, 3e-4))
-    trace, _ = traced(backend, cloud, fs.Quality(lowpass="none"), shape=shape)
-    kept = np.flatnonzero(trace["keys"] != CULLED)
-    y0, y1, x0, x1 = (trace["records"][kept][name] for name in ("y0", "y1", "x0", "x1"))
-    assert len(kept) > 5
+    features, view = prepare(cloud, fs.Capture(CAMERA, quality=fs.Quality(lowpass="none")))
+    pipeline = backend.pipeline(features, listing(backend, lists))
+    trace = pipeline.trace(backend.upload(cloud), view)
+    kept = trace["keys"] != CULLED
+    x0, x1, y0, y1 = backend.probe().boxes(pipeline, trace)[kept].T
+    assert 5 < kept.sum() < 1000
     assert (x0 < x1).all()
     assert (y0 < y1).all()
     assert trace["rgb"].any()
@@ -165,20 +166,11 @@ def test_tile_size_leaves_every_bit_as_it_was(backend):
     """numerics A4 and A5: one test that finds every bug of the bounds."""
     cloud = random_splats(300, seed=3)
     quality = fs.Quality()
-    shape = backend.shape
     base, _ = traced(backend, cloud, quality, ALL_OUTPUTS)
-    if shape.schedule == "lanes":
-        shapes = [replace(shape, tile_height=height) for height in (4, 8, 32)]
-        # a scalar exp may round otherwise than a vector one, so vectors are compared with vectors
-        shapes += [replace(shape, lanes=lanes, tile_width=lanes) for lanes in (4, 8) if lanes != shape.lanes]
-    else:
-        shapes = [replace(shape, tile_width=side, tile_height=side) for side in (8, 32)]
-    if hasattr(shape, "chunks"):
-        shapes += [replace(shape, chunks=3, radix_bits=5)]
-    for other in shapes:
+    for size, other in backend.shapes("tiles").items():
         trace, _ = traced(backend, cloud, quality, ALL_OUTPUTS, other)
         for name in ALL_OUTPUTS:
-            assert np.array_equal(trace[name], base[name]), f"{name} differs with {other}"
+            assert np.array_equal(trace[name], base[name]), f"{name} differs with {size}"
 
 
 @pytest.mark.parametrize("lowpass", ["screen", "none"])
@@ -189,17 +181,14 @@ def test_the_box_of_a_record_holds_all_that_the_splat_touches(backend, lowpass):
     features = select(cloud, fs.Capture(quality=quality))
     view = View.of(fs.Capture(CAMERA, quality=quality), cloud.origin)
     pipeline = backend.pipeline(features)
-    if not hasattr(pipeline, "layout"):
-        pytest.skip("not Warp's records")
     trace = pipeline.trace(backend.upload(cloud), view)
-    names = pipeline.layout.names
-    boxes = trace["records"].view(np.uint32)[:, [names.index("columns"), names.index("rows")]]
-    first, end = boxes & 0xFFFF, boxes >> 16
+    boxes = backend.probe().boxes(pipeline, trace)
     seen = 0
     for index in np.flatnonzero(trace["keys"] != CULLED):
         rows, columns = footprint(cloud, view, index, dot=lowpass == "screen")
         for axis, places in enumerate((columns, rows)):
-            assert np.all((places >= first[index, axis]) & (places < end[index, axis])), index
+            first, end = boxes[index, 2 * axis : 2 * axis + 2]
+            assert np.all((places >= first) & (places < end)), index
         seen += len(rows)
     assert seen > 1000
 
@@ -212,12 +201,10 @@ def test_layers_are_the_same_in_every_tile_size_and_schedule(backend, renderer):
     other, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS, backend.shapes("schedule")["groups"])
     for name in ("rgb", "alpha", "normal", "depth"):
         assert np.abs(other[name] - base[name]).max() < 2e-5, name
-    width = backend.shape.tile_width if backend.shape.schedule == "lanes" else 32
-    again, _ = traced(
-        backend, cloud, fs.Quality(), ALL_OUTPUTS, replace(backend.shape, tile_width=width, tile_height=32)
-    )
+    *_, (size, shape) = backend.shapes("tiles").items()
+    again, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS, shape)
     for name in ALL_OUTPUTS:
-        assert np.array_equal(again[name], base[name]), name
+        assert np.array_equal(again[name], base[name]), f"{name} differs with {size}"
 
 
 def test_splats_of_a_plane_share_its_key(backend):
@@ -248,9 +235,10 @@ def test_both_schedules_draw_the_same_picture(backend, renderer):
 def test_both_ways_of_listing_give_the_same_lists(backend, scale):
     """Small splats and ones that touch more tiles than a window of list/tiled.cl has."""
     cloud = random_splats(2500, seed=5, scale=scale)
-    groups = listing(backend, "tiled")
-    tiled, _ = traced(backend, cloud, fs.Quality(lowpass="none"), shape=groups)
-    ordered, _ = traced(backend, cloud, fs.Quality(lowpass="none"), shape=replace(groups, lists="ordered"))
+    tiled, ordered = (
+        traced(backend, cloud, fs.Quality(lowpass="none"), shape=listing(backend, lists))[0]
+        for lists in ("tiled", "ordered")
+    )
     assert max(np.diff(tiled["starts"].astype(int))) > 20
     # both hold every tile that a splat touches (the test above) and may differ a little in what else
     different = 0
@@ -263,7 +251,7 @@ def test_both_ways_of_listing_give_the_same_lists(backend, scale):
 
 def test_lists_that_outgrow_their_buffers_are_made_again(backend):
     """A picture that has far more pairs, or big splats, than the last one."""
-    groups = listing(backend, "tiled", 8)
+    groups = listing(backend, "tiled")
     few, many = random_splats(30, seed=2, scale=(1e-3, 0.05)), random_splats(9000, seed=2, scale=(0.5, 5.0))
     features, quality = select(few, fs.Capture(outputs=ALL_OUTPUTS)), fs.Quality()
     view = View.of(fs.Capture(CAMERA, quality=quality), few.origin)
@@ -305,7 +293,7 @@ def test_room_for_exactly_the_pairs_of_a_picture(backend, spare):
 def test_a_list_longer_than_local_memory_is_sorted(backend):
     """tiles.cl sorts 2048 pairs at once in local memory, longer lists in global memory as well."""
     cloud = random_splats(11000, seed=8, depth=(1.0, 9.0), scale=(0.2, 0.3), across=0.1)
-    trace, _ = traced(backend, cloud, fs.Quality(), shape=groups(backend, 16))
+    trace, _ = traced(backend, cloud, fs.Quality(), shape=backend.shapes("schedule")["groups"])
     visible = np.flatnonzero(trace["keys"] != CULLED)
     assert max(np.diff(trace["starts"].astype(int))) > 8192
     assert out_of_order(trace, visible[np.argsort(trace["keys"][visible], kind="stable")]) == 0
@@ -317,8 +305,8 @@ def test_a_small_pair_budget_gives_the_same_bits(backend, monkeypatch, budget, l
     """numerics E3: a picture with more pairs than fit is drawn in bands of tiles."""
     cloud = random_splats(300, seed=12)
     features, view = prepare(cloud, fs.Capture(CAMERA, ALL_OUTPUTS))
-    own = getattr(backend.shape, "lists", lists)
-    shape = backend.shape if lists == own == "ordered" else listing(backend, lists, 8)
+    # what lists in order draws a CPU's picture too: the way in which it is mostly drawn in bands
+    shape = backend.shape if lists == "ordered" else listing(backend, lists)
     pipeline, resident = backend.pipeline(features, shape), backend.upload(cloud)
     whole = pipeline.render(resident, view)
     assert whole.stats["pairs"] > 1000

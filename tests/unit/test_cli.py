@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 
+import cv2
 import numpy as np
 import pytest
 from ideal_picture import draw, photographed, pose, qr_bits, turned
@@ -18,7 +19,7 @@ from fidsplat.cli import main
 from fidsplat.commands import COMMANDS
 from fidsplat.commands.output import late_progress
 from fidsplat.vision.dictionaries import dictionary_bits
-from fidsplat.vision.images import write_png
+from fidsplat.vision.images import read_image, write_png
 
 CAMERA = fs.Camera.pinhole(320, 240, 400, 400, 160, 120)
 
@@ -75,7 +76,7 @@ def test_help_loads_nothing_heavy():
     ("words", "says"),
     [
         ([], "try `fidsplat demo` first"),
-        ([], "demo, devices, marker, render, detect"),
+        ([], "demo, devices, info, marker, render, detect"),
         (["mraker"], "Available subcommands: demo, devices"),
         (["marker"], "SPEC"),
         (["marker", "qr:a", "--sise", "1"], "perhaps --size M; see fidsplat marker --help"),
@@ -170,11 +171,19 @@ def test_a_failed_run_is_1_and_a_fault_of_ours_says_so(capsys, monkeypatch):
     assert status == 1
     assert "--debug" in line
 
+    class HalfMade:
+        def __del__(self):
+            raise AttributeError("what its constructor had not come to")
+
     def interrupted(self):
+        half = HalfMade()  # noqa: F841
         raise KeyboardInterrupt
 
     monkeypatch.setattr(COMMANDS["devices"], "run", interrupted)
+    heard = []
+    monkeypatch.setattr(sys, "unraisablehook", heard.append)
     assert fails(capsys, "devices") == (130, "fidsplat: interrupted\n")
+    assert heard == []
 
 
 @pytest.mark.parametrize(
@@ -282,6 +291,33 @@ def test_marker_with_the_mixture_of_the_paper(capsys):
     assert prints_json(capsys, "marker", "qr:hello", "--mixture", "paper")["mixture"] == "paper"
 
 
+def test_info(capsys, tmp_path):
+    """A ground of level splats and a post on it, y down, with a stray far away."""
+    generator = np.random.default_rng(0)
+    ground = generator.uniform(-2, 2, (2000, 3)) * [1, 0, 1] + [0, 1, 0]
+    post = generator.uniform(-1, 1, (300, 3)) * [0.1, 1, 0.1]
+    means = np.concatenate([ground, post, [[0, 0, 500]]])
+    level = np.sqrt(0.5) * np.array([1, 1, 0, 0])
+    quats = np.concatenate([np.tile(level, (2000, 1)), np.tile([1, 0, 0, 0], (301, 1))])
+    cloud = fs.SplatCloud(
+        means, quats, np.full((2301, 2), 0.05), np.full(2301, 0.9), colors=np.ones((2301, 3))
+    )
+    fs.save_ply(cloud, tmp_path / "yard.ply")
+    facts = prints_json(capsys, "info", tmp_path / "yard.ply")
+    assert (facts["splats"], facts["up"]) == (2301, "-y")
+    assert facts["bounds"][1][2] > 499
+    assert facts["middle_bounds"][1][2] < 2.1
+    assert facts["height"] == pytest.approx(2, abs=0.1)
+    assert facts["scales"] == pytest.approx([0.05] * 3, rel=1e-5)
+    assert 0.2 <= facts["marker_size"] <= 0.5
+    assert main(["info", str(tmp_path / "yard.ply")]) == 0
+    assert "-y?" in capsys.readouterr().out
+    assert "missing.ply" in fails(capsys, "info", tmp_path / "missing.ply")[1]
+    fs.save_ply(fs.SplatCloud.empty(), tmp_path / "empty.ply")
+    assert prints_json(capsys, "info", tmp_path / "empty.ply")["splats"] == 0
+    assert main(["info", str(tmp_path / "empty.ply")]) == 0
+
+
 def test_detect(capsys, picture):
     result = prints_json(capsys, "detect", picture)
     assert [code["name"] for code in result["detections"]] == ["apriltag:36h11:5", "qr:hello"]
@@ -294,6 +330,36 @@ def test_detect(capsys, picture):
         ]
         is None
     )
+
+
+def test_detect_in_folders_and_videos(capsys, picture, tmp_path):
+    folder = tmp_path / "stills"
+    folder.mkdir()
+    for name in ("b.png", "a.png"):
+        write_png(folder / name, read_image(picture))
+    (folder / "notes.txt").write_text("no picture")
+    result = prints_json(capsys, "detect", folder)
+    assert [one["image"] for one in result["pictures"]] == [str(folder / "a.png"), str(folder / "b.png")]
+    assert main(["detect", str(folder), str(picture)]) == 0
+    out = capsys.readouterr().out
+    assert "3 pictures" in out
+    assert out.count("apriltag:36h11:5") == 3
+
+    image = read_image(picture)
+    film = tmp_path / "film.avi"
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, image.shape[1::-1])
+    assert writer.isOpened()
+    for _ in range(2):
+        writer.write(image[:, :, ::-1])
+    writer.release()
+    result = prints_json(capsys, "detect", film)
+    assert [one["image"] for one in result["pictures"]] == [f"{film}:0", f"{film}:1"]
+    assert result["pictures"][1]["detections"][0]["name"] == "apriltag:36h11:5"
+
+    (tmp_path / "empty").mkdir()
+    assert "holds no picture" in fails(capsys, "detect", tmp_path / "empty")[1]
+    (tmp_path / "broken.mp4").write_bytes(b"no film")
+    assert "not a video" in fails(capsys, "detect", tmp_path / "broken.mp4")[1]
 
 
 def test_detect_where_nothing_is(capsys, tmp_path):

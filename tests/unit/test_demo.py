@@ -7,9 +7,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.cli import main
-from fidsplat.experiments.demo_scene import demo_scene, demo_views
-from fidsplat.experiments.readback import families_of, read_back, visible_share
-from fidsplat.vision.detect import Detection
+from fidsplat.experiments.demo_scene import demo_scene
 from fidsplat.vision.images import read_image
 
 
@@ -55,7 +53,7 @@ def test_the_demo_passes_and_writes_what_it_made(tmp_path, capsys):
 
 
 def test_a_marker_that_is_missed_fails_the_demo(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("fidsplat.experiments.demo.detect", lambda image, families: [])
+    monkeypatch.setattr("fidsplat.vision.readback.detect", lambda image, families: [])
     assert main(["demo", "--out", str(tmp_path)]) == 1
     out = capsys.readouterr().out
     assert "failed: " in out
@@ -78,55 +76,3 @@ def test_the_scene_is_the_same_every_time(scene):
     for name in ("means", "quats", "scales", "opacities", "colors", "labels"):
         assert np.array_equal(getattr(one, name), getattr(again, name)), name
     assert set(np.unique(one.labels)) == {0, 1, 2, 3}
-
-
-def test_visible_share_counts_the_labels_inside_the_outline(scene):
-    camera = demo_views()["frontal"]
-    placed = scene.markers[0]
-    label = np.full((camera.height, camera.width), placed.label)
-    assert visible_share(placed, camera, label) == 1.0
-    middle = camera.project(placed.pose[None, :3, 3])[0]
-    label[:, round(middle[0]) :] = 0
-    assert visible_share(placed, camera, label) == pytest.approx(0.5, abs=0.01)
-    assert visible_share(placed, camera, np.zeros_like(label)) == 0.0
-
-
-def test_what_is_outside_the_picture_or_turned_away_is_not_visible(scene):
-    placed = scene.markers[0]
-    camera = demo_views()["frontal"]
-    half = fs.Camera.pinhole(
-        camera.width, camera.height, camera.fx, camera.fy, 0, camera.cy, camera.world_to_camera
-    )
-    label = np.full((camera.height, camera.width), placed.label)
-    assert visible_share(placed, half, label) == 0.0
-    behind = fs.Camera.look_at(640, 480, 1.0, (0, 0, 3), (0, 0, 0))
-    assert visible_share(placed, behind, np.full((480, 640), placed.label)) == 0.0
-    away = fs.Camera.look_at(640, 480, 1.0, (0, 0, -3), (0, 0, -4))
-    assert visible_share(placed, away, np.full((480, 640), placed.label)) == 0.0
-
-
-def test_detections_are_matched_by_what_they_say_and_then_by_nearness(scene):
-    camera = demo_views()["frontal"]
-    tag, aruco, qr = scene.markers
-    twice = (tag, fs.scenes.PlacedMarker(tag.marker, pose=aruco.pose), qr)
-
-    def seen(placed, kind="apriltag", family="36h11", tag_id=5, payload=None):
-        return Detection(kind, family, tag_id, payload, camera.project(placed.corners))
-
-    found = [
-        seen(twice[1]),
-        seen(twice[0]),
-        seen(twice[0], tag_id=6),
-        seen(qr, "qr", "v2-L", None, "something else"),
-    ]
-    readings, others = read_back(found, twice, camera)
-    assert [reading.detection for reading in readings] == [found[1], found[0], None]
-    assert others == found[2:]
-    for reading in readings[:2]:
-        assert reading.position_error == pytest.approx(0, abs=1e-6)
-        assert reading.corner_error == 0
-    assert readings[2].as_dict()["found"] is False
-    assert families_of(placed.marker for placed in (tag, aruco, qr, tag)) == (
-        "apriltag:36h11",
-        "aruco:4x4_50",
-    )

@@ -57,6 +57,7 @@ def test_sensors_that_cannot_be(values, words):
     [
         (lambda: fs.Fog(-0.1), "density is -0.1"),
         (lambda: fs.Fog(0.1, (1, 2)), "fog: color"),
+        (lambda: fs.Fog(0.1, (1, -math.inf, 0)), "fog: color must be three finite numbers"),
         (lambda: fs.Gradient((0, 0, 0), (1, 1, math.nan)), "background: bottom"),
         (lambda: fs.Gradient((0, 0, 0), (1, 1, 1), (0, 0, 0)), "must be a direction"),
         (lambda: fs.Gradient((0, 0, 0), (1, 1, 1), (1e-300, 0, 0)), "must be a direction"),
@@ -73,6 +74,13 @@ def test_sensors_that_cannot_be(values, words):
 def test_surroundings_that_cannot_be(make, words):
     with pytest.raises(fs.InputError, match=words):
         make()
+
+
+def test_a_gradient_between_equal_colours_is_that_colour():
+    grey = (0.4, 0.5, 0.6)
+    assert fs.Capture(background=fs.Gradient(grey, grey, (1, 0, 0))).backdrop == grey
+    other = fs.Gradient(grey, (0.4, 0.5, 0.7), (1, 0, 0))
+    assert fs.Capture(background=other).backdrop is other
 
 
 def test_steps_come_in_the_order_of_the_light():

@@ -31,7 +31,7 @@ MAY_IMPORT = {
     "cloud_arrays": BASE,
     "splats": BASE | {"harmonics", "cloud_arrays"},
     "cameras": BASE,
-    "vision": BASE | {"cameras"},
+    "vision": BASE | {"cameras", "scenes", "markers"},
     "formats": BASE | {"splats", "harmonics", "cloud_arrays", "cameras"},
     "markers": BASE | {"splats", "quality", "vision.dictionaries", "vision.images"},
     "scenes": PLAIN | {"markers", "formats"},
@@ -54,7 +54,7 @@ HOME_OF = {
     "pupil_apriltags": ("vision",),
     "flip_evaluator": ("vision",),
     "bpy": ("experiments.blender_worker",),
-    "shapely": ("markers",),
+    "shapely": ("markers", "vision.visible"),
     "networkx": ("markers",),
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
@@ -156,7 +156,8 @@ def within_any(names, package) -> bool:
 
 
 # modules of the package that every backend may import
-SHARED = ("base", "view", "prepare", "registry", "planes", "bands")
+    "vision": BASE | {"cameras", "scenes", "markers"},
+    "formats": BASE | {"splats", "harmonics", "cloud_arrays", "cameras"},
 
 
 def test_backends_do_not_import_each_other():

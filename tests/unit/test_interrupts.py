@@ -59,6 +59,18 @@ def test_logs_and_figures_by_their_values(tmp_path):
         interrupt.facts(figures)
 
 
+def test_how_a_run_may_end():
+    assert interrupt.is_clear(0, "")
+    assert interrupt.is_clear(143, "half of a bar\nfidsplat: terminated")
+    assert interrupt.is_clear(-2, "Traceback ...\n  File site.py, line 3, in getpath\nKeyboardInterrupt")
+    assert not interrupt.is_clear(-2, "Traceback ...\n  File cli.py, line 3, in main\nKeyboardInterrupt")
+    assert not interrupt.is_clear(143, "fidsplat: terminated\nException ignored in\nTraceback")
+    assert not interrupt.is_clear(1, "OSError: [Errno 28]")
+    assert not interrupt.is_clear(
+        1, "fidsplat: OSError: [Errno 28] (a fault of fidsplat; --debug shows where)"
+    )
+
+
 def test_the_trials_are_planned_alike_each_time():
     plans = {name: interrupt.planned(name, 0) for name in interrupt.COMMANDS}
     assert plans == {name: interrupt.planned(name, 0) for name in interrupt.COMMANDS}

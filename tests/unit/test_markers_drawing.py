@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 import fidsplat as fs
 from fidsplat.markers import marker
-from fidsplat.markers.cover import turned
+from fidsplat.markers.cover import _met, turned
 from fidsplat.markers.kinds import parse_spec
 from fidsplat.markers.paths import circle_rings, path_rings
 from fidsplat.markers.shapes import filled
@@ -161,7 +161,14 @@ def test_circles():
         ('<path d="M0 0 # 5"/>', "'#' in a path"),
         ('<rect width="wide" height="5"/>', "<rect> cannot be read"),
         ('<path d="M0 0H1e300V5"/>', "too far"),
+        ('<path d="M1 1h5 1e400 5C1 2 3 4 5 6"/>', "too far"),
         ('<circle r="nan"/>', "too far"),
+        ('<g transform="rotate(1e400)"/>', "a number beyond 1e+09"),
+        (
+            5 * '<g transform="scale(1e9)">' + 40 * "<g>" + '<rect width="9" height="9"/>' + 45 * "</g>",
+            "too far",
+        ),
+        ('<rect width="5" height="5" fill="rgb(%s,0,0)"/>' % ("9" * 5000), "no plain colour"),
         ('<rect width="5" height="5" opacity="50%"/>', "translucent"),
         ("<g>" * 200 + "</g>" * 200, "deeper than 100"),
     ],
@@ -181,6 +188,7 @@ def test_files_that_are_no_drawings(tmp_path):
         ("<svg/>", "no viewBox"),
         ('<svg viewBox="0 0 0 5"/>', "above 0"),
         ('<svg viewBox="0 0 1 100000"/>', "rows of modules"),
+        ('<svg viewBox="0 0 1e-300 1e300"/>', "above 0"),
     ):
         file.write_text(text)
         with pytest.raises(fs.InputError, match=says):
@@ -198,3 +206,25 @@ def test_a_drawing_in_a_scene_file_is_beside_it(tmp_path):
     assert 'spec = "svg-40:sign.svg"' in (tmp_path / "scene.toml").read_text()
     again = fs.Scene.load(tmp_path / "scene.toml").markers[0].marker
     assert np.array_equal(again.cloud.colors, made.cloud.colors)
+
+
+def test_shapes_that_touch_the_sheet_leave_no_lines(tmp_path):
+    """The first lies beside the sheet and shares an edge with it."""
+    made = drawn(tmp_path, '<rect x="-5" width="5" height="9" fill="red"/><circle cx="9" cy="9" r="5"/>')
+    assert set(map(tuple, made.cloud.colors[:, :3])) == {(0, 0, 0), (1, 1, 1)}
+
+
+def test_which_modules_a_region_meets():
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        h, w = map(int, rng.integers(1, 40, 2))
+        region = shapely.union_all([shapely.Polygon(p).buffer(0) for p in rng.uniform(-5, 45, (3, 5, 2))])
+        y, x = np.indices((h, w))
+        assert np.array_equal(
+            _met(region, (h, w)), shapely.intersects(region, shapely.box(x, y, x + 1, y + 1))
+        )
+
+
+def test_heaps_of_shapes_are_refused(tmp_path):
+    with pytest.raises(fs.InputError, match="50000 pairs of shapes overlap: simplify"):
+        drawn(tmp_path, 400 * '<rect width="9" height="9"/>')

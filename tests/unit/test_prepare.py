@@ -47,3 +47,25 @@ def test_no_view_moves_by_minus_zero():
             view = view_of(capture, np.zeros(3))
             for moved in (view, view.groups[0][1]):
                 assert not np.signbit(moved.translation[moved.translation == 0]).any()
+
+
+def test_outputs_of_a_blurred_band_show_its_middle_pose_in_all_of_its_rows():
+    """Whatever the samples: rows of pixels, not of samples, have the turn of their band's middle pose."""
+
+    def turning(time):
+        pose = np.eye(4)
+        pose[:2, :2] = [[np.cos(time), -np.sin(time)], [np.sin(time), np.cos(time)]]
+        return pose
+
+    shutter = fs.Shutter(time=0.1, exposure_time=0.3, sub_poses=3, readout=0.4, rows_per_band=10)
+    for samples in (1, 2):
+        quality = fs.Quality(samples=samples)
+        view = view_of(
+            fs.Capture(CAMERA, quality=quality, motion=fs.Motion(turning), shutter=shutter), np.zeros(3)
+        )
+        bands = [(0, 10), (10, 20), (20, 24)]
+        assert [shot.middle for shot in view.shots] == [False, True, False] * 3
+        assert view.turns_of_rows.shape == (24, 3, 3)
+        for top, end in bands:
+            time = 0.1 + 0.4 * ((top + end) / 2 / 24 - 0.5)
+            assert np.allclose(view.turns_of_rows[top:end], turning(time)[:3, :3], atol=1e-12)

@@ -1,4 +1,7 @@
-"""One flat source text from a FeatureSet and the shape of a device. Needs no OpenCL.
+"""Flat source texts from a FeatureSet and the shape of a device. Needs no OpenCL.
+
+They are two programs, as most feature sets list and sort their splats alike: drivers keep what they have
+compiled by its text, so that the program `lists` is compiled once for all of those.
 
 A stage's file, or a section of an effect's, has hooks, lines `//@@ name`, where the sections `//@ name` of
 the chosen effects go, and lines `//@@ struct NAME` and `//@@ arguments KERNEL`, where the declarations of
@@ -13,6 +16,7 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -24,31 +28,53 @@ from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError
 from fidsplat.kernel_files import kernels_folder
 
-_LISTS = {"ordered": ("scan", "sort", "bin", "pack"), "tiled": ("tiles",)}
+_LISTS = {"ordered": ("scan", "sort", "bin"), "tiled": ("tiles",)}
+"""stages of the program `lists`, by the way of listing"""
+_DRAWN = ("prelude", "math", "splat", "bounds", "project", "pack", "blend", "schedule/{}", "resolve")
+"""stages of the program `picture`, with the way in which a device walks tiles; only splats that are listed in
+order are packed"""
 _HOOK = re.compile(r"[ \t]*//@@ (\w+)(?: (\w+))?[ \t]*")
 _SECTION = re.compile(r"//@ (\w+)[ \t]*")
-_COMMENT = re.compile(r"[ \t]*//[^\n]*")
 _KERNEL = re.compile(r"^kernel\b.*?\bvoid (\w+)\(", re.MULTILINE)
-_WIDE_CONSTANT = re.compile(r"\bWIDE\(([^()]+)\)")
-_WIDE = re.compile(r"\bwide\b")
+# both begin with a word itself, which re finds 20 times as fast as a boundary
+_WIDE_CONSTANT = re.compile(r"WIDE\(([^()]+)\)")
+_WIDE = re.compile(r"wide(?<=\bwide)\b")
 _DECLARED = ("struct", "arguments")
 
 
 @dataclass(frozen=True)
-class Source:
-    """A flat kernel source with what the host must know of it."""
+class Text:
+    """A program's text."""
 
     listing: str
     """with comments, to be read"""
-    text: str
-    """the same without them, line for line, to be compiled"""
+    compiled: str
+    """the same without them, line for line"""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Flat kernel sources with what the host must know of them."""
+
+    programs: dict[str, Text]
+    """`lists` and `picture`"""
     records: dict[str, np.dtype]
     """`View`, `Splat` and `Bounds` as the kernels have them"""
     arguments: dict[str, tuple[Argument, ...]]
-    """of each kernel of the text"""
+    """of each kernel of the texts"""
     samples: tuple[tuple[Samples, bool], ...]
     """what passes from blending to resolving, and whether several shots are averaged there"""
     scalars: Scalars
+
+    @property
+    def listing(self) -> str:
+        """All programs, to be read."""
+        return "".join(program.listing for program in self.programs.values())
+
+    @property
+    def text(self) -> str:
+        """All programs as they are compiled, one after the other."""
+        return "".join(program.compiled for program in self.programs.values())
 
     @property
     def digest(self) -> str:
@@ -101,12 +127,20 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     }
     if "color_sh" in layouts:
         defines["SH_DEGREE"] = features.sh_degree
+    if "compose_pixel" in layouts:
+        defines["WAITING"] = shape.waiting
     files = [layout.file for layout in layouts.values() if layout.file]
     if shape.lists == "tiled":
         files.append("list/tiled.cl")
-    stages = ["prelude", "math", "splat", "bounds", "project", *_LISTS[shape.lists], "blend"]
-    stages = [f"{stage}.cl" for stage in (*stages, f"schedule/{shape.schedule}", "resolve")]
-    _refuse_unknown_hooks(files, stages)
+    if "compose_pixel" in layouts:
+        files.append(LAYOUTS[f"waiting_{shape.schedule}"].file)
+    stages = {
+        "lists": ("prelude", "math", "bounds", *_LISTS[shape.lists]),
+        "picture": [
+            stage.format(shape.schedule) for stage in _DRAWN if stage != "pack" or shape.lists == "ordered"
+        ],
+    }
+    _refuse_unknown_hooks(files)
     sections = [(file, sections_of(file)) for file in files]
 
     def fill(hook: str, subject: str) -> Iterator[str]:
@@ -124,12 +158,19 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
             made.append(f"{filled}#line {number + 1} {_shown(file)}" if filled else "" if hook else line)
         return "\n".join(made) + "\n"
 
-    body = "".join(f"#line 1 {_shown(stage)}\n{expand(stage, 1, lines_of(stage))}" for stage in stages)
-    head = "".join(f"#define {name} {value}\n" for name, value in sorted(defines.items()))
-    listing = head + with_scalars(body, declared.scalars.wide)
-    text = _COMMENT.sub("", listing)
-    arguments = {kernel: declared.arguments(kernel) for kernel in _KERNEL.findall(text)}
-    return Source(listing, text, declared.records, arguments, declared.samples, declared.scalars)
+    def program(name: str) -> Text:
+        files = [f"{stage}.cl" for stage in stages[name]]
+        body = "".join(f"#line 1 {_shown(file)}\n{expand(file, 1, lines_of(file))}" for file in files)
+        body = with_scalars(body, declared.scalars.wide)
+        bare = "\n".join(map(_without_comment, body.split("\n")))
+        # a number that a program does not name must not make another program
+        head = "".join(f"#define {name} {value}\n" for name, value in sorted(defines.items()) if name in bare)
+        return Text(f"// the program `{name}`\n{head}{body}", f"\n{head}{bare}")
+
+    programs = {name: program(name) for name in stages}
+    kernels = (kernel for each in programs.values() for kernel in _KERNEL.findall(each.compiled))
+    arguments = {kernel: declared.arguments(kernel) for kernel in kernels}
+    return Source(programs, declared.records, arguments, declared.samples, declared.scalars)
 
 
 class _Declarations:
@@ -176,13 +217,19 @@ def _shown(file: str) -> str:
     return f'"{Path(file).name}"' if Path(file).is_absolute() else f'"opencl/{file}"'
 
 
+def _without_comment(line: str) -> str:
+    start = line.find("//")
+    return line if start < 0 else line[:start].rstrip(" \t")
+
+
 def with_scalars(text: str, wide: str = "float") -> str:
     """Kernel text in which the type `wide` and its constants are those of C."""
     return _WIDE.sub(wide, _WIDE_CONSTANT.sub(r"\1" if wide == "double" else r"\1f", text))
 
 
-def _refuse_unknown_hooks(files: list[str], stages: list[str]) -> None:
-    everywhere = {*stages, "schedule/lanes.cl", "schedule/group.cl"}
+def _refuse_unknown_hooks(files: list[str]) -> None:
+    stages = (stage.format(schedule) for stage in _DRAWN for schedule in ("lanes", "group"))
+    everywhere = {f"{stage}.cl" for stage in (*stages, *chain(*_LISTS.values()))}
     everywhere |= {layout.file for layout in LAYOUTS.values() if layout.file}
     known = {hook for file in everywhere for hook in _hooks(file)}
     for file in files:

@@ -4,7 +4,7 @@ stages on made-up input, and buffers that are filled with rubbish first.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -102,13 +102,17 @@ class OpenCLProbe:
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace
 
-    def contraction(self, a: np.ndarray, b: np.ndarray) -> tuple[list[np.ndarray], bool]:
+    @property
+    def fuses(self) -> bool:
+        """Whether the device fuses multiply-adds where it is asked to."""
+        return self._workspace.shape.fast_fma
+
+    def contraction(self, a: np.ndarray, b: np.ndarray) -> Sequence[np.ndarray]:
         """a b - a b; a b + a; the difference in the set-up's precision, of thirds; a b - (a b), fused: each
-        (n,), from a, b (n,) float32. And whether the device fuses where it is asked to.
-        """
+        (n,), from a, b (n,) float32."""
         real = np.float64 if self._workspace.info.float64 else np.float32
         types = (np.float32, np.float32, real, np.float32)
-        return evaluate(self._workspace, CONTRACTION, (a, b, a), types), self._workspace.shape.fast_fma
+        return evaluate(self._workspace, CONTRACTION, (a, b, a), types)
 
     def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
         """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
@@ -175,6 +179,11 @@ class OpenCLProbe:
         places = contents(workspace, starts).view(np.uint32)
         words = contents(workspace, sums).view(np.uint32)
         return places, int(words[place]) | int(words[place + 1]) << 32
+
+    def boxes(self, pipeline: OpenCLPipeline, trace: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Of what `pipeline.trace` gave: the samples that each splat can touch, (n, 4) int, columns [x0, x1)
+        and rows [y0, y1); undefined for culled splats."""
+        return np.stack([trace["records"][name].astype(int) for name in ("x0", "x1", "y0", "y1")], 1)
 
     @contextmanager
     def poisoned(self) -> Iterator[None]:

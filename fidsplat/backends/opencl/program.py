@@ -10,8 +10,8 @@ from typing import Any
 
 import pyopencl as cl
 
+from fidsplat.backends.caches import pocl_folder
 from fidsplat.backends.opencl.assemble import Source, kernel_text, with_scalars
-from fidsplat.backends.opencl.pocl_cache import cache_folder
 from fidsplat.backends.opencl.pocl_target import correct_target, needs_correction
 from fidsplat.backends.opencl.workspace import DeviceBuffer, Workspace
 from fidsplat.errors import DeviceError
@@ -113,13 +113,13 @@ def _kernels_of(workspace: Workspace, source: Source) -> dict[str, cl.Kernel]:
     load_invoker()
     for attempt in range(3):
         again = [f"-DATTEMPT_{attempt}"] if attempt else []
-        built = build(workspace, source.text, *again)
-        kernels = {kernel.function_name: kernel for kernel in built.all_kernels()}
+        built = [build(workspace, program.compiled, *again) for program in source.programs.values()]
+        kernels = {kernel.function_name: kernel for each in built for kernel in each.all_kernels()}
         if source.arguments.keys() <= kernels.keys():
             return kernels
     raise DeviceError(
         f"{workspace.info.title} gives a program without its kernels; its cache of compiled kernels may be "
-        f"damaged: remove {cache_folder()}"
+        f"damaged: remove {pocl_folder()}"
     )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from fidsplat.backends.base import DeviceInfo
 from fidsplat.backends.reference.blend import composite
+from fidsplat.backends.reference.culling import may_see
 from fidsplat.backends.reference.resolve import resolve
 from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
@@ -19,7 +20,8 @@ from fidsplat.effects import OUTPUTS, FeatureSet
 from fidsplat.errors import InputError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
 
-_BLOCK = 1 << 19  # (sample, splat) pairs that are evaluated at once
+_BLOCK = 1 << 16  # (sample, splat) pairs that are evaluated at once: half a megabyte each, which caches hold
+_TILE = 16  # samples along a side of those for which splats are chosen together
 
 
 def devices() -> list[DeviceInfo]:
@@ -28,7 +30,7 @@ def devices() -> list[DeviceInfo]:
     return [
         DeviceInfo(
             name="reference",
-            title="NumPy, float64, every pixel against every splat",
+            title="NumPy, float64, without bounds of footprints",
             platform="reference",
             version=f"NumPy {np.__version__}",
             kind="cpu",
@@ -154,12 +156,19 @@ class ReferencePipeline:
     ) -> dict[str, np.ndarray]:
         """What blending leaves (k, ...) at grid positions x, y (k,)."""
         splats = Setup(resident.cloud, view, self.features)
-        step = max(1, _BLOCK // max(1, len(splats.order)))
-        blocks = [
-            composite(splats, view, self.features, x[k : k + step], y[k : k + step])
-            for k in range(0, max(len(x), 1), step)
-        ]
-        return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+        if len(x) * len(splats.order) <= _BLOCK:
+            return composite(splats, view, self.features, x, y)
+        tile = y // _TILE * view.width + x // _TILE
+        places = np.argsort(tile, kind="stable")
+        parts = []
+        for mine in np.split(places, np.flatnonzero(np.diff(tile[places])) + 1):
+            seen = splats.among(may_see(splats, view, x[mine], y[mine]))
+            step = max(1, _BLOCK // max(1, len(seen.order)))
+            for k in range(0, len(mine), step):
+                block = mine[k : k + step]
+                parts.append(composite(seen, view, self.features, x[block], y[block]))
+        back = np.argsort(places)
+        return {name: np.concatenate([part[name] for part in parts])[back] for name in parts[0]}
 
     def _exposed(
         self, resident: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray

@@ -4,12 +4,13 @@ first.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
+from fidsplat.backends.warp.pipeline import WarpPipeline
 from fidsplat.backends.warp.runtime import kernels, load, quiet
 from fidsplat.backends.warp.workspace import ArrayPool, Workspace, nbytes
 from fidsplat.errors import DeviceError
@@ -21,13 +22,15 @@ class WarpProbe:
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace
 
-    def contraction(self, a: np.ndarray, b: np.ndarray) -> tuple[list[np.ndarray], bool]:
+    fuses = True
+    """Warp's devices fuse multiply-adds where they are asked to"""
+
+    def contraction(self, a: np.ndarray, b: np.ndarray) -> Sequence[np.ndarray]:
         """a b - a b; a b + a; (a / 3) (b / 3) - (a / 3) (b / 3) in float64; a b - (a b), fused: each (n,),
-        from a, b (n,) float32. And whether the device fuses where it is asked to.
-        """
+        from a, b (n,) float32."""
         n = len(a)
         types = (np.float32, np.float32, np.float64, np.float32)
-        return run(self._workspace, "contraction", n, (a, b, a), [np.zeros(n, each) for each in types]), True
+        return run(self._workspace, "contraction", n, (a, b, a), [np.zeros(n, each) for each in types])
 
     def not_a_number(self, x: np.ndarray) -> Sequence[np.ndarray]:
         """Of x (n,) float32: x != x, isnan, fails every comparison, isinf; each (n,) int32."""
@@ -64,6 +67,13 @@ class WarpProbe:
             wp.utils.array_scan(given, ends, inclusive=True)
         places = np.concatenate([[0], ends.numpy()])
         return places.astype(np.uint32), int(places[-1])
+
+    def boxes(self, pipeline: WarpPipeline, trace: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Of what `pipeline.trace` gave: the samples that each splat can touch, (n, 4) int, columns [x0, x1)
+        and rows [y0, y1); undefined for culled splats."""
+        words = [pipeline.program.layout.word(name) for name in ("columns", "rows")]
+        spans = trace["records"].view(np.uint32)[:, words].astype(int)
+        return np.stack([spans & 0xFFFF, spans >> 16], 2).reshape(-1, 4)
 
     @contextmanager
     def poisoned(self) -> Iterator[None]:

@@ -26,6 +26,10 @@ def other_shapes(own: WarpShape, kind: str) -> dict[str, WarpShape]:
     """As `Reshapes.shapes` (fidsplat/backends/base.py)."""
     if kind == "schedule":
         return {"groups": WarpShape("group", 8, 8)}
-    if kind == "sorting":
+    if kind == "listing":
+        return {"ordered": own}
+    if kind in ("sorting", "arithmetic"):
         return {"own": own}
+    if kind == "waiting":
+        return {}
     return {f"{side} x {side}": WarpShape(own.schedule, side, side) for side in (8, 32)}

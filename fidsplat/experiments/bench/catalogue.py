@@ -61,7 +61,8 @@ def qr_wall() -> tuple[SplatCloud, Camera]:
 
 def _random(name: str) -> BenchScene:
     scene = SCENES[name]
-    about = f"{scene.count:,} random splats, {scene.width} x {scene.height}"
+    kind = "3D Gaussians" if scene.thick else "splats"
+    about = f"{scene.count:,} random {kind}, {scene.width} x {scene.height}"
     return BenchScene(about, lambda: load_scene(name))
 
 

@@ -13,7 +13,6 @@ from fidsplat.accuracy import errors
 from fidsplat.errors import FidsplatError
 from fidsplat.experiments.angles import parse_tilts
 from fidsplat.experiments.plane import plane_picture
-from fidsplat.experiments.readback import corner_error, own_code
 from fidsplat.experiments.setup import BACKGROUND
 from fidsplat.experiments.tradeoff.hard import CELLS, cell_window
 from fidsplat.experiments.tradeoff.scenes import GREY, HARD, PROTOCOL, SEED, TradeScene, made_marker
@@ -22,6 +21,7 @@ from fidsplat.hard_cases.agreement import Picture, truth_of
 from fidsplat.quality import MarkerQuality, Quality
 from fidsplat.vision.images import to_uint8
 from fidsplat.vision.metrics import flip, has_flip, psnr
+from fidsplat.vision.readback import corner_error, own_code
 from fidsplat.vision.readers import Target, attempt
 
 FULL_TILTS, QUICK_TILTS = "0:40:20,46:88:1", "0:40:40,48:88:4"

@@ -24,6 +24,8 @@
     }
 //@ camera_derivative
         if (THICK_HERE) filtered = false;   // it has a low-pass of its own
+//@ camera_steepest
+    if (THICK_HERE) steepest = fabs(k0.z);  // which makes D 1, that of all samples
 //@ footprint_dot_bounds
         if (THICK_HERE) bounds.pr = -1.0f;
 //@ footprint_dot

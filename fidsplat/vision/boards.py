@@ -1,0 +1,78 @@
+"""Boards of tags in a picture: one pose from all that is seen of them."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.markers.boards import GAP, BoardSpec, tag_places
+from fidsplat.markers.kinds import parse_spec
+from fidsplat.scenes import PlacedMarker
+from fidsplat.vision.detect import Detection
+from fidsplat.vision.dictionaries import families, parse_family, predefined
+from fidsplat.vision.pose import plane_pose
+
+BOARDS = ("charuco", "gridboard", "aprilgrid")
+"""kinds of markers that are boards"""
+
+ENOUGH = 6
+"""Corners between squares from which a ChArUco board's pose is taken; its tags' where there are fewer."""
+
+
+def board_pose(
+    image: np.ndarray, tags: Iterable[Detection], placed: PlacedMarker, camera: Camera
+) -> tuple[tuple[Detection, np.ndarray] | None, list[Detection]]:
+    """A board as one detection, its corners as its pose has them, with camera_from_marker (4, 4), or None;
+    and the tags that are not its own.
+
+    image: (h, w, 3) uint8. tags: found in it; of several of one id the nearest to the board's true place.
+    """
+    marker, left = placed.marker, list(tags)
+    spec = parse_spec(marker.spec)
+    assert isinstance(spec, BoardSpec)
+    kind, family = parse_family(spec.family or "")
+    side = families(kind)[family].size
+    origin = marker.corners[0]
+    points, seen = [], []
+    for number, (y, x) in enumerate(tag_places(spec, side)):
+        own = [tag for tag in left if (tag.kind, tag.family, tag.id) == (kind, family, number)]
+        corners = np.array([(x, y), (x + side, y), (x + side, y + side), (x, y + side)], float)
+        where = origin[:2] + corners * marker.module
+        if own:
+            true = camera.project(
+                np.pad(where, ((0, 0), (0, 1))) @ placed.pose[:3, :3].T + placed.pose[:3, 3]
+            )
+            tag = min(own, key=lambda tag: np.nan_to_num(np.linalg.norm(tag.corners - true), nan=np.inf))
+            left.remove(tag)
+            points.append(where)
+            seen.append(tag.corners)
+    if not points:
+        return None, left
+    at, on = np.concatenate(points), np.concatenate(seen)
+    if spec.kind == "charuco":
+        squares, corners = _chess_corners(image, spec, side)
+        if len(corners) >= ENOUGH:
+            at, on = origin[:2] + squares * marker.module, corners
+    pose = plane_pose(at, on, camera)
+    if not np.isfinite(pose).all():
+        return None, left
+    standing = replace(camera, world_to_camera=np.eye(4), position=None)
+    corners = standing.project(marker.corners @ pose[:3, :3].T + pose[:3, 3])
+    text = f"{spec.columns}x{spec.rows}:{family}"
+    return (Detection(spec.kind, family, None, text, corners), pose), left
+
+
+def _chess_corners(image: np.ndarray, spec: BoardSpec, side: int) -> tuple[np.ndarray, np.ndarray]:
+    """Corners between the squares of a ChArUco board that OpenCV finds: (n, 2) modules and (n, 2) pixels."""
+    square = side + GAP
+    dictionary = predefined(*parse_family(spec.family or ""))
+    board = cv2.aruco.CharucoBoard((spec.columns, spec.rows), square, side, dictionary)
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    found, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
+    if ids is None or found is None:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    row, column = np.divmod(np.asarray(ids).ravel(), spec.columns - 1)
+    # OpenCV counts from the centre of the first pixel
+    return np.column_stack([column + 1, row + 1]) * float(square), np.asarray(found).reshape(-1, 2) + 0.5

@@ -1,0 +1,202 @@
+"""What is read in a picture of a scene, compared with where the scene's markers are."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.errors import InputError
+from fidsplat.markers import Marker
+from fidsplat.scenes import PlacedMarker, Scene
+from fidsplat.vision.boards import BOARDS, board_pose
+from fidsplat.vision.detect import Detection, detect
+from fidsplat.vision.dictionaries import parse_family
+from fidsplat.vision.images import to_uint8
+from fidsplat.vision.pose import marker_pose, pose_error
+from fidsplat.vision.visible import visible
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """One marker of a scene, and how it was read."""
+
+    placed: PlacedMarker
+    truth: np.ndarray
+    """(4, 4) camera_from_marker"""
+    corners: np.ndarray
+    """(4, 2) pixels where the code's corners are, NaN behind the camera"""
+    visible: float
+    """share of the marker, a module of its quiet zone included, that is in the picture, 0 to 1; of a frame
+    with labels, of what nothing hides"""
+    box: tuple[float, float, float, float] | None
+    """pixels x0, y0, x1, y1 around what of that lies in the picture; None where nothing does"""
+    detection: Detection | None = None
+    """None when the marker was not found"""
+    pose: np.ndarray | None = None
+    """(4, 4) camera_from_marker from what was detected"""
+    position_error: float | None = None
+    """metres"""
+    angle_error: float | None = None
+    """radians"""
+    corner_error: float | None = None
+    """pixels, root mean square over the four corners"""
+
+    @property
+    def distance(self) -> float:
+        """Metres from the camera to the middle of the marker."""
+        return float(np.linalg.norm(self.truth[:3, 3]))
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON: millimetres, degrees, pixels; None where the marker was not found."""
+        return {
+            "marker": self.placed.marker.spec,
+            "label": self.placed.label,
+            "found": self.detection is not None,
+            "visible": self.visible,
+            "box": self.box,
+            "distance_m": self.distance,
+            "position_error_mm": None if self.position_error is None else self.position_error * 1e3,
+            "angle_error_deg": None if self.angle_error is None else math.degrees(self.angle_error),
+            "corner_error_px": self.corner_error,
+            "camera_from_marker": None if self.pose is None else self.pose.tolist(),
+            "corners": None if self.detection is None else self.detection.corners.tolist(),
+        }
+
+
+class ReadBack(NamedTuple):
+    """What `read_back` returns."""
+
+    readings: list[Reading]
+    """of each marker of the scene, in its order"""
+    others: list[Detection]
+    """codes that were seen and that the scene does not have"""
+
+
+def read_back(
+    picture: Mapping[str, np.ndarray] | np.ndarray,
+    scene: Scene,
+    camera: Camera | None = None,
+    families: Iterable[str] | None = None,
+) -> ReadBack:
+    """Read every marker of a scene in its picture: id, corners, pose, and how far these are from the truth.
+
+    Of a scene that moves, the truth is where things are at its shutter's time. Boards (charuco, gridboard,
+    aprilgrid) give one pose each, from all that is seen of them. Drawings and images are not looked for.
+
+    Args:
+        picture: a `Frame` with `rgb`, and with `label` if `Reading.visible` is to know what hides markers; or
+            (h, w, 3) uint8, or float in [0, 1].
+        camera: that took it; default the scene's.
+        families: tag families to look for, see `detect`; default the scene's.
+
+    Raises:
+        InputError: no camera, or one of another size than the picture.
+    """
+    image = to_uint8(picture["rgb"] if isinstance(picture, Mapping) else np.asarray(picture))
+    label = picture["label"] if isinstance(picture, Mapping) and "label" in picture else None
+    time = 0.0 if scene.shutter is None else scene.shutter.time
+    camera = scene.camera if camera is None else camera
+    if camera is None:
+        raise InputError("the scene has no camera, so the pose of its markers is unknown; give read_back one")
+    if (camera.width, camera.height) != (image.shape[1], image.shape[0]):
+        raise InputError(
+            f"the picture has {image.shape[1]} x {image.shape[0]} pixels and the camera {camera.width} x "
+            f"{camera.height}; give the picture that this scene was rendered to"
+        )
+    if camera is scene.camera:
+        camera = scene.motion.moved(camera, time)
+    markers = [m if m.motion is None else replace(m, pose=m.motion(time)) for m in scene.markers]
+    found = detect(image, families_of(placed.marker for placed in markers) if families is None else families)
+    codes, left = match(found, markers, camera)
+    for number, placed in enumerate(markers):
+        if placed.marker.kind in BOARDS:
+            codes[number], left = board_pose(image, left, placed, camera)
+    readings = [_reading(placed, code, camera, label) for placed, code in zip(markers, codes, strict=True)]
+    return ReadBack(readings, left)
+
+
+def match(
+    detections: Iterable[Detection], markers: Sequence[PlacedMarker], camera: Camera
+) -> tuple[list[tuple[Detection, np.ndarray] | None], list[Detection]]:
+    """For each marker its detection and camera_from_marker, or None; and the detections that belong to none.
+
+    A detection belongs to a marker of the same kind and id or payload; of several such, the nearest pairs
+    go first.
+    """
+    left = list(detections)
+    seen = [camera.project(placed.corners) for placed in markers]
+    pairs = [
+        (_apart(found.corners, seen[i]), i, found)
+        for i, placed in enumerate(markers)
+        for found in left
+        if _same(found, placed.marker)
+    ]
+    chosen: dict[int, Detection] = {}
+    for _, i, found in sorted(pairs, key=lambda pair: pair[0]):
+        if i not in chosen and found in left:
+            chosen[i] = found
+            left.remove(found)
+    codes = [
+        (chosen[i], marker_pose(chosen[i].corners, placed.marker.size, camera)) if i in chosen else None
+        for i, placed in enumerate(markers)
+    ]
+    return codes, left
+
+
+def own_code(made: Marker, picture: np.ndarray) -> Detection | None:
+    """A marker's code in a picture, (h, w) or (h, w, 3) display values; None where it is not read."""
+    found = detect(to_uint8(picture), families_of([made]), qr=made.kind == "qr")
+    return next((code for code in found if _same(code, made)), None)
+
+
+def corner_error(code: Detection, corners: np.ndarray) -> float:
+    """Pixels between a code's corners and where they are, (4, 2): root mean square over the four."""
+    return float(np.sqrt(((code.corners - corners) ** 2).sum(1).mean()))
+
+
+def families_of(markers: Iterable[Marker]) -> tuple[str, ...]:
+    """Families of those that are tags or boards of tags, each once, for `detect`."""
+    tags = (made for made in markers if made.kind in ("apriltag", "aruco", *BOARDS))
+    return tuple(dict.fromkeys(":".join(parse_family(str(tag.family))) for tag in tags))
+
+
+def means(readings: Sequence[Reading]) -> dict[str, Any]:
+    """How many markers were found of how many, and the means of their errors, as `Reading.as_dict` has them;
+    None where none was found."""
+    facts = [reading.as_dict() for reading in readings if reading.detection is not None]
+    keys = ("position_error_mm", "angle_error_deg", "corner_error_px")
+    mean = {key: float(np.mean([fact[key] for fact in facts])) if facts else None for key in keys}
+    return {"markers": len(readings), "found": len(facts), **mean}
+
+
+def _same(found: Detection, made: Marker) -> bool:
+    if found.kind == "qr":  # whose family is its version
+        return (found.kind, found.payload) == (made.kind, made.payload)
+    return (found.kind, found.family, found.id) == (made.kind, made.family, made.id)
+
+
+def _apart(one: np.ndarray, other: np.ndarray) -> float:
+    distance = float(np.linalg.norm(one - other))
+    return distance if math.isfinite(distance) else math.inf
+
+
+def _reading(
+    placed: PlacedMarker, code: tuple[Detection, np.ndarray] | None, camera: Camera, label: np.ndarray | None
+) -> Reading:
+    truth, corners = camera.world_to_camera @ placed.pose, camera.project(placed.corners)
+    seen = Reading(placed, truth, corners, *visible(placed, camera, label))
+    if code is None:
+        return seen
+    found, pose = code
+    position, angle = pose_error(pose, truth)
+    return replace(
+        seen,
+        detection=found,
+        pose=pose,
+        position_error=position,
+        angle_error=angle,
+        corner_error=corner_error(found, corners),
+    )

@@ -1,0 +1,77 @@
+"""What of a marker lies in a picture."""
+
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+
+from fidsplat.cameras import Camera, Orthographic
+from fidsplat.scenes import PlacedMarker
+
+MARGIN = 1
+"""Modules of its quiet zone that are looked at with a code; without them no detector need find it."""
+
+POINTS = 16
+"""Places along a side, which a lens makes a curve."""
+
+
+class Visible(NamedTuple):
+    """What of a marker is in a picture."""
+
+    share: float
+    """0 to 1, of its outline in an endless picture"""
+    box: tuple[float, float, float, float] | None
+    """pixels x0, y0, x1, y1 around it, without regard to what stands in front; None for a share of 0"""
+
+
+def visible_part(placed: PlacedMarker, camera: Camera) -> tuple[shapely.Geometry, shapely.Geometry]:
+    """A marker's outline in an endless picture, and what of it lies in the camera's, in pixels.
+
+    The outline is the code's with a module of its quiet zone, as far as it has one. Both are empty for a
+    marker that is seen from behind.
+    """
+    marker = placed.marker
+    rows, columns = marker.bits.shape
+    margin = min(MARGIN, marker.quiet_zone)
+    corners = marker.corners * [1 + 2 * margin / columns, 1 + 2 * margin / rows, 1.0]
+    points = corners @ placed.pose[:3, :3].T + placed.pose[:3, 3]
+    if camera.lens is None or isinstance(camera.lens, Orthographic):
+        depth = points @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+        points = _before(points, depth - camera.near)
+    share = np.arange(POINTS)[:, None] / POINTS
+    sides = [a + share * (b - a) for a, b in zip(points, np.roll(points, -1, 0), strict=True)]
+    at = camera.project(np.concatenate(sides)) if sides else np.zeros((0, 2))
+    at = at[np.isfinite(at).all(1)]
+    after = np.roll(at, -1, 0)
+    area = (at[:, 0] * after[:, 1] - at[:, 1] * after[:, 0]).sum()
+    whole = shapely.Polygon(at).buffer(0) if area > 0 else shapely.Polygon()  # as printed, clockwise
+    return whole, whole & shapely.box(0, 0, camera.width, camera.height)
+
+
+def visible(placed: PlacedMarker, camera: Camera, label: np.ndarray | None = None) -> Visible:
+    """What of a marker's outline (`visible_part`) is in the picture.
+
+    label: (h, w) int32, the labels of the picture; None: nothing stands in front.
+    """
+    whole, part = visible_part(placed, camera)
+    if shapely.is_empty(part):
+        return Visible(0.0, None)
+    share = min(float(shapely.area(part) / shapely.area(whole)), 1.0)
+    x0, y0, x1, y1 = shapely.bounds(part).tolist()
+    if label is not None:
+        y, x = np.mgrid[int(y0) : min(int(y1) + 1, camera.height), int(x0) : min(int(x1) + 1, camera.width)]
+        inside = shapely.contains_xy(part, x + 0.5, y + 0.5)
+        own = label[y[inside], x[inside]] == placed.label
+        share *= float(own.mean()) if own.size else 0.0
+    return Visible(share, (x0, y0, x1, y1))
+
+
+def _before(points: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+    """The part of a polygon (n, 3) where a linear function, of these values at its corners, is above 0."""
+    kept = []
+    for a, b, at_a, at_b in zip(points, np.roll(points, -1, 0), ahead, np.roll(ahead, -1), strict=True):
+        if at_a > 0:
+            kept.append(a)
+        if (at_a > 0) != (at_b > 0):
+            kept.append(a + at_a / (at_a - at_b) * (b - a))
+    return np.array(kept).reshape(-1, 3)

@@ -1,0 +1,75 @@
+"""`pytest --certificates FILE`: what the reference leaves open, over all pictures that a run compares.
+
+A certificate says what float32 may change in a pixel's colour (fidsplat/backends/reference/error_bounds.py):
+where it is large, a test sees little there. Hooks of pytest, which conftest.py imports.
+"""
+
+import json
+import os
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.backends.reference.backend import ReferencePipeline
+
+THRESHOLDS = 2e-5, 1e-3, 0.05
+"""the tolerance of colours, a quarter of an 8-bit step, and what a thousandth of a picture may exceed"""
+_found = defaultdict(lambda: np.zeros(2 + len(THRESHOLDS), int))
+"""pictures, pixels, pixels above each threshold, by the file of the test"""
+
+
+def pytest_addoption(parser):
+    words = "count the certificates of all pictures that are compared, and print their distribution"
+    parser.addoption("--certificates", metavar="FILE", type=Path, help=words)
+
+
+def pytest_configure(config):
+    file = config.getoption("--certificates")
+    if file is None:
+        return
+    if not hasattr(config, "workerinput"):  # in the first process alone
+        file.write_text("", "utf-8")
+    ReferencePipeline.pixels = counting(ReferencePipeline.pixels)
+
+
+def counting(pixels):
+    """`ReferencePipeline.pixels`, through which each picture of the reference is drawn, and counted here."""
+
+    def counted(self, resident, view, rows, columns):
+        images = pixels(self, resident, view, rows, columns)
+        bound = images["certificate"]
+        above = [np.count_nonzero(bound > threshold) for threshold in THRESHOLDS]
+        _found[os.environ.get("PYTEST_CURRENT_TEST", "").split("::")[0]] += [1, bound.size, *above]
+        return images
+
+    return counted
+
+
+def pytest_sessionfinish(session):
+    file = session.config.getoption("--certificates")
+    if file is not None and _found:
+        with file.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps({name: counts.tolist() for name, counts in _found.items()}) + "\n")
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    file = config.getoption("--certificates")
+    if file is not None:
+        terminalreporter.write_line(table(file))
+
+
+def table(file):
+    """Markdown, of what each process has written."""
+    total = defaultdict(lambda: np.zeros(2 + len(THRESHOLDS), int))
+    for line in file.read_text("utf-8").splitlines():
+        for name, counts in json.loads(line).items():
+            total[name] += counts
+            total["all"] += counts
+    heads = "".join(f" above {threshold:g} |" for threshold in THRESHOLDS)
+    rows = [f"| tests | pictures | pixels |{heads}", "|---|" + "---|" * (2 + len(THRESHOLDS))]
+    for name in sorted(total, key=lambda name: (name == "all", name)):
+        pictures, pixels, *above = total[name].tolist()
+        shares = "".join(f" {count / max(pixels, 1):.4%} |" for count in above)
+        rows.append(f"| {name.removeprefix('tests/')} | {pictures} | {pixels:,} |{shares}")
+    return "\n".join(rows)

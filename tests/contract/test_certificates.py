@@ -1,0 +1,41 @@
+"""What the reference leaves open is little: certificates excuse no errors of a device in any scene."""
+
+import numpy as np
+import pytest
+from agreement import random_splats, truth_of
+from test_agreement import coplanar_cloud
+from test_lens_pictures import CAMERAS
+
+import fidsplat as fs
+from fidsplat.effects import OUTPUTS
+from fidsplat.hard_cases.agreement import RARE, RISKY, Picture
+
+CAMERA = fs.Camera.look_at(81, 59, 1.0, (0, 0, -0.1), (0, 0, 3.0))
+AROUND = random_splats(150, seed=1)
+SCENES = {
+    "splats around the camera": (AROUND, CAMERA),
+    "layers": (coplanar_cloud(1), CAMERA),
+    "boxes": (AROUND.with_boxes(np.arange(150) % 2 == 0), CAMERA),
+    "a fisheye": (AROUND, CAMERAS["fisheye 200"]),
+    "parallel rays": (AROUND, CAMERAS["parallel"]),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_certificates_leave_little_open(name):
+    """Nine pixels of ten are held to the tolerance of colours alone; decisions that may turn out otherwise
+    (where is half of the light, what is heaviest) are a matter of one in forty."""
+    truth = truth_of(Picture(*SCENES[name], fs.Quality(), tuple(OUTPUTS)))
+    bound = truth["certificate"]
+    assert np.median(bound) < 1e-5
+    assert (bound > 2e-5).mean() < 0.1
+    assert (bound > 1e-3).mean() < RARE
+    assert bound.max() < RISKY
+    seen = truth["depth"] != 0
+    depth = truth["certificate_depth"][seen] / np.abs(truth["depth"][seen])
+    assert np.median(depth) < 2e-5
+    assert (depth > 1e-3).mean() < 0.02
+    assert (truth["certificate_normal"] > 1e-3).mean() < 0.03
+    for output in OUTPUTS:
+        if f"{output}_may_flip" in truth:
+            assert truth[f"{output}_may_flip"].mean() < 0.025, output

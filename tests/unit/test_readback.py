@@ -1,0 +1,139 @@
+"""Reading back: what is visible, which detection is whose, poses of boards."""
+
+import numpy as np
+import pytest
+import shapely
+
+import fidsplat as fs
+from fidsplat.experiments.demo_scene import demo_scene, demo_views
+from fidsplat.scenes import PlacedMarker
+from fidsplat.vision import read_back
+from fidsplat.vision.detect import Detection
+from fidsplat.vision.readback import families_of, match, means
+from fidsplat.vision.visible import visible, visible_part
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return demo_scene()
+
+
+def test_the_visible_share_counts_the_labels_inside_the_outline(scene):
+    camera = demo_views()["frontal"]
+    placed = scene.markers[0]
+    label = np.full((camera.height, camera.width), placed.label)
+    assert visible(placed, camera, label).share == 1.0
+    middle = camera.project(placed.pose[None, :3, 3])[0]
+    label[:, round(middle[0]) :] = 0
+    assert visible(placed, camera, label).share == pytest.approx(0.5, abs=0.01)
+    assert visible(placed, camera, np.zeros_like(label)).share == 0.0
+
+
+def test_what_is_outside_the_picture_or_turned_away_is_not_visible(scene):
+    placed = scene.markers[0]
+    camera = demo_views()["frontal"]
+    half = fs.Camera.pinhole(
+        camera.width, camera.height, camera.fx, camera.fy, 0, camera.cy, camera.world_to_camera
+    )
+    label = np.full((camera.height, camera.width), placed.label)
+    assert visible(placed, half, label).share == 0.0
+    behind = fs.Camera.look_at(640, 480, 1.0, (0, 0, 3), (0, 0, 0))
+    assert visible(placed, behind, np.full((480, 640), placed.label)).share == 0.0
+    away = fs.Camera.look_at(640, 480, 1.0, (0, 0, -3), (0, 0, -4))
+    assert visible(placed, away, np.full((480, 640), placed.label)).share == 0.0
+
+
+def test_detections_are_matched_by_what_they_say_and_then_by_nearness(scene):
+    camera = demo_views()["frontal"]
+    tag, aruco, qr = scene.markers
+    twice = (tag, fs.scenes.PlacedMarker(tag.marker, pose=aruco.pose), qr)
+
+    def seen(placed, kind="apriltag", family="36h11", tag_id: int | None = 5, payload=None):
+        return Detection(kind, family, tag_id, payload, camera.project(placed.corners))
+
+    found = [
+        seen(twice[1]),
+        seen(twice[0]),
+        seen(twice[0], tag_id=6),
+        seen(qr, "qr", "v2-L", None, "something else"),
+    ]
+    codes, others = match(found, twice, camera)
+    assert [code and code[0] for code in codes] == [found[1], found[0], None]
+    assert others == found[2:]
+    for code, placed in zip(codes[:2], twice, strict=False):
+        assert code is not None
+        assert np.allclose(code[1], camera.world_to_camera @ placed.pose, atol=1e-5)
+    assert families_of(placed.marker for placed in (tag, aruco, qr, tag)) == (
+        "apriltag:36h11",
+        "aruco:4x4_50",
+    )
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return fs.Renderer()
+
+
+def outlined(spec="apriltag:36h11:5", **camera):
+    placed = PlacedMarker(fs.marker(spec, size=0.2))
+    look = {"position": (0.1, -0.2, -0.6), "target": (0, 0, 0)} | camera
+    return placed, fs.Camera.look_at(320, 240, 1.0, look["position"], look["target"])
+
+
+def test_a_box_is_as_tight_as_the_labels(renderer):
+    """The pixels of a drawn tag's label have its box's bounds, to a pixel."""
+    placed, camera = outlined()
+    frame = renderer.render(fs.Scene(markers=[placed]), camera, outputs=("rgb", "label"))
+    (reading,), others = read_back(frame, fs.Scene(markers=[placed]), camera)
+    assert others == []
+    y, x = np.nonzero(frame["label"] == 1)
+    assert np.abs(np.array(reading.box) - (x.min(), y.min(), x.max() + 1, y.max() + 1)).max() <= 1
+    assert reading.visible == 1.0
+    assert reading.corner_error < 0.1
+
+
+def test_what_the_pictures_edge_cuts_off():
+    """Half of a tag that is seen straight on; a tag that reaches behind the camera; one that is seen from
+    behind."""
+    placed, straight = outlined(position=(0, 0, -1))
+    aside = fs.Camera.pinhole(320, 240, straight.fx, straight.fy, 0.0, 120, straight.world_to_camera)
+    assert visible(placed, aside).share == pytest.approx(0.5, abs=1e-9)
+    whole, part = visible_part(placed, aside)
+    assert shapely.bounds(part)[:2] == pytest.approx((0, 120 - 0.125 * straight.fx), abs=1e-6)
+    assert shapely.area(whole) == pytest.approx((0.25 * straight.fx) ** 2)
+    inside, camera = outlined(position=(0, 0, -0.05), target=(1, 0, 0))
+    whole, part = visible_part(inside, camera)
+    assert 0 < shapely.area(part) < shapely.area(whole)
+    behind, camera = outlined(position=(0, 0, 1))
+    assert visible(behind, camera).share == 0.0
+
+
+@pytest.mark.parametrize("spec", ["charuco:5x4:4x4_50", "gridboard:3x2:5x5_100", "aprilgrid:3x2:36h11"])
+def test_a_board_gives_one_pose(renderer, spec):
+    """From half of its tags too, and a tag of another place in the picture stays what it is."""
+    board = PlacedMarker(fs.marker(spec, size=0.3))
+    camera = fs.Camera.look_at(640, 480, 0.9, (0.2, -0.15, -0.5), (0, 0, 0))
+    scene = fs.Scene(markers=[board], camera=camera, background=(0.5, 0.5, 0.5))
+    frame = renderer.render(scene, outputs=("rgb", "label"))
+    (reading,), others = read_back(frame, scene)
+    assert others == []
+    assert reading.detection.name == spec
+    assert reading.position_error < 1e-3 * reading.distance
+    assert reading.angle_error < np.radians(0.2)
+    half = np.array(frame["rgb"])
+    half[:, :320] = 0.5
+    (reading,), _ = read_back(half, scene)
+    assert reading.position_error < 5e-3 * reading.distance
+    assert means([reading])["found"] == 1
+    (reading,), _ = read_back(np.full_like(half, 0.5), scene)
+    assert reading.as_dict()["found"] is False
+    assert means([reading])["position_error_mm"] is None
+
+
+def test_pictures_that_cannot_be_read_back():
+    scene, picture = fs.Scene(markers=[outlined()[0]]), np.zeros((240, 320, 3), np.uint8)
+    with pytest.raises(fs.InputError, match="has no camera"):
+        read_back(picture, scene)
+    wide = fs.Camera.look_at(321, 240, 1.0, (0, 0, -1), (0, 0, 0))
+    with pytest.raises(fs.InputError, match="320 x 240 pixels and the camera 321"):
+        read_back(picture, scene, wide)
