@@ -33,6 +33,8 @@ WALL_STEP = math.radians(1e-3)
 """radians per picture; larger before a wall, whose splats change places more seldom"""
 SMOOTH = 1e-3
 """largest change of a pixel in a step of 1e-4 degrees that is none of order: edges move"""
+ON_TAGS = Camera.look_at(96, 80, 0.8, (0.05, -0.03, -1.6), (0, 0, 0))
+SIDES = ("before", "behind", "through")
 
 
 def tag(side: int = 8, seed: int = 0) -> SplatCloud:
@@ -151,10 +153,6 @@ def fronto_parallel(away: float, count: int = 200) -> Picture:
     grey = np.repeat(generator.integers(0, 2, (count, 1)), 3, axis=1)
     world = (means @ pose[:3, :3]).astype(np.float32)
     return Picture(splats(world, facing, 0.25, 0.9, grey), camera(world_to_camera=pose), outputs=ALL_OUTPUTS)
-
-
-ON_TAGS = Camera.look_at(96, 80, 0.8, (0.05, -0.03, -1.6), (0, 0, 0))
-SIDES = ("before", "behind", "through")
 
 
 def crossing_tags() -> list[SplatCloud]:
