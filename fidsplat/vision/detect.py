@@ -14,6 +14,7 @@ import zxingcpp
 from fidsplat.errors import InputError
 from fidsplat.vision.align import align, fit
 from fidsplat.vision.dictionaries import dictionary_bits, parse_family, predefined
+from fidsplat.vision.images import pixels_of
 
 # One family for every grid that people print; with each, a random dark square reads as a tag less than once
 # in 300 times. 16h5 (1 in 30), the families of 1000 and 36h10 cost more time or more false tags: searched
@@ -65,11 +66,13 @@ def detect(image: np.ndarray, families: Iterable[str] | None = None, qr: bool = 
     A square that reads in two families (the small ArUco ones are parts of the large ones) is given once, in
     the family named first. Raises InputError for an unknown family and for another kind of array.
     """
-    pixels = np.asarray(image)
+    pixels = pixels_of(image)
     if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] != 3):
         raise InputError(f"detect needs uint8 (h, w) or (h, w, 3), not {pixels.dtype} {pixels.shape}")
     if families is not None and (isinstance(families, str) or not isinstance(families, Iterable)):
         raise InputError(f"families must be several names, as ('36h11',), not {families!r}")
+    if not isinstance(qr, bool | np.bool_ | int):
+        raise InputError(f"qr must be True or False, not {type(qr).__name__}")
     wanted = [parse_family(name) for name in (DEFAULT_FAMILIES if families is None else families)]
     if min(pixels.shape[:2]) < MIN_SIDE:
         return []

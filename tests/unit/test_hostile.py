@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import hostile
 import pytest
 from hostile_inputs import KINDS
 from sampling import sampled
@@ -48,3 +49,10 @@ def test_each_way_to_end_is_told(tmp_path, broken, ending):
     done = subprocess.run(command, capture_output=True, text=True, env=env)
     assert f"scenes 3: {ending} " in done.stdout, done.stdout + done.stderr
     assert done.returncode == (0 if ending == "one line" else 1)
+
+
+def test_an_error_may_follow_a_bar_and_nothing_else():
+    bad = ("fidsplat: a\nfidsplat: b", "fidsplat: a\nTraceback", "fidsplat: a (a fault of fidsplat)", "")
+    assert {hostile._ending_of_a_command(2, err)[0] for err in bad} == {"fault"}
+    good = ("fidsplat: a\n", "reading 50 %\nfidsplat: a\n", "fidsplat: warning: b\nfidsplat: a")
+    assert {hostile._ending_of_a_command(2, err)[0] for err in good} == {"one line"}
