@@ -104,9 +104,9 @@ def layered(
     alone = [draw(renderer, Picture(part, camera, quality, outputs, (0, 0, 0))) for part in parts]
     whole = Picture(SplatCloud.concatenate(parts), camera, quality, outputs, (0, 0, 0))
     rgb, alpha, depth = (np.stack([frame[name] for frame in alone]) for name in outputs)
-    order = np.argsort(np.where(alpha > 0, depth, np.inf), axis=0)
+    ranks = np.argsort(np.where(alpha > 0, depth, np.inf), axis=0)
     light, wanted = np.ones(alpha.shape[1:]), np.zeros(rgb.shape[1:])
-    for k in order:
+    for k in ranks:
         index = k[None]
         wanted += light[..., None] * np.take_along_axis(rgb, index[..., None], 0)[0]
         light *= 1 - np.take_along_axis(alpha, index, 0)[0]
