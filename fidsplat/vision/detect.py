@@ -30,6 +30,7 @@ MAX_QR_SIDE = 65535
 # how much taller or wider the picture is made when a plain look finds no QR code: a tilted one has flat
 # modules
 STRETCHES = (1.5, 2.0, 3.0, 4.0)
+QR_ONLY = zxingcpp.BarcodeFormats([zxingcpp.BarcodeFormat.QRCode])
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,16 +164,19 @@ def _read_qr(grey: np.ndarray, wider: float, taller: float) -> list[Detection]:
     if (wider, taller) != (1.0, 1.0):
         picture = cv2.resize(grey, None, fx=wider, fy=taller, interpolation=cv2.INTER_LINEAR)
     scale = np.array([grey.shape[1] / picture.shape[1], grey.shape[0] / picture.shape[0]])
-    formats = zxingcpp.BarcodeFormats([zxingcpp.BarcodeFormat.QRCode])
-    read = zxingcpp.read_barcodes(picture, formats=formats, text_mode=zxingcpp.TextMode.Plain)
+    read = zxingcpp.read_barcodes(picture, formats=QR_ONLY, text_mode=zxingcpp.TextMode.Plain)
     return [_qr(grey, code, scale) for code in read]
 
 
-def _qr(grey: np.ndarray, code: zxingcpp.Barcode, scale: np.ndarray) -> Detection:
+def corners_of(code: zxingcpp.Barcode) -> np.ndarray:
+    """(4, 2) pixels, TL, TR, BR, BL as printed; zxing-cpp counts from the first pixel's corner, as we do."""
     place = code.position
     points = (place.top_left, place.top_right, place.bottom_right, place.bottom_left)
-    # zxing-cpp counts from the corner of the first pixel, as we do, in whole pixels
-    rough = np.array([(p.x, p.y) for p in points], np.float64) * scale
+    return np.array([(point.x, point.y) for point in points], np.float64)
+
+
+def _qr(grey: np.ndarray, code: zxingcpp.Barcode, scale: np.ndarray) -> Detection:
+    rough = corners_of(code) * scale
     bits = (np.array(code.to_image(scale=1, add_quiet_zones=False)) == 0).astype(np.uint8)
     # its fourth corner has no finder pattern and, in the smallest codes, nothing else: it can be a module off
     better = align(grey, rough, bits, unsure=(2,))
