@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -114,6 +115,16 @@ def test_what_is_whole_stays(full_cache, tmp_path):
     assert remove_broken(folder) == 0
     assert compiled(folder) == before
     assert remove_broken(tmp_path / "nowhere") == 0
+
+
+def test_a_clock_that_was_put_back_hides_nothing(full_cache, tmp_path):
+    folder = tmp_path / "cache"
+    shutil.copytree(full_cache[0], folder)
+    remove_broken(folder)
+    later = time.time() + 3600
+    os.utime(folder / "fidsplat-checked", (later, later))
+    compiled(folder)[0].write_bytes(b"")
+    assert remove_broken(folder) == 1
 
 
 def test_the_cache_is_where_pocl_looks(monkeypatch, tmp_path):

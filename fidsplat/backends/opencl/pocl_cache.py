@@ -42,6 +42,8 @@ def remove_broken(folder: Path) -> int:
         last = stamp.stat().st_mtime
     except OSError:
         last = 0.0
+    if last > now:  # the clock was put back: what is new looks old
+        last = 0.0
     removed = 0
     for place, _, names in os.walk(folder):
         for name in names:
