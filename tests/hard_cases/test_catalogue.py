@@ -6,7 +6,7 @@ from fidsplat.hard_cases.b_homography import QUALITY, grazing_errors
 from fidsplat.hard_cases.catalogue import GROUPS, all_cases
 from fidsplat.hard_cases.check import run_case
 
-SIZES = {"A": 7, "B": 8, "C": 3, "D": 5, "E": 5, "F": 6, "G": 5}
+SIZES = {"A": 7, "B": 8, "C": 4, "D": 5, "E": 5, "F": 6, "G": 5}
 
 
 @pytest.mark.parametrize("case", all_cases(), ids=lambda case: case.name)
