@@ -32,7 +32,7 @@ SPECS = {
     "AprilTag, wall": "apriltag:36h11:5",
 }
 TILTS = (0.0, 30.0, 60.0)
-MODES = ("order", "blend")
+MODES = ("centre", "pixel")
 SIZE = {"width": 240, "height": 192}
 
 
@@ -63,7 +63,7 @@ def picture(panels: dict) -> np.ndarray:
     for mode in MODES:
         jump, before, after = panels["QR 5", mode]
         titled = (
-            (f"coplanar={mode}", before),
+            (f"order={mode}", before),
             ("turned by 0.0001 degrees", after),
             (f"difference, at most {jump:.2g}", np.abs(after - before)),
         )

@@ -7,8 +7,8 @@ AprilTag 36h11 id 0, and QR codes in byte mode at level L of seeded random strin
 characters (versions 2, 5, 10 and 22), seen frontally at 800 x 800, the code's edge `--edge-px` pixels long,
 low-pass off, 3 x 3 samples per pixel, over grey. PSNR is taken against the ideal texture (each pixel the
 mean of 12 x 12 points) within the quiet zone's outer edge and one module around it. "layer" is how fidsplat
-draws a marker (Quality.coplanar "blend"); "order" composites by the depth of the splats' centres, here all
-equal, so by index, as other renderers do with the exported file; "tilted 30" is "order" again from 30
+draws a marker (Quality.order "auto"); "centre" composites by the depth of the splats' centres, here all
+equal, so by index, as other renderers do with the exported file; "tilted 30" is "centre" again from 30
 degrees, where the centres' depths decide. Seconds are the median time from the spec to the cloud in a warm
 process, on one thread.
 """
@@ -42,7 +42,7 @@ MIXTURES = {
     "fitted": {"mixture": "fitted"},
     **{f"fitted, {size}": {"mixture": "fitted", "template": size} for size in TEMPLATE_SIZES if size != 25},
 }
-VIEWS = {"layer": ("blend", 0.0), "order": ("order", 0.0), "tilted 30": ("order", 30.0)}
+VIEWS = {"layer": ("auto", 0.0), "centre": ("centre", 0.0), "tilted 30": ("centre", 30.0)}
 
 
 def categories(seed: int) -> dict[str, str]:
@@ -91,12 +91,12 @@ def ideal_picture(made: Marker, camera: fs.Camera, background: float) -> tuple[n
 def measure(renderer: fs.Renderer, made: Marker, edge_px: float, background: float, ideals: dict) -> dict:
     """PSNR in dB of each of VIEWS."""
     found = {}
-    for name, (coplanar, tilt) in VIEWS.items():
+    for name, (order, tilt) in VIEWS.items():
         camera = camera_at(made, edge_px, tilt)
         if (made.spec, tilt) not in ideals:
             ideals[made.spec, tilt] = ideal_picture(made, camera, background)
         ideal, counts = ideals[made.spec, tilt]
-        quality = fs.Quality(alpha_cutoff=1 / 255, lowpass="none", samples=3, coplanar=coplanar)
+        quality = fs.Quality(alpha_cutoff=1 / 255, lowpass="none", samples=3, order=order)
         frame = renderer.render(made.cloud, camera, quality=quality, background=(background,) * 3)
         off = frame["rgb"].mean(2)[counts] - ideal[counts]
         found[name] = float(-10 * np.log10(np.mean(off * off)))

@@ -1,6 +1,6 @@
 """How wrong a picture is: its error against the same definition drawn at full precision.
 
-What a picture is (low-pass, samples per pixel, how coplanar splats are composited) is its definition;
+What a picture is (low-pass, samples per pixel, by which depth splats are ordered) is its definition;
 constants that leave something out of it (cut-off, stop, ceiling) and the arithmetic decide how accurate it
 is.
 """
@@ -78,7 +78,7 @@ def errors(picture: ArrayLike, truth: ArrayLike) -> Errors:
 def full_precision(capture: Capture, renderer: Renderer) -> Capture:
     """The capture of the same definition with nothing left out, in the best arithmetic of the device.
 
-    Low-pass, samples, coplanar and first_hit stay. A device composites in float64 where it can
+    Low-pass, samples, order and first_hit stay. A device composites in float64 where it can
     (`draws_float64`); else the arithmetic is its own, with the set-up in float64 if it has that.
     """
     best = capture.quality.with_(

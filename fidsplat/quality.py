@@ -18,7 +18,7 @@ from fidsplat.errors import InputError, unknown
 LOWPASS = ("screen", "pixel", "none")
 STOP_RULES = ("inclusive", "exclusive")
 ELLIPSOID = ("exact", "ewa", "ewa_antialiased")
-COPLANAR = ("blend", "order")
+ORDERS = ("auto", "pixel", "centre")
 SETUP_PRECISIONS = ("float64", "float32")
 ARITHMETIC = ("precise", "fast")
 BLEND_PRECISIONS = ("float32", "float64")
@@ -131,10 +131,12 @@ class Quality:
     and at wide angles, as 3DGUT and ray tracers have it (docs/ellipsoids.md). Lenses with distortion,
     fisheyes and panoramas have `exact` always."""
 
-    coplanar: str = "blend"
-    """Splats that are printed on one plane (markers). `blend`: one layer whose colour does not depend on
-    their order, placed by its own depth at each pixel. `order`: by the depth of their centres, as any other
-    splats, which flips as the camera turns."""
+    order: str = "auto"
+    """By which depth what overlaps is composited. `pixel`: each fragment by its own, where the ray meets its
+    splat; splats that are printed on one plane (markers) are one layer, whose colour depends on no order.
+    `centre`: every splat by the depth of its centre, as other renderers do and captured scenes were trained;
+    large splats swap places as the camera turns. `auto`: `pixel` where splats are printed on planes, `centre`
+    elsewhere (docs/order.md says why)."""
 
     samples: int = 1
     """n, 1 to 8, default 1: each pixel is the mean of n x n samples on a regular grid. More smooth edges, and
@@ -190,7 +192,7 @@ class Quality:
             ("stop_rule", STOP_RULES),
             ("lowpass", LOWPASS),
             ("ellipsoid", ELLIPSOID),
-            ("coplanar", COPLANAR),
+            ("order", ORDERS),
             ("setup_precision", SETUP_PRECISIONS),
             ("arithmetic", ARITHMETIC),
             ("blend_precision", BLEND_PRECISIONS),
@@ -203,10 +205,10 @@ class Quality:
                 "quality: blend_precision='float64' means nothing after a set-up in float32; use "
                 "setup_precision='float64' with it"
             )
-        if self.stop_rule == "exclusive" and self.coplanar == "blend":
+        if self.stop_rule == "exclusive" and self.order != "centre":
             raise InputError(
-                "quality: the exclusive stop drops single fragments, which coplanar='blend' does not have; "
-                "use coplanar='order' with it"
+                f"quality: order is {self.order!r}, but the exclusive stop drops single splats, which a "
+                "printed plane has not at a pixel; use order='centre' with it"
             )
         whole_number("quality: samples", self.samples, 1, MAX_SAMPLES)
 
@@ -299,7 +301,7 @@ _PARITY = Quality(
     transmittance_stop=1e-4,
     opacity_ceiling=0.99,
     stop_rule="exclusive",
-    coplanar="order",
+    order="centre",
     arithmetic="precise",
 )
 

@@ -86,7 +86,7 @@ _FIXED = {
     "low-pass pixel": Switch("lowpass", quality={"lowpass": "pixel"}),
     # it drops single fragments, which a plane does not have
     "stop exclusive": Switch(
-        "planes", quality={"stop_rule": "exclusive", "transmittance_stop": 1e-2, "coplanar": "order"}
+        "planes", quality={"stop_rule": "exclusive", "transmittance_stop": 1e-2, "order": "centre"}
     ),
     "2 x 2 samples": Switch("samples", quality={"samples": 2}),
     "set-up in float32": Switch("set-up", quality={"setup_precision": "float32"}),

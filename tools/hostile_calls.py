@@ -133,7 +133,7 @@ CALLS: dict[str, Callable[[Path], Call]] = {
         fs.Quality,
         {
             "alpha_cutoff": 1e-3, "transmittance_stop": 0.0, "stop_rule": "inclusive", "opacity_ceiling": 1.0,
-            "lowpass": "screen", "coplanar": "blend", "samples": 1, "first_hit": 0.1, "arithmetic": "fast",
+            "lowpass": "screen", "order": "pixel", "samples": 1, "first_hit": 0.1, "arithmetic": "fast",
             "marker": fs.MarkerQuality(),
         },
         lambda quality: RENDERER.render(CLOUD, CAMERA, quality=quality),

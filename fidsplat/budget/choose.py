@@ -69,7 +69,7 @@ def quality_within(
 
     The error is the largest absolute difference of rgb, over all pixels and channels and before any sensor,
     from the same definition at full precision in float64 (`fidsplat.accuracy.truth`). The definition
-    (low-pass, samples, coplanar, marker) is that of the capture's quality.
+    (low-pass, samples, order, marker) is that of the capture's quality.
 
     With the error alone the answer comes from a list of errors over random scenes. With a scene and a camera
     it is measured: on this device, in that scene, from there. What was measured is kept in the user's cache

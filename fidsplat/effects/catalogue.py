@@ -39,7 +39,7 @@ def _image(
 _PLAIN = (
     *("camera_pinhole", "camera_brown_conrady", "camera_fisheye", "camera_equirectangular"),
     *("camera_orthographic", "color_rgb", "color_sh", "lowpass_none", "lowpass_pixel", "lowpass_screen"),
-    *("stop_inclusive", "stop_exclusive", "compose_ordered", "compose_planes"),
+    *("stop_inclusive", "stop_exclusive", "compose_ordered", "compose_pixel", "compose_planes"),
     *("footprint_gaussian", "footprint_box", "footprint_mixed"),
     *("ellipsoid_exact", "ellipsoid_ewa", "ellipsoid_ewa_antialiased", "ellipsoids_alone"),
     *("background_constant", "background_gradient", "background_panorama"),

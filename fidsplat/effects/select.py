@@ -104,7 +104,6 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
     double = quality.blend_precision == "float64"
     if double:
         _refuse_float64(lens, capture.foggy)
-    layered = cloud.has_planes and quality.coplanar == "blend"
     flat = cloud.footprint == "gaussian" and not ellipsoid
     in_spheres = lens is None and flat and lowpass != "pixel"
     # harmonics of degree 0 do not depend on the view: they are colours (`SplatCloud.plain_colors`)
@@ -117,7 +116,7 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
             *(("ellipsoids_alone",) if alone else ()),
             f"lowpass_{lowpass}",
             f"stop_{quality.stop_rule}",
-            "compose_planes" if layered else "compose_ordered",
+            _composing(cloud, quality.order),
             f"footprint_{cloud.footprint}",
             f"background_{_KINDS.get(type(background), 'constant')}",
             # short functions are float32's
@@ -133,6 +132,13 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
         setup_precision=quality.setup_precision,
         posts=(*(("fog",) if capture.foggy else ()), *capture.sensor.steps),
     )
+
+
+def _composing(cloud: Traits, order: str) -> str:
+    """The effect that composites: by splats' centres, or by depth at each pixel, with or without planes."""
+    if order == "centre" or (order == "auto" and not cloud.has_planes):
+        return "compose_ordered"
+    return "compose_planes" if cloud.has_planes else "compose_pixel"
 
 
 def _ellipsoid(cloud: Traits, quality: Quality, lens: Lens | None) -> str:

@@ -23,7 +23,7 @@ from fidsplat.experiments.setup import (
     novel_cameras,
     training_cameras,
 )
-from fidsplat.files import atomic_write, writable_folder
+from fidsplat.files import atomic_write, user_cache, writable_folder
 
 BPY = "bpy==5.0.1"
 VIEW_NAMES = ("standard", "raw")
@@ -77,7 +77,7 @@ def _note(folder: Path, view: str) -> Path:
 
 def default_environment() -> Path:
     """Where Blender is installed by default: the user's cache folder."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fidsplat" / "blender"
+    return user_cache() / "fidsplat" / "blender"
 
 
 def install(environment: Path, progress: Callable[[str], None] = lambda text: None) -> Path:

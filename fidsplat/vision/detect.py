@@ -63,11 +63,13 @@ def detect(image: np.ndarray, families: Iterable[str] | None = None, qr: bool = 
         qr: whether to look for QR codes.
 
     A square that reads in two families (the small ArUco ones are parts of the large ones) is given once, in
-    the family named first. Raises InputError for an unknown family, ValueError for another kind of array.
+    the family named first. Raises InputError for an unknown family and for another kind of array.
     """
     pixels = np.asarray(image)
     if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] != 3):
         raise InputError(f"detect needs uint8 (h, w) or (h, w, 3), not {pixels.dtype} {pixels.shape}")
+    if families is not None and (isinstance(families, str) or not isinstance(families, Iterable)):
+        raise InputError(f"families must be several names, as ('36h11',), not {families!r}")
     wanted = [parse_family(name) for name in (DEFAULT_FAMILIES if families is None else families)]
     if min(pixels.shape[:2]) < MIN_SIDE:
         return []

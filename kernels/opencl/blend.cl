@@ -50,20 +50,19 @@ static inline void composite(Pixel *pixel, const Seen *seen, vfloat opacity, vin
     pixel->t = pixel->t - weight;
 }
 
-//@@ compose_functions
 // Whether anything that follows can still be seen.
 static inline vint pixel_unfinished(const Pixel *pixel, const BlendConstants *constants) {
-    return VMASK(pixel->t > constants->stop);
+    return VMASK(pixel->t > constants->stop)
+//@@ unfinished
+        ;
 }
 
-// To be called once, after the last fragment.
-static inline void pixel_finish(Pixel *pixel, const BlendConstants *constants) {
-//@@ finish
-}
-
+//@@ compose_functions
 // Draws the fragment where `mask` is set.
 static inline void pixel_blend(Pixel *pixel, const Splat *s, Crossing c, vint mask, vfloat screen,
-                               const BlendConstants *constants) {
+                               const BlendConstants *constants
+//@@ blend_parameters
+) {
     vfloat inverse_d = 1.0f / c.d;
     vfloat opacity = fragment_opacity(s, fragment_half_rho(s, c, inverse_d, screen), constants->ceiling);
 //@@ footprint_opacity

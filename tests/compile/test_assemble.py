@@ -22,8 +22,8 @@ SHAPE, GROUP = cpu_shape(lanes=16, cores=2), gpu_shape()
 FURTHER = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
 DIGESTS = {
-    "none": ["d73f9e42450e95f6", "10b7473aac281d23"],
-    "screen": ["93048fdb2e4fe77d", "e183904080488bb1"],
+    "none": ["25f11a31e1b55612", "1f3dbe5b3874f281"],
+    "screen": ["7b2f536abc80485f", "c09aed7c0e370ee5"],
 }
 """of a scene that asks for nothing, by low-pass; `screen` is the default"""
 
@@ -59,8 +59,9 @@ def test_base_text_names_no_effect_that_was_not_asked_for():
         "arithmetic_fast",
     }
     of_knobs = ("wide", "WIDE")
-    of_layers = ("planes", "plane_keys", "layer", "Layer", "open", "waiting", "optical_depth")
-    for name in (*absent, *FURTHER, "sh", "finished", *of_layers, *of_knobs):
+    of_layers = ("planes", "plane_keys", "layer", "Layer", "open", "optical_depth")
+    of_order = (*of_layers, "waiting", "Waiting", "WAITING", "nearest")
+    for name in (*absent, *FURTHER, "sh", "finished", *of_order, *of_knobs):
         assert not re.search(rf"\b{name}(_|\b)", text), name
 
 
@@ -89,11 +90,11 @@ def test_an_output_brings_its_text_and_nothing_else(output):
 @pytest.mark.parametrize("outputs", [("rgb",), tuple(FURTHER)])
 def test_only_splats_on_planes_bring_layers(outputs):
     """What an output says of layers stays out as well, and layers bring the depth that places them."""
-    words = ("Layer", "layer_pick", "layer_gather", "plane_keys", "label_tau", "share")
+    words = ("Layer", "layer_close", "layer_gather", "plane_keys", "label_tau", "share")
     plain = assemble(select(COLORS, fs.Capture(outputs=outputs, quality=PLAIN)), SHAPE).text
     layered = assemble(select(Cloud(has_planes=True), fs.Capture(outputs=outputs, quality=PLAIN)), SHAPE).text
     in_order = assemble(
-        select(Cloud(has_planes=True), fs.Capture(outputs=outputs, quality=PLAIN.with_(coplanar="order"))),
+        select(Cloud(has_planes=True), fs.Capture(outputs=outputs, quality=PLAIN.with_(order="centre"))),
         SHAPE,
     ).text
     for word in words:

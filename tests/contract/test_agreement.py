@@ -193,7 +193,7 @@ def test_coplanar_splats_are_one_layer(renderer, seed, samples, camera):
     cloud = coplanar_cloud(seed)
     assert cloud.has_planes
     assert_agrees(renderer, cloud, camera, quality=fs.Quality(samples=samples))
-    assert_agrees(renderer, cloud, camera, quality=fs.Quality(samples=samples, coplanar="order"))
+    assert_agrees(renderer, cloud, camera, quality=fs.Quality(samples=samples, order="centre"))
 
 
 def test_the_order_of_coplanar_splats_means_nothing(renderer):

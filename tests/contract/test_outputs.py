@@ -90,7 +90,7 @@ def test_ties_go_to_what_is_nearer(renderer):
     assert (frame["label"][2, 2], frame["splat_id"][2, 2]) == (7, 0)
     first = half.with_(first_hit=0.5)
     assert renderer.render(layers_of([1, 1]), POINT, "depth_first", first)["depth_first"][2, 2] == 2
-    gsplat = half.with_(stop_rule="exclusive", coplanar="order", transmittance_stop=0.25)
+    gsplat = half.with_(stop_rule="exclusive", order="centre", transmittance_stop=0.25)
     for last in (1, 0.1):  # the pixel is finished, whatever comes behind the fragment that was dropped
         frame = renderer.render(layers_of([1, 1, last]), POINT, ("alpha", "blended"), gsplat)
         assert (frame["alpha"][2, 2], frame["blended"][2, 2]) == (0.5, 1)

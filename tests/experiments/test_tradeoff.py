@@ -45,8 +45,8 @@ def test_every_setting_is_one_knob_away_from_the_base():
             turned = {name for name in vars(BASE) if getattr(point.quality, name) != getattr(near, name)}
             if point.knob in vars(BASE):
                 # the exclusive stop knows no layers; markers are also drawn without a low-pass
-                beside = {"coplanar"} if point.value == "exclusive" else {"lowpass", "samples"}
-                wanted = beside if point.knob == "marker" or "coplanar" in beside else set()
+                beside = {"order"} if point.value == "exclusive" else {"lowpass", "samples"}
+                wanted = beside if point.knob == "marker" or "order" in beside else set()
                 assert turned, point
                 assert turned <= {point.knob, *wanted}, point
             elif point.knob == ALONE and point.value != "exact":
@@ -98,7 +98,7 @@ def test_the_hard_scene_is_the_same_each_time_and_fills_its_cells(session):
     # it hurts what it is to hurt: the haze is lost below 1/255, dropped layers let the lamp through
     off = np.abs(session.draw("hard", BASE)["rgb"] - picture)
     assert off[cell_window(CELLS.index("haze"))].max() > 0.1
-    dropped = session.draw("hard", BASE.with_(stop_rule="exclusive", coplanar="order"))["rgb"]
+    dropped = session.draw("hard", BASE.with_(stop_rule="exclusive", order="centre"))["rgb"]
     assert np.abs(dropped - picture)[cell_window(CELLS.index("opaque"))].max() > 0.5
 
 
@@ -191,10 +191,8 @@ def test_a_device_without_float64_is_held_against_one_with_it(session, monkeypat
 
 def test_a_definition_has_a_truth_of_its_own(session):
     assert session.truth("apriltag@0", BASE) is session.truth("apriltag@0", BASE.with_(alpha_cutoff=0.01))
-    order = BASE.with_(coplanar="order")
-    assert np.abs(session.truth("apriltag@0", BASE) - session.truth("apriltag@0", order)).max() > 0.1
-    # only coplanar splats have a rule
-    assert session.truth("hard", BASE) is session.truth("hard", order)
+    centre = BASE.with_(order="centre")
+    assert np.abs(session.truth("apriltag@0", BASE) - session.truth("apriltag@0", centre)).max() > 0.1
     full = session.full("hard", BASE)
     found = compare.check_truth(session.truth("hard", BASE), session.scene("hard", BASE.marker), full)
     assert found["pixels"] == 64

@@ -86,7 +86,7 @@ def marker_records() -> list[Record]:
         key = {"what": "decode", "scene": "qr10", **point.key(), "tilts": "0:80:20"}
         scan = {"reader": "zxing", "read": "11101", "splats": 100, "rectangles": 4}
         records.append(Record(json.loads(json.dumps(key)), scan, RUN))
-    truth = {"what": "truth", "scene": "qr10@60", "lowpass": "none", "samples": 3, "coplanar": "layer"}
+    truth = {"what": "truth", "scene": "qr10@60", "lowpass": "none", "samples": 3, "order": "auto"}
     records.append(Record(truth, {"blend_precision": "float64", "pixels": 64, "maximum": 2.5e-7}, RUN))
     return records
 
@@ -295,11 +295,11 @@ def test_a_folder_without_results_is_not_passed_over(tmp_path):
 
 
 def test_a_setting_knows_whether_it_draws_another_picture():
-    point = Point("coplanar", "order", BASE.with_(coplanar="order"))
+    point = Point("order", "centre", BASE.with_(order="centre"))
     base = Point("base", "base", BASE)
-    for scene, same in (("hard", 2), ("qr10@60", 1)):  # without coplanar splats their rule defines nothing
+    for scene in ("hard", "qr10@60"):
         records = [record(scene, one, result(1.0, 0.1)) for one in (base, point)]
-        assert len(device(records).same_picture(scene)) == same
+        assert len(device(records).same_picture(scene)) == 1
 
 
 def test_a_quality_in_words_is_the_same_for_the_same():

@@ -53,11 +53,11 @@ def test_truth_keeps_the_definition_and_leaves_nothing_out():
         lowpass="pixel",
         alpha_cutoff=0.1,
         opacity_ceiling=0.9,
-        coplanar="order",
+        order="centre",
         stop_rule="exclusive",
     )
     best = full_precision(fs.Capture(quality=like), fs.Renderer("reference")).quality
-    assert (best.samples, best.lowpass, best.coplanar) == (2, "pixel", "order")
+    assert (best.samples, best.lowpass, best.order) == (2, "pixel", "centre")
     assert best.alpha_cutoff <= 1e-6
     assert (best.transmittance_stop, best.opacity_ceiling, best.stop_rule) == (0.0, 1.0, "inclusive")
 

@@ -76,12 +76,12 @@ def test_less_error_is_never_cheaper(renderer):
 
 
 def test_the_definition_stays():
-    base = fs.Quality(lowpass="pixel", samples=3, coplanar="order", first_hit=0.3)
-    kept = ("lowpass", "samples", "coplanar", "first_hit", "marker")
+    base = fs.Quality(lowpass="pixel", samples=3, order="centre", first_hit=0.3)
+    kept = ("lowpass", "samples", "order", "first_hit", "marker")
     for candidate in prices.load("cpu"):
         assert all(getattr(candidate.of(base), name) == getattr(base, name) for name in kept)
         parity = candidate.of(fs.Quality.named("gsplat"))
-        assert (parity.opacity_ceiling, parity.stop_rule, parity.coplanar) == (1.0, "inclusive", "order")
+        assert (parity.opacity_ceiling, parity.stop_rule, parity.order) == (1.0, "inclusive", "centre")
 
 
 # calibration

@@ -110,7 +110,7 @@ ROLLING = {"motion": MOVING, "shutter": fs.Shutter(readout=0.1, rows_per_band=4)
 
 
 OF_PLANES, OF_BOXES = Cloud(has_planes=True), Cloud(footprint="box")
-ORDERED, FLOAT64 = fs.Quality(coplanar="order"), fs.Quality(blend_precision="float64")
+ORDERED, FLOAT64 = fs.Quality(order="centre"), fs.Quality(blend_precision="float64")
 GROUP = fs.Motion(None, {1: lambda time: np.eye(4)})
 
 

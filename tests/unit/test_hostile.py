@@ -20,7 +20,7 @@ def run(*words):
 def test_inputs_at_random(seed):
     done = run("--count", 150, "--seed", seed)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.count("\n| ") == 5  # a row for each kind
+    assert done.stdout.count("\n| ") == 7  # a row for each kind
 
 
 @pytest.mark.parametrize(

@@ -157,7 +157,7 @@ def within_any(names, package) -> bool:
 
 
 # modules of the package that every backend may import
-SHARED = ("base", "view", "prepare", "registry", "planes")
+SHARED = ("base", "caches", "view", "prepare", "registry", "planes")
 
 
 def test_backends_do_not_import_each_other():

@@ -169,6 +169,21 @@ def test_what_detect_cannot_use():
     with pytest.raises(ValueError, match="uint8"):
         detect(np.zeros((9, 9)))
     assert {parse_family(f)[1] for f in DEFAULT_FAMILIES} == set(DEFAULT_FAMILIES)
+    for wanted in (5, "36h11"):
+        with pytest.raises(InputError, match="families must be several names"):
+            detect(np.zeros((60, 60), np.uint8), wanted)
+
+
+def test_what_has_no_pose():
+    camera, corners = Camera.pinhole(9, 9, 9, 9, 4, 4), np.eye(4)[:, :2]
+    for given, says in (
+        ((np.eye(4), 0.1, camera), r"corners must be \(4, 2\)"),
+        ((corners, (0, 0, 0), camera), "size must be metres above 0"),
+        ((corners, float("nan"), camera), "size must be metres above 0"),
+        ((corners, 0.1, None), "camera must be a Camera, not NoneType"),
+    ):
+        with pytest.raises(InputError, match=says):
+            marker_pose(*given)
 
 
 @pytest.mark.parametrize("module", [3, 8, 30])

@@ -127,9 +127,13 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     }
     if "color_sh" in layouts:
         defines["SH_DEGREE"] = features.sh_degree
+    if "compose_pixel" in layouts:
+        defines["WAITING"] = shape.waiting
     files = [layout.file for layout in layouts.values() if layout.file]
     if shape.lists == "tiled":
         files.append("list/tiled.cl")
+    if "compose_pixel" in layouts:
+        files.append(LAYOUTS[f"waiting_{shape.schedule}"].file)
     stages = {
         "lists": ("prelude", "math", "bounds", *_LISTS[shape.lists]),
         "picture": [

@@ -187,9 +187,14 @@ LAYOUTS: dict[str, Layout] = {
     "stop_inclusive": Layout(),
     "stop_exclusive": Layout("slot/stop_exclusive.cl"),
     "compose_ordered": Layout("slot/compose_ordered.cl"),
+    "compose_pixel": Layout(
+        "slot/compose_pixel.cl",
+        parts=("ray_depth",),
+        splat=(member("wide nearest", "depth before which no fragment of the splat lies"),),
+    ),
     "compose_planes": Layout(
         "slot/compose_planes.cl",
-        parts=("ray_depth",),
+        parts=("compose_pixel",),
         splat=(member("int plane"),),
         project=takes(
             "cloud int planes  // (n) index of the splat's plane; -1: none",
@@ -282,6 +287,9 @@ LAYOUTS: dict[str, Layout] = {
         "part/ray_depth.cl",
         splat=(member("wide z_numerator", "depth = z_numerator / D"), member("wide z_center z_reach")),
     ),
+    # how fragments wait for nearer ones, by the schedule
+    "waiting_lanes": Layout("part/waiting_lanes.cl"),
+    "waiting_group": Layout("part/waiting_group.cl"),
     "shown": Layout("part/shown.cl"),
     "ray": Layout(resolve=_RAY),
     "turn": Layout("part/turn.cl", resolve=takes("array float turns  // (h, 3, 3)")),

@@ -26,6 +26,9 @@ class DeviceShape:
     """of the depth sort (`ordered`)"""
     scan_items: int
     fast_fma: bool
+    waiting: int
+    """fragments for which there is room where they are composited by their own depth, at most 254, or 31 in
+    `group`"""
 
     @property
     def blend_items(self) -> int:
@@ -35,19 +38,19 @@ class DeviceShape:
 
 def cpu_shape(lanes: int = 16, cores: int = 8, fast_fma: bool = True) -> DeviceShape:
     """For CPUs: a tile per work-item, in the widest vectors."""
-    return DeviceShape("lanes", "ordered", lanes, lanes, 16, min(max(4 * cores, 8), 256), 11, 1, fast_fma)
+    return DeviceShape("lanes", "ordered", lanes, lanes, 16, min(max(4 * cores, 8), 256), 11, 1, fast_fma, 32)
 
 
 def gpu_shape(scan_items: int = 1024, fast_fma: bool = True) -> DeviceShape:
     """For GPUs: a work-group per tile of 16 x 16 pixels."""
-    return DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, scan_items, fast_fma)
+    return DeviceShape("group", "tiled", 1, 16, 16, 1024, 8, scan_items, fast_fma, 8)
 
 
 def shape_for(features: FeatureSet, shape: DeviceShape) -> DeviceShape:
     """`shape` with the tiles and the schedule that these features ask for."""
     if "blend_double" in features.slots and shape.schedule == "lanes":
         # doubles are drawn one by one
-        shape = replace(shape, schedule="group", lanes=1, tile_width=16, tile_height=16)
+        shape = replace(shape, schedule="group", lanes=1, tile_width=16, tile_height=16, waiting=8)
     return shape
 
 
@@ -55,6 +58,12 @@ def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
     """Build constants by name, for tests: `Reshapes.shapes` of fidsplat/backends/base.py."""
     if kind == "schedule":
         return {"groups": _groups(own, 8)}
+    if kind == "waiting":
+        few = replace(_groups(own, 8), waiting=1), replace(_groups(own, 8), waiting=2)
+        return {
+            **{f"own, room for {room}": replace(own, waiting=room) for room in (1, 3)},
+            **{f"groups, room for {shape.waiting}": shape for shape in few},
+        }
     if kind == "listing":
         return {lists: replace(_groups(own, 8), lists=lists) for lists in ("ordered", "tiled")}
     if kind == "arithmetic":
@@ -77,4 +86,4 @@ def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
 def _groups(own: DeviceShape, side: int) -> DeviceShape:
     """The schedule of a GPU in tiles of side x side."""
     groups = replace(own, schedule="group", tile_width=side, tile_height=side)
-    return replace(groups, lists="tiled", lanes=1, scan_items=64)
+    return replace(groups, lists="tiled", lanes=1, scan_items=64, waiting=8)

@@ -6,7 +6,7 @@ import numpy as np
 
 from fidsplat.backends.reference import error_bounds
 from fidsplat.backends.reference.fragments import fragments_of, shifted
-from fidsplat.backends.reference.layers import in_layers, in_order
+from fidsplat.backends.reference.layers import by_center, by_depth
 from fidsplat.backends.reference.optics import ray_lengths
 from fidsplat.backends.reference.post import background_at
 from fidsplat.backends.reference.setup import Setup
@@ -21,7 +21,7 @@ def composite(
     """Samples (k,) at grid positions x, y against all splats: what blending leaves, before resolving."""
     f = fragments_of(s, view, x, y)
     span = error_bounds.span_of(s, view, f)
-    stack = in_order(s, f, span) if s.planes is None else in_layers(s, f, span, s.planes)
+    stack = by_depth(s, f, span) if s.by_depth else by_center(s, f, span)
     alpha, z, span = stack.alpha, stack.z, stack.span
     before, live, final = _transmittance(alpha, view.stop, s.exclusive)
     weight = np.where(live, before * alpha, 0.0)
@@ -45,21 +45,18 @@ def composite(
         out["rgb"] = out["rgb"] + final[:, None] * behind
         out["behind_bound"] = final * moved
     drawn = live & (alpha > 0)
-    uncertain = stack.reordered > 0
     if {"depth", "depth_median", "depth_first"} & features.names:
         out["weight"] = weight.sum(1)
         out["depth"] = (weight * z).sum(1)
         out |= error_bounds.of_depth(span, weight, z)
         last, seen, may_flip = median_of(before, alpha, drawn, span)
         out["depth_median"] = _pick(z, last, seen, 0.0)
-        out["depth_median_may_flip"] = (
-            may_flip
-            | (_pick(span.z_high - span.z_low, last, seen, 0.0) > 1e-5 * out["depth_median"])
-            | uncertain
+        out["depth_median_may_flip"] = may_flip | (
+            _pick(span.z_high - span.z_low, last, seen, 0.0) > 1e-5 * out["depth_median"]
         )
         first = drawn & (before * (1 - alpha) <= view.first_light)
         out["depth_first"] = _pick(z, _first(first), np.asarray(first.any(1)), 0.0)
-        out["depth_first_may_flip"] = error_bounds.of_first(span, view.first_light) | uncertain
+        out["depth_first_may_flip"] = error_bounds.of_first(span, view.first_light)
         out["depth_first_may_flip"] |= (
             _pick(span.z_high - span.z_low, _first(first), np.asarray(first.any(1)), 0.0)
             > 1e-5 * out["depth_first"]
@@ -72,15 +69,13 @@ def composite(
         heaviest = _first(weight)
         out["heaviest"] = _pick(weight, heaviest, out["shown"], 0.0)
         out[name] = _pick(ids[name], heaviest, out["shown"], -1)
-        flip = error_bounds.of_label(span, ids[name], out[name]) | flips[name].any(1) | uncertain
+        flip = error_bounds.of_label(span, ids[name], out[name]) | flips[name].any(1)
         out[f"{name}_may_flip"] = (flip & out["shown"]) | out["shown_may_flip"]
     if "splat_id" in features.names and len(s.order):
         out["splat_id"] = np.where(out["splat_id"] >= 0, s.order[out["splat_id"].astype(int)], -1)
     if "blended" in features.names:
         out["blended"] = np.where(drawn, stack.count, 0).sum(1)
-        out["blended_bound"] = error_bounds.of_count(
-            span, stack.count, stack.count_bound, view.stop, uncertain
-        )
+        out["blended_bound"] = error_bounds.of_count(span, stack.count, stack.count_bound, view.stop)
     return out
 
 

@@ -9,7 +9,7 @@ certificate adds up what that can change in it, to first order.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from fidsplat.backends.view import View
 
 _ROUND = ROUND
 _WEIGHT = 2 * _ROUND  # relative, of half rho and of an opacity: a division, two products, exp
+_DEPTH = _ROUND  # relative, of a depth beside its denominator's: its numerator's, a division and a product
 STOP = 5e-5
 """relative, of a transmittance at a threshold"""
 
@@ -102,6 +103,10 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
     z_high = np.clip(z_high, s.pz - s.reach, s.pz + s.reach)
     missed = d_high <= 0
     z_low, z_high = np.where(missed, s.pz, z_low), np.where(missed, s.pz, z_high)
+    # the ends of the disk's depth range are a sum and a difference of float32
+    off = 2.0**-23 * (np.abs(s.pz) + s.reach)
+    z_low = np.where(z_low <= s.pz - s.reach, z_low - off, z_low)
+    z_high = np.where(z_high >= s.pz + s.reach, z_high + off, z_high)
     return Span.of(low, high, z_low, z_high)
 
 
@@ -173,48 +178,37 @@ def first_column(mask: np.ndarray, start: int) -> np.ndarray:
     return start + np.where(mask.any(1), np.argmax(mask, axis=1), m) if m else np.full(k, start)
 
 
-def of_places(span: Span, is_layer: np.ndarray) -> np.ndarray:
-    """What may change (k,) in colour where it is not certain in which order layers and fragments
-    are composited.
+def of_order(span: Span) -> tuple[Span, np.ndarray]:
+    """Of things (k, m) sorted by depth, the span with transmittances in front that hold in every order which
+    rounding leaves open, and what other orders may change (k,) in colour, per unit of colour.
 
-    Columns (k, m) in the order in which they arrive. Two that are composited the other way round change a
-    colour by the product of their opacities and the light in front of them, at most.
+    Two neighbours that change places change a colour by the product of their opacities and the light in front
+    of them, at most; any order that is possible comes from such changes, of pairs whose depths meet.
     """
-    bound = np.zeros(len(span.low))
-    layers = np.flatnonzero(is_layer).tolist()
-    fragment = ~is_layer
-    may, must = (span.high > 0) & fragment, (span.low > 0) & fragment
-    light = shifted(np.cumprod(np.where(fragment, 1 - span.low, 1.0), axis=1), last=True)
-    rows = np.arange(len(bound))
-    earliest, latest = (np.zeros((len(bound), len(layers)), int) for _ in range(2))
-    for number, c in enumerate(layers):
-        after = np.s_[:, c + 1 :]
-        earliest[:, number] = first_column(may[after] & (span.z_high[after] > span.z_low[:, c, None]), c + 1)
-        latest[:, number] = first_column(must[after] & (span.z_low[after] > span.z_high[:, c, None]), c + 1)
-    drawn, present = span.high[:, layers] > 0, span.low[:, layers] > 0
-    uncertain = drawn & (earliest < latest)
-    for number, c in enumerate(layers):
-        unsure = np.flatnonzero(uncertain[:, number])
-        columns = np.arange(span.low.shape[1])
-        first, end = earliest[unsure, number], latest[unsure, number]
-        between = fragment & (columns >= first[:, None]) & (columns < end[:, None])
-        others = 1 - np.where(between, 1 - span.high[unsure], 1.0).prod(1)
-        bound[unsure] += light[unsure, first] * span.high[unsure, c] * others
-    wrong = uncertain.any(1) | (drawn & ~present).any(1)
-    for number, c in enumerate(layers):
-        for second, d in enumerate(layers[:number]):
-            meet = (earliest[:, number] <= latest[:, second]) & (earliest[:, second] <= latest[:, number])
-            level = (span.z_low[:, c] <= span.z_high[:, d]) & (span.z_low[:, d] <= span.z_high[:, c])
-            # what lies behind the further one lies behind the nearer too and lays both, unless that is late
-            apart = span.z_low[:, d] > span.z_high[:, c]
-            late = apart & (earliest[:, second] < c) & (latest[:, second] > c)
-            unsure = drawn[:, number] & drawn[:, second] & ((level & meet) | late)
-            front = light[rows, np.minimum(earliest[:, number], earliest[:, second])]
-            bound += np.where(unsure, front * span.high[:, c] * span.high[:, d], 0.0)
-            wrong |= unsure
-    # of three layers the first may be composited early, and which one it is hangs on all of them
-    crowded = (drawn.sum(1) > 2) & wrong
-    return np.where(crowded, 1.0, bound)
+    k, m = span.low.shape
+    may = span.high > 0
+    near = np.where(may, span.z_low - _DEPTH * np.abs(span.z_low), np.inf)
+    far = np.where(may, span.z_high + _DEPTH * np.abs(span.z_high), -np.inf)
+    furthest = np.maximum.accumulate(far, axis=1)
+    nearest = np.minimum.accumulate(near[:, ::-1], axis=1)[:, ::-1]
+    dimmed = np.log1p(-np.minimum(span.low, 1 - 2.0**-53))
+    light = np.cumsum(dimmed, axis=1) - dimmed
+    least = span.front_low.copy()
+    pairs = []
+    for apart in range(1, m):
+        first, second = np.s_[:, :-apart], np.s_[:, apart:]
+        if not (furthest[first] >= nearest[second]).any():
+            break
+        meet = may[first] & may[second] & (far[first] >= near[second])
+        pairs.append((first, second, meet))
+        light[second] -= np.where(meet, dimmed[first], 0.0)
+        least[first] *= np.where(meet, 1 - span.high[second], 1.0)
+    most = np.exp(light) if pairs else span.front_high
+    bound = np.zeros(k)
+    for first, second, meet in pairs:
+        front = np.minimum(most[first], most[second])
+        bound += np.where(meet, front * span.high[first] * span.high[second], 0.0).sum(1)
+    return replace(span, front_low=least, front_high=most), bound
 
 
 def of_depth(span: Span, weight: np.ndarray, z: np.ndarray) -> dict[str, np.ndarray]:
@@ -235,17 +229,14 @@ def of_first(span: Span, light: float) -> np.ndarray:
     return first_column(may, 0) != first_column(sure, 0)
 
 
-def of_count(
-    span: Span, count: np.ndarray, bound: np.ndarray, stop: float, reordered: np.ndarray
-) -> np.ndarray:
+def of_count(span: Span, count: np.ndarray, bound: np.ndarray, stop: float) -> np.ndarray:
     """By how much (k,) the number of splats blended may differ. count, bound (k, m): in each thing that is
     composited."""
     may, must = span.high > 0, span.low > 0
     off = np.where(may, bound + np.where(must, 0, count), 0)
     # from where the light may have reached the stop to where it must have, whatever comes may be drawn or not
     open_to = (span.front_high >= stop * (1 - STOP)) & (span.front_low * (1 - span.high) <= stop * (1 + STOP))
-    off = np.where(may & open_to & (stop > 0), count + bound, off)
-    return np.where(reordered, np.inf, off.sum(1))
+    return np.where(may & open_to & (stop > 0), count + bound, off).sum(1)
 
 
 def of_label(span: Span, labels: np.ndarray, label: np.ndarray) -> np.ndarray:

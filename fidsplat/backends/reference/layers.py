@@ -1,13 +1,10 @@
-"""The splats of a plane as one layer per sample, placed by its own depth (docs/coplanar.md).
-
-Columns are what arrives in the depth order: splats of no plane one by one, the splats of a plane together,
-where their common key puts them. A layer is pending from there until a fragment of no plane arrives that lies
-behind it, or until a third layer begins.
+"""In which order samples composite what they see (docs/order.md): by the splats' centres, or by depth at each
+sample, where the splats of a printed plane are one layer.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -73,48 +70,32 @@ _COLUMNS = (
 """fields of Stack that have a value for each of the m things"""
 
 
-def in_order(s: Setup, f: Fragments, span: Span) -> Stack:
-    """Every fragment by itself, in the depth order of the splats."""
-    shape = f.alpha.shape
-    nothing = np.zeros(shape)
-    return Stack(
-        alpha=f.alpha,
-        z=f.z,
-        span=span,
-        colors=s.colors,
-        normal=s.normal,
-        labels=np.broadcast_to(s.labels, shape),
-        ids=np.broadcast_to(np.arange(shape[1]), shape),
-        count=nothing + 1,
-        count_bound=nothing,
-        moved=nothing,
-        label_may_flip=nothing > 0,
-        id_may_flip=nothing > 0,
-        reordered=np.zeros(len(f.alpha)),
-    )
+def by_center(s: Setup, f: Fragments, span: Span) -> Stack:
+    """Every fragment by itself, in the order of the splats' centres."""
+    # colours and normals once, not for each sample
+    return replace(_plain(s, f, span, slice(None)), colors=s.colors, normal=s.normal)
 
 
-def in_layers(s: Setup, f: Fragments, span: Span, planes: np.ndarray) -> Stack:
-    """The fragments of each plane as one layer, each where the rule lays it. planes (n,): -1 for none."""
+def by_depth(s: Setup, f: Fragments, span: Span) -> Stack:
+    """Fragments, and those of each printed plane as one layer, by their own depths at each sample; of equals
+    the first of the splats' order. What is not drawn there is left out."""
+    planes = np.full(f.alpha.shape[1], -1) if s.planes is None else s.planes
     plain = np.flatnonzero(planes < 0)
     members = [np.flatnonzero(planes == plane) for plane in np.unique(planes[planes >= 0])]
-    members.sort(key=lambda splats: splats[0])
-    layers = [_layer(s, f, span, splats) for splats in members]
-    arrival = np.argsort(np.concatenate([plain, [splats[0] for splats in members]]), kind="stable")
-    rest = _plain(s, f, span, plain)
-    columns = _side_by_side([rest, *layers]).take(np.broadcast_to(arrival, (len(f.alpha), len(arrival))))
-    is_layer = arrival >= len(plain)
-    place = _places(columns, is_layer)
-    columns.reordered = error_bounds.of_places(columns.span, is_layer)
-    # before the fragment at a place, its layers, the nearest first
-    count = len(arrival)
-    nearness = np.where(is_layer, columns.z, 0.0)
-    behind = np.broadcast_to(~is_layer, (len(place), count))
-    return columns.take(np.lexsort((nearness, behind, place), axis=1))
+    columns = _side_by_side([_plain(s, f, span, plain), *(_layer(s, f, span, splats) for splats in members)])
+    arrival = np.concatenate([plain, [splats[0] for splats in members]])
+    may = columns.span.high > 0
+    depth = np.where(may, columns.z, np.inf)
+    rank = np.lexsort((np.broadcast_to(arrival, depth.shape), depth, ~may), axis=1)
+    stack = columns.take(rank[:, : may.sum(1).max(initial=0)])
+    stack.span, stack.reordered = error_bounds.of_order(stack.span)
+    return stack
 
 
-def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Stack:
-    k, m = len(f.alpha), len(splats)
+def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray | slice) -> Stack:
+    """The fragments of the splats, each by itself."""
+    ids = np.arange(f.alpha.shape[1])[splats]
+    k, m = len(f.alpha), len(ids)
     nothing = np.zeros((k, m))
     return Stack(
         alpha=f.alpha[:, splats],
@@ -125,7 +106,7 @@ def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Stack:
         colors=np.broadcast_to(s.colors[splats], (k, m, 3)),
         normal=np.broadcast_to(s.normal[splats], (k, m, 3)),
         labels=np.broadcast_to(s.labels[splats], (k, m)),
-        ids=np.broadcast_to(splats, (k, m)),
+        ids=np.broadcast_to(ids, (k, m)),
         count=nothing + 1,
         count_bound=nothing,
         moved=nothing,
@@ -137,7 +118,8 @@ def _plain(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Stack:
 
 def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Stack:
     """The layer (k, 1) of the splats (indices) of a plane."""
-    alpha, z = f.alpha[:, splats], f.z[:, splats]
+    alpha, nearest = f.alpha[:, splats], s.nearest[splats]
+    z, z_low, z_high = (np.maximum(z[:, splats], nearest) for z in (f.z, span.z_low, span.z_high))
     low, high = span.low[:, splats], span.high[:, splats]
     boxes = bool(s.box[splats[0]])  # a plane has one footprint
     tau = alpha if boxes else optical_depth(alpha)
@@ -152,9 +134,7 @@ def _layer(s: Setup, f: Fragments, span: Span, splats: np.ndarray) -> Stack:
     label = labels[heaviest]
     as_heavy = (high > 0) & (thick >= np.take_along_axis(thin, heaviest, 1))
     drawn = alpha > 0
-    z_low, z_high = error_bounds.of_layer_depth(
-        span.z_low[:, splats], span.z_high[:, splats], share, thin, thick
-    )
+    z_low, z_high = error_bounds.of_layer_depth(z_low, z_high, share, thin, thick)
     depth = np.where(total > 0, (share * z).sum(1, keepdims=True), (z_low + z_high) / 2)
     covered = (_covered(each, boxes) for each in (alpha, low, high))
     opacity, least, most = covered
@@ -193,28 +173,3 @@ def _side_by_side(parts: list[Stack]) -> Stack:
     return Stack(
         span=Span.of(*spans), reordered=parts[0].reordered, **{name: joined(name) for name in _COLUMNS}
     )
-
-
-def _places(columns: Stack, is_layer: np.ndarray) -> np.ndarray:
-    """Before which column (k, m) each is composited; a fragment at its own, m for what comes at the end."""
-    k, m = columns.alpha.shape
-    place = np.tile(np.arange(m), (k, 1))
-    drawn = columns.alpha > 0
-    rows = np.arange(k)
-    # columns of the two pending layers, the one that arrived first in front; -1: none
-    waiting, opened = np.full(k, -1), np.full(k, -1)
-    for column in np.flatnonzero(is_layer).tolist():
-        behind = columns.z[:, column + 1 :] > columns.z[:, column, None]
-        place[:, column] = error_bounds.first_column(
-            behind & drawn[:, column + 1 :] & ~is_layer[column + 1 :], column + 1
-        )
-        begins = drawn[:, column]
-        waiting = np.where(place[rows, waiting] < column, -1, waiting)
-        opened = np.where(place[rows, opened] < column, -1, opened)
-        both = begins & (waiting >= 0) & (opened >= 0)
-        newer = both & (columns.z[rows, opened] < columns.z[rows, waiting])
-        nearer = np.where(newer, opened, waiting)
-        place[rows[both], nearer[both]] = column
-        waiting = np.where(begins & (opened >= 0) & ~newer, opened, waiting)
-        opened = np.where(begins, column, opened)
-    return place

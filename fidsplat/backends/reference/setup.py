@@ -47,11 +47,6 @@ class Setup:
             area = area * grown
             with np.errstate(divide="ignore"):
                 log_opacity = log_opacity - np.log(grown)
-        planes = None
-        if "compose_planes" in features.slots:
-            table = PlaneTable(cloud)
-            planes = table.index
-            self.key = np.where(planes < 0, self.key, np.append(table.keys(view), 0)[planes])
         half_r2 = log_opacity - view.log_cut
         if view.along_ray:
             long_a, long_b = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
@@ -63,6 +58,16 @@ class Setup:
             reach = np.hypot(reach, shape.third[:, 2])
         reach = np.where(box, box_reach, np.sqrt(np.maximum(2 * half_r2, 0)) * reach)
         drawn = (half_r2 > 0) & (depth + reach >= view.near) & (depth - reach <= view.far)
+        self.by_depth = "compose_ordered" not in features.slots
+        """whether fragments are composited by their own depth"""
+        planes, nearest = None, np.full(len(cloud), -np.inf)
+        if self.by_depth:
+            self.key = self.key - reach.astype(np.float32)
+        if "compose_planes" in features.slots:
+            table = PlaneTable(cloud)
+            planes = table.index
+            nearest = np.where(planes < 0, nearest, np.append(table.keys(view), 0)[planes])
+            self.key = np.where(planes < 0, self.key, nearest.astype(np.float32))
         drawn &= np.isfinite(shape.inverse_m2)  # else the camera is at its centre: nothing is ahead
         order = np.flatnonzero(drawn)
         order = order[np.argsort(self.key[order], kind="stable")]
@@ -104,6 +109,8 @@ class Setup:
         self.screen = "lowpass_screen" in features.slots
         self.exclusive = "stop_exclusive" in features.slots
         self.planes = None if planes is None else planes[order]
+        self.nearest = nearest[order]
+        """depth before which none of a printed plane lies; -inf for splats of none"""
 
     def among(self, chosen: np.ndarray) -> Setup:
         """The set-up of those of the splats alone, chosen (n,) bool, in the same order."""
@@ -123,7 +130,7 @@ class Setup:
 
 _OF_SPLATS = (
     *("order", "log_opacity", "half_r2", "reach", "labels", "pz", "z_numerator", "inverse_m2"),
-    *("box", "dot", "center_x", "center_y", "anchor_x", "anchor_y", "colors", "normal"),
+    *("box", "dot", "center_x", "center_y", "anchor_x", "anchor_y", "colors", "normal", "nearest"),
 )
 """arrays (n, ...) of a Setup"""
 _OF_COORDINATES = ("forms", "anchors")

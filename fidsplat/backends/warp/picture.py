@@ -146,7 +146,8 @@ class Picture:
         self._take("keys", n, wp.uint32)
         counts, ends = self._exact("counts", n, wp.int64), self._exact("ends_by_index", n, wp.int64)
         drawn, places = self._exact("drawn", n, wp.int32), self._exact("places", n, wp.int32)
-        cloud = {"boxes": drawn} | self.resident.arrays  # not read where all are of one kind
+        # not read where all are of one kind
+        cloud = {"boxes": drawn, "thickness": self.resident.arrays["opacities"]} | self.resident.arrays
         cloud |= {"moving": moving_of(self.resident, self.view, self.workspace)} | self._planes()
         self._launch(self.program.project, n, block=self.program.project_block, **cloud)
         wp.utils.array_scan(drawn, places, inclusive=True)

@@ -30,4 +30,6 @@ def other_shapes(own: WarpShape, kind: str) -> dict[str, WarpShape]:
         return {"ordered": own}
     if kind in ("sorting", "arithmetic"):
         return {"own": own}
+    if kind == "waiting":
+        return {}
     return {f"{side} x {side}": WarpShape(own.schedule, side, side) for side in (8, 32)}

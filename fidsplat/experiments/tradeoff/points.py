@@ -35,7 +35,7 @@ _LADDERS: dict[str, tuple[tuple[Any, ...], str]] = {
     "transmittance_stop": ((0.0, 1e-6, 1e-5, 1e-3, 1 / 512, 1 / 256, 1e-2), "rm"),
     "opacity_ceiling": ((0.999, 0.99), "rm"),
     "stop_rule": (("exclusive",), "rm"),
-    "coplanar": (("order",), "m"),
+    "order": (("pixel", "centre"), "rm"),
     "lowpass": (("pixel", "none"), "rm"),
     "samples": ((2, 3), "rm"),
     "setup_precision": (("float32",), "rm"),
@@ -66,7 +66,7 @@ _ALONE: tuple[dict[str, Any], ...] = (
     {"transmittance_stop": 1e-4},
     {"transmittance_stop": 1 / 256},
     {"opacity_ceiling": 0.99},
-    {"stop_rule": "exclusive", "transmittance_stop": 1e-4, "coplanar": "order"},
+    {"stop_rule": "exclusive", "transmittance_stop": 1e-4, "order": "centre"},
     {"lowpass": "none"},
     {"setup_precision": "float32"},
     {"arithmetic": "fast"},
@@ -194,7 +194,7 @@ def alone(changes: dict[str, Any]) -> Point:
 def _turned(knob: str, value: Any) -> Point:
     changes = {knob: value}
     if value == "exclusive":
-        changes["coplanar"] = "order"  # the exclusive stop knows no layers
+        changes["order"] = "centre"  # the exclusive stop knows no layers
     return Point(knob, value_words(value), BASE.with_(**changes))
 
 

@@ -94,8 +94,7 @@ def all_points(names: tuple[str, ...], knobs: tuple[str, ...], quick: bool) -> l
                     continue  # 18 million samples: minutes on a CPU for what the smaller scene shows too
                 tier = 0 if point.knob in _EARLY else 2
                 found.append((tier, {"what": POINT, "scene": view, **point.key(), "quick": quick}))
-                rule = point.quality.coplanar if marked else BASE.coplanar  # only markers have planes
-                definition = (point.quality.lowpass, point.quality.samples, rule)
+                definition = tuple(getattr(point.quality, name) for name in DEFINITION)
                 if point.knob != MARKER_KNOB and definition not in defined:
                     defined.add(definition)
                     found.append((tier + 1, _truth_key(view, definition)))

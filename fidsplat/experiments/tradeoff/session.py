@@ -19,7 +19,7 @@ from fidsplat.timing import frame_timer, quartiles, ratios, take_turns
 
 _SCENES, _TRUTHS = 12, 6
 """kept at a time"""
-DEFINITION = ("lowpass", "samples", "coplanar")
+DEFINITION = ("lowpass", "samples", "order")
 """knobs that say what a picture is; the others say how well it is drawn"""
 
 
@@ -55,10 +55,8 @@ class Session:
         return truth(self._reference, what, scene.capture.with_(quality=like))
 
     def definition(self, view: str, quality: Quality) -> Quality:
-        """The base with what `quality` says of the definition; without coplanar splats there is one rule."""
+        """The base with what `quality` says of the definition."""
         asked = {name: getattr(quality, name) for name in DEFINITION}
-        if self.scene(view, quality.marker).cloud.planes is None:
-            asked["coplanar"] = BASE.coplanar
         return BASE.with_(**asked, marker=quality.marker)
 
     def full(self, view: str, quality: Quality) -> Quality:

@@ -132,10 +132,8 @@ class Device:
     def same_picture(self, scene: str) -> Frame:
         """Of `of` what has the base's definition, so that errors may be compared."""
         found = self.of(scene)
-        # without coplanar splats their rule defines nothing
-        knobs = [knob for knob in DEFINITION if knob != "coplanar" or is_marker(scene)]
         turned = found["quality"].str.split(r"[ =]")
-        return found[[not set(knobs) & set(words) for words in turned]]
+        return found[[not set(DEFINITION) & set(words) for words in turned]]
 
     def base_ms(self, scene: str) -> float:
         """Milliseconds of the base: the median over all settings that it was drawn beside."""

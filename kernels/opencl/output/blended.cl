@@ -7,8 +7,6 @@
     vint blended;
 //@ see
     seen.blended = 1;
-//@ pick
-    layer->mean.blended = VSELECT(layer->mean.blended, other->mean.blended, mask);
 //@ gather
     layer->mean.blended += VSELECT((vint)0, (vint)1, VMASK(opacity > 0.0f));
 //@ composite

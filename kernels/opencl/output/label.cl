@@ -14,9 +14,6 @@
     seen.label = s->label;
 //@ layer
     vfloat label_tau;       // greatest optical depth of its fragments: that one's label is the layer's
-//@ pick
-    layer->label_tau = VSELECT(layer->label_tau, other->label_tau, mask);
-    layer->mean.label = VSELECT(layer->mean.label, other->mean.label, mask);
 //@ gather
     layer->mean.label = VSELECT(layer->mean.label, seen->label, VMASK(tau > layer->label_tau));
     layer->label_tau = fmax(layer->label_tau, tau);

@@ -18,10 +18,6 @@
     seen.nx = s->nx;
     seen.ny = s->ny;
     seen.nz = s->nz;
-//@ pick
-    layer->mean.nx = VSELECT(layer->mean.nx, other->mean.nx, mask);
-    layer->mean.ny = VSELECT(layer->mean.ny, other->mean.ny, mask);
-    layer->mean.nz = VSELECT(layer->mean.nz, other->mean.nz, mask);
 //@ gather
     layer->mean.nx = FMA(share, seen->nx - layer->mean.nx, layer->mean.nx);
     layer->mean.ny = FMA(share, seen->ny - layer->mean.ny, layer->mean.ny);

@@ -8,8 +8,6 @@
     vint fragments;         // that it is made of
 //@ see
     seen.fragments = 1;
-//@ pick
-    layer->mean.fragments = VSELECT(layer->mean.fragments, other->mean.fragments, mask);
 //@ gather
     layer->mean.fragments -= mask;
 //@ composite

@@ -14,9 +14,6 @@
     seen.splat_id = s->splat_id;
 //@ layer
     vfloat splat_id_tau;    // greatest optical depth of its fragments: that one stands for the layer
-//@ pick
-    layer->splat_id_tau = VSELECT(layer->splat_id_tau, other->splat_id_tau, mask);
-    layer->mean.splat_id = VSELECT(layer->mean.splat_id, other->mean.splat_id, mask);
 //@ gather
     layer->mean.splat_id = VSELECT(layer->mean.splat_id, seen->splat_id, VMASK(tau > layer->splat_id_tau));
     layer->splat_id_tau = fmax(layer->splat_id_tau, tau);

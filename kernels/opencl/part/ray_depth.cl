@@ -12,8 +12,6 @@
                      clamp(s->z_numerator * inverse_d, (vfloat)(s->z_center - s->z_reach),
                            (vfloat)(s->z_center + s->z_reach)),
                      VMASK(c.d > 0.0f));
-//@@ camera_see
-//@ pick
-    layer->mean.z = VSELECT(layer->mean.z, other->mean.z, mask);
+//@@ see_depth
 //@ gather
     layer->mean.z = FMA(share, seen->z - layer->mean.z, layer->mean.z);

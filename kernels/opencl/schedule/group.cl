@@ -36,6 +36,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
 //@@ pixels_start
 
     uint base = starts[band_first], start = starts[tile] - base, end = starts[tile + 1] - base;
+//@@ pass
     for (uint batch = start; batch < end; batch += STAGED) {
         uint length = min(end - batch, (uint)STAGED);
         barrier(CLK_LOCAL_MEM_FENCE);
@@ -62,9 +63,9 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
         if (!alive) break;
         for (uint word = 0; word < STAGED / 32; word++)
             for (uint bits = touched[block][word]; bits != 0; bits &= bits - 1) {
+                uint which = word * 32 + 31 - clz(bits & -bits);
                 Staged copy;
-                for (int part = 0; part < VECTORS; part++)
-                    copy.words[part] = staged[word * 32 + 31 - clz(bits & -bits)].words[part];
+                for (int part = 0; part < VECTORS; part++) copy.words[part] = staged[which].words[part];
                 const Splat s = copy.splat;
                 wide half_r2 = s.log_opacity - constants.log_cut;
                 wide x = (wide)(px - s.ax);
@@ -77,16 +78,19 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
                     wide screen;
                     int mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
 //@@ mask
-                    if (VANY(mask)) pixel_blend(&pixels[row], &s, c, mask, screen, &constants);
+                    if (!VANY(mask)) continue;
+                    pixel_blend(&pixels[row], &s, c, mask, screen, &constants
+//@@ blend_arguments
+                    );
                 }
             }
     }
+//@@ pass_end
 
     size_t stride = (size_t)tiles_x * TILE_W, plane = stride * tiles_y * TILE_H;
     for (int row = 0; row < ROWS; row++) {
         size_t at = (py + row) * stride + px;
         Pixel *pixel = &pixels[row];
-        pixel_finish(pixel, &constants);
         PIXEL_STORE_BASE(pixel, raw, plane, at);
 //@@ store
     }

@@ -21,6 +21,7 @@ kernel void blend(
     uint alive = rows == 32 ? 0xFFFFFFFFu : (1u << rows) - 1u;
 
     uint base = starts[band_first];
+//@@ pass
     for (uint k = starts[tile] - base, end = starts[tile + 1] - base; k < end && alive; k++) {
         FETCH_AHEAD(splats + lists[min(k + AHEAD_SPLATS, end - 1)]);
         FETCH_AHEAD((global const char *)(splats + lists[min(k + AHEAD_SPLATS, end - 1)]) + 64);
@@ -40,16 +41,18 @@ kernel void blend(
             vint mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
 //@@ mask
             if (!VANY(mask)) continue;
-            pixel_blend(&pixels[row], &s, c, mask, screen, &constants);
+            pixel_blend(&pixels[row], &s, c, mask, screen, &constants
+//@@ blend_arguments
+            );
             if (!VANY(pixel_unfinished(&pixels[row], &constants))) alive &= ~(1u << row);
         }
     }
+//@@ pass_end
 
     size_t stride = (size_t)tiles_x * TILE_W, plane = stride * tiles_y * TILE_H;
     for (int row = 0; row < TILE_H; row++) {
         size_t at = (y0 + row) * stride + x0;
         Pixel *pixel = &pixels[row];
-        pixel_finish(pixel, &constants);
         PIXEL_STORE_BASE(pixel, raw, plane, at);
 //@@ store
     }

@@ -1,52 +1,75 @@
 // Splats that are printed on one plane have no order: at a pixel they are one layer, which nothing cuts. Cutting each into
 // ever thinner sheets and shuffling the sheets gives the limit that does not depend on the order: optical depths
-// tau = -ln(1 - opacity) add up, and what the layer shows is the mean of its fragments weighted by tau. So a marker does
-// not change when its splats are re-ordered or when a turning camera re-orders their centres (numerics C1).
+// tau = -ln(1 - opacity) add up, and what the layer shows is the mean of its fragments weighted by tau, its depth too. So a
+// marker does not change when its splats are re-ordered or when a turning camera re-orders their centres (numerics C1).
 //
-// The splats of a plane arrive together (plane_keys), before anything that the layer is compared with. It is pending until
-// a fragment of no plane (-1) arrives whose own depth at the pixel lies behind the layer's, or nothing more arrives. Of
-// more than two pending layers the nearer of the first two is composited when the third begins.
+// The splats of a plane stand together in the lists, where the nearest point of the plane puts them (plane_keys). When another
+// splat follows, the layer waits as one fragment, among the others (slot/compose_pixel.cl).
 //@ project
     record.plane = planes[i];
-//@ key
-    if (planes[i] >= 0) key = plane_keys[planes[i]];
+//@ plane_nearest
+    if (planes[i] >= 0) record.nearest = (wide)plane_keys[planes[i]];
+//@ see_depth
+    seen.z = fmax(seen.z, (vfloat)s->nearest);
 //@ compose_types
+#define LAYER 0x80000000u       // among indices of splats: none, but a layer
+
 typedef struct {
-    vint plane;             // -1: no layer
-    vfloat opacity;         // 1 - the product of its fragments' transmittances; itself, so that a faint one stays exact
-    vfloat optical_depth;   // sum of its fragments'
-    Seen mean;              // of its fragments by optical depth
+    int plane;                  // -1: no layer
+    uint place;                 // of the first of its splats in the list
+    vint lanes;                 // where it has fragments
+    vfloat opacity;             // 1 - the product of its fragments' transmittances; itself, so that a faint one stays exact
+    vfloat optical_depth;       // sum of its fragments'
+    Seen mean;                  // of its fragments by optical depth
 //@@ layer
 } Layer;
 
 static inline Layer no_layer(void) {
-    Layer layer = {(vint)(-1)};     // and the rest 0
+    Layer layer = {-1};         // and the rest 0
     return layer;
 }
-
 //@ state
-    Layer open, waiting;    // pending: the one that still gathers, and one that arrived before it
+    Layer open;                 // the one that still gathers
 //@ start
-    pixel->open = pixel->waiting = no_layer();
+    pixel->open = no_layer();
+//@ queue
+    Seen layers[WAITING + 1];   // of what is none of one splat
+//@ queue_seen
+    if (waiting->splat[at] & LAYER) return waiting->layers[at];
+//@ queue_put
+    if (splat & LAYER) waiting->layers[at] = pixel->open.mean;
+//@ sorted
+    Seen layers[WAITING + 1];   // an index of a splat that is LAYER + k stands for the k-th
+    uint layer_splats[WAITING + 1], unused_layers;
+//@ sorted_start
+    waiting->unused_layers = ~0u;
+//@ sorted_take
+    if (splat & LAYER) {
+        uint at = 31 - clz(waiting->unused_layers & -waiting->unused_layers);
+        waiting->unused_layers &= waiting->unused_layers - 1;
+        waiting->layers[at] = pixel->open.mean;
+        waiting->layer_splats[at] = place;
+        splat = LAYER | at;
+    }
+//@ sorted_drop
+    if (dropped & LAYER) {
+        waiting->unused_layers |= 1u << (dropped & ~LAYER);
+        dropped = waiting->layer_splats[dropped & ~LAYER];
+    }
+//@ sorted_composite
+    if (splat & LAYER) {
+        composite(pixel, &pixel->waiting.layers[splat & ~LAYER], opacity, VMASK(true), constants);
+        pixel->waiting.unused_layers |= 1u << (splat & ~LAYER);
+        return;
+    }
 //@ compose_functions
-// Makes a layer another one where `mask` is set.
-static inline void layer_pick(Layer *layer, const Layer *other, vint mask) {
-    layer->plane = VSELECT(layer->plane, other->plane, mask);
-    layer->opacity = VSELECT(layer->opacity, other->opacity, mask);
-    layer->optical_depth = VSELECT(layer->optical_depth, other->optical_depth, mask);
-    layer->mean.r = VSELECT(layer->mean.r, other->mean.r, mask);
-    layer->mean.g = VSELECT(layer->mean.g, other->mean.g, mask);
-    layer->mean.b = VSELECT(layer->mean.b, other->mean.b, mask);
-//@@ pick
-}
-
 // Adds a fragment where `mask` is set.
 static inline void layer_gather(Layer *layer, const Splat *s, const Seen *seen, vfloat opacity, vint mask) {
     opacity = VSELECT((vfloat)0.0f, opacity, mask);
     // an opaque fragment has the optical depth at which float32 leaves no light
 //@@ layer_tau
 //@@ footprint_tau
-    layer->plane = VSELECT(layer->plane, (vint)s->plane, mask);
+    layer->lanes |= mask;
     layer->opacity = FMA(opacity, 1.0f - layer->opacity, layer->opacity);
     layer->optical_depth += tau;
 //@@ footprint_gather
@@ -56,43 +79,24 @@ static inline void layer_gather(Layer *layer, const Splat *s, const Seen *seen, 
     layer->mean.b = FMA(share, seen->b - layer->mean.b, layer->mean.b);
 //@@ gather
 }
-
-static inline void layer_composite(Pixel *pixel, Layer *layer, vint mask, const BlendConstants *constants) {
-    if (!VANY(mask)) return;
-    const Layer none = no_layer();
-    composite(pixel, &layer->mean, layer->opacity, mask, constants);
-    layer_pick(layer, &none, mask);
+//@ plane_functions
+// Nothing more comes of the open layer's plane: it waits.
+static inline void layer_close(Pixel *pixel, wide nearest, global const Splat *splats, const BlendConstants *constants) {
+    const Layer *open = &pixel->open;
+    if (open->plane < 0) return;
+    waiting_take(pixel, nearest, open->mean.z, open->opacity, LAYER, open->place, open->lanes, splats, constants);
+    pixel->open = no_layer();
 }
 
-// Composites the pending layers `open` and `waiting` (masks), the nearer first.
-static inline void layers_composite(Pixel *pixel, vint open, vint waiting, const BlendConstants *constants) {
-    vint nearer = open & waiting & VMASK(pixel->open.mean.z < pixel->waiting.mean.z);
-    layer_composite(pixel, &pixel->open, nearer, constants);
-    layer_composite(pixel, &pixel->waiting, waiting, constants);
-    layer_composite(pixel, &pixel->open, open & ~nearer, constants);
-}
-
-// A layer of another plane begins: the open one waits, and of two that would wait the nearer is composited.
-static inline void layers_shift(Pixel *pixel, vint begins, const BlendConstants *constants) {
-    vint both = begins & VMASK(pixel->waiting.plane >= 0);
-    vint nearer = both & VMASK(pixel->open.mean.z < pixel->waiting.mean.z);
-    layer_composite(pixel, &pixel->open, nearer, constants);
-    layer_composite(pixel, &pixel->waiting, both & ~nearer, constants);
-    const Layer none = no_layer();
-    vint moves = begins & ~nearer;
-    layer_pick(&pixel->waiting, &pixel->open, moves);
-    layer_pick(&pixel->open, &none, moves);
-}
-//@ compose
-    if (s->plane < 0) {
-        vint open = mask & VMASK(pixel->open.plane >= 0) & VMASK(pixel->open.mean.z < seen.z);
-        vint waiting = mask & VMASK(pixel->waiting.plane >= 0) & VMASK(pixel->waiting.mean.z < seen.z);
-        if (VANY(open | waiting)) layers_composite(pixel, open, waiting, constants);
-        composite(pixel, &seen, opacity, mask, constants);
-    } else {
-        vint begins = mask & VMASK(pixel->open.plane >= 0) & VMASK(pixel->open.plane != (vint)s->plane);
-        if (VANY(begins)) layers_shift(pixel, begins, constants);
-        layer_gather(&pixel->open, s, &seen, opacity, mask);
+//@ plane_end
+    layer_close(pixel, INFINITY, splats, constants);
+//@ compose_plane
+    if (s->plane != pixel->open.plane) {
+        layer_close(pixel, s->nearest, splats, constants);
+        pixel->open.plane = s->plane;
+        pixel->open.place = place;
     }
-//@ finish
-    layers_composite(pixel, VMASK(pixel->open.plane >= 0), VMASK(pixel->waiting.plane >= 0), constants);
+    if (s->plane >= 0) {
+        layer_gather(&pixel->open, s, &seen, opacity, mask);
+        return;
+    }
