@@ -60,7 +60,8 @@ def row_of_cells(n: int, costly: bool) -> dict:
     def loss(values: np.ndarray) -> float:
         layer, ordered, alpha = pictures(values, n)
         error = np.mean((layer - ideal) ** 2) + np.mean((ordered - ideal) ** 2)
-        return 500 * error + (1000 * float(np.mean(np.maximum(0.9995 - alpha, 0))) if costly else 0)
+        leaks = np.mean(np.maximum(0.9995 - alpha, 0)) if costly else 0.0
+        return float(500 * error + 1000 * leaks)
 
     found = []
     for seed in range(STARTS):

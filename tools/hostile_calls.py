@@ -58,6 +58,9 @@ CALLS: dict[str, Callable[[Path], Call]] = {
         },
         draw,
     ),
+    "SplatCloud of 3D": lambda _: (
+        fs.SplatCloud, {"means": MEANS, "quats": QUATS, "scales": np.ones((N, 3)), "opacities": OPACITIES, "sh": R.random((N, 4, 3))}, draw
+    ),
     "SplatCloud.concatenate": lambda _: (fs.SplatCloud.concatenate, {"clouds": [CLOUD, CLOUD]}, draw),
     "SplatCloud.concatenate of": lambda _: (
         lambda a, b: fs.SplatCloud.concatenate([a, b]), {"a": CLOUD, "b": CLOUD}, draw

@@ -66,14 +66,14 @@ class Command(NamedTuple):
 
 RENDER = "render ../scene.toml -o picture.png --outputs rgb,depth,normal,label"
 COMMANDS = {
-    "render": Command(RENDER, 84, 14),
-    "marker": Command("marker qr-v22-L:text -o marker.ply", 57, 8),
+    "render": Command(RENDER, 96, 14),
+    "marker": Command("marker qr-v22-L:text -o marker.ply", 61, 8),
     "counts": Command("experiment counts --quick --category small --category medium -o .", 57, 10),
     "compiling": Command(RENDER, 12, 4, own_cache=True),
-    "demo": Command("demo --out .", 18, 4),
-    "dataset": Command("experiment dataset --category apriltag --markers 1 -o .", 9, 3),
-    "tradeoff": Command("tradeoff --quick --scenes apriltag --knobs transmittance_stop -o .", 9, 3),
-    "experiment": Command("experiment all --quick --category apriltag --mixture fitted -o .", 6, 2),
+    "demo": Command("demo --out .", 16, 2),
+    "dataset": Command("experiment dataset --category apriltag --markers 1 -o .", 8, 2),
+    "tradeoff": Command("tradeoff --quick --scenes apriltag --knobs transmittance_stop -o .", 4, 2),
+    "experiment": Command("experiment all --quick --category apriltag --mixture fitted -o .", 3, 1),
 }
 Facts = dict[Any, Any]
 

@@ -29,7 +29,7 @@ BPY = "bpy==5.0.1"
 VIEW_NAMES = ("standard", "raw")
 """`standard`: sRGB texture, linear light, the 'Standard' view, as the paper's authors would have it; `raw`:
 display values all the way, so that edges are means of what is displayed"""
-FULL_SAMPLES, QUICK_SAMPLES = 64, 16
+FULL_SAMPLES = 64
 WORKER = Path(__file__).with_name("blender_worker.py")
 
 

@@ -95,13 +95,22 @@ def read_bits(path: str | os.PathLike[str]) -> np.ndarray:
     return (grey == dark).astype(np.uint8) if dark is not None else np.zeros(grey.shape, np.uint8)
 
 
+def pixels_of(image: np.ndarray) -> np.ndarray:
+    """A picture as an array. Raises InputError for anything but real numbers."""
+    try:
+        array = np.asarray(image)
+    except ValueError:  # rows that differ in length
+        array = np.empty(0, object)
+    if array.dtype.kind not in "fiub":
+        raise InputError(f"a picture has rows of real numbers, not {array.dtype}")
+    return array
+
+
 def to_uint8(image: np.ndarray) -> np.ndarray:
     """Floats in [0, 1] to uint8, clamped and rounded; uint8 as it is; bool to 0 and 255.
 
     Raises InputError for anything but numbers."""
-    image = np.asarray(image)
-    if image.dtype.kind not in "fiub":
-        raise InputError(f"a picture has real numbers, not {image.dtype}")
+    image = pixels_of(image)
     if image.dtype == np.uint8:
         return image
     if image.dtype == bool:
@@ -119,7 +128,7 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> Path:
 
     Raises InputError when the folder cannot be written, and for another shape.
     """
-    array = np.asarray(image)
+    array = pixels_of(image)
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3) or array.size == 0:
         raise InputError(f"a PNG needs (h, w) or (h, w, 3), not {array.shape}")
     pixels = array if array.dtype == np.uint16 else to_uint8(array)

@@ -1,4 +1,4 @@
-"""Splats of one plane are one layer at a sample (docs/coplanar.md): its colour and depth
+"""Splats of one plane are one layer at a sample (docs/order.md): its colour and depth
 are means of its fragments by optical depth.
 
 They arrive together, before anything that the layer is compared with; it is composited before the first

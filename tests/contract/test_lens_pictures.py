@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, assert_agrees, random_splats, reference_pixels
+from sampling import SAMPLES, alternate
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
@@ -78,8 +79,7 @@ def test_splats_much_larger_than_the_picture(renderer, camera):
     assert_agrees(renderer, random_splats(80, 5, depth=(-4.0, 4.0), scale=(0.1, 30.0)), camera)
 
 
-@each_camera
-@pytest.mark.parametrize("samples", [1, 2])
+@pytest.mark.parametrize(("camera", "samples"), alternate(CAMERAS, SAMPLES))
 def test_layers(renderer, camera, samples):
     assert_agrees(renderer, coplanar_cloud(1), camera, quality=fs.Quality(samples=samples))
 

@@ -169,6 +169,10 @@ def test_what_detect_cannot_use():
     with pytest.raises(ValueError, match="uint8"):
         detect(np.zeros((9, 9)))
     assert {parse_family(f)[1] for f in DEFAULT_FAMILIES} == set(DEFAULT_FAMILIES)
+    with pytest.raises(InputError, match="rows of real numbers"):
+        detect([[1], [2, 3]])
+    with pytest.raises(InputError, match="qr must be True or False"):
+        detect(np.zeros((60, 60), np.uint8), qr=np.eye(4))
     for wanted in (5, "36h11"):
         with pytest.raises(InputError, match="families must be several names"):
             detect(np.zeros((60, 60), np.uint8), wanted)
