@@ -53,6 +53,20 @@ def test_near_and_far_planes_amid_the_splats(renderer, name):
     assert np.abs(frame["rgb"] - whole["rgb"]).max() > 0.1
 
 
+@pytest.mark.parametrize("name", ["pinhole", "distortion", "fisheye 200", "panorama", "parallel"])
+def test_depths_of_a_tilted_wall_are_right_to_a_hundred_thousandth(renderer, name):
+    """Without a certificate: nothing is hard here."""
+    camera = CAMERAS.get(name, seen_through(None))
+    center = np.linalg.inv(camera.world_to_camera) @ (0.1, -0.2, 3.0, 1.0)
+    turn = (0.9, 0.25, -0.2, 0.1)
+    wall = fs.SplatCloud([center[:3]], [turn], [(1.5, 1.5)], [1.0], colors=[(1, 1, 1)])
+    frame = renderer.render(wall, camera, ALL_OUTPUTS)
+    want = reference_pixels(wall, camera, ALL_OUTPUTS, fs.Quality())["depth"]
+    inside = frame["alpha"] > 0.1
+    assert np.ptp(want[inside]) > 0.3
+    assert frame["depth"][inside] == pytest.approx(want[inside], rel=1e-5)
+
+
 @each_camera
 def test_small_splats_of_all_shapes(renderer, camera):
     """Needles included; each at most a few pixels wide, where a bound that is too tight loses most."""
