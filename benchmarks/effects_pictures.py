@@ -136,7 +136,7 @@ def all_effects(renderer: fs.Renderer) -> list[tuple[str, np.ndarray]]:
         "panorama": lambda: seen(example("lens-panorama"), camera=fs.Camera.equirectangular(WIDTH, HEIGHT)),
         "parallel rays": lambda: seen(camera=wide),
         "motion blur": lambda: seen(motion=turn, shutter=fs.Shutter(exposure_time=0.03, sub_poses=16)),
-        "rolling shutter": lambda: seen(motion=turn, shutter=fs.Shutter(readout=0.1, rows_per_band=4)),
+        "rolling shutter": lambda: seen(motion=turn, shutter=fs.Shutter(readout=0.1, rows_per_band=1)),
         "fog": lambda: seen(fog=fs.Fog(0.15, (0.75, 0.78, 0.8))),
         "background: gradient": lambda: seen(background=fs.Gradient(*DUSK)),
         "background: panorama": lambda: seen(background=fs.Panorama(sky())),
@@ -161,6 +161,20 @@ def outputs_sheet(renderer: fs.Renderer, scene: fs.Scene) -> np.ndarray:
     return contact_sheet(rows, width=WIDTH, key=lambda row, height: keys[row](height))
 
 
+def drawing_sheet(renderer: fs.Renderer) -> np.ndarray:
+    """A drawing, tilted, and a corner of it from a twelfth as far."""
+    sign = fs.Scene(markers=[PlacedMarker(fs.marker(f"svg:{ROOT / 'examples/data/sign.svg'}"))])
+    eye, panels = np.array((0.3, -0.2, -1.1)), []
+    for name, target, away in (
+        ("sign.svg", (0, 0, 0), 1.0),
+        ("twelve times as near", (0.14, 0.07, 0), 1 / 12),
+    ):
+        camera = fs.Camera.look_at(WIDTH, HEIGHT, math.radians(55), target + away * eye, target)
+        frame = renderer.render(sign, camera, background=(0.55, 0.7, 0.9))
+        panels.append((name, to_uint8(frame["rgb"])))
+    return contact_sheet([panels], width=WIDTH)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -183,6 +197,7 @@ def main() -> None:
         [("fitted, far", picture(scene, camera=far)), ("exact, far", picture(exact, camera=far))],
     ]
     save(options.out / "effect-boxes.jpg", contact_sheet(boxes, width=WIDTH))
+    save(options.out / "drawing.jpg", drawing_sheet(renderer))
     save(options.out / "effect-outputs.jpg", outputs_sheet(renderer, exact))
 
     seen = [

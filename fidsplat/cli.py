@@ -66,7 +66,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
         if isinstance(error, FidsplatError):
             return _fail(str(error), error.exit_status)
-        if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
+        if (
+            isinstance(error, MemoryError)
+            or getattr(error, "errno", None) == errno.ENOMEM
+            or (isinstance(error, ImportError) and "failed to map segment" in str(error))
+        ):
             return _fail("not enough memory for this; use a smaller picture or fewer splats", 1)
         if isinstance(error, OSError) and error.errno in _SHORTAGES:
             _drop_output()

@@ -1,13 +1,62 @@
-"""What the arrays of a SplatCloud are made of: checks of what users give, types, origins, quaternions."""
+"""What the arrays of a SplatCloud are made of: checks of what users give, splats that cannot be drawn, types,
+origins, quaternions."""
 
 import numpy as np
 
-from fidsplat.defects import rows_beyond, square_of
 from fidsplat.errors import InputError
 from fidsplat.rotations import quaternion_multiply
 from fidsplat.scalars import LARGEST
 
 F32 = np.dtype(np.float32)
+
+
+def rows_beyond(array: np.ndarray, limit: float) -> np.ndarray | None:
+    """Which rows hold a value that is not finite or beyond +-limit; None, at no cost in memory, if none."""
+    with np.errstate(invalid="ignore"):
+        if not array.size or (array.min() >= -limit and array.max() <= limit):  # false where there is a NaN
+            return None
+        good = array <= limit
+        good &= array >= -limit
+    return ~np.asarray(good.all(axis=tuple(range(1, array.ndim))))
+
+
+def find_defects(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray | None, dict[str, int]]:
+    """(mask of the rows to keep, or None for all; reason -> count), each row under its first reason."""
+    bad: np.ndarray | None = None
+    dropped: dict[str, int] = {}
+    s, o = arrays["scales"], arrays["opacities"]
+    finite = float(np.finfo(F32).max)
+    beyond = {n: rows_beyond(array, finite if n == "quats" else LARGEST) for n, array in arrays.items()}
+    beyond = {name: rows for name, rows in beyond.items() if rows is not None}
+    defects = [(f"{name} not finite", rows_beyond(arrays[name], finite)) for name in beyond]
+    defects += [(f"{name} beyond {LARGEST:g}", rows) for name, rows in beyond.items()]
+    with np.errstate(over="ignore", invalid="ignore"):
+        defects += [
+            ("zero quaternion", square_of(arrays["quats"]) < 1e-30),
+            ("scale not above 0", (s[:, :2] <= 0).any(axis=1) | (s[:, 2:] < 0).any(axis=1)),
+            ("opacity outside [0, 1]", (o < 0) | (o > 1)),
+        ]
+    for reason, rows in defects:
+        if rows is None or not rows.any():
+            continue
+        fresh = rows if bad is None else rows & ~bad
+        bad = rows if bad is None else rows | bad
+        if fresh.any():
+            dropped[reason] = int(fresh.sum())
+    return (None if bad is None else ~bad), dropped
+
+
+def drop_report(dropped: dict[str, int], n: int, source) -> str:
+    """What a warning says about splats that are left out."""
+    parts = ", ".join(f"{reason}: {count}" for reason, count in dropped.items())
+    start = "" if source is None else f"{source}: "
+    return f"{start}{sum(dropped.values())} of {n} splats left out ({parts})"
+
+
+def square_of(quats: np.ndarray) -> np.ndarray:
+    """Squared lengths (n,) float64 of quaternions (n, 4)."""
+    return np.einsum("ij,ij->i", quats, quats, dtype=np.float64)
+
 
 # Turning the frame cyclically keeps it right-handed. Row i makes axis i the third: its new axes are
 # (y, z, x) for i = 0 and (z, x, y) for i = 1, a third of a turn about (1, 1, 1) and back.
@@ -116,3 +165,15 @@ def with_thinnest_last(quats: np.ndarray, scales: np.ndarray) -> tuple[np.ndarra
         with np.errstate(over="ignore", invalid="ignore"):
             quats[turned] = quaternion_multiply(quats[turned], _TURNS[thin[turned]])
     return quats, np.take_along_axis(scales, _CYCLES[thin], axis=1)
+
+
+def check_one_footprint(planes: np.ndarray | None, boxes: np.ndarray | None) -> None:
+    """Raises InputError for a plane (n,) of both kinds."""
+    if planes is None or boxes is None:
+        return
+    both = np.intersect1d(planes[(planes >= 0) & boxes], planes[~boxes])
+    if len(both):
+        raise InputError(
+            f"plane {both[0]} has boxes and Gaussians, whose coverage follows different rules; "
+            "give each kind a plane"
+        )

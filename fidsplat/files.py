@@ -86,6 +86,14 @@ def writable_folder(path: str | os.PathLike[str]) -> Path:
     return folder
 
 
+def user_cache() -> Path:
+    """The user's cache folder; the one for temporary files where the user has no home."""
+    home = os.path.expanduser("~")
+    return Path(
+        os.environ.get("XDG_CACHE_HOME") or (tempfile.gettempdir() if home == "~" else f"{home}/.cache")
+    )
+
+
 def _umask() -> int:
     # the only portable way to read the mask is to set it; a temporary file is made with 0600 whatever it is
     mask = os.umask(0)

@@ -288,12 +288,13 @@ class Renderer:
         """
         outputs = None if outputs is None else output_names(outputs)
         background = None if background is None else background_of(background)  # an iterator ends at once
-        if not isinstance(captures, Iterable):
-            raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera")
+        try:
+            rest = iter(captures)
+        except TypeError:
+            raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera") from None
         resident = self._resident(scene)
         waiting: Frame | None = None
         failure: Exception | None = None
-        rest = iter(captures)
         while True:
             try:
                 asked = _asked(

@@ -9,15 +9,18 @@ import numpy as np
 from fidsplat.cloud_arrays import (
     F32,
     as_single,
+    check_one_footprint,
     check_origin,
     check_shape,
     choose_origin,
+    drop_report,
+    find_defects,
     real_numbers,
+    rows_beyond,
     unit_quaternions,
     whole_numbers,
     with_thinnest_last,
 )
-from fidsplat.defects import drop_report, find_defects, rows_beyond
 from fidsplat.errors import InputError
 from fidsplat.harmonics import C0, MAX_DEGREE, rotation_of_coefficients, sh_basis
 from fidsplat.rotations import (
@@ -307,7 +310,7 @@ class SplatCloud(PickledByFields):
         ids = whole_numbers(planes, len(self), "planes")
         if (ids < -1).any():
             raise InputError(f"planes must be ids of at least 0, or -1 for none, not {int(ids.min())}")
-        _check_one_footprint(ids, self.boxes)
+        check_one_footprint(ids, self.boxes)
         if self.thickness is not None and ((ids >= 0) & (self.thickness > 0)).any():
             raise InputError("3D Gaussians lie in no plane; give their planes as -1, or a thickness of 0")
         return self._replaced(planes=ids if (ids >= 0).any() else None)
@@ -327,7 +330,7 @@ class SplatCloud(PickledByFields):
         if mask.dtype != bool or mask.shape not in ((), (len(self),)):
             raise InputError(f"boxes must be one bool or have the shape ({len(self)},) and the type bool")
         mask = np.full(len(self), mask) if mask.ndim == 0 else mask.copy()
-        _check_one_footprint(self.planes, mask)
+        check_one_footprint(self.planes, mask)
         if self.thickness is not None and (self.thickness[np.flatnonzero(mask)] > 0).any():
             raise InputError("a box has no thickness, but some of these splats are 3D Gaussians")
         return self._replaced(boxes=mask if mask.any() else None)
@@ -393,17 +396,6 @@ def _joined_planes(clouds: Sequence[SplatCloud]) -> np.ndarray | None:
         joined.append(np.where(ids >= 0, ids + first_free, -1).astype(np.int32))
         first_free = max(first_free, int(joined[-1].max()) + 1)
     return np.concatenate(joined)
-
-
-def _check_one_footprint(planes: np.ndarray | None, boxes: np.ndarray | None) -> None:
-    if planes is None or boxes is None:
-        return
-    both = np.intersect1d(planes[(planes >= 0) & boxes], planes[~boxes])
-    if len(both):
-        raise InputError(
-            f"plane {both[0]} has boxes and Gaussians, whose coverage follows different rules; "
-            "give each kind a plane"
-        )
 
 
 def _sh_of_degree(cloud: SplatCloud, degree: int) -> np.ndarray:

@@ -1,9 +1,13 @@
 """Sweeps of which plain pytest takes a sample, and `pytest -m exhaustive` the rest."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import product
 
 import numpy as np
 import pytest
+
+SAMPLES = {"1 sample": 1, "2 x 2 samples": 2}
+"""samples along a pixel's side, for `alternate`"""
 
 
 def sampled(cases: Sequence, count: int, seed: int) -> list:
@@ -11,3 +15,15 @@ def sampled(cases: Sequence, count: int, seed: int) -> list:
     kept = set(np.random.default_rng(seed).choice(len(cases), min(count, len(cases)), replace=False).tolist())
     rest = pytest.mark.exhaustive
     return [pytest.param(case, marks=() if k in kept else rest) for k, case in enumerate(cases)]
+
+
+def alternate(*axes: Mapping[str, object]) -> list:
+    """All combinations of the axes' values as parameters; every other one, as the fields of a chessboard, is
+    marked `exhaustive`. A plain run has each value of an axis with some values of each other axis."""
+    cases = []
+    for picked in product(*(list(axis) for axis in axes)):
+        places = [list(axis).index(name) for axis, name in zip(axes, picked, strict=True)]
+        values = [axis[name] for axis, name in zip(axes, picked, strict=True)]
+        rest = pytest.mark.exhaustive if sum(places) % 2 else ()
+        cases.append(pytest.param(*values, id="-".join(picked), marks=rest))
+    return cases

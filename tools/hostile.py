@@ -74,12 +74,14 @@ def outcome(kind: str, seed: int, number: int, folder: Path) -> tuple[str, str]:
 
 
 def _ending_of_a_command(status: int, err: str) -> tuple[str, str]:
-    lines = [line for line in err.splitlines() if not line.startswith("fidsplat: warning: ")]
+    lines = [line for line in err.splitlines() if line.startswith("fidsplat: ")]
+    lines = [line for line in lines if not line.startswith("fidsplat: warning: ")]
     if status == 0:
         return "used", ""
     if "not enough memory" in err:
         return "memory", err
-    clear = len(lines) == 1 and lines[0].startswith("fidsplat: ") and "a fault of fidsplat" not in lines[0]
+    last = err.rstrip("\n").rpartition("\n")[2]  # after a bar, where the machine was slow
+    clear = lines == [last] and "a fault of fidsplat" not in last and "Traceback" not in err
     return ("one line" if clear and status in (1, 2) else "fault"), f"status {status}: {err}"
 
 

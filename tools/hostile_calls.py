@@ -58,6 +58,9 @@ CALLS: dict[str, Callable[[Path], Call]] = {
         },
         draw,
     ),
+    "SplatCloud of 3D": lambda _: (
+        fs.SplatCloud, {"means": MEANS, "quats": QUATS, "scales": np.ones((N, 3)), "opacities": OPACITIES, "sh": R.random((N, 4, 3))}, draw
+    ),
     "SplatCloud.concatenate": lambda _: (fs.SplatCloud.concatenate, {"clouds": [CLOUD, CLOUD]}, draw),
     "SplatCloud.concatenate of": lambda _: (
         lambda a, b: fs.SplatCloud.concatenate([a, b]), {"a": CLOUD, "b": CLOUD}, draw
@@ -133,7 +136,7 @@ CALLS: dict[str, Callable[[Path], Call]] = {
         fs.Quality,
         {
             "alpha_cutoff": 1e-3, "transmittance_stop": 0.0, "stop_rule": "inclusive", "opacity_ceiling": 1.0,
-            "lowpass": "screen", "order": "auto", "samples": 1, "first_hit": 0.1, "arithmetic": "fast",
+            "lowpass": "screen", "order": "pixel", "samples": 1, "first_hit": 0.1, "arithmetic": "fast",
             "marker": fs.MarkerQuality(),
         },
         lambda quality: RENDERER.render(CLOUD, CAMERA, quality=quality),

@@ -54,7 +54,7 @@ def scene_text(rng: Random) -> str:
         rng.choice(["", "[fog]\ndensity = 0.1\ncolor = [0.5, 0.5, 0.5]\n"]),
         rng.choice(["", "[background]\ntop = [0.0, 0.0, 1.0]\nbottom = [1.0, 1.0, 1.0]\n", '[background]\nimage = "good.png"\n']),
         '[render]\noutputs = ["rgb", "depth"]\ndevice = "reference"\n',
-        rng.choice(["", '[quality]\npreset = "fast"\nsamples = 2\nalpha_cutoff = 1e-3\n[quality.marker]\ntemplate = 9\n']),
+        rng.choice(["", '[quality]\npreset = "fast"\nsamples = 2\nalpha_cutoff = 1e-3\norder = "pixel"\n[quality.marker]\ntemplate = 9\n']),
     ]  # fmt: skip
     return "\n".join(parts)
 

@@ -40,10 +40,12 @@ COMMANDS = 2 * [
     "marker gridboard:2x3:4x4_50 -o board.ply",
     "marker aprilgrid:2x2:36h11 --size 0.4 --json",
     "marker svg-16:good.svg -o drawing.ply",
-    "render scene.toml -o frames --outputs rgb,depth,label --device reference --quality fast,samples=2",
+    "render scene.toml -o frames --outputs rgb,depth,label --device reference --quality fast,samples=2,order=pixel",
     "render none.ply -o a.png --device reference --json",
     "detect good.png --family 36h11 --scene scene.toml --json",
+    "detect . --json",
     "source scene.toml --schedule group",
+    "info good.ply --json",
     "devices --json",
 ] + [
     "check --device nowhere",

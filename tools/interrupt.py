@@ -35,6 +35,8 @@ from rich.table import Table
 
 SIGNALS = ("SIGINT", "SIGTERM", "SIGKILL")
 DISK = "full disk"
+TIMED = ("repeats",)
+"""values that depend on the time that something takes, and may agree by chance"""
 FIDSPLAT = (sys.executable, "-c", "import sys; from fidsplat.cli import main; sys.exit(main())")
 SCENE = """\
 [camera]
@@ -64,14 +66,14 @@ class Command(NamedTuple):
 
 RENDER = "render ../scene.toml -o picture.png --outputs rgb,depth,normal,label"
 COMMANDS = {
-    "render": Command(RENDER, 66, 12),
-    "marker": Command("marker qr-v22-L:text -o marker.ply", 39, 6),
-    "demo": Command("demo --out .", 36, 8),
-    "counts": Command("experiment counts --quick --category small --category medium -o .", 48, 8),
-    "dataset": Command("experiment dataset --category apriltag --markers 1 -o .", 18, 6),
-    "tradeoff": Command("tradeoff --quick --scenes apriltag --knobs transmittance_stop -o .", 18, 6),
-    "experiment": Command("experiment all --quick --category apriltag --mixture fitted -o .", 9, 4),
+    "render": Command(RENDER, 96, 14),
+    "marker": Command("marker qr-v22-L:text -o marker.ply", 61, 8),
+    "counts": Command("experiment counts --quick --category small --category medium -o .", 57, 10),
     "compiling": Command(RENDER, 12, 4, own_cache=True),
+    "demo": Command("demo --out .", 16, 2),
+    "dataset": Command("experiment dataset --category apriltag --markers 1 -o .", 8, 2),
+    "tradeoff": Command("tradeoff --quick --scenes apriltag --knobs transmittance_stop -o .", 4, 2),
+    "experiment": Command("experiment all --quick --category apriltag --mixture fitted -o .", 3, 1),
 }
 Facts = dict[Any, Any]
 
@@ -99,6 +101,7 @@ def facts(path: Path) -> Facts:
                 for row in rows
                 if "key" in row  # and not the facts of a run
                 for place, value in _leaves(row["result"])
+                if place[-1] not in TIMED
             }
         case ".png" | ".jpg":
             if cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) is None:
@@ -226,11 +229,14 @@ def disturb(trial: Trial, name: str, how: str, at: float) -> dict[str, Any]:
         return {"stopped": status != 0, "lost": list(trial.lost(folder, status, said))}
 
 
-def planned(name: str, seed: int) -> list[tuple[str, float]]:
-    """How each trial of a command is disturbed, and where."""
-    command, chance = COMMANDS[name], random.Random(f"{seed} {name}")
-    how = [SIGNALS[k % 3] for k in range(command.kills)] + [DISK] * command.disks
-    return [(kind, chance.random()) for kind in how]
+def planned(name: str, seed: int) -> dict[str, tuple[str, float]]:
+    """How each trial of a command is disturbed, and where, by the trial's name."""
+    command = COMMANDS[name]
+    kinds = [*(f"{SIGNALS[k % 3]} {k // 3}" for k in range(command.kills))]
+    kinds += [f"{DISK} {k}" for k in range(command.disks)]
+    return {
+        kind: (kind.rpartition(" ")[0], random.Random(f"{seed} {name} {kind}").random()) for kind in kinds
+    }
 
 
 def read(file: Path) -> list[dict[str, Any]]:
@@ -264,22 +270,22 @@ def main() -> int:
         parser.error(f"unknown commands {', '.join(sorted(unknown))}; known: {', '.join(COMMANDS)}")
     done = read(given.file)
     for name in names:
-        there = {row["number"] for row in done if row["command"] == name}
-        left = [(k, *plan) for k, plan in enumerate(planned(name, given.seed)) if k not in there]
+        there = {row["trial"] for row in done if row["command"] == name}
+        left = [(part, *plan) for part, plan in planned(name, given.seed).items() if part not in there]
         left = [part for part in left if part[1] != DISK or os.geteuid() == 0][: given.most]
         given.most -= len(left)
         if not left:
             continue
         with tempfile.TemporaryDirectory() as temporary:
             trial = Trial(COMMANDS[name], Path(temporary))
-            for number, how, at in left:
-                found = disturb(trial, f"trial-{number}", how, at)
-                done.append({"command": name, "number": number, "how": how, "at": round(at, 3), **found})
+            for part, how, at in left:
+                found = disturb(trial, part, how, at)
+                done.append({"command": name, "trial": part, "how": how, "at": round(at, 3), **found})
                 with given.file.open("a") as stream:
                     stream.write(json.dumps(done[-1]) + "\n")
     for row in done:
         for words in row["lost"]:
-            print(f"{row['command']} {row['number']}, {row['how']} at {row['at']}: {words}")
+            print(f"{row['command']}, {row['trial']} at {row['at']}: {words}")
     Console().print(table_of(done))
     return int(any(row["lost"] for row in done))
 

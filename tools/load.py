@@ -187,17 +187,24 @@ def soak(minutes: float, devices: list[str]) -> dict[str, float]:
                 status.update(
                     f"{spent / 60:.1f} min, {seed} frames, {memory[-1][1] / 2**20:.0f} MiB, {wrong} wrong"
                 )
-    settled = min(600.0, 10 * minutes)  # the first ten minutes fill caches and pools
-    early = [size for at, size in memory if at <= settled][-5:] or [memory[0][1]]
-    late = [size for _, size in memory][-5:]
+    early, late = levels(memory, 60 * minutes)
     return {
         "minutes": round(minutes, 1),
         "frames": seed,
         "frames that differ from their first drawing": wrong,
-        "MiB after ten minutes": round(float(np.median(early)) / 2**20, 1),
-        "MiB at the end": round(float(np.median(late)) / 2**20, 1),
-        "growth in %": round(100 * (float(np.median(late)) / float(np.median(early)) - 1), 2),
+        "MiB after ten minutes": round(early / 2**20, 1),
+        "MiB at the end": round(late / 2**20, 1),
+        "growth in %": round(100 * (late / early - 1), 2),
     }
+
+
+def levels(memory: list[tuple[float, int]], seconds: float) -> tuple[float, float]:
+    """Medians of (time, bytes) over ten minutes after the first ten, which fill caches and pools, and over
+    the last ten: what a picture needs comes and goes."""
+    span = min(600.0, seconds / 6)
+    early = [size for at, size in memory if span <= at <= 2 * span] or [memory[0][1]]
+    late = [size for at, size in memory if at >= seconds - span] or [memory[-1][1]]
+    return float(np.median(early)), float(np.median(late))
 
 
 def main() -> int:

@@ -8,6 +8,7 @@ import os
 from importlib import import_module
 
 from fidsplat.backends.base import Backend, DeviceInfo
+from fidsplat.backends.caches import ensure_caches
 from fidsplat.errors import DeviceError, UnknownDeviceError, unknown
 
 FAMILIES = {
@@ -36,6 +37,8 @@ def open_backend(name: str) -> Backend:
         )
     if (family.lower(), selector.lower()) != ("warp", "cpu"):  # which has no driver
         _check_driver(family.lower())
+    if family.lower() != "reference":
+        ensure_caches()
     return import_module(FAMILIES[family.lower()]).open_device(selector)
 
 
@@ -44,6 +47,7 @@ def devices() -> list[DeviceInfo]:
     made a driver unusable."""
     for family in FAMILIES:
         _check_driver(family)
+    ensure_caches()
     return [info for module in FAMILIES.values() for info in import_module(module).devices()]
 
 

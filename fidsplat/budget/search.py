@@ -26,6 +26,14 @@ FEWEST = 3
 PATIENCE = 10.0
 """seconds that timing several qualities may take in all; where it would take longer, fewer frames are timed,
 but `FEWEST` of each"""
+ENOUGH = 4
+"""candidates that are timed together before one is taken"""
+TOO_LONG = 1.5
+"""times of the allowed time: a candidate whose first frame takes longer is timed no further"""
+SHORT = 0.5
+"""times of the allowed time: candidates that should take less by the list are tried last"""
+LUCK = 4.0
+"""how many times better than in proportion to the list a candidate may do in this scene"""
 
 
 @dataclass(frozen=True)
@@ -91,16 +99,6 @@ class Calibration:
     def timer(self, quality: Quality) -> Timer:
         """Times frames of a quality."""
         return frame_timer(self.renderer, self._resident, self._capture, quality=quality)
-
-
-ENOUGH = 4
-"""candidates that are timed together before one is taken"""
-TOO_LONG = 1.5
-"""times of the allowed time: a candidate whose first frame takes longer is timed no further"""
-SHORT = 0.5
-"""times of the allowed time: candidates that should take less by the list are tried last"""
-LUCK = 4.0
-"""how many times better than in proportion to the list a candidate may do in this scene"""
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -13,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write
+from fidsplat.files import atomic_write, user_cache
 
 
 def folder() -> Path:
     """Where answers are kept: fidsplat/budget in the user's cache folder."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fidsplat" / "budget"
+    return user_cache() / "fidsplat" / "budget"
 
 
 def digest(*parts: Any) -> str | None:

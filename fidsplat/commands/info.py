@@ -25,8 +25,9 @@ class Info:
     """Say what a splat file holds, where, and how large it is.
 
     Bounds are of all splats, and of the middle 99 % of their centres along each axis: captures have strays
-    far away. Which way is up is a guess: along the axis to which most of the area is level, away from where
-    that area lies. From these comes a place and a size for a first marker.
+    far away. Which way is up is a guess: away from where most of the area is level, or along a side that is
+    by far the longest. From these come a size for a first marker, and a place where it is seen from -z, as
+    `fidsplat render FILE.ply` looks.
 
     Examples:
       fidsplat info scene.ply
@@ -64,15 +65,15 @@ def describe(cloud: SplatCloud) -> dict[str, Any]:
     low, high = cloud.bounds()
     inner = np.percentile(cloud.means.astype(np.float64), (0.5, 99.5), axis=0) + cloud.origin
     extent = inner[1] - inner[0]
-    up, sure = guess_up(cloud)
+    up, why = guess_up(cloud)
     axis = "xyz".index(up[1])
     scales = cloud.scales.astype(np.float64)
     return facts | {
         "bounds": [low, high],
         "middle_bounds": list(inner),
-        "middle": inner.mean(0),
+        "marker_position": [*inner.mean(0)[:2], inner[0, 2]],
         "up": up,
-        "up_share": sure,
+        "up_because": why,
         "height": float(extent[axis]),
         "marker_size": float(f"{0.1 * max(extent.max(), 1e-9):.1g}"),
         "scales": np.percentile(scales.max(1), SHARES),
@@ -81,24 +82,26 @@ def describe(cloud: SplatCloud) -> dict[str, Any]:
     }
 
 
-def guess_up(cloud: SplatCloud) -> tuple[str, float]:
-    """Which way is up, e.g. "-y", and the share of the splats' area that is level then, 0 to 1."""
+def guess_up(cloud: SplatCloud) -> tuple[str, str]:
+    """Which way is up, e.g. "-y", and why: away from where most of the area is level; else along a side that
+    is by far the longest, as a thing stands."""
     import numpy as np
 
     from fidsplat.rotations import quaternion_to_matrix
 
-    normals = np.abs(quaternion_to_matrix(cloud.quats)[:, :, 2])
+    level = np.abs(quaternion_to_matrix(cloud.quats)[:, :, 2]) > FLAT
     area = cloud.scales.prod(1).astype(np.float64) * cloud.opacities
-    area = np.minimum(area, np.percentile(area, 99))  # a sky of few huge splats is no ground
-    level = normals > FLAT
-    axis = int(np.argmax(area @ level))
-    place = cloud.means[:, axis].astype(np.float64)
-    low, high = np.percentile(place, (0.5, 99.5))
+    area = np.minimum(area, np.percentile(area, 99)) + 1e-30  # a sky of few huge splats is no ground
+    low, high = np.percentile(cloud.means.astype(np.float64), (0.5, 99.5), axis=0)
+    shares, sides = area @ level / area.sum(), np.sort(high - low)
+    axis = int(np.argmax(shares))
+    if shares[axis] < 0.5 and sides[2] > 1.5 * sides[1]:
+        axis = int(np.argmax(high - low))
+        return ("+x", "-y", "+z")[axis], "the longest side"
     some = level[:, axis] if level[:, axis].any() else np.ones(len(cloud), bool)
-    ground = np.average(np.clip(place[some], low, high), weights=area[some] + 1e-30)
-    return ("+" if ground <= (low + high) / 2 else "-") + "xyz"[axis], float(
-        area @ level[:, axis] / max(area.sum(), 1e-300)
-    )
+    place = np.clip(cloud.means[some, axis], low[axis], high[axis])
+    below = np.average(place, weights=area[some]) <= (low[axis] + high[axis]) / 2
+    return ("+" if below else "-") + "xyz"[axis], f"{100 * shares[axis]:.0f} % of the area is level"
 
 
 def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
@@ -116,13 +119,12 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     scales, opacities = (" / ".join(f"{v:.3g}" for v in facts[key]) for key in ("scales", "opacities"))
     shares = " / ".join(map(str, SHARES))
     low, high = facts["middle_bounds"]
-    level = f"({100 * facts['up_share']:.0f} % of the area is level)"
-    place = f"position = {point(facts['middle'])}: a tenth of the whole, in its middle"
+    place = f"position = {point(facts['marker_position'])}: a tenth of the whole, before its middle from -z"
     return [
         *rows,
         ("bounds", " to ".join(map(point, facts["bounds"])) + " m"),
-        ("middle 99 %", f"{point(low)} to {point(high)} m, around {point(facts['middle'])}"),
-        ("up", f"{facts['up']}? {level}, {facts['height']:.3g} m high"),
+        ("middle 99 %", f"{point(low)} to {point(high)} m"),
+        ("up", f"{facts['up']}? ({facts['up_because']}), {facts['height']:.3g} m high"),
         ("longer scale", f"{scales} m at {shares} %; {facts['aspect']:.2g} times the shorter (median)"),
         ("opacity", f"{opacities} at {shares} %"),
         ("a first marker", f"size = {facts['marker_size']:g}, {place}"),

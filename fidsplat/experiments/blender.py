@@ -23,13 +23,13 @@ from fidsplat.experiments.setup import (
     novel_cameras,
     training_cameras,
 )
-from fidsplat.files import atomic_write, writable_folder
+from fidsplat.files import atomic_write, user_cache, writable_folder
 
 BPY = "bpy==5.0.1"
 VIEW_NAMES = ("standard", "raw")
 """`standard`: sRGB texture, linear light, the 'Standard' view, as the paper's authors would have it; `raw`:
 display values all the way, so that edges are means of what is displayed"""
-FULL_SAMPLES, QUICK_SAMPLES = 64, 16
+FULL_SAMPLES = 64
 WORKER = Path(__file__).with_name("blender_worker.py")
 
 
@@ -77,7 +77,7 @@ def _note(folder: Path, view: str) -> Path:
 
 def default_environment() -> Path:
     """Where Blender is installed by default: the user's cache folder."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fidsplat" / "blender"
+    return user_cache() / "fidsplat" / "blender"
 
 
 def install(environment: Path, progress: Callable[[str], None] = lambda text: None) -> Path:

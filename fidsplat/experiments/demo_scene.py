@@ -1,7 +1,7 @@
 """The demo's scene: three signs in a small yard, and the three views of it. All of it from one seed.
 
-x right, y down, z away; the signs stand at z = 0 and face -z. They stand free, well before the wall: splats
-are drawn in the order of their centres, and what nearly touches a marker could come to lie over it.
+x right, y down, z away; the signs stand at z = 0 and face -z. Stones and bricks lie some millimetres apart in
+depth, joints before them: of splats in one plane rounding would say which is in front.
 """
 
 import math
@@ -120,7 +120,8 @@ def _tiles(
     )
     colors = np.concatenate([colors, np.asarray(joint) * random.normal(1, 0.05, (len(joints), 1))])
     flat = np.concatenate([place, joints])
-    means = np.asarray(corner) + flat @ axes[:, :2].T
+    before = np.append(random.normal(0, 0.002, len(place)), random.normal(0.01, 0.001, len(joints)))
+    means = np.asarray(corner) + flat @ axes[:, :2].T - before[:, None] * axes[:, 2]
     turns = np.repeat(axes[None], len(flat), 0)
     return _cloud(means, turns, np.concatenate([spread, widths]), 0.97, colors)
 

@@ -114,7 +114,7 @@ def _counts(rows: Frame, folder: Path) -> dict[str, Frame]:
             "category": category.title,
             "characters": category.length or NOTHING,
             "QR version": category.version or NOTHING,
-            "modules": f"{side} x {side}",
+            "modules a side": side,
         }
         for column, words in (("components", "components"), ("rectangles", "rectangles")):
             row[words] = f"{own[f'{column}_dark'] + own[f'{column}_light']:.0f}"
@@ -163,13 +163,14 @@ def _angles(rows: Frame, folder: Path) -> dict[str, Frame]:
             categories,
             methods,
             lambda place, own=own: (
-                " ".join(_angle(own.get_group(place)[c]) for c in ("found", "read"))
+                "/".join(_angle(own.get_group(place)[c]) for c in ("found", "read"))
                 if place in own.groups
                 else NOTHING
             ),
             {
-                name: {key: "{:.1f} {:.1f}".format(*value) for key, value in row.items()}
+                name: {key: "{:.1f}/{:.1f}".format(*value) for key, value in row.items()}
                 for name, row in ANGLES.items()
+                if protocol == "fixed-plane"  # the paper's
             },
         )
     series = {
@@ -204,11 +205,12 @@ def _views(rows: Frame, folder: Path) -> dict:
         def cell(place: tuple[str, str], mean: Frame = mean) -> str:
             if place not in mean.index:
                 return NOTHING
-            return f"{fixed(mean['psnr'][place], 1)} / {fixed(mean['ssim'][place], 3)}"
+            return f"{fixed(mean['psnr'][place], 1)}/{fixed(mean['ssim'][place], 3)}"
 
         paper = {
-            name: {key: f"{value[0]:.1f} / {value[1]:.2f}" for key, value in row.items()}
+            name: {key: f"{value[0]:.1f}/{value[1]:.2f}" for key, value in row.items()}
             for name, row in VIEWS.items()
+            if truth in LINEAR  # as the paper's, which is Blender's
         }
         tables[truth] = {"title": TRUTHS[truth], "rows": _beside_paper(categories, methods, cell, paper)}
         # in linear light what blends linear light
@@ -222,15 +224,16 @@ def _views(rows: Frame, folder: Path) -> dict:
 
 
 def _localisation(rows: Frame, folder: Path) -> Frame:
-    """Median error of position by distance, and how many of the views were read."""
+    """Median error of position by every other distance, and how many of the views were read."""
     methods = method_order(rows["method"])
+    rows = rows[rows["distance_m"].isin(sorted(set(rows["distance_m"]))[::2])]
     table = []
     for (category, distance), own in rows.groupby(["category", "distance_m"]):
         row = {"marker, distance": f"{CATEGORIES[str(category)].title}, {distance:g} m"}
         for method in methods:
             one = own[own["method"] == method]
             read, seen = one["read"].sum(), one["amount"].sum()
-            lost = f" ({read} of {seen})" if read < seen else ""
+            lost = f" ({read}/{seen})" if read < seen else ""
             row[method] = (number(one["position_mm"].median()) if read else "not read") + (
                 lost if read else ""
             )
@@ -244,14 +247,12 @@ def _beside_paper(
     cell: Callable[[tuple[str, str]], str],
     paper: dict[str, dict],
 ) -> Frame:
-    """A row for each category: the paper's figures, then ours."""
+    """A row for each category: the paper's figures if there are any, then ours."""
+    theirs = {PAPER: "ours", TRAINED: 17} if paper else {}
     return pd.DataFrame(
         [
-            {
-                "category": CATEGORIES[category].title,
-                PAPER: paper.get(category, {}).get("ours", NOTHING),
-                TRAINED: paper.get(category, {}).get(17, NOTHING),
-            }
+            {"category": CATEGORIES[category].title}
+            | {words: paper.get(category, {}).get(key, NOTHING) for words, key in theirs.items()}
             | {method: cell((category, method)) for method in methods}
             for category in categories
         ]

@@ -63,7 +63,7 @@ def load(folders: Sequence[Path]) -> dict[str, Summary]:
                 found[name] = join(there, kind.about)
                 rows = found[name].rows
                 rows[list(kind.columns)] = rows[list(kind.columns)].apply(pd.to_numeric)
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             if isinstance(error, InputError):
                 raise
             raise InputError(

@@ -48,7 +48,7 @@ class Options:
     blender: Path | None = None
     """folder with Blender's pictures; None for "blender" in ``out``"""
     lpips: Path | None = None
-    """file with LPIPS weights, see `fidsplat.vision.lpips.load_lpips`"""
+    """file with LPIPS weights, see `fidsplat.vision.metrics.load_lpips`"""
     shard: str | None = None
     """"i/n\""""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)

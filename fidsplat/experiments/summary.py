@@ -100,8 +100,8 @@ def provenance(summaries: Mapping[str, Summary]) -> Frame:
         [
             {
                 "measured": f"{name}, {run['points']} points",
-                "on": f"{run['device'] or 'nothing drawn'}; {run['machine']}",
-                "commit, code": f"{run['commit']}, {run['code']}",
+                "on": run["device"] or run["machine"],
+                "commit/code": f"{run['commit']}/{run['code']}",
                 "date": run["date"],
             }
             for name, summary in summaries.items()

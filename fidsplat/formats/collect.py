@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.cloud_arrays import with_thinnest_last
-from fidsplat.defects import find_defects
+from fidsplat.cloud_arrays import find_defects, with_thinnest_last
 
 PADDED_LOG_SCALE = np.log(1e-6)
 """scale_2 of a disk written for tools that want three scales; SuperSplat writes the same"""

@@ -5,7 +5,7 @@ import warnings
 
 import numpy as np
 
-from fidsplat.defects import drop_report
+from fidsplat.cloud_arrays import drop_report
 from fidsplat.errors import InputError
 from fidsplat.formats.collect import BLOCK, Progress, Rows, collect
 from fidsplat.formats.compressed_ply import compressed_rows, is_compressed

@@ -39,11 +39,11 @@ TOLERANCE = (
 RARE = 1e-3
 """share of pixels whose certificate may exceed `RISKY`"""
 RISKY = 0.05
-
-
 CATALOGUED = Quality(alpha_cutoff=1 / 255)
 """the cut-off that the triggers of numerics.md are written for; the fuzzer and the contract tests draw with
 the presets"""
+CULLED = 0xFFFFFFFF
+"""depth key of a splat that is not drawn, on devices"""
 
 
 @dataclass(frozen=True)
@@ -146,10 +146,6 @@ def compare(images: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], o
 def against_reference(renderer: Renderer, picture: Picture) -> list[Difference]:
     """Draw a picture on a device and compare every output with the reference."""
     return compare(draw(renderer, picture), truth_of(picture), picture.outputs)
-
-
-CULLED = 0xFFFFFFFF
-"""depth key of a splat that is not drawn, on devices"""
 
 
 def trace(renderer: Renderer, picture: Picture, shape=None) -> dict[str, np.ndarray]:

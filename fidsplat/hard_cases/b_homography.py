@@ -18,6 +18,12 @@ from fidsplat.splats import SplatCloud
 WIDTH, HEIGHT, FOCAL = 8192, 5461, 6400.0
 QUALITY = Quality(lowpass="none", alpha_cutoff=1e-6)
 """the Gaussian alone, to 5.3 standard deviations, so that no rim lies where it is measured"""
+CUT = 1.0 / 255.0
+SHIFT = np.array([5e5, 4.5e6, 300.0])
+"""metres; a place in UTM coordinates"""
+SIDE = quaternion((0, 1, 0), (0, 0, 1))
+"""stands edge-on before a camera on its axis: tangents along y and z"""
+AHEAD = (1.0, 0.0, 0.0, 0.0)
 
 
 def grazing_errors(renderer: Renderer, tilt: float, sigma: int, quality: Quality = QUALITY) -> np.ndarray:
@@ -74,14 +80,6 @@ def _tilted(generator: np.random.Generator, ray: np.ndarray, tilt: float, flatne
     angle = math.radians(tilt)
     normal = math.cos(angle) * along + math.sin(angle) * np.cross(tangent, along)
     return quaternion(tangent, np.cross(normal, tangent))
-
-
-CUT = 1.0 / 255.0
-SHIFT = np.array([5e5, 4.5e6, 300.0])
-"""metres; a place in UTM coordinates"""
-SIDE = quaternion((0, 1, 0), (0, 0, 1))
-"""stands edge-on before a camera on its axis: tangents along y and z"""
-AHEAD = (1.0, 0.0, 0.0, 0.0)
 
 
 @case("B1", "cancellation in pixel coordinates", "8192 px wide, tilts to 89.9 deg at its far corner")

@@ -33,6 +33,8 @@ WALL_STEP = math.radians(1e-3)
 """radians per picture; larger before a wall, whose splats change places more seldom"""
 SMOOTH = 1e-3
 """largest change of a pixel in a step of 1e-4 degrees that is none of order: edges move"""
+ON_TAGS = Camera.look_at(96, 80, 0.8, (0.05, -0.03, -1.6), (0, 0, 0))
+SIDES = ("before", "behind", "through")
 
 
 def tag(side: int = 8, seed: int = 0) -> SplatCloud:
@@ -102,9 +104,9 @@ def layered(
     alone = [draw(renderer, Picture(part, camera, quality, outputs, (0, 0, 0))) for part in parts]
     whole = Picture(SplatCloud.concatenate(parts), camera, quality, outputs, (0, 0, 0))
     rgb, alpha, depth = (np.stack([frame[name] for frame in alone]) for name in outputs)
-    order = np.argsort(np.where(alpha > 0, depth, np.inf), axis=0)
+    ranks = np.argsort(np.where(alpha > 0, depth, np.inf), axis=0)
     light, wanted = np.ones(alpha.shape[1:]), np.zeros(rgb.shape[1:])
-    for k in order:
+    for k in ranks:
         index = k[None]
         wanted += light[..., None] * np.take_along_axis(rgb, index[..., None], 0)[0]
         light *= 1 - np.take_along_axis(alpha, index, 0)[0]
@@ -151,10 +153,6 @@ def fronto_parallel(away: float, count: int = 200) -> Picture:
     grey = np.repeat(generator.integers(0, 2, (count, 1)), 3, axis=1)
     world = (means @ pose[:3, :3]).astype(np.float32)
     return Picture(splats(world, facing, 0.25, 0.9, grey), camera(world_to_camera=pose), outputs=ALL_OUTPUTS)
-
-
-ON_TAGS = Camera.look_at(96, 80, 0.8, (0.05, -0.03, -1.6), (0, 0, 0))
-SIDES = ("before", "behind", "through")
 
 
 def crossing_tags() -> list[SplatCloud]:

@@ -33,6 +33,9 @@ BOUNDS = {
     "fast_exp": 2.3,
     "fast_log": 1.1,
 }
+VIEW = camera(60, 45, 48.0)
+UNSAFE = ("fast", "unsafe", "finite", "denorms", "mad-enable", "signed-zeros")
+"""words of build options that let go of IEEE arithmetic"""
 
 
 @dataclass(frozen=True)
@@ -96,11 +99,6 @@ def worst(got: np.ndarray, truth: np.ndarray) -> float:
     # not np.max of the errors alone: a NaN must not be lost
     errors = np.abs(got - truth) / spacing
     return float(errors.max()) if np.isfinite(errors).all() else float("inf")
-
-
-VIEW = camera(60, 45, 48.0)
-UNSAFE = ("fast", "unsafe", "finite", "denorms", "mad-enable", "signed-zeros")
-"""words of build options that let go of IEEE arithmetic"""
 
 
 @case(

@@ -40,6 +40,7 @@ QUALITIES = (
 )
 SHARES = (0.5, 0.15, 0.15, 0.1, 0.1)
 """of the scenes that are drawn with each quality"""
+_SAVE_EVERY = 5.0  # seconds
 
 
 def scene_of(seed: int) -> Picture:
@@ -155,9 +156,6 @@ def _tilt(generator: np.random.Generator, planes: np.ndarray, means: np.ndarray,
         middle = means[own].mean(axis=0)
         means[own] = middle + (means[own] - middle) @ quaternion_to_matrix(turn).T
         quats[own] = quaternion_multiply(turn, quats[own])
-
-
-_SAVE_EVERY = 5.0  # seconds
 
 
 @dataclass

@@ -82,17 +82,17 @@ def _met(region: shapely.Geometry, shape: tuple[int, int]) -> np.ndarray:
     quarter in turn."""
     shapely.prepare(region)
     grid, side = np.zeros(shape, np.uint8), 1 << max(shape).bit_length()
-    corners = np.zeros((1, 2), int)
-    while len(corners):
-        squares = shapely.box(*corners.T, *(corners + side).T)
+    x = y = np.zeros(1, int)
+    while len(x):
+        squares = shapely.box(x, y, x + side, y + side)
         met = shapely.intersects(region, squares)
         done = met & (shapely.covers(region, squares) if side > 1 else True)
-        for x, y in corners[done]:
-            grid[y : y + side, x : x + side] = 1
+        for x0, y0 in zip(x[done], y[done], strict=True):
+            grid[y0 : y0 + side, x0 : x0 + side] = 1
         side //= 2
-        corners = (corners[met & ~done][:, None] + side * np.array([[0, 0], [0, 1], [1, 0], [1, 1]])).reshape(
-            -1, 2
-        )
+        rest = met & ~done
+        x = np.concatenate([x[rest], x[rest] + side] * 2)
+        y = np.concatenate([y[rest], y[rest], y[rest] + side, y[rest] + side])
     return grid
 
 

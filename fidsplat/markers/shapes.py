@@ -79,7 +79,7 @@ def is_whole(regions: tuple[shapely.MultiPolygon, ...]) -> bool:
     return bool((np.abs(points - np.rint(points)) <= GRID).all() and (step.min(1) <= GRID).all())
 
 
-def modules(regions: tuple[shapely.Geometry, ...], shape: tuple[int, int]) -> np.ndarray:
+def modules(regions: tuple[shapely.MultiPolygon, ...], shape: tuple[int, int]) -> np.ndarray:
     """Which region holds the centre of each of (h, w) modules, uint8; of several the last."""
     grid = np.zeros(shape, np.uint8)
     for value, region in enumerate(regions):

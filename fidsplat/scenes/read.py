@@ -15,10 +15,9 @@ from fidsplat.files import path_of
 from fidsplat.formats import Progress, load_ply
 from fidsplat.quality import MarkerQuality, Quality, knobs
 from fidsplat.rotations import rigid_matrix
+from fidsplat.scenes.camera import POSE, TABLES, read_focal_lengths, read_keyframes, read_lens, read_shutter
 from fidsplat.scenes.imaging import read_background, read_part
 from fidsplat.scenes.knobs import quality_of
-from fidsplat.scenes.lens import TABLES, read_focal_lengths, read_lens
-from fidsplat.scenes.moving import POSE, read_keyframes, read_shutter
 from fidsplat.scenes.parts import PlacedMarker
 from fidsplat.scenes.table import Table
 from fidsplat.sensor import Sensor

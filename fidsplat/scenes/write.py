@@ -12,10 +12,9 @@ from fidsplat.markers import with_file
 from fidsplat.markers.printing import MAX_SPLATS
 from fidsplat.quality import Quality
 from fidsplat.rotations import matrix_to_quaternion
+from fidsplat.scenes.camera import keyframe_tables, lens_table, shutter_table
 from fidsplat.scenes.imaging import imaging_tables
 from fidsplat.scenes.knobs import marker_knobs, quality_tables
-from fidsplat.scenes.lens import lens_table
-from fidsplat.scenes.moving import keyframe_tables, shutter_table
 from fidsplat.scenes.parts import PlacedMarker, SceneParts
 
 

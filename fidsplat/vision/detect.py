@@ -14,6 +14,7 @@ import zxingcpp
 from fidsplat.errors import InputError
 from fidsplat.vision.align import align, fit
 from fidsplat.vision.dictionaries import dictionary_bits, parse_family, predefined
+from fidsplat.vision.images import pixels_of
 
 # One family for every grid that people print; with each, a random dark square reads as a tag less than once
 # in 300 times. 16h5 (1 in 30), the families of 1000 and 36h10 cost more time or more false tags: searched
@@ -29,6 +30,7 @@ MAX_QR_SIDE = 65535
 # how much taller or wider the picture is made when a plain look finds no QR code: a tilted one has flat
 # modules
 STRETCHES = (1.5, 2.0, 3.0, 4.0)
+QR_ONLY = zxingcpp.BarcodeFormats([zxingcpp.BarcodeFormat.QRCode])
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +65,15 @@ def detect(image: np.ndarray, families: Iterable[str] | None = None, qr: bool = 
         qr: whether to look for QR codes.
 
     A square that reads in two families (the small ArUco ones are parts of the large ones) is given once, in
-    the family named first. Raises InputError for an unknown family, ValueError for another kind of array.
+    the family named first. Raises InputError for an unknown family and for another kind of array.
     """
-    pixels = np.asarray(image)
+    pixels = pixels_of(image)
     if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] != 3):
         raise InputError(f"detect needs uint8 (h, w) or (h, w, 3), not {pixels.dtype} {pixels.shape}")
+    if families is not None and (isinstance(families, str) or not isinstance(families, Iterable)):
+        raise InputError(f"families must be several names, as ('36h11',), not {families!r}")
+    if not isinstance(qr, bool | np.bool_ | int):
+        raise InputError(f"qr must be True or False, not {type(qr).__name__}")
     wanted = [parse_family(name) for name in (DEFAULT_FAMILIES if families is None else families)]
     if min(pixels.shape[:2]) < MIN_SIDE:
         return []
@@ -158,16 +164,19 @@ def _read_qr(grey: np.ndarray, wider: float, taller: float) -> list[Detection]:
     if (wider, taller) != (1.0, 1.0):
         picture = cv2.resize(grey, None, fx=wider, fy=taller, interpolation=cv2.INTER_LINEAR)
     scale = np.array([grey.shape[1] / picture.shape[1], grey.shape[0] / picture.shape[0]])
-    formats = zxingcpp.BarcodeFormats([zxingcpp.BarcodeFormat.QRCode])
-    read = zxingcpp.read_barcodes(picture, formats=formats, text_mode=zxingcpp.TextMode.Plain)
+    read = zxingcpp.read_barcodes(picture, formats=QR_ONLY, text_mode=zxingcpp.TextMode.Plain)
     return [_qr(grey, code, scale) for code in read]
 
 
-def _qr(grey: np.ndarray, code: zxingcpp.Barcode, scale: np.ndarray) -> Detection:
+def corners_of(code: zxingcpp.Barcode) -> np.ndarray:
+    """(4, 2) pixels, TL, TR, BR, BL as printed; zxing-cpp counts from the first pixel's corner, as we do."""
     place = code.position
     points = (place.top_left, place.top_right, place.bottom_right, place.bottom_left)
-    # zxing-cpp counts from the corner of the first pixel, as we do, in whole pixels
-    rough = np.array([(p.x, p.y) for p in points], np.float64) * scale
+    return np.array([(point.x, point.y) for point in points], np.float64)
+
+
+def _qr(grey: np.ndarray, code: zxingcpp.Barcode, scale: np.ndarray) -> Detection:
+    rough = corners_of(code) * scale
     bits = (np.array(code.to_image(scale=1, add_quiet_zones=False)) == 0).astype(np.uint8)
     # its fourth corner has no finder pattern and, in the smallest codes, nothing else: it can be a module off
     better = align(grey, rough, bits, unsure=(2,))

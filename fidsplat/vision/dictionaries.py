@@ -46,7 +46,7 @@ def parse_family(text: str) -> tuple[str, str]:
 
     Raises InputError that lists the families when there is none of this name.
     """
-    kind, colon, name = text.rpartition(":")
+    kind, colon, name = str(text).rpartition(":")
     for known, names in _KINDS.items():
         if name in names and (not colon or kind == known):
             return known, name

@@ -95,8 +95,22 @@ def read_bits(path: str | os.PathLike[str]) -> np.ndarray:
     return (grey == dark).astype(np.uint8) if dark is not None else np.zeros(grey.shape, np.uint8)
 
 
+def pixels_of(image: np.ndarray) -> np.ndarray:
+    """A picture as an array. Raises InputError for anything but real numbers."""
+    try:
+        array = np.asarray(image)
+    except ValueError:  # rows that differ in length
+        array = np.empty(0, object)
+    if array.dtype.kind not in "fiub":
+        raise InputError(f"a picture has rows of real numbers, not {array.dtype}")
+    return array
+
+
 def to_uint8(image: np.ndarray) -> np.ndarray:
-    """Floats in [0, 1] to uint8, clamped and rounded; uint8 as it is; bool to 0 and 255."""
+    """Floats in [0, 1] to uint8, clamped and rounded; uint8 as it is; bool to 0 and 255.
+
+    Raises InputError for anything but numbers."""
+    image = pixels_of(image)
     if image.dtype == np.uint8:
         return image
     if image.dtype == bool:
@@ -112,15 +126,16 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> Path:
         path: where to; its folder must exist.
         image: (h, w) or (h, w, 3) RGB; float in [0, 1] (clamped and rounded), uint8, or uint16 (16-bit PNG).
 
-    Raises InputError when the folder cannot be written, ValueError for another shape.
+    Raises InputError when the folder cannot be written, and for another shape.
     """
-    array = np.asarray(image)
+    array = pixels_of(image)
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3) or array.size == 0:
-        raise ValueError(f"a PNG needs (h, w) or (h, w, 3), not {array.shape}")
+        raise InputError(f"a PNG needs (h, w) or (h, w, 3), not {array.shape}")
     pixels = array if array.dtype == np.uint16 else to_uint8(array)
     if pixels.ndim == 3:
         pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-    done, data = cv2.imencode(".png", np.ascontiguousarray(pixels))
+    # OpenCV 5's own level makes files of flat colours four times as large
+    done, data = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 3])
     if not done:
         raise ValueError(f"OpenCV could not encode an image of shape {array.shape} as PNG")
     with atomic_write(path) as stream:

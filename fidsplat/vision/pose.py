@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 
 from fidsplat.cameras import Camera
+from fidsplat.errors import InputError
+from fidsplat.scalars import LARGEST, real_array
 
 # OpenCV's square has y up and z towards the viewer, ours y down and z away (docs/conventions.md)
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -23,9 +25,17 @@ def marker_pose(corners: np.ndarray, size: float, camera: Camera) -> np.ndarray:
         camera: its intrinsics and lens are used, not its pose.
 
     Raises:
-        InputError: an orthographic camera, in which nothing tells how far a marker is.
+        InputError: corners of another shape, a size that is not above 0, or an orthographic camera, in which
+            nothing tells how far a marker is.
     """
-    half = size / 2
+    corners, edge = real_array("corners", corners), real_array("size", size)
+    if corners.shape != (4, 2):
+        raise InputError(f"corners must be (4, 2) pixels, not {corners.shape}")
+    if edge.shape != () or not 0 < edge < LARGEST:
+        raise InputError(f"size must be metres above 0, not {size!r}")
+    if not isinstance(camera, Camera):
+        raise InputError(f"camera must be a Camera, not {type(camera).__name__}")
+    half = float(edge) / 2
     square = np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]], np.float64)
     return _pose(square, corners, camera, cv2.SOLVEPNP_IPPE_SQUARE)
 

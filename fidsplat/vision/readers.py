@@ -18,6 +18,7 @@ import numpy as np
 import zxingcpp
 
 from fidsplat.errors import InputError
+from fidsplat.vision.detect import QR_ONLY, corners_of
 from fidsplat.vision.dictionaries import predefined
 
 # how much larger the picture is made, and how much taller beside that, until zxing-cpp reads the code: all
@@ -99,11 +100,10 @@ def _cv2_qr(grey: np.ndarray, target: Target) -> Attempt:
 
 def _zxing(grey: np.ndarray, target: Target, enlarged: tuple[float, float] = (1.0, 1.0)) -> Attempt:
     """zxing-cpp with its defaults, for QR codes."""
-    formats = zxingcpp.BarcodeFormats([zxingcpp.BarcodeFormat.QRCode])
     codes = zxingcpp.read_barcodes(
-        grey, formats=formats, text_mode=zxingcpp.TextMode.Plain, return_errors=True
+        grey, formats=QR_ONLY, text_mode=zxingcpp.TextMode.Plain, return_errors=True
     )
-    quads = (_position(code) / enlarged for code in codes)
+    quads = (corners_of(code) / enlarged for code in codes)
     read = any(code.valid and code.text == target.payload for code in codes)
     return Attempt(read or _any_over(quads, target), read)
 
@@ -180,12 +180,6 @@ def overlap(one: np.ndarray, other: np.ndarray) -> float:
 
 def _any_over(quads: Iterable[np.ndarray], target: Target) -> bool:
     return any(overlap(quad, target.corners) > MIN_OVERLAP for quad in quads)
-
-
-def _position(code: zxingcpp.Barcode) -> np.ndarray:
-    place = code.position
-    points = (place.top_left, place.top_right, place.bottom_right, place.bottom_left)
-    return np.array([(p.x, p.y) for p in points], np.float64)
 
 
 def _content_rows(grey: np.ndarray) -> tuple[int, int]:

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .common import View, fma, to_sample
+from .common import View, fma, population, to_sample
 
 # room for the rounding of the fields and of the per-sample test: samples, and relative
 PAD = wp.constant(0.02)
@@ -161,6 +161,15 @@ def make_bounds(screen: bool) -> SimpleNamespace:
                     bits = bits | (ones(end - first) << wp.uint32(row * WINDOW_W + first - left))
         return bits
 
-    return SimpleNamespace(
-        rows=rows, span=span, tile_rows=tile_rows, tile_span=tile_span, window_bits=window_bits
-    )
+    @wp.func
+    def touched(b: Bounds, left: int, columns: int, top: int, height: int, view: View):
+        """The same bits, and how many tiles can be touched, also of more than a window has."""
+        bits = window_bits(b, left, columns, top, height, view)
+        tiles = population(bits)
+        if tiles == 0:
+            for row in range(top, top + height):
+                begin, end = tile_span(b, row, view)
+                tiles += end - begin
+        return bits, tiles
+
+    return SimpleNamespace(rows=rows, span=span, tile_rows=tile_rows, tile_span=tile_span, touched=touched)

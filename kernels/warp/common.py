@@ -50,6 +50,7 @@ class View:
     stop: float
     first_light: float  # transmittance that is left behind a first hit
     fog_density: float  # 1 / metres
+    slopes: wp.vec4d  # of rays, -x, x, -y, y: EWA takes derivatives there where a centre lies further out
     ray_step: wp.float64  # behind a lens, where there are boxes: from a ray to the next sample's, at most
     ray: wp.vec4  # a sample's ray is ((column - [2]) [0], (row - [3]) [1], 1); 0 where depths are distances
 

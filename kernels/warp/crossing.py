@@ -7,6 +7,7 @@ import warp as wp
 
 from .boxes import between, between_curves
 from .common import View, fma, line_of, struct_of
+from .ellipsoids import EXACT
 from .fast import fast_exp
 from .rays import SLOPES
 from .records import BOXES, Layout
@@ -24,6 +25,7 @@ def make_crossing(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleN
     screen, bent, parallel, all_boxes = (
         name in effects for name in ("lowpass_screen", "rays", "camera_orthographic", "footprint_box")
     )
+    thick = EXACT in effects
     boxes = any(name in effects for name in BOXES)
     curved, edged = boxes and bent, boxes and not bent  # their edges: from each sample's ray, from a record
     exp = fast_exp if "arithmetic_fast" in effects else wp.exp
@@ -100,6 +102,14 @@ def make_crossing(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleN
             c.q = fma(nu, nu, nv * nv)
             # product form: no division, no special value of D (numerics B2)
             c.inside = c.q <= s.half_r2 * (c.d * c.d) and ahead
+        if wp.static(thick):
+            if s.bulge > 0.0:
+                squared = fma(s.bulge, c.q, c.d * c.d)  # D^2 (1 + rho of the disk / m^2)
+                c.inside = c.q <= s.half_r2 * squared and c.d > 0.0 and squared <= s.v[3] * c.d
+                # as a disk has them: rho / 2 is q / d^2, the depth falls with 1 / d
+                inverse = 1.0 / c.d
+                c.d = squared * inverse
+                c.q = c.q * c.d * inverse
         if wp.static(edged):
             if is_box(s):
                 across = between(c.d, nu, wp.vec2(s.edges[0], s.edges[1]))

@@ -1,14 +1,11 @@
 """Per splat: is it drawn, where, in which order, and the affine forms that each sample evaluates.
 
 A ray r = ((x - cx) / fx, (y - cy) / fy, 1) meets the plane of a splat with centre p, unit tangents t_u, t_v,
-normal n at depth
-(n p) / (n r), and there u = (t_v x p) r / (s_u n r), v = (p x t_u) r / (s_v n r): from n x (r x p) = r (n p)
-- p (n r). All three of
-n_u, n_v, D = n r are affine in the sample, and since p is orthogonal to the first two, n_u and n_v vanish at
-the projected centre.
-They are scaled by one factor: D > 0 in front of the camera, the steepest slope is 1; n_u, n_v also by
-sqrt(1/2), so that
-(n_u^2 + n_v^2) / D^2 is rho / 2.
+normal n at depth (n p) / (n r), and there u = (t_v x p) r / (s_u n r), v = (p x t_u) r / (s_v n r): from n x
+(r x p) = r (n p) - p (n r). All three of n_u, n_v, D = n r are affine in the sample, and since p is
+orthogonal to the first two, n_u and n_v vanish at the projected centre. They are scaled by one factor: D > 0
+in front of the camera, the steepest slope is 1; n_u, n_v also by sqrt(1/2), so that (n_u^2 + n_v^2) / D^2 is
+rho / 2.
 """
 
 import math
@@ -20,8 +17,9 @@ from . import output
 from .bounds import PAD, PAD_RELATIVE, Bounds, box_bounds, make_bounds
 from .boxes import make_boxes
 from .color import make_color
-from .common import CULLED, STRICT, View, as_bits, population, sortable, store_line
+from .common import CULLED, STRICT, View, as_bits, sortable, store_line
 from .disk import make_disk
+from .ellipsoids import EWA, EXACT, make_ellipsoids
 from .lens import LENSES, make_lens, make_optics
 from .lowpass import make_filter
 from .motion import make_motion
@@ -63,6 +61,9 @@ def make_project(
     all_boxes, mixed = "footprint_box" in effects, "footprint_mixed" in effects
     boxes_too = all_boxes or mixed
     of_box, disk = make_boxes(real), make_disk(real)
+    exact, drawn_ewa = EXACT in effects, any(name in effects for name in EWA)
+    thick_too = exact or drawn_ewa
+    ellipsoid = make_ellipsoids(effects, real)
     limits, color_of, widened = make_bounds(screen), make_color(sh_terms, real), make_filter(real)
     moves = "motion_groups" in effects
     motion = make_motion(moves)
@@ -76,9 +77,9 @@ def make_project(
     optics = make_optics(camera, real) if camera else None
     Lens = make_lens(camera)
     slopes_at = make_slopes("camera_orthographic" if parallel else camera, real)
-    at_dot, at_depth, at_edges, at_ray, at_plane, at_flag, at_box = (
+    at_dot, at_depth, at_edges, at_ray, at_plane, at_flag, at_box, at_bulge = (
         layout.word(name)
-        for name in ("dot_x", "z_numerator", "edge_u0", "nuz", "plane_z0", "boxed", "columns")
+        for name in ("dot_x", "z_numerator", "edge_u0", "nuz", "plane_z0", "boxed", "columns", "bulge")
     )
     at_nearest = layout.word("nearest")
 
@@ -106,6 +107,7 @@ def make_project(
         planes: wp.array(dtype=wp.int32),  # (n) index of the splat's plane; -1: none
         plane_keys: wp.array(dtype=wp.float32),  # (planes) depth at which a plane's splats are sorted in [m]
         boxes: wp.array(dtype=wp.int32),  # (n) 1: a box, of a cloud that has boxes and others
+        thickness: wp.array(dtype=wp.float32),  # (n) [m], of a cloud that has 3D Gaussians; 0: a disk
         lines: wp.array(dtype=wp.vec4),  # (n lines_each) out: records of splats that are drawn
         bounds: wp.array(dtype=Bounds),  # (n) out: as `every_bounds` says
         windows: wp.array(
@@ -145,22 +147,37 @@ def make_project(
         center = means[i]
         mean = vec3(real(center[0]), real(center[1]), real(center[2]))
         p = turn * mean + shift
-        a = tangent_u * su
-        b = tangent_v * sv
+        a, b = tangent_u * su, tangent_v * sv
         depth = p[2]
         if wp.static(ray_depths):
             depth = wp.length(p)
 
         near = real(view.near)
+        itself = bool(False)  # whether it is filtered by its own footprint
         if wp.static(boxes_too):
             boxed = bool(wp.static(all_boxes))
             if wp.static(mixed):
                 boxed = boxes[i] != 0
+            itself = boxed
+        third = vec3()  # half axis of an ellipsoid that is conjugate to a and b
+        inverse_m2 = zero
+        thick = bool(False)
+        if wp.static(thick_too):
+            thick = thickness[i] > 0.0
+            if thick:
+                sizes = vec3(su, sv, real(wp.max(thickness[i], SMALLEST_SCALE)))
+                a, b, third, inverse_m2, spanned, share = ellipsoid.disk(tangent_u, tangent_v, sizes, p, view)
+                log_opacity += float(wp.log(share))
+                half_r2 = log_opacity - view.log_cut
+                if not (half_r2 > 0.0):
+                    return
+                # of unit area, as a disk's
+                sv = wp.length(b)
+                su = spanned / sv
+                tangent_u, tangent_v = a / su, b / sv
+                itself = wp.static(drawn_ewa)
         if wp.static(filtered):
-            widens = depth >= near
-            if wp.static(boxes_too):
-                widens = widens and not boxed
-            if widens:
+            if depth >= near and not itself:
                 by_x, by_y, here = slopes_at(p, view, lens)
                 if here:
                     wide = widened(a, b, by_x, by_y)
@@ -183,6 +200,12 @@ def make_project(
             if wp.static(boxes_too):
                 if boxed:
                     reach = su + sv
+        rim, rim_reach = radius, reach  # of the disk whose picture bounds what is drawn
+        if wp.static(exact):
+            if thick:
+                rim = ellipsoid.rim(radius, inverse_m2)
+                rim_reach = rim * wp.sqrt(a[2] * a[2] + b[2] * b[2])
+                reach = ellipsoid.reach(a, b, third, radius)
         if not (depth + reach >= near and depth - reach <= real(view.far)):
             return
 
@@ -192,8 +215,7 @@ def make_project(
         in_front = depth >= near  # or, of a lens, whether it is known where the centre falls
         center_x, center_y = zero, zero
         if wp.static(parallel):
-            center_x = fx * p[0] + cx
-            center_y = fy * p[1] + cy
+            center_x, center_y = fx * p[0] + cx, fy * p[1] + cy
         elif wp.static(not bent):
             if in_front:
                 center_x = fx * (p[0] / p[2]) + cx
@@ -210,7 +232,7 @@ def make_project(
                     return
                 box = box_bounds(float(area[0]), float(area[1]), float(area[2]), float(area[3]))
             elif wp.static(mixed):
-                box = seen(a, b, p, radius, reach, center_x, center_y, view, lens)
+                box = seen(a, b, p, rim, rim_reach, center_x, center_y, view, lens)
         elif wp.static(boxes_too):
             if boxed:
                 # the disk around a larger rectangle
@@ -219,9 +241,12 @@ def make_project(
                 range_z = sqrt_two * wp.length(vec2(side_u[2], side_v[2]))
                 box = seen(side_u, side_v, p, sqrt_two, range_z, center_x, center_y, view, lens)
             elif wp.static(mixed):
-                box = seen(a, b, p, radius, reach, center_x, center_y, view, lens)
+                box = seen(a, b, p, rim, rim_reach, center_x, center_y, view, lens)
         else:
-            box = seen(a, b, p, radius, reach, center_x, center_y, view, lens)
+            box = seen(a, b, p, rim, rim_reach, center_x, center_y, view, lens)
+        if wp.static(exact and not parallel and not bent):
+            if thick and p[2] - reach < near:
+                box = ellipsoid.clipped(box, a, b, p, third, inverse_m2, view)
         if wp.static(mapped):
             x0, x1 = real(box.x - box.half_x), real(box.x + box.half_x)
             y0, y1 = real(box.y - box.half_y), real(box.y + box.half_y)
@@ -231,16 +256,14 @@ def make_project(
                 center_x, center_y, in_front = optics.image(p, view, lens)
         if wp.static(not parallel):
             if not in_front:
-                center_x = real(box.x)
-                center_y = real(box.y)
+                center_x, center_y = real(box.x), real(box.y)
         if wp.static(screen):
             if in_front:
                 box.dot_x = float(center_x)
                 box.dot_y = float(center_y)
                 box.dot_r = wp.sqrt(half_r2 / view.per_pixel) * (1.0 + PAD_RELATIVE) + PAD
-            if wp.static(boxes_too):
-                if boxed:
-                    box.dot_r = -1.0
+            if itself:
+                box.dot_r = -1.0
         row_first, row_end = limits.rows(box, view.height)
         first_column, end_column = limits.span(box, row_first, row_end, view.width)
         if row_first >= row_end or first_column >= end_column:
@@ -249,20 +272,14 @@ def make_project(
         columns = (end_column - 1) / view.tile_w - left + 1
         top = row_first / view.tile_h
         tile_rows = (row_end - 1) / view.tile_h - top + 1
-        bits = limits.window_bits(box, left, columns, top, tile_rows, view)
-        tiles = population(bits)
-        if tiles == 0:
-            for row in range(top, top + tile_rows):
-                begin, end = limits.tile_span(box, row, view)
-                tiles += end - begin
+        bits, tiles = limits.touched(box, left, columns, top, tile_rows, view)
         if tiles == 0:
             return
 
         # affine forms about the sample of the picture that is nearest to the centre (numerics B1)
         ax = wp.clamp(wp.floor(float(center_x)), 0.0, float(view.width - 1))
         ay = wp.clamp(wp.floor(float(center_y)), 0.0, float(view.height - 1))
-        anchor_x = real(ax) + half
-        anchor_y = real(ay) + half
+        anchor_x, anchor_y = real(ax) + half, real(ay) + half
         normal = wp.cross(tangent_u, tangent_v)
         height = wp.dot(normal, p)  # of the camera's centre above the plane, with its side
         ray = vec3((anchor_x - cx) * per_fx, (anchor_y - cy) * per_fy, one)
@@ -284,8 +301,7 @@ def make_project(
             steepest = wp.max(steepest, wp.max(wp.abs(form_u[2]), wp.abs(form_v[2])))
         if not (steepest > zero and steepest < real(wp.inf)):
             return
-        nu0 = wp.dot(form_u, ray)
-        nv0 = wp.dot(form_v, ray)
+        nu0, nv0 = wp.dot(form_u, ray), wp.dot(form_v, ray)
         if wp.static(not bent):
             if wp.static(parallel) or in_front:
                 # both vanish at the projected centre
@@ -337,11 +353,10 @@ def make_project(
             record[at_flag] = wp.where(boxed, 1.0, 0.0)
         if wp.static(screen):
             # far away if there is none
-            record[at_dot] = wp.where(in_front, float(center_x - anchor_x), 1.0e18)
+            record[at_dot] = wp.where(in_front and not itself, float(center_x - anchor_x), 1.0e18)
             record[at_dot + 1] = wp.where(in_front, float(center_y - anchor_y), 1.0e18)
-            if wp.static(boxes_too):
-                if boxed:
-                    record[at_dot] = 1.0e18
+        if wp.static(exact):
+            record[at_bulge] = float(two * inverse_m2)
         if wp.static(parallel):
             # D times the depth, which is p_z - (n_x X + n_y Y) / n_z at (X, Y) from the centre [m]
             off_x, off_y = (anchor_x - center_x) * per_fx, (anchor_y - center_y) * per_fy

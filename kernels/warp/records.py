@@ -22,6 +22,7 @@ _EXTRA = {
     "lowpass_screen": ("dot_x", "dot_y"),
     "ray_depth": ("z_numerator", "z_center", "z_reach"),
     "compose_pixel": ("nearest",),
+    "ellipsoid_exact": ("bulge",),
 }
 
 
@@ -34,7 +35,8 @@ class Layout:
     the depth. columns and rows hold first and end, 16 bits each, of the box of samples that it can touch.
     Behind a lens x, y, z are a sample's ray from the anchor's (ray_x, ray_y, ray_z), and boxed is 1 of a box,
     0 of another splat. For parallel rays plane_z0 + plane_zx x + plane_zy y is D times the depth, which is at
-    least plane_near. At last stands what outputs add.
+    least plane_near. bulge is 2 / m^2 of a 3D Gaussian (ellipsoids.py), 0 of another splat. At last stands
+    what outputs add.
     """
 
     def __init__(self, effects: Iterable[str], outputs: Iterable[str] = ()) -> None:

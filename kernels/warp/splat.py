@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .common import View, struct_of
+from .ellipsoids import EXACT
 from .records import BOXES, Layout
 from .staging import make_staging
 
@@ -22,11 +23,13 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
     screen, bent, parallel = (name in effects for name in ("lowpass_screen", "rays", "camera_orthographic"))
     edged = not bent and any(name in effects for name in BOXES)
     flagged = bent and "footprint_mixed" in effects
+    thick = EXACT in effects
     # u: nu0, nux, nuy, log opacity; v: nv0, nvx, nvy, D at the near plane; d: d0, dx, dy, ax; c: ay, r, g, b
     splat = {"u": wp.vec4, "v": wp.vec4, "d": wp.vec4, "c": wp.vec4, "half_r2": wp.float32}
     splat |= {"dot_x": wp.float32, "dot_y": wp.float32} if screen else {}
     splat |= {"edges": wp.vec4} if edged else {}
     splat |= {"boxed": wp.float32} if flagged else {}
+    splat |= {"bulge": wp.float32} if thick else {}
     # w: factors of the ray's Z, then the anchor's X; origin: the anchor's ray
     splat |= {"w": wp.vec4, "origin": wp.vec3} if bent else {}
     # plane_z0, plane_zx, plane_zy, plane_near
@@ -36,6 +39,7 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
     dot_y_lane = layout.place("dot_y")[1]  # of the same line
     edge_line = layout.place("edge_u0")[0]
     boxed_line, boxed_lane = layout.place("boxed")
+    bulge_line, bulge_lane = layout.place("bulge")
     ray_line, plane_line = layout.place("nuz")[0], layout.place("plane_z0")[0]
 
     @wp.func
@@ -60,6 +64,8 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
             s.edges = staged_line(pool, lines, lists, first, which, edge_line)
         if wp.static(flagged):
             s.boxed = staged_line(pool, lines, lists, first, which, boxed_line)[boxed_lane]
+        if wp.static(thick):
+            s.bulge = staged_line(pool, lines, lists, first, which, bulge_line)[bulge_lane]
         if wp.static(bent):
             s.w = staged_line(pool, lines, lists, first, which, ray_line)
             rest = staged_line(pool, lines, lists, first, which, ray_line + 1)

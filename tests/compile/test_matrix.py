@@ -63,7 +63,14 @@ def test_texts_of_all_effects_and_of_all_but_one(lens):
         assert_well_formed([name for name in names if name != left_out])
 
 
-@pytest.mark.parametrize("name", SWITCHES)
+# test_outputs.py has each output alone as it is among all, which are the reference's
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.exhaustive if switch.output else ())
+        for name, switch in SWITCHES.items()
+    ],
+)
 def test_each_effect_alone(renderer, name):
     assert_drawn(renderer, (name,))
 

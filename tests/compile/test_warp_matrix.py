@@ -23,12 +23,8 @@ OWN = [name for name in SWITCHES if has(name)]
 PAIRS = [pair for pair in combinations(OWN, 2) if goes(pair)]
 
 
-def test_warp_has_all_effects_but_3d_gaussians():
-    """These it refuses by name, with what does have them."""
-    lacking = {name for name in SWITCHES if "ellipsoids" in name}
-    assert set(SWITCHES) - set(OWN) == lacking
-    why = unsupported(combination(["exact ellipsoids"]).features(), "warp:cpu")
-    assert why == "warp:cpu (NVIDIA Warp) has no ellipsoid_exact; use an OpenCL device for it"
+def test_warp_has_all_effects():
+    assert set(SWITCHES) == set(OWN)
 
 
 @pytest.mark.parametrize("name", sampled(OWN, 3, 12))

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import assert_agrees, random_splats, reference_pixels
+from sampling import SAMPLES, alternate
 from test_boxes import EXACT, boxes_of, cut
 from test_lens_pictures import CAMERAS
 
@@ -47,8 +48,8 @@ def test_boxes_much_larger_than_the_picture(renderer, camera):
     assert_agrees(renderer, cloud.with_boxes(), camera, quality=EXACT)
 
 
-@each_camera
-@pytest.mark.parametrize("samples", [1, 2])
+# those that test_layers of test_lens_pictures.py leaves out
+@pytest.mark.parametrize(("camera", "samples"), alternate(CAMERAS, dict(reversed(SAMPLES.items()))))
 def test_boxes_and_gaussians_in_layers(renderer, camera, samples):
     pose = np.eye(4)
     pose[:3, 3] = (0.1, 0, 2)

@@ -8,14 +8,16 @@ from test_lens_pictures import CAMERAS
 
 import fidsplat as fs
 from fidsplat.effects import OUTPUTS
-from fidsplat.hard_cases.agreement import RARE, RISKY, Picture
+from fidsplat.hard_cases.agreement import RARE, RISKY, Picture, compare
 
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0, 0, -0.1), (0, 0, 3.0))
+MARKED = fs.Camera.look_at(81, 59, 0.7, (0.8, -0.3, -1.6), (0, 0, 0))
 AROUND = random_splats(150, seed=1)
 SCENES = {
     "splats around the camera": (AROUND, CAMERA),
     "layers": (coplanar_cloud(1), CAMERA),
     "boxes": (AROUND.with_boxes(np.arange(150) % 2 == 0), CAMERA),
+    "a marker of boxes": (fs.marker("aruco:4x4_50:7", size=1.0).cloud, MARKED),
     "a fisheye": (AROUND, CAMERAS["fisheye 200"]),
     "parallel rays": (AROUND, CAMERAS["parallel"]),
 }
@@ -39,3 +41,19 @@ def test_certificates_leave_little_open(name):
     for output in OUTPUTS:
         if f"{output}_may_flip" in truth:
             assert truth[f"{output}_may_flip"].mean() < 0.025, output
+
+
+@pytest.mark.parametrize("output", OUTPUTS)
+def test_one_wrong_pixel_is_named(output):
+    """By a thousandth of a colour, of a normal's length or of a depth; by one label, index or fragment."""
+    truth = truth_of(Picture(AROUND, CAMERA, fs.Quality(), tuple(OUTPUTS)))
+    images = {name: truth[name].astype(OUTPUTS[name].dtype) for name in OUTPUTS}
+    assert all(difference.agrees for difference in compare(images, truth, OUTPUTS))
+    sure = (truth["certificate"] < 1e-5) & (truth["certificate_normal"] < 2e-4) & (truth["depth_first"] > 0)
+    for name in OUTPUTS:
+        sure &= ~truth.get(f"{name}_may_flip", np.zeros_like(sure))
+    row, column = np.argwhere(sure)[0]
+    image = images[output]
+    thousandth = 1e-3 * max(1.0, float(np.abs(image[row, column]).max()))
+    image[row, column] += 1 if image.dtype == np.int32 else thousandth
+    assert [one.output for one in compare(images, truth, OUTPUTS) if not one.agrees] == [output]

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import random_splats
+from sampling import SAMPLES, alternate
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
@@ -60,8 +61,7 @@ def test_outputs_and_sensors_behind_every_lens(renderer, camera):
     assert_agrees(renderer, camera=camera, outputs=("rgb", *OUTPUTS), sensor=SENSOR)
 
 
-@pytest.mark.parametrize("samples", [1, 2])
-@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+@pytest.mark.parametrize(("camera", "samples"), alternate(CAMERAS, SAMPLES))
 def test_fog_and_distances_behind_lenses(renderer, camera, samples):
     outputs = ("rgb", "distance", "distance_median", "distance_first")
     quality = fs.Quality(samples=samples)
@@ -75,8 +75,13 @@ def test_distances_are_depths_where_depths_are_along_the_ray(renderer, name):
     assert np.array_equal(frame["depth"], frame["distance"])
 
 
-@pytest.mark.parametrize("shutter", [BLUR, ROLLING], ids=["blur", "rolling"])
-@pytest.mark.parametrize("around", ["fog", "sky", "panorama", "boxes", "pixel"])
+@pytest.mark.parametrize(
+    ("around", "shutter"),
+    alternate(
+        {name: name for name in ("fog", "sky", "panorama", "boxes", "pixel")},
+        {"blur": BLUR, "rolling": ROLLING},
+    ),
+)
 def test_effects_of_the_picture_under_a_shutter(renderer, around, shutter):
     cloud = BOXES if around == "boxes" else CLOUD
     quality = fs.Quality(lowpass="pixel" if around == "pixel" else "screen")
@@ -112,9 +117,9 @@ def test_fog_is_averaged_over_the_poses_of_a_shutter(renderer):
     assert np.allclose(both, (near + none) / 2, atol=1e-5)
 
 
-@pytest.mark.parametrize("samples", [1, 2])
-@pytest.mark.parametrize("behind", [SKY, PANORAMA], ids=["sky", "panorama"])
-@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+@pytest.mark.parametrize(
+    ("camera", "behind", "samples"), alternate(CAMERAS, {"sky": SKY, "panorama": PANORAMA}, SAMPLES)
+)
 def test_backgrounds_behind_every_lens(renderer, camera, behind, samples):
     picture = {"camera": camera, "background": behind, "quality": fs.Quality(samples=samples)}
     assert_agrees(renderer, outputs=("rgb", "normal_world"), **picture)

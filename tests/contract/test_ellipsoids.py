@@ -10,7 +10,6 @@ import fidsplat as fs
 from fidsplat.hard_cases import fuzz
 from fidsplat.hard_cases.agreement import against_reference
 
-BACKEND = "opencl"
 CAMERA = fs.Camera.pinhole(97, 71, 70.0, 70.0, 48.0, 36.0, near=0.05)
 
 

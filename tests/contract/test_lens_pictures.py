@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, assert_agrees, random_splats, reference_pixels
+from sampling import SAMPLES, alternate
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
@@ -52,6 +53,20 @@ def test_near_and_far_planes_amid_the_splats(renderer, name):
     assert np.abs(frame["rgb"] - whole["rgb"]).max() > 0.1
 
 
+@pytest.mark.parametrize("name", ["pinhole", "distortion", "fisheye 200", "panorama", "parallel"])
+def test_depths_of_a_tilted_wall_are_right_to_a_hundred_thousandth(renderer, name):
+    """Without a certificate: nothing is hard here."""
+    camera = CAMERAS.get(name, seen_through(None))
+    center = np.linalg.inv(camera.world_to_camera) @ (0.1, -0.2, 3.0, 1.0)
+    turn = (0.9, 0.25, -0.2, 0.1)
+    wall = fs.SplatCloud([center[:3]], [turn], [(1.5, 1.5)], [1.0], colors=[(1, 1, 1)])
+    frame = renderer.render(wall, camera, ALL_OUTPUTS)
+    want = reference_pixels(wall, camera, ALL_OUTPUTS, fs.Quality())["depth"]
+    inside = frame["alpha"] > 0.1
+    assert np.ptp(want[inside]) > 0.3
+    assert frame["depth"][inside] == pytest.approx(want[inside], rel=1e-5)
+
+
 @each_camera
 def test_small_splats_of_all_shapes(renderer, camera):
     """Needles included; each at most a few pixels wide, where a bound that is too tight loses most."""
@@ -64,8 +79,7 @@ def test_splats_much_larger_than_the_picture(renderer, camera):
     assert_agrees(renderer, random_splats(80, 5, depth=(-4.0, 4.0), scale=(0.1, 30.0)), camera)
 
 
-@each_camera
-@pytest.mark.parametrize("samples", [1, 2])
+@pytest.mark.parametrize(("camera", "samples"), alternate(CAMERAS, SAMPLES))
 def test_layers(renderer, camera, samples):
     assert_agrees(renderer, coplanar_cloud(1), camera, quality=fs.Quality(samples=samples))
 

@@ -21,3 +21,9 @@ def test_threads_share_a_renderer_or_have_their_own(device):
 def test_processes_share_an_empty_kernel_cache(monkeypatch):
     monkeypatch.setattr(load, "PROCESSES", 3)
     assert load.processes("opencl") == {"wrong of 3 processes": 0}
+
+
+def test_memory_that_comes_and_goes_is_no_growth():
+    each = [(10.0 * k, 500 + 100 * (k % 3 == 0) + k // 100) for k in range(720)]
+    assert load.levels(each, 7200) == (501, 507)
+    assert load.levels([(1.0, 7)], 60) == (7, 7)

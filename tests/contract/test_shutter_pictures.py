@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import random_splats
+from sampling import alternate
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
@@ -67,8 +68,7 @@ def assert_exposed(renderer, cloud, camera, motion, shutter, quality=None, outpu
     return frame
 
 
-@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
-@pytest.mark.parametrize("shutter", SHUTTERS.values(), ids=SHUTTERS)
+@pytest.mark.parametrize(("camera", "shutter"), alternate(CAMERAS, SHUTTERS))
 def test_shutters_before_every_lens(renderer, camera, shutter):
     cloud = random_splats(150, 3, depth=(-2.0, 5.0), scale=(0.01, 0.5))
     assert_exposed(renderer, cloud, camera, MOTION, shutter)

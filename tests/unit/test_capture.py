@@ -45,6 +45,13 @@ def test_a_part_of_the_wrong_kind_is_named_with_what_would_do(parts, message):
         fs.Capture().with_(**parts)
 
 
+@pytest.mark.parametrize("captures", [5, np.array("text")])
+def test_views_of_what_is_no_list(captures):
+    views = fs.Renderer("reference").render_views(fs.SplatCloud.empty(), captures)
+    with pytest.raises(fs.InputError, match=r"captures is .* must be a list of Capture or Camera"):
+        list(views)
+
+
 def test_a_copy_keeps_what_is_not_changed():
     capture = fs.Capture(CAMERA, ("rgb", "depth"), "fast", GREY)
     other = capture.with_(outputs=None, background=(0, 0, 0), fog=fs.Fog(0.1))

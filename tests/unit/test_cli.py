@@ -311,7 +311,13 @@ def test_info(capsys, tmp_path):
     assert facts["scales"] == pytest.approx([0.05] * 3, rel=1e-5)
     assert 0.2 <= facts["marker_size"] <= 0.5
     assert main(["info", str(tmp_path / "yard.ply")]) == 0
-    assert "-y?" in capsys.readouterr().out
+    assert "-y? (87 % of the area is level)" in capsys.readouterr().out
+    statue = means[2000:2300] * [1, 5, 1]
+    statue = fs.SplatCloud(
+        statue, generator.normal(size=(300, 4)), np.ones((300, 2)), np.ones(300), colors=statue
+    )
+    fs.save_ply(statue, tmp_path / "statue.ply")
+    assert prints_json(capsys, "info", tmp_path / "statue.ply")["up_because"] == "the longest side"
     assert "missing.ply" in fails(capsys, "info", tmp_path / "missing.ply")[1]
     fs.save_ply(fs.SplatCloud.empty(), tmp_path / "empty.ply")
     assert prints_json(capsys, "info", tmp_path / "empty.ply")["splats"] == 0

@@ -5,7 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import hostile
 import pytest
+from hostile_inputs import KINDS
+from sampling import sampled
 
 ROOT = Path(__file__).parents[2]
 
@@ -16,11 +19,12 @@ def run(*words):
     return subprocess.run(command, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": path})
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", sampled(range(3), 1, 0))
 def test_inputs_at_random(seed):
-    done = run("--count", 150, "--seed", seed)
+    """15 of each kind."""
+    done = run("--count", 15 * len(KINDS), "--seed", seed)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.count("\n| ") == 5  # a row for each kind
+    assert done.stdout.count("\n| ") == len(KINDS)
 
 
 @pytest.mark.parametrize(
@@ -45,3 +49,10 @@ def test_each_way_to_end_is_told(tmp_path, broken, ending):
     done = subprocess.run(command, capture_output=True, text=True, env=env)
     assert f"scenes 3: {ending} " in done.stdout, done.stdout + done.stderr
     assert done.returncode == (0 if ending == "one line" else 1)
+
+
+def test_an_error_may_follow_a_bar_and_nothing_else():
+    bad = ("fidsplat: a\nfidsplat: b", "fidsplat: a\nTraceback", "fidsplat: a (a fault of fidsplat)", "")
+    assert {hostile._ending_of_a_command(2, err)[0] for err in bad} == {"fault"}
+    good = ("fidsplat: a\n", "reading 50 %\nfidsplat: a\n", "fidsplat: warning: b\nfidsplat: a")
+    assert {hostile._ending_of_a_command(2, err)[0] for err in good} == {"one line"}

@@ -28,12 +28,11 @@ MAY_IMPORT = {
     "surroundings": BASE | {"vision.images"},
     "kernel_files": BASE,
     "provenance": BASE | {"kernel_files"},
-    "defects": BASE,
-    "cloud_arrays": BASE | {"defects"},
-    "splats": BASE | {"harmonics", "defects", "cloud_arrays"},
+    "cloud_arrays": BASE,
+    "splats": BASE | {"harmonics", "cloud_arrays"},
     "cameras": BASE,
     "vision": BASE | {"cameras", "scenes", "markers"},
-    "formats": BASE | {"splats", "harmonics", "defects", "cloud_arrays", "cameras"},
+    "formats": BASE | {"splats", "harmonics", "cloud_arrays", "cameras"},
     "markers": BASE | {"splats", "quality", "vision.dictionaries", "vision.images"},
     "scenes": PLAIN | {"markers", "formats"},
     "effects": PLAIN,
@@ -157,7 +156,7 @@ def within_any(names, package) -> bool:
 
 
 # modules of the package that every backend may import
-SHARED = ("base", "view", "prepare", "registry", "planes")
+SHARED = ("base", "caches", "view", "prepare", "registry", "planes", "bands")
 
 
 def test_backends_do_not_import_each_other():

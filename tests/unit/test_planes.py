@@ -30,10 +30,12 @@ def some_planes(seed=0, ids=(7, 3, 2_000_000_000)):
     return taken(cloud, generator.permutation(len(cloud)))
 
 
+@pytest.mark.parametrize("away", [(0, 0, 0), (3, -5, 8)])
 @pytest.mark.parametrize("cutoff", [1 / 255, 1e-6])
-def test_a_key_is_a_diameter_before_every_point_of_the_splats(cutoff):
-    quality = fs.Quality(alpha_cutoff=cutoff)
-    cloud = some_planes()
+def test_a_key_is_a_diameter_before_every_point_of_the_splats(cutoff, away):
+    quality, pose = fs.Quality(alpha_cutoff=cutoff), np.eye(4)
+    pose[:3, 3] = away
+    cloud = some_planes().transformed(pose)
     view = view_of(cloud, quality=quality)
     keys = PlaneTable(cloud).keys(view)
     radius = np.sqrt(2 * np.log(1 / cutoff))
@@ -50,6 +52,18 @@ def test_a_key_is_a_diameter_before_every_point_of_the_splats(cutoff):
         assert keys[number] <= depth.min() - diameter
         # and not much more than that: a box has corners
         assert keys[number] >= depth.min() - 3 * diameter
+
+
+def test_the_key_of_boxes_is_before_their_corners():
+    """Whatever the cut-off, at which a Gaussian would end within."""
+    turn = turned((0, 1, 0), 60)
+    cloud = splats([(0, 0, 3)], turn, [(0.5, 0.2)]).with_boxes().with_planes(0)
+    view = view_of(cloud, quality=fs.Quality(alpha_cutoff=0.9))
+    axes = quaternion_to_matrix(cloud.quats)[0, :, :2] * cloud.scales[0]
+    corners = cloud.means + np.array([(u, v) for u in (-1, 1) for v in (-1, 1)]) @ axes.T
+    depth = corners @ view.rotation[2] + view.translation[2]
+    diagonal = 2 * np.hypot(0.5, 0.2)
+    assert PlaneTable(cloud).keys(view)[0] <= depth.min() - diagonal
 
 
 def test_index_is_dense_whatever_the_ids():

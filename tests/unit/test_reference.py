@@ -23,6 +23,8 @@ def clouds():
     lines = fs.SplatCloud(cloud.means, cloud.quats, scales, cloud.opacities, colors=cloud.colors)
     group = np.arange(90) // 3
     thick = np.column_stack([cloud.scales, cloud.scales.mean(1) * (group % 3)])
+    # balls that the camera is just outside of: their rims lie far from those of disks of their size
+    thick[::5] = np.linalg.norm(cloud.means[::5], axis=1, keepdims=True) / 5.6
     return {
         "splats": cloud,
         "ellipsoids": fs.SplatCloud(cloud.means, cloud.quats, thick, cloud.opacities, colors=cloud.colors),

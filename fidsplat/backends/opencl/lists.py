@@ -14,6 +14,7 @@ from itertools import pairwise
 import numpy as np
 import pyopencl as cl
 
+from fidsplat.backends.bands import cut
 from fidsplat.backends.opencl.memory_plan import BIG, KEYS, WINDOWS
 from fidsplat.backends.opencl.picture import Picture
 from fidsplat.errors import DeviceError
@@ -55,20 +56,6 @@ class Lists:
         arrays = {name: picture.resident.part(name, first, end) for name in wanted}
         picture.launch("project", "project", count, 64, count=count, **arrays)
 
-    def _bands_of(self, totals: np.ndarray, start: int = 0) -> list[tuple[int, int, int]]:
-        """Ranges of tiles (first, end, pairs) whose lists fit the budget.
-
-        totals (k,): lengths of the lists of the tiles from `start` on. A band holds at least one tile.
-        """
-        ends = np.cumsum(totals, dtype=np.int64)
-        bands, first, done = [], 0, 0
-        while first < len(totals):
-            room = done + self.picture.workspace.pair_budget
-            end = max(int(np.searchsorted(ends, room, side="right")), first + 1)
-            bands.append((start + first, start + end, int(ends[end - 1]) - done))
-            first, done = end, int(ends[end - 1])
-        return bands
-
 
 class OrderedLists(Lists):
     """Kernels scan.cl, sort.cl, bin.cl."""
@@ -104,7 +91,7 @@ class OrderedLists(Lists):
         bands = [(first, end, pairs)]
         if pairs > picture.workspace.pair_budget:
             totals = picture.read("bin totals", np.uint32, (picture.tiles,))[first:end]
-            bands = self._bands_of(totals, first)
+            bands = cut(totals, picture.workspace.pair_budget, first)
         for start, stop, listed in bands:
             picture.take("lists", 4 * listed)
             band = {"band_first": start, "band_end": stop}
@@ -285,7 +272,7 @@ class TiledLists(Lists):
         bands = [(0, picture.tiles, self._pairs)]
         if self._pairs > budget:
             tallies = picture.read("tallies", np.uint32, (_TALLIES + picture.tiles,))
-            bands = self._bands_of(tallies[_TALLIES:])
+            bands = list(cut(tallies[_TALLIES:], budget))
         room = max(max(listed for _, _, listed in bands), min(self._pairs * 5 // 4, budget))
         for first, end, _ in bands:
             self._list(first, end, room, first == 0)

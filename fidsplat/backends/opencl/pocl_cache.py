@@ -18,23 +18,17 @@ from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
+from fidsplat.backends.caches import pocl_folder
+
 _BITCODE, _ELF = b"BC\xc0\xde", b"\x7fELF\x02\x01"
 _ENTER_SUBBLOCK = 1
 _UNFINISHED = "tempfile_"
 
 
-def cache_folder() -> Path:
-    """Where PoCL keeps compiled kernels, as it looks for that place itself."""
-    if given := os.environ.get("POCL_CACHE_DIR"):
-        return Path(given)
-    cache = os.environ.get("XDG_CACHE_HOME")
-    return (Path(cache) if cache else Path.home() / ".cache") / "pocl" / "kcache"
-
-
 @cache
 def check_once() -> None:
     """Looks through PoCL's cache, once in a process."""
-    remove_broken(cache_folder())
+    remove_broken(pocl_folder())
 
 
 def remove_broken(folder: Path) -> int:
@@ -47,6 +41,8 @@ def remove_broken(folder: Path) -> int:
     try:
         last = stamp.stat().st_mtime
     except OSError:
+        last = 0.0
+    if last > now:  # the clock was put back: what is new looks old
         last = 0.0
     removed = 0
     for place, _, names in os.walk(folder):

@@ -10,8 +10,8 @@ from typing import Any
 
 import pyopencl as cl
 
+from fidsplat.backends.caches import pocl_folder
 from fidsplat.backends.opencl.assemble import Source, kernel_text, with_scalars
-from fidsplat.backends.opencl.pocl_cache import cache_folder
 from fidsplat.backends.opencl.pocl_target import correct_target, needs_correction
 from fidsplat.backends.opencl.workspace import DeviceBuffer, Workspace
 from fidsplat.errors import DeviceError
@@ -119,7 +119,7 @@ def _kernels_of(workspace: Workspace, source: Source) -> dict[str, cl.Kernel]:
             return kernels
     raise DeviceError(
         f"{workspace.info.title} gives a program without its kernels; its cache of compiled kernels may be "
-        f"damaged: remove {cache_folder()}"
+        f"damaged: remove {pocl_folder()}"
     )
 
 

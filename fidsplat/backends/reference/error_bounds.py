@@ -178,17 +178,18 @@ def first_column(mask: np.ndarray, start: int) -> np.ndarray:
     return start + np.where(mask.any(1), np.argmax(mask, axis=1), m) if m else np.full(k, start)
 
 
-def of_order(span: Span) -> tuple[Span, np.ndarray]:
+def of_order(span: Span, lift: np.ndarray) -> tuple[Span, np.ndarray]:
     """Of things (k, m) sorted by depth, the span with transmittances in front that hold in every order which
-    rounding leaves open, and what other orders may change (k,) in colour, per unit of colour.
+    rounding leaves open, and what other orders may change (k,) in colour, per unit of colour. lift (k, m): by
+    how much each counts as nearer.
 
     Two neighbours that change places change a colour by the product of their opacities and the light in front
     of them, at most; any order that is possible comes from such changes, of pairs whose depths meet.
     """
     k, m = span.low.shape
     may = span.high > 0
-    near = np.where(may, span.z_low - _DEPTH * np.abs(span.z_low), np.inf)
-    far = np.where(may, span.z_high + _DEPTH * np.abs(span.z_high), -np.inf)
+    near = np.where(may, span.z_low - lift - _DEPTH * np.abs(span.z_low), np.inf)
+    far = np.where(may, span.z_high - lift + _DEPTH * np.abs(span.z_high), -np.inf)
     furthest = np.maximum.accumulate(far, axis=1)
     nearest = np.minimum.accumulate(near[:, ::-1], axis=1)[:, ::-1]
     dimmed = np.log1p(-np.minimum(span.low, 1 - 2.0**-53))

@@ -13,6 +13,9 @@ from fidsplat.backends.reference.error_bounds import Span
 from fidsplat.backends.reference.fragments import Fragments, optical_depth
 from fidsplat.backends.reference.setup import Setup
 
+LIFT = 2.0**-16
+"""by what share of its depth a printed plane counts as nearer: more than rounding, less than is seen"""
+
 
 @dataclass
 class Stack:
@@ -85,10 +88,14 @@ def by_depth(s: Setup, f: Fragments, span: Span) -> Stack:
     columns = _side_by_side([_plain(s, f, span, plain), *(_layer(s, f, span, splats) for splats in members)])
     arrival = np.concatenate([plain, [splats[0] for splats in members]])
     may = columns.span.high > 0
-    depth = np.where(may, columns.z, np.inf)
+    # a printed plane lies before splats of none that lie in it
+    lift = np.where(np.arange(columns.z.shape[1]) < len(plain), 0.0, LIFT * np.abs(columns.z))
+    depth = np.where(may, columns.z - lift, np.inf)
     rank = np.lexsort((np.broadcast_to(arrival, depth.shape), depth, ~may), axis=1)
-    stack = columns.take(rank[:, : may.sum(1).max(initial=0)])
-    stack.span, stack.reordered = error_bounds.of_order(stack.span)
+    rank = rank[:, : may.sum(1).max(initial=0)]
+    stack = columns.take(rank)
+    lift = np.take_along_axis(lift, rank, 1)
+    stack.span, stack.reordered = error_bounds.of_order(stack.span, lift)
     return stack
 
 

@@ -12,15 +12,27 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.backends.bands import cut
 from fidsplat.backends.view import Shot, View
-from fidsplat.backends.warp import bands
 from fidsplat.backends.warp.launch import BLOCK, Launcher
 from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import kernels, load
-from fidsplat.backends.warp.structs import lens_of, moving_of, rays_of, surroundings_of, uniforms
+from fidsplat.backends.warp.structs import (
+    lens_of,
+    memory_bytes,
+    moving_of,
+    rays_of,
+    surroundings_of,
+    uniforms,
+)
 from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.effects import Output
+from fidsplat.errors import DeviceError
+
+# bytes: of one splat's bounds; of its window, keys, counts, drawn, places, sums; of one that is drawn, in
+# sort and lists; of a pair with the scratch of its sort
+_BOUNDS, _PROJECTED, _VISIBLE, _PAIR = 44, 36, 40, 24
 
 
 class WarpImages:
@@ -85,7 +97,7 @@ class Picture:
     def _exposed(self) -> Any:
         """All stages but the last of each shot, and what their samples are together."""
         whole = self._samples("exposed")
-        beside = bands.image_bytes(self.program, self.view, self.grid)
+        beside = self._image_bytes()
         for shot in self.view.shots:
             part = Picture(self.program, self.workspace, self.resident, shot.view, self.launcher, beside)
             samples = part._drawn()
@@ -146,7 +158,8 @@ class Picture:
         self._take("keys", n, wp.uint32)
         counts, ends = self._exact("counts", n, wp.int64), self._exact("ends_by_index", n, wp.int64)
         drawn, places = self._exact("drawn", n, wp.int32), self._exact("places", n, wp.int32)
-        cloud = {"boxes": drawn} | self.resident.arrays  # not read where all are of one kind
+        # not read where all are of one kind
+        cloud = {"boxes": drawn, "thickness": self.resident.arrays["opacities"]} | self.resident.arrays
         cloud |= {"moving": moving_of(self.resident, self.view, self.workspace)} | self._planes()
         self._launch(self.program.project, n, block=self.program.project_block, **cloud)
         wp.utils.array_scan(drawn, places, inclusive=True)
@@ -175,8 +188,7 @@ class Picture:
 
     def _bands(self, visible: int, pairs: int) -> Iterator[tuple[int, int, int]]:
         """Ranges of tiles (first, end, pairs) whose lists fit the budgets; one, unless they are long."""
-        images = bands.image_bytes(self.program, self.view, self.grid) + self.beside
-        most = bands.room(self.program, self.workspace, self.resident, self.view, visible, images)
+        most = self._room(visible)
         if pairs <= most:
             return iter([(0, self.tiles, pairs)])
         totals = self._take("tile_totals", self.tiles, self.wp.int32)
@@ -184,7 +196,34 @@ class Picture:
         self.program.load_banding()
         # in one piece: on the CPU its sums are plain additions
         self.launcher.once(self.program.lists.histogram, visible, {**self.held, "first": 0})
-        return bands.cut(totals.numpy()[: self.tiles], most)
+        return cut(totals.numpy()[: self.tiles], most)
+
+    def _image_bytes(self) -> int:
+        """What sample buffers, of the padded grid, and output images take."""
+        sizes = map(self.wp.types.type_size_in_bytes, self.program.sample_fields.values())
+        pixels = self.view.width * self.view.height // self.view.samples**2
+        channels = sum(output.channels for output in self.program.images)
+        return self.grid[0] * self.grid[1] * sum(sizes) + 4 * pixels * channels
+
+    def _room(self, visible: int) -> int:
+        """How many pairs may be listed at once within the budgets.
+
+        Raises:
+            DeviceError: what else the picture needs is more than the memory budget.
+        """
+        workspace, resident = self.workspace, self.resident
+        # as the stages take them; the sorts have as much again
+        each = 16 * self.program.layout.lines + _BOUNDS + _PROJECTED
+        fixed = resident.memory_bytes + each * resident.count + _VISIBLE * visible
+        fixed += self._image_bytes() + self.beside + memory_bytes(self.view, workspace)
+        pairs = (workspace.memory_budget - fixed) // _PAIR
+        if pairs < 1:
+            raise DeviceError(
+                f"a memory budget of {workspace.memory_budget / 2**20:.0f} MiB is too small for "
+                f"{resident.count} splats in this picture, which take {fixed / 2**20:.0f} MiB before their "
+                "lists; raise memory_budget, or use an OpenCL device, which draws a cloud in chunks"
+            )
+        return min(workspace.pair_budget, pairs)
 
     def _list(self, visible: int, first: int, end: int, pairs: int, whole: bool) -> None:
         """The lists of the tiles of one band, each in depth order."""

@@ -17,27 +17,22 @@ SLOTS = frozenset(
     {"camera_pinhole", "camera_orthographic", "color_rgb", "color_sh"}
     | {"camera_brown_conrady", "camera_fisheye", "camera_equirectangular"}
     | {"lowpass_none", "lowpass_screen", "lowpass_pixel", "stop_inclusive", "stop_exclusive"}
-    | {
-        "compose_ordered",
-        "compose_pixel",
-        "compose_planes",
-        "footprint_gaussian",
-        "footprint_box",
-        "footprint_mixed",
-    }
+    | {"ellipsoid_exact", "ellipsoid_ewa", "ellipsoid_ewa_antialiased"}
+    | {"compose_ordered", "compose_pixel", "compose_planes"}
+    | {"footprint_gaussian", "footprint_box", "footprint_mixed"}
     | {"background_constant", "background_gradient", "background_panorama"}
     | {"arithmetic_precise", "arithmetic_fast", "motion_groups", "shutter_exposure"}
-    # it changes no picture, and nothing here
-    | {"shutter_rows"}
+    # they change no picture, and nothing here
+    | {"shutter_rows", "ellipsoids_alone"}
 )
 """effects of slots that the kernels have; outputs and steps after blending are those that have a file"""
 # what depends on an effect: a stage is compiled once for all feature sets that mean the same to it
 _RECORD = (
     *("lowpass_screen", "rays", "camera_orthographic", "ray_depth"),
-    *("compose_pixel", "compose_planes", "footprint_box", "footprint_mixed"),
+    *("compose_pixel", "compose_planes", "footprint_box", "footprint_mixed", "ellipsoid_exact"),
 )
 _PROJECT = (
-    *(*_RECORD, "lowpass_pixel", "motion_groups"),
+    *(*_RECORD, "lowpass_pixel", "motion_groups", "ellipsoid_ewa", "ellipsoid_ewa_antialiased"),
     *("camera_brown_conrady", "camera_fisheye", "camera_equirectangular"),
 )
 _SAMPLE = (*_RECORD, "stop_exclusive", "arithmetic_fast", "rays_length")

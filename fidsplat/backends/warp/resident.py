@@ -56,6 +56,8 @@ class Resident:
             arrays["planes"] = planes.index
         if cloud.footprint == "mixed" and cloud.boxes is not None:
             arrays["boxes"] = cloud.boxes.astype(np.int32)
+        if cloud.thickness is not None:
+            arrays["thickness"] = cloud.thickness
         device = {name: _uploaded(name, array, pool) for name, array in arrays.items()}
         kinds = cloud.footprint, cloud.ellipsoids
         return cls(device, len(cloud), cloud.origin, cloud.sh_degree, planes, *kinds)
@@ -101,6 +103,7 @@ def _dtype(name: str) -> Any:
         "labels": wp.int32,
         "planes": wp.int32,
         "boxes": wp.int32,
+        "thickness": wp.float32,
     }[name]
 
 

@@ -13,8 +13,7 @@ from pathlib import Path
 from fidsplat.accuracy import TRUTH_CUTOFF
 from fidsplat.errors import FidsplatError
 from fidsplat.experiments.sweep import Key, Results, Sweep
-from fidsplat.experiments.tradeoff import decoding, points, scenes
-from fidsplat.experiments.tradeoff.compare import check_truth, compare_picture
+from fidsplat.experiments.tradeoff import compare, points, scenes
 from fidsplat.experiments.tradeoff.points import ALONE, BASE, MARKER_KNOB, PRESETS_KNOB
 from fidsplat.experiments.tradeoff.session import DEFINITION, FULL, QUICK, Session, time_point
 from fidsplat.files import writable_folder
@@ -99,7 +98,7 @@ def all_points(names: tuple[str, ...], knobs: tuple[str, ...], quick: bool) -> l
                     defined.add(definition)
                     found.append((tier + 1, _truth_key(view, definition)))
         if marked:
-            tilts = decoding.QUICK_TILTS if quick else decoding.FULL_TILTS
+            tilts = compare.QUICK_TILTS if quick else compare.FULL_TILTS
             ideal = {"knob": IDEAL, "value": IDEAL, "quality": None}
             keys = [ideal, *(point.key() for point in points.decode_points(turned, quick))]
             found += [(1, {"what": DECODE, "scene": name, **key, "tilts": tilts}) for key in keys]
@@ -114,15 +113,15 @@ def _begin(session: Session, key: Key, quick: bool) -> Callable[[], dict]:
     view = key["scene"]
     if key["what"] == DECODE:
         quality = None if key["quality"] is None else points.quality_of(key["quality"])
-        return decoding.scan(session, view, quality, key["tilts"])
+        return compare.scan(session, view, quality, key["tilts"])
     if key["what"] == TRUTH:
         asked = BASE.with_(**{name: key[name] for name in DEFINITION})
         full, truth = session.full(view, asked), session.truth(view, asked)
         scene = session.scene(view, asked.marker)
         facts = {"blend_precision": full.blend_precision, "alpha_cutoff": TRUTH_CUTOFF}
-        return lambda: facts | check_truth(truth, scene, full)
+        return lambda: facts | compare.check_truth(truth, scene, full)
     quality = points.quality_of(key["quality"])
     frame, times = time_point(session, view, quality, QUICK if quick else FULL)
     picture, truth = frame["rgb"], session.truth(view, quality)
     scene = session.scene(view, quality.marker)
-    return lambda: times | compare_picture(picture, truth, scene, quality)
+    return lambda: times | compare.compare_picture(picture, truth, scene, quality)

@@ -5,6 +5,7 @@
     record.z_numerator = (wide)z_numerator;
     record.z_center = (wide)pz;
     record.z_reach = (wide)reach;
+//@@ depth_reach
 //@ seen
     vfloat z;
 //@ see

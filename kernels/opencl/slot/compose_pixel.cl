@@ -4,9 +4,20 @@
 // (part/waiting_*.cl). There is room for WAITING at a pixel. Of more the furthest is dropped, with all that lies behind it
 // (`until`), and the list is gone through again for what was dropped (`from`), until nothing is: the picture does not depend
 // on WAITING.
+//
+// What is fainter than 1/255 of its splat lies no nearer and no further than the rest, whatever the cut-off: depths, and with
+// them the order, are the same at every cut-off.
+//@ functions
+#define RANGE_RADIUS REAL(3.3290429691304455)   // sqrt(2 ln 255)
+#ifndef BOX_HERE
+#define BOX_HERE false
+#endif
 //@ project
-    record.nearest = (wide)convert_float_rtn((wide)pz - (wide)reach);
+    real depth_reach = BOX_HERE ? reach : reach * (RANGE_RADIUS / radius);
+    record.nearest = (wide)convert_float_rtn((wide)pz - (wide)depth_reach);
 //@@ plane_nearest
+//@ depth_reach
+    record.z_reach = (wide)depth_reach;
 //@ key
     key = (float)record.nearest;
 //@ state
@@ -17,4 +28,8 @@
                                , global const Splat *splats, uint splat, uint place
 //@ compose
 //@@ compose_plane
+    if (waiting_not(&pixel->waiting, s->nearest, seen.z, mask)) {
+        composite(pixel, &seen, opacity, mask, constants);
+        return;
+    }
     waiting_take(pixel, s->nearest, seen.z, opacity, splat, place, mask, splats, constants);

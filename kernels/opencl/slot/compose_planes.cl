@@ -16,6 +16,7 @@
 
 typedef struct {
     int plane;                  // -1: no layer
+    wide nearest;               // its splats' key
     uint place;                 // of the first of its splats in the list
     vint lanes;                 // where it has fragments
     vfloat opacity;             // 1 - the product of its fragments' transmittances; itself, so that a faint one stays exact
@@ -80,11 +81,13 @@ static inline void layer_gather(Layer *layer, const Splat *s, const Seen *seen, 
 //@@ gather
 }
 //@ plane_functions
-// Nothing more comes of the open layer's plane: it waits.
+// Nothing more comes of the open layer's plane: it waits, nearer by a little more than depths are rounded, so that it lies
+// before splats of no plane that lie in it.
 static inline void layer_close(Pixel *pixel, wide nearest, global const Splat *splats, const BlendConstants *constants) {
     const Layer *open = &pixel->open;
     if (open->plane < 0) return;
-    waiting_take(pixel, nearest, open->mean.z, open->opacity, LAYER, open->place, open->lanes, splats, constants);
+    vfloat z = fmax(FMA(fabs(open->mean.z), (vfloat)-0x1p-16f, open->mean.z), (vfloat)open->nearest);
+    waiting_take(pixel, nearest, z, open->opacity, LAYER, open->place, open->lanes, splats, constants);
     pixel->open = no_layer();
 }
 
@@ -94,6 +97,7 @@ static inline void layer_close(Pixel *pixel, wide nearest, global const Splat *s
     if (s->plane != pixel->open.plane) {
         layer_close(pixel, s->nearest, splats, constants);
         pixel->open.plane = s->plane;
+        pixel->open.nearest = s->nearest;
         pixel->open.place = place;
     }
     if (s->plane >= 0) {

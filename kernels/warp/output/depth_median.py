@@ -45,23 +45,26 @@ def sorted_in(values: Any, count: int, value: float):
 
 
 @wp.func
-def middle_of(values: Any, count: int) -> float:
-    """The lower median of `count` values in order; 0 of none."""
-    if count > 0:
-        return values[(count - 1) / 2]
-    return 0.0
-
-
-@wp.func
-def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
+def median_of(grid: PixelGrid, samples: Any, lengths: Any, stretched: bool) -> float:
+    """The lower median of the pixel's samples that have a median depth, along their rays if `stretched`; 0 if
+    none has one."""
     medians = type(lengths)()
     hits = int(0)
     for k in range(grid.count):
         half = samples.depth_median[sample_at(grid, k)]
         if half > 0.0:
+            if stretched:
+                half = half * lengths[k]
             medians = sorted_in(medians, hits, half)
             hits += 1
-    out.depth_median[grid.pixel] = middle_of(medians, hits)
+    if hits > 0:
+        return medians[(hits - 1) / 2]
+    return 0.0
+
+
+@wp.func
+def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
+    out.depth_median[grid.pixel] = median_of(grid, samples, lengths, False)
 
 
 OUTPUT = Output(

@@ -1,0 +1,63 @@
+"""Places for what drivers keep between runs (PoCL, pyopencl, Warp), where theirs cannot be written.
+
+PoCL without such a place shows no device, or refuses to compile, and pyopencl's caches fail.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import warnings
+import weakref
+from functools import cache
+from pathlib import Path
+
+from fidsplat.errors import InputError
+from fidsplat.files import user_cache, writable_folder
+
+LEAST_FREE = 2**25
+"""bytes, several times what the kernels of a picture take"""
+
+
+def pocl_folder() -> Path:
+    """Where PoCL keeps compiled kernels, as it looks for that place itself."""
+    if given := os.environ.get("POCL_CACHE_DIR"):
+        return Path(given)
+    home = os.environ.get("HOME")
+    cache = os.environ.get("XDG_CACHE_HOME") or (f"{home}/.cache" if home else "/tmp")
+    return Path(cache) / "pocl" / "kcache"
+
+
+@cache
+def ensure_caches() -> None:
+    """Before a driver is first asked for something: for each cache that cannot be written, or has no room, a
+    folder for this process, named in the environment. Warns."""
+    where = {"POCL_CACHE_DIR": pocl_folder(), "XDG_CACHE_HOME": user_cache()}
+    lacking = {name: why for name, folder in where.items() if (why := _lack(folder))}
+    if "XDG_CACHE_HOME" not in os.environ and os.path.expanduser("~") == "~":
+        lacking["XDG_CACHE_HOME"] = "this user has no home folder"
+    if not lacking:
+        return
+    place = Path(tempfile.mkdtemp(prefix="fidsplat-cache-"))
+    weakref.finalize(ensure_caches, _remove, place, os.getpid())
+    os.environ.update({name: str(place / name.lower()) for name in lacking})
+    warnings.warn(
+        f"kernels are compiled anew in this run: {'; '.join(lacking.values())}; "
+        f"set {' and '.join(lacking)} to a folder with room",
+        stacklevel=2,
+    )
+
+
+def _lack(folder: Path) -> str:
+    """Why nothing can be kept in a folder; empty if it can."""
+    try:
+        free = shutil.disk_usage(writable_folder(folder)).free
+    except (OSError, InputError) as error:
+        return str(error).partition(";")[0]
+    return "" if free >= LEAST_FREE else f"{folder} has room for {free // 2**20} MB only"
+
+
+def _remove(place: Path, process: int) -> None:
+    if os.getpid() == process:  # not where a fork of it ends
+        shutil.rmtree(place, ignore_errors=True)

@@ -1,0 +1,85 @@
+"""Drivers get a place for what they keep where their own cannot be written."""
+
+import os
+import subprocess
+import sys
+import warnings
+from collections import namedtuple
+from pathlib import Path
+
+import pytest
+
+from fidsplat.backends import caches
+
+NAMES = ("POCL_CACHE_DIR", "XDG_CACHE_HOME")
+
+
+@pytest.fixture
+def ensure(monkeypatch, tmp_path):
+    """Calls `ensure_caches` with some places, and returns what it warned of."""
+    made = []
+
+    def call(**places) -> str:
+        for name in NAMES:
+            monkeypatch.setenv(name, str(places.get(name, tmp_path / name)))
+        with warnings.catch_warnings(record=True) as heard:
+            warnings.simplefilter("always")
+            caches.ensure_caches.__wrapped__()
+        made.extend(Path(os.environ[name]) for name in places)
+        return " ".join(str(one.message) for one in heard)
+
+    yield call
+    for folder in made:
+        if "fidsplat-cache-" in str(folder):
+            caches._remove(folder.parent, os.getpid())
+            assert not folder.parent.exists()
+
+
+def test_what_can_be_written_stays(ensure, tmp_path):
+    assert ensure() == ""
+    assert [os.environ[name] for name in NAMES] == [str(tmp_path / name) for name in NAMES]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_cache_that_cannot_be_written_is_replaced(ensure, name):
+    said = ensure(**{name: "/dev/null/nowhere"})
+    assert said.startswith(
+        "kernels are compiled anew in this run: cannot write into the folder /dev/null/nowhere"
+    )
+    assert said.endswith(f"; set {name} to a folder with room")
+    assert Path(os.environ[name]).parent.name.startswith("fidsplat-cache-")
+
+
+def test_a_disk_without_room(ensure, monkeypatch):
+    monkeypatch.setattr(caches.shutil, "disk_usage", lambda _: namedtuple("Usage", "free")(2**20))
+    said = ensure(POCL_CACHE_DIR="/tmp", XDG_CACHE_HOME="/tmp")
+    assert "/tmp has room for 1 MB only" in said
+    assert said.endswith("set POCL_CACHE_DIR and XDG_CACHE_HOME to a folder with room")
+
+
+def test_nobody_without_a_home(ensure, monkeypatch):
+    monkeypatch.setattr(caches.os.path, "expanduser", lambda text: text)
+    monkeypatch.setenv("XDG_CACHE_HOME", "")
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("POCL_CACHE_DIR", "/tmp")
+    with pytest.warns(UserWarning, match="this user has no home folder; set XDG_CACHE_HOME"):
+        caches.ensure_caches.__wrapped__()
+    caches._remove(Path(os.environ["XDG_CACHE_HOME"]).parent, os.getpid())
+
+
+def test_a_picture_is_drawn_all_the_same(tmp_path):
+    """And what it took is removed."""
+    draw = (
+        "import fidsplat as fs, tempfile; from fidsplat.random_clouds import random_splats;"
+        "camera = fs.Camera.pinhole(8, 8, 8, 8, 4, 4);"
+        "print(fs.Renderer('opencl:pocl').render(random_splats(3, 0), camera)['rgb'].shape)"
+    )
+    places = dict.fromkeys(NAMES, "/dev/null/nowhere") | {"TMPDIR": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", draw], env=os.environ | places, capture_output=True, text=True
+    )
+    if "no OpenCL" in done.stderr:
+        pytest.skip("there is no PoCL here")
+    assert done.stdout == "(8, 8, 3)\n", done.stderr
+    assert "kernels are compiled anew" in done.stderr
+    assert list(tmp_path.glob("fidsplat-cache-*")) == []
