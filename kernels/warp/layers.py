@@ -19,38 +19,54 @@ DARKEST = wp.constant(wp.float32(2.0**-24))
 """transmittance of an opaque fragment, whose optical depth would be infinite"""
 
 
+NEARER = wp.constant(wp.float32(-(2.0**-16)))
+"""of a depth, by which a layer lies before what lies in its plane"""
+
+
 def make_layer(Seen, effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
     """Layer, and what is known of it: gather, gather_box; nothing, depth, shown."""
     log = fast_log if "arithmetic_fast" in effects else wp.log
     gathers, averages = (output.functions(outputs, part) for part in ("gather", "average"))
     # tau: optical depth; `mean`: sums over fragments, each times its optical depth; of boxes, its opacity
-    # place: of the first in the list
-    fields = {"plane": wp.int32, "place": wp.int32, "opacity": wp.float32, "tau": wp.float32, "mean": Seen}
+    # place: of the first in the list; nearest: depth before which none lies
+    fields = {
+        "plane": wp.int32,
+        "place": wp.int32,
+        "nearest": wp.float32,
+        "opacity": wp.float32,
+        "tau": wp.float32,
+        "mean": Seen,
+    }
     fields |= output.fields(outputs, "layer")
     Layer = struct_of("Layer", "What a sample sees of one plane; plane -1: nothing.", fields)
 
     @wp.func
-    def begun(plane: int, place: int):
+    def begun(plane: int, place: int, nearest: float):
         """The layer of a plane before its first fragment, whose splat stands at this place of the list."""
         layer = Layer()
         layer.plane = plane
         layer.place = place
+        layer.nearest = nearest
         return layer
 
     @wp.func
     def nothing():
-        return begun(-1, 0)
+        return begun(-1, 0, 0.0)
 
     @wp.func
     def depth(layer: Layer) -> float:
-        return layer.mean.z / layer.tau
+        """The depth at which it waits: nearer by a little more than depths are rounded, so that it lies before
+        splats of no plane that lie in it.
+        """
+        z = layer.mean.z / layer.tau
+        return wp.max(fma(wp.abs(z), NEARER, z), layer.nearest)
 
     @wp.func
     def shown(layer: Layer):
         """What the layer shows as one thing."""
         seen = layer.mean
         seen.rgb = layer.mean.rgb / layer.tau
-        seen.z = depth(layer)
+        seen.z = layer.mean.z / layer.tau
         for k in range(wp.static(len(averages))):
             seen = wp.static(averages[k])(seen, layer.tau)
         return seen

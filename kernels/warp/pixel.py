@@ -152,7 +152,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) ->
             nearest, plane = nearest_of(lines, index), planes[index]
             if plane != p.queue.open.plane:
                 p = waiting.close(p, nearest, lines, lists, view)
-                p.queue.open = layer.begun(plane, place)
+                p.queue.open = layer.begun(plane, place, nearest)
             if plane < 0:
                 return waiting.take(p, nearest, z, opacity, place, lines, lists, view)
             seen = see(color, wp.max(z, nearest), lines, index)

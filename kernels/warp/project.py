@@ -57,6 +57,7 @@ def make_project(
     words = wp.types.vector(4 * layout.lines, wp.float32)
     sqrt_half, sqrt_two = real(math.sqrt(0.5)), real(math.sqrt(2.0))
     edge_on = real(1e-13 if precision == "float64" else 1e-6)
+    range_radius = real(math.sqrt(2.0 * math.log(255.0)))
     one, two, half, zero = real(1.0), real(2.0), real(0.5), real(0.0)
     all_boxes, mixed = "footprint_box" in effects, "footprint_mixed" in effects
     boxes_too = all_boxes or mixed
@@ -378,10 +379,16 @@ def make_project(
         if wp.static(has_depth):
             record[at_depth] = float(height * facing)
             record[at_depth + 1] = float(depth)
-            record[at_depth + 2] = float(reach)
+            depth_reach = reach
+            if wp.static(waits):
+                # what is fainter than 1/255 of its splat lies within the rest, so that the order is the same
+                # at every cut-off
+                if not boxed:
+                    depth_reach = reach * (range_radius / radius)
+            record[at_depth + 2] = float(depth_reach)
         key = float(depth)
         if wp.static(waits):
-            key = float(depth) - float(reach)  # as blending bounds depths
+            key = float(depth) - float(depth_reach)  # as blending bounds depths
             if wp.static(layers):
                 if planes[i] >= 0:
                     key = plane_keys[planes[i]]
