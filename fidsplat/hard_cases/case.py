@@ -1,4 +1,4 @@
-"""A hard case: a name of the catalogue (numerics.md, A1 to F6), its trigger, and pictures and numbers that
+"""A hard case: a name of the catalogue (numerics.md, A1 to G5), its trigger, and pictures and numbers that
 must hold."""
 
 from __future__ import annotations

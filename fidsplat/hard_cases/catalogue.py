@@ -9,6 +9,7 @@ from fidsplat.hard_cases import (  # noqa: F401  each enters its cases
     d_alpha,
     e_inputs,
     f_arithmetic,
+    g_ellipsoids,
 )
 from fidsplat.hard_cases.case import CASES, Case
 
@@ -19,10 +20,11 @@ GROUPS = {
     "D": "alpha, depth",
     "E": "inputs, sizes",
     "F": "arithmetic",
+    "G": "3D Gaussians",
 }
 """Letter of each group of the catalogue -> what it is about."""
 
 
-def all_cases(groups: str = "ABCDEF") -> tuple[Case, ...]:
+def all_cases(groups: str = "ABCDEFG") -> tuple[Case, ...]:
     """Every case of the groups named by their letters, in the catalogue's order."""
     return tuple(sorted((case for case in CASES if case.name[0] in groups), key=lambda case: case.name))

@@ -38,19 +38,23 @@ def turned(axis, degrees: float) -> np.ndarray:
 def splats(
     means, quats, scales, opacities: ArrayLike = 1.0, colors: ArrayLike = ORANGE, **more
 ) -> SplatCloud:
-    """A cloud of n splats: means (n, 3); the others (n, ...) or the value of them all."""
+    """A cloud of n splats: means (n, 3); the others (n, ...) or the value of them all; scales of three are
+    those of 3D Gaussians."""
     n = len(means)
 
     def each(value, *shape) -> np.ndarray:
         return np.broadcast_to(np.asarray(value, float), (n, *shape))
 
     more.setdefault("labels", np.arange(n) % 100)
-    return SplatCloud(means, each(quats, 4), each(scales, 2), each(opacities), colors=each(colors, 3), **more)
+    sizes = each(scales, 3 if np.shape(scales)[-1:] == (3,) else 2)
+    return SplatCloud(means, each(quats, 4), sizes, each(opacities), colors=each(colors, 3), **more)
 
 
 def taken(cloud: SplatCloud, index) -> SplatCloud:
     """The splats at an index array, in its order."""
     names = ("means", "quats", "scales", "opacities", "colors", "sh", "labels")
     arrays = {name: array[index] for name in names if (array := getattr(cloud, name)) is not None}
+    if cloud.thickness is not None:
+        arrays["scales"] = np.column_stack([arrays["scales"], cloud.thickness[index]])
     chosen = SplatCloud(**arrays, origin=cloud.origin)
     return chosen if cloud.planes is None else chosen.with_planes(cloud.planes[index])

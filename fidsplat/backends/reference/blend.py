@@ -63,6 +63,7 @@ def composite(
         )
     if "normal" in features.names:
         out["normal"] = _sum(weight, stack.normal)
+        out["normal_moved"] = (f.alpha * s.turned).sum(1)
     ids = {"label": stack.labels, "splat_id": stack.ids}
     flips = {"label": stack.label_may_flip, "splat_id": stack.id_may_flip}
     for name in sorted(ids.keys() & features.names):

@@ -13,6 +13,7 @@ import numpy as np
 
 from fidsplat.backends.view import View
 
+_ROUND = 1e-15  # of a direction in float64
 EWA_SPREAD = 0.3
 """square pixels, by which 3DGS widens the covariance of every image"""
 
@@ -34,13 +35,16 @@ class Axes:
     """1 / |W p|^2; 0 of disks"""
     faint: np.ndarray
     """what is added to the logarithm of the opacity"""
+    turned: np.ndarray
+    """by how much the normal may be off: a flat one's turns by a right angle within the square of its
+    flatness of edge-on"""
 
 
 def disks(unit_a: np.ndarray, unit_b: np.ndarray, scale: np.ndarray) -> Axes:
     """Of disks with unit tangents (n, 3) and standard deviations (n, 2)."""
     n, area = len(scale), scale.prod(axis=1)
     a, b, normal = unit_a * scale[:, :1], unit_b * scale[:, 1:], np.cross(unit_a, unit_b)
-    return Axes(a, b, normal, area, np.zeros((n, 3)), np.zeros(n), np.zeros(n))
+    return Axes(a, b, normal, area, np.zeros((n, 3)), np.zeros(n), np.zeros(n), np.zeros(n))
 
 
 def exact(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View) -> Axes:
@@ -57,10 +61,13 @@ def exact(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View) -> Ax
         e1 = np.cross(e2, e3)
         a, b = (np.einsum("nk,nkc->nc", e * scales, axes) for e in (e1, e2))
         normal = np.einsum("nk,nkc->nc", white / scales * scales.min(axis=1)[:, None] ** 2, axes)
-        normal /= np.linalg.norm(normal, axis=1)[:, None]
+        length = np.linalg.norm(normal, axis=1)
+        turned = _ROUND * np.linalg.norm(towards, axis=1) / length
+        normal /= length[:, None]
         area = scales.prod(axis=1) * m / np.einsum("nc,nc->n", normal, towards)
         none = np.zeros(len(p))
-        return Axes(a, b, normal, area, towards / m[:, None], none if view.parallel else 1 / m**2, none)
+        inverse_m2 = none if view.parallel else 1 / m**2
+        return Axes(a, b, normal, area, towards / m[:, None], inverse_m2, none, turned)
 
 
 def ewa(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View, antialiased: bool) -> Axes:
@@ -86,4 +93,4 @@ def ewa(axes: np.ndarray, scales: np.ndarray, p: np.ndarray, view: View, antiali
     normal = np.stack([none, none, one], 1)
     with np.errstate(divide="ignore"):
         faint = 0.5 * np.log(before / after) if antialiased else none
-    return Axes(a, b, normal, a[:, 0] * b[:, 1], np.zeros_like(a), none, faint)
+    return Axes(a, b, normal, a[:, 0] * b[:, 1], np.zeros_like(a), none, faint, none)

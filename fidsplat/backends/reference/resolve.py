@@ -67,6 +67,7 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
         turns = view.turns_of_rows[np.floor(center_y / view.samples).astype(int)]
         out["normal_world"] = np.einsum("ki,kij->kj", out["normal"], turns)
         moved = 2 * bound_covered + _ROUND * (1 - samples["t"]).sum(1)
+        moved += np.where(covered, samples["normal_moved"], 0.0).sum(1)
         out["certificate_normal"] = _where_covered(
             _ratio(moved, length - bound_covered, math.inf), covered, unsure
         )

@@ -77,7 +77,7 @@ class Setup:
         order = order[np.argsort(self.key[order], kind="stable")]
         self.order = order
 
-        normal = shape.normal[order]
+        normal, self.turned = shape.normal[order], shape.turned[order]
         self.inverse_m2 = shape.inverse_m2[order]
         """above 0 for 3D Gaussians that are drawn exactly"""
         a, b, p, area = a[order], b[order], p[order], area[order]
@@ -135,7 +135,8 @@ class Setup:
 _RANGE_RADIUS = math.sqrt(2 * math.log(255))
 """radius, in standard deviations, of the part of a splat whose depths bound those of all of it"""
 _OF_SPLATS = (
-    *("order", "log_opacity", "half_r2", "reach", "labels", "pz", "z_numerator", "inverse_m2"),
+    *("order", "log_opacity", "half_r2", "reach", "labels", "pz", "z_numerator"),
+    *("inverse_m2", "turned"),
     *("box", "dot", "center_x", "center_y", "anchor_x", "anchor_y", "colors", "normal", "nearest"),
 )
 """arrays (n, ...) of a Setup"""

@@ -79,6 +79,9 @@ static inline void waiting_push(Pixel *pixel, wide nearest, wide z, wide opacity
     }
 }
 
+// All fragments go the same way.
+static inline bool waiting_not(const Waiting *waiting, wide nearest, wide z, int mask) { return false; }
+
 // Takes a fragment of a splat of which none is nearer than `nearest`; place: the splat, which says where in the list it stands.
 static inline void waiting_take(Pixel *pixel, wide nearest, wide z, wide opacity, uint splat, uint place, int mask,
                                 global const Splat *splats, const BlendConstants *constants) {

@@ -73,6 +73,11 @@ static inline void waiting_put(Pixel *pixel, int before, vfloat z, vfloat opacit
     waiting->bounded = 1;
 }
 
+// Whether a fragment need not wait: nothing waits, and nothing that follows can be nearer.
+static inline bool waiting_not(const Waiting *waiting, wide nearest, vfloat z, vint mask) {
+    return waiting->count == 0 && !waiting->bounded && !VANY(mask & VMASK(z > nearest));
+}
+
 // Takes a fragment of the splat at `place` in the list, of which none is nearer than `nearest`.
 static inline void waiting_take(Pixel *pixel, wide nearest, vfloat z, vfloat opacity, uint splat, uint place, vint mask,
                                 global const Splat *splats, const BlendConstants *constants) {

@@ -28,4 +28,8 @@
                                , global const Splat *splats, uint splat, uint place
 //@ compose
 //@@ compose_plane
+    if (waiting_not(&pixel->waiting, s->nearest, seen.z, mask)) {
+        composite(pixel, &seen, opacity, mask, constants);
+        return;
+    }
     waiting_take(pixel, s->nearest, seen.z, opacity, splat, place, mask, splats, constants);
