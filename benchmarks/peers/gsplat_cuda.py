@@ -1,4 +1,5 @@
-"""fidsplat beside gsplat's `rasterization_2dgs` on one NVIDIA GPU, the same scenes in the same run.
+"""fidsplat beside gsplat on one NVIDIA GPU, the same scenes in the same run: disks by `rasterization_2dgs`,
+scenes of 3D Gaussians (r100k_720p_3d ...) by `rasterization`, 3DGS.
 
     pip install . torch gsplat       # 1.5.3; the latest: git+https://github.com/nerfstudio-project/gsplat
     python benchmarks/peers/gsplat_cuda.py r100k_720p r1m_1080p r5m_1080p r20m_4k --json gsplat.json
@@ -24,11 +25,12 @@ from fidsplat.timing import Timer
 
 
 def tensors(cloud: SplatCloud, camera: Camera) -> dict:
-    """The arguments of `rasterization_2dgs`, on the GPU: one camera, plain colours, three scales of which the
-    last is not used."""
+    """The arguments of both rasterizations, on the GPU: one camera, plain colours, three scales, the last of
+    which disks do not use."""
     if cloud.colors is None:
         raise SystemExit("gsplat_cuda: this scene has colours that depend on the view; choose another")
-    scales = np.concatenate([cloud.scales, np.ones((len(cloud), 1), np.float32)], 1)
+    third = np.ones(len(cloud), np.float32) if cloud.thickness is None else cloud.thickness
+    scales = np.column_stack([cloud.scales, third])
     arrays = {
         "means": cloud.means + cloud.origin.astype(np.float32),
         "quats": cloud.quats,
@@ -65,9 +67,11 @@ def main() -> None:
 
         last = {}  # what gsplat tells of the latest frame
 
-        def draw(given=given, last=last):
+        rasterize = gsplat.rasterization_2dgs if cloud.thickness is None else gsplat.rasterization
+
+        def draw(given=given, last=last, rasterize=rasterize):
             with torch.no_grad():
-                colors, *_, last["meta"] = gsplat.rasterization_2dgs(**given, packed=options.packed)
+                colors, *_, last["meta"] = rasterize(**given, packed=options.packed)
             torch.cuda.synchronize()
             return _Picture(colors)
 
