@@ -266,3 +266,25 @@ def test_slopes_of_a_raster_are_the_differences_of_its_rays(lens):
         np.testing.assert_allclose(slopes[seen, axis], want[seen], atol=3e-5)
         furthest = max(furthest, np.linalg.norm(want[seen], axis=1).max())
     assert raster.step > furthest * 0.999
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        fs.Camera.pinhole(90, 70, 80.0, 85.0, 40.0, 36.0, lens=BrownConrady.opencv(COEFFICIENTS[3])),
+        fs.Camera.fisheye(90, 70, math.radians(200)),
+        fs.Camera.equirectangular(90, 70),
+    ],
+    ids=["distortion", "fisheye", "panorama"],
+)
+def test_rays_of_a_raster_go_through_the_centres_of_its_samples(camera):
+    """Back on the picture they are there, to what float32 rounds. No comparison with the reference asks that:
+    it has the same rays."""
+    raster = RayRaster(camera.lens, 90, 70, camera.fx, camera.fy, camera.cx, camera.cy)
+    for rows in (raster, raster.cropped(30, 50)):
+        seen = np.isfinite(rows.rays[..., 0])
+        assert seen.mean() > 0.5
+        back = camera.project(rows.rays[seen].astype(float))
+        row, column = np.nonzero(seen)
+        np.testing.assert_allclose(back[:, 0], column + 0.5, atol=1e-4)
+        np.testing.assert_allclose(back[:, 1], row + rows.top + 0.5, atol=1e-4)

@@ -52,6 +52,7 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
         sv = 1;
     }
 //@ footprint_reach
+    const real own_radius = radius;                     // the cone's is for bounds alone
     if (THICK_HERE) {
         reach = radius * sqrt(a.z * a.z + b.z * b.z + third.z * third.z);
 //@@ camera_ellipsoid_reach
@@ -62,6 +63,8 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
     if (THICK_HERE && pz - reach < near) {
 //@@ camera_ellipsoid_box
     }
+//@ footprint_bounds
+    radius = own_radius;
 //@ footprint_dot
         // the disk's rule for dots that never count knows nothing of fragments that `near` cuts off the ellipsoid
         if (THICK_HERE && pz >= near && pz - reach < near) record.dot_x = (wide)(center_x - anchor_x);
