@@ -55,8 +55,8 @@ def make_layer(Seen, effects: tuple[str, ...], outputs: tuple[str, ...]) -> Simp
 
     @wp.func
     def depth(layer: Layer) -> float:
-        """The depth at which it waits: nearer by a little more than depths are rounded, so that it lies before
-        splats of no plane that lie in it.
+        """The depth at which it waits: nearer by a little more than depths are rounded, so that it lies
+        before splats of no plane that lie in it.
         """
         z = layer.mean.z / layer.tau
         return wp.max(fma(wp.abs(z), NEARER, z), layer.nearest)

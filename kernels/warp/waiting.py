@@ -112,7 +112,7 @@ def make_waiting(Pixel, composite, see_of, layer: SimpleNamespace | None, room: 
         p.queue.until = place
         more = bool(True)
         while more:
-            at = p.queue.place[last]
+            at = int(p.queue.place[last])
             more = p.queue.z[last] > z or (p.queue.z[last] == z and list_place(p, at) >= place)
             if more:
                 p = without(p, at)
@@ -150,7 +150,8 @@ def make_waiting(Pixel, composite, see_of, layer: SimpleNamespace | None, room: 
             if p.queue.z[last] <= z:
                 return without(drop_from(p, z, list_place(p, place)), place)
             p = drop_from(p, p.queue.z[last], list_place(p, p.queue.place[last]))
-        first_z, first_opacity, first_place = p.queue.z[0], p.queue.opacity[0], p.queue.place[0]
+        first_z, first_opacity = float(p.queue.z[0]), float(p.queue.opacity[0])
+        first_place = int(p.queue.place[0])
         if z < first_z:
             return composite_at(p, z, opacity, place, lines, lists, view)
         for k in range(wp.static(last)):
@@ -197,7 +198,7 @@ def make_waiting(Pixel, composite, see_of, layer: SimpleNamespace | None, room: 
         """The pixel with what waits no further than `nearest` composited."""
         p = pixel
         for k in range(wp.static(room)):
-            place = p.queue.place[k]
+            place = int(p.queue.place[k])
             if p.queue.z[k] <= nearest and place != _NOTHING:
                 p = composite_at(p, p.queue.z[k], p.queue.opacity[k], place, lines, lists, view)
                 p.queue.z[k] = -wp.inf
@@ -216,17 +217,16 @@ def make_waiting(Pixel, composite, see_of, layer: SimpleNamespace | None, room: 
         p = pixel
         if p.queue.open.plane < 0:
             return p
-        z, opacity, place = depth(p.queue.open), p.queue.open.opacity, p.queue.open.place
+        z, opacity, place = depth(p.queue.open), float(p.queue.open.opacity), int(p.queue.open.place)
         if is_taken(p, z, place):
             if p.queue.first.plane >= 0 and p.queue.second.plane >= 0:
                 p = composite_until(p, nearest, lines, lists, view)
             if p.queue.first.plane >= 0 and p.queue.second.plane >= 0:
                 # room for two: the furthest of three is dropped
-                far_z, far = depth(p.queue.first), p.queue.first.place
-                if depth(p.queue.second) > far_z or (
-                    depth(p.queue.second) == far_z and p.queue.second.place > far
-                ):
-                    far_z, far = depth(p.queue.second), p.queue.second.place
+                far_z, far = depth(p.queue.first), int(p.queue.first.place)
+                other_z, other = depth(p.queue.second), int(p.queue.second.place)
+                if other_z > far_z or (other_z == far_z and other > far):
+                    far_z, far = other_z, other
                 if z >= far_z:
                     far_z, far = z, place
                 p = drop_from(p, far_z, far)
