@@ -90,8 +90,12 @@ def join(summaries: Sequence[Summary], about: Sequence[str]) -> Summary:
         runs += summary.runs
     rows = pd.concat(frames, ignore_index=True)
     chosen = rows.sort_values("amount", ascending=False, kind="stable").drop_duplicates(list(about))
-    notes = [note for summary in summaries for note in summary.notes]
-    return Summary(rows.loc[sorted(chosen.index)].reset_index(drop=True), runs, notes)
+    rows = rows.loc[sorted(chosen.index)].reset_index(drop=True)
+    # a report that is made again finds the tables of the one before, and needs none of their rows
+    used = sorted(set(rows["run"]))
+    rows["run"] = rows["run"].map({number: place for place, number in enumerate(used)})
+    notes = list(dict.fromkeys(note for summary in summaries for note in summary.notes))
+    return Summary(rows, [runs[number] for number in used], notes)
 
 
 def provenance(summaries: Mapping[str, Summary]) -> Frame:

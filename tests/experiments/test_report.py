@@ -227,6 +227,20 @@ def test_results_of_another_version_are_one_line(tmp_path):
         make_report([tmp_path], tmp_path)
 
 
+def test_a_report_that_is_made_again_has_the_same_tables(tmp_path):
+    """From its results and from the tables that lie beside them."""
+    results = Results(tmp_path / "counts.jsonl", run_facts(None, 0))
+    part = {"dark": 3, "light": 4}
+    found = {key: part for key in ("cells", "runs", "rectangles", "components")}
+    found |= {"gaussians": {"exact": {"rectangles": 7}}, "seconds": {"exact": [0.1, 0.2]}}
+    results.append({"category": "apriltag", "index": 0, "repeats": 2}, found)
+    first = load([tmp_path])["counts"].write(tmp_path / "counts.csv")
+    text = (tmp_path / "counts.csv").read_bytes()
+    load([tmp_path])["counts"].write(tmp_path / "counts.csv")
+    assert (tmp_path / "counts.csv").read_bytes() == text
+    assert len(first.runs) == 1
+
+
 def test_a_table_with_words_for_numbers_is_one_line(tmp_path):
     whole = (Path(__file__).parents[2] / "docs" / "results" / "counts.csv").read_text().splitlines()
     (tmp_path / "counts.csv").write_text("\n".join([*whole[:2], whole[2].replace(",48,52,", ",x,52,")]))
