@@ -383,9 +383,7 @@ def make_project(
             if wp.static(waits):
                 # what is fainter than 1/255 of its splat lies within the rest, so that the order is the same
                 # at every cut-off
-                if wp.static(not boxes_too):
-                    depth_reach = reach * (range_radius / radius)
-                elif not boxed:
+                if wp.static(not boxes_too) or not boxed:
                     depth_reach = reach * (range_radius / radius)
             record[at_depth + 2] = float(depth_reach)
         key = float(depth)
