@@ -383,8 +383,10 @@ def make_project(
             if wp.static(waits):
                 # what is fainter than 1/255 of its splat lies within the rest, so that the order is the same
                 # at every cut-off
-                if wp.static(not boxes_too) or not boxed:
-                    depth_reach = reach * (range_radius / radius)
+                depth_reach = reach * (range_radius / radius)
+                if wp.static(boxes_too):
+                    if boxed:
+                        depth_reach = reach
             record[at_depth + 2] = float(depth_reach)
         key = float(depth)
         if wp.static(waits):
