@@ -84,6 +84,7 @@ _FIXED = {
     ),
     "low-pass none": Switch("lowpass", quality={"lowpass": "none"}),
     "low-pass pixel": Switch("lowpass", quality={"lowpass": "pixel"}),
+    "order by pixel": Switch("planes", quality={"order": "pixel"}),
     # it drops single fragments, which a plane does not have
     "stop exclusive": Switch(
         "planes", quality={"stop_rule": "exclusive", "transmittance_stop": 1e-2, "order": "centre"}

@@ -341,8 +341,6 @@ def _ahead() -> np.ndarray:
 
 @case("C4", "fragments by their own depth", "splats and printed planes that cross; a fan of 40")
 def c4(renderer: Renderer) -> Found:
-    if renderer.backend.unsupported(next(_pixel_pictures()).prepared()[0]):
-        return
     yield from _pixel_pictures()
     # an edge along which two splats cross may pass over a few pixels
     _, before, after = largest_jump(renderer, turning(crossing(), "pixel", 2))

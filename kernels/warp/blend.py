@@ -21,9 +21,9 @@ NONE, ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 
 
 @cache
-def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool, threads: int):
+def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool, threads: int, room: int):
     """The kernel for these effects of splats and samples, and these outputs, and the struct that a sample
-    keeps; threads: of a block on a GPU, one for each of a tile's samples.
+    keeps; threads: of a block on a GPU, one for each of a tile's samples; room: for fragments that wait.
     """
     splats, crossing = make_splat(effects, outputs), make_crossing(effects, outputs)
     pool, stage, touched = splats.staging.pool, splats.staging.stage, splats.staging.touched
@@ -32,9 +32,10 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         *(crossing.row, crossing.cross),
         *(crossing.cross_ray, crossing.cross_slopes),
     )
-    pixels = make_pixel(effects, outputs)
+    pixels = make_pixel(effects, outputs, room)
     Rays, Pixel, start, unfinished = pixels.Rays, pixels.Pixel, pixels.start, pixels.unfinished
-    blend_one, finish = pixels.blend, pixels.finish
+    blend_one, end_pass, finish = pixels.blend, pixels.end, pixels.finish
+    repeats = end_pass is not None
     limits = make_bounds("lowpass_screen" in effects)
     Samples = make_samples(tuple(sample_fields(outputs).items()))
     stores, mark = output.functions(outputs, "store"), output.digest(outputs)
@@ -81,34 +82,39 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
             if p.t > 0.0:
                 slopes = rays.slopes[y0 * view.width + x0]
         records = pool()
-        k = starts[tile]
         end = starts[tile + 1]
-        while k < end:
-            length = wp.min(end - k, STAGED)
-            if not stage(records, lines, lists, k, length, unfinished(p, view)):
-                break
-            word = int(0)
-            while 32 * word < length:
-                bits = touched(records, word, length, left, top, unfinished(p, view))
-                while bits != NONE:
-                    which = 32 * word + lowest(bits)
-                    bits = bits & (bits - ONE)
-                    s = load(records, lines, lists, k, which, view)
-                    index = lists[k + which]
-                    if unfinished(p, view):
-                        x, y = float(x0) - s.d[3], float(y0) - s.c[0]
-                        if wp.static(curved):
-                            c = cross_slopes(s, ray, slopes, x, y, view)
-                        elif wp.static(bent):
-                            c = cross_ray(s, ray, x, y, view)
-                        else:
-                            c = cross(s, row_of(s.u, y), row_of(s.v, y), row_of(s.d, y), x, y, view)
-                        if c.drawn:
-                            p = blend_one(p, s, c, index, lines, planes, view)
-                word += 1
-            k += length
+        again = bool(True)
+        while again:
+            k = starts[tile]
+            while k < end:
+                length = wp.min(end - k, STAGED)
+                if not stage(records, lines, lists, k, length, unfinished(p, view)):
+                    break
+                word = int(0)
+                while 32 * word < length:
+                    bits = touched(records, word, length, left, top, unfinished(p, view))
+                    while bits != NONE:
+                        which = 32 * word + lowest(bits)
+                        bits = bits & (bits - ONE)
+                        s = load(records, lines, lists, k, which, view)
+                        if unfinished(p, view):
+                            x, y = float(x0) - s.d[3], float(y0) - s.c[0]
+                            if wp.static(curved):
+                                c = cross_slopes(s, ray, slopes, x, y, view)
+                            elif wp.static(bent):
+                                c = cross_ray(s, ray, x, y, view)
+                            else:
+                                c = cross(s, row_of(s.u, y), row_of(s.v, y), row_of(s.d, y), x, y, view)
+                            if c.drawn:
+                                p = blend_one(p, s, c, k + which, lines, lists, planes, view)
+                    word += 1
+                k += length
+            again = False
+            if wp.static(repeats):
+                p = end_pass(p, lines, lists, view)
+                again = stage(records, lines, lists, end, 0, unfinished(p, view))
         at = y0 * view.tiles_x * view.tile_w + x0
-        store(finish(p, view), at, samples)
+        store(finish(p), at, samples)
 
     @wp.kernel(name=f"blend_cpu_{mark}", **options)
     def blend_cpu(
@@ -134,42 +140,53 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         x_end = wp.min(x0 + view.tile_w, view.width)
         y_end = wp.min(y0 + view.tile_h, view.height)
         alive = (x_end - x0) * (y_end - y0)
-        k = starts[tile]
         end = starts[tile + 1]
-        while k < end and alive > 0:
-            index = lists[k]
-            s = load(wp.uint64(0), lines, lists, k, 0, view)
-            k += 1
-            b = bounds[index]
-            top, bottom = limits.rows(b, view.height)
-            top, bottom = wp.max(top, y0), wp.min(bottom, y_end)
-            left, right = limits.span(b, top, bottom, view.width)
-            left, right = wp.max(left, x0), wp.min(right, x_end)
-            for row in range(top, bottom):
-                y = float(row) - s.c[0]
-                u, v, d = row_of(s.u, y), row_of(s.v, y), row_of(s.d, y)
-                for column in range(left, right):
-                    x = float(column) - s.d[3]
-                    if wp.static(curved):
-                        at = row * view.width + column
-                        c = cross_slopes(s, rays.rays[at], rays.slopes[at], x, y, view)
-                    elif wp.static(bent):
-                        c = cross_ray(s, rays.rays[row * view.width + column], x, y, view)
-                    else:
-                        c = cross(s, u, v, d, x, y, view)
-                    if c.drawn:
-                        at = state_first + (row - y0) * view.tile_w + column - x0
-                        p = state[at]
-                        if unfinished(p, view):
-                            p = blend_one(p, s, c, index, lines, planes, view)
-                            if not unfinished(p, view):
-                                alive -= 1
-                            state[at] = p
+        again = bool(True)
+        while again:
+            k = starts[tile]
+            while k < end and alive > 0:
+                index = lists[k]
+                s = load(wp.uint64(0), lines, lists, k, 0, view)
+                k += 1
+                b = bounds[index]
+                top, bottom = limits.rows(b, view.height)
+                top, bottom = wp.max(top, y0), wp.min(bottom, y_end)
+                left, right = limits.span(b, top, bottom, view.width)
+                left, right = wp.max(left, x0), wp.min(right, x_end)
+                for row in range(top, bottom):
+                    y = float(row) - s.c[0]
+                    u, v, d = row_of(s.u, y), row_of(s.v, y), row_of(s.d, y)
+                    for column in range(left, right):
+                        x = float(column) - s.d[3]
+                        if wp.static(curved):
+                            at = row * view.width + column
+                            c = cross_slopes(s, rays.rays[at], rays.slopes[at], x, y, view)
+                        elif wp.static(bent):
+                            c = cross_ray(s, rays.rays[row * view.width + column], x, y, view)
+                        else:
+                            c = cross(s, u, v, d, x, y, view)
+                        if c.drawn:
+                            at = state_first + (row - y0) * view.tile_w + column - x0
+                            p = state[at]
+                            if unfinished(p, view):
+                                p = blend_one(p, s, c, k - 1, lines, lists, planes, view)
+                                if not unfinished(p, view):
+                                    alive -= 1
+                                state[at] = p
+            again = False
+            if wp.static(repeats):
+                alive = int(0)
+                for at in range(state_first, state_first + view.tile_w * view.tile_h):
+                    p = end_pass(state[at], lines, lists, view)
+                    if unfinished(p, view):
+                        alive += 1
+                    state[at] = p
+                again = alive > 0
         stride = view.tiles_x * view.tile_w
         for row in range(view.tile_h):
             for column in range(view.tile_w):
                 p = state[state_first + row * view.tile_w + column]
                 at = (y0 + row) * stride + x0 + column
-                store(finish(p, view), at, samples)
+                store(finish(p), at, samples)
 
     return (blend_gpu if on_gpu else blend_cpu), Pixel

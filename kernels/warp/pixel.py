@@ -1,7 +1,8 @@
 """One sample: its fragments, and what it keeps of them. Front to back, C = sum_k c_k alpha_k prod_{j<k} (1 -
 alpha_j).
 
-Splats of one plane are composited together (layers.py). What outputs keep stands in their files (output/).
+Fragments may wait for nearer ones (waiting.py), splats of one plane together (layers.py). What outputs keep
+stands in their files (output/).
 """
 
 from functools import cache
@@ -12,24 +13,25 @@ import warp as wp
 from . import output
 from .common import LEAST_ALPHA, View, fma, line_of, struct_of
 from .crossing import make_crossing
-from .layers import make_layer, make_pending
+from .layers import make_layer
 from .rays import make_rays
 from .records import BOXES, Layout
 from .splat import make_splat
+from .waiting import make_queue, make_waiting
 
 
 @cache
-def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
-    """The state of a sample, and what is done with it: Rays, Pixel; start, unfinished, blend, finish, store
-    (of outputs).
+def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) -> SimpleNamespace:
+    """The state of a sample, and what is done with it: Rays, Pixel; start, unfinished, blend, end (None
+    without a second pass), finish, store (of outputs). room: for fragments that wait.
     """
     Splat, crossing = make_splat(effects, outputs).Splat, make_crossing(effects, outputs)
     Crossing, is_box = crossing.Crossing, crossing.is_box
     opacity_of, depth_of = crossing.opacity_of, crossing.depth_of
     layout = Layout(effects, outputs)
     each = layout.lines
-    exclusive, has_depth, layered, bent = (
-        name in effects for name in ("stop_exclusive", "ray_depth", "compose_planes", "rays")
+    exclusive, has_depth, waits, layered, bent = (
+        name in effects for name in ("stop_exclusive", "ray_depth", "compose_pixel", "compose_planes", "rays")
     )
     boxes = any(name in effects for name in BOXES)
     rays = make_rays(bent, "rays_length" in effects, bent and boxes)
@@ -46,8 +48,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
     fields = {"t": wp.float32, "r": wp.float32, "g": wp.float32, "b": wp.float32}
     fields |= {"finished": wp.int32} if exclusive else {}
     fields |= output.fields(outputs, "state")
-    # pending: the layer that still gathers, and one that arrived before it
-    fields |= {"open": layer.Layer, "waiting": layer.Layer} if layer else {}
+    fields |= {"queue": make_queue(layer, room)} if waits else {}
     Pixel = struct_of("Pixel", "What a sample keeps.", fields)
 
     @wp.func
@@ -55,9 +56,8 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
         """The state of a sample before anything is drawn."""
         p = Pixel()
         p.t = 1.0
-        if wp.static(layered):
-            p.open.plane = -1
-            p.waiting.plane = -1
+        if wp.static(waits):
+            p = waiting.start(p)
         length = float(1.0)
         if wp.static(measured):
             length = length_of(x, y, rays, view)
@@ -70,15 +70,18 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
         """Whether anything that follows can still be seen."""
         if wp.static(exclusive):
             return p.t > view.stop and p.finished == 0
-        return p.t > view.stop
+        elif wp.static(waits):
+            return p.t > view.stop and p.queue.after_z < wp.inf
+        else:
+            return p.t > view.stop
 
     @wp.func
-    def see(s: Splat, c: Crossing, inverse_d: float, index: int, lines: wp.array(dtype=wp.vec4)):
-        """What a fragment shows."""
+    def see(color: wp.vec3, z: float, lines: wp.array(dtype=wp.vec4), index: int):
+        """What a fragment of a splat shows at depth z."""
         seen = Seen()
-        seen.rgb = wp.vec3(s.c[1], s.c[2], s.c[3])
+        seen.rgb = color
         if wp.static(has_depth):
-            seen.z = depth_of(lines, index, c, inverse_d)
+            seen.z = z
         for k in range(wp.static(len(sees))):
             seen = wp.static(sees[k])(seen, wp.static(readers[k])(lines, index * each), index)
         return seen
@@ -106,54 +109,81 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
         p.t = p.t - weight
         return p
 
-    pending = make_pending(layer, Pixel, composite) if layer else None
+    @wp.func
+    def see_again(lines: wp.array(dtype=wp.vec4), index: int, z: float):
+        """What a fragment shows that was seen before."""
+        c = line_of(lines, index * each + wp.static(layout.place("r")[0]))
+        return see(wp.vec3(c[1], c[2], c[3]), z, lines, index)
+
+    @wp.func
+    def nearest_of(lines: wp.array(dtype=wp.vec4), index: int) -> float:
+        """Depth before which no fragment of the splat lies."""
+        return line_of(lines, index * each + wp.static(layout.place("nearest")[0]))[
+            wp.static(layout.place("nearest")[1])
+        ]
+
+    waiting = make_waiting(Pixel, composite, see_again, layer, room) if waits else None
 
     @wp.func
     def blend(
         pixel: Pixel,
         s: Splat,
         c: Crossing,
-        index: int,
+        place: int,
         lines: wp.array(dtype=wp.vec4),
+        lists: wp.array(dtype=wp.int32),
         planes: wp.array(dtype=wp.int32),
         view: View,
     ):
-        """The pixel after a fragment that is drawn, of a pixel that is not finished."""
+        """The pixel after a fragment that is drawn of the splat at `place` in the list, of a pixel that is
+        not finished.
+        """
+        index = lists[place]
         inverse_d = 1.0 / c.d
         opacity = opacity_of(s, c, inverse_d, view)
-        seen = see(s, c, inverse_d, index, lines)
+        z = float(0.0)
+        if wp.static(has_depth):
+            z = depth_of(lines, index, c, inverse_d)
+        color = wp.vec3(s.c[1], s.c[2], s.c[3])
         if wp.static(layered):
             p = pixel
             if not (opacity > 0.0):
                 return p  # of no optical depth: a mean over it would be 0 / 0
-            plane = planes[index]
+            nearest, plane = nearest_of(lines, index), planes[index]
+            if plane != p.queue.open.plane:
+                p = waiting.close(p, nearest, lines, lists, view)
+                p.queue.open = layer.begun(plane, place, nearest)
             if plane < 0:
-                p = pending.composite_before(p, seen.z, view)
-                return composite(p, seen, opacity, view)
-            if p.open.plane >= 0 and p.open.plane != plane:
-                p = pending.begin(p, view)
+                return waiting.take(p, nearest, z, opacity, place, lines, lists, view)
+            seen = see(color, wp.max(z, nearest), lines, index)
             if wp.static(boxes):
                 if is_box(s):
-                    p.open = layer.gather_box(p.open, plane, seen, opacity)
+                    p.queue.open = layer.gather_box(p.queue.open, seen, opacity)
                     return p
-            p.open = layer.gather(p.open, plane, seen, opacity)
+            p.queue.open = layer.gather(p.queue.open, seen, opacity)
             return p
+        elif wp.static(waits):
+            return waiting.take(pixel, nearest_of(lines, index), z, opacity, place, lines, lists, view)
         else:
-            return composite(pixel, seen, opacity, view)
+            return composite(pixel, see(color, z, lines, index), opacity, view)
 
     @wp.func
-    def finish(pixel: Pixel, view: View):
+    def finish(pixel: Pixel):
         """The pixel after the last fragment."""
         p = pixel
-        if wp.static(layered):
-            p = pending.composite_before(p, float(wp.inf), view)
         if 1.0 - p.t < LEAST_ALPHA:
             for k in range(wp.static(len(clears))):
                 p = wp.static(clears[k])(p)
         return p
 
     return SimpleNamespace(
-        Rays=Rays, Pixel=Pixel, start=start, unfinished=unfinished, blend=blend, finish=finish
+        Rays=Rays,
+        Pixel=Pixel,
+        start=start,
+        unfinished=unfinished,
+        blend=blend,
+        end=waiting.end if waits else None,
+        finish=finish,
     )
 
 

@@ -44,8 +44,9 @@ def make_project(
     """
     layout = Layout(effects, outputs)
     lines_each = layout.lines
-    has_depth, screen, filtered, layers = (
-        name in effects for name in ("ray_depth", "lowpass_screen", "lowpass_pixel", "compose_planes")
+    has_depth, screen, filtered, waits, layers = (
+        name in effects
+        for name in ("ray_depth", "lowpass_screen", "lowpass_pixel", "compose_pixel", "compose_planes")
     )
     recorded = output.having(outputs, "project")
     projects = output.functions(recorded, "project")
@@ -56,6 +57,7 @@ def make_project(
     words = wp.types.vector(4 * layout.lines, wp.float32)
     sqrt_half, sqrt_two = real(math.sqrt(0.5)), real(math.sqrt(2.0))
     edge_on = real(1e-13 if precision == "float64" else 1e-6)
+    range_radius = real(math.sqrt(2.0 * math.log(255.0)))
     one, two, half, zero = real(1.0), real(2.0), real(0.5), real(0.0)
     all_boxes, mixed = "footprint_box" in effects, "footprint_mixed" in effects
     boxes_too = all_boxes or mixed
@@ -80,6 +82,7 @@ def make_project(
         layout.word(name)
         for name in ("dot_x", "z_numerator", "edge_u0", "nuz", "plane_z0", "boxed", "columns", "bulge")
     )
+    at_nearest = layout.word("nearest")
 
     @wp.func
     def seen(a: vec3, b: vec3, p: vec3, radius: real, reach: real, x: real, y: real, view: View, lens: Lens):
@@ -376,7 +379,22 @@ def make_project(
         if wp.static(has_depth):
             record[at_depth] = float(height * facing)
             record[at_depth + 1] = float(depth)
-            record[at_depth + 2] = float(reach)
+            depth_reach = reach
+            if wp.static(waits):
+                # what is fainter than 1/255 of its splat lies within the rest, so that the order is the same
+                # at every cut-off
+                depth_reach = reach * (range_radius / radius)
+                if wp.static(boxes_too):
+                    if boxed:
+                        depth_reach = reach
+            record[at_depth + 2] = float(depth_reach)
+        key = float(depth)
+        if wp.static(waits):
+            key = float(depth) - float(depth_reach)  # as blending bounds depths
+            if wp.static(layers):
+                if planes[i] >= 0:
+                    key = plane_keys[planes[i]]
+            record[at_nearest] = key
         for k in range(wp.static(len(projects))):
             record = wp.static(projects[k])(record, wp.static(places[k]), normal, height)
         for line in range(wp.static(lines_each)):
@@ -388,10 +406,6 @@ def make_project(
             bounds[i] = box
         corner = wp.uint64(top * view.tiles_x + left)
         windows[i] = (corner << BITS) | wp.uint64(bits)
-        key = float(depth)
-        if wp.static(layers):
-            if planes[i] >= 0:
-                key = plane_keys[planes[i]]
         keys[i] = sortable(key)
         counts[i] = wp.int64(tiles)
         drawn[i] = 1

@@ -21,6 +21,7 @@ _WHOLE = {
 _EXTRA = {
     "lowpass_screen": ("dot_x", "dot_y"),
     "ray_depth": ("z_numerator", "z_center", "z_reach"),
+    "compose_pixel": ("nearest",),
     "ellipsoid_exact": ("bulge",),
 }
 

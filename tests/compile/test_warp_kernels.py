@@ -9,7 +9,7 @@ from fidsplat.backends.warp import runtime
 from fidsplat.effects import OUTPUTS
 
 wp = pytest.importorskip("warp")
-RECORD = ("lowpass_screen", "ray_depth", "compose_planes")
+RECORD = ("lowpass_screen", "ray_depth", "compose_pixel", "compose_planes")
 MIXED = (*RECORD, "footprint_mixed")
 NORMAL = ("normal",)
 OF_BOXES = ("edges", "cover")
@@ -68,7 +68,7 @@ def blending(*effects, outputs=None, on_gpu=True, threads=256):
     """The kernel with these effects, and with all that outputs add to blending."""
     if outputs is None:
         outputs = made("output.having", everything(), "seen", "state", "samples")
-    return made("blend.make_blend", effects, outputs, on_gpu, threads)[0]
+    return made("blend.make_blend", effects, outputs, on_gpu, threads, 8)[0]
 
 
 def resolving(stretched, samples):
@@ -154,7 +154,7 @@ def test_a_record_grows_by_what_is_asked_for():
     assert layout(()).lines == 5
     assert layout(("lowpass_screen",)).names[-2:] == ["dot_x", "dot_y"]
     assert layout(RECORD, NORMAL).lines == 7
-    assert layout(RECORD, NORMAL).place("nz") == (6, 1)
+    assert layout(RECORD, NORMAL).place("nz") == (6, 2)
     assert layout(()).place("nz") == (0, 0)
     assert layout(("lowpass_screen", "footprint_mixed")).lines == 6
     assert layout(("footprint_box",)).place("edge_u0") == (4, 0), "a line of their own"

@@ -7,7 +7,6 @@ import pytest
 from agreement import assert_agrees, random_splats
 
 import fidsplat as fs
-from fidsplat.effects import select
 from fidsplat.hard_cases import fuzz
 from fidsplat.hard_cases.agreement import against_reference
 
@@ -48,8 +47,6 @@ def test_each_fragment_by_its_own_depth(renderer, way):
     disks = random_splats(20, 3, depth=(0.5, 4.0), scale=(0.05, 0.5), across=1.2)
     cloud = fs.SplatCloud.concatenate([thick(1), disks])
     quality = fs.Quality(ellipsoid=way, order="pixel")
-    if renderer.backend.unsupported(select(cloud, fs.Capture(CAMERA, quality=quality))):
-        pytest.skip("no order by pixel")
     assert_agrees(renderer, cloud, CAMERA, ("rgb", "alpha", "depth"), quality)
 
 

@@ -18,7 +18,8 @@ SLOTS = frozenset(
     | {"camera_brown_conrady", "camera_fisheye", "camera_equirectangular"}
     | {"lowpass_none", "lowpass_screen", "lowpass_pixel", "stop_inclusive", "stop_exclusive"}
     | {"ellipsoid_exact", "ellipsoid_ewa", "ellipsoid_ewa_antialiased"}
-    | {"compose_ordered", "compose_planes", "footprint_gaussian", "footprint_box", "footprint_mixed"}
+    | {"compose_ordered", "compose_pixel", "compose_planes"}
+    | {"footprint_gaussian", "footprint_box", "footprint_mixed"}
     | {"background_constant", "background_gradient", "background_panorama"}
     | {"arithmetic_precise", "arithmetic_fast", "motion_groups", "shutter_exposure"}
     # they change no picture, and nothing here
@@ -27,8 +28,8 @@ SLOTS = frozenset(
 """effects of slots that the kernels have; outputs and steps after blending are those that have a file"""
 # what depends on an effect: a stage is compiled once for all feature sets that mean the same to it
 _RECORD = (
-    *("lowpass_screen", "rays", "camera_orthographic", "ray_depth", "compose_planes"),
-    *("footprint_box", "footprint_mixed", "ellipsoid_exact"),
+    *("lowpass_screen", "rays", "camera_orthographic", "ray_depth"),
+    *("compose_pixel", "compose_planes", "footprint_box", "footprint_mixed", "ellipsoid_exact"),
 )
 _PROJECT = (
     *(*_RECORD, "lowpass_pixel", "motion_groups", "ellipsoid_ewa", "ellipsoid_ewa_antialiased"),
@@ -74,7 +75,9 @@ class _Needs:
         # rays of other lenses have a length of 1
         if "camera_brown_conrady" in effects and measured:
             effects.add("rays_length")
-        if "compose_planes" in effects or output.having(outputs, "depth"):
+        if "compose_planes" in effects:
+            effects.add("compose_pixel")
+        if "compose_pixel" in effects or output.having(outputs, "depth"):
             effects.add("ray_depth")
         steps = tuple(name for name in features.posts if name in kernels("post").known())
         blending = output.having(outputs, "seen", "state", "samples")
@@ -132,7 +135,7 @@ class Program:
         self.sloped = boxes and "rays" in needs.effects
         """whether blending reads the derivatives of a lens's rays"""
         self.blend, self.state = kernels("blend").make_blend(
-            needs.among(_SAMPLE), blending, self.shape.schedule == "group", self.block_dim
+            needs.among(_SAMPLE), blending, self.shape.schedule == "group", self.block_dim, self.shape.waiting
         )
         self.sample_fields = buffers.sample_fields(blending)
         """sample buffers: type of an element"""

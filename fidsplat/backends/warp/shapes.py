@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 
@@ -15,6 +15,8 @@ class WarpShape:
     tile_width: int
     """samples, a multiple of 4"""
     tile_height: int
+    waiting: int = 8
+    """fragments for which there is room where they are composited by their own depth"""
 
 
 def shape_for(device: Any) -> WarpShape:
@@ -31,5 +33,5 @@ def other_shapes(own: WarpShape, kind: str) -> dict[str, WarpShape]:
     if kind in ("sorting", "arithmetic"):
         return {"own": own}
     if kind == "waiting":
-        return {}
+        return {f"own, room for {room}": replace(own, waiting=room) for room in (1, 3)}
     return {f"{side} x {side}": WarpShape(own.schedule, side, side) for side in (8, 32)}
