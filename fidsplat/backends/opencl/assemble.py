@@ -125,6 +125,8 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         "TILE_H": shape.tile_height,
         "TILE_W": shape.tile_width,
     }
+    if shape.schedule == "group":
+        defines["ROWS"] = shape.rows
     if "color_sh" in layouts:
         defines["SH_DEGREE"] = features.sh_degree
     if "compose_pixel" in layouts:

@@ -29,11 +29,13 @@ class DeviceShape:
     waiting: int
     """fragments for which there is room where they are composited by their own depth, at most 254, or 31 in
     `group`"""
+    rows: int = 2
+    """pixels of a column that a work-item draws (`group`)"""
 
     @property
     def blend_items(self) -> int:
-        """Work-items of a work-group of the blend stage; schedule/group.cl draws two pixels in each."""
-        return 1 if self.schedule == "lanes" else self.tile_width * self.tile_height // 2
+        """Work-items of a work-group of the blend stage."""
+        return 1 if self.schedule == "lanes" else self.tile_width * self.tile_height // self.rows
 
 
 def cpu_shape(lanes: int = 16, cores: int = 8, fast_fma: bool = True) -> DeviceShape:
@@ -51,6 +53,9 @@ def shape_for(features: FeatureSet, shape: DeviceShape) -> DeviceShape:
     if "blend_double" in features.slots and shape.schedule == "lanes":
         # doubles are drawn one by one
         shape = replace(shape, schedule="group", lanes=1, tile_width=16, tile_height=16, waiting=8)
+    if not {"compose_pixel", "compose_planes"}.isdisjoint(features.slots):
+        # what waits takes the registers of a second pixel
+        shape = replace(shape, rows=1)
     return shape
 
 

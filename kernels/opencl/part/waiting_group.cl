@@ -96,11 +96,16 @@ static inline void waiting_take(Pixel *pixel, wide nearest, wide z, wide opacity
 // After the last splat of the list: composites what waits. Returns whether the list is to be gone through again.
 static inline int waiting_end(Pixel *pixel, global const Splat *splats, const BlendConstants *constants) {
 //@@ plane_end
-    for (int k = 0; k < WAITING; k++) waiting_push(pixel, INFINITY, INFINITY, 0.0f, NONE, splats, constants);
-    waiting_clear(&pixel->waiting);
-    pixel->waiting.from = pixel->waiting.until;
-    pixel->waiting.from_splat = pixel->waiting.until_splat;
-    pixel->waiting.until = INFINITY;
+    Waiting *waiting = &pixel->waiting;
+    if (waiting->splat[WAITING - 1] != NONE) {
+#pragma unroll
+        for (int k = 0; k < WAITING; k++)
+            waiting_composite(pixel, waiting->z[k], waiting->opacity[k], waiting->splat[k], splats, constants);
+        waiting_clear(waiting);
+    }
+    waiting->from = waiting->until;
+    waiting->from_splat = waiting->until_splat;
+    waiting->until = INFINITY;
     return pixel_unfinished(pixel, constants);
 }
 //@ blend_arguments
