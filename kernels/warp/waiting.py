@@ -206,6 +206,25 @@ def make_waiting(Pixel, composite, see_of, layer: SimpleNamespace | None, room: 
         return p
 
     @wp.func
+    def full(p: Pixel) -> bool:
+        """Whether there is no room for another layer."""
+        return p.queue.first.plane >= 0 and p.queue.second.plane >= 0
+
+    @wp.func
+    def drop_furthest(pixel: Pixel, z: float, place: int):
+        """The pixel without the furthest of the layers that wait and one at this depth and place in the list,
+        and without what is behind it.
+        """
+        p = pixel
+        far_z, far = depth(p.queue.first), int(p.queue.first.place)
+        other_z, other = depth(p.queue.second), int(p.queue.second.place)
+        if other_z > far_z or (other_z == far_z and other > far):
+            far_z, far = other_z, other
+        if z >= far_z:
+            far_z, far = z, place
+        return drop_from(p, far_z, far)
+
+    @wp.func
     def close(
         pixel: Pixel,
         nearest: float,
@@ -219,24 +238,20 @@ def make_waiting(Pixel, composite, see_of, layer: SimpleNamespace | None, room: 
             return p
         z, opacity, place = depth(p.queue.open), float(p.queue.open.opacity), int(p.queue.open.place)
         if is_taken(p, z, place):
-            if p.queue.first.plane >= 0 and p.queue.second.plane >= 0:
-                p = composite_until(p, nearest, lines, lists, view)
-            if p.queue.first.plane >= 0 and p.queue.second.plane >= 0:
-                # room for two: the furthest of three is dropped
-                far_z, far = depth(p.queue.first), int(p.queue.first.place)
-                other_z, other = depth(p.queue.second), int(p.queue.second.place)
-                if other_z > far_z or (other_z == far_z and other > far):
-                    far_z, far = other_z, other
-                if z >= far_z:
-                    far_z, far = z, place
-                p = drop_from(p, far_z, far)
-            if is_taken(p, z, place):
-                if p.queue.first.plane < 0:
-                    p.queue.first = p.queue.open
-                    p = put(p, nearest, z, opacity, _FIRST, lines, lists, view)
-                else:
-                    p.queue.second = p.queue.open
-                    p = put(p, nearest, z, opacity, _SECOND, lines, lists, view)
+            if full(p):
+                p = composite_until(p, wp.min(nearest, z), lines, lists, view)
+            if full(p) and z <= nearest:
+                p = composite(p, shown(p.queue.open), opacity, view)
+            else:
+                if full(p):
+                    p = drop_furthest(p, z, place)
+                if is_taken(p, z, place):
+                    if p.queue.first.plane < 0:
+                        p.queue.first = p.queue.open
+                        p = put(p, nearest, z, opacity, _FIRST, lines, lists, view)
+                    else:
+                        p.queue.second = p.queue.open
+                        p = put(p, nearest, z, opacity, _SECOND, lines, lists, view)
         p.queue.open = nothing()
         return p
 

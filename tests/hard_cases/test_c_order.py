@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from agreement import assert_agrees, random_splats
 
 import fidsplat as fs
 from fidsplat.cameras import Camera
@@ -93,6 +94,14 @@ def test_any_number_of_layers_wait(renderer):
     view = Camera.pinhole(17, 17, 20.0, 20.0, 8.5, 8.5)
     got, wanted = layered(renderer, [*sheets, splats([(0, 0, 5)], (1, 0, 0, 0), 2.0, 0.5)], view)
     assert np.abs(got - wanted).max() < 1e-6
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_planes_that_cross_each_other(renderer, seed):
+    """More layers wait at a pixel than a backend may have room for, and one that ends lies before others."""
+    cloud = random_splats(24, seed, depth=(0.8, 4.0), scale=(0.05, 0.5), across=1.2)
+    cloud = cloud.with_planes(np.arange(24) // 4 - 1)
+    assert_agrees(renderer, cloud, Camera.pinhole(37, 22, 30.0, 30.0, 18.0, 11.0), ("rgb", "depth"))
 
 
 def test_a_real_marker_does_not_jump(renderer):
