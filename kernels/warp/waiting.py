@@ -211,17 +211,13 @@ def make_waiting(Pixel, composite, see_of, layer: SimpleNamespace | None, room: 
         return p.queue.first.plane >= 0 and p.queue.second.plane >= 0
 
     @wp.func
-    def drop_furthest(pixel: Pixel, z: float, place: int):
-        """The pixel without the furthest of the layers that wait and one at this depth and place in the list,
-        and without what is behind it.
-        """
+    def drop_furthest(pixel: Pixel):
+        """The pixel without the further of the layers that wait, and without what is behind it."""
         p = pixel
         far_z, far = depth(p.queue.first), int(p.queue.first.place)
         other_z, other = depth(p.queue.second), int(p.queue.second.place)
         if other_z > far_z or (other_z == far_z and other > far):
             far_z, far = other_z, other
-        if z >= far_z:
-            far_z, far = z, place
         return drop_from(p, far_z, far)
 
     @wp.func
@@ -244,7 +240,7 @@ def make_waiting(Pixel, composite, see_of, layer: SimpleNamespace | None, room: 
                 p = composite(p, shown(p.queue.open), opacity, view)
             else:
                 if full(p):
-                    p = drop_furthest(p, z, place)
+                    p = drop_furthest(p)
                 if is_taken(p, z, place):
                     if p.queue.first.plane < 0:
                         p.queue.first = p.queue.open

@@ -14,6 +14,9 @@ from fidsplat.backends.reference.shown import LEAST_ALPHA, median_of
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 
+_SURE = 5e-5
+"""share of a depth within which rounding may move one that is still compared: half of what is tolerated"""
+
 
 def composite(
     s: Setup, view: View, features: FeatureSet, x: np.ndarray, y: np.ndarray
@@ -52,14 +55,14 @@ def composite(
         last, seen, may_flip = median_of(before, alpha, drawn, span)
         out["depth_median"] = _pick(z, last, seen, 0.0)
         out["depth_median_may_flip"] = may_flip | (
-            _pick(span.z_high - span.z_low, last, seen, 0.0) > 1e-5 * out["depth_median"]
+            _pick(span.z_high - span.z_low, last, seen, 0.0) > _SURE * out["depth_median"]
         )
         first = drawn & (before * (1 - alpha) <= view.first_light)
         out["depth_first"] = _pick(z, _first(first), np.asarray(first.any(1)), 0.0)
         out["depth_first_may_flip"] = error_bounds.of_first(span, view.first_light)
         out["depth_first_may_flip"] |= (
             _pick(span.z_high - span.z_low, _first(first), np.asarray(first.any(1)), 0.0)
-            > 1e-5 * out["depth_first"]
+            > _SURE * out["depth_first"]
         )
     if "normal" in features.names:
         out["normal"] = _sum(weight, stack.normal)

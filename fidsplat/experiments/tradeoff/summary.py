@@ -132,7 +132,9 @@ class Device:
     def same_picture(self, scene: str) -> Frame:
         """Of `of` what has the base's definition, so that errors may be compared."""
         found = self.of(scene)
-        turned = found["quality"].str.split(r"[ =]")
+        # gsplat's stop needs the order of centres, which without planes is the base's
+        constants = found["quality"].str.replace("order=centre ", "")
+        turned = found["quality"].where(found["knob"] == "order", constants).str.split(r"[ =]")
         return found[[not set(DEFINITION) & set(words) for words in turned]]
 
     def base_ms(self, scene: str) -> float:
