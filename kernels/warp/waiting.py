@@ -242,12 +242,13 @@ def make_waiting(Pixel, composite, see_of, layer: SimpleNamespace | None, room: 
                 if full(p):
                     p = drop_furthest(p)
                 if is_taken(p, z, place):
+                    room_at = int(_FIRST)
                     if p.queue.first.plane < 0:
                         p.queue.first = p.queue.open
-                        p = put(p, nearest, z, opacity, _FIRST, lines, lists, view)
                     else:
                         p.queue.second = p.queue.open
-                        p = put(p, nearest, z, opacity, _SECOND, lines, lists, view)
+                        room_at = _SECOND
+                    p = put(p, nearest, z, opacity, room_at, lines, lists, view)
         p.queue.open = nothing()
         return p
 
