@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,7 +33,7 @@ class Trajectory(PickledByFields):
     not 1 (within 1e-3).
     """
 
-    times: Sequence[float]
+    times: Sequence[float] | np.ndarray
     """(k,) seconds, increasing"""
     poses: np.ndarray
     """(k, 4, 4) rigid; or given as (k, 7): x, y, z in metres and a unit quaternion w, x, y, z"""
@@ -85,7 +86,7 @@ class Trajectory(PickledByFields):
         curve = [start, start @ exponential(self._velocities[after - 1] * (duration / 3))]
         curve += [end @ exponential(self._velocities[after] * (-duration / 3)), end]
         while len(curve) > 1:  # de Casteljau, a screw motion in place of each line
-            curve = [between(a, b, share) for a, b in zip(curve, curve[1:], strict=False)]
+            curve = [between(a, b, share) for a, b in itertools.pairwise(curve)]
         return curve[0]
 
     @cached_property
@@ -94,8 +95,7 @@ class Trajectory(PickledByFields):
         durations = np.diff(self.times)[:, None]
         if not len(durations):
             return np.zeros((1, 6))
-        pairs = zip(self.poses, self.poses[1:], strict=False)
-        along = np.array([twist(start, end) for start, end in pairs]) / durations
+        along = np.array([twist(*pair) for pair in itertools.pairwise(self.poses)]) / durations
         before, after = durations[:-1], durations[1:]
         inner = (along[:-1] * after + along[1:] * before) / (before + after)
         # what turns fast in a short time must not spin through a long one beside it: a third of that one's
@@ -128,8 +128,8 @@ class Trajectory(PickledByFields):
         steps = (last - first) * rate
         if steps >= MAX_SAMPLES:
             raise InputError(
-                f"{rate:g} poses a second over {last - first:g} s are more than {MAX_SAMPLES:,}; give a lower "
-                "rate"
+                f"{rate:g} poses a second over {last - first:g} s are more than {MAX_SAMPLES:,}; give a "
+                "lower rate"
             )
         times = first + np.arange(int(steps + 1e-6) + 1) / rate  # the last one too where it falls on a step
         return Trajectory(times, np.array([self(time) for time in times]))
@@ -153,8 +153,8 @@ def _of_vector(k: int, vector) -> np.ndarray:
     length = float(np.linalg.norm(numbers[3:]))
     if abs(length - 1) > UNIT:
         raise InputError(
-            f"pose {k} of a trajectory has a quaternion of length {length:g}, {numbers[3:].tolist()}; it must "
-            "be 1, and its order w, x, y, z"
+            f"pose {k} of a trajectory has a quaternion of length {length:g}, {numbers[3:].tolist()}; it "
+            "must be 1, and its order w, x, y, z"
         )
     return rigid_matrix(numbers[:3], numbers[3:])
 
