@@ -191,6 +191,14 @@ CALLS: dict[str, Callable[[Path], Call]] = {
     "Renderer.render_views": lambda _: (
         lambda **given: list(RENDERER.render_views(**given)), {"scene": CLOUD, "captures": [CAMERA], "outputs": ("rgb",)}, None
     ),
+    "Renderer.render_batch": lambda _: (
+        RENDERER.render_batch,
+        {
+            "scene": CLOUD, "captures": [CAMERA], "poses": np.array([[0, 0, 0, 1, 0, 0, 0.0]]), "groups": None,
+            "mask": np.array([True]),
+        },
+        dict,
+    ),
     "Capture": lambda _: (
         fs.Capture,
         {"camera": CAMERA, "outputs": ("rgb",), "quality": "fast", "background": (0, 0, 0), "motion": None, "shutter": None},
