@@ -30,6 +30,8 @@ _HOME = {
     "marker": "fidsplat.markers",
     "load_ply": "fidsplat.formats",
     "save_ply": "fidsplat.formats",
+    "load_trajectory": "fidsplat.formats",
+    "save_trajectory": "fidsplat.formats",
     "Renderer": "fidsplat.render",
     "Frame": "fidsplat.frame",
     "FrameBatch": "fidsplat.batch",
