@@ -92,16 +92,24 @@ class OpenCLPipeline:
         Raises:
             DeviceError: the device runs out of memory or fails.
         """
+        return OpenCLImages(*self.drawn(resident, view))
+
+    def drawn(self, resident: Resident, view: View) -> tuple[Picture, Images]:
+        """One picture with all that its stages have left on the device, until another is drawn.
+
+        Raises:
+            DeviceError: as `render`.
+        """
         plan = self._plan(resident, view)
         if plan.chunk and self.shape.lists != "ordered":
             # one way of drawing in chunks is enough: where memory is short, sorting takes the least time
-            return self._other(self.features, replace(self.shape, lists="ordered")).render(resident, view)
+            return self._other(self.features, replace(self.shape, lists="ordered")).drawn(resident, view)
         workspace = self.workspace
         way = workspace.memory_budget - plan.held
         # what this picture takes anew is planned for; that of its own kind is there already
         workspace.pool.make_way((self, view.width, view.height, resident.count, plan), way)
         try:
-            return OpenCLImages(*self._draw(resident, view, plan))
+            return self._draw(resident, view, plan)
         except BaseException as error:
             with suppress(cl.Error):
                 workspace.queue.finish()  # a CPU may be reading the arrays of a cloud that nobody keeps
