@@ -337,7 +337,7 @@ class DifferentiablePipeline(Protocol):
 
 
 @runtime_checkable
-class Differentiates(Protocol):
+class Differentiates(Backend, Protocol):
     """A backend that has derivatives of its pictures."""
 
     def differentiate(self, features: FeatureSet) -> DifferentiablePipeline:

@@ -4,7 +4,7 @@
 //   B_end = g C_behind,   B_k-1 = B_k + alpha_k (g c_k - B_k),   dL / d alpha_k = T_k (g c_k - B_k):
 // nothing is divided by 1 - alpha, so that opaque fragments have derivatives as all others.
 // The schedules (schedule/*_backward.cl) walk a tile's list forward for T, in the arithmetic of blending and with its
-// decisions, and then back.
+// decisions, and then back, CHUNK splats at a time.
 
 //@@ struct Moments
 #define FIELDS (sizeof(Moments) / sizeof(float))

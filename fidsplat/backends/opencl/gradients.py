@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pyopencl as cl
-import pyopencl.array
+from pyopencl.array import Array
 
 from fidsplat.backends.gradients import NOT_THE_LAST, check_shape, gradient_shape
 from fidsplat.backends.opencl.drawing import Images
-from fidsplat.backends.opencl.gradients_source import assemble_gradients
+from fidsplat.backends.opencl.gradients_source import assemble_gradients, chunk_of
 from fidsplat.backends.opencl.picture import Picture
 from fidsplat.backends.opencl.pipeline import OpenCLImages, OpenCLPipeline
 from fidsplat.backends.opencl.program import Program
@@ -41,11 +41,11 @@ class DifferentiableImages(OpenCLImages):
         """Whether no other picture has been drawn since: its records are still in the scratch buffer."""
         return self.picture.pool.holding("splats", self._stamp) is not None
 
-    def device_array(self, name: str) -> cl.array.Array:
+    def device_array(self, name: str) -> Array:
         """The image as an array of the device, (h, w) or (h, w, channels); no copy."""
         output, buffer = self._images[name]
         shape = self._size if output.channels == 1 else (*self._size, output.channels)
-        return cl.array.Array(self._queue, shape, np.dtype(output.dtype), data=buffer)
+        return Array(self._queue, shape, np.dtype(output.dtype), data=buffer)
 
 
 class OpenCLGradients:
@@ -87,11 +87,10 @@ class OpenCLGradients:
         groups = -(-count // _GROUP)
         record = self.source.records["Moments"].itemsize
         real = self.source.scalars.dtype("real").itemsize
-        chunk = 32 if shape.schedule == "lanes" else shape.blend_items // shape.tile_width
         tile = shape.tile_width * shape.tile_height
         picture.take("slots", 4 * count)
         picture.take("moments", record * pairs)
-        picture.take("checkpoints", 4 * tile * (pairs // chunk + picture.tiles + 1))
+        picture.take("checkpoints", 4 * tile * (pairs // chunk_of(shape) + picture.tiles + 1))
         picture.take("tile_sums", 3 * real * picture.tiles)
         picture.take("group_sums", 6 * real * groups)
         reserved = picture.take("reserved", 4)
@@ -132,14 +131,14 @@ class OpenCLGradients:
                 cl.enqueue_fill_buffer(picture.queue, buffer, np.zeros(1, np.float32), 0, size)
                 continue
             check_shape(name, given.shape, picture.view)
-            if isinstance(given, cl.array.Array):
+            if isinstance(given, Array):
                 if given.dtype != _F32 or not given.flags.c_contiguous or given.offset:
                     raise InputError(f"the gradient of {name} must be a whole, contiguous float32 array")
                 picture.held[f"by_{name}"] = given.data
             else:
                 picture.put(f"by_{name}", np.ascontiguousarray(given, np.float32))
 
-    def _room_for_results(self, picture: Picture) -> dict[str, cl.array.Array]:
+    def _room_for_results(self, picture: Picture) -> dict[str, Array]:
         """Arrays for the results, the same from call to call."""
         count, features = picture.resident.count, self._pipeline.features
         shapes: dict[str, tuple[int, ...]] = {
@@ -154,5 +153,5 @@ class OpenCLGradients:
         for name, shape in shapes.items():
             argument = name if name == "screen" else f"by_{name}"
             buffer = picture.take(argument, 4 * math.prod(shape))
-            found[name] = cl.array.Array(picture.queue, shape, _F32, data=buffer)
+            found[name] = Array(picture.queue, shape, _F32, data=buffer)
         return found

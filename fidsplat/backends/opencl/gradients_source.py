@@ -30,12 +30,17 @@ def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> Source:
     slots = (name for slot in features.slots for name in (slot, *DRAWN[slot].parts))
     files = [DRAWN[name].file for name in dict.fromkeys(slots)]
     files += [layout.file for layout in layouts]
-    writer = Writer(
-        [file for file in files if file], declared.text, numbers_of(features, shape), declared.scalars
-    )
+    numbers = numbers_of(features, shape) | {"CHUNK": chunk_of(shape)}
+    writer = Writer([file for file in files if file], declared.text, numbers, declared.scalars)
     text = writer.program("gradients", [stage.format(shape.schedule) for stage in _STAGES])
     arguments = {kernel: declared.arguments(kernel) for kernel in kernels_in(text)}
     return Source({"gradients": text}, declared.records, arguments, (), declared.scalars)
+
+
+def chunk_of(shape: DeviceShape) -> int:
+    """Splats of a tile's list that are walked forward and then back: on GPUs a column of a splat's pixels for
+    each work-item, on CPUs what a core's second cache holds the fragments of."""
+    return 128 if shape.schedule == "lanes" else shape.blend_items // shape.tile_width
 
 
 class _Declarations(Declarations):

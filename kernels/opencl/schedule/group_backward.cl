@@ -7,7 +7,6 @@
 // Writes: moments, a slot for each splat of the tile; tile_sums. Uses up: checkpoints.
 #define GROUP (TILE_W * TILE_H / ROWS)
 #define PIXELS (TILE_W * TILE_H)
-#define CHUNK (GROUP / TILE_W)
 #define STRIDE (PIXELS + TILE_W)   // of one splat's fragments: neighbours among the splats lie in other banks
 
 static inline Crossing cross_at(const Splat *s, int px, int py, const BlendConstants *constants, wide *x, wide *y,

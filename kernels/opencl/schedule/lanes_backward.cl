@@ -2,7 +2,8 @@
 // Index space: one work-item (and work-group) per tile.
 // Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, slots, and the images' derivatives.
 // Writes: moments, a slot for each splat of the tile; tile_sums. Uses up: checkpoints.
-#define CHUNK 32            // splats whose fragments are kept between the walk forward and the walk back
+// Splats of a tile lie anywhere in memory; the ones to come are fetched ahead.
+#define AHEAD_SPLATS 8
 
 typedef struct {            // fragments of a chunk, by splat and row
     vfloat light[CHUNK][TILE_H], opacity[CHUNK][TILE_H];
@@ -29,12 +30,12 @@ static inline Columns columns_of(const Splat *s, const Tile *tile) {
     return c;
 }
 
-// Lets the splat take its light in the rows that are alive; keeps on the tape what it took. Returns which rows stay alive.
+// Lets the splat take its light in the rows that are alive; keeps on the tape what it took there. Returns which rows stay alive.
 static inline uint walk_splat(const Splat *s, const Tile *tile, Pixel *pixels, uint alive, Tape *tape, uint place) {
     const BlendConstants *constants = tile->constants;
     const Columns columns = columns_of(s, tile);
     int first = max(s->y0 - tile->y0, 0), last = min(s->y1 - tile->y0, TILE_H);
-    if (tape) tape->rows[place] = 0;
+    tape->rows[place] = 0;
     for (int row = first; row < last; row++) {
         if (!(alive >> row & 1u)) continue;
         wide y = (wide)(tile->y0 + row - s->ay);
@@ -45,11 +46,9 @@ static inline uint walk_splat(const Splat *s, const Tile *tile, Pixel *pixels, u
         vfloat opacity = fragment_opacity(s, fragment_half_rho(s, c, 1.0f / c.d, screen), constants->ceiling);
         vfloat light = pixels[row].t;
         vfloat drawn = take_light(&pixels[row], opacity, mask, constants);
-        if (tape) {
-            tape->rows[place] |= 1u << row;
-            tape->light[place][row] = light;
-            tape->opacity[place][row] = drawn;
-        }
+        tape->rows[place] |= 1u << row;
+        tape->light[place][row] = light;
+        tape->opacity[place][row] = drawn;
         if (!VANY(VMASK(pixels[row].t > constants->stop))) alive &= ~(1u << row);
     }
     return alive;
@@ -97,20 +96,21 @@ kernel void blend_backward(
 //@@ loss_start
     }
 
-    // forward: the light in front of each chunk
+    // forward: the light in front of each chunk; of the last one the fragments stay on the tape
     Pixel pixels[TILE_H];
+    Tape tape;
     for (int row = 0; row < TILE_H; row++) pixel_start(&pixels[row], (vfloat)1.0f);
     int rows = min(height - tile.y0, TILE_H);
-    uint alive = rows == 32 ? 0xFFFFFFFFu : (1u << rows) - 1u, chunks = 0;
+    uint alive = rows == 32 ? 0xFFFFFFFFu : (1u << rows) - 1u, walked = start;
     global float *own = checkpoints + (size_t)(start / CHUNK + number) * (TILE_W * TILE_H);
-    for (uint k = start; k < end && alive; k++) {
-        if ((k - start) % CHUNK == 0) {
-            for (int row = 0; row < TILE_H; row++)
-                VSTORE(pixel_light(&pixels[row]), own + (size_t)chunks * (TILE_W * TILE_H) + row * TILE_W);
-            chunks++;
-        }
-        const Splat s = splats[lists[k]];
-        alive = walk_splat(&s, &tile, pixels, alive, 0, 0);
+    for (; walked < end && alive; walked++) {
+        uint place = (walked - start) % CHUNK, chunk = (walked - start) / CHUNK;
+        for (int row = 0; place == 0 && row < TILE_H; row++)
+            VSTORE(pixel_light(&pixels[row]), own + (size_t)chunk * (TILE_W * TILE_H) + row * TILE_W);
+        FETCH_AHEAD(splats + lists[min(walked + AHEAD_SPLATS, end - 1)]);
+        FETCH_AHEAD((global const char *)(splats + lists[min(walked + AHEAD_SPLATS, end - 1)]) + 64);
+        const Splat s = splats[lists[walked]];
+        alive = walk_splat(&s, &tile, pixels, alive, &tape, place);
     }
     vfloat behind_r = 0.0f, behind_g = 0.0f, behind_b = 0.0f;
     for (int row = 0; row < TILE_H; row++) {
@@ -122,22 +122,24 @@ kernel void blend_backward(
     tile_sums[3 * number + 1] = lane_sum(behind_g);
     tile_sums[3 * number + 2] = lane_sum(behind_b);
 
-    // back, chunk by chunk; splats behind the last have nothing to do with the picture
-    for (uint k = start + chunks * CHUNK; k < end; k++) {
+    // splats behind the last that was walked have nothing to do with the picture
+    for (uint k = walked; k < end; k++) {
         uint slot = slots[lists[k]] + tile_rank(windows[lists[k]], big_bounds, column, tile_row, width, height);
         for (uint field = 0; field < FIELDS; field++) moments[(size_t)slot * FIELDS + field] = 0.0f;
     }
-    Tape tape;
+    uint chunks = (walked - start + CHUNK - 1) / CHUNK;
     for (uint chunk = chunks; chunk-- > 0;) {
-        uint first = start + chunk * CHUNK, length = min(end - first, (uint)CHUNK);
-        alive = 0;
-        for (int row = 0; row < rows; row++) {
-            pixel_start(&pixels[row], VLOAD(own + (size_t)chunk * (TILE_W * TILE_H) + row * TILE_W));
-            if (VANY(VMASK(pixels[row].t > constants.stop))) alive |= 1u << row;
-        }
-        for (uint place = 0; place < length; place++) {
-            const Splat s = splats[lists[first + place]];
-            alive = walk_splat(&s, &tile, pixels, alive, &tape, place);
+        uint first = start + chunk * CHUNK, length = min(walked - first, (uint)CHUNK);
+        if (chunk + 1 < chunks) {
+            alive = 0;
+            for (int row = 0; row < rows; row++) {
+                pixel_start(&pixels[row], VLOAD(own + (size_t)chunk * (TILE_W * TILE_H) + row * TILE_W));
+                if (VANY(VMASK(pixels[row].t > constants.stop))) alive |= 1u << row;
+            }
+            for (uint place = 0; place < length; place++) {
+                const Splat s = splats[lists[first + place]];
+                alive = walk_splat(&s, &tile, pixels, alive, &tape, place);
+            }
         }
         for (uint place = length; place-- > 0;) {
             uint index = lists[first + place];
