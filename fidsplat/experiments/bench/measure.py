@@ -136,7 +136,7 @@ class SceneRun:
         self.camera = camera
         self.picture = np.zeros((camera.height, camera.width, 3), np.float32)
         """what was drawn, (h, w, 3)"""
-        timer = Timer(lambda: self.draw().timings, drops_out=True)  # reading the timings waits for the device
+        timer = Timer(lambda: self.draw().wait(), drops_out=True, parts=lambda frame: frame.timings)
         self.result = Result(scene, self.renderer.device, camera.width, camera.height, timer, rates)
         try:
             self.resident = self.renderer.upload(cloud)
