@@ -45,6 +45,7 @@ MAY_IMPORT = {
     "views": PLAIN,
     "batch": BASE | {"backends", "effects", "frame"},
     "render": PLAIN | {"scenes", "effects", "backends", "frame", "views", "batch"},
+    "flights": PLAIN | {"scenes", "render", "vision", "formats"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
     "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
 }
@@ -56,6 +57,7 @@ HOME_OF = {
     "zxingcpp": ("vision",),
     "pupil_apriltags": ("vision",),
     "flip_evaluator": ("vision",),
+    "imageio_ffmpeg": ("vision.video",),
     "bpy": ("experiments.blender_worker",),
     "shapely": ("markers", "vision.visible"),
     "networkx": ("markers",),
