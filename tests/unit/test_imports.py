@@ -42,6 +42,7 @@ MAY_IMPORT = {
     "hard_cases": PLAIN
     | {"scenes", "effects", "backends", "render", "vision", "provenance", "random_clouds"},
     "render": PLAIN | {"scenes", "effects", "backends"},
+    "sim": PLAIN | {"batch", "scenes", "markers", "render", "vision", "formats"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
     "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
 }
@@ -59,6 +60,8 @@ HOME_OF = {
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
     "warp": ("backends.warp",),
+    "mujoco": ("sim.mujoco",),
+    "gymnasium": ("sim.gymnasium",),
     "pandas": ("experiments",),
     "matplotlib": ("experiments.charts",),
     "jinja2": ("experiments.pages",),
