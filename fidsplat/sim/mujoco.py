@@ -17,9 +17,11 @@ from fidsplat.sim.rig import Pictures, Rig, RigCamera
 from fidsplat.splats import SplatCloud
 
 try:
-    import mujoco
+    import mujoco as _mujoco
 except ImportError as error:
     raise InputError(f"MuJoCo is not here ({error}); pip install 'fidsplat[sim]'") from None
+
+mujoco: Any = _mujoco  # whose names its types do not tell
 
 _OPENCV = np.array([0.0, 1.0, 0.0, 0.0])
 """half a turn about x: MuJoCo's cameras look along -z with y up, ours along z with y down"""

@@ -82,7 +82,7 @@ class Rig:
         rest: Mapping[str, Any] | None = None,
         outputs: Iterable[str] | None = None,
     ) -> None:
-        self.scene = scene if isinstance(scene, Scene) else Scene([scene])
+        self.scene = scene if isinstance(scene, Scene) else Scene((scene,))
         if not self.scene.motion.is_still:
             raise InputError("parts of this scene move by themselves; in a rig the simulator moves them")
         self.cameras = _cameras_of(cameras)
@@ -255,7 +255,7 @@ class Pictures(Mapping):
     def scene(self, name: str, environment: int = 0) -> Scene:
         """The rig's markers where they were, before that camera: for `read_back` and `truth_of`."""
         poses = {body: pose[environment] for body, pose in self.bodies.items()}
-        return Scene(markers=self.rig.placed(poses), camera=self.camera(name, environment))
+        return Scene(markers=tuple(self.rig.placed(poses)), camera=self.camera(name, environment))
 
 
 def _cameras_of(cameras: Any) -> dict[str, RigCamera]:

@@ -40,8 +40,11 @@ MAY_IMPORT = {
     "timing": BASE,
     "random_clouds": PLAIN,
     "hard_cases": PLAIN
-    | {"scenes", "effects", "backends", "render", "vision", "provenance", "random_clouds"},
-    "render": PLAIN | {"scenes", "effects", "backends"},
+    | {"scenes", "effects", "backends", "render", "frame", "vision", "provenance", "random_clouds"},
+    "frame": BASE | {"backends"},
+    "views": PLAIN,
+    "batch": BASE | {"backends", "effects", "frame"},
+    "render": PLAIN | {"scenes", "effects", "backends", "frame", "views", "batch"},
     "sim": PLAIN | {"batch", "scenes", "markers", "render", "vision", "formats"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
     "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
@@ -159,7 +162,7 @@ def within_any(names, package) -> bool:
 
 
 # modules of the package that every backend may import
-SHARED = ("base", "caches", "view", "prepare", "registry", "planes", "bands")
+SHARED = ("base", "caches", "view", "prepare", "registry", "planes", "bands", "gradients")
 
 
 def test_backends_do_not_import_each_other():
