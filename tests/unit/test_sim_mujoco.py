@@ -1,6 +1,8 @@
 """MuJoCo's cameras and bodies, and Gymnasium's observations."""
 
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -187,6 +189,18 @@ def test_gymnasium_observes_what_the_cameras_see(model, scene):
     assert first["front_rgb"].dtype == np.uint8
     near = [seen["front_depth"][seen["front_depth"] > 0].mean() for seen in (first, second)]
     assert near[0] - near[1] == pytest.approx(0.1, abs=0.01)
+
+
+def test_the_ten_lines_of_the_page_draw_a_tag_that_is_read():
+    page = Path(__file__).resolve().parents[2] / "docs/simulation.md"
+    names = {}
+    exec(
+        re.search(r"## MuJoCo in ten lines.*?```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL)[1],
+        names,
+    )
+    pictures = names["pictures"]
+    (reading,) = read_back(pictures.of("eye").frame(0), pictures.scene("eye")).readings
+    assert reading.position_error < 0.003  # 0.2 % of 1.4 m
 
 
 def test_gymnasium_needs_to_know_where_bodies_are(rig):
