@@ -45,6 +45,7 @@ MAY_IMPORT = {
     "views": PLAIN,
     "batch": BASE | {"backends", "effects", "frame"},
     "render": PLAIN | {"scenes", "effects", "backends", "frame", "views", "batch"},
+    "sim": PLAIN | {"batch", "scenes", "markers", "render", "vision", "formats"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
     "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
 }
@@ -62,6 +63,8 @@ HOME_OF = {
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
     "warp": ("backends.warp",),
+    "mujoco": ("sim.mujoco",),
+    "gymnasium": ("sim.gymnasium",),
     "pandas": ("experiments",),
     "matplotlib": ("experiments.charts",),
     "jinja2": ("experiments.pages",),
