@@ -45,7 +45,8 @@ MAY_IMPORT = {
     "views": PLAIN,
     "batch": BASE | {"backends", "effects", "frame"},
     "render": PLAIN | {"scenes", "effects", "backends", "frame", "views", "batch"},
-    "flights": PLAIN | {"scenes", "render", "vision", "formats"},
+    "flights": PLAIN | {"scenes", "render", "vision", "formats", "frame"},
+    "sim": PLAIN | {"batch", "scenes", "markers", "render", "vision", "formats"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
     "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
 }
@@ -64,6 +65,8 @@ HOME_OF = {
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
     "warp": ("backends.warp",),
+    "mujoco": ("sim.mujoco",),
+    "gymnasium": ("sim.gymnasium",),
     "pandas": ("experiments",),
     "matplotlib": ("experiments.charts",),
     "jinja2": ("experiments.pages",),
@@ -161,7 +164,7 @@ def within_any(names, package) -> bool:
 
 
 # modules of the package that every backend may import
-SHARED = ("base", "caches", "view", "prepare", "registry", "planes", "bands")
+SHARED = ("base", "caches", "view", "prepare", "registry", "planes", "bands", "gradients")
 
 
 def test_backends_do_not_import_each_other():
