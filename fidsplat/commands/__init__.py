@@ -17,6 +17,7 @@ from fidsplat.commands.marker import Marker
 from fidsplat.commands.render import Render
 from fidsplat.commands.source import Source
 from fidsplat.commands.tradeoff import Tradeoff
+from fidsplat.commands.view import View
 from fidsplat.commands.warm import Warm
 
 COMMANDS = {
@@ -25,6 +26,7 @@ COMMANDS = {
     "info": Info,
     "marker": Marker,
     "render": Render,
+    "view": View,
     "fly": Fly,
     "detect": Detect,
     "check": Check,
