@@ -76,3 +76,9 @@ def test_the_scene_is_the_same_every_time(scene):
     for name in ("means", "quats", "scales", "opacities", "colors", "labels"):
         assert np.array_equal(getattr(one, name), getattr(again, name)), name
     assert set(np.unique(one.labels)) == {0, 1, 2, 3}
+
+
+def test_disks_boxes_and_3d_gaussians_stand_in_it(scene):
+    cloud = scene.cloud()
+    assert (cloud.footprint, cloud.ellipsoids) == ("mixed", "some")
+    assert 0.05 < np.mean(cloud.thickness[cloud.labels == 0] > 0) < 0.2
