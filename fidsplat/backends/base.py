@@ -89,12 +89,37 @@ class Images(Protocol):
         ...
 
 
+class BatchImages(Protocol):
+    """Finished output images of many views."""
+
+    @property
+    def views(self) -> int:
+        """How many, those that were masked out among them."""
+        ...
+
+    def read(self, name: str) -> np.ndarray:
+        """The images as a NumPy array of its own, (views, h, w) or (views, h, w, channels), in the type of
+        `OUTPUTS[name]`; where a view was masked out 0, or -1 in `label` and `splat_id`."""
+        ...
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds on the device by stage, of all views together."""
+        ...
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        """splats in the cloud; visible and pairs of all views together."""
+        ...
+
+
 @runtime_checkable
 class GivesArrays(Protocol):
     """Images that others on the device can use where they were drawn."""
 
     def device_array(self, name: str) -> Any:
-        """The image as an array of the device, (h, w) or (h, w, channels); no copy."""
+        """The image as an array of the device, (h, w) or (h, w, channels), of a batch with the views before
+        these; no copy."""
         ...
 
 

@@ -40,8 +40,11 @@ MAY_IMPORT = {
     "timing": BASE,
     "random_clouds": PLAIN,
     "hard_cases": PLAIN
-    | {"scenes", "effects", "backends", "render", "vision", "provenance", "random_clouds"},
-    "render": PLAIN | {"scenes", "effects", "backends"},
+    | {"scenes", "effects", "backends", "render", "frame", "vision", "provenance", "random_clouds"},
+    "frame": BASE | {"backends"},
+    "views": PLAIN,
+    "batch": BASE | {"backends", "effects", "frame"},
+    "render": PLAIN | {"scenes", "effects", "backends", "frame", "views", "batch"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
     "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
 }

@@ -13,8 +13,9 @@ from fidsplat.backends.base import Measurable
 from fidsplat.capture import Capture
 from fidsplat.experiments.tradeoff.points import BASE
 from fidsplat.experiments.tradeoff.scenes import make
+from fidsplat.frame import Frame
 from fidsplat.quality import MarkerQuality, Quality
-from fidsplat.render import Frame, Renderer, ResidentCloud
+from fidsplat.render import Renderer, ResidentCloud
 from fidsplat.timing import frame_timer, quartiles, ratios, take_turns
 
 _SCENES, _TRUTHS = 12, 6
