@@ -46,6 +46,7 @@ MAY_IMPORT = {
     "batch": BASE | {"backends", "effects", "frame"},
     "render": PLAIN | {"scenes", "effects", "backends", "frame", "views", "batch"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
+    "train": PLAIN | {"formats", "vision", "render", "backends", "effects"},
     "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__"}
