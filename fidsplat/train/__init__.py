@@ -1,6 +1,7 @@
 """Training: splats from pictures with known cameras, on any device that has gradients."""
 
 from fidsplat.train.dataset import Dataset, TrainingView
+from fidsplat.train.memory import splats_within
 from fidsplat.train.parameters import TrainingError
 from fidsplat.train.read import load_dataset
 from fidsplat.train.settings import TrainSettings
@@ -15,4 +16,5 @@ __all__ = [
     "TrainingView",
     "ViewScore",
     "load_dataset",
+    "splats_within",
 ]
