@@ -129,10 +129,11 @@ class Renderer:
         """Splats in arrays that are on the device already: drawn where they lie, without a copy.
 
         Shapes and units are those of SplatCloud, float32 (labels int32): wp.array, or what gives DLPack
-        (torch, CuPy, JAX); NumPy arrays are copied. What is in the arrays when a picture is drawn is what it
-        shows, so a simulation may move the splats between pictures. Quaternions need no unit length; a splat
-        that cannot be drawn (a value that is not finite, a scale below 0) is left out of the picture without
-        a word. `origin` (3,): world position of the means' zero.
+        (torch, CuPy, JAX); NumPy arrays are copied. With scales (n, 3) splats are 3D Gaussians, those whose
+        third is 0 disks. What is in the arrays when a picture is drawn is what it shows, so a simulation may
+        move the splats between pictures. Quaternions need no unit length; a splat that cannot be drawn (a
+        value that is not finite, a scale below 0) is left out of the picture without a word. `origin` (3,):
+        world position of the means' zero.
 
         Raises:
             InputError: the backend takes no arrays, or one has the wrong shape, type or device.

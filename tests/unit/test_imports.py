@@ -160,7 +160,7 @@ def within_any(names, package) -> bool:
 
 
 # modules of the package that every backend may import
-SHARED = ("base", "caches", "view", "prepare", "registry", "planes", "bands")
+SHARED = ("base", "caches", "view", "prepare", "registry", "planes", "bands", "gradients")
 
 
 def test_backends_do_not_import_each_other():
