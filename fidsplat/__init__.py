@@ -44,7 +44,7 @@ _HOME = {
 _PACKAGES = ("train",)
 """packages that are names of their own, as fs.train.Trainer"""
 
-__all__ = ["__version__", *sorted((*_HOME, *_PACKAGES))]
+__all__ = ["__version__", *sorted(_HOME), *_PACKAGES]
 
 
 def __getattr__(name: str):
