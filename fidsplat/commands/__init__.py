@@ -11,6 +11,7 @@ from fidsplat.commands.demo import Demo
 from fidsplat.commands.detect import Detect
 from fidsplat.commands.devices import Devices
 from fidsplat.commands.experiment import Experiment
+from fidsplat.commands.fly import Fly
 from fidsplat.commands.info import Info
 from fidsplat.commands.marker import Marker
 from fidsplat.commands.render import Render
@@ -24,6 +25,7 @@ COMMANDS = {
     "info": Info,
     "marker": Marker,
     "render": Render,
+    "fly": Fly,
     "detect": Detect,
     "check": Check,
     "bench": Bench,
