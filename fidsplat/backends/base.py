@@ -89,12 +89,37 @@ class Images(Protocol):
         ...
 
 
+class BatchImages(Protocol):
+    """Finished output images of many views."""
+
+    @property
+    def views(self) -> int:
+        """How many, those that were masked out among them."""
+        ...
+
+    def read(self, name: str) -> np.ndarray:
+        """The images as a NumPy array of its own, (views, h, w) or (views, h, w, channels), in the type of
+        `OUTPUTS[name]`; where a view was masked out 0, or -1 in `label` and `splat_id`."""
+        ...
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds on the device by stage, of all views together."""
+        ...
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        """splats in the cloud; visible and pairs of all views together."""
+        ...
+
+
 @runtime_checkable
 class GivesArrays(Protocol):
     """Images that others on the device can use where they were drawn."""
 
     def device_array(self, name: str) -> Any:
-        """The image as an array of the device, (h, w) or (h, w, channels); no copy."""
+        """The image as an array of the device, (h, w) or (h, w, channels), of a batch with the views before
+        these; no copy."""
         ...
 
 
@@ -267,4 +292,59 @@ class Reshapes(Backend, Protocol):
 
     def pipeline(self, features: FeatureSet, shape: Any = None) -> Pipeline:
         """As `Backend.pipeline`, with build constants of `shapes`."""
+        ...
+
+
+class DifferentiablePipeline(Protocol):
+    """The stages and their derivatives, compiled for one FeatureSet."""
+
+    def forward(self, resident: Any, view: View) -> Images:
+        """Draw one picture of an uploaded cloud, with the bits of `Pipeline.render`, and keep what `backward`
+        needs of it until the device draws another one.
+
+        Raises:
+            DeviceError: the device runs out of memory or fails; or the picture is one of those that are drawn
+                in bands or chunks, which have no gradient.
+        """
+        ...
+
+    def backward(self, images: Any, gradients: Mapping[str, Any]) -> dict[str, Any]:
+        """From the derivatives of a loss by output images those by the splats, the background and the pose.
+
+        Steps (the alpha cut-off, the transmittance stop, the near plane, the order of splats) have no
+        derivative: they are taken as they were in the picture.
+
+        Args:
+            images: what `forward` has made last on this device.
+            gradients: by the names of outputs (rgb, alpha, depth, normal) float32 arrays of their shape, of
+                the device or NumPy's; outputs that are missing have gradients of 0.
+
+        Returns:
+            Arrays of the device in the cloud's shapes and units: `means` (n, 3), `quats` (n, 4), `scales`
+            (n, 2), `opacities` (n,), `colors` (n, 3) or `sh` (n, k, 3), by the values that the cloud has,
+            quaternions of any length among them; `screen` (n,), the norm of the derivative by the projected
+            centre in units of half pictures (the statistic by which 2DGS trainers densify, their
+            dL_dmean2D); `background` (3,); `pose` (6,): rotation vector [1 / rad] and translation [1 / m] of
+            a motion after world_to_camera, in the camera's axes. Splats that are not drawn have zeros. They
+            are the same in every bit on every run, and hold until the next call.
+
+        Raises:
+            InputError: another picture has been drawn since, or a gradient is of no output or of a wrong
+                shape.
+            DeviceError: the device runs out of memory or fails.
+        """
+        ...
+
+
+@runtime_checkable
+class Differentiates(Protocol):
+    """A backend that has derivatives of its pictures."""
+
+    def differentiate(self, features: FeatureSet) -> DifferentiablePipeline:
+        """The pipeline for these features with its derivatives, compiled on first use.
+
+        Raises:
+            InputError: an effect has no gradient; the message names it and what would do.
+            DeviceError: the compiler refuses.
+        """
         ...

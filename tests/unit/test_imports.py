@@ -40,9 +40,15 @@ MAY_IMPORT = {
     "timing": BASE,
     "random_clouds": PLAIN,
     "hard_cases": PLAIN
-    | {"scenes", "effects", "backends", "render", "vision", "provenance", "random_clouds"},
-    "render": PLAIN | {"scenes", "effects", "backends"},
+    | {"scenes", "effects", "backends", "render", "frame", "vision", "provenance", "random_clouds"},
+    "frame": BASE | {"backends"},
+    "views": PLAIN,
+    "batch": BASE | {"backends", "effects", "frame"},
+    "render": PLAIN | {"scenes", "effects", "backends", "frame", "views", "batch"},
+    "flights": PLAIN | {"scenes", "render", "vision", "formats", "frame"},
+    "sim": PLAIN | {"batch", "scenes", "markers", "render", "vision", "formats"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
+    "train": PLAIN | {"formats", "vision", "render", "backends", "effects"},
     "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__"}
@@ -53,12 +59,15 @@ HOME_OF = {
     "zxingcpp": ("vision",),
     "pupil_apriltags": ("vision",),
     "flip_evaluator": ("vision",),
+    "imageio_ffmpeg": ("vision.video",),
     "bpy": ("experiments.blender_worker",),
     "shapely": ("markers", "vision.visible"),
     "networkx": ("markers",),
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
     "warp": ("backends.warp",),
+    "mujoco": ("sim.mujoco",),
+    "gymnasium": ("sim.gymnasium",),
     "pandas": ("experiments",),
     "matplotlib": ("experiments.charts",),
     "jinja2": ("experiments.pages",),
@@ -156,7 +165,7 @@ def within_any(names, package) -> bool:
 
 
 # modules of the package that every backend may import
-SHARED = ("base", "caches", "view", "prepare", "registry", "planes", "bands")
+SHARED = ("base", "caches", "view", "prepare", "registry", "planes", "bands", "gradients")
 
 
 def test_backends_do_not_import_each_other():

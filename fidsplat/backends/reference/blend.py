@@ -26,7 +26,7 @@ def composite(
     span = error_bounds.span_of(s, view, f)
     stack = by_depth(s, f, span) if s.by_depth else by_center(s, f, span)
     alpha, z, span = stack.alpha, stack.z, stack.span
-    before, live, final = _transmittance(alpha, view.stop, s.exclusive)
+    before, live, final = transmittance(alpha, view.stop, s.exclusive)
     weight = np.where(live, before * alpha, 0.0)
     out = {
         "rgb": _sum(weight, stack.colors),
@@ -88,7 +88,7 @@ def _sum(weight: np.ndarray, values: np.ndarray) -> np.ndarray:
     return (weight[:, None, :] @ values)[:, 0]
 
 
-def _transmittance(
+def transmittance(
     alpha: np.ndarray, stop: float, exclusive: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Transmittance before each thing, which are drawn, and what is left at the end."""

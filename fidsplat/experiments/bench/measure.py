@@ -15,8 +15,9 @@ from fidsplat.capture import Capture
 from fidsplat.errors import FidsplatError
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED
 from fidsplat.experiments.bench.model import Counts, roofline_ms
+from fidsplat.frame import Frame
 from fidsplat.quality import Quality
-from fidsplat.render import Frame, Renderer, ResidentCloud
+from fidsplat.render import Renderer, ResidentCloud
 from fidsplat.splats import SplatCloud
 from fidsplat.timing import Timer, take_turns
 

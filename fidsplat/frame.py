@@ -1,0 +1,108 @@
+"""Frame: one finished picture."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends.base import GivesArrays, Images
+from fidsplat.errors import InputError, MissingOutputError
+
+
+class Frame(Mapping):
+    """A finished picture: a mapping from an output's name to a read-only NumPy array, copied from the
+    device on first use.
+
+    Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median`, `depth_first` (h, w)
+    metres along z, `distance`, `distance_median`, `distance_first` metres along the ray; `normal` (h, w, 3)
+    unit, camera frame, towards the camera, `normal_world` the same in the world's axes; `label`, `splat_id`
+    (h, w) int32; `blended` (h, w) int32. Where less than 1/255 is covered, or of first hits less than
+    `Quality.first_hit`, labels and ids are -1, the others of these 0.
+    """
+
+    def __init__(self, images: Images, outputs: tuple[str, ...]) -> None:
+        self._images, self._process = images, os.getpid()
+        self._arrays: dict[str, np.ndarray] = {}
+        self.outputs = outputs
+        """Names of the images, in the order in which they were asked for."""
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        self._check(name)
+        if name not in self._arrays:
+            check_process(self._process, "frame")
+            self._arrays[name] = image = self._images.read(name)
+            image.flags.writeable = False  # what is kept is what was drawn
+        return self._arrays[name]
+
+    def device_array(self, name: str) -> Any:
+        """The image where it was drawn, without a copy: on a Warp device a wp.array, (h, w) or (h, w, 3).
+
+        It belongs to this frame: the next picture is drawn into another array. `wp.to_torch`, DLPack and
+        `__cuda_array_interface__` make a tensor of it on the same device.
+
+        Raises:
+            InputError: an output that was not asked for, or the backend has no arrays to give.
+        """
+        self._check(name)
+        check_process(self._process, "frame")
+        if not isinstance(self._images, GivesArrays):
+            raise InputError(
+                f"this device keeps {name} in no array that others can use; draw with device='warp:cuda' or "
+                "'warp:cpu', or take frame[name], which is copied to the host"
+            )
+        return self._images.device_array(name)
+
+    def _check(self, name: str) -> None:
+        if not isinstance(name, str) or name not in self.outputs:
+            raise MissingOutputError(
+                f"this frame has no {name!r}; it was rendered with {', '.join(self.outputs)}; name it there"
+            )
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.outputs)
+
+    def __len__(self) -> int:
+        return len(self.outputs)
+
+    def __reduce__(self):
+        """Pickled and copied as NumPy arrays: what `device_array` gives stays on its device."""
+        return _kept_frame, (dict(self), dict(self.timings), dict(self.stats))
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds on the device by stage: project, sort, bin, blend, resolve."""
+        return self._images.timings
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        """splats (in the cloud), visible (not culled), pairs (of splats and tiles)."""
+        return self._images.stats
+
+
+@dataclass(frozen=True)
+class _KeptImages:
+    """Images that are no longer on a device."""
+
+    arrays: dict[str, np.ndarray]
+    timings: Mapping[str, float]
+    stats: Mapping[str, int]
+
+    def read(self, name: str) -> np.ndarray:
+        return self.arrays[name]
+
+
+def _kept_frame(arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int]) -> Frame:
+    return Frame(_KeptImages(arrays, timings, stats), tuple(arrays))
+
+
+def check_process(opened_by: int, what: str) -> None:
+    """Raises InputError in a fork of the process that opened it, where its driver does not work."""
+    if opened_by != os.getpid():
+        raise InputError(
+            f"this {what} belongs to process {opened_by}, of which this one is a fork; open a Renderer in "
+            "each process, and read frames before the fork"
+        )
