@@ -99,7 +99,7 @@ class Splats:
         means, sh = values["means"][:], values["sh"][:, coefficients]
         return SplatCloud.of_checked(
             means if shared else means.copy(),
-            values["quats"][:],
+            values["quats"].copy(),  # which are made unit where they lie
             self.scales,
             self.opacities,
             np.ascontiguousarray(sh) if shared else sh.copy(),

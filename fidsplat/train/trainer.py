@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.backends.base import Differentiates
+from fidsplat.backends.base import Differentiates, Trains
 from fidsplat.backends.prepare import prepare
 from fidsplat.capture import Capture
 from fidsplat.errors import DeviceError, InputError, unknown
@@ -23,6 +23,7 @@ from fidsplat.splats import SplatCloud
 from fidsplat.train import densify, mcmc
 from fidsplat.train.checkpoint import Progressed, load_checkpoint, save_checkpoint
 from fidsplat.train.dataset import Dataset, TrainingView
+from fidsplat.train.device import DeviceWork
 from fidsplat.train.host import HostWork
 from fidsplat.train.optimiser import rates
 from fidsplat.train.parameters import TrainingError, first_splats
@@ -101,7 +102,11 @@ class Trainer:
             )
         self._differentiate = backend.differentiate
         self._captures = [self._capture(view) for view in dataset.views]
-        self._work = HostWork(backend, dataset.views, self.settings)
+        self._work = (
+            DeviceWork(backend.training(), dataset.views, self.settings)
+            if isinstance(backend, Trains)
+            else HostWork(backend, dataset.views, self.settings)
+        )
         self._made = self._begin()
         self._work.load(self._made.splats)
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
@@ -246,18 +251,16 @@ class Trainer:
         self._made.adam_step += 1
         rate = rates(settings, iteration, extent)
         self._work.step(gradients, rate, self._made.adam_step)
+        if due:
+            self._work.load(mcmc.moved(self._work.store(), settings, iteration))
         if mcmc_runs:
-            splats = self._work.store()
-            if due:
-                splats = mcmc.moved(splats, settings, iteration)
-            mcmc.shake(splats, settings, iteration, rate["means"])
-            self._work.load(splats)
+            self._work.shake(iteration, rate["means"])
 
     def _note(self, iteration: int, loss: float, ratio: float) -> None:
         history = self._made.history
         history["losses"][iteration - 1] = loss
         history["psnrs"][iteration - 1] = ratio
-        history["counts"][iteration - 1] = len(self._work.store())
+        history["counts"][iteration - 1] = len(self._work)
 
     def _what_is_kept(self) -> str:
         if self.checkpoint is None or not self.checkpoint.exists():
