@@ -17,6 +17,7 @@ from fidsplat.commands.marker import Marker
 from fidsplat.commands.render import Render
 from fidsplat.commands.source import Source
 from fidsplat.commands.tradeoff import Tradeoff
+from fidsplat.commands.train import Train
 from fidsplat.commands.view import View
 from fidsplat.commands.warm import Warm
 
@@ -34,6 +35,7 @@ COMMANDS = {
     "tradeoff": Tradeoff,
     "warm": Warm,
     "experiment": Experiment,
+    "train": Train,
     "source": Source,
 }
 """Every command by its name, in the order in which help lists them."""

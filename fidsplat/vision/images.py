@@ -31,6 +31,20 @@ def read_image(path: str | os.PathLike[str], deep: bool = False) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
+def read_rgba(path: str | os.PathLike[str]) -> np.ndarray:
+    """Read a picture as (h, w, 4) uint8 RGBA, opaque where the file has no alpha.
+
+    Raises InputError when the file is missing, or is no picture of 8 bits.
+    """
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.dtype != np.uint8:
+        raise InputError(f"{path} holds {image.dtype} pixels; give 8 bits")
+    channels = 1 if image.ndim == 2 else image.shape[2]
+    if channels == 4:
+        return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA)
+    return cv2.cvtColor(image, cv2.COLOR_GRAY2RGBA if channels == 1 else cv2.COLOR_BGR2RGBA)
+
+
 def pictures(path: str | os.PathLike[str]) -> Iterator[tuple[str, np.ndarray]]:
     """Names and pictures (h, w, 3) uint8 RGB: of a file, of a folder's files by their names, of a video.
 

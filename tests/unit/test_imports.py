@@ -49,6 +49,7 @@ MAY_IMPORT = {
     "flights": PLAIN | {"scenes", "render", "vision", "formats", "frame"},
     "sim": PLAIN | {"batch", "scenes", "markers", "render", "vision", "formats"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
+    "train": PLAIN | {"formats", "vision", "render", "backends", "effects"},
     "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__"}
