@@ -29,6 +29,7 @@ Examples:
   fidsplat detect picture.png --scene scene.toml    read it back, with poses
   fidsplat bench                                    what a frame costs here
   fidsplat tradeoff --quick                         what accuracy costs in time
+  fidsplat train photos -o scene.ply                splats from pictures with known cameras
 
 `fidsplat COMMAND --help` explains a command. --debug, anywhere, shows where an error arose; --version, alone,
 says which fidsplat this is."""

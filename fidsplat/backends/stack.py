@@ -77,11 +77,11 @@ class ViewStack:
     @staticmethod
     def _of(views: Sequence[View], numbers: Mapping[str, np.ndarray]) -> ViewStack:
         own = [[view, *(moved for _, moved in view.groups)] for view in views]
-        arrays = [
-            np.stack([[getattr(group, name) for group in each] for each in own], axis=1)
-            for name in ("rotation", "translation", "eye")
-        ]
-        return ViewStack(views[0], *arrays, numbers)
+
+        def stacked(name: str) -> np.ndarray:
+            return np.stack([[getattr(group, name) for group in each] for each in own], axis=1)
+
+        return ViewStack(views[0], stacked("rotation"), stacked("translation"), stacked("eye"), numbers)
 
     @staticmethod
     def of_poses(
@@ -110,20 +110,27 @@ class ViewStack:
             centre = poses[:, :3, 3] - origin
             translation = _applied(-rotation, centre)
             eye = centre - FAR_EYE * rotation[:, 2] if view.parallel else centre
-        every = [(rotation, translation, eye)]
+        rotations, translations, eyes = [rotation], [translation], [eye]
         for motion in groups.values():
             turn, move = motion[:, :3, :3], motion[:, :3, 3]
             turned = rotation @ turn
             away = _applied(turn, np.broadcast_to(origin, (count, 3))) + move - origin
             moved = translation + _applied(rotation, away)
             own = _applied(-np.swapaxes(turned, 1, 2), moved)
-            every.append((turned, moved, own - FAR_EYE * turned[:, 2] if view.parallel else own))
-        return ViewStack(view, *(np.stack(each) for each in zip(*every, strict=True)))
+            rotations.append(turned)
+            translations.append(moved)
+            eyes.append(own - FAR_EYE * turned[:, 2] if view.parallel else own)
+        return ViewStack(view, np.stack(rotations), np.stack(translations), np.stack(eyes))
 
     def part(self, first: int, end: int) -> ViewStack:
         """Views [first, end)."""
-        arrays = (each[:, first:end] for each in (self.rotation, self.translation, self.eye))
-        return ViewStack(self.view, *arrays, {name: each[first:end] for name, each in self.numbers.items()})
+        return ViewStack(
+            self.view,
+            self.rotation[:, first:end],
+            self.translation[:, first:end],
+            self.eye[:, first:end],
+            {name: each[first:end] for name, each in self.numbers.items()},
+        )
 
     def one(self, number: int) -> View:
         """A view alone."""

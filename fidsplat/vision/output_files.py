@@ -15,6 +15,17 @@ from fidsplat.vision.paint import (
     normal_picture,
 )
 
+_WHOLE = ("label", "splat_id", "blended")
+"""outputs of whole numbers"""
+
+
+def suffixes_of(name: str) -> tuple[str, ...]:
+    """Endings of the files of an output, in the order in which `save_output` writes them; the last is a
+    picture to look at."""
+    if _is_depth(name):
+        return (".npy", ".png", "-turbo.png")
+    return (".npy", ".png") if name in _WHOLE else (".png",)
+
 
 def save_output(
     name: str, image: np.ndarray, name_of: Callable[[str, str], Path], bits: int | None = None
@@ -27,13 +38,13 @@ def save_output(
         bits: 16 writes rgb as a 16-bit PNG.
         name_of: gives the file for an output's name and a suffix such as ".png" or "-turbo.png".
     """
-    if name.startswith(("depth", "distance")):
+    if _is_depth(name):
         return [
             _write_array(name_of(name, ".npy"), image),
             write_png(name_of(name, ".png"), depth_millimetres(image)),
             write_png(name_of(name, "-turbo.png"), depth_picture(image)),
         ]
-    if name in ("label", "splat_id", "blended"):
+    if name in _WHOLE:
         picture = count_picture if name == "blended" else label_picture
         return [
             _write_array(name_of(name, ".npy"), image),
@@ -44,6 +55,10 @@ def save_output(
         return [write_png(name_of(name, ".png"), deep)]
     is_normal = name in ("normal", "normal_world")
     return [write_png(name_of(name, ".png"), normal_picture(image) if is_normal else image)]
+
+
+def _is_depth(name: str) -> bool:
+    return name.startswith(("depth", "distance"))
 
 
 def _write_array(path: Path, array: np.ndarray) -> Path:

@@ -60,6 +60,14 @@ def test_alone_or_among_others_they_have_the_same_bits(renderer):
     assert np.array_equal(*images)
 
 
+def test_several_samples_are_widened_as_one_pixel(renderer):
+    """By 0.3 square pixels, not samples; and a Gaussian whose centre lies behind the camera is not drawn."""
+    cloud, quality = mixed(5), fs.Quality(ellipsoid="ewa", samples=2)
+    assert_agrees(renderer, cloud, CAMERA, ("rgb", "alpha", "depth"), quality)
+    behind = fs.SplatCloud([[0, 0, -0.1]], [[1, 0, 0, 0]], [[1.0] * 3], [0.9], colors=[[1, 1, 1]])
+    assert not renderer.render(behind, CAMERA, ("alpha",), quality)["alpha"].any()
+
+
 def test_exact_behind_a_fisheye(renderer):
     camera = fs.Camera.fisheye(61, 61, math.radians(170), near=0.05)
     assert_agrees(renderer, mixed(7), camera, quality=fs.Quality())

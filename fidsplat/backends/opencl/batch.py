@@ -109,7 +109,8 @@ class OpenCLBatch:
         buffers = self._buffers
         shape, dtype = (self.views, *buffers.shape(name)), np.dtype(buffers.outputs[name].dtype)
         array = Array(self._workspace.queue, shape, dtype, data=buffers.held()[f"{name}_out"])
-        array.fidsplat_batch = self  # the buffer is not given to another batch while the array lives
+        # the buffer is not given to another batch while the array lives
+        array.batch = self  # pyright: ignore[reportAttributeAccessIssue]
         return array
 
     def wait(self) -> None:

@@ -15,6 +15,7 @@ from fidsplat.backends.opencl.probe import OpenCLProbe
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.roofline import measure_rates
 from fidsplat.backends.opencl.shapes import DeviceShape, cpu_shape, gpu_shape, other_shapes, shape_for
+from fidsplat.backends.opencl.training import OpenCLTraining
 from fidsplat.backends.opencl.vendors import intel_among_them
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.effects import FeatureSet
@@ -105,6 +106,10 @@ class OpenCLBackend(Workspace):
         if key not in self._pipelines:
             self._pipelines[key] = OpenCLPipeline(self, assemble(*key), *key, self.pipeline)
         return self._pipelines[key]
+
+    def training(self) -> OpenCLTraining:
+        """As `Trains`."""
+        return OpenCLTraining(self)
 
     def _key(self, features: FeatureSet, shape: DeviceShape | None) -> tuple[FeatureSet, DeviceShape]:
         if not self.info.float64 and features.setup_precision != "float32":

@@ -105,7 +105,7 @@ class OpenCLImages:
         shape = self._size if output.channels == 1 else (*self._size, output.channels)
         image = np.empty(shape, output.dtype)
         try:
-            drawn = self._settled()
+            drawn = self.settle()
             cl.enqueue_copy(drawn.queue, image, drawn.buffer(f"{name}_out"))
         except cl.Error as error:
             raise DeviceError(f"{self._workspace.info.title} failed while drawing {name}: {error}") from error
@@ -113,13 +113,13 @@ class OpenCLImages:
 
     def wait(self) -> None:
         """Until the device has drawn it."""
-        self._settled().queue.finish()
+        self.settle().queue.finish()
 
     @property
     def timings(self) -> dict[str, float]:
         """Milliseconds by stage. A picture that was launched again, by which nobody has taken the time, is
         drawn once more for that."""
-        drawn = self._settled()
+        drawn = self.settle()
         if drawn.events is None and self._repeat is not None:
             with self._workspace.lock:
                 timed = self._repeat.timed()
@@ -132,9 +132,9 @@ class OpenCLImages:
 
     @property
     def stats(self) -> Mapping[str, int]:
-        return self._settled().stats()
+        return self.settle().stats()
 
-    def _settled(self) -> Drawn:
+    def settle(self) -> Drawn:
         """What is drawn, for certain with room for all of it."""
         if self._repeat is not None:
             with self._workspace.lock:

@@ -252,6 +252,14 @@ LAYOUTS: dict[str, Layout] = {
         "slot/motion_groups.cl",
         project=takes("cloud int labels  // (n)", "in int moving  // number of groups, then their labels"),
     ),
+    "opaque_layer": Layout(
+        "slot/opaque_layer.cl",
+        parts=("ray_depth",),
+        blend=takes(
+            "array float layer_depth layer_rgb  // (h, w) infinite where there is none, (h, w, 3)",
+            "array int layer_label  // (h, w)",
+        ),
+    ),
     "shutter_exposure": Layout("slot/shutter_exposure.cl"),
     "shutter_rows": Layout("slot/shutter_rows.cl"),
     "blend_double": Layout(),
@@ -299,6 +307,7 @@ LAYOUTS: dict[str, Layout] = {
     # how fragments wait for nearer ones, by the schedule
     "waiting_lanes": Layout("part/waiting_lanes.cl"),
     "waiting_group": Layout("part/waiting_group.cl"),
+    "opaque_layer_end": Layout("part/opaque_layer_end.cl"),
     "shown": Layout("part/shown.cl"),
     "ray": Layout(resolve=_RAY),
     "turn": Layout("part/turn.cl", resolve=takes("array float turns  // (h, 3, 3)")),

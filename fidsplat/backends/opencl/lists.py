@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -214,7 +215,7 @@ class ChunkedLists(OrderedLists):
                 self._more_room_for_big()
                 return self._gather(top, end)
             picture.put("places", places[:-1].astype(np.uint32))
-            out = {f"{name}_out": buffer for name, buffer in packed.items()}
+            out: dict[str, Any] = {f"{name}_out": buffer for name, buffer in packed.items()}
             picture.launch("project", "pack_move", chunks, 1, count=stop - start, **out)
         picture.held |= packed
         self._count = total

@@ -219,7 +219,10 @@ class OpenCLPipeline:
             drawn = Drawn(queue, picture.leased, picture.stats, uploads=picture.uploads)
             recording = kept.recording = Recording(picture)
         repeat = Repeat(self._redrawn, resident, view, recording.big, recording.capacity)
-        return self._images(view, drawn, repeat)
+        images = self._images(view, drawn, repeat)
+        if not resident.fixed:
+            images.settle()
+        return images
 
     def _redrawn(self, resident: Resident, view: View) -> Drawn:
         """The picture drawn anew, whatever it takes, and its time."""

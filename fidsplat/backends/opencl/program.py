@@ -13,7 +13,7 @@ import pyopencl as cl
 from fidsplat.backends.caches import pocl_folder
 from fidsplat.backends.opencl.assemble import Source, kernel_text, with_scalars
 from fidsplat.backends.opencl.pocl_target import correct_target, needs_correction
-from fidsplat.backends.opencl.workspace import DeviceBuffer, Workspace
+from fidsplat.backends.opencl.workspace import Workspace, token_of
 from fidsplat.errors import DeviceError
 
 
@@ -96,8 +96,8 @@ class Program:
         for index, (value, scalar) in enumerate(zip(values, types, strict=True)):
             if scalar is not None:
                 mark: object = value
-            else:  # part of a buffer is made anew for each launch
-                mark = value.token if type(value) is DeviceBuffer else object()
+            else:
+                mark = token_of(value)
             if mark is not bound[index] and (type(mark) is not type(bound[index]) or mark != bound[index]):
                 put_argument(kernel, index, value, scalar)
                 bound[index] = mark
@@ -121,7 +121,7 @@ def put_argument(kernel: cl.Kernel, index: int, value: Any, scalar: Callable[[An
     if scalar is None:
         kernel.set_arg(index, value)
     else:  # as set_arg, which takes 20 times as long to find out that it is a number
-        kernel._set_arg_buf(index, scalar(value))
+        kernel._set_arg_buf(index, scalar(value))  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _kernels_of(workspace: Workspace, source: Source) -> dict[str, cl.Kernel]:

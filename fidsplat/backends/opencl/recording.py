@@ -16,6 +16,7 @@ from fidsplat.backends.opencl.declare import Argument
 from fidsplat.backends.opencl.lists import TiledLists
 from fidsplat.backends.opencl.picture import Picture
 from fidsplat.backends.opencl.program import put_argument
+from fidsplat.backends.opencl.workspace import token_of
 from fidsplat.backends.view import View
 
 _UPLOADS = 64
@@ -81,10 +82,11 @@ class Recording:
         leased = [(name, pool.lease(name, size)) for name, size in self._leases]
         for name, buffer in leased:
             # a token: what is remembered does not keep the buffer
-            if bound.get(name) is not buffer.token:
+            token = token_of(buffer)
+            if bound.get(name) is not token:
                 for kernel, index in self._takers[name]:
                     kernel.set_arg(index, buffer)
-                bound[name] = buffer.token
+                bound[name] = token
         for kernel, size, group in self._launches:
             cl.enqueue_nd_range_kernel(queue, kernel, size, group)
         queue.flush()

@@ -51,6 +51,8 @@ class Resident:
         self._buffers: dict[str, cl.Buffer] = {}
         self.kept: dict[Hashable, Any] = {}
         """what is kept of pictures that were drawn of it, by their kind"""
+        self.fixed = True
+        """whether its arrays stay as they are; a picture of others cannot be drawn again later"""
         total = self.count * self._bytes_of(self._arrays)
         widest = max(array.nbytes for array in self._arrays.values())
         device = workspace.device

@@ -30,6 +30,11 @@ class DeviceBuffer(cl.Buffer):
         self.token = object()
 
 
+def token_of(buffer: cl.Buffer) -> object:
+    """What tells a buffer from every other; a part of one is made anew each time."""
+    return buffer.token if type(buffer) is DeviceBuffer else object()
+
+
 class BufferPool:
     """Scratch buffers by name, kept from frame to frame and replaced only when one is too small."""
 
