@@ -10,8 +10,10 @@ import pytest
 from agreement import ALL_OUTPUTS, random_splats
 
 import fidsplat as fs
+from fidsplat.backends.opencl import batch, lists
 from fidsplat.backends.opencl.memory_plan import plan_of
 from fidsplat.backends.opencl.shapes import gpu_shape
+from fidsplat.views import views_of
 
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 
@@ -310,9 +312,12 @@ def test_a_picture_is_launched_again_for_each_view(opencl):
     assert kept[-1].wait() is kept[-1]
 
 
+@pytest.mark.parametrize("few", [True, False])
 @pytest.mark.parametrize("scale", [(1e-2, 0.3), (2.0, 3.0)], ids=["pairs", "big splats"])
-def test_a_picture_that_outgrows_the_last_is_drawn_again(opencl, scale):
-    """More pairs, or more splats of many tiles, than there is room for: found when the frame is read."""
+def test_a_picture_that_outgrows_the_last_is_drawn_again(opencl, monkeypatch, scale, few):
+    """More pairs, or more splats of many tiles, than there is room for: found when the frame is read. One
+    work-group lists few splats, whole launches many."""
+    monkeypatch.setattr(lists, "_FEW", 8192 if few else 0)
     machine, own = as_on_a_gpu(opencl), fs.Renderer(opencl.device.name)
     some = random_splats(6000, seed=4, scale=scale, depth=(2.0, 30.0))
     places = (-900, -800, 1, 2, -700) if scale[0] > 1 else (-90, -80, 1, 2, -70)
@@ -323,6 +328,37 @@ def test_a_picture_that_outgrows_the_last_is_drawn_again(opencl, scale):
     assert max(pairs) > 2 * pairs[1], "it did outgrow it"
     for frame, camera in zip(frames, cameras, strict=True):
         assert np.array_equal(frame["rgb"], own.render(some, camera)["rgb"])
+
+
+@machines
+def test_a_batch_in_parts_has_the_bits_of_its_views(opencl, monkeypatch, machine):
+    """Several views at a time, with planes, groups that move, a mask, and pictures of other kinds between."""
+    own, some = machine(opencl), random_splats(300, seed=4, scale=(1e-2, 2.0)).with_labels(np.arange(300) % 3)
+    some = some.with_planes(np.arange(300) // 250 - 1)
+    capture = fs.Capture(fs.Camera.look_at(50, 40, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0)), ("rgb", "label"))
+    poses = np.random.default_rng(0).normal(0, 0.05, (2, 7, 7))
+    poses[..., 3] += 1
+    asked = {"poses": poses[0], "groups": {2: poses[1]}, "mask": np.arange(7) != 3}
+    resident = own.upload(some)
+    for most in (1 << 31, 1 << 18):
+        monkeypatch.setattr(batch, "_MOST", {})
+        monkeypatch.setattr(batch, "_MOST_OTHERS", most)
+        drawn = own.render_batch(resident, capture, **asked)
+        alone = own.render(resident, capture)
+        for number in (0, 1, 2, 4, 5, 6):
+            one = {"poses": poses[0, [number]], "groups": {2: poses[1, [number]]}}
+            wanted = opencl.render(some, views_of([capture], **one).capture(0))
+            assert all(np.array_equal(drawn[name][number], wanted[name]) for name in drawn), (most, number)
+        assert (drawn["label"][3] == -1).all()
+        assert not drawn["rgb"][3].any()
+        assert np.array_equal(drawn.device_array("rgb").get(), drawn["rgb"])
+        assert np.array_equal(alone["rgb"], opencl.render(some, capture)["rgb"])
+
+
+def test_a_batch_whose_images_are_too_many_is_an_error(opencl):
+    own, poses = own_device(opencl, 2**23), np.tile([0, 0, 0, 1, 0, 0, 0.0], (400, 1))
+    with pytest.raises(fs.DeviceError, match=r"images of 400 views take .* draw fewer views"):
+        own.render_batch(random_splats(10, seed=1), CAMERA, poses=poses)
 
 
 def test_a_leased_buffer_has_the_size_that_was_asked_for(opencl):
