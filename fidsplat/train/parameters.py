@@ -86,8 +86,7 @@ class Splats:
             if not np.isfinite(array).all():
                 rows = np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(1))
                 raise TrainingError(
-                    f"{name} of {len(rows)} splats (the first is {rows[0]}) are not finite {when}; "
-                    "lower the learning rates, or check the data set's cameras"
+                    f"{name} of {len(rows)} splats (the first is {rows[0]}) are not finite {when}"
                 )
 
     def cloud(self, degree: int, origin: np.ndarray, shared: bool = False) -> SplatCloud:

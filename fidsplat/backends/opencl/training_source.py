@@ -69,7 +69,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "uint count seed_low seed_high iteration purpose",
         "float size  // metres times 1 / m^2 of the steps",
         "float steep clear  // of the opacity beyond which splats stay where they are",
-        "in float drawn_quats drawn_scales drawn_opacities",
+        "in float quats log_scales logits",
         "out float means",
     ),
 }
