@@ -163,6 +163,24 @@ def png_bytes(image: np.ndarray) -> bytes:
     return data.tobytes()
 
 
+def encoded(image: np.ndarray, kind: str) -> bytes:
+    """A picture (h, w, 3) RGB, float in [0, 1] or uint8, as the content of a "jpeg" or "png" file."""
+    done, data = cv2.imencode(f".{kind}", cv2.cvtColor(to_uint8(image), cv2.COLOR_RGB2BGR))
+    if not done:
+        raise ValueError(f"OpenCV could not encode an image of shape {image.shape} as {kind}")
+    return data.tobytes()
+
+
+def decoded(content: bytes) -> np.ndarray:
+    """The picture (h, w, 3) uint8 RGB of a file's content. Raises InputError for what is no picture."""
+    image = None
+    with _silent_opencv(), contextlib.suppress(cv2.error):
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR) if content else None
+    if image is None:
+        raise InputError("a compressed picture cannot be read; JPEG and PNG can")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
 def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
     try:
         data = np.fromfile(path_of(path), np.uint8)
