@@ -1,8 +1,9 @@
 """The stages of a picture on an in-order queue: project, lists, blend, expose, resolve.
 
 Nothing passes through the host between the stages but the number of (splat, tile) pairs, which sizes one
-buffer; and not even that where pictures of the kind were drawn before (recording.py). A picture with more pairs than the device's budget is listed and blended in bands of tiles, with the
-same bits. One of several poses is blended pose by pose, and resolved once.
+buffer; and not even that where pictures of the kind were drawn before (recording.py). A picture with more
+pairs than the device's budget is listed and blended in bands of tiles, with the same bits. One of several
+poses is blended pose by pose, and resolved once.
 """
 
 from __future__ import annotations
