@@ -13,7 +13,7 @@ import fidsplat
 
 PACKAGE = Path(fidsplat.__file__).parent
 
-BASE = {"errors", "files", "rotations", "scalars"}
+BASE = {"errors", "files", "rotations", "scalars", "summaries"}
 PLAIN = BASE | {"splats", "harmonics", "cameras", "quality", "sensor", "surroundings", "capture"}
 # package or module of fidsplat: what of fidsplat it may import, at the top or inside a function
 MAY_IMPORT = {
@@ -21,6 +21,7 @@ MAY_IMPORT = {
     "files": BASE,
     "rotations": BASE,
     "scalars": {"errors"},
+    "summaries": set(),
     "harmonics": BASE,
     "quality": BASE,
     "capture": BASE | {"cameras", "quality", "sensor", "surroundings"},
@@ -41,7 +42,7 @@ MAY_IMPORT = {
     "random_clouds": PLAIN,
     "hard_cases": PLAIN
     | {"scenes", "effects", "backends", "render", "frame", "vision", "provenance", "random_clouds"},
-    "frame": BASE | {"backends"},
+    "frame": BASE | {"backends", "vision"},
     "views": PLAIN,
     "batch": BASE | {"backends", "effects", "frame"},
     "render": PLAIN | {"scenes", "effects", "backends", "frame", "views", "batch"},
@@ -62,6 +63,7 @@ HOME_OF = {
     "pupil_apriltags": ("vision",),
     "flip_evaluator": ("vision",),
     "viser": ("viewer.server",),
+    "torch": ("frame",),
     "imageio_ffmpeg": ("vision.video",),
     "bpy": ("experiments.blender_worker",),
     "shapely": ("markers", "vision.visible"),
