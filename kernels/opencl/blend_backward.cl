@@ -191,7 +191,7 @@ static inline uint tile_count(uint2 window, uint big_capacity, global const Boun
 // Gives every splat that is drawn a slot for each of its tiles. Where they lie depends on the order of the groups, what they
 // hold and in which order it is added up does not.
 // Index space: one work-item per splat, in groups of RESERVED.
-// Reads: keys, windows, big_bounds. Writes: slots; adds to reserved.
+// Reads: keys, windows, big_bounds. Writes: splat_slots; adds to reserved.
 #define RESERVED 64
 kernel __attribute__((reqd_work_group_size(RESERVED, 1, 1))) void reserve_slots(
 //@@ arguments reserve_slots
@@ -205,5 +205,5 @@ kernel __attribute__((reqd_work_group_size(RESERVED, 1, 1))) void reserve_slots(
     barrier(CLK_LOCAL_MEM_FENCE);
     if (get_local_id(0) == 0) first = atomic_add(reserved, needed);
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (i < count) slots[i] = first + offset;
+    if (i < count) splat_slots[i] = first + offset;
 }

@@ -35,7 +35,7 @@ static inline real3_ rotate_to_world(global const View *view, real3_ v) {
 }
 
 // Index space: one work-item per splat, in groups of POSED.
-// Reads:  view, the cloud, splats, keys, windows, big_bounds, slots, moments.
+// Reads:  view, the cloud, splats, keys, windows, big_bounds, splat_slots, moments.
 // Writes: derivatives by the cloud's arrays, 0 for splats that are not drawn; group_sums, those by the pose.
 #define POSED 64
 kernel __attribute__((reqd_work_group_size(POSED, 1, 1))) void project_backward(
@@ -48,7 +48,7 @@ kernel __attribute__((reqd_work_group_size(POSED, 1, 1))) void project_backward(
         bool drawn = keys[i] < OUTSIDE;
         Totals total = {0};
         if (drawn) {
-            global const float *slot = moments + (size_t)slots[i] * FIELDS;
+            global const float *slot = moments + (size_t)splat_slots[i] * FIELDS;
             uint tiles = tile_count(windows[i], big_capacity, big_bounds, width, height);
             for (uint tile = 0; tile < tiles; tile++, slot += FIELDS)
                 for (uint field = 0; field < FIELDS; field++) ((real *)&total)[field] += slot[field];

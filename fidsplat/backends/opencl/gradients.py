@@ -12,13 +12,14 @@ import pyopencl as cl
 from pyopencl.array import Array
 
 from fidsplat.backends.gradients import NOT_THE_LAST, check_shape, gradient_shape
-from fidsplat.backends.opencl.drawing import Images
 from fidsplat.backends.opencl.gradients_source import assemble_gradients, chunk_of
+from fidsplat.backends.opencl.images import OpenCLImages
 from fidsplat.backends.opencl.picture import Picture
-from fidsplat.backends.opencl.pipeline import OpenCLImages, OpenCLPipeline
+from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.view import View
+from fidsplat.effects import OUTPUTS
 from fidsplat.effects.differentiable import GRADIENT_OUTPUTS, check_gradients
 from fidsplat.errors import DeviceError, InputError
 
@@ -26,26 +27,36 @@ _GROUP = 64  # RESERVED, POSED and ADDED of the kernels
 _F32 = np.dtype(np.float32)
 
 
-class DifferentiableImages(OpenCLImages):
+class DifferentiableImages:
     """Output images with what the stages have left, for `OpenCLGradients.backward`."""
 
-    def __init__(self, picture: Picture, images: Images) -> None:
-        super().__init__(picture, images)
-        self.picture = picture
-        self._stamp = np.zeros(1)
-        self._stamp.flags.writeable = False
-        picture.pool.now_holds("splats", self._stamp)
+    def __init__(self, picture: Picture, images: OpenCLImages) -> None:
+        self.picture, self._images = picture, images
+        self._number = picture.workspace.pictures
 
     @property
     def last(self) -> bool:
-        """Whether no other picture has been drawn since: its records are still in the scratch buffer."""
-        return self.picture.pool.holding("splats", self._stamp) is not None
+        """Whether no other picture has been begun on the device since."""
+        return self.picture.workspace.pictures == self._number
+
+    def read(self, name: str) -> np.ndarray:
+        """The image as a NumPy array of its own."""
+        return self._images.read(name)
 
     def device_array(self, name: str) -> Array:
         """The image as an array of the device, (h, w) or (h, w, channels); no copy."""
-        output, buffer = self._images[name]
-        shape = self._size if output.channels == 1 else (*self._size, output.channels)
-        return Array(self._queue, shape, np.dtype(output.dtype), data=buffer)
+        shape, dtype = gradient_shape(name, self.picture.view), np.dtype(OUTPUTS[name].dtype)
+        return Array(self.picture.queue, shape, dtype, data=self.picture.held[f"{name}_out"])
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds by stage, those of `backward` among them."""
+        return self._images.timings
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        """As of every picture."""
+        return self._images.stats
 
 
 class OpenCLGradients:
@@ -58,14 +69,7 @@ class OpenCLGradients:
 
     def forward(self, resident: Resident, view: View) -> DifferentiableImages:
         """As `DifferentiablePipeline`."""
-        picture, images = self._pipeline.drawn(resident, view)
-        drawn = DifferentiableImages(picture, images)
-        if picture.plan.chunk or drawn.stats["pairs"] > picture.workspace.pair_budget:
-            raise DeviceError(
-                f"{resident.count:,} splats are drawn in chunks or bands within the memory budget, and such "
-                "pictures have no gradient; raise memory_budget, or use fewer splats or smaller pictures"
-            )
-        return drawn
+        return DifferentiableImages(*self._pipeline.drawn(resident, view))
 
     def backward(self, images: DifferentiableImages, gradients: Mapping[str, Any]) -> dict[str, Any]:
         """As `DifferentiablePipeline`: pyopencl arrays."""
@@ -74,7 +78,8 @@ class OpenCLGradients:
             raise InputError(NOT_THE_LAST)
         picture = images.picture
         try:
-            return self._backward(picture, gradients, images.stats["pairs"])
+            with picture.workspace.lock:
+                return self._backward(picture, gradients, images.stats["pairs"])
         except cl.Error as error:
             title = picture.workspace.info.title
             raise DeviceError(f"{title} failed while taking derivatives: {error}") from error
@@ -88,7 +93,7 @@ class OpenCLGradients:
         record = self.source.records["Moments"].itemsize
         real = self.source.scalars.dtype("real").itemsize
         tile = shape.tile_width * shape.tile_height
-        picture.take("slots", 4 * count)
+        picture.take("splat_slots", 4 * count)
         picture.take("moments", record * pairs)
         picture.take("checkpoints", 4 * tile * (pairs // chunk_of(shape) + picture.tiles + 1))
         picture.take("tile_sums", 3 * real * picture.tiles)
@@ -100,22 +105,19 @@ class OpenCLGradients:
         if count:
             picture.launch("reserve", "reserve_slots", count, _GROUP, count=count)
         group = shape.blend_items
-        behind = dict(zip(("background_r", "background_g", "background_b"), view.background, strict=True))
-        constants = {
-            **{"log_cut": view.log_cut, "ceiling": view.ceiling, "stop": view.stop, "filter": 1.0},
-            "log_ceiling": math.log(view.ceiling),
-        }
-        picture.launch(
-            "blend backward", "blend_backward", picture.tiles * group, group, **constants, **behind
-        )
+        ceiling = math.log(view.ceiling)
+        picture.launch("blend backward", "blend_backward", picture.tiles * group, group, log_ceiling=ceiling)
         if count:
             wanted = [one.name for one in self.source.arguments["project_backward"] if one.source == "cloud"]
             arrays = {name: picture.resident.part(name, 0, count) for name in wanted}
             picture.launch("project backward", "project_backward", count, _GROUP, count=count, **arrays)
-        for name, rows, columns in (("tile_sums", picture.tiles, 3), ("group_sums", groups, 6)):
-            sums = found["background" if columns == 3 else "pose"].data
-            parts = {"parts": picture.held[name], "sums": sums}
-            picture.launch("project backward", "add_up", _GROUP, _GROUP, rows=rows, columns=columns, **parts)
+        for name, sums, rows, columns in (
+            ("tile_sums", "background", picture.tiles, 3),
+            ("group_sums", "pose", groups, 6),
+        ):
+            given: dict[str, Any] = {"parts": picture.held[name], "sums": found[sums].data}
+            given |= {"rows": rows, "columns": columns}
+            picture.launch("project backward", "add_up", _GROUP, _GROUP, **given)
         return found
 
     def _take_gradients(self, picture: Picture, gradients: Mapping[str, Any]) -> None:

@@ -39,11 +39,11 @@ _TILES = takes("in uint2 windows", "uint big_capacity", "in Bounds big_bounds", 
 KERNELS: dict[str, tuple[Argument, ...]] = {
     "reserve_slots": takes(
         *("uint count", "in uint keys", _TILES),
-        "out uint slots  // (n): the first of a splat's, which has one for each of its tiles",
+        "out uint splat_slots  // (n): the first of a splat's, which has one for each of its tiles",
         "out uint reserved  // (1) how many there are",
     ),
     "blend_backward": takes(
-        *("in Splat splats", "in uint lists starts", _TILES, "in uint slots"),
+        *("in Splat splats", "in uint lists starts", _TILES, "in uint splat_slots"),
         "wide log_cut ceiling stop filter",
         *("float log_ceiling", "float background_r background_g background_b"),
         *("int stride  // of the padded picture", "uint plane", "in float by_rgb  // (h, w, 3)"),
@@ -53,7 +53,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     "project_backward": takes(
         *("uint count", "in View view", "cloud float means quats scales opacities"),
-        *("in Splat splats", "in uint keys", _TILES, "in uint slots", "in float moments"),
+        *("in Splat splats", "in uint keys", _TILES, "in uint splat_slots", "in float moments"),
         "out float by_means  // (n, 3)",
         "out float by_quats  // (n, 4)",
         "out float by_scales  // (n, 2)",

@@ -3,7 +3,7 @@
 // pixels of one splat. So no sum runs across work-items but that of a splat's columns, in a fixed order and without atomics.
 // Barriers stand in loops whose bounds are the same for the whole group.
 // Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile.
-// Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, slots, and the images' derivatives.
+// Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, splat_slots, and the images' derivatives.
 // Writes: moments, a slot for each splat of the tile; tile_sums. Uses up: checkpoints.
 #define GROUP (TILE_W * TILE_H / ROWS)
 #define PIXELS (TILE_W * TILE_H)
@@ -101,7 +101,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
 
     // splats behind the last chunk have nothing to do with the picture
     for (uint k = start + chunks * CHUNK + item; k < end; k += GROUP) {
-        uint slot = slots[lists[k]] + tile_rank(windows[lists[k]], big_bounds, tile_column, tile_row, width, height);
+        uint slot = splat_slots[lists[k]] + tile_rank(windows[lists[k]], big_bounds, tile_column, tile_row, width, height);
         for (uint field = 0; field < FIELDS; field++) moments[(size_t)slot * FIELDS + field] = 0.0f;
     }
     // back, chunk by chunk
@@ -111,7 +111,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
         if (item < length) {
             uint index = lists[first + item];
             staged[item] = splats[index];
-            places[item] = slots[index] + tile_rank(windows[index], big_bounds, tile_column, tile_row, width, height);
+            places[item] = splat_slots[index] + tile_rank(windows[index], big_bounds, tile_column, tile_row, width, height);
         }
         barrier(CLK_LOCAL_MEM_FENCE);
         for (int row = 0; row < ROWS; row++) {

@@ -1,6 +1,6 @@
 // For CPUs: one work-item takes a tile back, a row of LANES pixels at a time, as schedule/lanes.cl draws it.
 // Index space: one work-item (and work-group) per tile.
-// Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, slots, and the images' derivatives.
+// Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, splat_slots, and the images' derivatives.
 // Writes: moments, a slot for each splat of the tile; tile_sums. Uses up: checkpoints.
 // Splats of a tile lie anywhere in memory; the ones to come are fetched ahead.
 #define AHEAD_SPLATS 8
@@ -124,7 +124,7 @@ kernel void blend_backward(
 
     // splats behind the last that was walked have nothing to do with the picture
     for (uint k = walked; k < end; k++) {
-        uint slot = slots[lists[k]] + tile_rank(windows[lists[k]], big_bounds, column, tile_row, width, height);
+        uint slot = splat_slots[lists[k]] + tile_rank(windows[lists[k]], big_bounds, column, tile_row, width, height);
         for (uint field = 0; field < FIELDS; field++) moments[(size_t)slot * FIELDS + field] = 0.0f;
     }
     uint chunks = (walked - start + CHUNK - 1) / CHUNK;
@@ -145,7 +145,7 @@ kernel void blend_backward(
             uint index = lists[first + place];
             const Splat s = splats[index];
             const Moments m = back_splat(&s, &tile, &tape, place, losses);
-            uint slot = slots[index] + tile_rank(windows[index], big_bounds, column, tile_row, width, height);
+            uint slot = splat_slots[index] + tile_rank(windows[index], big_bounds, column, tile_row, width, height);
             ((global Moments *)moments)[slot] = m;
         }
     }
