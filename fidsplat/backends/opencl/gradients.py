@@ -109,7 +109,7 @@ class OpenCLGradients:
         picture.launch("blend backward", "blend_backward", picture.tiles * group, group, log_ceiling=ceiling)
         if count:
             wanted = [one.name for one in self.source.arguments["project_backward"] if one.source == "cloud"]
-            arrays = {name: picture.resident.part(name, 0, count) for name in wanted}
+            arrays: dict[str, Any] = {name: picture.resident.part(name, 0, count) for name in wanted}
             picture.launch("project backward", "project_backward", count, _GROUP, count=count, **arrays)
         for name, sums, rows, columns in (
             ("tile_sums", "background", picture.tiles, 3),
