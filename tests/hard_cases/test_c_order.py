@@ -19,6 +19,7 @@ from fidsplat.hard_cases.c_order import (
     turning,
 )
 from fidsplat.hard_cases.clouds import splats, taken
+from fidsplat.random_clouds import load_scene, standard_camera
 
 
 @pytest.mark.parametrize("away", [0.0, 1.0])
@@ -69,6 +70,13 @@ def test_a_picture_does_not_depend_on_how_much_may_wait(renderer, cloud):
     wanted = trace(renderer, picture)
     for name, shape in shapes.items():
         assert differing(trace(renderer, picture, shape), wanted, picture.outputs) == 0, name
+
+
+@pytest.mark.exhaustive
+def test_every_pixel_of_a_hundred_thousand_splats(renderer):
+    """Against the sort of every pixel in float64; docs/order.md has the largest error."""
+    cloud, _ = load_scene("r100k_720p")
+    assert_agrees(renderer, cloud, standard_camera(320, 180), ("rgb", "depth"), fs.Quality(order="pixel"))
 
 
 def test_a_faint_splat_between_decides_nothing(renderer):
