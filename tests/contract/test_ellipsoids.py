@@ -8,7 +8,7 @@ from agreement import assert_agrees, random_splats
 
 import fidsplat as fs
 from fidsplat.hard_cases import fuzz
-from fidsplat.hard_cases.agreement import against_reference
+from fidsplat.hard_cases.agreement import RARE, against_reference
 
 CAMERA = fs.Camera.pinhole(97, 71, 70.0, 70.0, 48.0, 36.0, near=0.05)
 
@@ -60,6 +60,14 @@ def test_alone_or_among_others_they_have_the_same_bits(renderer, order):
     images = [renderer.render(cloud, CAMERA, quality=quality)["rgb"] for cloud in (alone, both)]
     assert images[0].any()
     assert np.array_equal(*images)
+
+
+def test_several_samples_are_widened_as_one_pixel(renderer):
+    """By 0.3 square pixels, not samples; and a Gaussian whose centre lies behind the camera is not drawn."""
+    cloud, quality = mixed(5), fs.Quality(ellipsoid="ewa", samples=2)
+    assert_agrees(renderer, cloud, CAMERA, ("rgb", "alpha", "depth"), quality)
+    behind = fs.SplatCloud([[0, 0, -0.1]], [[1, 0, 0, 0]], [[1.0] * 3], [0.9], colors=[[1, 1, 1]])
+    assert not renderer.render(behind, CAMERA, ("alpha",), quality)["alpha"].any()
 
 
 def test_exact_behind_a_fisheye(renderer):
@@ -125,8 +133,14 @@ def test_a_flat_ellipsoid_is_a_disk(renderer):
 
 @pytest.mark.parametrize("scenes", [6, pytest.param(1000, marks=pytest.mark.exhaustive)])
 def test_random_hard_scenes(renderer, scenes):
-    """The fuzzer's splats with a third scale; 1000 scenes have 100,000."""
+    """The fuzzer's splats with a third scale; 1000 scenes have 100,000. `pytest -s` shows the figures."""
+    worst, splats, pixels, risky = {}, 0, 0, 0.0
     for seed in range(scenes):
         picture = fuzz.thick_scene_of(seed)
-        wrong = [one for one in against_reference(renderer, picture) if not one.agrees]
-        assert not wrong, (seed, wrong)
+        found = against_reference(renderer, picture)
+        assert all(one.finite and one.excess <= 0 for one in found), (seed, found)
+        worst = {one.output: max(one.uncertified, worst.get(one.output, 0)) for one in found}
+        size = picture.camera.width * picture.camera.height
+        splats, pixels, risky = splats + len(picture.cloud), pixels + size, risky + found[0].risky * size
+    print(f"{splats} splats, {pixels} pixels, {risky:.0f} with large certificates, beyond them {worst}")
+    assert risky <= RARE * pixels
