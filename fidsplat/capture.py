@@ -78,10 +78,9 @@ class Capture(PickledByFields):
         Raises:
             InputError: an unknown part, or a value of the wrong kind.
         """
-        known = [part.name for part in fields(self)]
         for name in changes:
-            if name not in known:
-                raise InputError(unknown("part of a capture", name, known))
+            if name not in self.__dataclass_fields__:
+                raise InputError(unknown("part of a capture", name, [part.name for part in fields(self)]))
         given = {name: value for name, value in changes.items() if value is not None}
         return replace(self, **given) if given else self
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import GivesArrays, Images
+from fidsplat.backends.base import GivesArrays, Images, Waits
 from fidsplat.errors import InputError, MissingOutputError
 
 
@@ -115,9 +115,23 @@ class Frame(Mapping):
         """Pickled and copied as NumPy arrays: what `device_array` gives stays on its device."""
         return _kept_frame, (dict(self), dict(self.timings), dict(self.stats))
 
+    def wait(self) -> Frame:
+        """This frame, once the device has drawn it; nothing is copied.
+
+        Raises:
+            DeviceError: the device has failed while it was drawing.
+        """
+        if isinstance(self._images, Waits):
+            self._images.wait()
+        return self
+
     @property
     def timings(self) -> Mapping[str, float]:
-        """Milliseconds on the device by stage: project, sort, bin, blend, resolve."""
+        """Milliseconds on the device by stage: project, sort, bin, blend, resolve.
+
+        On a GPU a frame of a kind that was drawn before is drawn once more for that, since taking the time of
+        each launch would slow all frames down. Empty if its cloud is not on the device any more.
+        """
         return self._images.timings
 
     @property

@@ -12,6 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from fidsplat.backends.stack import ViewBatch
 from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
 from fidsplat.effects import FeatureSet
@@ -90,6 +91,15 @@ class Images(Protocol):
         ...
 
 
+@runtime_checkable
+class Waits(Protocol):
+    """Images that may still be on their way."""
+
+    def wait(self) -> None:
+        """Until the device has drawn them."""
+        ...
+
+
 class BatchImages(Protocol):
     """Finished output images of many views."""
 
@@ -101,6 +111,10 @@ class BatchImages(Protocol):
     def read(self, name: str) -> np.ndarray:
         """The images as a NumPy array of its own, (views, h, w) or (views, h, w, channels), in the type of
         `OUTPUTS[name]`; where a view was masked out 0, or -1 in `label` and `splat_id`."""
+        ...
+
+    def read_one(self, name: str, number: int) -> np.ndarray:
+        """The image of one view, as a NumPy array of its own."""
         ...
 
     @property
@@ -130,6 +144,15 @@ class GivesFloat64(Protocol):
 
     def read_float64(self, name: str) -> np.ndarray:
         """The image as a NumPy array in float64."""
+        ...
+
+
+@runtime_checkable
+class DrawsBatches(Protocol):
+    """A pipeline that draws many views together."""
+
+    def render_batch(self, resident: Any, batch: ViewBatch) -> BatchImages:
+        """Draw many views of an uploaded cloud, each with the bits of itself alone."""
         ...
 
 

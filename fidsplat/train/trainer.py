@@ -26,7 +26,7 @@ from fidsplat.train.dataset import Dataset, TrainingView
 from fidsplat.train.device import DeviceWork
 from fidsplat.train.host import HostWork
 from fidsplat.train.optimiser import rates
-from fidsplat.train.parameters import TrainingError, first_splats
+from fidsplat.train.parameters import TrainingError, first_splats, splats_of
 from fidsplat.train.random_numbers import Purpose, permutation
 from fidsplat.train.settings import TrainSettings
 from fidsplat.vision.images import to_uint8
@@ -76,6 +76,8 @@ class Trainer:
         renderer: opens the device that draws; None: the default device.
         settings: of the run; None: the defaults. `changes` are fields of it, given by name.
         checkpoint: a file that the run goes on from if it is there, and that `run` writes.
+        start: splats to begin with, in place of one at each of the data set's points; SH grow from degree 0
+            all the same.
 
     Raises:
         DeviceError: the device has no gradients.
@@ -88,6 +90,7 @@ class Trainer:
         renderer: Renderer | None = None,
         settings: TrainSettings | None = None,
         checkpoint: str | Path | None = None,
+        start: SplatCloud | None = None,
         **changes: Any,
     ) -> None:
         self.dataset = dataset
@@ -107,7 +110,7 @@ class Trainer:
             if isinstance(backend, Trains)
             else HostWork(backend, dataset.views, self.settings)
         )
-        self._made = self._begin()
+        self._made = self._begin(start)
         self._work.load(self._made.splats)
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
 
@@ -207,7 +210,7 @@ class Trainer:
             view.camera, quality=Quality.of(self.settings.quality), background=self.dataset.background
         )
 
-    def _begin(self) -> Progressed:
+    def _begin(self, start: SplatCloud | None) -> Progressed:
         settings = self.settings
         if self.checkpoint is not None and self.checkpoint.exists():
             made, device = load_checkpoint(self.checkpoint, settings, self.dataset.digest)
@@ -220,7 +223,13 @@ class Trainer:
         else:
             nothing = {"losses": np.float32, "psnrs": np.float32, "counts": np.int32}
             history = {name: np.zeros(0, dtype) for name, dtype in nothing.items()}
-            made = Progressed(0, 0, first_splats(self.dataset, settings), history)
+            dataset = self.dataset
+            splats = (
+                first_splats(dataset, settings)
+                if start is None
+                else splats_of(start, settings, dataset.origin)
+            )
+            made = Progressed(0, 0, splats, history)
         left = settings.iterations - made.iteration
         made.history = {name: np.append(a, np.zeros(left, a.dtype)) for name, a in made.history.items()}
         return made

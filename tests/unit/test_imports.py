@@ -37,7 +37,7 @@ MAY_IMPORT = {
     "markers": BASE | {"splats", "quality", "vision.dictionaries", "vision.images"},
     "scenes": PLAIN | {"markers", "formats"},
     "effects": PLAIN,
-    "backends": PLAIN | {"effects", "kernel_files"},
+    "backends": PLAIN | {"effects", "kernel_files", "views"},
     "timing": BASE,
     "random_clouds": PLAIN,
     "hard_cases": PLAIN
@@ -172,7 +172,7 @@ def within_any(names, package) -> bool:
 
 
 # modules of the package that every backend may import
-SHARED = ("base", "caches", "view", "prepare", "registry", "planes", "bands", "gradients")
+SHARED = ("base", "stack", "blank", "caches", "view", "prepare", "registry", "planes", "bands", "gradients")
 
 
 def test_backends_do_not_import_each_other():

@@ -75,6 +75,8 @@ class OpenCLBackend(Workspace):
             pocl_cache.check_once()
         super().__init__(device, _describe(device, _name_of(device)), _shape(device))
         self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
+        self._own: tuple[DeviceShape, dict[FeatureSet, OpenCLPipeline]] = self.shape, {}
+        """of the device's own shape, by what is asked for: found by the first look"""
 
     def upload(self, cloud: SplatCloud) -> Resident:
         """The cloud in device buffers."""
@@ -95,6 +97,8 @@ class OpenCLBackend(Workspace):
         Raises:
             DeviceError: the compiler refuses; its log is in the message. Or what is `unsupported`.
         """
+        if shape is None and self._own[0] is self.shape and (known := self._own[1].get(features)) is not None:
+            return known
         if why := self.unsupported(features):
             raise DeviceError(why)
         key = self._key(features, shape)
@@ -105,6 +109,10 @@ class OpenCLBackend(Workspace):
             )
         if key not in self._pipelines:
             self._pipelines[key] = OpenCLPipeline(self, assemble(*key), *key, self.pipeline)
+        if shape is None:
+            if self._own[0] is not self.shape:
+                self._own = self.shape, {}
+            self._own[1][features] = self._pipelines[key]
         return self._pipelines[key]
 
     def training(self) -> OpenCLTraining:

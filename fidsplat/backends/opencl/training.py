@@ -191,7 +191,7 @@ class OpenCLTraining:
         every = {**self._held, "count": self._count, **given}
         values = [every[one.name] for one in self._program.source.arguments[kernel]]
         try:
-            self._program.launch(kernel, size, group, values)
+            self._program.launch(self._workspace.turn_to(self._queue), kernel, size, group, values)
         except cl.Error as error:
             raise DeviceError(f"{self._workspace.info.title} failed while training: {error}") from error
 
