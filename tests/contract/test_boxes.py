@@ -1,6 +1,7 @@
 """Box footprints: what they cover, that they leave no seams, and every device against the reference."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -148,6 +149,12 @@ def corners_of(cloud):
 def test_boxes_around_and_behind_the_camera(renderer, seed, quality):
     """Bounds lose nothing: every device agrees with the reference, which asks every pixel."""
     assert_agrees(renderer, random_splats(60, seed=seed).with_boxes(), SMALL, quality=quality)
+
+
+def test_boxes_across_the_near_plane_end_there(renderer):
+    camera, boxes = replace(SMALL, near=1.0), random_splats(40, seed=1, scale=(0.1, 2.0)).with_boxes()
+    frame = assert_agrees(renderer, boxes, camera)
+    assert np.abs(frame["rgb"] - renderer.render(boxes, SMALL)["rgb"]).max() > 0.1
 
 
 @pytest.mark.parametrize("lowpass", ["none", "screen"])

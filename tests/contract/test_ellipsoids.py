@@ -42,6 +42,11 @@ def test_all_kinds_of_splats_in_one_picture(renderer, way):
     assert_agrees(renderer, mixed(5), CAMERA, quality=fs.Quality(ellipsoid=way))
 
 
+def test_samples_are_widened_as_pixels_are(renderer):
+    quality = fs.Quality(ellipsoid="ewa", samples=2)
+    assert_agrees(renderer, thick(6, spread=2.0), CAMERA, ("rgb", "alpha"), quality)
+
+
 @pytest.mark.parametrize("way", ["exact", "ewa"])
 def test_each_fragment_by_its_own_depth(renderer, way):
     disks = random_splats(20, 3, depth=(0.5, 4.0), scale=(0.05, 0.5), across=1.2)

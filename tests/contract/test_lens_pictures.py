@@ -79,6 +79,43 @@ def test_splats_much_larger_than_the_picture(renderer, camera):
     assert_agrees(renderer, random_splats(80, 5, depth=(-4.0, 4.0), scale=(0.1, 30.0)), camera)
 
 
+@each_camera
+def test_bounds_that_end_where_splats_are_half_opaque(renderer, camera):
+    """With so high a cut-off a bound that is too tight leaves a step where tiles end."""
+    cloud = random_splats(60, 9, depth=(-4.0, 4.0), scale=(0.1, 4.0))
+    opaque = fs.SplatCloud(cloud.means, cloud.quats, cloud.scales, np.full(60, 0.8), colors=cloud.colors)
+    quality = fs.Quality(alpha_cutoff=0.4, lowpass="none")
+    assert_agrees(renderer, opaque, camera, quality=quality)
+
+
+@pytest.mark.parametrize(
+    "camera", [fs.Camera.fisheye(70, 66, math.radians(200)), fs.Camera.equirectangular(70, 40)]
+)
+def test_small_splats_on_the_axis_and_at_the_poles(renderer, camera):
+    """Exactly there; filtered by the lens's own derivatives."""
+    means = [(0, 0, 2), (0, 0, -2), (0, 2, 0), (0, -2, 0), (2, 0, 0), (-2, 0, 0)]
+    scales = np.tile([0.05, 0.02], (6, 1))
+    splats = fs.SplatCloud(
+        means, np.tile([0.9, 0.3, -0.2, 0.1], (6, 1)), scales, np.full(6, 0.9), colors=np.ones((6, 3))
+    )
+    assert_agrees(renderer, splats, camera, ("rgb",), fs.Quality(lowpass="pixel"))
+
+
+def test_what_the_lens_does_not_see_is_no_surroundings_and_no_distance(renderer):
+    """Black, at no distance, and no NaN."""
+    sky = fs.Gradient((0.2, 0.4, 0.9), (0.3, 0.3, 0.1))
+    for name in ("fold", "fisheye 200"):
+        camera = CAMERAS[name]
+        rows, columns = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
+        unseen = np.isnan(camera.rays(np.stack([columns, rows], -1).reshape(-1, 2))).any(1)
+        unseen = unseen.reshape(rows.shape)
+        assert 0 < unseen.mean() < 1
+        cloud = random_splats(40, 1, depth=(1.0, 5.0))
+        frame = assert_agrees(renderer, cloud, camera, ("rgb", "distance"), background=sky)
+        assert not frame["distance"][unseen].any()
+        assert not frame["rgb"][unseen].any()
+
+
 @pytest.mark.parametrize(("camera", "samples"), alternate(CAMERAS, SAMPLES))
 def test_layers(renderer, camera, samples):
     assert_agrees(renderer, coplanar_cloud(1), camera, quality=fs.Quality(samples=samples))

@@ -10,6 +10,8 @@ import pytest
 from agreement import ALL_OUTPUTS, random_splats
 
 import fidsplat as fs
+from fidsplat.backends.bands import cut
+from fidsplat.backends.opencl import lists
 from fidsplat.backends.opencl.memory_plan import plan_of
 from fidsplat.backends.opencl.shapes import gpu_shape
 
@@ -85,6 +87,18 @@ def test_little_memory_gives_the_same_bits(opencl, cloud, whole, mebibytes, stre
         for name in ALL_OUTPUTS:
             assert np.array_equal(frame[name], whole[0][name]), name
     assert "packed splats" in own.backend.pool._buffers, "it was drawn in chunks"
+
+
+def test_one_pair_too_many_is_drawn_in_bands(monkeypatch):
+    renderer, cuts = fs.Renderer("opencl"), []
+    resident = renderer.upload(random_splats(300, seed=12))
+    camera = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
+    pairs = renderer.render(resident, camera).stats["pairs"]
+    monkeypatch.setattr(lists, "cut", lambda *given: cuts.append(given) or cut(*given))
+    for budget, times in ((pairs, 0), (pairs - 1, 1)):
+        monkeypatch.setattr(renderer.backend, "pair_budget", budget)
+        renderer.render(resident, camera)["rgb"]
+        assert len(cuts) == times
 
 
 def test_many_big_splats_in_chunks(opencl):

@@ -159,6 +159,13 @@ def test_a_rolling_shutter_takes_each_row_at_its_own_time(renderer):
         np.testing.assert_allclose(frame["rgb"][row], single["rgb"][row], atol=2e-5)
 
 
+def test_normals_in_the_world_are_those_of_each_rows_pose(renderer):
+    cloud = random_splats(60, 5, depth=(1.0, 5.0), scale=(0.1, 0.8))
+    assert_exposed(
+        renderer, cloud, CAMERAS["pinhole"], MOTION, SHUTTERS["rolling"], None, ("rgb", "normal_world")
+    )
+
+
 @pytest.mark.parametrize("rows", [1, 4, 15])
 def test_bands_are_off_by_at_most_their_stated_bound(renderer, rows):
     """A bar that crosses the picture while it is read out: its middle in each row, and where the time puts
@@ -196,6 +203,8 @@ def test_the_same_bits_again_and_in_bands_of_tiles(renderer):
         frame = renderer.render(
             cloud, camera, ("rgb", "depth", "label"), motion=MOTION, shutter=SHUTTERS["both"]
         )
+        # of the pose that sees most, not of all poses together
+        assert frame.stats["splats"] == len(cloud) >= frame.stats["visible"] > 0
         return [frame[name] for name in frame]
 
     first = draw()

@@ -7,7 +7,7 @@ import pytest
 import shapely
 
 import fidsplat as fs
-from fidsplat.experiments.plane import plane_picture
+from fidsplat.experiments.plane import from_srgb, plane_picture, srgb
 
 GRID = np.random.default_rng(5).integers(0, 2, (7, 9)).astype(np.uint8)
 MODULE = 0.2
@@ -117,3 +117,11 @@ def test_means_do_not_depend_on_how_the_picture_is_cut():
     )
     assert plane_picture(GRID, MODULE, part, **VALUES) == pytest.approx(picture[11:26, 17:37], abs=1e-12)
     assert math.isclose(picture.max(), VALUES["light"], abs_tol=1e-12)
+
+
+@pytest.mark.parametrize("light", [0.0, 0.001, 0.003, 0.0032, 0.02, 0.5, 1.0])
+def test_display_values_become_light_again(light):
+    """Straight below 0.0031308 of light, 0.04045 of the display."""
+    assert from_srgb(float(srgb(np.array(light)))) == pytest.approx(light, rel=1e-6)
+    straight = light <= 0.0031308
+    assert (srgb(np.array(light)) == pytest.approx(12.92 * light, rel=1e-9)) == straight

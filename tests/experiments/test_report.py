@@ -6,6 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
@@ -13,7 +14,7 @@ import fidsplat as fs
 from fidsplat.experiments import charts, pages
 from fidsplat.experiments.report import make_report
 from fidsplat.experiments.results import load
-from fidsplat.experiments.summary import Summary, read_summary
+from fidsplat.experiments.summary import Summary, join, read_summary
 from fidsplat.experiments.sweep import Results
 from fidsplat.experiments.targets import targets
 from fidsplat.provenance import run_facts
@@ -308,3 +309,14 @@ def test_labels_of_a_chart_do_not_overlap(tmp_path):
         extents = [super(type(text), text).get_window_extent(renderer) for text in boxes]
         for i, one in enumerate(extents):
             assert not any(one.overlaps(other) for other in extents[:i])
+
+
+def test_joined_rows_know_the_run_that_measured_them():
+    def of(device, *names):
+        rows = pd.DataFrame({"name": list(names), "amount": 1, "run": 0})
+        return Summary(rows, [{"device": device}])
+
+    joined = join([of("a", "x", "y"), of("b", "z"), of("c", "x")], ["name"])
+    devices = [joined.runs[run]["device"] for run in joined.rows["run"]]
+    assert list(zip(joined.rows["name"], devices, strict=True)) == [("x", "a"), ("y", "a"), ("z", "b")]
+    assert len(joined.runs) == 2  # nothing is left of the third

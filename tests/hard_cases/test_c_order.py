@@ -49,6 +49,19 @@ def test_a_tag_before_a_wall_does_not_jump(renderer):
         assert after < 10 * SMOOTH
 
 
+def test_of_equal_depths_the_first_goes_first(renderer):
+    """Disks at one depth that face the camera: the order of the cloud, at each pixel as by the centres."""
+    generator = np.random.default_rng(4)
+    means = np.column_stack([generator.uniform(-0.5, 0.5, (30, 2)), np.full(30, 2.0)])
+    colors = generator.uniform(0, 1, (30, 3))
+    cloud = fs.SplatCloud(means, [[1, 0, 0, 0]] * 30, [[0.3, 0.3]] * 30, [0.6] * 30, colors=colors)
+    view = Camera.pinhole(40, 30, 40.0, 40.0, 20.0, 15.0)
+    by_pixel, by_centre = (
+        renderer.render(cloud, view, quality=fs.Quality(order=order))["rgb"] for order in ("pixel", "centre")
+    )
+    assert np.abs(by_pixel - by_centre).max() < 1e-6
+
+
 @pytest.mark.parametrize("name", ["crossing", "fan"])
 def test_splats_that_cross_do_not_jump(renderer, name):
     """Every splat by itself is what its picture alone shows, composited in the order of depths there."""

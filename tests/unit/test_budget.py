@@ -11,6 +11,7 @@ from random_scenes import HELD_OUT, random_scene
 import fidsplat as fs
 from fidsplat.accuracy import errors, truth
 from fidsplat.budget import choose, prices, search, store
+from fidsplat.budget.choose import _measured
 from fidsplat.errors import InputError
 from fidsplat.timing import Clock, Timer
 
@@ -65,6 +66,11 @@ def test_the_price_list_keeps_its_promise(renderer, held_out, error):
     quality = fs.quality_within(error=error, device=renderer)
     found = [error_of(renderer, scene, quality, want) for scene, want in held_out]
     assert max(found) <= error, found
+
+
+def test_the_list_promises_no_more_than_was_asked_for(renderer):
+    for candidate in prices.load(renderer.device.kind):
+        assert choose(candidate.promised, device=renderer).error <= candidate.promised
 
 
 def test_less_error_is_never_cheaper(renderer):
@@ -145,6 +151,12 @@ def test_a_folder_that_cannot_be_written_is_no_obstacle(renderer, scene, tmp_pat
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setattr(store, "folder", lambda: tmp_path / "file" / "cache")
     assert within(renderer, scene, 1e-2).source == "measured"
+
+
+def test_a_sensor_changes_no_answer(renderer, scene):
+    """Errors are those of the light that it sees."""
+    assert within(renderer, scene, 1e-2).source == "measured"
+    assert within(renderer, scene, 1e-2, sensor=fs.Sensor(exposure=2.0)).source == "kept"
 
 
 def test_functions_have_no_key():
@@ -231,6 +243,16 @@ def test_a_time_is_kept_by_nine_frames_of_ten():
     candidates = tuple(prices.Candidate({"alpha_cutoff": cutoff}, 0, 0, 0, 1.0) for cutoff in late)
     assert search.Search(Known(), candidates).most_accurate_in(5.0).error == 1e-2
     assert search.Search(Known(), candidates).most_accurate_in(10.0).error == 1e-4
+
+
+def test_error_and_time_together_are_kept_by_nine_frames_of_ten():
+    found = SimpleNamespace(times=search.Times(1.0, 9.0), error=1e-3, quality=None)
+    found.candidate = SimpleNamespace(knobs={})
+    known = SimpleNamespace(cheapest_within=lambda error: found, device="known")
+    known.most_accurate_in = lambda ms: SimpleNamespace(error=0.5)
+    with pytest.raises(InputError, match=r"takes 9 ms a frame on known, not 5; the least error .* is 0\.5"):
+        _measured(known, 1e-3, 5.0)
+    assert _measured(known, 1e-3, 10.0).ms_late == 9.0
 
 
 @pytest.mark.parametrize("ms", [0, -3, 1e-6])

@@ -9,7 +9,7 @@ from fidsplat.experiments.demo_scene import demo_scene, demo_views
 from fidsplat.scenes import PlacedMarker
 from fidsplat.vision import read_back
 from fidsplat.vision.detect import Detection
-from fidsplat.vision.readback import families_of, match, means
+from fidsplat.vision.readback import corner_error, families_of, match, means
 from fidsplat.vision.visible import visible, visible_part
 
 
@@ -41,6 +41,22 @@ def test_what_is_outside_the_picture_or_turned_away_is_not_visible(scene):
     assert visible(placed, behind, np.full((480, 640), placed.label)).share == 0.0
     away = fs.Camera.look_at(640, 480, 1.0, (0, 0, -3), (0, 0, -4))
     assert visible(placed, away, np.full((480, 640), placed.label)).share == 0.0
+
+
+def test_of_a_marker_that_reaches_behind_the_camera_the_part_beyond_near_counts():
+    """It lies on the ground, 0.2 m below the camera: at depth 0.5, 40 pixels below the middle."""
+    lying = [[1, 0, 0, 0], [0, 0, 1, 0.2], [0, -1, 0, 1.2], [0, 0, 0, 1]]
+    placed = PlacedMarker(fs.marker("apriltag:36h11:5", size=3.0), np.array(lying, float))
+    camera = fs.Camera.pinhole(160, 100, 100.0, 100.0, 80.0, 50.0, near=0.5)
+    assert visible(placed, camera).box[3] == pytest.approx(90)
+
+
+def test_an_error_of_corners_is_a_distance():
+    square = np.array([[0, 0], [9, 0], [9, 9], [0, 9]], float)
+    code = Detection("apriltag", "36h11", 5, None, square + [3, 4])
+    assert corner_error(code, square) == pytest.approx(5)
+    code.corners[1:] = square[1:]
+    assert corner_error(code, square) == pytest.approx(2.5)
 
 
 def test_detections_are_matched_by_what_they_say_and_then_by_nearness(scene):

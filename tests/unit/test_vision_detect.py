@@ -136,6 +136,13 @@ def test_a_picture_with_several_codes():
     assert found[0].corners[:, 0].max() < 480 < found[1].corners[:, 0].min()
 
 
+def test_tags_that_stand_side_by_side_are_several():
+    """Less than two edges apart."""
+    left, right = (seen(dictionary_bits("apriltag", "36h11", k), 150)[0][:, 100:380] for k in (5, 7))
+    found = detect(np.hstack([left, right]), ["36h11"], qr=False)
+    assert [tag.name for tag in found] == ["apriltag:36h11:5", "apriltag:36h11:7"]
+
+
 @pytest.mark.parametrize("fails", [cv2.aruco.CORNER_REFINE_SUBPIX, cv2.aruco.CORNER_REFINE_APRILTAG])
 def test_either_way_to_squares_is_enough_and_both_give_a_tag_once(fails, monkeypatch):
     picture, corners, _ = seen(dictionary_bits("apriltag", "36h11", 5), 160, tilt=20, spin=8)
@@ -178,6 +185,12 @@ def test_what_detect_cannot_use():
             detect(np.zeros((60, 60), np.uint8), wanted)
 
 
+def test_corners_of_no_square_before_the_camera_have_no_pose():
+    """They cross; the squares that come nearest lie behind it."""
+    crossed = np.array([[73.0, 55.0], [231.0, 136.0], [385.0, 7.0], [39.0, 111.0]])
+    assert np.isnan(marker_pose(crossed, SIZE, CAMERA)).all()
+
+
 def test_what_has_no_pose():
     camera, corners = Camera.pinhole(9, 9, 9, 9, 4, 4), np.eye(4)[:, :2]
     for given, says in (
@@ -207,6 +220,8 @@ def test_align_gives_up_rather_than_slide_to_another_place():
     assert align(picture, corners + 5000.0, bits) is None
     assert align(np.full_like(picture, 90), corners, bits) is None
     assert align(255 - picture, corners, bits) is None
+    # another code stands there: its outer edge fits, its modules do not
+    assert align(picture, corners, dictionary_bits("apriltag", "36h11", 186)) is None
 
 
 def test_a_dark_line_at_a_corner_does_not_move_it():
@@ -248,7 +263,9 @@ def test_pose_error_is_the_distance_and_the_angle():
     apart, angle = pose_error(moved, truth)
     assert apart == pytest.approx(0.003)
     assert np.degrees(angle) == pytest.approx(1e-4)
-    assert pose_error(pose(turned(180), [0, 0, 1]), np.eye(4))[1] == pytest.approx(np.pi)
+    for degrees in (60, 90, 180):
+        angle = pose_error(pose(turned(degrees), [0, 0, 1]), np.eye(4))[1]
+        assert np.degrees(angle) == pytest.approx(degrees)
 
 
 @pytest.mark.parametrize("tilt", [-60, -20, 0, 20, 60])
