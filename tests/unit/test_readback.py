@@ -53,7 +53,7 @@ def test_of_a_marker_that_reaches_behind_the_camera_the_part_beyond_near_counts(
 
 def test_an_error_of_corners_is_a_distance():
     square = np.array([[0, 0], [9, 0], [9, 9], [0, 9]], float)
-    code = Detection("apriltag", "36h11", 5, None, square + [3, 4])
+    code = Detection("apriltag", "36h11", 5, None, square + 5 * np.array([0.6, 0.8]))
     assert corner_error(code, square) == pytest.approx(5)
     code.corners[1:] = square[1:]
     assert corner_error(code, square) == pytest.approx(2.5)
