@@ -93,7 +93,7 @@ def marker_records() -> list[Record]:
 
 
 def thick_records() -> list[Record]:
-    numbers = {"base": (1.0, 0.4), "ewa_antialiased": (1.0, 0.3), "exact": (1.5, 0.01)}
+    numbers = {"base": (1.0, 0.4), "ewa": (1.2, 0.4), "ewa_antialiased": (1.2, 0.3), "exact": (1.8, 0.01)}
     found = [record("r100k_720p_3d", p, result(*numbers[p.value])) for p in thick_points(KNOBS)]
     key = {"what": "linear", "scene": "ball", "knob": "3 sigma", "value": "60"}
     return [*found, Record(key, {"maximum": 0.58}, RUN)]

@@ -160,8 +160,8 @@ def points(
 
 
 def thick_points(knobs: Iterable[str]) -> list[Point]:
-    """The settings for scenes of 3D Gaussians: the base, and the ways of drawing them in pictures that are exact
-    otherwise."""
+    """The settings for scenes of 3D Gaussians: the base, and the ways of drawing them in pictures that are
+    exact otherwise."""
     values = _LADDERS["ellipsoid"][0] if "ellipsoid" in tuple(knobs) else ()
     ways = (Point("ellipsoid", value, EXACT.with_(ellipsoid=value)) for value in values)
     return [Point("base", "base", BASE), *ways]
