@@ -25,6 +25,7 @@ _HOME = {
     "Sensor": "fidsplat.sensor",
     "Fog": "fidsplat.surroundings",
     "Gradient": "fidsplat.surroundings",
+    "Layer": "fidsplat.surroundings",
     "Panorama": "fidsplat.surroundings",
     "Marker": "fidsplat.markers",
     "marker": "fidsplat.markers",

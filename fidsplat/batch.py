@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import BatchImages, GivesArrays, Images
+from fidsplat.backends.base import BatchImages, GivesArrays, Images, Waits
+from fidsplat.backends.blank import blank
 from fidsplat.effects import OUTPUTS
 from fidsplat.errors import InputError, MissingOutputError
 from fidsplat.frame import Frame, check_process
-
-_NOTHING = {"label": -1, "splat_id": -1}
-"""what images hold where nothing was drawn; the others 0"""
 
 
 class FrameBatch(Mapping):
@@ -74,7 +72,13 @@ class FrameBatch(Mapping):
             or not 0 <= number < self.views
         ):
             raise InputError(f"there is no view {number!r}; this batch has views 0 to {self.views - 1}")
-        return Frame(_OneOf(self, int(number)), self.outputs)
+        return Frame(_OneOf(self._images, int(number)), self.outputs)
+
+    def wait(self) -> FrameBatch:
+        """This batch, once the device has drawn it; nothing is copied."""
+        if isinstance(self._images, Waits):
+            self._images.wait()
+        return self
 
     def _check(self, name: str) -> None:
         if not isinstance(name, str) or name not in self.outputs:
@@ -113,10 +117,18 @@ class ViewByView:
         """(views, h, w) or (views, h, w, channels)."""
         output = OUTPUTS[name]
         channels = () if output.channels == 1 else (output.channels,)
-        made = np.full((self.views, *self._size, *channels), _NOTHING.get(name, 0), output.dtype)
+        made = np.full((self.views, *self._size, *channels), blank(name), output.dtype)
         for number, images in self._images.items():
             made[number] = images.read(name)
         return made
+
+    def read_one(self, name: str, number: int) -> np.ndarray:
+        """(h, w) or (h, w, channels)."""
+        if number in self._images:
+            return self._images[number].read(name)
+        output = OUTPUTS[name]
+        channels = () if output.channels == 1 else (output.channels,)
+        return np.full((*self._size, *channels), blank(name), output.dtype)
 
     @property
     def timings(self) -> Mapping[str, float]:
@@ -140,6 +152,9 @@ class _KeptBatch:
     def read(self, name: str) -> np.ndarray:
         return self._arrays[name]
 
+    def read_one(self, name: str, number: int) -> np.ndarray:
+        return self._arrays[name][number].copy()
+
 
 class _OneOf:
     """The images of one view of a batch."""
@@ -147,11 +162,11 @@ class _OneOf:
     timings: Mapping[str, float] = {}
     stats: Mapping[str, int] = {}
 
-    def __init__(self, batch: FrameBatch, number: int) -> None:
-        self._batch, self._number = batch, number
+    def __init__(self, images: BatchImages, number: int) -> None:
+        self._images, self._number = images, number
 
     def read(self, name: str) -> np.ndarray:
-        return self._batch[name][self._number].copy()
+        return self._images.read_one(name, self._number)
 
 
 def _kept_batch(

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import GivesArrays, Images
+from fidsplat.backends.base import GivesArrays, Images, Waits
 from fidsplat.errors import InputError, MissingOutputError
 
 
@@ -56,6 +56,49 @@ class Frame(Mapping):
             )
         return self._images.device_array(name)
 
+    def to_torch(self, name: str = "rgb") -> Any:
+        """The image as a torch tensor: without a copy on the device that drew it where that has arrays to
+        give (`device_array`), else copied to the host.
+
+        Raises:
+            InputError: an output that was not asked for, or torch is not installed.
+        """
+        self._check(name)
+        try:
+            import torch  # type: ignore[import-not-found]
+        except ImportError:
+            raise InputError(
+                "to_torch makes tensors of torch, which is not installed; pip install torch"
+            ) from None
+        if isinstance(self._images, GivesArrays):
+            check_process(self._process, "frame")
+            return torch.from_dlpack(self._images.device_array(name))
+        return torch.from_numpy(self[name].copy())  # torch has no arrays that are read-only
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        """The image of a frame with one output, as NumPy, PIL and OpenCV ask for it. Raises InputError where
+        there are several."""
+        if len(self.outputs) != 1:
+            raise InputError(
+                f"this frame has {len(self.outputs)} images ({', '.join(self.outputs)}); take one by its "
+                "name, frame['rgb'] say"
+            )
+        image = self[self.outputs[0]]
+        return image.astype(dtype or image.dtype) if copy or (dtype and dtype != image.dtype) else image
+
+    def __repr__(self) -> str:
+        took = sum(self.timings.values())
+        splats = f", {self.stats['splats']:,} splats" if "splats" in self.stats else ""
+        return f"Frame({', '.join(self.outputs)}{splats}, {took:.1f} ms)"
+
+    def _repr_png_(self) -> bytes:
+        """What a notebook shows: rgb, or else the first output, in colours."""
+        from fidsplat.vision.images import png_bytes  # late: it brings OpenCV
+        from fidsplat.vision.output_files import picture_of
+
+        name = "rgb" if "rgb" in self.outputs else self.outputs[0]
+        return png_bytes(picture_of(name, self[name]))
+
     def _check(self, name: str) -> None:
         if not isinstance(name, str) or name not in self.outputs:
             raise MissingOutputError(
@@ -72,9 +115,23 @@ class Frame(Mapping):
         """Pickled and copied as NumPy arrays: what `device_array` gives stays on its device."""
         return _kept_frame, (dict(self), dict(self.timings), dict(self.stats))
 
+    def wait(self) -> Frame:
+        """This frame, once the device has drawn it; nothing is copied.
+
+        Raises:
+            DeviceError: the device has failed while it was drawing.
+        """
+        if isinstance(self._images, Waits):
+            self._images.wait()
+        return self
+
     @property
     def timings(self) -> Mapping[str, float]:
-        """Milliseconds on the device by stage: project, sort, bin, blend, resolve."""
+        """Milliseconds on the device by stage: project, sort, bin, blend, resolve.
+
+        On a GPU a frame of a kind that was drawn before is drawn once more for that, since taking the time of
+        each launch would slow all frames down. Empty if its cloud is not on the device any more.
+        """
         return self._images.timings
 
     @property

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import Adopts, DeviceInfo, ResidentData
-from fidsplat.backends.prepare import prepare
+from fidsplat.backends.base import Adopts, DeviceInfo, DrawsBatches, ResidentData
+from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.registry import open_backend
 from fidsplat.backends.view import NO_CAMERA
 from fidsplat.batch import FrameBatch, ViewByView
@@ -277,23 +277,16 @@ class Renderer:
                     )
 
     def _draw_batch(self, resident: ResidentCloud, views: Views) -> FrameBatch:
-        first = views.capture(0)
-        features, view = prepare(resident._data, first)
-        images = {}
-        for number in range(len(views)) if len(views.captures) > 1 else views.drawn:
-            capture = views.capture(number)
-            own, one = prepare(resident._data, capture)
-            if own != features:
-                raise InputError(
-                    f"the views of a batch must have the same effects, but views 0 and {number} differ in "
-                    f"{', '.join(sorted(own.names ^ features.names)) or 'samples or precision'}; draw them "
-                    "in batches of their own"
-                )
-            if views.mask is None or views.mask[number]:
-                with self._lock:
-                    images[number] = self.backend.pipeline(features).render(resident._data, one)
-        size = view.height // view.samples, view.width // view.samples
-        return FrameBatch(ViewByView(images, len(views), size), first.outputs)
+        data = resident._data
+        features, batch = prepare_batch(data, views)
+        with self._lock:
+            pipeline = self.backend.pipeline(features)
+            if isinstance(pipeline, DrawsBatches):
+                images = pipeline.render_batch(data, batch)
+            else:
+                each = {int(k): pipeline.render(data, batch.one(n)) for n, k in enumerate(batch.slots)}
+                images = ViewByView(each, batch.total, batch.size)
+        return FrameBatch(images, views.captures[0].outputs)
 
     def _resident(self, scene: Scene | SplatCloud | ResidentCloud) -> ResidentCloud:
         resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)

@@ -12,7 +12,9 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from fidsplat.backends.stack import ViewBatch
 from fidsplat.backends.view import View
+from fidsplat.cameras import Camera
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.select import Traits
 from fidsplat.splats import SplatCloud
@@ -89,6 +91,15 @@ class Images(Protocol):
         ...
 
 
+@runtime_checkable
+class Waits(Protocol):
+    """Images that may still be on their way."""
+
+    def wait(self) -> None:
+        """Until the device has drawn them."""
+        ...
+
+
 class BatchImages(Protocol):
     """Finished output images of many views."""
 
@@ -100,6 +111,10 @@ class BatchImages(Protocol):
     def read(self, name: str) -> np.ndarray:
         """The images as a NumPy array of its own, (views, h, w) or (views, h, w, channels), in the type of
         `OUTPUTS[name]`; where a view was masked out 0, or -1 in `label` and `splat_id`."""
+        ...
+
+    def read_one(self, name: str, number: int) -> np.ndarray:
+        """The image of one view, as a NumPy array of its own."""
         ...
 
     @property
@@ -129,6 +144,15 @@ class GivesFloat64(Protocol):
 
     def read_float64(self, name: str) -> np.ndarray:
         """The image as a NumPy array in float64."""
+        ...
+
+
+@runtime_checkable
+class DrawsBatches(Protocol):
+    """A pipeline that draws many views together."""
+
+    def render_batch(self, resident: Any, batch: ViewBatch) -> BatchImages:
+        """Draw many views of an uploaded cloud, each with the bits of itself alone."""
         ...
 
 
@@ -332,6 +356,70 @@ class DifferentiablePipeline(Protocol):
             InputError: another picture has been drawn since, or a gradient is of no output or of a wrong
                 shape.
             DeviceError: the device runs out of memory or fails.
+        """
+        ...
+
+
+class TrainingKernels(Protocol):
+    """The work of a training step around the picture (`fidsplat.train`), on arrays of the device.
+
+    It holds splats before their activations, n of them, float32: `means` (n, 3), `log_scales` (n, 2), `quats`
+    (n, 4), `logits` (n,), `sh` (n, k, 3); Adam's running means of each as `first_NAME` and `second_NAME`;
+    `gradients` (n,) and `seen` (n,), the sums by which splats are made.
+    """
+
+    def take_views(self, views: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> None:
+        """Keep pictures (h, w, 3) uint8 with their masks (h, w) bool, to be compared with."""
+        ...
+
+    def load(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Hold these splats from now on."""
+        ...
+
+    def store(self) -> dict[str, np.ndarray]:
+        """The splats as they are now."""
+        ...
+
+    def resident(self, degree: int, origin: np.ndarray) -> ResidentData:
+        """The splats as they are drawn, with SH of this degree; it changes as they do."""
+        ...
+
+    def loss(self, images: Any, view: int, dssim_weight: float) -> tuple[float, float, Any]:
+        """Compare a picture with that of a view, by its number: the loss, the mean squared difference, and
+        the loss's derivative (h, w, 3) as an array of the device, which holds until the next call."""
+        ...
+
+    def count(self, screen: Any, camera: Camera, origin: np.ndarray) -> None:
+        """Add derivatives (n,) by places on the screen to their sums, and who was seen."""
+        ...
+
+    def step(
+        self, gradients: Mapping[str, Any], sizes: Mapping[str, float], numbers: Mapping[str, float]
+    ) -> None:
+        """A step of Adam by what `DifferentiablePipeline.backward` gave.
+
+        Args:
+            sizes: of the step, by `means`, `scales`, `quats`, `logits`, `sh` (of degree 0), `rest`.
+            numbers: `beta1`, `beta2`, `epsilon`, `root` (of 1 - beta2^step); `scale_penalty` and
+                `opacity_penalty`, added to the derivatives.
+        """
+        ...
+
+    def shake(self, size: float, steep: float, clear: float, words: Sequence[int]) -> None:
+        """Move means at random within their disks by `size` times their variance, those less whose opacity is
+        above `clear`. words: the seed's low and high word, the iteration, the purpose."""
+        ...
+
+
+@runtime_checkable
+class Trains(Protocol):
+    """A backend that has kernels for training."""
+
+    def training(self) -> TrainingKernels:
+        """They, compiled, without splats.
+
+        Raises:
+            DeviceError: the compiler refuses.
         """
         ...
 

@@ -18,6 +18,7 @@ from fidsplat.commands.render import Render
 from fidsplat.commands.source import Source
 from fidsplat.commands.tradeoff import Tradeoff
 from fidsplat.commands.train import Train
+from fidsplat.commands.view import View
 from fidsplat.commands.warm import Warm
 
 COMMANDS = {
@@ -26,6 +27,7 @@ COMMANDS = {
     "info": Info,
     "marker": Marker,
     "render": Render,
+    "view": View,
     "fly": Fly,
     "detect": Detect,
     "check": Check,

@@ -49,6 +49,7 @@ class Fly:
       fidsplat fly scene.toml --trajectory flight.tum -o flight --video flight.mp4
       fidsplat fly room.ply --trajectory poses.txt --file-rate 10 --smooth --outputs rgb,depth
       fidsplat fly moving.toml --times 0,0.5,1
+      fidsplat fly scene.toml --trajectory flight.tum --outputs rgb,label --log run.mcap --coco truth.json
     """
 
     source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply", "what to draw")]
@@ -69,6 +70,13 @@ class Fly:
     video: Annotated[str | None, option("FILE.mp4", "a video of the first output as well (extra: video)")] = (
         None
     )
+    log: Annotated[
+        str | None,
+        option("FILE.mcap|BAG", "a log of ROS 2 as well: pictures, intrinsics, poses (extra: logs)"),
+    ] = None
+    coco: Annotated[
+        str | None, option("FILE.json", "where markers are in each picture as well, as COCO annotations")
+    ] = None
     outputs: Annotated[
         str | None, option("A,B,...", "outputs, as for `fidsplat render` (default: the scene's, or rgb)")
     ] = None
@@ -85,6 +93,7 @@ class Fly:
 
     def run(self) -> int:
         import fidsplat as fs
+        from fidsplat.commands.flight_records import write_log, write_truth
         from fidsplat.effects import select
         from fidsplat.flights import Flight, FlightFolder
         from fidsplat.vision.video import check_video
@@ -113,6 +122,10 @@ class Fly:
         sheet = folder.write_sheet()
         if self.video is not None:
             self._steps("video", folder.write_video(self.video, self.rate), len(flight), 0)
+        if self.log is not None:
+            self._steps("log", write_log(folder, self.log, self.overwrite), len(flight), 0)
+        if self.coco is not None:
+            self._steps("truth", write_truth(folder, self.coco), len(flight), 0)
         self._tell(folder, sheet, left, seconds)
         return 0
 
@@ -130,15 +143,15 @@ class Fly:
         if self.json:
             facts: dict[str, Any] = {"source": self.source, "device": folder.device, "frames": frames}
             facts |= {"drawn": drawn, "seconds": seconds, "folder": str(folder.folder)}
-            print_json(facts | {"contact_sheet": str(sheet), "video": self.video})
+            facts |= {"contact_sheet": str(sheet), "video": self.video, "log": self.log, "coco": self.coco}
+            print_json(facts)
             return
         kept = f" ({frames - drawn} were there already)" if drawn < frames else ""
         rate = f", {drawn / seconds:.1f} a second" if drawn else ""
         say(
             console(False), f"{frames} pictures{kept} on {folder.device} in {seconds:.1f} s{rate}", str(sheet)
         )
-        if self.video is not None:
-            say(console(False), self.video)
+        say(console(False), *(name for name in (self.video, self.log, self.coco) if name is not None))
 
 
 def _own_motion(source: str, scene: Scene, smooth: bool) -> Trajectory:

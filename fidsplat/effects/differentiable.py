@@ -25,6 +25,7 @@ _REMEDIES = {
     "ellipsoid": "a cloud of disks",
     "ellipsoids": "a cloud of disks",
     "background": "a background of one colour",
+    "opaque": "a capture without a layer",
     "motion": "a capture in which no group moves",
     "shutter": "a capture of one pose",
     "blend": "blend_precision='float32'",

@@ -36,8 +36,8 @@ class FeatureSet:
     """
 
     slots: tuple[str, ...]
-    """One effect per kind, in the fixed order camera, color, ellipsoids if any, lowpass, stop, compose,
-    footprint, background, arithmetic; then motion, shutter and double blending, if any."""
+    """One effect per kind, in the fixed order camera, color, ellipsoids if any, lowpass, stop, a layer if
+    any, compose, footprint, background, arithmetic; then motion, shutter and double blending, if any."""
     outputs: tuple[str, ...]
     """Sorted names of the outputs beside rgb."""
     sh_degree: int
@@ -97,6 +97,10 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
     quality, background = capture.quality, capture.backdrop
     lens = None if capture.camera is None else capture.camera.lens
     ellipsoid = _ellipsoid(cloud, quality, lens)
+    if capture.layer is not None and capture.exposed:
+        raise InputError(
+            "a layer shows one moment; draw it with a shutter whose exposure_time and readout are 0"
+        )
     # what filters itself needs no low-pass
     alone = cloud.ellipsoids == "all" and ellipsoid != "exact"
     filtered = cloud.footprint == "box" or alone
@@ -116,6 +120,8 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
             *(("ellipsoids_alone",) if alone else ()),
             f"lowpass_{lowpass}",
             f"stop_{quality.stop_rule}",
+            # before what composites, whose fragments it hides
+            *(("opaque_layer",) if capture.layer is not None else ()),
             _composing(cloud, quality.order),
             f"footprint_{cloud.footprint}",
             f"background_{_KINDS.get(type(background), 'constant')}",

@@ -18,7 +18,7 @@ from fidsplat.render import Renderer
 from fidsplat.scenes import Scene
 from fidsplat.vision.images import write_png
 
-POINTS = 3000
+POINTS = 6000
 _SPREAD = 0.005
 """metres, by which points are off"""
 _TARGET = (0.0, 0.1, 0.3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from fidsplat.scenes import Scene
 from fidsplat.sim.poses import quaternions_of
 from fidsplat.sim.rig import Pictures, Rig, RigCamera
 from fidsplat.splats import SplatCloud
+from fidsplat.surroundings import Layer
 
 try:
     import mujoco as _mujoco
@@ -91,20 +92,25 @@ class MujocoRig(Rig):
         return bodies, cameras
 
     def render(  # type: ignore[override]
-        self, data: Any, *, outputs: Iterable[str] | None = None, mask: Any = None
+        self,
+        data: Any,
+        *,
+        outputs: Iterable[str] | None = None,
+        layers: Mapping[str, Sequence[Layer]] | None = None,
+        mask: Any = None,
     ) -> Pictures:
         """What the cameras see.
 
         Args:
             data: an MjData, a list of them, one for each environment, or mujoco_warp's Data; after
                 `mj_forward` or `mj_step`, which say where bodies and cameras are.
-            outputs, mask: as in `Rig.render`.
+            outputs, layers, mask: as in `Rig.render`.
 
         Raises:
             InputError: as `Rig.render`; data without poses.
         """
         bodies, cameras = self.poses(data)
-        return super().render(bodies, cameras, outputs=outputs, mask=mask)
+        return super().render(bodies, cameras, outputs=outputs, layers=layers, mask=mask)
 
 
 def camera_of(model: Any, name: str, default: bool = True) -> RigCamera:

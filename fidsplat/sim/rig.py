@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,6 +17,7 @@ from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.sensor import Sensor
 from fidsplat.sim.poses import IDENTITY, check_poses, compose, inverse, matrix_of, pose_of
 from fidsplat.splats import SplatCloud
+from fidsplat.surroundings import Layer
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +110,7 @@ class Rig:
         cameras: Mapping[str, Any] | Any = None,
         *,
         outputs: Iterable[str] | None = None,
+        layers: Mapping[str, Sequence[Layer]] | None = None,
         mask: Any = None,
     ) -> Pictures:
         """Pictures of every environment by every camera.
@@ -121,6 +123,7 @@ class Rig:
             cameras: poses, world from camera, OpenCV axes: {name: (env, 7)} of some cameras, or
                 (env, camera, 7). Cameras without one stand where they are mounted.
             outputs: names of the output images; default the rig's.
+            layers: {name of a camera: a Layer for each environment}, what another renderer drew from there.
             mask: (env,) bool; environments that are False are not drawn: 0, and labels of -1.
 
         Raises:
@@ -136,12 +139,13 @@ class Rig:
         stands = {name: self._stands(name, given, count) for name in self.cameras} | views
         names = None if outputs is None else output_names(outputs)
         drawn = _mask_of(mask, count)
+        seen = {name: () for name in self.cameras} | self._layers_of(layers, count)
         groups = {
             label: compose(given[name], self._rest[name]) if name in self._rest else given[name]
             for label, name in self.labels.items()
         }
         batches = {
-            name: self._draw(self._taken_by(name, names, count), stands[name], groups, drawn)
+            name: self._draw(self._taken_by(name, names, seen[name], count), stands[name], groups, drawn)
             for name in self.cameras
         }
         self._drawn += count
@@ -168,20 +172,36 @@ class Rig:
         on = np.broadcast_to(IDENTITY, (count, 7)) if camera.body is None else bodies[camera.body]
         return compose(on, camera.mount)
 
-    def _taken_by(self, name: str, outputs: tuple[str, ...] | None, count: int) -> list[Capture]:
-        """How a camera takes its pictures: one capture for all, or where there is noise one for each."""
+    def _layers_of(self, layers: Any, count: int) -> dict[str, Sequence[Layer]]:
+        for name, each in ({} if layers is None else layers).items():
+            if name not in self.cameras:
+                raise InputError(unknown("camera", name, self.cameras))
+            if len(each) != count:
+                raise InputError(
+                    f"{len(each)} layers for the camera {name!r}, but {count} environments; give one for each"
+                )
+        return dict(layers or {})
+
+    def _taken_by(
+        self, name: str, outputs: tuple[str, ...] | None, layers: Sequence[Layer], count: int
+    ) -> list[Capture]:
+        """How a camera takes its pictures: one capture for all, or where there is noise or a layer one for
+        each."""
         own = self.cameras[name]
         capture = self._capture.with_(
             camera=own.camera, sensor=own.sensor, outputs=outputs or self.outputs_of(name)
         )
         if "noise" not in capture.sensor.steps:
-            return [capture]
+            return [capture.with_(layer=layer) for layer in layers] or [capture]
         place = list(self.cameras).index(name)
         seeds = [
             (capture.sensor.seed + 0x9E3779B1 * (self._drawn + i) + 0x85EBCA77 * place) % 2**32
             for i in range(count)
         ]
-        return [capture.with_(sensor=replace(capture.sensor, seed=seed)) for seed in seeds]
+        return [
+            capture.with_(sensor=replace(capture.sensor, seed=seed), layer=layer)
+            for seed, layer in zip(seeds, layers or [None] * count, strict=True)
+        ]
 
     def _draw(
         self,

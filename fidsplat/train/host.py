@@ -9,6 +9,7 @@ import numpy as np
 
 from fidsplat.backends.base import Backend, Images, ResidentData
 from fidsplat.cameras import Camera
+from fidsplat.train import mcmc
 from fidsplat.train.dataset import TrainingView
 from fidsplat.train.losses import Loss, picture_loss
 from fidsplat.train.optimiser import adam_step, inner_gradients
@@ -34,6 +35,9 @@ class HostWork:
         """The splats as they are now."""
         return self._splats
 
+    def __len__(self) -> int:
+        return len(self._splats)
+
     def resident(self, degree: int, origin: np.ndarray) -> ResidentData:
         """The splats as the device draws them, with SH of this degree."""
         return self._backend.upload(self._splats.cloud(degree, origin, shared=True))
@@ -55,6 +59,10 @@ class HostWork:
         given = {name: on_host(array) for name, array in gradients.items()}
         inner = inner_gradients(self._splats, given, self._settings)
         adam_step(self._splats, inner, rate, self._settings, step)
+
+    def shake(self, iteration: int, rate: float) -> None:
+        """Moves the means at random."""
+        mcmc.shake(self._splats, self._settings, iteration, rate)
 
 
 def seen(splats: Splats, camera: Camera, origin: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from fidsplat.train.settings import TrainSettings
 
 MOST_COPIES = 51
 """copies of a splat that the formula for their opacity and scale counts, at most"""
-_STEEP, _CLEAR = 100.0, 0.995
+STEEP, CLEAR = 100.0, 0.995
 """of the sigmoid by which opaque splats are shaken less"""
 
 
@@ -59,7 +59,7 @@ def shake(splats: Splats, settings: TrainSettings, iteration: int, rate: float) 
     """
     turns = quaternion_to_matrix(splats.values["quats"])[:, :, :2]
     draws = normal(settings.seed, Purpose.NOISE, iteration, len(splats))[:, :3]
-    faint = sigmoid(-_STEEP * (splats.opacities.astype(np.float64) - (1 - _CLEAR)))
+    faint = sigmoid(-STEEP * (splats.opacities.astype(np.float64) - (1 - CLEAR)))
     inside = np.einsum("nji,nj->ni", turns, draws) * splats.scales.astype(np.float64) ** 2
     step = np.einsum("nij,nj->ni", turns, inside) * (faint * rate * settings.noise)[:, None]
     splats.values["means"] += step.astype(np.float32)

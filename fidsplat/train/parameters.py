@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.errors import FidsplatError
+from fidsplat.errors import FidsplatError, InputError
 from fidsplat.harmonics import C0
 from fidsplat.splats import SplatCloud
 from fidsplat.train.dataset import Dataset
@@ -18,6 +18,9 @@ NAMES = ("means", "log_scales", "quats", "logits", "sh")
 """the arrays of a `Splats`"""
 _LEAST_SQUARE = 1e-7
 """m^2, of the mean squared distance that first scales are made of"""
+
+_SMALLEST = 1e-6
+"""opacity, and distance from 1, of splats that training begins with: beyond it nothing would move them"""
 
 Arrays = dict[str, np.ndarray]
 
@@ -45,7 +48,7 @@ class Splats:
     @classmethod
     def of(cls, values: Arrays) -> Splats:
         """Splats that nothing is remembered of."""
-        values = {name: np.ascontiguousarray(values[name], np.float32) for name in NAMES}
+        values = {name: np.array(values[name], np.float32, order="C") for name in NAMES}
         count = len(values["means"])
         zero = np.zeros(count, np.float32)
         return cls(values, _zeros(values), _zeros(values), zero, zero.copy())
@@ -86,8 +89,7 @@ class Splats:
             if not np.isfinite(array).all():
                 rows = np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(1))
                 raise TrainingError(
-                    f"{name} of {len(rows)} splats (the first is {rows[0]}) are not finite {when}; "
-                    "lower the learning rates, or check the data set's cameras"
+                    f"{name} of {len(rows)} splats (the first is {rows[0]}) are not finite {when}"
                 )
 
     def cloud(self, degree: int, origin: np.ndarray, shared: bool = False) -> SplatCloud:
@@ -99,7 +101,7 @@ class Splats:
         means, sh = values["means"][:], values["sh"][:, coefficients]
         return SplatCloud.of_checked(
             means if shared else means.copy(),
-            values["quats"][:],
+            values["quats"].copy(),  # which are made unit where they lie
             self.scales,
             self.opacities,
             np.ascontiguousarray(sh) if shared else sh.copy(),
@@ -131,6 +133,37 @@ def first_splats(dataset: Dataset, settings: TrainSettings) -> Splats:
             "log_scales": np.repeat(np.log(scale)[:, None], 2, axis=1),
             "quats": uniform(settings.seed, Purpose.ROTATIONS, 0, count),
             "logits": np.full(count, logit(settings.first_opacity)),
+            "sh": sh,
+        }
+    )
+
+
+def splats_of(cloud: SplatCloud, settings: TrainSettings, origin: np.ndarray) -> Splats:
+    """The splats of a cloud, with zeros for SH coefficients that it lacks; those beyond `sh_degree` go.
+
+    Raises:
+        InputError: a cloud with boxes or 3D Gaussians, which are not trained, or with more than `max_splats`.
+    """
+    if cloud.boxes is not None or cloud.thickness is not None:
+        raise InputError("only disks are trained, and the cloud has boxes or 3D Gaussians; see flattened()")
+    if not 0 < len(cloud) <= settings.max_splats:
+        raise InputError(
+            f"the cloud to start from has {len(cloud)} splats; it must be 1 to max_splats, "
+            f"{settings.max_splats}"
+        )
+    sh = np.zeros((len(cloud), (settings.sh_degree + 1) ** 2, 3))
+    if cloud.sh is not None:
+        shared = min(sh.shape[1], cloud.sh.shape[1])
+        sh[:, :shared] = cloud.sh[:, :shared]
+    elif cloud.colors is not None:
+        sh[:, 0] = (cloud.colors.astype(np.float64) - 0.5) / C0
+    opacities = np.clip(cloud.opacities.astype(np.float64), _SMALLEST, 1 - _SMALLEST)
+    return Splats.of(
+        {
+            "means": cloud.world_means() - origin,
+            "log_scales": np.log(cloud.scales),
+            "quats": cloud.quats,
+            "logits": np.log(opacities) - np.log1p(-opacities),
             "sh": sh,
         }
     )

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.backends.base import Differentiates
+from fidsplat.backends.base import Differentiates, Trains
 from fidsplat.backends.prepare import prepare
 from fidsplat.capture import Capture
 from fidsplat.errors import DeviceError, InputError, unknown
@@ -23,9 +23,10 @@ from fidsplat.splats import SplatCloud
 from fidsplat.train import densify, mcmc
 from fidsplat.train.checkpoint import Progressed, load_checkpoint, save_checkpoint
 from fidsplat.train.dataset import Dataset, TrainingView
+from fidsplat.train.device import DeviceWork
 from fidsplat.train.host import HostWork
 from fidsplat.train.optimiser import rates
-from fidsplat.train.parameters import TrainingError, first_splats
+from fidsplat.train.parameters import TrainingError, first_splats, splats_of
 from fidsplat.train.random_numbers import Purpose, permutation
 from fidsplat.train.settings import TrainSettings
 from fidsplat.vision.images import to_uint8
@@ -75,6 +76,8 @@ class Trainer:
         renderer: opens the device that draws; None: the default device.
         settings: of the run; None: the defaults. `changes` are fields of it, given by name.
         checkpoint: a file that the run goes on from if it is there, and that `run` writes.
+        start: splats to begin with, in place of one at each of the data set's points; SH grow from degree 0
+            all the same.
 
     Raises:
         DeviceError: the device has no gradients.
@@ -87,6 +90,7 @@ class Trainer:
         renderer: Renderer | None = None,
         settings: TrainSettings | None = None,
         checkpoint: str | Path | None = None,
+        start: SplatCloud | None = None,
         **changes: Any,
     ) -> None:
         self.dataset = dataset
@@ -101,8 +105,12 @@ class Trainer:
             )
         self._differentiate = backend.differentiate
         self._captures = [self._capture(view) for view in dataset.views]
-        self._work = HostWork(backend, dataset.views, self.settings)
-        self._made = self._begin()
+        self._work = (
+            DeviceWork(backend.training(), dataset.views, self.settings)
+            if isinstance(backend, Trains)
+            else HostWork(backend, dataset.views, self.settings)
+        )
+        self._made = self._begin(start)
         self._work.load(self._made.splats)
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
 
@@ -202,7 +210,7 @@ class Trainer:
             view.camera, quality=Quality.of(self.settings.quality), background=self.dataset.background
         )
 
-    def _begin(self) -> Progressed:
+    def _begin(self, start: SplatCloud | None) -> Progressed:
         settings = self.settings
         if self.checkpoint is not None and self.checkpoint.exists():
             made, device = load_checkpoint(self.checkpoint, settings, self.dataset.digest)
@@ -215,7 +223,13 @@ class Trainer:
         else:
             nothing = {"losses": np.float32, "psnrs": np.float32, "counts": np.int32}
             history = {name: np.zeros(0, dtype) for name, dtype in nothing.items()}
-            made = Progressed(0, 0, first_splats(self.dataset, settings), history)
+            dataset = self.dataset
+            splats = (
+                first_splats(dataset, settings)
+                if start is None
+                else splats_of(start, settings, dataset.origin)
+            )
+            made = Progressed(0, 0, splats, history)
         left = settings.iterations - made.iteration
         made.history = {name: np.append(a, np.zeros(left, a.dtype)) for name, a in made.history.items()}
         return made
@@ -246,18 +260,16 @@ class Trainer:
         self._made.adam_step += 1
         rate = rates(settings, iteration, extent)
         self._work.step(gradients, rate, self._made.adam_step)
+        if due:
+            self._work.load(mcmc.moved(self._work.store(), settings, iteration))
         if mcmc_runs:
-            splats = self._work.store()
-            if due:
-                splats = mcmc.moved(splats, settings, iteration)
-            mcmc.shake(splats, settings, iteration, rate["means"])
-            self._work.load(splats)
+            self._work.shake(iteration, rate["means"])
 
     def _note(self, iteration: int, loss: float, ratio: float) -> None:
         history = self._made.history
         history["losses"][iteration - 1] = loss
         history["psnrs"][iteration - 1] = ratio
-        history["counts"][iteration - 1] = len(self._work.store())
+        history["counts"][iteration - 1] = len(self._work)
 
     def _what_is_kept(self) -> str:
         if self.checkpoint is None or not self.checkpoint.exists():

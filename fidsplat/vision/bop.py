@@ -16,6 +16,8 @@ from fidsplat.vision.images import write_png
 from fidsplat.vision.truth import Box, MarkerTruth, Truth
 from fidsplat.vision.visible import outline
 
+PIXEL = 0.5
+"""what BOP counts less than we do: the centre of its first pixel is at 0"""
 DEPTH_SCALE = 0.1
 """millimetres of a step of the depth's 16 bits, which then reach 6.5 m"""
 
@@ -69,7 +71,7 @@ class BopScene:
                 self._folder / "depth" / f"{name}.png", np.where(steps < 65536, steps, 0).astype(np.uint16)
             )
         self._cameras[str(number)] = {
-            "cam_K": camera.matrix.ravel().tolist(),
+            "cam_K": (camera.matrix - [[0, 0, PIXEL], [0, 0, PIXEL], [0, 0, 0]]).ravel().tolist(),
             "cam_R_w2c": camera.world_to_camera[:3, :3].ravel().tolist(),
             "cam_t_w2c": (1000 * camera.world_to_camera[:3, 3]).tolist(),
             "depth_scale": DEPTH_SCALE,

@@ -11,7 +11,9 @@ from sampling import SAMPLES, alternate
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
+from fidsplat.backends.view import View
 from fidsplat.cameras import BrownConrady, Fisheye
+from fidsplat.hard_cases.agreement import Picture, against_reference
 
 POSE = fs.Camera.look_at(64, 48, 1.0, (0.3, 0.2, -0.1), (0.1, 0.0, 3.0)).world_to_camera
 
@@ -101,21 +103,6 @@ def test_small_splats_on_the_axis_and_at_the_poles(renderer, camera):
     assert_agrees(renderer, splats, camera, ("rgb",), fs.Quality(lowpass="pixel"))
 
 
-def test_what_the_lens_does_not_see_is_no_surroundings_and_no_distance(renderer):
-    """Black, at no distance, and no NaN."""
-    sky = fs.Gradient((0.2, 0.4, 0.9), (0.3, 0.3, 0.1))
-    for name in ("fold", "fisheye 200"):
-        camera = CAMERAS[name]
-        rows, columns = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
-        unseen = np.isnan(camera.rays(np.stack([columns, rows], -1).reshape(-1, 2))).any(1)
-        unseen = unseen.reshape(rows.shape)
-        assert 0 < unseen.mean() < 1
-        cloud = random_splats(40, 1, depth=(1.0, 5.0))
-        frame = assert_agrees(renderer, cloud, camera, ("rgb", "distance"), background=sky)
-        assert not frame["distance"][unseen].any()
-        assert not frame["rgb"][unseen].any()
-
-
 @pytest.mark.parametrize(("camera", "samples"), alternate(CAMERAS, SAMPLES))
 def test_layers(renderer, camera, samples):
     assert_agrees(renderer, coplanar_cloud(1), camera, quality=fs.Quality(samples=samples))
@@ -173,6 +160,36 @@ def test_outside_the_lens_is_background(renderer):
     assert (frame["alpha"][outside] == 0).all()
     assert (frame["label"][outside] == -1).all()
     assert frame["alpha"][~outside].max() > 0.5
+
+
+@pytest.mark.parametrize("name", ["fold", "fisheye 200"])
+def test_where_a_lens_sees_nothing_there_is_no_distance_and_no_gradient(renderer, name):
+    picture = Picture(
+        random_splats(60, 3, depth=(1.0, 4.0)),
+        CAMERAS[name],
+        fs.Quality(samples=2),
+        ("rgb", "alpha", "distance", "distance_median"),
+        fs.Gradient((0.2, 0.4, 0.9), (0.9, 0.2, 0.1)),
+    )
+    frame = renderer.render(
+        picture.cloud, picture.camera, picture.outputs, picture.quality, picture.background
+    )
+    rays = View.of(fs.Capture(picture.camera, quality=picture.quality), np.zeros(3)).raster.rays[..., 0]
+    seen = (~np.isnan(rays)).reshape(picture.camera.height, 2, picture.camera.width, 2).sum((1, 3))
+    unseen = seen == 0
+    assert unseen.any()
+    assert ((seen > 0) & (seen < 4)).any()
+    for name in picture.outputs:
+        assert (frame[name][unseen] == 0).all(), name
+    assert all(difference.agrees for difference in against_reference(renderer, picture))
+
+
+def test_a_splat_beside_the_camera_that_is_seen_edge_on_leaves_its_dot(renderer):
+    """All of its plane lies at z = 0: only the forms' z is not 0."""
+    cloud = fs.SplatCloud([[1, 0.1, 0]], [[1, 0, 0, 0]], [[0.1, 0.2]], [0.9], colors=[[1, 0.5, 0.2]])
+    camera = fs.Camera.fisheye(71, 67, math.radians(200))
+    frame = assert_agrees(renderer, cloud, camera)
+    assert frame["alpha"].max() > 0.3
 
 
 def test_a_slight_distortion_is_nearly_a_pinhole(renderer):

@@ -255,6 +255,15 @@ def test_without_the_apriltag_library_the_table_shows_opencv(tmp_path):
     assert "| AR Tag | 84.0/82.0 |" in make_report([tmp_path], tmp_path)[0].read_text()
 
 
+def test_tables_that_are_joined_keep_the_runs_of_their_rows():
+    """Of rows about the same thing the one of most measurements stays, with the run that it is of."""
+    one = Summary(pd.DataFrame({"name": ["a", "b"], "amount": [1, 5], "run": [0, 1]}), [{"k": 0}, {"k": 1}])
+    other = Summary(pd.DataFrame({"name": ["a", "c"], "amount": [2, 1], "run": [1, 0]}), [{"k": 2}, {"k": 3}])
+    joined = join([one, other], ["name"])
+    found = {row["name"]: joined.runs[row["run"]]["k"] for _, row in joined.rows.iterrows()}
+    assert found == {"a": 3, "b": 1, "c": 2}
+
+
 def test_a_summary_is_what_its_file_says(tmp_path):
     rows = load_rows(tmp_path)
     summary = Summary(rows, [{"device": "d", "points": 1}], ["a note"])
@@ -309,14 +318,3 @@ def test_labels_of_a_chart_do_not_overlap(tmp_path):
         extents = [super(type(text), text).get_window_extent(renderer) for text in boxes]
         for i, one in enumerate(extents):
             assert not any(one.overlaps(other) for other in extents[:i])
-
-
-def test_joined_rows_know_the_run_that_measured_them():
-    def of(device, *names):
-        rows = pd.DataFrame({"name": list(names), "amount": 1, "run": 0})
-        return Summary(rows, [{"device": device}])
-
-    joined = join([of("a", "x", "y"), of("b", "z"), of("c", "x")], ["name"])
-    devices = [joined.runs[run]["device"] for run in joined.rows["run"]]
-    assert list(zip(joined.rows["name"], devices, strict=True)) == [("x", "a"), ("y", "a"), ("z", "b")]
-    assert len(joined.runs) == 2  # nothing is left of the third

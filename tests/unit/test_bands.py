@@ -1,23 +1,24 @@
-"""Bands of tiles, for pictures with more pairs than there is room for."""
-
-from itertools import pairwise
+"""Bands of tiles: where they are cut."""
 
 import numpy as np
 import pytest
 
 from fidsplat.backends.bands import cut
 
-TOTALS = np.array([2, 0, 3, 1, 9, 0, 0, 1, 1, 2])
-START = 5
+
+@pytest.mark.parametrize(
+    ("most", "bands"),
+    [
+        (100, [(10, 15, 16)]),
+        (7, [(10, 12, 7), (12, 14, 6), (14, 15, 3)]),
+        (1, [(10, 11, 3), (11, 12, 4), (12, 13, 5), (13, 14, 1), (14, 15, 3)]),
+    ],
+)
+def test_no_band_has_more_pairs_than_there_is_room_for(most, bands):
+    """Unless one tile alone has more."""
+    assert list(cut(np.array([3, 4, 5, 1, 3], np.uint32), most, start=10)) == bands
 
 
-@pytest.mark.parametrize("most", [1, 3, 7, 100])
-def test_tiles_are_cut_into_as_few_bands_as_keep_the_budget(most):
-    bands = list(cut(TOTALS, most, START))
-    assert (bands[0][0], bands[-1][1]) == (START, START + len(TOTALS))
-    assert all(end == first for (_, end, _), (first, _, _) in pairwise(bands))
-    for first, end, pairs in bands:
-        assert pairs == TOTALS[first - START : end - START].sum()
-        assert pairs <= most or end == first + 1
-    for _, end, pairs in bands[:-1]:
-        assert pairs + TOTALS[end - START] > most
+def test_many_bands_of_several_tiles_each():
+    """The room is that of each band, not of the first alone."""
+    assert [end - first for first, end, _ in cut(np.ones(100, np.uint32), 8)] == [8] * 12 + [4]

@@ -140,6 +140,21 @@ def test_the_scenes_own_motion(here):
         assert (here / "own" / name).read_bytes() == (here / "out" / name).read_bytes()
 
 
+def test_a_log_and_the_truth_beside_the_pictures(here):
+    logs = pytest.importorskip("fidsplat.logs", reason="pip install 'fidsplat[logs]'", exc_type=fs.InputError)
+    words = ("--rate", "2", "--outputs", "rgb,label", "--log", "run.mcap", "--coco", "truth.json")
+    assert fly(*words) == 0
+    pictures = list(logs.log_pictures("run.mcap"))
+    assert [name for name, _ in pictures] == [f"/camera/image_raw {t:.3f} s" for t in (0, 0.5, 1)]
+    np.testing.assert_array_equal(pictures[1][1], read_image("out/rgb/000001.png"))
+    truth = json.loads((here / "truth.json").read_text())
+    assert [image["file_name"] for image in truth["images"]] == [f"rgb/00000{k}.png" for k in range(3)]
+    moved = [annotation["camera_from_marker"][0][3] for annotation in truth["annotations"]]
+    np.testing.assert_allclose(moved, [0, -0.15, -0.3], atol=1e-9)
+    own = np.load("out/label/000001.npy") == 1
+    assert truth["annotations"][1]["area"] == own.sum() > 50
+
+
 def test_a_video_has_every_picture(here):
     pytest.importorskip("imageio_ffmpeg", reason="the extra video is not installed")
     pictures = [np.full((33, 47, 3), 60 + 20 * k, np.uint8) for k in range(4)]

@@ -43,22 +43,6 @@ def test_what_is_outside_the_picture_or_turned_away_is_not_visible(scene):
     assert visible(placed, away, np.full((480, 640), placed.label)).share == 0.0
 
 
-def test_of_a_marker_that_reaches_behind_the_camera_the_part_beyond_near_counts():
-    """It lies on the ground, 0.2 m below the camera: at depth 0.5, 40 pixels below the middle."""
-    lying = [[1, 0, 0, 0], [0, 0, 1, 0.2], [0, -1, 0, 1.2], [0, 0, 0, 1]]
-    placed = PlacedMarker(fs.marker("apriltag:36h11:5", size=3.0), np.array(lying, float))
-    camera = fs.Camera.pinhole(160, 100, 100.0, 100.0, 80.0, 50.0, near=0.5)
-    assert visible(placed, camera).box[3] == pytest.approx(90)
-
-
-def test_an_error_of_corners_is_a_distance():
-    square = np.array([[0, 0], [9, 0], [9, 9], [0, 9]], float)
-    code = Detection("apriltag", "36h11", 5, None, square + 5 * np.array([0.6, 0.8]))
-    assert corner_error(code, square) == pytest.approx(5)
-    code.corners[1:] = square[1:]
-    assert corner_error(code, square) == pytest.approx(2.5)
-
-
 def test_detections_are_matched_by_what_they_say_and_then_by_nearness(scene):
     camera = demo_views()["frontal"]
     tag, aruco, qr = scene.markers
@@ -117,9 +101,17 @@ def test_what_the_pictures_edge_cuts_off():
     whole, part = visible_part(placed, aside)
     assert shapely.bounds(part)[:2] == pytest.approx((0, 120 - 0.125 * straight.fx), abs=1e-6)
     assert shapely.area(whole) == pytest.approx((0.25 * straight.fx) ** 2)
-    inside, camera = outlined(position=(0, 0, -0.05), target=(1, 0, 0))
+    inside, _ = outlined()
+    camera = fs.Camera.look_at(320, 240, 1.5, (0.05, 0, -0.01), (1, 0, 0))
     whole, part = visible_part(inside, camera)
     assert 0 < shapely.area(part) < shapely.area(whole)
+    # the pixels whose rays meet the printed sheet: the code with a module of quiet zone
+    rays = camera.rays(np.stack(np.meshgrid(np.arange(320) + 0.5, np.arange(240) + 0.5), 2).reshape(-1, 2))
+    turn, place = camera.world_to_camera[:3, :3], camera.position
+    rays = rays @ turn
+    at = place + np.where(rays[:, 2] > 0, -place[2] / rays[:, 2], np.nan)[:, None] * rays
+    hit = (np.abs(at[:, :2]) < 0.125).all(1)
+    assert shapely.area(part) == pytest.approx(hit.sum(), rel=0.02)
     behind, camera = outlined(position=(0, 0, 1))
     assert visible(behind, camera).share == 0.0
 
@@ -144,6 +136,12 @@ def test_a_board_gives_one_pose(renderer, spec):
     (reading,), _ = read_back(np.full_like(half, 0.5), scene)
     assert reading.as_dict()["found"] is False
     assert means([reading])["position_error_mm"] is None
+
+
+def test_the_error_of_corners_is_the_root_mean_square_of_their_distances():
+    corners = np.array([[0, 0], [9, 0], [9, 9], [0, 9]], float)
+    code = Detection("apriltag", "36h11", 5, None, corners + np.array([3, 4]))
+    assert corner_error(code, corners) == pytest.approx(5)
 
 
 def test_pictures_that_cannot_be_read_back():

@@ -117,6 +117,22 @@ def test_bodies_at_rest_where_the_scene_has_their_splats(scene, renderer):
     )
 
 
+def test_layers_of_another_renderer_are_each_environments_own(scene):
+    camera = {"fixed": fs.Camera.pinhole(*SIZE, 150, 150, 80, 60)}
+    rig = Rig(scene, {1: "box"}, camera, renderer=fs.Renderer("reference"), outputs=("label",))
+    box = np.tile([0, 0, 1.5, 1, 0, 0, 0.0], (2, 1))
+    near, far = (
+        fs.Layer(np.zeros((*SIZE[::-1], 3)), np.full(SIZE[::-1], depth), label=9) for depth in (1.0, 2.0)
+    )
+    label = rig.render({"box": box}, layers={"fixed": [near, far]})["label"][:, 0]
+    assert set(np.unique(label[0])) == {9}
+    assert set(np.unique(label[1])) == {1, 9}
+    with pytest.raises(fs.InputError, match="1 layers for the camera 'fixed', but 2 environments"):
+        rig.render({"box": box}, layers={"fixed": [near]})
+    with pytest.raises(fs.InputError, match="unknown camera 'fxed'"):
+        rig.render({"box": box}, layers={"fxed": [near, far]})
+
+
 def test_masked_environments_are_not_drawn(rig):
     poses = some_poses(2)
     pictures = rig.render(poses, mask=np.array([False, True]))

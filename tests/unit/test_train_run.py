@@ -2,6 +2,10 @@
 
 import hashlib
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -76,6 +80,40 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(whole, dataset, tmp_pa
     assert sha(tmp_path / "scene.ply") == sha(whole[3])
 
 
+KILLED = """
+import fidsplat as fs
+from fidsplat.train import Trainer, trainer
+from training_scene import QUICK, scene
+
+trainer.CHECKPOINT_SECONDS = 0
+run = Trainer(scene(), fs.Renderer("reference"), checkpoint="scene.training.npz", iterations=20, **QUICK)
+run.run(lambda step: print(step.iteration, flush=True))
+"""
+
+
+def test_a_run_that_was_killed_goes_on_to_the_same_bytes(whole, dataset, tmp_path):
+    """At some moment of an iteration or of the writing of a checkpoint."""
+    path = os.pathsep.join([str(Path(__file__).parents[1]), str(Path(fs.__file__).parents[1])])
+    child = subprocess.Popen(
+        [sys.executable, "-c", KILLED],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": path},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    with child:
+        assert child.stdout is not None
+        while child.stdout.readline().strip() != "11":
+            assert child.poll() is None
+        child.kill()
+    checkpoint = tmp_path / "scene.training.npz"
+    again = Trainer(dataset, whole[0].renderer, iterations=ITERATIONS, checkpoint=checkpoint, **QUICK)
+    assert 10 <= again.iteration < 20
+    again.run()
+    again.save(tmp_path / "scene.ply")
+    assert sha(tmp_path / "scene.ply") == sha(whole[3])
+
+
 def test_a_checkpoint_of_another_run_is_refused(dataset, tmp_path):
     file = tmp_path / "scene.training.npz"
     renderer = fs.Renderer("reference")
@@ -145,6 +183,20 @@ def test_settings_and_devices_that_cannot_be_used_are_named(dataset):
         Trainer(dataset, fs.Renderer("reference"), iteration=3)
     with pytest.raises(fs.InputError, match="samples have no gradient"):
         Trainer(dataset, fs.Renderer("reference"), iterations=1, quality="surfel,samples=2").step()
+
+
+def test_a_run_may_start_from_splats(whole, dataset):
+    cloud = whole[0].cloud()
+    start = Trainer(dataset, whole[0].renderer, iterations=5, start=cloud, **QUICK)
+    again = start.cloud()
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        np.testing.assert_allclose(getattr(again, name), getattr(cloud, name), rtol=1e-5, atol=1e-6)
+    assert start.step().psnr > whole[0].history["psnrs"][:4].mean() + 1
+    boxes = cloud.with_boxes(np.arange(len(cloud)) < 1)
+    with pytest.raises(fs.InputError, match="only disks are trained"):
+        Trainer(dataset, whole[0].renderer, iterations=5, start=boxes)
+    with pytest.raises(fs.InputError, match=r"must be 1 to max_splats, 3"):
+        Trainer(dataset, whole[0].renderer, iterations=5, max_splats=3, start=cloud)
 
 
 def test_memory_bounds_the_number_of_splats(dataset):

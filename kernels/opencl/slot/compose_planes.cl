@@ -8,7 +8,7 @@
 //@ project
     record.plane = planes[i];
 //@ plane_nearest
-    if (planes[i] >= 0) record.nearest = (wide)plane_keys[planes[i]];
+    if (planes[i] >= 0) record.nearest = (wide)plane_keys[planes[i] * get_global_size(1) + number];
 //@ see_depth
     seen.z = fmax(seen.z, (vfloat)s->nearest);
 //@ compose_types
