@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
 
@@ -92,6 +93,8 @@ def write_report(folders: Sequence[Path], out: Path) -> list[Path]:
     files = [folder / f"{name}.csv" for name in names]
     devices = [Device(device.summary.write(file)) for device, file in zip(loaded, files, strict=True)]
     plotted = [next(iter(_plain(device)), "") for device in devices]
+    plain = [device for device in devices if _plain(device)]
+    twice = {device.title for device, other in combinations(devices, 2) if device.title == other.title}
     for device, name, scene in zip(devices, names, plotted, strict=True):
         if scene:
             files.append(folder / f"{name}.svg")
@@ -107,16 +110,21 @@ def write_report(folders: Sequence[Path], out: Path) -> list[Path]:
             }
             for device, name, scene in zip(devices, names, plotted, strict=True)
         ],
-        "constants": constants_table(devices),
+        "constants": constants_table(plain) if plain else None,
         "ways": ways_table(devices),
         "linear": linear_table(devices),
         "markers": markers_table(devices[0]),
-        "choices": choices(devices),
+        "choices": choices(plain),
         "standard": max((_worst(device, "standard") for device in devices), default=0.0),
         "fast": max((_worst(device, "fast") for device in devices), default=0.0),
         "refused": sorted({f"{r.knob} {r.value} ({r.error})" for d in devices for r in _refused(d)}),
         "checked": max((_truth_error(device) for device in devices), default=0.0),
-        "runs": provenance({device.title: device.summary for device in devices}),
+        "runs": provenance(
+            {
+                f"{device.title} ({name})" if device.title in twice else device.title: device.summary
+                for device, name in zip(devices, names, strict=True)
+            }
+        ),
         "notes": [note for device in devices for note in device.summary.notes],
         "marker": f"{MARKER} at {TILT} degrees",
         "invisible": INVISIBLE,
@@ -196,7 +204,7 @@ def _verdict(device: Device, constant: Constant) -> str:
 
 def ways_table(devices: Sequence[Device]) -> Frame:
     """What each way of drawing 3D Gaussians takes beside `ewa` on each device, and how far its picture is
-    from the Gaussians themselves; no column for what nobody measured."""
+    from the Gaussians themselves at most; no column for what nobody measured."""
     rows = []
     for way, words in WAYS.items():
         row = {"3D Gaussians": words}
@@ -209,7 +217,6 @@ def ways_table(devices: Sequence[Device]) -> Frame:
                     row[f"time, {scene}, {device.kind}"] = percent(point["ratio"] / ewa["ratio"])
             if points:
                 row[f"largest error, {scene}"] = number(max(point["maximum"] for point in points))
-                row[f"root mean square, {scene}"] = number(max(point["rmse"] for point in points))
         if len(row) > 1:
             rows.append(row)
     return pd.DataFrame(rows)
