@@ -49,7 +49,7 @@ def test_narrow_boxes(renderer, camera, narrow):
     scales = cloud.scales.copy()
     scales[:, narrow] = 1e-5
     lines = fs.SplatCloud(cloud.means, cloud.quats, scales, cloud.opacities, colors=cloud.colors)
-    assert_agrees(renderer, lines.with_boxes(), camera, ("rgb", "alpha"), EXACT)
+    assert_agrees(renderer, lines.with_boxes(), camera, quality=EXACT)
 
 
 @each_camera

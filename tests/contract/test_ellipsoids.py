@@ -50,9 +50,11 @@ def test_each_fragment_by_its_own_depth(renderer, way):
     assert_agrees(renderer, cloud, CAMERA, ("rgb", "alpha", "depth"), quality)
 
 
-def test_alone_or_among_others_they_have_the_same_bits(renderer):
-    """Clouds of nothing else have kernels without what disks need (`ellipsoids_alone`)."""
-    alone, quality = thick(3), fs.Quality(lowpass="none")
+@pytest.mark.parametrize("order", ["centre", "pixel"])
+def test_alone_or_among_others_they_have_the_same_bits(renderer, order):
+    """Clouds of nothing else have kernels without what disks need (`ellipsoids_alone`), in either order the
+    same: every fragment has its centre's depth."""
+    alone, quality = thick(3), fs.Quality(lowpass="none", order=order)
     behind = fs.SplatCloud([[0, 0, -5]], [[1, 0, 0, 0]], [[0.1, 0.1]], [1.0], colors=[[1, 1, 1]])
     both = fs.SplatCloud.concatenate([alone, behind])
     images = [renderer.render(cloud, CAMERA, quality=quality)["rgb"] for cloud in (alone, both)]

@@ -76,7 +76,8 @@ def whole(opencl, cloud):
 @pytest.mark.parametrize("mebibytes", [3.6, 4, 4.75])
 @pytest.mark.parametrize("streamed", [False, True])
 def test_little_memory_gives_the_same_bits(opencl, cloud, whole, mebibytes, streamed):
-    """Chunks of splats, bands of rows, and a cloud that is copied chunk by chunk or stays where it is."""
+    """Chunks of splats, bands of rows, and a cloud that is copied chunk by chunk or stays where it is. With a
+    printed plane among them, so every fragment by its own depth."""
     own = small(opencl, mebibytes, None if streamed else cloud)
     resident = own.upload(cloud)
     resident._data._shared &= not streamed  # a CPU reads the host's arrays; make it copy them
