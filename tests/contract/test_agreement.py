@@ -103,8 +103,8 @@ def test_markers_at_five_tilts(renderer, spec, tilt):
     outputs = ("rgb", "alpha", "depth", "normal")
     truth = reference_pixels(cloud, camera, outputs, "standard", pixels=(rows, columns))
     frame = renderer.render(cloud, camera, outputs=outputs)
-    planes = {name: frame[name][rows, columns] for name in outputs}
-    differences = compare(planes, truth, outputs)
+    images = {name: frame[name][rows, columns] for name in outputs}
+    differences = compare(images, truth, outputs)
     assert all(difference.agrees for difference in differences), differences
     assert truth["alpha"].mean() > 0.3
 

@@ -93,7 +93,7 @@ def test_a_file_of_something_else_is_no_hindrance(renderer, tmp_path, content):
 
 def test_a_failing_seed_is_named(renderer, monkeypatch):
     class Wrong(dict):
-        """Planes of a device that is off by a little where it is sure."""
+        """Images of a device that is off by a little where it is sure."""
 
     def wrong(one, picture):
         frame = draw(one, picture)

@@ -45,7 +45,7 @@ MAY_IMPORT = {
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
     "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
 }
-ANYTHING = {"cli", "commands", "experiments", "__init__"}
+ANYTHING = {"cli", "commands", "experiments", "__init__", "__main__"}
 
 # third-party module: the places that alone may import it
 HOME_OF = {

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 from sampling import sampled
+from traits import Traits
 
 import fidsplat as fs
 from fidsplat.cli import main
@@ -31,13 +32,12 @@ def test_a_recipe_compiles_what_its_words_say(renderer, recipe):
     cloud = warming._cloud(recipe, 5)
     assert cloud.sh_degree == recipe.sh_degree
 
-    class Traits:
-        sh_degree, has_planes, footprint, ellipsoids = recipe.sh_degree, recipe.markers, "gaussian", "none"
-
-    # a device without float64 has these in float32
-    wanted = replace(
-        select(Traits(), fs.Capture(outputs=recipe.outputs, quality=recipe.quality)), setup_precision=""
+    features = select(
+        Traits(recipe.sh_degree, recipe.markers),
+        fs.Capture(outputs=recipe.outputs, quality=recipe.quality),
     )
+    # a device without float64 has these in float32
+    wanted = replace(features, setup_precision="")
     compiled = [replace(key[0], setup_precision="") for key in renderer.backend._pipelines]
     assert wanted in compiled
 
