@@ -5,12 +5,20 @@ import pickle
 
 import numpy as np
 
-from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture, compare
+from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture, compare, draw
 from fidsplat.hard_cases.agreement import truth_of as draw_truth
 from fidsplat.quality import Quality
 from fidsplat.random_clouds import random_splats
 
-__all__ = ["ALL_OUTPUTS", "assert_agrees", "compare", "random_splats", "reference_pixels", "truth_of"]
+__all__ = [
+    "ALL_OUTPUTS",
+    "against_reference",
+    "assert_agrees",
+    "compare",
+    "random_splats",
+    "reference_pixels",
+    "truth_of",
+]
 
 _TRUTHS: dict[bytes, dict[str, np.ndarray]] = {}
 
@@ -21,6 +29,11 @@ def truth_of(picture, pixels=None):
     if key not in _TRUTHS:
         _TRUTHS[key] = draw_truth(picture, pixels)
     return _TRUTHS[key]
+
+
+def against_reference(renderer, picture):
+    """Draw a picture on a device and compare every output with the reference."""
+    return compare(draw(renderer, picture), truth_of(picture), picture.outputs)
 
 
 def reference_pixels(cloud, camera, outputs, quality, background=(0.0, 0.0, 0.0), pixels=None):

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from agreement import assert_agrees, random_splats
+from sampling import SAMPLES, alternate
 
 import fidsplat as fs
 from fidsplat.rotations import quaternion_to_matrix
@@ -150,8 +151,7 @@ def test_boxes_around_and_behind_the_camera(renderer, seed, quality):
     assert_agrees(renderer, random_splats(60, seed=seed).with_boxes(), SMALL, quality=quality)
 
 
-@pytest.mark.parametrize("lowpass", ["none", "screen"])
-@pytest.mark.parametrize("samples", [1, 2])
+@pytest.mark.parametrize(("lowpass", "samples"), alternate({"none": "none", "screen": "screen"}, SAMPLES))
 def test_a_scene_of_both_footprints(renderer, lowpass, samples):
     cloud = random_splats(150, seed=4, depth=(-0.5, 6.0))
     mixed = cloud.with_boxes(np.arange(150) % 3 == 0)

@@ -4,11 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from agreement import assert_agrees, random_splats
+from agreement import against_reference, assert_agrees, random_splats
 
 import fidsplat as fs
 from fidsplat.hard_cases import fuzz
-from fidsplat.hard_cases.agreement import against_reference
 
 CAMERA = fs.Camera.pinhole(97, 71, 70.0, 70.0, 48.0, 36.0, near=0.05)
 

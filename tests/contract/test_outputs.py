@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from agreement import assert_agrees, random_splats
+from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.effects import OUTPUTS
@@ -36,11 +37,12 @@ def test_outputs_of_layers(renderer, mixture):
     assert_agrees(renderer, scene, CAMERA, ALL)
 
 
-def test_an_output_alone_is_what_it_is_among_all(renderer):
+@in_turn()
+@pytest.mark.parametrize("name", ALL)
+def test_an_output_alone_is_what_it_is_among_all(renderer, name):
     cloud = random_splats(150, 4)
-    together = renderer.render(cloud, CAMERA, ALL)
-    for name in ALL:
-        assert np.array_equal(renderer.render(cloud, CAMERA, name)[name], together[name]), name
+    together, alone = (renderer.render(cloud, CAMERA, outputs) for outputs in (ALL, name))
+    assert np.array_equal(alone[name], together[name])
 
 
 def test_distances_are_depths_along_the_ray(renderer):

@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from agreement import random_splats
+from agreement import against_reference, random_splats
 from ideal_effects import assert_as_good, ideal_picture
+from sampling import alternate
 
 import fidsplat as fs
 from fidsplat.backends.reference.post import variates
 from fidsplat.backends.view import View
-from fidsplat.hard_cases.agreement import Picture, against_reference
+from fidsplat.hard_cases.agreement import Picture
 
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.3, -0.2, -0.1), (0.0, 0.1, 3.0))
 CLOUD = random_splats(120, 3)
@@ -62,10 +63,10 @@ def test_fog(renderer, density, samples):
         )
 
 
-@pytest.mark.parametrize("samples", [1, 3])
-@pytest.mark.parametrize(
-    "background", [fs.Gradient((0.2, 0.4, 0.9), (0.3, 0.2, 0.1), (0.1, -2, 0.3)), panorama()]
-)
+SKIES = {"gradient": fs.Gradient((0.2, 0.4, 0.9), (0.3, 0.2, 0.1), (0.1, -2, 0.3)), "panorama": panorama()}
+
+
+@pytest.mark.parametrize(("background", "samples"), alternate(SKIES, {"1 sample": 1, "3 x 3 samples": 3}))
 def test_backgrounds(renderer, background, samples):
     for target in ((0.0, 0.1, 3.0), (0.0, 0.1, -3.0), (0.3, -9.0, 0.0)):
         camera = fs.Camera.look_at(81, 59, 1.4, (0.3, -0.2, -0.1), target, up=(0.1, -1, 0.2))
