@@ -4,7 +4,7 @@ import json
 from dataclasses import replace
 
 import pytest
-from sampling import sampled
+from sampling import in_turn, sampled
 from traits import Traits
 
 import fidsplat as fs
@@ -24,6 +24,7 @@ def test_recipes_are_what_scenes_call_for():
     assert warming.Recipe(3, False, ("rgb",)) in wanted  # a captured scene's
 
 
+@in_turn()
 @pytest.mark.parametrize("recipe", sampled(warming.recipes(), 3, 2), ids=lambda recipe: recipe.words)
 def test_a_recipe_compiles_what_its_words_say(renderer, recipe):
     ((done, seconds),) = warming.warm(renderer, [recipe])
