@@ -20,6 +20,7 @@ def test_outputs_of_splats_around_the_camera(renderer, seed, quality):
     assert_agrees(renderer, random_splats(150, seed), CAMERA, ALL, quality)
 
 
+@in_turn()
 @pytest.mark.parametrize("samples", [2, 3])
 def test_outputs_of_several_samples(renderer, samples):
     cloud = random_splats(100, 5, depth=(0.5, 5.0))
@@ -217,6 +218,7 @@ def covered(frame, name):
     return plane.any(-1) if plane.ndim == 3 else plane
 
 
+@in_turn(1)
 @pytest.mark.parametrize("samples", [1, 2])
 def test_masks_do_not_grow_with_a_low_cutoff(renderer, samples):
     """They end where 1/255 is covered, whatever is drawn beyond it for the sake of colours."""

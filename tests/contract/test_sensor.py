@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from agreement import against_reference, random_splats
 from ideal_effects import assert_as_good, ideal_picture
-from sampling import alternate
+from sampling import SAMPLES, alternate, in_turn
 
 import fidsplat as fs
 from fidsplat.backends.reference.post import variates
@@ -40,6 +40,7 @@ SENSORS = {
 }
 
 
+@in_turn()
 @pytest.mark.parametrize("name", SENSORS)
 def test_steps_of_the_sensor(renderer, name):
     agree(renderer, Picture(CLOUD, CAMERA, sensor=SENSORS[name]))
@@ -50,8 +51,9 @@ def test_the_sensor_sees_pixels_not_samples(renderer, name):
     agree(renderer, Picture(CLOUD, CAMERA, fs.Quality(samples=2), sensor=SENSORS[name]))
 
 
-@pytest.mark.parametrize("samples", [1, 2])
-@pytest.mark.parametrize("density", [0.05, 1.0, 30.0])
+@pytest.mark.parametrize(
+    ("density", "samples"), alternate({"thin": 0.05, "fog": 1.0, "thick": 30.0}, SAMPLES)
+)
 def test_fog(renderer, density, samples):
     tag = fs.marker("aruco:4x4_50:7", size=1.0, mixture="fitted").cloud.transformed(
         np.diag([1, 1, 1, 1.0]) + shift(0, 0, 2)
@@ -219,6 +221,7 @@ def test_the_sensor_leaves_the_other_outputs_alone(renderer):
     assert not np.array_equal(plain["rgb"], seen["rgb"])
 
 
+@in_turn()
 @pytest.mark.parametrize("mixture", ["fitted", "exact"])
 def test_a_tag_is_found_where_it_is_in_fog_and_noise(renderer, mixture):
     """Position error under 1 % of the distance, as the ideal plane's: the pictures are for robots."""

@@ -75,6 +75,7 @@ def test_shutters_before_every_lens(renderer, camera, shutter):
     assert_exposed(renderer, cloud, camera, MOTION, shutter)
 
 
+@in_turn()
 @pytest.mark.parametrize("samples", [1, 2])
 def test_moving_layers(renderer, samples):
     cloud = coplanar_cloud(1)
