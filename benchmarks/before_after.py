@@ -43,7 +43,7 @@ print(renderer.device.title, "|", renderer.device.version, flush=True)
 for line in sys.stdin:
     start = time.perf_counter()
     frame = renderer.render(resident, *how)
-    frame.timings
+    getattr(frame, "wait", lambda: frame.timings)()
     spent = time.perf_counter() - start
     print(spent * 1e3, hashlib.sha256(frame["rgb"].tobytes()).hexdigest()[:16], flush=True)
 """

@@ -79,6 +79,7 @@ def frames(record: dict) -> dict[str, str]:
         "scene": record["scene"],
         "device": f"{record['device']}: {record['title']}",
         "ms per frame": f"{ms(record['frame_ms'])} ({ms(low)} to {ms(high)})",
+        "host": ms(record["host_ms"]) if "host_ms" in record else "-",
         "x roofline": times(record, "frame"),
         "splats/s": f"{rate / 1e6:.{0 if rate > 1e8 else 2}f} M",
         "memory": "-" if memory is None else f"{memory / 2**30:.3g} GiB",

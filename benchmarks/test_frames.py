@@ -5,8 +5,8 @@ from conftest import CLOCK
 
 
 def drawn(run):
-    """One frame, finished; its stages in ms."""
-    return run.draw().timings
+    """One frame, finished."""
+    return run.draw().wait()
 
 
 def facts(benchmark, run) -> None:
@@ -22,7 +22,7 @@ def test_frame(benchmark, run):
 @pytest.mark.benchmark(group="stage", timer=CLOCK)
 def test_stage(benchmark, run, stage):
     def one():
-        CLOCK.seconds += 1e-3 * drawn(run)[stage]
+        CLOCK.seconds += 1e-3 * drawn(run).timings[stage]
 
     facts(benchmark, run)
     benchmark.pedantic(one, rounds=10, warmup_rounds=2)

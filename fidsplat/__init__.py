@@ -25,23 +25,32 @@ _HOME = {
     "Sensor": "fidsplat.sensor",
     "Fog": "fidsplat.surroundings",
     "Gradient": "fidsplat.surroundings",
+    "Layer": "fidsplat.surroundings",
     "Panorama": "fidsplat.surroundings",
     "Marker": "fidsplat.markers",
     "marker": "fidsplat.markers",
     "load_ply": "fidsplat.formats",
     "save_ply": "fidsplat.formats",
+    "load_trajectory": "fidsplat.formats",
+    "save_trajectory": "fidsplat.formats",
     "Renderer": "fidsplat.render",
-    "Frame": "fidsplat.render",
+    "Frame": "fidsplat.frame",
+    "FrameBatch": "fidsplat.batch",
     "devices": "fidsplat.backends",
     "FidsplatError": "fidsplat.errors",
     "InputError": "fidsplat.errors",
     "DeviceError": "fidsplat.errors",
 }
 
-__all__ = ["__version__", *sorted(_HOME)]
+_PACKAGES = ("train",)
+"""packages that are names of their own, as fs.train.Trainer"""
+
+__all__ = ["__version__", *sorted(_HOME), *_PACKAGES]
 
 
 def __getattr__(name: str):
+    if name in _PACKAGES:
+        return import_module(f"fidsplat.{name}")
     home = _HOME.get(name)
     if home is None:
         raise AttributeError(f"module 'fidsplat' has no attribute {name!r}")
@@ -51,4 +60,4 @@ def __getattr__(name: str):
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOME])
+    return sorted({*globals(), *_HOME, *_PACKAGES})

@@ -11,7 +11,7 @@ from fidsplat.errors import InputError, unknown
 from fidsplat.quality import Quality
 from fidsplat.scalars import PickledByFields
 from fidsplat.sensor import Sensor
-from fidsplat.surroundings import Background, Fog, background_of
+from fidsplat.surroundings import Background, Fog, Layer, background_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +38,8 @@ class Capture(PickledByFields):
     """what becomes of rgb on its way out; None: nothing"""
     fog: Fog | None = None
     """between the camera and what it sees"""
+    layer: Layer | None = None
+    """what another renderer has drawn, as an opaque surface among the splats; of the camera's size"""
 
     def __post_init__(self) -> None:
         put = object.__setattr__
@@ -49,6 +51,7 @@ class Capture(PickledByFields):
         for name, kind in (("motion", Motion), ("shutter", Shutter), ("sensor", Sensor)):
             put(self, name, _of_kind(name, getattr(self, name), kind) or kind())
         _of_kind("fog", self.fog, Fog)
+        _of_kind("layer", self.layer, Layer)
 
     @cached_property
     def foggy(self) -> bool:
@@ -75,10 +78,9 @@ class Capture(PickledByFields):
         Raises:
             InputError: an unknown part, or a value of the wrong kind.
         """
-        known = [part.name for part in fields(self)]
         for name in changes:
-            if name not in known:
-                raise InputError(unknown("part of a capture", name, known))
+            if name not in self.__dataclass_fields__:
+                raise InputError(unknown("part of a capture", name, [part.name for part in fields(self)]))
         given = {name: value for name, value in changes.items() if value is not None}
         return replace(self, **given) if given else self
 

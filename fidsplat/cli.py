@@ -26,9 +26,11 @@ Examples:
   fidsplat devices                                  what can draw here
   fidsplat marker apriltag:36h11:5 -o tag.ply       a marker as a splat file
   fidsplat render scene.toml -o picture.png         draw a scene
+  fidsplat view scene.toml                          look at it in a browser
   fidsplat detect picture.png --scene scene.toml    read it back, with poses
   fidsplat bench                                    what a frame costs here
   fidsplat tradeoff --quick                         what accuracy costs in time
+  fidsplat train photos -o scene.ply                splats from pictures with known cameras
 
 `fidsplat COMMAND --help` explains a command. --debug, anywhere, shows where an error arose; --version, alone,
 says which fidsplat this is."""
@@ -135,7 +137,8 @@ def _parse(words: list[str]):
 
     if not words:
         _fail(
-            "no command; try `fidsplat demo` first, which makes, draws and reads markers here; "
+            "no command; try `fidsplat demo` first, which makes, draws and reads markers here, then "
+            "`fidsplat view fidsplat-demo/scene.toml`; "
             f"`fidsplat --help` explains: {', '.join(COMMANDS)}",
             2,
         )

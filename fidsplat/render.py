@@ -5,120 +5,28 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import Adopts, DeviceInfo, GivesArrays, Images, ResidentData
-from fidsplat.backends.prepare import prepare
+from fidsplat.backends.base import Adopts, DeviceInfo, DrawsBatches, ResidentData
+from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.registry import open_backend
 from fidsplat.backends.view import NO_CAMERA
+from fidsplat.batch import FrameBatch, ViewByView
 from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.capture import Capture, output_names
-from fidsplat.errors import InputError, MissingOutputError
+from fidsplat.errors import InputError, unknown
+from fidsplat.frame import Frame, check_process
 from fidsplat.quality import Quality
 from fidsplat.scenes import Scene
 from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
 from fidsplat.surroundings import Fog, Gradient, Panorama, background_of
+from fidsplat.views import Views, views_of
 
 _PLAIN = Capture()
-
-
-class Frame(Mapping):
-    """A finished picture: a mapping from an output's name to a read-only NumPy array, copied from the
-    device on first use.
-
-    Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median`, `depth_first` (h, w)
-    metres along z, `distance`, `distance_median`, `distance_first` metres along the ray; `normal` (h, w, 3)
-    unit, camera frame, towards the camera, `normal_world` the same in the world's axes; `label`, `splat_id`
-    (h, w) int32; `blended` (h, w) int32. Where less than 1/255 is covered, or of first hits less than
-    `Quality.first_hit`, labels and ids are -1, the others of these 0.
-    """
-
-    def __init__(self, images: Images, outputs: tuple[str, ...]) -> None:
-        self._images, self._process = images, os.getpid()
-        self._arrays: dict[str, np.ndarray] = {}
-        self.outputs = outputs
-        """Names of the images, in the order in which they were asked for."""
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        self._check(name)
-        if name not in self._arrays:
-            check_process(self._process, "frame")
-            self._arrays[name] = image = self._images.read(name)
-            image.flags.writeable = False  # what is kept is what was drawn
-        return self._arrays[name]
-
-    def device_array(self, name: str) -> Any:
-        """The image where it was drawn, without a copy: on a Warp device a wp.array, (h, w) or (h, w, 3).
-
-        It belongs to this frame: the next picture is drawn into another array. `wp.to_torch`, DLPack and
-        `__cuda_array_interface__` make a tensor of it on the same device.
-
-        Raises:
-            InputError: an output that was not asked for, or the backend has no arrays to give.
-        """
-        self._check(name)
-        check_process(self._process, "frame")
-        if not isinstance(self._images, GivesArrays):
-            raise InputError(
-                f"this device keeps {name} in no array that others can use; draw with device='warp:cuda' or "
-                "'warp:cpu', or take frame[name], which is copied to the host"
-            )
-        return self._images.device_array(name)
-
-    def _check(self, name: str) -> None:
-        if not isinstance(name, str) or name not in self.outputs:
-            raise MissingOutputError(
-                f"this frame has no {name!r}; it was rendered with {', '.join(self.outputs)}; name it there"
-            )
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.outputs)
-
-    def __len__(self) -> int:
-        return len(self.outputs)
-
-    def __reduce__(self):
-        """Pickled and copied as NumPy arrays: what `device_array` gives stays on its device."""
-        return _kept_frame, (dict(self), dict(self.timings), dict(self.stats))
-
-    @property
-    def timings(self) -> Mapping[str, float]:
-        """Milliseconds on the device by stage: project, sort, bin, blend, resolve."""
-        return self._images.timings
-
-    @property
-    def stats(self) -> Mapping[str, int]:
-        """splats (in the cloud), visible (not culled), pairs (of splats and tiles)."""
-        return self._images.stats
-
-
-@dataclass(frozen=True)
-class _KeptImages:
-    """Images that are no longer on a device."""
-
-    arrays: dict[str, np.ndarray]
-    timings: Mapping[str, float]
-    stats: Mapping[str, int]
-
-    def read(self, name: str) -> np.ndarray:
-        return self.arrays[name]
-
-
-def _kept_frame(arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int]) -> Frame:
-    return Frame(_KeptImages(arrays, timings, stats), tuple(arrays))
-
-
-def check_process(opened_by: int, what: str) -> None:
-    """Raises InputError in a fork of the process that opened it, where its driver does not work."""
-    if opened_by != os.getpid():
-        raise InputError(
-            f"this {what} belongs to process {opened_by}, of which this one is a fork; open a Renderer in "
-            "each process, and read frames before the fork"
-        )
 
 
 def default_device() -> str:
@@ -129,8 +37,10 @@ def default_device() -> str:
 class ResidentCloud:
     """A cloud on a renderer's device; rendering it transfers no splat."""
 
-    def __init__(self, renderer: Renderer, data: ResidentData, capture: Capture) -> None:
-        self._renderer, self._data = renderer, data
+    def __init__(
+        self, renderer: Renderer, data: ResidentData, capture: Capture, labels: np.ndarray | None = None
+    ) -> None:
+        self._renderer, self._data, self._labels = renderer, data, labels
         self.capture = capture
         """how its pictures are taken unless `render` is given another: that of the scene it came from"""
 
@@ -147,6 +57,11 @@ class ResidentCloud:
     def memory_bytes(self) -> int:
         """Device memory that it takes; 0 where the device reads the host's own arrays, as OpenCL on a CPU."""
         return self._data.memory_bytes
+
+    @cached_property
+    def labels(self) -> frozenset[int] | None:
+        """The labels that its splats have; None where they are on the device alone."""
+        return None if self._labels is None else frozenset(np.unique(self._labels).tolist())
 
 
 class Renderer:
@@ -197,7 +112,7 @@ class Renderer:
             raise InputError(f"cannot render a {type(scene).__name__}; give a Scene or a SplatCloud")
         capture = scene.capture if isinstance(scene, Scene) else _PLAIN
         with self._lock:
-            return ResidentCloud(self, self.backend.upload(cloud), capture)
+            return ResidentCloud(self, self.backend.upload(cloud), capture, cloud.labels)
 
     def adopt(
         self,
@@ -214,10 +129,11 @@ class Renderer:
         """Splats in arrays that are on the device already: drawn where they lie, without a copy.
 
         Shapes and units are those of SplatCloud, float32 (labels int32): wp.array, or what gives DLPack
-        (torch, CuPy, JAX); NumPy arrays are copied. What is in the arrays when a picture is drawn is what it
-        shows, so a simulation may move the splats between pictures. Quaternions need no unit length; a splat
-        that cannot be drawn (a value that is not finite, a scale below 0) is left out of the picture without
-        a word. `origin` (3,): world position of the means' zero.
+        (torch, CuPy, JAX); NumPy arrays are copied. With scales (n, 3) splats are 3D Gaussians, those whose
+        third is 0 disks. What is in the arrays when a picture is drawn is what it shows, so a simulation may
+        move the splats between pictures. Quaternions need no unit length; a splat that cannot be drawn (a
+        value that is not finite, a scale below 0) is left out of the picture without a word. `origin` (3,):
+        world position of the means' zero.
 
         Raises:
             InputError: the backend takes no arrays, or one has the wrong shape, type or device.
@@ -313,6 +229,64 @@ class Renderer:
             yield waiting
         if failure is not None:
             raise failure
+
+    def render_batch(
+        self,
+        scene: Scene | SplatCloud | ResidentCloud,
+        captures: Iterable[Capture | Camera] | Capture | Camera,
+        *,
+        poses: Any = None,
+        groups: Mapping[int, Any] | None = None,
+        mask: Any = None,
+    ) -> FrameBatch:
+        """Draw many views of one cloud at once. View i has the bits of `render` alone, whatever the batch.
+
+        Args:
+            scene: what to draw; a ResidentCloud transfers no splat.
+            captures: one Capture or Camera for each view, of one size and the same effects; or one for all
+                views. A Camera is taken with the scene's own capture, as in `render`.
+            poses: (views, 7) float64, camera to world: x y z in metres and a quaternion w x y z of any length
+                but 0. They take the place of the cameras' own poses.
+            groups: {label: (views, 7)}: the splats of that label make this motion of the world, from where
+                their cloud has them (`Motion.groups`).
+            mask: (views,) bool: a view that is False is not drawn, and costs nothing; its images hold 0, and
+                -1 in `label` and `splat_id`.
+
+        Raises:
+            InputError: as `render`; numbers of views, sizes, outputs or effects that differ; arrays of
+                another shape; what is no pose; a label that no splat has.
+            DeviceError: the device fails or lacks memory.
+        """
+        resident = self._resident(scene)
+        given = [captures] if isinstance(captures, (Capture, Camera)) else captures
+        try:
+            each = list(given)
+        except TypeError:
+            raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera") from None
+        plain = [_asked(scene, one, *[None] * 8) for one in each]
+        views = views_of(plain, poses, groups, mask)
+        self._refuse_unknown_labels(resident, views)
+        return self._draw_batch(resident, views)
+
+    def _refuse_unknown_labels(self, resident: ResidentCloud, views: Views) -> None:
+        if views.groups and resident.labels is not None:
+            for label in views.groups:
+                if label not in resident.labels:
+                    raise InputError(
+                        unknown("label of splats", str(label), map(str, sorted(resident.labels)))
+                    )
+
+    def _draw_batch(self, resident: ResidentCloud, views: Views) -> FrameBatch:
+        data = resident._data
+        features, batch = prepare_batch(data, views)
+        with self._lock:
+            pipeline = self.backend.pipeline(features)
+            if isinstance(pipeline, DrawsBatches):
+                images = pipeline.render_batch(data, batch)
+            else:
+                each = {int(k): pipeline.render(data, batch.one(n)) for n, k in enumerate(batch.slots)}
+                images = ViewByView(each, batch.total, batch.size)
+        return FrameBatch(images, views.captures[0].outputs)
 
     def _resident(self, scene: Scene | SplatCloud | ResidentCloud) -> ResidentCloud:
         resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)

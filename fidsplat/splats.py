@@ -32,12 +32,13 @@ from fidsplat.rotations import (
     quaternion_to_matrix,
 )
 from fidsplat.scalars import LARGEST, PickledByFields
+from fidsplat.summaries import Summarised, point
 
 __all__ = ["SplatCloud", "sh_basis"]
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
-class SplatCloud(PickledByFields):
+class SplatCloud(PickledByFields, Summarised):
     """2D Gaussian splats (disks), and 3D ones (ellipsoids) where they have a thickness. Every array is
     read-only; make a new cloud to change one."""
 
@@ -191,6 +192,16 @@ class SplatCloud(PickledByFields):
     def __repr__(self) -> str:
         color = "colors" if self.sh is None else f"SH degree {self.sh_degree}"
         return f"SplatCloud({len(self)} splats, {color}, origin {tuple(self.origin.tolist())})"
+
+    def summary(self) -> dict[str, str]:
+        """What it holds, in words."""
+        kinds = {"none": "2D", "all": "3D", "some": "2D and 3D"}
+        rows = {"splats": f"{len(self):,}, {kinds[self.ellipsoids]}"}
+        rows["colours"] = "plain" if self.sh is None else f"SH of degree {self.sh_degree}"
+        if len(self):
+            rows["bounds"] = " to ".join(map(point, self.bounds())) + " m"
+            rows["labels"] = f"{len(np.unique(self.labels)):,} different"
+        return rows | {f"left out: {why}": f"{count:,}" for why, count in self.dropped.items()}
 
     @property
     def sh_degree(self) -> int:

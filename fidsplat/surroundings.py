@@ -105,6 +105,56 @@ class Panorama(PickledByFields):
         return Panorama(read_image(path, deep=True), str(path))
 
 
+@dataclass(frozen=True, eq=False)
+class Layer(PickledByFields):
+    """A picture with depths from another renderer, as an opaque surface among the splats: in each pixel it
+    hides what of them lies behind it, and what lies in front of it is composited over it.
+
+    Raises InputError for arrays of other shapes, colours that are not finite, or depths below 0.
+    """
+
+    rgb: np.ndarray
+    """(h, w, 3) float32 in display space, read-only; uint8 is taken as 255ths"""
+    depth: np.ndarray
+    """(h, w) float32 metres, as the camera's depths are (along z; along the ray for a fisheye or panorama);
+    infinite where there is nothing, also given as 0 or NaN"""
+    label: np.ndarray | int = 0
+    """(h, w) int32, or one for all"""
+
+    def __post_init__(self) -> None:
+        rgb, depth = (_array_of(name, getattr(self, name)) for name in ("rgb", "depth"))
+        if depth.ndim != 2 or rgb.shape != (*depth.shape, 3):
+            raise InputError(
+                f"a layer has rgb (h, w, 3) and depth (h, w), but their shapes are {rgb.shape}, {depth.shape}"
+            )
+        whole = 255 if rgb.dtype == np.uint8 else 1
+        if not np.isfinite(rgb).all() or (depth < 0).any():
+            raise InputError("a layer holds colours that are not finite, or depths below 0; replace them")
+        label = _array_of("label", self.label)
+        if label.dtype.kind not in "iu" or label.shape not in ((), depth.shape):
+            raise InputError(f"the label of a layer must be whole numbers {depth.shape}, or one for all")
+        here = np.isfinite(depth) & (depth > 0)
+        made = {
+            "rgb": np.array(rgb, np.float32, order="C") / np.float32(whole),
+            "depth": np.where(here, depth, np.inf).astype(np.float32),
+            "label": np.ascontiguousarray(np.broadcast_to(label, depth.shape), np.int32),
+        }
+        for name, array in made.items():
+            array = array.copy() if array is getattr(self, name) else array
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+
+def _array_of(name: str, value: Any) -> np.ndarray:
+    try:
+        array: np.ndarray = np.asarray(value)
+    except ValueError:  # rows that differ in length
+        array = np.empty(0, object)
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"the {name} of a layer must be an array of numbers, not {value!r}")
+    return array
+
+
 Background = tuple[float, float, float] | Gradient | Panorama
 
 

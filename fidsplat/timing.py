@@ -40,16 +40,18 @@ class Timer:
         work: Callable[[], Any],
         clock: Callable[[], float] = time.perf_counter,
         drops_out: bool = False,
+        parts: Callable[[Any], Mapping[str, float]] | None = None,
     ) -> None:
         """
         Args:
-            work: does it once and ends when it is done. It may return milliseconds by name, as
-                `frame.timings`, which are kept beside the whole.
+            work: does it once and ends when it is done. It may return milliseconds by name, which are kept
+                beside the whole.
             clock: seconds.
+            parts: gives those milliseconds from what `work` returns, as `frame.timings`; not timed itself.
             drops_out: whether a FidsplatError of `work` ends its part and is kept in `error`; else it is
                 raised.
         """
-        self._work, self._clock, self._drops_out = work, clock, drops_out
+        self._work, self._clock, self._drops_out, self._parts = work, clock, drops_out, parts
         self.ms: list[float] = []
         """milliseconds of each run that counts"""
         self.parts: dict[str, list[float]] = {}
@@ -64,6 +66,8 @@ class Timer:
             begun = self._clock()
             parts = self._work()
             taken = 1e3 * (self._clock() - begun)
+            if self._parts is not None:
+                parts = self._parts(parts)
         except FidsplatError as error:
             if not self._drops_out:
                 raise
@@ -98,8 +102,8 @@ def frame_timer(renderer, scene, camera, drops_out: bool = False, **how) -> Time
     Args:
         renderer, scene, camera, how: as in `renderer.render(scene, camera, **how)`.
     """
-    # reading the timings waits for the device
-    return Timer(lambda: renderer.render(scene, camera, **how).timings, drops_out=drops_out)
+    draw = lambda: renderer.render(scene, camera, **how).wait()  # noqa: E731
+    return Timer(draw, drops_out=drops_out, parts=lambda frame: frame.timings)
 
 
 def take_turns(

@@ -29,6 +29,7 @@ MEANS, QUATS, SCALES, OPACITIES = (
 CLOUD = fs.SplatCloud(MEANS, QUATS, SCALES, OPACITIES, colors=R.random((N, 3)))
 CAMERA = fs.Camera.look_at(24, 16, 1.0, (0, 0, -9), (0, 0, 0))
 RENDERER = fs.Renderer("reference")
+PATH = fs.Trajectory([0.0, 1.0], np.stack([np.eye(4)] * 2))
 TAG = fs.marker("aruco:4x4_50:7", size=0.1, mixture="exact")
 
 
@@ -100,7 +101,15 @@ CALLS: dict[str, Callable[[Path], Call]] = {
         fs.Fisheye, {"k1": 0.1, "k4": 0.01}, lambda lens: _seen_by(fs.Camera.pinhole(24, 16, 20, 20, 12, 8, lens=lens))
     ),
     "Trajectory": lambda _: (
-        fs.Trajectory, {"times": [0.0, 1.0], "poses": np.stack([np.eye(4)] * 2)}, lambda path: path(0.5)
+        fs.Trajectory, {"times": [0.0, 1.0], "poses": np.stack([np.eye(4)] * 2), "smooth": True}, lambda path: path(0.5)
+    ),
+    "save_trajectory": lambda folder: (
+        fs.save_trajectory,
+        {"trajectory": PATH, "path": folder / "path.json", "camera": CAMERA, "images": ["a.png", "b.png"]},
+        None,
+    ),
+    "load_trajectory": lambda folder: (
+        fs.load_trajectory, {"path": folder / "none.tum", "rate": 10.0, "smooth": False}, None
     ),
     "Motion": lambda _: (
         fs.Motion,
@@ -181,6 +190,14 @@ CALLS: dict[str, Callable[[Path], Call]] = {
     ),
     "Renderer.render_views": lambda _: (
         lambda **given: list(RENDERER.render_views(**given)), {"scene": CLOUD, "captures": [CAMERA], "outputs": ("rgb",)}, None
+    ),
+    "Renderer.render_batch": lambda _: (
+        RENDERER.render_batch,
+        {
+            "scene": CLOUD, "captures": [CAMERA], "poses": np.array([[0, 0, 0, 1, 0, 0, 0.0]]), "groups": None,
+            "mask": np.array([True]),
+        },
+        dict,
     ),
     "Capture": lambda _: (
         fs.Capture,

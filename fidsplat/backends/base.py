@@ -12,7 +12,9 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from fidsplat.backends.stack import ViewBatch
 from fidsplat.backends.view import View
+from fidsplat.cameras import Camera
 from fidsplat.effects import FeatureSet
 from fidsplat.effects.select import Traits
 from fidsplat.splats import SplatCloud
@@ -90,11 +92,49 @@ class Images(Protocol):
 
 
 @runtime_checkable
+class Waits(Protocol):
+    """Images that may still be on their way."""
+
+    def wait(self) -> None:
+        """Until the device has drawn them."""
+        ...
+
+
+class BatchImages(Protocol):
+    """Finished output images of many views."""
+
+    @property
+    def views(self) -> int:
+        """How many, those that were masked out among them."""
+        ...
+
+    def read(self, name: str) -> np.ndarray:
+        """The images as a NumPy array of its own, (views, h, w) or (views, h, w, channels), in the type of
+        `OUTPUTS[name]`; where a view was masked out 0, or -1 in `label` and `splat_id`."""
+        ...
+
+    def read_one(self, name: str, number: int) -> np.ndarray:
+        """The image of one view, as a NumPy array of its own."""
+        ...
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds on the device by stage, of all views together."""
+        ...
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        """splats in the cloud; visible and pairs of all views together."""
+        ...
+
+
+@runtime_checkable
 class GivesArrays(Protocol):
     """Images that others on the device can use where they were drawn."""
 
     def device_array(self, name: str) -> Any:
-        """The image as an array of the device, (h, w) or (h, w, channels); no copy."""
+        """The image as an array of the device, (h, w) or (h, w, channels), of a batch with the views before
+        these; no copy."""
         ...
 
 
@@ -104,6 +144,15 @@ class GivesFloat64(Protocol):
 
     def read_float64(self, name: str) -> np.ndarray:
         """The image as a NumPy array in float64."""
+        ...
+
+
+@runtime_checkable
+class DrawsBatches(Protocol):
+    """A pipeline that draws many views together."""
+
+    def render_batch(self, resident: Any, batch: ViewBatch) -> BatchImages:
+        """Draw many views of an uploaded cloud, each with the bits of itself alone."""
         ...
 
 
@@ -267,4 +316,123 @@ class Reshapes(Backend, Protocol):
 
     def pipeline(self, features: FeatureSet, shape: Any = None) -> Pipeline:
         """As `Backend.pipeline`, with build constants of `shapes`."""
+        ...
+
+
+class DifferentiablePipeline(Protocol):
+    """The stages and their derivatives, compiled for one FeatureSet."""
+
+    def forward(self, resident: Any, view: View) -> Images:
+        """Draw one picture of an uploaded cloud, with the bits of `Pipeline.render`, and keep what `backward`
+        needs of it until the device draws another one.
+
+        Raises:
+            DeviceError: the device runs out of memory or fails; or the picture is one of those that are drawn
+                in bands or chunks, which have no gradient.
+        """
+        ...
+
+    def backward(self, images: Any, gradients: Mapping[str, Any]) -> dict[str, Any]:
+        """From the derivatives of a loss by output images those by the splats, the background and the pose.
+
+        Steps (the alpha cut-off, the transmittance stop, the near plane, the order of splats) have no
+        derivative: they are taken as they were in the picture.
+
+        Args:
+            images: what `forward` has made last on this device.
+            gradients: by the names of outputs (rgb, alpha, depth, normal) float32 arrays of their shape, of
+                the device or NumPy's; outputs that are missing have gradients of 0.
+
+        Returns:
+            Arrays of the device in the cloud's shapes and units: `means` (n, 3), `quats` (n, 4), `scales`
+            (n, 2), `opacities` (n,), `colors` (n, 3) or `sh` (n, k, 3), by the values that the cloud has,
+            quaternions of any length among them; `screen` (n,), the norm of the derivative by the projected
+            centre in units of half pictures (the statistic by which 2DGS trainers densify, their
+            dL_dmean2D); `background` (3,); `pose` (6,): rotation vector [1 / rad] and translation [1 / m] of
+            a motion after world_to_camera, in the camera's axes. Splats that are not drawn have zeros. They
+            are the same in every bit on every run, and hold until the next call.
+
+        Raises:
+            InputError: another picture has been drawn since, or a gradient is of no output or of a wrong
+                shape.
+            DeviceError: the device runs out of memory or fails.
+        """
+        ...
+
+
+class TrainingKernels(Protocol):
+    """The work of a training step around the picture (`fidsplat.train`), on arrays of the device.
+
+    It holds splats before their activations, n of them, float32: `means` (n, 3), `log_scales` (n, 2), `quats`
+    (n, 4), `logits` (n,), `sh` (n, k, 3); Adam's running means of each as `first_NAME` and `second_NAME`;
+    `gradients` (n,) and `seen` (n,), the sums by which splats are made.
+    """
+
+    def take_views(self, views: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> None:
+        """Keep pictures (h, w, 3) uint8 with their masks (h, w) bool, to be compared with."""
+        ...
+
+    def load(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Hold these splats from now on."""
+        ...
+
+    def store(self) -> dict[str, np.ndarray]:
+        """The splats as they are now."""
+        ...
+
+    def resident(self, degree: int, origin: np.ndarray) -> ResidentData:
+        """The splats as they are drawn, with SH of this degree; it changes as they do."""
+        ...
+
+    def loss(self, images: Any, view: int, dssim_weight: float) -> tuple[float, float, Any]:
+        """Compare a picture with that of a view, by its number: the loss, the mean squared difference, and
+        the loss's derivative (h, w, 3) as an array of the device, which holds until the next call."""
+        ...
+
+    def count(self, screen: Any, camera: Camera, origin: np.ndarray) -> None:
+        """Add derivatives (n,) by places on the screen to their sums, and who was seen."""
+        ...
+
+    def step(
+        self, gradients: Mapping[str, Any], sizes: Mapping[str, float], numbers: Mapping[str, float]
+    ) -> None:
+        """A step of Adam by what `DifferentiablePipeline.backward` gave.
+
+        Args:
+            sizes: of the step, by `means`, `scales`, `quats`, `logits`, `sh` (of degree 0), `rest`.
+            numbers: `beta1`, `beta2`, `epsilon`, `root` (of 1 - beta2^step); `scale_penalty` and
+                `opacity_penalty`, added to the derivatives.
+        """
+        ...
+
+    def shake(self, size: float, steep: float, clear: float, words: Sequence[int]) -> None:
+        """Move means at random within their disks by `size` times their variance, those less whose opacity is
+        above `clear`. words: the seed's low and high word, the iteration, the purpose."""
+        ...
+
+
+@runtime_checkable
+class Trains(Protocol):
+    """A backend that has kernels for training."""
+
+    def training(self) -> TrainingKernels:
+        """They, compiled, without splats.
+
+        Raises:
+            DeviceError: the compiler refuses.
+        """
+        ...
+
+
+@runtime_checkable
+class Differentiates(Protocol):
+    """A backend that has derivatives of its pictures."""
+
+    def differentiate(self, features: FeatureSet) -> DifferentiablePipeline:
+        """The pipeline for these features with its derivatives, compiled on first use.
+
+        Raises:
+            InputError: an effect has no gradient; the message names it and what would do.
+            DeviceError: the compiler refuses.
+        """
         ...

@@ -8,10 +8,13 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from fidsplat.backends.base import ResidentData
+from fidsplat.backends.stack import ViewBatch, ViewStack
 from fidsplat.backends.view import FAR_EYE, Shot, View
 from fidsplat.capture import Capture
 from fidsplat.effects import FeatureSet, select
+from fidsplat.errors import InputError
 from fidsplat.splats import SplatCloud
+from fidsplat.views import Views
 
 _Prepared = tuple[FeatureSet, View]
 _prepared: WeakKeyDictionary[Capture, WeakKeyDictionary[ResidentData, _Prepared]] = WeakKeyDictionary()
@@ -33,6 +36,39 @@ def prepare(cloud: ResidentData | SplatCloud, capture: Capture) -> _Prepared:
         view = view_of(capture, cloud.origin)
         held[cloud] = select(cloud, capture), view
     return held[cloud]
+
+
+def prepare_batch(cloud: ResidentData, views: Views) -> tuple[FeatureSet, ViewBatch]:
+    """What the views of a batch call for, and those that are drawn.
+
+    Raises:
+        InputError: as `prepare`; views that call for different effects.
+    """
+    drawn = views.drawn
+    slots = np.array(drawn, np.uint32)
+    slots.flags.writeable = False
+    camera = views.captures[0].camera
+    size = (0, 0) if camera is None else (camera.height, camera.width)
+    if len(views.captures) == 1 and views.captures[0].motion.is_still:
+        features, view = prepare(cloud, views.capture(0))
+        numbers, groups = slots.astype(np.intp), sorted((views.groups or {}).items())
+        poses = None if views.poses is None else views.poses[numbers]
+        if not view.shots:
+            moved = {label: each[numbers] for label, each in groups}
+            stack = ViewStack.of_poses(view, cloud.origin, poses, moved, len(drawn))
+            return features, ViewBatch(stack, slots, len(views), size)
+    own = [prepare(cloud, views.capture(number)) for number in range(len(views))]
+    features = own[0][0]
+    for number, (other, _) in enumerate(own):
+        if other != features:
+            differing = ", ".join(sorted(other.names ^ features.names)) or "samples or precision"
+            raise InputError(
+                f"the views of a batch must have the same effects, but views 0 and {number} differ in "
+                f"{differing}; draw them in batches of their own"
+            )
+    each = [own[number][1] for number in drawn]
+    stack = ViewStack.of(each) if each else None
+    return features, ViewBatch(each if stack is None else stack, slots, len(views), size)
 
 
 def view_of(capture: Capture, origin: np.ndarray) -> View:

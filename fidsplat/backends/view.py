@@ -14,7 +14,7 @@ from fidsplat.cameras.raster import RayRaster, raster_of
 from fidsplat.capture import Capture
 from fidsplat.errors import InputError
 from fidsplat.sensor import Sensor
-from fidsplat.surroundings import Gradient, Panorama
+from fidsplat.surroundings import Gradient, Layer, Panorama
 
 FAR_EYE = 1e9
 """metres: where the eye of a parallel projection is taken to be"""
@@ -66,6 +66,8 @@ class View:
     """1 / metres"""
     surroundings: Gradient | Panorama | None = None
     """a background that is not one colour"""
+    layer: Layer | None = None
+    """an opaque surface among the splats"""
     raster: RayRaster | None = None
     """the samples' rays behind a lens; None for a pinhole and for parallel rays"""
     along_ray: bool = False
@@ -134,7 +136,9 @@ class View:
                 return self.sensor.uniform(name)
 
     def array(self, name: str) -> np.ndarray:
-        """A float32 array of an effect, by its name."""
+        """An array of an effect, by its name: float32, but int32 labels."""
+        if self.layer is not None and name.startswith("layer_"):
+            return getattr(self.layer, name.removeprefix("layer_"))
         if name == "turns":
             return self.turns_of_rows.astype(np.float32)
         if name == "panorama" and isinstance(self.surroundings, Panorama):
@@ -158,6 +162,12 @@ class View:
             raise InputError(
                 f"{camera.width} x {camera.height} pixels with {n} x {n} samples each is too large: at most "
                 f"{MAX_GRID} samples along a side; use fewer samples or a smaller picture"
+            )
+        layer = capture.layer
+        if layer is not None and layer.depth.shape != (camera.height, camera.width):
+            raise InputError(
+                f"the layer has {layer.depth.shape[1]} x {layer.depth.shape[0]} pixels and the camera "
+                f"{camera.width} x {camera.height}; draw it with this camera"
             )
         plain = isinstance(backdrop, tuple)
         rotation = camera.world_to_camera[:3, :3]
@@ -197,6 +207,7 @@ class View:
             sensor=capture.sensor,
             fog_density=0.0 if capture.fog is None else capture.fog.density,
             surroundings=None if plain else backdrop,
+            layer=layer,
             raster=raster,
             slopes=slopes,
             along_ray=lens is not None and lens.along_ray,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, TypeAlias
@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.rotations import check_similarity, matrix_to_quaternion
-from fidsplat.scalars import PickledByFields, own_scalars, real_array
+from fidsplat.rotations import check_similarity
+from fidsplat.scalars import own_scalars
 
 if TYPE_CHECKING:
     from fidsplat.cameras.pinhole import Camera
@@ -71,86 +71,6 @@ class Shutter:
         """The times of the sub-poses of an exposure time with its middle there."""
         n = self.sub_poses if self.exposure_time > 0 else 1
         return [middle + self.exposure_time * ((k + 0.5) / n - 0.5) for k in range(n)]
-
-
-@dataclass(frozen=True, eq=False)
-class Trajectory(PickledByFields):
-    """A pose between keyframes: the screw motion from one to the next (a geodesic of SE(3)), at rest before
-    the first and after the last. Call it with a time in seconds.
-
-    Raises InputError for times that do not increase and poses that are not rigid.
-    """
-
-    times: Sequence[float]
-    """(k,) seconds, increasing"""
-    poses: np.ndarray
-    """(k, 4, 4) rigid"""
-
-    def __post_init__(self) -> None:
-        times = real_array("the times of a trajectory", self.times, "increasing numbers of seconds")
-        if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-            raise InputError(
-                "the times of a trajectory must be one or more finite, increasing numbers of seconds, not "
-                f"{self.times!r}"
-            )
-        count = len(self.poses) if isinstance(self.poses, Sequence) or np.ndim(self.poses) else 0
-        if count != len(times):
-            raise InputError(f"a trajectory has {len(times)} times but {count} poses; give one for each time")
-        for k, pose in enumerate(self.poses):
-            check_similarity(pose, f"pose {k} of a trajectory", rigid=True)
-        poses = np.array(self.poses, np.float64)
-        times.flags.writeable = poses.flags.writeable = False
-        object.__setattr__(self, "times", times)
-        object.__setattr__(self, "poses", poses)
-
-    def __call__(self, time: float) -> np.ndarray:
-        """(4, 4) float64."""
-        times = np.asarray(self.times)
-        after = int(np.searchsorted(times, time, side="right"))
-        if after == 0 or after == len(times):
-            return self.poses[min(after, len(times) - 1)]
-        share = (time - times[after - 1]) / (times[after] - times[after - 1])
-        return between(self.poses[after - 1], self.poses[after], float(share))
-
-
-def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
-    """The rigid pose (4, 4) that share of the way along the screw motion from one to another."""
-    turn = start[:3, :3].T @ end[:3, :3]
-    move = start[:3, :3].T @ (end[:3, 3] - start[:3, 3])
-    axis = _rotation_vector(turn)
-    # the velocity whose integral over the whole turn is `move`
-    velocity = np.linalg.solve(_integral(axis), move)
-    part = np.eye(4)
-    part[:3, :3] = _turned(axis * share)
-    part[:3, 3] = _integral(axis * share) @ (velocity * share)
-    return start @ part
-
-
-def _skew(axis: np.ndarray) -> np.ndarray:
-    x, y, z = axis
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-
-
-def _rotation_vector(turn: np.ndarray) -> np.ndarray:
-    """Axis times angle (0 to pi) of a rotation matrix."""
-    w, *xyz = matrix_to_quaternion(turn)
-    length = np.linalg.norm(xyz)
-    return np.array(xyz) * (2 * math.atan2(length, w) / length if length > 0 else 2.0)
-
-
-def _turned(axis: np.ndarray) -> np.ndarray:
-    """The rotation matrix of axis times angle."""
-    angle, skew = float(np.linalg.norm(axis)), _skew(axis)
-    half = np.sinc(angle / 2 / math.pi)
-    return np.eye(3) + np.sinc(angle / math.pi) * skew + half * half / 2 * skew @ skew
-
-
-def _integral(axis: np.ndarray) -> np.ndarray:
-    """The integral over s in [0, 1] of the rotations by s times the axis."""
-    angle, skew = float(np.linalg.norm(axis)), _skew(axis)
-    half = np.sinc(angle / 2 / math.pi)
-    third = 1 / 6 - angle**2 / 120 if angle < 1e-3 else (1 - np.sinc(angle / math.pi)) / angle**2
-    return np.eye(3) + half * half / 2 * skew + third * skew @ skew
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,11 +11,15 @@ from fidsplat.commands.demo import Demo
 from fidsplat.commands.detect import Detect
 from fidsplat.commands.devices import Devices
 from fidsplat.commands.experiment import Experiment
+from fidsplat.commands.fly import Fly
+from fidsplat.commands.greenhouse import Greenhouse
 from fidsplat.commands.info import Info
 from fidsplat.commands.marker import Marker
 from fidsplat.commands.render import Render
 from fidsplat.commands.source import Source
 from fidsplat.commands.tradeoff import Tradeoff
+from fidsplat.commands.train import Train
+from fidsplat.commands.view import View
 from fidsplat.commands.warm import Warm
 
 COMMANDS = {
@@ -24,12 +28,16 @@ COMMANDS = {
     "info": Info,
     "marker": Marker,
     "render": Render,
+    "view": View,
+    "fly": Fly,
     "detect": Detect,
     "check": Check,
     "bench": Bench,
     "tradeoff": Tradeoff,
     "warm": Warm,
     "experiment": Experiment,
+    "greenhouse": Greenhouse,
+    "train": Train,
     "source": Source,
 }
 """Every command by its name, in the order in which help lists them."""

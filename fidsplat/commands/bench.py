@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 _LEGEND = (
     "ms: median (quartiles) of whole frames, medians of the stages by the device's own clock; splats "
-    "resident, picture left on the device. x roofline: how many times the least that the device's "
-    "measured best rates allow (docs/roofline.md)."
+    "resident, picture left on the device. host: until the call returns. x roofline: how many times the "
+    "least that the device's measured best rates allow (docs/roofline.md)."
 )
 
 
@@ -150,7 +150,7 @@ def _print_scene(scene: str, drawn: "list[Result]", where: "Console") -> None:
         for row, stage in zip(rows[1:], stages, strict=True):
             ms = result.timer.part_medians.get(stage)
             row += ["-" if ms is None else f"{ms:.2f}", _times(result, stage)]
-    facts = ("first frame", *drawn[0].counts, "splats/s", "memory")
+    facts = ("host", "first frame", *drawn[0].counts, "splats/s", "memory")
     for fact in facts:
         rows.append([fact])
         for result in drawn:
@@ -168,6 +168,8 @@ def _times(result: "Result", name: str) -> str:
 
 
 def _fact(result: "Result", fact: str) -> str:
+    if fact == "host":
+        return f"{result.host:.3f}"
     if fact == "first frame":
         return f"{result.first_frame_ms:.1f}"
     if fact == "splats/s":

@@ -2,12 +2,57 @@
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
-from fidsplat.commands.output import Device, Json, console, option, print_json, print_table, say
+from fidsplat.commands.output import (
+    Device,
+    Json,
+    console,
+    late_progress,
+    option,
+    print_json,
+    print_table,
+    say,
+    tell,
+)
+from fidsplat.errors import InputError
 
 if TYPE_CHECKING:
     from fidsplat.experiments.demo import DemoResult, Sighting
+
+
+@dataclass
+class DemoViews:
+    """The demo's scene as a data set to train on: pictures from many places, cameras, points.
+
+    COLMAP's layout: DIR/images, DIR/sparse/0, and views to compare with in DIR/test; any trainer of splats
+    reads it.
+
+    Examples:
+      fidsplat demo views -o yard && fidsplat train yard -o yard.ply --iterations 2000
+      fidsplat demo views -o yard --views 60 --width 640
+    """
+
+    out: Annotated[str, option("DIR", "folder for the data set (default: fidsplat-demo-views)", "-o")] = (
+        "fidsplat-demo-views"
+    )
+    views: Annotated[int, option("N", "pictures to train on, 2 to 1000 (default: 30)")] = 30
+    width: Annotated[int, option("PIXELS", "of a picture, 64 to 4096 (default: 320)")] = 320
+    device: Device = None
+    json: Json = False
+
+    def run(self) -> int:
+        from fidsplat.experiments.demo_views import write_demo_views
+
+        if not 2 <= self.views <= 1000:
+            raise InputError(f"--views is {self.views}; give 2 to 1000")
+        if not 64 <= self.width <= 4096:
+            raise InputError(f"--width is {self.width}; give 64 to 4096 pixels")
+        with late_progress(console(True)) as progress:
+            folder = write_demo_views(
+                self.out, self.views, width=self.width, device=self.device, progress=progress
+            )
+        return tell(self.json, {"folder": str(folder)}, f"{self.views} views to train on in {folder}")
 
 
 @dataclass
@@ -22,7 +67,10 @@ class Demo:
       fidsplat demo
       fidsplat demo --mixture fitted --out soft
       fidsplat demo --out pictures --json
+      fidsplat demo views -o yard                       its scene as a data set to train on
     """
+
+    PARTS: ClassVar[dict[str, type]] = {"views": DemoViews}
 
     out: Annotated[
         str, option("DIR", "folder for pictures, scene and figures (default: fidsplat-demo)", "-o")

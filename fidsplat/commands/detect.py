@@ -1,6 +1,7 @@
 """`fidsplat detect`."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
@@ -9,6 +10,8 @@ from fidsplat.commands.output import Json, console, late_progress, option, print
 from fidsplat.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     import numpy as np
 
     from fidsplat.scenes import Scene
@@ -17,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Detect:
-    """Find AprilTag, ArUco and QR codes in pictures, folders of pictures and videos.
+    """Find AprilTag, ArUco and QR codes in pictures, folders of pictures, videos and logs of robots.
 
     Prints what they say and the corners of each, in pixels: top left, top right, bottom right, bottom left as
     printed, the centre of the first pixel at (0.5, 0.5). With --scene also where each marker and board of
@@ -28,12 +31,13 @@ class Detect:
       fidsplat detect photo.jpg
       fidsplat detect photo.png --family 16h5 --family 7x7_1000
       fidsplat detect flight.mp4 stills/ --json
+      fidsplat detect run.mcap --topic /front/image_raw
       fidsplat detect scene.png --scene scene.toml --json
     """
 
     images: Annotated[
         tyro.conf.Positional[tuple[str, ...]],
-        option("IMAGE", "PNG, JPEG, BMP, TIFF or WebP, a folder of them, or a video"),
+        option("IMAGE", "a picture, a folder of them, a video, an MCAP file or a rosbag2 folder"),
     ]
     family: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
@@ -44,11 +48,13 @@ class Detect:
         ),
     ] = ()
     scene: Annotated[str | None, option("SCENE.toml", "the scene that the pictures show")] = None
+    topic: Annotated[
+        str | None, option("TOPIC", "of logs the pictures of this topic alone (default: of all)")
+    ] = None
     json: Json = False
 
     def run(self) -> int:
         from fidsplat.vision.dictionaries import parse_family
-        from fidsplat.vision.images import pictures
         from fidsplat.vision.readback import means
 
         if not self.images:
@@ -59,7 +65,7 @@ class Detect:
         results: list[dict[str, Any]] = []
         readings: list[Reading] = []
         for path in self.images:
-            for name, image in pictures(path):
+            for name, image in self._pictures(path):
                 result, read = self._one(name, image, scene)
                 results.append(result)
                 readings += read
@@ -94,6 +100,15 @@ class Detect:
                 against.append(_mean_row(mean["means"]))
             print_table(where, f"Against {self.scene}: distance, and errors", heads, against)
         return 0
+
+    def _pictures(self, path: str) -> "Iterable[tuple[str, np.ndarray]]":
+        if path.endswith(".mcap") or (Path(path) / "metadata.yaml").is_file():
+            from fidsplat.logs import log_pictures
+
+            return log_pictures(path, self.topic)
+        from fidsplat.vision.images import pictures
+
+        return pictures(path)
 
     def _one(
         self, name: str, image: "np.ndarray", scene: "Scene | None"

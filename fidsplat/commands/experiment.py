@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from fidsplat.experiments.run import Options
 from typing import ClassVar
 
-from fidsplat.commands.experiment_files import Blender, Dataset, Merge, Report
+from fidsplat.commands.experiment_files import Baseline, Blender, Dataset, Merge, Report
 
 
 @dataclass
@@ -262,6 +262,7 @@ class Experiment:
         "localisation": Localisation,
         "pictures": Pictures,
         "dataset": Dataset,
+        "baseline": Baseline,
         "blender": Blender,
         "merge": Merge,
         "report": Report,

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from fidsplat.commands.output import Json, console, option, switch, tell
-from fidsplat.commands.sweeps import Folders, Names, ReportTo, Seed, need_reports
+import tyro
+
+from fidsplat.commands.output import Device, Json, console, option, switch, tell
+from fidsplat.commands.sweeps import Folders, Names, Overwrite, ReportTo, Seed, need_reports, run_sweeps
 from fidsplat.errors import InputError
 
 CATEGORY_HELP = "apriltag, small, medium, large or huge, once more for each (default: all)"
@@ -65,6 +67,71 @@ class Dataset:
             ]
         names = [scene.name for scene in scenes]
         return tell(self.json, {"folder": str(folder), "scenes": names}, f"{len(names)} scenes in {folder}")
+
+
+@dataclass
+class Baseline:
+    """Train the paper's baseline: 2DGS on 3, 5, 9 and 17 views of each marker, 7,000 iterations.
+
+    Writes the data set's scenes where they are missing, the splats as 2dgs-17/small-0.ply and the like, and
+    trained.jsonl with seconds, splats, PSNR and SSIM. A run that was stopped goes on where it was. What was
+    trained is then measured by `experiment views --trained DIR` and `angles --trained DIR`.
+
+    Examples:
+      fidsplat experiment baseline --device opencl:nvidia
+      fidsplat experiment baseline --category small --markers 1 --views 17 --iterations 1000 -o rough
+      fidsplat experiment views --trained fidsplat-baseline
+    """
+
+    out: Annotated[str, option("DIR", "folder for splats and results (default: fidsplat-baseline)", "-o")] = (
+        "fidsplat-baseline"
+    )
+    dataset: Annotated[Path, option("DIR", "of `experiment dataset` (default: fidsplat-dataset)")] = Path(
+        "fidsplat-dataset"
+    )
+    device: Device = None
+    category: Annotated[Names, option("NAME", CATEGORY_HELP)] = ()
+    markers: Annotated[int, option("N", "of each category, 1 to 5 (default: 5)")] = 5
+    views: Annotated[
+        tyro.conf.UseAppendAction[tuple[int, ...]],
+        option("N", "3, 5, 9 or 17, once more for each (default: all)"),
+    ] = ()
+    iterations: Annotated[int, option("N", "of each training (default: 7000)")] = 7000
+    seed: Seed = 0
+    overwrite: Overwrite = False
+    json: Json = False
+
+    def run(self) -> int:
+        from fidsplat.experiments.dataset import dataset_scenes
+        from fidsplat.experiments.setup import COLLECTIONS, MARKERS, chosen_categories
+        from fidsplat.experiments.sweep import Results, Sweep
+        from fidsplat.experiments.trained import NAME, train_marker
+        from fidsplat.files import writable_folder
+        from fidsplat.provenance import run_facts
+        from fidsplat.render import Renderer
+        from fidsplat.train import TrainSettings
+
+        if not 1 <= self.markers <= MARKERS:
+            raise InputError(f"--markers is {self.markers}; each category has 1 to {MARKERS}")
+        for number in self.views:
+            if number not in COLLECTIONS:
+                raise InputError(f"--views is {number}; known: {', '.join(map(str, COLLECTIONS))}")
+        settings = TrainSettings(iterations=self.iterations, seed=self.seed)
+        points = [
+            {**point, "iterations": self.iterations}
+            for point in dataset_scenes(chosen_categories(self.category), self.markers)
+            if not self.views or point["views"] in self.views
+        ]
+        out = writable_folder(self.out)
+        renderer = Renderer(self.device)
+        facts = run_facts(f"{renderer.device.title}, {renderer.device.version}", self.seed)
+        results = Results(out / f"{NAME}.jsonl", facts, self.overwrite)
+
+        def begin(point):
+            return lambda: train_marker(point, self.dataset, out, settings, renderer)
+
+        run_sweeps([Sweep(NAME, results, points, begin)])
+        return tell(self.json, {"file": str(results.file)}, str(results.file))
 
 
 @dataclass

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -27,6 +28,12 @@ def option(metavar: str, text: str, short: str | None = None):
 
 
 Device = Annotated[str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")]
+
+
+MemoryBudget = Annotated[
+    str | None,
+    option("SIZE", "of the device, for a picture and its splats, e.g. 2GiB (default: nine tenths of it)"),
+]
 
 
 def switch(text: str):
@@ -110,6 +117,20 @@ def late_progress(where: Console, after: float = 1.0) -> Iterator[Callable[[str,
         timer.join()
         if shown.live.is_started:
             shown.stop()
+
+
+_UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
+
+
+def bytes_of(option: str, text: str | None) -> int | None:
+    """A number of bytes with or without a unit; None stays None. Raises InputError for anything else."""
+    if text is None:
+        return None
+    found = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?)\s*([a-z]*)\s*", text.lower())
+    size = int(float(found[1]) * _UNITS.get(found[2], 0)) if found else 0
+    if size <= 0:
+        raise InputError(f"{option} is {text!r}; give a number of bytes above 0, e.g. 500MB or 2GiB")
+    return size
 
 
 def writable_file(path: str | Path) -> Path:

@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.output import Json, console, late_progress, option, print_json, print_table, say
+from fidsplat.commands.output import (
+    Json,
+    MemoryBudget,
+    bytes_of,
+    console,
+    late_progress,
+    option,
+    print_json,
+    print_table,
+    say,
+)
 from fidsplat.errors import FidsplatError, InputError
 from fidsplat.files import path_of, writable_folder
 
@@ -76,6 +86,7 @@ class Render:
         float | None,
         option("T", "draw with the most accurate quality that takes at most T milliseconds a frame"),
     ] = None
+    memory_budget: MemoryBudget = None
     json: Json = False
 
     def run(self) -> int:
@@ -88,6 +99,7 @@ class Render:
         names = None if self.outputs is None else tuple(n.strip() for n in self.outputs.split(","))
         # what is wrong with the words is said before anything is read or opened
         select(fs.SplatCloud.empty(), fs.Capture(outputs=names or "rgb", quality=Quality.of(self.quality)))
+        memory = bytes_of("--memory-budget", self.memory_budget)
         budget = self.max_error is not None or self.max_ms is not None
         if budget:
             check_bounds(self.max_error, self.max_ms)
@@ -99,7 +111,7 @@ class Render:
             select(fs.SplatCloud.empty(), fs.Capture(outputs=scene.outputs))
         of_scene = _named(self.source, "render.device", self.device is None)
         with where.status("opening the device"), of_scene:
-            renderer = fs.Renderer(self.device or scene.device)
+            renderer = fs.Renderer(self.device or scene.device, memory)
         choice = None
         if budget:
             with where.status("measuring") as status:

@@ -51,6 +51,7 @@ class Tradeoff:
     on where it was. Keep the machine quiet.
 
       r100k_720p, r1m_1080p            random splats, as in `fidsplat bench`
+      r100k_720p_3d, r1m_1080p_3d      of 3D Gaussians: the ways of drawing them
       hard                             haze, veils, opaque stacks, edge-on, tiny, needles, near, far away
       apriltag, qr2, qr5, qr10, qr22   markers at 0, 60 and 80 degrees: presets and ways of making them;
                                        of qr10 every knob

@@ -36,8 +36,8 @@ class FeatureSet:
     """
 
     slots: tuple[str, ...]
-    """One effect per kind, in the fixed order camera, color, ellipsoids if any, lowpass, stop, compose,
-    footprint, background, arithmetic; then motion, shutter and double blending, if any."""
+    """One effect per kind, in the fixed order camera, color, ellipsoids if any, lowpass, stop, a layer if
+    any, compose, footprint, background, arithmetic; then motion, shutter and double blending, if any."""
     outputs: tuple[str, ...]
     """Sorted names of the outputs beside rgb."""
     sh_degree: int
@@ -97,6 +97,10 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
     quality, background = capture.quality, capture.backdrop
     lens = None if capture.camera is None else capture.camera.lens
     ellipsoid = _ellipsoid(cloud, quality, lens)
+    if capture.layer is not None and capture.exposed:
+        raise InputError(
+            "a layer shows one moment; draw it with a shutter whose exposure_time and readout are 0"
+        )
     # what filters itself needs no low-pass
     alone = cloud.ellipsoids == "all" and ellipsoid != "exact"
     filtered = cloud.footprint == "box" or alone
@@ -116,7 +120,9 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
             *(("ellipsoids_alone",) if alone else ()),
             f"lowpass_{lowpass}",
             f"stop_{quality.stop_rule}",
-            _composing(cloud, quality.order),
+            # before what composites, whose fragments it hides
+            *(("opaque_layer",) if capture.layer is not None else ()),
+            _composing(cloud, quality.order, one_depth_each=alone and not double),
             f"footprint_{cloud.footprint}",
             f"background_{_KINDS.get(type(background), 'constant')}",
             # short functions are float32's
@@ -134,11 +140,15 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
     )
 
 
-def _composing(cloud: Traits, order: str) -> str:
-    """The effect that composites: by splats' centres, or by depth at each pixel, with or without planes."""
-    if order == "centre" or (order == "auto" and not cloud.has_planes):
-        return "compose_ordered"
-    return "compose_planes" if cloud.has_planes else "compose_pixel"
+def _composing(cloud: Traits, order: str, one_depth_each: bool) -> str:
+    """The effect that composites: by splats' centres, or by depth at each pixel, with or without planes.
+
+    Where every fragment has its centre's depth as float32, as the lists' keys are, both orders are the same,
+    and nothing need wait.
+    """
+    if cloud.has_planes:
+        return "compose_ordered" if order == "centre" else "compose_planes"
+    return "compose_pixel" if order == "pixel" and not one_depth_each else "compose_ordered"
 
 
 def _ellipsoid(cloud: Traits, quality: Quality, lens: Lens | None) -> str:

@@ -37,15 +37,15 @@ COLOURS = ("#777777", "#d1495b", "#edae49", "#00798c", "#30638e", "#7b4f9d", "#2
 
 
 @contextmanager
-def chart(file: Path, panels: int = 1, size: tuple[float, float] = (9.0, 4.2)):
-    """Axes to draw on, side by side, of one vertical scale; the figure is written when all went well.
+def chart(file: Path, panels: int = 1, size: tuple[float, float] = (9.0, 4.2), one_scale: bool = True):
+    """Axes to draw on, side by side; the figure is written when all went well.
 
-    size: inches.
+    size: inches. one_scale: whether they have one vertical scale.
     """
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(figure)  # measures texts
-        axes = figure.subplots(1, panels, squeeze=False, sharey=True)[0]
+        axes = figure.subplots(1, panels, squeeze=False, sharey=one_scale)[0]
         yield figure, axes
         with atomic_write(file) as stream:
             figure.savefig(stream, format=file.suffix[1:], metadata={"Date": None})

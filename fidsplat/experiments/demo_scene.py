@@ -1,7 +1,8 @@
 """The demo's scene: three signs in a small yard, and the three views of it. All of it from one seed.
 
 x right, y down, z away; the signs stand at z = 0 and face -z. Stones and bricks lie some millimetres apart in
-depth, joints before them: of splats in one plane rounding would say which is in front.
+depth, joints before them: of splats in one plane rounding would say which is in front. What is flat is made
+of disks, blooms and bushy shrubs of 3D Gaussians.
 """
 
 import math
@@ -130,19 +131,20 @@ def _plants(random: np.random.Generator) -> list[SplatCloud]:
     """Shrubs by the wall and to the sides, and the one that hides part of the middle sign in the third
     view."""
     green, dark, olive = (0.30, 0.52, 0.20), (0.16, 0.38, 0.18), (0.46, 0.50, 0.22)
-    shrubs = (  # middle, half axes, leaves, colour, flowers
-        ((-2.1, 0.35, 1.0), (0.55, 0.55, 0.55), 560, dark, None),
-        ((-1.55, 0.60, 1.15), (0.32, 0.32, 0.32), 300, green, (0.95, 0.75, 0.20)),
-        ((2.1, 0.30, 1.0), (0.60, 0.60, 0.60), 600, green, None),
-        ((1.5, 0.58, 1.2), (0.34, 0.34, 0.34), 300, olive, (0.85, 0.30, 0.45)),
-        ((0.37, 0.62, 1.2), (0.30, 0.30, 0.30), 280, dark, (0.93, 0.93, 0.96)),
-        ((-0.37, 0.64, 1.25), (0.28, 0.28, 0.28), 260, green, None),
-        ((-0.97, 0.38, -1.0), (0.17, 0.46, 0.17), 560, green, (0.90, 0.35, 0.35)),
+    shrubs = (  # middle, half axes, leaves, whether bushy, colour, flowers
+        ((-2.1, 0.35, 1.0), (0.55, 0.55, 0.55), 560, False, dark, None),
+        ((-1.55, 0.60, 1.15), (0.32, 0.32, 0.32), 300, False, green, (0.95, 0.75, 0.20)),
+        ((2.1, 0.30, 1.0), (0.60, 0.60, 0.60), 600, False, green, None),
+        ((1.5, 0.58, 1.2), (0.34, 0.34, 0.34), 300, True, olive, (0.85, 0.30, 0.45)),
+        ((0.37, 0.62, 1.2), (0.30, 0.30, 0.30), 280, True, dark, (0.93, 0.93, 0.96)),
+        ((-0.37, 0.64, 1.25), (0.28, 0.28, 0.28), 260, False, green, None),
+        ((-0.97, 0.38, -1.0), (0.17, 0.46, 0.17), 560, False, green, (0.90, 0.35, 0.35)),
     )
     return [_shrub(random, *shrub) for shrub in shrubs]
 
 
-def _shrub(random: np.random.Generator, middle, axes, leaves: int, colour, flowers) -> SplatCloud:
+def _shrub(random: np.random.Generator, middle, axes, leaves: int, bushy, colour, flowers) -> SplatCloud:
+    """Leaves are disks, or if bushy tufts half as thick as wide; blooms are balls."""
     direction = random.normal(size=(leaves, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     means = np.asarray(middle) + direction * np.asarray(axes) * np.cbrt(random.uniform(0.15, 1, (leaves, 1)))
@@ -151,10 +153,13 @@ def _shrub(random: np.random.Generator, middle, axes, leaves: int, colour, flowe
     turns *= np.sign(np.linalg.det(turns))[:, None, None]
     light = 0.75 + 0.35 * (-direction[:, 1:2]) + random.normal(0, 0.08, (leaves, 1))  # brighter on top
     colors = np.asarray(colour) * light
+    blooms = np.zeros(leaves, bool)
     if flowers is not None:
         blooms = random.uniform(size=leaves) < 0.12
         colors[blooms] = np.asarray(flowers) * random.uniform(0.85, 1.05, (int(blooms.sum()), 1))
     scales = min(axes) * random.uniform((0.08, 0.04), (0.14, 0.065), (leaves, 2))
+    scales = np.column_stack([scales, 0.5 * scales[:, 1] if bushy else np.zeros(leaves)])
+    scales[blooms] = 1.2 * scales[blooms, 1:2]
     return _cloud(means, turns, scales, 0.92, colors)
 
 

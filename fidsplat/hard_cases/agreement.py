@@ -20,8 +20,9 @@ from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
 from fidsplat.capture import Capture
 from fidsplat.effects import OUTPUTS, FeatureSet
+from fidsplat.frame import Frame
 from fidsplat.quality import Quality
-from fidsplat.render import Frame, Renderer
+from fidsplat.render import Renderer
 from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
 from fidsplat.surroundings import Background, Fog

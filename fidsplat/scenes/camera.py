@@ -145,6 +145,11 @@ def keyframe_tables(motion: Any, who: str, camera: bool = False) -> list[dict]:
             f"a scene file holds keyframes; the motion of {who} is a function. Sample it: "
             "fs.Trajectory(times, [pose(time) for time in times])"
         )
+    if motion.smooth:
+        raise InputError(
+            f"a scene file moves in screw motions from keyframe to keyframe; the motion of {who} is smooth. "
+            "Sample it: motion.sampled(30)"
+        )
     tables = []
     for time, pose in zip(motion.times, motion.poses, strict=True):
         if camera:

@@ -9,10 +9,29 @@ from fidsplat.quality import Quality
 from fidsplat.scenes.parts import SceneParts
 from fidsplat.scenes.read import read_scene
 from fidsplat.scenes.write import write_scene
+from fidsplat.summaries import Summarised, point
 
 
-class Scene(SceneParts):
+class Scene(SceneParts, Summarised):
     """What is drawn and how. Raises InputError for a part of the wrong kind."""
+
+    def __repr__(self) -> str:
+        words = (f"{len(cloud):,} splats" for cloud in self.clouds)
+        return f"Scene({', '.join([*words, *(placed.marker.spec for placed in self.markers)])})"
+
+    def summary(self) -> dict[str, str]:
+        """What it holds, in words."""
+        rows = {f"cloud {i}": f"{len(cloud):,} splats" for i, cloud in enumerate(self.clouds)}
+        for placed in self.markers:
+            moves = "" if placed.motion is None else ", moves"
+            size, place = f"{placed.marker.size:g} m", point(placed.pose[:3, 3])
+            rows[f"marker {placed.label}"] = f"{placed.marker.spec}, {size} at {place}{moves}"
+        if self.camera is not None:
+            lens = "pinhole" if self.camera.lens is None else self.camera.lens.kind
+            rows["camera"] = (
+                f"{self.camera.width} x {self.camera.height}, {lens}, at {point(self.camera.position)}"
+            )
+        return rows | {"outputs": ", ".join(self.outputs)}
 
     @staticmethod
     def load(

@@ -31,6 +31,20 @@ def read_image(path: str | os.PathLike[str], deep: bool = False) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
+def read_rgba(path: str | os.PathLike[str]) -> np.ndarray:
+    """Read a picture as (h, w, 4) uint8 RGBA, opaque where the file has no alpha.
+
+    Raises InputError when the file is missing, or is no picture of 8 bits.
+    """
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.dtype != np.uint8:
+        raise InputError(f"{path} holds {image.dtype} pixels; give 8 bits")
+    channels = 1 if image.ndim == 2 else image.shape[2]
+    if channels == 4:
+        return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA)
+    return cv2.cvtColor(image, cv2.COLOR_GRAY2RGBA if channels == 1 else cv2.COLOR_BGR2RGBA)
+
+
 def pictures(path: str | os.PathLike[str]) -> Iterator[tuple[str, np.ndarray]]:
     """Names and pictures (h, w, 3) uint8 RGB: of a file, of a folder's files by their names, of a video.
 
@@ -128,6 +142,14 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> Path:
 
     Raises InputError when the folder cannot be written, and for another shape.
     """
+    data = png_bytes(image)
+    with atomic_write(path) as stream:
+        stream.write(data)
+    return Path(path)
+
+
+def png_bytes(image: np.ndarray) -> bytes:
+    """A picture as a PNG file's content; shapes and errors as `write_png`."""
     array = pixels_of(image)
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] != 3) or array.size == 0:
         raise InputError(f"a PNG needs (h, w) or (h, w, 3), not {array.shape}")
@@ -138,9 +160,25 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> Path:
     done, data = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 3])
     if not done:
         raise ValueError(f"OpenCV could not encode an image of shape {array.shape} as PNG")
-    with atomic_write(path) as stream:
-        stream.write(data.tobytes())
-    return Path(path)
+    return data.tobytes()
+
+
+def encoded(image: np.ndarray, kind: str) -> bytes:
+    """A picture (h, w, 3) RGB, float in [0, 1] or uint8, as the content of a "jpeg" or "png" file."""
+    done, data = cv2.imencode(f".{kind}", cv2.cvtColor(to_uint8(image), cv2.COLOR_RGB2BGR))
+    if not done:
+        raise ValueError(f"OpenCV could not encode an image of shape {image.shape} as {kind}")
+    return data.tobytes()
+
+
+def decoded(content: bytes) -> np.ndarray:
+    """The picture (h, w, 3) uint8 RGB of a file's content. Raises InputError for what is no picture."""
+    image = None
+    with _silent_opencv(), contextlib.suppress(cv2.error):
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR) if content else None
+    if image is None:
+        raise InputError("a compressed picture cannot be read; JPEG and PNG can")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:

@@ -15,6 +15,17 @@ from fidsplat.vision.paint import (
     normal_picture,
 )
 
+_WHOLE = ("label", "splat_id", "blended")
+"""outputs of whole numbers"""
+
+
+def suffixes_of(name: str) -> tuple[str, ...]:
+    """Endings of the files of an output, in the order in which `save_output` writes them; the last is a
+    picture to look at."""
+    if _is_depth(name):
+        return (".npy", ".png", "-turbo.png")
+    return (".npy", ".png") if name in _WHOLE else (".png",)
+
 
 def save_output(
     name: str, image: np.ndarray, name_of: Callable[[str, str], Path], bits: int | None = None
@@ -27,23 +38,26 @@ def save_output(
         bits: 16 writes rgb as a 16-bit PNG.
         name_of: gives the file for an output's name and a suffix such as ".png" or "-turbo.png".
     """
-    if name.startswith(("depth", "distance")):
-        return [
-            _write_array(name_of(name, ".npy"), image),
-            write_png(name_of(name, ".png"), depth_millimetres(image)),
-            write_png(name_of(name, "-turbo.png"), depth_picture(image)),
-        ]
-    if name in ("label", "splat_id", "blended"):
-        picture = count_picture if name == "blended" else label_picture
-        return [
-            _write_array(name_of(name, ".npy"), image),
-            write_png(name_of(name, ".png"), picture(image)),
-        ]
     if name == "rgb" and bits == 16:
         deep = np.rint(np.clip(np.nan_to_num(image, nan=0.0), 0, 1) * 65535).astype(np.uint16)
         return [write_png(name_of(name, ".png"), deep)]
-    is_normal = name in ("normal", "normal_world")
-    return [write_png(name_of(name, ".png"), normal_picture(image) if is_normal else image)]
+    arrays = [_write_array(name_of(name, ".npy"), image)] if ".npy" in suffixes_of(name) else []
+    if _is_depth(name):
+        arrays.append(write_png(name_of(name, ".png"), depth_millimetres(image)))
+    return [*arrays, write_png(name_of(name, suffixes_of(name)[-1]), picture_of(name, image))]
+
+
+def picture_of(name: str, image: np.ndarray) -> np.ndarray:
+    """An output image, (h, w) or (h, w, 3), as a picture that people look at."""
+    if _is_depth(name):
+        return depth_picture(image)
+    if name in _WHOLE:
+        return count_picture(image) if name == "blended" else label_picture(image)
+    return normal_picture(image) if name in ("normal", "normal_world") else image
+
+
+def _is_depth(name: str) -> bool:
+    return name.startswith(("depth", "distance"))
 
 
 def _write_array(path: Path, array: np.ndarray) -> Path:

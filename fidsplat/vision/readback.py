@@ -2,13 +2,12 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.errors import InputError
 from fidsplat.markers import Marker
 from fidsplat.scenes import PlacedMarker, Scene
 from fidsplat.vision.boards import BOARDS, board_pose
@@ -16,23 +15,13 @@ from fidsplat.vision.detect import Detection, detect
 from fidsplat.vision.dictionaries import parse_family
 from fidsplat.vision.images import to_uint8
 from fidsplat.vision.pose import marker_pose, pose_error
-from fidsplat.vision.visible import visible
+from fidsplat.vision.truth import MarkerTruth, marker_truth, standing
 
 
 @dataclass(frozen=True, eq=False)
-class Reading:
-    """One marker of a scene, and how it was read."""
+class Reading(MarkerTruth):
+    """One marker of a scene, where it is, and how it was read."""
 
-    placed: PlacedMarker
-    truth: np.ndarray
-    """(4, 4) camera_from_marker"""
-    corners: np.ndarray
-    """(4, 2) pixels where the code's corners are, NaN behind the camera"""
-    visible: float
-    """share of the marker, a module of its quiet zone included, that is in the picture, 0 to 1; of a frame
-    with labels, of what nothing hides"""
-    box: tuple[float, float, float, float] | None
-    """pixels x0, y0, x1, y1 around what of that lies in the picture; None where nothing does"""
     detection: Detection | None = None
     """None when the marker was not found"""
     pose: np.ndarray | None = None
@@ -44,11 +33,6 @@ class Reading:
     corner_error: float | None = None
     """pixels, root mean square over the four corners"""
 
-    @property
-    def distance(self) -> float:
-        """Metres from the camera to the middle of the marker."""
-        return float(np.linalg.norm(self.truth[:3, 3]))
-
     def as_dict(self) -> dict[str, Any]:
         """For JSON: millimetres, degrees, pixels; None where the marker was not found."""
         return {
@@ -58,6 +42,7 @@ class Reading:
             "visible": self.visible,
             "box": self.box,
             "distance_m": self.distance,
+            "tilt_deg": math.degrees(self.tilt),
             "position_error_mm": None if self.position_error is None else self.position_error * 1e3,
             "angle_error_deg": None if self.angle_error is None else math.degrees(self.angle_error),
             "corner_error_px": self.corner_error,
@@ -97,18 +82,7 @@ def read_back(
     """
     image = to_uint8(picture["rgb"] if isinstance(picture, Mapping) else np.asarray(picture))
     label = picture["label"] if isinstance(picture, Mapping) and "label" in picture else None
-    time = 0.0 if scene.shutter is None else scene.shutter.time
-    camera = scene.camera if camera is None else camera
-    if camera is None:
-        raise InputError("the scene has no camera, so the pose of its markers is unknown; give read_back one")
-    if (camera.width, camera.height) != (image.shape[1], image.shape[0]):
-        raise InputError(
-            f"the picture has {image.shape[1]} x {image.shape[0]} pixels and the camera {camera.width} x "
-            f"{camera.height}; give the picture that this scene was rendered to"
-        )
-    if camera is scene.camera:
-        camera = scene.motion.moved(camera, time)
-    markers = [m if m.motion is None else replace(m, pose=m.motion(time)) for m in scene.markers]
+    camera, markers = standing(scene, camera, image.shape)
     found = detect(image, families_of(placed.marker for placed in markers) if families is None else families)
     codes, left = match(found, markers, camera)
     for number, placed in enumerate(markers):
@@ -186,17 +160,17 @@ def _apart(one: np.ndarray, other: np.ndarray) -> float:
 def _reading(
     placed: PlacedMarker, code: tuple[Detection, np.ndarray] | None, camera: Camera, label: np.ndarray | None
 ) -> Reading:
-    truth, corners = camera.world_to_camera @ placed.pose, camera.project(placed.corners)
-    seen = Reading(placed, truth, corners, *visible(placed, camera, label))
+    truth = marker_truth(placed, camera, label)
+    seen = Reading(**{field.name: getattr(truth, field.name) for field in fields(truth)})
     if code is None:
         return seen
     found, pose = code
-    position, angle = pose_error(pose, truth)
+    position, angle = pose_error(pose, truth.truth)
     return replace(
         seen,
         detection=found,
         pose=pose,
         position_error=position,
         angle_error=angle,
-        corner_error=corner_error(found, corners),
+        corner_error=corner_error(found, truth.corners),
     )

@@ -66,6 +66,28 @@ def visible(placed: PlacedMarker, camera: Camera, label: np.ndarray | None = Non
     return Visible(share, (x0, y0, x1, y1))
 
 
+class Outline(NamedTuple):
+    """A marker's outline, as `visible_part` has it."""
+
+    area: float
+    """square pixels, in an endless picture"""
+    box: tuple[float, float, float, float] | None
+    """pixels x0, y0, x1, y1 around that; None for a marker that is seen from behind"""
+    seen_area: float
+    """square pixels of what lies in the camera's picture"""
+    polygons: list[np.ndarray]
+    """that, in (n, 2) pixels"""
+
+
+def outline(placed: PlacedMarker, camera: Camera) -> Outline:
+    """A marker's outline in a camera's picture."""
+    whole, part = visible_part(placed, camera)
+    parts = [p for p in shapely.get_parts(part) if p.geom_type == "Polygon"]
+    box = None if shapely.is_empty(whole) else tuple(shapely.bounds(whole).tolist())
+    rings = [shapely.get_coordinates(shapely.get_exterior_ring(p))[:-1] for p in parts]
+    return Outline(float(shapely.area(whole)), box, float(shapely.area(part)), rings)
+
+
 def _before(points: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     """The part of a polygon (n, 3) where a linear function, of these values at its corners, is above 0."""
     kept = []

@@ -1,5 +1,5 @@
 // Lists of splats per tile for CPUs, each in depth order: a counting sort whose bins are the tiles.
-// Index space of both kernels: one work-item per chunk of the depth-sorted splats.
+// Index space of both kernels: one work-item per chunk of the depth-sorted splats of each view, which have `count` places.
 
 // The next splats' windows are fetched ahead: their places in memory follow no order.
 #define AHEAD 16
@@ -12,19 +12,20 @@ typedef struct {
 
 static inline Chunk chunk_of(uint length, int width, int height, global uint *restrict table) {
     Chunk c;
-    uint number = get_global_id(0), each = (length + CHUNKS - 1) / CHUNKS;
+    uint chunk = get_global_id(0), each = (length + CHUNKS - 1) / CHUNKS;
     c.width = width;
     c.height = height;
     c.tiles_x = (width + TILE_W - 1) / TILE_W;
     c.tiles_y = (height + TILE_H - 1) / TILE_H;
-    c.from = min(number * each, length);
+    c.from = min(chunk * each, length);
     c.to = min(c.from + each, length);
-    c.row = table + (size_t)number * c.tiles_x * c.tiles_y;
+    c.row = table + ((size_t)get_global_id(1) * CHUNKS + chunk) * c.tiles_x * c.tiles_y;
     return c;
 }
 
-typedef struct {             // of bin_emit; lists of the tiles of the band [first, end), from 0
+typedef struct {             // of bin_emit; lists of the tiles of the band [first, end), from `base`
     int first, end;
+    uint base;
     global const uint *starts;
     global uint *lists;
 } Emission;
@@ -34,7 +35,7 @@ static inline void bin_tile(int tile, uint index, const Chunk *c, const Emission
     if (e) {
         if (tile < e->first || tile >= e->end) return;
         // modulo 2^32: a place within the band is right even where the picture has more pairs than that
-        uint place = e->starts[tile] - e->starts[e->first] + c->row[tile];
+        uint place = e->starts[tile] - e->base + c->row[tile];
         e->lists[place] = index;
     }
     c->row[tile]++;
@@ -65,7 +66,8 @@ kernel void bin_count(
 //@@ arguments bin_count
 ) {
     if (get_global_id(0) >= CHUNKS) return;
-    const Chunk c = chunk_of(tallies[TALLY_VISIBLE], width, height, table);
+    const Chunk c = chunk_of(tallies[get_global_id(1) * TALLIES + TALLY_VISIBLE], width, height, table);
+    order += get_global_id(1) * count;
     for (int tile = 0; tile < c.tiles_x * c.tiles_y; tile++) c.row[tile] = 0;
     bin_splats(order, windows, big_capacity, big_bounds, &c, 0);
 }
@@ -75,7 +77,9 @@ kernel void bin_emit(
 //@@ arguments bin_emit
 ) {
     if (get_global_id(0) >= CHUNKS) return;
-    const Chunk c = chunk_of(tallies[TALLY_VISIBLE], width, height, table);
-    const Emission e = {band_first, band_end, starts, lists};
+    const Chunk c = chunk_of(tallies[get_global_id(1) * TALLIES + TALLY_VISIBLE], width, height, table);
+    order += get_global_id(1) * count;
+    int before = (int)get_global_id(1) * c.tiles_x * c.tiles_y;    // tiles of the views before
+    const Emission e = {band_first - before, band_end - before, starts[band_first], starts + before, lists};
     bin_splats(order, windows, big_capacity, big_bounds, &c, &e);
 }

@@ -23,6 +23,6 @@ typedef float real;
 #define CULLED 0xFFFFFFFFu   // sort key of a splat that is not drawn
 #define OUTSIDE 0xFFFFFFFEu  // of one that is drawn in another band of rows only
 
-// places in the buffer `tallies`: numbers of visible splats, of pairs and of splats (64 bits each) and of big splats; then
-// one word per tile
-enum { TALLY_VISIBLE = 0, TALLY_PAIRS = 2, TALLY_ALL = 4, TALLY_BIG = 6, TALLIES = 8 };
+// places in the buffer `tallies`: numbers of visible splats, of pairs (64 bits each) and of big splats; then one word per tile,
+// or the same of the next view
+enum { TALLY_VISIBLE = 0, TALLY_PAIRS = 2, TALLY_BIG = 6, TALLIES = 8 };

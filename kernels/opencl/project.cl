@@ -1,6 +1,6 @@
-// Index space: one work-item per splat.
+// Index space: one work-item per splat and view. Of each view `view` has a record, `splats`, `keys` and `windows` have `count`.
 // Reads:  view, means, quats, scales, opacities, and what the colour slot and the outputs ask for.
-// Writes: splats[i] of visible splats; keys[i]: depth key, or CULLED or OUTSIDE; windows[i]
+// Writes: splats[at] of visible splats; keys[at]: depth key, or CULLED or OUTSIDE; windows[at]
 //         of visible splats: the tiles that they touch; big, big_bounds and their number in tallies (numerics A5).
 //
 // The set-up is done in `real` (double where there is one) from float inputs (numerics B1).
@@ -51,9 +51,11 @@ static inline real3_ rotate_to_camera(global const View *view, real3_ v) {
 kernel void project(
 //@@ arguments project
 ) {
-    uint i = get_global_id(0);
+    uint i = get_global_id(0), number = get_global_id(1);
     if (i >= count) return;
-    keys[i] = CULLED;
+    uint at = number * count + i;
+    view += number;
+    keys[at] = CULLED;
 //@@ splat_view
 
     wide log_opacity = (wide)log((real)opacities[i]);
@@ -105,7 +107,7 @@ kernel void project(
     if (!(y0 < y1 && first <= (float)(width - 1) && last >= 0.0f && first <= last)) return;
 
     if (y1 <= (int)view->band || y0 >= (int)view->band_end) {
-        keys[i] = OUTSIDE;
+        keys[at] = OUTSIDE;
         return;
     }
 
@@ -140,19 +142,19 @@ kernel void project(
     record.x1 = (short)min(to_pixel(floor(x1 - 0.5f) + 1.0f, width), width);
 //@@ color
 //@@ project
-    splats[i] = record;
+    splats[at] = record;
     uint corner, window = tile_window(&bounds, record.x0, record.x1, y0, y1, width, height, &corner);
     if (window == 0) {
         // in any order: what is kept of them is looked up by its place or sorted
         corner = atomic_inc(tallies + TALLY_BIG);
         if (corner < big_capacity) {
-            big[corner] = i;
+            big[corner] = at;
             big_bounds[corner] = bounds;
         }
     }
-    windows[i] = (uint2)(corner, window);
+    windows[at] = (uint2)(corner, window);
 //@@ list
     float key = (float)pz;
 //@@ key
-    keys[i] = sortable(key);
+    keys[at] = sortable(key);
 }

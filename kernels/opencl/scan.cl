@@ -1,29 +1,32 @@
 // Counting sort without atomics: a list is cut into CHUNKS contiguous pieces, each piece counts its bins in its own row
 // of table[CHUNKS][bins]. These two kernels turn the counts into places; equal bins keep the list's order.
 
-// Index space: one work-item per bin.
+// Index space: one work-item per bin and list.
 // Reads and writes: table (counts become offsets within the bin). Writes: totals[bins].
 kernel void scan_chunks(
 //@@ arguments scan_chunks
 ) {
-    uint bin = get_global_id(0);
+    uint bin = get_global_id(0), number = get_global_id(1);
     if (bin >= bins) return;
+    table += (size_t)number * CHUNKS * bins;
     uint sum = 0;
     for (uint chunk = 0; chunk < CHUNKS; chunk++) {
         uint here = table[(size_t)chunk * bins + bin];
         table[(size_t)chunk * bins + bin] = sum;
         sum += here;
     }
-    totals[bin] = sum;
+    totals[number * bins + bin] = sum;
 }
 
-// Index space: one work-group of SCAN_ITEMS.
-// Reads: totals[bins]. Writes: starts[bins + 1], exclusive prefix; tallies[slot] and tallies[slot + 1], the sum in 64 bits.
+// Index space: one work-group of SCAN_ITEMS for each list.
+// Reads: totals[bins]. Writes: starts[bins + 1], exclusive prefix; of the list's tallies [slot] and [slot + 1], the sum in 64
+// bits.
 kernel void scan_bins(
 //@@ arguments scan_bins
 ) {
     local ulong partial[SCAN_ITEMS + 1];
-    uint item = get_local_id(0);
+    uint item = get_local_id(0), number = get_global_id(1);
+    totals += number * bins; starts += number * (bins + 1); tallies += number * TALLIES;
     uint each = (bins + SCAN_ITEMS - 1) / SCAN_ITEMS;
     uint from = min(item * each, bins), to = min(from + each, bins);
     ulong sum = 0;

@@ -1,17 +1,20 @@
-// Stable least-significant-digit radix sort of (depth key, splat index); culled splats are dropped in the first pass.
-// Index space of both kernels: one work-item per chunk.
+// Stable least-significant-digit radix sort of (depth key, splat index); culled splats are dropped in the first pass. The
+// splats of each view are a list of their own, in `count` places.
+// Index space of both kernels: one work-item per chunk and view.
 
 #define RADIX_BINS (1u << RADIX_BITS)
 
-// Reads: keys, tallies[slot] (length). Writes: this chunk's row of table.
+// Reads: keys, the view's number of visible splats unless `first`. Writes: this chunk's row of table.
 kernel void sort_count(
 //@@ arguments sort_count
 ) {
-    uint chunk = get_global_id(0);
+    uint chunk = get_global_id(0), number = get_global_id(1);
     if (chunk >= CHUNKS) return;
-    global uint *row = table + (size_t)chunk * RADIX_BINS;
+    keys += number * count;
+    tallies += number * TALLIES;
+    global uint *row = table + ((size_t)number * CHUNKS + chunk) * RADIX_BINS;
     for (uint bin = 0; bin < RADIX_BINS; bin++) row[bin] = 0;
-    uint length = tallies[slot], each = (length + CHUNKS - 1) / CHUNKS;
+    uint length = first ? count : tallies[TALLY_VISIBLE], each = (length + CHUNKS - 1) / CHUNKS;
     uint from = min(chunk * each, length), to = min(from + each, length);
     for (uint k = from; k < to; k++)
         if (keys[k] != CULLED) row[(keys[k] >> shift) & (RADIX_BINS - 1)]++;
@@ -22,10 +25,13 @@ kernel void sort_count(
 kernel void sort_scatter(
 //@@ arguments sort_scatter
 ) {
-    uint chunk = get_global_id(0);
+    uint chunk = get_global_id(0), number = get_global_id(1), before = number * count;
     if (chunk >= CHUNKS) return;
-    global uint *row = table + (size_t)chunk * RADIX_BINS;
-    uint length = tallies[slot], each = (length + CHUNKS - 1) / CHUNKS;
+    keys += before; indices += before; keys_out += before; indices_out += before;
+    tallies += number * TALLIES;
+    starts += number * (RADIX_BINS + 1);
+    global uint *row = table + ((size_t)number * CHUNKS + chunk) * RADIX_BINS;
+    uint length = first ? count : tallies[TALLY_VISIBLE], each = (length + CHUNKS - 1) / CHUNKS;
     uint from = min(chunk * each, length), to = min(from + each, length);
     for (uint k = from; k < to; k++) {
         uint key = keys[k];
@@ -33,6 +39,6 @@ kernel void sort_scatter(
         uint bin = (key >> shift) & (RADIX_BINS - 1);
         uint place = starts[bin] + row[bin]++;
         keys_out[place] = key;
-        indices_out[place] = first ? k : indices[k];
+        indices_out[place] = first ? before + k : indices[k];
     }
 }

@@ -1,6 +1,6 @@
 // Lists of splats per tile for GPUs: places from the tiles' tallies, pairs of (depth key, splat) written
 // there in any order, and a sort of each list. Keys are unique (the splat's index breaks ties), so the sorted lists are
-// the same on every run.
+// the same on every run. The tiles of many views stand one view after the other.
 
 // Exclusive prefix sum of `mine` over a work-group of SCAN_ITEMS; *total is the sum of all. partial: SCAN_ITEMS values.
 static inline ulong scan_group(local ulong *partial, uint item, ulong mine, ulong *total) {
@@ -18,17 +18,13 @@ static inline ulong scan_group(local ulong *partial, uint item, ulong mine, ulon
     return exclusive;
 }
 
-// places in the buffer `counts`, which the host reads while later stages run: number of big splats, of pairs (64 bits)
-enum { COUNT_BIG = 0, COUNT_PAIRS = 1 };
+// places in the buffer `counts`, which the host reads: numbers of big splats, of pairs (64 bits), of visible splats
+enum { COUNT_BIG = 0, COUNT_PAIRS = 1, COUNT_VISIBLE = 3 };
 
-// Index space: one work-group of SCAN_ITEMS.
-// Reads: tallies. Writes: starts[tiles + 1] modulo 2^32, cursors[tiles] (the same), counts; zeroes tallies' number of
-// visible splats.
-// If there are more pairs than `capacity` (and that is not 2^32 - 1), all lists are made empty.
-kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
-//@@ arguments tile_starts
-) {
-    local ulong partial[SCAN_ITEMS];
+// By one work-group of SCAN_ITEMS: where each tile's list starts, and `counts`. Zeroes the tallies for the next picture if
+// `clear`. If there are more pairs than `capacity` (and that is not 2^32 - 1), all lists are made empty.
+static inline void place_tiles(local ulong *partial, uint tiles, uint capacity, uint clear, global uint *restrict tallies,
+                               global uint *restrict starts, global uint *restrict cursors, global uint *restrict counts) {
     uint item = get_local_id(0);
     ulong running = 0;
     for (uint first = 0; first < tiles; first += 4 * SCAN_ITEMS) {
@@ -39,13 +35,15 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
         for (uint tile = from; tile < to; tile++) {
             starts[tile] = cursors[tile] = (uint)place;
             place += tallies[TALLIES + tile];
+            if (clear) tallies[TALLIES + tile] = 0;
         }
         running += total;
     }
     if (item == 0) {
         starts[tiles] = (uint)running;
-        tallies[TALLY_VISIBLE] = 0;   // emit adds them up
         counts[COUNT_BIG] = tallies[TALLY_BIG];
+        if (clear) tallies[TALLY_BIG] = 0;
+        counts[COUNT_VISIBLE] = 0;   // emit adds them up
         counts[COUNT_PAIRS] = (uint)running;
         counts[COUNT_PAIRS + 1] = (uint)(running >> 32);
     }
@@ -53,6 +51,16 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
         barrier(CLK_GLOBAL_MEM_FENCE);
         for (uint tile = item; tile <= tiles; tile += SCAN_ITEMS) starts[tile] = 0;
     }
+}
+
+// Index space: one work-group of SCAN_ITEMS.
+// Reads: tallies, and zeroes them for the next picture if `clear`. Writes: starts[tiles + 1] modulo 2^32, cursors[tiles]
+// (the same), counts, of which the visible splats are still to be added up.
+kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
+//@@ arguments tile_starts
+) {
+    local ulong partial[SCAN_ITEMS];
+    place_tiles(partial, tiles, capacity, clear, tallies, starts, cursors, counts);
 }
 
 // Work-groups of WALK_ITEMS, for what is done splat by splat. Of a splat that touches more than a window a whole group
@@ -70,6 +78,11 @@ static inline Walk walk_of(const Bounds *b, int width, int height) {
     return walk;
 }
 
+// Tiles of one view.
+static inline int tiles_of(int width, int height) {
+    return ((width + TILE_W - 1) / TILE_W) * ((height + TILE_H - 1) / TILE_H);
+}
+
 // The tile of one cell of these rows; -1 if the splat cannot touch it.
 static inline int walk_tile(const Walk *walk, int cell, const Bounds *b, int width, int height) {
     int row = walk->top + cell / walk->tiles_x, column = cell % walk->tiles_x;
@@ -79,17 +92,18 @@ static inline int walk_tile(const Walk *walk, int cell, const Bounds *b, int wid
 
 // Adds the tiles of big splats to the tallies.
 // Index space: any number of work-groups; each takes every so many-th splat.
-// Reads: tallies' number of big splats, big_bounds.
+// Reads: tallies' number of big splats, big, big_bounds.
 kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void tally_big(
 //@@ arguments tally_big
 ) {
-    uint count = min(tallies[TALLY_BIG], big_capacity);
-    for (uint k = get_group_id(0); k < count; k += get_num_groups(0)) {
+    uint big_count = min(tallies[TALLY_BIG], big_capacity);
+    for (uint k = get_group_id(0); k < big_count; k += get_num_groups(0)) {
         const Bounds b = big_bounds[k];
         const Walk walk = walk_of(&b, width, height);
+        int before = (int)(big[k] / count) * tiles_of(width, height);
         for (int cell = get_local_id(0); cell < walk.cells; cell += WALK_ITEMS) {
             int tile = walk_tile(&walk, cell, &b, width, height);
-            if (tile >= 0) atomic_inc(tallies + TALLIES + tile);
+            if (tile >= 0) atomic_inc(tallies + TALLIES + before + tile);
         }
     }
 }
@@ -108,36 +122,86 @@ static inline void emit_pair(int tile, const Band *band, uint key, uint splat, g
     if (place < band->capacity) pairs[place] = (uint2)(splat, key);
 }
 
-// Index space: `splat_groups` work-groups, a work-item per splat; then any number of them that share out the big splats.
-// Reads: windows, keys, starts, big, big_bounds. Uses up: cursors of the band. Writes: pairs; adds to tallies' number of
+// Index space: for each view `splat_groups` work-groups, a work-item per splat, and then the same number of work-groups as for
+// every other view; these share out the big splats.
+// Reads: windows, keys, starts, big, big_bounds. Uses up: cursors of the band. Writes: pairs; adds to counts' number of
 // visible splats.
 kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void emit(
 //@@ arguments emit
 ) {
     local uint visible;
     const Band band = {(width + TILE_W - 1) / TILE_W, band_first, band_end, starts[band_first], capacity};
-    uint item = get_local_id(0), big_count = min(tallies[TALLY_BIG], big_capacity);
+    uint item = get_local_id(0), number = get_group_id(1), big_count = min(counts[COUNT_BIG], big_capacity);
     if (get_group_id(0) >= splat_groups) {
-        for (uint k = get_group_id(0) - splat_groups; k < big_count; k += get_num_groups(0) - splat_groups) {
+        uint groups = get_num_groups(0) - splat_groups;
+        for (uint k = number * groups + get_group_id(0) - splat_groups; k < big_count; k += groups * get_num_groups(1)) {
             const Bounds b = big_bounds[k];
             const Walk walk = walk_of(&b, width, height);
             uint splat = big[k], key = keys[splat];
-            for (int cell = item; cell < walk.cells; cell += WALK_ITEMS)
-                emit_pair(walk_tile(&walk, cell, &b, width, height), &band, key, splat, cursors, pairs);
+            int before = (int)(splat / count) * tiles_of(width, height);
+            for (int cell = item; cell < walk.cells; cell += WALK_ITEMS) {
+                int tile = walk_tile(&walk, cell, &b, width, height);
+                if (tile >= 0) emit_pair(before + tile, &band, key, splat, cursors, pairs);
+            }
         }
         return;   // the whole group
     }
     if (item == 0) visible = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
-    uint i = get_global_id(0);
-    uint key = i < count ? keys[i] : CULLED;
+    uint i = get_global_id(0), splat = number * count + i;
+    uint key = i < count ? keys[splat] : CULLED;
     if (key != CULLED) {
+        int before = (int)number * tiles_of(width, height);
         if (first_band) atomic_inc(&visible);
-        for (uint2 window = windows[i]; window.y != 0; window.y &= window.y - 1)
-            emit_pair(window_tile(window, band.tiles_x), &band, key, i, cursors, pairs);
+        for (uint2 window = windows[splat]; window.y != 0; window.y &= window.y - 1)
+            emit_pair(before + window_tile(window, band.tiles_x), &band, key, splat, cursors, pairs);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
-    if (item == 0 && visible != 0) atomic_add(tallies + TALLY_VISIBLE, visible);
+    if (item == 0 && visible != 0) atomic_add(counts + COUNT_VISIBLE, visible);
+}
+
+// All that tally_big, tile_starts and emit do, for a picture of so few splats that launching them takes longer.
+// Index space: one work-group of SCAN_ITEMS. Big splats are shared out by teams of TEAM work-items.
+// Reads: windows, keys, big, big_bounds; tallies, and zeroes them if `clear`. Writes: starts, cursors, counts, pairs of all tiles.
+#define TEAM (SCAN_ITEMS < 32 ? SCAN_ITEMS : 32)
+kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void list_few(
+//@@ arguments list_few
+) {
+    local ulong partial[SCAN_ITEMS];
+    local uint visible;
+    uint item = get_local_id(0), big_count = min(tallies[TALLY_BIG], big_capacity);
+    int each = tiles_of(width, height);
+    if (item == 0) visible = 0;
+    for (uint k = item / TEAM; k < big_count; k += SCAN_ITEMS / TEAM) {
+        const Bounds b = big_bounds[k];
+        const Walk walk = walk_of(&b, width, height);
+        for (int cell = item % TEAM; cell < walk.cells; cell += TEAM) {
+            int tile = walk_tile(&walk, cell, &b, width, height);
+            if (tile >= 0) atomic_inc(tallies + TALLIES + (int)(big[k] / count) * each + tile);
+        }
+    }
+    barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
+    place_tiles(partial, tiles, capacity, clear, tallies, starts, cursors, counts);
+    barrier(CLK_GLOBAL_MEM_FENCE);
+    const Band band = {(width + TILE_W - 1) / TILE_W, 0, (int)tiles, 0, starts[tiles] == 0 ? 0 : capacity};
+    for (uint splat = item; splat < all; splat += SCAN_ITEMS) {
+        uint key = keys[splat];
+        if (key == CULLED) continue;
+        atomic_inc(&visible);
+        for (uint2 window = windows[splat]; window.y != 0; window.y &= window.y - 1)
+            emit_pair((int)(splat / count) * each + window_tile(window, band.tiles_x), &band, key, splat, cursors, pairs);
+    }
+    for (uint k = item / TEAM; k < big_count; k += SCAN_ITEMS / TEAM) {
+        const Bounds b = big_bounds[k];
+        const Walk walk = walk_of(&b, width, height);
+        uint splat = big[k], key = keys[splat];
+        for (int cell = item % TEAM; cell < walk.cells; cell += TEAM) {
+            int tile = walk_tile(&walk, cell, &b, width, height);
+            if (tile >= 0) emit_pair((int)(splat / count) * each + tile, &band, key, splat, cursors, pairs);
+        }
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (item == 0) counts[COUNT_VISIBLE] = visible;
 }
 
 // Sorts each list by (depth key, splat): a bitonic network whose every comparison puts the smaller first, so a list of

@@ -130,6 +130,9 @@ def make_project(
         size = scales[i]
         if not (size[0] >= 0.0 and size[0] < wp.inf and size[1] >= 0.0 and size[1] < wp.inf):
             return
+        if wp.static(thick_too):
+            if not (thickness[i] >= 0.0 and thickness[i] < wp.inf):
+                return
         su = real(wp.max(size[0], SMALLEST_SCALE))
         sv = real(wp.max(size[1], SMALLEST_SCALE))
 

@@ -1,10 +1,11 @@
 """Box footprints: what they cover, that they leave no seams, and every device against the reference."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from agreement import assert_agrees, random_splats
+from agreement import ALL_OUTPUTS, assert_agrees, random_splats
 from sampling import SAMPLES, alternate
 
 import fidsplat as fs
@@ -151,12 +152,21 @@ def test_boxes_around_and_behind_the_camera(renderer, seed, quality):
     assert_agrees(renderer, random_splats(60, seed=seed).with_boxes(), SMALL, quality=quality)
 
 
+def test_boxes_end_at_the_near_plane(renderer):
+    cloud = random_splats(80, seed=2, depth=(-1.0, 4.0), scale=(0.1, 1.0), across=1.0).with_boxes()
+    near = replace(SMALL, near=1.5)
+    frame = assert_agrees(renderer, cloud, near)
+    whole = renderer.render(cloud, SMALL)
+    assert np.abs(frame["rgb"] - whole["rgb"]).max() > 0.1
+
+
 @pytest.mark.parametrize(("lowpass", "samples"), alternate({"none": "none", "screen": "screen"}, SAMPLES))
 def test_a_scene_of_both_footprints(renderer, lowpass, samples):
     cloud = random_splats(150, seed=4, depth=(-0.5, 6.0))
     mixed = cloud.with_boxes(np.arange(150) % 3 == 0)
     assert mixed.footprint == "mixed"
-    assert_agrees(renderer, mixed, SMALL, quality=fs.Quality(lowpass=lowpass, samples=samples))
+    quality = fs.Quality(lowpass=lowpass, samples=samples)
+    assert_agrees(renderer, mixed, SMALL, (*ALL_OUTPUTS, "blended"), quality)
 
 
 def test_the_footprint_is_a_choice_of_each_splat(renderer):

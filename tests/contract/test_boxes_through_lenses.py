@@ -33,6 +33,16 @@ def test_small_boxes_of_all_shapes(renderer, camera):
 
 
 @each_camera
+def test_boxes_end_at_the_near_plane_and_the_far(renderer, camera):
+    """Fragments at the near one, whole boxes at the far one, of which one side may be much the longer."""
+    cloud = random_splats(80, 2, depth=(-3.0, 5.0), scale=(0.02, 1.0), across=1.5).with_boxes()
+    cut_off = replace(camera, near=1.0, far=3.0)
+    frame = assert_agrees(renderer, cloud, cut_off, quality=EXACT)
+    whole = renderer.render(cloud, camera, quality=EXACT)
+    assert np.abs(frame["rgb"] - whole["rgb"]).max() > 0.1
+
+
+@each_camera
 @pytest.mark.parametrize("narrow", [0, 1])
 def test_narrow_boxes(renderer, camera, narrow):
     """Lines far thinner than a pixel: samples beside them see them, whichever side is the short one."""

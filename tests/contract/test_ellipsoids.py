@@ -9,6 +9,7 @@ from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.hard_cases import fuzz
+from fidsplat.hard_cases.agreement import RARE
 
 CAMERA = fs.Camera.pinhole(97, 71, 70.0, 70.0, 48.0, 36.0, near=0.05)
 
@@ -50,14 +51,24 @@ def test_each_fragment_by_its_own_depth(renderer, way):
     assert_agrees(renderer, cloud, CAMERA, ("rgb", "alpha", "depth"), quality)
 
 
-def test_alone_or_among_others_they_have_the_same_bits(renderer):
-    """Clouds of nothing else have kernels without what disks need (`ellipsoids_alone`)."""
-    alone, quality = thick(3), fs.Quality(lowpass="none")
+@pytest.mark.parametrize("order", ["centre", "pixel"])
+def test_alone_or_among_others_they_have_the_same_bits(renderer, order):
+    """Clouds of nothing else have kernels without what disks need (`ellipsoids_alone`), in either order the
+    same: every fragment has its centre's depth."""
+    alone, quality = thick(3), fs.Quality(lowpass="none", order=order)
     behind = fs.SplatCloud([[0, 0, -5]], [[1, 0, 0, 0]], [[0.1, 0.1]], [1.0], colors=[[1, 1, 1]])
     both = fs.SplatCloud.concatenate([alone, behind])
     images = [renderer.render(cloud, CAMERA, quality=quality)["rgb"] for cloud in (alone, both)]
     assert images[0].any()
     assert np.array_equal(*images)
+
+
+def test_several_samples_are_widened_as_one_pixel(renderer):
+    """By 0.3 square pixels, not samples; and a Gaussian whose centre lies behind the camera is not drawn."""
+    cloud, quality = mixed(5), fs.Quality(ellipsoid="ewa", samples=2)
+    assert_agrees(renderer, cloud, CAMERA, ("rgb", "alpha", "depth"), quality)
+    behind = fs.SplatCloud([[0, 0, -0.1]], [[1, 0, 0, 0]], [[1.0] * 3], [0.9], colors=[[1, 1, 1]])
+    assert not renderer.render(behind, CAMERA, ("alpha",), quality)["alpha"].any()
 
 
 def test_exact_behind_a_fisheye(renderer):
@@ -127,8 +138,14 @@ REST = pytest.param(range(6, 1000), marks=pytest.mark.exhaustive)
 @in_turn()
 @pytest.mark.parametrize("seeds", [range(3), range(3, 6), REST], ids="{0.start} to {0.stop}".format)
 def test_random_hard_scenes(renderer, seeds):
-    """The fuzzer's splats with a third scale; 1000 scenes have 100,000."""
+    """The fuzzer's splats with a third scale; 1000 scenes have 100,000. `pytest -s` shows the figures."""
+    worst, splats, pixels, risky = {}, 0, 0, 0.0
     for seed in seeds:
         picture = fuzz.thick_scene_of(seed)
-        wrong = [one for one in against_reference(renderer, picture) if not one.agrees]
-        assert not wrong, (seed, wrong)
+        found = against_reference(renderer, picture)
+        assert all(one.finite and one.excess <= 0 for one in found), (seed, found)
+        worst = {one.output: max(one.uncertified, worst.get(one.output, 0)) for one in found}
+        size = picture.camera.width * picture.camera.height
+        splats, pixels, risky = splats + len(picture.cloud), pixels + size, risky + found[0].risky * size
+    print(f"{splats} splats, {pixels} pixels, {risky:.0f} with large certificates, beyond them {worst}")
+    assert risky <= RARE * pixels

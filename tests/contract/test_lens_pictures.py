@@ -11,7 +11,9 @@ from sampling import SAMPLES, alternate, in_turn
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
+from fidsplat.backends.view import View
 from fidsplat.cameras import BrownConrady, Fisheye
+from fidsplat.hard_cases.agreement import Picture, against_reference
 
 POSE = fs.Camera.look_at(64, 48, 1.0, (0.3, 0.2, -0.1), (0.1, 0.0, 3.0)).world_to_camera
 
@@ -139,6 +141,36 @@ def test_outside_the_lens_is_background(renderer):
     assert (frame["alpha"][outside] == 0).all()
     assert (frame["label"][outside] == -1).all()
     assert frame["alpha"][~outside].max() > 0.5
+
+
+@pytest.mark.parametrize("name", ["fold", "fisheye 200"])
+def test_where_a_lens_sees_nothing_there_is_no_distance_and_no_gradient(renderer, name):
+    picture = Picture(
+        random_splats(60, 3, depth=(1.0, 4.0)),
+        CAMERAS[name],
+        fs.Quality(samples=2),
+        ("rgb", "alpha", "distance", "distance_median"),
+        fs.Gradient((0.2, 0.4, 0.9), (0.9, 0.2, 0.1)),
+    )
+    frame = renderer.render(
+        picture.cloud, picture.camera, picture.outputs, picture.quality, picture.background
+    )
+    rays = View.of(fs.Capture(picture.camera, quality=picture.quality), np.zeros(3)).raster.rays[..., 0]
+    seen = (~np.isnan(rays)).reshape(picture.camera.height, 2, picture.camera.width, 2).sum((1, 3))
+    unseen = seen == 0
+    assert unseen.any()
+    assert ((seen > 0) & (seen < 4)).any()
+    for name in picture.outputs:
+        assert (frame[name][unseen] == 0).all(), name
+    assert all(difference.agrees for difference in against_reference(renderer, picture))
+
+
+def test_a_splat_beside_the_camera_that_is_seen_edge_on_leaves_its_dot(renderer):
+    """All of its plane lies at z = 0: only the forms' z is not 0."""
+    cloud = fs.SplatCloud([[1, 0.1, 0]], [[1, 0, 0, 0]], [[0.1, 0.2]], [0.9], colors=[[1, 0.5, 0.2]])
+    camera = fs.Camera.fisheye(71, 67, math.radians(200))
+    frame = assert_agrees(renderer, cloud, camera)
+    assert frame["alpha"].max() > 0.3
 
 
 def test_a_slight_distortion_is_nearly_a_pinhole(renderer):

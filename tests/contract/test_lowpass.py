@@ -66,6 +66,27 @@ def test_splats_of_every_size_through_every_lens(renderer, camera, scale):
     assert_agrees(renderer, cloud, camera, quality=PIXEL)
 
 
+@pytest.mark.parametrize(("name", "mean"), [("fisheye", (0, 0, 1.5)), ("panorama", (0, -1.5, 0))])
+def test_a_splat_where_the_derivative_has_no_direction(renderer, name, mean):
+    """On the axis of a fisheye, at a pole of a panorama."""
+    cloud = fs.SplatCloud([mean], [(0.9, 0.3, 0.2, 0.1)], [(0.02, 0.05)], [0.9], colors=[(1, 0.5, 0.2)])
+    frame = assert_agrees(renderer, cloud, LENSES[name], quality=PIXEL)
+    assert frame["alpha"].max() > 0.1
+
+
+def test_the_screen_dot_of_walls_that_are_nearly_seen_from_their_edge(renderer):
+    """Their horizon passes within a pixel or two of their centre: beyond it only the dot is drawn."""
+    camera = fs.Camera.pinhole(41, 31, 40.0, 40.0, 20.0, 15.0)
+    generator = np.random.default_rng(3)
+    for size in (0.5, 5.0, 50.0):
+        for away in (0.3, 0.8, 1.5):
+            half = (math.pi / 2 - away / 40.0) / 2  # of the angle by which it is tilted
+            spin = generator.uniform(0, math.pi)
+            turn = (math.cos(half), math.sin(half) * math.cos(spin), math.sin(half) * math.sin(spin), 0)
+            wall = fs.SplatCloud([(0.01, 0.02, 2.0)], [turn], [(size, size)], [0.95], colors=[(1, 0.6, 0.3)])
+            assert_agrees(renderer, wall, camera)
+
+
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
 def test_a_lens_keeps_the_light_of_a_splat(renderer, camera):
     """The sum of alpha over the picture is 2 pi opacity times the area of the image of the one-sigma square

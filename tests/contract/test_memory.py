@@ -10,8 +10,10 @@ import pytest
 from agreement import ALL_OUTPUTS, random_splats
 
 import fidsplat as fs
+from fidsplat.backends.opencl import batch, lists
 from fidsplat.backends.opencl.memory_plan import plan_of
 from fidsplat.backends.opencl.shapes import gpu_shape
+from fidsplat.views import views_of
 
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 
@@ -74,7 +76,8 @@ def whole(opencl, cloud):
 @pytest.mark.parametrize("mebibytes", [3.6, 4, 4.75])
 @pytest.mark.parametrize("streamed", [False, True])
 def test_little_memory_gives_the_same_bits(opencl, cloud, whole, mebibytes, streamed):
-    """Chunks of splats, bands of rows, and a cloud that is copied chunk by chunk or stays where it is."""
+    """Chunks of splats, bands of rows, and a cloud that is copied chunk by chunk or stays where it is. With a
+    printed plane among them, so every fragment by its own depth."""
     own = small(opencl, mebibytes, None if streamed else cloud)
     resident = own.upload(cloud)
     resident._data._shared &= not streamed  # a CPU reads the host's arrays; make it copy them
@@ -284,6 +287,81 @@ def test_kernels_see_new_buffers_at_old_addresses(opencl):
     assert len({picture.tobytes() for picture in first}) == 6
 
 
+def test_a_picture_is_launched_again_for_each_view(opencl):
+    """Of its kind, on a GPU: other poses, groups, colours and sizes come between, and frames are kept."""
+    machine, own = as_on_a_gpu(opencl), fs.Renderer(opencl.device.name)
+    some = random_splats(300, seed=4).with_labels(np.arange(300) % 2).with_planes(np.arange(300) // 250 - 1)
+    resident, places = machine.upload(some), (-0.3, 0.0, 0.2)
+    moved = [np.eye(4) + 0.1 * k * np.eye(4, k=3) for k in range(3)]
+    captures = [
+        fs.Capture(
+            fs.Camera.look_at(width, 40, 1.0, (x, 0.0, -0.1), (0.0, 0.0, 3.0)),
+            ("rgb", "depth"),
+            background=(0.1 * k, 0.2, 0.3),
+            motion=fs.Motion(groups={1: lambda time, k=k: moved[k]}),
+        )
+        for width in (50, 60)
+        for k, x in enumerate(places)
+    ]
+    kept = [machine.render(resident, capture) for _ in range(3) for capture in captures]
+    assert [each.recording is not None for each in resident._data.kept.values()] == [True, True]
+    for frame, capture in zip(kept, captures * 3, strict=True):
+        wanted = own.render(some, capture)
+        assert all(np.array_equal(frame[name], wanted[name]) for name in frame)
+        assert frame.stats == wanted.stats
+        assert set(frame.timings) == {"project", "sort", "bin", "blend", "resolve"}
+    assert kept[-1].wait() is kept[-1]
+
+
+@pytest.mark.parametrize("few", [True, False])
+@pytest.mark.parametrize("scale", [(1e-2, 0.3), (2.0, 3.0)], ids=["pairs", "big splats"])
+def test_a_picture_that_outgrows_the_last_is_drawn_again(opencl, monkeypatch, scale, few):
+    """More pairs, or more splats of many tiles, than there is room for: found when the frame is read. One
+    work-group lists few splats, whole launches many."""
+    monkeypatch.setattr(lists, "_FEW", 8192 if few else 0)
+    machine, own = as_on_a_gpu(opencl), fs.Renderer(opencl.device.name)
+    some = random_splats(6000, seed=4, scale=scale, depth=(2.0, 6.0))
+    places = (-900, -800, 0, 1, -700)
+    cameras = [fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, z), (0.0, 0.0, 30.0)) for z in places]
+    resident = machine.upload(some)
+    frames = [machine.render(resident, camera) for camera in cameras]
+    pairs = [frame.stats["pairs"] for frame in frames]
+    assert max(pairs) > 1.5 * pairs[1], "it did outgrow it"
+    for frame, camera in zip(frames, cameras, strict=True):
+        assert np.array_equal(frame["rgb"], own.render(some, camera)["rgb"])
+
+
+@machines
+def test_a_batch_in_parts_has_the_bits_of_its_views(opencl, monkeypatch, machine):
+    """Several views at a time, with planes, groups that move, a mask, and pictures of other kinds between."""
+    own, some = machine(opencl), random_splats(300, seed=4, scale=(1e-2, 2.0)).with_labels(np.arange(300) % 3)
+    some = some.with_planes(np.arange(300) // 250 - 1)
+    capture = fs.Capture(fs.Camera.look_at(50, 40, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0)), ("rgb", "label"))
+    poses = np.random.default_rng(0).normal(0, 0.05, (2, 7, 7))
+    poses[..., 3] += 1
+    asked = {"poses": poses[0], "groups": {2: poses[1]}, "mask": np.arange(7) != 3}
+    resident = own.upload(some)
+    for most in (1 << 31, 1 << 18):
+        monkeypatch.setattr(batch, "_MOST", {})
+        monkeypatch.setattr(batch, "_MOST_OTHERS", most)
+        drawn = own.render_batch(resident, capture, **asked)
+        alone = own.render(resident, capture)
+        for number in (0, 1, 2, 4, 5, 6):
+            one = {"poses": poses[0, [number]], "groups": {2: poses[1, [number]]}}
+            wanted = opencl.render(some, views_of([capture], **one).capture(0))
+            assert all(np.array_equal(drawn[name][number], wanted[name]) for name in drawn), (most, number)
+        assert (drawn["label"][3] == -1).all()
+        assert not drawn["rgb"][3].any()
+        assert np.array_equal(drawn.device_array("rgb").get(), drawn["rgb"])
+        assert np.array_equal(alone["rgb"], opencl.render(some, capture)["rgb"])
+
+
+def test_a_batch_whose_images_are_too_many_is_an_error(opencl):
+    own, poses = own_device(opencl, 2**23), np.tile([0, 0, 0, 1, 0, 0, 0.0], (400, 1))
+    with pytest.raises(fs.DeviceError, match=r"images of 400 views take .* draw fewer views"):
+        own.render_batch(random_splats(10, seed=1), CAMERA, poses=poses)
+
+
 def test_a_leased_buffer_has_the_size_that_was_asked_for(opencl):
     pool = fs.Renderer(opencl.device.name).backend.pool
     pool.give_back([("plane", pool.fresh("plane", 64)), ("plane", pool.fresh("plane", 64))])
@@ -295,8 +373,7 @@ def test_a_leased_buffer_has_the_size_that_was_asked_for(opencl):
 
 def test_an_image_that_cannot_be_read_is_an_error_of_the_device(opencl):
     frame = opencl.render(random_splats(10, seed=8), CAMERA)
-    output, _ = frame._images._images["rgb"]
-    frame._images._images["rgb"] = output, opencl.backend.pool.fresh("too small", 16)
+    frame._images._drawn.leased[:] = [("rgb_out", opencl.backend.pool.fresh("too small", 16))]
     with pytest.raises(fs.DeviceError, match="failed while drawing rgb"):
         frame["rgb"]
 

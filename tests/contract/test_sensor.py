@@ -157,6 +157,7 @@ def test_curves_at_their_own_points(renderer):
 
     assert value(0.5, response="srgb") == pytest.approx(0.735357, abs=1e-5)
     assert value(0.001, response="srgb") == pytest.approx(0.01292, abs=1e-6)
+    assert value(0.02, response="srgb") == pytest.approx(0.151703, abs=1e-5)
     assert value(0.25, response=2.0) == pytest.approx(0.5, abs=1e-6)
     assert value(0.25, response=(0, 0.5, 1, 1, 1)) == pytest.approx(0.5, abs=1e-6)
     assert value(9.0, response="srgb") == pytest.approx(1)

@@ -86,6 +86,24 @@ def test_moving_layers(renderer, samples):
     assert_exposed(renderer, cloud.with_labels(labels), camera, motion, shutter, Quality(samples=samples))
 
 
+def test_normals_in_the_world_are_those_of_each_rows_pose(renderer):
+    """A wall that stands still has one normal, however the camera turns while it is read out."""
+    wall = fs.SplatCloud([(0, 0, 4)], [(0.97, 0.2, 0.1, 0)], [(9, 9)], [0.9], colors=[(1, 1, 1)])
+    motion = fs.Motion(pose_at)
+    outputs = ("normal", "normal_world")
+    frame = renderer.render(wall, CAMERAS["pinhole"], outputs, motion=motion, shutter=SHUTTERS["rolling"])
+    first = frame["normal_world"][0, 0]
+    assert np.linalg.norm(first) == pytest.approx(1, abs=1e-5)
+    assert np.abs(frame["normal_world"] - first).max() < 1e-5
+    assert np.abs(frame["normal"] - frame["normal"][0, 0]).max() > 0.05
+
+
+def test_as_many_are_visible_as_in_the_fullest_pose(renderer):
+    cloud, motion = random_splats(50, 3, depth=(1.0, 5.0)), fs.Motion(pose_at)
+    frame = renderer.render(cloud, CAMERAS["pinhole"], motion=motion, shutter=SHUTTERS["blur"])
+    assert 10 < frame.stats["visible"] <= 50
+
+
 def test_colours_that_depend_on_the_view_turn_with_their_group(renderer):
     cloud = random_splats(100, 4, depth=(1, 5), scale=(0.05, 0.3), sh_degree=3)
     assert_exposed(renderer, cloud, CAMERAS["pinhole"], MOTION, SHUTTERS["both"], outputs=("rgb",))

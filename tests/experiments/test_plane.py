@@ -7,7 +7,7 @@ import pytest
 import shapely
 
 import fidsplat as fs
-from fidsplat.experiments.plane import plane_picture
+from fidsplat.experiments.plane import from_srgb, plane_picture
 
 GRID = np.random.default_rng(5).integers(0, 2, (7, 9)).astype(np.uint8)
 MODULE = 0.2
@@ -117,3 +117,10 @@ def test_means_do_not_depend_on_how_the_picture_is_cut():
     )
     assert plane_picture(GRID, MODULE, part, **VALUES) == pytest.approx(picture[11:26, 17:37], abs=1e-12)
     assert math.isclose(picture.max(), VALUES["light"], abs_tol=1e-12)
+
+
+def test_display_values_are_straight_where_they_are_dark():
+    """To both sides of where the curve begins, 0.04045 (IEC 61966-2-1)."""
+    assert from_srgb(0.04) == pytest.approx(0.04 / 12.92)
+    assert from_srgb(0.041) == pytest.approx(((0.041 + 0.055) / 1.055) ** 2.4)
+    assert from_srgb(0.0031) == pytest.approx(0.0031 / 12.92)

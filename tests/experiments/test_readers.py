@@ -3,6 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -71,6 +72,21 @@ def test_places_that_were_found_are_those_of_the_untouched_picture():
     assert not attempt(
         "zxing-tall", picture, replace(moved, corners=moved.corners + np.array([0.0, 120.0]))
     ).found
+
+
+def test_a_code_that_is_only_read_enlarged_is_found_where_it_is():
+    """Modules of less than two pixels: read in a picture twice as large."""
+    picture, target = ideal("small", 10.0)
+    height, width = picture.shape
+    for pixels in range(width, 20, -4):
+        shrunk = cv2.resize(picture, (pixels, pixels * height // width), interpolation=cv2.INTER_AREA)
+        same = replace(target, corners=target.corners * (pixels / width))
+        other = replace(same, payload="another")  # so that only the place counts
+        if attempt("zxing-tall", shrunk, same).read and not attempt("zxing", shrunk, other).found:
+            break
+    else:
+        pytest.fail("at no size it must be enlarged")
+    assert attempt("zxing-tall", shrunk, other) == Attempt(True, False)
 
 
 def test_threads_do_not_disturb_each_other():

@@ -6,6 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 
@@ -13,7 +14,7 @@ import fidsplat as fs
 from fidsplat.experiments import charts, pages
 from fidsplat.experiments.report import make_report
 from fidsplat.experiments.results import load
-from fidsplat.experiments.summary import Summary, read_summary
+from fidsplat.experiments.summary import Summary, join, read_summary
 from fidsplat.experiments.sweep import Results
 from fidsplat.experiments.targets import targets
 from fidsplat.provenance import run_facts
@@ -252,6 +253,15 @@ def test_without_the_apriltag_library_the_table_shows_opencv(tmp_path):
     key, result = scan("apriltag", 0, "ideal", "111111100")
     write(tmp_path, "angles", [(key, result | {"readers": {"aruco": result["readers"]["pupil"]}})])
     assert "| AR Tag | 84.0/82.0 |" in make_report([tmp_path], tmp_path)[0].read_text()
+
+
+def test_tables_that_are_joined_keep_the_runs_of_their_rows():
+    """Of rows about the same thing the one of most measurements stays, with the run that it is of."""
+    one = Summary(pd.DataFrame({"name": ["a", "b"], "amount": [1, 5], "run": [0, 1]}), [{"k": 0}, {"k": 1}])
+    other = Summary(pd.DataFrame({"name": ["a", "c"], "amount": [2, 1], "run": [1, 0]}), [{"k": 2}, {"k": 3}])
+    joined = join([one, other], ["name"])
+    found = {row["name"]: joined.runs[row["run"]]["k"] for _, row in joined.rows.iterrows()}
+    assert found == {"a": 3, "b": 1, "c": 2}
 
 
 def test_a_summary_is_what_its_file_says(tmp_path):

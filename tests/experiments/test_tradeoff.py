@@ -13,11 +13,21 @@ from fidsplat.experiments.sweep import read_records
 from fidsplat.experiments.tradeoff import compare, run
 from fidsplat.experiments.tradeoff import session as session_module
 from fidsplat.experiments.tradeoff.hard import CELLS, cell_window, hard_scene
-from fidsplat.experiments.tradeoff.points import ALONE, BASE, EXACT, KNOBS, decode_points, points, quality_of
+from fidsplat.experiments.tradeoff.linear import linear_error
+from fidsplat.experiments.tradeoff.points import (
+    ALONE,
+    BASE,
+    EXACT,
+    KNOBS,
+    decode_points,
+    points,
+    quality_of,
+    thick_points,
+)
 from fidsplat.experiments.tradeoff.scenes import NAMES, TradeScene, make, scene_names
 from fidsplat.experiments.tradeoff.session import QUICK, Session, memory_of, time_point
 from fidsplat.hard_cases.clouds import camera, splats
-from fidsplat.quality import PRESETS, MarkerQuality
+from fidsplat.quality import ELLIPSOID, PRESETS, MarkerQuality
 
 FACING = (1.0, 0.0, 0.0, 0.0)
 WORDS = ("tradeoff", "--quick", "--scenes", "apriltag", "--knobs", "opacity_ceiling")
@@ -54,9 +64,10 @@ def test_every_setting_is_one_knob_away_from_the_base():
 
 
 def test_every_knob_is_turned():
-    # first_hit decides where depth_first is, and nothing of rgb; no scene has 3D Gaussians
-    unturned = {"first_hit", "ellipsoid"}
-    assert {knob.name for knob in dataclasses.fields(fs.Quality)} - set(KNOBS) == unturned
+    # first_hit decides where depth_first is, and nothing of rgb
+    assert {knob.name for knob in dataclasses.fields(fs.Quality)} - set(KNOBS) == {"first_hit"}
+    assert {point.quality.ellipsoid for point in thick_points(KNOBS)} == set(ELLIPSOID)
+    assert len(thick_points(("samples",))) == 1
 
 
 def test_the_constants_of_other_systems_are_among_the_options():
@@ -75,7 +86,7 @@ def test_parts_are_all_different_and_the_telling_ones_come_first():
         assert len({json.dumps(part, sort_keys=True) for part in parts}) == len(parts)
         assert parts[0]["knob"] == "base"
     full = run.all_points((), (), False)
-    assert {part["scene"].partition("@")[0] for part in full} == set(NAMES)
+    assert {part["scene"].partition("@")[0] for part in full} == {*NAMES, "ball"}
     knobs = [part.get("knob") for part in full]
     assert knobs.index("blend_precision") > max(i for i, knob in enumerate(knobs) if knob == "alpha_cutoff")
     for point in points(KNOBS, True):
@@ -101,6 +112,24 @@ def test_the_hard_scene_is_the_same_each_time_and_fills_its_cells(session):
     assert off[cell_window(CELLS.index("haze"))].max() > 0.1
     dropped = session.draw("hard", BASE.with_(stop_rule="exclusive", order="centre"))["rgb"]
     assert np.abs(dropped - picture)[cell_window(CELLS.index("opaque"))].max() > 0.5
+
+
+def test_3d_gaussians_are_held_against_the_gaussians_themselves(session):
+    """What EWA widens and what its linear image is wrong by are errors."""
+    by_way = {
+        point.quality.ellipsoid: np.abs(
+            session.draw("r100k_720p_3d", point.quality)["rgb"]
+            - session.truth("r100k_720p_3d", point.quality)
+        )
+        for point in thick_points(KNOBS)
+    }
+    assert by_way["ewa"].max() > 5 * by_way["exact"].max()
+    assert by_way["ewa"].mean() > 2 * by_way["exact"].mean()
+
+
+def test_the_linear_image_is_wrong_off_the_axis_and_near():
+    assert 0.5 < linear_error(3, 60) < 0.65
+    assert linear_error(3, 60) > 3 * linear_error(3, 0) > 10 * linear_error(10, 0)
 
 
 def test_errors_are_those_of_the_cut_off():

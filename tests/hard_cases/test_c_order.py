@@ -1,5 +1,7 @@
 """Group C: order, ties and keys."""
 
+import math
+
 import numpy as np
 import pytest
 from agreement import assert_agrees, random_splats
@@ -19,6 +21,7 @@ from fidsplat.hard_cases.c_order import (
     turning,
 )
 from fidsplat.hard_cases.clouds import splats, taken
+from fidsplat.random_clouds import load_scene, standard_camera
 
 
 @pytest.mark.parametrize("away", [0.0, 1.0])
@@ -69,6 +72,32 @@ def test_a_picture_does_not_depend_on_how_much_may_wait(renderer, cloud):
     wanted = trace(renderer, picture)
     for name, shape in shapes.items():
         assert differing(trace(renderer, picture, shape), wanted, picture.outputs) == 0, name
+
+
+def test_of_equal_depths_that_wait_the_first_is_in_front(renderer):
+    """A column of pixels shows two splats of one depth before a wall; the next shows the second alone, before
+    what waited first: there it is put further in front, here it is not."""
+    column = 4 / 50  # of a pixel, at the depth of the wall
+    cloud = fs.SplatCloud(
+        # a wall whose nearest point is the nearest of all; a line across the next column, which leans forward
+        [(0, 0, 4), (column, 0, 3.9), (0, 0, 3), (0, 0, 3)],
+        [(math.cos(0.4), 0, math.sin(0.4), 0), (math.cos(0.6), math.sin(0.6), 0, 0), *[(1, 0, 0, 0)] * 2],
+        [(9, 9), (0.01, 1), (0.01, 1), (1, 1)],
+        [0.9, 0.9, 0.9, 0.9],
+        colors=[(0, 0, 1), (0, 0, 1), (1, 0, 0), (0, 1, 0)],
+    )
+    camera = Camera.pinhole(5, 5, 50.0, 50.0, 2.5, 2.5)
+    quality = fs.Quality(order="pixel", lowpass="none")
+    rgb = renderer.render(cloud, camera, quality=quality)["rgb"]
+    assert rgb[2, 2] == pytest.approx([0.9, 0.09, 0.009], abs=2e-3)
+    assert rgb[2, 3] == pytest.approx([0, 0.9, 0.09], abs=2e-2)
+
+
+@pytest.mark.exhaustive
+def test_every_pixel_of_a_hundred_thousand_splats(renderer):
+    """Against the sort of every pixel in float64; docs/order.md has the largest error."""
+    cloud, _ = load_scene("r100k_720p")
+    assert_agrees(renderer, cloud, standard_camera(320, 180), ("rgb", "depth"), fs.Quality(order="pixel"))
 
 
 def test_a_faint_splat_between_decides_nothing(renderer):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from importlib import import_module
 from types import SimpleNamespace
 
 import numpy as np
@@ -71,6 +72,7 @@ def test_the_price_list_keeps_its_promise(renderer, held_out, error):
 def test_less_error_is_never_cheaper(renderer):
     cost = {json.dumps(s.knobs): s.cost for s in prices.load(renderer.device.kind)}
     chosen = [choose(error, device=renderer) for error in (0.3, *BOUNDS)]
+    assert all(choice.error <= error for choice, error in zip(chosen, (0.3, *BOUNDS), strict=True))
     costs = [cost[json.dumps(choice.knobs)] for choice in chosen]
     assert costs == sorted(costs)
     assert costs[0] < costs[-1]
@@ -110,6 +112,12 @@ def test_what_the_truth_may_be_off_is_added(renderer, held_out, monkeypatch):
     plain = measured()
     monkeypatch.setattr(search, "error_bound", lambda *_: 0.25)
     assert measured() == plain + 0.25
+
+
+def test_errors_are_those_before_the_sensor(renderer, held_out):
+    scene, _ = held_out[0]
+    plain, dark = (within(renderer, scene, 1e-3, sensor=fs.Sensor(exposure=e)) for e in (1.0, 1e-3))
+    assert dark.error == plain.error
 
 
 @in_turn(1)
@@ -235,8 +243,13 @@ def test_a_time_is_kept_by_nine_frames_of_ten():
             return [search.Times(1.0, late[quality.alpha_cutoff]) for quality in qualities]
 
     candidates = tuple(prices.Candidate({"alpha_cutoff": cutoff}, 0, 0, 0, 1.0) for cutoff in late)
-    assert search.Search(Known(), candidates).most_accurate_in(5.0).error == 1e-2
-    assert search.Search(Known(), candidates).most_accurate_in(10.0).error == 1e-4
+    known = search.Search(Known(), candidates)
+    assert known.most_accurate_in(5.0).error == 1e-2
+    assert known.most_accurate_in(10.0).error == 1e-4
+    measured = import_module("fidsplat.budget.choose")._measured
+    assert measured(known, 1e-3, 10.0).error == 1e-4
+    with pytest.raises(InputError, match=r"takes 9 ms a frame on known, not 5; the least error .* 0\.01"):
+        measured(known, 1e-3, 5.0)
 
 
 @pytest.mark.parametrize("ms", [0, -3, 1e-6])

@@ -107,6 +107,7 @@ ROLLING = {"motion": MOVING, "shutter": fs.Shutter(readout=0.1, rows_per_band=4)
 
 OF_PLANES, OF_BOXES = Traits(has_planes=True), Traits(footprint="box")
 ORDERED, FLOAT64 = fs.Quality(order="centre"), fs.Quality(blend_precision="float64")
+BY_PIXEL, THICK = fs.Quality(order="pixel"), Traits(ellipsoids="all")
 GROUP = fs.Motion(None, {1: lambda time: np.eye(4)})
 
 
@@ -117,6 +118,11 @@ GROUP = fs.Motion(None, {1: lambda time: np.eye(4)})
         (Traits(sh_degree=1), {}, "color_sh", "color_rgb"),
         (OF_PLANES, {}, "compose_planes", "compose_ordered"),
         (OF_PLANES, {"quality": ORDERED}, "compose_ordered", "compose_planes"),
+        (Traits(), {"quality": BY_PIXEL}, "compose_pixel", "compose_ordered"),
+        (THICK, {"quality": BY_PIXEL}, "compose_ordered", "compose_pixel"),  # of one depth each
+        (Traits(ellipsoids="some"), {"quality": BY_PIXEL}, "compose_pixel", "compose_ordered"),
+        (THICK, {"quality": BY_PIXEL.with_(ellipsoid="exact")}, "compose_pixel", "compose_ordered"),
+        (THICK, {"quality": BY_PIXEL.with_(blend_precision="float64")}, "compose_pixel", "compose_ordered"),
         (OF_BOXES, {}, "lowpass_none", "lowpass_screen"),  # they are filtered by themselves
         (Traits(footprint="mixed"), {}, "lowpass_screen", "lowpass_none"),
         (Traits(), {"motion": GROUP}, "motion_groups", "shutter_exposure"),

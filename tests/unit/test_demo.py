@@ -48,7 +48,10 @@ def test_the_demo_passes_and_writes_what_it_made(tmp_path, capsys):
     # the scene file gives the picture that the demo saved
     assert main(["render", str(folder / "scene.toml"), "-o", str(folder / "again.png")]) == 0
     apart = np.abs(read_image(folder / "again.png").astype(int) - read_image(folder / "frontal-rgb.png"))
-    assert apart.max() <= 2, "PLY files hold logarithms of scales and logits of opacities in single precision"
+    # PLY files hold logarithms of scales and logits of opacities in single precision; that may also say which
+    # of two leaves is in front at a pixel where they cross
+    assert np.median(apart) == 0
+    assert (apart > 2).mean() < 1e-5
     assert main(["detect", str(folder / "frontal-rgb.png"), "--scene", str(folder / "scene.toml")]) == 0
 
 
@@ -76,3 +79,9 @@ def test_the_scene_is_the_same_every_time(scene):
     for name in ("means", "quats", "scales", "opacities", "colors", "labels"):
         assert np.array_equal(getattr(one, name), getattr(again, name)), name
     assert set(np.unique(one.labels)) == {0, 1, 2, 3}
+
+
+def test_disks_boxes_and_3d_gaussians_stand_in_it(scene):
+    cloud = scene.cloud()
+    assert (cloud.footprint, cloud.ellipsoids) == ("mixed", "some")
+    assert 0.05 < np.mean(cloud.thickness[cloud.labels == 0] > 0) < 0.2

@@ -13,7 +13,7 @@ import fidsplat
 
 PACKAGE = Path(fidsplat.__file__).parent
 
-BASE = {"errors", "files", "rotations", "scalars"}
+BASE = {"errors", "files", "rotations", "scalars", "summaries"}
 PLAIN = BASE | {"splats", "harmonics", "cameras", "quality", "sensor", "surroundings", "capture"}
 # package or module of fidsplat: what of fidsplat it may import, at the top or inside a function
 MAY_IMPORT = {
@@ -21,6 +21,7 @@ MAY_IMPORT = {
     "files": BASE,
     "rotations": BASE,
     "scalars": {"errors"},
+    "summaries": set(),
     "harmonics": BASE,
     "quality": BASE,
     "capture": BASE | {"cameras", "quality", "sensor", "surroundings"},
@@ -36,13 +37,21 @@ MAY_IMPORT = {
     "markers": BASE | {"splats", "quality", "vision.dictionaries", "vision.images"},
     "scenes": PLAIN | {"markers", "formats"},
     "effects": PLAIN,
-    "backends": PLAIN | {"effects", "kernel_files"},
+    "backends": PLAIN | {"effects", "kernel_files", "views"},
     "timing": BASE,
     "random_clouds": PLAIN,
     "hard_cases": PLAIN
-    | {"scenes", "effects", "backends", "render", "vision", "provenance", "random_clouds"},
-    "render": PLAIN | {"scenes", "effects", "backends"},
+    | {"scenes", "effects", "backends", "render", "frame", "vision", "provenance", "random_clouds"},
+    "frame": BASE | {"backends", "vision"},
+    "views": PLAIN,
+    "batch": BASE | {"backends", "effects", "frame"},
+    "render": PLAIN | {"scenes", "effects", "backends", "frame", "views", "batch"},
+    "viewer": PLAIN | {"scenes", "effects", "backends", "render", "frame", "vision", "formats"},
+    "flights": PLAIN | {"scenes", "render", "vision", "formats", "frame"},
+    "sim": PLAIN | {"batch", "scenes", "markers", "render", "vision", "formats"},
+    "logs": BASE | {"cameras", "vision"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
+    "train": PLAIN | {"formats", "vision", "render", "backends", "effects"},
     "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__", "__main__"}
@@ -53,12 +62,19 @@ HOME_OF = {
     "zxingcpp": ("vision",),
     "pupil_apriltags": ("vision",),
     "flip_evaluator": ("vision",),
+    "viser": ("viewer.server",),
+    "torch": ("frame",),
+    "imageio_ffmpeg": ("vision.video",),
     "bpy": ("experiments.blender_worker",),
     "shapely": ("markers", "vision.visible"),
     "networkx": ("markers",),
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
     "warp": ("backends.warp",),
+    "mujoco": ("sim.mujoco",),
+    "gymnasium": ("sim.gymnasium",),
+    "mcap": ("logs",),
+    "rosbags": ("logs",),
     "pandas": ("experiments",),
     "matplotlib": ("experiments.charts",),
     "jinja2": ("experiments.pages",),
@@ -156,7 +172,7 @@ def within_any(names, package) -> bool:
 
 
 # modules of the package that every backend may import
-SHARED = ("base", "caches", "view", "prepare", "registry", "planes", "bands")
+SHARED = ("base", "stack", "blank", "caches", "view", "prepare", "registry", "planes", "bands", "gradients")
 
 
 def test_backends_do_not_import_each_other():

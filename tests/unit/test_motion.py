@@ -9,7 +9,7 @@ from agreement import random_splats
 
 import fidsplat as fs
 from fidsplat.backends.prepare import view_of
-from fidsplat.cameras.motion import between
+from fidsplat.cameras.screw import between
 from fidsplat.rotations import quaternion_to_matrix
 from fidsplat.scenes import PlacedMarker
 

@@ -122,6 +122,7 @@ def test_the_wheel_holds_the_package_and_nothing_else(built):
     assert {name.split("/")[0] for name in names if ".dist-info/" not in name} == {"fidsplat"}
     assert any(name.endswith("entry_points.txt") for name in names)
     assert any(name.endswith("LICENSE") for name in names)
+    assert "fidsplat/py.typed" in names  # type checkers of those who use it read its annotations
 
 
 def test_missing_kernels_are_a_clear_error(tree, tmp_path):

@@ -10,7 +10,7 @@ from fidsplat.experiments.demo_scene import demo_scene, demo_views
 from fidsplat.scenes import PlacedMarker
 from fidsplat.vision import read_back
 from fidsplat.vision.detect import Detection
-from fidsplat.vision.readback import families_of, match, means
+from fidsplat.vision.readback import corner_error, families_of, match, means
 from fidsplat.vision.visible import visible, visible_part
 
 
@@ -102,9 +102,17 @@ def test_what_the_pictures_edge_cuts_off():
     whole, part = visible_part(placed, aside)
     assert shapely.bounds(part)[:2] == pytest.approx((0, 120 - 0.125 * straight.fx), abs=1e-6)
     assert shapely.area(whole) == pytest.approx((0.25 * straight.fx) ** 2)
-    inside, camera = outlined(position=(0, 0, -0.05), target=(1, 0, 0))
+    inside, _ = outlined()
+    camera = fs.Camera.look_at(320, 240, 1.5, (0.05, 0, -0.01), (1, 0, 0))
     whole, part = visible_part(inside, camera)
     assert 0 < shapely.area(part) < shapely.area(whole)
+    # the pixels whose rays meet the printed sheet: the code with a module of quiet zone
+    rays = camera.rays(np.stack(np.meshgrid(np.arange(320) + 0.5, np.arange(240) + 0.5), 2).reshape(-1, 2))
+    turn, place = camera.world_to_camera[:3, :3], camera.position
+    rays = rays @ turn
+    at = place + np.where(rays[:, 2] > 0, -place[2] / rays[:, 2], np.nan)[:, None] * rays
+    hit = (np.abs(at[:, :2]) < 0.125).all(1)
+    assert shapely.area(part) == pytest.approx(hit.sum(), rel=0.02)
     behind, camera = outlined(position=(0, 0, 1))
     assert visible(behind, camera).share == 0.0
 
@@ -130,6 +138,12 @@ def test_a_board_gives_one_pose(renderer, spec):
     (reading,), _ = read_back(np.full_like(half, 0.5), scene)
     assert reading.as_dict()["found"] is False
     assert means([reading])["position_error_mm"] is None
+
+
+def test_the_error_of_corners_is_the_root_mean_square_of_their_distances():
+    corners = np.array([[0, 0], [9, 0], [9, 9], [0, 9]], float)
+    code = Detection("apriltag", "36h11", 5, None, corners + np.array([3, 4]))
+    assert corner_error(code, corners) == pytest.approx(5)
 
 
 def test_pictures_that_cannot_be_read_back():

@@ -136,6 +136,14 @@ def test_a_picture_with_several_codes():
     assert found[0].corners[:, 0].max() < 480 < found[1].corners[:, 0].min()
 
 
+def test_neighbours_are_two_tags():
+    """Their middles are 1.3 sides apart."""
+    left, _, _ = seen(dictionary_bits("apriltag", "36h11", 7), 150, aside=(0, 0))
+    right, _, _ = seen(dictionary_bits("apriltag", "36h11", 8), 150, aside=(0, 0))
+    found = detect(np.hstack([left[:, 140:340], right[:, 140:340]]), ["36h11"], qr=False)
+    assert [tag.name for tag in found] == ["apriltag:36h11:7", "apriltag:36h11:8"]
+
+
 @pytest.mark.parametrize("fails", [cv2.aruco.CORNER_REFINE_SUBPIX, cv2.aruco.CORNER_REFINE_APRILTAG])
 def test_either_way_to_squares_is_enough_and_both_give_a_tag_once(fails, monkeypatch):
     picture, corners, _ = seen(dictionary_bits("apriltag", "36h11", 5), 160, tilt=20, spin=8)
@@ -205,6 +213,7 @@ def test_align_gives_up_rather_than_slide_to_another_place():
     picture, corners, _ = seen(bits, 160)
     assert align(picture, corners + 45.0, bits) is None
     assert align(picture, corners + 5000.0, bits) is None
+    assert align(picture, corners, dictionary_bits("apriltag", "36h11", 100)) is None
     assert align(np.full_like(picture, 90), corners, bits) is None
     assert align(255 - picture, corners, bits) is None
 
@@ -248,7 +257,24 @@ def test_pose_error_is_the_distance_and_the_angle():
     apart, angle = pose_error(moved, truth)
     assert apart == pytest.approx(0.003)
     assert np.degrees(angle) == pytest.approx(1e-4)
-    assert pose_error(pose(turned(180), [0, 0, 1]), np.eye(4))[1] == pytest.approx(np.pi)
+    for degrees in (60, 90, 180):
+        turn = pose_error(pose(turned(degrees), [0, 0, 1]), np.eye(4))[1]
+        assert np.degrees(turn) == pytest.approx(degrees)
+
+
+def test_a_pose_behind_the_camera_is_not_taken(monkeypatch):
+    """It is seen in the same places: the plane's axes and its place with their signs changed."""
+    placed = pose(turned(30, 20), [0.05, -0.04, 1.2])
+    _, corners = draw(np.ones((1, 1), np.uint8), SIZE, placed, CAMERA, samples=1)
+
+    def both(*args, **more):
+        _, turns, moves, errors = solve(*args, **more)
+        matrix = cv2.Rodrigues(turns[0])[0] * [-1, -1, 1]
+        return 2, (cv2.Rodrigues(matrix)[0], turns[0]), (-moves[0], moves[0]), errors
+
+    solve = cv2.solvePnPGeneric
+    monkeypatch.setattr(cv2, "solvePnPGeneric", both)
+    assert pose_error(marker_pose(corners, SIZE, CAMERA), placed)[0] < 1e-5
 
 
 @pytest.mark.parametrize("tilt", [-60, -20, 0, 20, 60])

@@ -190,6 +190,34 @@ def test_adopted_labels_harmonics_and_origins(renderer):
     assert np.allclose(renderer.render(moved, view)["rgb"], wanted["rgb"], atol=1e-5)
 
 
+def test_adopted_splats_with_three_scales(renderer):
+    """Disks among them; drawn where they lie, and left out where a third scale is none."""
+    device = renderer.backend.device
+    third = np.where(np.arange(len(CLOUD)) % 3 == 0, 0, CLOUD.scales[:, :1].T * 0.5)
+    scales = np.column_stack([CLOUD.scales, third[0]])
+    thick = fs.SplatCloud(CLOUD.means, CLOUD.quats, scales, CLOUD.opacities, colors=CLOUD.colors)
+    wanted = renderer.render(thick, CAMERA)["rgb"]
+    vectors = arrays_of(CLOUD, device) | {"scales": wp.array(scales, dtype=wp.vec3, device=device)}
+    rows = vectors | {"scales": wp.array(scales, dtype=wp.float32, device=device)}
+    plain = {name: getattr(CLOUD, name) for name in vectors} | {"scales": scales}
+    for arrays in (vectors, rows, plain):
+        resident = renderer.adopt(**arrays)
+        assert np.array_equal(renderer.render(resident, CAMERA)["rgb"], wanted)
+        words = 3 + 4 + 3 + 1 + 3 + 1
+        assert resident.memory_bytes == 4 * words * len(CLOUD)
+
+    resident = renderer.adopt(**vectors)
+    broken = {5: np.nan, 6: np.inf, 7: -0.1}
+    scales[list(broken), 2] = list(broken.values())
+    vectors["scales"].assign(scales)
+    keep = ~np.isin(np.arange(len(CLOUD)), list(broken))
+    rest = (CLOUD.means, CLOUD.quats, scales, CLOUD.opacities)
+    left = fs.SplatCloud(*(array[keep] for array in rest), colors=CLOUD.colors[keep])
+    after = renderer.render(resident, CAMERA)["rgb"]
+    assert np.array_equal(after, renderer.render(left, CAMERA)["rgb"])
+    assert not np.array_equal(after, wanted)
+
+
 def test_moving_an_adopted_array_moves_the_splats(renderer):
     arrays = arrays_of(CLOUD, renderer.backend.device)
     resident = renderer.adopt(**arrays)
@@ -223,6 +251,7 @@ def test_adopted_values_that_are_not_finite_leave_no_trace(renderer, name, value
             {"means": np.zeros((200, 2), np.float32)},
             r"means has the shape \(200, 2\); its last axis must be 3",
         ),
+        ({"scales": np.zeros((200, 4))}, r"scales has the shape \(200, 4\); its last axis must be 2 or 3"),
         ({"opacities": np.zeros(3, np.float32)}, "opacities holds 3 elements, but 200 means need 200"),
         ({"sh": np.zeros((200, 4, 3), np.float32)}, "exactly one of colors"),
         ({"colors": None, "sh": np.zeros((200, 5, 3), np.float32)}, "sh holds 5 coefficients"),

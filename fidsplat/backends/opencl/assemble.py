@@ -136,6 +136,8 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         files.append("list/tiled.cl")
     if "compose_pixel" in layouts:
         files.append(LAYOUTS[f"waiting_{shape.schedule}"].file)
+    if "opaque_layer" in layouts:  # behind what waits
+        files.append(LAYOUTS["opaque_layer_end"].file)
     stages = {
         "lists": ("prelude", "math", "bounds", *_LISTS[shape.lists]),
         "picture": [

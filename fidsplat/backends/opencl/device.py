@@ -15,6 +15,7 @@ from fidsplat.backends.opencl.probe import OpenCLProbe
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.roofline import measure_rates
 from fidsplat.backends.opencl.shapes import DeviceShape, cpu_shape, gpu_shape, other_shapes, shape_for
+from fidsplat.backends.opencl.training import OpenCLTraining
 from fidsplat.backends.opencl.vendors import intel_among_them
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.effects import FeatureSet
@@ -74,6 +75,8 @@ class OpenCLBackend(Workspace):
             pocl_cache.check_once()
         super().__init__(device, _describe(device, _name_of(device)), _shape(device))
         self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
+        self._own: tuple[DeviceShape, dict[FeatureSet, OpenCLPipeline]] = self.shape, {}
+        """of the device's own shape, by what is asked for: found by the first look"""
 
     def upload(self, cloud: SplatCloud) -> Resident:
         """The cloud in device buffers."""
@@ -94,6 +97,8 @@ class OpenCLBackend(Workspace):
         Raises:
             DeviceError: the compiler refuses; its log is in the message. Or what is `unsupported`.
         """
+        if shape is None and self._own[0] is self.shape and (known := self._own[1].get(features)) is not None:
+            return known
         if why := self.unsupported(features):
             raise DeviceError(why)
         key = self._key(features, shape)
@@ -104,7 +109,15 @@ class OpenCLBackend(Workspace):
             )
         if key not in self._pipelines:
             self._pipelines[key] = OpenCLPipeline(self, assemble(*key), *key, self.pipeline)
+        if shape is None:
+            if self._own[0] is not self.shape:
+                self._own = self.shape, {}
+            self._own[1][features] = self._pipelines[key]
         return self._pipelines[key]
+
+    def training(self) -> OpenCLTraining:
+        """As `Trains`."""
+        return OpenCLTraining(self)
 
     def _key(self, features: FeatureSet, shape: DeviceShape | None) -> tuple[FeatureSet, DeviceShape]:
         if not self.info.float64 and features.setup_precision != "float32":

@@ -1,14 +1,17 @@
 """The stages of a picture on an in-order queue: project, lists, blend, expose, resolve.
 
 Nothing passes through the host between the stages but the number of (splat, tile) pairs, which sizes one
-buffer. A picture with more pairs than the device's budget is listed and blended in bands of tiles, with the
-same bits. One of several poses is blended pose by pose, and resolved once.
+buffer; and not even that where pictures of the kind were drawn before (recording.py). A picture with more
+pairs than the device's budget is listed and blended in bands of tiles, with the same bits. One of several
+poses is blended pose by pose, and resolved once.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
+import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.opencl.lists import LISTS
@@ -16,31 +19,44 @@ from fidsplat.backends.opencl.picture import Picture
 from fidsplat.backends.view import Shot, View
 from fidsplat.effects.catalogue import Output
 
-Images = dict[str, tuple[Output, cl.Buffer]]
+_FIRST = np.zeros(1, np.uint32)
+_FIRST.flags.writeable = False
+
+
+@dataclass(frozen=True)
+class Slots:
+    """Where the views of a picture stand among the images of a batch."""
+
+    numbers: np.ndarray
+    """(views,) uint32, of each view"""
+    images: dict[str, cl.Buffer]
+    """of the whole batch, by the names of the kernels' arguments"""
+
+
 _RAW = ("raw", 4, True)
 """the sample buffer of every picture: name, channels, whether it is light"""
 
 
-def draw(start: Callable[[View], Picture], view: View, outputs: tuple[Output, ...]) -> tuple[Picture, Images]:
-    """All stages; the picture, and its output images by name. `start` begins a picture."""
+def draw(
+    start: Callable[[View], Picture], view: View, outputs: tuple[Output, ...], into: Slots | None = None
+) -> Picture:
+    """All stages; the output images are among what the picture has leased, unless they are given as `into`.
+    `start` begins a picture."""
     picture = start(view)
-    images = _room_for(outputs, picture)
+    if into is None:
+        into = Slots(_FIRST, {})
+        pixels = (view.height // view.samples) * (view.width // view.samples)
+        for output in outputs:
+            picture.lease(f"{output.name}_out", 4 * pixels * output.channels)
+    picture.held |= into.images
+    picture.put("slots", into.numbers)
     if view.shots:
         _expose(start, picture)
         _resolve(picture)
-        return picture, images
+        return picture
     for _ in _blended(picture):
         _resolve(picture)
-    return picture, images
-
-
-def _room_for(outputs: tuple[Output, ...], picture: Picture) -> Images:
-    view = picture.view
-    pixels = (view.height // view.samples) * (view.width // view.samples)
-    return {
-        output.name: (output, picture.lease(f"{output.name}_out", 4 * pixels * output.channels))
-        for output in outputs
-    }
+    return picture
 
 
 def _buffers_of(picture: Picture) -> list[tuple[str, int, bool]]:
@@ -56,16 +72,12 @@ def _blended(picture: Picture) -> Iterator[None]:
     """
     view, shape = picture.view, picture.shape
     for name, channels, _ in _buffers_of(picture):
-        picture.take(name, 4 * picture.rows * picture.stride * channels)
-    constants = {
-        **{"log_cut": view.log_cut, "ceiling": view.ceiling, "stop": view.stop},
-        "filter": 1.0 / view.samples**2,
-    }
+        picture.take(name, 4 * picture.held["plane"] * channels)
     # not an attribute: in a cycle, all that this picture holds would wait for the garbage collector
     lists = LISTS["chunked" if picture.plan.chunk else shape.lists](picture)
     group = shape.blend_items
     for first, end in lists.bands():
-        picture.launch("blend", "blend", (end - first) * group, group, band_first=first, **constants)
+        picture.launch("blend", "blend", (end - first) * group, group, band_first=first)
         if end == picture.tiles:
             if "backdrop" in picture.program.source.arguments:
                 picture.launch_grid("resolve", "backdrop", view.width, view.height)
@@ -76,9 +88,8 @@ def _blended(picture: Picture) -> Iterator[None]:
 def _resolve(picture: Picture) -> None:
     """The last stage: pixels from samples."""
     view = picture.view
-    behind = dict(zip(("background_r", "background_g", "background_b"), view.background, strict=True))
     size = view.width // view.samples, view.height // view.samples
-    picture.launch_grid("resolve", "resolve", *size, **behind)
+    picture.launch_grid("resolve", "resolve", *size)
 
 
 def _expose(start: Callable[[View], Picture], picture: Picture) -> None:

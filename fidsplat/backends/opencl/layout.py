@@ -24,7 +24,7 @@ VIEW = Record(
         member("real band band_end", "rows of samples that are drawn now"),
     ),
 )
-"""The uniforms of the projection; one for the picture, then one for each group of splats that moves by
+"""The uniforms of the projection; one for each view, then as many for each group of splats that moves by
 itself."""
 
 SPLAT = Record(
@@ -57,8 +57,15 @@ BOUNDS = Record(
 
 _SIZE = takes("int width height  // of the sample grid")
 _BIG = takes("uint big_capacity", "in Bounds big_bounds")
-_DIGIT = takes("in uint tallies", "uint slot shift")
-_WALK = takes("in uint order tallies", "in uint2 windows", _BIG, _SIZE, "out uint table")
+_DIGIT = takes("uint count  // places for the splats of a view", "in uint tallies", "uint first shift")
+_WALK = takes(
+    "uint count  // places for the splats of a view",
+    "in uint order tallies",
+    "in uint2 windows",
+    _BIG,
+    _SIZE,
+    "out uint table",
+)
 _EXPOSED = takes(
     _SIZE,
     "int stride  // samples per row of a shot",
@@ -79,9 +86,9 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "cloud float quats  // (n, 4) w x y z",
         "cloud float scales  // (n, 2) [m]",
         "cloud float opacities  // (n)",
-        "out Splat splats  // (n)",
-        "out uint keys  // (n)",
-        "out uint2 windows  // (n): corner and bits, or a place in `big` and 0",
+        "out Splat splats  // (views, n)",
+        "out uint keys  // (views, n)",
+        "out uint2 windows  // (views, n): corner and bits, or a place in `big` and 0",
         "out uint tallies",
         "uint big_capacity",
         "out uint big  // splats that touch more than a window",
@@ -96,15 +103,15 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "scan_bins": takes("uint bins", "in uint totals", "out uint starts tallies", "uint slot"),
     "sort_count": takes("in uint keys", _DIGIT, "out uint table"),
     "sort_scatter": takes(
-        *("in uint keys indices", _DIGIT, "uint first"),
+        *("in uint keys indices", _DIGIT),
         *("out uint table", "in uint starts", "out uint keys_out indices_out"),
     ),
     "bin_count": _WALK,
     "bin_emit": takes(
         *(_WALK, "in uint starts", "int band_first band_end", "out uint lists"),
     ),
-    "tile_starts": takes("uint tiles capacity", "out uint tallies starts cursors counts"),
-    "tally_big": takes(_SIZE, _BIG, "out uint tallies"),
+    "tile_starts": takes("uint tiles capacity clear", "out uint tallies starts cursors counts"),
+    "tally_big": takes("uint count", _SIZE, _BIG, "in uint big", "out uint tallies"),
     "emit": takes(
         *(
             "uint count splat_groups first_band",
@@ -113,13 +120,24 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
             "uint capacity big_capacity",
         ),
         *("in uint2 windows", "in uint keys big", "in Bounds big_bounds", "in uint starts"),
-        *("out uint tallies cursors", "out uint2 pairs"),
+        *("out uint counts cursors", "out uint2 pairs"),
+    ),
+    "list_few": takes(
+        *(
+            "uint all  // splats of all views",
+            "uint count  // of each view",
+            _SIZE,
+            "uint tiles capacity clear",
+        ),
+        *("uint big_capacity", "in uint2 windows", "in uint keys big", "in Bounds big_bounds"),
+        *("out uint tallies starts cursors counts", "out uint2 pairs"),
     ),
     "sort_tiles": takes("int band_first", "in uint starts", "out ulong pairs", "out uint lists"),
     "blend": takes(
         *("in Splat splats", "in uint lists starts"),
         "uint band_first  // the first tile of this launch; lists begin with its list",
         *(_SIZE, "wide log_cut ceiling stop filter"),
+        "uint plane  // samples per channel of raw, of all views",
         "out float raw  // 4 channels: r, g, b, transmittance",
     ),
     "expose": takes(_EXPOSED, "float weight", "int first", "in float raw", "out float exposed"),
@@ -136,7 +154,8 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "resolve": takes(
         "int width height  // of the picture",
         "int stride  // samples per row of raw",
-        "uint plane  // samples per channel of raw",
+        "uint plane  // samples per channel of raw, of all views",
+        "in uint slots  // of each view: its place among the output images",
         *("float background_r background_g background_b", "in float raw"),
     ),
 }
@@ -198,7 +217,7 @@ LAYOUTS: dict[str, Layout] = {
         splat=(member("int plane"),),
         project=takes(
             "cloud int planes  // (n) index of the splat's plane; -1: none",
-            "in float plane_keys  // (planes) depth at which its splats are sorted in [m]",
+            "in float plane_keys  // (planes, views) depth at which its splats are sorted in [m]",
         ),
     ),
     "footprint_gaussian": Layout(),
@@ -242,6 +261,14 @@ LAYOUTS: dict[str, Layout] = {
     "motion_groups": Layout(
         "slot/motion_groups.cl",
         project=takes("cloud int labels  // (n)", "in int moving  // number of groups, then their labels"),
+    ),
+    "opaque_layer": Layout(
+        "slot/opaque_layer.cl",
+        parts=("ray_depth",),
+        blend=takes(
+            "array float layer_depth layer_rgb  // (h, w) infinite where there is none, (h, w, 3)",
+            "array int layer_label  // (h, w)",
+        ),
     ),
     "shutter_exposure": Layout("slot/shutter_exposure.cl"),
     "shutter_rows": Layout("slot/shutter_rows.cl"),
@@ -290,6 +317,7 @@ LAYOUTS: dict[str, Layout] = {
     # how fragments wait for nearer ones, by the schedule
     "waiting_lanes": Layout("part/waiting_lanes.cl"),
     "waiting_group": Layout("part/waiting_group.cl"),
+    "opaque_layer_end": Layout("part/opaque_layer_end.cl"),
     "shown": Layout("part/shown.cl"),
     "ray": Layout(resolve=_RAY),
     "turn": Layout("part/turn.cl", resolve=takes("array float turns  // (h, 3, 3)")),

@@ -8,8 +8,9 @@ in local memory: few launches, all of them wide. docs/growth.md has both on both
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -17,12 +18,15 @@ import pyopencl as cl
 from fidsplat.backends.bands import cut
 from fidsplat.backends.opencl.memory_plan import BIG, KEYS, WINDOWS
 from fidsplat.backends.opencl.picture import Picture
+from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.errors import DeviceError
 
 # words of the buffer `tallies`, as in prelude.cl
-_VISIBLE, _PAIRS, _ALL, _BIG, _TALLIES = 0, 2, 4, 6, 8
-# words of the buffer `counts`, as in tiles.cl: big splats, pairs (two words)
-_COUNTS = 3
+_VISIBLE, _PAIRS, _BIG, _TALLIES = 0, 2, 6, 8
+_FEW = 1 << 13
+"""splats up to which one work-group lists them all: launching more takes longer than what they do"""
+# words of the buffer `counts`, as in tiles.cl: big splats, pairs (two words), visible splats
+_COUNTS = 4
 
 
 class Lists:
@@ -34,27 +38,30 @@ class Lists:
         """big splats for which there is room"""
 
     def make_room(self, words: int, needed: int = 0) -> None:
-        """Zeroes `words` words of the tallies; takes room for at least `needed` big splats."""
+        """Takes `words` words of zeroed tallies, and room for at least `needed` big splats."""
         picture = self.picture
         self.big = max(needed * 5 // 4, picture.pool.size("big") // 4, BIG)
         picture.held["big_capacity"] = self.big
-        tallies = picture.lease("tallies", 4 * words)
         picture.take("big", 4 * self.big)
         picture.take("big_bounds", picture.program.source.records["Bounds"].itemsize * self.big)
+        if picture.repeats:
+            picture.held["tallies"] = picture.pool.zeroed("tallies", 4 * words, picture.queue)
+            return
+        tallies = picture.take("tallies", 4 * words)
         cl.enqueue_fill_buffer(picture.queue, tallies, np.zeros(1, np.uint32), 0, 4 * words)
 
     def project(self, first: int, end: int) -> None:
         """Records, keys and windows of splats [first, end)."""
         picture, count = self.picture, end - first
-        source = picture.program.source
-        picture.take("splats", count * source.records["Splat"].itemsize)
-        picture.take("keys", KEYS * count)
-        picture.take("windows", WINDOWS * count)
+        source, places = picture.program.source, picture.views * count
+        picture.take("splats", places * source.records["Splat"].itemsize)
+        picture.take("keys", KEYS * places)
+        picture.take("windows", WINDOWS * places)
         if count == 0:
             return
         wanted = [one.name for one in source.arguments["project"] if one.source == "cloud"]
         arrays = {name: picture.resident.part(name, first, end) for name in wanted}
-        picture.launch("project", "project", count, 64, count=count, **arrays)
+        picture.launch("project", "project", count, 64, picture.views, count=count, **arrays)
 
 
 class OrderedLists(Lists):
@@ -75,13 +82,13 @@ class OrderedLists(Lists):
         picture, words = self.picture, np.zeros(_TALLIES, np.uint32)
         picture.put_view(0, picture.rows)
         while True:
-            self.make_room(_TALLIES, int(words[_BIG]))
+            self.make_room(_TALLIES * picture.views, int(words[_BIG]))
             self.project(0, self._count)
             self._sort()
-            words = self._tally()
+            words, visible = self._tally()
             if words[_BIG] <= self.big:
                 break
-        visible, pairs = (int(words[k]) | int(words[k + 1]) << 32 for k in (_VISIBLE, _PAIRS))
+        pairs = int(words[_PAIRS]) | int(words[_PAIRS + 1]) << 32
         self._stats = {"splats": picture.resident.count, "visible": visible, "pairs": pairs}
         yield from self._list(0, picture.tiles, pairs)
 
@@ -94,48 +101,49 @@ class OrderedLists(Lists):
             bands = cut(totals, picture.workspace.pair_budget, first)
         for start, stop, listed in bands:
             picture.take("lists", 4 * listed)
-            band = {"band_first": start, "band_end": stop}
-            picture.launch("bin", "bin_emit", self.shape.chunks, 1, table=picture.held["bin table"], **band)
+            band = {"band_first": start, "band_end": stop, "count": self._count}
+            table, views = picture.held["bin table"], picture.views
+            picture.launch("bin", "bin_emit", self.shape.chunks, 1, views, table=table, **band)
             yield start, stop
 
     def _sort(self) -> None:
         """Visible splats by depth, ties by index."""
-        picture = self.picture
+        picture, views = self.picture, self.picture.views
         count, bins = self._count, 1 << self.shape.radix_bits
-        table = picture.take("sort table", 4 * bins * self.shape.chunks)
-        keys, order = picture.held["keys"], picture.take("order 0", 4 * count)
-        length = np.array([count, 0], np.uint32)
-        copied = cl.enqueue_copy(
-            picture.queue, picture.held["tallies"], length, dst_offset=4 * _ALL, is_blocking=False
-        )
-        picture.uploads.append(copied)
+        table = picture.take("sort table", 4 * bins * self.shape.chunks * views)
+        keys, order = picture.held["keys"], picture.take("order 0", 4 * count * views)
         for number, shift in enumerate(range(0, 32, self.shape.radix_bits)):
-            keys_out = picture.take(f"sorted keys {number % 2}", 4 * count)
-            order_out = picture.take(f"order {(number + 1) % 2}", 4 * count)
-            digit = {"keys": keys, "slot": _VISIBLE if number else _ALL, "shift": shift, "table": table}
-            picture.launch("sort", "sort_count", self.shape.chunks, 1, **digit)
-            digit |= {"starts": self._starts("sort", table, bins, _VISIBLE), "indices": order}
+            keys_out = picture.take(f"sorted keys {number % 2}", 4 * count * views)
+            order_out = picture.take(f"order {(number + 1) % 2}", 4 * count * views)
+            digit = {"keys": keys, "count": count, "first": number == 0, "shift": shift, "table": table}
+            picture.launch("sort", "sort_count", self.shape.chunks, 1, views, **digit)
+            digit |= {"starts": self._starts("sort", table, bins, _VISIBLE, views), "indices": order}
             out = {"keys_out": keys_out, "indices_out": order_out}
-            picture.launch("sort", "sort_scatter", self.shape.chunks, 1, first=number == 0, **digit, **out)
+            picture.launch("sort", "sort_scatter", self.shape.chunks, 1, views, **digit, **out)
             keys, order = keys_out, order_out
         picture.held["order"] = order
 
-    def _tally(self) -> np.ndarray:
-        """Lengths of the tiles' lists; returns the tallies."""
-        picture = self.picture
+    def _tally(self) -> tuple[np.ndarray, int]:
+        """Lengths of the tiles' lists; returns the first view's tallies, and how many splats all see."""
+        picture, views = self.picture, self.picture.views
         table = picture.take("bin table", 4 * picture.tiles * self.shape.chunks)
-        picture.launch("bin", "bin_count", self.shape.chunks, 1, table=table)
-        picture.held["starts"] = self._starts("bin", table, picture.tiles, _PAIRS)
-        return picture.read("tallies", np.uint32, (_TALLIES,))
+        picture.launch("bin", "bin_count", self.shape.chunks, 1, views, table=table, count=self._count)
+        # one list: those of the second view follow those of the first
+        picture.held["starts"] = self._starts("bin", table, picture.tiles // views, _PAIRS, 1)
+        words = picture.read("tallies", np.uint32, (views, _TALLIES))
+        return words[0], int(words[:, _VISIBLE].sum(dtype=np.int64))
 
-    def _starts(self, stage: str, table: cl.Buffer, bins: int, slot: int) -> cl.Buffer:
-        """Turns a table of counts into places: returns where each bin starts (bins + 1)."""
-        picture = self.picture
-        totals = picture.take(f"{stage} totals", 4 * bins)
-        starts = picture.take(f"{stage} starts", 4 * (bins + 1))
-        items, scan = self.shape.scan_items, {"bins": bins, "totals": totals}
-        picture.launch(stage, "scan_chunks", bins, 64, table=table, **scan)
-        picture.launch(stage, "scan_bins", items, items, starts=starts, slot=slot, **scan)
+    def _starts(self, stage: str, table: cl.Buffer, bins: int, slot: int, lists: int) -> cl.Buffer:
+        """Turns the views' tables of counts into places in `lists` lists, one for each view or one for all:
+        returns where each bin starts (lists, all bins of the list + 1)."""
+        picture, views = self.picture, self.picture.views
+        totals = picture.take(f"{stage} totals", 4 * bins * views)
+        each = bins * views // lists
+        starts = picture.take(f"{stage} starts", 4 * (each + 1) * lists)
+        items = self.shape.scan_items
+        picture.launch(stage, "scan_chunks", bins, 64, views, table=table, bins=bins, totals=totals)
+        scan = {"bins": each, "totals": totals, "starts": starts, "slot": slot}
+        picture.launch(stage, "scan_bins", items, items, lists, **scan)
         return starts
 
 
@@ -209,7 +217,7 @@ class ChunkedLists(OrderedLists):
                 self._more_room_for_big()
                 return self._gather(top, end)
             picture.put("places", places[:-1].astype(np.uint32))
-            out = {f"{name}_out": buffer for name, buffer in packed.items()}
+            out: dict[str, Any] = {f"{name}_out": buffer for name, buffer in packed.items()}
             picture.launch("project", "pack_move", chunks, 1, count=stop - start, **out)
         picture.held |= packed
         self._count = total
@@ -222,7 +230,8 @@ class ChunkedLists(OrderedLists):
 
 class TiledLists(Lists):
     """Kernels tiles.cl. The buffers are as large as the last pictures needed, and all stages are launched
-    before the host knows whether that is enough; if it is not, the lists are empty and it is all done again.
+    before the host knows whether that is enough; if it is not, the lists are empty and it is all done again:
+    at once, or, where one of its kind was drawn before, when somebody asks (`enough`).
     """
 
     _ITEMS = 256  # WALK_ITEMS and SORT_ITEMS
@@ -235,28 +244,28 @@ class TiledLists(Lists):
 
     def stats(self) -> Callable[[], dict[str, int]]:
         """To be asked for after the last band, and called when splats, visible and pairs are wanted."""
-        queue, tallies = self.picture.queue, self.picture.held["tallies"]
-        splats, pairs = self.picture.resident.count, self._pairs
-
-        def read() -> dict[str, int]:
-            words = np.empty(_TALLIES, np.uint32)
-            cl.enqueue_copy(queue, words, tallies)
-            return {"splats": splats, "visible": int(words[_VISIBLE]), "pairs": pairs}
-
-        return read
+        queue, counts = self.picture.queue, self.picture.held["counts"]
+        splats = self.picture.resident.count
+        return lambda: stats_of(splats, read_counts(queue, counts))
 
     def bands(self) -> Iterator[tuple[int, int]]:
         """Projects; yields ranges of tiles (first, end), each when its lists are on the device."""
         picture = self.picture
         picture.put_view(0, picture.rows)
-        capacity = min(
-            picture.pool.size("lists") // 4, picture.pool.size("pairs") // 8, picture.workspace.pair_budget
-        )
+        # what the host reads has a buffer of its own: `emit` adds to it meanwhile
+        picture.lease("counts", 4 * _COUNTS)
+        capacity = self.capacity(picture.workspace)
+        if picture.repeats and picture.views * picture.resident.count <= _FEW:
+            self._list_few(capacity)
+            yield 0, picture.tiles
+            return
         self._project()
         counted = self._starts(capacity)
         if capacity:
             self._list(0, picture.tiles, capacity, True)
             yield 0, picture.tiles
+        if picture.repeats:
+            return
         big, self._pairs = self._read(counted)
         while big > self.big:
             self._project(big)
@@ -264,6 +273,12 @@ class TiledLists(Lists):
             big, self._pairs = self._read(counted)
         if self._pairs > capacity or not capacity:
             yield from self._again()
+
+    @staticmethod
+    def capacity(workspace: Workspace) -> int:
+        """Pairs for which the last pictures have left room."""
+        pool = workspace.pool
+        return min(pool.size("lists") // 4, pool.size("pairs") // 8, workspace.pair_budget)
 
     def _again(self) -> Iterator[tuple[int, int]]:
         """The lists in buffers that fit, in bands if need be."""
@@ -273,44 +288,77 @@ class TiledLists(Lists):
         if self._pairs > budget:
             tallies = picture.read("tallies", np.uint32, (_TALLIES + picture.tiles,))
             bands = list(cut(tallies[_TALLIES:], budget))
+            picture.in_bands = True
         room = max(max(listed for _, _, listed in bands), min(self._pairs * 5 // 4, budget))
         for first, end, _ in bands:
             self._list(first, end, room, first == 0)
             yield first, end
 
+    def _list_few(self, capacity: int) -> None:
+        """Projects, and lists in one launch what are few splats."""
+        picture, items, count = self.picture, self.picture.shape.scan_items, self.picture.resident.count
+        self.make_room(_TALLIES + picture.tiles)
+        self.project(0, count)
+        picture.take("starts", 4 * (picture.tiles + 1))
+        picture.take("cursors", 4 * picture.tiles)
+        picture.take("pairs", 8 * capacity)
+        picture.take("lists", 4 * capacity)
+        given = {"all": picture.views * count, "count": count, "tiles": picture.tiles}
+        given |= {"capacity": capacity, "clear": True}
+        picture.launch("bin", "list_few", items, items, **given)
+        picture.launch("sort", "sort_tiles", picture.tiles * self._ITEMS, self._ITEMS, band_first=0)
+
     def _project(self, needed: int = 0) -> None:
         """Projects and tallies."""
         self.make_room(_TALLIES + self.picture.tiles, needed)
         self.project(0, self.picture.resident.count)
-        self.picture.launch("bin", "tally_big", self._big_groups * self._ITEMS, self._ITEMS)
+        count = self.picture.resident.count
+        self.picture.launch("bin", "tally_big", self._big_groups * self._ITEMS, self._ITEMS, count=count)
 
     def _starts(self, capacity: int) -> cl.Event:
         """Where each tile's list starts; all lists are empty if there are more pairs than `capacity`."""
         picture, items = self.picture, self.picture.shape.scan_items
         picture.take("starts", 4 * (picture.tiles + 1))
         picture.take("cursors", 4 * picture.tiles)
-        # what the host reads has a buffer of its own: `emit` adds to the tallies meanwhile
-        picture.take("counts", 4 * _COUNTS)
-        return picture.launch("bin", "tile_starts", items, items, tiles=picture.tiles, capacity=capacity)
+        given = {"tiles": picture.tiles, "capacity": capacity, "clear": picture.repeats}
+        return picture.launch("bin", "tile_starts", items, items, **given)
 
     def _list(self, first: int, end: int, capacity: int, first_band: bool) -> None:
         """The sorted lists of the tiles of one band."""
         picture, items, count = self.picture, self._ITEMS, self.picture.resident.count
         picture.take("pairs", 8 * capacity)
         picture.take("lists", 4 * capacity)
-        groups = -(-count // items)
+        groups, views = -(-count // items), picture.views
         walk = {"count": count, "splat_groups": groups, "first_band": first_band}
         band = {"band_first": first, "band_end": end, "capacity": capacity}
-        picture.launch("bin", "emit", (groups + self._big_groups) * items, items, **walk, **band)
+        all_groups = groups + -(-self._big_groups // views)
+        picture.launch("bin", "emit", all_groups * items, items, views, **walk, **band)
         picture.launch("sort", "sort_tiles", (end - first) * items, items, band_first=first)
 
     def _read(self, counted: cl.Event) -> tuple[int, int]:
         """Numbers of big splats and of pairs as `counted` has left them, while later stages picture."""
-        words = np.empty(_COUNTS, np.uint32)
         self.picture.queue.flush()
-        side = self.picture.workspace.side_queue
-        cl.enqueue_copy(side, words, self.picture.held["counts"], wait_for=[counted])
-        return int(words[0]), int(words[1]) | int(words[2]) << 32
+        side, counts = self.picture.workspace.side_queue, self.picture.held["counts"]
+        return fullness_of(read_counts(side, counts, [counted]))
+
+
+def read_counts(
+    queue: cl.CommandQueue, counts: cl.Buffer, after: Sequence[cl.Event] | None = None
+) -> np.ndarray:
+    """The words of the buffer `counts` of a picture, once it is drawn or what is given is done."""
+    words = np.empty(_COUNTS, np.uint32)
+    cl.enqueue_copy(queue, words, counts, wait_for=after)
+    return words
+
+
+def fullness_of(words: np.ndarray) -> tuple[int, int]:
+    """Numbers of big splats and of pairs of a picture's `counts`."""
+    return int(words[0]), int(words[1]) | int(words[2]) << 32
+
+
+def stats_of(splats: int, words: np.ndarray) -> dict[str, int]:
+    """What a frame tells of a picture's `counts`."""
+    return {"splats": splats, "visible": int(words[3]), "pairs": fullness_of(words)[1]}
 
 
 LISTS = {"ordered": OrderedLists, "chunked": ChunkedLists, "tiled": TiledLists}

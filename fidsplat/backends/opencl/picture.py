@@ -15,6 +15,7 @@ from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.backends.opencl.workspace import Workspace
+from fidsplat.backends.stack import ViewStack
 from fidsplat.backends.view import View
 
 _GRID = (16, 4)
@@ -32,50 +33,91 @@ class Picture:
         resident: Resident,
         view: View,
         plan: MemoryPlan,
+        repeats: bool = False,
+        stack: ViewStack | None = None,
     ) -> None:
+        """repeats: whether one of its kind was drawn before; it is drawn without waiting for the device.
+        stack: many views instead of one, with all in common that they do not say."""
         self.workspace, self.program, self.shape = workspace, program, shape
-        self.resident, self.view, self.plan = resident, view, plan
-        self.queue, self.pool = workspace.queue, workspace.pool
+        self.resident, self.view, self.plan, self.repeats = resident, view, plan, repeats
+        self.stack = ViewStack.of_one(view) if stack is None else stack
+        self.views = len(self.stack)
+        self.queue = workspace.turn_to(workspace.repeat_queue if repeats else workspace.queue)
+        self.pool = workspace.pool
         self.tiles_x = -(-view.width // shape.tile_width)
         self.tiles_y = -(-view.height // shape.tile_height)
-        self.tiles = self.tiles_x * self.tiles_y
+        self.tiles = self.views * self.tiles_x * self.tiles_y
+        """of all views, one after the other"""
         self.stride = self.tiles_x * shape.tile_width
         self.rows = self.tiles_y * shape.tile_height
-        self.held: dict[str, Any] = {
+        behind = zip(("background_r", "background_g", "background_b"), view.background, strict=True)
+        self._numbers = {
+            **{"log_cut": view.log_cut, "ceiling": view.ceiling, "stop": view.stop},
+            **{"filter": 1.0 / view.samples**2, **dict(behind)},
+        }
+        self.held: dict[str, Any] = self._numbers | {
             "width": view.width,
             "height": view.height,
             "stride": self.stride,
-            "plane": self.rows * self.stride,
+            "plane": self.views * self.rows * self.stride,
         }
         """buffers and numbers by the names of the arguments that take them"""
         self.events: list[tuple[str, cl.Event]] = []
+        self.launched: list[tuple[str, str, tuple[int, ...], tuple[int, ...], list[Any]]] = []
+        """stage, kernel, size, work-group and values of the arguments of each launch"""
+        self.arrays: dict[str, np.ndarray] = {}
+        """what was put on the device for this view"""
         self.uploads: list[cl.Event] = []
         self.leased: list[tuple[str, cl.Buffer]] = []
+        self.in_bands = False
+        """whether its lists were too long for one band"""
         self.stats: Callable[[], dict[str, int]] = dict
         self._uniforms = cache(view.uniform)
 
-    def launch(self, stage: str, kernel: str, items: int, group: int, **given: Any) -> cl.Event:
-        """One-dimensional launch of at least `items` work-items; the kernels check their index.
+    def launch(
+        self, stage: str, kernel: str, items: int, group: int, views: int = 1, **given: Any
+    ) -> cl.Event:
+        """Launch of at least `items` work-items, for each of so many views; the kernels check their index.
 
         Arguments are given here, or held by the picture, or numbers and arrays of its view.
         """
-        return self._launch(stage, kernel, (-(-items // group) * group,), (group,), given)
+        size = -(-items // group) * group
+        if views == 1:
+            return self._launch(stage, kernel, (size,), (group,), given)
+        return self._launch(stage, kernel, (size, views), (group, 1), given)
 
     def launch_grid(self, stage: str, kernel: str, width: int, height: int, **given: Any) -> cl.Event:
-        """Launch of a work-item for each pixel or sample, which the kernel knows as `width` and `height`."""
+        """Launch of a work-item for each pixel or sample of each view; the kernel knows how many there are as
+        `width` and `height`."""
         size = (-(-width // _GRID[0]) * _GRID[0], -(-height // _GRID[1]) * _GRID[1])
-        return self._launch(stage, kernel, size, _GRID, given | {"width": width, "height": height})
+        given |= {"width": width, "height": height}
+        if self.views == 1:
+            return self._launch(stage, kernel, size, _GRID, given)
+        return self._launch(stage, kernel, (*size, self.views), (*_GRID, 1), given)
 
     def _launch(
         self, stage: str, kernel: str, size: tuple[int, ...], group: tuple[int, ...], given: dict[str, Any]
     ) -> cl.Event:
         arguments = self.program.source.arguments[kernel]
-        values = [given[one.name] if one.name in given else self._value(one) for one in arguments]
-        event = self.program.launch(kernel, size, group, values)
+        values = [given[one.name] if one.name in given else self.value(one) for one in arguments]
+        event = self.program.launch(self.queue, kernel, size, group, values)
         self.events.append((stage, event))
+        self.launched.append((stage, kernel, size, group, values))
         return event
 
-    def _value(self, argument: Argument) -> Any:
+    def is_of_view(self, argument: Argument) -> bool:
+        """Whether an argument is a number that changes with the view."""
+        return argument.source == "uniform" or argument.name in self._numbers
+
+    def put_arrays(self) -> None:
+        """The view's arrays that kernels take."""
+        for arguments in self.program.source.arguments.values():
+            for one in arguments:
+                if one.source == "array":
+                    self.value(one)
+
+    def value(self, argument: Argument) -> Any:
+        """What a kernel is given for an argument that is not given where it is launched."""
         if argument.source == "uniform":
             name, place = argument.uniform
             return self._uniforms(name)[place]
@@ -102,26 +144,24 @@ class Picture:
         return buffer
 
     def put(self, name: str, array: np.ndarray) -> cl.Buffer:
-        """A scratch buffer with these contents; does not wait. What the last picture put there and nobody can
-        change (a panorama) is not copied again."""
-        if (held := self.pool.holding(name, array)) is not None:
-            self.held[name] = held
-            return held
-        buffer = self.take(name, array.nbytes)
-        self.uploads.append(cl.enqueue_copy(self.queue, buffer, array, is_blocking=False))
-        self.pool.now_holds(name, array)
-        return buffer
+        """A scratch buffer with these contents; does not wait."""
+        self.arrays[name] = array
+        self.held[name], event = self.pool.put(self.queue, name, array)
+        if event is not None:
+            self.uploads.append(event)
+        return self.held[name]
 
     def put_view(self, row: int, end: int) -> None:
         """The uniforms of the projection, for rows of samples [row, end)."""
         view, record = self.view, self.program.source.records["View"]
         self.put_rays()
-        views = [_uniforms(each, row, end, record) for each in (view, *(of for _, of in view.groups))]
-        self.put("view", np.concatenate(views))
+        self.put("view", _kept(packed(self.stack, row, end, record)))
         if view.groups:
-            self.put("moving", np.array([len(view.groups), *(label for label, _ in view.groups)], np.int32))
+            moving = np.array([len(view.groups), *(label for label, _ in view.groups)], np.int32)
+            self.put("moving", _kept(moving))
         if self.resident.planes is not None:
-            self.put("plane_keys", self.resident.planes.keys(view))
+            keys = [self.resident.planes.keys(self.stack.one(k)) for k in range(self.views)]
+            self.put("plane_keys", _kept(np.stack(keys, axis=1)))
 
     def put_rays(self) -> None:
         """What the kernels read of a lens: rays of the samples, and the map of directions."""
@@ -130,8 +170,26 @@ class Picture:
             self.held |= self.workspace.ray_buffers.of(self.view.raster, self.rows, self.stride, slopes)
 
 
+def _kept(array: np.ndarray) -> np.ndarray:
+    """The array, which nobody changes any more: what the device has of it need not be copied again."""
+    array.flags.writeable = False
+    return array
+
+
+def packed(stack: ViewStack, row: int, end: int, record: np.dtype) -> np.ndarray:
+    """(groups that move + 1, views) of the record `View` (layout.py) for rows of samples [row, end)."""
+    made = np.empty(stack.translation.shape[:2], record)
+    made[:] = _uniforms(stack.view, row, end, record)
+    made["rotation"] = stack.rotation.reshape(*made.shape, 9)
+    made["translation"], made["eye"] = stack.translation, stack.eye
+    for name, values in stack.numbers.items():
+        if name in (record.names or ()):
+            made[name] = values
+    return made
+
+
 def _uniforms(view: View, row: int, end: int, record: np.dtype) -> np.ndarray:
-    """(1,) of the record `View` (layout.py) for rows of samples [row, end)."""
+    """(1,) of the record `View`, of one view."""
     made = np.zeros(1, record)
     values = {
         **{"rotation": view.rotation.ravel(), "translation": view.translation, "eye": view.eye},

@@ -1,69 +1,55 @@
-"""The stages compiled for one FeatureSet on one device, and the output images that they make."""
+"""The stages compiled for one FeatureSet on one device."""
 
 from __future__ import annotations
 
-import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.opencl.assemble import Source
-from fidsplat.backends.opencl.drawing import Images, draw
-from fidsplat.backends.opencl.memory_plan import BIG, SMALL, MemoryPlan, plan_of, table_bytes
+from fidsplat.backends.opencl.batch import OpenCLBatch, OutputBuffers, parts
+from fidsplat.backends.opencl.drawing import Slots, draw
+from fidsplat.backends.opencl.images import Drawn, OpenCLImages, Repeat, stats_later
+from fidsplat.backends.opencl.lists import TiledLists
+from fidsplat.backends.opencl.memory_plan import (
+    BIG,
+    KEYS,
+    SMALL,
+    SORTED,
+    WINDOWS,
+    MemoryPlan,
+    plan_of,
+    table_bytes,
+)
 from fidsplat.backends.opencl.picture import Picture
 from fidsplat.backends.opencl.program import Program
+from fidsplat.backends.opencl.recording import Recording
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.backends.opencl.workspace import RayBuffers, Workspace
+from fidsplat.backends.stack import ViewBatch, ViewStack
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError
 
+_OF_CAMERAS = ("ray", "vignette_center")
+"""groups of uniforms that differ where cameras do"""
+_KINDS = 32
+"""of pictures of one cloud that are kept"""
 
-class OpenCLImages:
-    """Output images on the device, with the events of the kernels that made them.
 
-    Their buffers go back to the pool when nobody holds the images any more.
-    """
+@dataclass
+class Kept:
+    """What is kept of a kind of picture that was drawn before."""
 
-    def __init__(self, picture: Picture, images: Images) -> None:
-        # not the picture itself, which holds the cloud and all scratch buffers
-        self._queue, self._images, self._events = picture.queue, images, picture.events
-        self._stats, self._title = picture.stats, picture.workspace.info.title
-        self._uploads = picture.uploads  # kept until the device has read them
-        view = picture.view
-        self._size = (view.height // view.samples, view.width // view.samples)
-        weakref.finalize(self, picture.pool.give_back, picture.leased)
-
-    def read(self, name: str) -> np.ndarray:
-        """The image on the host; waits for the device.
-
-        Raises:
-            DeviceError: the device has failed, in this or while it was drawing.
-        """
-        output, buffer = self._images[name]
-        shape = self._size if output.channels == 1 else (*self._size, output.channels)
-        image = np.empty(shape, output.dtype)
-        try:
-            cl.enqueue_copy(self._queue, image, buffer)
-        except cl.Error as error:
-            raise DeviceError(f"{self._title} failed while drawing {name}: {error}") from error
-        return image
-
-    @property
-    def timings(self) -> dict[str, float]:
-        self._queue.finish()
-        timings: dict[str, float] = {}
-        for stage, event in self._events:
-            timings[stage] = timings.get(stage, 0.0) + (event.profile.end - event.profile.start) * 1e-6
-        return timings
-
-    @property
-    def stats(self) -> Mapping[str, int]:
-        return self._stats()
+    plan: MemoryPlan
+    kind: tuple[Any, ...]
+    """for `BufferPool.make_way`"""
+    recording: Recording | None = None
 
 
 class OpenCLPipeline:
@@ -87,40 +73,174 @@ class OpenCLPipeline:
         """gives the pipeline of another shape"""
 
     def render(self, resident: Resident, view: View) -> OpenCLImages:
-        """Draw one picture.
+        """Draw one picture. One of a kind that was drawn before is launched without waiting for the device.
 
         Raises:
             DeviceError: the device runs out of memory or fails.
         """
-        plan = self._plan(resident, view)
-        if plan.chunk and self.shape.lists != "ordered":
-            # one way of drawing in chunks is enough: where memory is short, sorting takes the least time
-            return self._other(self.features, replace(self.shape, lists="ordered")).render(resident, view)
         workspace = self.workspace
-        way = workspace.memory_budget - plan.held
-        # what this picture takes anew is planned for; that of its own kind is there already
-        workspace.pool.make_way((self, view.width, view.height, resident.count, plan), way)
+        with workspace.lock:
+            key = self._kind(view)
+            kept = resident.kept.get(key)
+            if kept is not None and (repeated := self._tried(self._repeat, resident, view, kept)) is not None:
+                return repeated
+            plan = self._plan(resident, view)
+            if plan.chunk and self.shape.lists != "ordered":
+                # one way of drawing in chunks is enough: where memory is short, sorting takes the least time
+                return self._other(self.features, replace(self.shape, lists="ordered")).render(resident, view)
+            return self._images(view, self._tried(self._first, resident, view, plan, key))
+
+    def render_batch(self, resident: Resident, batch: ViewBatch) -> OpenCLBatch:
+        """Draw many views, as many at once as memory holds.
+
+        Raises:
+            DeviceError: the device runs out of memory or fails.
+        """
+        with self.workspace.lock:
+            return self._tried(self._batch, resident, batch)
+
+    def _batch(self, resident: Resident, batch: ViewBatch) -> OpenCLBatch:
+        workspace, pool, outputs = self.workspace, self.workspace.pool, self.features.images
+        workspace.turn_to(workspace.queue)
+        buffers = OutputBuffers(workspace, outputs, batch)
+        drawn: list[Drawn] = []
+        for first, end, plan in self._parts(resident, batch, buffers.nbytes):
+            shape, views = self.shape, batch.views
+            if plan.chunk and shape.lists != "ordered":
+                # as `render`
+                shape = replace(shape, lists="ordered")
+            pipeline = self if shape is self.shape else self._other(self.features, shape)
+            pool.make_way((pipeline, "views", resident.count, plan), workspace.memory_budget - plan.held)
+            stack = views.part(first, end) if isinstance(views, ViewStack) and end - first > 1 else None
+
+            def start(view: View, pipeline=pipeline, stack=stack, plan=plan) -> Picture:
+                return Picture(workspace, pipeline.program, pipeline.shape, resident, view, plan, stack=stack)
+
+            into = Slots(batch.slots[first:end].copy(), buffers.held())
+            drawn.append(Drawn.of(draw(start, batch.one(first), outputs, into)))
+        return OpenCLBatch(workspace, buffers, drawn, resident.count)
+
+    def _parts(
+        self, resident: Resident, batch: ViewBatch, beside: int
+    ) -> Iterator[tuple[int, int, MemoryPlan]]:
+        """Ranges of views (first, end) that are drawn at once, and what they may hold. beside: bytes of all
+        output images."""
+        count, views, budget = len(batch.slots), batch.views, self.workspace.memory_budget
+        if not count:
+            return
+        plan = self._plan(resident, batch.one(0), beside)
+        if plan.chunk or not (isinstance(views, ViewStack) and self._goes_together(resident, views)):
+            yield from ((k, k + 1, self._plan(resident, batch.one(k), beside)) for k in range(count))
+            return
+        each, samples = self._bytes_of_view(resident, views.view)
+        free = budget - plan.held + each
+        for first, end in parts(count, each, samples, self.workspace.info.kind, free):
+            yield first, end, MemoryPlan(0, resident.count, plan.held + (end - first - 1) * each)
+
+    def _goes_together(self, resident: Resident, stack: ViewStack) -> bool:
+        """Whether all that differs from view to view stands in the record `View`."""
+        arguments = self.source.arguments
+        every = [one for each in arguments.values() for one in each]
+        if resident.streamed or "backdrop" in arguments or any(one.source == "array" for one in every):
+            return False
+        if any(one.name == "rays" for one in arguments["resolve"]):
+            return False
+        return not (stack.numbers and any(one.uniform[0] in _OF_CAMERAS for one in every))
+
+    def _bytes_of_view(self, resident: Resident, view: View) -> tuple[int, int]:
+        """What a view of a batch takes beside its images, and its samples."""
+        shape, source = self.shape, self.source
+        tiles = -(-view.width // shape.tile_width) * -(-view.height // shape.tile_height)
+        samples = tiles * shape.tile_width * shape.tile_height
+        splat = source.records["Splat"].itemsize + KEYS + WINDOWS
+        splat += SORTED if shape.lists == "ordered" else 0
+        channels = 4 + sum(one.channels for one, _ in source.samples)
+        tables = table_bytes(shape.lists, tiles, shape.chunks, shape.radix_bits)
+        return resident.count * splat + tables + 4 * channels * samples, samples
+
+    def _kind(self, view: View) -> tuple[Any, ...]:
+        """What pictures have in common whose launches differ in numbers alone."""
+        labels = tuple(label for label, _ in view.groups)
+        budgets = self.workspace.memory_budget, self.workspace.pair_budget
+        return self, view.width, view.height, view.raster, labels, budgets
+
+    def _tried(self, work: Callable[..., Any], *given: Any) -> Any:
+        """Calls it; leaves the device idle if it fails."""
         try:
-            return OpenCLImages(*self._draw(resident, view, plan))
+            return work(*given)
         except BaseException as error:
+            workspace = self.workspace
+            workspace.pool.forget_zeros()
             with suppress(cl.Error):
                 workspace.queue.finish()  # a CPU may be reading the arrays of a cloud that nobody keeps
+                workspace.repeat_queue.finish()
             if isinstance(error, cl.Error):
                 raise DeviceError(f"{workspace.info.title} failed while drawing: {error}") from error
             raise
 
-    def _draw(self, resident: Resident, view: View, plan: MemoryPlan) -> tuple[Picture, Images]:
+    def _images(self, view: View, drawn: Drawn, repeat: Repeat | None = None) -> OpenCLImages:
+        size = view.height // view.samples, view.width // view.samples
+        return OpenCLImages(self.workspace, self.features.images, size, drawn, repeat)
+
+    def _first(
+        self, resident: Resident, view: View, plan: MemoryPlan, key: tuple[Any, ...] | None = None
+    ) -> Drawn:
+        """Draws a picture with what room it takes; remembers its kind, if the next may be launched again."""
+        pool = self.workspace.pool
+        kind = self, view.width, view.height, resident.count, plan
+        # what this picture takes anew is planned for; that of its own kind is there already
+        pool.make_way(kind, self.workspace.memory_budget - plan.held)
+        picture = self._draw(resident, view, plan)
+        whole = not (plan.chunk or resident.streamed or view.shots or picture.in_bands)
+        if key is not None and whole and self.shape.lists == "tiled" and resident.count:
+            if len(resident.kept) >= _KINDS:
+                resident.kept.clear()
+            resident.kept[key] = Kept(plan, kind)
+        return Drawn.of(picture)
+
+    def _repeat(self, resident: Resident, view: View, kept: Kept) -> OpenCLImages | None:
+        """The next picture of a kind; None where nothing is left of the last."""
+        workspace, plan = self.workspace, kept.plan
+        workspace.pool.make_way(kept.kind, workspace.memory_budget - plan.held)
+        if not TiledLists.capacity(workspace):
+            return None
+        queue = workspace.turn_to(workspace.repeat_queue)
+        recording = kept.recording
+
+        def undrawn(view: View) -> Picture:
+            return Picture(workspace, self.program, self.shape, resident, view, plan, repeats=True)
+
+        if recording is not None and recording.fits(view, undrawn, queue):
+            leased = recording.launch(queue)
+            stats = stats_later(queue, dict(leased)["counts"], resident.count)
+            drawn = Drawn(queue, leased, stats)
+        else:
+            picture = draw(undrawn, view, self.features.images)
+            drawn = Drawn(queue, picture.leased, picture.stats, uploads=picture.uploads)
+            recording = kept.recording = Recording(picture)
+        repeat = Repeat(self._redrawn, resident, view, recording.big, recording.capacity)
+        images = self._images(view, drawn, repeat)
+        if not resident.fixed:
+            images.settle()
+        return images
+
+    def _redrawn(self, resident: Resident, view: View) -> Drawn:
+        """The picture drawn anew, whatever it takes, and its time."""
+        return self._tried(self._first, resident, view, self._plan(resident, view))
+
+    def _draw(self, resident: Resident, view: View, plan: MemoryPlan) -> Picture:
         def start(view: View) -> Picture:
             return Picture(self.workspace, self.program, self.shape, resident, view, plan)
 
         return draw(start, view, self.features.images)
 
-    def _plan(self, resident: Resident, view: View) -> MemoryPlan:
+    def _plan(self, resident: Resident, view: View, beside: int = 0) -> MemoryPlan:
+        """beside: bytes that something else holds meanwhile."""
         shape, source = self.shape, self.source
         tiles_x = -(-view.width // shape.tile_width)
         tiles = tiles_x * -(-view.height // shape.tile_height)
         stays, upload = resident.bytes_for(self._cloud_arrays)
-        fixed = stays + SMALL + table_bytes(shape.lists, tiles, shape.chunks, shape.radix_bits)
+        fixed = beside + stays + SMALL + table_bytes(shape.lists, tiles, shape.chunks, shape.radix_bits)
         fixed += BIG * (4 + source.records["Bounds"].itemsize)
         channels = 4 + sum(one.channels for one, _ in source.samples)
         if view.shots:
@@ -144,8 +264,8 @@ class OpenCLPipeline:
         the record `Splat` (undefined for culled splats); raw (4, rows, columns) float32: r, g, b,
         transmittance of the padded sample grid; and the finished outputs by name.
         """
-        picture, images = self._draw(resident, view, MemoryPlan(0, resident.count, 0))
-        made = OpenCLImages(picture, images)
+        picture = self._draw(resident, view, MemoryPlan(0, resident.count, 0))
+        made = self._images(view, Drawn.of(picture))
         return {
             "keys": picture.read("keys", np.uint32, (resident.count,)),
             "starts": picture.read("starts", np.uint32, (picture.tiles + 1,)),

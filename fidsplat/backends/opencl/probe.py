@@ -163,7 +163,7 @@ class OpenCLProbe:
         given = {"starts": starts}
         if pipeline.shape.lists == "tiled":
             kernel, place = "tile_starts", 1
-            given |= {"tiles": len(lengths), "capacity": 2**32 - 1, "counts": sums}
+            given |= {"tiles": len(lengths), "capacity": 2**32 - 1, "clear": 0, "counts": sums}
             tallies = buffer_of(workspace, np.concatenate([np.zeros(8, np.uint32), lengths]))
             given |= {"tallies": tallies, "cursors": buffer_of(workspace, lengths)}
         else:
@@ -175,7 +175,7 @@ class OpenCLProbe:
                 "slot": 4,
             }
         arguments = pipeline.source.arguments[kernel]
-        pipeline.program.launch(kernel, items, items, [given[one.name] for one in arguments])
+        pipeline.program.launch(workspace.queue, kernel, items, items, [given[one.name] for one in arguments])
         places = contents(workspace, starts).view(np.uint32)
         words = contents(workspace, sums).view(np.uint32)
         return places, int(words[place]) | int(words[place + 1]) << 32

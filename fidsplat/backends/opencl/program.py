@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import sqlite3
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import pyopencl as cl
@@ -13,7 +13,7 @@ import pyopencl as cl
 from fidsplat.backends.caches import pocl_folder
 from fidsplat.backends.opencl.assemble import Source, kernel_text, with_scalars
 from fidsplat.backends.opencl.pocl_target import correct_target, needs_correction
-from fidsplat.backends.opencl.workspace import DeviceBuffer, Workspace
+from fidsplat.backends.opencl.workspace import Workspace, token_of
 from fidsplat.errors import DeviceError
 
 
@@ -64,7 +64,6 @@ class Program:
 
     def __init__(self, workspace: Workspace, source: Source) -> None:
         self.source = source
-        self._queue = workspace.queue
         self._kernels = _kernels_of(workspace, source)
         self._types = {
             kernel: [None if one.access else source.scalars.dtype(one.ctype).type for one in arguments]
@@ -78,7 +77,12 @@ class Program:
         return self._kernels
 
     def launch(
-        self, name: str, size: tuple[int, ...], group: tuple[int, ...], values: Sequence[Any]
+        self,
+        queue: cl.CommandQueue,
+        name: str,
+        size: tuple[int, ...],
+        group: tuple[int, ...],
+        values: Sequence[Any],
     ) -> cl.Event:
         """Launches a kernel with buffers and numbers in the order of its arguments.
 
@@ -92,13 +96,32 @@ class Program:
         for index, (value, scalar) in enumerate(zip(values, types, strict=True)):
             if scalar is not None:
                 mark: object = value
-            else:  # part of a buffer is made anew for each launch
-                mark = value.token if type(value) is DeviceBuffer else object()
+            else:
+                mark = token_of(value)
             if mark is not bound[index] and (type(mark) is not type(bound[index]) or mark != bound[index]):
-                kernel.set_arg(index, value if scalar is None else scalar(value))
+                put_argument(kernel, index, value, scalar)
                 bound[index] = mark
         self._bound[name] = bound
-        return cl.enqueue_nd_range_kernel(self._queue, kernel, size, group)
+        return cl.enqueue_nd_range_kernel(queue, kernel, size, group)
+
+    def bound(self, name: str, values: Sequence[Any]) -> cl.Kernel:
+        """A kernel of one's own whose arguments are these, and stay so."""
+        kernel = cl.Kernel(self._kernels[name].program, name)
+        for index, (value, scalar) in enumerate(zip(values, self._types[name], strict=True)):
+            put_argument(kernel, index, value, scalar)
+        return kernel
+
+    def type_of(self, name: str, index: int) -> Callable[[Any], Any] | None:
+        """The NumPy type of a kernel's argument; None for a buffer."""
+        return self._types[name][index]
+
+
+def put_argument(kernel: cl.Kernel, index: int, value: Any, scalar: Callable[[Any], Any] | None) -> None:
+    """Sets an argument: a buffer, or a number of a type."""
+    if scalar is None:
+        kernel.set_arg(index, value)
+    else:  # as set_arg, which takes 20 times as long to find out that it is a number
+        kernel._set_arg_buf(index, scalar(value))  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _kernels_of(workspace: Workspace, source: Source) -> dict[str, cl.Kernel]:

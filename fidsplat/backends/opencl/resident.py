@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -48,6 +49,10 @@ class Resident:
         elif cloud.sh is not None:  # always: a cloud has one of the two
             self._arrays["sh"] = cloud.sh
         self._buffers: dict[str, cl.Buffer] = {}
+        self.kept: dict[Hashable, Any] = {}
+        """what is kept of pictures that were drawn of it, by their kind"""
+        self.fixed = True
+        """whether its arrays stay as they are; a picture of others cannot be drawn again later"""
         total = self.count * self._bytes_of(self._arrays)
         widest = max(array.nbytes for array in self._arrays.values())
         device = workspace.device

@@ -4,6 +4,7 @@ how much memory a picture may take.
 
 from __future__ import annotations
 
+import threading
 import weakref
 from collections.abc import Collection, Hashable
 from typing import Any
@@ -29,6 +30,11 @@ class DeviceBuffer(cl.Buffer):
         self.token = object()
 
 
+def token_of(buffer: cl.Buffer) -> object:
+    """What tells a buffer from every other; a part of one is made anew each time."""
+    return buffer.token if type(buffer) is DeviceBuffer else object()
+
+
 class BufferPool:
     """Scratch buffers by name, kept from frame to frame and replaced only when one is too small."""
 
@@ -38,7 +44,10 @@ class BufferPool:
         self._buffers: dict[str, cl.Buffer] = {}
         self._contents: dict[str, weakref.ref[np.ndarray]] = {}
         self._spare: dict[str, list[cl.Buffer]] = {}
+        self._zeroed: set[str] = set()
         self._kind: Hashable = None
+        self.state = object()
+        """another object whenever a scratch buffer is replaced or let go"""
 
     def size(self, name: str) -> int:
         """Bytes of the scratch buffer of that name; 0 if there is none yet."""
@@ -74,30 +83,49 @@ class BufferPool:
             self.clear()
         self._kind = kind
 
+    def forget_zeros(self) -> None:
+        """After a failure: nobody knows what is left in buffers of zeros."""
+        self._zeroed.clear()
+        self.state = object()
+
     def clear(self) -> None:
         """Lets go of all that it holds."""
         self._spare.clear()
         self._buffers.clear()
         self._contents.clear()
+        self._zeroed.clear()
+        self.state = object()
 
-    def holding(self, name: str, array: np.ndarray) -> cl.Buffer | None:
-        """The scratch buffer of that name, if what it has still is this array (`now_holds`)."""
+    def put(self, queue: cl.CommandQueue, name: str, array: np.ndarray) -> tuple[cl.Buffer, cl.Event | None]:
+        """A scratch buffer with these contents, and the event of the copy; does not wait. What was put there
+        last and nobody can change (a panorama) is not copied again."""
         content = self._contents.get(name)
-        return self._buffers[name] if content is not None and content() is array else None
-
-    def now_holds(self, name: str, array: np.ndarray) -> None:
-        """Remembers that the scratch buffer of that name has this array, if the array stays as it is."""
+        if content is not None and content() is array:
+            return self._buffers[name], None
+        buffer = self.scratch(name, array.nbytes)
+        event = cl.enqueue_copy(queue, buffer, array, is_blocking=False)
         if not array.flags.writeable and array.flags.owndata:
             self._contents[name] = weakref.ref(array)
+        return buffer, event
 
     def scratch(self, name: str, size: int) -> cl.Buffer:
         """A buffer of at least `size` bytes whose content is undefined."""
         self._contents.pop(name, None)
+        self._zeroed.discard(name)
         held = self._buffers.get(name)
         if held is None or held.size < size:
             self._buffers.pop(name, None)
+            self.state = object()
             held = self._buffers[name] = self.fresh(name, size)
         return held
+
+    def zeroed(self, name: str, size: int, queue: cl.CommandQueue) -> cl.Buffer:
+        """A scratch buffer of zeros, for somebody who leaves zeros there."""
+        if name not in self._zeroed or self._buffers[name].size < size:
+            buffer = self.scratch(name, size)
+            cl.enqueue_fill_buffer(queue, buffer, np.zeros(1, np.uint32), 0, buffer.size)
+            self._zeroed.add(name)
+        return self._buffers[name]
 
     def fresh(self, name: str, size: int) -> cl.Buffer:
         """A buffer that nobody else holds.
@@ -126,9 +154,23 @@ class Workspace:
         self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
         self.side_queue = cl.CommandQueue(self.context)
         """for what the host reads while the stages run"""
+        self.repeat_queue = cl.CommandQueue(self.context)
+        """for pictures that were drawn before: without times, a launch takes the host a third less"""
+        self._last = self.queue
+        self.lock = threading.RLock()
+        """held while a picture is put on a queue: scratch buffers and arguments belong to one at a time"""
         self.pool = BufferPool(self.context, device)
         self.ray_buffers = RayBuffers(self)
         self.limit_memory(info.memory_bytes * 9 // 10)
+
+    def turn_to(self, queue: cl.CommandQueue) -> cl.CommandQueue:
+        """What is put on this queue from here on comes after all that was put on another."""
+        if queue is not self._last:
+            before = cl.enqueue_marker(self._last)
+            self._last.flush()
+            cl.enqueue_barrier(queue, wait_for=[before])
+            self._last = queue
+        return queue
 
     def limit_memory(self, budget: int) -> None:
         """Lets a picture and the cloud take at most `budget` bytes of the device.

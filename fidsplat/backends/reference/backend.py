@@ -13,10 +13,12 @@ import numpy as np
 from fidsplat.backends.base import DeviceInfo
 from fidsplat.backends.reference.blend import composite
 from fidsplat.backends.reference.culling import may_see
+from fidsplat.backends.reference.gradients import ReferenceGradients
 from fidsplat.backends.reference.resolve import resolve
 from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
 from fidsplat.effects import OUTPUTS, FeatureSet
+from fidsplat.effects.differentiable import check_differentiable
 from fidsplat.errors import InputError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
 
@@ -82,6 +84,11 @@ class ReferenceBackend:
     def pipeline(self, features: FeatureSet) -> ReferencePipeline:
         """Nothing to compile."""
         return ReferencePipeline(features)
+
+    def differentiate(self, features: FeatureSet) -> ReferenceGradients:
+        """As `Differentiates`."""
+        check_differentiable(features)
+        return ReferenceGradients(self.pipeline(features), features)
 
 
 class ReferenceCloud:

@@ -7,6 +7,7 @@ import numpy as np
 from fidsplat.backends.reference import error_bounds
 from fidsplat.backends.reference.fragments import fragments_of, shifted
 from fidsplat.backends.reference.layers import by_center, by_depth
+from fidsplat.backends.reference.opaque import surface_at
 from fidsplat.backends.reference.optics import ray_lengths
 from fidsplat.backends.reference.post import background_at
 from fidsplat.backends.reference.setup import Setup
@@ -24,9 +25,17 @@ def composite(
     """Samples (k,) at grid positions x, y against all splats: what blending leaves, before resolving."""
     f = fragments_of(s, view, x, y)
     span = error_bounds.span_of(s, view, f)
+    surface = None if view.layer is None else surface_at(view.layer, view, x, y)
+    if surface is not None:
+        span = surface.hide(s, f, span)
     stack = by_depth(s, f, span) if s.by_depth else by_center(s, f, span)
+    before, live, final = transmittance(stack.alpha, view.stop, s.exclusive)
+    if surface is not None:
+        stack = surface.behind(stack)
+        before = np.column_stack([before, final])
+        live = np.column_stack([live, surface.there])
+        final = np.where(surface.there, 0.0, final)
     alpha, z, span = stack.alpha, stack.z, stack.span
-    before, live, final = _transmittance(alpha, view.stop, s.exclusive)
     weight = np.where(live, before * alpha, 0.0)
     out = {
         "rgb": _sum(weight, stack.colors),
@@ -88,7 +97,7 @@ def _sum(weight: np.ndarray, values: np.ndarray) -> np.ndarray:
     return (weight[:, None, :] @ values)[:, 0]
 
 
-def _transmittance(
+def transmittance(
     alpha: np.ndarray, stop: float, exclusive: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Transmittance before each thing, which are drawn, and what is left at the end."""

@@ -69,8 +69,11 @@ class Resident:
         Raises:
             InputError: an array has the wrong shape or type, or lies on another device.
         """
-        arrays = {name: _adopted(name, value, pool) for name, value in given.items()}
+        arrays, ellipsoids = {name: _adopted(name, value, pool) for name, value in given.items()}, "none"
         count = arrays["means"].size
+        if count and arrays["scales"].dtype is load().vec3:
+            arrays |= _apart(arrays["scales"])
+            ellipsoids = "some"  # which are, the arrays say when a picture is drawn
         terms = 0
         if "sh" in arrays:
             arrays["colors"] = arrays.pop("sh")
@@ -87,7 +90,8 @@ class Resident:
             wanted = count * max(terms, 1) if name == "colors" else count
             if count and array.size != wanted:
                 raise InputError(f"{name} holds {array.size} elements, but {count} means need {wanted}")
-        return cls(arrays, count, origin, int(np.sqrt(terms)) - 1 if terms else -1)
+        sh_degree = int(np.sqrt(terms)) - 1 if terms else -1
+        return cls(arrays, count, origin, sh_degree, ellipsoids=ellipsoids)
 
 
 def _dtype(name: str) -> Any:
@@ -107,13 +111,28 @@ def _dtype(name: str) -> Any:
     }[name]
 
 
-def _uploaded(name: str, array: np.ndarray, pool: ArrayPool) -> Any:
+def _apart(scales: Any) -> dict[str, Any]:
+    """Scales and thickness, as the kernels read them, on the memory of an array of all three."""
     wp = load()
 
+    def part(first: int, dtype: Any) -> Any:
+        at = scales.ptr + first * wp.types.type_size_in_bytes(wp.float32)
+        shape, strides = scales.shape, scales.strides
+        view = wp.array(ptr=at, dtype=dtype, shape=shape, strides=strides, device=scales.device)
+        view._ref = scales  # which it must not outlive
+        return view
+
+    return {"scales": part(0, wp.vec2), "thickness": part(2, wp.float32)}
+
+
+def _uploaded(name: str, array: np.ndarray, pool: ArrayPool, dtype: Any = None) -> Any:
+    wp = load()
+
+    dtype = dtype or _dtype(name)
     if array.size == 0:
-        return pool.fresh(name, 1, _dtype(name))
+        return pool.fresh(name, 1, dtype)
     try:
-        return wp.array(np.ascontiguousarray(array), dtype=_dtype(name), device=pool.device).flatten()
+        return wp.array(np.ascontiguousarray(array), dtype=dtype, device=pool.device).flatten()
     except (RuntimeError, MemoryError) as error:
         size = array.nbytes / 2**20
         raise DeviceError(
@@ -121,19 +140,29 @@ def _uploaded(name: str, array: np.ndarray, pool: ArrayPool) -> Any:
         ) from error
 
 
+def _is_thick(scales: Any) -> bool:
+    """Whether an array of any kind has three scales for each splat."""
+    wp = load()
+    if isinstance(scales, wp.array) and scales.ndim == 1:
+        return wp.types.type_size(scales.dtype) == 3
+    shape = tuple(scales.shape) if hasattr(scales, "shape") else np.shape(scales)
+    return len(shape) > 1 and shape[-1] == 3
+
+
 def _adopted(name: str, value: Any, pool: ArrayPool) -> Any:
     """One array of elements as the kernels read them, on the memory of `value` wherever it can be."""
     wp = load()
 
-    dtype = _dtype(name)
+    dtype = wp.vec3 if name == "scales" and _is_thick(value) else _dtype(name)
     scalar, width = (wp.int32, 1) if dtype is wp.int32 else (wp.float32, wp.types.type_size(dtype))
     if not isinstance(value, wp.array) and not hasattr(value, "__dlpack__"):
         value = np.asarray(value)
     if isinstance(value, np.ndarray):
         typed = value.astype(np.int32 if dtype is wp.int32 else np.float32, copy=False)
         if width > 1 and (typed.ndim < 2 or typed.shape[-1] != width):
-            raise InputError(f"{name} has the shape {typed.shape}; its last axis must be {width}")
-        return _uploaded(name, typed, pool)
+            wanted = "2 or 3" if name == "scales" else width
+            raise InputError(f"{name} has the shape {typed.shape}; its last axis must be {wanted}")
+        return _uploaded(name, typed, pool, dtype)
     array: Any = value if isinstance(value, wp.array) else wp.from_dlpack(value)
     if array.device != pool.device:
         raise InputError(

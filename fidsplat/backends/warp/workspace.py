@@ -86,4 +86,4 @@ class Workspace:
 
 def nbytes(array: Any) -> int:
     """Bytes of a wp.array."""
-    return array.size * array.strides[0]
+    return array.size * load().types.type_size_in_bytes(array.dtype)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import date
@@ -15,8 +17,9 @@ from fidsplat.capture import Capture
 from fidsplat.errors import FidsplatError
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED
 from fidsplat.experiments.bench.model import Counts, roofline_ms
+from fidsplat.frame import Frame
 from fidsplat.quality import Quality
-from fidsplat.render import Frame, Renderer, ResidentCloud
+from fidsplat.render import Renderer, ResidentCloud
 from fidsplat.splats import SplatCloud
 from fidsplat.timing import Timer, take_turns
 
@@ -38,6 +41,8 @@ class Result:
     """with compilation, or with what a kernel cache leaves of it"""
     counts: dict[str, int] = field(default_factory=dict)
     """splats, visible, pairs as the frame tells, and fragments where the backend can count them"""
+    host_ms: list[float] = field(default_factory=list)
+    """of the same frames, the call alone, which returns while the device draws"""
     mean_rgb: float = 0.0
     memory_bytes: int | None = None
     """held on the device: cloud, scratch buffers and the finished picture"""
@@ -50,6 +55,11 @@ class Result:
         taken = self.timer.part_medians | {"frame": self.timer.median}
         least = self.rooflines | ({"frame": sum(self.rooflines.values())} if self.rooflines else {})
         return {name: taken[name] / least[name] for name in taken if least.get(name, 0.0) > 0}
+
+    @property
+    def host(self) -> float:
+        """Median milliseconds of the frames that count until the call returns, while the device draws."""
+        return float(np.median(self.host_ms[-len(self.timer.ms) :])) if self.host_ms else math.nan
 
     def as_dict(self) -> dict:
         """For JSON: one flat record."""
@@ -75,6 +85,7 @@ class Result:
             "quartiles_ms": [low, high],
             "fastest_ms": min(self.timer.ms),
             "first_frame_ms": self.first_frame_ms,
+            "host_ms": self.host,
             "stages_ms": self.timer.part_medians,
             "fastest_stages_ms": {stage: min(times) for stage, times in self.timer.parts.items()},
             **self.counts,
@@ -135,7 +146,7 @@ class SceneRun:
         self.camera = camera
         self.picture = np.zeros((camera.height, camera.width, 3), np.float32)
         """what was drawn, (h, w, 3)"""
-        timer = Timer(lambda: self.draw().timings, drops_out=True)  # reading the timings waits for the device
+        timer = Timer(self._whole, drops_out=True, parts=lambda frame: frame.timings)
         self.result = Result(scene, self.renderer.device, camera.width, camera.height, timer, rates)
         try:
             self.resident = self.renderer.upload(cloud)
@@ -147,6 +158,13 @@ class SceneRun:
     def draw(self) -> Frame:
         """One frame."""
         return self.renderer.render(self.resident, self.camera, quality=TIMED)
+
+    def _whole(self) -> Frame:
+        """One frame until the device is done."""
+        begun = time.perf_counter()
+        frame = self.draw()
+        self.result.host_ms.append(1e3 * (time.perf_counter() - begun))
+        return frame.wait()
 
     def _first(self) -> None:
         frame = self.draw()

@@ -26,7 +26,7 @@ EXACT = Quality(alpha_cutoff=1e-6, transmittance_stop=0.0, arithmetic="precise",
 SHARP = {"lowpass": "none", "samples": 3}
 """for markers: exact splats, the mean of 3 x 3 samples"""
 
-# knob -> (its values, in which kinds of scenes: r random and hard, m markers)
+# knob -> (its values, in which kinds of scenes: r random and hard, m markers, t of 3D Gaussians)
 _LADDERS: dict[str, tuple[tuple[Any, ...], str]] = {
     "alpha_cutoff": (
         (1e-6, 1e-5, 1e-4, 1 / 4096, 1 / 2048, 1 / 1024, 1 / 512, 2 / 255, math.exp(-4.5), 4 / 255),
@@ -36,6 +36,7 @@ _LADDERS: dict[str, tuple[tuple[Any, ...], str]] = {
     "opacity_ceiling": ((0.999, 0.99), "rm"),
     "stop_rule": (("exclusive",), "rm"),
     "order": (("pixel", "centre"), "rm"),
+    "ellipsoid": (("ewa_antialiased", "exact"), "t"),
     "lowpass": (("pixel", "none"), "rm"),
     "samples": ((2, 3), "rm"),
     "setup_precision": (("float32",), "rm"),
@@ -155,6 +156,13 @@ def points(
     if TOGETHER in chosen and not on_marker:
         found += _together(quick)
     return list({(point.knob, point.value): point for point in found}.values())
+
+
+def thick_points(knobs: Iterable[str]) -> list[Point]:
+    """The settings for scenes of 3D Gaussians: the ways of drawing them, the base's own first."""
+    chosen = tuple(knobs)
+    values = _LADDERS["ellipsoid"][0] if "ellipsoid" in chosen else ()
+    return [Point("base", "base", BASE), *(_turned("ellipsoid", value) for value in values)]
 
 
 def decode_points(knobs: Iterable[str], quick: bool = False) -> list[Point]:

@@ -12,8 +12,10 @@ import pandas as pd
 from fidsplat.experiments.charts import chart, label_points, plain_ticks
 from fidsplat.experiments.pages import fixed, number, percent, places, write_page
 from fidsplat.experiments.summary import Frame, Row, provenance
+from fidsplat.experiments.tradeoff.linear import ANGLES, DISTANCES
 from fidsplat.experiments.tradeoff.points import ALONE, MARKER_KNOB, PRESETS_KNOB, TOGETHER
-from fidsplat.experiments.tradeoff.scenes import HARD, RANDOM, is_marker
+from fidsplat.experiments.tradeoff.run import LINEAR
+from fidsplat.experiments.tradeoff.scenes import HARD, RANDOM, THICK
 from fidsplat.experiments.tradeoff.summary import TILT, Device, load
 
 INVISIBLE = 1 / 512
@@ -52,6 +54,12 @@ CONSTANTS = (
     Constant("**`fast`**: 2/255, T = 1/256, float32 set-up", "ours", PRESETS_KNOB, "fast"),
     Constant("**`standard`**: 1e-5, T = 1e-4, exponentials", "ours", PRESETS_KNOB, "standard"),
 )
+WAYS = {
+    ("base", "base"): "`ewa`: as 3DGS and gsplat",
+    ("ellipsoid", "ewa_antialiased"): "`ewa_antialiased`: as Mip-Splatting",
+    ("ellipsoid", "exact"): "`exact`",
+}
+"""points of the ways of drawing 3D Gaussians"""
 _LABELLED = {
     (PRESETS_KNOB, "gsplat"): "gsplat",
     (PRESETS_KNOB, "fast"): "fast",
@@ -100,6 +108,8 @@ def write_report(folders: Sequence[Path], out: Path) -> list[Path]:
             for device, name, scene in zip(devices, names, plotted, strict=True)
         ],
         "constants": constants_table(devices),
+        "ways": ways_table(devices),
+        "linear": linear_table(devices),
         "markers": markers_table(devices[0]),
         "choices": choices(devices),
         "standard": max((_worst(device, "standard") for device in devices), default=0.0),
@@ -184,6 +194,39 @@ def _verdict(device: Device, constant: Constant) -> str:
     return "no gain, invisible" if verdict == "trap" and point["maximum"] <= INVISIBLE / 2 else verdict
 
 
+def ways_table(devices: Sequence[Device]) -> Frame:
+    """What each way of drawing 3D Gaussians takes beside `ewa` on each device, and how far its picture is
+    from the Gaussians themselves; no column for what nobody measured."""
+    rows = []
+    for point_of, words in WAYS.items():
+        row = {"3D Gaussians": words}
+        for scene in THICK:
+            there = [(device, device.at(scene, *point_of)) for device in devices]
+            found = [(device, point) for device, point in there if point is not None]
+            row |= {f"time, {scene}, {device.kind}": percent(point["ratio"]) for device, point in found}
+            if found:
+                points = [point for _, point in found]
+                row[f"largest error, {scene}"] = number(max(point["maximum"] for point in points))
+                row[f"root mean square, {scene}"] = number(max(point["rmse"] for point in points))
+        if len(row) > 1:
+            rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def linear_table(devices: Sequence[Device]) -> Frame:
+    """What the linear image of EWA is wrong by, by distance and angle off the axis."""
+    rows: Frame = pd.concat([device.summary.rows for device in devices])
+    rows = rows[rows["what"] == LINEAR]
+    found = {(row["knob"], str(row["value"])): row["maximum"] for _, row in rows.iterrows()}
+    if not found:
+        return pd.DataFrame()
+    return pd.DataFrame(
+        {"distance, standard deviations": str(distance)}
+        | {f"{angle} degrees": number(found.get((f"{distance} sigma", str(angle)))) for angle in ANGLES}
+        for distance in DISTANCES
+    )
+
+
 def markers_table(device: Device) -> Frame:
     """What Gaussians of a marker give, drawn sharp: time, PSNR from the print, how far it is read."""
     view, rows = f"{MARKER}@{TILT}", []
@@ -251,9 +294,9 @@ def _worst(device: Device, preset: str) -> float:
 
 
 def _plain(device: Device) -> list[str]:
-    """Scenes that are no markers, the largest random one first."""
+    """Random scenes of disks, the largest first, and the hard cases."""
     order = [*reversed(RANDOM), HARD]
-    return sorted((s for s in device.scenes if not is_marker(s)), key=order.index)
+    return sorted((s for s in device.scenes if s in order), key=order.index)
 
 
 def _shared(devices: Sequence[Device]) -> str:

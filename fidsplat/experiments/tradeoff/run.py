@@ -13,7 +13,7 @@ from pathlib import Path
 from fidsplat.accuracy import TRUTH_CUTOFF
 from fidsplat.errors import FidsplatError
 from fidsplat.experiments.sweep import Key, Results, Sweep
-from fidsplat.experiments.tradeoff import compare, points, scenes
+from fidsplat.experiments.tradeoff import compare, linear, points, scenes
 from fidsplat.experiments.tradeoff.points import ALONE, BASE, MARKER_KNOB, PRESETS_KNOB
 from fidsplat.experiments.tradeoff.session import DEFINITION, FULL, QUICK, Session, time_point
 from fidsplat.files import writable_folder
@@ -24,7 +24,7 @@ from fidsplat.vision.readers import reader_versions
 
 NAME = "tradeoff"
 FILE = f"{NAME}.jsonl"
-POINT, DECODE, TRUTH = "point", "decode", "truth"
+POINT, DECODE, TRUTH, LINEAR = "point", "decode", "truth", "linear"
 IDEAL = "ideal"
 _EARLY = ("base", PRESETS_KNOB, ALONE, "alpha_cutoff", "transmittance_stop", MARKER_KNOB)
 _BATCH = 16
@@ -88,7 +88,9 @@ def all_points(names: tuple[str, ...], knobs: tuple[str, ...], quick: bool) -> l
         every = name not in scenes.FEW_KNOBS and not (marked and quick)
         for view in scenes.views_of(name):
             defined: set[tuple] = set()
-            for point in points.points(turned, marked, quick, every):
+            thick = name in scenes.THICK
+            settings = points.thick_points(turned) if thick else points.points(turned, marked, quick, every)
+            for point in settings:
                 if name == "r1m_1080p" and point.quality.samples > 2:
                     continue  # 18 million samples: minutes on a CPU for what the smaller scene shows too
                 tier = 0 if point.knob in _EARLY else 2
@@ -102,6 +104,12 @@ def all_points(names: tuple[str, ...], knobs: tuple[str, ...], quick: bool) -> l
             ideal = {"knob": IDEAL, "value": IDEAL, "quality": None}
             keys = [ideal, *(point.key() for point in points.decode_points(turned, quick))]
             found += [(1, {"what": DECODE, "scene": name, **key, "tilts": tilts}) for key in keys]
+    if "ellipsoid" in turned and set(scenes.THICK) & set(chosen):
+        found += [
+            (1, {"what": LINEAR, "scene": "ball", "knob": f"{distance} sigma", "value": str(degrees)})
+            for distance in linear.DISTANCES
+            for degrees in linear.ANGLES
+        ]
     return [key for _, key in sorted(found, key=lambda pair: pair[0])]
 
 
@@ -111,6 +119,9 @@ def _truth_key(view: str, definition: tuple) -> Key:
 
 def _begin(session: Session, key: Key, quick: bool) -> Callable[[], dict]:
     view = key["scene"]
+    if key["what"] == LINEAR:
+        distance, degrees = float(key["knob"].removesuffix(" sigma")), float(key["value"])
+        return lambda: {"maximum": linear.linear_error(distance, degrees)}
     if key["what"] == DECODE:
         quality = None if key["quality"] is None else points.quality_of(key["quality"])
         return compare.scan(session, view, quality, key["tilts"])

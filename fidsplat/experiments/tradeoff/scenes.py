@@ -1,4 +1,5 @@
-"""The scenes of `fidsplat tradeoff`: random ones, the hard cases, and markers at three tilts."""
+"""The scenes of `fidsplat tradeoff`: random ones, of 3D Gaussians too, the hard cases, and markers at three
+tilts."""
 
 from __future__ import annotations
 
@@ -17,12 +18,14 @@ from fidsplat.random_clouds import load_scene
 from fidsplat.splats import SplatCloud
 
 RANDOM = ("r100k_720p", "r1m_1080p")
+THICK = ("r100k_720p_3d", "r1m_1080p_3d")
+"""scenes of 3D Gaussians, which show what the ways of drawing them cost"""
 HARD = "hard"
 MARKERS = {"apriltag": "apriltag", "qr2": "small", "qr5": "medium", "qr10": "large", "qr22": "huge"}
 """name -> the category of the paper that marker 0 is taken of"""
 FEW_KNOBS = ("apriltag", "qr2", "qr5", "qr22")
 """markers that show how they are made; what every other knob does to markers qr10 shows"""
-NAMES = (*RANDOM, HARD, *MARKERS)
+NAMES = (*RANDOM, *THICK, HARD, *MARKERS)
 QUICK_NAMES = ("r100k_720p", HARD, "apriltag", "qr10")
 TILTS = (0, 60, 80)
 """degrees from the marker's normal"""

@@ -13,14 +13,16 @@ from fidsplat.backends.base import Measurable
 from fidsplat.capture import Capture
 from fidsplat.experiments.tradeoff.points import BASE
 from fidsplat.experiments.tradeoff.scenes import make
+from fidsplat.frame import Frame
 from fidsplat.quality import MarkerQuality, Quality
-from fidsplat.render import Frame, Renderer, ResidentCloud
+from fidsplat.render import Renderer, ResidentCloud
 from fidsplat.timing import frame_timer, quartiles, ratios, take_turns
 
 _SCENES, _TRUTHS = 12, 6
 """kept at a time"""
 DEFINITION = ("lowpass", "samples", "order")
-"""knobs that say what a picture is; the others say how well it is drawn"""
+"""knobs that say what a picture is; the others say how well it is drawn, and `ellipsoid` how near to 3D
+Gaussians themselves"""
 
 
 class Session:
@@ -55,9 +57,9 @@ class Session:
         return truth(self._reference, what, scene.capture.with_(quality=like))
 
     def definition(self, view: str, quality: Quality) -> Quality:
-        """The base with what `quality` says of the definition."""
+        """The base with what `quality` says of the definition, 3D Gaussians as they are."""
         asked = {name: getattr(quality, name) for name in DEFINITION}
-        return BASE.with_(**asked, marker=quality.marker)
+        return BASE.with_(**asked, ellipsoid="exact", marker=quality.marker)
 
     def full(self, view: str, quality: Quality) -> Quality:
         """The setting at which `truth` is drawn."""

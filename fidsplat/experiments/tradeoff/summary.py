@@ -16,7 +16,7 @@ from fidsplat.experiments.angles import largest, parse_tilts
 from fidsplat.experiments.summary import Frame, Row, Summary, join, read_summary, records_of, summarise
 from fidsplat.experiments.sweep import Record
 from fidsplat.experiments.tradeoff.points import KNOBS, PRESETS_KNOB, Point, preset
-from fidsplat.experiments.tradeoff.run import DECODE, NAME, POINT, TRUTH
+from fidsplat.experiments.tradeoff.run import DECODE, LINEAR, NAME, POINT, TRUTH
 from fidsplat.experiments.tradeoff.scenes import NAMES, is_marker, views_of
 from fidsplat.experiments.tradeoff.session import DEFINITION
 from fidsplat.quality import PRESETS
@@ -61,6 +61,8 @@ def rows_of(record: Record) -> Iterator[dict[str, Any]]:
     elif key["what"] == DECODE:
         row["read_to"] = largest(parse_tilts(key["tilts"]), found["read"])[1]
         row["amount"] = len(found["read"])
+    elif key["what"] == LINEAR:
+        row["maximum"] = found["maximum"]
     else:
         row |= {"value": ", ".join(str(key[name]) for name in DEFINITION), "maximum": found["maximum"]}
     yield row
@@ -76,7 +78,7 @@ def load(folders: Iterable[Path]) -> list[Device]:
     for folder in folders:
         by_device: dict[str, list[Record]] = {}
         for record in records_of(folder, NAME):
-            if record.key.get("what") not in (POINT, DECODE, TRUTH):
+            if record.key.get("what") not in (POINT, DECODE, TRUTH, LINEAR):
                 raise InputError(f"{folder} holds no results of fidsplat tradeoff; give folders that do")
             by_device.setdefault(record.run["device"], []).append(record)
         there = [summarise(records, rows_of, COLUMNS) for records in by_device.values()]

@@ -2,5 +2,6 @@
 // so their sums do not depend on the order of the additions.
 //@ list
     int tiles_x = (width + TILE_W - 1) / TILE_W;
+    tallies += number * (uint)(tiles_x * ((height + TILE_H - 1) / TILE_H));
     for (uint mask = window; mask != 0; mask &= mask - 1)
         atomic_inc(tallies + TALLIES + window_tile((uint2)(corner, mask), tiles_x));

@@ -19,3 +19,5 @@
             blended = max(blended, blended_raw[at]);
 //@ resolve_end
     blended_out[out] = blended;
+//@ layer_seen
+        seen.blended = 0;

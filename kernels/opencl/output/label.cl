@@ -34,3 +34,5 @@
             }
 //@ resolve_end
     label_out[out] = label;
+//@ layer_lane
+            OPAQUE(int, seen.label) = layer_label[at];

@@ -42,3 +42,5 @@
     normal_out[3 * out] = normal_x * normal_scale;
     normal_out[3 * out + 1] = normal_y * normal_scale;
     normal_out[3 * out + 2] = normal_z * normal_scale;
+//@ layer_seen
+        seen.nx = seen.ny = seen.nz = 0.0f;

@@ -34,3 +34,5 @@
             }
 //@ resolve_end
     splat_id_out[out] = splat_id;
+//@ layer_seen
+        seen.splat_id = -1;

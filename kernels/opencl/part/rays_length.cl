@@ -1,8 +1,8 @@
-// Length of the ray through a sample per unit of depth along z, of the ray that the lens gives it.
+// Length of the ray through a sample per unit of depth along z, of the ray that the lens gives it, whose z is 1.
 //@ functions
 static inline float length_of_ray(global const float *restrict rays, size_t plane, size_t at) {
-    float x = rays[at], y = rays[plane + at], z = rays[2 * plane + at];
-    float length = sqrt(FMA(x, x, FMA(y, y, z * z)));
+    float x = rays[at], y = rays[plane + at];
+    float length = sqrt(FMA(x, x, FMA(y, y, 1.0f)));
     return length == length ? length : 1.0f;   // where nothing is seen no depth is multiplied by it but 0
 }
 //@ fog_length

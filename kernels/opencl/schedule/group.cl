@@ -1,6 +1,6 @@
 // For GPUs: one work-group draws one tile, ROWS pixels of a column per work-item; splats are staged in local memory.
 // Barriers stand in loops whose bounds are the same for the whole group (numerics F5).
-// Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile.
+// Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile of each view.
 // Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 channels: r, g, b, transmittance) and the outputs' samples, whole tiles.
 #define GROUP (TILE_W * TILE_H / ROWS)
 // Neighbours in a group draw a block of BLOCK_W x BLOCK_H pixels, so that a splat that misses it costs it nothing.
@@ -24,7 +24,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
     const BlendConstants constants = {log_cut, ceiling, stop, filter};
     uint tile = band_first + get_group_id(0), item = get_local_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
-    int x0 = (int)(tile % (uint)tiles_x) * TILE_W, y0 = (int)(tile / (uint)tiles_x) * TILE_H;
+    uint number = tile / (uint)(tiles_x * tiles_y), here = tile - number * (uint)(tiles_x * tiles_y);
+    int x0 = (int)(here % (uint)tiles_x) * TILE_W, y0 = (int)(here / (uint)tiles_x) * TILE_H;
     uint block = item / 32;
     int px = x0 + (int)(block % (TILE_W / BLOCK_W) * BLOCK_W + item % BLOCK_W);
     int py = y0 + (int)(block / (TILE_W / BLOCK_W) * BLOCK_H + item % 32 / BLOCK_W * ROWS);
@@ -86,9 +87,9 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
     }
 //@@ pass_end
 
-    size_t stride = (size_t)tiles_x * TILE_W, plane = stride * tiles_y * TILE_H;
+    size_t stride = (size_t)tiles_x * TILE_W, top = (size_t)number * tiles_y * TILE_H;
     for (int row = 0; row < ROWS; row++) {
-        size_t at = (py + row) * stride + px;
+        size_t at = (top + py + row) * stride + px;
         Pixel *pixel = &pixels[row];
         PIXEL_STORE_BASE(pixel, raw, plane, at);
 //@@ store

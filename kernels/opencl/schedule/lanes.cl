@@ -1,5 +1,5 @@
 // For CPUs: one work-item draws one tile, a row of LANES pixels at a time; no barriers, no local memory.
-// Index space: one work-item (and work-group) per tile.
+// Index space: one work-item (and work-group) per tile of each view.
 // Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 channels: r, g, b, transmittance) and the outputs' samples, whole tiles.
 // Splats of a tile lie anywhere in memory; the ones to come are fetched ahead.
 #define AHEAD_SPLATS 8
@@ -10,7 +10,8 @@ kernel void blend(
     const BlendConstants constants = {log_cut, ceiling, stop, filter};
     uint tile = band_first + get_global_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
-    int x0 = (int)(tile % (uint)tiles_x) * TILE_W, y0 = (int)(tile / (uint)tiles_x) * TILE_H;
+    uint number = tile / (uint)(tiles_x * tiles_y), here = tile - number * (uint)(tiles_x * tiles_y);
+    int x0 = (int)(here % (uint)tiles_x) * TILE_W, y0 = (int)(here / (uint)tiles_x) * TILE_H;
 
     Pixel pixels[TILE_H];
     for (int row = 0; row < TILE_H; row++) pixel_start(&pixels[row]);
@@ -49,9 +50,9 @@ kernel void blend(
     }
 //@@ pass_end
 
-    size_t stride = (size_t)tiles_x * TILE_W, plane = stride * tiles_y * TILE_H;
+    size_t stride = (size_t)tiles_x * TILE_W, top = (size_t)number * tiles_y * TILE_H;
     for (int row = 0; row < TILE_H; row++) {
-        size_t at = (y0 + row) * stride + x0;
+        size_t at = (top + y0 + row) * stride + x0;
         Pixel *pixel = &pixels[row];
         PIXEL_STORE_BASE(pixel, raw, plane, at);
 //@@ store

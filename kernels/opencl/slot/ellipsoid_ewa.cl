@@ -3,7 +3,7 @@
 // rasterizer. What has that image is a disk that faces the camera: so nothing after the set-up knows of it.
 //@ lowpass_make
     if (THICK_HERE) {
-        if (!(pz >= near)) return;
+        if (!(pz >= near)) return;           // as below, where the disk has no depth: what follows is spared
         real sw = THICKNESS_HERE;
         real3_ c = {facet.x * sw, facet.y * sw, facet.z * sw}, across, down;    // the axes' images [samples]
         real per_x, per_y;                                           // samples per metre at the centre

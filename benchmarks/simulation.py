@@ -1,0 +1,112 @@
+"""Measures a camera in a simulator: tag truth against poses that are read, and environments a second.
+
+python benchmarks/simulation.py                       the two tables of docs/simulation.md
+python benchmarks/simulation.py --device opencl:nvidia --environments 4096 --json figures.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+import fidsplat as fs
+from fidsplat.files import atomic_write
+from fidsplat.provenance import run_facts
+from fidsplat.random_clouds import random_splats
+from fidsplat.rotations import rigid_matrix
+from fidsplat.scenes import PlacedMarker
+from fidsplat.sim import Rig
+from fidsplat.vision import read_back
+from fidsplat.vision.readback import Reading
+
+SIZE, DISTANCE = 0.16, 1.5
+"""metres: the tag's edge, and how far it is"""
+TILT = math.radians(50)
+"""of the tag, at most"""
+
+
+def tag_poses(count: int) -> np.ndarray:
+    """(count, 7) camera from tag: anywhere in a picture of 640 x 480 and 60 degrees, tilted by up to TILT."""
+    rng = np.random.default_rng(0)
+    across, down = rng.uniform(-0.45, 0.45, count), rng.uniform(-0.32, 0.32, count)
+    rays = np.stack([across, down, np.ones(count)], 1)
+    places = DISTANCE * rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    axes, angles = rng.normal(size=(count, 2)), rng.uniform(0, TILT, count)
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    turns = np.column_stack([np.cos(angles / 2), np.sin(angles / 2)[:, None] * axes, np.zeros(count)])
+    return np.concatenate([places, turns], 1)
+
+
+def readings(renderer: fs.Renderer, count: int) -> list[Reading]:
+    """A tag before the camera, read in every environment."""
+    camera = fs.Camera.look_at(640, 480, math.radians(60), (0, 0, 0), (0, 0, 1))
+    scene = fs.Scene(markers=(PlacedMarker(fs.marker("apriltag:36h11:5", size=SIZE)),), background=(0.5,) * 3)
+    rig = Rig(scene, {1: "tag"}, {"camera": camera}, renderer=renderer)
+    found = []
+    for pose in tag_poses(count):
+        pictures = rig.render({"tag": pose[None]})
+        found += read_back(pictures.of("camera").frame(0), pictures.scene("camera")).readings
+    return found
+
+
+def environments_a_second(renderer: fs.Renderer, count: int, side: int, splats: int, repeats: int) -> float:
+    """The median of steps in which every environment's tag has moved, rgb on the host."""
+    room = random_splats(splats, 3, depth=(2.0, 6.0), scale=(0.02, 0.2), across=1.5)
+    tag = PlacedMarker(fs.marker("apriltag:36h11:5", size=0.5), rigid_matrix((0, 0, 0)))
+    camera = fs.Camera.look_at(side, side, math.radians(60), (0, 0, 0), (0, 0, 1))
+    rig = Rig(fs.Scene((room.with_labels(0),), markers=(tag,)), {1: "tag"}, {"c": camera}, renderer=renderer)
+    rng, taken = np.random.default_rng(1), []
+    for _ in range(repeats + 1):
+        pose = np.tile([0, 0, DISTANCE, 1.0, 0, 0, 0], (count, 1))
+        pose[:, :2] += rng.uniform(-0.3, 0.3, (count, 2))
+        start = time.perf_counter()
+        _ = rig.render({"tag": pose})["rgb"]
+        taken.append(time.perf_counter() - start)
+    return count / float(np.median(taken[1:]))  # the first compiles
+
+
+def main() -> int:
+    """Measure, print, and keep."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--device", default=None)
+    parser.add_argument("--tags", type=int, default=50, help="poses of the tag")
+    parser.add_argument("--environments", type=int, default=64)
+    parser.add_argument("--side", type=int, default=128, help="pixels")
+    parser.add_argument("--splats", type=int, default=2000, help="of the room that environments share")
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--json", default=None, help="file for the figures")
+    asked = parser.parse_args()
+    renderer = fs.Renderer(asked.device)
+    read = [one for one in readings(renderer, asked.tags) if one.position_error is not None]
+    errors = np.array([(one.position_error, one.angle_error, one.corner_error) for one in read], float)
+    rate = environments_a_second(renderer, asked.environments, asked.side, asked.splats, asked.repeats)
+    facts = {
+        "run": run_facts(renderer.device.title, 0),
+        "tags": asked.tags,
+        "read": len(read),
+        "position_mm": (errors[:, 0] * 1e3).mean(),
+        "position_worst_mm": (errors[:, 0] * 1e3).max(),
+        "share_of_distance_percent": 100 * (errors[:, 0] / DISTANCE).mean(),
+        "angle_deg": np.degrees(errors[:, 1]).mean(),
+        "corners_px": errors[:, 2].mean(),
+        "environments": asked.environments,
+        "side": asked.side,
+        "splats": asked.splats,
+        "environments_a_second": rate,
+    }
+    if asked.json:
+        with atomic_write(Path(asked.json)) as stream:
+            stream.write(json.dumps(facts, indent=2, default=float).encode())
+    for name, value in facts.items():
+        print(f"{name}: {value:.4g}" if isinstance(value, float) else f"{name}: {value}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

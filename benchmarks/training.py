@@ -1,0 +1,88 @@
+"""What a training step costs: standard random scenes, their splats trained on pictures of other ones.
+
+    python benchmarks/training.py [SCENE ...] [--device opencl] [--degree 3] [--repeats 30] [--json FILE]
+
+A step is a picture, its loss, its derivatives and the optimiser, all splats included; none are made. It is
+timed on the clock, from the end of one step to that of the next, which waits for the loss: the median and the
+quartiles of the steps after ten that are not counted.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+from measuring import PROGRESS, facts, keep, options, show
+from rich.progress import track
+
+import fidsplat as fs
+from fidsplat.random_clouds import SCENES, load_scene
+from fidsplat.timing import quartiles
+from fidsplat.train import Dataset, Trainer, TrainingView
+from fidsplat.vision.images import to_uint8
+
+WARM = 10
+
+
+def trainer_of(name: str, renderer: fs.Renderer, degree: int, steps: int) -> Trainer:
+    """A trainer whose SH have their degree after a few steps, and that makes no splats."""
+    cloud, camera = load_scene(name)
+    other, _ = load_scene(name, seed=1)
+    aside = camera.world_to_camera.copy()
+    aside[0, 3] = 0.1
+    views = [
+        TrainingView(f"{i}", each, to_uint8(renderer.render(other, each)["rgb"]))
+        for i, each in enumerate((camera, replace(camera, world_to_camera=aside, position=None)))
+    ]
+    points = np.array([[0.0, 0.0, 8.0]])
+    dataset = Dataset(name, tuple(views), (), points, np.zeros((1, 3), np.uint8))
+    return Trainer(
+        dataset,
+        renderer,
+        start=cloud,
+        iterations=steps,
+        sh_degree=degree,
+        sh_every=1,
+        densify_until=0,
+        max_splats=len(cloud),
+    )
+
+
+def measure(name: str, renderer: fs.Renderer, degree: int, repeats: int) -> dict:
+    """Milliseconds of a step."""
+    trainer = trainer_of(name, renderer, degree, WARM + repeats)
+    for _ in range(WARM):
+        trainer.step()
+    times, last = [], time.perf_counter()
+    for _ in track(range(repeats), description=name, console=PROGRESS, transient=True):
+        trainer.step()
+        now = time.perf_counter()
+        times.append((now - last) * 1e3)
+        last = now
+    low, middle, high = quartiles(times)
+    return {"scene": name, "degree": degree, "step_ms": middle, "quartiles_ms": [low, high]}
+
+
+def main() -> None:
+    parser = options(__doc__, repeats=30)
+    disks = [name for name, scene in SCENES.items() if not scene.thick]
+    parser.add_argument("scenes", nargs="*", metavar="SCENE", help=f"of {', '.join(disks)}")
+    parser.add_argument("--degree", type=int, default=3, help="of the SH, 0 to 3 (default: 3)")
+    given = parser.parse_args()
+    renderer = fs.Renderer(given.device)
+    found = [
+        measure(name, renderer, given.degree, given.repeats) | facts(renderer)
+        for name in given.scenes or ["r100k_720p"]
+    ]
+    if keep(found, given.json):
+        return
+    rows = [
+        (one["scene"], f"{one['step_ms']:.1f}", " to ".join(f"{ms:.1f}" for ms in one["quartiles_ms"]))
+        for one in found
+    ]
+    show(f"{renderer.device.title}, SH degree {given.degree}", ("scene", "step [ms]", "quartiles"), rows)
+
+
+if __name__ == "__main__":
+    main()

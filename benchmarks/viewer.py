@@ -1,0 +1,108 @@
+"""How fast the viewer draws while one looks around: pictures a second, their size, and the time from a new
+viewpoint to its JPEG.
+
+Random splats, as `fidsplat bench` has them, are looked at by a browser that is none: it turns its view as
+soon as it has a picture, and takes the JPEG that a page would get.
+
+    PYTHONPATH=. python benchmarks/viewer.py
+    PYTHONPATH=. python benchmarks/viewer.py --device opencl:nvidia --splats 1000000 --size 1920 1080
+"""
+
+import argparse
+import math
+import time
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+import fidsplat as fs
+from fidsplat.random_clouds import SCENES, random_cloud, standard_camera
+from fidsplat.rotations import matrix_to_quaternion
+from fidsplat.viewer.server import JPEG
+from fidsplat.viewer.session import Session
+from fidsplat.viewer.settings import AT_REST, Viewpoint
+from fidsplat.viewer.stream import Stream
+from fidsplat.vision.images import to_uint8
+
+STEP = 0.01
+"""radians of the orbit from picture to picture"""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--device")
+    parser.add_argument("--splats", type=int, default=150_000)
+    parser.add_argument("--size", type=int, nargs=2, default=(1280, 720), metavar=("W", "H"))
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--rate", type=float, nargs="+", default=[15.0, 30.0])
+    words = parser.parse_args()
+    width, height = words.size
+    camera = standard_camera(width, height)
+    scene = fs.Scene([random_cloud(words.splats, SCENES["r100k_720p"].median_scale)], camera=camera)
+    session = Session(scene, words.device)
+    pose = np.linalg.inv(camera.world_to_camera)
+    start = Viewpoint(
+        tuple(pose[:3, 3].tolist()),
+        tuple(matrix_to_quaternion(pose[:3, :3]).tolist()),
+        2 * math.atan(height / 2 / camera.fy),
+        width,
+        height,
+    )
+    title = session.drawn.renderer.device.title
+    print(f"{words.splats:,} splats, {width} x {height}, {title}")
+    print("| aim | pictures a second | scale | drag to JPEG, median | 95 % | JPEG | exact picture |")
+    print("|---|---|---|---|---|---|---|")
+    for rate in words.rate:
+        print(measured(session, start, rate, words.seconds))
+    session.close()
+
+
+def measured(session: Session, start: Viewpoint, rate: float, seconds: float) -> str:
+    """A row of the table."""
+    latencies, sizes, scales, asked = [], [], [], 0.0
+
+    def moving(viewpoint: Viewpoint, scale: float) -> None:
+        rgb = to_uint8(session.draw(viewpoint, scale).frame["rgb"])
+        sizes.append(len(cv2.imencode(".jpg", rgb, [cv2.IMWRITE_JPEG_QUALITY, JPEG])[1]))
+        scales.append(scale)
+        latencies.append(time.perf_counter() - asked)
+
+    def rest(viewpoint: Viewpoint) -> None:
+        cv2.imencode(".png", to_uint8(session.draw(viewpoint, 1.0, AT_REST).frame["rgb"]))
+
+    stream = Stream(moving, rest, rate=rate)
+    for warm in range(10):  # the scale finds its place
+        stream.look(turned(start, -STEP * (warm + 1)))
+        asked = time.perf_counter()
+        stream.step()
+    del latencies[:], sizes[:], scales[:]
+    begun = time.perf_counter()
+    while time.perf_counter() - begun < seconds:
+        stream.look(turned(start, STEP * len(latencies)))
+        asked = time.perf_counter()
+        stream.step()
+    fps = len(latencies) / (time.perf_counter() - begun)
+    begun = time.perf_counter()
+    rest(start)
+    exact = time.perf_counter() - begun
+    middle, late = 1e3 * np.percentile(latencies, (50, 95))
+    return (
+        f"| {rate:g} | {fps:.1f} | {np.median(scales):.2f} | {middle:.0f} ms | {late:.0f} ms "
+        f"| {np.median(sizes) / 1e3:.0f} kB | {1e3 * exact:.0f} ms |"
+    )
+
+
+def turned(start: Viewpoint, angle: float) -> Viewpoint:
+    """The viewpoint after turning by an angle about the page's vertical."""
+    turn = np.eye(3)
+    turn[0, 0] = turn[2, 2] = math.cos(angle)
+    turn[0, 2], turn[2, 0] = math.sin(angle), -math.sin(angle)
+    rotation = start.pose[:3, :3] @ turn
+    return replace(start, quaternion=tuple(matrix_to_quaternion(rotation).tolist()))
+
+
+if __name__ == "__main__":
+    main()

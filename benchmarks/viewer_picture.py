@@ -1,0 +1,46 @@
+"""The picture of the viewer in docs/viewer.md: the demo's scene in a headless Chromium.
+
+fidsplat demo && PYTHONPATH=.:tools python benchmarks/viewer_picture.py fidsplat-demo/scene.toml docs/images/viewer.jpg
+"""  # noqa: E501
+
+import sys
+import time
+from pathlib import Path
+
+import chromium
+import cv2
+
+import fidsplat as fs
+from fidsplat.viewer.server import Viewer
+
+CLOSE = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(button => button.click())"
+
+
+def main(source: str, out: str) -> None:
+    """The page at rest, turned a little, with the errors of what was read."""
+    viewer = Viewer(fs.Scene.load(source), Path(source), port=0)
+    with chromium.Page(viewer.address, 1160, 640) as page:
+        rests(viewer)
+        page.drag((420.0, 500.0), (480.0, 490.0))
+        page.evaluate(CLOSE)
+        time.sleep(1.0)
+        rests(viewer)
+        viewer.read(next(iter(viewer.server.get_clients().values())))
+        page.evaluate(
+            "document.querySelectorAll('.mantine-ScrollArea-viewport').forEach(e => e.scrollTo(0, 9999))"
+        )
+        time.sleep(1.0)
+        cv2.imwrite(out, page.picture()[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
+    viewer.close()
+
+
+def rests(viewer: Viewer) -> None:
+    """Wait until the picture at rest has been sent and shown."""
+    before = None
+    while not viewer._views or before is not next(iter(viewer._views.values())):
+        before = next(iter(viewer._views.values()), None)
+        time.sleep(2.0)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,25 @@
+"""What backends that have derivatives share: the checks of what they are given."""
+
+from __future__ import annotations
+
+from fidsplat.backends.view import View
+from fidsplat.effects import OUTPUTS
+from fidsplat.errors import InputError
+
+NOT_THE_LAST = (
+    "backward takes the images that forward has made last on this device; call it before the next picture"
+)
+
+
+def gradient_shape(name: str, view: View) -> tuple[int, ...]:
+    """The shape of an output's gradient: that of its image."""
+    channels = OUTPUTS[name].channels
+    return (view.height, view.width) if channels == 1 else (view.height, view.width, channels)
+
+
+def check_shape(name: str, given: tuple[int, ...], view: View) -> None:
+    """Raises InputError unless a gradient has its output's shape."""
+    if tuple(given) != gradient_shape(name, view):
+        raise InputError(
+            f"the gradient of {name} has the shape {tuple(given)}; it must be {gradient_shape(name, view)}"
+        )

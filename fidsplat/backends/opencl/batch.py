@@ -1,0 +1,139 @@
+"""Many views of one cloud on an OpenCL device: parts of as many as memory holds, each one submission."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+from fidsplat.backends.blank import blank
+from fidsplat.backends.opencl.images import Drawn
+from fidsplat.backends.opencl.workspace import Workspace
+from fidsplat.backends.stack import ViewBatch
+from fidsplat.effects.catalogue import Output
+from fidsplat.errors import DeviceError
+
+_MOST = {"cpu": 1 << 28}
+"""bytes that the views of a part take together, beside their images: more is no faster"""
+_MOST_OTHERS = 1 << 31
+_MOST_SAMPLES = 1 << 30
+"""of all views of a part; kernels number them in 32 bits, several channels of them"""
+
+
+class OutputBuffers:
+    """The output images of all views of a batch, (views, h, w, channels) each."""
+
+    def __init__(self, workspace: Workspace, outputs: tuple[Output, ...], batch: ViewBatch) -> None:
+        """
+        Raises:
+            DeviceError: they take more than the memory budget.
+        """
+        self.outputs = {output.name: output for output in outputs}
+        views, size = batch.total, batch.size
+        self.views, self.size = views, size
+        bytes_of = {one.name: 4 * views * size[0] * size[1] * one.channels for one in outputs}
+        self.nbytes = sum(bytes_of.values())
+        if self.nbytes > workspace.memory_budget:
+            raise DeviceError(
+                f"the images of {views} views take {self.nbytes / 2**20:.0f} MiB, more than the memory "
+                f"budget of {workspace.memory_budget / 2**20:.0f} MiB; draw fewer views or outputs at once"
+            )
+        lease = workspace.pool.lease
+        self.leased = [
+            (f"{name} of views", lease(f"{name} of views", size)) for name, size in bytes_of.items()
+        ]
+        for (_, buffer), output in zip(self.leased, outputs, strict=True):
+            if len(batch.slots) < views:
+                pattern = np.full(1, blank(output.name), output.dtype)
+                cl.enqueue_fill_buffer(workspace.queue, buffer, pattern, 0, bytes_of[output.name])
+
+    def held(self) -> dict[str, cl.Buffer]:
+        """By the names of the kernels' arguments."""
+        return {f"{name.removesuffix(' of views')}_out": buffer for name, buffer in self.leased}
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Of an image of one view."""
+        channels = self.outputs[name].channels
+        return self.size if channels == 1 else (*self.size, channels)
+
+
+def parts(views: int, each: int, samples: int, kind: str, free: int) -> Iterator[tuple[int, int]]:
+    """Ranges of views (first, end) that are drawn together.
+
+    Args:
+        each: bytes that a view takes. samples: of a view. kind: of the device. free: bytes that there are.
+    """
+    room = min(free, _MOST.get(kind, _MOST_OTHERS)) // each
+    together = max(1, min(room, _MOST_SAMPLES // samples))
+    # of equal size, so that they take buffers of one size
+    count = -(-views // together)
+    cuts = [views * k // count for k in range(count + 1)]
+    return pairwise(cuts)
+
+
+class OpenCLBatch:
+    """Finished images of many views on the device."""
+
+    def __init__(self, workspace: Workspace, buffers: OutputBuffers, drawn: list[Drawn], splats: int) -> None:
+        self._workspace, self._buffers, self._drawn, self._splats = workspace, buffers, drawn, splats
+        self.views = buffers.views
+        leased = [*buffers.leased, *(each for one in drawn for each in one.leased)]
+        weakref.finalize(self, workspace.pool.give_back, leased)
+
+    def read(self, name: str) -> np.ndarray:
+        """(views, h, w) or (views, h, w, channels); waits for the device."""
+        shape = self.views, *self._buffers.shape(name)
+        return self._read(name, np.empty(shape, self._buffers.outputs[name].dtype), 0)
+
+    def read_one(self, name: str, number: int) -> np.ndarray:
+        """The image of one view."""
+        image = np.empty(self._buffers.shape(name), self._buffers.outputs[name].dtype)
+        return self._read(name, image, number * image.nbytes)
+
+    def _read(self, name: str, image: np.ndarray, offset: int) -> np.ndarray:
+        try:
+            buffer = self._buffers.held()[f"{name}_out"]
+            cl.enqueue_copy(self._workspace.queue, image, buffer, src_offset=offset)
+        except cl.Error as error:
+            raise DeviceError(f"{self._workspace.info.title} failed while drawing {name}: {error}") from error
+        return image
+
+    def device_array(self, name: str) -> Any:
+        """The images as a pyopencl.array.Array (views, h, w) or (views, h, w, channels); no copy."""
+        from pyopencl.array import Array
+
+        buffers = self._buffers
+        shape, dtype = (self.views, *buffers.shape(name)), np.dtype(buffers.outputs[name].dtype)
+        array = Array(self._workspace.queue, shape, dtype, data=buffers.held()[f"{name}_out"])
+        # the buffer is not given to another batch while the array lives
+        array.batch = self  # pyright: ignore[reportAttributeAccessIssue]
+        return array
+
+    def wait(self) -> None:
+        """Until the device has drawn all views."""
+        self._workspace.queue.finish()
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds by stage, of all views together."""
+        return _added([one.timings() for one in self._drawn])
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        return (
+            {"visible": 0, "pairs": 0}
+            | _added([one.stats() for one in self._drawn])
+            | {"splats": self._splats}
+        )
+
+
+def _added(counts: list[dict[str, Any]]) -> dict[str, Any]:
+    sums: dict[str, Any] = {}
+    for each in counts:
+        for name, value in each.items():
+            sums[name] = sums.get(name, 0) + value
+    return sums

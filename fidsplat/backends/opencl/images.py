@@ -1,0 +1,150 @@
+"""Output images on an OpenCL device."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+from fidsplat.backends.opencl.lists import fullness_of, read_counts, stats_of
+from fidsplat.backends.opencl.picture import Picture
+from fidsplat.backends.opencl.resident import Resident
+from fidsplat.backends.opencl.workspace import Workspace
+from fidsplat.backends.view import View
+from fidsplat.effects.catalogue import Output
+from fidsplat.errors import DeviceError
+
+
+@dataclass
+class Drawn:
+    """A picture on a queue. Not the `Picture` itself, which holds the cloud and all scratch buffers."""
+
+    queue: cl.CommandQueue
+    leased: list[tuple[str, cl.Buffer]]
+    """what is the picture's own, by name: output images and, of some ways of listing, counts"""
+    stats: Callable[[], dict[str, int]]
+    events: list[tuple[str, cl.Event]] | None = None
+    """of each launch, with its stage; None where nobody has taken the time"""
+    uploads: Any = None
+    """kept until the device has read them"""
+
+    @staticmethod
+    def of(picture: Picture) -> Drawn:
+        """What a picture leaves."""
+        return Drawn(picture.queue, picture.leased, picture.stats, picture.events, picture.uploads)
+
+    def buffer(self, name: str) -> cl.Buffer:
+        """A leased buffer."""
+        return dict(self.leased)[name]
+
+    def timings(self) -> dict[str, float]:
+        """Milliseconds by stage."""
+        self.queue.finish()
+        timings: dict[str, float] = {}
+        for stage, event in self.events or ():
+            timings[stage] = timings.get(stage, 0.0) + (event.profile.end - event.profile.start) * 1e-6
+        return timings
+
+
+class Repeat:
+    """A picture that was launched without asking whether there is room for all of it, and how to draw it with
+    more."""
+
+    def __init__(
+        self, draw: Callable[[Resident, View], Drawn], resident: Resident, view: View, big: int, pairs: int
+    ) -> None:
+        """draw: draws it anew, in events. big, pairs: for how many there is room."""
+        self._draw, self._view, self._room = draw, view, (big, pairs)
+        self._resident: Resident | None = resident
+        self._known = weakref.ref(resident)
+
+    def settled(self, drawn: Drawn) -> Drawn | None:
+        """Once it is drawn: the picture drawn again, if there was too little room."""
+        resident = self._resident
+        if resident is None:
+            return None
+        big, pairs = fullness_of(read_counts(drawn.queue, drawn.buffer("counts")))
+        again = None if big <= self._room[0] and pairs <= self._room[1] else self._draw(resident, self._view)
+        self._resident = None  # it is held no longer than it may be needed
+        return again
+
+    def timed(self) -> Drawn | None:
+        """The same picture, drawn once more to take the time; None if its cloud is gone."""
+        resident = self._known()
+        return None if resident is None else self._draw(resident, self._view)
+
+
+class OpenCLImages:
+    """The output images of one picture. Their buffers go back to the pool when nobody holds them any more."""
+
+    def __init__(
+        self,
+        workspace: Workspace,
+        outputs: tuple[Output, ...],
+        size: tuple[int, int],
+        drawn: Drawn,
+        repeat: Repeat | None = None,
+    ) -> None:
+        """size: rows and columns of pixels."""
+        self._workspace, self._size, self._drawn, self._repeat = workspace, size, drawn, repeat
+        self._outputs = {output.name: output for output in outputs}
+        self._leased = drawn.leased
+        weakref.finalize(self, workspace.pool.give_back, self._leased)
+
+    def read(self, name: str) -> np.ndarray:
+        """The image on the host; waits for the device.
+
+        Raises:
+            DeviceError: the device has failed, in this or while it was drawing.
+        """
+        output = self._outputs[name]
+        shape = self._size if output.channels == 1 else (*self._size, output.channels)
+        image = np.empty(shape, output.dtype)
+        try:
+            drawn = self.settle()
+            cl.enqueue_copy(drawn.queue, image, drawn.buffer(f"{name}_out"))
+        except cl.Error as error:
+            raise DeviceError(f"{self._workspace.info.title} failed while drawing {name}: {error}") from error
+        return image
+
+    def wait(self) -> None:
+        """Until the device has drawn it."""
+        self.settle().queue.finish()
+
+    @property
+    def timings(self) -> dict[str, float]:
+        """Milliseconds by stage. A picture that was launched again, by which nobody has taken the time, is
+        drawn once more for that."""
+        drawn = self.settle()
+        if drawn.events is None and self._repeat is not None:
+            with self._workspace.lock:
+                timed = self._repeat.timed()
+            if timed is None:
+                return {}
+            timings = timed.timings()
+            self._workspace.pool.give_back(timed.leased)
+            return timings
+        return drawn.timings()
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        return self.settle().stats()
+
+    def settle(self) -> Drawn:
+        """What is drawn, for certain with room for all of it."""
+        if self._repeat is not None:
+            with self._workspace.lock:
+                again = self._repeat.settled(self._drawn)
+                if again is not None:
+                    self._leased.extend(again.leased)  # given back together
+                    self._drawn = again
+        return self._drawn
+
+
+def stats_later(queue: cl.CommandQueue, counts: cl.Buffer, splats: int) -> Callable[[], dict[str, int]]:
+    """What a frame tells, read from a picture's buffer `counts` when it is wanted."""
+    return lambda: stats_of(splats, read_counts(queue, counts))

@@ -1,0 +1,220 @@
+"""The work of a training step around the picture, in kernels: no array of splats or pixels passes through the
+host."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyopencl as cl
+from pyopencl.array import Array
+
+from fidsplat.backends.opencl.program import Program
+from fidsplat.backends.opencl.training_source import MARGIN, MARGIN_ROWS, PLANES, training_source
+from fidsplat.backends.opencl.workspace import Workspace
+from fidsplat.cameras import Camera
+from fidsplat.errors import DeviceError
+
+_GROUP = 64
+_SUMS = 1024
+"""work-items that add up the loss"""
+
+
+class _Truth(NamedTuple):
+    """A view's picture on the device."""
+
+    picture: cl.Buffer
+    mask: cl.Buffer
+    masked: bool
+    counted: int
+    """values that matter"""
+
+
+class ResidentArrays:
+    """Splats in arrays of the device, as pictures read them: disks without labels and planes."""
+
+    has_planes, footprint, ellipsoids, planes = False, "gaussian", "none", None
+    streamed = False
+
+    def __init__(
+        self, buffers: Mapping[str, cl.Buffer], count: int, sh_degree: int, origin: np.ndarray
+    ) -> None:
+        self._buffers, self.count, self.origin = dict(buffers), count, origin
+        self.sh_degree = sh_degree
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes that the arrays hold."""
+        return sum(buffer.size for buffer in self._buffers.values())
+
+    def bytes_for(self, names: Any) -> tuple[int, int]:
+        """As `Resident.bytes_for`: all of them stay."""
+        return self.memory_bytes, 0
+
+    def part(self, name: str, first: int, end: int) -> cl.Buffer:
+        """The array of splats [first, end)."""
+        whole = self._buffers[name]
+        if end - first == self.count:
+            return whole
+        row = whole.size // self.count
+        return whole.get_sub_region(first * row, (end - first) * row)
+
+
+class OpenCLTraining:
+    """As `TrainingKernels`."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self._workspace, self._queue = workspace, workspace.queue
+        lanes = workspace.shape.lanes if workspace.shape.schedule == "lanes" else 1
+        self._lanes = lanes
+        self._program = Program(workspace, training_source(lanes, workspace.info.float64))
+        self._held: dict[str, Any] = {}
+        self._shapes: dict[str, tuple[int, ...]] = {}
+        self._count = 0
+        self._drawn: tuple[int, ResidentArrays] | None = None
+        self._truths: list[_Truth] = []
+        self._planes: tuple[tuple[int, int], cl.Buffer] | None = None
+
+    def take_views(self, views: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> None:
+        """As `TrainingKernels`."""
+        for picture, mask in views:
+            kept = np.zeros(1, np.uint8) if mask is None else mask.astype(np.uint8)
+            counted = picture.size if mask is None else max(1, 3 * int(kept.sum()))
+            buffers = self._put("a picture", picture), self._put("a mask", kept)
+            self._truths.append(_Truth(*buffers, mask is not None, counted))
+
+    def load(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """As `TrainingKernels`."""
+        self._count = len(arrays["means"])
+        for name, array in arrays.items():
+            self._held[name] = self._put(f"the splats' {name}", array)
+            self._shapes[name] = array.shape
+        self._drawn = None
+
+    def store(self) -> dict[str, np.ndarray]:
+        """As `TrainingKernels`."""
+        found = {}
+        for name, shape in self._shapes.items():
+            found[name] = np.empty(shape, np.float32)
+            cl.enqueue_copy(self._queue, found[name], self._held[name])
+        return found
+
+    def resident(self, degree: int, origin: np.ndarray) -> ResidentArrays:
+        """As `TrainingKernels`."""
+        if self._drawn is None or self._drawn[0] != degree:
+            count, drawn = self._count, (degree + 1) ** 2
+            for name, floats in (("quats", 4), ("scales", 2), ("opacities", 1), ("sh", 3 * drawn)):
+                size = 4 * count * floats
+                self._held[f"drawn_{name}"] = self._workspace.pool.fresh(f"the splats' {name}", size)
+            self._held |= {"drawn": drawn, "all": self._shapes["sh"][1], "plain": int(degree == 0)}
+            self._launch("activate", count)
+            self._launch("activate_sh", 3 * count * drawn)
+            buffers = {name: self._held[f"drawn_{name}"] for name in ("quats", "scales", "opacities")}
+            buffers["means"] = self._held["means"]
+            buffers["colors" if degree == 0 else "sh"] = self._held["drawn_sh"]
+            self._drawn = degree, ResidentArrays(buffers, count, degree, origin)
+        return self._drawn[1]
+
+    def loss(self, images: Any, view: int, dssim_weight: float) -> tuple[float, float, Any]:
+        """As `TrainingKernels`."""
+        image = images.device_array("rgb")
+        height, columns, _ = image.shape
+        truth = self._truths[view]
+        number, stride = truth.counted, self._stride(columns)
+        slope = Array(self._queue, image.shape, np.float32, data=self._scratch("by_rgb", 4 * image.size))
+        given = {
+            **{"rgb": image.data, "truth": truth.picture, "mask": truth.mask, "masked": int(truth.masked)},
+            **{"by_rgb": slope.data, "sums": self._scratch("loss sums", 12 * _SUMS)},
+            **{"l1_share": (1 - dssim_weight) / number, "ssim_share": dssim_weight / image.size},
+            **{"width": 3 * columns, "height": height, "stride": stride},
+            **{"planes": self._room_for_planes(height, columns)},
+            "plane": stride * (height + 2 * MARGIN_ROWS),
+        }
+        self._launch_rows("loss_take", 3 * columns, height, given)
+        for name in ("loss_rows", "loss_columns", "loss_rows_backward", "loss_columns_backward"):
+            self._launch_rows(name, -(-3 * columns // self._lanes), height, given)
+        self._launch("loss_sums", _SUMS, given)
+        sums = np.empty((_SUMS, 3), np.float32)
+        cl.enqueue_copy(self._queue, sums, given["sums"])
+        absolute, squared, similar = sums.sum(axis=0, dtype=np.float64)
+        value = (1 - dssim_weight) * absolute / number + dssim_weight * (1 - similar / image.size)
+        return float(value), float(squared / number), slope
+
+    def count(self, screen: Any, camera: Camera, origin: np.ndarray) -> None:
+        """As `TrainingKernels`."""
+        turn = camera.world_to_camera[:3, :3]
+        names = [f"turn_{i}{j}" for i in range(3) for j in range(3)]
+        given = dict(zip(names, turn.ravel().tolist(), strict=True))
+        move = turn @ (origin - camera.position)
+        given |= dict(zip(("move_x", "move_y", "move_z"), move.tolist(), strict=True))
+        given |= {"focal_x": camera.fx, "focal_y": camera.fy, "center_x": camera.cx, "center_y": camera.cy}
+        given |= {"near": camera.near, "width": camera.width, "height": camera.height}
+        self._launch("count_seen", self._count, given | {"screen": screen.data})
+
+    def step(
+        self, gradients: Mapping[str, Any], sizes: Mapping[str, float], numbers: Mapping[str, float]
+    ) -> None:
+        """As `TrainingKernels`."""
+        by_color = gradients["colors"] if "colors" in gradients else gradients["sh"]
+        given: dict[str, Any] = {
+            "by_means": gradients["means"].data,
+            "by_scales": gradients["scales"].data,
+            "by_quats": gradients["quats"].data,
+            "by_opacities": gradients["opacities"].data,
+            "by_sh": by_color.data,
+            **{f"size_{name}": size for name, size in sizes.items()},
+            **numbers,
+            "rest1": 1 - numbers["beta1"],
+            "rest2": 1 - numbers["beta2"],
+        }
+        self._launch("adam_shapes", self._count, given)
+        self._launch("adam_sh", 3 * self._count * self._held["drawn"], given)
+
+    def shake(self, size: float, steep: float, clear: float, words: Sequence[int]) -> None:
+        """As `TrainingKernels`."""
+        names = ("seed_low", "seed_high", "iteration", "purpose")
+        given = {"size": size, "steep": steep, "clear": clear, **dict(zip(names, words, strict=True))}
+        self._launch("shake", self._count, given)
+
+    def _launch(self, kernel: str, items: int, given: Mapping[str, Any] | None = None) -> None:
+        size = max(_GROUP, -(-items // _GROUP) * _GROUP)
+        self._enqueue(kernel, (size,), (_GROUP,), given or {})
+
+    def _launch_rows(self, kernel: str, items: int, rows: int, given: Mapping[str, Any]) -> None:
+        size = max(_GROUP, -(-items // _GROUP) * _GROUP)
+        self._enqueue(kernel, (size, rows), (_GROUP, 1), given)
+
+    def _enqueue(
+        self, kernel: str, size: tuple[int, ...], group: tuple[int, ...], given: Mapping[str, Any]
+    ) -> None:
+        every = {**self._held, "count": self._count, **given}
+        values = [every[one.name] for one in self._program.source.arguments[kernel]]
+        try:
+            self._program.launch(self._workspace.turn_to(self._queue), kernel, size, group, values)
+        except cl.Error as error:
+            raise DeviceError(f"{self._workspace.info.title} failed while training: {error}") from error
+
+    def _put(self, what: str, array: np.ndarray) -> cl.Buffer:
+        array = np.ascontiguousarray(array)
+        buffer = self._workspace.pool.fresh(what, array.nbytes)
+        if array.nbytes:
+            cl.enqueue_copy(self._queue, buffer, array)
+        return buffer
+
+    def _scratch(self, name: str, size: int) -> cl.Buffer:
+        return self._workspace.pool.scratch(f"training: {name}", size)
+
+    def _stride(self, columns: int) -> int:
+        return -(-3 * columns // self._lanes) * self._lanes + 2 * MARGIN
+
+    def _room_for_planes(self, height: int, columns: int) -> cl.Buffer:
+        """Planes for pictures of this size, all zeros at first: kernels leave the margins so."""
+        if self._planes is not None and self._planes[0] == (height, columns):
+            return self._planes[1]
+        size = 4 * PLANES * self._stride(columns) * (height + 2 * MARGIN_ROWS)
+        self._planes = None  # the old ones go first
+        buffer = self._workspace.pool.fresh("the loss's planes", size)
+        cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.float32), 0, size)
+        self._planes = (height, columns), buffer
+        return buffer

@@ -1,0 +1,94 @@
+"""The program `training`: its kernels' arguments, declared once for host and kernels, and its text."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from fidsplat.backends.opencl.assemble import Source, Text, kernel_text, with_scalars
+from fidsplat.backends.opencl.declare import Argument, Scalars, takes
+
+PLANES = 11
+"""of the loss (kernels/opencl/train/loss.cl)"""
+MARGIN, MARGIN_ROWS = 16, 5
+"""zeros around a plane, floats of a row and rows"""
+_FILES = ("prelude.cl", "math.cl", "train/loss.cl", "train/adam.cl", "train/shake.cl")
+
+_PICTURE = takes(
+    "int width height  // values of a row: three of a pixel; rows",
+    "int stride  // floats of a plane's row",
+    "uint plane  // floats of a plane",
+)
+_MASK = takes("int masked", "in uchar mask  // (rows, pixels), where `masked`")
+_PLANES = takes("out float planes")
+_ADAM = takes("float beta1 beta2 rest1 rest2 root epsilon")
+_DRAWN_SH = takes("uint count drawn all", "int plain")
+
+KERNELS: dict[str, tuple[Argument, ...]] = {
+    "loss_take": takes(_PICTURE, "in float rgb", "in uchar truth", _MASK, _PLANES),
+    "loss_rows": takes(_PICTURE, _PLANES),
+    "loss_columns": takes(_PICTURE, _PLANES),
+    "loss_rows_backward": takes(_PICTURE, _PLANES),
+    "loss_columns_backward": takes(
+        _PICTURE, "float l1_share ssim_share", _MASK, "in float planes", "out float by_rgb"
+    ),
+    "loss_sums": takes("uint plane", "in float planes", "out float sums  // (work-items, 3)"),
+    "activate": takes(
+        "uint count",
+        "in float quats log_scales logits",
+        "out float drawn_quats drawn_scales drawn_opacities",
+    ),
+    "activate_sh": takes(_DRAWN_SH, "in float sh", "out float drawn_sh"),
+    "adam_shapes": takes(
+        "uint count",
+        _ADAM,
+        "float size_means size_scales size_quats size_logits  // rates of this step",
+        "float scale_penalty opacity_penalty",
+        "in float by_means by_scales by_quats by_opacities",
+        "out float means first_means second_means",
+        "out float log_scales first_log_scales second_log_scales",
+        "out float quats first_quats second_quats",
+        "out float logits first_logits second_logits",
+        "out float drawn_quats drawn_scales drawn_opacities",
+    ),
+    "adam_sh": takes(
+        _DRAWN_SH,
+        _ADAM,
+        "float size_sh size_rest  // rates of this step, of degree 0 and above",
+        "in float by_sh",
+        "out float sh first_sh second_sh drawn_sh",
+    ),
+    "count_seen": takes(
+        "uint count",
+        "float turn_00 turn_01 turn_02 turn_10 turn_11 turn_12 turn_20 turn_21 turn_22",
+        "float move_x move_y move_z  // camera-space position of the means' zero [m]",
+        "float focal_x focal_y center_x center_y near width height",
+        "in float means drawn_scales screen",
+        "out float gradients seen",
+    ),
+    "shake": takes(
+        "uint count seed_low seed_high iteration purpose",
+        "float size  // metres times 1 / m^2 of the steps",
+        "float steep clear  // of the opacity beyond which splats stay where they are",
+        "in float quats log_scales logits",
+        "out float means",
+    ),
+}
+
+
+@cache
+def training_source(lanes: int, float64: bool) -> Source:
+    """The program for vectors of so many floats; sums are in float64 where the device has it."""
+    numbers = {"LANES": lanes, "FAST_FMA": 0, "SETUP_FP64": int(float64)}
+    head = "".join(f"#define {name} {value}\n" for name, value in numbers.items())
+    lines = "".join(map(kernel_text, _FILES)).split("\n")
+    text = with_scalars(head + "\n".join(map(_filled, lines)))
+    scalars = Scalars("double" if float64 else "float", "float")
+    return Source({"training": Text(text, text)}, {}, KERNELS, (), scalars)
+
+
+def _filled(line: str) -> str:
+    """A line, or what stands in place of a hook: a kernel's arguments, or nothing."""
+    if not line.startswith("//@@ "):
+        return line
+    hook, _, subject = line.removeprefix("//@@ ").partition(" ")
+    return ",\n".join(f"    {one.text}" for one in KERNELS[subject]) if hook == "arguments" else ""

@@ -1,0 +1,127 @@
+"""The reference's derivatives: of the picture in float64, its decisions as they were."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends.base import Images, Pipeline
+from fidsplat.backends.gradients import NOT_THE_LAST, check_shape, gradient_shape
+from fidsplat.backends.reference.gradients_blend import Blend, Decisions, Samples, decide
+from fidsplat.backends.reference.gradients_scene import Parameters, Placed, place, place_backward
+from fidsplat.backends.reference.setup import Setup
+from fidsplat.backends.view import View
+from fidsplat.effects import FeatureSet
+from fidsplat.effects.differentiable import check_gradients
+from fidsplat.errors import InputError
+
+_BLOCK = 1 << 16  # (sample, splat) pairs that are evaluated at once
+
+
+class ReferenceGradients:
+    """Pictures of the reference, and their derivatives."""
+
+    def __init__(self, pipeline: Pipeline, features: FeatureSet) -> None:
+        self._pipeline, self._features = pipeline, features
+        self._drawn: tuple[Images, FrozenPicture] | None = None
+
+    def forward(self, resident: Any, view: View) -> Images:
+        """As `DifferentiablePipeline`."""
+        images = self._pipeline.render(resident, view)
+        self._drawn = images, FrozenPicture(resident.cloud, view, self._features)
+        return images
+
+    def backward(self, images: Any, gradients: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        """As `DifferentiablePipeline`; float64."""
+        check_gradients(self._features, gradients)
+        if self._drawn is None or self._drawn[0] is not images:
+            raise InputError(NOT_THE_LAST)
+        picture = self._drawn[1]
+        return picture.backward({name: np.asarray(array, np.float64) for name, array in gradients.items()})
+
+
+class FrozenPicture:
+    """One picture as a function of what gradients are taken by, with its decisions as they were."""
+
+    def __init__(self, cloud: Any, view: View, features: FeatureSet) -> None:
+        self.parameters = Parameters.of(cloud, view)
+        self._view, self._features = view, features
+        self._setup = Setup(cloud, view, features)
+        self._blocks: list[tuple[np.ndarray, np.ndarray, Decisions]] = []
+        rows, columns = np.mgrid[0 : view.height, 0 : view.width]
+        x, y = columns.ravel() + 0.5, rows.ravel() + 0.5
+        step = max(1, _BLOCK // max(1, len(self._setup.order)))
+        for k in range(0, len(x), step):
+            at = x[k : k + step], y[k : k + step]
+            self._blocks.append((*at, decide(self._setup, view, *at)))
+
+    def images(self, parameters: Parameters) -> dict[str, np.ndarray]:
+        """The output images, float64, of other parameters."""
+        parts = [_images(blend.samples, made, parameters) for blend, made in self._blend(parameters)]
+        height, width = self._view.height, self._view.width
+        whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return {name: image.reshape(height, width, *image.shape[1:]) for name, image in whole.items()}
+
+    def backward(self, gradients: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Derivatives of a loss by the parameters, and `screen`, from those by the images."""
+        view, parameters = self._view, self.parameters
+        flat = {}
+        for name in ("rgb", "alpha", "depth", "normal"):
+            given = gradients[name] if name in gradients else np.zeros(gradient_shape(name, view))
+            check_shape(name, given.shape, view)
+            flat[name] = given.reshape(view.height * view.width, *given.shape[2:])
+        slopes, by_background, start = Placed.zeros(len(parameters.means)), np.zeros(3), 0
+        for blend, made in self._blend(parameters):
+            rows = slice(start, start + len(made.shown))
+            start = rows.stop
+            samples = blend.samples
+            here = {name: array[rows] for name, array in flat.items()}
+            by_background += samples.t @ here["rgb"]
+            found = blend.backward(_images_backward(here, samples, made, parameters))
+            for name, values in vars(found).items():
+                getattr(slopes, name)[...] += values
+        placed = place(parameters, view)
+        # as the 2DGS authors have it: the derivative by the centre's place in the picture, in half pictures
+        slope_x, slope_y = slopes.p[:, 0] / view.focal_x, slopes.p[:, 1] / view.focal_y
+        screen = 0.5 * placed.p[:, 2] * np.hypot(view.width * slope_x, view.height * slope_y)
+        return {
+            **place_backward(parameters, view, placed, slopes),
+            **{"background": by_background, "screen": screen},
+        }
+
+    def _blend(self, parameters: Parameters) -> Iterator[tuple[Blend, Decisions]]:
+        placed = place(parameters, self._view)
+        for x, y, made in self._blocks:
+            yield Blend(placed, self._view, made, x, y), made
+
+
+def _images(samples: Samples, made: Decisions, parameters: Parameters) -> dict[str, np.ndarray]:
+    """Pixels (k,) or (k, 3) from their samples."""
+    length = np.linalg.norm(samples.normal, axis=1)
+    seen = made.shown & (length > 0)
+    return {
+        "rgb": samples.rgb + samples.t[:, None] * parameters.background,
+        "alpha": 1 - samples.t,
+        "depth": np.where(made.shown, samples.depth / np.where(made.shown, samples.weight, 1), 0.0),
+        "normal": np.where(seen[:, None], samples.normal / np.where(seen, length, 1)[:, None], 0.0),
+    }
+
+
+def _images_backward(
+    by: Mapping[str, np.ndarray], samples: Samples, made: Decisions, parameters: Parameters
+) -> Samples:
+    """Derivatives of a loss by samples, from those by pixels."""
+    weight = np.where(made.shown, samples.weight, np.inf)
+    depth = np.where(made.shown, samples.depth / weight, 0.0)
+    length = np.linalg.norm(samples.normal, axis=1)
+    length = np.where(made.shown & (length > 0), length, np.inf)[:, None]
+    normal = samples.normal / length
+    return Samples(
+        rgb=by["rgb"],
+        t=by["rgb"] @ parameters.background - by["alpha"],
+        depth=by["depth"] / weight,
+        weight=-by["depth"] * depth / weight,
+        normal=(by["normal"] - normal * (normal * by["normal"]).sum(1, keepdims=True)) / length,
+    )

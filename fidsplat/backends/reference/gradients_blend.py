@@ -1,0 +1,187 @@
+"""Samples as functions of placed splats, with the picture's decisions as they were; and their derivatives.
+
+Where a ray meets a splat's plane is computed here from the ray and the plane's normal, not from the forms of
+the set-up, which devices have: so each finds the mistakes of the other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fidsplat.backends.reference.blend import transmittance
+from fidsplat.backends.reference.fragments import fragments_of
+from fidsplat.backends.reference.gradients_scene import Placed
+from fidsplat.backends.reference.optics import rays_of
+from fidsplat.backends.reference.setup import Setup
+from fidsplat.backends.reference.shown import LEAST_ALPHA
+from fidsplat.backends.view import View
+
+
+@dataclass
+class Decisions:
+    """What was decided at k samples for m splats; bool arrays (k, m) unless they say otherwise."""
+
+    order: np.ndarray
+    """(m,) int: the cloud's splats, nearest first"""
+    drawn: np.ndarray
+    """in reach, and light was left"""
+    by_dot: np.ndarray
+    """the low-pass's dot is the larger weight"""
+    clamped: np.ndarray
+    """at the ceiling of opacities"""
+    missed: np.ndarray
+    """the ray does not meet the plane in front: the depth is the centre's"""
+    beyond: np.ndarray
+    """int: the depth is the nearest of the disk's (-1), the furthest (1), or where the ray meets it (0)"""
+    shown: np.ndarray
+    """(k,): enough is covered for depths and normals"""
+
+
+def decide(s: Setup, view: View, x: np.ndarray, y: np.ndarray) -> Decisions:
+    """The decisions of the picture at samples (k,) at grid positions x, y."""
+    f = fragments_of(s, view, x, y)
+    _, live, final = transmittance(f.alpha, view.stop, s.exclusive)
+    q = f.n_u**2 + f.n_v**2
+    inside = (q <= 2 * s.half_r2 * f.d**2) & (f.d > 0) & (f.d * view.near <= f.dz)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        plane = np.where(inside, q / (2 * f.d**2), np.inf)
+        z = np.where(f.d > 0, f.dz / f.d, s.pz)
+    dot = np.where(f.offset <= s.half_r2, f.offset, np.inf) if s.screen else np.full_like(plane, np.inf)
+    return Decisions(
+        order=s.order,
+        drawn=live & (f.alpha > 0),
+        by_dot=dot < plane,
+        clamped=s.log_opacity - np.minimum(plane, dot) > np.log(view.ceiling),
+        missed=f.d <= 0,
+        beyond=(z > s.pz + s.reach).astype(int) - (z < s.pz - s.reach),
+        shown=1 - final >= LEAST_ALPHA,
+    )
+
+
+@dataclass
+class Samples:
+    """What blending leaves at k samples; or the derivatives of a loss by each of these."""
+
+    rgb: np.ndarray
+    """(k, 3)"""
+    t: np.ndarray
+    """transmittance"""
+    depth: np.ndarray
+    """sum of weights times depths"""
+    weight: np.ndarray
+    """sum of weights"""
+    normal: np.ndarray
+    """(k, 3) sum of weights times normals"""
+
+
+class Blend:
+    """k samples of m placed splats under decisions; arrays (k, m) or (k, m, 3)."""
+
+    def __init__(self, placed: Placed, view: View, made: Decisions, x: np.ndarray, y: np.ndarray) -> None:
+        self._placed, self._view, self._made = placed, view, made
+        order = made.order
+        self._unit_a, self._unit_b, self._p = placed.unit_a[order], placed.unit_b[order], placed.p[order]
+        self._su, self._sv = placed.scales[order].T
+        self._rgb, log_opacity = placed.rgb[order], placed.log_opacity[order]
+        self._rays = rays_of(view, x, y)[0][:, None, :]
+        self._normal = np.cross(self._unit_a, self._unit_b)
+        height = (self._normal * self._p).sum(1)
+        self._towards = np.where(height > 0, -1.0, 1.0)[:, None]
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            self._slant = (self._rays * self._normal).sum(2)
+            self._z_plane = height / self._slant
+            self._off = self._z_plane[..., None] * self._rays - self._p
+            self._u = (self._off * self._unit_a).sum(2) / self._su
+            self._v = (self._off * self._unit_b).sum(2) / self._sv
+            pz = self._p[:, 2]
+            self._dot_x = x[:, None] - (view.focal_x * self._p[:, 0] / pz + view.center_x)
+            self._dot_y = y[:, None] - (view.focal_y * self._p[:, 1] / pz + view.center_y)
+            half_rho = np.where(made.by_dot, self._dot_x**2 + self._dot_y**2, (self._u**2 + self._v**2) / 2)
+            opacity = np.where(made.clamped, view.ceiling, np.exp(log_opacity - half_rho))
+            self._radius = np.sqrt(2 * np.maximum(log_opacity - view.log_cut, 0))
+        self._steep = np.hypot(self._su * self._unit_a[:, 2], self._sv * self._unit_b[:, 2])
+        z = np.where(made.beyond == 0, self._z_plane, pz + made.beyond * self._radius * self._steep)
+        self._z = np.where(made.drawn, np.where(made.missed, pz, z), 0.0)
+        self._alpha = np.where(made.drawn, opacity, 0.0)
+        after = np.cumprod(1 - self._alpha, axis=1)
+        self._before = np.concatenate([np.ones((len(x), 1)), after], axis=1)
+        self._weight = self._before[:, :-1] * self._alpha
+
+    @property
+    def samples(self) -> Samples:
+        """What blending leaves."""
+        return Samples(
+            self._weight @ self._rgb,
+            self._before[:, -1],
+            (self._weight * self._z).sum(1),
+            self._weight.sum(1),
+            self._weight @ (self._normal * self._towards),
+        )
+
+    def backward(self, by: Samples) -> Placed:
+        """Derivatives of a loss by what is placed, from those by the samples."""
+        made, view = self._made, self._view
+        facing = self._normal * self._towards
+        by_z = self._weight * by.depth[:, None]
+        by_alpha = np.where(made.drawn, self._by_opacity(by, facing), 0.0)
+        by_log = np.where(made.clamped, 0.0, by_alpha * self._alpha)
+
+        on_plane = made.drawn & ~made.by_dot
+        with np.errstate(invalid="ignore", divide="ignore"):
+            by_u = np.where(on_plane, -by_log * self._u / self._su, 0.0)
+            by_v = np.where(on_plane, -by_log * self._v / self._sv, 0.0)
+            met = made.drawn & ~made.missed & (made.beyond == 0)
+            off = np.where((on_plane | met)[..., None], self._off, 0.0)
+            by_off = by_u[..., None] * self._unit_a + by_v[..., None] * self._unit_b
+            by_plane_z = (by_off * self._rays).sum(2) + np.where(met, by_z, 0.0)
+            by_plane_z = np.where(on_plane | met, by_plane_z / self._slant, 0.0)
+        by_normal = -(by_plane_z[..., None] * off).sum(0) + self._towards * (self._weight.T @ by.normal)
+        by_a = np.einsum("kn,knc->nc", by_u, off) + np.cross(self._unit_b, by_normal)
+        by_b = np.einsum("kn,knc->nc", by_v, off) + np.cross(by_normal, self._unit_a)
+        by_p = by_plane_z.sum(0)[:, None] * self._normal - by_off.sum(0)
+
+        # the dot, at the centre's image
+        dot = np.where(made.drawn & made.by_dot, 2 * by_log, 0.0)
+        by_x = (dot * np.where(made.by_dot, self._dot_x, 0.0)).sum(0)
+        by_y = (dot * np.where(made.by_dot, self._dot_y, 0.0)).sum(0)
+        x, y, z = self._p.T
+        by_p += np.stack(
+            [
+                by_x * view.focal_x / z,
+                by_y * view.focal_y / z,
+                -(by_x * view.focal_x * x + by_y * view.focal_y * y) / z**2,
+            ],
+            1,
+        )
+        # depths that are the centre's, or an end of the disk's range
+        by_p[:, 2] += np.where(made.missed | (made.beyond != 0), by_z, 0.0).sum(0)
+        by_reach = np.where(made.missed, 0, made.beyond * by_z).sum(0)
+        steep = np.where(self._steep > 0, self._steep, np.inf)
+        along_a = by_reach * self._radius * self._su * self._unit_a[:, 2] / steep
+        along_b = by_reach * self._radius * self._sv * self._unit_b[:, 2] / steep
+        by_a[:, 2] += along_a * self._su
+        by_b[:, 2] += along_b * self._sv
+
+        out, order = Placed.zeros(len(self._placed.p)), made.order
+        out.unit_a[order], out.unit_b[order], out.p[order] = by_a, by_b, by_p
+        with np.errstate(invalid="ignore"):
+            by_su = -np.where(on_plane, by_u * self._u, 0.0).sum(0) + along_a * self._unit_a[:, 2]
+            by_sv = -np.where(on_plane, by_v * self._v, 0.0).sum(0) + along_b * self._unit_b[:, 2]
+        out.scales[order] = np.stack([by_su, by_sv], 1)
+        out.log_opacity[order] = by_log.sum(0) + by_reach * self._steep / self._radius
+        out.rgb[order] = self._weight.T @ by.rgb
+        return out
+
+    def _by_opacity(self, by: Samples, facing: np.ndarray) -> np.ndarray:
+        """Derivatives (k, m) by the fragments' opacities: what their light is worth, less what is worth that
+        which they hide; from back to front, without a division by what is left of the light."""
+        worth = by.rgb @ self._rgb.T + by.normal @ facing.T + by.depth[:, None] * self._z
+        worth = worth + by.weight[:, None]
+        hidden, slopes = by.t.copy(), np.zeros_like(worth)
+        for k in range(worth.shape[1] - 1, -1, -1):
+            gain = worth[:, k] - hidden
+            slopes[:, k] = self._before[:, k] * gain
+            hidden = hidden + self._alpha[:, k] * gain
+        return slopes

@@ -1,0 +1,192 @@
+"""Splats in the camera's frame and in its colours, as functions of what gradients are taken by; float64."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from fidsplat.backends.view import View
+from fidsplat.splats import SplatCloud, sh_basis
+
+_SMALLEST = float(np.float32(1e-20))
+"""metres: scales below it are drawn as that"""
+
+
+@dataclass
+class Parameters:
+    """What a picture is differentiated by."""
+
+    means: np.ndarray
+    quats: np.ndarray
+    """(n, 4) of any length"""
+    scales: np.ndarray
+    opacities: np.ndarray
+    colors: np.ndarray | None
+    sh: np.ndarray | None
+    background: np.ndarray
+    pose: np.ndarray
+    """(6,): rotation vector [rad] and translation [m] of a motion after world_to_camera, in its axes"""
+
+    @classmethod
+    def of(cls, cloud: SplatCloud, view: View) -> Parameters:
+        """Those of a picture, in float64; its pose is 0."""
+        arrays = (cloud.means, cloud.quats, cloud.scales, cloud.opacities)
+        color = cloud.colors if cloud.colors is not None else cloud.plain_colors
+        sh = None if color is not None else cloud.sh
+        given = [None if array is None else array.astype(np.float64) for array in (*arrays, color, sh)]
+        return cls(*given, np.array(view.background, np.float64), np.zeros(6))  # type: ignore[arg-type]
+
+    @property
+    def names(self) -> list[str]:
+        """Those that there are."""
+        return [one.name for one in fields(self) if getattr(self, one.name) is not None]
+
+
+@dataclass
+class Placed:
+    """Splats in the camera's frame; or the derivatives of a loss by each of these arrays."""
+
+    unit_a: np.ndarray
+    """(n, 3) unit tangents"""
+    unit_b: np.ndarray
+    p: np.ndarray
+    """(n, 3) centres [m]"""
+    scales: np.ndarray
+    """(n, 2) as they are drawn [m]"""
+    log_opacity: np.ndarray
+    rgb: np.ndarray
+
+    @classmethod
+    def zeros(cls, n: int) -> Placed:
+        """Derivatives to be added to."""
+        a, b, p, rgb = np.zeros((4, n, 3))
+        return cls(a, b, p, np.zeros((n, 2)), np.zeros(n), rgb)
+
+
+def motion_of(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) and translation (3,) of a motion (6,)."""
+    angle = np.linalg.norm(pose[:3])
+    if angle == 0:
+        return np.eye(3), pose[3:]
+    x, y, z = pose[:3] / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross, pose[3:]
+
+
+def place(parameters: Parameters, view: View) -> Placed:
+    """The splats as the camera has them."""
+    turn, shift = motion_of(parameters.pose)
+    rotation, translation = turn @ view.rotation, turn @ view.translation + shift
+    tangent_u, tangent_v = _tangents(parameters.quats)
+    with np.errstate(divide="ignore"):
+        log_opacity = np.log(parameters.opacities)
+    return Placed(
+        tangent_u @ rotation.T,
+        tangent_v @ rotation.T,
+        parameters.means @ rotation.T + translation,
+        np.maximum(parameters.scales, _SMALLEST),
+        log_opacity,
+        _rgb(parameters, _eye(parameters, view)),
+    )
+
+
+def place_backward(parameters: Parameters, view: View, placed: Placed, slopes: Placed) -> dict:
+    """Derivatives by the parameters, where their pose is 0, from those by what is placed."""
+    turn = view.rotation
+    by_color, by_ray = _rgb_backward(parameters, _eye(parameters, view), slopes.rgb)
+    pairs = [(slopes.unit_a, placed.unit_a), (slopes.unit_b, placed.unit_b), (slopes.p, placed.p)]
+    turned = sum(np.cross(at, slope).sum(0) for slope, at in pairs)
+    # a motion of the camera moves its centre against the motion, and turns around it
+    moved = slopes.p.sum(0) + by_ray.sum(0) @ turn.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        by_opacity = slopes.log_opacity / parameters.opacities
+    return {
+        "means": slopes.p @ turn + by_ray,
+        "quats": _tangents_backward(parameters.quats, slopes.unit_a @ turn, slopes.unit_b @ turn),
+        "scales": np.where(parameters.scales >= _SMALLEST, slopes.scales, 0.0),
+        "opacities": np.where(slopes.log_opacity != 0, by_opacity, 0.0),
+        "sh" if parameters.colors is None else "colors": by_color,
+        "pose": np.concatenate([turned, moved]),
+    }
+
+
+def _tangents(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The first two columns of the rotations of quaternions of any length."""
+    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
+    return (
+        np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], 1),
+        np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], 1),
+    )
+
+
+def _tangents_backward(quats: np.ndarray, by_u: np.ndarray, by_v: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(quats, axis=1, keepdims=True)
+    w, x, y, z = unit = (quats / length).T
+    (ux, uy, uz), (vx, vy, vz) = by_u.T, by_v.T
+    slopes = 2 * np.stack(
+        [
+            uy * z - uz * y - vx * z + vz * x,
+            uy * y + uz * z + vx * y - 2 * vy * x + vz * w,
+            -2 * ux * y + uy * x - uz * w + vx * x + vz * z,
+            -2 * ux * z + uy * w + uz * x - vx * w - 2 * vy * z + vz * y,
+        ]
+    )
+    # along the quaternion nothing changes
+    return ((slopes - unit * (unit * slopes).sum(0)) / length.T).T
+
+
+def _eye(parameters: Parameters, view: View) -> np.ndarray:
+    turn, shift = motion_of(parameters.pose)
+    return view.eye - view.rotation.T @ (turn.T @ shift)
+
+
+def _rgb(parameters: Parameters, eye: np.ndarray) -> np.ndarray:
+    if parameters.sh is None:
+        assert parameters.colors is not None
+        return parameters.colors
+    return np.maximum(_unclamped(parameters.sh, _directions(parameters.means - eye)[0]), 0)
+
+
+def _directions(rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    length = np.linalg.norm(rays, axis=1, keepdims=True)
+    length = np.where(length > 0, length, np.inf)
+    return rays / length, length
+
+
+def _degree(sh: np.ndarray) -> int:
+    return {4: 1, 9: 2, 16: 3}[sh.shape[1]]
+
+
+def _unclamped(sh: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    return 0.5 + np.einsum("nk,nkc->nc", sh_basis(_degree(sh), directions), sh)
+
+
+def _rgb_backward(
+    parameters: Parameters, eye: np.ndarray, by_rgb: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives by the coefficients or colours, and by the rays (n, 3) from the eye to the centres."""
+    if parameters.sh is None:
+        return by_rgb, np.zeros_like(by_rgb)
+    directions, length = _directions(parameters.means - eye)
+    by_rgb = np.where(_unclamped(parameters.sh, directions) > 0, by_rgb, 0.0)
+    degree = _degree(parameters.sh)
+    by_basis = np.einsum("nc,nkc->nk", by_rgb, parameters.sh)
+    slopes = np.stack(
+        [np.einsum("nk,nk->n", by_basis, _basis_slope(degree, directions, axis)) for axis in range(3)], 1
+    )
+    across = slopes - directions * (directions * slopes).sum(1, keepdims=True)
+    return np.einsum("nk,nc->nkc", sh_basis(degree, directions), by_rgb), across / length
+
+
+def _basis_slope(degree: int, directions: np.ndarray, axis: int) -> np.ndarray:
+    """Derivatives (n, k) of the basis by a coordinate. Of polynomials of degree 3 the central differences
+    over h and 2 h, extrapolated, are exact."""
+
+    def difference(h: float) -> np.ndarray:
+        step = np.zeros(3)
+        step[axis] = h
+        ahead, behind = sh_basis(degree, directions + step), sh_basis(degree, directions - step)
+        return (ahead - behind) / (2 * h)
+
+    return (4 * difference(0.5) - difference(1.0)) / 3

@@ -1,0 +1,88 @@
+"""An opaque surface of another renderer among what samples see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from fidsplat.backends.reference.error_bounds import Span
+from fidsplat.backends.reference.fragments import Fragments
+from fidsplat.backends.reference.layers import Stack
+from fidsplat.backends.reference.setup import Setup
+from fidsplat.backends.view import View
+from fidsplat.surroundings import Layer
+
+
+@dataclass
+class Surface:
+    """What k samples see of a layer."""
+
+    z: np.ndarray
+    """(k,) metres; infinite where there is none"""
+    color: np.ndarray
+    """(k, 3)"""
+    label: np.ndarray
+    """(k,)"""
+
+    @property
+    def there(self) -> np.ndarray:
+        """(k,) bool: where there is one."""
+        return np.isfinite(self.z)
+
+    def hide(self, s: Setup, f: Fragments, span: Span) -> Span:
+        """Take away the fragments at its depth or behind it; the span of those that are left, in which one
+        that rounding may put on either side has all opacities down to 0."""
+        z = self.z[:, None]
+        # as fragments of printed planes are put: no nearer than these
+        depth, low, high = (np.maximum(one, s.nearest) for one in (f.z, span.z_low, span.z_high))
+        f.alpha = np.where(depth < z, f.alpha, 0.0)
+        return Span.of(
+            np.where(high < z, span.low, 0.0), np.where(low < z, span.high, 0.0), span.z_low, span.z_high
+        )
+
+    def behind(self, stack: Stack) -> Stack:
+        """The stack with the surface as its last thing."""
+        k, m = stack.alpha.shape
+        there = self.there[:, None].astype(float)
+        z = np.where(there > 0, self.z[:, None], 0.0)
+        span = stack.span
+        last = {
+            "alpha": there,
+            "z": z,
+            "colors": self.color[:, None],
+            "normal": np.zeros((k, 1, 3)),
+            "labels": self.label[:, None],
+            "ids": np.full((k, 1), -1),
+            "count": np.zeros((k, 1)),
+            "count_bound": np.zeros((k, 1)),
+            "moved": np.zeros((k, 1)),
+            "label_may_flip": np.zeros((k, 1), bool),
+            "id_may_flip": np.zeros((k, 1), bool),
+        }
+        joined = {}
+        for field in fields(Stack):
+            if field.name in last:
+                own = getattr(stack, field.name)
+                shape = (k, m, *last[field.name].shape[2:])
+                joined[field.name] = np.concatenate([np.broadcast_to(own, shape), last[field.name]], axis=1)
+        # transmittances in front hold in every order of the splats: the surface comes behind them all
+        front_low = np.prod(1 - span.high, axis=1, keepdims=True)
+        front_high = np.prod(1 - span.low, axis=1, keepdims=True)
+        joined["span"] = replace(
+            span,
+            low=np.column_stack([span.low, there]),
+            high=np.column_stack([span.high, there]),
+            z_low=np.column_stack([span.z_low, z]),
+            z_high=np.column_stack([span.z_high, z]),
+            front_low=np.column_stack([span.front_low, front_low]),
+            front_high=np.column_stack([span.front_high, front_high]),
+        )
+        return replace(stack, **joined)
+
+
+def surface_at(layer: Layer, view: View, x: np.ndarray, y: np.ndarray) -> Surface:
+    """What samples (k,) at grid positions x, y see of a layer."""
+    row, column = (np.floor(at / view.samples).astype(int) for at in (y, x))
+    color, label = layer.rgb[row, column].astype(np.float64), np.asarray(layer.label)[row, column]
+    return Surface(layer.depth[row, column].astype(np.float64), color, label)

@@ -1,0 +1,167 @@
+"""Trajectory: a pose as a function of time, through keyframes."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from fidsplat.cameras.screw import between, exponential, twist
+from fidsplat.errors import InputError
+from fidsplat.rotations import check_similarity, matrix_to_quaternion, rigid_matrix
+from fidsplat.scalars import PickledByFields, real_array
+
+UNIT = 1e-3
+"""how far from 1 the length of a quaternion may be: files round them"""
+MAX_SAMPLES = 10_000_000
+"""poses that one trajectory is sampled into: more is a mistake in the rate"""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory(PickledByFields):
+    """A pose between keyframes: the screw motion from one to the next (a geodesic of SE(3)), at rest before
+    the first and after the last. Call it with a time in seconds.
+
+    What is posed is up to its user: files of trajectories hold camera to world, `Motion.camera` wants world
+    to camera, which is the `inverse()`.
+
+    Raises InputError for times that do not increase, poses that are not rigid and quaternions whose length is
+    not 1 (within 1e-3).
+    """
+
+    times: Sequence[float] | np.ndarray
+    """(k,) seconds, increasing"""
+    poses: np.ndarray
+    """(k, 4, 4) rigid; or given as (k, 7): x, y, z in metres and a unit quaternion w, x, y, z"""
+    smooth: bool = False
+    """without a kink at the keyframes: a cubic Bezier curve of screw motions from each to the next, whose
+    velocity at a keyframe is that of the parabola through it and its neighbours (slower where these turn so
+    fast that it would spin). Give keyframes less than half a turn apart"""
+
+    def __post_init__(self) -> None:
+        times = real_array("the times of a trajectory", self.times, "increasing numbers of seconds")
+        if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+            raise InputError(
+                "the times of a trajectory must be one or more finite, increasing numbers of seconds, not "
+                f"{_shown(self.times, times)}"
+            )
+        count = len(self.poses) if isinstance(self.poses, Sequence) or np.ndim(self.poses) else 0
+        if count != len(times):
+            raise InputError(f"a trajectory has {len(times)} times but {count} poses; give one for each time")
+        if not isinstance(self.smooth, bool):
+            raise InputError(f"smooth is {self.smooth!r}; it must be True or False")
+        first = self.poses[0]
+        if isinstance(first, Sequence | np.ndarray) and len(first) == 7:
+            poses = np.array([_of_vector(k, vector) for k, vector in enumerate(self.poses)])
+        else:
+            for k, pose in enumerate(self.poses):
+                check_similarity(pose, f"pose {k} of a trajectory", rigid=True)
+            poses = np.array(self.poses, np.float64)
+        times.flags.writeable = poses.flags.writeable = False
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "poses", poses)
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def __repr__(self) -> str:
+        first, last = float(self.times[0]), float(self.times[-1])
+        kind = "smooth" if self.smooth else "screw motions"
+        return f"Trajectory({len(self)} poses, {first:g} to {last:g} s, {kind})"
+
+    def __call__(self, time: float) -> np.ndarray:
+        """(4, 4) float64."""
+        times = np.asarray(self.times)
+        after = int(np.searchsorted(times, time, side="right"))
+        if after == 0 or after == len(times):
+            return self.poses[min(after, len(times) - 1)]
+        start, end, duration = self.poses[after - 1], self.poses[after], times[after] - times[after - 1]
+        share = float((time - times[after - 1]) / duration)
+        if not self.smooth:
+            return between(start, end, share)
+        curve = [start, start @ exponential(self._velocities[after - 1] * (duration / 3))]
+        curve += [end @ exponential(self._velocities[after] * (-duration / 3)), end]
+        while len(curve) > 1:  # de Casteljau, a screw motion in place of each line
+            curve = [between(a, b, share) for a, b in itertools.pairwise(curve)]
+        return curve[0]
+
+    @cached_property
+    def _velocities(self) -> np.ndarray:
+        """(k, 6) twists per second at the keyframes, in their own axes."""
+        durations = np.diff(self.times)[:, None]
+        if not len(durations):
+            return np.zeros((1, 6))
+        along = np.array([twist(*pair) for pair in itertools.pairwise(self.poses)]) / durations
+        before, after = durations[:-1], durations[1:]
+        inner = (along[:-1] * after + along[1:] * before) / (before + after)
+        # what turns fast in a short time must not spin through a long one beside it: a third of that one's
+        # turn, which is what the curve takes, stays below a quarter turn, so that it has one direction
+        turns = np.linalg.norm(inner[:, :3], axis=1, keepdims=True) * np.maximum(before, after) / 3
+        inner *= np.minimum(1.0, math.pi / 2 / np.maximum(turns, 1e-300))
+        return np.concatenate([along[:1], inner, along[-1:]])
+
+    @property
+    def vectors(self) -> np.ndarray:
+        """(k, 7) float64: the poses as x, y, z in metres and unit quaternions w, x, y, z, w >= 0."""
+        return np.array([[*pose[:3, 3], *matrix_to_quaternion(pose[:3, :3])] for pose in self.poses])
+
+    def inverse(self) -> Trajectory:
+        """World to camera of camera to world, and the other way round, at every time."""
+        turned = self.poses[:, :3, :3].transpose(0, 2, 1)
+        poses = np.zeros_like(self.poses)
+        poses[:, :3, :3], poses[:, 3, 3] = turned, 1.0
+        poses[:, :3, 3] = -(turned @ self.poses[:, :3, 3:])[:, :, 0]
+        return Trajectory(self.times, poses, self.smooth)
+
+    def sampled(self, rate: float) -> Trajectory:
+        """Its poses that many times a second, from the first keyframe to the last.
+
+        Raises:
+            InputError: the rate is not above 0 or gives more than 10 million poses.
+        """
+        check_rate(rate)
+        first, last = float(self.times[0]), float(self.times[-1])
+        steps = (last - first) * rate
+        if steps >= MAX_SAMPLES:
+            raise InputError(
+                f"{rate:g} poses a second over {last - first:g} s are more than {MAX_SAMPLES:,}; give a "
+                "lower rate"
+            )
+        times = first + np.arange(int(steps + 1e-6) + 1) / rate  # the last one too where it falls on a step
+        return Trajectory(times, np.array([self(time) for time in times]))
+
+
+def check_rate(rate: float) -> None:
+    """Raises InputError for anything but a number of poses a second."""
+    known = isinstance(rate, (int, float, np.number)) and not isinstance(rate, bool)
+    if not known or not 0 < rate < math.inf:
+        raise InputError(f"the rate is {rate!r}; give a number of poses a second above 0, e.g. 30")
+
+
+def _of_vector(k: int, vector) -> np.ndarray:
+    """The matrix of x, y, z and a unit quaternion. Raises InputError, naming pose k, for anything else."""
+    numbers = real_array(f"pose {k} of a trajectory", vector, "x, y, z and a quaternion w, x, y, z")
+    if numbers.shape != (7,) or not np.isfinite(numbers).all():
+        raise InputError(
+            f"pose {k} of a trajectory must be 7 finite numbers, x, y, z and a quaternion w, x, y, z, not "
+            f"{numbers.tolist()}"
+        )
+    length = float(np.linalg.norm(numbers[3:]))
+    if abs(length - 1) > UNIT:
+        raise InputError(
+            f"pose {k} of a trajectory has a quaternion of length {length:g}, {numbers[3:].tolist()}; it "
+            "must be 1, and its order w, x, y, z"
+        )
+    return rigid_matrix(numbers[:3], numbers[3:])
+
+
+def _shown(given, times: np.ndarray) -> str:
+    """The times as an error shows them: where they stop increasing, if that is what is wrong."""
+    if times.ndim == 1 and len(times) > 1 and np.isfinite(times).all():
+        k = int(np.argmax(np.diff(times) <= 0))
+        return f"{times[k]:.15g} and then {times[k + 1]:.15g} (number {k + 1}, counted from 0)"
+    return repr(given)

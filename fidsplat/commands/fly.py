@@ -1,0 +1,171 @@
+"""`fidsplat fly`."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from fidsplat.commands.output import (
+    Json,
+    MemoryBudget,
+    bytes_of,
+    console,
+    late_progress,
+    option,
+    print_json,
+    say,
+    switch,
+)
+from fidsplat.commands.render import load_source
+from fidsplat.commands.sweeps import Overwrite
+from fidsplat.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from fidsplat.cameras import Trajectory
+    from fidsplat.flights import FlightFolder
+    from fidsplat.scenes import Scene
+
+DEFAULT_FOLDER = "fidsplat-flight"
+
+
+@dataclass
+class Fly:
+    """Draw a scene along a trajectory: a picture for each moment, a contact sheet, a video.
+
+    DIR/rgb/000000.png and so on, likewise for other outputs; trajectory.tum and transforms.json have the pose
+    of each picture, so that the folder is a data set too. A run that is stopped goes on where it was. What
+    moves in the scene moves by the trajectory's clock, and a shutter of the scene sees the camera move.
+
+    Files of poses, camera to world (docs/trajectories.md): TUM, KITTI, COLMAP's images.txt or folder,
+    nerfstudio's transforms.json. Without --trajectory the camera moves as the scene file says.
+
+    Examples:
+      fidsplat fly scene.toml --trajectory flight.tum -o flight --video flight.mp4
+      fidsplat fly room.ply --trajectory poses.txt --file-rate 10 --smooth --outputs rgb,depth
+      fidsplat fly moving.toml --times 0,0.5,1
+      fidsplat fly scene.toml --trajectory flight.tum --outputs rgb,label --log run.mcap --coco truth.json
+    """
+
+    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply", "what to draw")]
+    trajectory: Annotated[
+        str | None, option("FILE", "the camera's poses (default: the scene's [[camera.motion]])")
+    ] = None
+    out: Annotated[str, option("DIR", f"folder for pictures (default: {DEFAULT_FOLDER})", "-o")] = (
+        DEFAULT_FOLDER
+    )
+    rate: Annotated[float, option("HZ", "pictures a second, also of the video (default: 30)")] = 30.0
+    times: Annotated[
+        str | None, option("T,T,...", "seconds on the trajectory's clock, instead of --rate")
+    ] = None
+    file_rate: Annotated[float, option("HZ", "poses a second of a file that has no times (default: 10)")] = (
+        10.0
+    )
+    smooth: Annotated[bool, switch("curves through the poses, without a kink there")] = False
+    video: Annotated[str | None, option("FILE.mp4", "a video of the first output as well (extra: video)")] = (
+        None
+    )
+    log: Annotated[
+        str | None,
+        option("FILE.mcap|BAG", "a log of ROS 2 as well: pictures, intrinsics, poses (extra: logs)"),
+    ] = None
+    coco: Annotated[
+        str | None, option("FILE.json", "where markers are in each picture as well, as COCO annotations")
+    ] = None
+    outputs: Annotated[
+        str | None, option("A,B,...", "outputs, as for `fidsplat render` (default: the scene's, or rgb)")
+    ] = None
+    device: Annotated[
+        str | None,
+        option("D", "see `fidsplat devices` (default: the scene's, or FIDSPLAT_DEVICE, or opencl)"),
+    ] = None
+    quality: Annotated[
+        str | None, option("Q", "as for `fidsplat render` (default: the scene's, or standard)")
+    ] = None
+    memory_budget: MemoryBudget = None
+    overwrite: Overwrite = False
+    json: Json = False
+
+    def run(self) -> int:
+        import fidsplat as fs
+        from fidsplat.commands.flight_records import write_log, write_truth
+        from fidsplat.effects import select
+        from fidsplat.flights import Flight, FlightFolder
+        from fidsplat.vision.video import check_video
+
+        names = None if self.outputs is None else tuple(n.strip() for n in self.outputs.split(","))
+        # what is wrong with the words is said before anything is read or opened
+        select(fs.SplatCloud.empty(), fs.Capture(outputs=names or "rgb", quality=fs.Quality.of(self.quality)))
+        budget = bytes_of("--memory-budget", self.memory_budget)
+        if self.video is not None:
+            check_video(self.video)
+        given = self.trajectory
+        path = None if given is None else fs.load_trajectory(given, self.file_rate, self.smooth)
+        where = console(self.json)
+        with late_progress(console(True)) as progress:
+            scene = load_source(self.source, self.quality, progress)
+        path = path or _own_motion(self.source, scene, self.smooth)
+        times = path.sampled(self.rate).times if self.times is None else _times(self.times)
+        flight = Flight(scene, path, times, scene.capture.with_(outputs=names, quality=self.quality))
+        with where.status("opening the device"):
+            renderer = fs.Renderer(self.device or scene.device, budget)
+        folder = FlightFolder(self.out, flight, renderer.device.title, self.overwrite)
+        begun = time.perf_counter()
+        left = len(folder.left())
+        self._steps("pictures", folder.draw(renderer), len(flight), len(flight) - left)
+        seconds = time.perf_counter() - begun
+        sheet = folder.write_sheet()
+        if self.video is not None:
+            self._steps("video", folder.write_video(self.video, self.rate), len(flight), 0)
+        if self.log is not None:
+            self._steps("log", write_log(folder, self.log, self.overwrite), len(flight), 0)
+        if self.coco is not None:
+            self._steps("truth", write_truth(folder, self.coco), len(flight), 0)
+        self._tell(folder, sheet, left, seconds)
+        return 0
+
+    def _steps(self, what: str, steps: Iterable[int], total: int, done: int) -> None:
+        from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
+
+        columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=console(True), transient=True) as progress:
+            task = progress.add_task(what, total=total, completed=done)
+            for _ in steps:
+                progress.advance(task)
+
+    def _tell(self, folder: FlightFolder, sheet: Path, drawn: int, seconds: float) -> None:
+        frames = len(folder.flight)
+        if self.json:
+            facts: dict[str, Any] = {"source": self.source, "device": folder.device, "frames": frames}
+            facts |= {"drawn": drawn, "seconds": seconds, "folder": str(folder.folder)}
+            facts |= {"contact_sheet": str(sheet), "video": self.video, "log": self.log, "coco": self.coco}
+            print_json(facts)
+            return
+        kept = f" ({frames - drawn} were there already)" if drawn < frames else ""
+        rate = f", {drawn / seconds:.1f} a second" if drawn else ""
+        say(
+            console(False), f"{frames} pictures{kept} on {folder.device} in {seconds:.1f} s{rate}", str(sheet)
+        )
+        say(console(False), *(name for name in (self.video, self.log, self.coco) if name is not None))
+
+
+def _own_motion(source: str, scene: Scene, smooth: bool) -> Trajectory:
+    """The camera's own keyframes, camera to world."""
+    from fidsplat.cameras import Trajectory
+
+    if not isinstance(scene.camera_motion, Trajectory):
+        raise InputError(f"{source} has no [[camera.motion]] to fly along; give --trajectory FILE")
+    back = scene.camera_motion.inverse()
+    return Trajectory(back.times, back.poses, smooth)
+
+
+def _times(text: str) -> list[float]:
+    try:
+        return [float(word) for word in text.split(",")]
+    except ValueError:
+        raise InputError(f"--times is {text!r}; give seconds with commas between, e.g. 0,0.5,1") from None

@@ -1,0 +1,186 @@
+"""`fidsplat train`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from fidsplat.commands.output import (
+    Device,
+    Json,
+    console,
+    late_progress,
+    option,
+    print_json,
+    print_table,
+    say,
+    switch,
+    writable_file,
+)
+from fidsplat.commands.sweeps import need_reports
+from fidsplat.errors import InputError
+from fidsplat.files import path_of
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from fidsplat.train import Step, Trainer, ViewScore
+
+
+@dataclass
+class Train:
+    """Train splats on pictures with known cameras.
+
+    DATASET is a folder with COLMAP's model (sparse/0) and pictures (images), one with nerfstudio's
+    transforms.json, or what `fidsplat demo views` and `fidsplat experiment dataset` write. Views in its
+    folder test, or else every eighth of 16 and more, are held out and compared with at the end.
+
+    The same command gives the same file, in every bit, on the same device. A run that was stopped goes on
+    where its last checkpoint is, FILE.training.npz beside FILE.ply, which is written every half minute and
+    stays: with more iterations the same command goes on from there. --overwrite begins again.
+
+    Examples:
+      fidsplat demo views -o yard && fidsplat train yard -o yard.ply --iterations 2000
+      fidsplat train garden -o garden.ply --strategy mcmc --max-splats 300000 --report garden-report
+      fidsplat train photos -o photos.ply --random-points 5000 --within-memory 4
+    """
+
+    dataset: Annotated[tyro.conf.Positional[str], option("DATASET", "folder, or transforms.json")]
+    out: Annotated[str, option("FILE.ply", "where the splats go", "-o")]
+    device: Device = None
+    iterations: Annotated[int, option("N", "views that are looked at (default: 7000)")] = 7000
+    strategy: Annotated[
+        str,
+        option(
+            "NAME", "default: the 2DGS authors' densification; mcmc: up to --max-splats (default: default)"
+        ),
+    ] = "default"
+    max_splats: Annotated[int, option("N", "most splats (default: 1000000)")] = 1_000_000
+    within_memory: Annotated[
+        float | None, option("GIB", "of splats and pictures while training: fewer splats where it needs them")
+    ] = None
+    sh_degree: Annotated[int, option("N", "of the colours, 0 to 3 (default: 3)")] = 3
+    seed: Annotated[int, option("N", "of all random numbers (default: 0)")] = 0
+    hold_out: Annotated[
+        int | None, option("N", "keep every N-th view to compare with, 0 for none (default: see above)")
+    ] = None
+    random_points: Annotated[
+        int, option("N", "start from so many random points, not the data set's (default: 0)")
+    ] = 0
+    report: Annotated[
+        str | None, option("DIR|FILE.md", "write a page with curves and pictures of the views held out")
+    ] = None
+    overwrite: Annotated[bool, switch("begin again, whatever the checkpoint has")] = False
+    json: Json = False
+
+    def run(self) -> int:
+        from fidsplat.render import Renderer
+        from fidsplat.train import Trainer, TrainSettings, load_dataset, splats_within
+
+        if path_of(self.out).suffix.lower() != ".ply":
+            raise InputError(f"-o is {self.out}; splats are written as PLY: name a file that ends in .ply")
+        if self.random_points < 0:
+            raise InputError(f"--random-points is {self.random_points}; give at least 1, or 0 for none")
+        if self.report is not None:
+            need_reports()
+        settings = TrainSettings(
+            iterations=self.iterations,
+            strategy=self.strategy,
+            max_splats=self.max_splats,
+            sh_degree=self.sh_degree,
+            seed=self.seed,
+        )
+        file = writable_file(self.out)
+        checkpoint = file.with_suffix(".training.npz")
+        where = console(self.json)
+        with late_progress(console(True)) as progress:
+            dataset = load_dataset(self.dataset, self.hold_out, self.random_points, self.seed, progress)
+        if self.within_memory is not None:
+            settings = splats_within(settings, _bytes(self.within_memory), dataset)
+        with where.status("opening the device"):
+            renderer = Renderer(self.device)
+        if self.overwrite:
+            checkpoint.unlink(missing_ok=True)
+        trainer = Trainer(dataset, renderer, settings, checkpoint)
+        before, begun = trainer.iteration, time.perf_counter()
+        with _bar(trainer) as tell:
+            trainer.run(tell)
+        seconds = time.perf_counter() - begun
+        trainer.save(file)
+        scores = trainer.evaluate()
+        done = trainer.iteration - before
+        facts = _facts(trainer, scores, seconds, done) | {"file": str(file), "checkpoint": str(checkpoint)}
+        if self.report is not None:
+            from fidsplat.experiments.training_page import write_training_page
+
+            pages = write_training_page(trainer, scores, facts, Path(self.report))
+            facts["report"] = [str(page) for page in pages]
+        if self.json:
+            print_json(facts)
+            return 0
+        _tell(where, trainer, scores, facts)
+        return 0
+
+
+def _bytes(gibibytes: float) -> int:
+    if not 0 < gibibytes < 2**20:
+        raise InputError(f"--within-memory is {gibibytes!r}; give GiB, above 0, e.g. 4")
+    return int(gibibytes * 2**30)
+
+
+@contextmanager
+def _bar(trainer: Trainer) -> Iterator:
+    """A progress bar, and what to call with each step."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        *(TextColumn("training"), BarColumn(), MofNCompleteColumn()),
+        *(TextColumn("{task.description}"), TimeRemainingColumn()),
+    )
+    with Progress(*columns, console=console(True), transient=True) as bars:
+        task = bars.add_task("", total=trainer.settings.iterations, completed=trainer.iteration)
+        first, begun = trainer.iteration, time.perf_counter()
+        mean = {"loss": 0.0, "psnr": 0.0}
+
+        def tell(step: Step) -> None:
+            share = max(0.02, 1 / (step.iteration - first))  # of the last in the mean that is shown
+            mean["loss"] += share * (step.loss - mean["loss"])
+            mean["psnr"] += share * (min(step.psnr, 100.0) - mean["psnr"])
+            rate = (step.iteration - first) / (time.perf_counter() - begun)
+            words = f"loss {mean['loss']:.4f}  {mean['psnr']:.1f} dB  {step.splats:,} splats  {rate:.1f} it/s"
+            bars.update(task, completed=step.iteration, description=words)
+
+        yield tell
+
+
+def _facts(trainer: Trainer, scores: list[ViewScore], seconds: float, done: int) -> dict:
+    count = max(1, len(scores))
+    return {
+        "dataset": trainer.dataset.name,
+        "device": trainer.renderer.device.title,
+        "iterations": trainer.iteration,
+        "splats": len(trainer.cloud()),
+        "seconds": seconds,
+        "iterations_per_second": done / seconds if done else None,
+        "psnr": sum(score.psnr for score in scores) / count if scores else None,
+        "ssim": sum(score.ssim for score in scores) / count if scores else None,
+        "views": [{"name": score.name, "psnr": score.psnr, "ssim": score.ssim} for score in scores],
+    }
+
+
+def _tell(where: Console, trainer: Trainer, scores: list[ViewScore], facts: dict) -> None:
+    rows = [(score.name, f"{score.psnr:.2f}", f"{score.ssim:.4f}") for score in scores]
+    if scores:
+        rows.append(("mean", f"{facts['psnr']:.2f}", f"{facts['ssim']:.4f}"))
+    title = f"{trainer.dataset.name} on {facts['device']}: views held out"
+    print_table(where, title, ("view", "PSNR, dB", "SSIM"), rows)
+    rate = facts["iterations_per_second"]
+    speed = "nothing was left to do" if rate is None else f"{facts['seconds']:.1f} s, {rate:.1f} it/s"
+    say(where, f"{facts['splats']:,} splats after {facts['iterations']:,} iterations ({speed})")
+    say(where, facts["file"], *facts.get("report", []))

@@ -1,0 +1,60 @@
+"""Which pictures have gradients: of the effects those whose derivatives backends know."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from fidsplat.effects.select import FeatureSet
+from fidsplat.errors import InputError
+
+DIFFERENTIABLE = frozenset(
+    (
+        *("camera_pinhole", "color_rgb", "color_sh", "lowpass_none", "lowpass_screen"),
+        *("stop_inclusive", "stop_exclusive", "compose_ordered", "footprint_gaussian"),
+        *("background_constant", "arithmetic_precise", "arithmetic_fast"),
+    )
+)
+"""effects through which gradients go"""
+GRADIENT_OUTPUTS = ("rgb", "alpha", "depth", "normal")
+"""outputs whose gradients backends take"""
+_REMEDIES = {
+    "camera": "a pinhole camera",
+    "lowpass": "lowpass='screen' or 'none'",
+    "compose": "order='centre'",
+    "footprint": "a cloud without boxes",
+    "ellipsoid": "a cloud of disks",
+    "ellipsoids": "a cloud of disks",
+    "background": "a background of one colour",
+    "opaque": "a capture without a layer",
+    "motion": "a capture in which no group moves",
+    "shutter": "a capture of one pose",
+    "blend": "blend_precision='float32'",
+}
+
+
+def check_differentiable(features: FeatureSet) -> None:
+    """Refuse pictures that have no gradient.
+
+    Raises:
+        InputError: it names the first effect that has none, and what would do.
+    """
+    for name in features.slots:
+        if name not in DIFFERENTIABLE:
+            raise InputError(f"{name} has no gradient; use {_REMEDIES[name.partition('_')[0]]}")
+    if features.samples > 1:
+        raise InputError(f"{features.samples} x {features.samples} samples have no gradient; use samples=1")
+    if features.posts:
+        raise InputError(f"{features.posts[0]} has no gradient; use a capture without fog and sensor steps")
+
+
+def check_gradients(features: FeatureSet, names: Iterable[str]) -> None:
+    """Refuse gradients of outputs that have none, or that were not drawn.
+
+    Raises:
+        InputError: it names the output, and those that would do.
+    """
+    drawn = [name for name in GRADIENT_OUTPUTS if name == "rgb" or name in features.names]
+    for name in names:
+        if name not in drawn:
+            why = "was not drawn" if name in GRADIENT_OUTPUTS else "has no gradient"
+            raise InputError(f"the output {name!r} {why}; give gradients of: {', '.join(drawn)}")

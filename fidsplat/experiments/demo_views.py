@@ -1,0 +1,89 @@
+"""The demo's scene as a data set to train on: pictures from an arc before it, their cameras, and points as a
+reconstruction from pictures would leave them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.experiments.demo_scene import FOV_X, demo_scene
+from fidsplat.files import atomic_write, writable_folder
+from fidsplat.formats.colmap import save_colmap
+from fidsplat.render import Renderer
+from fidsplat.scenes import Scene
+from fidsplat.vision.images import write_png
+
+POINTS = 6000
+_SPREAD = 0.005
+"""metres, by which points are off"""
+_TARGET = (0.0, 0.1, 0.3)
+_ARC = math.radians(50.0)
+"""to either side"""
+
+
+def write_demo_views(
+    folder: str | Path,
+    views: int = 30,
+    test: int = 6,
+    width: int = 320,
+    seed: int = 0,
+    device: str | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Path:
+    """Draw the demo's scene from many places and write the data set (`fidsplat.train.load_dataset`).
+
+    Args:
+        views: pictures to train on; test: pictures to compare with, in the folder test.
+        width: pixels of a picture, 16 / 9 as wide as high.
+
+    Raises:
+        InputError: the folder cannot be written; DeviceError: the device cannot be used.
+    """
+    place = writable_folder(folder)
+    scene, renderer = demo_scene(seed), Renderer(device)
+    resident, done = renderer.upload(scene), 0
+    for where, stem, cameras in (
+        (place, "view", _cameras(views, width, 0.0)),
+        (place / "test", "test", _cameras(test, width, 0.5)),
+    ):
+        writable_folder(where / "images")
+        names = [f"{stem}-{i:02d}.png" for i in range(len(cameras))]
+        frames = renderer.render_views(resident, cameras, outputs="rgb", quality="standard,samples=3")
+        for name, frame in zip(names, frames, strict=True):
+            write_png(where / "images" / name, frame["rgb"])
+            done += 1
+            if progress is not None:
+                progress("pictures", done / (views + test))
+        save_colmap(where / "sparse" / "0", names, cameras, *_points(scene, seed))
+    # last: a data set with it is whole
+    with atomic_write(place / "dataset.json") as stream:
+        stream.write(json.dumps({"background": scene.background, "seed": seed}).encode())
+    return place
+
+
+def _cameras(count: int, width: int, shift: float) -> list[Camera]:
+    """Cameras on an arc, nearer and farther, higher and lower in turn; shift: by which they lie between
+    those of 0."""
+    height = round(width * 9 / 16)
+    cameras = []
+    for i in range(count):
+        angle = _ARC * (2 * (i + shift + 0.25) / count - 1)
+        away, up = 2.2 + 0.3 * math.cos(2.4 * (i + shift)), 0.25 + 0.3 * math.sin(1.7 * (i + shift))
+        offset = (away * math.sin(angle), -up, -away * math.cos(angle))
+        cameras.append(Camera.look_at(width, height, FOV_X, np.add(_TARGET, offset), _TARGET))
+    return cameras
+
+
+def _points(scene: Scene, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    cloud = scene.cloud()
+    random = np.random.default_rng(seed)
+    rows = np.sort(random.choice(len(cloud), POINTS, replace=False))
+    points = cloud.world_means()[rows] + random.normal(0, _SPREAD, (POINTS, 3))
+    colors = cloud.plain_colors
+    assert colors is not None  # the demo's scene has no other
+    return points, np.rint(np.clip(colors[rows], 0, 1) * 255).astype(np.uint8)

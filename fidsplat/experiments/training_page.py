@@ -1,0 +1,79 @@
+"""A page about a training run: curves, pictures of views that were held out, settings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from fidsplat.experiments.charts import COLOURS, chart
+from fidsplat.experiments.pages import fixed, places, write_page
+from fidsplat.provenance import run_facts
+from fidsplat.train import Trainer, TrainingView, ViewScore
+from fidsplat.vision.images import write_png
+
+PICTURES = 4
+"""views that are shown at most"""
+_POINTS = 200
+"""of a curve: means of as many stretches of the run"""
+
+
+def write_training_page(
+    trainer: Trainer, scores: Sequence[ViewScore], facts: Mapping[str, Any], out: Path
+) -> list[Path]:
+    """Write the page, its chart and pictures; returns the files, the page first.
+
+    facts: what `fidsplat train --json` prints.
+
+    Raises InputError when they cannot be written.
+    """
+    page, folder = places(out)
+    files = [page, folder / "training.svg"]
+    draw_curves(trainer.history, files[1])
+    shown = []
+    rows = np.unique(np.linspace(0, len(scores) - 1, min(PICTURES, len(scores))).astype(int))
+    for row in rows if len(scores) else ():
+        name = f"held-out-{len(shown)}.png"
+        files.append(write_png(folder / name, beside(trainer.dataset.held_out[row], scores[row])))
+        shown.append({"name": scores[row].name, "file": name})
+    table = [{"view": one.name, "PSNR, dB": fixed(one.psnr, 2), "SSIM": fixed(one.ssim, 4)} for one in scores]
+    if scores:
+        table.append({"view": "mean", "PSNR, dB": fixed(facts["psnr"], 2), "SSIM": fixed(facts["ssim"], 4)})
+    settings = asdict(trainer.settings).items()
+    context = {
+        "facts": facts,
+        "scores": pd.DataFrame(table),
+        "pictures": shown,
+        "settings": pd.DataFrame([{"setting": name, "value": value} for name, value in settings]),
+        "run": run_facts(trainer.renderer.device.title, trainer.settings.seed),
+    }
+    write_page(page, folder, "training.md.j2", context)
+    return files
+
+
+def draw_curves(history: Mapping[str, np.ndarray], file: Path) -> None:
+    """Loss, PSNR of the views trained on, and number of splats, each over the iterations."""
+    panels = (("losses", "loss"), ("psnrs", "PSNR of the view, dB"), ("counts", "splats"))
+    with chart(file, panels=len(panels), size=(9.0, 3.0), one_scale=False) as (_, axes):
+        for (name, words), axis, colour in zip(panels, axes, COLOURS[1:], strict=False):
+            places_, means = _means(history[name])
+            axis.plot(places_, means, color=colour)
+            axis.set(title=words, xlabel="iteration")
+
+
+def beside(view: TrainingView, score: ViewScore) -> np.ndarray:
+    """The picture, the splats, and four times their difference around grey, side by side."""
+    difference = 4 * (score.picture.astype(float) - view.picture) + 128
+    return np.hstack([view.picture, score.picture, np.clip(difference, 0, 255).astype(np.uint8)])
+
+
+def _means(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Middles and means of stretches of a curve; what is infinite is left out."""
+    parts = [part for part in np.array_split(np.arange(len(values)), _POINTS) if len(part)]
+    kept = [values[part][np.isfinite(values[part])] for part in parts]
+    means = [float(np.mean(one)) if len(one) else np.nan for one in kept]
+    return np.array([part.mean() + 1 for part in parts]), np.array(means)

@@ -1,0 +1,183 @@
+"""Reading models in COLMAP's format, text or binary (COLMAP's documentation, "Output format")."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.errors import InputError
+from fidsplat.rotations import quaternion_to_matrix
+
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
+    6: ("FULL_OPENCV", 12),
+    7: ("FOV", 5),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
+    10: ("THIN_PRISM_FISHEYE", 12),
+}
+"""camera models by their numbers: name, parameters"""
+_ONE_FOCAL_LENGTH = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+_PERSPECTIVE = (*_ONE_FOCAL_LENGTH, "PINHOLE", "OPENCV", "FULL_OPENCV")
+"""those that are pinholes where their distortion is 0"""
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """What a model says of a scene."""
+
+    names: tuple[str, ...]
+    """of the images, as paths below the folder of images, in their alphabetical order"""
+    cameras: tuple[Camera, ...]
+    """of each image"""
+    points: np.ndarray
+    """(m, 3) float64, metres (or whatever unit the model has)"""
+    colors: np.ndarray
+    """(m, 3) uint8"""
+
+
+def load_colmap(folder: Path) -> ColmapModel:
+    """Read cameras, images and points3D from a folder, binary where both are there.
+
+    Raises InputError when a file is missing or damaged, or a camera is no pinhole.
+    """
+    lenses = dict(_read(folder, "cameras", _binary_cameras, _text_cameras))
+    views = sorted(_read(folder, "images", _binary_images, _text_images), key=lambda view: view[0])
+    found = list(_read(folder, "points3D", _binary_points, _text_points))
+    if not views:
+        raise InputError(f"the COLMAP model in {folder} has no images; give one with views")
+    cameras = []
+    for name, number, pose in views:
+        if number not in lenses:
+            raise InputError(f"{folder}: image {name} has camera {number}, which cameras does not have")
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = quaternion_to_matrix(np.array(pose[:4])), pose[4:]
+        cameras.append(_camera(folder, lenses[number], matrix))
+    values = np.array(found, np.float64).reshape(-1, 6)
+    return ColmapModel(
+        tuple(name for name, _, _ in views), tuple(cameras), values[:, :3], values[:, 3:].astype(np.uint8)
+    )
+
+
+def has_colmap(folder: Path) -> bool:
+    """Whether a model lies in the folder."""
+    return any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
+
+
+def _read(folder: Path, name: str, binary, text) -> list:
+    file = folder / f"{name}.bin"
+    try:
+        if file.is_file():
+            return list(binary(_Bytes(file.read_bytes())))
+        file = folder / f"{name}.txt"
+        lines = file.read_text("utf-8").splitlines()
+        return list(text([line.strip() for line in lines if not line.lstrip().startswith("#")]))
+    except FileNotFoundError:
+        raise InputError(f"{folder} has neither {name}.bin nor {name}.txt; it is no COLMAP model") from None
+    except OSError as error:
+        raise InputError(f"cannot read {file}: {error.strerror or error}") from error
+    except (ValueError, IndexError, KeyError, struct.error) as error:
+        raise InputError(f"{file} is damaged, or not COLMAP's: {error}; export the model again") from error
+
+
+class _Bytes:
+    """A binary file, read from its beginning on."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data, self._place = data, 0
+
+    def take(self, form: str) -> tuple:
+        """The next numbers."""
+        values = struct.unpack_from("<" + form, self._data, self._place)
+        self._place += struct.calcsize("<" + form)
+        return values
+
+    def count(self) -> int:
+        """The next number of things, of which each takes a byte at least."""
+        (count,) = self.take("Q")
+        if count > len(self._data):
+            raise ValueError(f"it says that it holds {count} things")
+        return count
+
+    def word(self) -> str:
+        """The next text, which a zero ends."""
+        end = self._data.index(b"\0", self._place)
+        text = self._data[self._place : end].decode()
+        self._place = end + 1
+        return text
+
+    def skip(self, size: int) -> None:
+        """Leaves out so many bytes."""
+        if self._place + size > len(self._data):
+            raise ValueError("it ends too early")
+        self._place += size
+
+
+_Lens = tuple[str, int, int, tuple[float, ...]]
+_View = tuple[str, int, tuple[float, ...]]
+
+
+def _binary_cameras(data: _Bytes) -> Iterator[tuple[int, _Lens]]:
+    for _ in range(data.count()):
+        number, model, width, height = data.take("iiQQ")
+        name, parameters = _MODELS[model]
+        yield number, (name, width, height, data.take(f"{parameters}d"))
+
+
+def _text_cameras(lines: list[str]) -> Iterator[tuple[int, _Lens]]:
+    for line in filter(None, lines):
+        number, model, width, height, *parameters = line.split()
+        yield int(number), (model, int(width), int(height), tuple(map(float, parameters)))
+
+
+def _binary_images(data: _Bytes) -> Iterator[_View]:
+    for _ in range(data.count()):
+        _, *pose, camera = data.take("i7di")
+        name = data.word()
+        data.skip(24 * data.count())  # points that were found in the picture
+        yield name, camera, tuple(pose)
+
+
+def _text_images(lines: list[str]) -> Iterator[_View]:
+    # every second line has the points that were found in the picture, and may be empty
+    for line in lines[::2]:
+        if line:
+            words = line.split(maxsplit=9)
+            yield words[9], int(words[8]), tuple(map(float, words[1:8]))
+
+
+def _binary_points(data: _Bytes) -> Iterator[tuple]:
+    for _ in range(data.count()):
+        _, *values, _ = data.take("Q3d3Bd")
+        data.skip(8 * data.count())  # pictures that it was seen in
+        yield tuple(values)
+
+
+def _text_points(lines: list[str]) -> Iterator[tuple]:
+    for line in filter(None, lines):
+        yield tuple(map(float, line.split()[1:7]))
+
+
+def _camera(folder: Path, lens: _Lens, pose: np.ndarray) -> Camera:
+    model, width, height, values = lens
+    if model in _ONE_FOCAL_LENGTH:
+        (f, cx, cy), rest = values[:3], values[3:]
+        fx = fy = f
+    else:
+        (fx, fy, cx, cy), rest = values[:4], values[4:]
+    if model not in _PERSPECTIVE or any(rest):
+        raise InputError(
+            f"{folder}: a camera has the model {model} with distortion, and pictures are trained on without; "
+            "undistort them first, e.g. by colmap image_undistorter"
+        )
+    return Camera.pinhole(width, height, fx, fy, cx, cy, pose)

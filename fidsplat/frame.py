@@ -1,0 +1,165 @@
+"""Frame: one finished picture."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends.base import GivesArrays, Images, Waits
+from fidsplat.errors import InputError, MissingOutputError
+
+
+class Frame(Mapping):
+    """A finished picture: a mapping from an output's name to a read-only NumPy array, copied from the
+    device on first use.
+
+    Shapes and units: `rgb` (h, w, 3) float32; `alpha` (h, w); `depth`, `depth_median`, `depth_first` (h, w)
+    metres along z, `distance`, `distance_median`, `distance_first` metres along the ray; `normal` (h, w, 3)
+    unit, camera frame, towards the camera, `normal_world` the same in the world's axes; `label`, `splat_id`
+    (h, w) int32; `blended` (h, w) int32. Where less than 1/255 is covered, or of first hits less than
+    `Quality.first_hit`, labels and ids are -1, the others of these 0.
+    """
+
+    def __init__(self, images: Images, outputs: tuple[str, ...]) -> None:
+        self._images, self._process = images, os.getpid()
+        self._arrays: dict[str, np.ndarray] = {}
+        self.outputs = outputs
+        """Names of the images, in the order in which they were asked for."""
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        self._check(name)
+        if name not in self._arrays:
+            check_process(self._process, "frame")
+            self._arrays[name] = image = self._images.read(name)
+            image.flags.writeable = False  # what is kept is what was drawn
+        return self._arrays[name]
+
+    def device_array(self, name: str) -> Any:
+        """The image where it was drawn, without a copy: on a Warp device a wp.array, (h, w) or (h, w, 3).
+
+        It belongs to this frame: the next picture is drawn into another array. `wp.to_torch`, DLPack and
+        `__cuda_array_interface__` make a tensor of it on the same device.
+
+        Raises:
+            InputError: an output that was not asked for, or the backend has no arrays to give.
+        """
+        self._check(name)
+        check_process(self._process, "frame")
+        if not isinstance(self._images, GivesArrays):
+            raise InputError(
+                f"this device keeps {name} in no array that others can use; draw with device='warp:cuda' or "
+                "'warp:cpu', or take frame[name], which is copied to the host"
+            )
+        return self._images.device_array(name)
+
+    def to_torch(self, name: str = "rgb") -> Any:
+        """The image as a torch tensor: without a copy on the device that drew it where that has arrays to
+        give (`device_array`), else copied to the host.
+
+        Raises:
+            InputError: an output that was not asked for, or torch is not installed.
+        """
+        self._check(name)
+        try:
+            import torch  # type: ignore[import-not-found]
+        except ImportError:
+            raise InputError(
+                "to_torch makes tensors of torch, which is not installed; pip install torch"
+            ) from None
+        if isinstance(self._images, GivesArrays):
+            check_process(self._process, "frame")
+            return torch.from_dlpack(self._images.device_array(name))
+        return torch.from_numpy(self[name].copy())  # torch has no arrays that are read-only
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        """The image of a frame with one output, as NumPy, PIL and OpenCV ask for it. Raises InputError where
+        there are several."""
+        if len(self.outputs) != 1:
+            raise InputError(
+                f"this frame has {len(self.outputs)} images ({', '.join(self.outputs)}); take one by its "
+                "name, frame['rgb'] say"
+            )
+        image = self[self.outputs[0]]
+        return image.astype(dtype or image.dtype) if copy or (dtype and dtype != image.dtype) else image
+
+    def __repr__(self) -> str:
+        took = sum(self.timings.values())
+        splats = f", {self.stats['splats']:,} splats" if "splats" in self.stats else ""
+        return f"Frame({', '.join(self.outputs)}{splats}, {took:.1f} ms)"
+
+    def _repr_png_(self) -> bytes:
+        """What a notebook shows: rgb, or else the first output, in colours."""
+        from fidsplat.vision.images import png_bytes  # late: it brings OpenCV
+        from fidsplat.vision.output_files import picture_of
+
+        name = "rgb" if "rgb" in self.outputs else self.outputs[0]
+        return png_bytes(picture_of(name, self[name]))
+
+    def _check(self, name: str) -> None:
+        if not isinstance(name, str) or name not in self.outputs:
+            raise MissingOutputError(
+                f"this frame has no {name!r}; it was rendered with {', '.join(self.outputs)}; name it there"
+            )
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.outputs)
+
+    def __len__(self) -> int:
+        return len(self.outputs)
+
+    def __reduce__(self):
+        """Pickled and copied as NumPy arrays: what `device_array` gives stays on its device."""
+        return _kept_frame, (dict(self), dict(self.timings), dict(self.stats))
+
+    def wait(self) -> Frame:
+        """This frame, once the device has drawn it; nothing is copied.
+
+        Raises:
+            DeviceError: the device has failed while it was drawing.
+        """
+        if isinstance(self._images, Waits):
+            self._images.wait()
+        return self
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds on the device by stage: project, sort, bin, blend, resolve.
+
+        On a GPU a frame of a kind that was drawn before is drawn once more for that, since taking the time of
+        each launch would slow all frames down. Empty if its cloud is not on the device any more.
+        """
+        return self._images.timings
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        """splats (in the cloud), visible (not culled), pairs (of splats and tiles)."""
+        return self._images.stats
+
+
+@dataclass(frozen=True)
+class _KeptImages:
+    """Images that are no longer on a device."""
+
+    arrays: dict[str, np.ndarray]
+    timings: Mapping[str, float]
+    stats: Mapping[str, int]
+
+    def read(self, name: str) -> np.ndarray:
+        return self.arrays[name]
+
+
+def _kept_frame(arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int]) -> Frame:
+    return Frame(_KeptImages(arrays, timings, stats), tuple(arrays))
+
+
+def check_process(opened_by: int, what: str) -> None:
+    """Raises InputError in a fork of the process that opened it, where its driver does not work."""
+    if opened_by != os.getpid():
+        raise InputError(
+            f"this {what} belongs to process {opened_by}, of which this one is a fork; open a Renderer in "
+            "each process, and read frames before the fork"
+        )

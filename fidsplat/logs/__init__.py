@@ -1,0 +1,6 @@
+"""Logs that robotics tools open: MCAP files and rosbag2 folders. Needs `pip install 'fidsplat[logs]'`."""
+
+from fidsplat.logs.log import RobotLog
+from fidsplat.logs.reader import log_pictures
+
+__all__ = ["RobotLog", "log_pictures"]

@@ -1,0 +1,218 @@
+"""RobotLog: pictures, poses and detections as ROS 2 messages."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from fidsplat.cameras import BrownConrady, Camera, Fisheye
+from fidsplat.errors import InputError, unknown
+from fidsplat.logs.files import log_file, typestore
+from fidsplat.rotations import check_similarity, matrix_to_quaternion
+from fidsplat.scalars import real_array
+from fidsplat.vision.detect import Detection
+from fidsplat.vision.images import encoded, to_uint8
+
+_ENCODINGS = {"rgb": "rgb8", "label": "32SC1", "splat_id": "32SC1", "blended": "32SC1"}
+"""of outputs; the others are 32FC1 or 32FC3"""
+PIXEL = 0.5
+"""what ROS and OpenCV count less than we do: the centre of their first pixel is at 0"""
+
+
+class RobotLog:
+    """A log that is written message by message, NAME.mcap or a rosbag2 folder (SQLite), for `with`.
+
+    Times are seconds, of each topic not decreasing. What is written appears under its name when the block
+    ends; if it ends with an error, nothing does.
+
+    Args:
+        path: NAME.mcap, or a folder to be made.
+        world: name of the frame in which poses are.
+        overwrite: whether a log of that name is replaced.
+
+    Raises:
+        InputError: the log exists, cannot be written, or the packages are missing (extra `logs`).
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, world: str = "map", overwrite: bool = False) -> None:
+        self._store = typestore()
+        self._file = log_file(path, self._store, overwrite)
+        self._path, self.world = path, world
+        self._last: dict[str, float] = {}
+
+    def __enter__(self) -> RobotLog:
+        return self
+
+    def __exit__(self, kind: type | None, *_: Any) -> None:
+        try:
+            self._file.close(kind is None)
+        except OSError as error:
+            raise InputError(f"cannot write {self._path}: {error.strerror or error}") from error
+
+    def image(
+        self, time: float, camera: str, image: np.ndarray, output: str = "rgb", compress: str | None = None
+    ) -> None:
+        """An output image as `/CAMERA/image_raw`, or `/CAMERA/OUTPUT/image_raw` for all but rgb: rgb8, 32FC1,
+        32FC3 or 32SC1.
+
+        compress: "jpeg" or "png" for `/CAMERA/image_raw/compressed` instead, of rgb alone.
+
+        Raises:
+            InputError: a time before the last, a compression that nobody knows.
+        """
+        topic = f"/{camera}/image_raw" if output == "rgb" else f"/{camera}/{output}/image_raw"
+        if compress is not None:
+            if compress not in ("jpeg", "png") or output != "rgb":
+                raise InputError(
+                    f"compress is {compress!r} for {output}; rgb alone is compressed, as 'jpeg' or 'png'"
+                )
+            data = np.frombuffer(encoded(image, compress), np.uint8)
+            message = self._of("sensor_msgs/msg/CompressedImage")(self._header(time, camera), compress, data)
+            self._write(f"{topic}/compressed", time, message)
+            return
+        pixels = to_uint8(image) if output == "rgb" else np.asarray(image)
+        kind = _ENCODINGS.get(output, f"32FC{1 if pixels.ndim == 2 else pixels.shape[2]}")
+        dtype = np.uint8 if kind == "rgb8" else np.int32 if kind == "32SC1" else np.float32
+        pixels = np.ascontiguousarray(pixels, dtype)
+        height, width = pixels.shape[:2]
+        data = pixels.reshape(-1).view(np.uint8)
+        self._write(
+            topic,
+            time,
+            self._of("sensor_msgs/msg/Image")(
+                self._header(time, camera), height, width, kind, 0, data.size // height, data
+            ),
+        )
+
+    def camera_info(self, time: float, name: str, camera: Camera) -> None:
+        """A camera's intrinsics and distortion as `/CAMERA/camera_info`: plumb_bob, rational_polynomial or
+        equidistant.
+
+        Raises:
+            InputError: a lens that ROS does not know.
+        """
+        model, factors = _distortion(camera)
+        k = camera.matrix - [[0, 0, PIXEL], [0, 0, PIXEL], [0, 0, 0]]
+        roi = self._of("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False)
+        message = self._of("sensor_msgs/msg/CameraInfo")(
+            self._header(time, name), camera.height, camera.width, model, np.array(factors, np.float64),
+            k.ravel(), np.eye(3).ravel(), np.column_stack([k, np.zeros(3)]).ravel(), 0, 0, roi,
+        )  # fmt: skip
+        self._write(f"/{name}/camera_info", time, message)
+
+    def transform(self, time: float, frame: str, pose: Any, parent: str | None = None) -> None:
+        """Where a frame is, parent from frame (4, 4), as `/tf`; the parent is the world by default. A
+        camera's frame has OpenCV's axes, as ROS's optical frames have."""
+        position, turn = self._pose_parts(f"the pose of {frame}", pose)
+        made = self._of("geometry_msgs/msg/Transform")(self._of("geometry_msgs/msg/Vector3")(*position), turn)
+        stamped = self._of("geometry_msgs/msg/TransformStamped")(
+            self._header(time, self.world if parent is None else parent), frame, made
+        )
+        self._write("/tf", time, self._of("tf2_msgs/msg/TFMessage")([stamped]))
+
+    def odometry(
+        self, time: float, pose: Any, velocity: Any = (0, 0, 0), turning: Any = (0, 0, 0),
+        frame: str = "base_link", topic: str = "/odom", covariance: Any = None,
+    ) -> None:  # fmt: skip
+        """World from body (4, 4), with velocities (3,) in metres and radians a second in the body's axes, and
+        the pose's covariance (6, 6)."""
+        position, turn = self._pose_parts("the pose of odometry", pose)
+        spread = np.zeros(36) if covariance is None else np.asarray(covariance, np.float64).ravel()
+        vector, point = self._of("geometry_msgs/msg/Vector3"), self._of("geometry_msgs/msg/Point")
+        body = self._of("geometry_msgs/msg/Pose")(point(*position), turn)
+        twist = self._of("geometry_msgs/msg/Twist")(
+            vector(*_three("velocity", velocity)), vector(*_three("turning", turning))
+        )
+        message = self._of("nav_msgs/msg/Odometry")(
+            self._header(time, self.world),
+            frame,
+            self._of("geometry_msgs/msg/PoseWithCovariance")(body, spread),
+            self._of("geometry_msgs/msg/TwistWithCovariance")(twist, np.zeros(36)),
+        )
+        self._write(topic, time, message)
+
+    def imu(
+        self, time: float, turning: Any, acceleration: Any, frame: str = "imu", topic: str = "/imu"
+    ) -> None:
+        """Angular velocity (3,) radians and acceleration (3,) metres a second (squared), without
+        orientation."""
+        vector, none = self._of("geometry_msgs/msg/Vector3"), np.zeros(9)
+        unknown_turn = np.array([-1.0, *np.zeros(8)])
+        message = self._of("sensor_msgs/msg/Imu")(
+            self._header(time, frame), self._of("geometry_msgs/msg/Quaternion")(0.0, 0.0, 0.0, 1.0),
+            unknown_turn, vector(*_three("turning", turning)), none,
+            vector(*_three("acceleration", acceleration)), none,
+        )  # fmt: skip
+        self._write(topic, time, message)
+
+    def detections(self, time: float, camera: str, found: Iterable[Detection]) -> None:
+        """Tags of a picture as `/CAMERA/detections` (apriltag_msgs); a QR code's family is its payload."""
+        point, tag = (self._of(f"apriltag_msgs/msg/{name}") for name in ("Point", "AprilTagDetection"))
+        tags = []
+        for code in found:
+            corners = [point(float(x), float(y)) for x, y in np.asarray(code.corners) - PIXEL]
+            middle = point(*(np.asarray(code.corners).mean(0) - PIXEL).tolist())
+            family, number = (code.payload or "", -1) if code.id is None else (code.family or "", code.id)
+            tags.append(tag(family, number, 0, 0.0, 0.0, middle, corners, np.zeros(9)))
+        message = self._of("apriltag_msgs/msg/AprilTagDetectionArray")(self._header(time, camera), tags)
+        self._write(f"/{camera}/detections", time, message)
+
+    def _of(self, kind: str) -> Any:
+        return self._store.types[kind]
+
+    def _header(self, time: float, frame: str) -> Any:
+        seconds, rest = divmod(_nanoseconds(time), 10**9)
+        return self._of("std_msgs/msg/Header")(self._of("builtin_interfaces/msg/Time")(seconds, rest), frame)
+
+    def _pose_parts(self, name: str, pose: Any) -> tuple[list[float], Any]:
+        _, _, position = check_similarity(pose, name, rigid=True)
+        w, x, y, z = matrix_to_quaternion(np.asarray(pose, np.float64)[:3, :3]).tolist()
+        return position.tolist(), self._of("geometry_msgs/msg/Quaternion")(x, y, z, w)
+
+    def _write(self, topic: str, time: float, message: Any) -> None:
+        if time < self._last.get(topic, -math.inf):
+            raise InputError(
+                f"{topic} jumps back in time, from {self._last[topic]:g} s to {time:g} s; a simulator that "
+                "was reset needs a log of its own"
+            )
+        self._last[topic] = time
+        kind = message.__msgtype__
+        data = bytes(self._store.serialize_cdr(message, kind))
+        try:
+            self._file.write(topic, kind, _nanoseconds(time), data)
+        except OSError as error:
+            raise InputError(f"cannot write {self._path}: {error.strerror or error}") from error
+
+
+def _nanoseconds(time: float) -> int:
+    value = float(time)
+    if not 0 <= value < 2**31:
+        raise InputError(f"a log's time is {time!r}; it must be seconds from 0 to 2^31")
+    return round(value * 1e9)
+
+
+def _three(name: str, value: Any) -> list[float]:
+    numbers = real_array(name, value, "three numbers")
+    if numbers.shape != (3,) or not np.isfinite(numbers).all():
+        raise InputError(f"{name} must be three finite numbers, not {value!r}")
+    return numbers.tolist()
+
+
+def _distortion(camera: Camera) -> tuple[str, list[float]]:
+    lens = camera.lens
+    if lens is None:
+        return "plumb_bob", [0.0] * 5
+    if isinstance(lens, Fisheye):
+        return "equidistant", [lens.k1, lens.k2, lens.k3, lens.k4]
+    if isinstance(lens, BrownConrady):
+        first = [lens.k1, lens.k2, lens.p1, lens.p2, lens.k3]
+        prism = [lens.s1, lens.s2, lens.s3, lens.s4]
+        rational = [lens.k4, lens.k5, lens.k6]
+        if any(prism):
+            return "rational_polynomial", first + rational + prism
+        return ("rational_polynomial", first + rational) if any(rational) else ("plumb_bob", first)
+    raise InputError(unknown("lens of ROS's CameraInfo", lens.kind, ("brown_conrady", "fisheye")))

@@ -1,0 +1,187 @@
+"""The XML that SDF and URDF share: numbers, poses, and SDF's `<camera>` element."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from fidsplat.cameras import BrownConrady, Camera, Fisheye, fisheye_focal_length, focal_length
+from fidsplat.errors import InputError
+from fidsplat.files import path_of
+from fidsplat.rotations import quaternion_multiply
+from fidsplat.sensor import Sensor
+from fidsplat.sim.poses import IDENTITY, check_poses, compose, inverse, matrix_of
+from fidsplat.sim.rig import RigCamera
+
+OPTICAL = np.array([0.0, 0.0, 0.0, 0.5, -0.5, 0.5, -0.5])
+"""sensor from camera: theirs looks along x with z up, ours along z with y down"""
+KINDS = {
+    "camera": ("rgb",),
+    "wideanglecamera": ("rgb",),
+    "depth_camera": ("depth",),
+    "depth": ("depth",),
+    "rgbd_camera": ("rgb", "depth"),
+    "rgbd": ("rgb", "depth"),
+    "segmentation": ("label",),
+    "segmentation_camera": ("label",),
+    "boundingbox_camera": ("rgb", "label"),
+}
+"""outputs of each type of sensor"""
+_WELL = 1e12
+"""electrons: so deep a well has no shot noise to speak of"""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where in a file something stands, for errors."""
+
+    file: Path
+    path: str = ""
+
+    def within(self, name: str) -> Place:
+        """A part of it."""
+        return Place(self.file, f"{self.path}/{name}" if self.path else name)
+
+    def wrong(self, why: str) -> InputError:
+        """The error that says why it cannot be used."""
+        return InputError(f"{self.file}: {self.path}: {why}" if self.path else f"{self.file}: {why}")
+
+
+def parse(path: str | os.PathLike[str]) -> tuple[ElementTree.Element, Place]:
+    """A file's root. Raises InputError for a file that cannot be read, or is no XML."""
+    file = path_of(path)
+    try:
+        root = ElementTree.parse(file).getroot()
+    except OSError as error:
+        raise InputError(f"cannot read {file}: {error.strerror or error}") from error
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # or an encoding that nobody knows
+        raise InputError(f"{file} is no XML: {error}") from None
+    for element in root.iter():
+        if "ros.org/wiki/xacro" in str(element.tag):
+            raise InputError(f"{file} is a xacro file; run `xacro {file.name} > out.urdf` and read that")
+    return root, Place(file)
+
+
+def name_of(element: ElementTree.Element, place: Place) -> str:
+    """The attribute `name`."""
+    name = element.get("name", "")
+    if not name:
+        raise place.wrong(f"a <{element.tag}> has no name")
+    return name
+
+
+def numbers(text: str | None, count: int, place: Place) -> list[float]:
+    """So many finite numbers of a text."""
+    try:
+        values = [float(word) for word in (text or "").split()]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(map(math.isfinite, values)):
+        raise place.wrong(f"{text!r} must be {count} finite number{'s' if count > 1 else ''}")
+    return values
+
+
+def number(parent: ElementTree.Element, tag: str, default: float, place: Place) -> float:
+    """The number in a child element."""
+    child = parent.find(tag)
+    return default if child is None else numbers(child.text, 1, place.within(tag))[0]
+
+
+def pose_of_angles(position: list[float], angles: list[float]) -> np.ndarray:
+    """(7,) of x y z and roll, pitch, yaw in radians about the fixed axes x, y, z."""
+    turn = np.array([1.0, 0.0, 0.0, 0.0])
+    for axis, angle in enumerate(angles):
+        own = np.zeros(4)
+        own[0], own[1 + axis] = math.cos(angle / 2), math.sin(angle / 2)
+        turn = quaternion_multiply(own, turn)
+    return np.array([*position, *turn])
+
+
+def pose_element(parent: ElementTree.Element, place: Place) -> np.ndarray:
+    """The (7,) of a child `<pose>`; it stands still where there is none."""
+    element, place = parent.find("pose"), place.within("pose")
+    if element is None or not (element.text or "").strip():
+        return IDENTITY
+    if element.get("rotation_format", "euler_rpy") == "quat_xyzw":
+        x, y, z, qx, qy, qz, qw = numbers(element.text, 7, place)
+        return check_poses(f"{place.file}: {place.path}", [x, y, z, qw, qx, qy, qz], ())
+    values = numbers(element.text, 6, place)
+    unit = math.radians(1) if element.get("degrees", "false").lower() in ("true", "1") else 1.0
+    return pose_of_angles(values[:3], [unit * angle for angle in values[3:]])
+
+
+def camera_sensor(sensor: ElementTree.Element, body: str, at: np.ndarray, place: Place) -> RigCamera | None:
+    """The camera that an SDF `<sensor>` is; None for another sensor.
+
+    body: the link that carries it. at: (7,), link from sensor.
+    """
+    kind = sensor.get("type", "")
+    element = sensor.find("camera")
+    if kind not in KINDS or element is None:
+        return None
+    place = place.within("camera")
+    mount = compose(compose(at, pose_element(element, place)), OPTICAL)
+    plain = _camera(element, place)
+    camera = Camera(
+        plain.width, plain.height, plain.fx, plain.fy, plain.cx, plain.cy,
+        matrix_of(inverse(mount)), plain.near, plain.far, lens=plain.lens,
+    )  # fmt: skip
+    rate = number(sensor, "update_rate", 0.0, place)
+    return RigCamera(camera, body, _noise(element, place), KINDS[kind], rate if rate > 0 else None)
+
+
+def _camera(element: ElementTree.Element, place: Place) -> Camera:
+    image = element.find("image")
+    sizes = [("width", 320), ("height", 240)]
+    width, height = (d if image is None else number(image, tag, d, place.within("image")) for tag, d in sizes)
+    if not (width == int(width) and height == int(height)):
+        raise place.within("image").wrong(f"{width:g} x {height:g} are no whole numbers of pixels")
+    fov = number(element, "horizontal_fov", 1.047, place)
+    kind = element.findtext("lens/type", "gnomonical").strip()
+    lens: Fisheye | BrownConrady | None
+    try:
+        if kind == "equidistant":
+            lens = Fisheye()
+            focal = fisheye_focal_length(int(width), fov, lens)
+        elif kind == "gnomonical":
+            lens = _distortion(element, place)
+            focal = focal_length(int(width), fov)
+        else:
+            raise InputError(f"a lens of type {kind!r} is not offered; known: gnomonical, equidistant")
+        intrinsics, inside = element.find("lens/intrinsics"), place.within("lens/intrinsics")
+        values = (("fx", focal), ("fy", focal), ("cx", width / 2), ("cy", height / 2))
+        fx, fy, cx, cy = (
+            value if intrinsics is None else number(intrinsics, tag, value, inside) for tag, value in values
+        )
+        clip, inside = element.find("clip"), place.within("clip")
+        near = 0.01 if clip is None else number(clip, "near", 0.01, inside)
+        far = math.inf if clip is None else number(clip, "far", math.inf, inside)
+        return Camera(int(width), int(height), fx, fy, cx, cy, near=near, far=far, lens=lens)
+    except InputError as error:
+        raise error if str(error).startswith(str(place.file)) else place.wrong(str(error)) from None
+
+
+def _distortion(element: ElementTree.Element, place: Place) -> BrownConrady | None:
+    distortion, place = element.find("distortion"), place.within("distortion")
+    if distortion is None:
+        return None
+    return BrownConrady(
+        **{tag: number(distortion, tag, 0.0, place) for tag in ("k1", "k2", "k3", "p1", "p2")}
+    )
+
+
+def _noise(element: ElementTree.Element, place: Place) -> Sensor | None:
+    noise, place = element.find("noise"), place.within("noise")
+    if noise is None:
+        return None
+    mean, deviation = number(noise, "mean", 0.0, place), number(noise, "stddev", 0.0, place)
+    if mean:
+        raise place.wrong(f"a mean of {mean:g} is no noise; make it 0")
+    if not 0 <= deviation <= 1:
+        raise place.wrong(f"a stddev of {deviation:g} must lie between 0 and 1, the white of a picture")
+    return Sensor(full_well=_WELL, read_noise=deviation * _WELL) if deviation else None

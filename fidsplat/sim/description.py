@@ -1,0 +1,259 @@
+"""Cameras and bodies of SDF worlds and models, and of URDF robots."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from fidsplat.cameras import Camera, focal_length
+from fidsplat.errors import InputError, unknown
+from fidsplat.sim.camera_element import (
+    KINDS,
+    OPTICAL,
+    Place,
+    camera_sensor,
+    name_of,
+    numbers,
+    parse,
+    pose_element,
+    pose_of_angles,
+)
+from fidsplat.sim.poses import IDENTITY, compose, inverse, matrix_of
+from fidsplat.sim.rig import RigCamera
+
+DEEPEST = 32
+"""includes within includes"""
+
+
+@dataclass
+class Description:
+    """What `read_description` finds."""
+
+    cameras: dict[str, RigCamera] = field(default_factory=dict)
+    """by the sensor's name, for `Rig`; each hangs on its link"""
+    bodies: dict[str, np.ndarray] = field(default_factory=dict)
+    """links by name, MODEL::LINK in SDF: their poses (7,) in the world as the file has them, of a robot with
+    all joints at 0"""
+
+    def add(self, name: str, camera: RigCamera | None, place: Place) -> None:
+        """Keep a camera. Raises InputError where another has its name."""
+        if camera is None:
+            return
+        if name in self.cameras:
+            raise place.wrong(
+                f"two cameras have the name {name!r}, on {self.cameras[name].body} and on {camera.body}; "
+                "rename one"
+            )
+        self.cameras[name] = camera
+
+
+def read_description(
+    path: str | os.PathLike[str], models: Iterable[str | os.PathLike[str]] = ()
+) -> Description:
+    """The cameras and links of an SDF or URDF file.
+
+    Of an SDF: nested models and includes, poses relative to links, frames and joints of the same model;
+    sensors that are cameras, with field of view or intrinsics, distortion, clip, noise and update rate. Of a
+    URDF: links, joints at 0, sensors within `<gazebo reference>`, and `<sensor>` elements.
+
+    Args:
+        path: the file, or a model's folder with model.sdf in it.
+        models: folders in which `model://NAME` is looked for, before those of the environment variables
+            GZ_SIM_RESOURCE_PATH and SDF_PATH and the file's own.
+
+    Raises:
+        InputError: a file that cannot be read, an include that is not found or that includes itself, a value
+            that makes no camera, two cameras of one name; it names the file and the element.
+    """
+    file = Path(path)
+    if file.is_dir():
+        file = file / "model.sdf"
+    root, place = parse(file)
+    found = Description()
+    if root.tag == "robot":
+        _read_robot(root, found, place)
+    elif root.tag == "sdf":
+        folders = [Path(folder) for folder in models]
+        for variable in ("GZ_SIM_RESOURCE_PATH", "SDF_PATH"):
+            folders += [Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
+        reader = _Sdf(found, folders)
+        reader.group(root, "", IDENTITY, place, ())
+        for world in root.findall("world"):
+            reader.group(world, "", IDENTITY, place.within("world"), ())
+    else:
+        raise place.wrong(f"the root is <{root.tag}>; it must be <sdf> or <robot>")
+    return found
+
+
+@dataclass
+class _Sdf:
+    found: Description
+    folders: list[Path]
+
+    def group(
+        self, parent: ElementTree.Element, prefix: str, at: np.ndarray, place: Place, files: tuple[Path, ...]
+    ) -> None:
+        """The models of a world or a file."""
+        for model in parent.findall("model"):
+            self.model(model, prefix, at, place, files)
+        for include in parent.findall("include"):
+            self.include(include, prefix, at, place, files)
+
+    def include(
+        self, include: ElementTree.Element, prefix: str, at: np.ndarray, place: Place, files: tuple[Path, ...]
+    ) -> None:
+        uri = include.findtext("uri", "").strip()
+        place = place.within(f"include {uri}")
+        file = self._file_of(uri, place)
+        if file in files or len(files) >= DEEPEST:
+            raise place.wrong("it includes itself")
+        root, inner = parse(file)
+        model = root.find("model")
+        if model is None:
+            raise inner.wrong("it has no <model> to include")
+        pose = None if include.find("pose") is None else pose_element(include, place)
+        name = include.findtext("name", "").strip() or None
+        self.model(model, prefix, at, inner, (*files, file), name, pose)
+
+    def _file_of(self, uri: str, place: Place) -> Path:
+        name = uri.removeprefix("model://").removeprefix("file://")
+        beside = place.file.resolve().parent
+        for folder in (*self.folders, beside, beside.parent):
+            for candidate in (folder / name, folder / name / "model.sdf"):
+                if name and candidate.is_file():
+                    return candidate.resolve()
+        places = ", ".join(map(str, (*self.folders, beside, beside.parent)))
+        raise place.wrong(f"the model is not found in {places}; give its folder as models=[...]")
+
+    def model(
+        self,
+        model: ElementTree.Element,
+        prefix: str,
+        at: np.ndarray,
+        place: Place,
+        files: tuple[Path, ...],
+        name: str | None = None,
+        pose: np.ndarray | None = None,
+    ) -> None:
+        """One model, whose parent stands at `at`. An include may give it another name and pose."""
+        own = name or name_of(model, place)
+        place = place.within(own)
+        here = compose(at, pose_element(model, place) if pose is None else pose)
+        frames = _Frames(model, place)
+        for link in model.findall("link"):
+            body = f"{prefix}{own}::{name_of(link, place)}"
+            within = place.within(name_of(link, place))
+            self.found.bodies[body] = compose(here, frames.pose(link.get("name", "")))
+            for sensor in link.findall("sensor"):
+                sensed = name_of(sensor, within)
+                inside = within.within(sensed)
+                camera = camera_sensor(sensor, body, pose_element(sensor, inside), inside)
+                self.found.add(sensed, camera, inside)
+        self.group(model, f"{prefix}{own}::", here, place, files)
+
+
+class _Frames:
+    """Poses of a model's links, frames and joints in the model."""
+
+    def __init__(self, model: ElementTree.Element, place: Place) -> None:
+        kinds = ("link", "frame", "joint", "model")
+        self._parts = {part.get("name", ""): part for kind in kinds for part in model.findall(kind)}
+        self._place = place
+
+    def pose(self, name: str, seen: tuple[str, ...] = ()) -> np.ndarray:
+        """(7,), model from it."""
+        if name == "__model__":
+            return IDENTITY
+        if name not in self._parts:
+            raise self._place.wrong(unknown("frame", name, self._parts))
+        if name in seen:
+            raise self._place.wrong(f"the pose of {name!r} is relative to itself")
+        part = self._parts[name]
+        own = pose_element(part, self._place.within(name))
+        element = part.find("pose")
+        base = "" if element is None else element.get("relative_to", "")
+        if not base:
+            base = part.get("attached_to", "") if part.tag == "frame" else ""
+            base = part.findtext("child", "").strip() if part.tag == "joint" else base
+        return compose(self.pose(base, (*seen, name)), own) if base else own
+
+
+def _read_robot(root: ElementTree.Element, found: Description, place: Place) -> None:
+    parents: dict[str, tuple[str, np.ndarray]] = {}
+    for joint in root.findall("joint"):
+        inside = place.within(name_of(joint, place))
+        parent, child = (_link_of(joint, tag, inside) for tag in ("parent", "child"))
+        if child in parents:
+            raise inside.wrong(f"the link {child!r} has two parents")
+        parents[child] = parent, _origin(joint, inside)
+    links = [name_of(link, place) for link in root.findall("link")]
+    for name in links:
+        pose, at = IDENTITY, name
+        for _ in range(len(links) + 1):
+            if at not in parents:
+                break
+            at, step = parents[at]
+            pose = compose(step, pose)
+        else:
+            raise place.wrong(f"the joints above the link {name!r} go in a circle")
+        found.bodies[name] = pose
+    for gazebo in root.findall("gazebo"):
+        link = gazebo.get("reference", "")
+        for sensor in gazebo.findall("sensor"):
+            inside = place.within(link).within(name_of(sensor, place))
+            if link not in links:
+                raise inside.wrong(unknown("link", link, links))
+            camera = camera_sensor(sensor, link, pose_element(sensor, inside), inside)
+            found.add(sensor.get("name", ""), camera, inside)
+    for sensor in root.findall("sensor"):
+        inside = place.within(name_of(sensor, place))
+        if sensor.find("camera/image") is not None:
+            link = _link_of(sensor, "parent", inside)
+            if link not in links:
+                raise inside.wrong(unknown("link", link, links))
+            found.add(sensor.get("name", ""), _own_camera(sensor, link, inside), inside)
+
+
+def _link_of(element: ElementTree.Element, tag: str, place: Place) -> str:
+    child = element.find(tag)
+    name = "" if child is None else child.get("link", "")
+    if not name:
+        raise place.wrong(f"its <{tag}> names no link")
+    return name
+
+
+def _origin(element: ElementTree.Element, place: Place) -> np.ndarray:
+    origin, place = element.find("origin"), place.within("origin")
+    if origin is None:
+        return IDENTITY
+    return pose_of_angles(
+        numbers(origin.get("xyz", "0 0 0"), 3, place), numbers(origin.get("rpy", "0 0 0"), 3, place)
+    )
+
+
+def _own_camera(sensor: ElementTree.Element, link: str, place: Place) -> RigCamera:
+    """A camera of URDF's own `<sensor>`."""
+    image = sensor.find("camera/image")
+    assert image is not None
+    inside = place.within("camera/image")
+
+    def attribute(name: str, default: str | None = None) -> float:
+        return numbers(image.get(name, default), 1, inside.within(name))[0]
+
+    mount = compose(_origin(sensor, place), OPTICAL)
+    width, height = int(attribute("width")), int(attribute("height"))
+    try:
+        f = focal_length(width, attribute("hfov"))
+        near, far = attribute("near", "0.01"), attribute("far") if image.get("far") else math.inf
+        camera = Camera(width, height, f, f, width / 2, height / 2, matrix_of(inverse(mount)), near, far)
+    except InputError as error:
+        raise error if str(error).startswith(str(place.file)) else inside.wrong(str(error)) from None
+    rate = sensor.get("update_rate")
+    outputs = KINDS.get(sensor.get("type", "camera"), ("rgb",))
+    return RigCamera(camera, link, None, outputs, numbers(rate, 1, place)[0] if rate else None)

@@ -1,0 +1,161 @@
+"""Cameras of a MuJoCo model that see splats."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from fidsplat.cameras import Camera, Orthographic
+from fidsplat.errors import InputError, unknown
+from fidsplat.render import Renderer
+from fidsplat.scenes import Scene
+from fidsplat.sim.poses import quaternions_of
+from fidsplat.sim.rig import Pictures, Rig, RigCamera
+from fidsplat.splats import SplatCloud
+from fidsplat.surroundings import Layer
+
+try:
+    import mujoco as _mujoco
+except ImportError as error:
+    raise InputError(f"MuJoCo is not here ({error}); pip install 'fidsplat[sim]'") from None
+
+mujoco: Any = _mujoco  # whose names its types do not tell
+
+_OPENCV = np.array([0.0, 1.0, 0.0, 0.0])
+"""half a turn about x: MuJoCo's cameras look along -z with y up, ours along z with y down"""
+_OUTPUTS = {
+    "mjCAMOUT_RGB": "rgb",
+    "mjCAMOUT_DEPTH": "depth",
+    "mjCAMOUT_DIST": "distance",
+    "mjCAMOUT_NORMAL": "normal",
+    "mjCAMOUT_SEG": "label",
+}
+"""our name of each output that a camera of MJCF may name"""
+
+
+class MujocoRig(Rig):
+    """The cameras of a MuJoCo model, looking at splats that hang on its bodies.
+
+    Resolution, fovy, focal length, principal point and outputs are the model's; the near and far planes are
+    ours (0.01 m and none), since MuJoCo's grow with the model.
+
+    Args:
+        model: mujoco.MjModel.
+        scene: splats and markers; those with a label in `bodies` in the frame of their body.
+        bodies: {label: name of the body in the model}.
+        cameras: names of the cameras that are wanted; default all that have one.
+        renderer, rest, outputs: as in `Rig`; without `outputs` a camera gives what its `output` names.
+
+    Raises:
+        InputError: as `Rig`; a body or camera that the model does not have, a camera without a name.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        scene: Scene | SplatCloud,
+        bodies: Mapping[int, str] | None = None,
+        cameras: Iterable[str] | None = None,
+        *,
+        renderer: Renderer | None = None,
+        rest: Mapping[str, Any] | None = None,
+        outputs: Iterable[str] | None = None,
+    ) -> None:
+        if not isinstance(model, mujoco.MjModel):
+            raise InputError(f"model is {model!r}; it must be a mujoco.MjModel")
+        there = [model.camera(i).name for i in range(model.ncam)]
+        wanted = [name for name in there if name] if cameras is None else list(cameras)
+        for name in wanted:
+            if name not in there or not name:
+                raise InputError(unknown("camera", name, filter(None, there)))
+        seen = [(name, camera_of(model, name, default=outputs is None)) for name in wanted]
+        super().__init__(scene, bodies, seen, renderer=renderer, rest=rest, outputs=outputs)
+        names = [model.body(i).name for i in range(model.nbody)]
+        for name in self.bodies:
+            if name not in names:
+                raise InputError(unknown("body", name, filter(None, names)))
+        self._body_ids = [names.index(name) for name in self.bodies]
+        self._camera_ids = [there.index(name) for name in self.cameras]
+
+    def poses(self, data: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Poses (env, body, 7) and (env, camera, 7), OpenCV axes, of what `render` takes."""
+        many = data if isinstance(data, list | tuple) else [data]
+        if not many:
+            raise InputError("data is empty; give at least one MjData")
+        parts = [_arrays_of(each) for each in many]
+        position, turn, at, axes = (np.concatenate([part[k] for part in parts]) for k in range(4))
+        bodies = np.concatenate([position, turn], -1)[:, self._body_ids]
+        cameras = np.concatenate([at, quaternions_of(axes, turned=_OPENCV)], -1)[:, self._camera_ids]
+        return bodies, cameras
+
+    def render(  # type: ignore[override]
+        self,
+        data: Any,
+        *,
+        outputs: Iterable[str] | None = None,
+        layers: Mapping[str, Sequence[Layer]] | None = None,
+        mask: Any = None,
+    ) -> Pictures:
+        """What the cameras see.
+
+        Args:
+            data: an MjData, a list of them, one for each environment, or mujoco_warp's Data; after
+                `mj_forward` or `mj_step`, which say where bodies and cameras are.
+            outputs, layers, mask: as in `Rig.render`.
+
+        Raises:
+            InputError: as `Rig.render`; data without poses.
+        """
+        bodies, cameras = self.poses(data)
+        return super().render(bodies, cameras, outputs=outputs, layers=layers, mask=mask)
+
+
+def camera_of(model: Any, name: str, default: bool = True) -> RigCamera:
+    """A camera of a MuJoCo model as ours. A model that gives no resolution means its off-screen buffer's.
+
+    default: take the outputs that the model names.
+    """
+    number = model.camera(name).id
+    width, height = map(int, model.cam_resolution[number])
+    if (width, height) == (1, 1):
+        width, height = int(model.vis.global_.offwidth), int(model.vis.global_.offheight)
+    size = np.array([width, height], float)
+    fovy, physical = float(model.cam_fovy[number]), np.asarray(model.cam_sensorsize[number], float)
+    center, lens = size / 2, None
+    if model.cam_projection[number] == mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC:
+        focal, lens = np.full(2, height / fovy), Orthographic()  # fovy is metres then
+    elif physical.all():
+        focal_length, shift = np.split(np.asarray(model.cam_intrinsic[number], float), 2)
+        focal = focal_length / physical * size
+        center = center - shift / physical * size
+    else:
+        focal = np.full(2, height / 2 / math.tan(math.radians(fovy) / 2))
+    camera = Camera(width, height, *focal.tolist(), *center.tolist(), lens=lens)
+    return RigCamera(camera, outputs=_outputs_of(model, number) if default else None)
+
+
+def _outputs_of(model: Any, number: int) -> tuple[str, ...] | None:
+    asked = int(model.cam_output[number])
+    return (
+        tuple(ours for theirs, ours in _OUTPUTS.items() if asked & int(getattr(mujoco.mjtCamOutBit, theirs)))
+        or None
+    )
+
+
+def _arrays_of(data: Any) -> list[np.ndarray]:
+    """Positions (env, n, 3), quaternions (env, n, 4) of bodies, positions and axes (env, n, 3, 3) of
+    cameras."""
+    found = []
+    for name, width in (("xpos", 3), ("xquat", 4), ("cam_xpos", 3), ("cam_xmat", 9)):
+        array = getattr(data, name, None)
+        if array is None:
+            raise InputError(f"data is {data!r}; it must be a mujoco.MjData or mujoco_warp's Data")
+        host = array.numpy() if hasattr(array, "numpy") else array  # a wp.array, or NumPy
+        numbers = np.asarray(host, np.float64)
+        numbers = numbers.reshape(-1, numbers.size // width if host.ndim == 2 else numbers.shape[1], width)
+        found.append(numbers)
+    found[3] = found[3].reshape(*found[3].shape[:2], 3, 3)
+    return found

@@ -1,0 +1,20 @@
+"""Training: splats from pictures with known cameras, on any device that has gradients."""
+
+from fidsplat.train.dataset import Dataset, TrainingView
+from fidsplat.train.memory import splats_within
+from fidsplat.train.parameters import TrainingError
+from fidsplat.train.read import load_dataset
+from fidsplat.train.settings import TrainSettings
+from fidsplat.train.trainer import Step, Trainer, ViewScore
+
+__all__ = [
+    "Dataset",
+    "Step",
+    "TrainSettings",
+    "Trainer",
+    "TrainingError",
+    "TrainingView",
+    "ViewScore",
+    "load_dataset",
+    "splats_within",
+]

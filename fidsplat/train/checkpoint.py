@@ -1,0 +1,96 @@
+"""Checkpoints: all that a run needs to go on to the same bits, in one file that is whole or not there."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from fidsplat.errors import InputError
+from fidsplat.files import atomic_write
+from fidsplat.train.parameters import NAMES, Splats
+from fidsplat.train.settings import TrainSettings
+
+_FORMAT = 1
+_GROUPS = ("values", "first", "second")
+_HISTORY = ("losses", "psnrs", "counts")
+_MAY_DIFFER = ("iterations",)
+"""settings that do not change what an iteration does: a run may be made longer"""
+
+
+@dataclass
+class Progressed:
+    """How far a run has come."""
+
+    iteration: int
+    """iterations that are done"""
+    adam_step: int
+    """steps of the optimiser, which are fewer: an iteration that makes splats has none"""
+    splats: Splats
+    history: dict[str, np.ndarray]
+    """`losses` and `psnrs` (iteration,) float32, `counts` (iteration,) int32 of splats"""
+
+
+def save_checkpoint(file: Path, made: Progressed, settings: TrainSettings, digest: str, device: str) -> None:
+    """Write a checkpoint.
+
+    Args:
+        digest: of the data set.
+        device: title of what draws.
+
+    Raises InputError when the file cannot be written, as when the disk is full; an older one then stays.
+    """
+    facts = {
+        "format": _FORMAT,
+        "iteration": made.iteration,
+        "adam_step": made.adam_step,
+        "settings": asdict(settings),
+        "dataset": digest,
+        "device": device,
+    }
+    arrays = {f"{group}.{name}": getattr(made.splats, group)[name] for group in _GROUPS for name in NAMES}
+    arrays |= {"gradients": made.splats.gradients, "seen": made.splats.seen, **made.history}
+    with atomic_write(file) as stream:
+        np.savez(stream, facts=np.frombuffer(json.dumps(facts).encode(), np.uint8), **arrays)
+
+
+def load_checkpoint(file: Path, settings: TrainSettings, digest: str) -> tuple[Progressed, str]:
+    """Read a checkpoint of the same run; how far it came, and the device that it ran on.
+
+    Raises InputError for a file that is damaged or of another run, which it names the difference of.
+    """
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            facts = json.loads(bytes(arrays["facts"]))
+            if facts.get("format") != _FORMAT:
+                raise ValueError("it is of another version of fidsplat")
+            values, first, second = ({name: arrays[f"{group}.{name}"] for name in NAMES} for group in _GROUPS)
+            splats = Splats(values, first, second, arrays["gradients"], arrays["seen"])
+            history = {name: arrays[name] for name in _HISTORY}
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        raise InputError(
+            f"{file} is no checkpoint that can be read: {error}; remove it, or give --overwrite to begin "
+            "again"
+        ) from error
+    if differ := _differences(facts, settings, digest):
+        raise InputError(
+            f"{file} is of a run with another {' and another '.join(differ)}; give another name with -o, or "
+            "--overwrite to begin again"
+        )
+    return Progressed(facts["iteration"], facts["adam_step"], splats, history), facts["device"]
+
+
+def _differences(facts: dict[str, Any], settings: TrainSettings, digest: str) -> list[str]:
+    now = asdict(settings)
+    names = [
+        f"{name} ({facts['settings'].get(name)!r}, not {value!r})"
+        for name, value in now.items()
+        if name not in _MAY_DIFFER and facts["settings"].get(name) != value
+    ]
+    if facts["iteration"] > settings.iterations:
+        names.append(f"number of iterations (at least {facts['iteration']}, not {settings.iterations})")
+    return names + (["data set"] if facts["dataset"] != digest else [])

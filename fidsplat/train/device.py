@@ -1,0 +1,93 @@
+"""The work of a training step around the picture, by a device's kernels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends.base import Images, ResidentData, TrainingKernels
+from fidsplat.cameras import Camera
+from fidsplat.train.dataset import TrainingView
+from fidsplat.train.losses import Loss
+from fidsplat.train.mcmc import CLEAR, STEEP
+from fidsplat.train.optimiser import REST_SHARE
+from fidsplat.train.parameters import NAMES, Splats
+from fidsplat.train.random_numbers import Purpose
+from fidsplat.train.settings import TrainSettings
+
+_PREFIXES = ("", "first_", "second_")
+
+
+class DeviceWork:
+    """As `fidsplat.train.host.HostWork`, with the splats on the device."""
+
+    def __init__(
+        self, kernels: TrainingKernels, views: Sequence[TrainingView], settings: TrainSettings
+    ) -> None:
+        self._kernels, self._settings = kernels, settings
+        kernels.take_views([(view.picture, view.mask) for view in views])
+        self._number = 0
+
+    def load(self, splats: Splats) -> None:
+        """Takes over splats."""
+        groups = (splats.values, splats.first, splats.second)
+        arrays = {
+            prefix + name: group[name]
+            for prefix, group in zip(_PREFIXES, groups, strict=True)
+            for name in NAMES
+        }
+        self._kernels.load(arrays | {"gradients": splats.gradients, "seen": splats.seen})
+        self._number = len(splats)
+
+    def store(self) -> Splats:
+        """The splats as they are now, in the host's memory."""
+        arrays = self._kernels.store()
+        values, first, second = ({name: arrays[prefix + name] for name in NAMES} for prefix in _PREFIXES)
+        return Splats(values, first, second, arrays["gradients"], arrays["seen"])
+
+    def __len__(self) -> int:
+        return self._number
+
+    def resident(self, degree: int, origin: np.ndarray) -> ResidentData:
+        """The splats as the device draws them, with SH of this degree."""
+        return self._kernels.resident(degree, origin)
+
+    def loss(self, images: Images, view: int) -> tuple[Loss, Any]:
+        """The loss of a picture of a view, by its number, and its derivative (h, w, 3) on the device."""
+        value, squared, slope = self._kernels.loss(images, view, self._settings.dssim_weight)
+        return Loss(value, squared), slope
+
+    def count(self, gradients: Mapping[str, Any], camera: Camera, origin: np.ndarray) -> None:
+        """Adds the gradients on the screen to their sums."""
+        self._kernels.count(gradients["screen"], camera, origin)
+
+    def step(self, gradients: Mapping[str, Any], rate: Mapping[str, float], step: int) -> None:
+        """One step of Adam."""
+        settings, count = self._settings, max(1, self._number)
+        by_names = {
+            "means": "means",
+            "scales": "log_scales",
+            "quats": "quats",
+            "logits": "logits",
+            "sh": "sh",
+        }
+        share = 1 / (1 - settings.beta1**step)
+        sizes = {name: share * rate[of] for name, of in by_names.items()}
+        sizes["rest"] = REST_SHARE * sizes["sh"]
+        mcmc = settings.strategy == "mcmc"
+        numbers = {
+            **{"beta1": settings.beta1, "beta2": settings.beta2, "epsilon": settings.epsilon},
+            "root": math.sqrt(1 - settings.beta2**step),
+            "scale_penalty": settings.scale_penalty / (2 * count) if mcmc else 0.0,
+            "opacity_penalty": settings.opacity_penalty / count if mcmc else 0.0,
+        }
+        self._kernels.step(gradients, sizes, numbers)
+
+    def shake(self, iteration: int, rate: float) -> None:
+        """Moves the means at random (`fidsplat.train.mcmc.shake`)."""
+        seed = self._settings.seed
+        words = (seed & 0xFFFFFFFF, seed >> 32, iteration, int(Purpose.NOISE))
+        self._kernels.shake(rate * self._settings.noise, STEEP, 1 - CLEAR, words)

@@ -1,0 +1,89 @@
+"""The work of a training step around the picture, in NumPy: for backends that have no kernels for it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends.base import Backend, Images, ResidentData
+from fidsplat.cameras import Camera
+from fidsplat.train import mcmc
+from fidsplat.train.dataset import TrainingView
+from fidsplat.train.losses import Loss, picture_loss
+from fidsplat.train.optimiser import adam_step, inner_gradients
+from fidsplat.train.parameters import Splats
+from fidsplat.train.settings import TrainSettings
+
+_REACH = 3.0
+"""standard deviations to which a splat counts as seen"""
+
+
+class HostWork:
+    """Splats in training in the host's memory, with the pictures that they are compared with."""
+
+    def __init__(self, backend: Backend, views: Sequence[TrainingView], settings: TrainSettings) -> None:
+        self._backend, self._views, self._settings = backend, views, settings
+        self._splats: Splats
+
+    def load(self, splats: Splats) -> None:
+        """Takes over splats, which this changes from now on."""
+        self._splats = splats
+
+    def store(self) -> Splats:
+        """The splats as they are now."""
+        return self._splats
+
+    def __len__(self) -> int:
+        return len(self._splats)
+
+    def resident(self, degree: int, origin: np.ndarray) -> ResidentData:
+        """The splats as the device draws them, with SH of this degree."""
+        return self._backend.upload(self._splats.cloud(degree, origin, shared=True))
+
+    def loss(self, images: Images, view: int) -> tuple[Loss, np.ndarray]:
+        """The loss of a picture of a view, by its number, and its derivative (h, w, 3)."""
+        of = self._views[view]
+        truth = of.picture * np.float32(1 / 255)
+        return picture_loss(images.read("rgb"), truth, of.mask, self._settings.dssim_weight)
+
+    def count(self, gradients: Mapping[str, Any], camera: Camera, origin: np.ndarray) -> None:
+        """Adds the gradients on the screen to their sums."""
+        splats = self._splats
+        splats.gradients += on_host(gradients["screen"])
+        splats.seen += seen(splats, camera, origin)
+
+    def step(self, gradients: Mapping[str, Any], rate: Mapping[str, float], step: int) -> None:
+        """One step of Adam."""
+        given = {name: on_host(array) for name, array in gradients.items()}
+        inner = inner_gradients(self._splats, given, self._settings)
+        adam_step(self._splats, inner, rate, self._settings, step)
+
+    def shake(self, iteration: int, rate: float) -> None:
+        """Moves the means at random."""
+        mcmc.shake(self._splats, self._settings, iteration, rate)
+
+
+def seen(splats: Splats, camera: Camera, origin: np.ndarray) -> np.ndarray:
+    """Whether (n,) a sphere of three standard deviations around a splat reaches into the picture."""
+    turn = camera.world_to_camera[:3, :3].astype(np.float32)
+    move = (turn.astype(np.float64) @ (origin - camera.position)).astype(np.float32)
+    x, y, z = (splats.values["means"] @ turn.T + move).T
+    reach = _REACH * splats.scales.max(axis=1)
+    inside = z > camera.near
+    for place, focal, middle, size in (
+        (x, camera.fx, camera.cx, camera.width),
+        (y, camera.fy, camera.cy, camera.height),
+    ):
+        # of pixels times depth, so that nothing is divided by a depth of 0
+        at = np.float32(focal) * place + np.float32(middle) * z
+        wide = np.float32(focal) * reach
+        inside &= (at + wide > 0) & (at - wide < np.float32(size) * z)
+    return inside
+
+
+def on_host(array: Any) -> np.ndarray:
+    """An array of a device as NumPy's float32."""
+    get = getattr(array, "get", None) or getattr(array, "numpy", None)
+    return np.asarray(array if get is None else get(), np.float32)

@@ -1,0 +1,95 @@
+"""The loss of one picture and its gradient: (1 - w) L1 + w (1 - SSIM), as 3DGS and 2DGS have it.
+
+SSIM (Wang et al. 2004) has a Gaussian window of 11 pixels and sigma 1.5 for each channel, zeros beyond the
+picture, and is the mean over all pixels. Masked pixels are the truth's own in both pictures: they add
+nothing, and their gradient is 0. The kernels' twin is kernels/opencl/train/loss.cl.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+RADIUS, SIGMA = 5, 1.5
+"""pixels, of the window"""
+C1, C2 = 0.01**2, 0.03**2
+
+
+class Loss(NamedTuple):
+    """What a picture was found to be worth."""
+
+    value: float
+    """the loss"""
+    squared: float
+    """mean squared difference, of which the PSNR is made"""
+
+    @property
+    def psnr(self) -> float:
+        """dB; infinite for equal pictures."""
+        return math.inf if self.squared == 0 else -10 * math.log10(self.squared)
+
+
+def window() -> np.ndarray:
+    """Weights (11,) float64 of the window along one axis; their sum is 1."""
+    weights = np.exp(-(np.arange(-RADIUS, RADIUS + 1) ** 2) / (2 * SIGMA**2))
+    return weights / weights.sum()
+
+
+def blurred(image: np.ndarray) -> np.ndarray:
+    """The window's mean around each pixel of (h, w, c), zeros beyond the picture."""
+    for _ in range(2):
+        padded = np.pad(image, ((RADIUS, RADIUS), (0, 0), (0, 0)))
+        total = np.zeros_like(image)
+        for k, weight in enumerate(window().astype(image.dtype)):
+            total += weight * padded[k : k + len(image)]
+        image = total.swapaxes(0, 1)
+    return image
+
+
+def picture_loss(
+    image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None, dssim_weight: float
+) -> tuple[Loss, np.ndarray]:
+    """The loss of a picture and its derivative by each of its values.
+
+    Args:
+        image: (h, w, 3) float as it was drawn, not clamped.
+        truth: (h, w, 3) float display values.
+        mask: (h, w) bool, False where the picture does not matter; None: it matters everywhere.
+        dssim_weight: share of 1 - SSIM, 0 to 1.
+
+    Returns:
+        the loss, and (h, w, 3) of the picture's type.
+    """
+    counted = np.ones(image.shape[:2], image.dtype) if mask is None else mask.astype(image.dtype)
+    counted = counted[:, :, None]
+    # not image * counted: a value that is not finite would stay
+    image = np.where(counted > 0, image, truth)
+    number = float(image.size if mask is None else max(1, 3 * int(mask.sum())))
+    difference = image - truth
+    l1 = float(np.abs(difference).sum(dtype=np.float64)) / number
+    squared = float((difference * difference).sum(dtype=np.float64)) / number
+    gradient = np.sign(difference) * image.dtype.type((1 - dssim_weight) / number)
+    similar = 1.0
+    if dssim_weight:
+        similar, slope = _ssim(image, truth)
+        gradient -= slope * image.dtype.type(dssim_weight)
+    return Loss((1 - dssim_weight) * l1 + dssim_weight * (1 - similar), squared), gradient * counted
+
+
+def _ssim(image: np.ndarray, truth: np.ndarray) -> tuple[float, np.ndarray]:
+    """Mean SSIM over all values of two pictures (h, w, 3), and its derivative by the first."""
+    mean_a, mean_b = blurred(image), blurred(truth)
+    var_a = blurred(image * image) - mean_a * mean_a
+    var_b = blurred(truth * truth) - mean_b * mean_b
+    shared = blurred(image * truth) - mean_a * mean_b
+    a, b = 2 * mean_a * mean_b + C1, 2 * shared + C2
+    c, d = mean_a * mean_a + mean_b * mean_b + C1, var_a + var_b + C2
+    similar = a * b / (c * d)
+    by_mean = 2 * (mean_b * b - mean_a * similar * d) / (c * d)
+    by_var, by_shared = -similar / d, 2 * a / (c * d)
+    # the window is symmetric, so that the way back is the same blur
+    slope = blurred(by_mean - 2 * mean_a * by_var - mean_b * by_shared)
+    slope += 2 * image * blurred(by_var) + truth * blurred(by_shared)
+    return float(similar.mean(dtype=np.float64)), slope / image.dtype.type(image.size)

@@ -1,0 +1,59 @@
+"""How far points are from those nearest to them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+_LEAF = 256
+_NEAREST = 3
+
+
+def mean_square_distances(points: np.ndarray) -> np.ndarray:
+    """Mean squared distance (n,) float64 of each point (n, 3) from the three nearest others, 0 for a point
+    alone.
+
+    Points are put into boxes of some hundreds; those of a box are compared with the points of all boxes that
+    the farthest third neighbour found within it reaches.
+    """
+    points = np.asarray(points, np.float64)
+    if len(points) < 2:
+        return np.zeros(len(points))
+    boxes = _boxes(points)
+    low = np.array([points[box].min(0) for box in boxes])
+    high = np.array([points[box].max(0) for box in boxes])
+    found = np.zeros(len(points))
+    for number, box in enumerate(boxes):
+        mine = points[box]
+        nearest = _nearest(mine, mine)
+        reach = nearest[:, -1].max() if nearest.shape[1] == _NEAREST else np.inf
+        gap = np.maximum(np.maximum(low - high[number], low[number] - high), 0)
+        near = np.flatnonzero((gap * gap).sum(1) <= reach)
+        if len(near) > 1:
+            nearest = _nearest(mine, points[np.concatenate([boxes[k] for k in near])])
+        found[box] = nearest.mean(1)
+    return found
+
+
+def _boxes(points: np.ndarray) -> list[np.ndarray]:
+    """Indices of the points, cut in halves across the longest side until there are few in each."""
+    todo, done = [np.arange(len(points))], []
+    while todo:
+        box = todo.pop()
+        if len(box) <= _LEAF:
+            done.append(box)
+            continue
+        axis = np.argmax(np.ptp(points[box], axis=0))
+        order = box[np.argsort(points[box, axis], kind="stable")]
+        todo += [order[len(order) // 2 :], order[: len(order) // 2]]
+    return done
+
+
+def _nearest(mine: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """Squared distances (n, at most 3), in their order, to the nearest of `among`, which holds `mine`."""
+    squares = np.zeros((len(mine), len(among)))
+    for axis in range(3):
+        squares += (mine[:, None, axis] - among[None, :, axis]) ** 2
+    count = min(_NEAREST + 1, len(among))
+    nearest = np.partition(squares, count - 1, axis=1)[:, :count]
+    nearest.sort(axis=1)
+    return nearest[:, 1:]  # without the point itself

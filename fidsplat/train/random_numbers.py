@@ -1,0 +1,70 @@
+"""Random numbers by counter: what a splat draws depends on the seed, the iteration, the purpose and the
+splat's index, and on nothing that was drawn before. So a run that goes on after a kill draws what the run
+would have drawn.
+
+Philox 4x32-10: Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011. The kernels' twin is
+kernels/opencl/train/philox.cl.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+_MULTIPLIERS = 0xD2511F53, 0xCD9E8D57
+_WEYL = 0x9E3779B9, 0xBB67AE85
+_LOW = np.uint64(0xFFFFFFFF)
+_HALF = np.uint64(32)
+
+
+class Purpose(IntEnum):
+    """What random numbers are for; each has a stream of its own."""
+
+    VIEWS = 0
+    ROTATIONS = 1
+    SPLITS = 2
+    NOISE = 3
+    RELOCATION = 4
+    GROWTH = 5
+    POINTS = 6
+
+
+def philox(counters: np.ndarray, key: int) -> np.ndarray:
+    """Four words (n, 4) uint32 for each counter (n, 4) uint32, by a key of 64 bits."""
+    c0, c1, c2, c3 = np.asarray(counters, np.uint32).astype(np.uint64).T
+    k0, k1 = key & 0xFFFFFFFF, key >> 32 & 0xFFFFFFFF
+    for _ in range(10):
+        first = c0 * np.uint64(_MULTIPLIERS[0])
+        second = c2 * np.uint64(_MULTIPLIERS[1])
+        c0, c1, c2, c3 = (
+            (second >> _HALF) ^ c1 ^ np.uint64(k0),
+            second & _LOW,
+            (first >> _HALF) ^ c3 ^ np.uint64(k1),
+            first & _LOW,
+        )
+        k0, k1 = (k0 + _WEYL[0]) & 0xFFFFFFFF, (k1 + _WEYL[1]) & 0xFFFFFFFF
+    return np.stack([c0, c1, c2, c3], axis=1).astype(np.uint32)
+
+
+def uniform(seed: int, purpose: Purpose, iteration: int, count: int, draw: int = 0) -> np.ndarray:
+    """Four numbers (count, 4) float64 for each index, in (0, 1).
+
+    draw: tells several calls of one purpose and iteration apart.
+    """
+    counters = np.empty((count, 4), np.uint32)
+    counters[:, 0] = np.arange(count, dtype=np.uint32)
+    counters[:, 1:] = iteration, purpose, draw
+    return (philox(counters, seed) + 0.5) * 2.0**-32
+
+
+def normal(seed: int, purpose: Purpose, iteration: int, count: int, draw: int = 0) -> np.ndarray:
+    """Four numbers (count, 4) float64 for each index of the standard normal distribution (Box and Muller)."""
+    u = uniform(seed, purpose, iteration, count, draw)
+    radius, angle = np.sqrt(-2 * np.log(u[:, :2])), 2 * np.pi * u[:, 2:]
+    return np.concatenate([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+
+
+def permutation(seed: int, purpose: Purpose, iteration: int, count: int) -> np.ndarray:
+    """The numbers below count in a random order."""
+    return np.argsort(uniform(seed, purpose, iteration, count)[:, 0], kind="stable")

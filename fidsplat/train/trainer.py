@@ -1,0 +1,294 @@
+"""Trainer: splats that look like a data set's pictures, the same in every bit on every run of a device."""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fidsplat.backends.base import Differentiates, Trains
+from fidsplat.backends.prepare import prepare
+from fidsplat.capture import Capture
+from fidsplat.errors import DeviceError, InputError, unknown
+from fidsplat.formats import save_ply
+from fidsplat.quality import Quality
+from fidsplat.render import Renderer
+from fidsplat.splats import SplatCloud
+from fidsplat.train import densify, mcmc
+from fidsplat.train.checkpoint import Progressed, load_checkpoint, save_checkpoint
+from fidsplat.train.dataset import Dataset, TrainingView
+from fidsplat.train.device import DeviceWork
+from fidsplat.train.host import HostWork
+from fidsplat.train.optimiser import rates
+from fidsplat.train.parameters import TrainingError, first_splats, splats_of
+from fidsplat.train.random_numbers import Purpose, permutation
+from fidsplat.train.settings import TrainSettings
+from fidsplat.vision.images import to_uint8
+from fidsplat.vision.metrics import psnr, ssim
+
+CHECKPOINT_SECONDS = 30.0
+"""a run writes a checkpoint when this has passed since the last"""
+
+
+class Step(NamedTuple):
+    """What one iteration did."""
+
+    iteration: int
+    """1 for the first"""
+    view: str
+    """name of the view that was looked at"""
+    loss: float
+    psnr: float
+    """dB, of that view before the step"""
+    splats: int
+    """after the step"""
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """How well the splats show one view."""
+
+    name: str
+    psnr: float
+    """dB, of 8-bit pictures"""
+    ssim: float
+    """mean over the channels, of whole windows (`fidsplat.vision.metrics.ssim`)"""
+    picture: np.ndarray
+    """(h, w, 3) uint8, as it is drawn"""
+
+
+class Trainer:
+    """Trains splats on a data set.
+
+    ```python
+    trainer = Trainer(load_dataset("yard"), Renderer("opencl"), iterations=2000, seed=0)
+    cloud = trainer.run()
+    ```
+
+    Args:
+        dataset: views and points.
+        renderer: opens the device that draws; None: the default device.
+        settings: of the run; None: the defaults. `changes` are fields of it, given by name.
+        checkpoint: a file that the run goes on from if it is there, and that `run` writes.
+        start: splats to begin with, in place of one at each of the data set's points; SH grow from degree 0
+            all the same.
+
+    Raises:
+        DeviceError: the device has no gradients.
+        InputError: a setting that cannot be used, or a checkpoint that is damaged or of another run.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        renderer: Renderer | None = None,
+        settings: TrainSettings | None = None,
+        checkpoint: str | Path | None = None,
+        start: SplatCloud | None = None,
+        **changes: Any,
+    ) -> None:
+        self.dataset = dataset
+        self.settings = _settings(settings, changes)
+        self.renderer = Renderer() if renderer is None else renderer
+        self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        backend = self.renderer.backend
+        if not isinstance(backend, Differentiates):
+            raise DeviceError(
+                f"{self.renderer.device.name} has no gradients to train by; use device='opencl' or "
+                "'reference'"
+            )
+        self._differentiate = backend.differentiate
+        self._captures = [self._capture(view) for view in dataset.views]
+        self._work = (
+            DeviceWork(backend.training(), dataset.views, self.settings)
+            if isinstance(backend, Trains)
+            else HostWork(backend, dataset.views, self.settings)
+        )
+        self._made = self._begin(start)
+        self._work.load(self._made.splats)
+        self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
+
+    @property
+    def iteration(self) -> int:
+        """Iterations that are done."""
+        return self._made.iteration
+
+    @property
+    def done(self) -> bool:
+        """Whether all iterations are done."""
+        return self.iteration >= self.settings.iterations
+
+    @property
+    def history(self) -> dict[str, np.ndarray]:
+        """Of each iteration that is done: `losses`, `psnrs` float32, `counts` int32 of splats; read them, do
+        not write."""
+        return {name: array[: self.iteration] for name, array in self._made.history.items()}
+
+    def step(self) -> Step:
+        """Look at one view, and change the splats so that they look more like it.
+
+        Raises:
+            TrainingError: the loss is not finite, or no splat is left.
+            DeviceError: the device fails or lacks memory.
+        """
+        made, settings = self._made, self.settings
+        iteration = made.iteration + 1
+        number = self._view_at(iteration)
+        view = self.dataset.views[number]
+        resident = self._work.resident(settings.degree_at(iteration), self.dataset.origin)
+        features, seen = prepare(resident, self._captures[number])
+        pipeline = self._differentiate(features)
+        images = pipeline.forward(resident, seen)
+        loss, slope = self._work.loss(images, number)
+        if not math.isfinite(loss.value):
+            raise TrainingError(
+                f"the loss is {loss.value} at iteration {iteration}, in the view {view.name}; "
+                + self._what_is_kept()
+            )
+        gradients = pipeline.backward(images, {"rgb": slope})
+        self._change(gradients, iteration, view)
+        made.iteration = iteration
+        self._note(iteration, loss.value, loss.psnr)
+        return Step(iteration, view.name, loss.value, loss.psnr, int(made.history["counts"][iteration - 1]))
+
+    def run(self, progress: Callable[[Step], None] | None = None) -> SplatCloud:
+        """Train to the end, and write checkpoints on the way where there is a file for them.
+
+        progress: called after each iteration.
+
+        Raises:
+            as `step`; InputError where a checkpoint cannot be written. The last one is whole.
+        """
+        last = time.monotonic()
+        while not self.done:
+            step = self.step()
+            if progress is not None:
+                progress(step)
+            if self.done or time.monotonic() - last > CHECKPOINT_SECONDS:
+                self.save_checkpoint()
+                last = time.monotonic()
+        return self.cloud()
+
+    def cloud(self) -> SplatCloud:
+        """The splats as they are now."""
+        return self._work.store().cloud(self.settings.sh_degree, self.dataset.origin)
+
+    def save(self, path: str | Path) -> None:
+        """Write the splats as they are now to a PLY file. Raises InputError when it cannot be written."""
+        save_ply(self.cloud(), path)
+
+    def save_checkpoint(self) -> None:
+        """Write the checkpoint, if there is a file for it.
+
+        Raises:
+            InputError: it cannot be written; an older one then stays.
+            TrainingError: a value of the splats is not finite.
+        """
+        if self.checkpoint is None:
+            return
+        self._made.splats = self._work.store()
+        self._made.splats.check(f"after iteration {self.iteration}; {self._what_is_kept()}")
+        kept = Progressed(self.iteration, self._made.adam_step, self._made.splats, self.history)
+        title = self.renderer.device.title
+        save_checkpoint(self.checkpoint, kept, self.settings, self.dataset.digest, title)
+
+    def evaluate(self, views: tuple[TrainingView, ...] | None = None) -> list[ViewScore]:
+        """Compare the splats with views: those that were held out, unless others are given."""
+        views = self.dataset.held_out if views is None else views
+        captures = [self._capture(view) for view in views]
+        frames = self.renderer.render_views(self.cloud(), captures)
+        return [_score(view, frame["rgb"]) for view, frame in zip(views, frames, strict=True)]
+
+    def _capture(self, view: TrainingView) -> Capture:
+        return Capture(
+            view.camera, quality=Quality.of(self.settings.quality), background=self.dataset.background
+        )
+
+    def _begin(self, start: SplatCloud | None) -> Progressed:
+        settings = self.settings
+        if self.checkpoint is not None and self.checkpoint.exists():
+            made, device = load_checkpoint(self.checkpoint, settings, self.dataset.digest)
+            if device != self.renderer.device.title:
+                warnings.warn(
+                    f"{self.checkpoint} is of {device}, and the run goes on on {self.renderer.device.title}: "
+                    "its bits will not be those of a run on one device",
+                    stacklevel=3,
+                )
+        else:
+            nothing = {"losses": np.float32, "psnrs": np.float32, "counts": np.int32}
+            history = {name: np.zeros(0, dtype) for name, dtype in nothing.items()}
+            dataset = self.dataset
+            splats = (
+                first_splats(dataset, settings)
+                if start is None
+                else splats_of(start, settings, dataset.origin)
+            )
+            made = Progressed(0, 0, splats, history)
+        left = settings.iterations - made.iteration
+        made.history = {name: np.append(a, np.zeros(left, a.dtype)) for name, a in made.history.items()}
+        return made
+
+    def _view_at(self, iteration: int) -> int:
+        """The number of a view: all of them in a random order, then all in another."""
+        count = len(self.dataset.views)
+        round_, place = divmod(iteration - 1, count)
+        if self._order[0] != round_:
+            self._order = round_, permutation(self.settings.seed, Purpose.VIEWS, round_, count)
+        return int(self._order[1][place])
+
+    def _change(self, gradients: dict[str, Any], iteration: int, view: TrainingView) -> None:
+        """The optimiser's step, or the making of splats in its place, as in the authors' trainer, in which
+        splats that are made anew have no gradient yet."""
+        settings, origin = self.settings, self.dataset.origin
+        extent, mcmc_runs = self.dataset.extent, settings.strategy == "mcmc"
+        until = settings.relocate_until if mcmc_runs else settings.densify_until
+        if not mcmc_runs and iteration < until:
+            self._work.count(gradients, view.camera, origin)
+        due = settings.densify_from < iteration < until and iteration % settings.densify_every == 0
+        if due and not mcmc_runs:
+            splats = densify.densified(self._work.store(), settings, iteration, extent)
+            if iteration % settings.reset_every == 0:
+                splats = densify.with_opacities_reset(splats, settings)
+            self._work.load(splats)
+            return
+        self._made.adam_step += 1
+        rate = rates(settings, iteration, extent)
+        self._work.step(gradients, rate, self._made.adam_step)
+        if due:
+            self._work.load(mcmc.moved(self._work.store(), settings, iteration))
+        if mcmc_runs:
+            self._work.shake(iteration, rate["means"])
+
+    def _note(self, iteration: int, loss: float, ratio: float) -> None:
+        history = self._made.history
+        history["losses"][iteration - 1] = loss
+        history["psnrs"][iteration - 1] = ratio
+        history["counts"][iteration - 1] = len(self._work)
+
+    def _what_is_kept(self) -> str:
+        if self.checkpoint is None or not self.checkpoint.exists():
+            return "nothing was kept; lower the learning rates, or check the data set's cameras"
+        return f"the checkpoint {self.checkpoint} is whole, as it was written last"
+
+
+def _settings(settings: TrainSettings | None, changes: dict[str, Any]) -> TrainSettings:
+    given = {} if settings is None else vars(settings)
+    for name in changes:
+        if name not in TrainSettings.__dataclass_fields__:
+            raise InputError(unknown("training setting", name, TrainSettings.__dataclass_fields__))
+    return TrainSettings(**{**given, **changes})
+
+
+def _score(view: TrainingView, drawn: np.ndarray) -> ViewScore:
+    picture = to_uint8(drawn)
+    ours, theirs = picture / 255.0, view.picture / 255.0
+    if view.mask is not None:
+        ours = np.where(view.mask[:, :, None], ours, theirs)
+    similar = float(np.mean([ssim(ours[:, :, c], theirs[:, :, c]) for c in range(3)]))
+    return ViewScore(view.name, psnr(ours, theirs), similar, picture)

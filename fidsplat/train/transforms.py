@@ -1,0 +1,136 @@
+"""nerfstudio's data sets: transforms.json (docs.nerf.studio, "Data conventions"), and the NeRF authors'
+transforms_train.json with transforms_test.json. Poses are camera to world with OpenGL's axes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fidsplat.cameras import Camera, focal_length
+from fidsplat.errors import InputError
+from fidsplat.formats.ply_header import read_header
+from fidsplat.train.dataset import TrainingView
+from fidsplat.vision.images import read_image, read_rgba
+
+_NAMES = ("transforms.json", "transforms_train.json")
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_SUFFIXES = ("", ".png", ".jpg", ".jpeg")
+"""the NeRF authors' files name pictures without one"""
+
+
+class Found(NamedTuple):
+    """What a data set's files hold, before it is checked as a whole."""
+
+    views: list[TrainingView]
+    held_out: list[TrainingView]
+    points: np.ndarray
+    colors: np.ndarray
+    background: tuple[float, float, float]
+
+
+def has_transforms(path: Path) -> bool:
+    """Whether this is such a file, or a folder with one."""
+    return path.suffix.lower() == ".json" or any((path / name).is_file() for name in _NAMES)
+
+
+def load_transforms(path: Path, tell: Callable[[str, float], None]) -> Found:
+    """Read the views, those of transforms_test.json beside the file, and the points that it names.
+
+    Pictures with alpha are put on black.
+
+    Raises InputError for a file that is damaged, a picture that is missing, or a lens with distortion.
+    """
+    file = path if path.is_file() else next(path / name for name in _NAMES if (path / name).is_file())
+    table = _table(file)
+    views = _views(file, table, tell, "pictures")
+    test = file.with_name("transforms_test.json")
+    held_out = _views(test, _table(test), tell, "test pictures") if test.is_file() else []
+    points, colors = _points(file, table)
+    return Found(views, held_out, points, colors, (0.0, 0.0, 0.0))
+
+
+def _table(file: Path) -> dict[str, Any]:
+    try:
+        table = json.loads(file.read_text("utf-8"))
+        if not isinstance(table, dict) or not isinstance(table.get("frames"), list):
+            raise ValueError("it has no list of frames")
+    except OSError as error:
+        raise InputError(f"cannot read {file}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise InputError(f"{file} is no transforms.json: {error}") from None
+    return table
+
+
+def _views(file: Path, table: dict, tell: Callable[[str, float], None], words: str) -> list[TrainingView]:
+    views = []
+    for number, frame in enumerate(table["frames"]):
+        tell(words, number / len(table["frames"]))
+        try:
+            name, matrix = str(frame["file_path"]), np.array(frame["transform_matrix"], float)
+            if matrix.shape == (3, 4):
+                matrix = np.vstack([matrix, (0, 0, 0, 1)])
+            if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+                raise ValueError
+        except (KeyError, TypeError, ValueError):
+            raise InputError(
+                f"{file}: frame {number} needs a file_path and a transform_matrix of 4 x 4 finite numbers"
+            ) from None
+        picture, mask = _picture(file, name), None
+        if "mask_path" in frame:
+            mask = read_image(file.parent / str(frame["mask_path"])).max(axis=2) > 0
+        given = {**table, **frame}
+        views.append(TrainingView(name, _camera(f"{file}: {name}", given, picture, matrix), picture, mask))
+    return sorted(views, key=lambda view: view.name)
+
+
+def _picture(file: Path, name: str) -> np.ndarray:
+    places = [file.parent / (name + suffix) for suffix in _SUFFIXES]
+    place = next((place for place in places if place.is_file()), places[0])
+    rgba = read_rgba(place)
+    return np.rint(rgba[:, :, :3] * (rgba[:, :, 3:] / 255.0)).astype(np.uint8)
+
+
+def _camera(what: str, given: dict, picture: np.ndarray, camera_to_world: np.ndarray) -> Camera:
+    if any(given.get(name) for name in _DISTORTION):
+        raise InputError(
+            f"{what}: its camera has distortion, and pictures are trained on without; undistort them first"
+        )
+    height, width = picture.shape[:2]
+    try:
+        stated = int(given.get("w", width)), int(given.get("h", height))
+        if "fl_x" in given:
+            fx = float(given["fl_x"])
+        else:
+            fx = focal_length(stated[0], float(given["camera_angle_x"]))
+        fy = float(given.get("fl_y", fx))
+        cx, cy = float(given.get("cx", stated[0] / 2)), float(given.get("cy", stated[1] / 2))
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"{what}: needs fl_x, or camera_angle_x, as a number") from None
+    pose = camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])
+    turn = pose[:3, :3].T
+    world_to_camera = np.eye(4)
+    world_to_camera[:3, :3], world_to_camera[:3, 3] = turn, -turn @ pose[:3, 3]
+    try:
+        return Camera.pinhole(*stated, fx, fy, cx, cy, world_to_camera)
+    except InputError as error:
+        raise InputError(f"{what}: {error}") from error
+
+
+def _points(file: Path, table: dict) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the PLY file that the table names; none where it names none."""
+    if not table.get("ply_file_path"):
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    header = read_header(file.parent / str(table["ply_file_path"]))
+    element = header.elements.get("vertex")
+    if element is None or not {"x", "y", "z"} <= set(element.properties):
+        raise InputError(f"{header.path} has no points: its element vertex needs x, y and z")
+    rows = header.rows("vertex", 0, element.count)
+    points = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(np.float64)
+    named = [name for name in ("red", "green", "blue") if name in element.properties]
+    if len(named) < 3:
+        return points, np.full((len(points), 3), 128, np.uint8)
+    return points, np.stack([rows[name] for name in named], axis=1).astype(np.uint8)

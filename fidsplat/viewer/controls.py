@@ -1,0 +1,99 @@
+"""The page's panel: sliders and selectors for how it is drawn, and buttons for what is done with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Protocol
+
+from fidsplat.quality import PRESETS
+from fidsplat.scenes import Scene
+from fidsplat.viewer.session import Session
+from fidsplat.viewer.settings import LENSES
+
+NOBODY = "none"
+OF_SCENE = "the scene's"
+
+
+class Actions(Protocol):
+    """What the buttons do; client is viser's handle of who pressed."""
+
+    def picture(self, client: Any) -> None: ...
+    def read(self, client: Any) -> None: ...
+    def add_keyframe(self, client: Any) -> None: ...
+    def save_keyframes(self, client: Any) -> None: ...
+    def clear_keyframes(self, client: Any) -> None: ...
+    def hold(self, name: str) -> None: ...
+    def overlay(self, visible: bool) -> None: ...
+
+
+class Controls:
+    """The panel of a viser page (its `gui`).
+
+    Args:
+        devices: names to choose from; the session's own is among them.
+    """
+
+    def __init__(self, gui: Any, session: Session, devices: list[str], actions: Actions) -> None:
+        self._gui, self._session = gui, session
+        drawn = session.drawn
+        with gui.add_folder("Drawing"):
+            self.status = gui.add_markdown("")
+            self._choice("device", devices, drawn.device, lambda value: {"device": value})
+            self._choice(
+                "quality", [OF_SCENE, *PRESETS], OF_SCENE, lambda v: {"quality": None if v == OF_SCENE else v}
+            )
+            own = drawn.scene.camera is not None and drawn.scene.camera.lens is not None
+            lenses = [lens for lens in LENSES if lens != "scene" or own]
+            self._choice("lens", lenses, drawn.settings.lens, lambda value: {"lens": value})
+            self._slider("fog", "fog [1/m]", 0.0, 2.0, 0.01)
+            self._slider("exposure", "exposure", 0.0, 4.0, 0.05)
+            self._slider("noise", "shot noise", 0.0, 0.3, 0.005)
+            if drawn.scene.motion.groups:
+                self._slider("time", "time [s]", *_span(drawn.scene), 0.01)
+                self._slider("exposure_ms", "exposure time [ms]", 0.0, 200.0, 1.0)
+                self._slider("readout_ms", "readout [ms]", 0.0, 100.0, 1.0)
+        with gui.add_folder("Scene"):
+            names = [NOBODY, *(f"{p.label}: {p.marker.spec}"[:60] for p in drawn.scene.markers)]
+            held = gui.add_dropdown("move", names, initial_value=NOBODY)
+            held.on_update(lambda _: actions.hold(held.value))
+            shown = gui.add_checkbox("outlines", True)
+            shown.on_update(lambda _: actions.overlay(shown.value))
+            self._button("What a detector sees", actions.read)
+            self._button("Picture", actions.picture)
+        with gui.add_folder("Trajectory"):
+            self._button("Add keyframe", actions.add_keyframe)
+            self._button("Save keyframes", actions.save_keyframes)
+            self._button("Clear keyframes", actions.clear_keyframes)
+        self.say("")
+
+    def say(self, problem: str) -> None:
+        """How it is drawn now, and what went wrong, if anything did."""
+        drawn = self._session.drawn
+        lines = [f"{len(drawn.resident):,} splats, {drawn.renderer.device.title}"]
+        self.status.content = "\n\n".join(lines + ([f"**{problem}**"] if problem else []))
+
+    def _change(self, **changes: Any) -> None:
+        _, settings = self._session.wanted()
+        self._session.wish(settings=replace(settings, **changes), done=lambda why: self.say(why or ""))
+
+    def _choice(
+        self, label: str, options: list[str], value: str, of: Callable[[str], dict[str, Any]]
+    ) -> None:
+        handle = self._gui.add_dropdown(label, options, initial_value=value)
+        handle.on_update(lambda _: self._change(**of(handle.value)))
+
+    def _slider(self, name: str, label: str, low: float, high: float, step: float) -> None:
+        value = getattr(self._session.drawn.settings, name)
+        handle = self._gui.add_slider(label, min(low, value), max(high, value), step, value)
+        handle.on_update(lambda _: self._change(**{name: float(handle.value)}))
+
+    def _button(self, label: str, act: Callable[[Any], None]) -> None:
+        self._gui.add_button(label).on_click(lambda event: act(event.client))
+
+
+def _span(scene: Scene) -> tuple[float, float]:
+    """The times between which keyframes of the scene lie; 0 to 1 where motions are functions."""
+    motions = [*scene.cloud_motions.values(), *(p.motion for p in scene.markers if p.motion is not None)]
+    times = [float(time) for motion in motions for time in getattr(motion, "times", ())]
+    return (min(times), max(times)) if len(set(times)) > 1 else (0.0, 1.0)

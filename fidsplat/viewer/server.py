@@ -1,0 +1,319 @@
+"""The page: viser's server, a stream for each browser, and what they do."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import socket
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends import devices
+from fidsplat.cameras import Trajectory
+from fidsplat.errors import FidsplatError, InputError
+from fidsplat.formats import save_trajectory
+from fidsplat.scenes import Scene
+from fidsplat.viewer.controls import NOBODY, Controls
+from fidsplat.viewer.edits import SceneFile
+from fidsplat.viewer.nodes import Nodes
+from fidsplat.viewer.session import Session, View
+from fidsplat.viewer.settings import AT_REST, Viewpoint
+from fidsplat.viewer.stream import Stream
+from fidsplat.vision.images import png_bytes, to_uint8
+from fidsplat.vision.readback import read_back
+
+LOOK = 1.0
+"""seconds between two looks at the scene file"""
+JPEG = 75
+"""quality of pictures while moving; at rest they are PNG, without a loss"""
+
+
+def check_port(host: str, port: int) -> None:
+    """Raises InputError where the port cannot be had: viser would take the next one in silence."""
+    try:
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((host, port))
+    except (OSError, OverflowError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise InputError(f"cannot listen on {host}, port {port}: {why}; give another --port") from None
+
+
+class Viewer:
+    """A scene in the browsers that look at it.
+
+    Args:
+        scene: what is shown.
+        file: the scene file that it is of: read again when it changes, and written when a marker is moved.
+        device, memory_budget: as `Session`.
+        host: 127.0.0.1, which nobody else reaches, unless told otherwise.
+        port: 0 takes a free one.
+        rate: pictures a second to aim at while moving.
+
+    Raises:
+        InputError: the port is in use, or the extra `viewer` is missing.
+        DeviceError: the device cannot be used.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        file: Path | None = None,
+        device: str | None = None,
+        memory_budget: int | None = None,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        rate: float = 30.0,
+    ) -> None:
+        viser = _viser()
+        check_port(host, port)
+        self._rate, self._lock = rate, threading.Lock()
+        self._streams: dict[int, Stream] = {}
+        self._views: dict[int, View] = {}
+        self._said: dict[int, Any] = {}
+        self._keyframes: list[np.ndarray] = []
+        self._file = None if file is None else SceneFile(file)
+        self._held: int | None = None
+        self.session = Session(scene, device, memory_budget, self._changed)
+        with _silent():
+            self.server: Any = viser.ViserServer(host, port, label="fidsplat", verbose=False)
+        self.server.gui.configure_theme(dark_mode=True, show_logo=False)
+        self.server.gui.main_panel.dock_right()
+        self._nodes = Nodes(self.server.scene)
+        own = self.session.drawn.device
+        names = [d.name for d in devices() if d.usable and d.name != "reference"]
+        self._controls = Controls(self.server.gui, self.session, list(dict.fromkeys([own, *names])), self)
+        self._start_camera(scene)
+        self._nodes.show(scene, self._overlay)
+        self.server.on_client_connect(self._enter)
+        self.server.on_client_disconnect(self._leave)
+        self.server.scene.on_click()(self._click)
+        self._closed = threading.Event()
+        self._watcher = threading.Thread(target=self._watch, name="viewer file", daemon=True)
+        self._watcher.start()
+
+    @property
+    def address(self) -> str:
+        """Where browsers find it."""
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    def close(self) -> None:
+        """Let all go."""
+        self._closed.set()
+        for stream in list(self._streams.values()):
+            stream.close()
+        self.session.close()
+        with _silent():
+            self.server.stop()
+
+    # browsers come and go
+
+    def _enter(self, client: Any) -> None:
+        with client.gui.add_folder("What is seen"):
+            self._said[client.client_id] = client.gui.add_markdown("Click into the picture.")
+        stream = Stream(
+            lambda viewpoint, scale: self._send(client, viewpoint, scale),
+            lambda viewpoint: self._send_exact(client, viewpoint),
+            self._controls.say,
+            self._rate,
+        )
+        self._streams[client.client_id] = stream
+        client.camera.on_update(lambda camera: stream.look(_viewpoint(camera)))
+        threading.Thread(target=stream.run, name=f"viewer stream {client.client_id}", daemon=True).start()
+        stream.look(_viewpoint(client.camera))
+
+    def _leave(self, client: Any) -> None:
+        stream = self._streams.pop(client.client_id, None)
+        if stream is not None:
+            stream.close()
+        self._views.pop(client.client_id, None)
+        self._said.pop(client.client_id, None)
+
+    def _send(self, client: Any, viewpoint: Viewpoint, scale: float) -> None:
+        view = self.session.draw(viewpoint, scale)
+        client.scene.set_background_image(to_uint8(view.frame["rgb"]), "jpeg", jpeg_quality=JPEG)
+
+    def _send_exact(self, client: Any, viewpoint: Viewpoint) -> None:
+        view = self.session.draw(viewpoint, 1.0, AT_REST)
+        client.scene.set_background_image(to_uint8(view.frame["rgb"]), "png")
+        self._views[client.client_id] = view
+
+    def _changed(self) -> None:
+        """What is drawn has changed."""
+        self._nodes.show(self.session.drawn.scene, self._overlay)
+        self._refresh()
+
+    def _refresh(self) -> None:
+        for stream in list(self._streams.values()):
+            stream.refresh()
+
+    @property
+    def _overlay(self) -> bool:
+        drawn = self.session.drawn
+        plain = drawn.scene.camera is None or drawn.scene.camera.lens is None
+        return drawn.settings.lens == "pinhole" or (drawn.settings.lens == "scene" and plain)
+
+    def _start_camera(self, scene: Scene) -> None:
+        camera = scene.camera
+        if camera is None:
+            return
+        pose, start = np.linalg.inv(camera.world_to_camera), self.server.initial_camera
+        start.position = pose[:3, 3]
+        start.look_at = pose[:3, 3] + pose[:3, 2] * _distance(scene, pose)
+        start.up = -pose[:3, 1]
+        start.fov = float(2 * np.arctan(camera.height / 2 / camera.fy)) if camera.lens is None else 1.0
+        start.near, start.far = max(camera.near, 1e-3), min(camera.far, 1e4)
+        self.server.scene.set_up_direction(-pose[:3, 1])
+
+    # what the page's buttons do; `Actions`
+
+    def _click(self, event: Any) -> None:
+        said, view = self._said.get(event.client_id), self._views.get(event.client_id)
+        if said is None:
+            return
+        if view is None:
+            said.content = "Wait until the picture is still, then click again."
+            return
+        found = view.at(*event.screen_pos)
+        depth = "nothing" if found["depth"] is None else f"{found['depth']:.4f} m"
+        rows = [f"pixel {found['pixel']}", f"depth {depth}", f"label {found['label']}"]
+        rows += [f"splat {found['splat_id']}", f"marker {found['marker'] or '-'}"]
+        said.content = "  \n".join(rows)
+
+    def read(self, client: Any) -> None:
+        """Read the markers in the picture at rest, with their errors."""
+        said, view = self._said.get(client.client_id), self._views.get(client.client_id)
+        if said is None or view is None:
+            return
+        try:
+            camera = view.viewpoint.camera(view.drawn.scene, view.drawn.settings.lens)
+            scene = replace(view.drawn.scene, shutter=None)
+            readings, others = read_back(view.frame, scene, camera)
+        except FidsplatError as error:
+            said.content = str(error)
+            return
+        lines = ["| marker | mm | deg |", "|---|---|---|"]
+        for facts in (reading.as_dict() for reading in readings):
+            errors = (facts["position_error_mm"], facts["angle_error_deg"])
+            cells = ["not read", ""] if errors[0] is None else [f"{value:.2f}" for value in errors]
+            lines.append(f"| {facts['marker']} | {' | '.join(cells)} |")
+        lines += [f"\nnot of the scene: {code.name}" for code in others]
+        said.content = "\n".join(lines)
+
+    def picture(self, client: Any) -> None:
+        """The picture as this browser sees it, for its user to keep."""
+        stream = self._streams.get(client.client_id)
+        if stream is not None:
+            image = self.session.draw(_viewpoint(client.camera)).frame["rgb"]
+            client.send_file_download("fidsplat.png", png_bytes(image))
+
+    def add_keyframe(self, client: Any) -> None:
+        """Keep where this browser looks from."""
+        self._keyframes.append(_viewpoint(client.camera).pose)
+        self._nodes.show_keyframes(self.session.drawn.scene.camera, self._keyframes)
+
+    def clear_keyframes(self, client: Any) -> None:
+        """Forget them."""
+        self._keyframes = []
+        self._nodes.show_keyframes(None, [])
+
+    def save_keyframes(self, client: Any) -> None:
+        """Write them as a trajectory, a second apart, beside the scene file or into the current folder."""
+        if not self._keyframes:
+            self._controls.say("no keyframe to save; add some first")
+            return
+        stem = Path("view") if self._file is None else self._file.path.with_suffix("")
+        file = stem.with_name(f"{stem.name}-trajectory.tum")
+        try:
+            save_trajectory(Trajectory(range(len(self._keyframes)), np.array(self._keyframes)), file)
+            self._controls.say(f"{file}: fidsplat fly SCENE --trajectory {file} --smooth")
+        except FidsplatError as error:
+            self._controls.say(str(error))
+
+    def hold(self, name: str) -> None:
+        """Put the gizmo at a marker, by its name in the selector."""
+        scene, _ = self.session.wanted()
+        self._held = None if name == NOBODY else int(name.partition(":")[0]) - 1
+        placed = None if self._held is None else scene.markers[self._held]
+        if placed is not None and placed.motion is not None:
+            self._controls.say(f"{placed.marker.spec} moves by keyframes; it is not moved by hand")
+            placed = None
+        self._nodes.hold(placed, self._move)
+
+    def overlay(self, visible: bool) -> None:
+        """Show or hide outlines, names and frusta."""
+        self._nodes.visible = visible
+        self._nodes.show(self.session.drawn.scene, self._overlay)
+
+    def _move(self, pose: np.ndarray, let_go: bool) -> None:
+        """The gizmo is dragged; once it is let go its pose is written into the scene file."""
+        with self._lock:
+            if self._held is None:
+                return
+            scene, _ = self.session.wanted()
+            markers = list(scene.markers)
+            markers[self._held] = replace(markers[self._held], pose=pose)
+            problem = ""
+            if let_go and self._file is not None:
+                try:
+                    self._file.place(self._held, pose)
+                except FidsplatError as error:
+                    problem = str(error)
+            moved = replace(scene, markers=tuple(markers))
+            self.session.wish(scene=moved, done=lambda why: self._controls.say(why or problem))
+
+    def _watch(self) -> None:
+        """Read the scene file again when somebody else has written it."""
+        while not self._closed.wait(LOOK):
+            try:
+                with self._lock:
+                    again = self._file is not None and self._file.changed()
+                if self._file is not None and again:
+                    scene = Scene.load(self._file.path)
+                    self.session.wish(scene=scene, done=lambda why: self._controls.say(why or ""))
+            except FidsplatError as error:
+                self._controls.say(f"{error}; what was read before is shown")
+
+
+def _silent() -> contextlib.AbstractContextManager[Any]:
+    """viser says on stdout where it listens and that it stopped; so do commands, in their own words."""
+    return contextlib.redirect_stdout(io.StringIO())
+
+
+def _viser() -> Any:
+    try:
+        import viser
+    except ImportError:
+        raise InputError("the viewer needs viser; pip install 'fidsplat[viewer]'") from None
+    logging.getLogger("websockets").setLevel(logging.CRITICAL)  # browsers leave in the middle
+    return viser
+
+
+def _viewpoint(camera: Any) -> Viewpoint:
+    """What viser says of a browser's camera."""
+    position, wxyz = np.asarray(camera.position, float), np.asarray(camera.wxyz, float)
+    away = float(np.linalg.norm(np.asarray(camera.look_at, float) - position))
+    return Viewpoint(
+        tuple(position.tolist()),
+        tuple(wxyz.tolist()),
+        float(camera.fov),
+        max(1, int(camera.image_width)),
+        max(1, int(camera.image_height)),
+        max(away, 1e-3),
+    )
+
+
+def _distance(scene: Scene, pose: np.ndarray) -> float:
+    """Metres before the camera about which the page turns: to the nearest marker, else to the middle of the
+    splats."""
+    targets = [placed.pose[:3, 3] for placed in scene.markers]
+    cloud = scene.cloud()
+    if not targets and len(cloud):
+        targets = [np.median(cloud.means, axis=0) + cloud.origin]
+    ahead = [float((target - pose[:3, 3]) @ pose[:3, 2]) for target in targets]
+    return min((distance for distance in ahead if distance > 0), default=1.0)

@@ -1,0 +1,142 @@
+"""What a viewer's controls say, as plain data, and the captures that follow from it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fidsplat.cameras import Camera, Motion, Shutter
+from fidsplat.capture import Capture
+from fidsplat.errors import InputError
+from fidsplat.quality import Quality
+from fidsplat.rotations import rigid_matrix
+from fidsplat.scenes import Scene
+from fidsplat.surroundings import Fog
+
+LENSES = ("pinhole", "fisheye", "panorama", "parallel", "scene")
+"""`fisheye` sees 180 degrees across; `scene` is the lens of the scene's own camera"""
+MOVING = ("rgb",)
+AT_REST = ("rgb", "depth", "label", "splat_id")
+"""outputs of the picture that one looks at and asks: what is there?"""
+_FOG_COLOR = (0.7, 0.7, 0.7)
+_LEAST = 16  # pixels a side
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """From where a browser looks. OpenCV's camera axes."""
+
+    position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+    """w, x, y, z: camera to world"""
+    fov_y: float
+    """radians"""
+    width: int
+    """pixels of the page"""
+    height: int
+    distance: float = 1.0
+    """metres to what it turns about: as much is seen by parallel rays as at that distance by others"""
+
+    @property
+    def pose(self) -> np.ndarray:
+        """Camera to world (4, 4)."""
+        return rigid_matrix(self.position, self.quaternion)
+
+    def camera(self, scene: Scene, lens: str = "pinhole", scale: float = 1.0) -> Camera:
+        """The camera of its picture, that much smaller than the page.
+
+        Raises:
+            InputError: an unknown lens, or the scene's where its camera has none.
+        """
+        width, height = (max(_LEAST, round(size * scale)) for size in (self.width, self.height))
+        world_to_camera = np.linalg.inv(self.pose)
+        world_to_camera[3] = 0, 0, 0, 1
+        near = 0.01 if scene.camera is None else scene.camera.near
+        far = math.inf if scene.camera is None else scene.camera.far
+        if lens == "fisheye":
+            return Camera.fisheye(width, height, math.pi, world_to_camera, near=near, far=far)
+        if lens == "panorama":
+            return Camera.equirectangular(width, height, world_to_camera, near, far)
+        tall = 2 * math.tan(self.fov_y / 2)
+        if lens == "parallel":
+            across = self.distance * tall * width / height
+            return Camera.orthographic(width, height, across, world_to_camera, near, far)
+        if lens == "scene" and scene.camera is not None and scene.camera.lens is not None:
+            f = scene.camera.fx * width / scene.camera.width
+            ratio = scene.camera.fy / scene.camera.fx
+            middle, given = (width / 2, height / 2), scene.camera.lens
+            return Camera.pinhole(
+                width, height, f, f * ratio, *middle, world_to_camera, near, far, lens=given
+            )
+        if lens not in ("pinhole", "scene"):
+            raise InputError(f"unknown lens {lens!r}; known: {', '.join(LENSES)}")
+        f = height / tall
+        return Camera.pinhole(width, height, f, f, width / 2, height / 2, world_to_camera, near, far)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the controls say."""
+
+    device: str | None = None
+    """None: the scene's, or the default"""
+    quality: str | None = None
+    """None: the scene's"""
+    lens: str = "pinhole"
+    fog: float = 0.0
+    """1 / metres"""
+    exposure: float = 1.0
+    """the sensor's factor of light"""
+    noise: float = 0.0
+    """shot noise of white, as a share of it; 0: none"""
+    time: float = 0.0
+    """seconds, on the clock of what moves"""
+    exposure_ms: float = 0.0
+    readout_ms: float = 0.0
+
+    @staticmethod
+    def of(scene: Scene, device: str | None = None) -> Settings:
+        """Those with which a scene looks as its file says."""
+        capture = scene.capture
+        well = capture.sensor.full_well
+        return Settings(
+            device=device or scene.device,
+            lens="pinhole" if scene.camera is None or scene.camera.lens is None else "scene",
+            fog=0.0 if capture.fog is None else capture.fog.density,
+            exposure=capture.sensor.exposure,
+            noise=0.0 if math.isinf(well) else 1 / math.sqrt(well),
+            time=capture.shutter.time,
+            exposure_ms=1e3 * capture.shutter.exposure_time,
+            readout_ms=1e3 * capture.shutter.readout,
+        )
+
+    def capture(self, scene: Scene, camera: Camera, outputs: tuple[str, ...]) -> Capture:
+        """How a scene's picture is taken from a camera that the browser moves.
+
+        Raises:
+            InputError: a value out of range.
+        """
+        own = scene.capture
+        color = _FOG_COLOR if own.fog is None else own.fog.color
+        shutter = replace(
+            own.shutter,
+            time=self.time,
+            exposure_time=self.exposure_ms / 1e3,
+            readout=self.readout_ms / 1e3,
+        )
+        full_well = math.inf if self.noise <= 0 else max(1.0, 1 / self.noise**2)
+        read_noise = 0.0 if math.isinf(full_well) else min(own.sensor.read_noise, full_well)
+        sensor = replace(own.sensor, exposure=self.exposure, full_well=full_well, read_noise=read_noise)
+        still = not scene.motion.groups
+        return replace(
+            own,
+            camera=camera,
+            outputs=outputs,
+            quality=own.quality if self.quality is None else Quality.of(self.quality),
+            motion=Motion(None, scene.motion.groups),
+            shutter=Shutter() if still else shutter,
+            sensor=sensor,
+            fog=Fog(self.fog, color) if self.fog > 0 else None,
+        )

@@ -1,0 +1,136 @@
+"""Pictures and their truth in the format of the BOP challenge
+(https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md)."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fidsplat.errors import InputError
+from fidsplat.files import atomic_write, writable_folder
+from fidsplat.vision.images import write_png
+from fidsplat.vision.truth import Box, MarkerTruth, Truth
+from fidsplat.vision.visible import outline
+
+PIXEL = 0.5
+"""what BOP counts less than we do: the centre of its first pixel is at 0"""
+DEPTH_SCALE = 0.1
+"""millimetres of a step of the depth's 16 bits, which then reach 6.5 m"""
+
+
+class BopScene:
+    """One scene of a BOP data set: rgb, depth and masks as pictures, intrinsics and poses as JSON. An object
+    is a marker; its obj_id is its label.
+
+    The JSON files are written by `save`, or when a `with` block ends.
+
+    Args:
+        folder: e.g. `dataset/train/000000`. `models/models_info.json` is written two folders above.
+
+    Raises:
+        InputError: a folder that cannot be written, or that holds a scene already.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self._folder = writable_folder(folder)
+        if (self._folder / "scene_gt.json").exists():
+            raise InputError(f"{self._folder} holds a scene already; give another folder")
+        for name in ("rgb", "depth", "mask_visib"):
+            (self._folder / name).mkdir(exist_ok=True)
+        self._cameras: dict[str, Any] = {}
+        self._poses: dict[str, Any] = {}
+        self._seen: dict[str, Any] = {}
+        self._models: dict[str, Any] = {}
+
+    def __enter__(self) -> BopScene:
+        return self
+
+    def __exit__(self, kind: type | None, *_: Any) -> None:
+        if kind is None:
+            self.save()
+
+    def add(self, picture: Mapping[str, np.ndarray], truth: Truth) -> None:
+        """Keep a picture, with `rgb`, and `depth` and `label` where it has them.
+
+        Raises:
+            InputError: a camera with a lens, which BOP cannot say, or depths beyond what its 16 bits hold.
+        """
+        camera = truth.camera
+        if camera.lens is not None:
+            raise InputError("BOP knows pinhole cameras alone; render without a lens, or undistort first")
+        number = len(self._cameras)
+        name = f"{number:06d}"
+        write_png(self._folder / "rgb" / f"{name}.png", picture["rgb"])
+        if "depth" in picture:
+            steps = np.rint(picture["depth"] * (1000 / DEPTH_SCALE))
+            write_png(
+                self._folder / "depth" / f"{name}.png", np.where(steps < 65536, steps, 0).astype(np.uint16)
+            )
+        self._cameras[str(number)] = {
+            "cam_K": (camera.matrix - [[0, 0, PIXEL], [0, 0, PIXEL], [0, 0, 0]]).ravel().tolist(),
+            "cam_R_w2c": camera.world_to_camera[:3, :3].ravel().tolist(),
+            "cam_t_w2c": (1000 * camera.world_to_camera[:3, 3]).tolist(),
+            "depth_scale": DEPTH_SCALE,
+        }
+        self._poses[str(number)], self._seen[str(number)] = [], []
+        for i, marker in enumerate(truth.markers):
+            label = marker.placed.label
+            self._poses[str(number)].append(
+                {
+                    "obj_id": label,
+                    "cam_R_m2c": marker.truth[:3, :3].ravel().tolist(),
+                    "cam_t_m2c": (1000 * marker.truth[:3, 3]).tolist(),
+                }
+            )
+            group = truth.groups.get(label)
+            mask = np.zeros((camera.height, camera.width), bool) if group is None else group.mask
+            write_png(self._folder / "mask_visib" / f"{name}_{i:06d}.png", mask)
+            self._seen[str(number)].append(_seen(marker, truth, mask))
+            self._models[str(label)] = _model(marker)
+
+    def save(self) -> None:
+        """Write the JSON files. Raises InputError when one cannot be written."""
+        for name, content in (
+            ("scene_camera.json", self._cameras),
+            ("scene_gt.json", self._poses),
+            ("scene_gt_info.json", self._seen),
+        ):
+            _write(self._folder / name, content)
+        models = writable_folder(self._folder.resolve().parent.parent / "models")
+        _write(models / "models_info.json", self._models)
+
+
+def _seen(marker: MarkerTruth, truth: Truth, mask: np.ndarray) -> dict[str, Any]:
+    whole, group = outline(marker.placed, truth.camera), truth.groups.get(marker.placed.label)
+    return {
+        "bbox_obj": _box(whole.box),
+        "bbox_visib": _box(None if group is None else group.box),
+        "px_count_all": round(whole.area),
+        "px_count_visib": int(mask.sum()),
+        "visib_fract": marker.visible,
+    }
+
+
+def _box(box: Box | None) -> list[float]:
+    """x, y, width, height; -1 for nothing, as BOP has it."""
+    return [-1, -1, -1, -1] if box is None else [box[0], box[1], box[2] - box[0], box[3] - box[1]]
+
+
+def _model(marker: MarkerTruth) -> dict[str, Any]:
+    low, high = (1000 * marker.placed.marker.corners[k] for k in (0, 2))
+    names = "xyz"
+    return {
+        "spec": marker.placed.marker.spec,
+        "diameter": float(np.linalg.norm(high - low)),
+        **{f"min_{n}": float(v) for n, v in zip(names, low, strict=True)},
+        **{f"size_{n}": float(v) for n, v in zip(names, high - low, strict=True)},
+    }
+
+
+def _write(path: os.PathLike[str], content: Any) -> None:
+    with atomic_write(path) as stream:
+        stream.write(json.dumps(content, allow_nan=False).encode())

@@ -1,0 +1,124 @@
+"""The truth of pictures as COCO annotations (https://cocodataset.org/#format-data)."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fidsplat.errors import InputError
+from fidsplat.files import atomic_write, ordinary_file
+from fidsplat.vision.truth import GroupTruth, MarkerTruth, Truth
+from fidsplat.vision.visible import outline
+
+CORNERS = ("top_left", "top_right", "bottom_right", "bottom_left")
+
+
+class CocoAnnotations:
+    """Annotations of many pictures: for each marker that is seen its box, mask and corners as keypoints, for
+    each named group of splats its box and mask.
+
+    A category is a marker's spec, `apriltag:36h11:5` say, or a group's name. Beside COCO's fields a marker's
+    annotation has `camera_from_marker`, `visible`, `distance_m` and `tilt_deg`.
+
+    Args:
+        groups: {label: name} of groups of splats to annotate.
+    """
+
+    def __init__(self, groups: Mapping[int, str] | None = None) -> None:
+        self._groups = {} if groups is None else dict(groups)
+        self._categories: dict[str, dict[str, Any]] = {}
+        self._images: list[dict[str, Any]] = []
+        self._annotations: list[dict[str, Any]] = []
+
+    def add(self, file_name: str, truth: Truth) -> None:
+        """Annotate a picture. file_name: as it is to stand in the file.
+
+        Raises:
+            InputError: the picture is there already.
+        """
+        if any(image["file_name"] == file_name for image in self._images):
+            raise InputError(f"the picture {file_name!r} is annotated already; each has a name of its own")
+        camera = truth.camera
+        image = {"id": len(self._images) + 1, "file_name": file_name}
+        self._images.append(image | {"width": camera.width, "height": camera.height})
+        for marker in truth.markers:
+            if marker.visible > 0:
+                self._keep(image["id"], marker.placed.marker.spec, self._of_marker(marker, truth), True)
+        for label, name in self._groups.items():
+            if label in truth.groups:
+                self._keep(image["id"], name, _of_group(truth.groups[label]), False)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write all of it as JSON. Raises InputError when the file cannot be written."""
+        content = {
+            "info": {"description": "rendered by fidsplat"},
+            "images": self._images,
+            "annotations": self._annotations,
+            "categories": list(self._categories.values()),
+        }
+        with atomic_write(ordinary_file(path)) as stream:
+            stream.write(json.dumps(content, allow_nan=False).encode())
+
+    def _keep(self, image: Any, name: str, annotation: dict[str, Any], marker: bool) -> None:
+        if name not in self._categories:
+            category: dict[str, Any] = {"id": len(self._categories) + 1, "name": name}
+            category["supercategory"] = "marker" if marker else "group"
+            if marker:
+                category |= {"keypoints": list(CORNERS), "skeleton": [[1, 2], [2, 3], [3, 4], [4, 1]]}
+            self._categories[name] = category
+        number = {"id": len(self._annotations) + 1, "image_id": image}
+        self._annotations.append(number | {"category_id": self._categories[name]["id"]} | annotation)
+
+    def _of_marker(self, marker: MarkerTruth, truth: Truth) -> dict[str, Any]:
+        group = truth.groups.get(marker.placed.label)
+        if group is not None:
+            annotation = _of_group(group)
+        else:  # a picture without labels: its outline
+            assert marker.box is not None
+            x0, y0, x1, y1 = marker.box
+            seen = outline(marker.placed, truth.camera)
+            annotation = {
+                "segmentation": [polygon.ravel().tolist() for polygon in seen.polygons],
+                "bbox": [x0, y0, x1 - x0, y1 - y0],
+                "area": seen.seen_area,
+                "iscrowd": 0,
+            }
+        points, width, height = marker.corners, truth.camera.width, truth.camera.height
+        inside = [bool(0 <= x < width and 0 <= y < height) for x, y in points]
+        keypoints = [
+            float(number)
+            for (x, y), seen in zip(points, inside, strict=True)
+            for number in ((x, y, 2) if seen else (0, 0, 0))
+        ]
+        return annotation | {
+            "keypoints": keypoints,
+            "num_keypoints": sum(inside),
+            "camera_from_marker": marker.truth.tolist(),
+            "visible": marker.visible,
+            "distance_m": marker.distance,
+            "tilt_deg": math.degrees(marker.tilt),
+        }
+
+
+def _of_group(group: GroupTruth) -> dict[str, Any]:
+    x0, y0, x1, y1 = group.box
+    return {
+        "segmentation": {"counts": run_lengths(group.mask), "size": list(group.mask.shape)},
+        "bbox": [x0, y0, x1 - x0, y1 - y0],
+        "area": float(group.mask.sum()),
+        "iscrowd": 0,
+    }
+
+
+def run_lengths(mask: np.ndarray) -> list[int]:
+    """COCO's uncompressed run lengths of a mask (h, w) bool: column by column, False first."""
+    flat = np.concatenate([[False], mask.ravel(order="F"), [False]])
+    edges = np.flatnonzero(flat[1:] != flat[:-1])
+    lengths = np.diff(np.concatenate([[0], edges])).tolist()
+    rest = mask.size - int(edges[-1]) if len(edges) else mask.size
+    return [*lengths, rest] if rest else lengths

@@ -1,0 +1,180 @@
+"""What a picture of a scene shows, from the scene itself: where its markers are, what is whose, what moves
+where."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fidsplat.cameras import Camera, Orthographic
+from fidsplat.errors import InputError
+from fidsplat.rotations import check_similarity
+from fidsplat.scenes import PlacedMarker, Scene
+from fidsplat.vision.visible import visible
+
+Box = tuple[float, float, float, float]
+"""pixels x0, y0, x1, y1"""
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerTruth:
+    """One marker of a scene, and where it is in a picture."""
+
+    placed: PlacedMarker
+    truth: np.ndarray
+    """(4, 4) camera_from_marker"""
+    corners: np.ndarray
+    """(4, 2) pixels where the code's corners are, NaN behind the camera"""
+    visible: float
+    """share of the marker, a module of its quiet zone included, that is in the picture, 0 to 1; of a frame
+    with labels, of what nothing hides"""
+    box: Box | None
+    """around what of that lies in the picture; None where nothing does"""
+
+    @property
+    def distance(self) -> float:
+        """Metres from the camera to the middle of the marker."""
+        return float(np.linalg.norm(self.truth[:3, 3]))
+
+    @property
+    def tilt(self) -> float:
+        """Radians between the marker's normal and the line to the camera: 0 is seen head on, above pi / 2
+        from behind."""
+        distance = self.distance
+        towards = float(self.truth[:3, 2] @ self.truth[:3, 3])
+        return math.acos(max(-1.0, min(1.0, towards / distance))) if distance else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class GroupTruth:
+    """The pixels of the splats of one label."""
+
+    label: int
+    mask: np.ndarray
+    """(h, w) bool"""
+    box: Box
+    """around them"""
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What `truth_of` returns."""
+
+    camera: Camera
+    """that took the picture, where it was"""
+    markers: list[MarkerTruth]
+    """of each marker of the scene, in its order"""
+    groups: dict[int, GroupTruth]
+    """by label, of those that are in the picture; empty for a frame without labels"""
+
+
+def truth_of(picture: Mapping[str, np.ndarray], scene: Scene, camera: Camera | None = None) -> Truth:
+    """What a picture of a scene shows; of a scene that moves, at its shutter's time.
+
+    Args:
+        picture: a Frame, or images by name. Its `label` tells what hides markers, and gives masks.
+        camera: that took it; default the scene's.
+
+    Raises:
+        InputError: no camera, or one of another size than the picture.
+    """
+    first = next(iter(picture))
+    camera, markers = standing(scene, camera, picture[first].shape)
+    label = picture.get("label")
+    return Truth(
+        camera,
+        [marker_truth(placed, camera, label) for placed in markers],
+        {} if label is None else groups_of(label),
+    )
+
+
+def standing(scene: Scene, camera: Camera | None, shape: Sequence[int]) -> tuple[Camera, list[PlacedMarker]]:
+    """The camera and the markers where they are at the scene's shutter's time.
+
+    Raises InputError as `truth_of`, for a picture of that shape.
+    """
+    time = 0.0 if scene.shutter is None else scene.shutter.time
+    camera = scene.camera if camera is None else camera
+    if camera is None:
+        raise InputError("the scene has no camera, so the pose of its markers is unknown; give one")
+    if (camera.height, camera.width) != tuple(shape[:2]):
+        raise InputError(
+            f"the picture has {shape[1]} x {shape[0]} pixels and the camera {camera.width} x "
+            f"{camera.height}; give the picture that this scene was rendered to"
+        )
+    if camera is scene.camera:
+        camera = scene.motion.moved(camera, time)
+    return camera, [m if m.motion is None else replace(m, pose=m.motion(time)) for m in scene.markers]
+
+
+def marker_truth(placed: PlacedMarker, camera: Camera, label: np.ndarray | None = None) -> MarkerTruth:
+    """One marker as a camera sees it. label: (h, w) int32, the labels of the picture; None: nothing stands in
+    front."""
+    pose, corners = camera.world_to_camera @ placed.pose, camera.project(placed.corners)
+    return MarkerTruth(placed, pose, corners, *visible(placed, camera, label))
+
+
+def groups_of(label: np.ndarray) -> dict[int, GroupTruth]:
+    """Masks and boxes of the labels of a picture, (h, w) int32; -1 is nobody's."""
+    found = {}
+    for value in np.unique(label).tolist():
+        if value < 0:
+            continue
+        mask = label == value
+        rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+        box = columns[0], rows[0], columns[-1] + 1, rows[-1] + 1
+        found[value] = GroupTruth(value, mask, tuple(map(float, box)))  # type: ignore[arg-type]
+    return found
+
+
+def points_of(depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """World points (h, w, 3) float64 that pixels show, from any of a frame's depths (`depth`, `depth_median`,
+    `depth_first`); NaN where that is 0."""
+    if depth.shape != (camera.height, camera.width):
+        raise InputError(
+            f"the depth has the shape {depth.shape}; the camera's have {(camera.height, camera.width)}"
+        )
+    y, x = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
+    pixels = np.stack([x.ravel(), y.ravel()], 1)
+    far = np.where(depth > 0, depth, np.nan).astype(np.float64).reshape(-1, 1)
+    if isinstance(camera.lens, Orthographic):
+        flat = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        seen = np.concatenate([flat, far], 1)
+    else:
+        seen = camera.rays(pixels) * far
+    return (seen @ camera.world_to_camera[:3, :3] + camera.position).reshape(*depth.shape, 3)
+
+
+def optical_flow(
+    depth: np.ndarray,
+    before: Camera,
+    after: Camera,
+    label: np.ndarray | None = None,
+    motions: Mapping[int, np.ndarray] | None = None,
+) -> np.ndarray:
+    """Where what a pixel shows will be, (h, w, 2) float32: pixels right and down; NaN where nothing is seen,
+    or where the second camera cannot see it.
+
+    Args:
+        depth: (h, w) of the first picture, any of a frame's depths; at edges `depth_first` mixes least.
+        before, after: the cameras of the two pictures, where they were.
+        label: (h, w) int32 of the first picture, where things move.
+        motions: {label: (4, 4)}: the motion of the world that its splats make between the pictures.
+
+    Raises:
+        InputError: sizes that differ, motions without labels or that are not rigid.
+    """
+    points = points_of(depth, before)
+    if motions and label is None:
+        raise InputError("motions say how labels move, but there is no label image; render with 'label'")
+    for value, motion in (motions or {}).items():
+        check_similarity(motion, f"the motion of label {value}", rigid=True)
+        if label is not None:
+            matrix, own = np.asarray(motion, np.float64), label == value
+            points[own] = points[own] @ matrix[:3, :3].T + matrix[:3, 3]
+    moved = after.project(points.reshape(-1, 3)).reshape(*depth.shape, 2)
+    y, x = np.mgrid[0.5 : before.height, 0.5 : before.width]
+    return (moved - np.stack([x, y], -1)).astype(np.float32)

@@ -1,0 +1,27 @@
+// The opaque surface takes all the light that the splats before it have left, also where they have left so little that splats
+// behind them would not be drawn. Stands behind whatever else ends the walk through a tile's list.
+//@ pass_end
+    const BlendConstants unstopped = {log_cut, ceiling, -1.0f, filter};
+    for (int row = 0; row < (int)(sizeof(pixels) / sizeof(pixels[0])); row++) {
+        Pixel *pixel = &pixels[row];
+        vint mask = VMASK(pixel->opaque_z < INFINITY);
+        if (!VANY(mask)) continue;
+        Seen seen;
+        seen.z = VSELECT((vfloat)0.0f, pixel->opaque_z, mask);
+        for (int lane = 0; lane < LANES; lane++) {
+#if LANES == 1
+            int opaque_x = min(px, width - 1), opaque_y = min(py + row, height - 1);
+#define OPAQUE(type, of) of
+#else
+            int opaque_x = min(x0 + lane, width - 1), opaque_y = min(y0 + row, height - 1);
+#define OPAQUE(type, of) ((type *)&(of))[lane]
+#endif
+            size_t at = (size_t)(opaque_y / SAMPLES) * (width / SAMPLES) + opaque_x / SAMPLES;
+            OPAQUE(float, seen.r) = layer_rgb[3 * at];
+            OPAQUE(float, seen.g) = layer_rgb[3 * at + 1];
+            OPAQUE(float, seen.b) = layer_rgb[3 * at + 2];
+//@@ layer_lane
+        }
+//@@ layer_seen
+        composite(pixel, &seen, (vfloat)1.0f, mask, &unstopped);
+    }

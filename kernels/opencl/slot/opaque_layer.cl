@@ -1,0 +1,20 @@
+// A picture with depths from another renderer, as one opaque surface among the splats: of a fragment at its depth or behind it
+// nothing is seen. It is composited itself after the last splat (part/opaque_layer_end.cl).
+//@ state
+    vfloat opaque_z;        // depth of the surface; infinite where there is none
+//@ pixels_start
+    for (int row = 0; row < (int)(sizeof(pixels) / sizeof(pixels[0])); row++)
+        for (int lane = 0; lane < LANES; lane++) {
+#if LANES == 1
+            int opaque_x = px, opaque_y = py + row;
+            pixels[row].opaque_z
+#else
+            int opaque_x = x0 + lane, opaque_y = y0 + row;
+            ((float *)&pixels[row].opaque_z)[lane]
+#endif
+                = opaque_x < width && opaque_y < height
+                      ? layer_depth[(opaque_y / SAMPLES) * (width / SAMPLES) + opaque_x / SAMPLES] : INFINITY;
+        }
+//@ compose
+    mask &= VMASK(seen.z < pixel->opaque_z);
+    if (!VANY(mask)) return;

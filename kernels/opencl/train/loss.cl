@@ -1,0 +1,147 @@
+// The loss of a picture, (1 - w) L1 + w (1 - SSIM), and its derivative by each value. Its twin in NumPy, with the formulas:
+// fidsplat/train/losses.py.
+//
+// A plane is rows of `stride` floats, the three channels of a pixel side by side, with MARGIN_ROWS rows and MARGIN floats of zeros
+// around the picture, so that a window that leaves it sees zeros without asking. A work-item computes LANES values of a row.
+
+#define RADIUS 5
+#define MARGIN_ROWS RADIUS
+#define MARGIN 16  // at least three channels of RADIUS pixels
+
+constant float WINDOW[2 * RADIUS + 1] = {
+    0.00102838012f, 0.00759875821f, 0.0360007733f, 0.109360687f, 0.213005543f, 0.266011715f,
+    0.213005543f, 0.109360687f, 0.0360007733f, 0.00759875821f, 0.00102838012f,
+};
+#define C1 1e-4f
+#define C2 9e-4f
+
+// Where a work-item's values lie in a plane, and how many of them belong to the picture.
+#define HERE \
+    int column = get_global_id(0) * LANES, row = get_global_id(1); \
+    if (column >= width || row >= height) return; \
+    size_t at = (size_t)(row + MARGIN_ROWS) * stride + MARGIN + column
+
+// Values beyond the picture's last column stay 0.
+#define INSIDE(v) VSELECT((vfloat)(0.0f), v, VMASK((vfloat)((float)column) + VLANE < (vfloat)((float)width)))
+
+// Index space: one work-item per value of the picture. Reads: the picture, the truth, the mask. Writes: planes 0 and 1 of `planes`.
+// Where the mask is 0 the picture is the truth.
+kernel void loss_take(
+//@@ arguments loss_take
+) {
+    int column = get_global_id(0), row = get_global_id(1);
+    if (column >= width || row >= height) return;
+    size_t from = (size_t)row * width + column, to = (size_t)(row + MARGIN_ROWS) * stride + MARGIN + column;
+    float wanted = truth[from] * (1.0f / 255);
+    bool counts = !masked || mask[(size_t)row * (width / 3) + column / 3];
+    planes[to] = counts ? rgb[from] : wanted;
+    planes[plane + to] = wanted;
+}
+
+// Index space: (LANES values, rows). Reads: planes 0 and 1, of a and b. Writes: planes 2 to 6, the means along rows of a, b, a a,
+// b b, a b.
+kernel void loss_rows(
+//@@ arguments loss_rows
+) {
+    HERE;
+    vfloat a = 0, b = 0, aa = 0, bb = 0, ab = 0;
+    for (int k = -RADIUS; k <= RADIUS; k++) {
+        vfloat x = VLOAD(planes + at + 3 * k), y = VLOAD(planes + plane + at + 3 * k), w = WINDOW[k + RADIUS];
+        a += w * x;
+        b += w * y;
+        aa += w * (x * x);
+        bb += w * (y * y);
+        ab += w * (x * y);
+    }
+    VSTORE(INSIDE(a), planes + 2 * plane + at);
+    VSTORE(INSIDE(b), planes + 3 * plane + at);
+    VSTORE(INSIDE(aa), planes + 4 * plane + at);
+    VSTORE(INSIDE(bb), planes + 5 * plane + at);
+    VSTORE(INSIDE(ab), planes + 6 * plane + at);
+}
+
+// Index space: (LANES values, rows). Reads: planes 2 to 6. Writes: planes 7 to 9, the derivatives of the SSIM by the mean of a, by the
+// mean of a a, by that of a b; plane 10, the SSIM.
+kernel void loss_columns(
+//@@ arguments loss_columns
+) {
+    HERE;
+    vfloat a = 0, b = 0, aa = 0, bb = 0, ab = 0;
+    for (int k = -RADIUS; k <= RADIUS; k++) {
+        global const float *from = planes + 2 * plane + at + k * stride;
+        vfloat w = WINDOW[k + RADIUS];
+        a += w * VLOAD(from);
+        b += w * VLOAD(from + plane);
+        aa += w * VLOAD(from + 2 * plane);
+        bb += w * VLOAD(from + 3 * plane);
+        ab += w * VLOAD(from + 4 * plane);
+    }
+    vfloat means = a * a + b * b + C1, variances = (aa - a * a) + (bb - b * b) + C2;
+    vfloat top = 2.0f * a * b + C1, shared = 2.0f * (ab - a * b) + C2;
+    vfloat similar = top * shared / (means * variances);
+    vfloat by_shared = 2.0f * top / (means * variances), by_variance = -similar / variances;
+    vfloat by_mean = 2.0f * (b * shared - a * similar * variances) / (means * variances);
+    by_mean -= 2.0f * a * by_variance + b * by_shared;
+    VSTORE(INSIDE(by_mean), planes + 7 * plane + at);
+    VSTORE(INSIDE(by_variance), planes + 8 * plane + at);
+    VSTORE(INSIDE(by_shared), planes + 9 * plane + at);
+    VSTORE(INSIDE(similar), planes + 10 * plane + at);
+}
+
+// Index space: (LANES values, rows). Reads: planes 7 to 9. Writes: planes 2 to 4, their means along rows.
+kernel void loss_rows_backward(
+//@@ arguments loss_rows_backward
+) {
+    HERE;
+    vfloat by_mean = 0, by_variance = 0, by_shared = 0;
+    for (int k = -RADIUS; k <= RADIUS; k++) {
+        global const float *from = planes + 7 * plane + at + 3 * k;
+        vfloat w = WINDOW[k + RADIUS];
+        by_mean += w * VLOAD(from);
+        by_variance += w * VLOAD(from + plane);
+        by_shared += w * VLOAD(from + 2 * plane);
+    }
+    VSTORE(INSIDE(by_mean), planes + 2 * plane + at);
+    VSTORE(INSIDE(by_variance), planes + 3 * plane + at);
+    VSTORE(INSIDE(by_shared), planes + 4 * plane + at);
+}
+
+// Index space: (LANES values, rows). Reads: planes 0 to 4. Writes: the derivative of the loss, of the picture's shape.
+kernel void loss_columns_backward(
+//@@ arguments loss_columns_backward
+) {
+    HERE;
+    vfloat by_mean = 0, by_variance = 0, by_shared = 0;
+    for (int k = -RADIUS; k <= RADIUS; k++) {
+        global const float *from = planes + 2 * plane + at + k * stride;
+        vfloat w = WINDOW[k + RADIUS];
+        by_mean += w * VLOAD(from);
+        by_variance += w * VLOAD(from + plane);
+        by_shared += w * VLOAD(from + 2 * plane);
+    }
+    vfloat a = VLOAD(planes + at), b = VLOAD(planes + plane + at);
+    vfloat slope = sign(a - b) * l1_share - (by_mean + 2.0f * a * by_variance + b * by_shared) * ssim_share;
+    float values[LANES];
+    VSTORE(slope, values);
+    for (int k = 0; k < LANES && column + k < width; k++) {
+        bool counts = !masked || mask[(size_t)row * (width / 3) + (column + k) / 3];
+        by_rgb[(size_t)row * width + column + k] = counts ? values[k] : 0.0f;
+    }
+}
+
+// Index space: any number of work-items. Reads: planes 0, 1 and 10, margins of zeros too. Writes: each work-item's sums of |a - b|,
+// (a - b)^2 and the SSIM, in the order of the values: the same on every run.
+kernel void loss_sums(
+//@@ arguments loss_sums
+) {
+    real absolute = 0, squared = 0, similar = 0;
+    for (size_t at = get_global_id(0); at < plane; at += get_global_size(0)) {
+        float difference = planes[at] - planes[plane + at];
+        absolute += fabs(difference);
+        squared += difference * difference;
+        similar += planes[10 * plane + at];
+    }
+    sums[3 * get_global_id(0)] = (float)absolute;
+    sums[3 * get_global_id(0) + 1] = (float)squared;
+    sums[3 * get_global_id(0) + 2] = (float)similar;
+}

@@ -1,0 +1,162 @@
+"""Renderer.render_batch, on every device: a view has the bits of itself alone, whatever is drawn with it."""
+
+import pickle
+
+import numpy as np
+import pytest
+from agreement import random_splats
+
+import fidsplat as fs
+from fidsplat.rotations import rigid_matrix
+
+OUTPUTS = ("rgb", "depth", "label")
+CAMERA = fs.Camera.look_at(50, 40, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
+CAMERAS = [fs.Camera.look_at(50, 40, 1.0, (x, 0.1, -0.1), (0.0, 0.0, 3.0)) for x in (-0.4, 0.0, 0.3)]
+POSES = np.array([[0.1, 0, -0.2, 1, 0, 0, 0], [0, 0.1, 0, 1, 0.02, 0, 0.1], [0, 0, 0.2, 2, 0, -0.1, 0]])
+
+
+@pytest.fixture(scope="module")
+def cloud():
+    return random_splats(300, seed=2).with_labels(np.arange(300) % 3)
+
+
+def assert_same(batch, frames):
+    """Each view has the bits of a frame; None: it is masked out."""
+    for name in batch.outputs:
+        assert len(batch[name]) == len(frames)
+        for number, (images, frame) in enumerate(zip(batch[name], frames, strict=True)):
+            if frame is None:
+                assert (images == (-1 if name == "label" else 0)).all(), (number, name)
+            else:
+                assert np.array_equal(images, frame[name]), (number, name)
+                assert images.dtype == frame[name].dtype
+
+
+def moved(pose):
+    """The motion that stands at a pose (7,)."""
+    return lambda time: rigid_matrix(pose[:3], pose[3:])
+
+
+def camera_at(pose):
+    turn = rigid_matrix((0, 0, 0), pose[3:])[:3, :3].T
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = turn, -turn @ pose[:3]
+    return fs.Camera.pinhole(50, 40, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, matrix, position=pose[:3])
+
+
+def test_views_have_the_bits_of_themselves_alone(renderer, cloud):
+    captures = [fs.Capture(camera, OUTPUTS) for camera in CAMERAS]
+    batch = renderer.render_batch(cloud, captures)
+    assert batch["rgb"].shape == (3, 40, 50, 3)
+    assert batch["depth"].shape == (3, 40, 50)
+    assert not batch["rgb"].flags.writeable
+    assert_same(batch, [renderer.render(cloud, capture) for capture in captures])
+    assert_same(renderer.render_batch(cloud, captures[1:2]), [renderer.render(cloud, captures[1])])
+    assert batch.stats["splats"] == 300
+    assert batch.stats["pairs"] == sum(renderer.render(cloud, each).stats["pairs"] for each in captures)
+
+
+def test_poses_take_the_place_of_the_cameras_own(renderer, cloud):
+    batch = renderer.render_batch(cloud, fs.Capture(CAMERA, OUTPUTS), poses=POSES)
+    assert_same(batch, [renderer.render(cloud, camera_at(pose), OUTPUTS) for pose in POSES])
+
+
+def test_groups_move_in_each_view_by_themselves(renderer, cloud):
+    groups = {1: POSES, 2: POSES[::-1]}
+    batch = renderer.render_batch(cloud, fs.Capture(CAMERA, OUTPUTS), groups=groups)
+    motions = [fs.Motion(groups={label: moved(each[k]) for label, each in groups.items()}) for k in range(3)]
+    assert_same(batch, [renderer.render(cloud, CAMERA, OUTPUTS, motion=motion) for motion in motions])
+
+
+def test_masked_views_are_not_drawn(renderer, cloud):
+    captures = [fs.Capture(camera, OUTPUTS, background=(0.5, 0.5, 0.5)) for camera in CAMERAS]
+    mask = np.array([False, True, False])
+    batch = renderer.render_batch(cloud, captures, mask=mask)
+    assert_same(batch, [None, renderer.render(cloud, captures[1]), None])
+    assert_same(renderer.render_batch(cloud, captures, mask=mask & False), [None] * 3)
+
+
+def test_a_batch_outlives_the_next(renderer, cloud):
+    first = renderer.render_batch(cloud, [fs.Capture(camera, OUTPUTS) for camera in CAMERAS])
+    frame = renderer.render(cloud, CAMERA, OUTPUTS)
+    renderer.render_batch(cloud, [fs.Capture(camera, OUTPUTS) for camera in CAMERAS[::-1]])
+    assert_same(first, [renderer.render(cloud, camera, OUTPUTS) for camera in CAMERAS])
+    assert np.array_equal(frame["rgb"], renderer.render(cloud, CAMERA)["rgb"])
+
+
+def test_a_batch_is_given_where_it_was_drawn(renderer, cloud):
+    batch = renderer.render_batch(cloud, fs.Capture(CAMERA, OUTPUTS), poses=POSES).wait()
+    arrays = {name: batch.device_array(name) for name in OUTPUTS}
+    for name, array in arrays.items():
+        assert tuple(array.shape) == batch[name].shape
+        on_host = array.numpy() if hasattr(array, "numpy") else array.get()
+        assert np.array_equal(on_host, batch[name])
+    assert set(batch.timings) >= {"project", "blend", "resolve"}
+    with pytest.raises(fs.InputError, match="no 'alpha'"):
+        batch.device_array("alpha")
+
+
+def test_a_view_as_a_frame_and_a_batch_as_arrays(renderer, cloud):
+    batch = renderer.render_batch(cloud, CAMERAS)
+    frame = batch.frame(2)
+    assert isinstance(frame, fs.Frame)
+    assert np.array_equal(frame["rgb"], batch["rgb"][2])
+    copy = pickle.loads(pickle.dumps(batch))
+    assert np.array_equal(copy["rgb"], batch["rgb"])
+    assert copy.views == batch.views == 3
+    with pytest.raises(fs.InputError, match="no view 3; this batch has views 0 to 2"):
+        batch.frame(3)
+    with pytest.raises(fs.InputError, match="no 'depth'; it was rendered with rgb"):
+        batch["depth"]
+
+
+def test_what_moves_already_may_go_on_beside_poses(renderer, cloud):
+    """A motion of the capture's own groups, a shutter that is open for a while, and masks, in one batch."""
+    capture = fs.Capture(
+        CAMERA, ("rgb",), motion=fs.Motion(groups={2: moved(POSES[0])}),
+        shutter=fs.Shutter(exposure_time=0.1, sub_poses=2),
+    )  # fmt: skip
+    batch = renderer.render_batch(cloud, capture, poses=POSES, mask=np.array([True, False, True]))
+    wanted = [renderer.render(cloud, capture.with_(camera=camera_at(POSES[k]))) for k in (0, 2)]
+    assert_same(batch, [wanted[0], None, wanted[1]])
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"captures": []}, "captures is empty"),
+        ({"captures": 5}, "captures is 5; it must be a list"),
+        ({"captures": [CAMERA, "front"]}, "camera is 'front'"),
+        ({"captures": [CAMERA, fs.Camera.pinhole(51, 40, 9, 9, 9, 9)]}, "same size.* view 1 has 51 x 40"),
+        ({"captures": [CAMERA, fs.Capture(CAMERA, "alpha")]}, "same outputs"),
+        (
+            {"captures": [CAMERA, fs.Capture(CAMERA, sensor=fs.Sensor(gain=2.0))]},
+            "views 0 and 1 differ in gain",
+        ),
+        ({"captures": CAMERAS, "poses": POSES[:2]}, "captures has 3, poses has 2"),
+        ({"poses": POSES[:, :6]}, r"poses must have the shape \(views, 7\).* \(3, 6\)"),
+        ({"poses": np.zeros((2, 7))}, r"poses\[0\] is no pose: .* not all 0"),
+        ({"poses": np.full((2, 7), np.nan)}, r"poses\[0\] is no pose"),
+        ({"groups": {9: POSES}}, "unknown label of splats '9'; known: 0, 1, 2"),
+        ({"groups": {"1": POSES}}, "label '1' is no whole number"),
+        ({"groups": [POSES]}, "groups is .* must be {label: poses"),
+        ({"groups": {1: POSES}, "poses": POSES[:2]}, r"poses has 2, groups\[1\] has 3"),
+        ({"poses": POSES, "mask": [True]}, "poses has 3, mask has 1"),
+        ({"mask": [1, 0]}, "mask must be .* bools"),
+        (
+            {"captures": fs.Capture(CAMERA, motion=fs.Motion(lambda time: np.eye(4))), "poses": POSES},
+            "poses say where the camera of view 0 is, and its motion does too",
+        ),
+        (
+            {"captures": fs.Capture(CAMERA, motion=fs.Motion(groups={1: np.eye})), "groups": {1: POSES}},
+            "the splats of label 1 move, and the motion of view 0 does too",
+        ),
+        (
+            {"captures": fs.Capture(CAMERA, motion=fs.Motion(groups={1: lambda time: 2 * np.eye(4)}))},
+            "last row",
+        ),
+    ],
+)
+def test_what_is_no_batch_is_named(renderer, cloud, given, words):
+    with pytest.raises(fs.InputError, match=words):
+        renderer.render_batch(cloud, **{"captures": CAMERA, **given})

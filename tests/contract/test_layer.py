@@ -1,0 +1,191 @@
+"""A layer of another renderer among splats: exact per pixel, and as the reference has it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from agreement import compare, random_splats
+
+import fidsplat as fs
+from fidsplat.backends.opencl.assemble import assemble
+from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
+from fidsplat.backends.prepare import prepare
+from fidsplat.backends.reference import ReferenceBackend
+from fidsplat.effects import select
+from fidsplat.rotations import rigid_matrix
+
+BACKEND = "opencl"  # Warp has no layers, and says so
+SIZE = WIDTH, HEIGHT = 37, 22
+OUTPUTS = ("rgb", "alpha", "depth", "depth_median", "depth_first", "normal", "label", "splat_id", "blended")
+CAMERA = fs.Camera.pinhole(*SIZE, 30.0, 30.0, 18.0, 11.0)
+
+
+def a_layer(seed=0, label=77):
+    """Random colours and depths among the splats, with holes."""
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(0.9, 3.0, (HEIGHT, WIDTH))
+    depth[rng.random(depth.shape) < 0.2] = np.inf
+    return fs.Layer(rng.random((HEIGHT, WIDTH, 3)), depth, label)
+
+
+def a_cloud():
+    return random_splats(24, 21, depth=(0.8, 4.0), scale=(0.05, 0.5), across=1.2)
+
+
+CASES = {
+    "centre": (a_cloud(), {}),
+    "pixel": (a_cloud(), {"quality": "standard,order=pixel"}),
+    "planes, fog, 2 x 2 samples": (
+        a_cloud().with_planes(np.arange(24) // 4 - 1),
+        {"quality": "standard,samples=2", "fog": fs.Fog(0.2, (0.6, 0.65, 0.7))},
+    ),
+    "exclusive stop, gradient, fisheye": (
+        a_cloud(),
+        {
+            "quality": "gsplat",
+            "background": fs.Gradient((0.2, 0.4, 0.9), (0.4, 0.3, 0.1)),
+            "camera": fs.Camera.fisheye(*SIZE, 2.0),
+        },
+    ),
+}
+
+
+def differences(pipeline, resident, cloud, capture):
+    """A picture of a pipeline against the reference's."""
+    _, view = prepare(resident, capture)
+    images = pipeline.render(resident, view)
+    reference = ReferenceBackend()
+    truth = reference.pipeline(select(cloud, capture.with_(outputs=(*capture.outputs, "alpha"))))
+    found = {name: images.read(name) for name in capture.outputs}
+    return compare(found, truth.render(reference.upload(cloud), view).images, capture.outputs)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_output_is_the_references(renderer, case):
+    cloud, asked = CASES[case]
+    capture = fs.Capture(**{"camera": CAMERA, "outputs": OUTPUTS, "layer": a_layer()} | asked)
+    resident = renderer.upload(cloud)._data
+    pipeline = renderer.backend.pipeline(prepare(resident, capture)[0])
+    wrong = [one for one in differences(pipeline, resident, cloud, capture) if not one.agrees]
+    assert not wrong, wrong
+
+
+@pytest.mark.parametrize("case", ["centre", "planes, fog, 2 x 2 samples"])
+def test_both_schedules_agree(renderer, case):
+    cloud, asked = CASES[case]
+    capture = fs.Capture(CAMERA, OUTPUTS, layer=a_layer()).with_(**asked)
+    resident = renderer.upload(cloud)._data
+    for shape in renderer.backend.shapes("schedule").values():
+        pipeline = renderer.backend.pipeline(prepare(resident, capture)[0], shape)
+        wrong = [one for one in differences(pipeline, resident, cloud, capture) if not one.agrees]
+        assert not wrong, wrong
+
+
+def test_a_plane_that_goes_through_the_layer_is_hidden_where_it_is_behind(renderer):
+    """Not by its centre: pixel by pixel, by its own depth there."""
+    plane = fs.SplatCloud([[0, 0, 0]], [[1, 0, 0, 0]], [[3.0, 3.0]], [0.9], colors=[[1, 0, 0]]).with_boxes()
+    plane = plane.transformed(rigid_matrix((0, 0, 2), (1, 0, 0.3, 0))).with_labels(5)
+    layer = fs.Layer(np.full((HEIGHT, WIDTH, 3), (0, 0, 255), np.uint8), np.full((HEIGHT, WIDTH), 2.0), 9)
+    alone = renderer.render(plane, fs.Capture(CAMERA, OUTPUTS))
+    both = renderer.render(plane, fs.Capture(CAMERA, OUTPUTS, layer=layer))
+    front = (alone["depth"] > 0) & (alone["depth"] < 2.0)
+    assert 0.3 < front.mean() < 0.7
+    np.testing.assert_array_equal(both["label"], np.where(front, 5, 9))
+    np.testing.assert_allclose(both["rgb"][~front], [[0, 0, 1]] * (~front).sum())
+    np.testing.assert_allclose(both["rgb"][front], [[0.9, 0, 0.1]] * front.sum(), atol=1e-6)
+    mixed = 0.9 * alone["depth"] + 0.1 * 2.0
+    np.testing.assert_allclose(both["depth"], np.where(front, mixed, 2.0), rtol=1e-6)
+
+
+def test_a_layer_in_front_of_all_is_all_that_is_seen(renderer):
+    layer = a_layer()
+    near = fs.Layer(layer.rgb, np.full((HEIGHT, WIDTH), 0.5), layer.label)
+    frame = renderer.render(a_cloud(), fs.Capture(CAMERA, OUTPUTS, layer=near))
+    np.testing.assert_array_equal(frame["rgb"], layer.rgb)
+    np.testing.assert_array_equal(frame["depth"], near.depth)
+    assert (frame["label"] == 77).all()
+    assert (frame["alpha"] == 1).all()
+
+
+def test_a_layer_of_nothing_changes_no_bit(renderer):
+    nothing = fs.Layer(np.ones((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH)))
+    alone = renderer.render(a_cloud(), fs.Capture(CAMERA, OUTPUTS))
+    beside = renderer.render(a_cloud(), fs.Capture(CAMERA, OUTPUTS, layer=nothing))
+    for name in OUTPUTS:
+        assert alone[name].tobytes() == beside[name].tobytes(), name
+
+
+def test_our_depth_is_a_layer_for_the_next(renderer):
+    """What is drawn in two parts, each behind the other where it is: opaque splats give the same picture."""
+    boxes = fs.SplatCloud(
+        [[-0.2, 0, 1.5], [0.2, 0, 2.0], [0, 0.1, 1.8]],
+        np.tile([1, 0, 0, 0], (3, 1)),
+        np.full((3, 2), 0.4),
+        np.ones(3),
+        colors=np.eye(3),
+        labels=[1, 2, 3],
+    ).with_boxes()
+    first, rest = (fs.SplatCloud(
+        boxes.means[rows], boxes.quats[rows], boxes.scales[rows], boxes.opacities[rows],
+        colors=boxes.colors[rows], labels=boxes.labels[rows],
+    ).with_boxes() for rows in ([1], [0, 2]))  # fmt: skip
+    quality = "standard,opacity_ceiling=1"
+    drawn = renderer.render(first, fs.Capture(CAMERA, OUTPUTS, quality))
+    layer = fs.Layer(drawn["rgb"], drawn["depth"], np.maximum(drawn["label"], 0))
+    both = renderer.render(rest, fs.Capture(CAMERA, OUTPUTS, quality, layer=layer))
+    whole = renderer.render(boxes, fs.Capture(CAMERA, OUTPUTS, quality))
+    inside = np.abs(whole["rgb"] - np.rint(whole["rgb"])).max(-1) < 1e-6  # edges cover parts of pixels
+    assert inside.mean() > 0.8
+    np.testing.assert_allclose(both["rgb"][inside], whole["rgb"][inside], atol=1e-6)
+    np.testing.assert_array_equal(both["label"][inside], whole["label"][inside])
+
+
+def test_views_of_a_batch_have_layers_of_their_own(renderer):
+    captures = [fs.Capture(CAMERA, OUTPUTS, layer=a_layer(seed)) for seed in (1, 2)]
+    batch = renderer.render_batch(a_cloud(), captures)
+    for i, capture in enumerate(captures):
+        alone = renderer.render(a_cloud(), capture)
+        assert batch["rgb"][i].tobytes() == alone["rgb"].tobytes()
+
+
+@pytest.mark.parametrize("shape", [cpu_shape(), gpu_shape()], ids=["lanes", "group"])
+def test_a_scene_without_a_layer_has_none_of_its_text(shape):
+    plain = fs.Capture(CAMERA, OUTPUTS)
+    text = assemble(select(a_cloud(), plain), shape).text
+    assert "opaque" not in text
+    assert "opaque" in assemble(select(a_cloud(), replace(plain, layer=a_layer())), shape).text
+
+
+def test_warp_says_that_it_has_no_layers():
+    warp = next((info for info in fs.devices() if info.name == "warp:cpu" and info.usable), None)
+    if warp is None:
+        pytest.skip("no Warp here")
+    with pytest.raises(fs.DeviceError, match="has no opaque_layer; use an OpenCL device"):
+        fs.Renderer("warp:cpu").render(a_cloud(), fs.Capture(CAMERA, layer=a_layer()))
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: fs.Layer(np.zeros((4, 5)), np.zeros((4, 5))), r"their shapes are \(4, 5\), \(4, 5\)"),
+        (lambda: fs.Layer(np.zeros((4, 5, 3)), np.full((4, 5), -1.0)), "depths below 0"),
+        (lambda: fs.Layer(np.full((4, 5, 3), np.nan), np.ones((4, 5))), "not finite"),
+        (lambda: fs.Layer(np.zeros((4, 5, 3)), np.ones((4, 5)), 0.5), "must be whole numbers"),
+        (lambda: fs.Layer("red", np.ones((4, 5))), "the rgb of a layer must be an array"),
+        (lambda: fs.Capture(CAMERA, layer=3), "layer is 3; it must be a Layer"),
+    ],
+)
+def test_layers_that_cannot_be(make, words):
+    with pytest.raises(fs.InputError, match=words):
+        make()
+
+
+def test_a_layer_of_another_size_and_one_of_a_long_exposure(reference):
+    small = fs.Layer(np.zeros((4, 5, 3)), np.ones((4, 5)))
+    with pytest.raises(fs.InputError, match="the layer has 5 x 4 pixels and the camera 37 x 22"):
+        reference.render(a_cloud(), fs.Capture(CAMERA, layer=small))
+    blurred = fs.Capture(
+        CAMERA, layer=a_layer(), motion=fs.Motion(lambda t: np.eye(4)), shutter=fs.Shutter(exposure_time=0.1)
+    )
+    with pytest.raises(fs.InputError, match="a layer shows one moment"):
+        reference.render(a_cloud(), blurred)

@@ -1,0 +1,164 @@
+"""The kernels of a training step against their twins in NumPy, on every device that has some."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pyopencl.array
+import pytest
+from training_scene import scene
+
+from fidsplat.backends.base import Trains
+from fidsplat.train import TrainSettings
+from fidsplat.train.device import DeviceWork
+from fidsplat.train.host import HostWork, on_host
+from fidsplat.train.losses import picture_loss
+from fidsplat.train.optimiser import rates
+from fidsplat.train.parameters import NAMES, Splats
+
+BACKEND = "opencl"
+COUNT = 70
+
+
+@pytest.fixture(scope="module")
+def views():
+    """Of two sizes, neither a multiple of a vector; the second has a mask."""
+    small, wide = (scene(views=2, held_out=0, size=size).views[0] for size in ((11, 9), (31, 18)))
+    mask = np.random.default_rng(0).uniform(size=(18, 31)) < 0.7
+    return [small, replace(wide, mask=mask)]
+
+
+@pytest.fixture
+def works(renderer, views):
+    """What makes the kernels' work and its twin, with the same splats."""
+    assert isinstance(renderer.backend, Trains)
+
+    def make(**changes):
+        settings = TrainSettings(iterations=5, **changes)
+        found = (
+            DeviceWork(renderer.backend.training(), views, settings),
+            HostWork(renderer.backend, views, settings),
+        )
+        for work in found:
+            work.load(splats())
+        return found
+
+    return make
+
+
+def splats():
+    random = np.random.default_rng(0)
+    shapes = {"means": (3,), "log_scales": (2,), "quats": (4,), "logits": (), "sh": (9, 3)}
+    made = Splats.of({name: random.normal(size=(COUNT, *shape)) for name, shape in shapes.items()})
+    for group in (made.first, made.second):
+        for array in group.values():
+            array[:] = random.uniform(0.1, 1, array.shape)
+    made.gradients[:], made.seen[:] = random.uniform(size=(2, COUNT))
+    return made
+
+
+def on_device(renderer, array):
+    return pyopencl.array.to_device(renderer.backend.queue, np.ascontiguousarray(array, np.float32))
+
+
+def drawn(renderer, image):
+    """Images as a pipeline gives them."""
+    return SimpleNamespace(device_array=lambda name: on_device(renderer, image), read=lambda name: image)
+
+
+def agree(device, host, rtol=2e-5, atol=2e-6):
+    device, host = device.store(), host.store()
+    for group in ("values", "first", "second"):
+        for name in NAMES:
+            a, b = (getattr(each, group)[name] for each in (device, host))
+            np.testing.assert_allclose(a, b, rtol=rtol, atol=atol, err_msg=f"{group} {name}")
+    np.testing.assert_allclose(device.gradients, host.gradients, rtol=1e-6)
+    np.testing.assert_array_equal(device.seen, host.seen)
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_loss(renderer, views, works, weight):
+    """Of pictures of two sizes in turn, as planes are kept, against float64."""
+    work, _ = works(dssim_weight=weight)
+    random = np.random.default_rng(1)
+    for number in (0, 1, 0):
+        truth = views[number].picture / 255.0
+        image = (truth + random.normal(0, 0.2, truth.shape)).astype(np.float32)
+        found, slope = work.loss(drawn(renderer, image), number)
+        wanted, wanted_slope = picture_loss(image.astype(np.float64), truth, views[number].mask, weight)
+        assert found.value == pytest.approx(wanted.value, rel=1e-5)
+        assert found.squared == pytest.approx(wanted.squared, rel=1e-5)
+        np.testing.assert_allclose(slope.get(), wanted_slope, rtol=1e-3, atol=2e-7)
+        again, same = work.loss(drawn(renderer, image), number)
+        assert (again, same.get().tobytes()) == (found, slope.get().tobytes())
+
+
+def test_masked_values_that_are_not_finite_do_not_count(renderer, views, works):
+    work, _ = works()
+    image = np.full((18, 31, 3), 0.5, np.float32)
+    image[~views[1].mask] = np.nan
+    found, slope = work.loss(drawn(renderer, image), 1)
+    assert np.isfinite(found.value)
+    assert not slope.get()[~views[1].mask].any()
+    image[tuple(np.argwhere(views[1].mask)[0])] = np.nan
+    assert np.isnan(work.loss(drawn(renderer, image), 1)[0].value)
+
+
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_adam_and_what_is_drawn(renderer, works, strategy):
+    """At degree 0, which has plain colours, then at degrees 1 and 2."""
+    device, host = works(strategy=strategy, sh_degree=2)
+    random, rate = np.random.default_rng(2), rates(TrainSettings(), 100, 1.5)
+    for step, degree in ((1, 0), (2, 0), (3, 1), (4, 2)):
+        shown = [work.resident(degree, np.zeros(3)) for work in (device, host)]
+        color = "sh" if degree else "colors"
+        for name in ("means", "quats", "scales", "opacities", color):
+            shape = (COUNT, -1)
+            a, b = (read(renderer, one, name).reshape(shape) for one in shown)
+            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6, err_msg=f"{name} before step {step}")
+        shapes = {"means": (3,), "quats": (4,), "scales": (2,), "opacities": ()}
+        shapes[color] = ((degree + 1) ** 2, 3) if degree else (3,)
+        gradients = {name: random.normal(0, 0.1, (COUNT, *shape)) for name, shape in shapes.items()}
+        device.step({name: on_device(renderer, array) for name, array in gradients.items()}, rate, step)
+        host.step(gradients, rate, step)
+        agree(device, host)
+
+
+def read(renderer, resident, name):
+    buffer = resident.part(name, 0, COUNT)
+    array = np.empty(buffer.size // 4, np.float32)
+    renderer.backend.queue.finish()
+    pyopencl.enqueue_copy(renderer.backend.queue, array, buffer)
+    return array
+
+
+def test_who_is_seen(renderer, views, works):
+    device, host = works()
+    random, origin = np.random.default_rng(3), np.array([0.2, 0.1, -0.3])
+    for view in views:
+        screen = random.uniform(size=COUNT)
+        device.resident(0, origin)
+        device.count({"screen": on_device(renderer, screen)}, view.camera, origin)
+        host.count({"screen": screen}, view.camera, origin)
+    agree(device, host)
+    counted = host.store().seen - splats().seen
+    assert {0.0, 1.0, 2.0} >= set(np.rint(counted).tolist()) > {0.0}
+
+
+def test_shaking(renderer, works):
+    device, host = works(strategy="mcmc", seed=2**40 + 7)
+    before = host.store().values["means"].copy()
+    for work in (device, host):
+        work.shake(17, 1e-4)  # as after splats were made, when nothing of them has been drawn
+    assert np.abs(host.store().values["means"] - before).max() > 0.01
+    agree(device, host, atol=2e-5)
+
+
+def test_what_was_loaded_is_stored(works):
+    device, _ = works()
+    kept, wanted = device.store(), splats()
+    for name in NAMES:
+        np.testing.assert_array_equal(kept.values[name], wanted.values[name])
+        np.testing.assert_array_equal(kept.second[name], wanted.second[name])
+    assert len(device) == COUNT
+    assert on_host(np.float64(1)).dtype == np.float32

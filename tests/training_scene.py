@@ -1,0 +1,47 @@
+"""A small scene to train on, and settings by which a few steps show."""
+
+import numpy as np
+
+import fidsplat as fs
+from fidsplat.train import Dataset, TrainingView
+from fidsplat.vision.images import to_uint8
+
+BACKGROUND = (0.2, 0.3, 0.4)
+QUICK = {
+    "color_rate": 0.05,
+    "initial_opacity": 0.6,
+    "sh_every": 16,
+    "densify_from": 7,
+    "densify_every": 8,
+    "reset_every": 16,
+    "reset_opacity": 0.5,
+    "prune_scale": 0.3,
+    "gradient_threshold": 2e-3,
+    "max_splats": 30,
+}
+
+
+def scene(views=4, held_out=1, size=(24, 18), count=16, renderer=None):
+    """A data set of `count` splats seen from an arc, and points near their centres."""
+    random = np.random.default_rng(0)
+    cloud = fs.SplatCloud(
+        random.uniform(-0.5, 0.5, (count, 3)),
+        random.normal(size=(count, 4)),
+        random.uniform(0.08, 0.2, (count, 2)),
+        random.uniform(0.6, 0.95, count),
+        colors=random.uniform(0, 1, (count, 3)),
+    )
+    cameras = [
+        fs.Camera.look_at(*size, 0.9, (1.6 * np.sin(a), 0.3 * np.cos(3 * a), -1.6 * np.cos(a)), (0, 0, 0))
+        for a in np.linspace(-1, 1, views + held_out)
+    ]
+    renderer = renderer or fs.Renderer("reference")
+    drawn = [
+        TrainingView(
+            f"{i}.png", camera, to_uint8(renderer.render(cloud, camera, background=BACKGROUND)["rgb"])
+        )
+        for i, camera in enumerate(cameras)
+    ]
+    points = cloud.world_means() + random.normal(0, 0.02, (count, 3))
+    grey = np.full((count, 3), 128, np.uint8)
+    return Dataset("tiny", tuple(drawn[held_out:]), tuple(drawn[:held_out]), points, grey, BACKGROUND)

@@ -1,0 +1,87 @@
+"""What frames, clouds and scenes are to notebooks and to other libraries."""
+
+import sys
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.scenes import PlacedMarker
+from fidsplat.vision.images import to_uint8
+
+CAMERA = fs.Camera.look_at(24, 16, 1.0, (0, 0, -1), (0, 0, 0))
+TAG = fs.marker("aruco:4x4_50:7", size=0.4)
+SCENE = fs.Scene(markers=[PlacedMarker(TAG)], camera=CAMERA)
+
+
+def frame(*outputs) -> fs.Frame:
+    return fs.Renderer("reference").render(SCENE, outputs=outputs)
+
+
+def decoded(png: bytes) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1]
+
+
+def test_a_frame_shows_itself():
+    both = frame("depth", "rgb")
+    np.testing.assert_array_equal(decoded(both._repr_png_()), to_uint8(both["rgb"]))
+    assert repr(both).startswith("Frame(depth, rgb, ")
+    deep = decoded(frame("depth")._repr_png_())
+    assert deep[8, 12].any()  # in colours, as there is no rgb
+    assert not deep[0, 0].any()
+
+
+def test_a_frame_of_one_output_is_an_array():
+    one = frame("rgb")
+    np.testing.assert_array_equal(np.asarray(one), one["rgb"])
+    assert np.asarray(one, np.float64).dtype == np.float64
+    assert np.array(one).flags.writeable  # a copy
+    assert cv2.cvtColor(np.asarray(one), cv2.COLOR_RGB2GRAY).shape == (16, 24)
+    with pytest.raises(fs.InputError, match=r"this frame has 2 images \(rgb, depth\); take one by its name"):
+        np.asarray(frame("rgb", "depth"))
+
+
+def test_a_frame_becomes_a_tensor(monkeypatch):
+    """Of a device with arrays to give by DLPack, without a copy; else of a copy that may be written."""
+    torch = SimpleNamespace(from_dlpack=lambda array: ("dlpack", array), from_numpy=lambda a: ("numpy", a))
+    monkeypatch.setitem(sys.modules, "torch", torch)
+    drawn = frame("rgb", "label")
+    kind, array = drawn.to_torch("label")
+    assert kind == "numpy"
+    assert array.flags.writeable
+    np.testing.assert_array_equal(array, drawn["label"])
+    images = SimpleNamespace(read=None, timings={}, stats={}, device_array=lambda name: f"{name} there")
+    assert fs.Frame(images, ("rgb",)).to_torch() == ("dlpack", "rgb there")
+    with pytest.raises(fs.InputError, match="no 'depth'"):
+        drawn.to_torch("depth")
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(fs.InputError, match="torch, which is not installed; pip install torch"):
+        drawn.to_torch()
+
+
+def test_torch_itself_takes_a_frame():
+    torch = pytest.importorskip("torch", reason="torch is not installed")
+    drawn = frame("rgb")
+    assert torch.equal(drawn.to_torch(), torch.tensor(drawn["rgb"]))
+
+
+def test_clouds_and_scenes_say_what_they_hold():
+    cloud = fs.SplatCloud(
+        [[0, 0, 0], [1, 2, 3]], [[1, 0, 0, 0]] * 2, [[0.1, 0.1, 0.0], [0.1, 0.1, 0.2]], [1, 1],
+        sh=np.zeros((2, 4, 3)), labels=[0, 5],
+    )  # fmt: skip
+    said = cloud.summary()
+    assert said["splats"] == "2, 2D and 3D"
+    assert said["colours"] == "SH of degree 1"
+    assert said["labels"] == "2 different"
+    assert said["bounds"].endswith(" m")
+    assert "<td style='text-align:left'>2, 2D and 3D</td>" in cloud._repr_html_()
+    assert fs.SplatCloud.empty().summary() == {"splats": "0, 2D", "colours": "plain"}
+    scene = fs.Scene([cloud], camera=CAMERA, markers=[PlacedMarker(fs.marker("qr:<b>", size=0.1))])
+    assert repr(scene) == "Scene(2 splats, qr:<b>)"
+    assert scene.summary()["marker 1"] == "qr:<b>, 0.1 m at (0, 0, 0)"
+    assert scene.summary()["camera"] == "24 x 16, pinhole, at (0, 0, -1)"
+    assert "qr:&lt;b&gt;" in scene._repr_html_()
+    assert "<b>Scene</b>" in scene._repr_html_()

@@ -1,0 +1,218 @@
+"""Flights: what each picture shows, going on after a stop, sheets and videos; `fidsplat fly`."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.cli import main
+from fidsplat.flights import Flight, FlightFolder
+from fidsplat.vision.images import read_image
+from fidsplat.vision.video import write_video
+
+SCENE = """
+[camera]
+width = 33
+height = 24
+fov_x_deg = 60.0
+position = [0.0, 0.0, -1.0]
+look_at = [0.0, 0.0, 0.0]
+
+[[markers]]
+spec = "aruco:4x4_50:7"
+size = 0.4
+"""
+KEYFRAMES = """
+[[camera.motion]]
+time = 0.0
+position = [0.0, 0.0, -1.0]
+look_at = [0.0, 0.0, 0.0]
+
+[[camera.motion]]
+time = 1.0
+position = [0.3, 0.0, -1.0]
+look_at = [0.3, 0.0, 0.0]
+"""
+POSES = "0 0 0 -1 0 0 0 1\n1 0.3 0 -1 0 0 0 1\n"
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("FIDSPLAT_DEVICE", "reference")
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "moving.toml").write_text(
+        SCENE.replace("position =", "# ").replace("look_at", "#") + KEYFRAMES
+    )
+    (tmp_path / "poses.tum").write_text(POSES)
+    return tmp_path
+
+
+def fly(*words) -> int:
+    return main(["fly", "scene.toml", "--trajectory", "poses.tum", "-o", "out", *words])
+
+
+def small_flight(rate=2.0, **changes) -> Flight:
+    path = fs.Trajectory([0.0, 1.0], [[0, 0, -1, 1, 0, 0, 0], [0.3, 0, -1, 1, 0, 0, 0]])
+    scene = fs.Scene.load("scene.toml")
+    return Flight(scene, path, path.sampled(rate).times, scene.capture.with_(**changes))
+
+
+def test_each_picture_is_that_of_its_pose(here):
+    """As drawn alone from there, in every output."""
+    assert fly("--rate", "2", "--outputs", "rgb,depth") == 0
+    scene, renderer = fs.Scene.load("scene.toml"), fs.Renderer()
+    for k, x in enumerate((0.0, 0.15, 0.3)):
+        camera = fs.Camera.look_at(33, 24, np.radians(60), (x, 0, -1), (x, 0, 0))
+        frame = renderer.render(scene, camera, outputs=("rgb", "depth"))
+        drawn = read_image(f"out/rgb/{k:06d}.png") / 255
+        assert np.abs(drawn - np.clip(frame["rgb"], 0, 1)).max() < 0.6 / 255
+        np.testing.assert_allclose(np.load(f"out/depth/{k:06d}.npy"), frame["depth"], atol=1e-6)
+    assert len(list((here / "out" / "depth").iterdir())) == 9
+    poses = fs.load_trajectory("out/trajectory.tum")
+    np.testing.assert_allclose(poses.poses[:, 0, 3], [0, 0.15, 0.3], atol=1e-12)
+    said = json.loads((here / "out" / "transforms.json").read_text())
+    assert [frame["file_path"] for frame in said["frames"]] == [f"rgb/{k:06d}.png" for k in range(3)]
+    assert (here / "out" / "contact-sheet.png").exists()
+
+
+def test_the_shutter_sees_the_camera_move(here):
+    """Pictures of a flight are blurred along it, each about its own time."""
+    flight = small_flight(shutter=fs.Shutter(exposure_time=0.2, sub_poses=2))
+    capture = flight.captures[1]
+    assert capture.exposed
+    assert capture.shutter.time == 0.5
+    assert capture.camera is not None
+    for time in capture.shutter.times(0.5):
+        seen = capture.motion.moved(capture.camera, time)
+        np.testing.assert_allclose(seen.position, [0.3 * time, 0, -1], atol=1e-12)
+
+
+def test_a_flight_goes_on_where_it_was(here, capsys):
+    assert fly("--rate", "4") == 0
+    first = {file.name: file.stat().st_mtime_ns for file in (here / "out" / "rgb").iterdir()}
+    for name in ("000001.png", "000004.png"):
+        (here / "out" / "rgb" / name).unlink()
+    capsys.readouterr()
+    assert fly("--rate", "4", "--json") == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (said["frames"], said["drawn"]) == (5, 2)
+    again = {file.name: file.stat().st_mtime_ns for file in (here / "out" / "rgb").iterdir()}
+    assert sorted(again) == sorted(first)
+    assert sorted(name for name in first if first[name] != again[name]) == ["000001.png", "000004.png"]
+
+
+def test_what_is_drawn_is_not_mixed_with_another_flight(here, capsys):
+    assert fly("--times", "0,1") == 0
+    (here / "poses.tum").write_text(POSES.replace("0.3", "0.2"))
+    assert fly("--times", "0,1") == 2
+    assert "out holds another flight, of 2 pictures; give another folder" in capsys.readouterr().err
+    before = (here / "out" / "rgb" / "000001.png").read_bytes()
+    assert fly("--times", "0,1", "--overwrite") == 0
+    assert (here / "out" / "rgb" / "000001.png").read_bytes() != before
+    (here / "out" / "flight.json").unlink()
+    assert fly("--times", "0,1") == 2
+    assert "pictures that no flight.json there tells of" in capsys.readouterr().err
+
+
+def test_what_a_flight_is_of(here):
+    """Its key changes with each thing that its pictures depend on, and with nothing else."""
+    key = small_flight().key("a")
+    assert key == small_flight().key("a")
+    others = [
+        small_flight(3.0).key("a"),
+        small_flight(quality=fs.Quality(samples=2)).key("a"),
+        small_flight(background=(0.1, 0, 0)).key("a"),
+        small_flight().key("b"),
+    ]
+    (here / "scene.toml").write_text(SCENE.replace("0.4", "0.41"))
+    others.append(small_flight().key("a"))
+    assert len({key, *others}) == 6
+
+
+def test_the_scenes_own_motion(here):
+    assert main(["fly", "moving.toml", "-o", "own", "--rate", "2"]) == 0
+    assert fly("--rate", "2") == 0
+    for k in range(3):
+        name = f"rgb/{k:06d}.png"
+        assert (here / "own" / name).read_bytes() == (here / "out" / name).read_bytes()
+
+
+def test_a_log_and_the_truth_beside_the_pictures(here):
+    logs = pytest.importorskip("fidsplat.logs", reason="pip install 'fidsplat[logs]'", exc_type=fs.InputError)
+    words = ("--rate", "2", "--outputs", "rgb,label", "--log", "run.mcap", "--coco", "truth.json")
+    assert fly(*words) == 0
+    pictures = list(logs.log_pictures("run.mcap"))
+    assert [name for name, _ in pictures] == [f"/camera/image_raw {t:.3f} s" for t in (0, 0.5, 1)]
+    np.testing.assert_array_equal(pictures[1][1], read_image("out/rgb/000001.png"))
+    truth = json.loads((here / "truth.json").read_text())
+    assert [image["file_name"] for image in truth["images"]] == [f"rgb/00000{k}.png" for k in range(3)]
+    moved = [annotation["camera_from_marker"][0][3] for annotation in truth["annotations"]]
+    np.testing.assert_allclose(moved, [0, -0.15, -0.3], atol=1e-9)
+    own = np.load("out/label/000001.npy") == 1
+    assert truth["annotations"][1]["area"] == own.sum() > 50
+
+
+def test_a_video_has_every_picture(here):
+    pytest.importorskip("imageio_ffmpeg", reason="the extra video is not installed")
+    pictures = [np.full((33, 47, 3), 60 + 20 * k, np.uint8) for k in range(4)]
+    assert list(write_video("v.mp4", pictures, 10.0)) == [0, 1, 2, 3]
+    video = cv2.VideoCapture("v.mp4")
+    assert video.get(cv2.CAP_PROP_FPS) == 10
+    for k in range(4):
+        done, frame = video.read()
+        assert done
+        assert frame.shape == (34, 48, 3)  # H.264 wants even sides
+        assert abs(float(frame.mean()) - (60 + 20 * k)) < 4
+    assert not video.read()[0]
+    with pytest.raises(fs.InputError, match="there is no picture"):
+        list(write_video("none.mp4", [], 10.0))
+    assert sorted(p.name for p in here.glob("*.mp4*")) == ["v.mp4"]
+    assert list(here.glob(".*")) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--rate", "0"], "the rate is 0.0; give a number"),
+        (["--times", "0,noon"], "--times is '0,noon'; give seconds"),
+        (["--times", "1,0"], "increasing"),
+        (["--video", "a.avi"], "videos are written as MP4: name a.mp4"),
+        (["--outputs", "deep"], "unknown output 'deep'"),
+        (["--memory-budget", "lots"], "--memory-budget is 'lots'; give a number of bytes"),
+        (["--trajectory", "none.tum"], "cannot read none.tum"),
+    ],
+)
+def test_words_that_cannot_be_flown(here, capsys, words, message):
+    assert fly(*words) == 2
+    assert message in capsys.readouterr().err
+    assert not (here / "out").exists()
+
+
+def test_a_scene_that_stands_still_needs_a_trajectory(here, capsys):
+    assert main(["fly", "scene.toml"]) == 2
+    assert "scene.toml has no [[camera.motion]] to fly along; give --trajectory" in capsys.readouterr().err
+
+
+def test_sizes_in_bytes():
+    from fidsplat.commands.output import bytes_of
+
+    assert bytes_of("--x", None) is None
+    sizes = {"1": 1, "2GiB": 2 * 2**30, "1.5 MB": 1_500_000, "3kb": 3000, "7 MiB": 7 * 2**20}
+    assert {text: bytes_of("--x", text) for text in sizes} == sizes
+    for text in ("", "0", "-1", "2 GBit", "1e9", "GiB"):
+        with pytest.raises(fs.InputError, match="give a number of bytes above 0"):
+            bytes_of("--x", text)
+
+
+def test_pictures_that_are_not_whole_are_drawn_again(here):
+    """One file of three is missing: the output is."""
+    flight = small_flight(outputs=("depth",))
+    renderer = fs.Renderer()
+    folder = FlightFolder("d", flight, renderer.device.title)
+    assert list(folder.draw(renderer)) == [0, 1, 2]
+    assert folder.left() == []
+    folder.file(1, "depth", ".npy").unlink()
+    assert folder.left() == [1]

@@ -1,0 +1,165 @@
+"""The reference's derivatives: against central differences of its own pictures, decisions as they were."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.backends.prepare import prepare
+from fidsplat.backends.reference.backend import ReferenceBackend
+from fidsplat.backends.reference.gradients import FrozenPicture
+
+OUTPUTS = ("rgb", "alpha", "depth", "normal")
+CAMERA = fs.Camera.pinhole(14, 11, 12.0, 13.0, 6.6, 5.2, near=0.3)
+
+
+def splats(n=5, seed=0, *, scale=0.35, opacity=(0.2, 0.9), degree=-1, depth=(1.2, 3.0)):
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(*depth, n)
+    means = np.stack([rng.uniform(-0.5, 0.5, n) * z, rng.uniform(-0.4, 0.4, n) * z, z], 1)
+    colors = rng.uniform(0, 1, (n, 3)) if degree < 0 else None
+    # many colours below 0, which are clamped
+    sh = None if degree < 0 else rng.normal(0, 0.8, (n, (degree + 1) ** 2, 3))
+    scales = scale * rng.uniform(0.5, 1.5, (n, 2))
+    quats, opacities = rng.normal(size=(n, 4)), rng.uniform(*opacity, n)
+    return fs.SplatCloud(means, quats, scales, opacities, colors=colors, sh=sh)
+
+
+def edge_on():
+    """Seen along their planes but for little: most of what is seen are dots of the low-pass, whose rays miss
+    the plane or meet it far away."""
+    cloud = splats(6, 5)
+    tilt = np.deg2rad(89.0 + np.arange(6) / 6) / 2
+    quats = np.stack([np.cos(tilt), np.sin(tilt), 0 * tilt, 0 * tilt], 1)
+    return fs.SplatCloud(cloud.means, quats, 0.2 * cloud.scales, cloud.opacities, colors=cloud.colors)
+
+
+def before_the_camera():
+    """A floor that goes through the near plane and the camera's own."""
+    quats = [[np.cos(0.7), np.sin(0.7), 0, 0], [np.cos(0.75), np.sin(0.75), 0, 0.1]]
+    means = [[0.1, 0.4, 0.6], [-0.2, 0.5, 0.1]]
+    return fs.SplatCloud(means, quats, [[0.5, 0.6], [0.7, 0.5]], [0.7, 0.8], colors=np.eye(3)[:2])
+
+
+NONE, SCREEN = fs.Quality(lowpass="none", alpha_cutoff=1e-3), fs.Quality(alpha_cutoff=1e-3)
+SCENES = {
+    "no low-pass": (splats(), NONE),
+    "dots": (splats(8, 1, scale=0.03), SCREEN),
+    "dots and disks": (splats(6, 2, scale=0.1), SCREEN),
+    "edge-on": (edge_on(), SCREEN),
+    "ceiling": (splats(5, 3, opacity=(0.8, 1.0)), replace(NONE, opacity_ceiling=0.7)),
+    "opaque": (splats(8, 4, opacity=(1.0, 1.0), scale=0.6), NONE),
+    "exclusive stop": (
+        splats(9, 6, opacity=(0.9, 1.0), scale=0.9),
+        replace(fs.Quality.named("surfel"), transmittance_stop=0.05),
+    ),
+    "near plane": (before_the_camera(), SCREEN),
+    "harmonics": (splats(3, 7, degree=3), NONE),
+}
+
+
+def pictured(name, background=(0.2, 0.5, 0.1)):
+    cloud, quality = SCENES[name]
+    capture = fs.Capture(CAMERA, outputs=OUTPUTS, quality=quality, background=background)
+    return cloud, *prepare(cloud, capture)
+
+
+def weights_of(images, seed=0):
+    """A loss that is linear in all images."""
+    rng = np.random.default_rng(seed)
+    return {name: rng.normal(size=images[name].shape) for name in OUTPUTS}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_frozen_pictures_are_the_references(name):
+    cloud, features, view = pictured(name)
+    backend = ReferenceBackend()
+    drawn = backend.pipeline(features).render(backend.upload(cloud), view)
+    frozen = FrozenPicture(cloud, view, features)
+    images = frozen.images(frozen.parameters)
+    for output in OUTPUTS:
+        assert np.allclose(images[output], drawn.read_float64(output), rtol=1e-9, atol=1e-9), output
+    assert images["alpha"].max() > 0.1
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_derivatives_are_those_of_central_differences(name):
+    cloud, features, view = pictured(name)
+    frozen = FrozenPicture(cloud, view, features)
+    at = frozen.parameters
+    weights = weights_of(frozen.images(at))
+
+    def loss(parameters):
+        images = frozen.images(parameters)
+        return sum((weights[output] * images[output]).sum() for output in OUTPUTS)
+
+    found = frozen.backward(weights)
+    for parameter in at.names:
+        values = getattr(at, parameter)
+        expected = np.zeros_like(values)
+        for place in np.ndindex(values.shape):
+            step = 1e-6 * max(1.0, abs(values[place]))
+            ends = []
+            for sign in (1, -1):
+                moved = values.copy()
+                moved[place] += sign * step
+                ends.append(loss(replace(at, **{parameter: moved})))
+            expected[place] = (ends[0] - ends[1]) / (2 * step)
+        off = np.abs(found[parameter] - expected).max()
+        assert off <= 2e-6 * max(1.0, np.abs(expected).max()), (parameter, off)
+        assert np.abs(expected).max() > 0, parameter
+
+
+def test_every_decision_occurs():
+    made = {}
+    for name in SCENES:
+        cloud, features, view = pictured(name)
+        ((_, _, made[name]),) = FrozenPicture(cloud, view, features)._blocks
+    assert made["dots"].by_dot[made["dots"].drawn].all()
+    both = made["dots and disks"]
+    assert {*both.by_dot[both.drawn].tolist()} == {True, False}
+    assert made["ceiling"].clamped[made["ceiling"].drawn].any()
+    assert (made["edge-on"].missed & made["edge-on"].drawn).any()
+    assert ((made["edge-on"].beyond != 0) & made["edge-on"].drawn).any()
+    assert not made["opaque"].drawn.all()
+
+
+def test_the_screen_statistic_is_the_derivative_by_the_centres_place():
+    """What the 2DGS authors call dL_dmean2D: by the centre's place in the picture, in half pictures."""
+    cloud, features, view = pictured("dots")
+    found = FrozenPicture(cloud, view, features).backward({"rgb": np.ones((view.height, view.width, 3))})
+    z, (x, y, _) = cloud.means[:, 2].astype(float), found["means"].T
+    across = 0.5 * z * np.hypot(view.width * x / view.focal_x, view.height * y / view.focal_y)
+    assert np.allclose(found["screen"], across)
+    assert across.max() > 0
+
+
+def test_what_has_no_gradient_is_refused_by_name():
+    cloud = splats()
+    backend = ReferenceBackend()
+    cases = {
+        "lowpass_pixel": fs.Capture(CAMERA, quality=fs.Quality(lowpass="pixel")),
+        "compose_pixel": fs.Capture(CAMERA, quality=fs.Quality(order="pixel")),
+        "2 x 2 samples": fs.Capture(CAMERA, quality=fs.Quality(samples=2)),
+        "exposure": fs.Capture(CAMERA, sensor=fs.Sensor(exposure=2.0)),
+        "camera_equirectangular": fs.Capture(fs.Camera.equirectangular(32, 16)),
+        "background_gradient": fs.Capture(CAMERA, background=fs.Gradient((1, 1, 1), (0, 0, 0))),
+    }
+    for name, capture in cases.items():
+        features, _ = prepare(cloud, capture)
+        with pytest.raises(fs.InputError, match=name):
+            backend.differentiate(features)
+    features, view = prepare(cloud, fs.Capture(CAMERA, outputs=("rgb", "label")))
+    pipeline = backend.differentiate(features)
+    resident = backend.upload(cloud)
+    images = pipeline.forward(resident, view)
+    with pytest.raises(fs.InputError, match="'label' has no gradient"):
+        pipeline.backward(images, {"label": np.zeros((11, 14))})
+    with pytest.raises(fs.InputError, match="'depth' was not drawn"):
+        pipeline.backward(images, {"depth": np.zeros((11, 14))})
+    with pytest.raises(fs.InputError, match=r"\(11, 14\); it must be \(11, 14, 3\)"):
+        pipeline.backward(images, {"rgb": np.zeros((11, 14))})
+    pipeline.forward(resident, view)
+    with pytest.raises(fs.InputError, match="made last"):
+        pipeline.backward(images, {})

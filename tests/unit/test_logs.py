@@ -1,0 +1,185 @@
+"""Logs: what is written is read by the packages that robotics tools are made of."""
+
+import json
+import resource
+import signal
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.cli import main
+from fidsplat.rotations import rigid_matrix
+from fidsplat.vision.detect import Detection, detect
+from fidsplat.vision.images import to_uint8
+
+rosbags = pytest.importorskip("rosbags.highlevel", reason="pip install 'fidsplat[logs]'")
+mcap_reader = pytest.importorskip("mcap.reader", reason="pip install 'fidsplat[logs]'")
+
+RNG = np.random.default_rng(4)
+RGB = RNG.random((24, 32, 3)).astype(np.float32)
+DEPTH = RNG.random((24, 32)).astype(np.float32)
+LABEL = RNG.integers(-1, 5, (24, 32)).astype(np.int32)
+POSE = rigid_matrix((1, 2, 3), (0.9, 0.1, -0.2, 0.3))
+TAG = Detection("apriltag", "36h11", 5, None, np.array([[1.0, 2], [3, 2], [3, 4], [1, 4]]))
+LENS = fs.Camera.pinhole(32, 24, 30, 31, 16, 12, lens=fs.BrownConrady(k1=-0.1, k2=0.02, p1=0.001, k3=0.003))
+
+
+def written(path):
+    from fidsplat.logs import RobotLog
+
+    with RobotLog(path) as log:
+        for time in (0.5, 1.25):
+            log.image(time, "front", RGB)
+            log.image(time, "front", DEPTH, "depth")
+            log.image(time, "front", LABEL, "label")
+            log.image(time, "front", RGB, compress="png")
+            log.camera_info(time, "front", LENS)
+            log.transform(time, "front", POSE)
+            log.odometry(time, POSE, velocity=(1, 0, 0), turning=(0, 0, 0.5))
+            log.imu(time, (0, 0, 0.5), (0, 0, 9.81))
+            log.detections(time, "front", [TAG])
+    return path
+
+
+def by_rosbags(path):
+    with rosbags.AnyReader([path]) as reader:
+        return [
+            (connection.topic, time, reader.deserialize(data, connection.msgtype))
+            for connection, time, data in reader.messages()
+        ]
+
+
+def by_mcap(path):
+    ros2 = pytest.importorskip("mcap_ros2.decoder", reason="pip install mcap-ros2-support")
+    with path.open("rb") as stream:
+        reader = mcap_reader.make_reader(stream, decoder_factories=[ros2.DecoderFactory()])
+        return [
+            (channel.topic, message.log_time, decoded)
+            for _, channel, message, decoded in reader.iter_decoded_messages()
+        ]
+
+
+@pytest.mark.parametrize(("name", "read"), [("run.mcap", by_mcap), ("bag", by_rosbags)])
+def test_their_own_readers_read_what_we_write(tmp_path, name, read):
+    found = {}
+    for topic, time, message in read(written(tmp_path / name)):
+        found.setdefault(topic, []).append((time, message))
+    assert set(found) == {
+        *(f"/front/{part}" for part in ("image_raw", "depth/image_raw", "label/image_raw", "camera_info")),
+        *("/front/image_raw/compressed", "/front/detections", "/tf", "/odom", "/imu"),
+    }
+    assert [[time for time, _ in each] for each in found.values()] == [[500_000_000, 1_250_000_000]] * 9
+    first = {topic: each[0][1] for topic, each in found.items()}
+    image, depth, label = (first[f"/front/{part}image_raw"] for part in ("", "depth/", "label/"))
+    assert (image.encoding, image.height, image.width, image.step) == ("rgb8", 24, 32, 96)
+    assert (image.header.frame_id, image.header.stamp.nanosec) == ("front", 500_000_000)
+    pixels = np.frombuffer(bytes(image.data), np.uint8).reshape(24, 32, 3)
+    np.testing.assert_allclose(pixels / 255, RGB, atol=0.51 / 255)
+    np.testing.assert_array_equal(np.frombuffer(bytes(depth.data), np.float32).reshape(24, 32), DEPTH)
+    np.testing.assert_array_equal(np.frombuffer(bytes(label.data), np.int32).reshape(24, 32), LABEL)
+    info = first["/front/camera_info"]
+    assert (info.distortion_model, list(info.d)) == ("plumb_bob", [-0.1, 0.02, 0.001, 0.0, 0.003])
+    assert list(info.k) == [30, 0, 15.5, 0, 31, 11.5, 0, 0, 1]
+    assert list(info.p) == [30, 0, 15.5, 0, 0, 31, 11.5, 0, 0, 0, 1, 0]
+    (moved,) = first["/tf"].transforms
+    assert (moved.header.frame_id, moved.child_frame_id) == ("map", "front")
+    turn = moved.transform.rotation
+    np.testing.assert_allclose(rigid_matrix((1, 2, 3), (turn.w, turn.x, turn.y, turn.z)), POSE, atol=1e-12)
+    odometry = first["/odom"]
+    assert (odometry.pose.pose.position.z, odometry.twist.twist.angular.z) == (3, 0.5)
+    assert (first["/imu"].linear_acceleration.z, first["/imu"].orientation_covariance[0]) == (9.81, -1)
+    (tag,) = first["/front/detections"].detections
+    assert (tag.family, tag.id, tag.corners[2].x, tag.centre.y) == ("36h11", 5, 2.5, 2.5)
+
+
+@pytest.fixture(scope="module")
+def tag_picture():
+    tag = fs.marker("apriltag:36h11:5", size=1.0)
+    camera = fs.Camera.pinhole(120, 100, 120, 120, 60, 50, rigid_matrix((0, 0, 2)))
+    frame = fs.Renderer("reference").render(tag.cloud, camera, background=(0.5, 0.5, 0.5))
+    return frame["rgb"]
+
+
+@pytest.mark.parametrize(("name", "compress"), [("run.mcap", None), ("bag", "jpeg")])
+def test_detect_reads_logs(tmp_path, capsys, tag_picture, name, compress):
+    from fidsplat.logs import RobotLog
+
+    with RobotLog(tmp_path / name) as log:
+        for time in (0.0, 0.1):
+            log.image(time, "front", tag_picture, compress=compress)
+            log.image(time, "front", DEPTH, "depth")
+    assert main(["detect", str(tmp_path / name), "--json"]) == 0
+    pictures = json.loads(capsys.readouterr().out)["pictures"]
+    assert [p["image"] for p in pictures] == [
+        f"/front/image_raw{'/compressed' if compress else ''} {time} s" for time in ("0.000", "0.100")
+    ]
+    assert all(p["detections"][0]["name"] == "apriltag:36h11:5" for p in pictures)
+    (there,) = detect(to_uint8(tag_picture))
+    np.testing.assert_allclose(pictures[0]["detections"][0]["corners"], there.corners, atol=0.1)
+    assert main(["detect", str(tmp_path / name), "--topic", "/rear"]) == 2
+    assert "has no colour pictures on /rear" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["run.mcap", "bag"])
+def test_a_log_that_is_there_stays_as_it_is(tmp_path, name):
+    from fidsplat.logs import RobotLog
+
+    path = written(tmp_path / name)
+    with pytest.raises(fs.InputError, match="is there already"):
+        RobotLog(path)
+    with pytest.raises(fs.InputError, match="must be seconds"), RobotLog(path, overwrite=True) as log:
+        log.image(-1.0, "front", RGB)
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    read = by_mcap if name.endswith("mcap") else by_rosbags
+    assert len(read(path)) == 18
+    with RobotLog(path, overwrite=True) as log:
+        log.image(0.0, "front", RGB)
+    assert len(read(path)) == 1
+
+
+def test_what_a_log_cannot_take(tmp_path):
+    from fidsplat.logs import RobotLog, log_pictures
+
+    with RobotLog(tmp_path / "run.mcap") as log:
+        log.image(1.0, "front", RGB)
+        log.image(0.5, "rear", RGB)  # another topic's clock
+        with pytest.raises(fs.InputError, match=r"/front/image_raw jumps back in time, from 1 s to 0\.9 s"):
+            log.image(0.9, "front", RGB)
+        with pytest.raises(fs.InputError, match="must be seconds from 0"):
+            log.image(-1.0, "side", RGB)
+        with pytest.raises(fs.InputError, match="rgb alone is compressed"):
+            log.image(1.0, "front", DEPTH, "depth", compress="png")
+        with pytest.raises(fs.InputError, match="the pose of front must be rigid"):
+            log.transform(1.0, "front", np.diag([2, 2, 2, 1]))
+        with pytest.raises(fs.InputError, match="unknown lens of ROS's CameraInfo 'orthographic'"):
+            log.camera_info(1.0, "front", fs.Camera.orthographic(32, 24, 1.0))
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(fs.InputError, match="no bag"):
+        RobotLog(tmp_path / "folder", overwrite=True)
+    with pytest.raises(fs.InputError, match="cannot write"):
+        RobotLog(tmp_path / "none/run.mcap")
+    (tmp_path / "bad.mcap").write_bytes(b"not a log")
+    with pytest.raises(fs.InputError, match="no log that can be read"):
+        list(log_pictures(tmp_path / "bad.mcap"))
+
+
+def fill(path):
+    from fidsplat.logs import RobotLog
+
+    with RobotLog(path) as log:
+        for k in range(60):
+            log.image(float(k), "front", RNG.random((64, 64, 3)))
+
+
+def test_a_disk_that_is_full_leaves_nothing(tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, hard))
+        with pytest.raises(fs.InputError, match="cannot write"):
+            fill(tmp_path / "run.mcap")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, before)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,219 @@
+"""Rigs: bodies, cameras and environments, as plain arrays."""
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.rotations import matrix_to_quaternion, rigid_matrix
+from fidsplat.scenes import PlacedMarker
+from fidsplat.sim import Rig, RigCamera
+from fidsplat.sim.poses import compose, inverse, matrix_of, pose_of, quaternions_of
+from fidsplat.vision import read_back
+
+SIZE = 160, 120
+RNG = np.random.default_rng(19)
+
+
+def a_pose(move=0.2, turn=0.3):
+    quaternion = np.array([1.0, *RNG.uniform(-turn, turn, 3)])
+    return np.array([*RNG.uniform(-move, move, 3), *(quaternion / np.linalg.norm(quaternion))])
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return fs.Renderer("opencl:pocl")
+
+
+@pytest.fixture(scope="module")
+def scene():
+    tag = PlacedMarker(fs.marker("apriltag:36h11:5", size=0.4), rigid_matrix((0.05, 0, 0)))
+    wall = fs.SplatCloud([[0, 0, 3.0]], [[1, 0, 0, 0]], [[1.0, 1.0]], [0.9], colors=[[0.2, 0.4, 0.6]])
+    return fs.Scene([wall], markers=[tag], outputs=("rgb", "label"))
+
+
+@pytest.fixture(scope="module")
+def rig(scene, renderer):
+    camera = fs.Camera.pinhole(*SIZE, 150, 150, 80, 60)
+    on_robot = fs.Camera.pinhole(*SIZE, 150, 150, 80, 60, rigid_matrix((0.1, 0, 0.2)))
+    cameras = {"fixed": camera, "mounted": RigCamera(on_robot, body="robot")}
+    return Rig(scene, {1: "box"}, cameras, renderer=renderer)
+
+
+def some_poses(count):
+    box = np.stack([compose(np.array([0, 0, 1.5, 1, 0, 0, 0.0]), a_pose()) for _ in range(count)])
+    return {"box": box, "robot": np.stack([a_pose(0.1, 0.05) for _ in range(count)])}
+
+
+def test_poses_compose_and_invert_as_matrices_do():
+    a, b = np.stack([a_pose(), a_pose()]), np.stack([a_pose(), a_pose()])
+    np.testing.assert_allclose(matrix_of(compose(a, b)), matrix_of(a) @ matrix_of(b), atol=1e-15)
+    np.testing.assert_allclose(matrix_of(inverse(a)), np.linalg.inv(matrix_of(a)), atol=1e-15)
+    np.testing.assert_allclose(pose_of(matrix_of(a[0])), a[0], atol=1e-15)
+
+
+def test_quaternions_of_many_matrices_are_those_of_each():
+    q = RNG.normal(size=(50, 4))
+    turns = matrix_of(np.concatenate([np.zeros((50, 3)), q / np.linalg.norm(q, axis=1)[:, None]], 1))[
+        :, :3, :3
+    ]
+    for one, turn in zip(quaternions_of(turns), turns, strict=True):
+        assert np.abs(np.abs(one @ matrix_to_quaternion(turn)) - 1) < 1e-14
+
+
+def test_an_environment_has_the_same_bits_alone_and_among_others(rig):
+    poses = some_poses(3)
+    many = rig.render(poses)
+    assert many["rgb"].shape == (3, 2, SIZE[1], SIZE[0], 3)
+    for i in range(3):
+        alone = rig.render({name: pose[i : i + 1] for name, pose in poses.items()})
+        for name in ("rgb", "label"):
+            assert many[name][i].tobytes() == alone[name][0].tobytes()
+    assert not np.array_equal(many["rgb"][0], many["rgb"][1])
+
+
+def test_a_marker_is_read_where_its_body_is_by_a_fixed_camera_and_by_one_that_moves(rig):
+    poses = some_poses(2)
+    pictures = rig.render(poses)
+    for camera in ("fixed", "mounted"):
+        for i in range(2):
+            there = matrix_of(poses["box"][i]) @ rigid_matrix((0.05, 0, 0))
+            scene = pictures.scene(camera, i)
+            np.testing.assert_allclose(scene.markers[0].pose, there, atol=1e-12)
+            (reading,) = read_back(pictures.of(camera).frame(i), scene).readings
+            assert reading.position_error < 0.01, (camera, i)
+            assert reading.corner_error < 0.1
+    robot = matrix_of(poses["robot"][1]) @ np.linalg.inv(rigid_matrix((0.1, 0, 0.2)))
+    np.testing.assert_allclose(
+        pictures.camera("mounted", 1).world_to_camera, np.linalg.inv(robot), atol=1e-12
+    )
+
+
+def test_arrays_in_the_rigs_order_say_the_same_as_names(rig):
+    poses = some_poses(2)
+    assert rig.bodies == ("box", "robot")
+    stacked = np.stack([poses[name] for name in rig.bodies], axis=1)
+    assert rig.render(stacked)["rgb"].tobytes() == rig.render(poses)["rgb"].tobytes()
+
+
+def test_a_camera_that_is_given_a_pose_stands_there_whatever_carries_it(rig):
+    poses = some_poses(1)
+    pictures = rig.render(poses, {"mounted": [[0, 0, 0, 1, 0, 0, 0]]})
+    assert pictures["rgb"][0, 1].tobytes() == pictures["rgb"][0, 0].tobytes()
+
+
+def test_bodies_at_rest_where_the_scene_has_their_splats(scene, renderer):
+    rest = a_pose()
+    moved = scene.markers[0].pose.copy()
+    moved = matrix_of(rest) @ moved
+    placed = fs.Scene(scene.clouds, markers=[PlacedMarker(scene.markers[0].marker, moved)])
+    camera = {"fixed": fs.Camera.pinhole(*SIZE, 150, 150, 80, 60)}
+    at_rest = Rig(placed, {1: "box"}, camera, renderer=renderer, rest={"box": rest}, outputs="label")
+    in_frame = Rig(scene, {1: "box"}, camera, renderer=renderer, outputs="label")
+    pose = {"box": compose(np.array([0, 0, 1.5, 1, 0, 0, 0.0]), a_pose())[None]}
+    one, other = at_rest.render(pose), in_frame.render(pose)
+    assert (one["label"] != other["label"]).mean() < 1e-3  # float32 of another place
+    np.testing.assert_allclose(
+        one.scene("fixed").markers[0].pose, other.scene("fixed").markers[0].pose, atol=1e-12
+    )
+
+
+def test_layers_of_another_renderer_are_each_environments_own(scene):
+    camera = {"fixed": fs.Camera.pinhole(*SIZE, 150, 150, 80, 60)}
+    rig = Rig(scene, {1: "box"}, camera, renderer=fs.Renderer("reference"), outputs=("label",))
+    box = np.tile([0, 0, 1.5, 1, 0, 0, 0.0], (2, 1))
+    near, far = (
+        fs.Layer(np.zeros((*SIZE[::-1], 3)), np.full(SIZE[::-1], depth), label=9) for depth in (1.0, 2.0)
+    )
+    label = rig.render({"box": box}, layers={"fixed": [near, far]})["label"][:, 0]
+    assert set(np.unique(label[0])) == {9}
+    assert set(np.unique(label[1])) == {1, 9}
+    with pytest.raises(fs.InputError, match="1 layers for the camera 'fixed', but 2 environments"):
+        rig.render({"box": box}, layers={"fixed": [near]})
+    with pytest.raises(fs.InputError, match="unknown camera 'fxed'"):
+        rig.render({"box": box}, layers={"fxed": [near, far]})
+
+
+def test_masked_environments_are_not_drawn(rig):
+    poses = some_poses(2)
+    pictures = rig.render(poses, mask=np.array([False, True]))
+    assert not pictures["rgb"][0].any()
+    assert (pictures["label"][0] == -1).all()
+    assert pictures["rgb"][1].tobytes() == rig.render(poses)["rgb"][1].tobytes()
+
+
+def test_noise_is_another_in_every_environment_and_step(scene, renderer):
+    camera = RigCamera(fs.Camera.pinhole(*SIZE, 150, 150, 80, 60), sensor=fs.Sensor(full_well=500.0))
+    box = {"box": np.tile([0, 0, 1.5, 1, 0, 0, 0.0], (2, 1))}
+
+    def rig():
+        return Rig(scene, {1: "box"}, {"noisy": camera}, renderer=renderer, outputs="rgb")
+
+    one = rig()
+    first, second = one.render(box)["rgb"], one.render(box)["rgb"]
+    assert not np.array_equal(first[0], first[1])
+    assert not np.array_equal(first[0], second[0])
+    assert first.tobytes() == rig().render(box)["rgb"].tobytes()
+
+
+def test_cameras_of_different_sizes_are_taken_one_by_one(scene, renderer):
+    cameras = {
+        "a": fs.Camera.pinhole(*SIZE, 150, 150, 80, 60),
+        "b": fs.Camera.pinhole(64, 48, 60, 60, 32, 24),
+    }
+    pictures = Rig(scene, {1: "box"}, cameras, renderer=renderer).render({"box": [[0, 0, 1.5, 1, 0, 0, 0]]})
+    assert pictures.of("b")["label"].shape == (1, 48, 64)
+    with pytest.raises(fs.InputError, match=r"different sizes; .*pictures.of\('a'\)"):
+        _ = pictures["rgb"]
+
+
+GOOD = np.array([[0, 0, 1.5, 1, 0, 0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("bodies", "cameras", "words"),
+    [
+        ({"bxo": GOOD, "robot": GOOD}, None, r"unknown body 'bxo' \(did you mean 'box'\?\)"),
+        (
+            {"box": GOOD, "robot": GOOD},
+            {"mountde": GOOD},
+            r"unknown camera 'mountde' \(did you mean 'mounted'",
+        ),
+        ({"box": GOOD}, None, "no pose for the body 'robot'"),
+        ({"box": GOOD * np.nan, "robot": GOOD}, None, "must be finite"),
+        ({"box": GOOD * 2, "robot": GOOD}, None, "not rigid: .* has the length 2, not 1"),
+        ({"box": GOOD[0], "robot": GOOD}, None, r"must have the shape \(env, 7\), but the shape is \(7,\)"),
+        ({"box": GOOD, "robot": np.tile(GOOD, (3, 1))}, None, "poses of 1 environments, .* of 3"),
+        (np.tile(GOOD, (2, 3, 1)), None, "has 3 of them; the rig has 2: box, robot"),
+        ("box", None, "must be poses"),
+    ],
+)
+def test_poses_that_cannot_be_used(rig, bodies, cameras, words):
+    with pytest.raises(fs.InputError, match=words):
+        rig.render(bodies, cameras)
+
+
+@pytest.mark.parametrize(
+    ("bodies", "cameras", "words"),
+    [
+        ({7: "box"}, {"a": 0}, "the body 'box' has no splats: none has the label 7; there are 0, 1"),
+        ({"box": 1}, {"a": 0}, "label of splats: name of the body"),
+        ({1: "box"}, [("a", 0), ("a", 0)], "two cameras have the name 'a'"),
+        ({1: "box"}, {}, "a rig without a camera draws nothing"),
+        ({1: "box"}, {"a": "wide"}, "camera is 'wide'"),
+        ({1: "box"}, 3, "cameras is 3"),
+    ],
+)
+def test_rigs_that_cannot_be(scene, renderer, bodies, cameras, words):
+    camera = fs.Camera.pinhole(*SIZE, 150, 150, 80, 60)
+    if isinstance(cameras, dict):
+        cameras = {name: camera if value == 0 else value for name, value in cameras.items()}
+    elif isinstance(cameras, list):
+        cameras = [(name, camera) for name, _ in cameras]
+    with pytest.raises(fs.InputError, match=words):
+        Rig(scene, bodies, cameras, renderer=renderer)
+
+
+def test_a_scene_that_moves_by_itself_is_refused(scene, renderer):
+    moving = fs.Scene(scene.clouds, cloud_motions={0: lambda time: np.eye(4)})
+    with pytest.raises(fs.InputError, match="the simulator moves them"):
+        Rig(moving, cameras={"a": fs.Camera.pinhole(*SIZE, 150, 150, 80, 60)}, renderer=renderer)

@@ -1,0 +1,237 @@
+"""Data sets from disk: what is read, and what is said about those that cannot be trained on."""
+
+import json
+
+import numpy as np
+import pytest
+from training_scene import BACKGROUND, scene
+
+import fidsplat as fs
+from fidsplat.cli import main
+from fidsplat.formats.colmap import save_colmap
+from fidsplat.formats.colmap_read import load_colmap
+from fidsplat.train import Dataset, TrainingView, load_dataset
+from fidsplat.train.dataset import looked_at
+from fidsplat.vision.images import read_rgba, write_png
+
+
+@pytest.fixture(scope="module")
+def made():
+    return scene(count=6)
+
+
+@pytest.fixture
+def folder(made, tmp_path):
+    """The data set as fidsplat writes one."""
+    write(made, tmp_path / "set")
+    return tmp_path / "set"
+
+
+def write(made, folder):
+    for place, views in ((folder, made.views), (folder / "test", made.held_out)):
+        (place / "images").mkdir(parents=True)
+        for view in views:
+            write_png(place / "images" / view.name, view.picture)
+        names, cameras = [view.name for view in views], [view.camera for view in views]
+        save_colmap(place / "sparse" / "0", names, cameras, made.points, made.colors)
+    (folder / "dataset.json").write_text(json.dumps({"background": BACKGROUND}))
+
+
+def transforms(made, folder, **more):
+    folder.mkdir()
+    frames = []
+    for view in made.views:
+        write_png(folder / view.name, view.picture)
+        pose = np.linalg.inv(view.camera.world_to_camera) @ np.diag([1, -1, -1, 1])
+        frames.append({"file_path": f"./{view.name}", "transform_matrix": pose.tolist()})
+    camera = made.views[0].camera
+    table = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(table | more))
+    return folder
+
+
+def same_views(found, wanted):
+    assert [view.name.removeprefix("./") for view in found] == [view.name for view in wanted]
+    for a, b in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(a.picture, b.picture)
+        np.testing.assert_allclose(a.camera.world_to_camera, b.camera.world_to_camera, atol=1e-12)
+        assert (a.camera.fx, a.camera.cx) == (b.camera.fx, b.camera.cx)
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+def test_colmap_as_binary_and_as_text(made, folder, suffix):
+    for file in folder.rglob(f"sparse/0/*{'.txt' if suffix == '.bin' else '.bin'}"):
+        file.unlink()
+    found = load_dataset(folder)
+    same_views(found.views, made.views)
+    same_views(found.held_out, made.held_out)
+    np.testing.assert_array_equal(found.points, made.points)
+    np.testing.assert_array_equal(found.colors, made.colors)
+    assert found.background == BACKGROUND
+
+
+def test_a_model_of_pycolmap_is_read_as_pycolmap_reads_it(folder):
+    pycolmap = pytest.importorskip("pycolmap", reason="of the extra test")
+    theirs = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
+    again = folder / "again"
+    again.mkdir()
+    theirs.write(str(again))
+    ours = load_colmap(again)
+    for image in theirs.images.values():
+        camera = ours.cameras[ours.names.index(image.name)]
+        np.testing.assert_allclose(camera.world_to_camera[:3], image.cam_from_world().matrix(), atol=1e-12)
+    assert len(ours.points) == len(theirs.points3D)
+
+
+def test_transforms_with_the_points_that_they_name(made, tmp_path):
+    folder = transforms(made, tmp_path / "nerf", ply_file_path="points.ply")
+    rows = np.zeros(6, [*((axis, "<f4") for axis in "xyz"), *((c, "u1") for c in ("red", "green", "blue"))])
+    for i, axis in enumerate("xyz"):
+        rows[axis] = made.points[:, i]
+    rows["green"] = 7
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 6\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz")
+    head += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
+    (folder / "points.ply").write_bytes(head.encode() + rows.tobytes())
+    found = load_dataset(folder)
+    same_views(found.views, made.views)
+    np.testing.assert_allclose(found.points, made.points, atol=1e-6)
+    assert found.colors.tolist() == [[0, 7, 0]] * 6
+
+
+def test_alpha_and_masks(made, tmp_path):
+    import cv2
+
+    folder = transforms(made, tmp_path / "nerf")
+    rgba = np.dstack([made.views[0].picture[:, :, ::-1], np.full(made.views[0].picture.shape[:2], 51)])
+    cv2.imwrite(str(folder / "1.png"), rgba)
+    table = json.loads((folder / "transforms.json").read_text())
+    table["frames"][1]["mask_path"] = "mask.png"
+    (folder / "transforms.json").write_text(json.dumps(table))
+    mask = np.random.default_rng(0).uniform(size=rgba.shape[:2]) < 0.5
+    write_png(folder / "mask.png", mask)
+    found = load_dataset(folder, random_points=5)
+    np.testing.assert_array_equal(found.views[0].picture, np.rint(made.views[0].picture / 5))
+    np.testing.assert_array_equal(found.views[1].mask, mask)
+    assert read_rgba(folder / "mask.png").shape == (*mask.shape, 4)
+
+
+def test_views_that_are_held_out(made, folder):
+    assert [len(load_dataset(folder, n).views) for n in (0, 2)] == [4, 2]
+    assert [view.name for view in load_dataset(folder, 2).held_out] == ["1.png", "3.png", "0.png"]
+    many = Dataset("many", made.views * 4, (), made.points, made.colors)
+    assert many.digest != made.digest
+
+
+def test_random_points_lie_where_the_cameras_look(made):
+    low, high = looked_at([view.camera for view in made.views])
+    assert np.abs(low + high).max() < 1e-9  # all look at 0
+    found = made.with_random_points(500, 3)
+    assert (found.points > low).all()
+    assert (found.points < high).all()
+    assert (made.with_random_points(500, 3).points == found.points).all()
+    assert (made.with_random_points(500, 4).points != found.points).any()
+
+
+def test_scenes_far_from_the_origin_have_one_of_their_own(made):
+    shift = np.array([5e5, -4e6, 0.0])
+
+    def moved(view):
+        matrix = view.camera.world_to_camera.copy()
+        matrix[:3, 3] -= matrix[:3, :3] @ shift
+        c = view.camera
+        camera = fs.Camera.pinhole(c.width, c.height, c.fx, c.fy, c.cx, c.cy, matrix)
+        return TrainingView(view.name, camera, view.picture)
+
+    far = Dataset("far", tuple(map(moved, made.views)), (), made.points + shift, made.colors)
+    assert np.abs(far.origin - shift).max() < 10
+    assert not made.origin.any()
+
+
+def refusals(made):
+    view, names = made.views[0], {}
+    camera = view.camera
+    names["2 x 2.*give pictures of the size"] = lambda: TrainingView(
+        "a.png", camera, np.zeros((2, 2, 3), np.uint8)
+    )
+    names["has 1 view to train on"] = lambda: Dataset("one", (view,), (), made.points, made.colors)
+    names["stand at one place"] = lambda: Dataset("still", (view, view), (), made.points, made.colors)
+    behind = 9 * camera.position + made.points
+    names["all 6 points of back lie behind the camera"] = lambda: Dataset(
+        "back", made.views, (), behind, made.colors
+    )
+    names["has a lens"] = lambda: TrainingView(
+        "a.png", fs.Camera.fisheye(24, 18, 2.0), np.zeros((18, 24, 3), np.uint8)
+    )
+    return names
+
+
+def test_data_sets_that_cannot_be_trained_on_are_refused(made):
+    for words, make in refusals(made).items():
+        with pytest.raises(fs.InputError, match=words):
+            make()
+
+
+def test_files_that_are_missing_or_damaged_are_named(made, folder, tmp_path):
+    with pytest.raises(fs.InputError, match="is not there"):
+        load_dataset(tmp_path / "nothing")
+    with pytest.raises(fs.InputError, match="holds no data set"):
+        load_dataset(tmp_path)
+    with pytest.raises(fs.InputError, match="--hold-out is 1"):
+        load_dataset(folder, 1)
+    (folder / "images" / "2.png").unlink()
+    with pytest.raises(fs.InputError, match=r"cannot read the image .*2\.png"):
+        load_dataset(folder)
+    for name in ("points3D", "images", "cameras"):
+        file = folder / "sparse" / "0" / f"{name}.bin"
+        whole = file.read_bytes()
+        for data in (whole[:-3], whole[:11], b"\xff" * 40):
+            file.write_bytes(data)
+            with pytest.raises(fs.InputError, match=f"{name}.bin is damaged"):
+                load_dataset(folder)
+        file.write_bytes(whole)
+    nerf = transforms(made, tmp_path / "nerf")
+    with pytest.raises(fs.InputError, match="has no points to start from; give --random-points"):
+        load_dataset(nerf)
+    for change, words in (
+        ({"frames": 3}, "no list of frames"),
+        ({"frames": [{"file_path": "a"}]}, "frame 0 needs"),
+        ({"k1": 0.1}, "has distortion"),
+        ({"fl_x": "far"}, "needs fl_x"),
+    ):
+        table = json.loads((nerf / "transforms.json").read_text())
+        (tmp_path / "transforms.json").write_text(json.dumps(table | change))
+        (nerf / "other.json").write_text(json.dumps(table | change))
+        with pytest.raises(fs.InputError, match=words):
+            load_dataset(nerf / "other.json", random_points=5)
+
+
+def test_the_command_trains_resumes_and_reports(folder, tmp_path, capsys):
+    words = [
+        "train",
+        str(folder),
+        "-o",
+        str(tmp_path / "a.ply"),
+        "--device",
+        "reference",
+        "--iterations",
+        "4",
+    ]
+    assert main([*words, "--json", "--report", str(tmp_path / "page")]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["iterations"] == 4
+    assert facts["splats"] == len(fs.load_ply(tmp_path / "a.ply")) == 6
+    assert [view["name"] for view in facts["views"]] == ["0.png"]
+    assert all(
+        (tmp_path / "page" / name).is_file() for name in ("report.md", "training.svg", "held-out-0.png")
+    )
+    first = (tmp_path / "a.ply").read_bytes()
+    words[3] = str(tmp_path / "b.ply")
+    assert main([*words[:-1], "2"]) == 0
+    assert main(words) == 0  # goes on
+    assert (tmp_path / "b.ply").read_bytes() == first
+    assert main([*words[:-1], "3"]) == 2
+    assert "number of iterations" in capsys.readouterr().err
+    assert main([*words[:-1], "3", "--overwrite"]) == 0
+    for wrong in (["-o", "a.png"], ["--random-points", "-1"], ["--within-memory", "0"]):
+        assert main([*words, *wrong]) == 2

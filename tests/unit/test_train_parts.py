@@ -1,0 +1,296 @@
+"""The parts of a training step, each against a written-out twin: loss, Adam, random numbers, neighbours,
+densification, MCMC."""
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.train import TrainSettings, densify, mcmc
+from fidsplat.train.losses import C1, C2, blurred, picture_loss, window
+from fidsplat.train.neighbours import mean_square_distances
+from fidsplat.train.optimiser import adam_step, inner_gradients
+from fidsplat.train.parameters import Splats, TrainingError, logit, sigmoid
+from fidsplat.train.random_numbers import Purpose, normal, permutation, philox, uniform
+
+
+def pictures(seed=0, size=(9, 12)):
+    random = np.random.default_rng(seed)
+    return random.uniform(-0.1, 1.1, (2, *size, 3))
+
+
+def splats_of(count, seed=0, degree=1):
+    random = np.random.default_rng(seed)
+    shapes = {"means": (3,), "log_scales": (2,), "quats": (4,), "logits": (), "sh": ((degree + 1) ** 2, 3)}
+    made = Splats.of({name: random.normal(size=(count, *shape)) for name, shape in shapes.items()})
+    for group in (made.first, made.second):
+        for array in group.values():
+            array[:] = random.uniform(0.1, 1, array.shape)
+    return made
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_gradient_of_the_loss_is_that_of_central_differences(weight, masked):
+    image, truth = pictures()
+    mask = np.random.default_rng(1).uniform(size=image.shape[:2]) < 0.6 if masked else None
+    _, gradient = picture_loss(image, truth, mask, weight)
+    random = np.random.default_rng(2)
+    for _ in range(40):
+        place = tuple(random.integers(image.shape))
+        values = []
+        for change in (1e-5, -1e-5):
+            moved = image.copy()
+            moved[place] += change
+            values.append(picture_loss(moved, truth, mask, weight)[0].value)
+        assert gradient[place] == pytest.approx((values[0] - values[1]) / 2e-5, abs=1e-9)
+        if masked and not mask[place[:2]]:
+            assert gradient[place] == 0
+
+
+def test_the_loss_is_what_its_definition_says():
+    """SSIM written out pixel by pixel: a window of 11 that sees zeros beyond the picture."""
+    image, truth = pictures(size=(5, 7))
+    weights = np.outer(window(), window())
+    similar = []
+    for c in range(3):
+        a, b = (np.pad(picture[:, :, c], 5) for picture in (image, truth))
+        for y in range(5):
+            for x in range(7):
+                p, q = (each[y : y + 11, x : x + 11] for each in (a, b))
+                mean_p, mean_q = (weights * p).sum(), (weights * q).sum()
+                var_p = (weights * p * p).sum() - mean_p**2
+                var_q = (weights * q * q).sum() - mean_q**2
+                shared = (weights * p * q).sum() - mean_p * mean_q
+                top = (2 * mean_p * mean_q + C1) * (2 * shared + C2)
+                similar.append(top / ((mean_p**2 + mean_q**2 + C1) * (var_p + var_q + C2)))
+    loss, _ = picture_loss(image, truth, None, 0.2)
+    l1 = np.abs(image - truth).mean()
+    assert loss.value == pytest.approx(0.8 * l1 + 0.2 * (1 - np.mean(similar)), rel=1e-12)
+    assert loss.psnr == pytest.approx(-10 * np.log10(np.mean((image - truth) ** 2)))
+    assert picture_loss(truth, truth, None, 0.2)[0].psnr == np.inf
+    np.testing.assert_allclose(blurred(np.ones((30, 30, 1)))[15, 15], 1)
+
+
+def test_a_value_that_is_not_finite_is_seen_unless_it_is_masked():
+    image, truth = pictures()
+    image[3, 4, 1] = np.nan
+    assert np.isnan(picture_loss(image, truth, None, 0.2)[0].value)
+    mask = np.ones(image.shape[:2], bool)
+    mask[3, 4] = False
+    assert np.isfinite(picture_loss(image, truth, mask, 0.2)[0].value)
+
+
+def test_adam_takes_the_step_that_is_written_out():
+    settings, rate = (
+        TrainSettings(),
+        {"means": 0.1, "log_scales": 0.2, "quats": 0.3, "logits": 0.4, "sh": 0.5},
+    )
+    splats, gradients = splats_of(6), splats_of(6, seed=1).values
+    before = {name: [group[name].astype(float) for group in splats._groups] for name in gradients}
+    adam_step(splats, gradients, rate, settings, 7)
+    for name, (value, first, second) in before.items():
+        g = gradients[name].astype(float)
+        m, v = 0.9 * first + 0.1 * g, 0.999 * second + 0.001 * g * g
+        rates = np.full(value.shape, rate[name])
+        if name == "sh":
+            rates[:, 1:] /= 20
+        wanted = value - rates * (m / (1 - 0.9**7)) / (np.sqrt(v / (1 - 0.999**7)) + 1e-15)
+        np.testing.assert_allclose(splats.values[name], wanted, rtol=2e-5, atol=2e-6)
+        np.testing.assert_allclose(splats.first[name], m, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(splats.second[name], v, rtol=1e-5)
+
+
+def test_coefficients_that_were_not_drawn_stay():
+    splats = splats_of(5, degree=2)
+    before = splats.values["sh"].copy()
+    gradients = splats_of(5, seed=1, degree=1).values
+    adam_step(splats, gradients, dict.fromkeys(gradients, 0.1), TrainSettings(), 1)
+    np.testing.assert_array_equal(splats.values["sh"][:, 4:], before[:, 4:])
+    assert (splats.values["sh"][:, :4] != before[:, :4]).all()
+
+
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+@pytest.mark.parametrize("plain", [False, True])
+def test_gradients_by_inner_values_are_those_of_central_differences(strategy, plain):
+    """Of a made-up loss that is linear in what the cloud shows, with the penalties that mcmc adds."""
+    settings = TrainSettings(strategy=strategy)
+    splats, random = splats_of(4, degree=0 if plain else 1), np.random.default_rng(3)
+    cloud = splats.cloud(0 if plain else 1, np.zeros(3))
+    names = ("means", "quats", "scales", "opacities", "colors" if plain else "sh")
+
+    def shown(values):
+        quats = values["quats"] / np.linalg.norm(values["quats"], axis=1, keepdims=True)
+        found = {"means": values["means"], "quats": quats, "scales": np.exp(values["log_scales"])}
+        found["opacities"] = sigmoid(values["logits"])
+        color = np.maximum(values["sh"][:, 0] * 0.28209479177387814 + 0.5, 0)
+        return found | ({"colors": color} if plain else {"sh": values["sh"]})
+
+    start = {name: array.astype(np.float64) for name, array in splats.values.items()}
+    weights = {name: random.normal(size=shown(start)[name].shape) for name in names}
+    for name in ("means", "quats", "scales", "opacities"):
+        np.testing.assert_allclose(getattr(cloud, name), shown(start)[name], rtol=1e-5, atol=1e-6)
+
+    def loss(values):
+        found = shown(values)
+        total = sum((found[name] * weights[name]).sum() for name in names)
+        if strategy == "mcmc":
+            total += 0.01 * found["opacities"].mean() + 0.01 * found["scales"].mean()
+        return total
+
+    found = inner_gradients(splats, weights, settings)
+    for name, array in start.items():
+        for place in np.ndindex(array.shape):
+            values = []
+            for change in (1e-6, -1e-6):
+                moved = {**start, name: array.copy()}
+                moved[name][place] += change
+                values.append(loss(moved))
+            assert found[name][place] == pytest.approx((values[0] - values[1]) / 2e-6, rel=1e-4, abs=1e-6)
+
+
+def test_philox_gives_what_its_authors_print():
+    """Known answers of Random123 for philox4x32-10."""
+    ones = 0xFFFFFFFF
+    known = (
+        ((0, 0, 0, 0), 0, (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
+        ((ones,) * 4, ones | ones << 32, (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD)),
+        (
+            (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344),
+            0xA4093822 | 0x299F31D0 << 32,
+            (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1),
+        ),
+    )
+    for counter, key, answer in known:
+        assert tuple(philox(np.array([counter], np.uint32), key)[0]) == answer
+
+
+def test_random_numbers_are_of_their_splat_iteration_and_purpose_alone():
+    few, many = (uniform(5, Purpose.SPLITS, 100, count) for count in (10, 1000))
+    np.testing.assert_array_equal(few, many[:10])
+    others = [(6, Purpose.SPLITS, 100), (5, Purpose.NOISE, 100), (5, Purpose.SPLITS, 101)]
+    for other in others:
+        assert (uniform(*other, 10) != few).all()
+    assert (uniform(5, Purpose.SPLITS, 100, 10, draw=1) != few).all()
+    assert ((many > 0) & (many < 1)).all()
+    draws = normal(5, Purpose.NOISE, 1, 20_000)
+    assert np.abs(draws.mean(0)).max() < 0.03
+    assert np.abs(np.cov(draws.T) - np.eye(4)).max() < 0.03
+    assert sorted(permutation(0, Purpose.VIEWS, 3, 50)) == list(range(50))
+
+
+def test_neighbours_are_those_of_all_pairs():
+    random = np.random.default_rng(0)
+    points = np.concatenate([random.normal(size=(900, 3)), random.normal(5, 0.01, (300, 3))])
+    squares = ((points[:, None] - points) ** 2).sum(2)
+    np.testing.assert_allclose(
+        mean_square_distances(points), np.sort(squares, axis=1)[:, 1:4].mean(1), rtol=1e-9
+    )
+    np.testing.assert_allclose(mean_square_distances(points[:2]), squares[0, 1])
+    assert mean_square_distances(points[:1]).tolist() == [0]
+
+
+def ready(count=8):
+    """Splats with ids as their colours, of opacity 0.5 and 1 cm."""
+    splats = splats_of(count)
+    splats.values["logits"][:] = 0
+    splats.values["log_scales"][:] = np.log(0.01)
+    splats.values["sh"][:, 0, 0] = np.arange(count)
+    splats.seen[:] = 4
+    return splats
+
+
+def ids(splats):
+    return splats.values["sh"][:, 0, 0].astype(int).tolist()
+
+
+def test_densification_keeps_the_order_and_puts_new_splats_behind():
+    settings, splats = TrainSettings(), ready()
+    splats.gradients[[1, 2, 5]] = 4 * settings.gradient_threshold
+    splats.gradients[3] = 3.99 * settings.gradient_threshold  # in 4 pictures: below the threshold
+    splats.values["log_scales"][[2, 5]] = np.log(0.03)  # larger than a hundredth of the extent
+    splats.values["logits"][7] = logit(0.04)
+    old = splats.chosen(slice(None))
+    made = densify.densified(splats, settings, 600, extent=2.0)
+    assert ids(made) == [0, 1, 3, 4, 6, 1, 2, 5, 2, 5]
+    kept = old.chosen(np.array([0, 1, 3, 4, 6]))
+    for name in kept.values:
+        np.testing.assert_array_equal(made.values[name][:5], kept.values[name])
+        np.testing.assert_array_equal(made.first[name][:5], kept.first[name])
+        assert not made.first[name][5:].any()
+        assert not made.second[name][5:].any()
+    np.testing.assert_array_equal(made.values["means"][5], old.values["means"][1])  # a clone
+    np.testing.assert_allclose(made.scales[6:], 0.03 / 1.6, rtol=1e-5)
+    away = made.values["means"][6:] - old.values["means"][[2, 5, 2, 5]]
+    assert (np.abs(away).max(axis=1) > 0).all()
+    turns = fs.rotations.quaternion_to_matrix(old.values["quats"][[2, 5, 2, 5]])
+    assert np.abs(np.einsum("ni,ni->n", away, turns[:, :, 2])).max() < 1e-6  # within their disks
+    assert not made.gradients.any()
+    assert not made.seen.any()
+
+
+def test_no_more_splats_are_made_than_allowed():
+    settings, splats = TrainSettings(max_splats=10), ready()
+    splats.gradients[[1, 2, 5, 6]] = np.array([2, 1, 3, 2]) * 4 * settings.gradient_threshold
+    assert ids(densify.densified(splats, settings, 600, 2.0)) == [*range(8), 1, 5]
+
+
+def test_large_splats_go_after_the_first_reset():
+    settings = TrainSettings()
+    for iteration, left in ((600, 8), (3100, 7)):
+        splats = ready()
+        splats.values["log_scales"][4] = np.log(0.3)
+        assert len(densify.densified(splats, settings, iteration, 2.0)) == left
+    reset = densify.with_opacities_reset(ready(), settings)
+    np.testing.assert_allclose(reset.opacities, 0.01, rtol=1e-5)
+    assert not reset.first["logits"].any()
+    splats.values["logits"][:] = logit(0.01)
+    with pytest.raises(TrainingError, match=r"no splat is left after iteration 600"):
+        densify.densified(splats, settings, 600, 2.0)
+
+
+def test_mcmc_moves_the_dead_and_grows_up_to_its_limit():
+    settings = TrainSettings(strategy="mcmc", max_splats=41)
+    splats = ready(40)
+    splats.values["logits"][[3, 9]] = logit(0.004)
+    made = mcmc.moved(splats, settings, 600)
+    assert len(made) == 41
+    assert [i for i, new in enumerate(ids(made)[:40]) if i != new] == [3, 9]
+    # two that stand for one let through what the one did
+    sources = [ids(made)[3], ids(made)[9], ids(made)[40]]
+    for source in sources:
+        copies = ids(made).count(source)
+        together = 1 - (1 - made.opacities[source]) ** copies
+        assert together == pytest.approx(0.5, rel=1e-4)
+    assert not made.first["means"][sources[:2]].any()
+    splats.values["logits"][:] = logit(0.004)
+    with pytest.raises(TrainingError, match=r"all splats are fainter"):
+        mcmc.moved(splats, settings, 600)
+
+
+def test_mcmc_shakes_faint_splats_within_their_disks():
+    settings, splats = TrainSettings(strategy="mcmc"), ready(40)
+    splats.values["logits"][:20] = logit(0.001)
+    before = splats.values["means"].copy()
+    mcmc.shake(splats, settings, 5, 1e-4)
+    away = splats.values["means"] - before
+    assert np.abs(away[:20]).max(axis=1).min() > 100 * np.abs(away[20:]).max()
+    turns = fs.rotations.quaternion_to_matrix(splats.values["quats"])
+    assert np.abs(np.einsum("ni,ni->n", away, turns[:, :, 2])).max() < 1e-6
+
+
+def test_settings_say_what_they_take():
+    assert TrainSettings().position_rate_at(7000) == pytest.approx(5.46e-5, rel=1e-3)
+    assert [TrainSettings().degree_at(i) for i in (999, 1000, 9000)] == [0, 1, 3]
+    wrong = {
+        "iterations": 0,
+        "seed": -1,
+        "strategy": "best",
+        "sh_degree": 4,
+        "color_rate": np.nan,
+        "dssim_weight": 2,
+        "max_splats": True,
+        "quality": "fine",
+    }
+    for name, value in wrong.items():
+        with pytest.raises(fs.InputError):
+            TrainSettings(**{name: value})

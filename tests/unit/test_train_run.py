@@ -1,0 +1,215 @@
+"""Training runs: they raise the PSNR, give the same bytes twice and after a stop, and lose nothing."""
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from training_scene import QUICK, scene
+
+import fidsplat as fs
+from fidsplat.train import Trainer, TrainingError, TrainSettings, splats_within
+
+ITERATIONS = 26
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return scene()
+
+
+@pytest.fixture(scope="module")
+def whole(dataset, tmp_path_factory):
+    """A run from its beginning to its end: the trainer, its steps, the PSNR at first, its file."""
+    trainer = Trainer(dataset, fs.Renderer("reference"), iterations=ITERATIONS, **QUICK)
+    at_first = trainer.evaluate(dataset.views)
+    steps = []
+    trainer.run(steps.append)
+    file = tmp_path_factory.mktemp("whole") / "scene.ply"
+    trainer.save(file)
+    return trainer, steps, at_first, file
+
+
+def sha(file):
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def mean_psnr(scores):
+    return np.mean([score.psnr for score in scores])
+
+
+def test_training_raises_the_psnr_and_lowers_the_loss(whole, dataset):
+    """By 3 dB on the views that are trained on, and 1 dB on one that is not."""
+    trainer, steps, at_first, _ = whole
+    assert mean_psnr(trainer.evaluate(dataset.views)) > mean_psnr(at_first) + 3
+    start = Trainer(dataset, trainer.renderer, iterations=1, **QUICK)
+    assert mean_psnr(trainer.evaluate()) > mean_psnr(start.evaluate()) + 1
+    losses = trainer.history["losses"]
+    assert losses[-8:].mean() < 0.8 * losses[:8].mean()
+    assert [step.iteration for step in steps] == list(range(1, ITERATIONS + 1))
+    for first in range(0, 24, 4):  # every view once, then every view again
+        assert {step.view for step in steps[first : first + 4]} == {"1.png", "2.png", "3.png", "4.png"}
+    counts = trainer.history["counts"]
+    assert counts[0] == 16
+    assert 16 < counts[-1] <= 30
+    assert len(trainer.cloud()) == counts[-1]
+
+
+def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(whole, dataset, tmp_path):
+    """Stopped between two checkpoints, amid sums of gradients, and made longer when it goes on."""
+    renderer, checkpoint = whole[0].renderer, tmp_path / "scene.training.npz"
+    first = Trainer(dataset, renderer, iterations=20, checkpoint=checkpoint, **QUICK)
+    for _ in range(13):
+        first.step()
+    first.save_checkpoint()
+    first.step()  # lost
+    again = Trainer(dataset, renderer, iterations=ITERATIONS, checkpoint=checkpoint, **QUICK)
+    assert again.iteration == 13
+    again.run()
+    again.save(tmp_path / "scene.ply")
+    assert sha(tmp_path / "scene.ply") == sha(whole[3])
+    for name, array in whole[0].history.items():
+        np.testing.assert_array_equal(again.history[name], array)
+    done = Trainer(dataset, renderer, iterations=ITERATIONS, checkpoint=checkpoint, **QUICK)
+    assert done.done
+    done.save(tmp_path / "scene.ply")
+    assert sha(tmp_path / "scene.ply") == sha(whole[3])
+
+
+KILLED = """
+import fidsplat as fs
+from fidsplat.train import Trainer, trainer
+from training_scene import QUICK, scene
+
+trainer.CHECKPOINT_SECONDS = 0
+run = Trainer(scene(), fs.Renderer("reference"), checkpoint="scene.training.npz", iterations=20, **QUICK)
+run.run(lambda step: print(step.iteration, flush=True))
+"""
+
+
+def test_a_run_that_was_killed_goes_on_to_the_same_bytes(whole, dataset, tmp_path):
+    """At some moment of an iteration or of the writing of a checkpoint."""
+    path = os.pathsep.join([str(Path(__file__).parents[1]), str(Path(fs.__file__).parents[1])])
+    child = subprocess.Popen(
+        [sys.executable, "-c", KILLED],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": path},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    with child:
+        assert child.stdout is not None
+        while child.stdout.readline().strip() != "11":
+            assert child.poll() is None
+        child.kill()
+    checkpoint = tmp_path / "scene.training.npz"
+    again = Trainer(dataset, whole[0].renderer, iterations=ITERATIONS, checkpoint=checkpoint, **QUICK)
+    assert 10 <= again.iteration < 20
+    again.run()
+    again.save(tmp_path / "scene.ply")
+    assert sha(tmp_path / "scene.ply") == sha(whole[3])
+
+
+def test_a_checkpoint_of_another_run_is_refused(dataset, tmp_path):
+    file = tmp_path / "scene.training.npz"
+    renderer = fs.Renderer("reference")
+    trainer = Trainer(dataset, renderer, iterations=3, checkpoint=file, **QUICK)
+    trainer.run()
+    for change, words in (
+        ({"seed": 1}, r"another seed \(0, not 1\)"),
+        ({"iterations": 2}, "number of iterations"),
+        ({"strategy": "mcmc"}, "another strategy"),
+    ):
+        with pytest.raises(fs.InputError, match=words):
+            Trainer(dataset, renderer, checkpoint=file, **{"iterations": 3, **QUICK, **change})
+    with pytest.raises(fs.InputError, match="another data set"):
+        Trainer(scene(views=3), renderer, checkpoint=file, iterations=3, **QUICK)
+    file.write_bytes(file.read_bytes()[:200])
+    with pytest.raises(fs.InputError, match="no checkpoint that can be read"):
+        Trainer(dataset, renderer, checkpoint=file, iterations=3, **QUICK)
+
+
+def test_what_is_not_finite_ends_the_run_and_leaves_the_checkpoint(dataset, tmp_path):
+    file = tmp_path / "scene.training.npz"
+    renderer = fs.Renderer("reference")
+    trainer = Trainer(dataset, renderer, iterations=9, checkpoint=file, **QUICK)
+    trainer.step()
+    trainer.save_checkpoint()
+    kept = sha(file)
+    splats = trainer._work.store()
+    splats.values["sh"][:] = np.nan
+    with pytest.raises(TrainingError, match=r"the loss is nan at iteration 2.*is whole"):
+        trainer.run()
+    with pytest.raises(TrainingError, match=r"sh of 16 splats .* are not finite after iteration 1"):
+        trainer.save_checkpoint()
+    assert sha(file) == kept
+
+
+def test_a_full_disk_leaves_the_last_checkpoint(dataset, tmp_path, monkeypatch):
+    file = tmp_path / "scene.training.npz"
+    trainer = Trainer(dataset, fs.Renderer("reference"), iterations=9, checkpoint=file, **QUICK)
+    trainer.save_checkpoint()
+    kept = sha(file)
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(fs.InputError, match="No space left on device"):
+        trainer.save_checkpoint()
+    assert sha(file) == kept
+    assert [each.name for each in tmp_path.iterdir()] == [file.name]
+
+
+def test_mcmc_grows_to_its_limit(dataset):
+    trainer = Trainer(
+        dataset,
+        fs.Renderer("reference"),
+        iterations=10,
+        strategy="mcmc",
+        growth=1.5,
+        **{**QUICK, "max_splats": 18},
+    )
+    trainer.run()
+    assert trainer.history["counts"].tolist() == [16] * 7 + [18] * 3
+
+
+def test_settings_and_devices_that_cannot_be_used_are_named(dataset):
+    with pytest.raises(fs.InputError, match="did you mean 'iterations'"):
+        Trainer(dataset, fs.Renderer("reference"), iteration=3)
+    with pytest.raises(fs.InputError, match="samples have no gradient"):
+        Trainer(dataset, fs.Renderer("reference"), iterations=1, quality="surfel,samples=2").step()
+
+
+def test_a_run_may_start_from_splats(whole, dataset):
+    cloud = whole[0].cloud()
+    start = Trainer(dataset, whole[0].renderer, iterations=5, start=cloud, **QUICK)
+    again = start.cloud()
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        np.testing.assert_allclose(getattr(again, name), getattr(cloud, name), rtol=1e-5, atol=1e-6)
+    assert start.step().psnr > whole[0].history["psnrs"][:4].mean() + 1
+    boxes = cloud.with_boxes(np.arange(len(cloud)) < 1)
+    with pytest.raises(fs.InputError, match="only disks are trained"):
+        Trainer(dataset, whole[0].renderer, iterations=5, start=boxes)
+    with pytest.raises(fs.InputError, match=r"must be 1 to max_splats, 3"):
+        Trainer(dataset, whole[0].renderer, iterations=5, max_splats=3, start=cloud)
+
+
+def test_memory_bounds_the_number_of_splats(dataset):
+    settings = splats_within(TrainSettings(), 2**30, dataset)
+    assert 400_000 < settings.max_splats < 700_000
+    assert splats_within(TrainSettings(sh_degree=0), 2**30, dataset).max_splats == 1_000_000
+    with pytest.raises(fs.InputError, match="alone take"):
+        splats_within(TrainSettings(), 1000, dataset)
+
+
+def test_scores_are_those_of_the_pictures_that_are_drawn(whole, dataset):
+    score = whole[0].evaluate()[0]
+    difference = score.picture / 255.0 - dataset.held_out[0].picture / 255.0
+    assert score.psnr == pytest.approx(-10 * np.log10((difference**2).mean()))
+    assert 0 < score.ssim < 1
+    assert json.dumps([score.name, score.psnr, score.ssim])
