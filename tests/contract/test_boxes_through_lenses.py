@@ -5,14 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from agreement import ALL_OUTPUTS, assert_agrees, compare, random_splats, reference_pixels, truth_of
+from agreement import ALL_OUTPUTS, assert_agrees, random_splats, reference_pixels
 from sampling import SAMPLES, alternate, in_turn
 from test_boxes import EXACT, boxes_of, cut
 from test_lens_pictures import CAMERAS
 
 import fidsplat as fs
 from fidsplat.cameras.raster import raster_of
-from fidsplat.hard_cases.agreement import Picture
 from fidsplat.rotations import quaternion_to_matrix
 
 SEAM = 1e-3
@@ -50,10 +49,7 @@ def test_narrow_boxes(renderer, camera, narrow):
     scales = cloud.scales.copy()
     scales[:, narrow] = 1e-5
     lines = fs.SplatCloud(cloud.means, cloud.quats, scales, cloud.opacities, colors=cloud.colors)
-    frame = renderer.render(lines.with_boxes(), camera, ALL_OUTPUTS, EXACT)
-    picture = Picture(lines.with_boxes(), camera, EXACT, background=(0.0, 0.0, 0.0))
-    differences = compare(frame, truth_of(picture), picture.outputs)
-    assert all(difference.agrees for difference in differences), differences
+    assert_agrees(renderer, lines.with_boxes(), camera, quality=EXACT)
 
 
 @each_camera

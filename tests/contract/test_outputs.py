@@ -38,6 +38,12 @@ def test_outputs_of_layers(renderer, mixture):
     assert_agrees(renderer, scene, CAMERA, ALL)
 
 
+def test_a_layer_shows_the_mean_of_what_its_splats_show(renderer):
+    """Splats that are called a plane and are turned every way."""
+    cloud = random_splats(40, seed=6, depth=(1.0, 3.0), scale=(0.2, 0.8), across=0.5)
+    assert_agrees(renderer, cloud.with_planes(np.arange(40) // 4), CAMERA, ALL)
+
+
 @in_turn()
 @pytest.mark.parametrize("name", ALL)
 def test_an_output_alone_is_what_it_is_among_all(renderer, name):
