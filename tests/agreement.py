@@ -9,8 +9,17 @@ from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture, compare
 from fidsplat.hard_cases.agreement import truth_of as draw_truth
 from fidsplat.quality import Quality
 from fidsplat.random_clouds import random_splats
+from fidsplat.splats import SplatCloud
 
-__all__ = ["ALL_OUTPUTS", "assert_agrees", "compare", "random_splats", "reference_pixels", "truth_of"]
+__all__ = [
+    "ALL_OUTPUTS",
+    "assert_agrees",
+    "compare",
+    "random_splats",
+    "reference_pixels",
+    "some_thick",
+    "truth_of",
+]
 
 _TRUTHS: dict[bytes, dict[str, np.ndarray]] = {}
 
@@ -37,3 +46,10 @@ def assert_agrees(renderer, cloud, camera, outputs=ALL_OUTPUTS, quality=None, ba
     differences = compare(frame, truth, outputs)
     assert all(difference.agrees for difference in differences), differences
     return frame
+
+
+def some_thick(cloud, thickness):
+    """The cloud with 3D Gaussians where the thickness (n,) is above 0."""
+    scales = np.column_stack([cloud.scales, thickness])
+    arrays = (cloud.means, cloud.quats, scales, cloud.opacities)
+    return SplatCloud(*arrays, colors=cloud.colors, sh=cloud.sh, labels=cloud.labels, origin=cloud.origin)
