@@ -155,7 +155,7 @@ def test_views_are_drawn_as_single_pictures_are(renderer):
 
 
 def test_pictures_of_many_sizes_leave_no_heap_of_buffers(opencl):
-    """Planes go back to the pool when their frame dies; those of another size are let go."""
+    """Images go back to the pool when their frame dies; those of another size are let go."""
     some = random_splats(50, seed=5)
     own = fs.Renderer(opencl.device.name)
     held = []
@@ -172,7 +172,7 @@ def test_pictures_of_many_sizes_leave_no_heap_of_buffers(opencl):
 
 @machines
 def test_a_pool_keeps_to_the_budget_whatever_was_drawn_before(opencl, machine):
-    """Pictures at once and in chunks, few and many planes: what one kind has left does not count against
+    """Pictures at once and in chunks, few and many outputs: what one kind has left does not count against
     the next."""
     budget = 16 * 2**20
     own, opencl = machine(opencl, budget), machine(opencl)
@@ -376,7 +376,7 @@ def test_a_leased_buffer_has_the_size_that_was_asked_for(opencl):
     assert pool.lease("plane", 4096) is kept
 
 
-def test_a_plane_that_cannot_be_read_is_an_error_of_the_device(opencl):
+def test_an_image_that_cannot_be_read_is_an_error_of_the_device(opencl):
     frame = opencl.render(random_splats(10, seed=8), CAMERA)
     frame._images._drawn.leased[:] = [("rgb_out", opencl.backend.pool.fresh("too small", 16))]
     with pytest.raises(fs.DeviceError, match="failed while drawing rgb"):
