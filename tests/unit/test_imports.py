@@ -64,6 +64,7 @@ HOME_OF = {
     "flip_evaluator": ("vision",),
     "viser": ("viewer.server",),
     "torch": ("frame",),
+    "pxr": ("formats.usd",),
     "imageio_ffmpeg": ("vision.video",),
     "bpy": ("experiments.blender_worker",),
     "shapely": ("markers", "vision.visible"),
