@@ -84,6 +84,18 @@ def test_a_batch_outlives_the_next(renderer, cloud):
     assert np.array_equal(frame["rgb"], renderer.render(cloud, CAMERA)["rgb"])
 
 
+def test_a_batch_is_given_where_it_was_drawn(renderer, cloud):
+    batch = renderer.render_batch(cloud, fs.Capture(CAMERA, OUTPUTS), poses=POSES).wait()
+    arrays = {name: batch.device_array(name) for name in OUTPUTS}
+    for name, array in arrays.items():
+        assert tuple(array.shape) == batch[name].shape
+        on_host = array.numpy() if hasattr(array, "numpy") else array.get()
+        assert np.array_equal(on_host, batch[name])
+    assert set(batch.timings) >= {"project", "blend", "resolve"}
+    with pytest.raises(fs.InputError, match="no 'alpha'"):
+        batch.device_array("alpha")
+
+
 def test_a_view_as_a_frame_and_a_batch_as_arrays(renderer, cloud):
     batch = renderer.render_batch(cloud, CAMERAS)
     frame = batch.frame(2)

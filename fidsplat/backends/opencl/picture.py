@@ -44,6 +44,7 @@ class Picture:
         self.views = len(self.stack)
         self.queue = workspace.turn_to(workspace.repeat_queue if repeats else workspace.queue)
         self.pool = workspace.pool
+        workspace.pictures += 1
         self.tiles_x = -(-view.width // shape.tile_width)
         self.tiles_y = -(-view.height // shape.tile_height)
         self.tiles = self.views * self.tiles_x * self.tiles_y

@@ -107,9 +107,13 @@ class Launcher:
     def read_back(self, totals: Any, host: Any) -> list[int]:
         """A few integers from the device by way of `host`, as long: waits for all that was launched."""
         self._wp.copy(host, totals)
+        self.finish()
+        return host.numpy().tolist()
+
+    def finish(self) -> None:
+        """Waits for all that was launched."""
         if self._workers is None:
             self._wp.synchronize_stream(self._device.stream)
-        return host.numpy().tolist()
 
     def stage(self, name: str | None) -> None:
         """What is launched from here on belongs to the stage `name`; None ends the last."""

@@ -58,6 +58,10 @@ class WarpImages:
         # a CPU array's numpy() is its own memory, which device_array gives away
         return np.array(self.device_array(name).numpy())
 
+    def wait(self) -> None:
+        """Until the device has drawn it."""
+        self._launcher.finish()
+
     @property
     def timings(self) -> dict[str, float]:
         """Milliseconds on the device by stage, in the order in which they ran."""
@@ -75,10 +79,16 @@ class Picture:
         view: View,
         launcher: Launcher,
         beside: int = 0,
+        into: Mapping[str, Any] | None = None,
     ) -> None:
-        """beside: bytes on the device that belong to the picture of which this one is a part."""
+        """
+        Args:
+            beside: bytes on the device that belong to the picture or batch of which this one is a part.
+            into: arrays for the output images, by name, instead of fresh ones.
+        """
         self.program, self.workspace, self.pool = program, workspace, workspace.pool
         self.resident, self.view, self.launcher, self.beside = resident, view, launcher, beside
+        self.into = into or {}
         self.wp = load()
         u = uniforms(view, program.shape, program.sloped)
         self.tiles = u.tiles_x * u.tiles_y
@@ -264,8 +274,10 @@ class Picture:
         height, width = view.height // view.samples, view.width // view.samples
         images, out = {}, program.images_type()
         for output in program.images:
-            # a fresh one: the caller keeps it
-            array = self.pool.fresh(output.name, height * width * output.channels, getattr(wp, output.dtype))
+            array = self.into.get(output.name)
+            if array is None:  # a fresh one: the caller keeps it
+                size, dtype = height * width * output.channels, getattr(wp, output.dtype)
+                array = self.pool.fresh(output.name, size, dtype)
             images[output.name] = output, array
             setattr(out, output.name, array)
         for name in program.cloud_arrays:

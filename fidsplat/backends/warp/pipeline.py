@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 
+from fidsplat.backends.stack import ViewBatch
 from fidsplat.backends.view import View
+from fidsplat.backends.warp.batch import WarpBatch
 from fidsplat.backends.warp.launch import Commands, Launcher
 from fidsplat.backends.warp.picture import Picture, WarpImages
 from fidsplat.backends.warp.program import Program
@@ -27,6 +32,22 @@ class WarpPipeline:
             DeviceError: the device runs out of memory or fails.
         """
         return self._drawn(resident, view).images
+
+    def render_batch(self, resident: Resident, batch: ViewBatch) -> WarpBatch:
+        """Draw many views, one after another.
+
+        Raises:
+            DeviceError: the device runs out of memory or fails.
+        """
+        with self._drawing():
+            images = WarpBatch(self.workspace, self.program.images, batch)
+            for number, slot in enumerate(batch.slots.tolist()):
+                launcher, into = Launcher(self._commands), images.part(slot)
+                view, beside = batch.one(number), images.nbytes
+                picture = Picture(self.program, self.workspace, resident, view, launcher, beside, into)
+                picture.draw()
+                images.add(picture.images)
+            return images
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Draw one picture and return what passes between the stages.
@@ -51,11 +72,17 @@ class WarpPipeline:
         }
 
     def _drawn(self, resident: Resident, view: View) -> Picture:
+        with self._drawing():
+            picture = Picture(self.program, self.workspace, resident, view, Launcher(self._commands))
+            picture.draw()
+            return picture
+
+    @contextmanager
+    def _drawing(self) -> Iterator[None]:
+        """On the device, whose failures are those of drawing."""
         try:
             with load().ScopedDevice(self.workspace.device):
-                picture = Picture(self.program, self.workspace, resident, view, Launcher(self._commands))
-                picture.draw()
-                return picture
+                yield
         except RuntimeError as error:
             if isinstance(error, DeviceError):
                 raise

@@ -1,0 +1,94 @@
+"""Many views of one cloud on a Warp device: drawn one after another into one array of each output."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends.blank import blank
+from fidsplat.backends.stack import ViewBatch
+from fidsplat.backends.warp.picture import WarpImages
+from fidsplat.backends.warp.runtime import load
+from fidsplat.backends.warp.workspace import Workspace
+from fidsplat.effects import Output
+from fidsplat.errors import DeviceError
+
+
+class WarpBatch:
+    """The output images of many views, on the device until asked for."""
+
+    def __init__(self, workspace: Workspace, outputs: tuple[Output, ...], batch: ViewBatch) -> None:
+        """
+        Raises:
+            DeviceError: they take more than the memory budget, or than the device has.
+        """
+        self._workspace, self._size, self.views = workspace, batch.size, batch.total
+        height, width = batch.size
+        self.nbytes = 4 * batch.total * height * width * sum(output.channels for output in outputs)
+        if self.nbytes > workspace.memory_budget:
+            raise DeviceError(
+                f"the images of {batch.total} views take {self.nbytes / 2**20:.0f} MiB, more than the memory "
+                f"budget of {workspace.memory_budget / 2**20:.0f} MiB; draw fewer views or outputs at once"
+            )
+        self._images: dict[str, tuple[Output, Any]] = {}
+        for output in outputs:
+            size, dtype = batch.total * height * width * output.channels, getattr(load(), output.dtype)
+            array = workspace.pool.fresh(f"{output.name} of {batch.total} views", size, dtype)
+            if len(batch.slots) < batch.total:
+                array.fill_(blank(output.name))
+            self._images[output.name] = output, array
+        self._pictures: list[WarpImages] = []
+
+    def part(self, slot: int) -> dict[str, Any]:
+        """Where the images of one view go, by name."""
+        pixels = self._size[0] * self._size[1]
+        return {
+            name: array[slot * pixels * output.channels : (slot + 1) * pixels * output.channels]
+            for name, (output, array) in self._images.items()
+        }
+
+    def add(self, images: WarpImages) -> None:
+        """A view that was drawn."""
+        self._pictures.append(images)
+
+    def device_array(self, name: str) -> Any:
+        """The images as a wp.array (views, h, w) or (views, h, w, 3) on the device; no copy."""
+        output, array = self._images[name]
+        shape = self.views, *self._size
+        return array.reshape(shape if output.channels == 1 else (*shape, output.channels))
+
+    def read(self, name: str) -> np.ndarray:
+        """The images as a NumPy array of its own."""
+        return np.array(self.device_array(name).numpy())
+
+    def read_one(self, name: str, number: int) -> np.ndarray:
+        """The image of one view."""
+        output = self._images[name][0]
+        shape = self._size if output.channels == 1 else (*self._size, output.channels)
+        return np.array(self.part(number)[name].numpy()).reshape(shape)
+
+    def wait(self) -> None:
+        """Until the device has drawn all views."""
+        load().synchronize_device(self._workspace.device)
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds by stage, of all views together."""
+        return _added(images.timings for images in self._pictures)
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        """Of all views together, but for the splats of the cloud."""
+        counts = [images.stats for images in self._pictures]
+        splats = {"splats": counts[0]["splats"]} if counts else {"splats": 0, "visible": 0, "pairs": 0}
+        return _added(counts) | splats
+
+
+def _added(counts: Any) -> dict[str, Any]:
+    sums: dict[str, Any] = {}
+    for each in counts:
+        for name, value in each.items():
+            sums[name] = sums.get(name, 0) + value
+    return sums
