@@ -262,21 +262,22 @@ def test_the_wall_fills_the_picture_with_200_codes(monkeypatch):
 
 
 def test_ones_own_scene_from_ones_own_cameras(tmp_path, monkeypatch, capsys):
-    """Each pose is timed by itself, eight of them at most, and draws what it sees."""
+    """Each pose is timed by itself, so many at most, and draws what it sees."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(catalogue, "MOST_VIEWS", 3)
     fs.save_ply(random_cloud(200, 0.2), "own.ply")
     (tmp_path / "own.toml").write_text(
         "[camera]\nwidth = 64\nheight = 48\nfov_x_deg = 60.0\nposition = [0.0, 0.0, 0.0]\n"
         'look_at = [0.0, 0.0, 1.0]\n[[splats]]\nfile = "own.ply"\n'
     )
-    lines = [f"{k} {0.1 * k} 0 0 0 0 0 1" for k in range(15)]
+    lines = [f"{k} {0.1 * k} 0 0 0 0 0 1" for k in range(5)]
     (tmp_path / "poses.tum").write_text("\n".join(lines))
     words = ("--scene", "own.toml", "--device", "reference")
     assert bench(*words, "--cameras", "poses.tum", "--json", "-") == 0
     said = json.loads(capsys.readouterr().out)
-    assert said["scenes"] == [f"own.toml@{k}" for k in range(0, 15, 2)]
+    assert said["scenes"] == [f"own.toml@{k}" for k in (0, 2, 4)]
     cloud, renderer = fs.load_ply("own.ply"), fs.Renderer("reference")
-    for k, result in zip(range(0, 15, 2), said["results"], strict=True):
+    for k, result in zip((0, 2, 4), said["results"], strict=True):
         pose = np.eye(4)
         pose[0, 3] = -0.1 * k
         camera = fs.Camera.pinhole(64, 48, CAMERA.fx, CAMERA.fy, 32, 24, pose)
