@@ -12,8 +12,8 @@ class Warm:
 
     The kernels of a scene are compiled when it is first drawn, which takes a second or more, and kept in the
     caches of pyopencl, of Warp and of the driver. This fills them: markers, 2D splats and captures of 3D
-    Gaussians, alone and together, the usual outputs. Worth it once after an installation, an update or a change of
-    the driver. What is there already takes no time.
+    Gaussians, alone and together, the usual outputs. Worth it once after an installation, an update or a
+    change of the driver. What is there already takes no time.
 
     Examples:
       fidsplat warm
