@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pyopencl as cl
 import pytest
-from agreement import ALL_OUTPUTS, random_splats
+from agreement import ALL_OUTPUTS, random_splats, some_thick
 
 import fidsplat as fs
 from fidsplat.backends.opencl import batch, lists
@@ -39,6 +39,7 @@ def small(renderer, mebibytes, cloud=None):
             cloud.colors,
             cloud.sh,
             cloud.planes,
+            cloud.thickness,
         )
         budget += sum(array.nbytes for array in arrays if array is not None)
     return fs.Renderer(renderer.device.name, memory_budget=budget)
@@ -63,8 +64,12 @@ machines = pytest.mark.parametrize("machine", [own_device, as_on_a_gpu], ids=["o
 
 @pytest.fixture(scope="module")
 def cloud():
+    """200 disks of a plane; of the others every third is a 3D Gaussian."""
     made = random_splats(30000, 1, scale=(1e-3, 0.5), sh_degree=2)
-    return made.with_planes(np.where(np.arange(len(made)) < 200, 0, -1))
+    number = np.arange(len(made))
+    third = np.where((number >= 200) & (number % 3 == 0), 0.05, 0)
+    made = some_thick(made, third)
+    return made.with_planes(np.where(number < 200, 0, -1))
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from agreement import random_splats
+from agreement import random_splats, some_thick
 from sampling import SAMPLES, alternate, in_turn
 from test_agreement import coplanar_cloud
 
@@ -105,7 +105,9 @@ def test_as_many_are_visible_as_in_the_fullest_pose(renderer):
 
 
 def test_colours_that_depend_on_the_view_turn_with_their_group(renderer):
+    """Of disks and of 3D Gaussians."""
     cloud = random_splats(100, 4, depth=(1, 5), scale=(0.05, 0.3), sh_degree=3)
+    cloud = some_thick(cloud, np.where(np.arange(100) % 2 == 0, 0.1, 0))
     assert_exposed(renderer, cloud, CAMERAS["pinhole"], MOTION, SHUTTERS["both"], outputs=("rgb",))
 
 
