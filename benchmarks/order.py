@@ -1,7 +1,7 @@
 """What the order of splats does to a picture, and what it costs (docs/order.md).
 
     python benchmarks/order.py [--device opencl] [--scene FILE] [--repeats 15]
-        [-o docs/images/order-jump.png] [--json FILE]
+        [-o docs/images/order-jump.png] [--json FILE] [--times-only]
 
 Jumps: how far a pixel goes when a camera turns in steps of 1e-4 degrees, by the depth of centres and by
 depth at each pixel, and when the splats are shuffled. Markers of Gaussians alone and 5 cm before a wall of
@@ -147,12 +147,13 @@ def main() -> None:
     parser = options(__doc__, repeats=15)
     parser.add_argument("--scene", metavar="FILE", help="a captured scene, y down, as in docs/real-scene.md")
     parser.add_argument("-o", "--out", type=Path, help="PNG file for the picture")
+    parser.add_argument("--times-only", action="store_true", help="no jumps, and so no picture")
     asked = parser.parse_args()
     renderer = fs.Renderer(asked.device)
     capture = None if asked.scene is None else fs.load_ply(asked.scene)
     panels: dict = {}
-    figures = {**facts(renderer), "jumps": jumps(renderer, capture, panels)}
-    if asked.out is not None:
+    figures = {**facts(renderer), "jumps": [] if asked.times_only else jumps(renderer, capture, panels)}
+    if asked.out is not None and panels:
         write_png(asked.out, picture(panels))
     figures["times"] = times(renderer, capture, asked.repeats)
     if keep(figures, asked.json):
@@ -163,11 +164,9 @@ def main() -> None:
         (row["scene"], str(row["splats"]), *(_number(row.get(name)) for name in columns))
         for row in figures["jumps"]
     ]
-    show(
-        title,
-        ("scene", "splats", *(f"{name.split('_')[0]}, {name.split('_')[1]}" for name in columns)),
-        cells,
-    )
+    if cells:
+        names = (f"{name.split('_')[0]}, {name.split('_')[1]}" for name in columns)
+        show(title, ("scene", "splats", *names), cells)
     rows = []
     for row in figures["times"]:
         low, high = row["quartiles"]

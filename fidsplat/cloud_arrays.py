@@ -1,5 +1,7 @@
 """What the arrays of a SplatCloud are made of: checks of what users give, splats that cannot be drawn, types,
-origins, quaternions."""
+origins, quaternions, clouds in one."""
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -177,3 +179,24 @@ def check_one_footprint(planes: np.ndarray | None, boxes: np.ndarray | None) -> 
             f"plane {both[0]} has boxes and Gaussians, whose coverage follows different rules; "
             "give each kind a plane"
         )
+
+
+def joined_arrays(arrays: Sequence[np.ndarray | None], counts: Sequence[int], kind) -> np.ndarray | None:
+    """One array of several clouds' (counts: of their splats), 0 or False where a cloud has none; None if all
+    have none."""
+    if all(array is None for array in arrays):
+        return None
+    pairs = zip(arrays, counts, strict=True)
+    return np.concatenate([np.zeros(count, kind) if array is None else array for array, count in pairs])
+
+
+def joined_planes(ids: Sequence[np.ndarray | None], counts: Sequence[int]) -> np.ndarray | None:
+    """The planes of several clouds, those of different clouds different ones; None if no cloud has any."""
+    if all(each is None for each in ids):
+        return None
+    joined, first_free = [], 0
+    for own, count in zip(ids, counts, strict=True):
+        planes = np.full(count, -1, np.int32) if own is None else own
+        joined.append(np.where(planes >= 0, planes + first_free, -1).astype(np.int32))
+        first_free = max(first_free, int(joined[-1].max()) + 1)
+    return np.concatenate(joined)

@@ -122,7 +122,7 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
             f"stop_{quality.stop_rule}",
             # before what composites, whose fragments it hides
             *(("opaque_layer",) if capture.layer is not None else ()),
-            _composing(cloud, quality.order),
+            _composing(cloud, quality.order, one_depth_each=alone and not double),
             f"footprint_{cloud.footprint}",
             f"background_{_KINDS.get(type(background), 'constant')}",
             # short functions are float32's
@@ -140,11 +140,15 @@ def select(cloud: Traits, capture: Capture) -> FeatureSet:
     )
 
 
-def _composing(cloud: Traits, order: str) -> str:
-    """The effect that composites: by splats' centres, or by depth at each pixel, with or without planes."""
-    if order == "centre" or (order == "auto" and not cloud.has_planes):
-        return "compose_ordered"
-    return "compose_planes" if cloud.has_planes else "compose_pixel"
+def _composing(cloud: Traits, order: str, one_depth_each: bool) -> str:
+    """The effect that composites: by splats' centres, or by depth at each pixel, with or without planes.
+
+    Where every fragment has its centre's depth as float32, as the lists' keys are, both orders are the same,
+    and nothing need wait.
+    """
+    if cloud.has_planes:
+        return "compose_ordered" if order == "centre" else "compose_planes"
+    return "compose_pixel" if order == "pixel" and not one_depth_each else "compose_ordered"
 
 
 def _ellipsoid(cloud: Traits, quality: Quality, lens: Lens | None) -> str:

@@ -98,18 +98,17 @@ def scene_of(seed: int) -> Picture:
 
 def thick_scene_of(seed: int) -> Picture:
     """The same with 3D Gaussians for most splats of no plane, drawn in one of the ways: a third standard
-    deviation from 1e-6 of the first two, needles and balls among them, to 100 times as large. Their centres
-    have depths of their own: which of two is in front says nothing but the centre, as EWA draws them."""
+    deviation from 1e-6 of the first two, needles and balls among them, to 100 times as large. No two splats
+    of no plane have one depth: by nothing else are they ordered, as EWA draws them."""
     flat, generator = scene_of(seed), np.random.default_rng([seed, 2])
     cloud, count = flat.cloud, len(flat.cloud)
     third = cloud.scales.max(axis=1) * log_uniform(generator, 1e-6, 1e2, count)
     needle = generator.random(count) < 0.2
     third[needle] = cloud.scales.min(axis=1)[needle]
-    chosen = generator.random(count) < 0.8
-    if cloud.planes is not None:
-        chosen &= cloud.planes < 0
+    loose = np.ones(count, bool) if cloud.planes is None else cloud.planes < 0
+    chosen = (generator.random(count) < 0.8) & loose
     scales = np.column_stack([cloud.scales, np.where(chosen, np.clip(third, 1e-7, 1e3), 0)])
-    away = 1 + np.where(chosen, generator.uniform(0, 1e-3, count), 0)  # from the camera, at the origin
+    away = 1 + np.where(loose, generator.uniform(0, 1e-3, count), 0)  # from the camera, at the origin
     means = (cloud.world_means() * away[:, None]).astype(np.float32)
     thick = SplatCloud(means, cloud.quats, scales, cloud.opacities, colors=cloud.colors, labels=cloud.labels)
     if cloud.planes is not None:

@@ -17,7 +17,8 @@ def marker_pose(corners: np.ndarray, size: float, camera: Camera) -> np.ndarray:
     """camera_from_marker, (4, 4) float64, metres.
 
     IPPE (Collins and Bartoli 2014) gives the two poses that a square can nearly be confused between; both are
-    settled by Levenberg-Marquardt on the reprojection error and the one with the lower error is returned.
+    settled by Levenberg-Marquardt on the reprojection error and the one with the lower error is returned; NaN
+    where neither lies before the camera.
 
     Args:
         corners: (4, 2) pixels, TL, TR, BR, BL as printed.

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, assert_agrees, random_splats
+from sampling import SAMPLES, alternate
 
 import fidsplat as fs
 from fidsplat.rotations import quaternion_to_matrix
@@ -159,8 +160,7 @@ def test_boxes_end_at_the_near_plane(renderer):
     assert np.abs(frame["rgb"] - whole["rgb"]).max() > 0.1
 
 
-@pytest.mark.parametrize("lowpass", ["none", "screen"])
-@pytest.mark.parametrize("samples", [1, 2])
+@pytest.mark.parametrize(("lowpass", "samples"), alternate({"none": "none", "screen": "screen"}, SAMPLES))
 def test_a_scene_of_both_footprints(renderer, lowpass, samples):
     cloud = random_splats(150, seed=4, depth=(-0.5, 6.0))
     mixed = cloud.with_boxes(np.arange(150) % 3 == 0)

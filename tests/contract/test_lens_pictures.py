@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, assert_agrees, random_splats, reference_pixels
-from sampling import SAMPLES, alternate
+from sampling import SAMPLES, alternate, in_turn
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
@@ -81,11 +81,36 @@ def test_splats_much_larger_than_the_picture(renderer, camera):
     assert_agrees(renderer, random_splats(80, 5, depth=(-4.0, 4.0), scale=(0.1, 30.0)), camera)
 
 
+@each_camera
+def test_bounds_that_end_where_splats_are_half_opaque(renderer, camera):
+    """With so high a cut-off a bound that is too tight leaves a step where tiles end."""
+    cloud = random_splats(60, 9, depth=(-4.0, 4.0), scale=(0.1, 4.0))
+    opaque = fs.SplatCloud(cloud.means, cloud.quats, cloud.scales, np.full(60, 0.8), colors=cloud.colors)
+    quality = fs.Quality(alpha_cutoff=0.4, lowpass="none")
+    assert_agrees(renderer, opaque, camera, quality=quality)
+
+
+@pytest.mark.parametrize(
+    "camera", [fs.Camera.fisheye(70, 66, math.radians(200)), fs.Camera.equirectangular(70, 40)]
+)
+def test_small_splats_on_the_axis_and_at_the_poles(renderer, camera):
+    """Exactly there; filtered by the lens's own derivatives."""
+    means = [(0, 0, 2), (0, 0, -2), (0, 2, 0), (0, -2, 0), (2, 0, 0), (-2, 0, 0)]
+    scales = np.tile([0.05, 0.02], (6, 1))
+    splats = fs.SplatCloud(
+        means, np.tile([0.9, 0.3, -0.2, 0.1], (6, 1)), scales, np.full(6, 0.9), colors=np.ones((6, 3))
+    )
+    assert_agrees(renderer, splats, camera, ("rgb",), fs.Quality(lowpass="pixel"))
+
+
+@in_turn()
 @pytest.mark.parametrize(("camera", "samples"), alternate(CAMERAS, SAMPLES))
 def test_layers(renderer, camera, samples):
     assert_agrees(renderer, coplanar_cloud(1), camera, quality=fs.Quality(samples=samples))
 
 
+# test_all_effects of both matrices has them behind every lens
+@in_turn()
 @pytest.mark.parametrize("name", ["distortion", "fisheye", "panorama", "parallel"])
 def test_colours_that_depend_on_the_view(renderer, name):
     cloud = random_splats(100, 11, depth=(1, 6), scale=(0.02, 0.4), sh_degree=3)
@@ -195,17 +220,18 @@ def test_depths_of_a_fisheye_are_distances(renderer):
 @pytest.mark.parametrize("name", ["fisheye", "parallel"])
 def test_bands_give_the_same_bits(renderer, name):
     cloud, camera = random_splats(300, 2, depth=(-4.0, 5.0)), CAMERAS[name]
-    first = renderer.render(cloud, camera)["rgb"]
-    assert (renderer.render(cloud, camera)["rgb"] == first).all()
+    first = renderer.render(cloud, camera, ALL_OUTPUTS)["rgb"]
+    assert (renderer.render(cloud, camera, ALL_OUTPUTS)["rgb"] == first).all()
     backend = renderer.backend
     held = backend.pair_budget
     backend.pair_budget = 50
     try:
-        assert (renderer.render(cloud, camera)["rgb"] == first).all()
+        assert (renderer.render(cloud, camera, ALL_OUTPUTS)["rgb"] == first).all()
     finally:
         backend.pair_budget = held
 
 
+@in_turn()
 @pytest.mark.parametrize("name", ["distortion", "fisheye", "panorama", "parallel"])
 def test_lenses_in_single_precision(renderer, name):
     """The set-up of devices without float64, held as the pinhole's is: to a tenth of an 8-bit step."""

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from agreement import assert_agrees, random_splats
+from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.effects import OUTPUTS
@@ -19,6 +20,7 @@ def test_outputs_of_splats_around_the_camera(renderer, seed, quality):
     assert_agrees(renderer, random_splats(150, seed), CAMERA, ALL, quality)
 
 
+@in_turn()
 @pytest.mark.parametrize("samples", [2, 3])
 def test_outputs_of_several_samples(renderer, samples):
     cloud = random_splats(100, 5, depth=(0.5, 5.0))
@@ -36,11 +38,18 @@ def test_outputs_of_layers(renderer, mixture):
     assert_agrees(renderer, scene, CAMERA, ALL)
 
 
-def test_an_output_alone_is_what_it_is_among_all(renderer):
+def test_a_layer_shows_the_mean_of_what_its_splats_show(renderer):
+    """Splats that are called a plane and are turned every way."""
+    cloud = random_splats(40, seed=6, depth=(1.0, 3.0), scale=(0.2, 0.8), across=0.5)
+    assert_agrees(renderer, cloud.with_planes(np.arange(40) // 4), CAMERA, ALL)
+
+
+@in_turn()
+@pytest.mark.parametrize("name", ALL)
+def test_an_output_alone_is_what_it_is_among_all(renderer, name):
     cloud = random_splats(150, 4)
-    together = renderer.render(cloud, CAMERA, ALL)
-    for name in ALL:
-        assert np.array_equal(renderer.render(cloud, CAMERA, name)[name], together[name]), name
+    together, alone = (renderer.render(cloud, CAMERA, outputs) for outputs in (ALL, name))
+    assert np.array_equal(alone[name], together[name])
 
 
 def test_distances_are_depths_along_the_ray(renderer):
@@ -215,6 +224,7 @@ def covered(frame, name):
     return plane.any(-1) if plane.ndim == 3 else plane
 
 
+@in_turn(1)
 @pytest.mark.parametrize("samples", [1, 2])
 def test_masks_do_not_grow_with_a_low_cutoff(renderer, samples):
     """They end where 1/255 is covered, whatever is drawn beyond it for the sake of colours."""

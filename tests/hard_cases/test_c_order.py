@@ -21,6 +21,7 @@ from fidsplat.hard_cases.c_order import (
     turning,
 )
 from fidsplat.hard_cases.clouds import splats, taken
+from fidsplat.random_clouds import load_scene, standard_camera
 
 
 @pytest.mark.parametrize("away", [0.0, 1.0])
@@ -90,6 +91,13 @@ def test_of_equal_depths_that_wait_the_first_is_in_front(renderer):
     rgb = renderer.render(cloud, camera, quality=quality)["rgb"]
     assert rgb[2, 2] == pytest.approx([0.9, 0.09, 0.009], abs=2e-3)
     assert rgb[2, 3] == pytest.approx([0, 0.9, 0.09], abs=2e-2)
+
+
+@pytest.mark.exhaustive
+def test_every_pixel_of_a_hundred_thousand_splats(renderer):
+    """Against the sort of every pixel in float64; docs/order.md has the largest error."""
+    cloud, _ = load_scene("r100k_720p")
+    assert_agrees(renderer, cloud, standard_camera(320, 180), ("rgb", "depth"), fs.Quality(order="pixel"))
 
 
 def test_a_faint_splat_between_decides_nothing(renderer):

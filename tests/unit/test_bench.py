@@ -115,7 +115,7 @@ def test_memory_is_that_of_cloud_buffers_and_picture(renderer):
     held = renderer.backend.memory_bytes
     assert held >= 640 * 480 * 16  # samples: colours and transmittance
     del frame
-    assert renderer.backend.memory_bytes >= held  # a plane that is given back is kept for the next picture
+    assert renderer.backend.memory_bytes >= held  # an image that is given back is kept for the next picture
 
 
 def test_devices_take_turns(monkeypatch):

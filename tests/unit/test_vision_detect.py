@@ -186,6 +186,12 @@ def test_what_detect_cannot_use():
             detect(np.zeros((60, 60), np.uint8), wanted)
 
 
+def test_corners_of_no_square_before_the_camera_have_no_pose():
+    """They cross; the squares that come nearest lie behind it."""
+    crossed = np.array([[73.0, 55.0], [231.0, 136.0], [385.0, 7.0], [39.0, 111.0]])
+    assert np.isnan(marker_pose(crossed, SIZE, CAMERA)).all()
+
+
 def test_what_has_no_pose():
     camera, corners = Camera.pinhole(9, 9, 9, 9, 4, 4), np.eye(4)[:, :2]
     for given, says in (

@@ -4,7 +4,8 @@ import json
 from dataclasses import replace
 
 import pytest
-from sampling import sampled
+from sampling import in_turn, sampled
+from traits import Traits
 
 import fidsplat as fs
 from fidsplat.cli import main
@@ -23,6 +24,7 @@ def test_recipes_are_what_scenes_call_for():
     assert warming.Recipe(3, False, ("rgb",)) in wanted  # a captured scene's
 
 
+@in_turn()
 @pytest.mark.parametrize("recipe", sampled(warming.recipes(), 3, 2), ids=lambda recipe: recipe.words)
 def test_a_recipe_compiles_what_its_words_say(renderer, recipe):
     ((done, seconds),) = warming.warm(renderer, [recipe])
@@ -31,13 +33,12 @@ def test_a_recipe_compiles_what_its_words_say(renderer, recipe):
     cloud = warming._cloud(recipe, 5)
     assert cloud.sh_degree == recipe.sh_degree
 
-    class Traits:
-        sh_degree, has_planes, footprint, ellipsoids = recipe.sh_degree, recipe.markers, "gaussian", "none"
-
-    # a device without float64 has these in float32
-    wanted = replace(
-        select(Traits(), fs.Capture(outputs=recipe.outputs, quality=recipe.quality)), setup_precision=""
+    features = select(
+        Traits(recipe.sh_degree, recipe.markers),
+        fs.Capture(outputs=recipe.outputs, quality=recipe.quality),
     )
+    # a device without float64 has these in float32
+    wanted = replace(features, setup_precision="")
     compiled = [replace(key[0], setup_precision="") for key in renderer.backend._pipelines]
     assert wanted in compiled
 

@@ -46,6 +46,7 @@ class Picture:
         self.stack, self.views = stack, 1 if stack is None else len(stack)
         self.queue = workspace.turn_to(workspace.queue) if queue is None else queue
         self.pool = workspace.pool
+        workspace.pictures += 1
         self.tiles_x = -(-view.width // shape.tile_width)
         self.tiles_y = -(-view.height // shape.tile_height)
         self.tiles = self.views * self.tiles_x * self.tiles_y

@@ -88,7 +88,28 @@ class OpenCLPipeline:
             if plan.chunk and self.shape.lists != "ordered":
                 # one way of drawing in chunks is enough: where memory is short, sorting takes the least time
                 return self._other(self.features, replace(self.shape, lists="ordered")).render(resident, view)
-            return self._images(view, self._tried(self._first, resident, view, plan, key))
+            return self._images(view, Drawn.of(self._tried(self._first, resident, view, plan, key)))
+
+    def drawn(self, resident: Resident, view: View) -> tuple[Picture, OpenCLImages]:
+        """One picture with all that its stages have left on the device, until another is drawn.
+
+        Raises:
+            DeviceError: as `render`.
+        """
+        with self.workspace.lock:
+            picture = self._tried(self._whole, resident, view)
+            return picture, self._images(view, Drawn.of(picture))
+
+    def _whole(self, resident: Resident, view: View) -> Picture:
+        """A picture that is drawn at once, not in chunks or bands."""
+        plan = self._plan(resident, view)
+        picture = None if plan.chunk else self._first(resident, view, plan)
+        if picture is None or picture.stats()["pairs"] > self.workspace.pair_budget:
+            raise DeviceError(
+                f"{resident.count:,} splats are drawn in chunks or bands within the memory budget, and such "
+                "pictures have no gradient; raise memory_budget, or use fewer splats or smaller pictures"
+            )
+        return picture
 
     def render_batch(self, resident: Resident, batch: ViewBatch) -> OpenCLBatch:
         """Draw many views, as many at once as memory holds.
@@ -184,7 +205,7 @@ class OpenCLPipeline:
 
     def _first(
         self, resident: Resident, view: View, plan: MemoryPlan, key: tuple[Any, ...] | None = None
-    ) -> Drawn:
+    ) -> Picture:
         """Draws a picture with what room it takes; remembers its kind, if the next may be launched again."""
         pool = self.workspace.pool
         kind = self, view.width, view.height, resident.count, plan
@@ -196,7 +217,7 @@ class OpenCLPipeline:
             if len(resident.kept) >= _KINDS:
                 resident.kept.clear()
             resident.kept[key] = Kept(plan, kind)
-        return Drawn.of(picture)
+        return picture
 
     def _repeat(self, resident: Resident, view: View, kept: Kept) -> OpenCLImages | None:
         """The next picture of a kind; None where nothing is left of the last."""
@@ -205,6 +226,7 @@ class OpenCLPipeline:
         if not TiledLists.capacity(workspace):
             return None
         queue, recording = workspace.turn_to(workspace.repeat_queue), kept.recording
+        workspace.pictures += 1
 
         def undrawn(view: View) -> Picture:
             return Picture(workspace, self.program, self.shape, resident, view, plan, queue)
@@ -227,6 +249,7 @@ class OpenCLPipeline:
         """Milliseconds of the stages, of the picture drawn once more."""
         workspace = self.workspace
         queue = workspace.turn_to(workspace.queue)
+        workspace.pictures += 1
 
         def undrawn(view: View) -> Picture:
             return Picture(workspace, self.program, self.shape, resident, view, MemoryPlan(0, 0, 0), queue)
@@ -242,7 +265,7 @@ class OpenCLPipeline:
 
     def _redrawn(self, resident: Resident, view: View) -> Drawn:
         """The picture drawn anew, whatever it takes, and its time."""
-        return self._tried(self._first, resident, view, self._plan(resident, view))
+        return Drawn.of(self._tried(self._first, resident, view, self._plan(resident, view)))
 
     def _draw(self, resident: Resident, view: View, plan: MemoryPlan) -> Picture:
         def start(view: View) -> Picture:

@@ -64,7 +64,8 @@ def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
     if kind == "schedule":
         return {"groups": _groups(own, 8)}
     if kind == "waiting":
-        few = replace(_groups(own, 8), waiting=1), replace(_groups(own, 8), waiting=2)
+        # less than what groups keep in registers, and a little more
+        few = replace(_groups(own, 8), waiting=1), replace(_groups(own, 8), waiting=4)
         return {
             **{f"own, room for {room}": replace(own, waiting=room) for room in (1, 3)},
             **{f"groups, room for {shape.waiting}": shape for shape in few},

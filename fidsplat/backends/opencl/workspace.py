@@ -157,6 +157,8 @@ class Workspace:
         self.repeat_queue = cl.CommandQueue(self.context)
         """for pictures that were drawn before: without times, a launch takes the host a third less"""
         self._last, self._idle = self.queue, True
+        self.pictures = 0
+        """that were begun: another one overwrites what the last has left in scratch buffers"""
         self.lock = threading.RLock()
         """held while a picture is put on a queue: scratch buffers and arguments belong to one at a time"""
         self.pool = BufferPool(self.context, device)

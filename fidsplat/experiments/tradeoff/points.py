@@ -11,6 +11,7 @@ from typing import Any
 from fidsplat.errors import InputError, unknown
 from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.quality import (
+    ELLIPSOID,
     NESTED,
     PRESETS,
     TEMPLATE_SIZES,
@@ -36,7 +37,7 @@ _LADDERS: dict[str, tuple[tuple[Any, ...], str]] = {
     "opacity_ceiling": ((0.999, 0.99), "rm"),
     "stop_rule": (("exclusive",), "rm"),
     "order": (("pixel", "centre"), "rm"),
-    "ellipsoid": (("ewa_antialiased", "exact"), "t"),
+    "ellipsoid": (ELLIPSOID, "t"),
     "lowpass": (("pixel", "none"), "rm"),
     "samples": ((2, 3), "rm"),
     "setup_precision": (("float32",), "rm"),
@@ -159,10 +160,11 @@ def points(
 
 
 def thick_points(knobs: Iterable[str]) -> list[Point]:
-    """The settings for scenes of 3D Gaussians: the ways of drawing them, the base's own first."""
-    chosen = tuple(knobs)
-    values = _LADDERS["ellipsoid"][0] if "ellipsoid" in chosen else ()
-    return [Point("base", "base", BASE), *(_turned("ellipsoid", value) for value in values)]
+    """The settings for scenes of 3D Gaussians: the base, and the ways of drawing them in pictures that are
+    exact otherwise."""
+    values = _LADDERS["ellipsoid"][0] if "ellipsoid" in tuple(knobs) else ()
+    ways = (Point("ellipsoid", value, EXACT.with_(ellipsoid=value)) for value in values)
+    return [Point("base", "base", BASE), *ways]
 
 
 def decode_points(knobs: Iterable[str], quick: bool = False) -> list[Point]:

@@ -1,17 +1,27 @@
-// What waits at a pixel, for GPUs (slot/compose_pixel.cl): always WAITING fragments, sorted by depth, in registers. One more takes its
-// place among them, and the nearest of all leaves.
+// What waits at a pixel, for GPUs (slot/compose_pixel.cl). The furthest are in registers, IN_REGISTERS of them, always full and
+// sorted by depth: one more takes its place among them, and the nearest of all leaves. Nearly always it can be composited; else it goes
+// to a queue in memory, which is short and mostly empty.
 //@ compose_types
 #define NONE 0xFFFFFFFFu            // a place where nothing waits
+#define IN_REGISTERS (WAITING < 3 ? WAITING : 3)
+#define QUEUED (WAITING - IN_REGISTERS)
+typedef struct {                    // apart from what is to stay in registers: an index that is not constant puts all of a struct in memory
+    wide z[QUEUED + 1], opacity[QUEUED + 1];    // a ring, sorted by depth
+    uint splat[QUEUED + 1];
+//@@ queued
+} Queue;
 typedef struct {
-    wide z[WAITING], opacity[WAITING];
-    uint splat[WAITING];
+    wide z[IN_REGISTERS], opacity[IN_REGISTERS];
+    uint splat[IN_REGISTERS];
+    Queue *queue;
+    uint head, count;               // of the queue
 //@@ sorted
     wide from, until;               // depths between which fragments are taken: at the first from `from_splat` on in the
     uint from_splat, until_splat;   // list, at the second those before `until_splat`
 } Waiting;
 
 static inline void waiting_clear(Waiting *waiting) {
-    for (int k = 0; k < WAITING; k++) {
+    for (int k = 0; k < IN_REGISTERS; k++) {
         waiting->z[k] = -INFINITY;
         waiting->splat[k] = NONE;
     }
@@ -19,11 +29,15 @@ static inline void waiting_clear(Waiting *waiting) {
 
 static inline void waiting_start(Waiting *waiting) {
     waiting_clear(waiting);
+    waiting->head = waiting->count = 0;
 //@@ sorted_start
     waiting->from = -INFINITY;
     waiting->until = INFINITY;
     waiting->from_splat = waiting->until_splat = 0;
 }
+//@ group_start
+    Queue queues[ROWS];
+    for (int row = 0; row < ROWS; row++) pixels[row].waiting.queue = &queues[row];
 //@ unfinished
         & VMASK(pixel->waiting.from < INFINITY)
 //@ compose_functions
@@ -35,7 +49,6 @@ static inline bool waiting_earlier(global const Splat *splats, uint splat, uint 
 
 static inline void waiting_composite(Pixel *pixel, wide z, wide opacity, uint splat, global const Splat *splats,
                                      const BlendConstants *constants) {
-    if (splat == NONE) return;
 //@@ sorted_composite
     const Splat s = splats[splat];
     const Crossing nowhere = {1.0f};
@@ -44,39 +57,82 @@ static inline void waiting_composite(Pixel *pixel, wide z, wide opacity, uint sp
     composite(pixel, &seen, opacity, VMASK(true), constants);
 }
 
-// One fragment more, with nothing to come before `nearest`: the nearest is composited or, where it may not yet be, the furthest
-// dropped.
+// Where the k-th of the queue lies.
+static inline uint waiting_place(const Waiting *waiting, uint k) {
+    uint at = waiting->head + k;
+    return at < QUEUED ? at : at - QUEUED;
+}
+
+// Composites what of the queue lies no further than `nearest`.
+static inline void waiting_leave(Pixel *pixel, wide nearest, global const Splat *splats, const BlendConstants *constants) {
+    Waiting *waiting = &pixel->waiting;
+    Queue *queue = waiting->queue;
+    while (waiting->count > 0 && queue->z[waiting->head] <= nearest) {
+        uint at = waiting->head;
+        waiting->head = waiting_place(waiting, 1);
+        waiting->count--;
+        waiting_composite(pixel, queue->z[at], queue->opacity[at], queue->splat[at], splats, constants);
+    }
+}
+
+// A fragment no further than those in registers, to the queue. Where that is full the furthest of all is dropped.
+static inline void waiting_queue(Pixel *pixel, wide z, wide opacity, uint splat) {
+    Waiting *waiting = &pixel->waiting;
+    Queue *queue = waiting->queue;
+    if (waiting->count == QUEUED) {
+        uint dropped = waiting->splat[IN_REGISTERS - 1];
+//@@ sorted_drop
+        waiting->until = waiting->z[IN_REGISTERS - 1];
+        waiting->until_splat = dropped;
+#pragma unroll
+        for (int k = IN_REGISTERS - 1; k > 0; k--) {
+            waiting->z[k] = waiting->z[k - 1];
+            waiting->opacity[k] = waiting->opacity[k - 1];
+            waiting->splat[k] = waiting->splat[k - 1];
+        }
+        uint last = waiting_place(waiting, waiting->count - 1);
+        bool further = QUEUED > 0 && queue->z[last] > z;
+        waiting->z[0] = further ? queue->z[last] : z;
+        waiting->opacity[0] = further ? queue->opacity[last] : opacity;
+        waiting->splat[0] = further ? queue->splat[last] : splat;
+        if (!further) return;
+        waiting->count--;
+    }
+    uint k = waiting->count++, at = waiting_place(waiting, k);
+    for (; k > 0; k--) {
+        uint before = waiting_place(waiting, k - 1);
+        if (queue->z[before] <= z) break;
+        queue->z[at] = queue->z[before];
+        queue->opacity[at] = queue->opacity[before];
+        queue->splat[at] = queue->splat[before];
+        at = before;
+    }
+    queue->z[at] = z;
+    queue->opacity[at] = opacity;
+    queue->splat[at] = splat;
+}
+
+// One fragment more, with nothing to come before `nearest`.
 static inline void waiting_push(Pixel *pixel, wide nearest, wide z, wide opacity, uint splat, global const Splat *splats,
                                 const BlendConstants *constants) {
     Waiting *waiting = &pixel->waiting;
-    if (fmin(z, waiting->z[0]) <= nearest) {
-        bool first = z < waiting->z[0];
-        wide first_z = first ? z : waiting->z[0], first_opacity = first ? opacity : waiting->opacity[0];
-        uint first_splat = first ? splat : waiting->splat[0];
+    waiting_leave(pixel, nearest, splats, constants);
+    bool first = z < waiting->z[0];
+    wide first_z = first ? z : waiting->z[0], first_opacity = first ? opacity : waiting->opacity[0];
+    uint first_splat = first ? splat : waiting->splat[0];
 #pragma unroll
-        for (int k = 0; k < WAITING; k++) {
-            bool moves = k + 1 < WAITING && waiting->z[min(k + 1, WAITING - 1)] <= z, here = !moves && waiting->z[k] <= z;
-            int from = min(k + 1, WAITING - 1);
-            waiting->opacity[k] = moves ? waiting->opacity[from] : here ? opacity : waiting->opacity[k];
-            waiting->splat[k] = moves ? waiting->splat[from] : here ? splat : waiting->splat[k];
-            waiting->z[k] = moves ? waiting->z[from] : here ? z : waiting->z[k];
-        }
+    for (int k = 0; k < IN_REGISTERS; k++) {
+        int from = min(k + 1, IN_REGISTERS - 1);
+        bool moves = k + 1 < IN_REGISTERS && waiting->z[from] <= z, here = !moves && waiting->z[k] <= z;
+        waiting->opacity[k] = moves ? waiting->opacity[from] : here ? opacity : waiting->opacity[k];
+        waiting->splat[k] = moves ? waiting->splat[from] : here ? splat : waiting->splat[k];
+        waiting->z[k] = moves ? waiting->z[from] : here ? z : waiting->z[k];
+    }
+    if (first_splat == NONE) return;
+    if (waiting->count == 0 && first_z <= nearest)
         waiting_composite(pixel, first_z, first_opacity, first_splat, splats, constants);
-        return;
-    }
-    bool last = waiting->z[WAITING - 1] <= z;
-    uint dropped = last ? splat : waiting->splat[WAITING - 1];
-//@@ sorted_drop
-    waiting->until = last ? z : waiting->z[WAITING - 1];
-    waiting->until_splat = dropped;
-#pragma unroll
-    for (int k = WAITING - 1; k >= 0; k--) {
-        bool stays = waiting->z[k] <= z, here = !stays && (k == 0 || waiting->z[max(k - 1, 0)] <= z);
-        int from = max(k - 1, 0);
-        waiting->opacity[k] = stays ? waiting->opacity[k] : here ? opacity : waiting->opacity[from];
-        waiting->splat[k] = stays ? waiting->splat[k] : here ? splat : waiting->splat[from];
-        waiting->z[k] = stays ? waiting->z[k] : here ? z : waiting->z[from];
-    }
+    else
+        waiting_queue(pixel, first_z, first_opacity, first_splat);
 }
 
 // All fragments go the same way.
@@ -97,12 +153,12 @@ static inline void waiting_take(Pixel *pixel, wide nearest, wide z, wide opacity
 static inline int waiting_end(Pixel *pixel, global const Splat *splats, const BlendConstants *constants) {
 //@@ plane_end
     Waiting *waiting = &pixel->waiting;
-    if (waiting->splat[WAITING - 1] != NONE) {
+    waiting_leave(pixel, INFINITY, splats, constants);
 #pragma unroll
-        for (int k = 0; k < WAITING; k++)
+    for (int k = 0; k < IN_REGISTERS; k++)
+        if (waiting->splat[k] != NONE)
             waiting_composite(pixel, waiting->z[k], waiting->opacity[k], waiting->splat[k], splats, constants);
-        waiting_clear(waiting);
-    }
+    waiting_clear(waiting);
     waiting->from = waiting->until;
     waiting->from_splat = waiting->until_splat;
     waiting->until = INFINITY;

@@ -2,7 +2,7 @@
 // of the lanes, in an order that is right in every lane. A fragment that is in front of another in one lane and behind it in the
 // next is cut in two. What can be composited is so when the queue fills.
 //@ compose_types
-#define LEAST_DUE min(8, WAITING)
+#define LEAST_DUE min(16, WAITING)
 typedef struct {
     vfloat z[WAITING + 1];      // NaN in lanes where it does not wait
     vfloat opacity[WAITING + 1];
@@ -10,6 +10,7 @@ typedef struct {
 //@@ queue
     uchar order[WAITING + 1];   // places in the above: `count` that are taken, the nearest first, then those that are free
     int count, due;             // at `due` what can be composited is so
+    vfloat furthest;            // of all that have waited
     int bounded;                // whether not all fragments are taken, but those between
     vfloat from, until;         // these depths: at the first from `from_place` in the list on, at the second those before
     vint from_place, until_place;
@@ -19,7 +20,7 @@ static inline void waiting_start(Waiting *waiting) {
     for (int k = 0; k <= WAITING; k++) waiting->order[k] = (uchar)k;
     waiting->count = waiting->bounded = 0;
     waiting->due = LEAST_DUE;
-    waiting->from = -INFINITY;
+    waiting->furthest = waiting->from = -INFINITY;
     waiting->until = INFINITY;
     waiting->from_place = waiting->until_place = 0;
 }
@@ -43,8 +44,8 @@ static inline void waiting_composite(Pixel *pixel, wide nearest, global const Sp
         if (VANY(ready)) {
             const Seen seen = waiting_seen(waiting, at, ready, splats);
             composite(pixel, &seen, waiting->opacity[at], ready, constants);
+            if (!VANY(VMASK(waiting->z[at] > nearest))) continue;
             waiting->z[at] = VSELECT(waiting->z[at], (vfloat)NAN, ready);
-            if (!VANY(VMASK(waiting->z[at] == waiting->z[at]))) continue;
         }
         waiting->order[k] = waiting->order[kept];
         waiting->order[kept++] = (uchar)at;
@@ -89,9 +90,11 @@ static inline void waiting_take(Pixel *pixel, wide nearest, vfloat z, vfloat opa
         if (!VANY(mask)) return;
     }
     vfloat own = VSELECT((vfloat)NAN, z, mask);
-    vint lanes = mask, settled = 0;     // lanes that are still to be put; those that cannot be put further in front
+    // lanes in which it may lie before something; those in which it cannot be put further in front
+    vint lanes = VMASK(own < waiting->furthest), settled = 0;
+    waiting->furthest = fmax(waiting->furthest, own);
     int at = waiting->count;
-    for (int k = waiting->count - 1; k >= 0; k--) {
+    for (int k = waiting->count - 1; k >= 0 && VANY(lanes & ~settled); k--) {
         vfloat other = waiting->z[waiting->order[k]];
         settled |= VMASK(own >= other);
         if (VANY(VMASK(own < other))) {
@@ -102,8 +105,6 @@ static inline void waiting_take(Pixel *pixel, wide nearest, vfloat z, vfloat opa
                 settled = 0;
             }
             at = k;
-        } else if (!VANY(lanes & ~settled)) {
-            break;
         }
     }
     waiting_put(pixel, at, own, opacity, splat, place);

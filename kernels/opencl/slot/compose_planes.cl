@@ -39,27 +39,29 @@ static inline Layer no_layer(void) {
     if (waiting->splat[at] & LAYER) return waiting->layers[at];
 //@ queue_put
     if (splat & LAYER) waiting->layers[at] = pixel->open.mean;
-//@ sorted
+//@ queued
     Seen layers[WAITING + 1];   // an index of a splat that is LAYER + k stands for the k-th
-    uint layer_splats[WAITING + 1], unused_layers;
+    uint layer_splats[WAITING + 1];
+//@ sorted
+    uint unused_layers;
 //@ sorted_start
     waiting->unused_layers = ~0u;
 //@ sorted_take
     if (splat & LAYER) {
         uint at = 31 - clz(waiting->unused_layers & -waiting->unused_layers);
         waiting->unused_layers &= waiting->unused_layers - 1;
-        waiting->layers[at] = pixel->open.mean;
-        waiting->layer_splats[at] = place;
+        waiting->queue->layers[at] = pixel->open.mean;
+        waiting->queue->layer_splats[at] = place;
         splat = LAYER | at;
     }
 //@ sorted_drop
     if (dropped & LAYER) {
         waiting->unused_layers |= 1u << (dropped & ~LAYER);
-        dropped = waiting->layer_splats[dropped & ~LAYER];
+        dropped = waiting->queue->layer_splats[dropped & ~LAYER];
     }
 //@ sorted_composite
     if (splat & LAYER) {
-        composite(pixel, &pixel->waiting.layers[splat & ~LAYER], opacity, VMASK(true), constants);
+        composite(pixel, &pixel->waiting.queue->layers[splat & ~LAYER], opacity, VMASK(true), constants);
         pixel->waiting.unused_layers |= 1u << (splat & ~LAYER);
         return;
     }
