@@ -127,11 +127,9 @@ def test_a_moved_group_is_the_transformed_cloud(renderer):
 def test_blur_is_the_mean_of_its_poses(renderer):
     cloud, camera = random_splats(100, 5, depth=(1, 5), scale=(0.02, 0.3)), CAMERAS["pinhole"]
     shutter = fs.Shutter(time=0.1, exposure_time=0.4, sub_poses=4)
-    frame = renderer.render(cloud, camera, ("rgb", "alpha", "depth"), None, BACKGROUND, MOTION, shutter)
+    frame = renderer.render(cloud, camera, ALL_OUTPUTS, None, BACKGROUND, MOTION, shutter)
     single = [
-        renderer.render(
-            cloud, camera, ("rgb", "alpha", "depth"), None, BACKGROUND, MOTION, fs.Shutter(time=0.1 + t)
-        )
+        renderer.render(cloud, camera, ALL_OUTPUTS, None, BACKGROUND, MOTION, fs.Shutter(time=0.1 + t))
         for t in (-0.15, -0.05, 0.05, 0.15)
     ]
     for name in ("rgb", "alpha"):
@@ -173,10 +171,10 @@ def test_what_bands_leave_out_by_its_sphere_draws_nothing_there(renderer, lowpas
 def test_a_rolling_shutter_takes_each_row_at_its_own_time(renderer):
     cloud, camera = random_splats(100, 6, depth=(1, 5), scale=(0.02, 0.3)), CAMERAS["pinhole"]
     shutter = fs.Shutter(readout=0.8, rows_per_band=1)
-    frame = renderer.render(cloud, camera, motion=MOTION, shutter=shutter)
+    frame = renderer.render(cloud, camera, ALL_OUTPUTS, motion=MOTION, shutter=shutter)
     for row in (0, 17, 44):
         time = 0.8 * ((row + 0.5) / SIZE[1] - 0.5)
-        single = renderer.render(cloud, camera, motion=MOTION, shutter=fs.Shutter(time=time))
+        single = renderer.render(cloud, camera, ALL_OUTPUTS, motion=MOTION, shutter=fs.Shutter(time=time))
         np.testing.assert_allclose(frame["rgb"][row], single["rgb"][row], atol=2e-5)
 
 
