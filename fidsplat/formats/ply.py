@@ -16,7 +16,7 @@ ORIGIN_COMMENT = "fidsplat origin"
 """a header comment of this beginning and three numbers holds the origin that x, y, z are relative to"""
 
 FILTER = "filter_3D"
-"""standard deviation in metres that Mip-Splatting widens a splat by in space, beside its scales in the file"""
+"""standard deviation in metres by which Mip-Splatting widens a splat in space, beside its scales"""
 
 _NEEDED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1")
 _NEEDED += ("rot_0", "rot_1", "rot_2", "rot_3")
