@@ -2,6 +2,7 @@
 origins, quaternions, clouds in one."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -181,22 +182,23 @@ def check_one_footprint(planes: np.ndarray | None, boxes: np.ndarray | None) -> 
         )
 
 
-def joined_arrays(arrays: Sequence[np.ndarray | None], counts: Sequence[int], kind) -> np.ndarray | None:
-    """One array of several clouds' (counts: of their splats), 0 or False where a cloud has none; None if all
-    have none."""
+def joined_arrays(clouds: Sequence[Any], name: str, kind) -> np.ndarray | None:
+    """The arrays of this name of several clouds as one: 0 where a cloud has None; None if all have None."""
+    arrays = [getattr(cloud, name) for cloud in clouds]
     if all(array is None for array in arrays):
         return None
-    pairs = zip(arrays, counts, strict=True)
-    return np.concatenate([np.zeros(count, kind) if array is None else array for array, count in pairs])
+    pairs = zip(arrays, clouds, strict=True)
+    return np.concatenate([np.zeros(len(cloud), kind) if a is None else a for a, cloud in pairs])
 
 
-def joined_planes(ids: Sequence[np.ndarray | None], counts: Sequence[int]) -> np.ndarray | None:
-    """The planes of several clouds, those of different clouds different ones; None if no cloud has any."""
-    if all(each is None for each in ids):
+def joined_planes(clouds: Sequence[Any]) -> np.ndarray | None:
+    """The same of `planes`, whose ids in different clouds are different planes; -1 where a cloud has None."""
+    given = [cloud.planes for cloud in clouds]
+    if all(ids is None for ids in given):
         return None
     joined, first_free = [], 0
-    for own, count in zip(ids, counts, strict=True):
-        planes = np.full(count, -1, np.int32) if own is None else own
-        joined.append(np.where(planes >= 0, planes + first_free, -1).astype(np.int32))
+    for cloud, own in zip(clouds, given, strict=True):
+        ids = np.full(len(cloud), -1, np.int32) if own is None else own
+        joined.append(np.where(ids >= 0, ids + first_free, -1).astype(np.int32))
         first_free = max(first_free, int(joined[-1].max()) + 1)
     return np.concatenate(joined)

@@ -1,6 +1,7 @@
 """SplatCloud: the Gaussian splats of a scene as a structure of arrays, checked once and then frozen."""
 
 import warnings
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -363,10 +364,7 @@ class SplatCloud(PickledByFields, Summarised):
         for cloud in clouds:
             if not isinstance(cloud, SplatCloud):
                 raise InputError(f"concatenate takes a list of SplatCloud, not of {type(cloud).__name__}")
-        dropped: dict[str, int] = {}
-        for cloud in clouds:
-            for reason, count in cloud.dropped.items():
-                dropped[reason] = dropped.get(reason, 0) + count
+        dropped = dict(sum((Counter(cloud.dropped) for cloud in clouds), Counter[str]()))
         filled = [cloud for cloud in clouds if len(cloud)]
         if not filled:
             return (clouds[0] if clouds else SplatCloud.empty())._replaced(dropped=dropped)
@@ -386,10 +384,8 @@ class SplatCloud(PickledByFields, Summarised):
             colors, sh = np.concatenate([cloud.colors for cloud in filled if cloud.colors is not None]), None
         else:
             colors, sh = None, np.concatenate([_sh_of_degree(cloud, degree) for cloud in filled])
-        counts = [len(cloud) for cloud in filled]
-        joined["planes"] = joined_planes([cloud.planes for cloud in filled], counts)
-        joined["boxes"] = joined_arrays([cloud.boxes for cloud in filled], counts, bool)
-        joined["thickness"] = joined_arrays([cloud.thickness for cloud in filled], counts, F32)
+        joined |= {"planes": joined_planes(filled), "boxes": joined_arrays(filled, "boxes", bool)}
+        joined["thickness"] = joined_arrays(filled, "thickness", F32)
         return first._replaced(**joined, colors=colors, sh=sh, dropped=dropped)
 
 

@@ -9,6 +9,7 @@ from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture, compare, draw
 from fidsplat.hard_cases.agreement import truth_of as draw_truth
 from fidsplat.quality import Quality
 from fidsplat.random_clouds import random_splats
+from fidsplat.splats import SplatCloud
 
 __all__ = [
     "ALL_OUTPUTS",
@@ -17,6 +18,7 @@ __all__ = [
     "compare",
     "random_splats",
     "reference_pixels",
+    "some_thick",
     "truth_of",
 ]
 
@@ -50,3 +52,10 @@ def assert_agrees(renderer, cloud, camera, outputs=ALL_OUTPUTS, quality=None, ba
     differences = compare(frame, truth, outputs)
     assert all(difference.agrees for difference in differences), differences
     return frame
+
+
+def some_thick(cloud, thickness):
+    """The cloud with 3D Gaussians where the thickness (n,) is above 0."""
+    scales = np.column_stack([cloud.scales, thickness])
+    arrays = (cloud.means, cloud.quats, scales, cloud.opacities)
+    return SplatCloud(*arrays, colors=cloud.colors, sh=cloud.sh, labels=cloud.labels, origin=cloud.origin)

@@ -153,7 +153,7 @@ def test_outside_the_lens_is_background(renderer):
     frame = renderer.render(
         random_splats(100, 3, scale=(1.0, 9.0)),
         camera,
-        outputs=("rgb", "alpha", "label"),
+        outputs=ALL_OUTPUTS,
         background=(0.2, 0.4, 0.6),
     )
     x, y = np.meshgrid(np.arange(70) + 0.5 - 35, np.arange(66) + 0.5 - 33)
@@ -199,8 +199,7 @@ def test_a_slight_distortion_is_nearly_a_pinhole(renderer):
     cloud = random_splats(200, 1, depth=(0.5, 6.0), scale=(0.02, 0.3))
     plain, bent = seen_through(None), seen_through(BrownConrady(k1=1e-7))
     assert bent.lens is not None
-    outputs = ("rgb", "depth", "normal")
-    a, b = (renderer.render(cloud, camera, outputs) for camera in (plain, bent))
+    a, b = (renderer.render(cloud, camera, ALL_OUTPUTS) for camera in (plain, bent))
     for name in ("rgb", "normal"):
         assert np.quantile(np.abs(a[name] - b[name]), 0.999) < 1e-3
     assert np.quantile(np.abs(a["depth"] - b["depth"]), 0.999) < 1e-2
@@ -210,11 +209,11 @@ def test_depths_of_a_fisheye_are_distances(renderer):
     """A wall at z = 2: the distance grows as 1 / cos; along z with parallel rays it is 2."""
     wall = fs.SplatCloud([[0, 0, 2]], [[1, 0, 0, 0]], [[50, 50]], [1.0], colors=[[1, 1, 1]])
     fisheye = fs.Camera.fisheye(101, 101, math.radians(120))
-    depth = renderer.render(wall, fisheye, "depth")["depth"]
+    depth = renderer.render(wall, fisheye, ALL_OUTPUTS)["depth"]
     angles = np.radians((np.arange(101) + 0.5 - 50.5) * 120 / 101)
     np.testing.assert_allclose(depth[50], 2 / np.cos(angles), rtol=1e-5)
     parallel = fs.Camera.orthographic(64, 48, 4.0)
-    np.testing.assert_allclose(renderer.render(wall, parallel, "depth")["depth"], 2, rtol=1e-5)
+    np.testing.assert_allclose(renderer.render(wall, parallel, ALL_OUTPUTS)["depth"], 2, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["fisheye", "parallel"])

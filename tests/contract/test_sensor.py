@@ -43,7 +43,7 @@ SENSORS = {
 @in_turn()
 @pytest.mark.parametrize("name", SENSORS)
 def test_steps_of_the_sensor(renderer, name):
-    agree(renderer, Picture(CLOUD, CAMERA, sensor=SENSORS[name]))
+    agree(renderer, Picture(CLOUD, CAMERA, outputs=("rgb",), sensor=SENSORS[name]))
 
 
 @pytest.mark.parametrize("name", ["all", "vignetting"])

@@ -72,7 +72,7 @@ HOME_OF = {
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
     "warp": ("backends.warp",),
-    "mujoco": ("sim.mujoco",),
+    "mujoco": ("sim.mujoco", "sim.robot"),
     "gymnasium": ("sim.gymnasium",),
     "mcap": ("logs",),
     "rosbags": ("logs",),
