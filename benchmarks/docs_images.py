@@ -30,7 +30,7 @@ def save(sheet: Path, name: str) -> None:
 
 def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
-        subprocess.run([sys.executable, "-m", "fidsplat.cli", "demo", "--out", folder], check=True)
+        subprocess.run([sys.executable, "-m", "fidsplat", "demo", "--out", folder], check=True)
         save(Path(folder) / "contact-sheet.png", "demo.jpg")
         for scene in sys.argv[1:]:
             script = str(HERE / "real_scene.py")

@@ -73,7 +73,7 @@ def first_frame(scene: str, device: str, folder: Path) -> dict[str, float]:
 def warm(device: str, folder: Path) -> float:
     """Seconds that `fidsplat warm` takes with empty caches."""
     begun = time.time()
-    command = [sys.executable, "-m", "fidsplat.cli", "warm", "--device", device]
+    command = [sys.executable, "-m", "fidsplat", "warm", "--device", device]
     subprocess.run(command, capture_output=True, check=True, env=caches_in(folder))
     return time.time() - begun
 

@@ -4,6 +4,7 @@ Names are loaded on first use, so that ``import fidsplat`` imports no OpenCL, sh
 """
 
 from importlib import import_module
+from typing import Any
 
 __version__ = "0.1.0"
 
@@ -31,6 +32,8 @@ _HOME = {
     "marker": "fidsplat.markers",
     "load_ply": "fidsplat.formats",
     "save_ply": "fidsplat.formats",
+    "load_splats": "fidsplat.formats",
+    "save_splats": "fidsplat.formats",
     "load_trajectory": "fidsplat.formats",
     "save_trajectory": "fidsplat.formats",
     "Renderer": "fidsplat.render",
@@ -48,7 +51,7 @@ _PACKAGES = ("train",)
 __all__ = ["__version__", *sorted(_HOME), *_PACKAGES]
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     if name in _PACKAGES:
         return import_module(f"fidsplat.{name}")
     home = _HOME.get(name)

@@ -1,5 +1,8 @@
 """What the arrays of a SplatCloud are made of: checks of what users give, splats that cannot be drawn, types,
-origins, quaternions."""
+origins, quaternions, clouds in one."""
+
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -177,3 +180,25 @@ def check_one_footprint(planes: np.ndarray | None, boxes: np.ndarray | None) -> 
             f"plane {both[0]} has boxes and Gaussians, whose coverage follows different rules; "
             "give each kind a plane"
         )
+
+
+def joined_arrays(clouds: Sequence[Any], name: str, kind) -> np.ndarray | None:
+    """The arrays of this name of several clouds as one: 0 where a cloud has None; None if all have None."""
+    arrays = [getattr(cloud, name) for cloud in clouds]
+    if all(array is None for array in arrays):
+        return None
+    pairs = zip(arrays, clouds, strict=True)
+    return np.concatenate([np.zeros(len(cloud), kind) if a is None else a for a, cloud in pairs])
+
+
+def joined_planes(clouds: Sequence[Any]) -> np.ndarray | None:
+    """The same of `planes`, whose ids in different clouds are different planes; -1 where a cloud has None."""
+    given = [cloud.planes for cloud in clouds]
+    if all(ids is None for ids in given):
+        return None
+    joined, first_free = [], 0
+    for cloud, own in zip(clouds, given, strict=True):
+        ids = np.full(len(cloud), -1, np.int32) if own is None else own
+        joined.append(np.where(ids >= 0, ids + first_free, -1).astype(np.int32))
+        first_free = max(first_free, int(joined[-1].max()) + 1)
+    return np.concatenate(joined)

@@ -1,6 +1,7 @@
 """SplatCloud: the Gaussian splats of a scene as a structure of arrays, checked once and then frozen."""
 
 import warnings
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -15,6 +16,8 @@ from fidsplat.cloud_arrays import (
     choose_origin,
     drop_report,
     find_defects,
+    joined_arrays,
+    joined_planes,
     real_numbers,
     rows_beyond,
     unit_quaternions,
@@ -361,10 +364,7 @@ class SplatCloud(PickledByFields, Summarised):
         for cloud in clouds:
             if not isinstance(cloud, SplatCloud):
                 raise InputError(f"concatenate takes a list of SplatCloud, not of {type(cloud).__name__}")
-        dropped: dict[str, int] = {}
-        for cloud in clouds:
-            for reason, count in cloud.dropped.items():
-                dropped[reason] = dropped.get(reason, 0) + count
+        dropped = dict(sum((Counter(cloud.dropped) for cloud in clouds), Counter[str]()))
         filled = [cloud for cloud in clouds if len(cloud)]
         if not filled:
             return (clouds[0] if clouds else SplatCloud.empty())._replaced(dropped=dropped)
@@ -384,29 +384,9 @@ class SplatCloud(PickledByFields, Summarised):
             colors, sh = np.concatenate([cloud.colors for cloud in filled if cloud.colors is not None]), None
         else:
             colors, sh = None, np.concatenate([_sh_of_degree(cloud, degree) for cloud in filled])
-        joined |= {"planes": _joined_planes(filled), "boxes": _joined(filled, "boxes", bool)}
-        joined["thickness"] = _joined(filled, "thickness", F32)
+        joined |= {"planes": joined_planes(filled), "boxes": joined_arrays(filled, "boxes", bool)}
+        joined["thickness"] = joined_arrays(filled, "thickness", F32)
         return first._replaced(**joined, colors=colors, sh=sh, dropped=dropped)
-
-
-def _joined(clouds: Sequence[SplatCloud], name: str, kind) -> np.ndarray | None:
-    """An array that clouds may lack, whose splats then have 0 or False; None if all lack it."""
-    arrays = [getattr(cloud, name) for cloud in clouds]
-    if all(array is None for array in arrays):
-        return None
-    pairs = zip(arrays, clouds, strict=True)
-    return np.concatenate([np.zeros(len(cloud), kind) if a is None else a for a, cloud in pairs])
-
-
-def _joined_planes(clouds: Sequence[SplatCloud]) -> np.ndarray | None:
-    if all(cloud.planes is None for cloud in clouds):
-        return None
-    joined, first_free = [], 0
-    for cloud in clouds:
-        ids = np.full(len(cloud), -1, np.int32) if cloud.planes is None else cloud.planes
-        joined.append(np.where(ids >= 0, ids + first_free, -1).astype(np.int32))
-        first_free = max(first_free, int(joined[-1].max()) + 1)
-    return np.concatenate(joined)
 
 
 def _sh_of_degree(cloud: SplatCloud, degree: int) -> np.ndarray:

@@ -5,31 +5,46 @@ import pickle
 
 import numpy as np
 
-from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture, compare
+from fidsplat.hard_cases.agreement import ALL_OUTPUTS, Picture, compare, draw
 from fidsplat.hard_cases.agreement import truth_of as draw_truth
 from fidsplat.quality import Quality
 from fidsplat.random_clouds import random_splats
+from fidsplat.splats import SplatCloud
 
-__all__ = ["ALL_OUTPUTS", "assert_agrees", "compare", "random_splats", "reference_pixels", "truth_of"]
+__all__ = [
+    "ALL_OUTPUTS",
+    "against_reference",
+    "assert_agrees",
+    "compare",
+    "random_splats",
+    "reference_pixels",
+    "some_thick",
+    "truth_of",
+]
 
 _TRUTHS: dict[bytes, dict[str, np.ndarray]] = {}
 
 
 def truth_of(picture, pixels=None):
-    """The reference's planes. It is drawn once for all devices: it takes longer than any of them."""
+    """The reference's images. They are drawn once for all devices: they take longer than on any of them."""
     key = hashlib.sha256(pickle.dumps((picture, pixels))).digest()
     if key not in _TRUTHS:
         _TRUTHS[key] = draw_truth(picture, pixels)
     return _TRUTHS[key]
 
 
+def against_reference(renderer, picture):
+    """Draw a picture on a device and compare every output with the reference."""
+    return compare(draw(renderer, picture), truth_of(picture), picture.outputs)
+
+
 def reference_pixels(cloud, camera, outputs, quality, background=(0.0, 0.0, 0.0), pixels=None):
-    """Reference planes with the certificate: whole, or at `pixels` = (rows, columns)."""
+    """Reference images with the certificate: whole, or at `pixels` = (rows, columns)."""
     return truth_of(Picture(cloud, camera, Quality.of(quality), tuple(outputs), background), pixels)
 
 
 def assert_agrees(renderer, cloud, camera, outputs=ALL_OUTPUTS, quality=None, background=(0.1, 0.2, 0.3)):
-    """Draw with a device and with the reference and compare every plane; returns the frame."""
+    """Draw with a device and with the reference and compare every output; returns the frame."""
     picture = Picture(cloud, camera, Quality.of(quality), tuple(outputs), background)
     frame = renderer.render(cloud, camera, outputs, picture.quality, background)
     truth = truth_of(picture)
@@ -37,3 +52,10 @@ def assert_agrees(renderer, cloud, camera, outputs=ALL_OUTPUTS, quality=None, ba
     differences = compare(frame, truth, outputs)
     assert all(difference.agrees for difference in differences), differences
     return frame
+
+
+def some_thick(cloud, thickness):
+    """The cloud with 3D Gaussians where the thickness (n,) is above 0."""
+    scales = np.column_stack([cloud.scales, thickness])
+    arrays = (cloud.means, cloud.quats, scales, cloud.opacities)
+    return SplatCloud(*arrays, colors=cloud.colors, sh=cloud.sh, labels=cloud.labels, origin=cloud.origin)

@@ -7,6 +7,7 @@ from certificates import (  # noqa: F401 (hooks)
     pytest_sessionfinish,
     pytest_terminal_summary,
 )
+from sampling import take_turns
 
 import fidsplat as fs
 
@@ -20,6 +21,11 @@ def pytest_generate_tests(metafunc):
         backend = getattr(metafunc.module, "BACKEND", "")
         names = [info.name for info in USABLE if info.name.startswith(backend)]
         metafunc.parametrize("renderer", names, indirect=True, scope="session")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    take_turns(items, [info.name for info in USABLE if info.kind == "cpu"])
 
 
 @pytest.fixture(scope="session")

@@ -27,3 +27,25 @@ def alternate(*axes: Mapping[str, object]) -> list:
         rest = pytest.mark.exhaustive if sum(places) % 2 else ()
         cases.append(pytest.param(*values, id="-".join(picked), marks=rest))
     return cases
+
+
+def in_turn(first: int = 0):
+    """Marks a test whose first case runs on the processor's device number `first` (modulo their number), the
+    next case on the next device, and so on; what this leaves out is `exhaustive`. GPUs run all cases."""
+    return pytest.mark.in_turn(first)
+
+
+def take_turns(items: Sequence[pytest.Item], devices: Sequence[str]) -> None:
+    """Marks what `in_turn` leaves out of these tests. devices: the processor's."""
+    cases: dict[str, dict[str, int]] = {}
+    for item in items:
+        mark, call = item.get_closest_marker("in_turn"), getattr(item, "callspec", None)
+        if mark is None or call is None or item.get_closest_marker("exhaustive"):
+            continue
+        device = call.params.get("renderer")
+        if device not in devices:
+            continue
+        seen = cases.setdefault(item.nodeid.partition("[")[0], {})
+        turn = seen.setdefault(call.id.replace(device, "", 1), len(seen)) + mark.args[0]
+        if turn % len(devices) != devices.index(device):
+            item.add_marker(pytest.mark.exhaustive)

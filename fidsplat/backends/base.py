@@ -425,7 +425,7 @@ class Trains(Protocol):
 
 
 @runtime_checkable
-class Differentiates(Protocol):
+class Differentiates(Backend, Protocol):
     """A backend that has derivatives of its pictures."""
 
     def differentiate(self, features: FeatureSet) -> DifferentiablePipeline:

@@ -11,7 +11,7 @@ from fidsplat.backends.view import FAR_EYE, View
 
 _SHARED = (
     *("width", "height", "samples", "log_cut", "ceiling", "stop", "background", "first_light", "sensor"),
-    *("fog_density", "surroundings", "along_ray", "parallel"),
+    *("fog_density", "surroundings", "layer", "along_ray", "parallel"),
 )
 _OWN = ("focal_x", "focal_y", "center_x", "center_y", "near", "far", "slopes")
 
@@ -55,11 +55,6 @@ class ViewStack:
     def __len__(self) -> int:
         """Views."""
         return self.translation.shape[1]
-
-    @staticmethod
-    def of_one(view: View) -> ViewStack:
-        """A stack of one."""
-        return ViewStack._of([view], {})
 
     @staticmethod
     def of(views: Sequence[View]) -> ViewStack | None:

@@ -7,6 +7,7 @@ Nothing heavy is imported before ``run``, so that help and errors come at once.
 
 from fidsplat.commands.bench import Bench
 from fidsplat.commands.check import Check
+from fidsplat.commands.convert import Convert
 from fidsplat.commands.demo import Demo
 from fidsplat.commands.detect import Detect
 from fidsplat.commands.devices import Devices
@@ -31,6 +32,7 @@ COMMANDS = {
     "view": View,
     "fly": Fly,
     "detect": Detect,
+    "convert": Convert,
     "check": Check,
     "bench": Bench,
     "tradeoff": Tradeoff,

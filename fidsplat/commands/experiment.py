@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from fidsplat.commands.experiment_files import CATEGORY_HELP, write_report
+from fidsplat.commands.localise import Localise
 from fidsplat.commands.output import Json, console, option, say, switch, tell
 from fidsplat.commands.sweeps import Names, Overwrite, Seed, need_reports, run_sweeps
 from fidsplat.errors import InputError
@@ -260,6 +261,7 @@ class Experiment:
         "views": Views,
         "counts": Counts,
         "localisation": Localisation,
+        "localise": Localise,
         "pictures": Pictures,
         "dataset": Dataset,
         "baseline": Baseline,

@@ -34,14 +34,14 @@ class Info:
       fidsplat info scene.ply --json
     """
 
-    file: Annotated[tyro.conf.Positional[str], option("FILE.ply", "a splat file")]
+    file: Annotated[tyro.conf.Positional[str], option("FILE", "a splat file: PLY, .splat, SPZ, glTF, USD")]
     json: Json = False
 
     def run(self) -> int:
         import fidsplat as fs
 
         with late_progress(console(True)) as progress:
-            cloud = fs.load_ply(self.file, progress)
+            cloud = fs.load_splats(self.file, progress)
         facts = {"file": self.file, "bytes": Path(self.file).stat().st_size, **describe(cloud)}
         if self.json:
             print_json(facts)

@@ -196,6 +196,7 @@ def load_source(source: str, quality: str | None, progress: "Progress") -> "Scen
     """
     import fidsplat as fs
     from fidsplat.commands.framing import framing_camera
+    from fidsplat.formats.files import FORMATS
 
     suffix = Path(source).suffix.lower()
     if suffix == ".toml":
@@ -205,7 +206,7 @@ def load_source(source: str, quality: str | None, progress: "Progress") -> "Scen
                 f"{source} has no [camera] table; add one with width, height, fov_x_deg, position, look_at"
             )
         return scene
-    if suffix == ".ply":
-        cloud = fs.load_ply(source, progress)
+    if suffix in FORMATS:
+        cloud = fs.load_splats(source, progress)
         return fs.Scene([cloud], camera=framing_camera(cloud))
     raise InputError(f"cannot draw {source}: give a scene file (.toml) or a splat file (.ply)")

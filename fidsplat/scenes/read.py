@@ -12,7 +12,7 @@ import numpy as np
 from fidsplat.cameras import Camera, Trajectory, look_at_matrix
 from fidsplat.errors import InputError
 from fidsplat.files import path_of
-from fidsplat.formats import Progress, load_ply
+from fidsplat.formats import Progress, load_splats
 from fidsplat.quality import MarkerQuality, Quality, knobs
 from fidsplat.rotations import rigid_matrix
 from fidsplat.scenes.camera import POSE, TABLES, read_focal_lengths, read_keyframes, read_lens, read_shutter
@@ -58,7 +58,7 @@ def read_scene(
     """What `SceneParts` takes, from a scene file and from the splat and image files that it names, which are
     looked for beside it.
 
-    quality: instead of the file's; markers are made with it too. progress: as `load_ply` takes it.
+    quality: instead of the file's; markers are made with it too. progress: as `load_splats` takes it.
 
     Raises InputError, naming the file and the key, for whatever is wrong.
     """
@@ -171,7 +171,7 @@ def _splats(table: Table, folder: Path, progress: Progress | None) -> tuple[Spla
     if motion is not None:
         motion = Trajectory(motion.times, motion.poses @ np.linalg.inv(_pose(table)))
     with table.at("file"):
-        cloud = load_ply(folder / name, progress)
+        cloud = load_splats(folder / name, progress)
         moved = any(key in table for key in ("position", "quaternion", "scale"))
         return (cloud.transformed(pose) if moved else cloud), motion
 

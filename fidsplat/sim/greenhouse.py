@@ -164,7 +164,8 @@ class Greenhouse:
             for row, y in enumerate(self.middles)
         )
         return (
-            '<mujoco model="greenhouse">\n  <option timestep="0.002" cone="elliptic" impratio="10"/>\n'
+            '<mujoco model="greenhouse">\n'
+            '  <option timestep="0.002" integrator="implicitfast" cone="elliptic" impratio="10"/>\n'
             f'  <worldbody>\n    <geom name="floor" type="plane" size="0 0 1"/>\n{boxes}\n{robot}'
             "  </worldbody>\n</mujoco>\n"
         )

@@ -70,7 +70,7 @@ static inline void pixel_blend(Pixel *pixel, const Splat *s, Crossing c, vint ma
 //@@ compose
 }
 
-// Writes LANES pixels at `at` of planes of `plane` samples.
+// Writes LANES pixels at `at` of each channel of `raw`, which are `plane` samples long.
 #define PIXEL_STORE_BASE(pixel, raw, plane, at) \
     VSTORE((pixel)->r, raw + (at)); \
     VSTORE((pixel)->g, raw + (plane) + (at)); \

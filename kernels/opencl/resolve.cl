@@ -1,5 +1,5 @@
 // Index space: one work-item per pixel of the picture (x, y) and view.
-// Reads:  raw (4 planes) and the outputs' samples. Writes: rgb (h, w, 3) and the outputs asked for.
+// Reads:  raw (4 channels) and the outputs' samples. Writes: rgb (h, w, 3) and the outputs asked for.
 kernel void resolve(
 //@@ arguments resolve
 ) {

@@ -72,6 +72,18 @@ def make_waiting(Pixel, composite, see_of, layer: SimpleNamespace | None, room: 
         return p
 
     @wp.func
+    def shown_at(
+        p: Pixel, z: float, place: int, lines: wp.array(dtype=wp.vec4), lists: wp.array(dtype=wp.int32)
+    ):
+        """What waits at this place of the list shows."""
+        if wp.static(layered):
+            if place == _FIRST:
+                return shown(p.queue.first)
+            if place == _SECOND:
+                return shown(p.queue.second)
+        return see_of(lines, lists[place], z)
+
+    @wp.func
     def composite_at(
         pixel: Pixel,
         z: float,
@@ -83,14 +95,9 @@ def make_waiting(Pixel, composite, see_of, layer: SimpleNamespace | None, room: 
     ):
         """The pixel with what waited at this place of the list."""
         p = pixel
-        if place >= 0:
-            p = composite(p, see_of(lines, lists[place], z), opacity, view)
-        if wp.static(layered):
-            if place == _FIRST:
-                p = composite(p, shown(p.queue.first), opacity, view)
-            if place == _SECOND:
-                p = composite(p, shown(p.queue.second), opacity, view)
-        return without(p, place)
+        if place != _NOTHING:
+            p = without(composite(p, shown_at(p, z, place, lines, lists), opacity, view), place)
+        return p
 
     @wp.func
     def list_place(p: Pixel, place: int) -> int:

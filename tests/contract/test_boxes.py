@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, assert_agrees, random_splats
+from sampling import SAMPLES, alternate
 
 import fidsplat as fs
 from fidsplat.rotations import quaternion_to_matrix
@@ -133,7 +134,7 @@ def test_light_is_conserved(renderer):
     for _ in range(20):
         cx, cy = 20 + generator.uniform(0, 1, 2)
         camera = fs.Camera.pinhole(40, 40, 100.0, 100.0, cx, cy)
-        areas.append(float(renderer.render(cloud, camera, "alpha", EXACT)["alpha"].sum()))
+        areas.append(float(renderer.render(cloud, camera, ALL_OUTPUTS, EXACT)["alpha"].sum()))
     corners = fs.Camera.pinhole(40, 40, 100.0, 100.0, 20, 20).project(corners_of(cloud))
     x, y = corners.T
     area = abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2
@@ -155,12 +156,11 @@ def test_boxes_end_at_the_near_plane(renderer):
     cloud = random_splats(80, seed=2, depth=(-1.0, 4.0), scale=(0.1, 1.0), across=1.0).with_boxes()
     near = replace(SMALL, near=1.5)
     frame = assert_agrees(renderer, cloud, near)
-    whole = renderer.render(cloud, SMALL)
+    whole = renderer.render(cloud, SMALL, ALL_OUTPUTS)
     assert np.abs(frame["rgb"] - whole["rgb"]).max() > 0.1
 
 
-@pytest.mark.parametrize("lowpass", ["none", "screen"])
-@pytest.mark.parametrize("samples", [1, 2])
+@pytest.mark.parametrize(("lowpass", "samples"), alternate({"none": "none", "screen": "screen"}, SAMPLES))
 def test_a_scene_of_both_footprints(renderer, lowpass, samples):
     cloud = random_splats(150, seed=4, depth=(-0.5, 6.0))
     mixed = cloud.with_boxes(np.arange(150) % 3 == 0)
@@ -174,12 +174,10 @@ def test_the_footprint_is_a_choice_of_each_splat(renderer):
     cloud = random_splats(40, seed=9, depth=(1.0, 4.0))
     behind = random_splats(1, seed=2, depth=(50.0, 51.0))
     for kind in (False, True):
-        alone = renderer.render(fs.SplatCloud.concatenate([cloud.with_boxes(kind)]), CAMERA, quality=EXACT)[
-            "rgb"
-        ]
+        alone = renderer.render(cloud.with_boxes(kind), CAMERA, ALL_OUTPUTS, EXACT)["rgb"]
         culled = fs.SplatCloud.concatenate([cloud.with_boxes(kind), hidden(behind).with_boxes(not kind)])
         assert culled.footprint == "mixed"
-        assert np.array_equal(renderer.render(culled, CAMERA, quality=EXACT)["rgb"], alone)
+        assert np.array_equal(renderer.render(culled, CAMERA, ALL_OUTPUTS, EXACT)["rgb"], alone)
 
 
 def hidden(cloud):

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from agreement import assert_agrees, random_splats, reference_pixels
-from sampling import SAMPLES, alternate
+from agreement import ALL_OUTPUTS, assert_agrees, random_splats, reference_pixels
+from sampling import SAMPLES, alternate, in_turn
 from test_boxes import EXACT, boxes_of, cut
 from test_lens_pictures import CAMERAS
 
@@ -58,7 +58,8 @@ def test_boxes_much_larger_than_the_picture(renderer, camera):
     assert_agrees(renderer, cloud.with_boxes(), camera, quality=EXACT)
 
 
-# those that test_layers of test_lens_pictures.py leaves out
+# those that test_layers of test_lens_pictures.py leaves out, each on another device
+@in_turn(1)
 @pytest.mark.parametrize(("camera", "samples"), alternate(CAMERAS, dict(reversed(SAMPLES.items()))))
 def test_boxes_and_gaussians_in_layers(renderer, camera, samples):
     pose = np.eye(4)
@@ -83,8 +84,8 @@ def test_a_small_box_is_listed_for_few_tiles(renderer, camera):
     cloud = random_splats(300, 2, depth=(0.8, 4.0), scale=(0.01, 0.04), across=0.8)
     turns = np.random.default_rng(1).uniform(-0.15, 0.15, (300, 4)) + np.array([1, 0, 0, 0])
     cloud = fs.SplatCloud(cloud.means, turns, cloud.scales, np.ones(300), colors=cloud.colors)
-    boxes = renderer.render(cloud.with_boxes(), camera, quality=EXACT)
-    disks = renderer.render(cloud, camera, quality=EXACT.with_(alpha_cutoff=1 / 255))
+    boxes = renderer.render(cloud.with_boxes(), camera, ALL_OUTPUTS, EXACT)
+    disks = renderer.render(cloud, camera, ALL_OUTPUTS, EXACT.with_(alpha_cutoff=1 / 255))
     assert boxes.stats["visible"] > 50
     assert boxes.stats["pairs"] < 1.2 * disks.stats["pairs"]
 
@@ -150,15 +151,17 @@ def test_light_is_that_of_the_image(renderer, camera, size):
     grid = np.stack(np.meshgrid(np.arange(8), np.arange(8)), 2).reshape(-1, 2)
     for shift in (grid + np.random.default_rng(0).uniform(0, 1, (64, 2))) / 8:
         moved = replace(looking, cx=looking.cx + shift[0], cy=looking.cy + shift[1])
-        areas.append(float(renderer.render(box, moved, "alpha", EXACT)["alpha"].sum()))
+        areas.append(float(renderer.render(box, moved, ALL_OUTPUTS, EXACT)["alpha"].sum()))
     assert np.mean(areas) == pytest.approx(area, rel=0.03)
 
 
-def test_boxes_through_lenses_in_single_precision(renderer):
+# each on a device on which test_lens_pictures.py does not have that lens
+@in_turn(1)
+@pytest.mark.parametrize("name", ["distortion", "fisheye", "panorama"])
+def test_boxes_through_lenses_in_single_precision(renderer, name):
     """The set-up of devices without float64, held as Gaussians are: to a tenth of an 8-bit step."""
     cloud = random_splats(100, 0, depth=(0.5, 6.0)).with_boxes()
-    for name in ("distortion", "fisheye", "panorama"):
-        frame = renderer.render(cloud, CAMERAS[name], quality="fast")
-        truth = reference_pixels(cloud, CAMERAS[name], ("rgb",), "fast")
-        excess = np.abs(frame["rgb"] - truth["rgb"]).max(2) - truth["certificate"]
-        assert np.quantile(excess, 0.995) < 0.1 / 255
+    frame = renderer.render(cloud, CAMERAS[name], quality="fast")
+    truth = reference_pixels(cloud, CAMERAS[name], ("rgb",), "fast")
+    excess = np.abs(frame["rgb"] - truth["rgb"]).max(2) - truth["certificate"]
+    assert np.quantile(excess, 0.995) < 0.1 / 255

@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from agreement import random_splats
-from sampling import SAMPLES, alternate
+from agreement import against_reference, random_splats
+from sampling import SAMPLES, alternate, in_turn
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.effects import select
-from fidsplat.hard_cases.agreement import Picture, against_reference, compare
+from fidsplat.hard_cases.agreement import Picture, compare
 
 SIZE = (41, 29)
 CLOUD = random_splats(120, 21, depth=(0.5, 5.0), scale=(0.02, 0.4))
@@ -31,7 +31,7 @@ CAMERAS = {
     "parallel": fs.Camera.orthographic(*SIZE, 4.0),
 }
 ALONG = {name: camera for name, camera in CAMERAS.items() if name != "distortion"}
-OUTPUTS = ("depth_first", "normal_world", "splat_id", "blended")
+OUTPUTS = ("depth", "distance", "depth_first", "normal_world", "splat_id", "blended")
 BLUR = fs.Shutter(exposure_time=0.4, sub_poses=3)
 WARP = next((info.name for info in fs.devices() if info.usable and info.name.startswith("warp")), None)
 ROLLING = fs.Shutter(time=0.1, exposure_time=0.2, sub_poses=2, readout=0.4, rows_per_band=8)
@@ -56,11 +56,13 @@ def assert_agrees(renderer, **picture):
     assert all(difference.agrees for difference in differences), differences
 
 
+@in_turn()
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 def test_outputs_and_sensors_behind_every_lens(renderer, camera):
     assert_agrees(renderer, camera=camera, outputs=("rgb", *OUTPUTS), sensor=SENSOR)
 
 
+@in_turn(1)
 @pytest.mark.parametrize(("camera", "samples"), alternate(CAMERAS, SAMPLES))
 def test_fog_and_distances_behind_lenses(renderer, camera, samples):
     outputs = ("rgb", "distance", "distance_median", "distance_first")
@@ -68,13 +70,16 @@ def test_fog_and_distances_behind_lenses(renderer, camera, samples):
     assert_agrees(renderer, camera=camera, outputs=outputs, quality=quality, fog=FOG)
 
 
+# where test_outputs_and_sensors_behind_every_lens has compiled it
+@in_turn(1)
 @pytest.mark.parametrize("name", ALONG)
 def test_distances_are_depths_where_depths_are_along_the_ray(renderer, name):
-    frame = renderer.render(CLOUD, ALONG[name], ("depth", "distance"))
+    frame = renderer.render(CLOUD, ALONG[name], ("rgb", *OUTPUTS), sensor=SENSOR)
     assert frame["depth"].max() > 0.5
     assert np.array_equal(frame["depth"], frame["distance"])
 
 
+@in_turn()
 @pytest.mark.parametrize(
     ("around", "shutter"),
     alternate(
@@ -117,6 +122,7 @@ def test_fog_is_averaged_over_the_poses_of_a_shutter(renderer):
     assert np.allclose(both, (near + none) / 2, atol=1e-5)
 
 
+@in_turn()
 @pytest.mark.parametrize(
     ("camera", "behind", "samples"), alternate(CAMERAS, {"sky": SKY, "panorama": PANORAMA}, SAMPLES)
 )

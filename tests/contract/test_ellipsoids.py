@@ -4,11 +4,12 @@ import math
 
 import numpy as np
 import pytest
-from agreement import assert_agrees, random_splats
+from agreement import against_reference, assert_agrees, random_splats
+from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.hard_cases import fuzz
-from fidsplat.hard_cases.agreement import RARE, against_reference
+from fidsplat.hard_cases.agreement import RARE
 
 CAMERA = fs.Camera.pinhole(97, 71, 70.0, 70.0, 48.0, 36.0, near=0.05)
 
@@ -131,11 +132,15 @@ def test_a_flat_ellipsoid_is_a_disk(renderer):
     assert -10 * math.log10(max(float((error**2).mean()), 1e-20)) > 80
 
 
-@pytest.mark.parametrize("scenes", [6, pytest.param(1000, marks=pytest.mark.exhaustive)])
-def test_random_hard_scenes(renderer, scenes):
+REST = pytest.param(range(6, 1000), marks=pytest.mark.exhaustive)
+
+
+@in_turn()
+@pytest.mark.parametrize("seeds", [range(3), range(3, 6), REST], ids="{0.start} to {0.stop}".format)
+def test_random_hard_scenes(renderer, seeds):
     """The fuzzer's splats with a third scale; 1000 scenes have 100,000. `pytest -s` shows the figures."""
     worst, splats, pixels, risky = {}, 0, 0, 0.0
-    for seed in range(scenes):
+    for seed in seeds:
         picture = fuzz.thick_scene_of(seed)
         found = against_reference(renderer, picture)
         assert all(one.finite and one.excess <= 0 for one in found), (seed, found)

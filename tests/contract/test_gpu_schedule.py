@@ -9,6 +9,7 @@ import multiprocessing
 import numpy as np
 import pytest
 from agreement import random_splats, truth_of
+from sampling import in_turn
 from test_lens_pictures import CAMERAS
 
 import fidsplat as fs
@@ -47,6 +48,7 @@ PICTURES = {
 }
 
 
+@in_turn()
 @pytest.mark.parametrize("name", PICTURES)
 def test_the_schedule_of_gpus_agrees_with_the_reference(renderer, name):
     picture = PICTURES[name]()

@@ -33,9 +33,9 @@ def opencl(renderer):
     ],
     ids=["around", "dense", "sh", "planes"],
 )
-def test_blending_in_double_leaves_the_rounding_of_the_planes_alone(opencl, cloud, samples):
-    """No certificate here: what float32 might change, double does not. A plane of samples is rounded when it
-    is written, and their sum and the background once more each."""
+def test_blending_in_double_leaves_the_rounding_of_what_is_written_alone(opencl, cloud, samples):
+    """No certificate here: what float32 might change, double does not. A sample buffer is rounded when it
+    is written, and the sum of the samples and the background once more each."""
     if not opencl.device.float64:
         pytest.skip("the device has no float64")
     quality = DOUBLE.with_(samples=samples)

@@ -141,11 +141,14 @@ def test_our_depth_is_a_layer_for_the_next(renderer):
 
 
 def test_views_of_a_batch_have_layers_of_their_own(renderer):
-    captures = [fs.Capture(CAMERA, OUTPUTS, layer=a_layer(seed)) for seed in (1, 2)]
-    batch = renderer.render_batch(a_cloud(), captures)
-    for i, capture in enumerate(captures):
-        alone = renderer.render(a_cloud(), capture)
-        assert batch["rgb"][i].tobytes() == alone["rgb"].tobytes()
+    first, second = a_layer(1), a_layer(2)
+    for layers in ((first, second), (first, first)):
+        captures = [fs.Capture(CAMERA, OUTPUTS, layer=layer) for layer in layers]
+        batch = renderer.render_batch(a_cloud(), captures)
+        for i, capture in enumerate(captures):
+            alone = renderer.render(a_cloud(), capture)
+            for name in ("rgb", "label"):
+                assert batch[name][i].tobytes() == alone[name].tobytes()
 
 
 @pytest.mark.parametrize("shape", [cpu_shape(), gpu_shape()], ids=["lanes", "group"])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, assert_agrees, random_splats, reference_pixels
-from sampling import SAMPLES, alternate
+from sampling import SAMPLES, alternate, in_turn
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
@@ -103,11 +103,14 @@ def test_small_splats_on_the_axis_and_at_the_poles(renderer, camera):
     assert_agrees(renderer, splats, camera, ("rgb",), fs.Quality(lowpass="pixel"))
 
 
+@in_turn()
 @pytest.mark.parametrize(("camera", "samples"), alternate(CAMERAS, SAMPLES))
 def test_layers(renderer, camera, samples):
     assert_agrees(renderer, coplanar_cloud(1), camera, quality=fs.Quality(samples=samples))
 
 
+# test_all_effects of both matrices has them behind every lens
+@in_turn()
 @pytest.mark.parametrize("name", ["distortion", "fisheye", "panorama", "parallel"])
 def test_colours_that_depend_on_the_view(renderer, name):
     cloud = random_splats(100, 11, depth=(1, 6), scale=(0.02, 0.4), sh_degree=3)
@@ -150,7 +153,7 @@ def test_outside_the_lens_is_background(renderer):
     frame = renderer.render(
         random_splats(100, 3, scale=(1.0, 9.0)),
         camera,
-        outputs=("rgb", "alpha", "label"),
+        outputs=ALL_OUTPUTS,
         background=(0.2, 0.4, 0.6),
     )
     x, y = np.meshgrid(np.arange(70) + 0.5 - 35, np.arange(66) + 0.5 - 33)
@@ -196,8 +199,7 @@ def test_a_slight_distortion_is_nearly_a_pinhole(renderer):
     cloud = random_splats(200, 1, depth=(0.5, 6.0), scale=(0.02, 0.3))
     plain, bent = seen_through(None), seen_through(BrownConrady(k1=1e-7))
     assert bent.lens is not None
-    outputs = ("rgb", "depth", "normal")
-    a, b = (renderer.render(cloud, camera, outputs) for camera in (plain, bent))
+    a, b = (renderer.render(cloud, camera, ALL_OUTPUTS) for camera in (plain, bent))
     for name in ("rgb", "normal"):
         assert np.quantile(np.abs(a[name] - b[name]), 0.999) < 1e-3
     assert np.quantile(np.abs(a["depth"] - b["depth"]), 0.999) < 1e-2
@@ -207,27 +209,28 @@ def test_depths_of_a_fisheye_are_distances(renderer):
     """A wall at z = 2: the distance grows as 1 / cos; along z with parallel rays it is 2."""
     wall = fs.SplatCloud([[0, 0, 2]], [[1, 0, 0, 0]], [[50, 50]], [1.0], colors=[[1, 1, 1]])
     fisheye = fs.Camera.fisheye(101, 101, math.radians(120))
-    depth = renderer.render(wall, fisheye, "depth")["depth"]
+    depth = renderer.render(wall, fisheye, ALL_OUTPUTS)["depth"]
     angles = np.radians((np.arange(101) + 0.5 - 50.5) * 120 / 101)
     np.testing.assert_allclose(depth[50], 2 / np.cos(angles), rtol=1e-5)
     parallel = fs.Camera.orthographic(64, 48, 4.0)
-    np.testing.assert_allclose(renderer.render(wall, parallel, "depth")["depth"], 2, rtol=1e-5)
+    np.testing.assert_allclose(renderer.render(wall, parallel, ALL_OUTPUTS)["depth"], 2, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["fisheye", "parallel"])
 def test_bands_give_the_same_bits(renderer, name):
     cloud, camera = random_splats(300, 2, depth=(-4.0, 5.0)), CAMERAS[name]
-    first = renderer.render(cloud, camera)["rgb"]
-    assert (renderer.render(cloud, camera)["rgb"] == first).all()
+    first = renderer.render(cloud, camera, ALL_OUTPUTS)["rgb"]
+    assert (renderer.render(cloud, camera, ALL_OUTPUTS)["rgb"] == first).all()
     backend = renderer.backend
     held = backend.pair_budget
     backend.pair_budget = 50
     try:
-        assert (renderer.render(cloud, camera)["rgb"] == first).all()
+        assert (renderer.render(cloud, camera, ALL_OUTPUTS)["rgb"] == first).all()
     finally:
         backend.pair_budget = held
 
 
+@in_turn()
 @pytest.mark.parametrize("name", ["distortion", "fisheye", "panorama", "parallel"])
 def test_lenses_in_single_precision(renderer, name):
     """The set-up of devices without float64, held as the pinhole's is: to a tenth of an 8-bit step."""

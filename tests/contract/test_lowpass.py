@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from agreement import assert_agrees, random_splats
+from agreement import ALL_OUTPUTS, assert_agrees, random_splats
 from test_lens_pictures import EVERY_TERM
 
 import fidsplat as fs
@@ -102,7 +102,7 @@ def test_a_lens_keeps_the_light_of_a_splat(renderer, camera):
     )
     want = 2 * math.pi * 0.9 * abs(u[0] * v[1] - u[1] * v[0])
     quality = PIXEL.with_(alpha_cutoff=1e-9)
-    light = float(renderer.render(cloud, camera, "alpha", quality)["alpha"].sum())
+    light = float(renderer.render(cloud, camera, ALL_OUTPUTS, quality)["alpha"].sum())
     assert light == pytest.approx(want, rel=0.032)
 
 
@@ -123,7 +123,7 @@ def test_light_does_not_depend_on_where_a_splat_lies_between_pixels(renderer, sp
     for _ in range(12):
         cx, cy = 20 + generator.uniform(0, 1, 2)
         camera = fs.Camera.pinhole(40, 40, 100.0, 100.0, cx, cy)
-        sums.append(float(renderer.render(cloud, camera, "alpha", quality)["alpha"].sum()))
+        sums.append(float(renderer.render(cloud, camera, ALL_OUTPUTS, quality)["alpha"].sum()))
     assert np.array(sums) == pytest.approx(2 * math.pi * 0.9 * spread_px**2, rel=0.032)
 
 
@@ -132,13 +132,10 @@ def test_the_screen_filter_keeps_no_light(renderer):
     too bright."""
     cloud = fs.SplatCloud([(0, 0, 1)], [(1, 0, 0, 0)], [(1e-4, 1e-4)], [0.9], colors=[(1, 1, 1)])
     camera = fs.Camera.pinhole(40, 40, 100.0, 100.0, 20.2, 20.4)
+    qualities = {name: fs.Quality(lowpass=name, alpha_cutoff=1e-9) for name in ("screen", "pixel")}
     light = {
-        name: float(
-            renderer.render(cloud, camera, "alpha", fs.Quality(lowpass=name, alpha_cutoff=1e-9))[
-                "alpha"
-            ].sum()
-        )
-        for name in ("screen", "pixel")
+        name: float(renderer.render(cloud, camera, ALL_OUTPUTS, quality)["alpha"].sum())
+        for name, quality in qualities.items()
     }
     assert light["screen"] == pytest.approx(math.pi * 0.9, rel=0.05)
     assert light["pixel"] == pytest.approx(2 * math.pi * 0.9 * 1e-4, rel=0.05)

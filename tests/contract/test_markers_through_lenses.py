@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 from ideal_effects import assert_as_good, ideal_picture
+from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.vision.detect import detect
@@ -78,12 +79,14 @@ def assert_found(renderer, name, turn, **effects):
     assert errors[1] < 0.01 * np.linalg.norm(position)
 
 
+@in_turn()
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("turn_deg", [0, 30])
 def test_a_tag_is_found_where_it_is(renderer, name, turn_deg):
     assert_found(renderer, name, math.radians(turn_deg))
 
 
+@in_turn(1)
 @pytest.mark.parametrize("name", CASES)
 def test_a_tag_that_moves_is_found_in_blur_and_noise_through_every_lens(renderer, name):
     """It turns about the camera by 0.4 rad a second, up to 2 px during the exposure; light falls off, and
@@ -102,6 +105,7 @@ def test_a_tag_that_moves_is_found_in_blur_and_noise_through_every_lens(renderer
     )
 
 
+@in_turn()
 @pytest.mark.parametrize("blurred", [False, True])
 @pytest.mark.parametrize("turn_deg", [0, 30])
 def test_parallel_rays_show_where_a_tag_is_across_them_and_how_it_is_turned(renderer, turn_deg, blurred):
@@ -132,6 +136,7 @@ def test_parallel_rays_show_where_a_tag_is_across_them_and_how_it_is_turned(rend
     assert errors[1] < 0.01 * 1.5
 
 
+@in_turn()
 @pytest.mark.parametrize("modules", [0.1, 1.0, 4.0])
 def test_a_blurred_tag_is_found_wherever_the_ideal_plane_is(renderer, modules):
     """From a tenth of a module, with which all is well, to four, with which no code can be read."""
@@ -180,6 +185,7 @@ def test_a_rolling_shutter_shows_the_tag_at_its_rows_time(renderer):
     assert errors[1] < 0.01 * np.linalg.norm(position)
 
 
+@in_turn()
 @pytest.mark.parametrize(
     ("wide", "position", "target", "up"),
     [

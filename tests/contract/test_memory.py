@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pyopencl as cl
 import pytest
-from agreement import ALL_OUTPUTS, random_splats
+from agreement import ALL_OUTPUTS, random_splats, some_thick
 
 import fidsplat as fs
-from fidsplat.backends.opencl import batch, lists
+from fidsplat.backends.opencl import batch
 from fidsplat.backends.opencl.memory_plan import plan_of
 from fidsplat.backends.opencl.shapes import gpu_shape
 from fidsplat.views import views_of
@@ -39,6 +39,7 @@ def small(renderer, mebibytes, cloud=None):
             cloud.colors,
             cloud.sh,
             cloud.planes,
+            cloud.thickness,
         )
         budget += sum(array.nbytes for array in arrays if array is not None)
     return fs.Renderer(renderer.device.name, memory_budget=budget)
@@ -63,8 +64,12 @@ machines = pytest.mark.parametrize("machine", [own_device, as_on_a_gpu], ids=["o
 
 @pytest.fixture(scope="module")
 def cloud():
+    """200 disks of a plane; of the others every third is a 3D Gaussian."""
     made = random_splats(30000, 1, scale=(1e-3, 0.5), sh_degree=2)
-    return made.with_planes(np.where(np.arange(len(made)) < 200, 0, -1))
+    number = np.arange(len(made))
+    third = np.where((number >= 200) & (number % 3 == 0), 0.05, 0)
+    made = some_thick(made, third)
+    return made.with_planes(np.where(number < 200, 0, -1))
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +155,7 @@ def test_views_are_drawn_as_single_pictures_are(renderer):
 
 
 def test_pictures_of_many_sizes_leave_no_heap_of_buffers(opencl):
-    """Planes go back to the pool when their frame dies; those of another size are let go."""
+    """Images go back to the pool when their frame dies; those of another size are let go."""
     some = random_splats(50, seed=5)
     own = fs.Renderer(opencl.device.name)
     held = []
@@ -167,7 +172,7 @@ def test_pictures_of_many_sizes_leave_no_heap_of_buffers(opencl):
 
 @machines
 def test_a_pool_keeps_to_the_budget_whatever_was_drawn_before(opencl, machine):
-    """Pictures at once and in chunks, few and many planes: what one kind has left does not count against
+    """Pictures at once and in chunks, few and many outputs: what one kind has left does not count against
     the next."""
     budget = 16 * 2**20
     own, opencl = machine(opencl, budget), machine(opencl)
@@ -313,12 +318,9 @@ def test_a_picture_is_launched_again_for_each_view(opencl):
     assert kept[-1].wait() is kept[-1]
 
 
-@pytest.mark.parametrize("few", [True, False])
 @pytest.mark.parametrize("scale", [(1e-2, 0.3), (2.0, 3.0)], ids=["pairs", "big splats"])
-def test_a_picture_that_outgrows_the_last_is_drawn_again(opencl, monkeypatch, scale, few):
-    """More pairs, or more splats of many tiles, than there is room for: found when the frame is read. One
-    work-group lists few splats, whole launches many."""
-    monkeypatch.setattr(lists, "_FEW", 8192 if few else 0)
+def test_a_picture_that_outgrows_the_last_is_drawn_again(opencl, scale):
+    """More pairs, or more splats of many tiles, than there is room for: found when the frame is read."""
     machine, own = as_on_a_gpu(opencl), fs.Renderer(opencl.device.name)
     some = random_splats(6000, seed=4, scale=scale, depth=(2.0, 6.0))
     places = (-900, -800, 0, 1, -700)
@@ -371,7 +373,7 @@ def test_a_leased_buffer_has_the_size_that_was_asked_for(opencl):
     assert pool.lease("plane", 4096) is kept
 
 
-def test_a_plane_that_cannot_be_read_is_an_error_of_the_device(opencl):
+def test_an_image_that_cannot_be_read_is_an_error_of_the_device(opencl):
     frame = opencl.render(random_splats(10, seed=8), CAMERA)
     frame._images._drawn.leased[:] = [("rgb_out", opencl.backend.pool.fresh("too small", 16))]
     with pytest.raises(fs.DeviceError, match="failed while drawing rgb"):

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from agreement import assert_agrees, random_splats
+from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.effects import OUTPUTS
@@ -19,6 +20,7 @@ def test_outputs_of_splats_around_the_camera(renderer, seed, quality):
     assert_agrees(renderer, random_splats(150, seed), CAMERA, ALL, quality)
 
 
+@in_turn()
 @pytest.mark.parametrize("samples", [2, 3])
 def test_outputs_of_several_samples(renderer, samples):
     cloud = random_splats(100, 5, depth=(0.5, 5.0))
@@ -42,11 +44,12 @@ def test_a_layer_shows_the_mean_of_what_its_splats_show(renderer):
     assert_agrees(renderer, cloud.with_planes(np.arange(40) // 4), CAMERA, ALL)
 
 
-def test_an_output_alone_is_what_it_is_among_all(renderer):
+@in_turn()
+@pytest.mark.parametrize("name", ALL)
+def test_an_output_alone_is_what_it_is_among_all(renderer, name):
     cloud = random_splats(150, 4)
-    together = renderer.render(cloud, CAMERA, ALL)
-    for name in ALL:
-        assert np.array_equal(renderer.render(cloud, CAMERA, name)[name], together[name]), name
+    together, alone = (renderer.render(cloud, CAMERA, outputs) for outputs in (ALL, name))
+    assert np.array_equal(alone[name], together[name])
 
 
 def test_distances_are_depths_along_the_ray(renderer):
@@ -60,11 +63,11 @@ def test_distances_are_depths_along_the_ray(renderer):
 
 
 def test_normals_in_the_world_are_the_cameras_turned(renderer):
-    frame = renderer.render(random_splats(150, 6), CAMERA, ("normal", "normal_world"))
+    frame = renderer.render(random_splats(150, 6), CAMERA, ALL)
     turned = frame["normal"] @ CAMERA.world_to_camera[:3, :3]
     assert frame["normal_world"] == pytest.approx(turned, abs=1e-6)
     wall = fs.SplatCloud([(0, 0, 3)], [(1, 0, 0, 0)], [(9, 9)], [1.0], colors=[(1, 1, 1)])
-    normals = renderer.render(wall, CAMERA, "normal_world")["normal_world"]
+    normals = renderer.render(wall, CAMERA, ALL)["normal_world"]
     assert normals[30, 40] == pytest.approx([0, 0, -1], abs=1e-6)
 
 
@@ -88,17 +91,17 @@ POINT = fs.Camera.pinhole(5, 5, 50.0, 50.0, 2.5, 2.5)
 def test_ties_go_to_what_is_nearer(renderer):
     """Thresholds met exactly, by opacities that float32 has: half of the light, equal weights, the stop."""
     half = fs.Quality(opacity_ceiling=0.5)
-    frame = renderer.render(layers_of([1, 1, 1]), POINT, ("alpha", "depth_median"), half)
+    frame = renderer.render(layers_of([1, 1, 1]), POINT, ALL, half)
     assert frame["alpha"][2, 2] == 0.875
     assert frame["depth_median"][2, 2] == pytest.approx(2, rel=1e-6)  # half is left in front of the next
-    frame = renderer.render(layers_of([0.5, 1.0]), POINT, ("label", "splat_id"))
-    assert renderer.render(layers_of([0.5]), POINT, "alpha")["alpha"][2, 2] == 0.5
+    frame = renderer.render(layers_of([0.5, 1.0]), POINT, ALL)
+    assert renderer.render(layers_of([0.5]), POINT, ALL)["alpha"][2, 2] == 0.5
     assert (frame["label"][2, 2], frame["splat_id"][2, 2]) == (7, 0)
     first = half.with_(first_hit=0.5)
-    assert renderer.render(layers_of([1, 1]), POINT, "depth_first", first)["depth_first"][2, 2] == 2
+    assert renderer.render(layers_of([1, 1]), POINT, ALL, first)["depth_first"][2, 2] == 2
     gsplat = half.with_(stop_rule="exclusive", order="centre", transmittance_stop=0.25)
     for last in (1, 0.1):  # the pixel is finished, whatever comes behind the fragment that was dropped
-        frame = renderer.render(layers_of([1, 1, last]), POINT, ("alpha", "blended"), gsplat)
+        frame = renderer.render(layers_of([1, 1, last]), POINT, ALL, gsplat)
         assert (frame["alpha"][2, 2], frame["blended"][2, 2]) == (0.5, 1)
 
 
@@ -110,7 +113,7 @@ def test_a_pixel_ends_at_the_stop_whatever_its_neighbours_do(renderer):
     scales = wide.scales.copy()
     scales[1] = 0.5 * 3 / 50  # half a pixel
     layers = fs.SplatCloud(wide.means, wide.quats, scales, wide.opacities, colors=np.eye(3))
-    frame = renderer.render(layers, POINT, ("rgb", "alpha", "blended"), quality)
+    frame = renderer.render(layers, POINT, ALL, quality)
     assert (frame["alpha"][2] == [0.75] * 5).all()
     assert (frame["blended"][2] == [2] * 5).all()
     assert frame["rgb"][2, 2].tolist() == [0.5, 0.25, 0]
@@ -122,7 +125,7 @@ def test_of_equal_splats_in_a_layer_and_equal_samples_of_a_pixel_the_first_is_na
     of the light: the left one's are read first. Of its samples a pixel takes the nearest first hit, and of
     their medians the lower."""
     twice = layers_of([0.5, 0.5, 0.5], step=0.0).with_planes([0, 0, 0])
-    frame = renderer.render(twice, POINT, ("label", "splat_id"))
+    frame = renderer.render(twice, POINT, ALL)
     assert (frame["label"][2, 2], frame["splat_id"][2, 2]) == (7, 0)
 
     # columns 2.75 and 2.25 of the picture, row 2.5; within 1.2 sigma they are as opaque as the ceiling allows
@@ -156,7 +159,7 @@ def test_a_layer_of_a_thousand_faint_splats(renderer):
         opacities,
         colors=colors,
     )
-    rgb = renderer.render(wall.with_planes(np.zeros(count + 1, int)), POINT)["rgb"][2, 2]
+    rgb = renderer.render(wall.with_planes(np.zeros(count + 1, int)), POINT, ALL)["rgb"][2, 2]
     red, green = -count * math.log1p(-9.9e-4), -math.log(0.4)
     assert rgb[0] / rgb[1] == pytest.approx(red / green, rel=1e-4)
     assert rgb[0] + rgb[1] == pytest.approx(1 - math.exp(-red - green), rel=1e-4)
@@ -165,7 +168,7 @@ def test_a_layer_of_a_thousand_faint_splats(renderer):
 def test_a_wall_that_the_camera_almost_lies_in(renderer):
     """Its centre 10^9 m ahead, its plane 0.1 m aside: it covers all that lies on that side."""
     wall = fs.SplatCloud([(-0.1, 0, 1e9)], [(0.5, 0.5, 0.5, 0.5)], [(1e9, 1e9)], [1.0], colors=[(1, 1, 1)])
-    frame = renderer.render(wall, fs.Camera.pinhole(9, 9, 9.0, 9.0, 4.5, 4.5), ("alpha", "depth"))
+    frame = renderer.render(wall, fs.Camera.pinhole(9, 9, 9.0, 9.0, 4.5, 4.5), ALL)
     assert frame["alpha"][:, :4] == pytest.approx(math.exp(-0.5), rel=1e-5)
     assert frame["depth"][4, :4] == pytest.approx(0.9 / (4.5 - np.arange(0.5, 4)), rel=1e-5)
 
@@ -174,20 +177,20 @@ def test_a_wall_that_the_camera_almost_lies_in(renderer):
 def test_the_first_hit_is_where_the_opacity_reaches_the_threshold(renderer, first_hit, depth):
     """Three layers of opacity 0.2 cover 0.2, 0.36 and 0.488."""
     quality = fs.Quality(first_hit=first_hit)
-    frame = renderer.render(layers_of([0.2, 0.2, 0.2]), POINT, ("depth_first", "blended"), quality)
+    frame = renderer.render(layers_of([0.2, 0.2, 0.2]), POINT, ALL, quality)
     assert frame["depth_first"][2, 2] == pytest.approx(depth, rel=1e-6)
     assert frame["blended"][2, 2] == 3
 
 
 def test_an_opaque_layer_ends_the_count(renderer):
-    frame = renderer.render(layers_of([0.2, 1.0, 0.2, 0.2]), POINT, ("blended", "splat_id"))
+    frame = renderer.render(layers_of([0.2, 1.0, 0.2, 0.2]), POINT, ALL)
     assert (frame["blended"][2, 2], frame["splat_id"][2, 2]) == (2, 1)
     assert frame["blended"].dtype == frame["splat_id"].dtype == np.int32
 
 
 def test_splat_ids_are_indices_of_the_cloud_in_chunks_too(renderer):
     cloud = random_splats(3000, 8, depth=(1.0, 6.0), scale=(1e-3, 0.3))
-    whole = renderer.render(cloud, CAMERA, ("splat_id", "label"))
+    whole = renderer.render(cloud, CAMERA, ALL)
     ids = whole["splat_id"]
     assert ids.max() > 2000
     seen = ids >= 0
@@ -221,6 +224,7 @@ def covered(frame, name):
     return plane.any(-1) if plane.ndim == 3 else plane
 
 
+@in_turn(1)
 @pytest.mark.parametrize("samples", [1, 2])
 def test_masks_do_not_grow_with_a_low_cutoff(renderer, samples):
     """They end where 1/255 is covered, whatever is drawn beyond it for the sake of colours."""
@@ -228,7 +232,7 @@ def test_masks_do_not_grow_with_a_low_cutoff(renderer, samples):
     masks = {}
     for cutoff in (1 / 255, 1e-3, 1e-5):
         quality = fs.Quality(alpha_cutoff=cutoff, samples=samples)
-        frame = renderer.render(splat, CAMERA, ("alpha", *MASKED), quality)
+        frame = renderer.render(splat, CAMERA, ALL, quality)
         masks[cutoff] = covered(frame, "label")
         for name in MASKED:
             assert np.array_equal(covered(frame, name), masks[cutoff]), name
@@ -244,7 +248,7 @@ def test_haze_is_told_of_once_it_covers_enough(renderer, opacity, count, seen):
     """However little each layer is; the median lies where half of the light is left, within the layers that
     count together.
     """
-    frame = renderer.render(layers_of([opacity] * count), POINT, MASKED)
+    frame = renderer.render(layers_of([opacity] * count), POINT, ALL)
     assert {name: bool(covered(frame, name)[2, 2]) for name in MASKED} == dict.fromkeys(MASKED, seen)
     if count > 100:
         half = math.log(0.5) / math.log(1 - opacity)
@@ -254,7 +258,7 @@ def test_haze_is_told_of_once_it_covers_enough(renderer, opacity, count, seen):
 def test_faint_fragments_behind_do_not_move_the_median(renderer):
     """Of half-transparent things the last that shows is the median, not a rim of 1/1000 far behind it."""
     cloud = layers_of([0.2, 0.1, 1e-3, 1e-3])
-    frame = renderer.render(cloud, POINT, ("depth_median", "blended"))
+    frame = renderer.render(cloud, POINT, ALL)
     assert frame["blended"][2, 2] == 4
     assert frame["depth_median"][2, 2] == pytest.approx(3, rel=1e-6)
     for seed in range(3):

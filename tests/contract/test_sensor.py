@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from agreement import random_splats
+from agreement import against_reference, random_splats
 from ideal_effects import assert_as_good, ideal_picture
+from sampling import SAMPLES, alternate, in_turn
 
 import fidsplat as fs
 from fidsplat.backends.reference.post import variates
 from fidsplat.backends.view import View
-from fidsplat.hard_cases.agreement import Picture, against_reference
+from fidsplat.hard_cases.agreement import Picture
 
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.3, -0.2, -0.1), (0.0, 0.1, 3.0))
 CLOUD = random_splats(120, 3)
@@ -39,9 +40,10 @@ SENSORS = {
 }
 
 
+@in_turn()
 @pytest.mark.parametrize("name", SENSORS)
 def test_steps_of_the_sensor(renderer, name):
-    agree(renderer, Picture(CLOUD, CAMERA, sensor=SENSORS[name]))
+    agree(renderer, Picture(CLOUD, CAMERA, outputs=("rgb",), sensor=SENSORS[name]))
 
 
 @pytest.mark.parametrize("name", ["all", "vignetting"])
@@ -49,8 +51,9 @@ def test_the_sensor_sees_pixels_not_samples(renderer, name):
     agree(renderer, Picture(CLOUD, CAMERA, fs.Quality(samples=2), sensor=SENSORS[name]))
 
 
-@pytest.mark.parametrize("samples", [1, 2])
-@pytest.mark.parametrize("density", [0.05, 1.0, 30.0])
+@pytest.mark.parametrize(
+    ("density", "samples"), alternate({"thin": 0.05, "fog": 1.0, "thick": 30.0}, SAMPLES)
+)
 def test_fog(renderer, density, samples):
     tag = fs.marker("aruco:4x4_50:7", size=1.0, mixture="fitted").cloud.transformed(
         np.diag([1, 1, 1, 1.0]) + shift(0, 0, 2)
@@ -62,10 +65,10 @@ def test_fog(renderer, density, samples):
         )
 
 
-@pytest.mark.parametrize("samples", [1, 3])
-@pytest.mark.parametrize(
-    "background", [fs.Gradient((0.2, 0.4, 0.9), (0.3, 0.2, 0.1), (0.1, -2, 0.3)), panorama()]
-)
+SKIES = {"gradient": fs.Gradient((0.2, 0.4, 0.9), (0.3, 0.2, 0.1), (0.1, -2, 0.3)), "panorama": panorama()}
+
+
+@pytest.mark.parametrize(("background", "samples"), alternate(SKIES, {"1 sample": 1, "3 x 3 samples": 3}))
 def test_backgrounds(renderer, background, samples):
     for target in ((0.0, 0.1, 3.0), (0.0, 0.1, -3.0), (0.3, -9.0, 0.0)):
         camera = fs.Camera.look_at(81, 59, 1.4, (0.3, -0.2, -0.1), target, up=(0.1, -1, 0.2))
@@ -219,6 +222,7 @@ def test_the_sensor_leaves_the_other_outputs_alone(renderer):
     assert not np.array_equal(plain["rgb"], seen["rgb"])
 
 
+@in_turn()
 @pytest.mark.parametrize("mixture", ["fitted", "exact"])
 def test_a_tag_is_found_where_it_is_in_fog_and_noise(renderer, mixture):
     """Position error under 1 % of the distance, as the ideal plane's: the pictures are for robots."""

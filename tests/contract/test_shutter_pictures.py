@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from agreement import random_splats
-from sampling import alternate
+from agreement import random_splats, some_thick
+from sampling import SAMPLES, alternate, in_turn
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
@@ -68,12 +68,14 @@ def assert_exposed(renderer, cloud, camera, motion, shutter, quality=None, outpu
     return frame
 
 
+@in_turn()
 @pytest.mark.parametrize(("camera", "shutter"), alternate(CAMERAS, SHUTTERS))
 def test_shutters_before_every_lens(renderer, camera, shutter):
     cloud = random_splats(150, 3, depth=(-2.0, 5.0), scale=(0.01, 0.5))
     assert_exposed(renderer, cloud, camera, MOTION, shutter)
 
 
+@in_turn()
 @pytest.mark.parametrize("samples", [1, 2])
 def test_moving_layers(renderer, samples):
     cloud = coplanar_cloud(1)
@@ -103,7 +105,9 @@ def test_as_many_are_visible_as_in_the_fullest_pose(renderer):
 
 
 def test_colours_that_depend_on_the_view_turn_with_their_group(renderer):
+    """Of disks and of 3D Gaussians."""
     cloud = random_splats(100, 4, depth=(1, 5), scale=(0.05, 0.3), sh_degree=3)
+    cloud = some_thick(cloud, np.where(np.arange(100) % 2 == 0, 0.1, 0))
     assert_exposed(renderer, cloud, CAMERAS["pinhole"], MOTION, SHUTTERS["both"], outputs=("rgb",))
 
 
@@ -123,11 +127,9 @@ def test_a_moved_group_is_the_transformed_cloud(renderer):
 def test_blur_is_the_mean_of_its_poses(renderer):
     cloud, camera = random_splats(100, 5, depth=(1, 5), scale=(0.02, 0.3)), CAMERAS["pinhole"]
     shutter = fs.Shutter(time=0.1, exposure_time=0.4, sub_poses=4)
-    frame = renderer.render(cloud, camera, ("rgb", "alpha", "depth"), None, BACKGROUND, MOTION, shutter)
+    frame = renderer.render(cloud, camera, ALL_OUTPUTS, None, BACKGROUND, MOTION, shutter)
     single = [
-        renderer.render(
-            cloud, camera, ("rgb", "alpha", "depth"), None, BACKGROUND, MOTION, fs.Shutter(time=0.1 + t)
-        )
+        renderer.render(cloud, camera, ALL_OUTPUTS, None, BACKGROUND, MOTION, fs.Shutter(time=0.1 + t))
         for t in (-0.15, -0.05, 0.05, 0.15)
     ]
     for name in ("rgb", "alpha"):
@@ -149,8 +151,7 @@ def test_many_views_share_a_motion_and_a_shutter(renderer):
         assert all(np.array_equal(moved[name], single[name]) for name in outputs)
 
 
-@pytest.mark.parametrize("lowpass", ["screen", "none"])
-@pytest.mark.parametrize("samples", [1, 2])
+@pytest.mark.parametrize(("lowpass", "samples"), alternate({"screen": "screen", "none": "none"}, SAMPLES))
 def test_what_bands_leave_out_by_its_sphere_draws_nothing_there(renderer, lowpass, samples):
     """The same bits with and without `shutter_rows`: near, behind, large and far below a pixel."""
     cloud = random_splats(3000, 11, depth=(-2.0, 6.0), scale=(1e-4, 1.0), across=2.0)
@@ -170,10 +171,10 @@ def test_what_bands_leave_out_by_its_sphere_draws_nothing_there(renderer, lowpas
 def test_a_rolling_shutter_takes_each_row_at_its_own_time(renderer):
     cloud, camera = random_splats(100, 6, depth=(1, 5), scale=(0.02, 0.3)), CAMERAS["pinhole"]
     shutter = fs.Shutter(readout=0.8, rows_per_band=1)
-    frame = renderer.render(cloud, camera, motion=MOTION, shutter=shutter)
+    frame = renderer.render(cloud, camera, ALL_OUTPUTS, motion=MOTION, shutter=shutter)
     for row in (0, 17, 44):
         time = 0.8 * ((row + 0.5) / SIZE[1] - 0.5)
-        single = renderer.render(cloud, camera, motion=MOTION, shutter=fs.Shutter(time=time))
+        single = renderer.render(cloud, camera, ALL_OUTPUTS, motion=MOTION, shutter=fs.Shutter(time=time))
         np.testing.assert_allclose(frame["rgb"][row], single["rgb"][row], atol=2e-5)
 
 

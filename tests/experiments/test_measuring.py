@@ -4,6 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.experiments import angles, counts, localisation, plane, views
@@ -56,6 +57,7 @@ def test_scans_of_the_ideal_texture_find_its_ceiling(pool):
         )
 
 
+@in_turn()
 def test_scans_do_not_hang_on_the_number_of_threads(renderer):
     painter = Painter(renderer)
     parts = angles.angles_points(
@@ -70,6 +72,7 @@ def test_scans_do_not_hang_on_the_number_of_threads(renderer):
         assert "1" in results[0]["readers"]["pupil"]["read"]
 
 
+@in_turn()
 @pytest.mark.parametrize(
     ("category", "tilts"), [("apriltag", "72:84:6"), ("small", "0:44:22"), ("medium", "0:40:20")]
 )
@@ -94,6 +97,7 @@ def test_every_mixture_is_a_row_with_both_filters():
         method_names(("boxes",))
 
 
+@in_turn(1)
 def test_every_method_puts_the_marker_where_the_ideal_has_it(renderer):
     spec = CATEGORIES["small"].spec(0)
     protocol = PROTOCOLS["fixed-plane"]
@@ -109,6 +113,7 @@ def test_every_method_puts_the_marker_where_the_ideal_has_it(renderer):
         assert match > shifted + 3
 
 
+@in_turn()
 def test_trained_models_are_rows_where_they_are(renderer, tmp_path):
     """A model that is our own marker, saved as a trainer saves it, is drawn like our own marker."""
     spec = CATEGORIES["apriltag"].spec(2)
@@ -173,6 +178,7 @@ def test_pictures_are_drawn_once_for_all_truths(pool, tmp_path):
     assert drawn == ["small-0", "small-0", "small-1", "small-1"]
 
 
+@in_turn(1)
 def test_views_by_the_renderer_with_every_metric(renderer, pool, tmp_path):
     point = part_of("fitted/best", "exact")
     found = views.measure_views(

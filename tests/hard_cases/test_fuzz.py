@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from sampling import in_turn
 
 from fidsplat.hard_cases import fuzz
 from fidsplat.rotations import quaternion_to_matrix
@@ -67,6 +68,7 @@ def test_the_scenes_are_hard():
     assert opacities == set(fuzz.OPACITIES.tolist())
 
 
+@in_turn()
 def test_a_stopped_run_goes_on(renderer, tmp_path, monkeypatch):
     monkeypatch.setattr(fuzz, "_SAVE_EVERY", 0.0)
     file = tmp_path / "fuzz.json"
@@ -84,6 +86,7 @@ def test_a_stopped_run_goes_on(renderer, tmp_path, monkeypatch):
     assert next(fuzz.fuzz_run(renderer, 300, file)).scenes == 1
 
 
+@in_turn()
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"key": 3}', '{"key": "%s", "scenes": "a", "new": 1}'])
 def test_a_file_of_something_else_is_no_hindrance(renderer, tmp_path, content):
     file = tmp_path / "fuzz.json"
@@ -91,9 +94,10 @@ def test_a_file_of_something_else_is_no_hindrance(renderer, tmp_path, content):
     assert next(fuzz.fuzz_run(renderer, 50, file)).scenes == 1
 
 
+@in_turn(1)
 def test_a_failing_seed_is_named(renderer, monkeypatch):
     class Wrong(dict):
-        """Planes of a device that is off by a little where it is sure."""
+        """Images of a device that is off by a little where it is sure."""
 
     def wrong(one, picture):
         frame = draw(one, picture)

@@ -25,8 +25,8 @@ def backend(renderer):
     return renderer.backend
 
 
-def traced(backend, cloud, quality, outputs=("rgb",), shape=None):
-    features, view = prepare(cloud, fs.Capture(CAMERA, outputs, quality))
+def traced(backend, cloud, quality, shape=None):
+    features, view = prepare(cloud, fs.Capture(CAMERA, ALL_OUTPUTS, quality))
     return backend.pipeline(features, shape).trace(backend.upload(cloud), view), view
 
 
@@ -151,7 +151,7 @@ def test_culled_splats_change_nothing(backend):
 def test_splats_between_the_samples_are_culled(backend, lists):
     """Without a low-pass a splat that is smaller than a sample mostly meets no ray; it costs no list."""
     cloud = random_splats(20000, seed=3, scale=(1e-5, 3e-4))
-    features, view = prepare(cloud, fs.Capture(CAMERA, quality=fs.Quality(lowpass="none")))
+    features, view = prepare(cloud, fs.Capture(CAMERA, ALL_OUTPUTS, fs.Quality(lowpass="none")))
     pipeline = backend.pipeline(features, listing(backend, lists))
     trace = pipeline.trace(backend.upload(cloud), view)
     kept = trace["keys"] != CULLED
@@ -166,9 +166,9 @@ def test_tile_size_leaves_every_bit_as_it_was(backend):
     """numerics A4 and A5: one test that finds every bug of the bounds."""
     cloud = random_splats(300, seed=3)
     quality = fs.Quality()
-    base, _ = traced(backend, cloud, quality, ALL_OUTPUTS)
+    base, _ = traced(backend, cloud, quality)
     for size, other in backend.shapes("tiles").items():
-        trace, _ = traced(backend, cloud, quality, ALL_OUTPUTS, other)
+        trace, _ = traced(backend, cloud, quality, shape=other)
         for name in ALL_OUTPUTS:
             assert np.array_equal(trace[name], base[name]), f"{name} differs with {size}"
 
@@ -178,7 +178,7 @@ def test_the_box_of_a_record_holds_all_that_the_splat_touches(backend, lowpass):
     """What a block of a GPU passes over, it must not have needed."""
     quality = fs.Quality(lowpass=lowpass)
     cloud = random_splats(200, seed=5, scale=(1e-3, 5.0))
-    features = select(cloud, fs.Capture(quality=quality))
+    features = select(cloud, fs.Capture(outputs=ALL_OUTPUTS, quality=quality))
     view = View.of(fs.Capture(CAMERA, quality=quality), cloud.origin)
     pipeline = backend.pipeline(features)
     trace = pipeline.trace(backend.upload(cloud), view)
@@ -197,12 +197,12 @@ def test_layers_are_the_same_in_every_tile_size_and_schedule(backend, renderer):
     """Four planes whose layers wait for one another, and splats of none."""
     planes = np.random.default_rng(9).choice([-1, -1, -1, 0, 1, 2, 3], 300)
     cloud = random_splats(300, seed=9, scale=(0.05, 0.5)).with_planes(planes)
-    base, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS)
-    other, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS, backend.shapes("schedule")["groups"])
+    base, _ = traced(backend, cloud, fs.Quality())
+    other, _ = traced(backend, cloud, fs.Quality(), shape=backend.shapes("schedule")["groups"])
     for name in ("rgb", "alpha", "normal", "depth"):
         assert np.abs(other[name] - base[name]).max() < 2e-5, name
     *_, (size, shape) = backend.shapes("tiles").items()
-    again, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS, shape)
+    again, _ = traced(backend, cloud, fs.Quality(), shape=shape)
     for name in ALL_OUTPUTS:
         assert np.array_equal(again[name], base[name]), f"{name} differs with {size}"
 
@@ -224,8 +224,8 @@ def test_splats_of_a_plane_share_its_key(backend):
 
 def test_both_schedules_draw_the_same_picture(backend, renderer):
     cloud = random_splats(300, seed=9)
-    base, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS)
-    other, _ = traced(backend, cloud, fs.Quality(), ALL_OUTPUTS, backend.shapes("schedule")["groups"])
+    base, _ = traced(backend, cloud, fs.Quality())
+    other, _ = traced(backend, cloud, fs.Quality(), shape=backend.shapes("schedule")["groups"])
     for name in ("rgb", "alpha", "normal", "depth"):
         assert np.allclose(other[name], base[name], rtol=1e-5, atol=2e-6), name
     assert np.array_equal(other["label"], base["label"])

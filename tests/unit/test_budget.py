@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from random_scenes import HELD_OUT, random_scene
+from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.accuracy import errors, truth
@@ -89,6 +90,7 @@ def test_the_definition_stays():
 # calibration
 
 
+@in_turn()
 def test_a_measured_error_is_the_error(renderer, held_out):
     for scene, want in held_out[:6]:
         for bound in BOUNDS:
@@ -118,6 +120,7 @@ def test_errors_are_those_before_the_sensor(renderer, held_out):
     assert dark.error == plain.error
 
 
+@in_turn(1)
 def test_measuring_finds_what_is_cheaper_than_the_price_list(renderer, held_out):
     """Most scenes need less than the worst of the list does."""
     cutoff = fs.quality_within(error=1e-3, device=renderer).alpha_cutoff
@@ -125,6 +128,7 @@ def test_measuring_finds_what_is_cheaper_than_the_price_list(renderer, held_out)
     assert np.median(own) > cutoff
 
 
+@in_turn()
 def test_the_answer_is_kept_and_a_broken_file_is_made_anew(renderer, scene, monkeypatch):
     first = within(renderer, scene, 1e-3)
     (file,) = store.folder().iterdir()
@@ -138,6 +142,7 @@ def test_the_answer_is_kept_and_a_broken_file_is_made_anew(renderer, scene, monk
         assert json.loads(file.read_bytes())["knobs"]
 
 
+@in_turn(1)
 def test_what_is_kept_is_for_one_question(renderer, scene):
     within(renderer, scene, 1e-3)
     within(renderer, scene, 1e-2)
@@ -149,6 +154,7 @@ def test_what_is_kept_is_for_one_question(renderer, scene):
     assert len(list(store.folder().iterdir())) == 6
 
 
+@in_turn()
 def test_a_folder_that_cannot_be_written_is_no_obstacle(renderer, scene, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setattr(store, "folder", lambda: tmp_path / "file" / "cache")
@@ -252,6 +258,7 @@ def test_a_time_that_nothing_keeps(renderer, scene, clock, ms):
         within(renderer, scene, ms=ms)
 
 
+@in_turn(1)
 def test_frames_are_really_timed(renderer, scene):
     choice = within(renderer, scene, ms=10_000)
     assert 0 < choice.ms <= choice.ms_late <= 10_000

@@ -1,9 +1,8 @@
 """Capture: what it takes, and what it says of values that it cannot have."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
+from traits import Traits
 
 import fidsplat as fs
 from fidsplat.effects import select
@@ -103,48 +102,38 @@ def test_a_capture_and_its_parts_draw_the_same():
     assert all(np.array_equal(frame[name], long[name]) for frame in frames for name in long)
 
 
-@dataclass(frozen=True)
-class Cloud:
-    """What of a cloud decides the features."""
-
-    sh_degree: int = -1
-    has_planes: bool = False
-    footprint: str = "gaussian"
-    ellipsoids: str = "none"
-
-
 ROLLING = {"motion": MOVING, "shutter": fs.Shutter(readout=0.1, rows_per_band=4)}
 
 
-OF_PLANES, OF_BOXES = Cloud(has_planes=True), Cloud(footprint="box")
+OF_PLANES, OF_BOXES = Traits(has_planes=True), Traits(footprint="box")
 ORDERED, FLOAT64 = fs.Quality(order="centre"), fs.Quality(blend_precision="float64")
-BY_PIXEL, THICK = fs.Quality(order="pixel"), Cloud(ellipsoids="all")
+BY_PIXEL, THICK = fs.Quality(order="pixel"), Traits(ellipsoids="all")
 GROUP = fs.Motion(None, {1: lambda time: np.eye(4)})
 
 
 @pytest.mark.parametrize(
     ("cloud", "parts", "called", "not_called"),
     [
-        (Cloud(sh_degree=0), {}, "color_rgb", "color_sh"),
-        (Cloud(sh_degree=1), {}, "color_sh", "color_rgb"),
+        (Traits(sh_degree=0), {}, "color_rgb", "color_sh"),
+        (Traits(sh_degree=1), {}, "color_sh", "color_rgb"),
         (OF_PLANES, {}, "compose_planes", "compose_ordered"),
         (OF_PLANES, {"quality": ORDERED}, "compose_ordered", "compose_planes"),
-        (Cloud(), {"quality": BY_PIXEL}, "compose_pixel", "compose_ordered"),
+        (Traits(), {"quality": BY_PIXEL}, "compose_pixel", "compose_ordered"),
         (THICK, {"quality": BY_PIXEL}, "compose_ordered", "compose_pixel"),  # of one depth each
-        (Cloud(ellipsoids="some"), {"quality": BY_PIXEL}, "compose_pixel", "compose_ordered"),
+        (Traits(ellipsoids="some"), {"quality": BY_PIXEL}, "compose_pixel", "compose_ordered"),
         (THICK, {"quality": BY_PIXEL.with_(ellipsoid="exact")}, "compose_pixel", "compose_ordered"),
         (THICK, {"quality": BY_PIXEL.with_(blend_precision="float64")}, "compose_pixel", "compose_ordered"),
         (OF_BOXES, {}, "lowpass_none", "lowpass_screen"),  # they are filtered by themselves
-        (Cloud(footprint="mixed"), {}, "lowpass_screen", "lowpass_none"),
-        (Cloud(), {"motion": GROUP}, "motion_groups", "shutter_exposure"),
-        (Cloud(), {"motion": MOVING}, "camera_pinhole", "shutter_exposure"),
-        (Cloud(), ROLLING, "shutter_rows", "motion_groups"),
+        (Traits(footprint="mixed"), {}, "lowpass_screen", "lowpass_none"),
+        (Traits(), {"motion": GROUP}, "motion_groups", "shutter_exposure"),
+        (Traits(), {"motion": MOVING}, "camera_pinhole", "shutter_exposure"),
+        (Traits(), ROLLING, "shutter_rows", "motion_groups"),
         (OF_BOXES, ROLLING, "shutter_exposure", "shutter_rows"),
-        (Cloud(), ROLLING | {"quality": fs.Quality(lowpass="pixel")}, "shutter_exposure", "shutter_rows"),
-        (Cloud(), ROLLING | {"camera": PANORAMIC}, "shutter_exposure", "shutter_rows"),
-        (Cloud(), {"quality": FLOAT64}, "arithmetic_precise", "arithmetic_fast"),
-        (Cloud(), {"fog": fs.Fog(0.0)}, "background_constant", "fog"),
-        (Cloud(), {"fog": fs.Fog(0.1)}, "fog", "shutter_rows"),
+        (Traits(), ROLLING | {"quality": fs.Quality(lowpass="pixel")}, "shutter_exposure", "shutter_rows"),
+        (Traits(), ROLLING | {"camera": PANORAMIC}, "shutter_exposure", "shutter_rows"),
+        (Traits(), {"quality": FLOAT64}, "arithmetic_precise", "arithmetic_fast"),
+        (Traits(), {"fog": fs.Fog(0.0)}, "background_constant", "fog"),
+        (Traits(), {"fog": fs.Fog(0.1)}, "fog", "shutter_rows"),
     ],
 )
 def test_a_scene_calls_for_what_it_needs_and_nothing_else(cloud, parts, called, not_called):

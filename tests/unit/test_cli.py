@@ -76,7 +76,7 @@ def test_help_loads_nothing_heavy():
     ("words", "says"),
     [
         ([], "try `fidsplat demo` first"),
-        ([], "demo, devices, info, marker, render, detect"),
+        ([], "demo, devices, info, marker, render, view, fly, detect"),
         (["mraker"], "Available subcommands: demo, devices"),
         (["marker"], "SPEC"),
         (["marker", "qr:a", "--sise", "1"], "perhaps --size M; see fidsplat marker --help"),
@@ -138,7 +138,7 @@ def test_a_terminal_without_unicode_gets_help_and_errors(tmp_path):
     plain = {**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
 
     def run(*words):
-        command = [sys.executable, "-m", "fidsplat.cli", *words]
+        command = [sys.executable, "-m", "fidsplat", *words]
         return subprocess.run(command, capture_output=True, text=True, env=plain, cwd=tmp_path)
 
     assert run("--help").returncode == 0

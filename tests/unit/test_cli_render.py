@@ -126,7 +126,7 @@ look_at = [0.12, 0.0, 0.0]
     assert marker["corner_error_px"] < 0.5
 
 
-def test_every_plane_is_a_file(scene, tmp_path, capsys):
+def test_every_output_is_a_file(scene, tmp_path, capsys):
     words = "rgb,alpha,depth,depth_median,distance_first,normal,normal_world,label,splat_id,blended"
     assert main(["render", scene, "-o", "frames", "--outputs", words, "--json"]) == 0
     assert sorted(said(capsys)["files"]) == sorted(f"frames/{name}" for name in names(tmp_path / "frames"))

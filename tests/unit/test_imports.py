@@ -54,7 +54,7 @@ MAY_IMPORT = {
     "train": PLAIN | {"formats", "vision", "render", "backends", "effects"},
     "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
 }
-ANYTHING = {"cli", "commands", "experiments", "__init__"}
+ANYTHING = {"cli", "commands", "experiments", "__init__", "__main__"}
 
 # third-party module: the places that alone may import it
 HOME_OF = {
@@ -64,6 +64,7 @@ HOME_OF = {
     "flip_evaluator": ("vision",),
     "viser": ("viewer.server",),
     "torch": ("frame",),
+    "pxr": ("formats.usd",),
     "imageio_ffmpeg": ("vision.video",),
     "bpy": ("experiments.blender_worker",),
     "shapely": ("markers", "vision.visible"),
@@ -71,7 +72,7 @@ HOME_OF = {
     "segno": ("markers",),
     "pyopencl": ("backends.opencl",),
     "warp": ("backends.warp",),
-    "mujoco": ("sim.mujoco",),
+    "mujoco": ("sim.mujoco", "sim.robot"),
     "gymnasium": ("sim.gymnasium",),
     "mcap": ("logs",),
     "rosbags": ("logs",),

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import shapely
+from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.experiments.demo_scene import demo_scene, demo_views
@@ -116,6 +117,7 @@ def test_what_the_pictures_edge_cuts_off():
     assert visible(behind, camera).share == 0.0
 
 
+@in_turn()
 @pytest.mark.parametrize("spec", ["charuco:5x4:4x4_50", "gridboard:3x2:5x5_100", "aprilgrid:3x2:36h11"])
 def test_a_board_gives_one_pose(renderer, spec):
     """From half of its tags too, and a tag of another place in the picture stays what it is."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-FIDSPLAT = f"{sys.executable} -m fidsplat.cli"
+FIDSPLAT = f"{sys.executable} -m fidsplat"
 NO_ROOM = "fidsplat: No space left on device; make room there, or on what the output goes to"
 
 

@@ -135,7 +135,7 @@ def test_planes_are_warp_arrays_without_a_copy(renderer):
         renderer.render(CLOUD, CAMERA).device_array("depth")
 
 
-def test_what_is_done_to_a_shared_plane_is_not_done_to_what_was_read(renderer):
+def test_what_is_done_to_a_shared_image_is_not_done_to_what_was_read(renderer):
     frame = renderer.render(CLOUD, CAMERA)
     before = frame["rgb"].copy()
     frame.device_array("rgb").zero_()
@@ -273,7 +273,7 @@ def test_arrays_that_cannot_be_adopted(renderer, changes, words):
         renderer.adopt(**{**arrays_of(CLOUD, device), **changes})
 
 
-def test_numpy_sees_the_plane_of_a_cpu_through_dlpack():
+def test_numpy_sees_the_image_of_a_cpu_through_dlpack():
     frame = fs.Renderer("warp:cpu").render(CLOUD, CAMERA, outputs=("rgb", "label"))
     for name in frame:
         seen = np.from_dlpack(frame.device_array(name))

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from itertools import chain
@@ -113,24 +113,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         DeviceError: an effect's file fills a hook that no file has.
     """
     layouts = layouts_of(features)
-    declared = _Declarations(layouts, features)
-    defines = {
-        "CHUNKS": shape.chunks,
-        "FAST_FMA": int(shape.fast_fma),
-        "LANES": shape.lanes,
-        "RADIX_BITS": shape.radix_bits,
-        "SAMPLES": features.samples,
-        "SCAN_ITEMS": shape.scan_items,
-        "SETUP_FP64": int(features.setup_precision == "float64"),
-        "TILE_H": shape.tile_height,
-        "TILE_W": shape.tile_width,
-    }
-    if shape.schedule == "group":
-        defines["ROWS"] = shape.rows
-    if "color_sh" in layouts:
-        defines["SH_DEGREE"] = features.sh_degree
-    if "compose_pixel" in layouts:
-        defines["WAITING"] = shape.waiting
+    declared = Declarations(layouts, features)
     files = [layout.file for layout in layouts.values() if layout.file]
     if shape.lists == "tiled":
         files.append("list/tiled.cl")
@@ -145,39 +128,81 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         ],
     }
     _refuse_unknown_hooks(files)
-    sections = [(file, sections_of(file)) for file in files]
-
-    def fill(hook: str, subject: str) -> Iterator[str]:
-        if hook in _DECLARED:
-            yield f'#line 1 "layout.py: {subject}"\n{declared.text(hook, subject)}'
-        for file, by_hook in sections:
-            for first, lines in by_hook.get(hook, ()):
-                yield f"#line {first} {_shown(file)}\n{expand(file, first, lines)}"
-
-    def expand(file: str, first: int, lines: tuple[str, ...]) -> str:
-        made = []
-        for number, line in enumerate(lines, first):
-            hook = _HOOK.fullmatch(line)
-            filled = "".join(fill(hook[1], hook[2] or "")) if hook else ""
-            made.append(f"{filled}#line {number + 1} {_shown(file)}" if filled else "" if hook else line)
-        return "\n".join(made) + "\n"
-
-    def program(name: str) -> Text:
-        files = [f"{stage}.cl" for stage in stages[name]]
-        body = "".join(f"#line 1 {_shown(file)}\n{expand(file, 1, lines_of(file))}" for file in files)
-        body = with_scalars(body, declared.scalars.wide)
-        bare = "\n".join(map(_without_comment, body.split("\n")))
-        # a number that a program does not name must not make another program
-        head = "".join(f"#define {name} {value}\n" for name, value in sorted(defines.items()) if name in bare)
-        return Text(f"// the program `{name}`\n{head}{body}", f"\n{head}{bare}")
-
-    programs = {name: program(name) for name in stages}
-    kernels = (kernel for each in programs.values() for kernel in _KERNEL.findall(each.compiled))
+    writer = Writer(files, declared.text, numbers_of(features, shape), declared.scalars)
+    programs = {name: writer.program(name, stages[name]) for name in stages}
+    kernels = (kernel for each in programs.values() for kernel in kernels_in(each))
     arguments = {kernel: declared.arguments(kernel) for kernel in kernels}
     return Source(programs, declared.records, arguments, declared.samples, declared.scalars)
 
 
-class _Declarations:
+def numbers_of(features: FeatureSet, shape: DeviceShape) -> dict[str, int]:
+    """The build constants, by their names in the kernels."""
+    numbers = {
+        "CHUNKS": shape.chunks,
+        "FAST_FMA": int(shape.fast_fma),
+        "LANES": shape.lanes,
+        "RADIX_BITS": shape.radix_bits,
+        "SAMPLES": features.samples,
+        "SCAN_ITEMS": shape.scan_items,
+        "SETUP_FP64": int(features.setup_precision == "float64"),
+        "SH_DEGREE": features.sh_degree,
+        "TILE_H": shape.tile_height,
+        "TILE_W": shape.tile_width,
+        "WAITING": shape.waiting,
+    }
+    if shape.schedule == "group":
+        numbers["ROWS"] = shape.rows
+    return numbers
+
+
+class Writer:
+    """Puts programs together from stage files, whose hooks effects' files and declarations fill."""
+
+    def __init__(
+        self,
+        files: Iterable[str],
+        declared: Callable[[str, str], str],
+        defines: Mapping[str, int],
+        scalars: Scalars,
+    ) -> None:
+        """files: of the effects, below kernels/opencl/, in the order in which they fill a hook. declared: the
+        text of `//@@ struct NAME` or `//@@ arguments KERNEL`."""
+        self._sections = [(file, sections_of(file)) for file in files]
+        self._declared, self._defines, self._scalars = declared, defines, scalars
+
+    def program(self, name: str, stages: Iterable[str]) -> Text:
+        """The program of these stage files."""
+        files = [f"{stage}.cl" for stage in stages]
+        body = "".join(f"#line 1 {_shown(file)}\n{self._expand(file, 1, lines_of(file))}" for file in files)
+        body = with_scalars(body, self._scalars.wide)
+        bare = "\n".join(map(_without_comment, body.split("\n")))
+        # a number that a program does not name must not make another program
+        numbers = sorted(self._defines.items())
+        head = "".join(f"#define {name} {value}\n" for name, value in numbers if name in bare)
+        return Text(f"// the program `{name}`\n{head}{body}", f"\n{head}{bare}")
+
+    def _fill(self, hook: str, subject: str) -> Iterator[str]:
+        if hook in _DECLARED:
+            yield f'#line 1 "layout.py: {subject}"\n{self._declared(hook, subject)}'
+        for file, by_hook in self._sections:
+            for first, lines in by_hook.get(hook, ()):
+                yield f"#line {first} {_shown(file)}\n{self._expand(file, first, lines)}"
+
+    def _expand(self, file: str, first: int, lines: tuple[str, ...]) -> str:
+        made = []
+        for number, line in enumerate(lines, first):
+            hook = _HOOK.fullmatch(line)
+            filled = "".join(self._fill(hook[1], hook[2] or "")) if hook else ""
+            made.append(f"{filled}#line {number + 1} {_shown(file)}" if filled else "" if hook else line)
+        return "\n".join(made) + "\n"
+
+
+def kernels_in(text: Text) -> list[str]:
+    """Names of a program's kernels."""
+    return _KERNEL.findall(text.compiled)
+
+
+class Declarations:
     """What layout.py declares, with what the chosen effects add to it."""
 
     def __init__(self, layouts: dict[str, Layout], features: FeatureSet) -> None:
@@ -191,7 +216,13 @@ class _Declarations:
             "Splat": SPLAT.with_members(one for layout in every for one in layout.splat),
             "Bounds": BOUNDS.with_members(one for layout in every for one in layout.bounds),
         }
-        self.records = {name: record.dtype(self.scalars) for name, record in self._structs.items()}
+        self.records: dict[str, np.dtype] = {}
+        self.add(*self._structs.values())
+
+    def add(self, *records: Record) -> None:
+        """Further structs that kernels may ask for."""
+        self._structs |= {record.name: record for record in records}
+        self.records |= {record.name: record.dtype(self.scalars) for record in records}
 
     def arguments(self, kernel: str) -> tuple[Argument, ...]:
         """Its own, then those of the effects in their order, each name once."""

@@ -10,6 +10,7 @@ import pyopencl as cl
 from fidsplat.backends.base import DeviceInfo, Rates
 from fidsplat.backends.opencl import pocl_cache, pocl_target
 from fidsplat.backends.opencl.assemble import Source, assemble
+from fidsplat.backends.opencl.gradients import OpenCLGradients
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.probe import OpenCLProbe
 from fidsplat.backends.opencl.resident import Resident
@@ -19,6 +20,7 @@ from fidsplat.backends.opencl.training import OpenCLTraining
 from fidsplat.backends.opencl.vendors import intel_among_them
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.effects import FeatureSet
+from fidsplat.effects.differentiable import check_differentiable
 from fidsplat.errors import DeviceError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
 
@@ -75,6 +77,7 @@ class OpenCLBackend(Workspace):
             pocl_cache.check_once()
         super().__init__(device, _describe(device, _name_of(device)), _shape(device))
         self._pipelines: dict[tuple[FeatureSet, DeviceShape], OpenCLPipeline] = {}
+        self._gradients: dict[OpenCLPipeline, OpenCLGradients] = {}
         self._own: tuple[DeviceShape, dict[FeatureSet, OpenCLPipeline]] = self.shape, {}
         """of the device's own shape, by what is asked for: found by the first look"""
 
@@ -114,6 +117,14 @@ class OpenCLBackend(Workspace):
                 self._own = self.shape, {}
             self._own[1][features] = self._pipelines[key]
         return self._pipelines[key]
+
+    def differentiate(self, features: FeatureSet, shape: DeviceShape | None = None) -> OpenCLGradients:
+        """As `Differentiates`; `shape` replaces the device's own build constants (tests)."""
+        check_differentiable(features)
+        pipeline = self.pipeline(features, shape)
+        if pipeline not in self._gradients:
+            self._gradients[pipeline] = OpenCLGradients(pipeline)
+        return self._gradients[pipeline]
 
     def training(self) -> OpenCLTraining:
         """As `Trains`."""

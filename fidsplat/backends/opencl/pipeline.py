@@ -88,7 +88,28 @@ class OpenCLPipeline:
             if plan.chunk and self.shape.lists != "ordered":
                 # one way of drawing in chunks is enough: where memory is short, sorting takes the least time
                 return self._other(self.features, replace(self.shape, lists="ordered")).render(resident, view)
-            return self._images(view, self._tried(self._first, resident, view, plan, key))
+            return self._images(view, Drawn.of(self._tried(self._first, resident, view, plan, key)))
+
+    def drawn(self, resident: Resident, view: View) -> tuple[Picture, OpenCLImages]:
+        """One picture with all that its stages have left on the device, until another is drawn.
+
+        Raises:
+            DeviceError: as `render`.
+        """
+        with self.workspace.lock:
+            picture = self._tried(self._whole, resident, view)
+            return picture, self._images(view, Drawn.of(picture))
+
+    def _whole(self, resident: Resident, view: View) -> Picture:
+        """A picture that is drawn at once, not in chunks or bands."""
+        plan = self._plan(resident, view)
+        picture = None if plan.chunk else self._first(resident, view, plan)
+        if picture is None or picture.stats()["pairs"] > self.workspace.pair_budget:
+            raise DeviceError(
+                f"{resident.count:,} splats are drawn in chunks or bands within the memory budget, and such "
+                "pictures have no gradient; raise memory_budget, or use fewer splats or smaller pictures"
+            )
+        return picture
 
     def render_batch(self, resident: Resident, batch: ViewBatch) -> OpenCLBatch:
         """Draw many views, as many at once as memory holds.
@@ -184,7 +205,7 @@ class OpenCLPipeline:
 
     def _first(
         self, resident: Resident, view: View, plan: MemoryPlan, key: tuple[Any, ...] | None = None
-    ) -> Drawn:
+    ) -> Picture:
         """Draws a picture with what room it takes; remembers its kind, if the next may be launched again."""
         pool = self.workspace.pool
         kind = self, view.width, view.height, resident.count, plan
@@ -196,7 +217,7 @@ class OpenCLPipeline:
             if len(resident.kept) >= _KINDS:
                 resident.kept.clear()
             resident.kept[key] = Kept(plan, kind)
-        return Drawn.of(picture)
+        return picture
 
     def _repeat(self, resident: Resident, view: View, kept: Kept) -> OpenCLImages | None:
         """The next picture of a kind; None where nothing is left of the last."""
@@ -204,29 +225,47 @@ class OpenCLPipeline:
         workspace.pool.make_way(kept.kind, workspace.memory_budget - plan.held)
         if not TiledLists.capacity(workspace):
             return None
-        queue = workspace.turn_to(workspace.repeat_queue)
-        recording = kept.recording
+        queue, recording = workspace.turn_to(workspace.repeat_queue), kept.recording
+        workspace.pictures += 1
 
         def undrawn(view: View) -> Picture:
-            return Picture(workspace, self.program, self.shape, resident, view, plan, repeats=True)
+            return Picture(workspace, self.program, self.shape, resident, view, plan, queue)
 
         if recording is not None and recording.fits(view, undrawn, queue):
-            leased = recording.launch(queue)
+            leased, _ = recording.launch(queue)
             stats = stats_later(queue, dict(leased)["counts"], resident.count)
             drawn = Drawn(queue, leased, stats)
         else:
             picture = draw(undrawn, view, self.features.images)
             drawn = Drawn(queue, picture.leased, picture.stats, uploads=picture.uploads)
             recording = kept.recording = Recording(picture)
-        repeat = Repeat(self._redrawn, resident, view, recording.big, recording.capacity)
+        repeat = Repeat(self._redrawn, self._timed, resident, view, recording)
         images = self._images(view, drawn, repeat)
         if not resident.fixed:
             images.settle()
         return images
 
+    def _timed(self, resident: Resident, view: View, recording: Recording) -> dict[str, float]:
+        """Milliseconds of the stages, of the picture drawn once more."""
+        workspace = self.workspace
+        queue = workspace.turn_to(workspace.queue)
+        workspace.pictures += 1
+
+        def undrawn(view: View) -> Picture:
+            return Picture(workspace, self.program, self.shape, resident, view, MemoryPlan(0, 0, 0), queue)
+
+        if recording.fits(view, undrawn, queue):
+            leased, events = recording.launch(queue, timed=True)
+            drawn = Drawn(queue, leased, dict, events)
+        else:
+            drawn = self._redrawn(resident, view)
+        workspace.finish()
+        workspace.pool.give_back(drawn.leased)
+        return drawn.timings()
+
     def _redrawn(self, resident: Resident, view: View) -> Drawn:
         """The picture drawn anew, whatever it takes, and its time."""
-        return self._tried(self._first, resident, view, self._plan(resident, view))
+        return Drawn.of(self._tried(self._first, resident, view, self._plan(resident, view)))
 
     def _draw(self, resident: Resident, view: View, plan: MemoryPlan) -> Picture:
         def start(view: View) -> Picture:

@@ -3,7 +3,7 @@ host."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,13 +35,14 @@ class ResidentArrays:
     """Splats in arrays of the device, as pictures read them: disks without labels and planes."""
 
     has_planes, footprint, ellipsoids, planes = False, "gaussian", "none", None
-    streamed = False
+    streamed = fixed = False
 
     def __init__(
         self, buffers: Mapping[str, cl.Buffer], count: int, sh_degree: int, origin: np.ndarray
     ) -> None:
         self._buffers, self.count, self.origin = dict(buffers), count, origin
         self.sh_degree = sh_degree
+        self.kept: dict[Hashable, Any] = {}
 
     @property
     def memory_bytes(self) -> int:
@@ -65,7 +66,7 @@ class OpenCLTraining:
     """As `TrainingKernels`."""
 
     def __init__(self, workspace: Workspace) -> None:
-        self._workspace, self._queue = workspace, workspace.queue
+        self._workspace = workspace
         lanes = workspace.shape.lanes if workspace.shape.schedule == "lanes" else 1
         self._lanes = lanes
         self._program = Program(workspace, training_source(lanes, workspace.info.float64))
@@ -177,6 +178,11 @@ class OpenCLTraining:
         given = {"size": size, "steep": steep, "clear": clear, **dict(zip(names, words, strict=True))}
         self._launch("shake", self._count, given)
 
+    @property
+    def _queue(self) -> cl.CommandQueue:
+        """The queue on which pictures with derivatives are drawn, after all that is on others."""
+        return self._workspace.turn_to(self._workspace.queue)
+
     def _launch(self, kernel: str, items: int, given: Mapping[str, Any] | None = None) -> None:
         size = max(_GROUP, -(-items // _GROUP) * _GROUP)
         self._enqueue(kernel, (size,), (_GROUP,), given or {})
@@ -191,7 +197,7 @@ class OpenCLTraining:
         every = {**self._held, "count": self._count, **given}
         values = [every[one.name] for one in self._program.source.arguments[kernel]]
         try:
-            self._program.launch(self._workspace.turn_to(self._queue), kernel, size, group, values)
+            self._program.launch(self._queue, kernel, size, group, values)
         except cl.Error as error:
             raise DeviceError(f"{self._workspace.info.title} failed while training: {error}") from error
 

@@ -2,7 +2,7 @@
 // to compare with the truth. Built with prelude.cl and math.cl in front, the latter with the functions of slot/arithmetic_fast.cl.
 
 // Index space: one work-item per LANES values.
-// Reads:  exponents, shares, above, below (each n; n a multiple of LANES). Writes: out, planes of n floats:
+// Reads:  exponents, shares, above, below (each n; n a multiple of LANES). Writes: out, n floats of each:
 //         exp, log, above / below, sqrt of below, fma, fast_exp, fast_log.
 kernel void arithmetic_float(uint n, global const float *restrict exponents, global const float *restrict shares,
                              global const float *restrict above, global const float *restrict below,
@@ -20,7 +20,7 @@ kernel void arithmetic_float(uint n, global const float *restrict exponents, glo
 }
 
 // Index space: one work-item per value.
-// Reads:  above, below (n). Writes: out, planes of n: above / below, sqrt of below, log of below.
+// Reads:  above, below (n). Writes: out, n of each: above / below, sqrt of below, log of below.
 kernel void arithmetic_real(uint n, global const real *restrict above, global const real *restrict below,
                             global real *restrict out) {
     uint at = get_global_id(0);

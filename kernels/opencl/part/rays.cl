@@ -1,4 +1,4 @@
-// Lenses whose samples each have a ray of their own, in the buffer `rays`: 3 planes X, Y, Z of the padded sample grid, NaN
+// Lenses whose samples each have a ray of their own, in the buffer `rays`: 3 channels X, Y, Z of the padded sample grid, NaN
 // where nothing is seen. A ray r meets the splat's plane at (u, v) with (u, v, 1) D = (n_u, n_v, D) = r . (b x p, p x a, a x b),
 // at the depth det[a b p] / D in units of r's length: along z if rays have Z = 1, else along the ray. The forms are kept
 // relative to the ray of the sample nearest to the centre, so that nothing cancels (numerics B1).

@@ -1,5 +1,5 @@
 // Edges of boxes (part/box_cover.cl) where samples have rays of their own: curves, which within a sample are straight. The
-// gradients of the forms come from the ray's derivatives by the sample's position, in the buffer `ray_slopes`: 6 planes
+// gradients of the forms come from the ray's derivatives by the sample's position, in the buffer `ray_slopes`: 6 channels
 // dX/dx, dY/dx, dZ/dx, dX/dy, dY/dy, dZ/dy.
 //@ footprint_functions
 // 1 where a form is half a sample above 0, 0 where it is as much below, by its derivatives along x and y.

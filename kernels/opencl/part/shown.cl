@@ -1,4 +1,4 @@
-// What the planes that name or measure what is seen take for nothing: a sample that is covered by less than this. A low cut-off
+// What the outputs that name or measure what is seen take for nothing: a sample that is covered by less than this. A low cut-off
 // draws the far rims of splats, for the sake of colours; nobody would call them part of a mask.
 //@ compose_types
 #define LEAST_ALPHA (WIDE(1.0) / WIDE(255.0))

@@ -1,7 +1,7 @@
 // For GPUs: one work-group draws one tile, ROWS pixels of a column per work-item; splats are staged in local memory.
 // Barriers stand in loops whose bounds are the same for the whole group (numerics F5).
 // Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile of each view.
-// Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 planes: r, g, b, transmittance) and the outputs' samples, whole tiles.
+// Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 channels: r, g, b, transmittance) and the outputs' samples, whole tiles.
 #define GROUP (TILE_W * TILE_H / ROWS)
 // Neighbours in a group draw a block of BLOCK_W x BLOCK_H pixels, so that a splat that misses it costs it nothing.
 #define BLOCK_W 8

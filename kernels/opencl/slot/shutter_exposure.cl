@@ -1,6 +1,6 @@
-// A picture of several poses: sub-pictures are blended one after another, and their samples gathered in the picture's planes.
+// A picture of several poses: sub-pictures are blended one after another, and their samples gathered in the picture's.
 //@ kernels
-// Adds a sub-picture's light (colours and transmittances, or a plane of fog), weighted, to that of its rows.
+// Adds a sub-picture's light (colours and transmittances, or fog's one channel), weighted, to that of its rows.
 // Index space: one work-item per sample of the sub-picture (x, y). Reads: raw. Writes: exposed.
 kernel void expose(
 //@@ arguments expose
@@ -14,7 +14,7 @@ kernel void expose(
     }
 }
 
-// Copies the planes that are not averaged. Index space as above; 32 bits of any kind each.
+// Copies the sample buffers that are not averaged. Index space as above; 32 bits of any kind each.
 kernel void expose_middle(
 //@@ arguments expose_middle
 ) {

@@ -1,0 +1,86 @@
+"""Derivatives: how far they are from the reference's, and how long they take (docs/gradients.md).
+
+    python benchmarks/gradients.py [--device D] [--scenes 200] [--json FILE]
+    python benchmarks/gradients.py --time r100k_720p r1m_1080p [--quality surfel] [--repeats 15]
+
+Errors are of random scenes as tests/contract/test_gradients.py has them: of each parameter's whole array the
+relative error and one less its cosine, the median and the largest of all scenes. Times are of a picture, and
+of its derivatives by colour, the splats resident: medians of the device's own clock, stage by stage.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+
+import numpy as np
+from measuring import PROGRESS, facts, keep, options, show
+from rich.progress import track
+
+import fidsplat as fs
+from fidsplat.backends.base import Differentiates
+from fidsplat.backends.prepare import prepare
+from fidsplat.backends.reference.backend import ReferenceBackend
+from fidsplat.errors import InputError
+from fidsplat.hard_cases.derivatives import derivatives, differences, random_loss, random_picture
+from fidsplat.random_clouds import load_scene
+from fidsplat.timing import Timer, take_turns
+
+
+def errors(backend: Differentiates, scenes: int) -> list[dict[str, float | str]]:
+    """Of each parameter the median and the largest error of all scenes."""
+    reference, found = ReferenceBackend(), defaultdict(list)
+    for seed in track(range(scenes), "Scenes", console=PROGRESS):
+        picture = random_picture(seed)
+        for one in differences(derivatives(backend, *picture), derivatives(reference, *picture)):
+            found[one.parameter].append(one[1:])
+    return [
+        {
+            "parameter": name,
+            "median": float(np.median(values, axis=0)[0]),
+            **dict(zip(("largest", "largest_turn"), np.max(values, axis=0).tolist(), strict=True)),
+        }
+        for name, values in found.items()
+    ]
+
+
+def times(backend: Differentiates, scene: str, quality: str | None, repeats: int) -> dict[str, float | str]:
+    """Medians in milliseconds of a picture and its derivatives, and of each stage."""
+    cloud, camera = load_scene(scene)
+    features, view = prepare(cloud, fs.Capture(camera, quality=quality))
+    pipeline, resident = backend.differentiate(features), backend.upload(cloud)
+    loss = random_loss(features, view)
+
+    def step() -> dict[str, float]:
+        images = pipeline.forward(resident, view)
+        pipeline.backward(images, loss)
+        return dict(images.timings)
+
+    timer = Timer(step)
+    take_turns([timer], repeats)
+    stages = {name: float(np.median(ms)) for name, ms in timer.parts.items()}
+    return {"scene": scene, "step": sum(stages.values()), **stages}
+
+
+def main() -> None:
+    parser = options(__doc__, repeats=15)
+    parser.add_argument("--scenes", type=int, default=200, help="random scenes (default: 200)")
+    parser.add_argument("--time", nargs="+", metavar="SCENE", help="time these standard scenes instead")
+    parser.add_argument("--quality", help="of what is timed (default: standard)")
+    given = parser.parse_args()
+    renderer = fs.Renderer(given.device)
+    if not isinstance(renderer.backend, Differentiates):
+        raise InputError(f"{given.device} has no derivatives; use an OpenCL device")
+    backend = renderer.backend
+    if given.time:
+        rows = [times(backend, scene, given.quality, given.repeats) for scene in given.time]
+        heads, title = list(rows[0]), "Milliseconds of a picture and its derivatives"
+    else:
+        rows = errors(backend, given.scenes)
+        heads, title = list(rows[0]), f"Derivatives of {given.scenes} random scenes against float64"
+    if not keep({**facts(renderer), "figures": rows}, given.json):
+        cells = [[one if isinstance(one, str) else f"{one:.3g}" for one in row.values()] for row in rows]
+        show(f"{title}, {renderer.device.title}", heads, cells)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,159 @@
+"""Pictures with their derivatives: the stages of pipeline.py, and the kernels of the program `gradients`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from copy import copy
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+from pyopencl.array import Array
+
+from fidsplat.backends.gradients import NOT_THE_LAST, check_shape, gradient_shape
+from fidsplat.backends.opencl.gradients_source import assemble_gradients, chunk_of
+from fidsplat.backends.opencl.images import OpenCLImages
+from fidsplat.backends.opencl.picture import Picture
+from fidsplat.backends.opencl.pipeline import OpenCLPipeline
+from fidsplat.backends.opencl.program import Program
+from fidsplat.backends.opencl.resident import Resident
+from fidsplat.backends.view import View
+from fidsplat.effects import OUTPUTS
+from fidsplat.effects.differentiable import GRADIENT_OUTPUTS, check_gradients
+from fidsplat.errors import DeviceError, InputError
+
+_GROUP = 64  # RESERVED, POSED and ADDED of the kernels
+_F32 = np.dtype(np.float32)
+
+
+class DifferentiableImages:
+    """Output images with what the stages have left, for `OpenCLGradients.backward`."""
+
+    def __init__(self, picture: Picture, images: OpenCLImages) -> None:
+        self.picture, self._images = picture, images
+        self._number = picture.workspace.pictures
+
+    @property
+    def last(self) -> bool:
+        """Whether no other picture has been begun on the device since."""
+        return self.picture.workspace.pictures == self._number
+
+    def read(self, name: str) -> np.ndarray:
+        """The image as a NumPy array of its own."""
+        return self._images.read(name)
+
+    def device_array(self, name: str) -> Array:
+        """The image as an array of the device, (h, w) or (h, w, channels); no copy."""
+        shape, dtype = gradient_shape(name, self.picture.view), np.dtype(OUTPUTS[name].dtype)
+        return Array(self.picture.queue, shape, dtype, data=self.picture.held[f"{name}_out"])
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds by stage, those of `backward` among them."""
+        return self._images.timings
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        """As of every picture."""
+        return self._images.stats
+
+
+class OpenCLGradients:
+    """Compiled stages and their derivatives."""
+
+    def __init__(self, pipeline: OpenCLPipeline) -> None:
+        self._pipeline = pipeline
+        self.source = assemble_gradients(pipeline.features, pipeline.shape)
+        self.program = Program(pipeline.workspace, self.source)
+
+    def forward(self, resident: Resident, view: View) -> DifferentiableImages:
+        """As `DifferentiablePipeline`."""
+        return DifferentiableImages(*self._pipeline.drawn(resident, view))
+
+    def backward(self, images: DifferentiableImages, gradients: Mapping[str, Any]) -> dict[str, Any]:
+        """As `DifferentiablePipeline`: pyopencl arrays."""
+        check_gradients(self._pipeline.features, gradients)
+        if not images.last:
+            raise InputError(NOT_THE_LAST)
+        picture = images.picture
+        try:
+            with picture.workspace.lock:
+                return self._backward(picture, gradients, images.stats["pairs"])
+        except cl.Error as error:
+            title = picture.workspace.info.title
+            raise DeviceError(f"{title} failed while taking derivatives: {error}") from error
+
+    def _backward(self, drawn: Picture, gradients: Mapping[str, Any], pairs: int) -> dict[str, Any]:
+        picture = copy(drawn)  # its buffers and events, with other kernels
+        picture.program = self.program
+        view, shape, count = picture.view, self._pipeline.shape, picture.resident.count
+        self._take_gradients(picture, gradients)
+        groups = -(-count // _GROUP)
+        record = self.source.records["Moments"].itemsize
+        real = self.source.scalars.dtype("real").itemsize
+        tile = shape.tile_width * shape.tile_height
+        picture.take("splat_slots", 4 * count)
+        picture.take("moments", record * pairs)
+        picture.take("checkpoints", 4 * tile * (pairs // chunk_of(shape) + picture.tiles + 1))
+        picture.take("tile_sums", 3 * real * picture.tiles)
+        picture.take("group_sums", 6 * real * groups)
+        reserved = picture.take("reserved", 4)
+        found = self._room_for_results(picture)
+
+        cl.enqueue_fill_buffer(picture.queue, reserved, np.zeros(1, np.uint32), 0, 4)
+        if count:
+            picture.launch("reserve", "reserve_slots", count, _GROUP, count=count)
+        group = shape.blend_items
+        ceiling = math.log(view.ceiling)
+        picture.launch("blend backward", "blend_backward", picture.tiles * group, group, log_ceiling=ceiling)
+        if count:
+            wanted = [one.name for one in self.source.arguments["project_backward"] if one.source == "cloud"]
+            arrays: dict[str, Any] = {name: picture.resident.part(name, 0, count) for name in wanted}
+            picture.launch("project backward", "project_backward", count, _GROUP, count=count, **arrays)
+        for name, sums, rows, columns in (
+            ("tile_sums", "background", picture.tiles, 3),
+            ("group_sums", "pose", groups, 6),
+        ):
+            given: dict[str, Any] = {"parts": picture.held[name], "sums": found[sums].data}
+            given |= {"rows": rows, "columns": columns}
+            picture.launch("project backward", "add_up", _GROUP, _GROUP, **given)
+        return found
+
+    def _take_gradients(self, picture: Picture, gradients: Mapping[str, Any]) -> None:
+        """The derivatives by the images, as arguments of the kernels."""
+        wanted = {one.name for one in self.source.arguments["blend_backward"]}
+        for name in GRADIENT_OUTPUTS:
+            if f"by_{name}" not in wanted:
+                continue
+            shape, given = gradient_shape(name, picture.view), gradients.get(name)
+            if given is None:
+                size = 4 * math.prod(shape)
+                buffer = picture.take(f"by_{name}", size)
+                cl.enqueue_fill_buffer(picture.queue, buffer, np.zeros(1, np.float32), 0, size)
+                continue
+            check_shape(name, given.shape, picture.view)
+            if isinstance(given, Array):
+                if given.dtype != _F32 or not given.flags.c_contiguous or given.offset:
+                    raise InputError(f"the gradient of {name} must be a whole, contiguous float32 array")
+                picture.held[f"by_{name}"] = given.data
+            else:
+                picture.put(f"by_{name}", np.ascontiguousarray(given, np.float32))
+
+    def _room_for_results(self, picture: Picture) -> dict[str, Array]:
+        """Arrays for the results, the same from call to call."""
+        count, features = picture.resident.count, self._pipeline.features
+        shapes: dict[str, tuple[int, ...]] = {
+            **{"means": (count, 3), "quats": (count, 4), "scales": (count, 2), "opacities": (count,)},
+            **{"screen": (count,), "background": (3,), "pose": (6,)},
+        }
+        if "color_sh" in features.slots:
+            shapes["sh"] = (count, (features.sh_degree + 1) ** 2, 3)
+        else:
+            shapes["colors"] = (count, 3)
+        found = {}
+        for name, shape in shapes.items():
+            argument = name if name == "screen" else f"by_{name}"
+            buffer = picture.take(argument, 4 * math.prod(shape))
+            found[name] = Array(picture.queue, shape, _F32, data=buffer)
+        return found

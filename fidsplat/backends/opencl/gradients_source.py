@@ -1,0 +1,64 @@
+"""The text of the program `gradients`: put together as assemble.py does, when derivatives are asked for.
+
+What only draws never has it: the programs `lists` and `picture` are the same with derivatives and without.
+"""
+
+from __future__ import annotations
+
+from fidsplat.backends.opencl.assemble import (
+    Declarations,
+    Source,
+    Writer,
+    kernels_in,
+    layouts_of,
+    numbers_of,
+)
+from fidsplat.backends.opencl.declare import Argument, Record, member
+from fidsplat.backends.opencl.gradients_layout import KERNELS, LAYOUTS, MOMENTS, BackwardLayout
+from fidsplat.backends.opencl.layout import LAYOUTS as DRAWN
+from fidsplat.backends.opencl.shapes import DeviceShape
+from fidsplat.effects import FeatureSet
+
+_STAGES = ("prelude", "math", "splat", "bounds", "blend_backward", "schedule/{}_backward", "project_backward")
+
+
+def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> Source:
+    """The source of the derivatives of these features on a device of this shape."""
+    layouts = [LAYOUTS[name] for name in layouts_of(features) if name in LAYOUTS]
+    declared = _Declarations(features, layouts)
+    # of what is drawn the ways of drawing are needed again, of outputs only their derivatives
+    slots = (name for slot in features.slots for name in (slot, *DRAWN[slot].parts))
+    files = [DRAWN[name].file for name in dict.fromkeys(slots)]
+    files += [layout.file for layout in layouts]
+    numbers = numbers_of(features, shape) | {"CHUNK": chunk_of(shape)}
+    writer = Writer([file for file in files if file], declared.text, numbers, declared.scalars)
+    text = writer.program("gradients", [stage.format(shape.schedule) for stage in _STAGES])
+    arguments = {kernel: declared.arguments(kernel) for kernel in kernels_in(text)}
+    return Source({"gradients": text}, declared.records, arguments, (), declared.scalars)
+
+
+def chunk_of(shape: DeviceShape) -> int:
+    """Splats of a tile's list that are walked forward and then back: on GPUs a column of a splat's pixels for
+    each work-item, on CPUs what a core's second cache holds the fragments of."""
+    return 128 if shape.schedule == "lanes" else shape.blend_items // shape.tile_width
+
+
+class _Declarations(Declarations):
+    """What gradients_layout.py declares beside the records of the picture."""
+
+    def __init__(self, features: FeatureSet, layouts: list[BackwardLayout]) -> None:
+        super().__init__(layouts_of(features), features)
+        self._backward = layouts
+        moments = MOMENTS.with_members(one for layout in layouts for one in layout.moments)
+        names = [name for one in moments.members for name, _ in one.names]
+        # with as many fields of padding
+        alignment = moments.alignment // 4 * self.scalars.dtype("real").itemsize
+        totals = Record("Totals", (member(f"real {' '.join(names)}", "of all tiles"),), alignment)
+        self.add(moments, totals)
+
+    def arguments(self, kernel: str) -> tuple[Argument, ...]:
+        """Its own, then those of the effects in their order."""
+        added: list[Argument] = []
+        if kernel in ("blend_backward", "project_backward"):
+            added += (one for layout in self._backward for one in getattr(layout, kernel))
+        return (*KERNELS[kernel], *added)

@@ -1,0 +1,96 @@
+"""`fidsplat experiment localise`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from fidsplat.commands.output import Device, Json, console, option, print_json, print_table, say, switch
+
+if TYPE_CHECKING:
+    from fidsplat.experiments.localise import Localise as Asked
+    from fidsplat.render import Renderer
+
+
+@dataclass
+class Localise:
+    """A robot drives through a greenhouse and finds its way by tags: how far a simulated camera moves that.
+
+    MuJoCo drives it up one aisle and down the next; wheels, gyroscope and tags go through an error-state
+    filter. Compared are odometry alone, ideal corners, the markers' mixtures, and lens, blur, rolling shutter
+    and noise: absolute and relative trajectory errors, trajectories as TUM for evo, a page. A run that was
+    stopped goes on where it was. Needs the extra `sim`.
+
+    Examples:
+      fidsplat experiment localise --quick
+      fidsplat experiment localise --variant odometry --variant exact -o drive
+    """
+
+    out: Annotated[str, option("DIR", "folder (default: fidsplat-localise)", "-o")] = "fidsplat-localise"
+    quick: Annotated[bool, switch("one row of four plants, and the first three variants")] = False
+    rows: Annotated[int, option("N", "of plants (default: 4, a path of 50 m)")] = 4
+    plants: Annotated[int, option("N", "in each row (default: 12)")] = 12
+    variant: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]],
+        option("NAME", "what to compare, once more for each (default: all)"),
+    ] = ()
+    log: Annotated[
+        str | None, option("FILE.mcap|BAG", "the drive of `exact` as a log of ROS 2 as well (extra: logs)")
+    ] = None
+    video: Annotated[
+        str | None, option("FILE.mp4", "the pictures of `exact` as a video as well (extra: video)")
+    ] = None
+    seed: Annotated[int, option("N", "of plants and of errors of the sensors (default: 0)")] = 0
+    device: Device = None
+    overwrite: Annotated[bool, switch("measure again what is in the folder")] = False
+    json: Json = False
+
+    def run(self) -> int:
+        from rich.progress import Progress
+
+        import fidsplat as fs
+        from fidsplat.commands.sweeps import need_reports
+        from fidsplat.experiments.localise import HEADS, VARIANTS, LocaliseFolder
+        from fidsplat.experiments.localise import Localise as Asked
+        from fidsplat.vision.video import check_video
+
+        asked = Asked(1, 4, self.seed) if self.quick else Asked(self.rows, self.plants, self.seed)
+        names = list(self.variant) or (list(VARIANTS)[:3] if self.quick else list(VARIANTS))
+        need_reports()
+        if self.video is not None:
+            check_video(self.video)
+        _ = asked.house  # what is wrong with it is said before a device is opened
+        renderer = fs.Renderer(self.device)
+        folder = LocaliseFolder(Path(self.out), asked, renderer.device.title, self.overwrite)
+        with Progress(console=console(True), transient=True) as progress:
+            task = progress.add_task("drive", total=1.0)
+            for words, share in folder.measure(names, renderer):
+                progress.update(task, description=words, completed=share)
+        folder.write_chart()
+        page = folder.write_page()
+        self._record(asked, renderer)
+        if self.json:
+            print_json(folder.results)
+            return 0
+        where = console(False)
+        print_table(where, f"{folder.results['length_m']:.1f} m", HEADS, folder.rows())
+        say(where, *(name for name in (str(page), self.log, self.video) if name is not None))
+        return 0
+
+    def _record(self, asked: Asked, renderer: Renderer) -> None:
+        """The log and the video."""
+        from fidsplat.experiments.localise import RATE, VARIANTS, write_log
+        from fidsplat.vision.video import write_video
+
+        if self.log is None and self.video is None:
+            return
+        pictures = asked.pictures(VARIANTS["exact"], asked.run(), renderer)
+        if self.log is not None:
+            pictures = write_log(asked, "exact", renderer, self.log, self.overwrite)
+        steps = pictures if self.video is None else write_video(self.video, pictures, RATE)
+        with console(True).status("recording"):
+            for _ in steps:
+                pass

@@ -1,0 +1,102 @@
+"""Splat files of every format, told apart by their endings."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.errors import InputError, unknown
+from fidsplat.files import path_of
+from fidsplat.formats.collect import Progress
+from fidsplat.formats.gltf import load_gltf, save_gltf
+from fidsplat.formats.ply import load_ply
+from fidsplat.formats.ply_write import save_ply
+from fidsplat.formats.splat import load_splat, save_splat
+from fidsplat.formats.spz import load_spz, save_spz
+from fidsplat.formats.usd import load_usd, save_usd
+from fidsplat.splats import SplatCloud
+
+
+@dataclass(frozen=True)
+class Format:
+    """How files of an ending are read and written, and what they cannot hold."""
+
+    name: str
+    load: Callable[[Path], SplatCloud]
+    save: Callable[[SplatCloud, Path], None]
+    labels: bool = False
+    planes: bool = False
+    harmonics: bool = True
+    origin: bool = False
+    rounds: str = ""
+    """what it keeps with fewer bits than float32"""
+
+
+_USD = Format("OpenUSD ParticleField", load_usd, save_usd, labels=True, planes=True)
+_GLTF = Format("glTF KHR_gaussian_splatting", load_gltf, save_gltf, labels=True)
+FORMATS = {
+    ".ply": Format("PLY", load_ply, save_ply, labels=True, planes=True, origin=True),
+    ".splat": Format(
+        ".splat", load_splat, save_splat, harmonics=False, rounds="colours, opacities and rotations to 8 bits"
+    ),
+    ".spz": Format(
+        "SPZ",
+        load_spz,
+        save_spz,
+        rounds="positions to 24 bits, rotations to 10, colours, opacities, scales and SH to 8 bits",
+    ),
+    ".glb": _GLTF,
+    ".gltf": _GLTF,
+    ".usda": _USD,
+    ".usdc": _USD,
+    ".usd": _USD,
+}
+"""by their endings"""
+
+
+def format_of(path: str | os.PathLike[str]) -> Format:
+    """The format of a file by its ending. Raises InputError for an unknown one."""
+    suffix = path_of(path).suffix.lower()
+    if suffix not in FORMATS:
+        raise InputError(f"{path}: {unknown('ending of a splat file', suffix, FORMATS)}")
+    return FORMATS[suffix]
+
+
+def load_splats(path: str | os.PathLike[str], progress: Progress | None = None) -> SplatCloud:
+    """Read splats of any format that is known by its ending: .ply, .splat, .spz, .glb, .gltf, .usda, .usdc,
+    .usd. progress: as `load_ply`, for PLY.
+
+    Raises InputError for an unknown ending or a damaged file.
+    """
+    known = format_of(path)
+    return load_ply(path, progress) if known.load is load_ply else known.load(path_of(path))
+
+
+def save_splats(cloud: SplatCloud, path: str | os.PathLike[str]) -> None:
+    """Write splats in the format of the file's ending; `losses` says what it cannot hold.
+
+    Raises InputError for an unknown ending, boxes, or a file that cannot be written.
+    """
+    if not isinstance(cloud, SplatCloud):
+        raise InputError(f"save_splats writes a SplatCloud, not a {type(cloud).__name__}")
+    format_of(path).save(cloud, path_of(path))
+
+
+def losses(cloud: SplatCloud, path: str | os.PathLike[str]) -> list[str]:
+    """What of a cloud the format of that file cannot hold, in words; empty where it comes back whole."""
+    known, found = format_of(path), []
+    if cloud.sh_degree > 0 and not known.harmonics:
+        found.append(f"SH of degree {cloud.sh_degree}: colours do not change with the view")
+    if cloud.labels.any() and not known.labels:
+        found.append(f"labels ({len(np.unique(cloud.labels))} different)")
+    if cloud.planes is not None and not known.planes:
+        found.append("planes: splats printed on one are ordered by their depth alone")
+    if cloud.origin.any() and not known.origin:
+        means = cloud.world_means()
+        off = float(np.abs(means - means.astype(np.float32)).max(initial=0.0))
+        found.append(f"the origin: positions are rounded by up to {off:.2g} m")
+    return found + ([f"rounds {known.rounds}"] if known.rounds else [])

@@ -1,0 +1,253 @@
+"""glTF with KHR_gaussian_splatting, as .glb and .gltf: activated values in float32, so that a cloud comes
+back with its bits. Extension: KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting.
+
+glTF has y up. The splats are written as they are, under a node that turns them half about x, and read through
+the transforms of the nodes above them and that half turn.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import struct
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+
+from fidsplat.errors import InputError
+from fidsplat.files import atomic_write
+from fidsplat.formats.plain import (
+    HALF_TURN,
+    cloud_of,
+    coefficients,
+    content,
+    refuse_boxes,
+    three_scales,
+    world_means,
+)
+from fidsplat.rotations import rigid_matrix
+from fidsplat.splats import SplatCloud
+
+EXTENSION = "KHR_gaussian_splatting"
+_MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
+_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+
+
+def load_gltf(path: Path) -> SplatCloud:
+    """Read the splats of a .glb or .gltf file, all that its nodes show, as one cloud.
+
+    Raises:
+        InputError: it is damaged, holds no splats, refers to a file outside of its folder, or its nodes
+            scale unevenly or mirror.
+    """
+    data = content(path, "a glTF file")
+    document, binary = _parts(path, data)
+    try:
+        reader = _Reader(path, document, binary)
+        clouds = reader.clouds()
+    except InputError:
+        raise
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise InputError(f"{path}: the glTF file is damaged ({type(error).__name__}: {error})") from None
+    if not clouds:
+        raise InputError(f"{path} holds no splats: no primitive of its nodes has {EXTENSION}")
+    return clouds[0] if len(clouds) == 1 else SplatCloud.concatenate(clouds)
+
+
+def save_gltf(cloud: SplatCloud, path: Path) -> None:
+    """Write a .glb file, or a .gltf one with its data inside. Labels stand in the attribute _LABEL.
+
+    Raises InputError for boxes, or where it cannot be written.
+    """
+    refuse_boxes(cloud, "glTF")
+    if not len(cloud):
+        raise InputError("glTF cannot hold an empty cloud: its arrays have at least one element")
+    means, sh = world_means(cloud), coefficients(cloud)
+    prefix = f"{EXTENSION}:"
+    arrays = {"POSITION": means, f"{prefix}ROTATION": cloud.quats[:, [1, 2, 3, 0]]}
+    arrays |= {f"{prefix}SCALE": three_scales(cloud), f"{prefix}OPACITY": cloud.opacities[:, None]}
+    for k in range(sh.shape[1]):
+        degree = int(np.sqrt(k))
+        arrays[f"{prefix}SH_DEGREE_{degree}_COEF_{k - degree * degree}"] = sh[:, k]
+    if cloud.labels.any():
+        if np.abs(cloud.labels.astype(np.int64)).max() >= 2**24:
+            raise InputError("glTF holds labels as floats, so up to 2^24; give smaller ones")
+        arrays["_LABEL"] = cloud.labels[:, None].astype(np.float32)
+    views, accessors, chunks, place = [], [], [], 0
+    for array in arrays.values():
+        chunk = np.ascontiguousarray(array, "<f4").tobytes()
+        views.append({"buffer": 0, "byteOffset": place, "byteLength": len(chunk)})
+        kind = {width: name for name, width in _WIDTHS.items()}[array.shape[1]]
+        accessors.append(
+            {"bufferView": len(views) - 1, "componentType": 5126, "count": len(cloud), "type": kind}
+        )
+        chunks.append(chunk)
+        place += len(chunk)
+    accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "fidsplat"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "rotation": [1.0, 0.0, 0.0, 0.0]}],
+        "meshes": [{"primitives": [_primitive(list(arrays))]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": place}],
+    }
+    binary = b"".join(chunks)
+    if path.suffix.lower() == ".gltf":
+        uri = "data:application/octet-stream;base64," + base64.b64encode(binary).decode("ascii")
+        document["buffers"][0]["uri"] = uri
+        out = json.dumps(document).encode()
+    else:
+        out = _glb(document, binary)
+    with atomic_write(path) as stream:
+        stream.write(out)
+
+
+def _primitive(names: list[str]) -> dict[str, Any]:
+    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    return {
+        "mode": 0,
+        "attributes": {name: k for k, name in enumerate(names)},
+        "extensions": {EXTENSION: splats | {"projection": "perspective", "sortingMethod": "cameraDistance"}},
+    }
+
+
+def _glb(document: dict[str, Any], binary: bytes) -> bytes:
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    binary += b"\0" * (-len(binary) % 4)
+    size = 12 + 8 + len(text) + 8 + len(binary)
+    head = struct.pack("<III", _MAGIC, 2, size) + struct.pack("<II", len(text), _JSON)
+    return head + text + struct.pack("<II", len(binary), _BIN) + binary
+
+
+def _parts(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | None]:
+    """The document, and the binary part that a .glb file has."""
+    text, binary = data, None
+    if data[:4] == b"glTF":
+        try:
+            _, version, size = struct.unpack_from("<III", data)
+            chunks, place = {}, 12
+            while place + 8 <= min(size, len(data)):
+                length, kind = struct.unpack_from("<II", data, place)
+                chunks.setdefault(kind, data[place + 8 : place + 8 + length])
+                place += 8 + length
+        except struct.error:
+            version, size, chunks = 0, 0, {}
+        if version != 2 or size > len(data) or _JSON not in chunks:
+            raise InputError(f"{path}: cut short, or not binary glTF of version 2")
+        text, binary = chunks[_JSON], chunks.get(_BIN)
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError):
+        raise InputError(f"{path} is not a glTF file: it is not JSON") from None
+    if not isinstance(document, dict):
+        raise InputError(f"{path} is not a glTF file: it is not a JSON object")
+    return document, binary
+
+
+class _Reader:
+    """The splats of a document."""
+
+    def __init__(self, path: Path, document: dict[str, Any], binary: bytes | None) -> None:
+        self._path, self._document, self._binary = path, document, binary
+        self._buffers: dict[int, bytes] = {}
+        self._seen: set[int] = set()
+
+    def clouds(self) -> list[SplatCloud]:
+        scenes = self._document.get("scenes")
+        roots = (
+            scenes[self._document.get("scene", 0)].get("nodes", [])
+            if scenes
+            else range(len(self._document.get("nodes", [])))
+        )
+        return [cloud for root in roots for cloud in self._below(root, HALF_TURN)]
+
+    def _below(self, number: int, above: np.ndarray) -> list[SplatCloud]:
+        if number in self._seen:
+            raise InputError(f"{self._path}: node {number} stands below two others, or below itself")
+        self._seen.add(number)
+        node = self._document["nodes"][number]
+        matrix = above @ _matrix(node)
+        found = []
+        if "mesh" in node:
+            for primitive in self._document["meshes"][node["mesh"]]["primitives"]:
+                if EXTENSION in primitive.get("extensions", {}):
+                    cloud = self._cloud(primitive)
+                    same = np.abs(matrix - np.eye(4)).max() < 1e-12
+                    found.append(cloud if same else cloud.transformed(matrix))
+        return found + [cloud for child in node.get("children", []) for cloud in self._below(child, matrix)]
+
+    def _cloud(self, primitive: dict[str, Any]) -> SplatCloud:
+        kernel = primitive["extensions"][EXTENSION].get("kernel", "ellipse")
+        if kernel != "ellipse":
+            raise InputError(f"{self._path}: the kernel {kernel!r} is not known; ellipse is")
+        attributes, prefix = primitive["attributes"], f"{EXTENSION}:"
+        if primitive["extensions"][EXTENSION].get("extensions"):
+            raise InputError(f"{self._path}: its splats are compressed by an extension, which is not read")
+        arrays = {name: self._array(number) for name, number in attributes.items() if name != "COLOR_0"}
+        count = sum(name.startswith(f"{prefix}SH_DEGREE_") for name in arrays)
+        names = [f"{prefix}SH_DEGREE_{(d := int(np.sqrt(k)))}_COEF_{k - d * d}" for k in range(count)]
+        sh = np.stack([arrays[name] for name in names], axis=1)
+        labels = arrays["_LABEL"][:, 0].astype(np.int32) if "_LABEL" in arrays else None
+        quats = arrays[f"{prefix}ROTATION"][:, [3, 0, 1, 2]]
+        scales, opacities = arrays[f"{prefix}SCALE"], arrays[f"{prefix}OPACITY"][:, 0]
+        return cloud_of(self._path, arrays["POSITION"], quats, scales, opacities, sh, labels=labels)
+
+    def _array(self, number: int) -> np.ndarray:
+        """(n, width) float32 of an accessor."""
+        accessor = self._document["accessors"][number]
+        if "sparse" in accessor or "bufferView" not in accessor:
+            raise InputError(f"{self._path}: accessor {number} is sparse, which is not read")
+        view = self._document["bufferViews"][accessor["bufferView"]]
+        kind, width = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]]
+        row, count = kind.itemsize * width, int(accessor["count"])
+        stride, first = view.get("byteStride", row), accessor.get("byteOffset", 0)
+        start = view.get("byteOffset", 0) + first
+        data = self._buffer(view["buffer"])
+        need = start + (count - 1) * stride + row
+        if min(count, start + 1, stride) < 1 or need > len(data) or need > start - first + view["byteLength"]:
+            raise InputError(f"{self._path}: cut short: accessor {number} reaches beyond its buffer")
+        values = np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
+        if kind.kind == "f":
+            return values.copy()
+        if not accessor.get("normalized"):
+            raise InputError(f"{self._path}: accessor {number} holds whole numbers that are not normalized")
+        return np.maximum(values.astype(np.float32) / np.iinfo(kind).max, -1)
+
+    def _buffer(self, number: int) -> bytes:
+        if number not in self._buffers:
+            buffer = self._document["buffers"][number]
+            self._buffers[number] = self._read(buffer.get("uri"), number)
+        return self._buffers[number]
+
+    def _read(self, uri: str | None, number: int) -> bytes:
+        if uri is None:
+            if self._binary is None or number:
+                raise InputError(f"{self._path}: buffer {number} has no data")
+            return self._binary
+        if uri.startswith("data:"):
+            try:
+                return base64.b64decode(uri.partition(",")[2], validate=True)
+            except binascii.Error:
+                raise InputError(f"{self._path}: buffer {number} is damaged: it is not base64") from None
+        folder = self._path.parent.resolve()
+        file = (folder / unquote(uri)).resolve()
+        if "://" in uri or not file.is_relative_to(folder):
+            raise InputError(f"{self._path} refers to {uri!r}, outside of its folder; it is not read")
+        return content(file, "the data of a glTF file")
+
+
+def _matrix(node: dict[str, Any]) -> np.ndarray:
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    x, y, z, w = node.get("rotation", (0.0, 0.0, 0.0, 1.0))
+    scale = np.array(node.get("scale", (1.0, 1.0, 1.0)), np.float64)
+    return rigid_matrix(node.get("translation", (0.0, 0.0, 0.0)), (w, x, y, z)) @ np.diag([*scale, 1.0])

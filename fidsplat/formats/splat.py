@@ -1,0 +1,45 @@
+"""`.splat`, as antimatter15's viewer reads it: 32 bytes a splat and nothing else.
+
+Three float32 of position, three of scale in metres, then bytes: red, green, blue, opacity, and the quaternion
+w, x, y, z as 128 + 128 q. Colours do not depend on the view.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.errors import InputError
+from fidsplat.files import atomic_write
+from fidsplat.formats.plain import cloud_of, content, plain_colors, refuse_boxes, three_scales, world_means
+from fidsplat.harmonics import C0
+from fidsplat.splats import SplatCloud
+
+_ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+
+
+def load_splat(path: Path) -> SplatCloud:
+    """Read a .splat file. Raises InputError where it is not one."""
+    data = content(path, "a .splat file")
+    if not data or len(data) % _ROW.itemsize:
+        raise InputError(
+            f"{path}: {len(data)} bytes are not rows of {_ROW.itemsize}; cut short, or not a .splat file"
+        )
+    rows = np.frombuffer(data, _ROW)
+    rgba = rows["rgba"].astype(np.float32) / 255
+    quats = (rows["quat"].astype(np.float32) - 128) / 128
+    sh = ((rgba[:, None, :3] - 0.5) / C0).astype(np.float32)
+    return cloud_of(path, rows["means"], quats, rows["scales"], rgba[:, 3], sh)
+
+
+def save_splat(cloud: SplatCloud, path: Path) -> None:
+    """Write a .splat file. Raises InputError for boxes, or where it cannot be written."""
+    refuse_boxes(cloud, "a .splat file")
+    rows = np.zeros(len(cloud), _ROW)
+    rows["means"], rows["scales"] = world_means(cloud), three_scales(cloud)
+    rgba = np.column_stack([plain_colors(cloud), cloud.opacities])
+    rows["rgba"] = np.rint(np.clip(rgba, 0, 1) * 255)
+    rows["quat"] = np.clip(np.rint(cloud.quats * 128 + 128), 0, 255)
+    with atomic_write(path) as stream:
+        stream.write(rows.tobytes())

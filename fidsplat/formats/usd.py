@@ -1,0 +1,153 @@
+"""OpenUSD: ParticleField with the Gaussian surflet kernel, which is a 2D splat as ours, or of 3D Gaussians as
+ParticleField3DGaussianSplat (extra `usd`). Schemas: openusd.org, usdVol.
+
+USD stages here have y up: the splats are written as they are, under a half turn about x. Labels and planes
+stand in attributes of our own, fidsplat:labels and fidsplat:planes.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fidsplat.errors import InputError
+from fidsplat.files import ordinary_file
+from fidsplat.formats.plain import (
+    HALF_TURN,
+    cloud_of,
+    coefficients,
+    content,
+    refuse_boxes,
+    three_scales,
+    world_means,
+)
+from fidsplat.splats import SplatCloud
+
+_SURFLET = "ParticleFieldKernelGaussianSurfletAPI"
+_KINDS = ("ParticleField", "ParticleField3DGaussianSplat")
+
+
+def load_usd(path: Path) -> SplatCloud:
+    """Read the splats of a .usda, .usdc, .usd or .usdz file, all its fields of Gaussians, as one cloud.
+
+    Raises:
+        InputError: it is damaged, holds no such field, or one whose kernel is not known; the extra is
+            missing.
+    """
+    pxr = _pxr()
+    content(path, "a USD file")
+    try:
+        stage = pxr.Usd.Stage.Open(str(path), pxr.Usd.Stage.LoadAll)
+    except pxr.Tf.ErrorException:
+        raise InputError(f"{path} is not a USD file that can be read") from None
+    prims = [prim for prim in stage.Traverse() if prim.GetTypeName() in _KINDS]
+    if not prims:
+        raise InputError(f"{path} holds no ParticleField")
+    up = HALF_TURN if pxr.UsdGeom.GetStageUpAxis(stage) == "Y" else np.eye(4)
+    metres = pxr.UsdGeom.GetStageMetersPerUnit(stage) if stage.HasAuthoredMetadata("metersPerUnit") else 1.0
+    clouds = []
+    for prim in prims:
+        # USD's matrices act on rows
+        placed = np.array(pxr.UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(0)).T
+        matrix = np.diag([metres, metres, metres, 1.0]) @ up @ placed
+        cloud = _cloud(path, prim)
+        clouds.append(cloud if np.abs(matrix - np.eye(4)).max() < 1e-12 else cloud.transformed(matrix))
+    return clouds[0] if len(clouds) == 1 else SplatCloud.concatenate(clouds)
+
+
+def save_usd(cloud: SplatCloud, path: Path) -> None:
+    """Write a .usda, .usdc or .usd file. Raises InputError for boxes, or where it cannot be written."""
+    refuse_boxes(cloud, "USD")
+    pxr = _pxr()
+    target, flat = ordinary_file(path), cloud.thickness is None
+    suffix = path.suffix.lower()
+    stage = pxr.Usd.Stage.CreateInMemory(f"splats{suffix}")
+    pxr.UsdGeom.SetStageUpAxis(stage, "Y")
+    pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    prim = stage.DefinePrim("/Splats", _KINDS[0] if flat else _KINDS[1])
+    stage.SetDefaultPrim(prim)
+    if flat:
+        for name in ("PositionAttribute", "OrientationAttribute", "ScaleAttribute", "OpacityAttribute"):
+            prim.ApplyAPI(f"ParticleField{name}API")
+        prim.ApplyAPI("ParticleFieldSphericalHarmonicsAttributeAPI")
+        prim.ApplyAPI(_SURFLET)
+    means, sh = world_means(cloud), coefficients(cloud)
+    scales = three_scales(cloud)
+    if flat:
+        scales[:, 2] = 1.0  # the kernel lies in the plane z = 0
+    vt = pxr.Vt
+    values = {
+        "positions": vt.Vec3fArray.FromNumpy(np.ascontiguousarray(means)),
+        "scales": vt.Vec3fArray.FromNumpy(scales),
+        "orientations": vt.QuatfArray.FromNumpy(np.ascontiguousarray(cloud.quats[:, [1, 2, 3, 0]])),
+        "opacities": vt.FloatArray.FromNumpy(cloud.opacities),
+        "radiance:sphericalHarmonicsDegree": int(np.sqrt(sh.shape[1])) - 1,
+        "radiance:sphericalHarmonicsCoefficients": vt.Vec3fArray.FromNumpy(
+            np.ascontiguousarray(sh.reshape(-1, 3))
+        ),
+    }
+    for name, value in values.items():
+        prim.GetAttribute(name).Set(value)
+    whole = {"labels": cloud.labels if cloud.labels.any() else None, "planes": cloud.planes}
+    for name, numbers in whole.items():
+        if numbers is not None:
+            made = prim.CreateAttribute(f"fidsplat:{name}", pxr.Sdf.ValueTypeNames.IntArray, True)
+            made.Set(vt.IntArray.FromNumpy(numbers))
+    if len(cloud):
+        extent = np.array(cloud.bounds(), np.float32)
+        prim.GetAttribute("extent").Set(vt.Vec3fArray.FromNumpy(extent))
+    pxr.UsdGeom.Xformable(prim).AddRotateXOp().Set(180.0)
+    handle, name = tempfile.mkstemp(prefix=".fidsplat-", suffix=suffix, dir=target.parent)
+    os.close(handle)
+    try:
+        stage.GetRootLayer().Export(name)
+        os.chmod(name, 0o644)
+        os.replace(name, target)
+    finally:
+        Path(name).unlink(missing_ok=True)
+
+
+def _cloud(path: Path, prim: Any) -> SplatCloud:
+    surflet = _SURFLET in prim.GetAppliedSchemas()
+    if prim.GetTypeName() == _KINDS[0] and not surflet:
+        raise InputError(f"{path}: the kernel of {prim.GetPath()} is not known; Gaussian surflets are")
+
+    def array(name: str) -> np.ndarray:
+        found = prim.GetAttribute(name).Get() or prim.GetAttribute(f"{name}h").Get()  # h: in half precision
+        if found is None:
+            raise InputError(f"{path}: {prim.GetPath()} has no {name}")
+        return np.array(found)
+
+    means = array("positions").astype(np.float32)
+    imaginary_first = array("orientations").astype(np.float32)
+    scales = array("scales").astype(np.float32)
+    if surflet:
+        scales[:, 2] = 0
+    degree = int(prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get() or 0)
+    sh = array("radiance:sphericalHarmonicsCoefficients").astype(np.float32)
+    n, k = len(means), (degree + 1) ** 2
+    if len(sh) != n * k:
+        raise InputError(f"{path}: {prim.GetPath()} has {len(sh)} SH coefficients for {n} splats of {k}")
+    labels, planes = (prim.GetAttribute(f"fidsplat:{name}").Get() for name in ("labels", "planes"))
+    quats = imaginary_first[:, [3, 0, 1, 2]]
+    labels = None if labels is None else np.array(labels)
+    cloud = cloud_of(path, means, quats, scales, array("opacities"), sh.reshape(n, k, 3), labels=labels)
+    return cloud if planes is None or cloud.dropped else cloud.with_planes(np.array(planes))
+
+
+def _pxr() -> Any:
+    try:
+        import pxr.Gf
+        import pxr.Sdf
+        import pxr.Tf
+        import pxr.Usd
+        import pxr.UsdGeom
+        import pxr.UsdVol
+        import pxr.Vt
+    except ImportError:
+        raise InputError("USD files need usd-core 26.3 or newer; pip install 'fidsplat[usd]'") from None
+    return pxr

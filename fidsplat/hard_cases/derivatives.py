@@ -1,0 +1,90 @@
+"""A device's derivatives against the reference's: random pictures, a random loss, how far off they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fidsplat.backends.base import Differentiates
+from fidsplat.backends.prepare import prepare
+from fidsplat.backends.view import View
+from fidsplat.cameras import Camera
+from fidsplat.capture import Capture
+from fidsplat.effects import FeatureSet
+from fidsplat.effects.differentiable import GRADIENT_OUTPUTS
+from fidsplat.random_clouds import random_splats
+from fidsplat.splats import SplatCloud
+
+NORM, COSINE = 1e-4, 1e-6
+"""what a device may be off at most, as `Difference` has it"""
+_BEHIND = (0.3, 0.6, 0.1)
+
+
+class Difference(NamedTuple):
+    """Of one parameter's whole array."""
+
+    parameter: str
+    norm: float
+    """of the difference, relative to the truth's"""
+    turned: float
+    """one less the cosine of both"""
+
+
+def random_picture(
+    seed: int,
+    count: int = 90,
+    size: tuple[int, int] = (61, 43),
+    degree: int | None = 1,
+    outputs: tuple[str, ...] = GRADIENT_OUTPUTS,
+    quality: Any = None,
+    **splats: Any,
+) -> tuple[SplatCloud, Capture]:
+    """Random splats before a camera that looks at their middle; others are `random_splats`' own."""
+    cloud = random_splats(count, seed, sh_degree=degree, **splats)
+    eye = np.random.default_rng(seed).uniform(-0.3, 0.3, 3)
+    camera = Camera.look_at(*size, 1.1, eye, (0.0, 0.1, 3.0))
+    return cloud, Capture(camera, outputs=outputs, quality=quality, background=_BEHIND)
+
+
+def random_loss(features: FeatureSet, view: View, seed: int = 0) -> dict[str, np.ndarray]:
+    """Derivatives of a loss by the images, float32, of a normal distribution."""
+    rng = np.random.default_rng(seed)
+    shapes = {one.name: (3,) if one.channels == 3 else () for one in features.images}
+    return {
+        name: rng.normal(size=(view.height, view.width, *shape)).astype(np.float32)
+        for name, shape in shapes.items()
+    }
+
+
+def derivatives(
+    backend: Differentiates,
+    cloud: SplatCloud,
+    capture: Capture,
+    by_images: Mapping[str, np.ndarray] | None = None,
+    **build: Any,
+) -> dict[str, np.ndarray]:
+    """A picture's derivatives in NumPy; those of a random loss unless `by_images` says by which images.
+
+    build: further arguments of `Differentiates.differentiate`, that some backends have.
+    """
+    features, view = prepare(cloud, capture)
+    pipeline = backend.differentiate(features, **build)
+    images = pipeline.forward(backend.upload(cloud), view)
+    given = random_loss(features, view) if by_images is None else by_images
+    found = pipeline.backward(images, given)
+    return {name: one if isinstance(one, np.ndarray) else one.get() for name, one in found.items()}
+
+
+def differences(found: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]) -> Iterator[Difference]:
+    """How far each array of `found` is from the reference's; where that is 0 all over, anything else is
+    infinitely far."""
+    for name, expected in truth.items():
+        got, length = found[name].astype(np.float64), float(np.linalg.norm(expected))
+        off = float(np.linalg.norm(got - expected))
+        if length == 0 or not np.any(got):
+            yield Difference(name, 0.0 if off == 0 else np.inf, 0.0)
+            continue
+        cosine = float((got * expected).sum() / (length * np.linalg.norm(got)))
+        yield Difference(name, off / length, 1 - cosine)

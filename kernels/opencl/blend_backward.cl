@@ -1,0 +1,212 @@
+// The derivatives of compositing, fragment by fragment. A loss L depends on what a pixel shows,
+//   C = sum_k T_k alpha_k c_k + T_end C_behind,   T_k = prod_{j<k} (1 - alpha_j).
+// With g = dL / dC and B_k = what the light is worth that fragment k lets through, from the back
+//   B_end = g C_behind,   B_k-1 = B_k + alpha_k (g c_k - B_k),   dL / d alpha_k = T_k (g c_k - B_k):
+// nothing is divided by 1 - alpha, so that opaque fragments have derivatives as all others.
+// The schedules (schedule/*_backward.cl) walk a tile's list forward for T, in the arithmetic of blending and with its
+// decisions, and then back, CHUNK splats at a time.
+
+//@@ struct Moments
+#define FIELDS (sizeof(Moments) / sizeof(float))
+
+//@@ compose_types
+typedef struct {            // uniforms of the blend stage
+    wide log_cut, ceiling, stop, filter;
+    float log_ceiling;
+} BlendConstants;
+
+typedef struct {
+    vfloat t;               // transmittance in front of the next fragment
+//@@ state
+} Pixel;
+
+static inline void pixel_start(Pixel *pixel, vfloat light) {
+    pixel->t = light;
+//@@ start
+}
+
+// What `pixel_start` has to be given to go on from here.
+static inline vfloat pixel_light(const Pixel *pixel) {
+    vfloat light = pixel->t;
+//@@ light
+    return light;
+}
+
+//@@ fragment_mask
+//@@ fragment_half_rho
+//@@ fragment_branch
+
+// What is drawn of a fragment of this opacity; lets the light behind it go on.
+static inline vfloat take_light(Pixel *pixel, vfloat opacity, vint mask, const BlendConstants *constants) {
+    vint live = mask & VMASK(pixel->t > constants->stop);
+//@@ stop
+    vfloat drawn = VSELECT((vfloat)0.0f, opacity, live);
+    pixel->t = pixel->t - pixel->t * drawn;
+    return drawn;
+}
+
+typedef struct {            // of a pixel: the loss's derivatives
+    vfloat r, g, b;         // by the light that it shows
+    vfloat behind;          // B above
+//@@ loss
+} Loss;
+
+// LANES pixels of an image (h, w, channels) from column x on; 0 outside of it.
+static inline vfloat pixels_of(global const float *image, int channels, int channel, int x, int y, int width, int height) {
+    float row[LANES];
+    global const float *from = image + (size_t)channels * (y * (size_t)width + x) + channel;
+    if (y < height && x + LANES <= width)
+        for (int lane = 0; lane < LANES; lane++) row[lane] = from[channels * lane];
+    else
+        for (int lane = 0; lane < LANES; lane++) row[lane] = y < height && x + lane < width ? from[channels * lane] : 0.0f;
+    return VLOAD(row);
+}
+
+typedef struct {            // sums over fragments of one column of pixels in each lane
+    vfloat nu, nu_y, nv, nv_y, d, d_y;
+    vfloat log_opacity, r, g, b;
+//@@ sums
+} Sums;
+
+typedef struct {
+    vfloat nu, nv, inverse_d;
+    vfloat half_rho;        // where `on_plane`
+    vint on_plane;          // by the splat's plane, not by a low-pass
+//@@ geometry
+} Geometry;
+
+// The fragment's place on the splat, of the rows' forms and the low-pass's own.
+static inline Geometry geometry_of(const Splat *s, Crossing c, vfloat nu_x, vfloat nv_x, wide y, vfloat screen) {
+    Geometry g;
+    g.nu = FMA((vfloat)s->nuy, (vfloat)y, nu_x);
+    g.nv = FMA((vfloat)s->nvy, (vfloat)y, nv_x);
+    g.inverse_d = VSELECT((vfloat)0.0f, 1.0f / c.d, VMASK(c.d > 0.0f));
+    g.half_rho = (c.q * g.inverse_d) * g.inverse_d;
+    g.on_plane = fragment_on_plane(s, c, g.half_rho, screen);
+//@@ geometry_make
+    return g;
+}
+
+// What a unit of the fragment's light is worth.
+static inline vfloat fragment_worth(const Splat *s, const Loss *loss, const Geometry *g) {
+    vfloat worth = FMA(loss->r, (vfloat)s->r, FMA(loss->g, (vfloat)s->g, loss->b * s->b));
+//@@ worth
+    return worth;
+}
+
+// dL / d ln(opacity) of a fragment that takes `weight` of the light, where the ceiling does not hold it.
+static inline vfloat take_back(Loss *loss, vfloat worth, vfloat weight, vfloat opacity) {
+    vfloat gain = worth - loss->behind;
+    loss->behind = FMA(opacity, gain, loss->behind);
+    return weight * gain;
+}
+
+// Adds a fragment's derivatives. by_log: by ln(opacity); at: its row, relative to the anchor.
+static inline void add_fragment(Sums *sums, const Splat *s, const Loss *loss, const Geometry *g, vfloat weight, vfloat by_log,
+                                vfloat screen, wide y, const BlendConstants *constants) {
+    sums->r = FMA(weight, loss->r, sums->r);
+    sums->g = FMA(weight, loss->g, sums->g);
+    sums->b = FMA(weight, loss->b, sums->b);
+    vfloat half_rho = VSELECT(screen, g->half_rho, g->on_plane);
+    by_log = VSELECT((vfloat)0.0f, by_log, VMASK(s->log_opacity - half_rho <= constants->log_ceiling));
+    sums->log_opacity += by_log;
+    vfloat plane = 2.0f * VSELECT((vfloat)0.0f, by_log * g->inverse_d, g->on_plane);
+    vfloat by_nu = -plane * g->nu * g->inverse_d, by_nv = -plane * g->nv * g->inverse_d;
+    vfloat by_d = VSELECT((vfloat)0.0f, plane * g->half_rho, g->on_plane);
+//@@ fragment_backward
+    sums->nu += by_nu;
+    sums->nu_y = FMA(by_nu, (vfloat)y, sums->nu_y);
+    sums->nv += by_nv;
+    sums->nv_y = FMA(by_nv, (vfloat)y, sums->nv_y);
+    sums->d += by_d;
+    sums->d_y = FMA(by_d, (vfloat)y, sums->d_y);
+}
+
+#if LANES == 16
+static inline float lane_sum(vfloat v) {
+    float8 w = v.lo + v.hi;
+    float4 x = w.lo + w.hi;
+    return (x.x + x.z) + (x.y + x.w);
+}
+#elif LANES == 8
+static inline float lane_sum(vfloat v) {
+    float4 x = v.lo + v.hi;
+    return (x.x + x.z) + (x.y + x.w);
+}
+#elif LANES == 4
+static inline float lane_sum(vfloat x) { return (x.x + x.z) + (x.y + x.w); }
+#else
+#define lane_sum(x) (x)
+#endif
+
+// x: the lanes' columns, relative to the anchor.
+static inline Moments moments_of(const Sums *sums, const Splat *s, vfloat x, const BlendConstants *constants) {
+    Moments m = {0};        // padding too
+    m.nu0 = lane_sum(sums->nu);
+    m.nux = lane_sum(sums->nu * x);
+    m.nuy = lane_sum(sums->nu_y);
+    m.nv0 = lane_sum(sums->nv);
+    m.nvx = lane_sum(sums->nv * x);
+    m.nvy = lane_sum(sums->nv_y);
+    m.d0 = lane_sum(sums->d);
+    m.dx = lane_sum(sums->d * x);
+    m.dy = lane_sum(sums->d_y);
+    m.log_opacity = lane_sum(sums->log_opacity);
+    m.r = lane_sum(sums->r);
+    m.g = lane_sum(sums->g);
+    m.b = lane_sum(sums->b);
+//@@ moments
+    return m;
+}
+
+// Which of a splat's tiles this one is, counted row by row.
+static inline uint tile_rank(uint2 window, global const Bounds *big_bounds, int column, int row, int width, int height) {
+    if (window.y != 0) {
+        int bit = (row - (int)(window.x >> 16)) * WINDOW_W + column - (int)(window.x & 0xFFFFu);
+        return popcount(window.y & ((1u << bit) - 1u));
+    }
+    const Bounds b = big_bounds[window.x];
+    int y0, y1;
+    bounds_rows(&b, height, &y0, &y1);
+    uint rank = column - tile_span(&b, row, width, height).first;
+    for (int above = y0 / TILE_H; above < row; above++) {
+        TileSpan span = tile_span(&b, above, width, height);
+        rank += max(span.last - span.first + 1, 0);
+    }
+    return rank;
+}
+
+// How many tiles a splat has.
+static inline uint tile_count(uint2 window, uint big_capacity, global const Bounds *big_bounds, int width, int height) {
+    if (window.y != 0) return popcount(window.y);
+    if (window.x >= big_capacity) return 0;
+    const Bounds b = big_bounds[window.x];
+    int y0, y1;
+    bounds_rows(&b, height, &y0, &y1);
+    uint tiles = 0;
+    for (int row = y0 / TILE_H; row * TILE_H < y1; row++) {
+        TileSpan span = tile_span(&b, row, width, height);
+        tiles += max(span.last - span.first + 1, 0);
+    }
+    return tiles;
+}
+
+// Gives every splat that is drawn a slot for each of its tiles. Where they lie depends on the order of the groups, what they
+// hold and in which order it is added up does not.
+// Index space: one work-item per splat, in groups of RESERVED.
+// Reads: keys, windows, big_bounds. Writes: splat_slots; adds to reserved.
+#define RESERVED 64
+kernel __attribute__((reqd_work_group_size(RESERVED, 1, 1))) void reserve_slots(
+//@@ arguments reserve_slots
+) {
+    local uint needed, first;
+    uint i = get_global_id(0), offset = 0;
+    if (get_local_id(0) == 0) needed = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (i < count && keys[i] < OUTSIDE)
+        offset = atomic_add(&needed, tile_count(windows[i], big_capacity, big_bounds, width, height));
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (get_local_id(0) == 0) first = atomic_add(reserved, needed);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (i < count) splat_slots[i] = first + offset;
+}

@@ -1,0 +1,33 @@
+// normal: the direction of sum w n.
+//@ loss
+    vfloat normal_x, normal_y, normal_z;
+//@ loss_start
+        vfloat nx = VLOAD(normal_raw + at), ny = VLOAD(normal_raw + plane + at), nz = VLOAD(normal_raw + 2 * (size_t)plane + at);
+        vfloat normal_length = sqrt(nx * nx + ny * ny + nz * nz);
+        vint has_normal = VMASK(normal_length > 0.0f);
+        vfloat normal_scale = VSELECT((vfloat)0.0f, 1.0f / normal_length, has_normal);
+        nx *= normal_scale; ny *= normal_scale; nz *= normal_scale;
+        vfloat by_nx = pixels_of(by_normal, 3, 0, x, y, width, height), by_ny = pixels_of(by_normal, 3, 1, x, y, width, height);
+        vfloat by_nz = pixels_of(by_normal, 3, 2, x, y, width, height), along = by_nx * nx + by_ny * ny + by_nz * nz;
+        loss->normal_x = (by_nx - along * nx) * normal_scale;
+        loss->normal_y = (by_ny - along * ny) * normal_scale;
+        loss->normal_z = (by_nz - along * nz) * normal_scale;
+//@ worth
+    worth = FMA(loss->normal_x, (vfloat)s->nx, worth);
+    worth = FMA(loss->normal_y, (vfloat)s->ny, worth);
+    worth = FMA(loss->normal_z, (vfloat)s->nz, worth);
+//@ sums
+    vfloat nx, ny, nz;
+//@ fragment_backward
+    sums->nx = FMA(weight, loss->normal_x, sums->nx);
+    sums->ny = FMA(weight, loss->normal_y, sums->ny);
+    sums->nz = FMA(weight, loss->normal_z, sums->nz);
+//@ moments
+    m.nx = lane_sum(sums->nx);
+    m.ny = lane_sum(sums->ny);
+    m.nz = lane_sum(sums->nz);
+//@ facet_backward
+        real towards = offset > 0 ? -1 : 1;
+        real3_ by_facet = {towards * total.nx, towards * total.ny, towards * total.nz};
+        by_unit_a = add3(by_unit_a, cross3(unit_b, by_facet));
+        by_unit_b = add3(by_unit_b, cross3(by_facet, unit_a));

@@ -1,0 +1,169 @@
+// For GPUs: one work-group takes a tile back, CHUNK splats at a time. A work-item walks its ROWS pixels through the chunk, forward
+// and back, and leaves in local memory what each fragment takes and what its opacity is worth; then it adds up one column of
+// pixels of one splat. So no sum runs across work-items but that of a splat's columns, in a fixed order and without atomics.
+// Barriers stand in loops whose bounds are the same for the whole group.
+// Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile.
+// Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, splat_slots, and the images' derivatives.
+// Writes: moments, a slot for each splat of the tile; tile_sums. Uses up: checkpoints.
+#define GROUP (TILE_W * TILE_H / ROWS)
+#define PIXELS (TILE_W * TILE_H)
+#define STRIDE (PIXELS + TILE_W)   // of one splat's fragments: neighbours among the splats lie in other banks
+
+static inline Crossing cross_at(const Splat *s, int px, int py, const BlendConstants *constants, wide *x, wide *y,
+                                wide *nu_x, wide *nv_x, wide *half_r2) {
+    *x = (wide)(px - s->ax);
+    *y = (wide)(py - s->ay);
+    *nu_x = FMA(s->nux, *x, s->nu0);
+    *nv_x = FMA(s->nvx, *x, s->nv0);
+    *half_r2 = s->log_opacity - constants->log_cut;
+    return cross_row(s, *nu_x, *nv_x, FMA(s->dx, *x, s->d0), *y, *half_r2);
+}
+
+// Lets the splat take its light at a pixel; returns its opacity there.
+static inline wide walk_fragment(const Splat *s, int px, int py, Pixel *pixel, const BlendConstants *constants) {
+    if (px < s->x0 || px >= s->x1 || py < s->y0 || py >= s->y1 || !(pixel->t > constants->stop)) return 0.0f;
+    wide x, y, nu_x, nv_x, half_r2, screen;
+    Crossing c = cross_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
+    int mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
+    if (!VANY(mask)) return 0.0f;
+    wide opacity = fragment_opacity(s, fragment_half_rho(s, c, 1.0f / c.d, screen), constants->ceiling);
+    return take_light(pixel, opacity, mask, constants);
+}
+
+kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
+//@@ arguments blend_backward
+) {
+    local Splat staged[CHUNK];
+    local float weights[CHUNK * STRIDE], by_logs[CHUNK * STRIDE];   // by splat and pixel: opacity and light, then these
+    local float parts[GROUP * FIELDS];
+    local Loss shared[PIXELS];
+    local uint places[CHUNK];
+    local int alive;
+    const BlendConstants constants = {log_cut, ceiling, stop, filter, log_ceiling};
+    uint number = get_group_id(0), item = get_local_id(0);
+    int tiles_x = (width + TILE_W - 1) / TILE_W;
+    int tile_column = (int)(number % (uint)tiles_x), tile_row = (int)(number / (uint)tiles_x);
+    uint start = starts[number], end = starts[number + 1];
+    // neighbours in a group take neighbours in a row; its pixels lie one below the other
+    int column = item % TILE_W, top = item / TILE_W * ROWS, px = tile_column * TILE_W + column, py = tile_row * TILE_H + top;
+
+    Loss losses[ROWS];
+    for (int row = 0; row < ROWS; row++) {
+        Loss *loss = &losses[row];
+        int x = px, y = py + row;
+        size_t at = y * (size_t)stride + x;
+        loss->r = pixels_of(by_rgb, 3, 0, x, y, width, height);
+        loss->g = pixels_of(by_rgb, 3, 1, x, y, width, height);
+        loss->b = pixels_of(by_rgb, 3, 2, x, y, width, height);
+        loss->behind = FMA(loss->r, (vfloat)background_r, FMA(loss->g, (vfloat)background_g, loss->b * background_b));
+//@@ loss_start
+        shared[(top + row) * TILE_W + column] = *loss;
+    }
+
+    // forward: the light in front of each chunk
+    Pixel pixels[ROWS];
+    for (int row = 0; row < ROWS; row++) pixel_start(&pixels[row], 1.0f);
+    global float *own = checkpoints + (size_t)(start / CHUNK + number) * PIXELS + top * TILE_W + column;
+    uint chunks = 0;
+    for (uint first = start; first < end; first += CHUNK) {
+        uint length = min(end - first, (uint)CHUNK);
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (item == 0) alive = 0;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (item < length) staged[item] = splats[lists[first + item]];
+        for (int row = 0; row < ROWS; row++)
+            if (px < width && py + row < height && pixels[row].t > stop) alive = 1;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (!alive) break;
+        for (int row = 0; row < ROWS; row++) own[(size_t)chunks * PIXELS + row * TILE_W] = pixel_light(&pixels[row]);
+        chunks++;
+        for (uint place = 0; place < length; place++) {
+            const Splat s = staged[place];
+            for (int row = 0; row < ROWS; row++) walk_fragment(&s, px, py + row, &pixels[row], &constants);
+        }
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    float behind_r = 0, behind_g = 0, behind_b = 0;
+    for (int row = 0; row < ROWS; row++) {
+        behind_r = FMA((float)pixels[row].t, (float)losses[row].r, behind_r);
+        behind_g = FMA((float)pixels[row].t, (float)losses[row].g, behind_g);
+        behind_b = FMA((float)pixels[row].t, (float)losses[row].b, behind_b);
+    }
+    parts[item] = behind_r;
+    parts[GROUP + item] = behind_g;
+    parts[2 * GROUP + item] = behind_b;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (item < 3) {
+        real sum = 0;
+        for (uint other = 0; other < GROUP; other++) sum += parts[item * GROUP + other];
+        tile_sums[3 * number + item] = sum;
+    }
+
+    // splats behind the last chunk have nothing to do with the picture
+    for (uint k = start + chunks * CHUNK + item; k < end; k += GROUP) {
+        uint slot = splat_slots[lists[k]] + tile_rank(windows[lists[k]], big_bounds, tile_column, tile_row, width, height);
+        for (uint field = 0; field < FIELDS; field++) moments[(size_t)slot * FIELDS + field] = 0.0f;
+    }
+    // back, chunk by chunk
+    for (uint chunk = chunks; chunk-- > 0;) {
+        uint first = start + chunk * CHUNK, length = min(end - first, (uint)CHUNK);
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (item < length) {
+            uint index = lists[first + item];
+            staged[item] = splats[index];
+            places[item] = splat_slots[index] + tile_rank(windows[index], big_bounds, tile_column, tile_row, width, height);
+        }
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (int row = 0; row < ROWS; row++) {
+            uint mine = (top + row) * TILE_W + column;
+            Pixel pixel;
+            pixel_start(&pixel, own[(size_t)chunk * PIXELS + row * TILE_W]);
+            for (uint place = 0; place < length; place++) {
+                const Splat s = staged[place];
+                weights[place * STRIDE + mine] = pixel.t;
+                by_logs[place * STRIDE + mine] = walk_fragment(&s, px, py + row, &pixel, &constants);
+            }
+            for (uint place = length; place-- > 0;) {
+                wide opacity = by_logs[place * STRIDE + mine], weight = weights[place * STRIDE + mine] * opacity, by_log = 0.0f;
+                if (opacity > 0.0f) {
+                    const Splat s = staged[place];
+                    wide x, y, nu_x, nv_x, half_r2, screen;
+                    Crossing c = cross_at(&s, px, py + row, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
+                    fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
+                    const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, screen);
+                    by_log = take_back(&losses[row], fragment_worth(&s, &losses[row], &g), weight, opacity);
+                }
+                weights[place * STRIDE + mine] = weight;
+                by_logs[place * STRIDE + mine] = by_log;
+            }
+        }
+        barrier(CLK_LOCAL_MEM_FENCE);
+        // a column of a splat
+        uint place = item / TILE_W;
+        if (place < length) {
+            const Splat s = staged[place];
+            Sums sums = {0};
+            wide x = (wide)(px - s.ax);
+            for (int row = 0; row < TILE_H; row++) {
+                uint at = row * TILE_W + column;
+                wide weight = weights[place * STRIDE + at], by_log = by_logs[place * STRIDE + at];
+                if (weight == 0.0f) continue;
+                wide y, nu_x, nv_x, half_r2, screen;
+                Crossing c = cross_at(&s, px, tile_row * TILE_H + row, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
+                fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
+                const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, screen);
+                const Loss loss = shared[at];
+                add_fragment(&sums, &s, &loss, &g, weight, by_log, screen, y, &constants);
+            }
+            const Moments m = moments_of(&sums, &s, x, &constants);
+            for (uint field = 0; field < FIELDS; field++) parts[field * GROUP + item] = ((const float *)&m)[field];
+        }
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (uint cell = item; cell < length * FIELDS; cell += GROUP) {
+            uint field = cell % FIELDS, splat = cell / FIELDS;
+            float sum = 0;
+            for (uint other = 0; other < TILE_W; other++) sum += parts[field * GROUP + splat * TILE_W + other];
+            moments[(size_t)places[splat] * FIELDS + field] = sum;
+        }
+    }
+}

@@ -1,0 +1,120 @@
+"""Derivatives of every device against the reference's in float64, and the same bits on every run."""
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.backends.base import Differentiates
+from fidsplat.backends.prepare import prepare
+from fidsplat.backends.reference.backend import ReferenceBackend
+from fidsplat.hard_cases.derivatives import (
+    COSINE,
+    NORM,
+    derivatives,
+    differences,
+    random_loss,
+    random_picture,
+)
+
+BACKEND = "opencl"
+
+
+def assert_same(backend, cloud, capture, **build):
+    found = derivatives(backend, cloud, capture, **build)
+    expected = derivatives(ReferenceBackend(), cloud, capture)
+    assert found.keys() == expected.keys()
+    for name, array in found.items():
+        assert array.shape == expected[name].shape, name
+    for one in differences(found, expected):
+        assert max(one.norm / NORM, one.turned / COSINE) < 1, one
+    return found
+
+
+CASES = {
+    "random": {},
+    "plain colours, surfel": {"degree": None, "quality": "surfel", "outputs": ("rgb",)},
+    "far below a pixel": {"scale": (1e-5, 1e-3), "depth": (1.0, 5.0), "across": 1.0},
+    "huge": {"scale": (1.0, 50.0), "depth": (0.5, 4.0), "count": 30},
+    "needles": {"scale": (1e-4, 5.0), "depth": (1.0, 4.0)},
+    "around the camera": {"depth": (-0.5, 0.5), "across": 0.5, "scale": (1e-2, 1.0)},
+}
+
+
+@pytest.fixture
+def backend(renderer):
+    assert isinstance(renderer.backend, Differentiates)
+    return renderer.backend
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_derivatives_are_the_references(backend, case):
+    found = assert_same(backend, *random_picture(1, **CASES[case]))
+    assert all(np.abs(array).max() > 0 for array in found.values())
+
+
+@pytest.mark.parametrize("seeds", [range(3), pytest.param(range(200), marks=pytest.mark.exhaustive)])
+def test_derivatives_of_random_scenes_are_the_references(backend, seeds):
+    for seed in seeds:
+        assert_same(backend, *random_picture(seed))
+
+
+def test_the_schedule_of_gpus_has_the_references_derivatives(backend):
+    for shape in backend.shapes("schedule").values():
+        assert_same(backend, *random_picture(2), shape=shape)
+
+
+def test_opaque_splats_have_derivatives(backend):
+    """Nothing shines through them, and their own opacity counts."""
+    cloud, capture = random_picture(3, scale=(0.3, 1.0), depth=(1.5, 4.0))
+    opaque = fs.SplatCloud(cloud.means, cloud.quats, cloud.scales, np.ones(90), sh=cloud.sh)
+    found = assert_same(backend, opaque, capture)
+    assert np.abs(found["opacities"]).max() > 0
+    assert all(np.isfinite(array).all() for array in found.values())
+
+
+def test_long_lists_are_taken_back_in_chunks(backend):
+    """Hundreds of faint splats in each tile, in windows and beyond them: light is left at the end."""
+    cloud, capture = random_picture(
+        4, count=400, scale=(0.2, 1.5), depth=(2.0, 5.0), across=1.0, size=(150, 40)
+    )
+    faint = fs.SplatCloud(cloud.means, cloud.quats, cloud.scales, 0.004 + 0.01 * cloud.opacities, sh=cloud.sh)
+    assert_same(backend, faint, capture)
+
+
+def test_the_same_bits_on_every_run_and_those_of_render(backend, renderer):
+    cloud, capture = random_picture(5, count=400)
+    first, again = derivatives(backend, cloud, capture), derivatives(backend, cloud, capture)
+    for name, array in first.items():
+        assert array.tobytes() == again[name].tobytes(), name
+    features, view = prepare(cloud, capture)
+    images = backend.differentiate(features).forward(backend.upload(cloud), view)
+    drawn = {name: images.read(name) for name in capture.outputs}
+    frame = renderer.render(cloud, capture)
+    assert all(np.array_equal(drawn[name], frame[name]) for name in drawn)
+
+
+def test_outputs_without_a_gradient_given_have_one_of_zero(backend):
+    cloud, capture = random_picture(6)
+    features, view = prepare(cloud, capture)
+    weights = random_loss(features, view)
+    alone = derivatives(backend, cloud, capture, {"rgb": weights["rgb"]})
+    zeros = {name: 0 * array for name, array in weights.items()} | {"rgb": weights["rgb"]}
+    beside = derivatives(backend, cloud, capture, zeros)
+    for name in alone:
+        assert np.array_equal(alone[name], beside[name]), name
+
+
+def test_another_picture_in_between_is_an_error(backend, renderer):
+    cloud, capture = random_picture(6)
+    features, view = prepare(cloud, capture)
+    pipeline = backend.differentiate(features)
+    images = pipeline.forward(backend.upload(cloud), view)
+    renderer.render(cloud, capture)
+    with pytest.raises(fs.InputError, match="made last"):
+        pipeline.backward(images, {})
+
+
+def test_a_cloud_of_no_splat_has_the_backgrounds_derivative(backend):
+    _, capture = random_picture(7)
+    empty = fs.SplatCloud(np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 2)), [], sh=np.zeros((0, 4, 3)))
+    assert_same(backend, empty, capture)

@@ -1,0 +1,13 @@
+"""A cloud of which nothing is known but what decides the features of its picture."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Traits:
+    """In place of a SplatCloud, for `select`."""
+
+    sh_degree: int = -1
+    has_planes: bool = False
+    footprint: str = "gaussian"
+    ellipsoids: str = "none"

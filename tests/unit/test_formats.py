@@ -1,0 +1,302 @@
+"""Splat files beside PLY: what comes back, what an independent reader finds, and what is refused."""
+
+import gzip
+import json
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.cli import main
+from fidsplat.formats import losses
+from fidsplat.formats.files import FORMATS
+from fidsplat.harmonics import C0
+from fidsplat.rotations import quaternion_to_matrix, rigid_matrix
+
+USD = [pytest.param(suffix, id=suffix) for suffix in (".usda", ".usdc", ".usd")]
+
+
+def some(count=40, degree=2, thick=True, seed=4, **more) -> fs.SplatCloud:
+    random = np.random.default_rng(seed)
+    scales = random.uniform(0.01, 0.3, (count, 3))
+    scales[::3, 2] = 0  # disks among them
+    return fs.SplatCloud(
+        random.uniform(-3, 3, (count, 3)).astype(np.float32), random.normal(size=(count, 4)),
+        scales if thick else scales[:, :2], random.uniform(0, 1, count),
+        sh=random.normal(0, 0.2, (count, (degree + 1) ** 2, 3)), **more,
+    )  # fmt: skip
+
+
+def need(suffix):
+    if suffix.startswith(".us"):
+        pytest.importorskip("pxr", reason="the extra usd is not installed")
+
+
+def assert_same_bits(a: fs.SplatCloud, b: fs.SplatCloud):
+    for name in ("means", "scales", "opacities", "labels", "sh", "thickness", "planes"):
+        one, other = getattr(a, name), getattr(b, name)
+        assert (one is None) == (other is None), name
+        if one is not None:
+            np.testing.assert_array_equal(one, other, err_msg=name)
+    np.testing.assert_allclose(a.quats, b.quats, atol=1.2e-7)  # made of unit length once more
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".gltf", *USD])
+@pytest.mark.parametrize("thick", [True, False])
+def test_what_keeps_every_bit(tmp_path, suffix, thick):
+    need(suffix)
+    cloud = some(thick=thick, labels=np.arange(40) % 5)
+    fs.save_splats(cloud, tmp_path / f"a{suffix}")
+    assert_same_bits(fs.load_splats(tmp_path / f"a{suffix}"), cloud)
+    assert losses(cloud, f"a{suffix}") == []
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_spz_is_as_near_as_its_bits(tmp_path, degree):
+    cloud = some(degree=degree)
+    fs.save_splats(cloud, tmp_path / "a.spz")
+    read = fs.load_splats(tmp_path / "a.spz")
+    np.testing.assert_allclose(read.means, cloud.means, atol=0.5 / 2**20 + 3e-7)
+    np.testing.assert_allclose(np.log(read.scales), np.log(cloud.scales), atol=1 / 32 + 1e-5)
+    np.testing.assert_allclose(read.opacities, cloud.opacities, atol=0.5 / 255 + 1e-6)
+    assert ((read.thickness > 0) == (cloud.thickness > 0)).all()
+    turn = np.abs((read.quats * cloud.quats).sum(axis=1))
+    assert np.degrees(2 * np.arccos(turn.clip(0, 1))).max() < 0.3
+    assert np.abs(read.sh[:, 0] - cloud.sh[:, 0]).max() < 0.5 / 255 / 0.15 + 1e-5
+    if degree:
+        assert np.abs(read.sh[:, 1:] - cloud.sh[:, 1:]).max() < 0.5 / 128 * 2.5  # turned after rounding
+    assert "rounds positions to 24 bits" in losses(cloud, "a.spz")[-1]
+
+
+def test_splat_is_as_near_as_its_bytes(tmp_path):
+    cloud = some(degree=0)
+    fs.save_splats(cloud, tmp_path / "a.splat")
+    read = fs.load_splats(tmp_path / "a.splat")
+    np.testing.assert_array_equal(read.means, cloud.means)
+    np.testing.assert_allclose(read.scales, cloud.scales, rtol=1e-6)
+    assert ((read.thickness > 0) == (cloud.thickness > 0)).all()
+    np.testing.assert_allclose(read.opacities, cloud.opacities, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(read.plain_colors, cloud.plain_colors, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(np.abs((read.quats * cloud.quats).sum(axis=1)), 1, atol=1e-4)
+
+
+# independent readers: the specifications, by other hands or word by word
+
+
+def test_a_splat_file_word_by_word(tmp_path):
+    half = math.sqrt(0.5)
+    cloud = fs.SplatCloud([[1, 2, 3]], [[half, 0, half, 0]], [[0.5, 0.25]], [0.6], colors=[[1.0, 0.2, 0.0]])
+    fs.save_splats(cloud, tmp_path / "a.splat")
+    row = struct.unpack("<6f8B", (tmp_path / "a.splat").read_bytes())
+    assert row[:5] == (1, 2, 3, 0.5, 0.25)
+    assert row[5] == pytest.approx(1e-6)
+    assert row[6:] == (255, 51, 0, 153, 219, 128, 219, 128)
+
+
+def test_an_spz_file_word_by_word(tmp_path):
+    """Axes are right, up and backwards; one splat, of which every field is worked out by hand."""
+    cloud = fs.SplatCloud(
+        [[1.0, 2.0, -0.5]], [[0.8, 0.0, 0.6, 0.0]], [[math.exp(-2), math.exp(-1)]], [0.2],
+        sh=[[[0.0, 1.0, -1.0]] + [[0.5, 0.25, 0.0]] * 3],
+    )  # fmt: skip
+    fs.save_splats(cloud, tmp_path / "a.spz")
+    data = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    assert struct.unpack_from("<IIIBBBB", data) == (0x5053474E, 3, 1, 1, 20, 0, 0)
+    places = [int.from_bytes(data[16 + 3 * i : 19 + 3 * i], "little", signed=True) / 2**20 for i in range(3)]
+    assert places == [1.0, -2.0, 0.5]
+    assert data[25] == 51
+    assert list(data[26:29]) == [128, 166, 89]
+    assert list(data[29:32]) == [128, 144, 0]
+    word = int.from_bytes(data[32:36], "little")
+    # half a turn about x times (0.8, 0, 0.6, 0) is (0, 0.8, 0, 0.6): x is the largest and left out
+    assert word >> 30 == 0
+    others = [
+        ((-1 if word >> s + 9 & 1 else 1) * (word >> s & 511) / 511 / math.sqrt(2)) for s in (20, 10, 0)
+    ]
+    np.testing.assert_allclose(np.abs(others), [0, 0.6, 0], atol=1e-3)
+    # bands of -y, z, -x: y and z change sign with the axes
+    np.testing.assert_allclose(
+        (np.array(list(data[36:45])) - 128) / 128, [-0.5, -0.25, 0] * 2 + [0.5, 0.25, 0]
+    )
+    assert len(data) == 45
+
+
+def test_an_spz_file_of_version_2(tmp_path):
+    """By hand: its rotations are three bytes, x, y, z."""
+    body = struct.pack("<IIIBBBB", 0x5053474E, 2, 1, 0, 12, 0, 0)
+    body += b"".join(int(v * 4096).to_bytes(3, "little", signed=True) for v in (1.0, -2.0, 0.5))
+    body += bytes([255, 128, 128, 128, 128, 128, 0, 128, 128, 255])
+    (tmp_path / "a.spz").write_bytes(gzip.compress(body))
+    cloud = fs.load_splats(tmp_path / "a.spz")
+    np.testing.assert_allclose(cloud.means, [[1.0, 2.0, -0.5]])
+    normal = quaternion_to_matrix(cloud.quats)[0][:, 2]
+    np.testing.assert_allclose(normal, [0, 0, -1], atol=0.02)  # half about z, then half about x
+    assert cloud.thickness is None
+
+
+def test_a_glb_file_by_another_reader(tmp_path):
+    pygltflib = pytest.importorskip("pygltflib", reason="pygltflib reads glTF by itself")
+    cloud = some(degree=1, labels=3)
+    fs.save_splats(cloud, tmp_path / "a.glb")
+    document = pygltflib.GLTF2().load(str(tmp_path / "a.glb"))
+    blob, primitive = document.binary_blob(), document.meshes[0].primitives[0]
+    assert document.extensionsUsed == ["KHR_gaussian_splatting"]
+    assert primitive.mode == 0
+    assert primitive.extensions["KHR_gaussian_splatting"]["kernel"] == "ellipse"
+    accessor = document.accessors[primitive.attributes.POSITION]
+    view = document.bufferViews[accessor.bufferView]
+    means = np.frombuffer(blob, "<f4", 3 * accessor.count, view.byteOffset).reshape(-1, 3)
+    np.testing.assert_array_equal(means, cloud.means)
+    np.testing.assert_allclose(accessor.min, cloud.means.min(axis=0))
+    assert document.nodes[0].rotation == [1, 0, 0, 0]  # y up
+
+
+def test_a_usd_file_says_what_the_schema_wants(tmp_path):
+    need(".usda")
+    from pxr import Usd, UsdGeom
+
+    cloud = some(degree=1, thick=False).with_planes(3)
+    fs.save_splats(cloud, tmp_path / "a.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    prim = stage.GetDefaultPrim()
+    assert prim.GetTypeName() == "ParticleField"
+    assert "ParticleFieldKernelGaussianSurfletAPI" in prim.GetAppliedSchemas()
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    quaternion = prim.GetAttribute("orientations").Get()[7]
+    np.testing.assert_allclose([quaternion.GetReal(), *quaternion.GetImaginary()], cloud.quats[7])
+    assert list(prim.GetAttribute("positions").Get()[7]) == cloud.means[7].tolist()
+    assert prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get() == 1
+    assert_same_bits(fs.load_splats(tmp_path / "a.usda"), cloud)
+
+
+def test_a_gltf_of_nodes_bytes_and_a_file_beside(tmp_path):
+    """By hand: two nodes below each other, opacity in bytes, rotation in shorts, data in another file."""
+    half = round(32767 * math.sqrt(0.5))
+    data = (
+        struct.pack("<3f", 1, 0, 0) + struct.pack("<4h", 0, 0, half, half) + struct.pack("<3f", 0.1, 0.2, 0.3)
+    )
+    data += struct.pack("<3f", 1, 0, -1) + bytes([51, 0, 0, 0])
+    (tmp_path / "data.bin").write_bytes(data)
+    layout = [(0, 12, 5126, "VEC3"), (12, 8, 5122, "VEC4"), (20, 12, 5126, "VEC3"), (32, 12, 5126, "VEC3")]
+    layout.append((44, 4, 5121, "SCALAR"))
+    prefix = "KHR_gaussian_splatting:"
+    names = ["POSITION", *(prefix + name for name in ("ROTATION", "SCALE", "SH_DEGREE_0_COEF_0", "OPACITY"))]
+    document = {
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"children": [1], "scale": [2, 2, 2]}, {"mesh": 0, "translation": [0, 5, 0]}],
+        "meshes": [{"primitives": [{
+            "attributes": {name: i for i, name in enumerate(names)},
+            "extensions": {"KHR_gaussian_splatting": {"kernel": "ellipse"}},
+        }]}],
+        "accessors": [
+            {"bufferView": i, "componentType": kind, "count": 1, "type": shape, "normalized": kind != 5126}
+            for i, (_, _, kind, shape) in enumerate(layout)
+        ],
+        "bufferViews": [{"buffer": 0, "byteOffset": o, "byteLength": n} for o, n, _, _ in layout],
+        "buffers": [{"byteLength": len(data), "uri": "data.bin"}],
+    }  # fmt: skip
+    path = tmp_path / "a.gltf"
+    path.write_text(json.dumps(document))
+    cloud = fs.load_splats(path)
+    np.testing.assert_allclose(cloud.world_means(), [[2, -10, 0]], atol=1e-6)
+    np.testing.assert_allclose(cloud.scales, [[0.2, 0.4]], rtol=1e-6)
+    np.testing.assert_allclose(cloud.thickness, [0.6], rtol=1e-6)
+    np.testing.assert_allclose(cloud.opacities, [0.2], rtol=1e-6)
+    np.testing.assert_allclose(cloud.plain_colors, [[0.5 + C0, 0.5, 0.5 - C0]], rtol=1e-6)
+    axis = quaternion_to_matrix(cloud.quats)[0][:, 0]
+    np.testing.assert_allclose(axis, [0, -1, 0], atol=1e-4)  # x to y, which is up
+    for uri in ("../data.bin", "/etc/hostname", "https://a.example/data.bin", "%2e%2e/data.bin"):
+        document["buffers"][0]["uri"] = uri
+        path.write_text(json.dumps(document))
+        with pytest.raises(fs.InputError, match="outside of its folder; it is not read"):
+            fs.load_splats(path)
+    document["buffers"][0]["uri"] = "data.bin"
+    document["nodes"][1]["children"] = [0]
+    path.write_text(json.dumps(document))
+    with pytest.raises(fs.InputError, match="node 0 stands below two others, or below itself"):
+        fs.load_splats(path)
+
+
+# bad input
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".splat", ".glb", ".gltf", *USD[:2]])
+def test_files_that_are_cut_short_or_something_else(tmp_path, suffix):
+    need(suffix)
+    path = tmp_path / f"a{suffix}"
+    fs.save_splats(some(count=9, degree=1), path)
+    whole = path.read_bytes()
+    last = len(whole.rstrip()) - 1  # text may do without its line's end
+    for cut in sorted({0, 1, 5, 13, 25, len(whole) // 2, last, len(whole) - 7}):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(fs.InputError, match=str(path)):
+            fs.load_splats(path)
+    path.write_bytes(b"\x89PNG" + bytes(100))
+    with pytest.raises(fs.InputError, match=str(path)):
+        fs.load_splats(path)
+    path.unlink()
+    with pytest.raises(fs.InputError, match="cannot read"):
+        fs.load_splats(path)
+
+
+def test_an_spz_file_that_promises_more_than_gzip_can_hold(tmp_path):
+    head = struct.pack("<IIIBBBB", 0x5053474E, 3, 2**32 - 1, 3, 12, 0, 0)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(head))
+    with pytest.raises(fs.InputError, match=r"cut short: its header calls for \d+ bytes"):
+        fs.load_splats(tmp_path / "a.spz")
+
+
+def test_what_cannot_be_written(tmp_path):
+    tag = fs.marker("aruco:4x4_50:7", size=0.4)
+    for suffix in FORMATS:
+        need(suffix)
+        with pytest.raises(fs.InputError, match="are boxes"):
+            fs.save_splats(tag.cloud, tmp_path / f"a{suffix}")
+    with pytest.raises(fs.InputError, match=r"unknown ending of a splat file '.obj'"):
+        fs.save_splats(tag.gaussians, tmp_path / "a.obj")
+    with pytest.raises(fs.InputError, match="empty cloud"):
+        fs.save_splats(fs.SplatCloud.empty(), tmp_path / "a.glb")
+    far = fs.SplatCloud([[1e8, 0, 0]], [[1, 0, 0, 0]], [[1, 1]], [1], colors=[[1, 1, 1]])
+    with pytest.raises(fs.InputError, match="SPZ holds coordinates up to 8,388,608 m"):
+        fs.save_splats(far, tmp_path / "a.spz")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_format_cannot_hold_is_said():
+    cloud = some(labels=3, thick=False).with_planes(1).transformed(rigid_matrix((1e6, 0, 0)))
+    words = " ".join(losses(cloud, "a.splat"))
+    for part in (
+        "SH of degree 2",
+        "labels (1 different)",
+        "planes",
+        "the origin: positions",
+        "rounds colours",
+    ):
+        assert part in words
+    assert losses(cloud, "a.ply") == []
+
+
+# the command
+
+
+def test_convert_says_what_it_costs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("fidsplat.commands.framing.WIDTH", 64)
+    monkeypatch.setattr("fidsplat.commands.framing.HEIGHT", 36)
+    fs.save_splats(some(labels=2), "a.ply")
+    assert main(["convert", "a.ply", "a.glb", "--device", "reference", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (said["splats"], said["lost"], said["format"]) == (40, [], "glTF KHR_gaussian_splatting")
+    assert said["error"]["largest"] < 1e-5
+    assert main(["convert", "a.ply", "a.spz", "--device", "reference"]) == 0
+    out = capsys.readouterr().out
+    assert "not kept: labels (1 different)" in out
+    assert "pictures differ by 0." in out
+    assert main(["convert", "a.ply", "b.splat", "--no-pictures"]) == 0
+    assert "pictures" not in capsys.readouterr().out
+    assert Path("b.splat").stat().st_size == 40 * 32
+    assert main(["convert", "a.ply", "a.xyz"]) == 2
+    assert "unknown ending of a splat file '.xyz'" in capsys.readouterr().err

@@ -1,0 +1,196 @@
+"""The robot, its filter, and `fidsplat experiment localise`."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.cli import main
+from fidsplat.rotations import rigid_matrix
+from fidsplat.sim.localiser import Localiser
+
+mujoco = pytest.importorskip("mujoco", reason="pip install 'fidsplat[sim]'")
+
+from fidsplat.experiments.localise import Localise, errors_of, write_log  # noqa: E402 (needs MuJoCo)
+from fidsplat.sim.greenhouse import Greenhouse  # noqa: E402
+from fidsplat.sim.robot import BODY, CAMERA_AT, Errors, Run, camera_at, drive, mount  # noqa: E402
+
+EXACT = Errors(wheels=0, slip=0, gyro_bias=0, gyro_noise=0)
+CAMERA = fs.Camera.look_at(320, 240, 1.2, (0, 0, 0), (0, 0, 1))
+
+
+@pytest.fixture(scope="module")
+def house():
+    return Greenhouse(1, 3)
+
+
+@pytest.fixture(scope="module")
+def run(house):
+    return drive(house.mjcf(BODY), np.array([[-0.5, -0.75], [1.0, -0.75], [1.0, -1.5]]), errors=EXACT)
+
+
+def headed(heading, x=0.0, y=0.0):
+    return rigid_matrix((x, y, 0), (math.cos(heading / 2), 0, 0, math.sin(heading / 2)))
+
+
+def test_the_robot_follows_its_path_and_stays_upright(run):
+    assert run.length == pytest.approx(2.25, abs=0.05)
+    np.testing.assert_allclose(run.poses[-1, :2, 3], [1.0, -1.5], atol=0.03)
+    assert np.abs(run.poses[:, 2, 3]).max() < 0.005
+    assert np.abs(run.poses[:, 2, :2]).max() < 0.02
+
+
+def test_wheels_and_gyroscope_without_errors_say_where_it_is(run):
+    filtered = Localiser(np.array([-0.5, -0.75, 0.0]))
+    for k in range(1, len(run.times)):
+        filtered.move(run.wheels[k], run.gyro[k], run.times[k] - run.times[k - 1])
+    assert np.linalg.norm(filtered.pose[:2, 3] - run.poses[-1, :2, 3]) < 0.03
+    heading = math.atan2(run.poses[-1, 1, 0], run.poses[-1, 0, 0])
+    assert filtered.state[2] == pytest.approx(heading, abs=0.02)
+
+
+def test_errors_of_sensors_are_the_seeds(house):
+    path = np.array([[-0.5, -0.75], [0.0, -0.75]])
+    one, same, other = (drive(house.mjcf(BODY), path, errors=Errors(seed=s)) for s in (1, 1, 2))
+    np.testing.assert_array_equal(one.wheels, same.wheels)
+    np.testing.assert_array_equal(one.poses, other.poses)
+    assert not np.array_equal(one.wheels, other.wheels)
+    assert one.gyro.std() == pytest.approx(0.002, abs=0.01)
+
+
+def test_a_robot_that_meets_a_bench_says_so(house):
+    with pytest.raises(fs.InputError, match="does not get on at"):
+        drive(house.mjcf(BODY), np.array([[0.9, -0.9], [0.9, 0.9]]), speed=3.0)
+    with pytest.raises(fs.InputError, match="two or more corners"):
+        drive(house.mjcf(BODY), np.zeros((1, 2)))
+
+
+def test_the_camera_looks_ahead():
+    camera = camera_at(CAMERA, headed(math.pi / 2, 1.0, 2.0))
+    np.testing.assert_allclose(camera.position, [1.0, 2.0 + CAMERA_AT[0], CAMERA_AT[2]], atol=1e-12)
+    np.testing.assert_allclose(camera.project([[1.0, 5.0, CAMERA_AT[2]]]), [[160, 120]], atol=1e-9)
+    (x, y) = camera.project([[0.5, 5.0, 1.0]])[0]
+    assert x < 160  # what lies to the left, higher
+    assert y < 120
+    assert mount()[:3, 2] @ [1, 0, 0] == pytest.approx(1)
+
+
+def test_a_tag_takes_the_error_away_and_one_elsewhere_is_not_believed():
+    far = np.array([[2.0, 0.3, 0.5], [2.0, 0.1, 0.5], [2.0, 0.1, 0.3], [2.0, 0.3, 0.3]])
+    near = far * [0.5, 1.0, 1.0] + [0.0, -0.5, 0.0]
+
+    def standing(pose):
+        return camera_at(CAMERA, pose)
+
+    filtered = Localiser(np.array([0.02, -0.02, 0.01]))
+    filtered.covariance[:3, :3] = np.diag([0.03, 0.03, 0.02]) ** 2
+    for _ in range(30):
+        for tag in (far, near):
+            assert filtered.see(standing(np.eye(4)).project(tag), tag, standing)
+    assert np.abs(filtered.state[:2]).max() < 0.005
+    assert abs(filtered.state[2]) < 0.002
+    assert np.sqrt(np.diag(filtered.covariance)[:2]).max() < 0.02
+    before = filtered.state.copy()
+    assert not filtered.see(standing(np.eye(4)).project(far) + 60, far, standing)
+    np.testing.assert_array_equal(filtered.state, before)
+    assert filtered.refused == 1
+
+
+def test_a_tag_behind_the_robot_is_not_believed():
+    tag = np.array([[-2.0, 0.3, 0.5], [-2.0, 0.1, 0.5], [-2.0, 0.1, 0.3], [-2.0, 0.3, 0.3]])
+    filtered = Localiser(np.zeros(3))
+    assert not filtered.see(np.full((4, 2), 100.0), tag, lambda pose: camera_at(CAMERA, pose))
+
+
+def test_errors_are_those_of_evo():
+    times = np.linspace(0, 10, 400)
+    truth = np.array([headed(0.1 * t, 0.5 * t, math.sin(t)) for t in times])
+    rng = np.random.default_rng(0)
+    guess = truth @ np.array(
+        [headed(a, *b) for a, b in zip(rng.normal(0, 0.02, 400), rng.normal(0, 0.05, (400, 2)), strict=True)]
+    )
+    found = errors_of(Run(times, truth, np.zeros((400, 2)), np.zeros(400)), guess)
+    assert found["heading_deg"] == pytest.approx(math.degrees(0.02), rel=0.15)
+    metrics = pytest.importorskip("evo.core.metrics", reason="pip install evo")
+    from evo.core.trajectory import PoseTrajectory3D
+
+    pair = [PoseTrajectory3D(poses_se3=list(poses), timestamps=times) for poses in (truth, guess)]
+    ape = metrics.APE(metrics.PoseRelation.translation_part)
+    ape.process_data(pair)
+    assert found["ate_m"] == pytest.approx(ape.get_statistic(metrics.StatisticsType.rmse))
+    assert found["worst_m"] == pytest.approx(ape.get_statistic(metrics.StatisticsType.max))
+    rpe = metrics.RPE(metrics.PoseRelation.translation_part, 1.0, metrics.Unit.meters, all_pairs=True)
+    rpe.process_data(pair)
+    assert found["rpe_m"] == pytest.approx(rpe.get_statistic(metrics.StatisticsType.rmse), rel=0.2)
+
+
+def test_the_command_measures_once(tmp_path, monkeypatch, capsys):
+    """Odometry alone, which draws nothing."""
+    monkeypatch.setenv("FIDSPLAT_DEVICE", "reference")
+    words = ["experiment", "localise", "--quick", "-o", str(tmp_path / "out"), "--variant", "odometry"]
+    assert main([*words, "--json"]) == 0
+    first = json.loads(capsys.readouterr().out)
+    assert first["variants"]["odometry"]["ate_m"] > 0.02
+    assert 9 < first["length_m"] < 10
+    truth = fs.load_trajectory(tmp_path / "out/truth.tum")
+    guess = fs.load_trajectory(tmp_path / "out/odometry.tum")
+    off = np.linalg.norm(truth.poses[:, :2, 3] - guess.poses[:, :2, 3], axis=1)
+    assert np.sqrt((off**2).mean()) == pytest.approx(first["variants"]["odometry"]["ate_m"], rel=1e-6)
+    monkeypatch.setattr(Localise, "run", lambda self: pytest.fail("measured again"))
+    assert main([*words, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == first
+    assert "<svg" in (tmp_path / "out/localise.svg").read_text()
+    assert "| odometry |" in (tmp_path / "out/localise.md").read_text()
+    assert main([*words, "--seed", "1"]) == 2
+    assert "is of another drive" in capsys.readouterr().err
+    assert main([*words[:-1], "odometri"]) == 2
+    assert "unknown variant 'odometri' (did you mean 'odometry'?)" in capsys.readouterr().err
+
+
+def test_the_drive_as_a_log(tmp_path, monkeypatch):
+    reader = pytest.importorskip("mcap.reader", reason="pip install 'fidsplat[logs]'")
+    monkeypatch.setattr("fidsplat.experiments.localise.RATE", 0.5)
+    grey = np.full((480, 640, 3), 128, np.uint8)
+    monkeypatch.setattr(
+        Localise, "pictures", lambda self, variant, run, renderer: (grey for _ in self.shots(run))
+    )
+    asked = Localise(1, 1)
+    pictures = list(write_log(asked, "exact", None, str(tmp_path / "run.mcap"), False))
+    with (tmp_path / "run.mcap").open("rb") as stream:
+        counts = reader.make_reader(stream).get_summary().statistics.channel_message_counts
+        stream.seek(0)
+        topics = {k: each.topic for k, each in reader.make_reader(stream).get_summary().channels.items()}
+    counts = {topics[k]: count for k, count in counts.items()}
+    assert (
+        counts["/eye/image_raw/compressed"] == counts["/tf"] == counts["/eye/detections"] == len(pictures) > 3
+    )
+    assert counts["/odom"] == counts["/imu"] > 50 * len(pictures)
+    with pytest.raises(fs.InputError, match="takes no pictures"):
+        list(write_log(asked, "odometry", None, str(tmp_path / "other.mcap"), False))
+
+
+def test_with_ideal_corners_it_knows_its_way():
+    """The filter alone: every tag that the camera could see, with corners where they are."""
+    asked = Localise(1, 3)
+    house = asked.house
+    moved = drive(
+        house.mjcf(BODY), np.array([[-0.5, -0.75], [2.0, -0.75]]), errors=Errors(0.03, gyro_bias=0.01, seed=3)
+    )
+    from fidsplat.vision.detect import Detection
+    from fidsplat.vision.visible import visible
+
+    sightings = []
+    for k in asked.shots(moved):
+        camera = camera_at(asked.camera, moved.poses[k])
+        tags = [p for p in house.markers if p.marker.kind == "apriltag" and visible(p, camera).share > 0.99]
+        near = [p for p in tags if np.linalg.norm(p.pose[:3, 3] - camera.position) < 1.5]
+        sightings.append(
+            [Detection("apriltag", "36h11", p.marker.id, None, camera.project(p.corners)) for p in near]
+        )
+    _, blind = asked.localised(moved, None, asked.camera)
+    _, seeing = asked.localised(moved, sightings, asked.camera, 0.05)
+    assert seeing["tags"] > 5
+    assert seeing["refused"] == 0
+    assert seeing["ate_m"] < 0.01 < blind["ate_m"]

@@ -1,0 +1,55 @@
+"""What plain pytest leaves to `pytest -m exhaustive`."""
+
+from types import SimpleNamespace
+
+import pytest
+from sampling import alternate, in_turn, sampled, take_turns
+
+DEVICES = ("one", "two", "gpu")
+
+
+class Item:
+    """A collected test."""
+
+    def __init__(self, device, case, *marks):
+        self.name = f"{device}-{case}"
+        self.nodeid = f"file::test[{self.name}]"
+        self.callspec = SimpleNamespace(id=self.name, params={"renderer": device})
+        self.marks = {mark.name: mark for mark in marks}
+
+    def get_closest_marker(self, name):
+        return self.marks.get(name)
+
+    def add_marker(self, mark):
+        self.marks[mark.name] = mark.mark
+
+
+def kept(marks_of):
+    """Of five cases on three devices, those that plain pytest runs."""
+    items = [Item(device, case, *marks_of(case)) for device in DEVICES for case in range(5)]
+    take_turns(items, DEVICES[:2])
+    return [item.name for item in items if "exhaustive" not in item.marks and item.name[:3] != "gpu"], items
+
+
+def test_each_case_runs_on_one_device_in_turn_and_on_every_gpu():
+    names, items = kept(lambda case: [in_turn().mark])
+    assert names == ["one-0", "one-2", "one-4", "two-1", "two-3"]
+    assert not any("exhaustive" in item.marks for item in items[10:])
+    assert kept(lambda case: [in_turn(1).mark])[0] == ["one-1", "one-3", "two-0", "two-2", "two-4"]
+
+
+def test_what_is_left_out_anyway_has_no_turn():
+    rest = pytest.mark.exhaustive.mark
+    assert kept(lambda case: [in_turn().mark] + [rest] * (case % 2))[0] == ["one-0", "one-4", "two-2"]
+
+
+def test_other_tests_run_on_every_device():
+    assert len(kept(lambda case: [])[0]) == 10
+
+
+def test_a_chessboard_and_a_sample():
+    fields = alternate({"a": 1, "b": 2}, {"x": 3, "y": 4})
+    assert [case.values for case in fields if not case.marks] == [(1, 3), (2, 4)]
+    cases = sampled("abcdef", 2, seed=1)
+    assert sum(not case.marks for case in cases) == 2
+    assert [case.values[0] for case in cases] == list("abcdef")
