@@ -92,8 +92,9 @@ class _Digest:
         self.sha = hashlib.sha256()
 
     def write(self, data: Any) -> int:
-        self.sha.update(data)
-        return len(data)
+        content = memoryview(data)  # bytes, or a large array where it lies
+        self.sha.update(content)
+        return content.nbytes
 
 
 class FlightFolder:

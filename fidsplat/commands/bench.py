@@ -5,13 +5,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from fidsplat.commands.output import console, json_text, option, print_table, say, writable_file
+from fidsplat.commands.output import (
+    console,
+    json_text,
+    late_progress,
+    option,
+    print_table,
+    say,
+    writable_file,
+)
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from fidsplat.experiments.bench.catalogue import BenchScene
     from fidsplat.experiments.bench.measure import Bench as Measuring
     from fidsplat.experiments.bench.measure import Result
 
@@ -41,17 +50,28 @@ class Bench:
       qr_wall         200 QR codes of version 22 on a wall, 1920 x 1080
       tag_in_million  an AprilTag before 1,000,000 random splats, 1920 x 1080
 
+    --scene takes one's own instead, with its camera; --cameras poses from which it is seen, of which eight
+    are drawn. Splats are timed alone: its effects, and what moves in it, are left out.
+
     Examples:
       fidsplat bench
       fidsplat bench --scenes r100k_720p r1m_1080p --repeats 50
       fidsplat bench --device opencl:nvidia --device opencl:pocl --json figures.json
       fidsplat bench --scenes all --json -
+      fidsplat bench --scene room.ply --cameras poses.tum
     """
 
     scenes: Annotated[
         tuple[str, ...],
         option("NAME...", "scenes, or all (default: tag r100k_720p r1m_1080p tag_in_million)"),
     ] = ()
+    scene: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]],
+        option("SCENE.toml|FILE.ply", "one's own, instead of --scenes; once more for each"),
+    ] = ()
+    cameras: Annotated[
+        str | None, option("FILE", "poses, camera to world, for --scene (docs/trajectories.md)")
+    ] = None
     device: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
         option("D", "see `fidsplat devices`; once more for each (default: FIDSPLAT_DEVICE, or opencl)"),
@@ -65,13 +85,14 @@ class Bench:
     def run(self) -> int:
         from rich.progress import Progress, TextColumn
 
-        from fidsplat.experiments.bench.catalogue import scene_names
+        from fidsplat.experiments.bench.catalogue import BENCH_SCENES, scene_names
         from fidsplat.experiments.bench.measure import Bench as Measuring
         from fidsplat.render import default_device
 
         if self.repeats < 1:
             raise InputError(f"--repeats is {self.repeats}; give a number of frames, at least 1")
-        scenes = scene_names(self.scenes)
+        known = self._own_scenes() or BENCH_SCENES
+        scenes = tuple(known) if self.scene else scene_names(self.scenes)
         if self.json not in (None, "-"):
             writable_file(self.json)
         where = console(self.json == "-")
@@ -84,7 +105,10 @@ class Bench:
             task = progress.add_task("frames", total=frames, now="")
             try:
                 measuring = Measuring(
-                    devices, lambda words: progress.update(task, now=words), lambda: progress.advance(task)
+                    devices,
+                    lambda words: progress.update(task, now=words),
+                    lambda: progress.advance(task),
+                    known,
                 )
                 for scene in scenes:
                     measuring.run(scene, self.repeats)
@@ -97,12 +121,29 @@ class Bench:
         if self.json == "-":
             print(json_text(_record(results, scenes, interrupted)))
         else:
-            _print(results, where)
-            if not self.scenes and not interrupted:
+            _print(results, where, {name: scene.about for name, scene in known.items()})
+            if not (self.scenes or self.scene) and not interrupted:
                 where.print(f"These were {', '.join(scenes)}; more with --scenes NAME... or --scenes all.")
         if interrupted:
             raise KeyboardInterrupt
         return 1 if any(result.timer.error for result in results) else 0
+
+    def _own_scenes(self) -> "dict[str, BenchScene]":
+        """The scenes of --scene, from the poses of --cameras."""
+        from fidsplat.commands.render import load_source
+        from fidsplat.experiments.bench.catalogue import own_scenes
+        from fidsplat.formats import load_trajectory
+
+        if self.scene and self.scenes:
+            raise InputError("--scene and --scenes exclude each other; give one of them")
+        if self.cameras is not None and not self.scene:
+            raise InputError("--cameras are those of --scene; give that as well")
+        path = None if self.cameras is None else load_trajectory(self.cameras)
+        found: dict[str, BenchScene] = {}
+        for name in self.scene:
+            with late_progress(console(True)) as progress:
+                found |= own_scenes(name, load_source(name, None, progress), path)
+        return found
 
     def _save(self, measuring: "Measuring", scenes: tuple[str, ...], interrupted: bool) -> None:
         if self.json in (None, "-"):
@@ -123,8 +164,8 @@ def _record(results: "list[Result]", scenes: tuple[str, ...], interrupted: bool)
     }
 
 
-def _print(results: "list[Result]", where: "Console") -> None:
-    """A table for each scene; the devices are its columns."""
+def _print(results: "list[Result]", where: "Console", about: dict[str, str]) -> None:
+    """A table for each scene; the devices are its columns. about: what scenes are, by name."""
     for scene in dict.fromkeys(result.scene for result in results):
         drawn = [result for result in results if result.scene == scene]
         for result in drawn:
@@ -132,14 +173,12 @@ def _print(results: "list[Result]", where: "Console") -> None:
                 say(where, f"{scene} on {result.device.name}: {result.timer.error}")
         drawn = [result for result in drawn if result.timer.ms]
         if drawn:
-            _print_scene(scene, drawn, where)
+            _print_scene(f"{scene}: {about[scene]}", drawn, where)
     if any(result.timer.ms for result in results):
         where.print(_LEGEND, markup=False)
 
 
-def _print_scene(scene: str, drawn: "list[Result]", where: "Console") -> None:
-    from fidsplat.experiments.bench.catalogue import BENCH_SCENES
-
+def _print_scene(title: str, drawn: "list[Result]", where: "Console") -> None:
     heads, rows = ["ms"], [["frame"]]
     stages = list(dict.fromkeys(stage for result in drawn for stage in result.timer.parts))
     rows += [[stage] for stage in stages]
@@ -155,7 +194,7 @@ def _print_scene(scene: str, drawn: "list[Result]", where: "Console") -> None:
         rows.append([fact])
         for result in drawn:
             rows[-1] += [_fact(result, fact), ""]
-    print_table(where, f"{scene}: {BENCH_SCENES[scene].about}", heads, rows)
+    print_table(where, title, heads, rows)
     for result in drawn:
         device, frames = result.device, len(result.timer.ms)
         say(where, f"{device.name}: {device.title}, {device.version}; {frames} frames")

@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 import tyro
 
-from fidsplat.commands.framing import framing_camera
 from fidsplat.commands.output import (
     Device,
     Json,
@@ -80,6 +79,7 @@ def picture_error(before, after, device: str | None) -> dict[str, float]:
     import numpy as np
 
     import fidsplat as fs
+    from fidsplat.commands.framing import framing_camera
 
     renderer, camera = fs.Renderer(device), framing_camera(before)
     one, other = (renderer.render(cloud, camera)["rgb"].astype(np.float64) for cloud in (before, after))

@@ -11,9 +11,9 @@ class Warm:
     """Compile what scenes commonly call for, so that first pictures come at once.
 
     The kernels of a scene are compiled when it is first drawn, which takes a second or more, and kept in the
-    caches of pyopencl, of Warp and of the driver. This fills them: plain colours and spherical harmonics,
-    with and without markers, the usual outputs. Worth it once after an installation, an update or a change of
-    the driver. What is there already takes no time.
+    caches of pyopencl, of Warp and of the driver. This fills them: markers, 2D splats and captures of 3D
+    Gaussians, alone and together, the usual outputs. Worth it once after an installation, an update or a
+    change of the driver. What is there already takes no time.
 
     Examples:
       fidsplat warm

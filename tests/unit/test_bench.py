@@ -21,7 +21,15 @@ KEYS = (
     *("width", "height", "repeats", "error"),
 )
 FIGURES = (
-    *("frame_ms", "quartiles_ms", "fastest_ms", "first_frame_ms", "stages_ms", "fastest_stages_ms"),
+    *(
+        "frame_ms",
+        "quartiles_ms",
+        "fastest_ms",
+        "first_frame_ms",
+        "host_ms",
+        "stages_ms",
+        "fastest_stages_ms",
+    ),
     *("splats", "visible", "pairs", "fragments", "splats_per_second", "memory_bytes", "mean_rgb"),
     *("rates", "rooflines_ms", "times_roofline"),
 )
@@ -259,3 +267,37 @@ def test_the_wall_fills_the_picture_with_200_codes(monkeypatch):
     assert shown.min() > 0
     assert np.all(shown.max(0) < (1920, 1080))
     assert np.ptp(shown[:, 0]) > 0.9 * 1920
+
+
+def test_ones_own_scene_from_ones_own_cameras(tmp_path, monkeypatch, capsys):
+    """Each pose is timed by itself, so many at most, and draws what it sees."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(catalogue, "MOST_VIEWS", 3)
+    fs.save_ply(random_cloud(200, 0.2), "own.ply")
+    (tmp_path / "own.toml").write_text(
+        "[camera]\nwidth = 64\nheight = 48\nfov_x_deg = 60.0\nposition = [0.0, 0.0, 0.0]\n"
+        'look_at = [0.0, 0.0, 1.0]\n[[splats]]\nfile = "own.ply"\n'
+    )
+    lines = [f"{k} {0.1 * k} 0 0 0 0 0 1" for k in range(5)]
+    (tmp_path / "poses.tum").write_text("\n".join(lines))
+    words = ("--scene", "own.toml", "--device", "reference")
+    assert bench(*words, "--cameras", "poses.tum", "--json", "-") == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["scenes"] == [f"own.toml@{k}" for k in (0, 2, 4)]
+    cloud, renderer = fs.load_ply("own.ply"), fs.Renderer("reference")
+    for k, result in zip((0, 2, 4), said["results"], strict=True):
+        pose = np.eye(4)
+        pose[0, 3] = -0.1 * k
+        camera = fs.Camera.pinhole(64, 48, CAMERA.fx, CAMERA.fy, 32, 24, pose)
+        drawn = renderer.render(cloud, camera, quality=catalogue.TIMED)["rgb"]
+        assert result["mean_rgb"] == pytest.approx(float(drawn.mean(dtype=np.float64)), rel=1e-5)
+    assert bench(*words) == 0
+    out = capsys.readouterr().out
+    assert "own.toml: 200 splats, 64 x 48" in out
+    assert "more with --scenes" not in out
+    for wrong, why in (
+        (("--scene", "own.toml", "--scenes", "small"), "exclude each other"),
+        (("--cameras", "poses.tum"), "give that as well"),
+    ):
+        assert bench(*wrong) == 2
+        assert why in capsys.readouterr().err

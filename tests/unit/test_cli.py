@@ -76,7 +76,7 @@ def test_help_loads_nothing_heavy():
     ("words", "says"),
     [
         ([], "try `fidsplat demo` first"),
-        ([], "demo, devices, info, marker, render, detect"),
+        ([], "demo, devices, info, marker, render, view, fly, detect"),
         (["mraker"], "Available subcommands: demo, devices"),
         (["marker"], "SPEC"),
         (["marker", "qr:a", "--sise", "1"], "perhaps --size M; see fidsplat marker --help"),

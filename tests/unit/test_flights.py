@@ -132,6 +132,21 @@ def test_what_a_flight_is_of(here):
     assert len({key, *others}) == 6
 
 
+def test_a_large_cloud_is_hashed_too(here):
+    """Arrays of more than 64 KiB go to the hash where they lie."""
+    flight = small_flight()
+    means = np.zeros((30_000, 3), np.float32)
+
+    def key(last: float) -> str:
+        means[-1, 2] = last
+        rest = np.ones((len(means), 4), np.float32)
+        cloud = fs.SplatCloud(means, rest, rest[:, :2], rest[:, 0], colors=rest[:, :3])
+        return Flight(fs.Scene([cloud]), flight.trajectory, flight.times, flight.capture).key("a")
+
+    assert key(1.0) == key(1.0)
+    assert key(1.0) != key(2.0)
+
+
 def test_the_scenes_own_motion(here):
     assert main(["fly", "moving.toml", "-o", "own", "--rate", "2"]) == 0
     assert fly("--rate", "2") == 0
@@ -153,6 +168,13 @@ def test_a_log_and_the_truth_beside_the_pictures(here):
     np.testing.assert_allclose(moved, [0, -0.15, -0.3], atol=1e-9)
     own = np.load("out/label/000001.npy") == 1
     assert truth["annotations"][1]["area"] == own.sum() > 50
+
+
+def test_a_log_named_as_the_output_has_its_pictures_beside_it(here):
+    pytest.importorskip("fidsplat.logs", reason="pip install 'fidsplat[logs]'", exc_type=fs.InputError)
+    assert fly("--rate", "1", "-o", "run.mcap") == 0
+    assert (here / "run.mcap").is_file()
+    assert len(list((here / "run/rgb").iterdir())) == 2
 
 
 def test_a_video_has_every_picture(here):

@@ -3,25 +3,32 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from sampling import in_turn, sampled
-from traits import Traits
 
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.effects import select
 from fidsplat.experiments.bench import warm as warming
+from fidsplat.experiments.demo_scene import demo_scene
 
 
 def test_recipes_are_what_scenes_call_for():
     wanted = warming.recipes()
     assert len(set(wanted)) == len(wanted)
     assert len({recipe.words for recipe in wanted}) == len(wanted)
-    tag = fs.marker("apriltag:36h11:5").gaussians
-    assert (tag.sh_degree, tag.planes is not None) == (-1, True)
-    assert warming.Recipe(-1, True, ("rgb",)) in wanted
-    assert warming.Recipe(-1, True, ("rgb", "depth", "normal", "label")) in wanted  # the demo's
-    assert warming.Recipe(3, False, ("rgb",)) in wanted  # a captured scene's
+    called_for = {
+        select(warming._cloud(recipe, 5), fs.Capture(outputs=recipe.outputs, quality=recipe.quality))
+        for recipe in wanted
+    }
+    assert len(called_for) == len(wanted)
+    tag, demo = fs.marker("apriltag:36h11:5").cloud, demo_scene()
+    assert select(tag, fs.Capture()) in called_for
+    assert select(demo.cloud(), demo.capture) in called_for
+    capture = fs.SplatCloud([[0, 0, 1]], [[1, 0, 0, 0]], [[1, 1, 1]], [1], sh=np.zeros((1, 16, 3)))
+    assert select(capture, fs.Capture()) in called_for
+    assert select(fs.SplatCloud.concatenate([capture, tag]), fs.Capture(outputs=("depth",))) in called_for
 
 
 @in_turn()
@@ -33,10 +40,7 @@ def test_a_recipe_compiles_what_its_words_say(renderer, recipe):
     cloud = warming._cloud(recipe, 5)
     assert cloud.sh_degree == recipe.sh_degree
 
-    features = select(
-        Traits(recipe.sh_degree, recipe.markers),
-        fs.Capture(outputs=recipe.outputs, quality=recipe.quality),
-    )
+    features = select(cloud, fs.Capture(outputs=recipe.outputs, quality=recipe.quality))
     # a device without float64 has these in float32
     wanted = replace(features, setup_precision="")
     compiled = [replace(key[0], setup_precision="") for key in renderer.backend._pipelines]
@@ -62,7 +66,7 @@ def test_an_interrupt_says_what_is_ready(capsys, monkeypatch):
 
     monkeypatch.setattr(warming, "warm", stopped)
     assert main(["warm"]) == 130
-    assert "1 of 18 sets of kernels are ready" in capsys.readouterr().out
+    assert "1 of 22 sets of kernels are ready" in capsys.readouterr().out
 
 
 def test_a_device_that_is_not_there(capsys):

@@ -5,9 +5,11 @@ from __future__ import annotations
 import random
 import string
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from fidsplat.cameras import Camera
+import numpy as np
+
+from fidsplat.cameras import Camera, Trajectory
 from fidsplat.errors import InputError, unknown
 from fidsplat.markers import marker
 from fidsplat.quality import Quality
@@ -73,6 +75,33 @@ BENCH_SCENES: dict[str, BenchScene] = {
     "tag_in_million": BenchScene("an AprilTag before 1,000,000 random splats, 1920 x 1080", tag_in_million),
 }
 """In the order in which they are listed."""
+
+MOST_VIEWS = 8
+"""of one's own scene, evenly spread over the cameras' trajectory"""
+
+
+def own_scenes(name: str, scene: Scene, path: Trajectory | None) -> dict[str, BenchScene]:
+    """Entries of one's own scene: from its camera, or from poses of a trajectory, camera to world, by names
+    such as `room.toml@2`. The splats are joined once.
+
+    Raises InputError for a scene without a camera.
+    """
+    camera = scene.camera
+    if camera is None:
+        raise InputError(
+            f"{name} has no [camera] table; add one, whose size and lens are those of the pictures"
+        )
+    about = f"{len(scene.cloud()):,} splats, {camera.width} x {camera.height}"
+    if path is None:
+        return {name: BenchScene(about, lambda: (scene.cloud(), camera))}
+    poses = path.inverse().poses
+    some = sorted({round(k) for k in np.linspace(0, len(poses) - 1, min(len(poses), MOST_VIEWS))})
+    views = {k: replace(camera, world_to_camera=poses[k], position=None) for k in some}
+    return {
+        f"{name}@{k}": BenchScene(f"{about}, pose {k}", lambda view=view: (scene.cloud(), view))
+        for k, view in views.items()
+    }
+
 
 DEFAULT_SCENES = ("tag", "r100k_720p", "r1m_1080p", "tag_in_million")
 """About a minute on two cores."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import date
 
@@ -15,7 +15,7 @@ from fidsplat.backends.prepare import prepare
 from fidsplat.cameras import Camera
 from fidsplat.capture import Capture
 from fidsplat.errors import FidsplatError
-from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED
+from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED, BenchScene
 from fidsplat.experiments.bench.model import Counts, roofline_ms
 from fidsplat.frame import Frame
 from fidsplat.quality import Quality
@@ -104,20 +104,27 @@ class Bench:
     `results` grows as frames are drawn, so that a run which is stopped keeps what it has.
     """
 
-    def __init__(self, devices: Sequence[str], tell: Callable[[str], None], tick: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        devices: Sequence[str],
+        tell: Callable[[str], None],
+        tick: Callable[[], None],
+        scenes: Mapping[str, BenchScene] = BENCH_SCENES,
+    ) -> None:
         """Opens the devices and measures their rates.
 
         Args:
             devices: names as `Renderer` takes them.
             tell: called with what is being done.
             tick: is called after each frame that counts.
+            scenes: what `run` finds its scenes in.
 
         Raises:
             DeviceError, UnknownDeviceError: a device cannot be opened.
         """
         self.results: list[Result] = []
         self.devices: dict[str, Rates | None] = {}
-        self._tell, self._tick = tell, tick
+        self._tell, self._tick, self._scenes = tell, tick, scenes
         for name in dict.fromkeys(devices):
             tell(f"rates of {name}")
             backend = Renderer(name).backend
@@ -126,7 +133,7 @@ class Bench:
     def run(self, scene: str, repeats: int) -> None:
         """Draw a scene `repeats` times on each device. What a device cannot draw stands in its result."""
         self._tell(f"making {scene}")
-        cloud, camera = BENCH_SCENES[scene].make()
+        cloud, camera = self._scenes[scene].make()
         runs = []
         for name, rates in self.devices.items():
             self._tell(f"{scene}: first frame on {name}")
@@ -143,7 +150,7 @@ class SceneRun:
         self, scene: str, device: str, rates: Rates | None, cloud: SplatCloud, camera: Camera
     ) -> None:
         self.renderer = Renderer(device)
-        self.camera = camera
+        self.camera, self.capture = camera, Capture(camera, quality=TIMED)
         self.picture = np.zeros((camera.height, camera.width, 3), np.float32)
         """what was drawn, (h, w, 3)"""
         timer = Timer(self._whole, drops_out=True, parts=lambda frame: frame.timings)
@@ -157,7 +164,7 @@ class SceneRun:
 
     def draw(self) -> Frame:
         """One frame."""
-        return self.renderer.render(self.resident, self.camera, quality=TIMED)
+        return self.renderer.render(self.resident, self.capture)
 
     def _whole(self) -> Frame:
         """One frame until the device is done."""

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
+
 from fidsplat.cameras import Camera
 from fidsplat.quality import Quality
 from fidsplat.random_clouds import random_splats
@@ -21,6 +23,8 @@ COUNTS = (2, 70_000)
 _OUTPUTS = (("rgb",), ("rgb", "depth"), ("rgb", "depth", "normal", "label"))
 _STANDARD = Quality()
 _SHARP = Quality(lowpass="none", samples=3)  # what docs/quality.md advises for dense codes
+MARKER, DISKS, CAPTURE = "a marker", "disks", "a capture"
+"""boxes on a plane, 2D splats, 3D Gaussians"""
 
 
 @dataclass(frozen=True)
@@ -29,8 +33,8 @@ class Recipe:
 
     sh_degree: int
     """-1: plain colours"""
-    markers: bool
-    """whether splats are printed on planes, as those of markers are"""
+    kinds: tuple[str, ...]
+    """what stands in the scene: any of `MARKER`, `DISKS` and `CAPTURE`, each with as many splats"""
     outputs: tuple[str, ...]
     quality: Quality = _STANDARD
 
@@ -38,22 +42,22 @@ class Recipe:
     def words(self) -> str:
         """For people."""
         colors = "plain colours" if self.sh_degree < 0 else f"SH of degree {self.sh_degree}"
-        markers = "markers" if self.markers else "no markers"
         quality = "" if self.quality == _STANDARD else "; no low-pass, 3 x 3 samples"
-        return f"{colors}, {markers}: {', '.join(self.outputs)}{quality}"
+        return f"{' and '.join(self.kinds)}, {colors}: {', '.join(self.outputs)}{quality}"
 
 
 def recipes() -> list[Recipe]:
     """What scenes commonly call for, the commonest first."""
     common = [
-        Recipe(degree, markers, outputs)
-        for degree in (-1, 3)
-        for outputs in _OUTPUTS
-        for markers in (True, False)
+        *((-1, kinds) for kinds in ((MARKER,), (MARKER, DISKS), (DISKS,))),
+        *((3, kinds) for kinds in ((CAPTURE,), (MARKER, CAPTURE))),
     ]
-    sharp = [Recipe(degree, True, ("rgb",), _SHARP) for degree in (-1, 3)]
-    rest = [Recipe(degree, markers, ("rgb",)) for degree in (1, 2) for markers in (True, False)]
-    return common + sharp + rest
+    some = [Recipe(*scene, outputs) for outputs in _OUTPUTS for scene in common]
+    demo = Recipe(-1, (MARKER, DISKS, CAPTURE), _OUTPUTS[-1])
+    sharp = [Recipe(-1, (MARKER, DISKS), ("rgb",), _SHARP), Recipe(3, (MARKER, CAPTURE), ("rgb",), _SHARP)]
+    degrees = [Recipe(degree, (CAPTURE,), ("rgb",)) for degree in (1, 2)]
+    flat = [Recipe(3, kinds, ("rgb",)) for kinds in ((DISKS,), (MARKER, DISKS))]
+    return [*some, demo, *sharp, *degrees, *flat]
 
 
 def warm(renderer: Renderer, wanted: list[Recipe]) -> Iterator[tuple[Recipe, float]]:
@@ -75,7 +79,12 @@ def warm(renderer: Renderer, wanted: list[Recipe]) -> Iterator[tuple[Recipe, flo
 
 
 def _cloud(recipe: Recipe, count: int) -> SplatCloud:
-    """`count` small splats that are all in view."""
+    """`count` small splats that are all in view; at least one of each kind."""
     degree = None if recipe.sh_degree < 0 else recipe.sh_degree
-    cloud = random_splats(count, 0, depth=(1.0, 2.0), scale=(0.002, 0.003), across=0.3, sh_degree=degree)
-    return cloud.with_planes(0) if recipe.markers else cloud
+    count = max(count, len(recipe.kinds))
+    flat = random_splats(count, 0, depth=(1.0, 2.0), scale=(0.002, 0.003), across=0.3, sh_degree=degree)
+    kind = np.array(recipe.kinds)[np.arange(count) % len(recipe.kinds)]
+    scales = np.column_stack([flat.scales, np.where(kind == CAPTURE, 0.002, 0.0)])
+    cloud = SplatCloud(flat.means, flat.quats, scales, flat.opacities, colors=flat.colors, sh=flat.sh)
+    printed = kind == MARKER
+    return cloud.with_planes(np.where(printed, 0, -1)).with_boxes(printed) if printed.any() else cloud

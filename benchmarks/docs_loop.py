@@ -1,0 +1,47 @@
+"""The loop at the head of the README: a flight past the demo's markers, as an animated WebP.
+
+pip install '.[video]' && PYTHONPATH=. python benchmarks/docs_loop.py docs/images/flight.webp
+"""
+
+import math
+import subprocess
+import sys
+import tempfile
+from dataclasses import replace
+
+import imageio_ffmpeg
+import numpy as np
+
+import fidsplat as fs
+from fidsplat.experiments.demo_scene import demo_scene
+from fidsplat.flights import Flight, FlightFolder
+
+WIDTH, HEIGHT, RATE = 480, 270, 16.0
+AIM = (0.0, 0.05, 0.0)
+WAY = ((-35, 2.4, -0.25), (-12, 1.7, -0.05), (12, 1.9, -0.15), (35, 2.3, -0.3))
+"""degrees to the side, metres away, metres down: there and back"""
+
+
+def main(out: str) -> None:
+    """Draw it and write the file."""
+    scene, poses = demo_scene(), []
+    for degrees, away, down in (*WAY, *WAY[-2::-1]):
+        angle = math.radians(degrees)
+        place = (away * math.sin(angle), down, -away * math.cos(angle))
+        poses.append(fs.Camera.look_at(WIDTH, HEIGHT, 1.0, place, AIM).world_to_camera)
+    path = fs.Trajectory(np.arange(len(poses)) * 0.75, np.array(poses), smooth=True).inverse()
+    camera = fs.Camera.look_at(WIDTH, HEIGHT, math.radians(60.0), (0, 0, -2), (0, 0, 0))
+    scene = replace(scene, camera=camera, outputs=("rgb",))
+    flight = Flight(scene, path, path.sampled(RATE).times[:-1], scene.capture)
+    with tempfile.TemporaryDirectory() as folder:
+        renderer = fs.Renderer()
+        drawn = FlightFolder(folder, flight, renderer.device.title)
+        for number in drawn.draw(renderer):
+            print(f"{number + 1} of {len(flight)}", end="\r", file=sys.stderr)
+        words = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", "-framerate", str(RATE)]
+        words += ["-i", f"{folder}/rgb/%06d.png", "-c:v", "libwebp_anim", "-quality", "60", "-loop", "0", out]
+        subprocess.run(words, check=True)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
