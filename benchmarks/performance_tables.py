@@ -4,10 +4,10 @@
     python benchmarks/performance_tables.py benchmarks/results/*.json* --into docs/*.md
 
 Takes what `fidsplat bench --json`, benchmarks/peers, benchmarks/first_frame.py --json,
-benchmarks/listing_ways.py --json, benchmarks/large_scenes.py --json and benchmarks/growth.py write, in any
-mixture; other figures are left alone. Without --into the tables are printed. With it, each replaces what
-stands between `<!-- begin NAME -->` and `<!-- end NAME -->` in those of the pages that have such lines; a
-table for which nothing was measured is left alone.
+benchmarks/listing_ways.py --json, benchmarks/large_scenes.py --json, benchmarks/batches.py --json and
+benchmarks/growth.py write, in any mixture; other figures are left alone. Without --into the tables are
+printed. With it, each replaces what stands between `<!-- begin NAME -->` and `<!-- end NAME -->` in those of
+the pages that have such lines; a table for which nothing was measured is left alone.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from fidsplat.files import atomic_write
 
 def load(files: Iterable[Path]) -> dict[str, list[dict]]:
     """Records by kind; of `peers`, a fidsplat's is followed by the peer's."""
-    kinds = ("frames", "peers", "first", "ways", "large", "growth")
+    kinds = ("frames", "peers", "first", "ways", "large", "growth", "batches")
     found: dict[str, list[dict]] = {kind: [] for kind in kinds}
     for file in files:
         if file.suffix == ".jsonl":
@@ -37,7 +37,7 @@ def load(files: Iterable[Path]) -> dict[str, list[dict]]:
             continue
         content = json.loads(file.read_text("utf-8"))
         if isinstance(content, list):
-            kinds = {"way": "ways", "millions": "large", "caches": "first"}
+            kinds = {"way": "ways", "millions": "large", "caches": "first", "batch": "batches"}
             for kind in (kinds[key] for key in kinds if key in content[0]):
                 found[kind] += content
             continue
@@ -79,7 +79,7 @@ def frames(record: dict) -> dict[str, str]:
         "scene": record["scene"],
         "device": f"{record['device']}: {record['title']}",
         "ms per frame": f"{ms(record['frame_ms'])} ({ms(low)} to {ms(high)})",
-        "host": ms(record["host_ms"]) if "host_ms" in record else "-",
+        **({"host": ms(record["host_ms"])} if "host_ms" in record else {}),
         "x roofline": times(record, "frame"),
         "splats/s": f"{rate / 1e6:.{0 if rate > 1e8 else 2}f} M",
         "memory": "-" if memory is None else f"{memory / 2**30:.3g} GiB",
@@ -161,6 +161,21 @@ def large(record: dict) -> dict[str, str]:
     }
 
 
+def batches(record: dict) -> dict[str, str]:
+    """Batches of views, and the same views one by one."""
+    low, high = record["quartiles_us"]
+    return {
+        "views": f"{record['views']} of {record['width']} x {record['height']}",
+        "outputs": ", ".join(record["outputs"]),
+        "splats": f"{record['splats']:,}",
+        "device": record["device"],
+        "us per view": f"{ms(record['us_per_view'])} ({ms(low)} to {ms(high)})",
+        "one by one": ms(record["alone_us_per_view"]),
+        **{stage: ms(taken) for stage, taken in record["stages_us"].items()},
+        "date": record["date"],
+    }
+
+
 def growth(curve: tuple[str, str, dict[str, float | None]]) -> dict[str, str]:
     """Exponents of a growth curve."""
     title, series, found = curve
@@ -187,12 +202,13 @@ def tables(records: dict[str, list[dict]]) -> dict[str, str]:
         "first": map(first, records["first"]),
         "ways": map(ways, records["ways"]),
         "large": map(large, records["large"]),
+        "batches": map(batches, records["batches"]),
         "growth": map(growth, exponents(records["growth"])),
     }
     return {name: text for name in TABLES if (text := markdown(rows[name]))}
 
 
-TABLES = ("counts", "rates", "frames", "stages", "peers", "first", "ways", "large", "growth")
+TABLES = ("counts", "rates", "frames", "stages", "peers", "first", "ways", "large", "batches", "growth")
 
 
 def insert(page: str, name: str, text: str) -> str:

@@ -57,11 +57,6 @@ class ViewStack:
         return self.translation.shape[1]
 
     @staticmethod
-    def of_one(view: View) -> ViewStack:
-        """A stack of one."""
-        return ViewStack._of([view], {})
-
-    @staticmethod
     def of(views: Sequence[View]) -> ViewStack | None:
         """The views as a stack; None if they have too little in common, or one is made of several poses."""
         first = views[0]

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from fidsplat.commands.output import Device, Json, console, option, print_json, print_table, say, switch
+
+if TYPE_CHECKING:
+    from fidsplat.experiments.localise import Localise as Asked
+    from fidsplat.render import Renderer
 
 
 @dataclass
@@ -33,6 +37,12 @@ class Localise:
         tyro.conf.UseAppendAction[tuple[str, ...]],
         option("NAME", "what to compare, once more for each (default: all)"),
     ] = ()
+    log: Annotated[
+        str | None, option("FILE.mcap|BAG", "the drive of `exact` as a log of ROS 2 as well (extra: logs)")
+    ] = None
+    video: Annotated[
+        str | None, option("FILE.mp4", "the pictures of `exact` as a video as well (extra: video)")
+    ] = None
     seed: Annotated[int, option("N", "of plants and of errors of the sensors (default: 0)")] = 0
     device: Device = None
     overwrite: Annotated[bool, switch("measure again what is in the folder")] = False
@@ -42,11 +52,16 @@ class Localise:
         from rich.progress import Progress
 
         import fidsplat as fs
+        from fidsplat.commands.sweeps import need_reports
         from fidsplat.experiments.localise import HEADS, VARIANTS, LocaliseFolder
         from fidsplat.experiments.localise import Localise as Asked
+        from fidsplat.vision.video import check_video
 
         asked = Asked(1, 4, self.seed) if self.quick else Asked(self.rows, self.plants, self.seed)
         names = list(self.variant) or (list(VARIANTS)[:3] if self.quick else list(VARIANTS))
+        need_reports()
+        if self.video is not None:
+            check_video(self.video)
         _ = asked.house  # what is wrong with it is said before a device is opened
         renderer = fs.Renderer(self.device)
         folder = LocaliseFolder(Path(self.out), asked, renderer.device.title, self.overwrite)
@@ -54,11 +69,28 @@ class Localise:
             task = progress.add_task("drive", total=1.0)
             for words, share in folder.measure(names, renderer):
                 progress.update(task, description=words, completed=share)
+        folder.write_chart()
         page = folder.write_page()
+        self._record(asked, renderer)
         if self.json:
             print_json(folder.results)
             return 0
         where = console(False)
         print_table(where, f"{folder.results['length_m']:.1f} m", HEADS, folder.rows())
-        say(where, str(page))
+        say(where, *(name for name in (str(page), self.log, self.video) if name is not None))
         return 0
+
+    def _record(self, asked: Asked, renderer: Renderer) -> None:
+        """The log and the video."""
+        from fidsplat.experiments.localise import RATE, VARIANTS, write_log
+        from fidsplat.vision.video import write_video
+
+        if self.log is None and self.video is None:
+            return
+        pictures = asked.pictures(VARIANTS["exact"], asked.run(), renderer)
+        if self.log is not None:
+            pictures = write_log(asked, "exact", renderer, self.log, self.overwrite)
+        steps = pictures if self.video is None else write_video(self.video, pictures, RATE)
+        with console(True).status("recording"):
+            for _ in steps:
+                pass

@@ -16,7 +16,7 @@ from fidsplat.cameras import BrownConrady, Camera, Motion, Shutter, Trajectory
 from fidsplat.capture import Capture
 from fidsplat.errors import InputError, unknown
 from fidsplat.files import atomic_write, writable_folder
-from fidsplat.formats import save_trajectory
+from fidsplat.formats import load_trajectory, save_trajectory
 from fidsplat.provenance import run_facts
 from fidsplat.render import Renderer
 from fidsplat.sensor import Sensor
@@ -28,8 +28,10 @@ from fidsplat.vision.images import to_uint8
 
 RATE = 4.0
 """pictures a second"""
-RESULTS, REPORT = "localise.json", "localise.md"
+RESULTS, REPORT, CHART = "localise.json", "localise.md", "localise.svg"
 FAMILY = "apriltag:36h11"
+CAMERA = "eye"
+"""name of the camera in logs"""
 _LENS = BrownConrady(k1=-0.18, k2=0.03, p1=0.0005, p2=-0.0003)
 _SENSOR = Sensor(full_well=2000.0, read_noise=6.0, bits=8)
 
@@ -96,26 +98,28 @@ class Localise:
         """Numbers of the moments of a drive at which pictures are taken."""
         return np.unique(np.searchsorted(run.times, np.arange(1 / RATE, run.times[-1], 1 / RATE)))
 
+    def pictures(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[np.ndarray]:
+        """What the camera sees at each moment, (480, 640, 3) uint8."""
+        scene = replace(self.house, mixture=variant.mixture).scene
+        plain = Capture(
+            replace(self.camera, lens=variant.lens),
+            background=scene.background,
+            motion=Motion(run.camera.inverse()),
+        )
+        captures = []
+        for k in self.shots(run):
+            shutter = Shutter(
+                float(run.times[k]), variant.exposure_time, 5, variant.readout, rows_per_band=30
+            )
+            sensor = None if variant.sensor is None else replace(variant.sensor, seed=int(k))
+            captures.append(plain.with_(shutter=shutter, sensor=sensor))
+        for frame in renderer.render_views(renderer.upload(scene), captures):
+            yield to_uint8(frame["rgb"])
+
     def sightings(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[list[Detection]]:
         """The tags in each picture of a variant."""
-        house = replace(self.house, mixture=variant.mixture)
-        scene = house.scene
-        camera = replace(self.camera, lens=variant.lens)
-        motion = Motion(run.camera.inverse())
-        captures = [
-            Capture(
-                camera,
-                background=scene.background,
-                motion=motion,
-                shutter=Shutter(
-                    float(run.times[k]), variant.exposure_time, 5, variant.readout, rows_per_band=30
-                ),
-                sensor=None if variant.sensor is None else replace(variant.sensor, seed=int(k)),  # type: ignore[arg-type]
-            )
-            for k in self.shots(run)
-        ]
-        for frame in renderer.render_views(renderer.upload(scene), captures):
-            yield detect(to_uint8(frame["rgb"]), (FAMILY,), qr=False)
+        for picture in self.pictures(variant, run, renderer):
+            yield detect(picture, (FAMILY,), qr=False)
 
     def localised(
         self, run: Run, sightings: list[list[Detection]] | None, camera: Camera, noise: float = 0.5
@@ -209,7 +213,7 @@ class LocaliseFolder:
             return
         run = self.asked.run()
         self.results["length_m"] = run.length
-        save_trajectory(Trajectory(run.times, run.poses), self.folder / "truth.tum")
+        save_trajectory(Trajectory(run.times, run.poses), self.folder / _tum("truth"))
         seen: dict[str, list[list[Detection]]] = {}
         count = len(self.asked.shots(run))
         for done, name in enumerate(left):
@@ -226,7 +230,7 @@ class LocaliseFolder:
                 sightings = self.asked.ideal(run, sightings)
             camera = replace(self.asked.camera, lens=variant.lens)
             path, facts = self.asked.localised(run, sightings, camera, 0.05 if variant.ideal else 0.5)
-            save_trajectory(path, self.folder / f"{name.replace(' ', '-')}.tum")
+            save_trajectory(path, self.folder / _tum(name))
             self.results["variants"][name] = facts
             with atomic_write(self.folder / RESULTS) as stream:
                 stream.write(json.dumps(self.results, indent=2).encode())
@@ -247,6 +251,22 @@ class LocaliseFolder:
             for name, facts in self.results["variants"].items()
         ]
 
+    def write_chart(self) -> Path:
+        """The drive from above, as it was and as it was taken to be. Needs matplotlib."""
+        from fidsplat.experiments.charts import COLOURS, chart, legend_above
+
+        names = [name for name in self.results["variants"] if (self.folder / _tum(name)).exists()]
+        with chart(self.folder / CHART, size=(9.0, 5.0)) as (figure, axes):
+            for number, name in enumerate(["truth", *names]):
+                path = load_trajectory(self.folder / _tum(name)).poses[:, :2, 3]
+                width, colour = (3.0, "#bbbbbb") if number == 0 else (1.0, COLOURS[number % len(COLOURS)])
+                axes[0].plot(path[:, 0], path[:, 1], label=name, color=colour, linewidth=width)
+            axes[0].set_aspect("equal")
+            axes[0].set_xlabel("x [m]")
+            axes[0].set_ylabel("y [m]")
+            legend_above(figure, axes[0])
+        return self.folder / CHART
+
     def write_page(self) -> Path:
         """The table as a page."""
         lines = [
@@ -259,6 +279,8 @@ class LocaliseFolder:
             f"|{'---|' * len(HEADS)}",
             *(f"| {' | '.join(row)} |" for row in self.rows()),
             "",
+            f"![The drive from above]({CHART})",
+            "",
         ]
         with atomic_write(self.folder / REPORT) as stream:
             stream.write("\n".join(lines).encode())
@@ -266,3 +288,38 @@ class LocaliseFolder:
 
 
 HEADS = ("", "ATE [cm]", "worst [cm]", "RPE over 1 m [cm]", "heading [deg]", "tags", "refused")
+
+
+def _tum(name: str) -> str:
+    return f"{name.replace(' ', '-')}.tum"
+
+
+def write_log(
+    asked: Localise, name: str, renderer: Renderer, path: str, overwrite: bool
+) -> Iterator[np.ndarray]:
+    """One variant's drive as a log: pictures (JPEG), intrinsics, detections, the gyroscope, where the camera
+    is (/tf) and where the robot takes itself to be (/odom). Yields the pictures as they are logged.
+
+    Raises InputError for a variant that takes no pictures, and as `RobotLog`.
+    """
+    from fidsplat.logs import RobotLog
+
+    variant = VARIANTS[name]
+    if variant.mixture is None:
+        raise InputError(f"{name!r} takes no pictures, of which a log is made; known: exact, fitted ...")
+    run = asked.run()
+    shots, camera = asked.shots(run), replace(asked.camera, lens=variant.lens)
+    sightings = []
+    with RobotLog(path, overwrite=overwrite) as log:
+        for k, picture in zip(shots.tolist(), asked.pictures(variant, run, renderer), strict=True):
+            time, codes = float(run.times[k]), detect(picture, (FAMILY,), qr=False)
+            sightings.append(codes)
+            log.image(time, CAMERA, picture, compress="jpeg")
+            log.camera_info(time, CAMERA, camera)
+            log.transform(time, CAMERA, run.camera.poses[k])
+            log.detections(time, CAMERA, codes)
+            yield picture
+        path_taken, _ = asked.localised(run, sightings, camera)
+        for k, time in enumerate(run.times.tolist()):
+            log.imu(time, (0, 0, run.gyro[k]), (0, 0, 9.81), frame="base_link")
+            log.odometry(time, path_taken.poses[k])

@@ -15,6 +15,9 @@ from fidsplat.splats import SplatCloud
 ORIGIN_COMMENT = "fidsplat origin"
 """a header comment of this beginning and three numbers holds the origin that x, y, z are relative to"""
 
+FILTER = "filter_3D"
+"""standard deviation in metres by which Mip-Splatting widens a splat in space, beside its scales"""
+
 _NEEDED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1")
 _NEEDED += ("rot_0", "rot_1", "rot_2", "rot_3")
 
@@ -24,7 +27,9 @@ def load_ply(path: str | os.PathLike[str], progress: Progress | None = None) -> 
 
     Properties are found by name, in any order and among any others. Splats of three scales are 3D Gaussians
     (`SplatCloud.thickness`; `SplatCloud.flattened` makes disks of them), but those whose third is 1e-6, which
-    marks a disk. Integer properties ``label`` and ``plane`` are taken up. Colours come as SH of degree 0 to
+    marks a disk. The 3D filter of Mip-Splatting's files (``filter_3D``) is applied: splats are as their
+    trainer drew them (`Quality.ellipsoid="ewa_antialiased"`). Integer properties ``label`` and ``plane`` are
+    taken up. Colours come as SH of degree 0 to
     3. Splats that cannot be drawn are left out while the file is read, as `SplatCloud` does, and one warning
     counts them.
 
@@ -68,6 +73,7 @@ def _plain_rows(header: Header) -> Rows:
     places |= {
         f"f_rest_{c * (k - 1) + i}": ("sh", slice(None), 1 + i, c) for c in range(3) for i in range(k - 1)
     }
+    filtered = scales == 3 and FILTER in names and element.dtype[FILTER].kind == "f"
     for name in ("label", "plane"):
         if name in names and np.can_cast(element.dtype[name], np.int32):
             columns[f"{name}s"], places[name] = ((), np.int32), (f"{name}s",)
@@ -80,6 +86,8 @@ def _plain_rows(header: Header) -> Rows:
                 arrays[array][start : start + BLOCK][*index] = block[name]
         np.exp(arrays["scales"], out=arrays["scales"])
         _sigmoid(arrays["opacities"])
+        if filtered:
+            _widen(arrays["scales"], arrays["opacities"], rows[FILTER])
         if "planes" in arrays and (least := arrays["planes"].min(initial=-1)) < -1:
             raise InputError(
                 f"{header.path}: the property plane holds {least}; it must be an id of at least 0, or -1 for "
@@ -114,6 +122,14 @@ def _sigmoid(x: np.ndarray) -> None:
     np.exp(x, out=x)
     x += 1
     np.reciprocal(x, out=x)
+
+
+def _widen(scales: np.ndarray, opacities: np.ndarray, filters: np.ndarray) -> None:
+    """3D Gaussians (n, 3) convolved with one of the standard deviation of their filter (n,), in place; their
+    opacities (n,) fall as their density does (the 3D smoothing filter of Mip-Splatting, Yu et al. 2024)."""
+    wide = np.hypot(scales.astype(np.float64), filters[:, None])
+    opacities *= np.divide(scales, wide, out=np.ones_like(wide), where=wide > 0).prod(axis=1)
+    scales[:] = wide
 
 
 def _origin(header: Header) -> np.ndarray | None:

@@ -21,10 +21,14 @@ static inline ulong scan_group(local ulong *partial, uint item, ulong mine, ulon
 // places in the buffer `counts`, which the host reads: numbers of big splats, of pairs (64 bits), of visible splats
 enum { COUNT_BIG = 0, COUNT_PAIRS = 1, COUNT_VISIBLE = 3 };
 
-// By one work-group of SCAN_ITEMS: where each tile's list starts, and `counts`. Zeroes the tallies for the next picture if
-// `clear`. If there are more pairs than `capacity` (and that is not 2^32 - 1), all lists are made empty.
-static inline void place_tiles(local ulong *partial, uint tiles, uint capacity, uint clear, global uint *restrict tallies,
-                               global uint *restrict starts, global uint *restrict cursors, global uint *restrict counts) {
+// Index space: one work-group of SCAN_ITEMS.
+// Reads: tallies, and zeroes them for the next picture if `clear`. Writes: starts[tiles + 1] modulo 2^32, cursors[tiles]
+// (the same), counts, of which the visible splats are still to be added up.
+// If there are more pairs than `capacity` (and that is not 2^32 - 1), all lists are made empty.
+kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
+//@@ arguments tile_starts
+) {
+    local ulong partial[SCAN_ITEMS];
     uint item = get_local_id(0);
     ulong running = 0;
     for (uint first = 0; first < tiles; first += 4 * SCAN_ITEMS) {
@@ -51,16 +55,6 @@ static inline void place_tiles(local ulong *partial, uint tiles, uint capacity, 
         barrier(CLK_GLOBAL_MEM_FENCE);
         for (uint tile = item; tile <= tiles; tile += SCAN_ITEMS) starts[tile] = 0;
     }
-}
-
-// Index space: one work-group of SCAN_ITEMS.
-// Reads: tallies, and zeroes them for the next picture if `clear`. Writes: starts[tiles + 1] modulo 2^32, cursors[tiles]
-// (the same), counts, of which the visible splats are still to be added up.
-kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
-//@@ arguments tile_starts
-) {
-    local ulong partial[SCAN_ITEMS];
-    place_tiles(partial, tiles, capacity, clear, tallies, starts, cursors, counts);
 }
 
 // Work-groups of WALK_ITEMS, for what is done splat by splat. Of a splat that touches more than a window a whole group
@@ -158,50 +152,6 @@ kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void emit(
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     if (item == 0 && visible != 0) atomic_add(counts + COUNT_VISIBLE, visible);
-}
-
-// All that tally_big, tile_starts and emit do, for a picture of so few splats that launching them takes longer.
-// Index space: one work-group of SCAN_ITEMS. Big splats are shared out by teams of TEAM work-items.
-// Reads: windows, keys, big, big_bounds; tallies, and zeroes them if `clear`. Writes: starts, cursors, counts, pairs of all tiles.
-#define TEAM (SCAN_ITEMS < 32 ? SCAN_ITEMS : 32)
-kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void list_few(
-//@@ arguments list_few
-) {
-    local ulong partial[SCAN_ITEMS];
-    local uint visible;
-    uint item = get_local_id(0), big_count = min(tallies[TALLY_BIG], big_capacity);
-    int each = tiles_of(width, height);
-    if (item == 0) visible = 0;
-    for (uint k = item / TEAM; k < big_count; k += SCAN_ITEMS / TEAM) {
-        const Bounds b = big_bounds[k];
-        const Walk walk = walk_of(&b, width, height);
-        for (int cell = item % TEAM; cell < walk.cells; cell += TEAM) {
-            int tile = walk_tile(&walk, cell, &b, width, height);
-            if (tile >= 0) atomic_inc(tallies + TALLIES + (int)(big[k] / count) * each + tile);
-        }
-    }
-    barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
-    place_tiles(partial, tiles, capacity, clear, tallies, starts, cursors, counts);
-    barrier(CLK_GLOBAL_MEM_FENCE);
-    const Band band = {(width + TILE_W - 1) / TILE_W, 0, (int)tiles, 0, starts[tiles] == 0 ? 0 : capacity};
-    for (uint splat = item; splat < all; splat += SCAN_ITEMS) {
-        uint key = keys[splat];
-        if (key == CULLED) continue;
-        atomic_inc(&visible);
-        for (uint2 window = windows[splat]; window.y != 0; window.y &= window.y - 1)
-            emit_pair((int)(splat / count) * each + window_tile(window, band.tiles_x), &band, key, splat, cursors, pairs);
-    }
-    for (uint k = item / TEAM; k < big_count; k += SCAN_ITEMS / TEAM) {
-        const Bounds b = big_bounds[k];
-        const Walk walk = walk_of(&b, width, height);
-        uint splat = big[k], key = keys[splat];
-        for (int cell = item % TEAM; cell < walk.cells; cell += TEAM) {
-            int tile = walk_tile(&walk, cell, &b, width, height);
-            if (tile >= 0) emit_pair((int)(splat / count) * each + tile, &band, key, splat, cursors, pairs);
-        }
-    }
-    barrier(CLK_LOCAL_MEM_FENCE);
-    if (item == 0) counts[COUNT_VISIBLE] = visible;
 }
 
 // Sorts each list by (depth key, splat): a bitonic network whose every comparison puts the smaller first, so a list of

@@ -8,6 +8,7 @@ from agreement import random_splats
 
 import fidsplat as fs
 from fidsplat.rotations import rigid_matrix
+from fidsplat.views import views_of
 
 OUTPUTS = ("rgb", "depth", "label")
 CAMERA = fs.Camera.look_at(50, 40, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
@@ -108,6 +109,27 @@ def test_a_view_as_a_frame_and_a_batch_as_arrays(renderer, cloud):
         batch.frame(3)
     with pytest.raises(fs.InputError, match="no 'depth'; it was rendered with rgb"):
         batch["depth"]
+
+
+LENSES = {
+    "fisheye": fs.Camera.fisheye(50, 40, 2.5),
+    "orthographic": fs.Camera.orthographic(50, 40, 3.0),
+}
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_effects_are_those_of_the_views_alone(renderer, cloud, lens):
+    """Rays of samples, fog, a sensor that counts in pixels, several samples; view by view where a picture has
+    more of its own than a batch can hold."""
+    capture = fs.Capture(
+        LENSES[lens], ("rgb", "normal"), "standard,samples=2", (0.1, 0.2, 0.3), fog=fs.Fog(0.1),
+        sensor=fs.Sensor(full_well=1000.0, vignetting=(-0.3, 0.0, 0.0)),
+    )  # fmt: skip
+    batch = renderer.render_batch(cloud, capture, poses=POSES, groups={1: POSES})
+    for number in range(3):
+        alone = views_of([capture], POSES[[number]], {1: POSES[[number]]}).capture(0)
+        frame = renderer.render(cloud, alone)
+        assert all(np.array_equal(batch[name][number], frame[name]) for name in batch), number
 
 
 def test_what_moves_already_may_go_on_beside_poses(renderer, cloud):

@@ -10,7 +10,7 @@ import pytest
 from agreement import ALL_OUTPUTS, random_splats, some_thick
 
 import fidsplat as fs
-from fidsplat.backends.opencl import batch, lists
+from fidsplat.backends.opencl import batch
 from fidsplat.backends.opencl.memory_plan import plan_of
 from fidsplat.backends.opencl.shapes import gpu_shape
 from fidsplat.views import views_of
@@ -318,12 +318,9 @@ def test_a_picture_is_launched_again_for_each_view(opencl):
     assert kept[-1].wait() is kept[-1]
 
 
-@pytest.mark.parametrize("few", [True, False])
 @pytest.mark.parametrize("scale", [(1e-2, 0.3), (2.0, 3.0)], ids=["pairs", "big splats"])
-def test_a_picture_that_outgrows_the_last_is_drawn_again(opencl, monkeypatch, scale, few):
-    """More pairs, or more splats of many tiles, than there is room for: found when the frame is read. One
-    work-group lists few splats, whole launches many."""
-    monkeypatch.setattr(lists, "_FEW", 8192 if few else 0)
+def test_a_picture_that_outgrows_the_last_is_drawn_again(opencl, scale):
+    """More pairs, or more splats of many tiles, than there is room for: found when the frame is read."""
     machine, own = as_on_a_gpu(opencl), fs.Renderer(opencl.device.name)
     some = random_splats(6000, seed=4, scale=scale, depth=(2.0, 6.0))
     places = (-900, -800, 0, 1, -700)

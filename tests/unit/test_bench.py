@@ -21,7 +21,15 @@ KEYS = (
     *("width", "height", "repeats", "error"),
 )
 FIGURES = (
-    *("frame_ms", "quartiles_ms", "fastest_ms", "first_frame_ms", "stages_ms", "fastest_stages_ms"),
+    *(
+        "frame_ms",
+        "quartiles_ms",
+        "fastest_ms",
+        "first_frame_ms",
+        "host_ms",
+        "stages_ms",
+        "fastest_stages_ms",
+    ),
     *("splats", "visible", "pairs", "fragments", "splats_per_second", "memory_bytes", "mean_rgb"),
     *("rates", "rooflines_ms", "times_roofline"),
 )

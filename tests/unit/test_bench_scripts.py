@@ -48,6 +48,13 @@ FIRST = {
     "range": [1.5, 2.0],
 }
 
+BATCH = {
+    "batch": "few",
+    **{"views": 64, "splats": 10000, "width": 128, "height": 96, "outputs": ["rgb", "depth"]},
+    **{"device": "a CPU", "date": "2026-11-22", "us_per_view": 900.0, "quartiles_us": [800.0, 1000.0]},
+    **{"alone_us_per_view": 5000.0, "stages_us": {"blend": 600.0}},
+}
+
 
 @pytest.fixture
 def files(tmp_path):
@@ -63,6 +70,7 @@ def files(tmp_path):
         "bench.json": {"results": [RECORD, failed]},
         "peer.json": {"results": [RECORD | {"frame_ms": 1.2}, PEER]},
         "first.json": [FIRST],
+        "batches.json": [BATCH],
     }
     for name, content in kinds.items():
         (tmp_path / name).write_text(json.dumps(content))
@@ -101,6 +109,9 @@ def test_each_kind_of_figures_becomes_its_table(files):
     ]
     assert rows(made["first"]) == [
         "| tag | opencl | empty | 1.68 s (1.50 to 2.00) | 0.01 | 1.30 | 2026-11-21 |"
+    ]
+    assert rows(made["batches"]) == [
+        "| 64 of 128 x 96 | rgb, depth | 10,000 | a CPU | 900 (800 to 1000) | 5000 | 600 | 2026-11-22 |"
     ]
     assert rows(made["growth"]) == ["| a CPU | splats | 0.50 | 1.00 |"]
 

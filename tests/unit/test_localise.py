@@ -13,7 +13,7 @@ from fidsplat.sim.localiser import Localiser
 
 mujoco = pytest.importorskip("mujoco", reason="pip install 'fidsplat[sim]'")
 
-from fidsplat.experiments.localise import Localise, errors_of  # noqa: E402 (needs MuJoCo)
+from fidsplat.experiments.localise import Localise, errors_of, write_log  # noqa: E402 (needs MuJoCo)
 from fidsplat.sim.greenhouse import Greenhouse  # noqa: E402
 from fidsplat.sim.robot import BODY, CAMERA_AT, Errors, Run, camera_at, drive, mount  # noqa: E402
 
@@ -141,11 +141,34 @@ def test_the_command_measures_once(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(Localise, "run", lambda self: pytest.fail("measured again"))
     assert main([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == first
+    assert "<svg" in (tmp_path / "out/localise.svg").read_text()
     assert "| odometry |" in (tmp_path / "out/localise.md").read_text()
     assert main([*words, "--seed", "1"]) == 2
     assert "is of another drive" in capsys.readouterr().err
     assert main([*words[:-1], "odometri"]) == 2
     assert "unknown variant 'odometri' (did you mean 'odometry'?)" in capsys.readouterr().err
+
+
+def test_the_drive_as_a_log(tmp_path, monkeypatch):
+    reader = pytest.importorskip("mcap.reader", reason="pip install 'fidsplat[logs]'")
+    monkeypatch.setattr("fidsplat.experiments.localise.RATE", 0.5)
+    grey = np.full((480, 640, 3), 128, np.uint8)
+    monkeypatch.setattr(
+        Localise, "pictures", lambda self, variant, run, renderer: (grey for _ in self.shots(run))
+    )
+    asked = Localise(1, 1)
+    pictures = list(write_log(asked, "exact", None, str(tmp_path / "run.mcap"), False))
+    with (tmp_path / "run.mcap").open("rb") as stream:
+        counts = reader.make_reader(stream).get_summary().statistics.channel_message_counts
+        stream.seek(0)
+        topics = {k: each.topic for k, each in reader.make_reader(stream).get_summary().channels.items()}
+    counts = {topics[k]: count for k, count in counts.items()}
+    assert (
+        counts["/eye/image_raw/compressed"] == counts["/tf"] == counts["/eye/detections"] == len(pictures) > 3
+    )
+    assert counts["/odom"] == counts["/imu"] > 50 * len(pictures)
+    with pytest.raises(fs.InputError, match="takes no pictures"):
+        list(write_log(asked, "odometry", None, str(tmp_path / "other.mcap"), False))
 
 
 def test_with_ideal_corners_it_knows_its_way():

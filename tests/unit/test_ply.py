@@ -1,5 +1,6 @@
 """PLY files: what is written, and what comes back from the layouts of 2DGS and 3DGS."""
 
+import math
 import os
 import tracemalloc
 import warnings
@@ -250,6 +251,19 @@ def test_3dgs_splats_are_ellipsoids_as_the_file_has_them(tmp_path, thin):
         read = fs.load_ply(path)
     np.testing.assert_allclose(np.column_stack([read.scales, read.thickness]), scales, rtol=1e-5)
     np.testing.assert_allclose(read.quats, quats, atol=1e-6)
+
+
+def test_the_3d_filter_of_mip_splatting_is_applied(tmp_path):
+    """Wider, and as much fainter as the density falls; by 0 they stay, and one that is none is no splat."""
+    columns = {name: 1.0 for name in PLAIN} | {"opacity": 0.0}
+    columns |= {f"scale_{i}": [np.log(0.3), np.log(0.3), -np.inf, 0.0] for i in range(3)}
+    columns["scale_1"][0] = np.log(0.4)
+    columns["filter_3D"] = [0.4, 0.0, 0.4, np.nan]
+    with pytest.warns(UserWarning, match="1 of 4 splats left out"):
+        read = fs.load_ply(write(tmp_path / "a.ply", columns, 4))
+    scales = [[0.5, math.hypot(0.4, 0.4), 0.5], [0.3] * 3, [0.4] * 3]
+    np.testing.assert_allclose(np.column_stack([read.scales, read.thickness]), scales, rtol=1e-6)
+    np.testing.assert_allclose(read.opacities, [0.5 * 0.36 * math.sqrt(0.5), 0.5, 0.0], rtol=1e-5)
 
 
 def test_ellipsoids_and_disks_come_back_together(tmp_path):

@@ -12,6 +12,7 @@ import pyopencl as cl
 
 from fidsplat.backends.opencl.lists import fullness_of, read_counts, stats_of
 from fidsplat.backends.opencl.picture import Picture
+from fidsplat.backends.opencl.recording import Recording
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View
@@ -55,10 +56,16 @@ class Repeat:
     more."""
 
     def __init__(
-        self, draw: Callable[[Resident, View], Drawn], resident: Resident, view: View, big: int, pairs: int
+        self,
+        draw: Callable[[Resident, View], Drawn],
+        time: Callable[[Resident, View, Recording], dict[str, float]],
+        resident: Resident,
+        view: View,
+        recording: Recording,
     ) -> None:
-        """draw: draws it anew, in events. big, pairs: for how many there is room."""
-        self._draw, self._view, self._room = draw, view, (big, pairs)
+        """draw: draws it anew, with the room that it needs. time: tells how long its stages take."""
+        self._draw, self._time, self._view, self._recording = draw, time, view, recording
+        self._room = recording.big, recording.capacity
         self._resident: Resident | None = resident
         self._known = weakref.ref(resident)
 
@@ -72,10 +79,10 @@ class Repeat:
         self._resident = None  # it is held no longer than it may be needed
         return again
 
-    def timed(self) -> Drawn | None:
-        """The same picture, drawn once more to take the time; None if its cloud is gone."""
+    def timings(self) -> dict[str, float]:
+        """The picture is drawn once more to take the time; empty if its cloud is gone."""
         resident = self._known()
-        return None if resident is None else self._draw(resident, self._view)
+        return {} if resident is None else self._time(resident, self._view, self._recording)
 
 
 class OpenCLImages:
@@ -122,12 +129,7 @@ class OpenCLImages:
         drawn = self.settle()
         if drawn.events is None and self._repeat is not None:
             with self._workspace.lock:
-                timed = self._repeat.timed()
-            if timed is None:
-                return {}
-            timings = timed.timings()
-            self._workspace.pool.give_back(timed.leased)
-            return timings
+                return self._repeat.timings()
         return drawn.timings()
 
     @property

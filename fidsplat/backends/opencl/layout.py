@@ -122,16 +122,6 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("in uint2 windows", "in uint keys big", "in Bounds big_bounds", "in uint starts"),
         *("out uint counts cursors", "out uint2 pairs"),
     ),
-    "list_few": takes(
-        *(
-            "uint all  // splats of all views",
-            "uint count  // of each view",
-            _SIZE,
-            "uint tiles capacity clear",
-        ),
-        *("uint big_capacity", "in uint2 windows", "in uint keys big", "in Bounds big_bounds"),
-        *("out uint tallies starts cursors counts", "out uint2 pairs"),
-    ),
     "sort_tiles": takes("int band_first", "in uint starts", "out ulong pairs", "out uint lists"),
     "blend": takes(
         *("in Splat splats", "in uint lists starts"),

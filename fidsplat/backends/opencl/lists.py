@@ -23,8 +23,6 @@ from fidsplat.errors import DeviceError
 
 # words of the buffer `tallies`, as in prelude.cl
 _VISIBLE, _PAIRS, _BIG, _TALLIES = 0, 2, 6, 8
-_FEW = 1 << 13
-"""splats up to which one work-group lists them all: launching more takes longer than what they do"""
 # words of the buffer `counts`, as in tiles.cl: big splats, pairs (two words), visible splats
 _COUNTS = 4
 
@@ -255,10 +253,6 @@ class TiledLists(Lists):
         # what the host reads has a buffer of its own: `emit` adds to it meanwhile
         picture.lease("counts", 4 * _COUNTS)
         capacity = self.capacity(picture.workspace)
-        if picture.repeats and picture.views * picture.resident.count <= _FEW:
-            self._list_few(capacity)
-            yield 0, picture.tiles
-            return
         self._project()
         counted = self._starts(capacity)
         if capacity:
@@ -293,20 +287,6 @@ class TiledLists(Lists):
         for first, end, _ in bands:
             self._list(first, end, room, first == 0)
             yield first, end
-
-    def _list_few(self, capacity: int) -> None:
-        """Projects, and lists in one launch what are few splats."""
-        picture, items, count = self.picture, self.picture.shape.scan_items, self.picture.resident.count
-        self.make_room(_TALLIES + picture.tiles)
-        self.project(0, count)
-        picture.take("starts", 4 * (picture.tiles + 1))
-        picture.take("cursors", 4 * picture.tiles)
-        picture.take("pairs", 8 * capacity)
-        picture.take("lists", 4 * capacity)
-        given = {"all": picture.views * count, "count": count, "tiles": picture.tiles}
-        given |= {"capacity": capacity, "clear": True}
-        picture.launch("bin", "list_few", items, items, **given)
-        picture.launch("sort", "sort_tiles", picture.tiles * self._ITEMS, self._ITEMS, band_first=0)
 
     def _project(self, needed: int = 0) -> None:
         """Projects and tallies."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -33,16 +32,19 @@ class Picture:
         resident: Resident,
         view: View,
         plan: MemoryPlan,
-        repeats: bool = False,
+        queue: cl.CommandQueue | None = None,
         stack: ViewStack | None = None,
     ) -> None:
-        """repeats: whether one of its kind was drawn before; it is drawn without waiting for the device.
-        stack: many views instead of one, with all in common that they do not say."""
+        """
+        Args:
+            queue: where it is drawn without waiting for the device, as one of its kind was drawn before; None
+                for the first of its kind.
+            stack: many views instead of one, with all in common that they do not say.
+        """
         self.workspace, self.program, self.shape = workspace, program, shape
-        self.resident, self.view, self.plan, self.repeats = resident, view, plan, repeats
-        self.stack = ViewStack.of_one(view) if stack is None else stack
-        self.views = len(self.stack)
-        self.queue = workspace.turn_to(workspace.repeat_queue if repeats else workspace.queue)
+        self.resident, self.view, self.plan, self.repeats = resident, view, plan, queue is not None
+        self.stack, self.views = stack, 1 if stack is None else len(stack)
+        self.queue = workspace.turn_to(workspace.queue) if queue is None else queue
         self.pool = workspace.pool
         workspace.pictures += 1
         self.tiles_x = -(-view.width // shape.tile_width)
@@ -73,7 +75,7 @@ class Picture:
         self.in_bands = False
         """whether its lists were too long for one band"""
         self.stats: Callable[[], dict[str, int]] = dict
-        self._uniforms = cache(view.uniform)
+        self._uniforms: dict[str, tuple[Any, ...]] = {}
 
     def launch(
         self, stage: str, kernel: str, items: int, group: int, views: int = 1, **given: Any
@@ -121,7 +123,9 @@ class Picture:
         """What a kernel is given for an argument that is not given where it is launched."""
         if argument.source == "uniform":
             name, place = argument.uniform
-            return self._uniforms(name)[place]
+            if name not in self._uniforms:
+                self._uniforms[name] = self.view.uniform(name)
+            return self._uniforms[name][place]
         if argument.source == "array" and argument.name not in self.held:
             return self.put(argument.name, self.view.array(argument.name))
         return self.held[argument.name]
@@ -156,13 +160,15 @@ class Picture:
         """The uniforms of the projection, for rows of samples [row, end)."""
         view, record = self.view, self.program.source.records["View"]
         self.put_rays()
-        self.put("view", _kept(packed(self.stack, row, end, record)))
+        self.put("view", _kept(packed(self.stack or view, row, end, record)))
         if view.groups:
             moving = np.array([len(view.groups), *(label for label, _ in view.groups)], np.int32)
             self.put("moving", _kept(moving))
         if self.resident.planes is not None:
-            keys = [self.resident.planes.keys(self.stack.one(k)) for k in range(self.views)]
-            self.put("plane_keys", _kept(np.stack(keys, axis=1)))
+            planes, stack = self.resident.planes, self.stack
+            # (planes, views), in memory of its own
+            keys = planes.keys(view) if stack is None else planes.keys_of(stack).T.copy()
+            self.put("plane_keys", _kept(keys))
 
     def put_rays(self) -> None:
         """What the kernels read of a lens: rays of the samples, and the map of directions."""
@@ -177,42 +183,39 @@ def _kept(array: np.ndarray) -> np.ndarray:
     return array
 
 
-def packed(stack: ViewStack, row: int, end: int, record: np.dtype) -> np.ndarray:
-    """(groups that move + 1, views) of the record `View` (layout.py) for rows of samples [row, end)."""
-    made = np.empty(stack.translation.shape[:2], record)
-    made[:] = _uniforms(stack.view, row, end, record)
-    made["rotation"] = stack.rotation.reshape(*made.shape, 9)
-    made["translation"], made["eye"] = stack.translation, stack.eye
-    for name, values in stack.numbers.items():
+def packed(views: View | ViewStack, row: int, end: int, record: np.dtype) -> np.ndarray:
+    """(groups that move + 1, views) of the record `View` (layout.py) for rows of samples [row, end); of one
+    view their numbers in one row."""
+    real = record[0].base  # all members have one type
+    if isinstance(views, View):
+        every = [views, *(of for _, of in views.groups)]
+        return np.array([number for each in every for number in _numbers(each, row, end, record)], real)
+    made = np.empty(views.translation.shape[:2], record)
+    made[:] = np.array(_numbers(views.view, row, end, record), real).view(record)
+    made["rotation"] = views.rotation.reshape(*made.shape, 9)
+    made["translation"], made["eye"] = views.translation, views.eye
+    for name, values in views.numbers.items():
         if name in (record.names or ()):
             made[name] = values
     return made
 
 
-def _uniforms(view: View, row: int, end: int, record: np.dtype) -> np.ndarray:
-    """(1,) of the record `View`, of one view."""
-    made = np.zeros(1, record)
-    values = {
-        **{"rotation": view.rotation.ravel(), "translation": view.translation, "eye": view.eye},
-        **{
-            "focal_x": view.focal_x,
-            "focal_y": view.focal_y,
-            "center_x": view.center_x,
-            "center_y": view.center_y,
-        },
-        **{"near": view.near, "far": view.far, "log_cut": view.log_cut},
-        **{"width": view.width, "height": view.height, "filter": 1.0 / view.samples**2},
-        **{"band": row, "band_end": end},
+def _numbers(view: View, row: int, end: int, record: np.dtype) -> list[float]:
+    """Of the record `View` of one view, in their order."""
+    values: dict[str, Any] = {
+        **{"rotation": view.rotation.ravel().tolist(), "translation": view.translation.tolist()},
+        **{"eye": view.eye.tolist(), "focal_x": view.focal_x, "focal_y": view.focal_y},
+        **{"center_x": view.center_x, "center_y": view.center_y, "near": view.near, "far": view.far},
+        **{"log_cut": view.log_cut, "width": view.width, "height": view.height},
+        **{"filter": 1.0 / view.samples**2, "band": row, "band_end": end, "slopes": view.slopes},
     }
-    if "slopes" in (record.names or ()):
-        values["slopes"] = view.slopes
-    if view.raster is not None:
-        # lens, then map, as the record has them behind its own
-        own = [name for name in record.names or () if name not in values]
-        numbers = iter(view.raster.uniforms)
-        for name in own:
-            shape = record[name].shape
-            values[name] = [next(numbers) for _ in range(shape[0])] if shape else next(numbers)
-    for name, value in values.items():
-        made[name] = value
-    return made
+    # of a lens, then of its map, as the record has them behind its own
+    lens = iter(() if view.raster is None else view.raster.uniforms)
+    flat: list[float] = []
+    for name in record.names or ():
+        if name in values:
+            value = values[name]
+            flat += value if isinstance(value, (list, tuple)) else (value,)
+        else:
+            flat += (next(lens) for _ in range(record[name].shape[0] if record[name].shape else 1))
+    return flat

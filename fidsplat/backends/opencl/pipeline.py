@@ -225,26 +225,43 @@ class OpenCLPipeline:
         workspace.pool.make_way(kept.kind, workspace.memory_budget - plan.held)
         if not TiledLists.capacity(workspace):
             return None
-        queue = workspace.turn_to(workspace.repeat_queue)
+        queue, recording = workspace.turn_to(workspace.repeat_queue), kept.recording
         workspace.pictures += 1
-        recording = kept.recording
 
         def undrawn(view: View) -> Picture:
-            return Picture(workspace, self.program, self.shape, resident, view, plan, repeats=True)
+            return Picture(workspace, self.program, self.shape, resident, view, plan, queue)
 
         if recording is not None and recording.fits(view, undrawn, queue):
-            leased = recording.launch(queue)
+            leased, _ = recording.launch(queue)
             stats = stats_later(queue, dict(leased)["counts"], resident.count)
             drawn = Drawn(queue, leased, stats)
         else:
             picture = draw(undrawn, view, self.features.images)
             drawn = Drawn(queue, picture.leased, picture.stats, uploads=picture.uploads)
             recording = kept.recording = Recording(picture)
-        repeat = Repeat(self._redrawn, resident, view, recording.big, recording.capacity)
+        repeat = Repeat(self._redrawn, self._timed, resident, view, recording)
         images = self._images(view, drawn, repeat)
         if not resident.fixed:
             images.settle()
         return images
+
+    def _timed(self, resident: Resident, view: View, recording: Recording) -> dict[str, float]:
+        """Milliseconds of the stages, of the picture drawn once more."""
+        workspace = self.workspace
+        queue = workspace.turn_to(workspace.queue)
+        workspace.pictures += 1
+
+        def undrawn(view: View) -> Picture:
+            return Picture(workspace, self.program, self.shape, resident, view, MemoryPlan(0, 0, 0), queue)
+
+        if recording.fits(view, undrawn, queue):
+            leased, events = recording.launch(queue, timed=True)
+            drawn = Drawn(queue, leased, dict, events)
+        else:
+            drawn = self._redrawn(resident, view)
+        workspace.finish()
+        workspace.pool.give_back(drawn.leased)
+        return drawn.timings()
 
     def _redrawn(self, resident: Resident, view: View) -> Drawn:
         """The picture drawn anew, whatever it takes, and its time."""

@@ -8,8 +8,9 @@ what it takes to plan the picture, and nothing waits for the device.
 from __future__ import annotations
 
 from collections import deque
-from typing import Any
+from typing import Any, TypeAlias
 
+import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.opencl.declare import Argument
@@ -19,6 +20,9 @@ from fidsplat.backends.opencl.program import put_argument
 from fidsplat.backends.opencl.workspace import token_of
 from fidsplat.backends.view import View
 
+Launched: TypeAlias = tuple[list[tuple[str, cl.Buffer]], list[tuple[str, cl.Event]]]
+_VIEWS = 256
+"""that are kept ready"""
 _UPLOADS = 64
 """copies to the device that may be under way before the host waits for the first"""
 
@@ -31,6 +35,8 @@ class Recording:
         self.capacity, self.big = TiledLists.capacity(picture.workspace), picture.held["big_capacity"]
         """pairs and big splats for which there is room"""
         self._view, self._arrays = picture.view, picture.arrays
+        self._ready: dict[int, tuple[View, dict[str, np.ndarray], list[Any]]] = {}
+        """of views that were drawn: arrays, and values of the numbers"""
         self._tallies = picture.pool.size("tallies")
         self._uploads: deque[cl.Event] = deque(picture.uploads, maxlen=_UPLOADS)
         self._leases = [(name, buffer.size) for name, buffer in picture.leased]
@@ -38,12 +44,15 @@ class Recording:
         self._bound: dict[str, object] = {}
         self._numbers: list[tuple[cl.Kernel, int, Argument, Any]] = []
         """arguments that are numbers of the view, with their types"""
-        self._launches: list[tuple[cl.Kernel, tuple[int, ...], tuple[int, ...]]] = []
+        self._values: list[Any] = []
+        """what they are now"""
+        self._launches: list[tuple[str, cl.Kernel, tuple[int, ...], tuple[int, ...]]] = []
+        """with their stages"""
         leased = {id(buffer): name for name, buffer in picture.leased}
         program = picture.program
-        for _, name, size, group, values in picture.launched:
+        for stage, name, size, group, values in picture.launched:
             kernel = program.bound(name, values)
-            self._launches.append((kernel, size, group))
+            self._launches.append((stage, kernel, size, group))
             for index, (argument, value) in enumerate(
                 zip(program.source.arguments[name], values, strict=True)
             ):
@@ -51,6 +60,8 @@ class Recording:
                     self._takers[leased[id(value)]].append((kernel, index))
                 elif picture.is_of_view(argument):
                     self._numbers.append((kernel, index, argument, program.type_of(name, index)))
+                    self._values.append(value)
+        self._ready[id(self._view)] = self._view, self._arrays, self._values
 
     def fits(self, view: View, picture_of: Any, queue: cl.CommandQueue) -> bool:
         """Makes it ready for a view. Returns whether it still can be launched: not where buffers were
@@ -62,13 +73,14 @@ class Recording:
         if pool.state is not self._state:
             return False
         if view is not self._view:
-            picture = picture_of(view)
-            picture.put_view(0, picture.rows)
-            picture.put_arrays()
-            for kernel, index, argument, scalar in self._numbers:
-                put_argument(kernel, index, picture.value(argument), scalar)
-            self._view, self._arrays = view, self._arrays | picture.arrays
-            self._uploads.extend(picture.uploads)
+            if id(view) not in self._ready:
+                self._prepare(picture_of(view))
+            _, arrays, values = self._ready[id(view)]
+            before = zip(self._numbers, self._values, values, strict=True)
+            for (kernel, index, _, scalar), old, value in before:
+                if value != old:
+                    put_argument(kernel, index, value, scalar)
+            self._view, self._arrays, self._values = view, arrays, values
         for name, array in self._arrays.items():
             _, event = pool.put(queue, name, array)
             if event is not None:  # pictures of other kinds have theirs in the same buffers
@@ -76,8 +88,20 @@ class Recording:
         pool.zeroed("tallies", self._tallies, queue)  # where a picture of another kind has left its own
         return pool.state is self._state
 
-    def launch(self, queue: cl.CommandQueue) -> list[tuple[str, cl.Buffer]]:
-        """Draws the picture into leased buffers, which are returned by name."""
+    def _prepare(self, picture: Picture) -> None:
+        """What a view that was not drawn yet needs, all of it the host's."""
+        picture.put_view(0, picture.rows)
+        picture.put_arrays()
+        self._uploads.extend(picture.uploads)
+        if len(self._ready) >= _VIEWS:
+            self._ready.clear()
+        values = [picture.value(argument) for _, _, argument, _ in self._numbers]
+        # the view is held, so that no other is found by its number
+        self._ready[id(picture.view)] = picture.view, self._arrays | picture.arrays, values
+
+    def launch(self, queue: cl.CommandQueue, timed: bool = False) -> Launched:
+        """Draws the picture into leased buffers, which are returned by name; with the events of the launches
+        if it is timed."""
         pool, bound = self._pool, self._bound
         leased = [(name, pool.lease(name, size)) for name, size in self._leases]
         for name, buffer in leased:
@@ -87,7 +111,10 @@ class Recording:
                 for kernel, index in self._takers[name]:
                     kernel.set_arg(index, buffer)
                 bound[name] = token
-        for kernel, size, group in self._launches:
-            cl.enqueue_nd_range_kernel(queue, kernel, size, group)
+        events: list[tuple[str, cl.Event]] = []
+        for stage, kernel, size, group in self._launches:
+            event = cl.enqueue_nd_range_kernel(queue, kernel, size, group)
+            if timed:
+                events.append((stage, event))
         queue.flush()
-        return leased
+        return leased, events

@@ -156,7 +156,7 @@ class Workspace:
         """for what the host reads while the stages run"""
         self.repeat_queue = cl.CommandQueue(self.context)
         """for pictures that were drawn before: without times, a launch takes the host a third less"""
-        self._last = self.queue
+        self._last, self._idle = self.queue, True
         self.pictures = 0
         """that were begun: another one overwrites what the last has left in scratch buffers"""
         self.lock = threading.RLock()
@@ -168,11 +168,18 @@ class Workspace:
     def turn_to(self, queue: cl.CommandQueue) -> cl.CommandQueue:
         """What is put on this queue from here on comes after all that was put on another."""
         if queue is not self._last:
-            before = cl.enqueue_marker(self._last)
-            self._last.flush()
-            cl.enqueue_barrier(queue, wait_for=[before])
+            if not self._idle:
+                before = cl.enqueue_marker(self._last)
+                self._last.flush()
+                cl.enqueue_barrier(queue, wait_for=[before])
             self._last = queue
+        self._idle = False
         return queue
+
+    def finish(self) -> None:
+        """Waits for all that was put on queues (with `lock` held)."""
+        self._last.finish()
+        self._idle = True
 
     def limit_memory(self, budget: int) -> None:
         """Lets a picture and the cloud take at most `budget` bytes of the device.

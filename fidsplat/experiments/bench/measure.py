@@ -150,7 +150,7 @@ class SceneRun:
         self, scene: str, device: str, rates: Rates | None, cloud: SplatCloud, camera: Camera
     ) -> None:
         self.renderer = Renderer(device)
-        self.camera = camera
+        self.camera, self.capture = camera, Capture(camera, quality=TIMED)
         self.picture = np.zeros((camera.height, camera.width, 3), np.float32)
         """what was drawn, (h, w, 3)"""
         timer = Timer(self._whole, drops_out=True, parts=lambda frame: frame.timings)
@@ -164,7 +164,7 @@ class SceneRun:
 
     def draw(self) -> Frame:
         """One frame."""
-        return self.renderer.render(self.resident, self.camera, quality=TIMED)
+        return self.renderer.render(self.resident, self.capture)
 
     def _whole(self) -> Frame:
         """One frame until the device is done."""
