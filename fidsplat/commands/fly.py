@@ -56,9 +56,14 @@ class Fly:
     trajectory: Annotated[
         str | None, option("FILE", "the camera's poses (default: the scene's [[camera.motion]])")
     ] = None
-    out: Annotated[str, option("DIR", f"folder for pictures (default: {DEFAULT_FOLDER})", "-o")] = (
-        DEFAULT_FOLDER
-    )
+    out: Annotated[
+        str,
+        option(
+            "DIR|RUN.mcap",
+            f"folder for pictures (default: {DEFAULT_FOLDER}), or a log, with the pictures in RUN",
+            "-o",
+        ),
+    ] = DEFAULT_FOLDER
     rate: Annotated[float, option("HZ", "pictures a second, also of the video (default: 30)")] = 30.0
     times: Annotated[
         str | None, option("T,T,...", "seconds on the trajectory's clock, instead of --rate")
@@ -102,6 +107,8 @@ class Fly:
         # what is wrong with the words is said before anything is read or opened
         select(fs.SplatCloud.empty(), fs.Capture(outputs=names or "rgb", quality=fs.Quality.of(self.quality)))
         budget = bytes_of("--memory-budget", self.memory_budget)
+        if self.out.endswith(".mcap"):
+            self.log, self.out = self.log or self.out, self.out.removesuffix(".mcap")
         if self.video is not None:
             check_video(self.video)
         given = self.trajectory

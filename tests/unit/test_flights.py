@@ -170,6 +170,13 @@ def test_a_log_and_the_truth_beside_the_pictures(here):
     assert truth["annotations"][1]["area"] == own.sum() > 50
 
 
+def test_a_log_named_as_the_output_has_its_pictures_beside_it(here):
+    pytest.importorskip("fidsplat.logs", reason="pip install 'fidsplat[logs]'", exc_type=fs.InputError)
+    assert fly("--rate", "1", "-o", "run.mcap") == 0
+    assert (here / "run.mcap").is_file()
+    assert len(list((here / "run/rgb").iterdir())) == 2
+
+
 def test_a_video_has_every_picture(here):
     pytest.importorskip("imageio_ffmpeg", reason="the extra video is not installed")
     pictures = [np.full((33, 47, 3), 60 + 20 * k, np.uint8) for k in range(4)]

@@ -149,6 +149,33 @@ def test_names_that_the_model_does_not_have(model, scene, bodies, cameras, words
         MujocoRig(model, scene, bodies, cameras, renderer=fs.Renderer("opencl:pocl"))
 
 
+class OnDevice:
+    """An array as mujoco_warp has it."""
+
+    def __init__(self, array):
+        self._array = array
+
+    def numpy(self):
+        return self._array
+
+
+class Worlds:
+    """Batched data: positions and axes with the worlds first."""
+
+    def __init__(self, states, model):
+        shapes = {"xpos": (-1, 3), "xquat": (-1, 4), "cam_xpos": (-1, 3), "cam_xmat": (-1, 3, 3)}
+        for name, shape in shapes.items():
+            arrays = [np.asarray(getattr(data, name), np.float32).reshape(shape) for data in states]
+            setattr(self, name, OnDevice(np.stack(arrays)))
+
+
+def test_batched_data_stands_where_its_worlds_do(model, rig):
+    states = [moved(model, seed) for seed in (4, 5, 6)]
+    for batched, single in zip(rig.poses(Worlds(states, model)), rig.poses(states), strict=True):
+        assert batched.shape == single.shape
+        np.testing.assert_allclose(batched, single, atol=1e-6)
+
+
 def test_data_without_poses(rig):
     with pytest.raises(fs.InputError, match=r"must be a mujoco\.MjData"):
         rig.render("data")
