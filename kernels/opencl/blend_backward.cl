@@ -54,8 +54,11 @@ typedef struct {            // of a pixel: the loss's derivatives
 // LANES pixels of an image (h, w, channels) from column x on; 0 outside of it.
 static inline vfloat pixels_of(global const float *image, int channels, int channel, int x, int y, int width, int height) {
     float row[LANES];
-    for (int lane = 0; lane < LANES; lane++)
-        row[lane] = x + lane < width && y < height ? image[(size_t)channels * (y * (size_t)width + x + lane) + channel] : 0.0f;
+    global const float *from = image + (size_t)channels * (y * (size_t)width + x) + channel;
+    if (y < height && x + LANES <= width)
+        for (int lane = 0; lane < LANES; lane++) row[lane] = from[channels * lane];
+    else
+        for (int lane = 0; lane < LANES; lane++) row[lane] = y < height && x + lane < width ? from[channels * lane] : 0.0f;
     return VLOAD(row);
 }
 
@@ -138,7 +141,7 @@ static inline float lane_sum(vfloat x) { return (x.x + x.z) + (x.y + x.w); }
 
 // x: the lanes' columns, relative to the anchor.
 static inline Moments moments_of(const Sums *sums, const Splat *s, vfloat x, const BlendConstants *constants) {
-    Moments m;
+    Moments m = {0};        // padding too
     m.nu0 = lane_sum(sums->nu);
     m.nux = lane_sum(sums->nu * x);
     m.nuy = lane_sum(sums->nu_y);

@@ -18,6 +18,7 @@ MOMENTS = Record(
         member("float log_opacity"),
         member("float r g b"),
     ),
+    alignment=16,  # as few lines of a cache as can be
 )
 """What a tile adds to the derivatives by a splat's record."""
 

@@ -51,7 +51,9 @@ class _Declarations(Declarations):
         self._backward = layouts
         moments = MOMENTS.with_members(one for layout in layouts for one in layout.moments)
         names = [name for one in moments.members for name, _ in one.names]
-        totals = Record("Totals", (member(f"real {' '.join(names)}", "of all tiles"),))
+        # with as many fields of padding
+        alignment = moments.alignment // 4 * self.scalars.dtype("real").itemsize
+        totals = Record("Totals", (member(f"real {' '.join(names)}", "of all tiles"),), alignment)
         self.add(moments, totals)
 
     def arguments(self, kernel: str) -> tuple[Argument, ...]:

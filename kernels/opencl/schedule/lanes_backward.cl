@@ -8,6 +8,7 @@
 typedef struct {            // fragments of a chunk, by splat and row
     vfloat light[CHUNK][TILE_H], opacity[CHUNK][TILE_H];
     uint rows[CHUNK];       // bits: rows where anything is drawn
+    uint slots[CHUNK];
 } Tape;
 
 typedef struct {
@@ -35,7 +36,7 @@ static inline uint walk_splat(const Splat *s, const Tile *tile, Pixel *pixels, u
     const BlendConstants *constants = tile->constants;
     const Columns columns = columns_of(s, tile);
     int first = max(s->y0 - tile->y0, 0), last = min(s->y1 - tile->y0, TILE_H);
-    tape->rows[place] = 0;
+    uint touched = 0;
     for (int row = first; row < last; row++) {
         if (!(alive >> row & 1u)) continue;
         wide y = (wide)(tile->y0 + row - s->ay);
@@ -46,11 +47,12 @@ static inline uint walk_splat(const Splat *s, const Tile *tile, Pixel *pixels, u
         vfloat opacity = fragment_opacity(s, fragment_half_rho(s, c, 1.0f / c.d, screen), constants->ceiling);
         vfloat light = pixels[row].t;
         vfloat drawn = take_light(&pixels[row], opacity, mask, constants);
-        tape->rows[place] |= 1u << row;
+        touched |= 1u << row;
         tape->light[place][row] = light;
         tape->opacity[place][row] = drawn;
         if (!VANY(VMASK(pixels[row].t > constants->stop))) alive &= ~(1u << row);
     }
+    tape->rows[place] = touched;
     return alive;
 }
 
@@ -72,6 +74,18 @@ static inline Moments back_splat(const Splat *s, const Tile *tile, const Tape *t
     }
     return moments_of(&sums, s, columns.x, constants);
 }
+
+static inline void leave_nothing(global float *moments, uint slot) {
+    const Moments nothing = {0};
+    ((global Moments *)moments)[slot] = nothing;
+}
+
+// All that is asked of the splat that the list has at `next`.
+#define FETCH_SPLAT(next)                                                          \
+    FETCH_AHEAD(splats + lists[next]);                                             \
+    FETCH_AHEAD((global const char *)(splats + lists[next]) + 64);                 \
+    FETCH_AHEAD(windows + lists[next]);                                            \
+    FETCH_AHEAD(splat_slots + lists[next])
 
 kernel void blend_backward(
 //@@ arguments blend_backward
@@ -107,9 +121,11 @@ kernel void blend_backward(
         uint place = (walked - start) % CHUNK, chunk = (walked - start) / CHUNK;
         for (int row = 0; place == 0 && row < TILE_H; row++)
             VSTORE(pixel_light(&pixels[row]), own + (size_t)chunk * (TILE_W * TILE_H) + row * TILE_W);
-        FETCH_AHEAD(splats + lists[min(walked + AHEAD_SPLATS, end - 1)]);
-        FETCH_AHEAD((global const char *)(splats + lists[min(walked + AHEAD_SPLATS, end - 1)]) + 64);
-        const Splat s = splats[lists[walked]];
+        FETCH_SPLAT(min(walked + AHEAD_SPLATS, end - 1));
+        uint index = lists[walked];
+        tape.slots[place] = splat_slots[index] + tile_rank(windows[index], big_bounds, column, tile_row, width, height);
+        FETCH_AHEAD(moments + (size_t)tape.slots[place] * FIELDS);
+        const Splat s = splats[index];
         alive = walk_splat(&s, &tile, pixels, alive, &tape, place);
     }
     vfloat behind_r = 0.0f, behind_g = 0.0f, behind_b = 0.0f;
@@ -124,8 +140,10 @@ kernel void blend_backward(
 
     // splats behind the last that was walked have nothing to do with the picture
     for (uint k = walked; k < end; k++) {
+        FETCH_AHEAD(windows + lists[min(k + AHEAD_SPLATS, end - 1)]);
+        FETCH_AHEAD(splat_slots + lists[min(k + AHEAD_SPLATS, end - 1)]);
         uint slot = splat_slots[lists[k]] + tile_rank(windows[lists[k]], big_bounds, column, tile_row, width, height);
-        for (uint field = 0; field < FIELDS; field++) moments[(size_t)slot * FIELDS + field] = 0.0f;
+        leave_nothing(moments, slot);
     }
     uint chunks = (walked - start + CHUNK - 1) / CHUNK;
     for (uint chunk = chunks; chunk-- > 0;) {
@@ -137,16 +155,19 @@ kernel void blend_backward(
                 if (VANY(VMASK(pixels[row].t > constants.stop))) alive |= 1u << row;
             }
             for (uint place = 0; place < length; place++) {
-                const Splat s = splats[lists[first + place]];
+                uint index = lists[first + place];
+                tape.slots[place] = splat_slots[index] + tile_rank(windows[index], big_bounds, column, tile_row, width, height);
+                const Splat s = splats[index];
                 alive = walk_splat(&s, &tile, pixels, alive, &tape, place);
             }
         }
         for (uint place = length; place-- > 0;) {
-            uint index = lists[first + place];
-            const Splat s = splats[index];
-            const Moments m = back_splat(&s, &tile, &tape, place, losses);
-            uint slot = splat_slots[index] + tile_rank(windows[index], big_bounds, column, tile_row, width, height);
-            ((global Moments *)moments)[slot] = m;
+            if (tape.rows[place] == 0) {
+                leave_nothing(moments, tape.slots[place]);
+                continue;
+            }
+            const Splat s = splats[lists[first + place]];
+            ((global Moments *)moments)[tape.slots[place]] = back_splat(&s, &tile, &tape, place, losses);
         }
     }
 }
