@@ -87,14 +87,16 @@ def errors_kept(renderer: fs.Renderer, count: int, measured: int) -> list[dict]:
     for k in track(range(count), "errors", console=PROGRESS):
         scene = random_scene(HELD_OUT + k)
         want = truth_of(scene)
+        crossing = random_scene(HELD_OUT + k, crossing=True)
+        mixed = truth_of(crossing)
         for bound, quality in listed.items():
             hold("prices", bound, scene, quality, want)
+            hold("crossing", bound, crossing, quality, mixed)
         if k >= measured:
             continue
-        crossing, elsewhere = random_scene(HELD_OUT + k, crossing=True), moved(scene)
-        mixed, there = truth_of(crossing), truth_of(elsewhere)
-        for bound, quality in listed.items():
-            hold("crossing", bound, crossing, quality, mixed)
+        elsewhere = moved(scene)
+        there = truth_of(elsewhere)
+        for bound in BOUNDS:
             place = {"scene": scene.cloud, "capture": capture_of(scene)}
             try:
                 own = fs.quality_within(error=bound, device=renderer, **place)

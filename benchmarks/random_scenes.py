@@ -36,8 +36,7 @@ def random_scene(seed: int, crossing: bool = False) -> RandomScene:
     across the near plane; cameras from wide to narrow, near and far; any background.
 
     Every fifth scene is printed on one plane, as a marker is, with nothing else. `crossing`: every scene is
-    half printed on a plane and half not, all mixed up. There a fragment of no plane, however faint, decides
-    when the plane is composited, so that the error does not go to 0 with the cut-off.
+    half printed on a plane and half not, all mixed up.
     """
     generator = np.random.default_rng([seed, 7])
     width, height = int(generator.integers(16, 97)), int(generator.integers(12, 73))

@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from fidsplat.backends.stack import ViewStack
 from fidsplat.backends.view import View
 from fidsplat.rotations import quaternion_to_matrix
 from fidsplat.splats import SplatCloud
@@ -57,24 +58,44 @@ class PlaneTable:
         Whatever lies before the plane at some pixel, with its centre at most a diameter nearer than the
         plane, arrives after it and can be placed before it; so can what lies behind.
         """
-        keys = self._keys(view)
-        for label, own in view.groups:
-            keys = np.where(self._labels == label, self._keys(own), keys)
+        every = [view, *(own for _, own in view.groups)]
+        axes, depths, eyes = (
+            np.stack([of(one) for one in every])[:, None]
+            for of in (lambda v: v.rotation[2], lambda v: v.translation[2], lambda v: v.eye)
+        )
+        return self._keys_of(view, axes, depths, eyes)[0].copy()
+
+    def keys_of(self, stack: ViewStack) -> np.ndarray:
+        """(views, p) float32: the keys of each view."""
+        axes, depths = stack.rotation[:, :, 2], stack.translation[:, :, 2]
+        return self._keys_of(stack.view, axes, depths, stack.eye)
+
+    def _keys_of(self, view: View, axes: np.ndarray, depths: np.ndarray, eyes: np.ndarray) -> np.ndarray:
+        """From the camera's z axis (groups + 1, views, 3), the depth of the origin (groups + 1, views) and
+        the eye (groups + 1, views, 3): (views, p)."""
+        keys = self._keys(view, axes[0], depths[0], eyes[0])
+        for k, (label, _) in enumerate(view.groups, 1):
+            keys = np.where(self._labels == label, self._keys(view, axes[k], depths[k], eyes[k]), keys)
         # of equal keys the index decides, and shuffled splats of two planes would mix
-        order = np.argsort(keys, kind="stable")
-        for before, here in pairwise(order):
-            if keys[here] <= keys[before]:
-                keys[here] = np.nextafter(keys[before], np.float32(np.inf))
+        order = np.argsort(keys, axis=1, kind="stable")
+        steps = np.diff(np.take_along_axis(keys, order, axis=1), axis=1)
+        for number in np.flatnonzero(~(steps > 0).all(1)):
+            own = keys[number]
+            for before, here in pairwise(order[number]):
+                if own[here] <= own[before]:
+                    own[here] = np.nextafter(own[before], np.float32(np.inf))
         return keys
 
-    def _keys(self, view: View) -> np.ndarray:
+    def _keys(self, view: View, axis: np.ndarray, depth: np.ndarray, eye: np.ndarray) -> np.ndarray:
         radius = max(math.sqrt(-2 * view.log_cut), self._least_radius)
         half = self._half + radius * self._sigma
         if view.along_ray:
-            aside = np.abs(self._axes @ view.eye - self._center) - half
-            nearest = np.linalg.norm(np.maximum(aside, 0.0), axis=1)
+            aside = np.abs((self._axes @ eye[:, None, :, None])[..., 0] - self._center) - half
+            nearest = np.linalg.norm(np.maximum(aside, 0.0), axis=2)
         else:
-            along = self._axes @ view.rotation[2]  # (p, 3): depth per metre along each axis
-            depth = np.einsum("pk,pk->p", along, self._center) + view.translation[2]
-            nearest = depth - (np.abs(along) * half).sum(1)
+            along = (self._axes @ axis[:, None, :, None])[..., 0]  # (views, p, 3): depth per metre
+            # row by row, so that a view is rounded as if it were alone
+            rows, centers = along.reshape(-1, 3), np.tile(self._center, (len(axis), 1))
+            centre = np.einsum("pk,pk->p", rows, centers).reshape(along.shape[:2])
+            nearest = centre + depth[:, None] - (np.abs(along) * half).sum(2)
         return (nearest - 2 * np.linalg.norm(half, axis=1)).astype(np.float32)

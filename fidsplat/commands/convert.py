@@ -27,9 +27,9 @@ class Convert:
     """Write splats in another format, and say what that costs.
 
     Formats by their endings: .ply, .splat, .spz, .glb and .gltf (KHR_gaussian_splatting), .usda, .usdc and
-    .usd (OpenUSD's ParticleField; extra usd). What B cannot hold is said in words; then both files are drawn
-    from where `fidsplat render A` looks, and the largest and mean difference of the pictures and their PSNR
-    are measured.
+    .usd (OpenUSD's ParticleField; extra usd), and .sog, which is read only. What B cannot hold is said in
+    words; then both files are drawn from where `fidsplat render A` looks, and the largest and mean difference
+    of the pictures and their PSNR are measured.
 
     Examples:
       fidsplat convert room.ply room.spz
@@ -45,9 +45,9 @@ class Convert:
     def run(self) -> int:
         import fidsplat as fs
         from fidsplat.formats import losses, save_splats
-        from fidsplat.formats.files import format_of
+        from fidsplat.formats.files import check_writable
 
-        known = format_of(self.target)
+        known = check_writable(self.target)
         writable_file(self.target)
         with late_progress(console(True)) as progress:
             cloud = fs.load_splats(self.source, progress)

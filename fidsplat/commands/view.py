@@ -32,6 +32,12 @@ class View:
     """
 
     source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply", "what to show")]
+    trajectory: Annotated[
+        str | None,
+        option(
+            "FILE", "poses shown as keyframes (docs/trajectories.md), e.g. DIR/trajectory.tum of a flight"
+        ),
+    ] = None
     port: Annotated[int, option("N", "of the page (default: 8080)")] = 8080
     host: Annotated[
         str, option("ADDRESS", "to listen on; 0.0.0.0 lets the whole network in (default: 127.0.0.1)")
@@ -47,18 +53,20 @@ class View:
     memory_budget: MemoryBudget = None
 
     def run(self) -> int:
+        from fidsplat.formats import load_trajectory
         from fidsplat.viewer.server import Viewer, check_port
 
         budget = bytes_of("--memory-budget", self.memory_budget)
         if not 0 < self.rate <= 1000:
             raise InputError(f"--rate is {self.rate:g}; give pictures a second, up to 1000")
         check_port(self.host, self.port)
+        path = None if self.trajectory is None else load_trajectory(self.trajectory)
         where = console(True)
         with late_progress(where) as progress:
             scene = load_source(self.source, self.quality, progress)
         file = Path(self.source) if self.source.lower().endswith(".toml") else None
         with where.status("compiling"):
-            viewer = Viewer(scene, file, self.device, budget, self.host, self.port, self.rate)
+            viewer = Viewer(scene, file, self.device, budget, self.host, self.port, self.rate, path)
         say(console(False), f"{viewer.address} shows {self.source}; Ctrl-C ends it")
         try:
             while True:

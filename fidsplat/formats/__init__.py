@@ -1,4 +1,4 @@
-"""Files of splats (PLY, .splat, SPZ, glTF, OpenUSD) and of trajectories (TUM, KITTI, COLMAP,
+"""Files of splats (PLY, .splat, SPZ, glTF, OpenUSD, SOG) and of trajectories (TUM, KITTI, COLMAP,
 transforms.json)."""
 
 from fidsplat.formats.collect import Progress

@@ -15,6 +15,7 @@ from fidsplat.formats.collect import Progress
 from fidsplat.formats.gltf import load_gltf, save_gltf
 from fidsplat.formats.ply import load_ply
 from fidsplat.formats.ply_write import save_ply
+from fidsplat.formats.sog import load_sog
 from fidsplat.formats.splat import load_splat, save_splat
 from fidsplat.formats.spz import load_spz, save_spz
 from fidsplat.formats.usd import load_usd, save_usd
@@ -27,7 +28,8 @@ class Format:
 
     name: str
     load: Callable[[Path], SplatCloud]
-    save: Callable[[SplatCloud, Path], None]
+    save: Callable[[SplatCloud, Path], None] | None
+    """None: it is read only"""
     labels: bool = False
     planes: bool = False
     harmonics: bool = True
@@ -54,6 +56,7 @@ FORMATS = {
     ".usda": _USD,
     ".usdc": _USD,
     ".usd": _USD,
+    ".sog": Format("SOG", load_sog, None),
 }
 """by their endings"""
 
@@ -68,7 +71,7 @@ def format_of(path: str | os.PathLike[str]) -> Format:
 
 def load_splats(path: str | os.PathLike[str], progress: Progress | None = None) -> SplatCloud:
     """Read splats of any format that is known by its ending: .ply, .splat, .spz, .glb, .gltf, .usda, .usdc,
-    .usd. progress: as `load_ply`, for PLY.
+    .usd, .sog. progress: as `load_ply`, for PLY.
 
     Raises InputError for an unknown ending or a damaged file.
     """
@@ -79,11 +82,22 @@ def load_splats(path: str | os.PathLike[str], progress: Progress | None = None) 
 def save_splats(cloud: SplatCloud, path: str | os.PathLike[str]) -> None:
     """Write splats in the format of the file's ending; `losses` says what it cannot hold.
 
-    Raises InputError for an unknown ending, boxes, or a file that cannot be written.
+    Raises InputError for an unknown or read-only ending, boxes, or a file that cannot be written.
     """
     if not isinstance(cloud, SplatCloud):
         raise InputError(f"save_splats writes a SplatCloud, not a {type(cloud).__name__}")
-    format_of(path).save(cloud, path_of(path))
+    save = check_writable(path).save
+    assert save is not None
+    save(cloud, path_of(path))
+
+
+def check_writable(path: str | os.PathLike[str]) -> Format:
+    """The format of a file that is to be written. Raises InputError for an unknown or a read-only one."""
+    known = format_of(path)
+    if known.save is None:
+        others = ", ".join(suffix for suffix, other in FORMATS.items() if other.save is not None)
+        raise InputError(f"{path}: {known.name} is read only; write {others}")
+    return known
 
 
 def losses(cloud: SplatCloud, path: str | os.PathLike[str]) -> list[str]:

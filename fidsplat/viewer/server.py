@@ -54,6 +54,7 @@ class Viewer:
         host: 127.0.0.1, which nobody else reaches, unless told otherwise.
         port: 0 takes a free one.
         rate: pictures a second to aim at while moving.
+        keyframes: whose poses, camera to world, stand there at first.
 
     Raises:
         InputError: the port is in use, or the extra `viewer` is missing.
@@ -69,6 +70,7 @@ class Viewer:
         host: str = "127.0.0.1",
         port: int = 8080,
         rate: float = 30.0,
+        keyframes: Trajectory | None = None,
     ) -> None:
         viser = _viser()
         check_port(host, port)
@@ -76,7 +78,7 @@ class Viewer:
         self._streams: dict[int, Stream] = {}
         self._views: dict[int, View] = {}
         self._said: dict[int, Any] = {}
-        self._keyframes: list[np.ndarray] = []
+        self._keyframes: list[np.ndarray] = [] if keyframes is None else list(keyframes.poses)
         self._file = None if file is None else SceneFile(file)
         self._held: int | None = None
         self.session = Session(scene, device, memory_budget, self._changed)
@@ -90,6 +92,7 @@ class Viewer:
         self._controls = Controls(self.server.gui, self.session, list(dict.fromkeys([own, *names])), self)
         self._start_camera(scene)
         self._nodes.show(scene, self._overlay)
+        self._nodes.show_keyframes(scene.camera, self._keyframes)
         self.server.on_client_connect(self._enter)
         self.server.on_client_disconnect(self._leave)
         self.server.scene.on_click()(self._click)

@@ -181,6 +181,20 @@ def decoded(content: bytes) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
+def rgba_pixels(data: bytes, name: str) -> np.ndarray:
+    """(h, w, 4) uint8 of a picture file's content, alpha 255 where it has none.
+
+    name: of the file, for errors. Raises InputError for anything but a picture of 8 bits.
+    """
+    image = None
+    with _silent_opencv(), contextlib.suppress(cv2.error):
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    if image is None or image.dtype != np.uint8:
+        raise InputError(f"{name} is not a picture of 8 bits that can be read")
+    kinds = {2: cv2.COLOR_GRAY2RGBA, 3: cv2.COLOR_BGR2RGBA, 4: cv2.COLOR_BGRA2RGBA}
+    return cv2.cvtColor(image, kinds[2 if image.ndim == 2 else image.shape[2]])
+
+
 def _decode(path: str | os.PathLike[str], flags: int) -> np.ndarray:
     try:
         data = np.fromfile(path_of(path), np.uint8)

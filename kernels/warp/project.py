@@ -57,7 +57,7 @@ def make_project(
     words = wp.types.vector(4 * layout.lines, wp.float32)
     sqrt_half, sqrt_two = real(math.sqrt(0.5)), real(math.sqrt(2.0))
     edge_on = real(1e-13 if precision == "float64" else 1e-6)
-    range_radius = real(math.sqrt(2.0 * math.log(255.0)))
+    range_radius, plane_radius = real(math.sqrt(2.0 * math.log(255.0))), real(64.0)
     one, two, half, zero = real(1.0), real(2.0), real(0.5), real(0.0)
     all_boxes, mixed = "footprint_box" in effects, "footprint_mixed" in effects
     boxes_too = all_boxes or mixed
@@ -387,6 +387,10 @@ def make_project(
                 # what is fainter than 1/255 of its splat lies within the rest, so that the order is the same
                 # at every cut-off
                 depth_reach = reach * (range_radius / radius)
+                if wp.static(layers):
+                    # on the plane wherever any cut-off and a low-pass let it be drawn
+                    if planes[i] >= 0:
+                        depth_reach = reach * (plane_radius / radius)
                 if wp.static(boxes_too):
                     if boxed:
                         depth_reach = reach

@@ -24,14 +24,16 @@ MIXED = AROUND.with_boxes(np.arange(90) % 3 == 0)
 
 
 def scene_of_layers():
-    """A marker of boxes, one of Gaussians, and splats and boxes of no plane."""
+    """A marker of boxes, one of Gaussians, splats and boxes of no plane, and ten layers that cross, so that
+    many wait."""
     pose = np.eye(4)
     pose[:3, :3] = [[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]]
     pose[:3, 3] = (0.1, 0, 2.2)
     exact = fs.marker("aruco:4x4_50:7", size=0.8, mixture="exact").cloud.transformed(pose)
     pose[:3, 3] = (-0.4, 0.1, 2.5)
     fitted = fs.marker("aruco:4x4_50:7", size=0.8, mixture="fitted").cloud.transformed(pose)
-    return fs.SplatCloud.concatenate([exact, fitted, MIXED])
+    crossing = random_splats(40, seed=6, depth=(1.0, 3.0), scale=(0.2, 0.8), across=0.5)
+    return fs.SplatCloud.concatenate([exact, fitted, MIXED, crossing.with_planes(np.arange(40) // 4)])
 
 
 PICTURES = {

@@ -114,6 +114,23 @@ def test_a_layer_lies_where_its_depth_says(renderer, side):
     assert np.abs(got - wanted).max() < 1e-6
 
 
+def test_a_cutoff_moves_no_layer(renderer):
+    """Tails of a tilted plane's splats, drawn or not, before a splat 2 mm behind it: bounded by what of a
+    splat is not fainter than 1/255 they moved it back by 6 mm."""
+    tilted, along = (math.cos(math.pi / 6), 0, math.sin(math.pi / 6), 0), np.array([0.5, 0, -(0.75**0.5)])
+    spot = splats([(0, 0, 2)], tilted, 0.05, 0.5, (1, 0, 0))
+    tails = splats([np.array([0, 0, 2]) - 4 * along] * 20, tilted, 1.0, 1.0, (1, 0, 0))
+    sheet = fs.SplatCloud.concatenate([spot, tails]).with_planes(0)
+    cloud = fs.SplatCloud.concatenate([sheet, splats([(0, 0, 2.002)], tilted, 0.05, 0.9, (0, 1, 0))])
+    view = Camera.pinhole(5, 5, 100.0, 100.0, 2.5, 2.5)
+    few, all_of_them = (
+        renderer.render(cloud, view, quality=fs.Quality(alpha_cutoff=cutoff))["rgb"][2, 2]
+        for cutoff in (1 / 255, 1e-5)
+    )
+    assert few[0] > 0.45
+    assert np.abs(few - all_of_them).max() < 0.02
+
+
 def test_any_number_of_layers_wait(renderer):
     """Three sheets one behind the other, and a big splat between whose centre is nearer than all."""
     colors = np.eye(3)

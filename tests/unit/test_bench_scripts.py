@@ -111,7 +111,7 @@ def test_each_kind_of_figures_becomes_its_table(files):
         "| tag | opencl | empty | 1.68 s (1.50 to 2.00) | 0.01 | 1.30 | 2026-11-21 |"
     ]
     assert rows(made["batches"]) == [
-        "| 64 of 128 x 96 | rgb, depth | 10,000 | a CPU | 900 (800 to 1e+03) | 5000 | 600 | 2026-11-22 |"
+        "| 64 of 128 x 96 | rgb, depth | 10,000 | a CPU | 900 (800 to 1000) | 5000 | 600 | 2026-11-22 |"
     ]
     assert rows(made["growth"]) == ["| a CPU | splats | 0.50 | 1.00 |"]
 

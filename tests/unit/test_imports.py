@@ -33,7 +33,7 @@ MAY_IMPORT = {
     "splats": BASE | {"harmonics", "cloud_arrays"},
     "cameras": BASE,
     "vision": BASE | {"cameras", "scenes", "markers"},
-    "formats": BASE | {"splats", "harmonics", "cloud_arrays", "cameras"},
+    "formats": BASE | {"splats", "harmonics", "cloud_arrays", "cameras", "vision.images"},
     "markers": BASE | {"splats", "quality", "vision.dictionaries", "vision.images"},
     "scenes": PLAIN | {"markers", "formats"},
     "effects": PLAIN,

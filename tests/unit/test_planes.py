@@ -5,9 +5,12 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.backends.planes import PlaneTable
+from fidsplat.backends.prepare import view_of as moved_view_of
+from fidsplat.backends.stack import ViewStack
 from fidsplat.backends.view import View
 from fidsplat.hard_cases.clouds import splats, taken, turned
 from fidsplat.rotations import quaternion_to_matrix
+from fidsplat.views import views_of
 
 CAMERA = fs.Camera.look_at(64, 48, 1.0, (0.4, -0.2, -2.0), (0, 0, 0))
 
@@ -95,3 +98,16 @@ def test_a_cloud_without_planes_has_none():
     table = PlaneTable(cloud)
     assert table.index.tolist() == [-1]
     assert table.keys(view_of(cloud)).shape == (0,)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, fs.Camera.fisheye(64, 48, 2.5)], ids=["pinhole", "fisheye"])
+def test_keys_of_many_views_are_those_of_each(camera):
+    """Bit for bit, also of planes that move by themselves."""
+    cloud = some_planes()
+    cloud = cloud.with_labels(np.where(cloud.planes == 3, 1, 0))
+    poses = np.random.default_rng(1).normal(0, 0.3, (20, 7)) + np.eye(7)[3]
+    views = views_of([fs.Capture(camera)], poses, {1: poses[::-1].copy()})
+    each = [moved_view_of(views.capture(k), cloud.origin) for k in range(20)]
+    stack = ViewStack.of_poses(each[0], cloud.origin, views.poses, views.groups, 20)
+    table = PlaneTable(cloud)
+    assert np.array_equal(table.keys_of(stack), [table.keys(view) for view in each])

@@ -10,7 +10,7 @@ import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.formats.colmap_read import load_colmap
-from fidsplat.train import Dataset, TrainingView, load_dataset
+from fidsplat.train import Dataset, TrainingView, TrainSettings, load_dataset
 from fidsplat.train.dataset import looked_at
 from fidsplat.vision.images import read_rgba, write_png
 
@@ -204,6 +204,22 @@ def test_files_that_are_missing_or_damaged_are_named(made, folder, tmp_path):
         (nerf / "other.json").write_text(json.dumps(table | change))
         with pytest.raises(fs.InputError, match=words):
             load_dataset(nerf / "other.json", random_points=5)
+
+
+def test_the_baseline_of_a_marker(folder, tmp_path, monkeypatch):
+    """Its splats stand where `experiment views --trained` looks; what was stopped goes on."""
+    from fidsplat.experiments import trained
+
+    monkeypatch.setattr(trained, "write_scene", lambda *_: folder)
+    point = {"category": "small", "index": 2, "views": 9}
+    settings, renderer = TrainSettings(iterations=2), fs.Renderer("reference")
+    steps = []
+    found = trained.train_marker(point, tmp_path, tmp_path / "out", settings, renderer, steps.append)
+    assert [step.iteration for step in steps] == [1, 2]
+    assert (found["splats"], found["iterations"]) == (6, 2)
+    assert found["psnr"] > 5
+    assert [each.name for each in (tmp_path / "out").rglob("*.*")] == ["small-2.ply"]
+    assert (tmp_path / "out" / "2dgs-9" / "small-2.ply").is_file()
 
 
 def test_the_command_trains_resumes_and_reports(folder, tmp_path, capsys):

@@ -451,6 +451,21 @@ def test_keyframes_become_a_trajectory(viewer, tmp_path):
     assert viewer._keyframes == []
 
 
+def test_a_trajectory_stands_there_as_keyframes(tmp_path):
+    pytest.importorskip("viser", reason="the extra viewer is not installed")
+    from fidsplat.viewer.server import Viewer
+
+    path = fs.Trajectory(range(100), [rigid_matrix((k, 0, 0)) for k in range(100)])
+    viewer = Viewer(scene(), None, "reference", port=0, keyframes=path)
+    try:
+        assert len(viewer._keyframes) == 100
+        assert len(viewer._nodes._frusta) == 50  # not all of many
+        viewer.add_keyframe(Client())
+        assert len(viewer._keyframes) == 101
+    finally:
+        viewer.close()
+
+
 def test_a_port_in_use_is_said():
     from fidsplat.viewer.server import check_port
 

@@ -165,8 +165,10 @@ class Picture:
             moving = np.array([len(view.groups), *(label for label, _ in view.groups)], np.int32)
             self.put("moving", _kept(moving))
         if self.resident.planes is not None:
-            every = [view] if self.stack is None else map(self.stack.one, range(self.views))
-            self.put("plane_keys", _kept(np.stack([self.resident.planes.keys(one) for one in every], axis=1)))
+            planes, stack = self.resident.planes, self.stack
+            # (planes, views), in memory of its own
+            keys = planes.keys(view) if stack is None else planes.keys_of(stack).T.copy()
+            self.put("plane_keys", _kept(keys))
 
     def put_rays(self) -> None:
         """What the kernels read of a lens: rays of the samples, and the map of directions."""

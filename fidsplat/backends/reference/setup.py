@@ -64,8 +64,11 @@ class Setup:
         planes, nearest = None, np.full(len(cloud), -np.inf)
         if self.by_depth:
             # depths are the same at every cut-off
+            radius = np.full(len(cloud), _RANGE_RADIUS)
+            if cloud.planes is not None:
+                radius[cloud.planes >= 0] = _PLANE_RADIUS
             with np.errstate(divide="ignore", invalid="ignore"):
-                reach = np.where(box, reach, reach * (_RANGE_RADIUS / np.sqrt(2 * half_r2)))
+                reach = np.where(box, reach, reach * (radius / np.sqrt(2 * half_r2)))
             self.key = self.key - reach.astype(np.float32)
         if "compose_planes" in features.slots:
             table = PlaneTable(cloud)
@@ -134,6 +137,9 @@ class Setup:
 
 _RANGE_RADIUS = math.sqrt(2 * math.log(255))
 """radius, in standard deviations, of the part of a splat whose depths bound those of all of it"""
+_PLANE_RADIUS = 64.0
+"""the same of splats that are printed on a plane: they lie on it wherever any cut-off and a low-pass let them
+be drawn, so that those that a cut-off leaves out move no layer"""
 _OF_SPLATS = (
     *("order", "log_opacity", "half_r2", "reach", "labels", "pz", "z_numerator"),
     *("inverse_m2", "turned"),

@@ -116,7 +116,8 @@ static inline void waiting_queue(Pixel *pixel, wide z, wide opacity, uint splat)
 static inline void waiting_push(Pixel *pixel, wide nearest, wide z, wide opacity, uint splat, global const Splat *splats,
                                 const BlendConstants *constants) {
     Waiting *waiting = &pixel->waiting;
-    waiting_leave(pixel, nearest, splats, constants);
+    // a layer that ends may be nearer than what follows it in the list, and than what waits
+    waiting_leave(pixel, fmin(nearest, z), splats, constants);
     bool first = z < waiting->z[0];
     wide first_z = first ? z : waiting->z[0], first_opacity = first ? opacity : waiting->opacity[0];
     uint first_splat = first ? splat : waiting->splat[0];

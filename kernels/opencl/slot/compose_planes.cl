@@ -7,8 +7,15 @@
 // splat follows, the layer waits as one fragment, among the others (slot/compose_pixel.cl).
 //@ project
     record.plane = planes[i];
+//@ functions
+#define PLANE_RADIUS REAL(64.0)
 //@ plane_nearest
-    if (planes[i] >= 0) record.nearest = (wide)plane_keys[planes[i] * get_global_size(1) + number];
+    if (planes[i] >= 0) {
+        record.nearest = (wide)plane_keys[planes[i] * get_global_size(1) + number];
+        // its fragments lie on the plane as far out as any cut-off and a low-pass let them be drawn: so those that a cut-off leaves
+        // out move no layer
+        if (!BOX_HERE) depth_reach = reach * (PLANE_RADIUS / radius);
+    }
 //@ see_depth
     seen.z = fmax(seen.z, (vfloat)s->nearest);
 //@ compose_types

@@ -1,0 +1,120 @@
+"""SOG, PlayCanvas' "Spatially Ordered Gaussians", version 2, read only: a zip of meta.json and lossless WebP
+pictures with a pixel for each splat. Layout: developer.playcanvas.com, "The SOG Format".
+
+Positions have 16 bits an axis of sign(p) log(1 + |p|), rotations the three smallest of w, x, y, z in 8 bits;
+scales, colours and SH are places in code books of 256. Axes are those of the file that it was made of.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fidsplat.errors import InputError
+from fidsplat.formats.plain import cloud_of, content
+from fidsplat.splats import SplatCloud
+
+MAX_PART = 2**30
+"""bytes of a file within the zip: no picture of so many splats as fit a machine is larger"""
+_ROW = 64  # palette entries in a row of the picture of centroids
+_COEFFICIENTS = {1: 3, 2: 8, 3: 15}
+
+
+def load_sog(path: Path) -> SplatCloud:
+    """Read a .sog file. Raises InputError where it is damaged, lacks a part, or has another version."""
+    content(path, "a SOG file")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return _cloud(path, archive)
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        raise InputError(f"{path} is not a SOG file: its zip is damaged ({error})") from None
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: the SOG file is damaged ({type(error).__name__}: {error})") from None
+
+
+def _cloud(path: Path, archive: zipfile.ZipFile) -> SplatCloud:
+    meta = json.loads(_part(path, archive, "meta.json"))
+    if meta.get("version") != 2:
+        raise InputError(f"{path}: SOG of version {meta.get('version')!r}; version 2 is read")
+    count = int(meta["count"])
+
+    def pixels(part: str, number: int = 0) -> np.ndarray:
+        """(count, 4) uint8 of a picture with a pixel for each splat."""
+        name = meta[part]["files"][number]
+        found = _picture(path, archive, name).reshape(-1, 4)
+        if not 0 <= count <= len(found):
+            raise InputError(f"{path}: {name} has {len(found)} pixels for {count} splats")
+        return found[:count]
+
+    low, high = pixels("means", 0)[:, :3].astype(np.uint16), pixels("means", 1)[:, :3].astype(np.uint16)
+    least, most = (np.array(meta["means"][end], np.float64).reshape(3) for end in ("mins", "maxs"))
+    place = least + (most - least) * ((high << 8 | low) / 65535.0)
+    means = np.sign(place) * np.expm1(np.abs(place))
+    scales = np.exp(_book(meta["scales"])[pixels("scales")[:, :3]])
+    base = pixels("sh0")
+    sh = _book(meta["sh0"])[base[:, None, :3]]
+    if "shN" in meta:
+        labels = pixels("shN", 1).astype(np.int64)
+        sh = np.concatenate(
+            [sh, _higher(path, archive, meta["shN"], labels[:, 0] | labels[:, 1] << 8)], axis=1
+        )
+    quats = _quaternions(path, pixels("quats"))
+    return cloud_of(path, means.astype(np.float32), quats, scales, base[:, 3] / np.float32(255), sh)
+
+
+def _part(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
+    try:
+        info = archive.getinfo(name)
+    except KeyError:
+        raise InputError(f"{path}: the SOG file lacks {name}") from None
+    if info.file_size > MAX_PART:
+        raise InputError(f"{path}: {name} has {info.file_size} bytes, which no part of a SOG file has")
+    return archive.read(info)
+
+
+def _picture(path: Path, archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    """(h, w, 4) uint8 RGBA."""
+    from fidsplat.vision.images import rgba_pixels  # late: it brings OpenCV
+
+    return rgba_pixels(_part(path, archive, name), f"{path}: {name}")
+
+
+def _book(part: dict[str, Any]) -> np.ndarray:
+    return np.array(part["codebook"], np.float32).reshape(256)
+
+
+def _higher(path: Path, archive: zipfile.ZipFile, part: dict[str, Any], labels: np.ndarray) -> np.ndarray:
+    """(n, k, 3) SH above degree 0 of the palette's entries."""
+    name, k = part["files"][0], _COEFFICIENTS[part["bands"]]
+    palette = _picture(path, archive, name)
+    if palette.shape[1] != _ROW * k:
+        raise InputError(
+            f"{path}: {name} is {palette.shape[1]} pixels wide; {part['bands']} bands have {_ROW * k}"
+        )
+    entries = palette[:, :, :3].reshape(-1, k, 3)
+    if len(labels) and labels.max() >= len(entries):
+        raise InputError(
+            f"{path}: an SH label, {labels.max()}, is none of the palette's {len(entries)} entries"
+        )
+    return _book(part)[entries[labels]]
+
+
+def _quaternions(path: Path, pixels: np.ndarray) -> np.ndarray:
+    """(n, 4) w, x, y, z: alpha less 252 names the largest, which is left out."""
+    largest = pixels[:, 3].astype(np.int64) - 252
+    if (largest < 0).any():
+        raise InputError(f"{path}: a rotation's alpha is {int(pixels[:, 3].min())}; it must be 252 to 255")
+    three = (pixels[:, :3] / 255.0 * 2 - 1) / np.sqrt(2)
+    quats = np.zeros((len(pixels), 4))
+    for k in range(4):
+        rows = largest == k
+        quats[np.ix_(rows, [i for i in range(4) if i != k])] = three[rows]
+        quats[rows, k] = np.sqrt(np.maximum(0, 1 - (three[rows] ** 2).sum(axis=1)))
+    return quats
