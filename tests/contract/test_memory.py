@@ -2,6 +2,7 @@
 
 import sys
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -331,6 +332,32 @@ def test_a_picture_that_outgrows_the_last_is_drawn_again(opencl, scale):
     assert max(pairs) > 1.5 * pairs[1], "it did outgrow it"
     for frame, camera in zip(frames, cameras, strict=True):
         assert np.array_equal(frame["rgb"], own.render(some, camera)["rgb"])
+
+
+def test_threads_share_launches_that_are_kept(opencl):
+    """Sixteen draw pictures of two kinds with a GPU's kernels, of a cloud that outgrows its room at times,
+    and read them, their times and their counts while others draw."""
+    machine, own = as_on_a_gpu(opencl), fs.Renderer(opencl.device.name)
+    some = random_splats(500, seed=4, scale=(1e-2, 0.3), depth=(2.0, 6.0))
+    captures = [
+        fs.Capture(fs.Camera.look_at(width, 40, 1.0, (0.0, 0.0, z), (0.0, 0.0, 30.0)))
+        for width in (50, 60)
+        for z in (-900, 0, 1)
+    ]
+    wanted = [own.render(some, capture) for capture in captures]
+    resident = machine.upload(some)
+
+    def draw(number):
+        frames = [machine.render(resident, captures[(number + k) % 6]) for k in range(6)]
+        return all(
+            np.array_equal(frame["rgb"], wanted[(number + k) % 6]["rgb"])
+            and frame.stats == wanted[(number + k) % 6].stats
+            and len(frame.timings) == 5
+            for k, frame in enumerate(frames)
+        )
+
+    with ThreadPoolExecutor(16) as pool:
+        assert all(pool.map(draw, range(32)))
 
 
 @machines
