@@ -4,7 +4,9 @@
     python benchmarks/gradients.py --time r100k_720p r1m_1080p [--quality surfel] [--repeats 15]
 
 Errors are of random scenes as tests/contract/test_gradients.py has them: of each parameter's whole array the
-relative error and one less its cosine, the median and the largest of all scenes. Times are of a picture, and
+relative error and one less its cosine, the median and the largest of all scenes; how many scenes are beyond
+1e-4; and the largest error in units of what one unit in the last place of means and quaternions changes in
+those. Times are of a picture, and
 of its derivatives by colour, the splats resident: medians of the device's own clock, stage by stage.
 """
 
@@ -21,23 +23,39 @@ from fidsplat.backends.base import Differentiates
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
 from fidsplat.errors import InputError
-from fidsplat.hard_cases.derivatives import derivatives, differences, random_loss, random_picture
+from fidsplat.hard_cases.derivatives import (
+    NORM,
+    derivatives,
+    differences,
+    last_place,
+    random_loss,
+    random_picture,
+)
 from fidsplat.random_clouds import load_scene
 from fidsplat.timing import Timer, take_turns
 
 
 def errors(backend: Differentiates, scenes: int) -> list[dict[str, float | str]]:
     """Of each parameter the median and the largest error of all scenes."""
-    reference, found = ReferenceBackend(), defaultdict(list)
+    reference, found, beyond = ReferenceBackend(), defaultdict(list), defaultdict(list)
     for seed in track(range(scenes), "Scenes", console=PROGRESS):
-        picture = random_picture(seed)
-        for one in differences(derivatives(backend, *picture), derivatives(reference, *picture)):
+        cloud, capture = random_picture(seed)
+        truth = derivatives(reference, cloud, capture)
+        off = list(differences(derivatives(backend, cloud, capture), truth))
+        for one in off:
             found[one.parameter].append(one[1:])
+        if any(one.norm > NORM for one in off):
+            moved = differences(derivatives(reference, last_place(cloud), capture), truth)
+            for one, place in zip(off, moved, strict=True):
+                if one.norm > NORM:
+                    beyond[one.parameter].append(one.norm / place.norm)
     return [
         {
             "parameter": name,
             "median": float(np.median(values, axis=0)[0]),
-            **dict(zip(("largest", "largest_turn"), np.max(values, axis=0).tolist(), strict=True)),
+            **dict(zip(("largest", "turned"), np.max(values, axis=0).tolist(), strict=True)),
+            "beyond": sum(norm > NORM for norm, _ in values),
+            "last_places": max(beyond[name], default=0.0),
         }
         for name, values in found.items()
     ]

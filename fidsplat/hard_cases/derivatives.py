@@ -18,7 +18,7 @@ from fidsplat.random_clouds import random_splats
 from fidsplat.splats import SplatCloud
 
 NORM, COSINE = 1e-4, 1e-6
-"""what a device may be off at most, as `Difference` has it"""
+"""what a device may be off at most, as `Difference` has it; or by twice what `last_place` changes"""
 _BEHIND = (0.3, 0.6, 0.1)
 
 
@@ -75,6 +75,23 @@ def derivatives(
     given = random_loss(features, view) if by_images is None else by_images
     found = pipeline.backward(images, given)
     return {name: one if isinstance(one, np.ndarray) else one.get() for name, one in found.items()}
+
+
+def last_place(cloud: SplatCloud) -> SplatCloud:
+    """The cloud with every mean and quaternion moved to a neighbour in float32, up or down by chance.
+
+    What that changes in derivatives no device can be asked to know, as its splats' records are float32 too:
+    needles of a small part of a pixel change by more than `NORM`.
+    """
+    rng = np.random.default_rng(0)
+
+    def moved(array: np.ndarray) -> np.ndarray:
+        towards = np.where(rng.random(array.shape) < 0.5, -np.inf, np.inf).astype(np.float32)
+        return np.nextafter(array, towards)
+
+    color = {"colors": cloud.colors} if cloud.sh is None else {"sh": cloud.sh}
+    means, quats = moved(cloud.means), moved(cloud.quats)
+    return SplatCloud(means, quats, cloud.scales, cloud.opacities, origin=cloud.origin, **color)
 
 
 def differences(found: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]) -> Iterator[Difference]:
