@@ -11,8 +11,8 @@ from fidsplat.sim.rig import Rig
 from fidsplat.vision.images import to_uint8
 
 try:
-    import gymnasium
-    from gymnasium import spaces
+    import gymnasium  # type: ignore[import-not-found]
+    from gymnasium import spaces  # type: ignore[import-not-found]
 except ImportError as error:
     raise InputError(f"Gymnasium is not here ({error}); pip install 'fidsplat[sim]'") from None
 

@@ -18,7 +18,7 @@ from fidsplat.splats import SplatCloud
 from fidsplat.surroundings import Layer
 
 try:
-    import mujoco as _mujoco
+    import mujoco as _mujoco  # type: ignore[import-not-found]
 except ImportError as error:
     raise InputError(f"MuJoCo is not here ({error}); pip install 'fidsplat[sim]'") from None
 

@@ -14,7 +14,7 @@ from fidsplat.errors import InputError
 from fidsplat.rotations import rigid_matrix
 
 try:
-    import mujoco as _mujoco
+    import mujoco as _mujoco  # type: ignore[import-not-found]
 except ImportError as error:
     raise InputError(f"MuJoCo is not here ({error}); pip install 'fidsplat[sim]'") from None
 
