@@ -177,6 +177,8 @@ CALLS: dict[str, Callable[[Path], Call]] = {
     ),
     "Panorama.load": lambda folder: (fs.Panorama.load, {"path": folder / "good.png"}, None),
     "load_ply": lambda folder: (fs.load_ply, {"path": folder / "good.ply"}, draw),
+    "load_splats": lambda folder: (fs.load_splats, {"path": folder / "good.ply"}, draw),
+    "save_splats": lambda folder: (fs.save_splats, {"cloud": CLOUD, "path": folder / "out.spz"}, None),
     "save_ply": lambda folder: (fs.save_ply, {"cloud": CLOUD, "path": folder / "out.ply", "native_2dgs": False}, None),
     "Renderer": lambda _: (fs.Renderer, {"device": "reference", "memory_budget": None}, None),
     "Renderer.upload": lambda _: (RENDERER.upload, {"scene": CLOUD}, None),
