@@ -258,7 +258,7 @@ class LocaliseFolder:
         names = [name for name in self.results["variants"] if (self.folder / _tum(name)).exists()]
         with chart(self.folder / CHART, size=(9.0, 5.0)) as (figure, axes):
             for number, name in enumerate(["truth", *names]):
-                path = load_trajectory(self.folder / _tum(name)).poses[:, :2, 3]
+                path = load_trajectory(self.folder / _tum(name)).poses[::10, :2, 3]  # every fifth of a second
                 width, colour = (3.0, "#bbbbbb") if number == 0 else (1.0, COLOURS[number % len(COLOURS)])
                 axes[0].plot(path[:, 0], path[:, 1], label=name, color=colour, linewidth=width)
             axes[0].set_aspect("equal")

@@ -69,21 +69,32 @@ def load_colmap(folder: Path) -> ColmapModel:
     )
 
 
+def image_poses(file: Path) -> list[tuple[str, tuple[float, ...]]]:
+    """Names of the images in a file images.bin or images.txt, in their alphabetical order, with the poses
+    world to camera: quaternion w, x, y, z and translation, as they stand there. Raises InputError for a
+    damaged file."""
+    views = _read_file(file, _binary_images, _text_images)
+    return sorted((name, pose) for name, _, pose in views)
+
+
 def has_colmap(folder: Path) -> bool:
     """Whether a model lies in the folder."""
     return any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
 
 
 def _read(folder: Path, name: str, binary, text) -> list:
-    file = folder / f"{name}.bin"
+    for suffix in (".bin", ".txt"):
+        if (folder / f"{name}{suffix}").exists():
+            return _read_file(folder / f"{name}{suffix}", binary, text)
+    raise InputError(f"{folder} has neither {name}.bin nor {name}.txt; it is no COLMAP model")
+
+
+def _read_file(file: Path, binary, text) -> list:
     try:
-        if file.is_file():
+        if file.suffix.lower() == ".bin":
             return list(binary(_Bytes(file.read_bytes())))
-        file = folder / f"{name}.txt"
         lines = file.read_text("utf-8").splitlines()
         return list(text([line.strip() for line in lines if not line.lstrip().startswith("#")]))
-    except FileNotFoundError:
-        raise InputError(f"{folder} has neither {name}.bin nor {name}.txt; it is no COLMAP model") from None
     except OSError as error:
         raise InputError(f"cannot read {file}: {error.strerror or error}") from error
     except (ValueError, IndexError, KeyError, struct.error) as error:

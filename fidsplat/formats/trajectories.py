@@ -11,7 +11,6 @@ import json
 import math
 import os
 import stat
-import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from fidsplat.cameras.trajectory import check_rate
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write, path_of
 from fidsplat.formats.colmap import save_colmap
+from fidsplat.formats.colmap_read import image_poses
 from fidsplat.rotations import matrix_to_quaternion, rigid_matrix
 
 MAX_BYTES = 2**28
@@ -54,8 +54,8 @@ def load_trajectory(path: str | os.PathLike[str], rate: float = RATE, smooth: bo
     if file.is_dir():
         file = _of_folder(file)
     content = _content(file)
-    if file.suffix.lower() == ".bin":
-        times, poses = None, _colmap_binary(file, content)
+    if file.suffix.lower() == ".bin" or file.name == "images.txt":
+        times, poses = None, _colmap(file)
     else:
         try:
             text = content.decode("utf-8")
@@ -63,8 +63,6 @@ def load_trajectory(path: str | os.PathLike[str], rate: float = RATE, smooth: bo
             raise InputError(f"{file} is not a trajectory: it is not text in UTF-8") from None
         if file.suffix.lower() == ".json":
             times, poses = _transforms(file, text)
-        elif file.name == "images.txt":
-            times, poses = None, _colmap_text(file, text)
         else:
             times, poses = _lines(file, text)
     if not len(poses):
@@ -246,42 +244,10 @@ def _transforms(file: Path, text: str) -> tuple[list[float] | None, list[np.ndar
     return _numbers(f"{file}, the times of its frames", [time for time, _ in pairs]), poses
 
 
-def _colmap_text(file: Path, text: str) -> list[np.ndarray]:
-    """Poses in the order of the images' names: two lines for each, of which the second may be empty."""
-    named = []
-    lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if not line.startswith("#")]
-    for number, line in lines[::2]:
-        words = line.split(maxsplit=9)
-        if len(words) != 10:
-            raise InputError(f"{file}, line {number}: an image has 10 entries, not {len(words)}")
-        where = f"{file}, line {number}"
-        values = _numbers(where, words[1:8])
-        named.append((words[9], _turned(where, values[4:], values[:4])))
-    return _inverted(named)
-
-
-def _colmap_binary(file: Path, content: bytes) -> list[np.ndarray]:
-    head, points = struct.Struct("<i7di"), struct.Struct("<Q")
-    named, place = [], points.size
-    try:
-        (count,) = points.unpack_from(content)
-        for k in range(count):
-            _, *values, _ = head.unpack_from(content, place)
-            end = content.index(b"\0", place + head.size)
-            name = content[place + head.size : end].decode("utf-8", "replace")
-            (seen,) = points.unpack_from(content, end + 1)
-            place = end + 1 + points.size + 24 * seen
-            where = f"{file}, image {k}"
-            named.append((name, _turned(where, _numbers(where, values)[4:], values[:4])))
-        if place > len(content):
-            raise ValueError
-    except (struct.error, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{file}: cut short, or not COLMAP's images.bin") from None
-    return _inverted(named)
-
-
-def _inverted(named: list[tuple[str, np.ndarray]]) -> list[np.ndarray]:
-    poses = np.array([pose for _, pose in sorted(named, key=lambda pair: pair[0])])
-    return list(Trajectory(np.arange(len(poses)), poses).inverse().poses) if len(poses) else []
+def _colmap(file: Path) -> list[np.ndarray]:
+    """Camera to world of COLMAP's images, in the order of their names."""
+    found = [
+        _turned(f"{file}, image {name}", _numbers(f"{file}, image {name}", pose)[4:], pose[:4])
+        for name, pose in image_poses(file)
+    ]
+    return list(Trajectory(np.arange(len(found)), np.array(found)).inverse().poses) if found else []

@@ -81,28 +81,6 @@ def test_splats_much_larger_than_the_picture(renderer, camera):
     assert_agrees(renderer, random_splats(80, 5, depth=(-4.0, 4.0), scale=(0.1, 30.0)), camera)
 
 
-@each_camera
-def test_bounds_that_end_where_splats_are_half_opaque(renderer, camera):
-    """With so high a cut-off a bound that is too tight leaves a step where tiles end."""
-    cloud = random_splats(60, 9, depth=(-4.0, 4.0), scale=(0.1, 4.0))
-    opaque = fs.SplatCloud(cloud.means, cloud.quats, cloud.scales, np.full(60, 0.8), colors=cloud.colors)
-    quality = fs.Quality(alpha_cutoff=0.4, lowpass="none")
-    assert_agrees(renderer, opaque, camera, quality=quality)
-
-
-@pytest.mark.parametrize(
-    "camera", [fs.Camera.fisheye(70, 66, math.radians(200)), fs.Camera.equirectangular(70, 40)]
-)
-def test_small_splats_on_the_axis_and_at_the_poles(renderer, camera):
-    """Exactly there; filtered by the lens's own derivatives."""
-    means = [(0, 0, 2), (0, 0, -2), (0, 2, 0), (0, -2, 0), (2, 0, 0), (-2, 0, 0)]
-    scales = np.tile([0.05, 0.02], (6, 1))
-    splats = fs.SplatCloud(
-        means, np.tile([0.9, 0.3, -0.2, 0.1], (6, 1)), scales, np.full(6, 0.9), colors=np.ones((6, 3))
-    )
-    assert_agrees(renderer, splats, camera, ("rgb",), fs.Quality(lowpass="pixel"))
-
-
 @in_turn()
 @pytest.mark.parametrize(("camera", "samples"), alternate(CAMERAS, SAMPLES))
 def test_layers(renderer, camera, samples):
