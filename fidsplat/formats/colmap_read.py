@@ -148,6 +148,8 @@ def _binary_cameras(data: _Bytes) -> Iterator[tuple[int, _Lens]]:
 def _text_cameras(lines: list[str]) -> Iterator[tuple[int, _Lens]]:
     for line in filter(None, lines):
         number, model, width, height, *parameters = line.split()
+        if len(parameters) != dict(_MODELS.values())[model]:
+            raise ValueError(f"camera {number} has {len(parameters)} parameters")
         yield int(number), (model, int(width), int(height), tuple(map(float, parameters)))
 
 
@@ -176,7 +178,8 @@ def _binary_points(data: _Bytes) -> Iterator[tuple]:
 
 def _text_points(lines: list[str]) -> Iterator[tuple]:
     for line in filter(None, lines):
-        yield tuple(map(float, line.split()[1:7]))
+        _, x, y, z, r, g, b, *_ = line.split()
+        yield tuple(map(float, (x, y, z, r, g, b)))
 
 
 def _camera(folder: Path, lens: _Lens, pose: np.ndarray) -> Camera:
