@@ -110,8 +110,9 @@ class FrameBatch(Mapping):
 class ViewByView:
     """The images of a batch that was drawn one view after another."""
 
-    def __init__(self, images: Mapping[int, Images], views: int, size: tuple[int, int]) -> None:
-        self._images, self.views, self._size = images, views, size
+    def __init__(self, images: Mapping[int, Images], views: int, size: tuple[int, int], splats: int) -> None:
+        """images: of the views that were drawn, by their number. splats: in the cloud."""
+        self._images, self.views, self._size, self._splats = images, views, size, splats
 
     def read(self, name: str) -> np.ndarray:
         """(views, h, w) or (views, h, w, channels)."""
@@ -136,8 +137,9 @@ class ViewByView:
 
     @property
     def stats(self) -> Mapping[str, int]:
+        none = {"splats": 0, "visible": 0, "pairs": 0}
         counts = [images.stats for images in self._images.values()]
-        return {**_added(counts), **({"splats": counts[0]["splats"]} if counts else {})}
+        return _added([none, *counts]) | {"splats": self._splats}
 
 
 class _KeptBatch:

@@ -285,7 +285,7 @@ class Renderer:
                 images = pipeline.render_batch(data, batch)
             else:
                 each = {int(k): pipeline.render(data, batch.one(n)) for n, k in enumerate(batch.slots)}
-                images = ViewByView(each, batch.total, batch.size)
+                images = ViewByView(each, batch.total, batch.size, len(resident))
         return FrameBatch(images, views.captures[0].outputs)
 
     def _resident(self, scene: Scene | SplatCloud | ResidentCloud) -> ResidentCloud:

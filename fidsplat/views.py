@@ -43,7 +43,7 @@ class Views:
             told = ", ".join(f"{name} has {count}" for name, count in counts.items())
             raise InputError(f"a batch must have one number of views: {told}")
         if not len(self):
-            raise InputError("a batch must have one view or more; captures is empty")
+            raise InputError(f"a batch must have one view or more; {next(iter(counts))} is empty")
         for number, capture in enumerate(self.captures):
             self._refuse_two_motions(number, capture.motion)
 

@@ -76,7 +76,9 @@ class Train:
     report: Annotated[
         str | None, option("DIR|FILE.md", "write a page with curves and pictures of the views held out")
     ] = None
-    overwrite: Annotated[bool, switch("begin again, whatever the checkpoint has")] = False
+    overwrite: Annotated[
+        bool, switch("begin again; the checkpoint stays until the new run writes its first")
+    ] = False
     json: Json = False
 
     def run(self) -> int:
@@ -105,9 +107,7 @@ class Train:
             settings = splats_within(settings, _bytes(self.within_memory), dataset)
         with where.status("opening the device"):
             renderer = Renderer(self.device)
-        if self.overwrite:
-            checkpoint.unlink(missing_ok=True)
-        trainer = Trainer(dataset, renderer, settings, checkpoint)
+        trainer = Trainer(dataset, renderer, settings, checkpoint, restart=self.overwrite)
         before, begun = trainer.iteration, time.perf_counter()
         with _bar(trainer) as tell:
             trainer.run(tell)

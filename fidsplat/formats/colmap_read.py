@@ -25,6 +25,7 @@ _MODELS = {
     8: ("SIMPLE_RADIAL_FISHEYE", 4),
     9: ("RADIAL_FISHEYE", 5),
     10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 }
 """camera models by their numbers: name, parameters"""
 _ONE_FOCAL_LENGTH = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
@@ -47,13 +48,14 @@ class ColmapModel:
 
 
 def load_colmap(folder: Path) -> ColmapModel:
-    """Read cameras, images and points3D from a folder, binary where both are there.
+    """Read cameras, images and points3D from a folder, binary where both are there; without points3D there
+    are no points.
 
     Raises InputError when a file is missing or damaged, or a camera is no pinhole.
     """
     lenses = dict(_read(folder, "cameras", _binary_cameras, _text_cameras))
     views = sorted(_read(folder, "images", _binary_images, _text_images), key=lambda view: view[0])
-    found = list(_read(folder, "points3D", _binary_points, _text_points))
+    found = list(_read(folder, "points3D", _binary_points, _text_points, needed=False))
     if not views:
         raise InputError(f"the COLMAP model in {folder} has no images; give one with views")
     cameras = []
@@ -61,8 +63,12 @@ def load_colmap(folder: Path) -> ColmapModel:
         if number not in lenses:
             raise InputError(f"{folder}: image {name} has camera {number}, which cameras does not have")
         matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = quaternion_to_matrix(np.array(pose[:4])), pose[4:]
-        cameras.append(_camera(folder, lenses[number], matrix))
+        with np.errstate(invalid="ignore"):  # of 0 none is made, and the camera says so
+            matrix[:3, :3], matrix[:3, 3] = quaternion_to_matrix(np.array(pose[:4])), pose[4:]
+        try:
+            cameras.append(_camera(lenses[number], matrix))
+        except InputError as error:
+            raise InputError(f"{folder}: image {name}: {error}") from error
     values = np.array(found, np.float64).reshape(-1, 6)
     return ColmapModel(
         tuple(name for name, _, _ in views), tuple(cameras), values[:, :3], values[:, 3:].astype(np.uint8)
@@ -82,10 +88,12 @@ def has_colmap(folder: Path) -> bool:
     return any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
 
 
-def _read(folder: Path, name: str, binary, text) -> list:
+def _read(folder: Path, name: str, binary, text, needed: bool = True) -> list:
     for suffix in (".bin", ".txt"):
         if (folder / f"{name}{suffix}").exists():
             return _read_file(folder / f"{name}{suffix}", binary, text)
+    if not needed:
+        return []
     raise InputError(f"{folder} has neither {name}.bin nor {name}.txt; it is no COLMAP model")
 
 
@@ -141,6 +149,8 @@ _View = tuple[str, int, tuple[float, ...]]
 def _binary_cameras(data: _Bytes) -> Iterator[tuple[int, _Lens]]:
     for _ in range(data.count()):
         number, model, width, height = data.take("iiQQ")
+        if model not in _MODELS:
+            raise ValueError(f"camera {number} has a model that is not known, {model}")
         name, parameters = _MODELS[model]
         yield number, (name, width, height, data.take(f"{parameters}d"))
 
@@ -148,8 +158,8 @@ def _binary_cameras(data: _Bytes) -> Iterator[tuple[int, _Lens]]:
 def _text_cameras(lines: list[str]) -> Iterator[tuple[int, _Lens]]:
     for line in filter(None, lines):
         number, model, width, height, *parameters = line.split()
-        if len(parameters) != dict(_MODELS.values())[model]:
-            raise ValueError(f"camera {number} has {len(parameters)} parameters")
+        if len(parameters) != dict(_MODELS.values()).get(model, len(parameters)):
+            raise ValueError(f"camera {number} is {model} with {len(parameters)} parameters")
         yield int(number), (model, int(width), int(height), tuple(map(float, parameters)))
 
 
@@ -182,16 +192,13 @@ def _text_points(lines: list[str]) -> Iterator[tuple]:
         yield tuple(map(float, (x, y, z, r, g, b)))
 
 
-def _camera(folder: Path, lens: _Lens, pose: np.ndarray) -> Camera:
+def _camera(lens: _Lens, pose: np.ndarray) -> Camera:
     model, width, height, values = lens
-    if model in _ONE_FOCAL_LENGTH:
-        (f, cx, cy), rest = values[:3], values[3:]
-        fx = fy = f
-    else:
-        (fx, fy, cx, cy), rest = values[:4], values[4:]
-    if model not in _PERSPECTIVE or any(rest):
+    own = 3 if model in _ONE_FOCAL_LENGTH else 4
+    if model not in _PERSPECTIVE or any(values[own:]):
         raise InputError(
-            f"{folder}: a camera has the model {model} with distortion, and pictures are trained on without; "
+            f"its camera has the model {model} with distortion, and pictures are trained on without; "
             "undistort them first, e.g. by colmap image_undistorter"
         )
+    fx, fy, cx, cy = values[:4] if own == 4 else (values[0], *values[:3])
     return Camera.pinhole(width, height, fx, fy, cx, cy, pose)

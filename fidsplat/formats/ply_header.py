@@ -6,6 +6,7 @@ import re
 import stat
 import warnings
 from dataclasses import dataclass
+from itertools import islice, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -58,19 +59,44 @@ class Header:
     path: Path
     elements: dict[str, Element]
     comments: tuple[str, ...]
+    text: bool = False
+    """whether the rows are lines of text; ``offset`` is then where the first element's begin, for all"""
 
     def rows(self, name: str, first: int, end: int) -> np.ndarray:
-        """Rows first to end of an element as a read-only structured array, mapped from the file, not read."""
+        """Rows first to end of an element as a read-only structured array, mapped from the file, not read;
+        those of a text are read. Raises InputError for a text that is damaged."""
         element = self.elements[name]
         if end <= first:
             return np.zeros(0, element.dtype)
+        if self.text:
+            return self._text_rows(element)[first:end]
         offset = element.offset + first * element.dtype.itemsize
         mapped = np.memmap(self.path, element.dtype, "r", offset, (end - first,))
         return mapped.view(np.ndarray)  # indexing a memmap costs several times that of an array
 
+    def _text_rows(self, element: Element) -> np.ndarray:
+        before = 0
+        for other in takewhile(lambda other: other is not element, self.elements.values()):
+            before += other.count
+        try:
+            with self.path.open("rb") as stream:
+                stream.seek(element.offset)
+                lines = islice(stream, before, before + element.count)
+                rows = np.loadtxt(lines, element.dtype, comments=None, ndmin=1)
+        except (OSError, ValueError) as error:
+            raise InputError(f"{self.path}: rows of {element.name} are damaged: {error}") from error
+        if len(rows) != element.count:
+            raise InputError(
+                f"{self.path}: cut short: its header calls for {element.count} rows of {element.name}, but "
+                f"the file has {len(rows)}"
+            )
+        return rows
 
-def read_header(path: str | os.PathLike[str]) -> Header:
+
+def read_header(path: str | os.PathLike[str], text: bool = False) -> Header:
     """Read and check a header.
+
+    text: whether ASCII files are read too.
 
     Raises InputError when the path is not a file that can be read, the file is not a binary little-endian
     PLY, its header is damaged, longer than 64 KiB or holds a list property, or the file is shorter than its
@@ -100,6 +126,10 @@ def read_header(path: str | os.PathLike[str]) -> Header:
             fields[current].append(_field(file, line, words, fields[current]))
         else:
             raise InputError(f"{file}: the PLY header's line {line[:60]!r} is unknown")
+    if text and layout == "ascii":
+        dtypes = {name: np.dtype(fields[name]) for name in counts}
+        elements = {name: Element(name, counts[name], dtypes[name], start) for name in counts}
+        return Header(file, elements, tuple(comments), True)
     if layout != "binary_little_endian":
         raise InputError(
             f"{file}: the PLY format is {layout}; only binary_little_endian is read, so convert it first"

@@ -137,13 +137,13 @@ def _cloud(path: Path, prim: Any) -> SplatCloud:
 
 def _pxr() -> Any:
     try:
-        import pxr.Gf
-        import pxr.Sdf
-        import pxr.Tf
-        import pxr.Usd
-        import pxr.UsdGeom
-        import pxr.UsdVol
-        import pxr.Vt
+        import pxr.Gf  # type: ignore[import-not-found]
+        import pxr.Sdf  # type: ignore[import-not-found]
+        import pxr.Tf  # type: ignore[import-not-found]
+        import pxr.Usd  # type: ignore[import-not-found]
+        import pxr.UsdGeom  # type: ignore[import-not-found]
+        import pxr.UsdVol  # type: ignore[import-not-found]
+        import pxr.Vt  # type: ignore[import-not-found]
     except ImportError:
         raise InputError("USD files need usd-core 26.3 or newer; pip install 'fidsplat[usd]'") from None
     return pxr

@@ -11,11 +11,12 @@ from fidsplat.sim.rig import Rig
 from fidsplat.vision.images import to_uint8
 
 try:
-    import gymnasium  # type: ignore[import-not-found]
-    from gymnasium import spaces  # type: ignore[import-not-found]
+    import gymnasium as _gymnasium  # type: ignore[import-not-found]
 except ImportError as error:
     raise InputError(f"Gymnasium is not here ({error}); pip install 'fidsplat[sim]'") from None
 
+gymnasium: Any = _gymnasium  # whose names its types do not tell where it is not installed
+spaces = gymnasium.spaces
 _LIMITS = {"label": (-1, np.iinfo(np.int32).max), "splat_id": (-1, np.iinfo(np.int32).max)}
 
 
@@ -36,7 +37,7 @@ class SplatObservation(gymnasium.ObservationWrapper):
         InputError: an environment without MuJoCo's data and no `poses`.
     """
 
-    def __init__(self, env: gymnasium.Env, rig: Rig, poses: Any = None) -> None:
+    def __init__(self, env: Any, rig: Rig, poses: Any = None) -> None:
         super().__init__(env)
         if poses is None and not hasattr(env.unwrapped, "data"):
             raise InputError(
@@ -60,8 +61,8 @@ class SplatObservation(gymnasium.ObservationWrapper):
         }
         return ({"state": observation} if self._whole else dict(observation)) | seen
 
-    def _picture_spaces(self) -> dict[str, spaces.Space]:
-        found: dict[str, spaces.Space] = {}
+    def _picture_spaces(self) -> dict[str, Any]:
+        found: dict[str, Any] = {}
         for name, camera in self._rig.cameras.items():
             size = camera.camera.height, camera.camera.width
             for output in self._rig.outputs_of(name):

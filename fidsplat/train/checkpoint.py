@@ -18,6 +18,8 @@ from fidsplat.train.settings import TrainSettings
 _FORMAT = 1
 _GROUPS = ("values", "first", "second")
 _HISTORY = ("losses", "psnrs", "counts")
+_DAMAGED = (OSError, ValueError, KeyError, EOFError, BadZipFile, TypeError, AttributeError, RuntimeError)
+"""what NumPy and zipfile raise for files that are not theirs any more"""
 _MAY_DIFFER = ("iterations",)
 """settings that do not change what an iteration does: a run may be made longer"""
 
@@ -71,7 +73,7 @@ def load_checkpoint(file: Path, settings: TrainSettings, digest: str) -> tuple[P
             values, first, second = ({name: arrays[f"{group}.{name}"] for name in NAMES} for group in _GROUPS)
             splats = Splats(values, first, second, arrays["gradients"], arrays["seen"])
             history = {name: arrays[name] for name in _HISTORY}
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+    except _DAMAGED as error:
         raise InputError(
             f"{file} is no checkpoint that can be read: {error}; remove it, or give --overwrite to begin "
             "again"

@@ -16,6 +16,8 @@ from fidsplat.train.random_numbers import Purpose, uniform
 
 FAR = 1e4
 """extents from the world's origin beyond which means have an origin of their own: float32 would blur them"""
+_STILL = 1e-9
+"""share of a camera's distance from the world's origin, below which movements are what rounding leaves"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +77,7 @@ class Dataset:
                 f"{self.name} has {len(self.views)} view{'' if len(self.views) == 1 else 's'} to train on; a "
                 "scene needs at least two, from different places"
             )
-        if not self.extent > 0:
+        if not self.extent > _STILL * max(np.abs(view.camera.position).max() for view in self.views):
             raise InputError(
                 f"all {len(self.views)} cameras of {self.name} stand at one place, from which no depth can "
                 "be told; give views from different places"

@@ -6,6 +6,8 @@ import numpy as np
 
 _LEAF = 256
 _NEAREST = 3
+_PAIRS = 1 << 22
+"""of points that are compared at once"""
 
 
 def mean_square_distances(points: np.ndarray) -> np.ndarray:
@@ -50,10 +52,15 @@ def _boxes(points: np.ndarray) -> list[np.ndarray]:
 
 def _nearest(mine: np.ndarray, among: np.ndarray) -> np.ndarray:
     """Squared distances (n, at most 3), in their order, to the nearest of `among`, which holds `mine`."""
-    squares = np.zeros((len(mine), len(among)))
-    for axis in range(3):
-        squares += (mine[:, None, axis] - among[None, :, axis]) ** 2
     count = min(_NEAREST + 1, len(among))
-    nearest = np.partition(squares, count - 1, axis=1)[:, :count]
+    nearest = np.empty((len(mine), count))
+    step = max(1, _PAIRS // len(among))  # a box of stray points may reach all the others
+    for first in range(0, len(mine), step):
+        part = slice(first, first + step)
+        squares = np.zeros((len(mine[part]), len(among)))
+        for axis in range(3):
+            squares += (mine[part, None, axis] - among[None, :, axis]) ** 2
+        squares.partition(count - 1, axis=1)
+        nearest[part] = squares[:, :count]
     nearest.sort(axis=1)
     return nearest[:, 1:]  # without the point itself

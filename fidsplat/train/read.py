@@ -9,13 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from fidsplat.cameras import Camera
 from fidsplat.errors import InputError
 from fidsplat.files import path_of
 from fidsplat.formats.colmap_read import has_colmap, load_colmap
 from fidsplat.train.dataset import Dataset, TrainingView
 from fidsplat.train.transforms import Found, has_transforms, load_transforms
-from fidsplat.vision.images import read_image
+from fidsplat.vision.images import read_image, read_over
 
 NOTES = ("dataset.json", "marker.json")
 """files beside a data set of ours that may say its `background`: one display value, or three"""
@@ -25,6 +24,7 @@ HOLD_OUT, ENOUGH = 8, 16
 """every eighth view is held out where no other views are and there are this many"""
 
 Progress = Callable[[str, float], None]
+Background = tuple[float, float, float]
 
 
 def load_dataset(
@@ -86,33 +86,36 @@ def _load_colmap(folder: Path, tell: Progress) -> Found:
             f"{folder} holds no data set; known are COLMAP's (sparse/0/cameras.bin and images/) and "
             "nerfstudio's (transforms.json)"
         )
-    views, points, colors = _model(folder, place, tell, "pictures")
+    background = _background(folder)
+    views, points, colors = _model(folder, place, background, tell, "pictures")
     held_out: list[TrainingView] = []
     if has_colmap(folder / "test" / "sparse" / "0"):
-        held_out, _, _ = _model(folder / "test", folder / "test" / "sparse" / "0", tell, "test pictures")
-    return Found(views, held_out, points, colors, _background(folder))
+        test = folder / "test"
+        held_out, _, _ = _model(test, test / "sparse" / "0", background, tell, "test pictures")
+    return Found(views, held_out, points, colors, background)
 
 
 def _model(
-    folder: Path, place: Path, tell: Progress, words: str
+    folder: Path, place: Path, background: Background, tell: Progress, words: str
 ) -> tuple[list[TrainingView], np.ndarray, np.ndarray]:
     model = load_colmap(place)
     views = []
     for i, (name, camera) in enumerate(zip(model.names, model.cameras, strict=True)):
         tell(words, i / len(model.names))
-        views.append(_view(name, camera, folder / "images" / name, folder / "masks" / name))
+        picture = read_over(folder / "images" / name, background)
+        views.append(TrainingView(name, camera, picture, _mask(folder / "masks" / name)))
     return views, model.points, model.colors
 
 
-def _view(name: str, camera: Camera, picture: Path, mask: Path) -> TrainingView:
+def _mask(mask: Path) -> np.ndarray | None:
     # COLMAP adds .png to the picture's name, others put it in place of the suffix
     places = (mask.with_name(f"{mask.name}.png"), mask.with_suffix(".png"))
     there = next((place for place in places if place.is_file()), None)
-    kept = None if there is None else read_image(there).max(axis=2) > 0
-    return TrainingView(name, camera, read_image(picture), kept)
+    return None if there is None else read_image(there).max(axis=2) > 0
 
 
-def _background(folder: Path) -> tuple[float, float, float]:
+def _background(folder: Path) -> Background:
+
     for name in NOTES:
         file = folder / name
         if file.is_file():

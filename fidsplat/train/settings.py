@@ -115,6 +115,8 @@ class TrainSettings:
             _put(self, name, whole_number(f"training: {name}", getattr(self, name), least, most))
         if self.strategy not in STRATEGIES:
             raise InputError(f"training: strategy is {self.strategy!r}; known: {', '.join(STRATEGIES)}")
+        if not isinstance(self.quality, str):  # checkpoints hold it as text
+            raise InputError(f"training: quality is {self.quality!r}; give it as text, e.g. 'surfel'")
         Quality.of(self.quality)
         for field in fields(self):
             value = getattr(self, field.name)
@@ -124,9 +126,18 @@ class TrainSettings:
                         f"training: {field.name} is {value!r}; it must be a number of at least 0"
                     )
                 _put(self, field.name, float(value))
-        for name in ("dssim_weight", "beta1", "beta2", "initial_opacity", "mcmc_opacity", "reset_opacity"):
-            if not getattr(self, name) <= 1:
-                raise InputError(f"training: {name} is {getattr(self, name)!r}; it must lie from 0 to 1")
+        if not self.dssim_weight <= 1:
+            raise InputError(f"training: dssim_weight is {self.dssim_weight!r}; it must lie from 0 to 1")
+        for name in ("beta1", "beta2"):
+            if not getattr(self, name) < 1:
+                raise InputError(
+                    f"training: {name} is {getattr(self, name)!r}; it must be at least 0 and below 1"
+                )
+        for name in ("initial_opacity", "mcmc_opacity", "reset_opacity"):
+            if not 0 < getattr(self, name) < 1:  # whose logit is finite
+                raise InputError(
+                    f"training: {name} is {getattr(self, name)!r}; it must lie between 0 and 1, without these"
+                )
 
     def position_rate_at(self, iteration: int) -> float:
         """Learning rate of the means, in units of the extent: falls evenly in its logarithm."""

@@ -16,6 +16,7 @@ from fidsplat.backends.base import Differentiates, Trains
 from fidsplat.backends.prepare import prepare
 from fidsplat.capture import Capture
 from fidsplat.errors import DeviceError, InputError, unknown
+from fidsplat.files import ordinary_file, writable_folder
 from fidsplat.formats import save_ply
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer
@@ -76,6 +77,7 @@ class Trainer:
         renderer: opens the device that draws; None: the default device.
         settings: of the run; None: the defaults. `changes` are fields of it, given by name.
         checkpoint: a file that the run goes on from if it is there, and that `run` writes.
+        restart: begin anew though there is a checkpoint, which stays until the first new one replaces it.
         start: splats to begin with, in place of one at each of the data set's points; SH grow from degree 0
             all the same.
 
@@ -91,12 +93,13 @@ class Trainer:
         settings: TrainSettings | None = None,
         checkpoint: str | Path | None = None,
         start: SplatCloud | None = None,
+        restart: bool = False,
         **changes: Any,
     ) -> None:
         self.dataset = dataset
         self.settings = _settings(settings, changes)
         self.renderer = Renderer() if renderer is None else renderer
-        self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        self.checkpoint = None if checkpoint is None else _writable(checkpoint)
         backend = self.renderer.backend
         if not isinstance(backend, Differentiates):
             raise DeviceError(
@@ -110,7 +113,7 @@ class Trainer:
             if isinstance(backend, Trains)
             else HostWork(backend, dataset.views, self.settings)
         )
-        self._made = self._begin(start)
+        self._made = self._begin(start, restart)
         self._work.load(self._made.splats)
         self._order: tuple[int, np.ndarray] = (-1, np.zeros(0, int))
 
@@ -134,10 +137,14 @@ class Trainer:
         """Look at one view, and change the splats so that they look more like it.
 
         Raises:
+            InputError: all iterations are done.
             TrainingError: the loss is not finite, or no splat is left.
             DeviceError: the device fails or lacks memory.
         """
         made, settings = self._made, self.settings
+        if self.done:
+            raise InputError(f"all {settings.iterations} iterations are done; give a trainer more of them")
+        self._make_splats()
         iteration = made.iteration + 1
         number = self._view_at(iteration)
         view = self.dataset.views[number]
@@ -210,9 +217,9 @@ class Trainer:
             view.camera, quality=Quality.of(self.settings.quality), background=self.dataset.background
         )
 
-    def _begin(self, start: SplatCloud | None) -> Progressed:
+    def _begin(self, start: SplatCloud | None, restart: bool) -> Progressed:
         settings = self.settings
-        if self.checkpoint is not None and self.checkpoint.exists():
+        if self.checkpoint is not None and self.checkpoint.exists() and not restart:
             made, device = load_checkpoint(self.checkpoint, settings, self.dataset.digest)
             if device != self.renderer.device.title:
                 warnings.warn(
@@ -242,27 +249,39 @@ class Trainer:
             self._order = round_, permutation(self.settings.seed, Purpose.VIEWS, round_, count)
         return int(self._order[1][place])
 
-    def _change(self, gradients: dict[str, Any], iteration: int, view: TrainingView) -> None:
-        """The optimiser's step, or the making of splats in its place, as in the authors' trainer, in which
-        splats that are made anew have no gradient yet."""
-        settings, origin = self.settings, self.dataset.origin
-        extent, mcmc_runs = self.dataset.extent, settings.strategy == "mcmc"
-        until = settings.relocate_until if mcmc_runs else settings.densify_until
-        if not mcmc_runs and iteration < until:
-            self._work.count(gradients, view.camera, origin)
-        due = settings.densify_from < iteration < until and iteration % settings.densify_every == 0
-        if due and not mcmc_runs:
-            splats = densify.densified(self._work.store(), settings, iteration, extent)
-            if iteration % settings.reset_every == 0:
-                splats = densify.with_opacities_reset(splats, settings)
-            self._work.load(splats)
+    def _due(self, iteration: int) -> bool:
+        """Whether splats are made and taken away after an iteration."""
+        settings = self.settings
+        until = settings.relocate_until if settings.strategy == "mcmc" else settings.densify_until
+        return settings.densify_from < iteration < until and iteration % settings.densify_every == 0
+
+    def _make_splats(self) -> None:
+        """By the default rule, after the last iteration that was done. It comes before the next one: a run
+        that ends here keeps splats that were fitted, and opacities that were not reset, as the authors'
+        trainer, which saves them first."""
+        settings, iteration = self.settings, self.iteration
+        if settings.strategy == "mcmc" or not self._due(iteration):
             return
+        splats = densify.densified(self._work.store(), settings, iteration, self.dataset.extent)
+        if iteration % settings.reset_every == 0:
+            splats = densify.with_opacities_reset(splats, settings)
+        self._work.load(splats)
+
+    def _change(self, gradients: dict[str, Any], iteration: int, view: TrainingView) -> None:
+        """The optimiser's step; none where the default rule makes splats next, as in the authors' trainer, in
+        which splats that are made anew have no gradient yet."""
+        settings, mcmc_runs = self.settings, self.settings.strategy == "mcmc"
+        if not mcmc_runs:
+            if iteration < settings.densify_until:
+                self._work.count(gradients, view.camera, self.dataset.origin)
+            if self._due(iteration):
+                return
         self._made.adam_step += 1
-        rate = rates(settings, iteration, extent)
+        rate = rates(settings, iteration, self.dataset.extent)
         self._work.step(gradients, rate, self._made.adam_step)
-        if due:
-            self._work.load(mcmc.moved(self._work.store(), settings, iteration))
         if mcmc_runs:
+            if self._due(iteration):
+                self._work.load(mcmc.moved(self._work.store(), settings, iteration))
             self._work.shake(iteration, rate["means"])
 
     def _note(self, iteration: int, loss: float, ratio: float) -> None:
@@ -275,6 +294,13 @@ class Trainer:
         if self.checkpoint is None or not self.checkpoint.exists():
             return "nothing was kept; lower the learning rates, or check the data set's cameras"
         return f"the checkpoint {self.checkpoint} is whole, as it was written last"
+
+
+def _writable(checkpoint: str | Path) -> Path:
+    """The path, after a proof that a file can be written beside it: before the work, not half a minute in."""
+    file = ordinary_file(checkpoint)
+    writable_folder(file.parent)
+    return file
 
 
 def _settings(settings: TrainSettings | None, changes: dict[str, Any]) -> TrainSettings:

@@ -14,12 +14,15 @@ from fidsplat.cameras import Camera, focal_length
 from fidsplat.errors import InputError
 from fidsplat.formats.ply_header import read_header
 from fidsplat.train.dataset import TrainingView
-from fidsplat.vision.images import read_image, read_rgba
+from fidsplat.vision.images import read_image, read_over
 
 _NAMES = ("transforms.json", "transforms_train.json")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 """the NeRF authors' files name pictures without one"""
+_PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+"""values of `camera_model` that are pinholes where their distortion is 0"""
+_BLACK = (0.0, 0.0, 0.0)
 
 
 class Found(NamedTuple):
@@ -34,7 +37,8 @@ class Found(NamedTuple):
 
 def has_transforms(path: Path) -> bool:
     """Whether this is such a file, or a folder with one."""
-    return path.suffix.lower() == ".json" or any((path / name).is_file() for name in _NAMES)
+    named = path.suffix.lower() == ".json" and path.is_file()
+    return named or any((path / name).is_file() for name in _NAMES)
 
 
 def load_transforms(path: Path, tell: Callable[[str, float], None]) -> Found:
@@ -50,7 +54,7 @@ def load_transforms(path: Path, tell: Callable[[str, float], None]) -> Found:
     test = file.with_name("transforms_test.json")
     held_out = _views(test, _table(test), tell, "test pictures") if test.is_file() else []
     points, colors = _points(file, table)
-    return Found(views, held_out, points, colors, (0.0, 0.0, 0.0))
+    return Found(views, held_out, points, colors, _BLACK)
 
 
 def _table(file: Path) -> dict[str, Any]:
@@ -90,14 +94,19 @@ def _views(file: Path, table: dict, tell: Callable[[str, float], None], words: s
 def _picture(file: Path, name: str) -> np.ndarray:
     places = [file.parent / (name + suffix) for suffix in _SUFFIXES]
     place = next((place for place in places if place.is_file()), places[0])
-    rgba = read_rgba(place)
-    return np.rint(rgba[:, :, :3] * (rgba[:, :, 3:] / 255.0)).astype(np.uint8)
+    return read_over(place, _BLACK)
 
 
 def _camera(what: str, given: dict, picture: np.ndarray, camera_to_world: np.ndarray) -> Camera:
     if any(given.get(name) for name in _DISTORTION):
         raise InputError(
             f"{what}: its camera has distortion, and pictures are trained on without; undistort them first"
+        )
+    model = given.get("camera_model", "PINHOLE")
+    if model not in _PINHOLES:
+        raise InputError(
+            f"{what}: its camera_model is {model!r}, and pictures are trained on as pinholes "
+            f"({', '.join(_PINHOLES)}); undistort them first"
         )
     height, width = picture.shape[:2]
     try:
@@ -108,8 +117,8 @@ def _camera(what: str, given: dict, picture: np.ndarray, camera_to_world: np.nda
             fx = focal_length(stated[0], float(given["camera_angle_x"]))
         fy = float(given.get("fl_y", fx))
         cx, cy = float(given.get("cx", stated[0] / 2)), float(given.get("cy", stated[1] / 2))
-    except (KeyError, TypeError, ValueError):
-        raise InputError(f"{what}: needs fl_x, or camera_angle_x, as a number") from None
+    except (KeyError, TypeError, ValueError, OverflowError):
+        raise InputError(f"{what}: needs fl_x, or camera_angle_x, as a finite number") from None
     pose = camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])
     turn = pose[:3, :3].T
     world_to_camera = np.eye(4)
@@ -124,7 +133,7 @@ def _points(file: Path, table: dict) -> tuple[np.ndarray, np.ndarray]:
     """Points of the PLY file that the table names; none where it names none."""
     if not table.get("ply_file_path"):
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    header = read_header(file.parent / str(table["ply_file_path"]))
+    header = read_header(file.parent / str(table["ply_file_path"]), text=True)
     element = header.elements.get("vertex")
     if element is None or not {"x", "y", "z"} <= set(element.properties):
         raise InputError(f"{header.path} has no points: its element vertex needs x, y and z")

@@ -2,7 +2,7 @@
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -34,15 +34,30 @@ def read_image(path: str | os.PathLike[str], deep: bool = False) -> np.ndarray:
 def read_rgba(path: str | os.PathLike[str]) -> np.ndarray:
     """Read a picture as (h, w, 4) uint8 RGBA, opaque where the file has no alpha.
 
-    Raises InputError when the file is missing, or is no picture of 8 bits.
+    Pixels are as they are stored, however EXIF would turn them; 16 bits are cut to 8.
+    Raises InputError when the file is missing, or is no picture of 8 or 16 bits.
     """
     image = _decode(path, cv2.IMREAD_UNCHANGED)
-    if image.dtype != np.uint8:
-        raise InputError(f"{path} holds {image.dtype} pixels; give 8 bits")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{path} holds {image.dtype} pixels; give 8 or 16 bits")
+    if image.dtype == np.uint16:
+        image = (image >> 8).astype(np.uint8)
     channels = 1 if image.ndim == 2 else image.shape[2]
     if channels == 4:
         return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA)
     return cv2.cvtColor(image, cv2.COLOR_GRAY2RGBA if channels == 1 else cv2.COLOR_BGR2RGBA)
+
+
+def read_over(path: str | os.PathLike[str], background: Sequence[float]) -> np.ndarray:
+    """Read a picture as (h, w, 3) uint8 RGB on a background of display values, which shows where it is clear.
+    Pixels and errors as `read_rgba`.
+    """
+    rgba = read_rgba(path)
+    if rgba[:, :, 3].min() == 255:
+        return rgba[:, :, :3].copy()
+    share = rgba[:, :, 3:] / 255.0
+    over = np.clip(background, 0, 1) * 255 * (1 - share)
+    return np.rint(rgba[:, :, :3] * share + over).astype(np.uint8)
 
 
 def pictures(path: str | os.PathLike[str]) -> Iterator[tuple[str, np.ndarray]]:

@@ -77,6 +77,10 @@ def resolving(stretched, samples):
     return made("resolve.make_resolve", images, everything(), stretched, samples)
 
 
+LONG = pytest.mark.exhaustive
+"""of blending with every output: 13 s each. Plain runs compile it for rays and boxes, and without either"""
+
+
 @pytest.fixture(autouse=True)
 def started():
     runtime.load()
@@ -99,13 +103,13 @@ def started():
         pytest.param(lambda: projecting(*LENSES[2], "footprint_mixed"), id="project-fisheye-mixed"),
         pytest.param(lambda: projecting(*LENSES[0], "footprint_mixed"), id="project-parallel-mixed"),
         pytest.param(lambda: blending(*RECORD), id="blend-all"),
-        pytest.param(lambda: blending(*RECORD, "arithmetic_fast"), id="blend-fast"),
-        pytest.param(lambda: blending(*MIXED), id="blend-mixed"),
+        pytest.param(lambda: blending(*RECORD, "arithmetic_fast"), id="blend-fast", marks=LONG),
+        pytest.param(lambda: blending(*MIXED), id="blend-mixed", marks=LONG),
         pytest.param(lambda: blending("footprint_box", outputs=()), id="blend-boxes"),
         pytest.param(lambda: blending("rays", "footprint_box", outputs=()), id="blend-rays-boxes"),
         pytest.param(lambda: blending("rays", *MIXED), id="blend-rays-mixed"),
-        pytest.param(lambda: blending("rays", *RECORD, "rays_length"), id="blend-rays"),
-        pytest.param(lambda: blending("camera_orthographic", *RECORD), id="blend-parallel"),
+        pytest.param(lambda: blending("rays", *RECORD, "rays_length"), id="blend-rays", marks=LONG),
+        pytest.param(lambda: blending("camera_orthographic", *RECORD), id="blend-parallel", marks=LONG),
         pytest.param(lambda: blending("lowpass_screen", "stop_exclusive", outputs=()), id="blend-exclusive"),
         pytest.param(lambda: resolving(False, 3), id="resolve"),
         pytest.param(lambda: resolving(True, 1), id="resolve-stretched"),

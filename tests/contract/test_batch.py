@@ -74,7 +74,9 @@ def test_masked_views_are_not_drawn(renderer, cloud):
     mask = np.array([False, True, False])
     batch = renderer.render_batch(cloud, captures, mask=mask)
     assert_same(batch, [None, renderer.render(cloud, captures[1]), None])
-    assert_same(renderer.render_batch(cloud, captures, mask=mask & False), [None] * 3)
+    none = renderer.render_batch(cloud, captures, mask=mask & False)
+    assert_same(none, [None] * 3)
+    assert none.stats == {"splats": 300, "visible": 0, "pairs": 0}
 
 
 def test_a_batch_outlives_the_next(renderer, cloud):
@@ -143,6 +145,20 @@ def test_what_moves_already_may_go_on_beside_poses(renderer, cloud):
     assert_same(batch, [wanted[0], None, wanted[1]])
 
 
+def test_a_batch_of_exposures_counts_all_its_images(renderer, cloud):
+    """Against the memory budget, while each is made of its shots."""
+    if renderer.device.name == "reference":
+        pytest.skip("no memory budget")
+    capture = fs.Capture(
+        CAMERA, ("rgb",), motion=fs.Motion(groups={2: moved(POSES[0])}),
+        shutter=fs.Shutter(exposure_time=0.1, sub_poses=2),
+    )  # fmt: skip
+    poses = np.repeat(POSES, 200, axis=0)
+    own = fs.Renderer(renderer.device.name, memory_budget=600 * 50 * 40 * 12 + 10_000)
+    with pytest.raises(fs.DeviceError, match="memory budget of 14 MiB is too small"):
+        own.render_batch(cloud, capture, poses=poses)
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [
@@ -157,6 +173,7 @@ def test_what_moves_already_may_go_on_beside_poses(renderer, cloud):
         ),
         ({"captures": CAMERAS, "poses": POSES[:2]}, "captures has 3, poses has 2"),
         ({"poses": POSES[:, :6]}, r"poses must have the shape \(views, 7\).* \(3, 6\)"),
+        ({"poses": np.zeros((0, 7))}, "poses is empty"),
         ({"poses": np.zeros((2, 7))}, r"poses\[0\] is no pose: .* not all 0"),
         ({"poses": np.full((2, 7), np.nan)}, r"poses\[0\] is no pose"),
         ({"groups": {9: POSES}}, "unknown label of splats '9'; known: 0, 1, 2"),

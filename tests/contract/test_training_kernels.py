@@ -124,6 +124,22 @@ def test_adam_and_what_is_drawn(renderer, works, strategy):
         agree(device, host)
 
 
+def test_what_is_drawn_is_that_of_a_run_that_goes_on(renderer, works):
+    """In every bit: after a stop it is made anew from the values."""
+    random, rate = np.random.default_rng(4), rates(TrainSettings(), 100, 1.5)
+    device, _ = works(sh_degree=2)
+    names = ("means", "quats", "scales", "opacities", "sh")
+    shapes = {"means": (3,), "quats": (4,), "scales": (2,), "opacities": (), "sh": (9, 3)}
+    for step in range(1, 6):
+        device.resident(2, np.zeros(3))
+        gradients = {name: random.normal(0, 0.1, (COUNT, *shape)) for name, shape in shapes.items()}
+        device.step({name: on_device(renderer, array) for name, array in gradients.items()}, rate, step)
+    went_on = [read(renderer, device.resident(2, np.zeros(3)), name) for name in names]
+    device.load(device.store())
+    for name, array in zip(names, went_on, strict=True):
+        np.testing.assert_array_equal(read(renderer, device.resident(2, np.zeros(3)), name), array, name)
+
+
 def read(renderer, resident, name):
     buffer = resident.part(name, 0, COUNT)
     array = np.empty(buffer.size // 4, np.float32)

@@ -116,6 +116,81 @@ def test_alpha_and_masks(made, tmp_path):
     assert read_rgba(folder / "mask.png").shape == (*mask.shape, 4)
 
 
+def test_points_as_text(made, tmp_path):
+    """As nerfstudio writes them."""
+    folder = transforms(made, tmp_path / "nerf", ply_file_path="points.ply", camera_model="OPENCV")
+    head = "ply\nformat ascii 1.0\nelement vertex 6\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz")
+    head += "".join(f"property uint8 {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
+    lines = [f"{x:8f} {y:8f} {z:8f} 1 2 {255 - i}\n" for i, (x, y, z) in enumerate(made.points)]
+    (folder / "points.ply").write_text(head + "".join(lines))
+    found = load_dataset(folder)
+    np.testing.assert_allclose(found.points, made.points, atol=1e-6)
+    assert found.colors.tolist() == [[1, 2, 255 - i] for i in range(6)]
+    for damaged, words in (
+        (lines[:4], "cut short.* 6 rows of vertex, but the file has 4"),
+        (["1 2\n"], "damaged"),
+    ):
+        (folder / "points.ply").write_text(head + "".join(damaged))
+        with pytest.raises(fs.InputError, match=words):
+            load_dataset(folder)
+
+
+def test_pictures_of_colmap_are_read_as_they_are_stored(made, folder):
+    """Not turned as EXIF says; what is transparent shows the background; 16 bits are cut to 8."""
+    import cv2
+
+    images = folder / "images"
+    picture = made.views[0].picture
+    turned = b"MM\0*\0\0\0\x08\0\1\x01\x12\0\3\0\0\0\1\0\3\0\0\0\0\0\0"  # orientation 3: upside down
+    plain = cv2.imencode(".jpg", picture[:, :, ::-1])[1].tobytes()
+    segment = b"Exif\0\0" + turned
+    exif = plain[:2] + b"\xff\xe1" + (len(segment) + 2).to_bytes(2, "big") + segment + plain[2:]
+    (images / "1.png").write_bytes(exif)
+    clear = np.dstack([made.views[1].picture[:, :, ::-1], np.full(picture.shape[:2], 51, np.uint8)])
+    cv2.imwrite(str(images / "2.png"), clear)
+    cv2.imwrite(str(images / "3.png"), made.views[2].picture[:, :, ::-1].astype(np.uint16) * 257)
+    found = [view.picture.astype(int) for view in load_dataset(folder).views]
+    assert np.abs(found[0] - picture).mean() < 0.6 * np.abs(found[0] - picture[::-1, ::-1]).mean()
+    np.testing.assert_array_equal(
+        found[1], np.rint(made.views[1].picture * 0.2 + 255 * 0.8 * np.array(BACKGROUND))
+    )
+    np.testing.assert_array_equal(found[2], made.views[2].picture)
+
+
+def test_a_model_without_points_may_start_from_random_ones(folder):
+    for file in folder.rglob("points3D.*"):
+        file.unlink()
+    assert len(load_dataset(folder, random_points=5).points) == 5
+    with pytest.raises(fs.InputError, match="has no points to start from; give --random-points"):
+        load_dataset(folder)
+
+
+def test_cameras_of_a_model_that_cannot_be_used_are_named(folder):
+    model = folder / "sparse" / "0"
+    for file in model.glob("*.bin"):
+        file.unlink()
+    cameras, images = model / "cameras.txt", model / "images.txt"
+    texts = cameras.read_text(), images.read_text()
+    line = next(line for line in texts[0].splitlines() if line[:1].isdigit())
+    number = line.split()[0]
+    for other, words in (
+        (f"{number} PINHOLE 24 18 20", "cameras.txt is damaged.*PINHOLE with 1 parameters"),
+        (f"{number} FOV 24 18 20 20 12 9 0.1", r"image 1\.png: .*FOV with distortion"),
+        (f"{number} SIMPLE_RADIAL 24 18 20 12 9 0.1", r"image 1\.png: .*SIMPLE_RADIAL with distortion"),
+        (f"{number} PINHOLE 24 18 0 20 12 9", r"image 1\.png: "),
+    ):
+        cameras.write_text(texts[0].replace(line, other))
+        with pytest.raises(fs.InputError, match=words):
+            load_dataset(folder)
+    cameras.write_text(texts[0])
+    first = next(line for line in texts[1].splitlines() if line[:1].isdigit()).split()
+    words = [first[0], "0", "0", "0", "0", *first[5:]]
+    images.write_text(texts[1].replace(" ".join(first), " ".join(words)))
+    with pytest.raises(fs.InputError, match=f"image {first[9]}: "):
+        load_dataset(folder)
+
+
 def test_views_that_are_held_out(made, folder):
     assert [len(load_dataset(folder, n).views) for n in (0, 2)] == [4, 2]
     assert [view.name for view in load_dataset(folder, 2).held_out] == ["1.png", "3.png", "0.png"]
@@ -156,6 +231,14 @@ def refusals(made):
     )
     names["has 1 view to train on"] = lambda: Dataset("one", (view,), (), made.points, made.colors)
     names["stand at one place"] = lambda: Dataset("still", (view, view), (), made.points, made.colors)
+    turned = []
+    for k in range(5):  # a tripod: the place is what rounding leaves of it
+        other = fs.Camera.look_at(24, 18, 0.9, (-1.7, 0.3, -2.1), (0.1 * k, 0.07 * k, 0))
+        pinhole = (24, 18, other.fx, other.fy, other.cx, other.cy, other.world_to_camera)
+        turned.append(TrainingView(f"{k}.png", fs.Camera.pinhole(*pinhole), view.picture))
+    names["all 5 cameras of tripod stand at one place"] = lambda: Dataset(
+        "tripod", tuple(turned), (), made.points, made.colors
+    )
     behind = 9 * camera.position + made.points
     names["all 6 points of back lie behind the camera"] = lambda: Dataset(
         "back", made.views, (), behind, made.colors
@@ -198,6 +281,8 @@ def test_files_that_are_missing_or_damaged_are_named(made, folder, tmp_path):
         ({"frames": [{"file_path": "a"}]}, "frame 0 needs"),
         ({"k1": 0.1}, "has distortion"),
         ({"fl_x": "far"}, "needs fl_x"),
+        ({"w": float("inf")}, "needs fl_x"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model is 'EQUIRECTANGULAR'"),
     ):
         table = json.loads((nerf / "transforms.json").read_text())
         (tmp_path / "transforms.json").write_text(json.dumps(table | change))
@@ -255,7 +340,7 @@ def test_the_command_trains_resumes_and_reports(folder, tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("name", "line", "words"),
-    [("cameras", "1 PINHOLE 64 48 50", "camera 1 has 1 parameters"), ("points3D", "1 0 0 0 9", "not enough")],
+    [("cameras", "1 PINHOLE 64 48 50", "with 1 parameters"), ("points3D", "1 0 0 0 9", "not enough")],
 )
 def test_lines_of_a_colmap_model_that_end_early(folder, name, line, words):
     model = folder / "sparse/0"

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.train import TrainSettings, densify, mcmc
+from fidsplat.train import TrainSettings, densify, mcmc, neighbours
 from fidsplat.train.losses import C1, C2, blurred, picture_loss, window
 from fidsplat.train.neighbours import mean_square_distances
 from fidsplat.train.optimiser import adam_step, inner_gradients
@@ -178,7 +178,11 @@ def test_random_numbers_are_of_their_splat_iteration_and_purpose_alone():
     assert sorted(permutation(0, Purpose.VIEWS, 3, 50)) == list(range(50))
 
 
-def test_neighbours_are_those_of_all_pairs():
+@pytest.mark.parametrize("pairs", [None, 1000])
+def test_neighbours_are_those_of_all_pairs(pairs, monkeypatch):
+    """All of a box at once, and few of them: strays may have to be compared with all points."""
+    if pairs is not None:
+        monkeypatch.setattr(neighbours, "_PAIRS", pairs)
     random = np.random.default_rng(0)
     points = np.concatenate([random.normal(size=(900, 3)), random.normal(5, 0.01, (300, 3))])
     squares = ((points[:, None] - points) ** 2).sum(2)
@@ -282,6 +286,11 @@ def test_settings_say_what_they_take():
     assert TrainSettings().position_rate_at(7000) == pytest.approx(5.46e-5, rel=1e-3)
     assert [TrainSettings().degree_at(i) for i in (999, 1000, 9000)] == [0, 1, 3]
     wrong = {
+        "beta1": 1,
+        "beta2": 1.0,
+        "initial_opacity": 0,
+        "reset_opacity": 0.0,
+        "mcmc_opacity": 1,
         "iterations": 0,
         "seed": -1,
         "strategy": "best",
@@ -291,6 +300,8 @@ def test_settings_say_what_they_take():
         "max_splats": True,
         "quality": "fine",
     }
+    with pytest.raises(fs.InputError, match="as text"):  # which a checkpoint could not hold
+        TrainSettings(quality=fs.Quality())  # type: ignore[arg-type]
     for name, value in wrong.items():
         with pytest.raises(fs.InputError):
             TrainSettings(**{name: value})

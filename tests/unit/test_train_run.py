@@ -80,6 +80,34 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(whole, dataset, tmp_pa
     assert sha(tmp_path / "scene.ply") == sha(whole[3])
 
 
+def test_a_run_that_ends_where_opacities_fall_keeps_its_own(whole, dataset, tmp_path):
+    """Splats are made and opacities fall at iteration 16, where a run that goes on then has them fall."""
+    checkpoint = tmp_path / "scene.training.npz"
+    renderer = whole[0].renderer
+    ended = Trainer(dataset, renderer, iterations=16, checkpoint=checkpoint, **QUICK)
+    assert ended.run().opacities.max() > QUICK["reset_opacity"] + 0.1
+    with pytest.raises(fs.InputError, match="all 16 iterations are done"):
+        ended.step()
+    again = Trainer(dataset, renderer, iterations=ITERATIONS, checkpoint=checkpoint, **QUICK)
+    again.run()
+    again.save(tmp_path / "scene.ply")
+    assert sha(tmp_path / "scene.ply") == sha(whole[3])
+
+
+def test_a_run_that_begins_again_keeps_the_old_checkpoint_until_it_has_its_own(dataset, tmp_path):
+    file, renderer = tmp_path / "scene.training.npz", fs.Renderer("reference")
+    Trainer(dataset, renderer, iterations=2, checkpoint=file, **QUICK).run()
+    kept = sha(file)
+    again = Trainer(dataset, renderer, iterations=2, checkpoint=file, restart=True, seed=1, **QUICK)
+    assert again.iteration == 0
+    again.step()
+    assert sha(file) == kept
+    again.run()
+    assert sha(file) != kept
+    with pytest.raises(fs.InputError, match="not an ordinary file"):  # before any work
+        Trainer(dataset, renderer, checkpoint=tmp_path, **QUICK)
+
+
 KILLED = """
 import fidsplat as fs
 from fidsplat.train import Trainer, trainer
@@ -128,9 +156,17 @@ def test_a_checkpoint_of_another_run_is_refused(dataset, tmp_path):
             Trainer(dataset, renderer, checkpoint=file, **{"iterations": 3, **QUICK, **change})
     with pytest.raises(fs.InputError, match="another data set"):
         Trainer(scene(views=3), renderer, checkpoint=file, iterations=3, **QUICK)
-    file.write_bytes(file.read_bytes()[:200])
-    with pytest.raises(fs.InputError, match="no checkpoint that can be read"):
-        Trainer(dataset, renderer, checkpoint=file, iterations=3, **QUICK)
+    whole = file.read_bytes()
+    flag = whole.index(b"PK\1\2") + 8
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    for damaged in (
+        whole[:200],
+        whole[:flag] + b"\1" + whole[flag + 1 :],  # says that it is encrypted
+        (tmp_path / "array.npy").read_bytes(),
+    ):
+        file.write_bytes(damaged)
+        with pytest.raises(fs.InputError, match="no checkpoint that can be read"):
+            Trainer(dataset, renderer, checkpoint=file, iterations=3, **QUICK)
 
 
 def test_what_is_not_finite_ends_the_run_and_leaves_the_checkpoint(dataset, tmp_path):

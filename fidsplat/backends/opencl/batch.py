@@ -30,13 +30,19 @@ class OutputBuffers:
     def __init__(self, workspace: Workspace, outputs: tuple[Output, ...], batch: ViewBatch) -> None:
         """
         Raises:
-            DeviceError: they take more than the memory budget.
+            DeviceError: they take more than the memory budget, or one more than the device gives at once.
         """
         self.outputs = {output.name: output for output in outputs}
         views, size = batch.total, batch.size
         self.views, self.size = views, size
         bytes_of = {one.name: 4 * views * size[0] * size[1] * one.channels for one in outputs}
         self.nbytes = sum(bytes_of.values())
+        largest, most = max(bytes_of, key=bytes_of.__getitem__), workspace.device.max_mem_alloc_size
+        if bytes_of[largest] > most:
+            raise DeviceError(
+                f"{largest} of {views} views takes {bytes_of[largest] / 2**20:.1f} MiB in one piece, and the "
+                f"device gives at most {most / 2**20:.1f} MiB; draw fewer views at once"
+            )
         if self.nbytes > workspace.memory_budget:
             raise DeviceError(
                 f"the images of {views} views take {self.nbytes / 2**20:.0f} MiB, more than the memory "
@@ -95,11 +101,9 @@ class OpenCLBatch:
         return self._read(name, image, number * image.nbytes)
 
     def _read(self, name: str, image: np.ndarray, offset: int) -> np.ndarray:
-        try:
+        with self._workspace.failing(f"drawing {name}"):
             buffer = self._buffers.held()[f"{name}_out"]
             cl.enqueue_copy(self._workspace.queue, image, buffer, src_offset=offset)
-        except cl.Error as error:
-            raise DeviceError(f"{self._workspace.info.title} failed while drawing {name}: {error}") from error
         return image
 
     def device_array(self, name: str) -> Any:
@@ -108,14 +112,15 @@ class OpenCLBatch:
 
         buffers = self._buffers
         shape, dtype = (self.views, *buffers.shape(name)), np.dtype(buffers.outputs[name].dtype)
-        array = Array(self._workspace.queue, shape, dtype, data=buffers.held()[f"{name}_out"])
-        # the buffer is not given to another batch while the array lives
-        array.batch = self  # pyright: ignore[reportAttributeAccessIssue]
-        return array
+        buffer: Any = cl.MemoryObject.from_int_ptr(buffers.held()[f"{name}_out"].int_ptr)
+        # not given to another batch while this array lives, or a part of it: all of them hold this object
+        buffer.batch = self
+        return Array(self._workspace.queue, shape, dtype, data=buffer)
 
     def wait(self) -> None:
         """Until the device has drawn all views."""
-        self._workspace.queue.finish()
+        with self._workspace.failing("drawing"):
+            self._workspace.queue.finish()
 
     @property
     def timings(self) -> Mapping[str, float]:

@@ -17,7 +17,6 @@ from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View
 from fidsplat.effects.catalogue import Output
-from fidsplat.errors import DeviceError
 
 
 @dataclass
@@ -99,6 +98,7 @@ class OpenCLImages:
         """size: rows and columns of pixels."""
         self._workspace, self._size, self._drawn, self._repeat = workspace, size, drawn, repeat
         self._outputs = {output.name: output for output in outputs}
+        self._timings: dict[str, float] = {}
         self._leased = drawn.leased
         weakref.finalize(self, workspace.pool.give_back, self._leased)
 
@@ -111,30 +111,36 @@ class OpenCLImages:
         output = self._outputs[name]
         shape = self._size if output.channels == 1 else (*self._size, output.channels)
         image = np.empty(shape, output.dtype)
-        try:
+        with self._workspace.failing(f"drawing {name}"):
             drawn = self.settle()
             cl.enqueue_copy(drawn.queue, image, drawn.buffer(f"{name}_out"))
-        except cl.Error as error:
-            raise DeviceError(f"{self._workspace.info.title} failed while drawing {name}: {error}") from error
         return image
 
     def wait(self) -> None:
-        """Until the device has drawn it."""
-        self.settle().queue.finish()
+        """Until the device has drawn it.
+
+        Raises:
+            DeviceError: as `read`.
+        """
+        with self._workspace.failing("drawing"):
+            self.settle().queue.finish()
 
     @property
     def timings(self) -> dict[str, float]:
         """Milliseconds by stage. A picture that was launched again, by which nobody has taken the time, is
-        drawn once more for that."""
-        drawn = self.settle()
-        if drawn.events is None and self._repeat is not None:
+        drawn once more for that; the first time that they are asked for."""
+        with self._workspace.failing("drawing"):
+            drawn = self.settle()
+            if drawn.events is not None or self._repeat is None:
+                return drawn.timings()
             with self._workspace.lock:
-                return self._repeat.timings()
-        return drawn.timings()
+                self._timings = self._timings or self._repeat.timings()
+            return self._timings
 
     @property
     def stats(self) -> Mapping[str, int]:
-        return self.settle().stats()
+        with self._workspace.failing("drawing"):
+            return self.settle().stats()
 
     def settle(self) -> Drawn:
         """What is drawn, for certain with room for all of it."""

@@ -33,6 +33,7 @@ from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.backends.opencl.workspace import RayBuffers, Workspace
 from fidsplat.backends.stack import ViewBatch, ViewStack
 from fidsplat.backends.view import View
+from fidsplat.cameras.raster import RayRaster
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError
 
@@ -40,6 +41,8 @@ _OF_CAMERAS = ("ray", "vignette_center")
 """groups of uniforms that differ where cameras do"""
 _KINDS = 32
 """of pictures of one cloud that are kept"""
+_RASTERS = 4
+"""of lenses among them: as many as `raster_of` keeps"""
 
 
 @dataclass
@@ -49,6 +52,8 @@ class Kept:
     plan: MemoryPlan
     kind: tuple[Any, ...]
     """for `BufferPool.make_way`"""
+    raster: RayRaster | None
+    """whose rays stay on the device as long as it is kept"""
     recording: Recording | None = None
 
 
@@ -154,7 +159,8 @@ class OpenCLPipeline:
             yield from ((k, k + 1, self._plan(resident, batch.one(k), beside)) for k in range(count))
             return
         each, samples = self._bytes_of_view(resident, views.view)
-        free = budget - plan.held + each
+        # no buffer may be larger than the device gives in one piece
+        free = min(budget - plan.held + each, self.workspace.device.max_mem_alloc_size)
         for first, end in parts(count, each, samples, self.workspace.info.kind, free):
             yield first, end, MemoryPlan(0, resident.count, plan.held + (end - first - 1) * each)
 
@@ -192,9 +198,9 @@ class OpenCLPipeline:
         except BaseException as error:
             workspace = self.workspace
             workspace.pool.forget_zeros()
-            with suppress(cl.Error):
-                workspace.queue.finish()  # a CPU may be reading the arrays of a cloud that nobody keeps
-                workspace.repeat_queue.finish()
+            for queue in (workspace.queue, workspace.repeat_queue):
+                with suppress(cl.Error):
+                    queue.finish()  # a CPU may be reading the arrays of a cloud that nobody keeps
             if isinstance(error, cl.Error):
                 raise DeviceError(f"{workspace.info.title} failed while drawing: {error}") from error
             raise
@@ -214,9 +220,10 @@ class OpenCLPipeline:
         picture = self._draw(resident, view, plan)
         whole = not (plan.chunk or resident.streamed or view.shots or picture.in_bands)
         if key is not None and whole and self.shape.lists == "tiled" and resident.count:
-            if len(resident.kept) >= _KINDS:
+            rasters = {each.raster for each in resident.kept.values()} - {None, view.raster}
+            if len(resident.kept) >= _KINDS or (view.raster is not None and len(rasters) >= _RASTERS):
                 resident.kept.clear()
-            resident.kept[key] = Kept(plan, kind)
+            resident.kept[key] = Kept(plan, kind, view.raster)
         return picture
 
     def _repeat(self, resident: Resident, view: View, kept: Kept) -> OpenCLImages | None:
@@ -247,6 +254,9 @@ class OpenCLPipeline:
 
     def _timed(self, resident: Resident, view: View, recording: Recording) -> dict[str, float]:
         """Milliseconds of the stages, of the picture drawn once more."""
+        return self._tried(self._drawn_for_time, resident, view, recording).timings()
+
+    def _drawn_for_time(self, resident: Resident, view: View, recording: Recording) -> Drawn:
         workspace = self.workspace
         queue = workspace.turn_to(workspace.queue)
         workspace.pictures += 1
@@ -261,7 +271,7 @@ class OpenCLPipeline:
             drawn = self._redrawn(resident, view)
         workspace.finish()
         workspace.pool.give_back(drawn.leased)
-        return drawn.timings()
+        return drawn
 
     def _redrawn(self, resident: Resident, view: View) -> Drawn:
         """The picture drawn anew, whatever it takes, and its time."""

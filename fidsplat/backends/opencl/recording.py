@@ -23,6 +23,8 @@ from fidsplat.backends.view import View
 Launched: TypeAlias = tuple[list[tuple[str, cl.Buffer]], list[tuple[str, cl.Event]]]
 _VIEWS = 256
 """that are kept ready"""
+_VIEWS_BYTES = 1 << 26
+"""that their arrays may take together: layers, say"""
 _UPLOADS = 64
 """copies to the device that may be under way before the host waits for the first"""
 
@@ -37,6 +39,8 @@ class Recording:
         self._view, self._arrays = picture.view, picture.arrays
         self._ready: dict[int, tuple[View, dict[str, np.ndarray], list[Any]]] = {}
         """of views that were drawn: arrays, and values of the numbers"""
+        self._bytes = 0
+        """of those arrays"""
         self._tallies = picture.pool.size("tallies")
         self._uploads: deque[cl.Event] = deque(picture.uploads, maxlen=_UPLOADS)
         self._leases = [(name, buffer.size) for name, buffer in picture.leased]
@@ -93,8 +97,12 @@ class Recording:
         picture.put_view(0, picture.rows)
         picture.put_arrays()
         self._uploads.extend(picture.uploads)
-        if len(self._ready) >= _VIEWS:
+        # what views have in common, a panorama say, counts once
+        own = sum(a.nbytes for name, a in picture.arrays.items() if a is not self._arrays.get(name))
+        if len(self._ready) >= _VIEWS or self._bytes + own > _VIEWS_BYTES:
             self._ready.clear()
+            self._bytes = 0
+        self._bytes += own
         values = [picture.value(argument) for _, _, argument, _ in self._numbers]
         # the view is held, so that no other is found by its number
         self._ready[id(picture.view)] = picture.view, self._arrays | picture.arrays, values

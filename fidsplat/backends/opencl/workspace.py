@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import threading
 import weakref
-from collections.abc import Collection, Hashable
+from collections.abc import Collection, Hashable, Iterator
+from contextlib import contextmanager
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -73,7 +74,8 @@ class BufferPool:
     @property
     def memory_bytes(self) -> int:
         """What the scratch buffers hold, and leased ones that were given back."""
-        spare = (buffer for buffers in self._spare.values() for buffer in buffers)
+        # copied first: images that die meanwhile give back theirs
+        spare = [buffer for buffers in list(self._spare.values()) for buffer in list(buffers)]
         return sum(buffer.size for buffer in (*self._buffers.values(), *spare))
 
     def make_way(self, kind: Hashable, size: int) -> None:
@@ -180,6 +182,14 @@ class Workspace:
         """Waits for all that was put on queues (with `lock` held)."""
         self._last.finish()
         self._idle = True
+
+    @contextmanager
+    def failing(self, what: str) -> Iterator[None]:
+        """The device's failures as DeviceError. what: it was doing, as `drawing rgb`."""
+        try:
+            yield
+        except cl.Error as error:
+            raise DeviceError(f"{self.info.title} failed while {what}: {error}") from error
 
     def limit_memory(self, budget: int) -> None:
         """Lets a picture and the cloud take at most `budget` bytes of the device.

@@ -19,12 +19,14 @@ from fidsplat.errors import DeviceError
 class WarpBatch:
     """The output images of many views, on the device until asked for."""
 
-    def __init__(self, workspace: Workspace, outputs: tuple[Output, ...], batch: ViewBatch) -> None:
+    def __init__(
+        self, workspace: Workspace, outputs: tuple[Output, ...], batch: ViewBatch, splats: int
+    ) -> None:
         """
         Raises:
             DeviceError: they take more than the memory budget, or than the device has.
         """
-        self._workspace, self._size, self.views = workspace, batch.size, batch.total
+        self._workspace, self._size, self.views, self._splats = workspace, batch.size, batch.total, splats
         height, width = batch.size
         self.nbytes = 4 * batch.total * height * width * sum(output.channels for output in outputs)
         if self.nbytes > workspace.memory_budget:
@@ -81,9 +83,8 @@ class WarpBatch:
     @property
     def stats(self) -> Mapping[str, int]:
         """Of all views together, but for the splats of the cloud."""
-        counts = [images.stats for images in self._pictures]
-        splats = {"splats": counts[0]["splats"]} if counts else {"splats": 0, "visible": 0, "pairs": 0}
-        return _added(counts) | splats
+        none = {"splats": 0, "visible": 0, "pairs": 0}
+        return _added([none, *(images.stats for images in self._pictures)]) | {"splats": self._splats}
 
 
 def _added(counts: Any) -> dict[str, Any]:

@@ -107,7 +107,7 @@ class Picture:
     def _exposed(self) -> Any:
         """All stages but the last of each shot, and what their samples are together."""
         whole = self._samples("exposed")
-        beside = self._image_bytes()
+        beside = self.beside + self._image_bytes()
         for shot in self.view.shots:
             part = Picture(self.program, self.workspace, self.resident, shot.view, self.launcher, beside)
             samples = part._drawn()

@@ -40,7 +40,7 @@ class WarpPipeline:
             DeviceError: the device runs out of memory or fails.
         """
         with self._drawing():
-            images = WarpBatch(self.workspace, self.program.images, batch)
+            images = WarpBatch(self.workspace, self.program.images, batch, resident.count)
             for number, slot in enumerate(batch.slots.tolist()):
                 launcher, into = Launcher(self._commands), images.part(slot)
                 view, beside = batch.one(number), images.nbytes
