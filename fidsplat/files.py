@@ -50,14 +50,26 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
     Raises InputError when the folder is missing or cannot be written.
     """
+    with atomic_path(path) as part, part.open("wb") as stream:
+        yield stream
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike[str], suffix: str = "") -> Iterator[Path]:
+    """As `atomic_write`, for libraries that open files themselves: an empty file of a temporary name.
+
+    suffix: what that name ends with, for those that go by it.
+    """
     target = ordinary_file(path)
     try:
-        descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
+        descriptor, name = tempfile.mkstemp(
+            prefix=f".{target.name}.", suffix=f".part{suffix}", dir=target.parent
+        )
     except OSError as error:
         raise InputError(f"cannot write {target}: {error.strerror or error}") from error
     try:
-        with os.fdopen(descriptor, "wb") as stream:
-            yield stream
+        os.close(descriptor)
+        yield Path(name)
         os.chmod(name, 0o666 & ~_umask())
         os.replace(name, target)
     except BaseException as error:

@@ -19,6 +19,7 @@ from fidsplat.commands.output import (
     print_json,
     say,
     switch,
+    writable_file,
 )
 from fidsplat.commands.render import load_source
 from fidsplat.commands.sweeps import Overwrite
@@ -98,6 +99,7 @@ class Fly:
 
     def run(self) -> int:
         import fidsplat as fs
+        from fidsplat.cameras.trajectory import check_rate
         from fidsplat.commands.flight_records import write_log, write_truth
         from fidsplat.effects import select
         from fidsplat.flights import Flight, FlightFolder
@@ -109,8 +111,15 @@ class Fly:
         budget = bytes_of("--memory-budget", self.memory_budget)
         if self.out.endswith(".mcap"):
             self.log, self.out = self.log or self.out, self.out.removesuffix(".mcap")
+        check_rate(self.rate)
         if self.video is not None:
             check_video(self.video)
+        if self.log is not None:
+            from fidsplat.logs import check_log
+
+            check_log(self.log, self.overwrite)
+        if self.coco is not None:
+            writable_file(self.coco)
         given = self.trajectory
         path = None if given is None else fs.load_trajectory(given, self.file_rate, self.smooth)
         where = console(self.json)

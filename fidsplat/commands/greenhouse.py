@@ -41,9 +41,9 @@ class Greenhouse:
         if scene_file.exists() and not self.overwrite:
             raise InputError(f"{scene_file} is there already; give another folder, or --overwrite")
         writable_folder(folder)
-        made.scene.save(scene_file)
         with atomic_write(model) as stream:
             stream.write(made.mjcf().encode())
+        made.scene.save(scene_file)  # last: by it the next run knows that all is there
         splats, markers = len(made.scene.cloud()), len(made.markers)
         facts = {"scene": str(scene_file), "model": str(model), "splats": splats, "markers": markers}
         facts |= {"rows": self.rows, "plants": self.rows * self.plants, "length_m": made.length}

@@ -62,6 +62,10 @@ class Localise:
         need_reports()
         if self.video is not None:
             check_video(self.video)
+        if self.log is not None:
+            from fidsplat.logs import check_log
+
+            check_log(self.log, self.overwrite)
         _ = asked.house  # what is wrong with it is said before a device is opened
         renderer = fs.Renderer(self.device)
         folder = LocaliseFolder(Path(self.out), asked, renderer.device.title, self.overwrite)

@@ -188,7 +188,8 @@ def _binary_points(data: _Bytes) -> Iterator[tuple]:
 
 def _text_points(lines: list[str]) -> Iterator[tuple]:
     for line in filter(None, lines):
-        yield tuple(map(float, line.split()[1:7]))
+        _, x, y, z, r, g, b, *_ = line.split()
+        yield tuple(map(float, (x, y, z, r, g, b)))
 
 
 def _camera(lens: _Lens, pose: np.ndarray) -> Camera:

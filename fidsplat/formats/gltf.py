@@ -51,7 +51,7 @@ def load_gltf(path: Path) -> SplatCloud:
         clouds = reader.clouds()
     except InputError:
         raise
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RuntimeError) as error:
         raise InputError(f"{path}: the glTF file is damaged ({type(error).__name__}: {error})") from None
     if not clouds:
         raise InputError(f"{path} holds no splats: no primitive of its nodes has {EXTENSION}")
@@ -128,8 +128,8 @@ def _glb(document: dict[str, Any], binary: bytes) -> bytes:
     return head + text + struct.pack("<II", len(binary), _BIN) + binary
 
 
-def _parts(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | None]:
-    """The document, and the binary part that a .glb file has."""
+def _parts(path: Path, data: bytes) -> tuple[dict[str, Any], memoryview | None]:
+    """The document, and the binary part that a .glb file has, where it lies."""
     text, binary = data, None
     if data[:4] == b"glTF":
         try:
@@ -137,13 +137,13 @@ def _parts(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | None]:
             chunks, place = {}, 12
             while place + 8 <= min(size, len(data)):
                 length, kind = struct.unpack_from("<II", data, place)
-                chunks.setdefault(kind, data[place + 8 : place + 8 + length])
+                chunks.setdefault(kind, memoryview(data)[place + 8 : place + 8 + length])
                 place += 8 + length
         except struct.error:
             version, size, chunks = 0, 0, {}
         if version != 2 or size > len(data) or _JSON not in chunks:
             raise InputError(f"{path}: cut short, or not binary glTF of version 2")
-        text, binary = chunks[_JSON], chunks.get(_BIN)
+        text, binary = bytes(chunks[_JSON]), chunks.get(_BIN)
     try:
         document = json.loads(text)
     except (ValueError, RecursionError):
@@ -156,9 +156,9 @@ def _parts(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | None]:
 class _Reader:
     """The splats of a document."""
 
-    def __init__(self, path: Path, document: dict[str, Any], binary: bytes | None) -> None:
+    def __init__(self, path: Path, document: dict[str, Any], binary: memoryview | None) -> None:
         self._path, self._document, self._binary = path, document, binary
-        self._buffers: dict[int, bytes] = {}
+        self._buffers: dict[int, bytes | memoryview] = {}
         self._seen: set[int] = set()
 
     def clouds(self) -> list[SplatCloud]:
@@ -222,13 +222,13 @@ class _Reader:
             raise InputError(f"{self._path}: accessor {number} holds whole numbers that are not normalized")
         return np.maximum(values.astype(np.float32) / np.iinfo(kind).max, -1)
 
-    def _buffer(self, number: int) -> bytes:
+    def _buffer(self, number: int) -> bytes | memoryview:
         if number not in self._buffers:
             buffer = self._document["buffers"][number]
             self._buffers[number] = self._read(buffer.get("uri"), number)
         return self._buffers[number]
 
-    def _read(self, uri: str | None, number: int) -> bytes:
+    def _read(self, uri: str | None, number: int) -> bytes | memoryview:
         if uri is None:
             if self._binary is None or number:
                 raise InputError(f"{self._path}: buffer {number} has no data")

@@ -66,10 +66,19 @@ def cloud_of(
 
 def content(path: Path, what: str) -> bytes:
     """A file's bytes. Raises InputError where it cannot be read."""
+    check_file(path, what)
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):  # to open a pipe would wait for its writer
-            raise InputError(f"{path} is not an ordinary file, so not {what}")
         return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+
+
+def check_file(path: Path, what: str) -> None:
+    """Raises InputError where there is no file that can be opened."""
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):  # to open a pipe would wait for its writer
+            raise InputError(f"{path} is not an ordinary file, so not {what}")
+        with path.open("rb"):
+            pass
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error

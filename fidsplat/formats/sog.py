@@ -8,6 +8,7 @@ scales, colours and SH are places in code books of 256. Axes are those of the fi
 from __future__ import annotations
 
 import json
+import lzma
 import zipfile
 import zlib
 from pathlib import Path
@@ -16,31 +17,35 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.formats.plain import cloud_of, content
+from fidsplat.formats.plain import check_file, cloud_of
 from fidsplat.splats import SplatCloud
 
-MAX_PART = 2**30
-"""bytes of a file within the zip: no picture of so many splats as fit a machine is larger"""
+MAX_PART, MAX_META = 2**30, 2**24
+"""bytes of a picture within the zip and of meta.json: none of so many splats as fit a machine is larger"""
+SPARE = 2**16
+"""pixels that a picture may have beyond those it is for: writers fill up its last rows"""
 _ROW = 64  # palette entries in a row of the picture of centroids
+MOST_ENTRIES = 2**16
+"""of the palette: labels have 16 bits"""
 _COEFFICIENTS = {1: 3, 2: 8, 3: 15}
 
 
 def load_sog(path: Path) -> SplatCloud:
     """Read a .sog file. Raises InputError where it is damaged, lacks a part, or has another version."""
-    content(path, "a SOG file")
+    check_file(path, "a SOG file")
     try:
         with zipfile.ZipFile(path) as archive:
             return _cloud(path, archive)
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+    except (zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError, RuntimeError) as error:
         raise InputError(f"{path} is not a SOG file: its zip is damaged ({error})") from None
-    except (KeyError, IndexError, TypeError, ValueError) as error:
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: the SOG file is damaged ({type(error).__name__}: {error})") from None
 
 
 def _cloud(path: Path, archive: zipfile.ZipFile) -> SplatCloud:
-    meta = json.loads(_part(path, archive, "meta.json"))
+    meta = json.loads(_part(path, archive, "meta.json", MAX_META))
     if meta.get("version") != 2:
         raise InputError(f"{path}: SOG of version {meta.get('version')!r}; version 2 is read")
     count = int(meta["count"])
@@ -48,7 +53,7 @@ def _cloud(path: Path, archive: zipfile.ZipFile) -> SplatCloud:
     def pixels(part: str, number: int = 0) -> np.ndarray:
         """(count, 4) uint8 of a picture with a pixel for each splat."""
         name = meta[part]["files"][number]
-        found = _picture(path, archive, name).reshape(-1, 4)
+        found = _picture(path, archive, name, count).reshape(-1, 4)
         if not 0 <= count <= len(found):
             raise InputError(f"{path}: {name} has {len(found)} pixels for {count} splats")
         return found[:count]
@@ -69,21 +74,41 @@ def _cloud(path: Path, archive: zipfile.ZipFile) -> SplatCloud:
     return cloud_of(path, means.astype(np.float32), quats, scales, base[:, 3] / np.float32(255), sh)
 
 
-def _part(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
+def _part(path: Path, archive: zipfile.ZipFile, name: str, most: int = MAX_PART) -> bytes:
     try:
         info = archive.getinfo(name)
     except KeyError:
         raise InputError(f"{path}: the SOG file lacks {name}") from None
-    if info.file_size > MAX_PART:
+    if info.file_size > most:
         raise InputError(f"{path}: {name} has {info.file_size} bytes, which no part of a SOG file has")
     return archive.read(info)
 
 
-def _picture(path: Path, archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    """(h, w, 4) uint8 RGBA."""
+def _picture(path: Path, archive: zipfile.ZipFile, name: str, count: int) -> np.ndarray:
+    """(h, w, 4) uint8 RGBA of so many pixels that are meant: a small file can hold a huge picture."""
     from fidsplat.vision.images import rgba_pixels  # late: it brings OpenCV
 
-    return rgba_pixels(_part(path, archive, name), f"{path}: {name}")
+    data = _part(path, archive, name)
+    pixels = _pixels(data)
+    if pixels > 2 * max(count, 0) + SPARE:
+        raise InputError(f"{path}: {name} has {pixels} pixels for {count}; it is not read")
+    return rgba_pixels(data if pixels else b"", f"{path}: {name}")
+
+
+def _pixels(data: bytes) -> int:
+    """The pixels of a WebP (RFC 9649) or PNG picture, by its header; 0 for another file."""
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        return int.from_bytes(data[16:20], "big") * int.from_bytes(data[20:24], "big")
+    kind, body = data[12:16], data[20:30]
+    if data[:4] != b"RIFF" or data[8:12] != b"WEBP":
+        return 0
+    if kind == b"VP8L":  # 14 bits each, less 1, after a byte
+        bits = int.from_bytes(body[1:5], "little")
+        return ((bits & 0x3FFF) + 1) * ((bits >> 14 & 0x3FFF) + 1)
+    if kind == b"VP8X":  # 24 bits each, less 1, after 4 bytes
+        return (int.from_bytes(body[4:7], "little") + 1) * (int.from_bytes(body[7:10], "little") + 1)
+    width, height = (int.from_bytes(body[k : k + 2], "little") & 0x3FFF for k in (6, 8))
+    return width * height
 
 
 def _book(part: dict[str, Any]) -> np.ndarray:
@@ -93,7 +118,7 @@ def _book(part: dict[str, Any]) -> np.ndarray:
 def _higher(path: Path, archive: zipfile.ZipFile, part: dict[str, Any], labels: np.ndarray) -> np.ndarray:
     """(n, k, 3) SH above degree 0 of the palette's entries."""
     name, k = part["files"][0], _COEFFICIENTS[part["bands"]]
-    palette = _picture(path, archive, name)
+    palette = _picture(path, archive, name, MOST_ENTRIES * k)
     if palette.shape[1] != _ROW * k:
         raise InputError(
             f"{path}: {name} is {palette.shape[1]} pixels wide; {part['bands']} bands have {_ROW * k}"

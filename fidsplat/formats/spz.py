@@ -28,6 +28,8 @@ _LEAST = float(np.exp(-10.0))
 _REST = {0: 0, 1: 3, 2: 8, 3: 15}
 _FINEST, _BITS = 20, 23
 """bits behind the point at most, and of a coordinate without its sign"""
+_FEW = 2**20
+"""splats that a file may hold however small it is; of more, each takes a byte of it at least"""
 
 
 def load_spz(path: Path) -> SplatCloud:
@@ -48,6 +50,8 @@ def load_spz(path: Path) -> SplatCloud:
     widths = {"means": 9, "opacities": 1, "colors": 3, "scales": 3, "quats": 4 if version == 3 else 3}
     widths["rest"] = 3 * _REST[degree]
     size = _HEAD.size + n * sum(widths.values())
+    if max(_FEW, len(data)) < n and size <= 1040 * len(data):
+        raise InputError(f"{path}: {n} splats in {len(data)} bytes; no scene is so small, and it is not read")
     try:
         # nothing is made larger than the header says, and no file grows by more than gzip can
         stream = zlib.decompressobj(31)
@@ -63,9 +67,9 @@ def load_spz(path: Path) -> SplatCloud:
     means = _fixed(parts["means"]) / 2.0**point
     quats = _smallest_three(parts["quats"]) if version == 3 else _first_three(parts["quats"])
     scales = np.exp(parts["scales"] / 16.0 - 10.0)
-    dc = (parts["colors"] / 255.0 - 0.5) / _COLOR
-    rest = (parts["rest"].reshape(n, -1, 3) - 128.0) / 128.0
-    sh = np.concatenate([dc[:, None], rest], axis=1).astype(np.float32)
+    dc = ((parts["colors"] / 255.0 - 0.5) / _COLOR).astype(np.float32)
+    rest = (parts["rest"].reshape(n, -1, 3).astype(np.float32) - 128) / 128
+    sh = np.concatenate([dc[:, None], rest], axis=1)
     opacities = (parts["opacities"][:, 0] / 255.0).astype(np.float32)
     return cloud_of(path, means, quats, scales, opacities, sh, _LEAST).transformed(HALF_TURN)
 

@@ -198,7 +198,7 @@ def _lines(file: Path, text: str) -> tuple[list[float] | None, list[np.ndarray]]
 def _numbers(where: str, words: Sequence[Any]) -> list[float]:
     try:
         values = [float(word) for word in words]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"{where}: {' '.join(map(str, words))[:80]!r} are not numbers") from None
     if not all(map(math.isfinite, values)):
         raise InputError(f"{where}: a number is not finite")
@@ -226,7 +226,7 @@ def _transforms(file: Path, text: str) -> tuple[list[float] | None, list[np.ndar
     try:
         frames = json.loads(text)["frames"]
         pairs = [(frame.get("time"), np.array(frame["transform_matrix"], np.float64)) for frame in frames]
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
         raise InputError(
             f'{file} is not a transforms.json: it needs "frames", a list of objects with a '
             f'"transform_matrix" of 4 x 4 numbers ({type(error).__name__}: {error})'

@@ -7,20 +7,18 @@ stand in attributes of our own, fidsplat:labels and fidsplat:planes.
 
 from __future__ import annotations
 
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import ordinary_file
+from fidsplat.files import atomic_path
 from fidsplat.formats.plain import (
     HALF_TURN,
+    check_file,
     cloud_of,
     coefficients,
-    content,
     refuse_boxes,
     three_scales,
     world_means,
@@ -32,14 +30,14 @@ _KINDS = ("ParticleField", "ParticleField3DGaussianSplat")
 
 
 def load_usd(path: Path) -> SplatCloud:
-    """Read the splats of a .usda, .usdc, .usd or .usdz file, all its fields of Gaussians, as one cloud.
+    """Read the splats of a .usda, .usdc or .usd file, all its fields of Gaussians, as one cloud.
 
     Raises:
         InputError: it is damaged, holds no such field, or one whose kernel is not known; the extra is
             missing.
     """
     pxr = _pxr()
-    content(path, "a USD file")
+    check_file(path, "a USD file")
     try:
         stage = pxr.Usd.Stage.Open(str(path), pxr.Usd.Stage.LoadAll)
     except pxr.Tf.ErrorException:
@@ -63,8 +61,7 @@ def save_usd(cloud: SplatCloud, path: Path) -> None:
     """Write a .usda, .usdc or .usd file. Raises InputError for boxes, or where it cannot be written."""
     refuse_boxes(cloud, "USD")
     pxr = _pxr()
-    target, flat = ordinary_file(path), cloud.thickness is None
-    suffix = path.suffix.lower()
+    flat, suffix = cloud.thickness is None, path.suffix.lower()
     stage = pxr.Usd.Stage.CreateInMemory(f"splats{suffix}")
     pxr.UsdGeom.SetStageUpAxis(stage, "Y")
     pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -101,14 +98,13 @@ def save_usd(cloud: SplatCloud, path: Path) -> None:
         extent = np.array(cloud.bounds(), np.float32)
         prim.GetAttribute("extent").Set(vt.Vec3fArray.FromNumpy(extent))
     pxr.UsdGeom.Xformable(prim).AddRotateXOp().Set(180.0)
-    handle, name = tempfile.mkstemp(prefix=".fidsplat-", suffix=suffix, dir=target.parent)
-    os.close(handle)
-    try:
-        stage.GetRootLayer().Export(name)
-        os.chmod(name, 0o644)
-        os.replace(name, target)
-    finally:
-        Path(name).unlink(missing_ok=True)
+    with atomic_path(path, suffix) as part:
+        try:
+            done = stage.GetRootLayer().Export(str(part))
+        except pxr.Tf.ErrorException:
+            done = False
+        if not done:
+            raise InputError(f"cannot write {path}: USD says no more; is the disk full?")
 
 
 def _cloud(path: Path, prim: Any) -> SplatCloud:

@@ -1,6 +1,7 @@
 """Logs that robotics tools open: MCAP files and rosbag2 folders. Needs `pip install 'fidsplat[logs]'`."""
 
+from fidsplat.logs.files import check_log
 from fidsplat.logs.log import RobotLog
 from fidsplat.logs.reader import log_pictures
 
-__all__ = ["RobotLog", "log_pictures"]
+__all__ = ["RobotLog", "check_log", "log_pictures"]

@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import Any, Protocol
 
 from fidsplat.errors import InputError
-from fidsplat.files import path_of
+from fidsplat.files import atomic_write, path_of, writable_folder
 
 try:
     from mcap.writer import Writer as McapWriter
@@ -56,6 +58,19 @@ def log_file(path: str | os.PathLike[str], store: Any, overwrite: bool) -> LogFi
     Raises:
         InputError: it is there and is not to be overwritten, or cannot be written.
     """
+    target = _target(path, overwrite)
+    try:
+        return _McapFile(target, store) if target.suffix == ".mcap" else _Bag(target, store)
+    except OSError as error:
+        raise InputError(f"cannot write {target}: {error.strerror or error}") from error
+
+
+def check_log(path: str | os.PathLike[str], overwrite: bool) -> None:
+    """Asked before long work: raises InputError where a log could not be written."""
+    writable_folder(_target(path, overwrite).parent)
+
+
+def _target(path: str | os.PathLike[str], overwrite: bool) -> Path:
     target = path_of(path)
     if target.exists() and not overwrite:
         raise InputError(f"{target} is there already; give another name, or overwrite it (--overwrite)")
@@ -63,20 +78,20 @@ def log_file(path: str | os.PathLike[str], store: Any, overwrite: bool) -> LogFi
         raise InputError(f"{target} is no log; give another name")
     if target.is_dir() and not (target / "metadata.yaml").exists():
         raise InputError(f"{target} is a folder without metadata.yaml, no bag; give another name")
-    try:
-        return _McapFile(target, store) if target.suffix == ".mcap" else _Bag(target, store)
-    except OSError as error:
-        raise InputError(f"cannot write {target}: {error.strerror or error}") from error
+    return target
+
+
+class _Dropped(Exception):
+    """A log is thrown away."""
 
 
 class _McapFile:
     def __init__(self, target: Path, store: Any) -> None:
-        self._target, self._store = target, store
-        descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
-        self._part = Path(name)
-        self._stream: IO[bytes] = os.fdopen(descriptor, "wb")
-        self._writer = McapWriter(self._stream)
-        self._writer.start(profile="ros2", library="fidsplat")
+        self._store = store
+        with ExitStack() as stack:
+            self._writer = McapWriter(stack.enter_context(atomic_write(target)))
+            self._writer.start(profile="ros2", library="fidsplat")
+            self._file = stack.pop_all()
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._count = 0
@@ -91,15 +106,10 @@ class _McapFile:
         self._count += 1
 
     def close(self, keep: bool) -> None:
-        try:
-            if keep:
-                self._writer.finish()
-            self._stream.close()
-            if keep:
-                self._part.chmod(0o644)
-                os.replace(self._part, self._target)
-        finally:
-            self._part.unlink(missing_ok=True)
+        with suppress(_Dropped), self._file:
+            if not keep:
+                raise _Dropped
+            self._writer.finish()
 
 
 class _Bag:
@@ -111,16 +121,32 @@ class _Bag:
         self._connections: dict[str, Any] = {}
 
     def write(self, topic: str, kind: str, time: int, data: bytes) -> None:
-        if topic not in self._connections:
-            self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
-        self._writer.write(self._connections[topic], time, data)
+        with _sqlite_says():
+            if topic not in self._connections:
+                self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
+            self._writer.write(self._connections[topic], time, data)
 
     def close(self, keep: bool) -> None:
         try:
-            self._writer.close()
             if keep:
+                with _sqlite_says():
+                    self._writer.close()
                 if self._target.exists():
-                    shutil.rmtree(self._target)
+                    self._target.rename(self._folder / "before")
                 (self._folder / self._target.name).rename(self._target)
+            else:
+                with suppress(Exception):  # what went wrong is known already
+                    self._writer.close()
         finally:
             shutil.rmtree(self._folder, ignore_errors=True)
+
+
+@contextmanager
+def _sqlite_says() -> Iterator[None]:
+    """What SQLite cannot write as OSError; its errors are those of the package by which rosbags has it."""
+    try:
+        yield
+    except OSError:
+        raise
+    except Exception as error:
+        raise OSError(str(error)) from error

@@ -15,10 +15,8 @@ from fidsplat.logs.files import typestore
 from fidsplat.vision.images import decoded
 
 try:
-    from mcap.exceptions import McapError
     from mcap.reader import make_reader
     from rosbags.rosbag2 import Reader as BagReader
-    from rosbags.rosbag2 import ReaderError
 except ImportError as error:
     raise InputError(f"logs need more packages ({error}); pip install 'fidsplat[logs]'") from None
 
@@ -48,9 +46,11 @@ def log_pictures(path: str | os.PathLike[str], topic: str | None = None) -> Iter
                 yield f"{name} {time / 1e9:.3f} s", picture
     except OSError as error:
         raise InputError(f"cannot read {file}: {error.strerror or error}") from error
-    except (McapError, ReaderError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
+    except InputError:
+        raise
+    except (
+        Exception
+    ) as error:  # of what reads, decompresses and decodes, five packages with errors of their own
         raise InputError(f"{file} is no log that can be read: {error}") from None
     if not found:
         wanted = f" on {topic}" if topic else ""

@@ -173,9 +173,15 @@ class Rig:
         return compose(on, camera.mount)
 
     def _layers_of(self, layers: Any, count: int) -> dict[str, Sequence[Layer]]:
-        for name, each in ({} if layers is None else layers).items():
+        if not isinstance(layers, Mapping | None):
+            raise InputError(f"layers is {layers!r}; it must be {{name of a camera: list of Layer}}")
+        for name, each in (layers or {}).items():
             if name not in self.cameras:
                 raise InputError(unknown("camera", name, self.cameras))
+            if not isinstance(each, Sequence):
+                raise InputError(
+                    f"the layers of the camera {name!r} are {each!r}; give a list, one for each environment"
+                )
             if len(each) != count:
                 raise InputError(
                     f"{len(each)} layers for the camera {name!r}, but {count} environments; give one for each"

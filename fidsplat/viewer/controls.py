@@ -54,8 +54,7 @@ class Controls:
                 self._slider("exposure_ms", "exposure time [ms]", 0.0, 200.0, 1.0)
                 self._slider("readout_ms", "readout [ms]", 0.0, 100.0, 1.0)
         with gui.add_folder("Scene"):
-            names = [NOBODY, *(f"{p.label}: {p.marker.spec}"[:60] for p in drawn.scene.markers)]
-            held = gui.add_dropdown("move", names, initial_value=NOBODY)
+            self._held = held = gui.add_dropdown("move", _names(drawn.scene), initial_value=NOBODY)
             held.on_update(lambda _: actions.hold(held.value))
             shown = gui.add_checkbox("outlines", True)
             shown.on_update(lambda _: actions.overlay(shown.value))
@@ -72,6 +71,11 @@ class Controls:
         drawn = self._session.drawn
         lines = [f"{len(drawn.resident):,} splats, {drawn.renderer.device.title}"]
         self.status.content = "\n\n".join(lines + ([f"**{problem}**"] if problem else []))
+
+    def offer(self, scene: Scene) -> None:
+        """Let the markers of another scene be moved; none of them is held at first."""
+        self._held.value = NOBODY
+        self._held.options = _names(scene)
 
     def _change(self, **changes: Any) -> None:
         _, settings = self._session.wanted()
@@ -90,6 +94,11 @@ class Controls:
 
     def _button(self, label: str, act: Callable[[Any], None]) -> None:
         self._gui.add_button(label).on_click(lambda event: act(event.client))
+
+
+def _names(scene: Scene) -> list[str]:
+    """Of the markers that may be moved, after nobody's."""
+    return [NOBODY, *(f"{placed.label}: {placed.marker.spec}"[:60] for placed in scene.markers)]
 
 
 def _span(scene: Scene) -> tuple[float, float]:

@@ -20,17 +20,19 @@ DIGITS = 9
 
 
 class SceneFile:
-    """A scene file on disk, and what was last read from it."""
+    """A scene file on disk."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.text = self._read()
+        """that of the scene which is shown: it alone is written back"""
+        self._seen = self.text
 
-    def changed(self) -> bool:
-        """Whether somebody else has written it; what it holds now counts as known from here on."""
+    def changed(self) -> str | None:
+        """What it holds now, if somebody else has written it since this was last asked."""
         text = self._read()
-        known, self.text = self.text, text
-        return text != known
+        known, self._seen = self._seen, text
+        return None if text == known else text
 
     def place(self, number: int, pose: np.ndarray) -> None:
         """Write the pose (4, 4) of marker number, counted from 0.
@@ -44,7 +46,7 @@ class SceneFile:
         text = placed(self.text, number, pose, str(self.path))
         with atomic_write(self.path) as stream:
             stream.write(text.encode("utf-8"))
-        self.text = text
+        self.text = self._seen = text
 
     def _read(self) -> str:
         try:

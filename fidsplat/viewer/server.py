@@ -8,6 +8,7 @@ import logging
 import socket
 import threading
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -144,7 +145,8 @@ class Viewer:
     def _send_exact(self, client: Any, viewpoint: Viewpoint) -> None:
         view = self.session.draw(viewpoint, 1.0, AT_REST)
         client.scene.set_background_image(to_uint8(view.frame["rgb"]), "png")
-        self._views[client.client_id] = view
+        if client.client_id in self._streams:  # else it has left meanwhile
+            self._views[client.client_id] = view
 
     def _changed(self) -> None:
         """What is drawn has changed."""
@@ -241,7 +243,8 @@ class Viewer:
     def hold(self, name: str) -> None:
         """Put the gizmo at a marker, by its name in the selector."""
         scene, _ = self.session.wanted()
-        self._held = None if name == NOBODY else int(name.partition(":")[0]) - 1
+        number = None if name == NOBODY else int(name.partition(":")[0]) - 1
+        self._held = number if number in range(len(scene.markers)) else None
         placed = None if self._held is None else scene.markers[self._held]
         if placed is not None and placed.motion is not None:
             self._controls.say(f"{placed.marker.spec} moves by keyframes; it is not moved by hand")
@@ -256,9 +259,9 @@ class Viewer:
     def _move(self, pose: np.ndarray, let_go: bool) -> None:
         """The gizmo is dragged; once it is let go its pose is written into the scene file."""
         with self._lock:
-            if self._held is None:
-                return
             scene, _ = self.session.wanted()
+            if self._held is None or self._held >= len(scene.markers):
+                return
             markers = list(scene.markers)
             markers[self._held] = replace(markers[self._held], pose=pose)
             problem = ""
@@ -275,12 +278,22 @@ class Viewer:
         while not self._closed.wait(LOOK):
             try:
                 with self._lock:
-                    again = self._file is not None and self._file.changed()
-                if self._file is not None and again:
+                    text = None if self._file is None else self._file.changed()
+                if self._file is not None and text is not None:
                     scene = Scene.load(self._file.path)
-                    self.session.wish(scene=scene, done=lambda why: self._controls.say(why or ""))
+                    self.session.wish(scene=scene, done=partial(self._edited, scene, text))
             except FidsplatError as error:
                 self._controls.say(f"{error}; what was read before is shown")
+
+    def _edited(self, scene: Scene, text: str, problem: str | None) -> None:
+        """Another scene, of that text, is shown, unless there was a problem. Until then, and while what the
+        file holds cannot be shown, no marker is written into it: it may be another's place."""
+        if problem is None and self._file is not None:
+            with self._lock:
+                self._file.text = text
+            self.hold(NOBODY)
+            self._controls.offer(scene)
+        self._controls.say(problem or "")
 
 
 def _silent() -> contextlib.AbstractContextManager[Any]:

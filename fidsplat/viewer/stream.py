@@ -95,8 +95,8 @@ class Stream:
                 self._moving(viewpoint, scale)
             else:
                 self._rest(viewpoint)
-        except FidsplatError as error:
-            self._failed(str(error))
+        except (FidsplatError, MemoryError) as error:
+            self._failed(str(error) or "not enough memory for this picture")
             return 0.0
         if new:
             self.pace.took(self._clock() - begun, scale)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,8 @@ class BopScene:
     The JSON files are written by `save`, or when a `with` block ends.
 
     Args:
-        folder: e.g. `dataset/train/000000`. `models/models_info.json` is written two folders above.
+        folder: e.g. `dataset/train/000000`. `models/models_info.json`, which the scenes of a data set share,
+            is written two folders above.
 
     Raises:
         InputError: a folder that cannot be written, or that holds a scene already.
@@ -54,10 +56,11 @@ class BopScene:
             self.save()
 
     def add(self, picture: Mapping[str, np.ndarray], truth: Truth) -> None:
-        """Keep a picture, with `rgb`, and `depth` and `label` where it has them.
+        """Keep a picture, with `rgb`, and `depth` and `label` where it has them. Depths beyond what 16 bits
+        hold are written as 0, which is unknown.
 
         Raises:
-            InputError: a camera with a lens, which BOP cannot say, or depths beyond what its 16 bits hold.
+            InputError: a camera with a lens, which BOP cannot say.
         """
         camera = truth.camera
         if camera.lens is not None:
@@ -93,15 +96,27 @@ class BopScene:
             self._models[str(label)] = _model(marker)
 
     def save(self) -> None:
-        """Write the JSON files. Raises InputError when one cannot be written."""
+        """Write the JSON files.
+
+        Raises:
+            InputError: one cannot be written, or another scene of the data set has another marker under the
+                same label.
+        """
+        models = writable_folder(self._folder.resolve().parent.parent / "models") / "models_info.json"
+        known = _known(models)
+        for label, model in self._models.items():
+            if known.get(label, model) != model:
+                raise InputError(
+                    f"{models}: object {label} is {known[label].get('spec')} there, and {model['spec']} "
+                    "here; give markers the same labels in every scene, or this one a data set of its own"
+                )
         for name, content in (
             ("scene_camera.json", self._cameras),
             ("scene_gt.json", self._poses),
             ("scene_gt_info.json", self._seen),
         ):
             _write(self._folder / name, content)
-        models = writable_folder(self._folder.resolve().parent.parent / "models")
-        _write(models / "models_info.json", self._models)
+        _write(models, known | self._models)
 
 
 def _seen(marker: MarkerTruth, truth: Truth, mask: np.ndarray) -> dict[str, Any]:
@@ -129,6 +144,14 @@ def _model(marker: MarkerTruth) -> dict[str, Any]:
         **{f"min_{n}": float(v) for n, v in zip(names, low, strict=True)},
         **{f"size_{n}": float(v) for n, v in zip(names, high - low, strict=True)},
     }
+
+
+def _known(path: Path) -> dict[str, dict[str, Any]]:
+    """The models that other scenes have written."""
+    try:
+        return json.loads(path.read_text("utf-8")) if path.exists() else {}
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read {path}: {error}; give another folder") from None
 
 
 def _write(path: os.PathLike[str], content: Any) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import ordinary_file, writable_folder
+from fidsplat.files import atomic_path, ordinary_file, writable_folder
 
 
 def check_video(path: str | os.PathLike[str]) -> Path:
@@ -38,33 +37,41 @@ def write_video(path: str | os.PathLike[str], pictures: Iterable[np.ndarray], ra
     wants even.
 
     Raises:
-        InputError: as `check_video`; no picture.
+        InputError: as `check_video`; no picture; ffmpeg cannot write, on a full disk say.
     """
     file = check_video(path)
     import imageio_ffmpeg  # type: ignore[import-not-found]
 
-    descriptor, name = tempfile.mkstemp(prefix=f".{file.name}.", suffix=".part.mp4", dir=file.parent)
-    os.close(descriptor)
-    writer = None
-    try:
-        for number, picture in enumerate(pictures):
-            even = np.pad(picture, ((0, picture.shape[0] % 2), (0, picture.shape[1] % 2), (0, 0)), "edge")
-            if writer is None:
-                size: Any = even.shape[1::-1]
-                encoding: Any = {"fps": rate, "codec": "libx264", "quality": 8, "macro_block_size": 2}
-                writer = imageio_ffmpeg.write_frames(name, size, **encoding)
-                writer.send(None)
-            writer.send(np.ascontiguousarray(even))
-            yield number
-        if writer is None:
+    with atomic_path(file, file.suffix) as part:
+        writer, count = None, 0
+        try:
+            for number, picture in enumerate(pictures):
+                even = np.pad(picture, ((0, picture.shape[0] % 2), (0, picture.shape[1] % 2), (0, 0)), "edge")
+                if writer is None:
+                    size: Any = even.shape[1::-1]
+                    encoding: Any = {"fps": rate, "codec": "libx264", "quality": 8, "macro_block_size": 2}
+                    writer = imageio_ffmpeg.write_frames(str(part), size, **encoding)
+                    writer.send(None)
+                writer.send(np.ascontiguousarray(even))
+                count += 1
+                yield number
+        finally:
+            if writer is not None:
+                writer.close()
+        if not count:
             raise InputError(f"cannot write {file}: there is no picture")
-        writer.close()
-        writer = None
-        os.chmod(name, 0o644)
-        os.replace(name, file)
-    except OSError as error:
-        raise InputError(f"cannot write {file}: {error.strerror or error}") from error
+        if not _lasts(part, (count - 1) / rate):
+            raise InputError(f"cannot write {file}: ffmpeg stopped before its end; is the disk full?")
+
+
+def _lasts(file: Path, seconds: float) -> bool:
+    """Whether a video can be read and is longer than that: ffmpeg that fails at its end says nothing."""
+    import imageio_ffmpeg  # type: ignore[import-not-found]
+
+    reader: Any = imageio_ffmpeg.read_frames(str(file))
+    try:
+        return next(reader)["duration"] > seconds - 0.02  # it is said in hundredths
+    except (OSError, RuntimeError, IndexError, StopIteration):
+        return False
     finally:
-        if writer is not None:
-            writer.close()
-        Path(name).unlink(missing_ok=True)
+        reader.close()

@@ -5,6 +5,7 @@ import json
 import cv2
 import numpy as np
 import pytest
+from full_disk import small_files
 
 import fidsplat as fs
 from fidsplat.cli import main
@@ -191,6 +192,9 @@ def test_a_video_has_every_picture(here):
     assert not video.read()[0]
     with pytest.raises(fs.InputError, match="there is no picture"):
         list(write_video("none.mp4", [], 10.0))
+    noise = [np.random.default_rng(k).integers(0, 256, (64, 64, 3), np.uint8) for k in range(4)]
+    with small_files(2000), pytest.raises(fs.InputError, match="is the disk full"):
+        list(write_video("full.mp4", noise, 10.0))
     assert sorted(p.name for p in here.glob("*.mp4*")) == ["v.mp4"]
     assert list(here.glob(".*")) == []
 
@@ -205,6 +209,9 @@ def test_a_video_has_every_picture(here):
         (["--outputs", "deep"], "unknown output 'deep'"),
         (["--memory-budget", "lots"], "--memory-budget is 'lots'; give a number of bytes"),
         (["--trajectory", "none.tum"], "cannot read none.tum"),
+        (["--times", "0,1", "--rate", "-1"], "the rate is -1.0; give a number"),
+        (["--log", "poses.tum"], "poses.tum is there already"),
+        (["--coco", "."], ". is a folder"),
     ],
 )
 def test_words_that_cannot_be_flown(here, capsys, words, message):

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from full_disk import small_files
 
 import fidsplat as fs
 from fidsplat.cli import main
@@ -215,11 +216,28 @@ def test_a_gltf_of_nodes_bytes_and_a_file_beside(tmp_path):
         path.write_text(json.dumps(document))
         with pytest.raises(fs.InputError, match="outside of its folder; it is not read"):
             fs.load_splats(path)
+    (tmp_path / "inside").mkdir()
+    (tmp_path / "inside/link.bin").symlink_to(tmp_path / "data.bin")
+    (tmp_path / "inside/loop.bin").symlink_to("loop.bin")
+    for uri, words in (("link.bin", "outside of its folder"), ("loop.bin", "damaged|cannot read")):
+        document["buffers"][0]["uri"] = uri
+        (tmp_path / "inside/a.gltf").write_text(json.dumps(document))
+        with pytest.raises(fs.InputError, match=words):
+            fs.load_splats(tmp_path / "inside/a.gltf")
     document["buffers"][0]["uri"] = "data.bin"
+    document["accessors"][0]["count"] = math.inf
+    path.write_text(json.dumps(document))
+    with pytest.raises(fs.InputError, match=r"damaged \(OverflowError"):
+        fs.load_splats(path)
+    document["accessors"][0]["count"] = 1
     document["nodes"][1]["children"] = [0]
     path.write_text(json.dumps(document))
     with pytest.raises(fs.InputError, match="node 0 stands below two others, or below itself"):
         fs.load_splats(path)
+
+
+def picture(kind: str, side: int) -> bytes:
+    return cv2.imencode(kind, np.zeros((side, side, 4), np.uint8))[1].tobytes()
 
 
 def sog(path, **changes):
@@ -288,6 +306,13 @@ def test_a_sog_file_by_hand(tmp_path):
         ({"q.webp": np.full((2, 2, 4), 251, np.uint8)}, "alpha is 251; it must be 252"),
         ({"n.webp": np.full((2, 2, 4), 255, np.uint8)}, "65535, is none of the palette's 128 entries"),
         ({"p.webp": np.full((2, 64, 4), 255, np.uint8)}, "64 pixels wide; 1 bands have 192"),
+        ({"count": math.inf}, r"damaged \(OverflowError"),
+        ({"means": "nothing"}, r"damaged \(TypeError"),
+        # small files of huge pictures
+        ({"q.webp": np.zeros((300, 300, 4), np.uint8)}, "q.webp has 90000 pixels for 2; it is not read"),
+        ({"q.webp": picture(".png", 300)}, "q.webp has 90000 pixels for 2; it is not read"),
+        ({"p.webp": np.zeros((2600, 192, 4), np.uint8)}, "p.webp has 499200 pixels for 196608"),
+        ({"q.webp": picture(".bmp", 2)}, "q.webp is not a picture of 8 bits"),
     ],
 )
 def test_damaged_sog_files(tmp_path, changes, words):
@@ -299,7 +324,41 @@ def test_damaged_sog_files(tmp_path, changes, words):
         fs.load_splats(tmp_path / "a.sog")
 
 
+@pytest.mark.parametrize("way", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_a_sog_file_whose_parts_are_damaged(tmp_path, way):
+    path = tmp_path / "a.sog"
+    with zipfile.ZipFile(path, "w", way) as archive:
+        archive.writestr("meta.json", json.dumps({"version": 2, "words": list(range(500))}))
+    data = bytearray(path.read_bytes())
+    data[60:90] = bytes(30)
+    path.write_bytes(data)
+    with pytest.raises(fs.InputError, match="its zip is damaged"):
+        fs.load_splats(path)
+
+
+def test_a_sog_file_that_says_nothing_or_too_much(tmp_path, monkeypatch):
+    path = tmp_path / "a.sog"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("meta.json", "[]")
+    with pytest.raises(fs.InputError, match=r"damaged \(AttributeError"):
+        fs.load_splats(path)
+    monkeypatch.setattr("fidsplat.formats.sog.MAX_META", 1)
+    with pytest.raises(fs.InputError, match=r"meta\.json has 2 bytes"):
+        fs.load_splats(path)
+
+
 # bad input
+
+
+@pytest.mark.parametrize("suffix", [".sog", *USD[1:2]])
+def test_a_huge_file_that_is_something_else_is_not_read_as_a_whole(tmp_path, monkeypatch, suffix):
+    need(suffix)
+    path = tmp_path / f"a{suffix}"
+    with path.open("wb") as stream:
+        stream.truncate(5 * 10**9)  # of zeros, which take no room on a disk
+    monkeypatch.setattr(Path, "read_bytes", lambda _: pytest.fail("read as a whole"))
+    with pytest.raises(fs.InputError, match=str(path)):
+        fs.load_splats(path)
 
 
 @pytest.mark.parametrize("suffix", [".spz", ".splat", ".glb", ".gltf", *USD[:2]])
@@ -328,12 +387,37 @@ def test_an_spz_file_that_promises_more_than_gzip_can_hold(tmp_path):
         fs.load_splats(tmp_path / "a.spz")
 
 
+def test_a_small_spz_file_of_many_splats(tmp_path, monkeypatch):
+    """20 bytes a splat, all 0, are packed a thousandfold."""
+    monkeypatch.setattr("fidsplat.formats.spz._FEW", 100)
+    head = struct.pack("<IIIBBBB", 0x5053474E, 3, 1000, 0, 12, 0, 0)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(head + bytes(20 * 1000)))
+    with pytest.raises(fs.InputError, match=r"1000 splats in \d\d bytes; no scene is so small"):
+        fs.load_splats(tmp_path / "a.spz")
+    monkeypatch.setattr("fidsplat.formats.spz._FEW", 1000)
+    assert len(fs.load_splats(tmp_path / "a.spz")) == 1000
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".usda", ".usdc"])
+def test_a_disk_that_is_full_leaves_the_old_file(tmp_path, suffix):
+    need(suffix)
+    path = tmp_path / f"a{suffix}"
+    fs.save_splats(some(count=3), path)
+    before = path.read_bytes()
+    with small_files(20_000), pytest.raises(fs.InputError, match="cannot write"):
+        fs.save_splats(some(count=4000), path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def test_what_cannot_be_written(tmp_path):
     tag = fs.marker("aruco:4x4_50:7", size=0.4)
     for suffix in (suffix for suffix, known in FORMATS.items() if known.save):
         need(suffix)
         with pytest.raises(fs.InputError, match="are boxes"):
             fs.save_splats(tag.cloud, tmp_path / f"a{suffix}")
+        with pytest.raises(fs.InputError, match="cannot write"):
+            fs.save_splats(tag.gaussians, tmp_path / f"none/a{suffix}")
     with pytest.raises(fs.InputError, match=r"unknown ending of a splat file '.obj'"):
         fs.save_splats(tag.gaussians, tmp_path / "a.obj")
     with pytest.raises(fs.InputError, match="empty cloud"):

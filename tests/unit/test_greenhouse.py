@@ -68,6 +68,13 @@ def test_the_model_loads_and_has_the_benches(small):
     np.testing.assert_allclose(bench.size, [1.5 * SPACING, BENCH[0] / 2, BENCH[1] / 2])
 
 
+def test_the_scene_file_is_there_when_all_else_is(tmp_path, capsys):
+    (tmp_path / "greenhouse.xml").mkdir()
+    assert main(["greenhouse", "-o", str(tmp_path), "--rows", "1", "--plants", "1"]) == 2
+    assert "not an ordinary file" in capsys.readouterr().err
+    assert not (tmp_path / "greenhouse.toml").exists()
+
+
 def test_the_command(tmp_path, capsys):
     words = ["greenhouse", "-o", str(tmp_path / "g"), "--rows", "1", "--plants", "2", "--json"]
     assert main(words) == 0

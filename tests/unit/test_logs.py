@@ -1,11 +1,11 @@
 """Logs: what is written is read by the packages that robotics tools are made of."""
 
+import contextlib
 import json
-import resource
-import signal
 
 import numpy as np
 import pytest
+from full_disk import small_files
 
 import fidsplat as fs
 from fidsplat.cli import main
@@ -172,14 +172,26 @@ def fill(path):
             log.image(float(k), "front", RNG.random((64, 64, 3)))
 
 
-def test_a_disk_that_is_full_leaves_nothing(tmp_path):
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, hard))
-        with pytest.raises(fs.InputError, match="cannot write"):
-            fill(tmp_path / "run.mcap")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-        signal.signal(signal.SIGXFSZ, before)
+@pytest.mark.parametrize("name", ["run.mcap", "bag"])
+def test_a_disk_that_is_full_leaves_nothing(tmp_path, name):
+    with small_files(200_000), pytest.raises(fs.InputError, match="cannot write"):
+        fill(tmp_path / name)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["run.mcap", "bag"])
+def test_damaged_logs(tmp_path, name):
+    from fidsplat.logs import log_pictures
+
+    path = written(tmp_path / name)
+    file = path if path.is_file() else next(path.glob("*.db3"))
+    whole = file.read_bytes()
+    random = np.random.default_rng(0)
+    for k in range(40):
+        data = bytearray(whole[: random.integers(1, len(whole))] if k % 2 else whole)
+        for place in random.integers(0, len(data), 30):
+            data[place] = random.integers(256)
+        file.write_bytes(data)
+        with contextlib.suppress(fs.InputError):
+            for _, image in log_pictures(path):
+                assert image.shape[2] == 3

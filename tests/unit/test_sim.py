@@ -136,6 +136,10 @@ def test_layers_of_another_renderer_are_each_environments_own(scene):
         rig.render({"box": box}, layers={"fixed": [near]})
     with pytest.raises(fs.InputError, match="unknown camera 'fxed'"):
         rig.render({"box": box}, layers={"fxed": [near, far]})
+    with pytest.raises(fs.InputError, match=r"the layers of the camera 'fixed' are .*; give a list"):
+        rig.render({"box": box}, layers={"fixed": near})
+    with pytest.raises(fs.InputError, match=r"layers is \[.*\]; it must be"):
+        rig.render({"box": box}, layers=[near, far])
 
 
 def test_masked_environments_are_not_drawn(rig):

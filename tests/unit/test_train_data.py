@@ -336,3 +336,16 @@ def test_the_command_trains_resumes_and_reports(folder, tmp_path, capsys):
     assert main([*words[:-1], "3", "--overwrite"]) == 0
     for wrong in (["-o", "a.png"], ["--random-points", "-1"], ["--within-memory", "0"]):
         assert main([*words, *wrong]) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "line", "words"),
+    [("cameras", "1 PINHOLE 64 48 50", "with 1 parameters"), ("points3D", "1 0 0 0 9", "not enough")],
+)
+def test_lines_of_a_colmap_model_that_end_early(folder, name, line, words):
+    model = folder / "sparse/0"
+    for file in model.glob("*.bin"):
+        file.unlink()
+    (model / f"{name}.txt").write_text(line + "\n")
+    with pytest.raises(fs.InputError, match=words):
+        load_colmap(model)

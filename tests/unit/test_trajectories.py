@@ -198,6 +198,9 @@ def test_rounded_files_are_read(tmp_path):
         ("t.json", "{", "not a transforms.json"),
         ("t.json", '{"frames": [{"transform_matrix": [[1, 2]]}]}', "must be 4 x 4 finite numbers"),
         ("t.json", '{"frames": []}', "holds no pose"),
+        pytest.param(
+            "t.json", f'{{"frames": [{{"transform_matrix": [[1{"0" * 400}]]}}]}}', "OverflowError", id="big"
+        ),
         ("images.txt", "1 1 0 0\n\n", "is damaged, or not COLMAP's"),
     ],
 )

@@ -183,6 +183,15 @@ def test_bop_has_what_its_format_asks_for(tmp_path, truth, frame, scene):
     assert models["1"]["diameter"] == pytest.approx(400 * math.sqrt(2))
     with pytest.raises(fs.InputError, match="holds a scene already"):
         BopScene(folder)
+    again = BopScene(tmp_path / "set/train/000001")
+    again.add(frame, truth)
+    again.save()
+    other = replace(scene.markers[0], marker=fs.marker("apriltag:36h11:6", size=0.4))
+    another = BopScene(tmp_path / "set/train/000002")
+    another.add(frame, truth_of(frame, replace(scene, markers=(other,))))
+    with pytest.raises(fs.InputError, match="object 1 is apriltag:36h11:5 there, and apriltag:36h11:6 here"):
+        another.save()
+    assert json.loads((tmp_path / "set/models/models_info.json").read_text()) == models
 
 
 def test_bop_has_no_lenses(tmp_path, truth, frame):

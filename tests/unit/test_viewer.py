@@ -251,6 +251,18 @@ def test_a_picture_that_fails_is_told_and_the_stream_goes_on():
     assert stream.step() is not None
 
 
+def test_a_picture_that_is_too_large_for_the_memory_is_told():
+    told: list[str] = []
+
+    def draw(*_):
+        raise MemoryError
+
+    stream = Stream(draw, draw, told.append, clock=lambda: 0.0)
+    stream.look(HERE)
+    stream.step()
+    assert told == ["not enough memory for this picture"]
+
+
 def test_a_stream_runs_in_a_thread_until_it_is_closed():
     seen = threading.Event()
     stream = Stream(lambda *_: None, lambda *_: seen.set())
@@ -323,8 +335,13 @@ def test_a_file_that_was_edited_meanwhile_is_not_written(tmp_path):
     with pytest.raises(fs.InputError, match="was edited meanwhile; it is read again"):
         file.place(0, POSE)
     assert path.read_text() == FILE + "\n# edited"
-    assert file.changed()
-    assert not file.changed()
+    text = file.changed()
+    assert text == FILE + "\n# edited"
+    assert file.changed() is None
+    with pytest.raises(fs.InputError, match="was edited meanwhile"):
+        file.place(0, POSE)  # until the scene of that text is shown
+    file.text = text
+    file.place(0, POSE)
     path.unlink()
     with pytest.raises(fs.InputError, match="cannot read"):
         file.changed()
@@ -434,6 +451,36 @@ def test_a_file_that_is_edited_is_shown(viewer, tmp_path):
     assert until(lambda: "what was read before is shown" in viewer._controls.status.content)
     assert "did you mean 'size'" in viewer._controls.status.content
     assert viewer.session.drawn.scene.markers[0].marker.size == 0.2
+
+
+def test_a_marker_is_not_written_into_a_file_that_cannot_be_shown(viewer, tmp_path):
+    """Its tables may be those of other markers."""
+    file, table = tmp_path / "scene.toml", '[[markers]]\nspec = "aruco:4x4_50:8"\nsize = 0.4\n'
+    edited = table.replace("0.4", "-1") + file.read_text()
+    viewer.hold("1: aruco:4x4_50:7")
+    file.write_text(edited)
+    assert until(lambda: "what was read before is shown" in viewer._controls.status.content)
+    viewer._move(rigid_matrix((0.1, 0.0, 0.2)), True)
+    assert viewer.session.settle()
+    assert file.read_text() == edited
+    assert "nothing was written" in viewer._controls.status.content
+    file.write_text(edited.replace("-1", "0.4"))
+    assert until(lambda: len(viewer._controls._held.options) == 3)
+    assert viewer._controls._held.options[2] == "2: aruco:4x4_50:7"
+    viewer._move(np.eye(4), True)  # nothing is held any more
+    assert "position" not in file.read_text()
+    viewer.hold("2: aruco:4x4_50:7")
+    viewer._move(rigid_matrix((0.1, 0.0, 0.2)), True)
+    assert viewer.session.settle()
+    np.testing.assert_allclose(fs.Scene.load(file).markers[1].pose[:3, 3], (0.1, 0, 0.2))
+    viewer.hold("9: nobody")
+    viewer._move(np.eye(4), True)
+
+
+def test_a_browser_that_left_keeps_nothing(viewer):
+    client = Client(5)
+    viewer._send_exact(client, HERE)
+    assert viewer._views == {}
 
 
 def test_keyframes_become_a_trajectory(viewer, tmp_path):
