@@ -2,10 +2,10 @@
 
     python benchmarks/containers.py [--millions 4] [--json FILE]
 
-Needs pyarrow, zarr and h5py (pip install pyarrow zarr h5py), which fidsplat itself does not. Of each container:
-seconds to write means, quaternions, scales, opacities and colours of so many splats; milliseconds to open; and
-per chunk of 32,768 splats, files in the page cache, the time to have its arrays, which is none where the container gives
-the mapped file itself, and the time to have and add up every number.
+Needs pyarrow, zarr and h5py (pip install pyarrow zarr h5py), which fidsplat itself does not. Of each: seconds
+to write means, quaternions, scales, opacities and colours of so many splats; milliseconds to open; and per
+chunk of 32,768 splats, files in the page cache, the time to have its arrays, which is next to none where the
+container gives the mapped file itself, and the time to have and add up every number.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
@@ -21,6 +21,9 @@ from fidsplat.commands.output import (
     tell,
 )
 from fidsplat.errors import InputError
+
+if TYPE_CHECKING:
+    import fidsplat as fs
 
 Out = Annotated[str, option("OUT.fss", "the store to write", "-o")]
 Overwrite = Annotated[bool, switch("replace the store that is there, once the new one is whole")]
@@ -153,18 +156,22 @@ class StoreInfo:
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.store.store import Store
-
-        facts = describe_store(Store(self.store))
-        if self.json:
-            print_json(facts)
-            return 0
-        print_store(self.store, facts)
-        return 0
+        return tell_store(self.store, self.json)
 
 
-def describe_store(store) -> dict:
-    """A store in figures."""
+def tell_store(path: str, as_json: bool) -> int:
+    """Print what a store holds; returns the exit status 0. Raises InputError for what is none."""
+    from fidsplat.store.store import Store
+
+    facts = _facts(Store(path))
+    if as_json:
+        print_json(facts)
+    else:
+        _print_facts(path, facts)
+    return 0
+
+
+def _facts(store: fs.Store) -> dict[str, Any]:
     import numpy as np
 
     nodes = store.nodes
@@ -188,8 +195,7 @@ def describe_store(store) -> dict:
 _KINDS = {"none": "2D", "all": "3D", "some": "2D and 3D"}
 
 
-def print_store(name: str, facts: dict) -> None:
-    """The figures as a table."""
+def _print_facts(name: str, facts: dict[str, Any]) -> None:
     rows = [("splats", f"{facts['splats']:,} ({facts['kind']}), SH degree {facts['sh_degree']}")]
     if facts["placed"] is not None:
         rows.append(("places", f"{facts['places']:,} of {facts['placed']}"))

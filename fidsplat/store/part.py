@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from fidsplat.harmonics import rotation_of_coefficients
+from fidsplat.harmonics import C0, rotation_of_coefficients
 from fidsplat.rotations import matrix_to_quaternion
 from fidsplat.splats import SplatCloud
 
@@ -69,6 +69,25 @@ def joined(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
     if len(parts) == 1:
         return dict(parts[0])
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def colors_of(given: Mapping[str, np.ndarray], sh_degree: int) -> dict[str, np.ndarray]:
+    """Of splats with `colors` or `sh` those of one degree: plain colours where it is -1, with the bits of
+    `SplatCloud.plain_colors`; else SH, its missing bands 0."""
+    if sh_degree < 0:
+        if "colors" in given:
+            return {"colors": given["colors"]}
+        return {"colors": np.maximum(np.float32(C0) * given["sh"][:, 0] + np.float32(0.5), np.float32(0))}
+    terms = (sh_degree + 1) ** 2
+    if "sh" in given and given["sh"].shape[1] == terms:
+        return {"sh": given["sh"]}
+    sh = np.zeros((len(given["means"]), terms, 3), np.float32)
+    if "sh" in given:
+        kept = min(terms, given["sh"].shape[1])
+        sh[:, :kept] = given["sh"][:, :kept]
+    else:
+        sh[:, 0] = (given["colors"].astype(np.float64) - 0.5) / C0
+    return {"sh": sh}
 
 
 def moved(splats: Mapping[str, np.ndarray], pose: np.ndarray, move: np.ndarray) -> dict[str, np.ndarray]:

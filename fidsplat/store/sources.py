@@ -16,9 +16,8 @@ from fidsplat.files import path_of
 from fidsplat.formats.collect import WINDOW, Rows, window
 from fidsplat.formats.files import format_of, load_splats
 from fidsplat.formats.ply import ply_rows
-from fidsplat.harmonics import C0
 from fidsplat.splats import SplatCloud
-from fidsplat.store.layout import shapes_of
+from fidsplat.store.part import colors_of
 
 _SAMPLES, _SAMPLE = 64, 4096
 """parts of each source, and rows of each, by which bounds and the spread of splats are judged"""
@@ -72,8 +71,8 @@ def source_of(cloud: SplatCloud, name: Path, stamp: str) -> Source:
     columns = {name: (array.shape[1:], array.dtype.type) for name, array in arrays.items()}
 
     def fill(first: int, into: dict[str, np.ndarray]) -> None:
-        for key, array in into.items():
-            array[:] = arrays[key][first : first + len(array)]
+        for key, array in arrays.items():
+            into[key][:] = array[first : first + len(into[key])]
 
     return Source(Rows(name, len(cloud), columns, fill), cloud.origin, stamp)
 
@@ -135,7 +134,7 @@ def splats_of(
         means = (means.astype(np.float64) + (source.origin - origin)).astype(np.float32)
     made = {"means": means, "quats": unit_quaternions(part["quats"])}
     made |= {name: part[name] for name in ("scales", "opacities")}
-    made |= _colors(part, count, sh_degree)
+    made |= colors_of(part, sh_degree)
     if "thickness" in columns:
         made["thickness"] = part.get("thickness", np.zeros(count, np.float32))
     if "labels" in columns:
@@ -144,18 +143,3 @@ def splats_of(
         ids = part.get("planes", np.full(count, -1, np.int32))
         made["planes"] = np.where(ids >= 0, ids + source.first_plane, -1).astype(np.int32)
     return {name: made[name].astype(kind, copy=False) for name, kind in columns.items()}, dropped
-
-
-def _colors(part: dict[str, np.ndarray], count: int, sh_degree: int) -> dict[str, np.ndarray]:
-    """Colours as a store of that degree has them, the bits of `SplatCloud.plain_colors` for plain ones."""
-    if sh_degree < 0:
-        if "colors" in part:
-            return {"colors": part["colors"]}
-        return {"colors": np.maximum(np.float32(C0) * part["sh"][:, 0] + np.float32(0.5), np.float32(0))}
-    sh = np.zeros((count, *shapes_of(sh_degree)["sh"]), np.float32)
-    if "colors" in part:
-        sh[:, 0] = (part["colors"].astype(np.float64) - 0.5) / C0
-    else:
-        terms = min(sh.shape[1], part["sh"].shape[1])
-        sh[:, :terms] = part["sh"][:, :terms]
-    return {"sh": sh}

@@ -125,12 +125,13 @@ class Store(Summarised):
         shapes = layout.shapes_of(self.sh_degree)
         return sum(layout.row_bytes("<f4", shapes[name]) for name in {*self._own.columns, "labels"})
 
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Axis-aligned box (min (3,), max (3,)) float64, world, around all splats to 5 standard deviations.
+    def bounds(self, sigmas: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
+        """Axis-aligned box (min (3,), max (3,)) float64, world, around all splats to that many standard
+        deviations; somewhat larger than that of a cloud, since it is made of the boxes of chunks.
 
         Raises InputError for an empty store.
         """
-        low, high = self.boxes(layout.FAR)
+        low, high = self.boxes(sigmas)
         leaves = np.tile(self.nodes["level"] == 0, self.places)
         if not leaves.any():
             raise InputError("an empty store has no bounds")
@@ -179,6 +180,18 @@ class Store(Summarised):
         place, node = divmod(int(number), len(self.nodes))
         first = int(self.nodes["first"][node])
         return self._rows(first, first + int(self.nodes["count"][node]), place)
+
+    def labels(self) -> set[int]:
+        """The labels that its splats have; all of that column is read."""
+        if "labels" not in self._columns:
+            return {0} if len(self) else set()
+        return set(np.unique(self._columns["labels"][: self._own.splats]).tolist())
+
+    def last_plane(self) -> int:
+        """The largest id of its planes; -1 without."""
+        if not self.has_planes:
+            return -1
+        return int(self._columns["planes"][self._own.pinned : self._own.splats].max(initial=-1))
 
     def cloud(self) -> SplatCloud:
         """All of its splats in one cloud, mapped where the files have them as they are drawn, else in memory:
