@@ -401,7 +401,8 @@ class TrainingKernels(Protocol):
         Args:
             sizes: of the step, by `means`, `scales`, `quats`, `logits`, `sh` (of degree 0), `rest`.
             numbers: `beta1`, `beta2`, `epsilon`, `root` (of 1 - beta2^step); `scale_penalty` and
-                `opacity_penalty`, added to the derivatives.
+                `opacity_penalty`, added to the derivatives; `sparse`: 1 where splats rest that the picture
+                does not depend on.
         """
         ...
 

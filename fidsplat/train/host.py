@@ -12,7 +12,7 @@ from fidsplat.cameras import Camera
 from fidsplat.train import mcmc
 from fidsplat.train.dataset import TrainingView
 from fidsplat.train.losses import Loss, picture_loss
-from fidsplat.train.optimiser import adam_step, inner_gradients
+from fidsplat.train.optimiser import adam_step, inner_gradients, moved_by, sparse_adam_step
 from fidsplat.train.parameters import Splats
 from fidsplat.train.settings import TrainSettings
 
@@ -58,7 +58,10 @@ class HostWork:
         """One step of Adam."""
         given = {name: on_host(array) for name, array in gradients.items()}
         inner = inner_gradients(self._splats, given, self._settings)
-        adam_step(self._splats, inner, rate, self._settings, step)
+        if self._settings.sparse_adam:
+            sparse_adam_step(self._splats, moved_by(given), inner, rate, self._settings, step)
+        else:
+            adam_step(self._splats, inner, rate, self._settings, step)
 
     def shake(self, iteration: int, rate: float) -> None:
         """Moves the means at random."""

@@ -104,10 +104,11 @@ def test_masked_values_that_are_not_finite_do_not_count(renderer, views, works):
     assert np.isnan(work.loss(drawn(renderer, image), 1)[0].value)
 
 
-@pytest.mark.parametrize("strategy", ["default", "mcmc"])
-def test_adam_and_what_is_drawn(renderer, works, strategy):
-    """At degree 0, which has plain colours, then at degrees 1 and 2."""
-    device, host = works(strategy=strategy, sh_degree=2)
+@pytest.mark.parametrize(("strategy", "sparse"), [("default", False), ("default", True), ("mcmc", False)])
+def test_adam_and_what_is_drawn(renderer, works, strategy, sparse):
+    """At degree 0, which has plain colours, then at degrees 1 and 2; every third splat has no derivative but
+    in the last step; one has none but by its mean, one none but by its colour."""
+    device, host = works(strategy=strategy, sh_degree=2, sparse_adam=sparse)
     random, rate = np.random.default_rng(2), rates(TrainSettings(), 100, 1.5)
     for step, degree in ((1, 0), (2, 0), (3, 1), (4, 2)):
         shown = [work.resident(degree, np.zeros(3)) for work in (device, host)]
@@ -119,9 +120,18 @@ def test_adam_and_what_is_drawn(renderer, works, strategy):
         shapes = {"means": (3,), "quats": (4,), "scales": (2,), "opacities": ()}
         shapes[color] = ((degree + 1) ** 2, 3) if degree else (3,)
         gradients = {name: random.normal(0, 0.1, (COUNT, *shape)) for name, shape in shapes.items()}
+        for name, array in gradients.items():
+            if step < 4:
+                array[::3] = 0
+            for row in {1, 2} - {{"means": 1, color: 2}.get(name)}:
+                array[row] = 0
+        before = host.store().chosen(np.arange(0, COUNT, 3))
         device.step({name: on_device(renderer, array) for name, array in gradients.items()}, rate, step)
         host.step(gradients, rate, step)
         agree(device, host)
+        rested = device.store().chosen(np.arange(0, COUNT, 3))
+        same = [np.array_equal(rested.first[name], before.first[name]) for name in NAMES]
+        assert all(same) == (sparse and step < 4)
 
 
 def test_what_is_drawn_is_that_of_a_run_that_goes_on(renderer, works):

@@ -17,8 +17,8 @@ from fidsplat.cameras import Camera
 from fidsplat.errors import DeviceError
 
 _GROUP = 64
-_SUMS = 1024
-"""work-items that add up the loss"""
+_SUMS, _SUMMED = 512, 128
+"""work-groups that add up the loss, and their work-items (SUMMED of kernels/opencl/train/loss.cl)"""
 
 
 class _Truth(NamedTuple):
@@ -88,6 +88,8 @@ class OpenCLTraining:
     def load(self, arrays: Mapping[str, np.ndarray]) -> None:
         """As `TrainingKernels`."""
         self._count = len(arrays["means"])
+        if arrays["sh"].size >= 2**32:  # kernels count coefficients in 32 bits
+            raise DeviceError(f"{self._count:,} splats are too many to train; use fewer")
         for name, array in arrays.items():
             self._held[name] = self._put(f"the splats' {name}", array)
             self._shapes[name] = array.shape
@@ -135,7 +137,7 @@ class OpenCLTraining:
         self._launch_rows("loss_take", 3 * columns, height, given)
         for name in ("loss_rows", "loss_columns", "loss_rows_backward", "loss_columns_backward"):
             self._launch_rows(name, -(-3 * columns // self._lanes), height, given)
-        self._launch("loss_sums", _SUMS, given)
+        self._enqueue("loss_sums", (_SUMS * _SUMMED,), (_SUMMED,), given)
         sums = np.empty((_SUMS, 3), np.float32)
         cl.enqueue_copy(self._queue, sums, given["sums"])
         absolute, squared, similar = sums.sum(axis=0, dtype=np.float64)
@@ -166,6 +168,7 @@ class OpenCLTraining:
             "by_sh": by_color.data,
             **{f"size_{name}": size for name, size in sizes.items()},
             **numbers,
+            "sparse": int(numbers["sparse"]),
             "rest1": 1 - numbers["beta1"],
             "rest2": 1 - numbers["beta2"],
         }
