@@ -253,7 +253,7 @@ class Renderer:
                 following = next(captures, None)
                 if following is not None and waiting is not None:
                     features, view = prepare(store.scene, following)
-                    store.fetch(view, features, 0.0)
+                    store.fetch(view, features, store.scene.pixels_of(following.quality))
             except Exception:
                 if waiting is not None:
                     yield waiting
@@ -317,7 +317,8 @@ class Renderer:
             data, ids = whole, None
             if isinstance(whole, Residency):
                 drawn = [batch.one(number) for number in range(len(batch.slots))]
-                data, ids = whole.of(drawn, features, 0.0)
+                pixels = min(whole.scene.pixels_of(capture.quality) for capture in views.captures)
+                data, ids = whole.of(drawn, features, pixels)
             pipeline = self.backend.pipeline(features)
             if isinstance(pipeline, DrawsBatches):
                 images = pipeline.render_batch(data, batch)
@@ -341,7 +342,7 @@ class Renderer:
         with self._lock:  # scratch buffers and kernels' arguments belong to one picture at a time
             data, ids = whole, None
             if isinstance(whole, Residency):
-                data, ids = whole.of([view], features, 0.0)
+                data, ids = whole.of([view], features, whole.scene.pixels_of(capture.quality))
             return Frame(self.backend.pipeline(features).render(data, view), capture.outputs, ids)
 
 
