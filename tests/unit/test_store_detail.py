@@ -64,7 +64,6 @@ def test_nodes_stand_for_every_chunk_once_and_for_none_that_is_too_near(store, p
             # the middle lies no nearer than the nearest point, by which it was chosen
             assert nodes["size"][number] * view.focal_x / depth <= pixels
     assert len(covered) == len(set(covered))
-    assert below
     if away >= 200:  # all of the city is in the picture
         assert sorted(covered) == np.flatnonzero(nodes["level"] == 0).tolist()
     assert list(numbers) == sorted(numbers)
