@@ -29,6 +29,7 @@ from fidsplat.experiments.tradeoff.session import QUICK, Session, memory_of, tim
 from fidsplat.hard_cases.clouds import camera, splats
 from fidsplat.quality import ELLIPSOID, PRESETS, MarkerQuality
 
+pytestmark = pytest.mark.usefixtures("optimised")
 FACING = (1.0, 0.0, 0.0, 0.0)
 WORDS = ("tradeoff", "--quick", "--scenes", "apriltag", "--knobs", "opacity_ceiling")
 
