@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import Adopts, DeviceInfo, DrawsBatches, ResidentData
+from fidsplat.backends.base import Adopts, DeviceInfo, DrawsBatches, DrawsEvery, ResidentData
 from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.registry import open_backend
 from fidsplat.backends.view import NO_CAMERA
@@ -19,7 +19,7 @@ from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.capture import Capture, output_names
 from fidsplat.errors import InputError, unknown
 from fidsplat.frame import Frame, check_process
-from fidsplat.quality import Quality
+from fidsplat.quality import Quality, whole_number
 from fidsplat.scenes import Scene
 from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
@@ -182,6 +182,39 @@ class Renderer:
         """
         asked = _asked(scene, capture, camera, outputs, quality, background, motion, shutter, sensor, fog)
         return self._draw(self._resident(scene), asked)
+
+    def render_every(
+        self,
+        step: int,
+        scene: Scene | SplatCloud | ResidentCloud,
+        capture: Capture | Camera | None = None,
+        outputs: Iterable[str] | None = None,
+        quality: Quality | str | None = None,
+        tell: Callable[[float], object] | None = None,
+    ) -> Frame:
+        """Every step-th pixel of a picture, in both directions: what `render` gives those pixels, in a share
+        of the time. The reference alone draws so.
+
+        Args:
+            step: 1 or more.
+            scene, capture, outputs, quality: as `render`.
+            tell: called meanwhile with the share that is done, 0 to 1.
+
+        Raises:
+            InputError: as `render`; the device draws whole pictures only.
+        """
+        whole_number("step", step, 1, 2**31 - 1)
+        asked = _asked(scene, capture, None, outputs, quality, *[None] * 5)
+        resident = self._resident(scene)
+        features, view = prepare(resident._data, asked)
+        with self._lock:
+            pipeline = self.backend.pipeline(features)
+            if not isinstance(pipeline, DrawsEvery):
+                raise InputError(
+                    f"{self.device.name} draws whole pictures only; device='reference' draws some of their "
+                    "pixels"
+                )
+            return Frame(pipeline.render_every(resident._data, view, step, tell), asked.outputs)
 
     def render_views(
         self,
