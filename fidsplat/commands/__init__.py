@@ -19,6 +19,7 @@ from fidsplat.commands.info import Info
 from fidsplat.commands.marker import Marker
 from fidsplat.commands.render import Render
 from fidsplat.commands.source import Source
+from fidsplat.commands.store import Store
 from fidsplat.commands.tradeoff import Tradeoff
 from fidsplat.commands.train import Train
 from fidsplat.commands.view import View
@@ -42,6 +43,7 @@ COMMANDS = {
     "gallery": Gallery,
     "greenhouse": Greenhouse,
     "train": Train,
+    "store": Store,
     "source": Source,
 }
 """Every command by its name, in the order in which help lists them."""

@@ -38,7 +38,7 @@ class View:
       fidsplat view yard.training.npz --trajectory yard/sparse/0       a training, and its cameras
     """
 
-    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply|RUN", "what to show")]
+    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply|STORE.fss|RUN", "what to show")]
     trajectory: Annotated[
         str | None,
         option(
@@ -85,10 +85,12 @@ class View:
 
     def _shown(self) -> tuple[str, str | None, TrainingRun | None]:
         """What to load, the poses to show, and the run that is followed."""
+        from fidsplat.store.layout import SUFFIX
+
         folder = path_of(self.source)
         if checkpoint := checkpoint_of(folder):
             return self.source, self.trajectory, TrainingRun(checkpoint)
-        if not folder.is_dir():
+        if not folder.is_dir() or folder.suffix.lower() == SUFFIX:
             return self.source, self.trajectory, None
         source, poses = flown(folder)
         return source, self.trajectory or poses, None

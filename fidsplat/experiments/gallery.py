@@ -68,7 +68,8 @@ def write_gallery(folder: Path, pieces: Sequence[Piece], device: str | None = No
             renderers[wanted] = Renderer(wanted)
         renderer = renderers[wanted]
         names = piece.scene.capture.outputs
-        key = digest_of((piece.scene.cloud(), piece.scene.capture, renderer.device.title, __version__))
+        splats = piece.scene.splats if piece.scene.streamed is None else piece.scene.streamed.content
+        key = digest_of((splats, piece.scene.capture, renderer.device.title, __version__))
         files = [folder / f"{number:03d}-{piece.name}-{name}-{key}.png" for name in names]
         if not all(file.exists() for file in files):
             _draw(renderer.render(piece.scene), files)
@@ -88,7 +89,7 @@ def _figure(piece: Piece, files: Sequence[Path], device: str) -> str:
     said = html.escape
     first, *more = [said(file.name) for file in files]
     markers = ", ".join(placed.marker.spec for placed in piece.scene.markers)
-    facts = f"{len(piece.scene.cloud()):,} splats{': ' if markers else ''}{markers[:200]}. {device}"
+    facts = f"{len(piece.scene.splats):,} splats{': ' if markers else ''}{markers[:200]}. {device}"
     images = "".join(f'<a href="{name}"><img src="{name}" loading="lazy" alt=""></a> ' for name in more)
     text = f"<details><summary>scene file</summary><pre>{said(piece.text)}</pre></details>"
     return (
