@@ -11,10 +11,10 @@ import json
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -132,6 +132,15 @@ class Sweep:
             found = map(_call, rest) if self.pool is None else self.pool.map(_call, rest)
             for key, result in zip(keys, found, strict=True):
                 yield self.results.append(key, result)
+
+
+def in_turn(sweeps: Sequence[Sweep]) -> Iterator[Record]:
+    """Measure what is left, the first point of each sweep before the second of any; yields each record when
+    it is in its file."""
+    for keys in zip_longest(*(sweep.points for sweep in sweeps)):
+        for sweep, key in zip(sweeps, keys, strict=True):
+            if key is not None and sweep.results.left([key]):
+                yield sweep.results.append(key, sweep.begin(key)())
 
 
 def read_records(file: Path) -> list[Record]:

@@ -75,6 +75,9 @@ class TrainSettings:
     beta2: float = 0.999
     epsilon: float = 1e-15
     """of Adam's denominator"""
+    sparse_adam: bool = False
+    """in a step the splats rest that its picture does not depend on; otherwise they move on by what is
+    remembered of them, as with the authors"""
 
     densify_from: int = 500
     """iterations before this are left to the splats that there are"""
@@ -118,6 +121,8 @@ class TrainSettings:
         if not isinstance(self.quality, str):  # checkpoints hold it as text
             raise InputError(f"training: quality is {self.quality!r}; give it as text, e.g. 'surfel'")
         Quality.of(self.quality)
+        if not isinstance(self.sparse_adam, bool):
+            raise InputError(f"training: sparse_adam is {self.sparse_adam!r}; it must be True or False")
         for field in fields(self):
             value = getattr(self, field.name)
             if field.type == "float":

@@ -20,7 +20,11 @@ _PICTURE = takes(
 )
 _MASK = takes("int masked", "in uchar mask  // (rows, pixels), where `masked`")
 _PLANES = takes("out float planes")
-_ADAM = takes("float beta1 beta2 rest1 rest2 root epsilon")
+_ADAM = takes(
+    "float beta1 beta2 rest1 rest2 root epsilon",
+    "int sparse  // splats that the picture does not depend on rest",
+    "in float by_means by_opacities by_sh",
+)
 _DRAWN_SH = takes("uint count drawn all", "int plain")
 
 KERNELS: dict[str, tuple[Argument, ...]] = {
@@ -31,7 +35,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "loss_columns_backward": takes(
         _PICTURE, "float l1_share ssim_share", _MASK, "in float planes", "out float by_rgb"
     ),
-    "loss_sums": takes("uint plane", "in float planes", "out float sums  // (work-items, 3)"),
+    "loss_sums": takes("uint plane", "in float planes", "out float sums  // (work-groups, 3)"),
     "activate": takes(
         "uint count",
         "in float quats log_scales logits",
@@ -39,11 +43,11 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     "activate_sh": takes(_DRAWN_SH, "in float sh", "out float drawn_sh"),
     "adam_shapes": takes(
-        "uint count",
+        "uint count drawn",
         _ADAM,
         "float size_means size_scales size_quats size_logits  // rates of this step",
         "float scale_penalty opacity_penalty",
-        "in float by_means by_scales by_quats by_opacities",
+        "in float by_scales by_quats",
         "out float means first_means second_means",
         "out float log_scales first_log_scales second_log_scales",
         "out float quats first_quats second_quats",
@@ -54,7 +58,6 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         _DRAWN_SH,
         _ADAM,
         "float size_sh size_rest  // rates of this step, of degree 0 and above",
-        "in float by_sh",
         "out float sh first_sh second_sh drawn_sh",
     ),
     "count_seen": takes(
