@@ -53,7 +53,7 @@ class Fly:
       fidsplat fly scene.toml --trajectory flight.tum --outputs rgb,label --log run.mcap --coco truth.json
     """
 
-    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply", "what to draw")]
+    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply|STORE.fss", "what to draw")]
     trajectory: Annotated[
         str | None, option("FILE", "the camera's poses (default: the scene's [[camera.motion]])")
     ] = None
@@ -130,7 +130,7 @@ class Fly:
         flight = Flight(scene, path, times, scene.capture.with_(outputs=names, quality=self.quality))
         with where.status("opening the device"):
             renderer = fs.Renderer(self.device or scene.device, budget)
-        folder = FlightFolder(self.out, flight, renderer.device.title, self.overwrite)
+        folder = FlightFolder(self.out, flight, renderer.device.title, self.overwrite, self.source)
         begun = time.perf_counter()
         left = len(folder.left())
         self._steps("pictures", folder.draw(renderer), len(flight), len(flight) - left)
