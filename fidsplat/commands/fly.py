@@ -130,7 +130,7 @@ class Fly:
         flight = Flight(scene, path, times, scene.capture.with_(outputs=names, quality=self.quality))
         with where.status("opening the device"):
             renderer = fs.Renderer(self.device or scene.device, budget)
-        folder = FlightFolder(self.out, flight, renderer.device.title, self.overwrite)
+        folder = FlightFolder(self.out, flight, renderer.device.title, self.overwrite, self.source)
         begun = time.perf_counter()
         left = len(folder.left())
         self._steps("pictures", folder.draw(renderer), len(flight), len(flight) - left)

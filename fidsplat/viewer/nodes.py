@@ -84,7 +84,9 @@ class Nodes:
             name, around, _OUTLINE, thickness=2.0, thickness_units="screen", **frame
         )
         spec = placed.marker.spec
-        self._page.add_label(f"{name}/name", spec if len(spec) <= 40 else f"{spec[:37]}...")
+        top = (corners[0] + corners[1]) / 2  # above its upper edge, where it covers no module
+        text = spec if len(spec) <= 40 else f"{spec[:37]}..."
+        self._page.add_label(f"{name}/name", text, position=top, anchor="bottom-center")
         return lines
 
     def _frustum(self, name: str, camera: Camera | None, pose: np.ndarray, color: Any, scale: float) -> Any:

@@ -7,6 +7,7 @@ import io
 import logging
 import socket
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,9 +22,10 @@ from fidsplat.formats import save_trajectory
 from fidsplat.scenes import Scene
 from fidsplat.viewer.controls import NOBODY, Controls
 from fidsplat.viewer.edits import SceneFile
+from fidsplat.viewer.guard import guarded
 from fidsplat.viewer.nodes import Nodes
 from fidsplat.viewer.session import Session, View
-from fidsplat.viewer.settings import AT_REST, Viewpoint
+from fidsplat.viewer.settings import Viewpoint
 from fidsplat.viewer.stream import Stream
 from fidsplat.vision.images import png_bytes, to_uint8
 from fidsplat.vision.readback import read_back
@@ -56,6 +58,7 @@ class Viewer:
         port: 0 takes a free one.
         rate: pictures a second to aim at while moving.
         keyframes: whose poses, camera to world, stand there at first.
+        again: asked once a second for another scene to show, None where there is none: of a run that goes on.
 
     Raises:
         InputError: the port is in use, or the extra `viewer` is missing.
@@ -72,6 +75,7 @@ class Viewer:
         port: int = 8080,
         rate: float = 30.0,
         keyframes: Trajectory | None = None,
+        again: Callable[[], Scene | None] | None = None,
     ) -> None:
         viser = _viser()
         check_port(host, port)
@@ -81,10 +85,13 @@ class Viewer:
         self._said: dict[int, Any] = {}
         self._keyframes: list[np.ndarray] = [] if keyframes is None else list(keyframes.poses)
         self._file = None if file is None else SceneFile(file)
+        self._again = again
         self._held: int | None = None
         self.session = Session(scene, device, memory_budget, self._changed)
         with _silent():
-            self.server: Any = viser.ViserServer(host, port, label="fidsplat", verbose=False)
+            self.server: Any = guarded(
+                lambda: viser.ViserServer(host, port, label="fidsplat", verbose=False), host
+            )
         self.server.gui.configure_theme(dark_mode=True, show_logo=False)
         self.server.gui.main_panel.dock_right()
         self._nodes = Nodes(self.server.scene)
@@ -139,11 +146,11 @@ class Viewer:
         self._said.pop(client.client_id, None)
 
     def _send(self, client: Any, viewpoint: Viewpoint, scale: float) -> None:
-        view = self.session.draw(viewpoint, scale)
-        client.scene.set_background_image(to_uint8(view.frame["rgb"]), "jpeg", jpeg_quality=JPEG)
+        frame = self.session.draw_moving(viewpoint, scale)
+        client.scene.set_background_image(to_uint8(frame["rgb"]), "jpeg", jpeg_quality=JPEG)
 
     def _send_exact(self, client: Any, viewpoint: Viewpoint) -> None:
-        view = self.session.draw(viewpoint, 1.0, AT_REST)
+        view = self.session.draw(viewpoint)
         client.scene.set_background_image(to_uint8(view.frame["rgb"]), "png")
         if client.client_id in self._streams:  # else it has left meanwhile
             self._views[client.client_id] = view
@@ -274,9 +281,11 @@ class Viewer:
             self.session.wish(scene=moved, done=lambda why: self._controls.say(why or problem))
 
     def _watch(self) -> None:
-        """Read the scene file again when somebody else has written it."""
+        """Read the scene file again when somebody else has written it, and ask for a run's newest splats."""
         while not self._closed.wait(LOOK):
             try:
+                if self._again is not None and (newer := self._again()) is not None:
+                    self.session.wish(scene=newer, done=lambda why: self._controls.say(why or ""))
                 with self._lock:
                     text = None if self._file is None else self._file.changed()
                 if self._file is not None and text is not None:
