@@ -47,7 +47,7 @@ MAY_IMPORT = {
     "views": PLAIN,
     "batch": BASE | {"backends", "effects", "frame"},
     "render": PLAIN | {"store", "scenes", "effects", "backends", "frame", "views", "batch"},
-    "viewer": PLAIN | {"scenes", "effects", "backends", "render", "frame", "vision", "formats"},
+    "viewer": PLAIN | {"store", "scenes", "effects", "backends", "render", "frame", "vision", "formats"},
     "flights": PLAIN | {"store", "scenes", "render", "vision", "formats", "frame", "provenance"},
     "remote": BASE | {"provenance", "flights", "render", "vision", "experiments"},
     "sim": PLAIN | {"batch", "scenes", "markers", "render", "vision", "formats"},
