@@ -31,6 +31,7 @@ from fidsplat.hard_cases.clouds import camera, splats
 from fidsplat.quality import ELLIPSOID, PRESETS, MarkerQuality
 from fidsplat.random_clouds import random_cloud
 
+pytestmark = pytest.mark.usefixtures("optimised")
 FACING = (1.0, 0.0, 0.0, 0.0)
 WORDS = ("tradeoff", "--quick", "--scenes", "apriltag", "--knobs", "opacity_ceiling")
 

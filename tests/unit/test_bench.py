@@ -5,7 +5,6 @@ import xml.dom.minidom
 
 import numpy as np
 import pytest
-from optimisation import as_users_compile
 
 import fidsplat as fs
 from fidsplat.backends.base import Measurable
@@ -68,10 +67,10 @@ def measurable(renderer):
     return renderer.backend
 
 
+@pytest.mark.usefixtures("optimised")  # else each takes as long as the loop around it
 def test_rates_of_a_device_are_those_of_a_computer(renderer):
     assert renderer.device.platform == "NVIDIA Warp" or isinstance(renderer.backend, Measurable)
-    with as_users_compile():  # without optimisation each takes as long as the loop around it
-        rates = measurable(renderer).rates()
+    rates = measurable(renderer).rates()
     assert 1e8 < rates.copy_bytes < 1e14
     # results per second: a multiply-add is never slower than an exponential or a division
     assert 1e7 < rates.exp < rates.fma < 1e16
