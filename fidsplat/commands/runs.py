@@ -80,7 +80,7 @@ class TrainingRun:
         from fidsplat.train import splats_of
 
         cloud, background = splats_of(self.file)
-        return Scene([cloud], camera=framing_camera(cloud), background=background)
+        return Scene((cloud,), camera=framing_camera(cloud), background=background)
 
     def _stamp(self) -> tuple[int, int] | None:
         try:
