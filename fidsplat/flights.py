@@ -75,7 +75,8 @@ class Flight:
     def key(self, device: str) -> str:
         """16 hexadecimal digits of all that its pictures depend on: splats, captures, device, version."""
         digest = _Digest()
-        content = (self.scene.cloud(), self.capture, self.trajectory, self.path, device, __version__)
+        splats = self.scene.splats if self.scene.streamed is None else self.scene.streamed.content
+        content = (splats, self.capture, self.trajectory, self.path, device, __version__)
         try:
             pickle.Pickler(digest, protocol=5).dump(content)
         except (pickle.PicklingError, AttributeError, TypeError) as error:

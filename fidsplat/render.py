@@ -23,6 +23,9 @@ from fidsplat.quality import Quality
 from fidsplat.scenes import Scene
 from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
+from fidsplat.store.residency import Residency
+from fidsplat.store.store import Store
+from fidsplat.store.streamed import Streamed
 from fidsplat.surroundings import Fog, Gradient, Panorama, background_of
 from fidsplat.views import Views, views_of
 
@@ -35,10 +38,15 @@ def default_device() -> str:
 
 
 class ResidentCloud:
-    """A cloud on a renderer's device; rendering it transfers no splat."""
+    """A cloud on a renderer's device; rendering it transfers no splat. Of a store, or a scene with stores,
+    what views need is brought there when they are drawn, and what the last one needed stays."""
 
     def __init__(
-        self, renderer: Renderer, data: ResidentData, capture: Capture, labels: np.ndarray | None = None
+        self,
+        renderer: Renderer,
+        data: ResidentData | Residency,
+        capture: Capture,
+        labels: np.ndarray | None = None,
     ) -> None:
         self._renderer, self._data, self._labels = renderer, data, labels
         self.capture = capture
@@ -60,7 +68,7 @@ class ResidentCloud:
 
     @cached_property
     def labels(self) -> frozenset[int] | None:
-        """The labels that its splats have; None where they are on the device alone."""
+        """The labels that its splats have; None where they are on the device, or on disk."""
         return None if self._labels is None else frozenset(np.unique(self._labels).tolist())
 
 
@@ -104,13 +112,19 @@ class Renderer:
         """The device that draws."""
         return self.backend.info
 
-    def upload(self, scene: Scene | SplatCloud) -> ResidentCloud:
-        """Put a scene's splats on the device, to be rendered many times. A scene's capture is kept."""
+    def upload(self, scene: Scene | SplatCloud | Store) -> ResidentCloud:
+        """Put a scene's splats on the device, to be rendered many times. A scene's capture is kept. Of stores
+        nothing is read before a view needs it."""
         check_process(self._process, "Renderer")
+        capture = scene.capture if isinstance(scene, Scene) else _PLAIN
+        streamed = Streamed([scene]) if isinstance(scene, Store) else None
+        if isinstance(scene, Scene):
+            streamed = scene.streamed
+        if streamed is not None:
+            return ResidentCloud(self, Residency(streamed, self.backend), capture)
         cloud = scene.cloud() if isinstance(scene, Scene) else scene
         if not isinstance(cloud, SplatCloud):
-            raise InputError(f"cannot render a {type(scene).__name__}; give a Scene or a SplatCloud")
-        capture = scene.capture if isinstance(scene, Scene) else _PLAIN
+            raise InputError(f"cannot render a {type(scene).__name__}; give a Scene, a SplatCloud or a Store")
         with self._lock:
             return ResidentCloud(self, self.backend.upload(cloud), capture, cloud.labels)
 
@@ -154,7 +168,7 @@ class Renderer:
 
     def render(
         self,
-        scene: Scene | SplatCloud | ResidentCloud,
+        scene: Scene | SplatCloud | Store | ResidentCloud,
         capture: Capture | Camera | None = None,
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
@@ -185,7 +199,7 @@ class Renderer:
 
     def render_views(
         self,
-        scene: Scene | SplatCloud | ResidentCloud,
+        scene: Scene | SplatCloud | Store | ResidentCloud,
         captures: Iterable[Capture | Camera],
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
@@ -209,14 +223,15 @@ class Renderer:
         except TypeError:
             raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera") from None
         resident = self._resident(scene)
+        parts = (outputs, quality, background, motion, shutter, sensor, fog)
+        asked = (_asked(scene, one, None, *parts) for one in rest)
+        if isinstance(resident._data, Residency):
+            asked = self._read_ahead(resident._data, asked)
         waiting: Frame | None = None
         failure: Exception | None = None
         while True:
             try:
-                asked = _asked(
-                    scene, next(rest), None, outputs, quality, background, motion, shutter, sensor, fog
-                )
-                frame = self._draw(resident, asked)
+                frame = self._draw(resident, next(asked))
             except StopIteration:
                 break
             except Exception as error:
@@ -230,9 +245,28 @@ class Renderer:
         if failure is not None:
             raise failure
 
+    def _read_ahead(self, store: Residency, captures: Iterator[Capture]) -> Iterator[Capture]:
+        """The captures, each once what the next needs is being read."""
+        waiting: Capture | None = None
+        while True:
+            try:
+                following = next(captures, None)
+                if following is not None and waiting is not None:
+                    features, view = prepare(store.scene, following)
+                    store.fetch(view, features, 0.0)
+            except Exception:
+                if waiting is not None:
+                    yield waiting
+                raise
+            if waiting is not None:
+                yield waiting
+            if following is None:
+                return
+            waiting = following
+
     def render_batch(
         self,
-        scene: Scene | SplatCloud | ResidentCloud,
+        scene: Scene | SplatCloud | Store | ResidentCloud,
         captures: Iterable[Capture | Camera] | Capture | Camera,
         *,
         poses: Any = None,
@@ -277,18 +311,22 @@ class Renderer:
                     )
 
     def _draw_batch(self, resident: ResidentCloud, views: Views) -> FrameBatch:
-        data = resident._data
-        features, batch = prepare_batch(data, views)
+        whole = resident._data
+        features, batch = prepare_batch(whole.scene if isinstance(whole, Residency) else whole, views)
         with self._lock:
+            data, ids = whole, None
+            if isinstance(whole, Residency):
+                drawn = [batch.one(number) for number in range(len(batch.slots))]
+                data, ids = whole.of(drawn, features, 0.0)
             pipeline = self.backend.pipeline(features)
             if isinstance(pipeline, DrawsBatches):
                 images = pipeline.render_batch(data, batch)
             else:
                 each = {int(k): pipeline.render(data, batch.one(n)) for n, k in enumerate(batch.slots)}
                 images = ViewByView(each, batch.total, batch.size, len(resident))
-        return FrameBatch(images, views.captures[0].outputs)
+        return FrameBatch(images, views.captures[0].outputs, ids)
 
-    def _resident(self, scene: Scene | SplatCloud | ResidentCloud) -> ResidentCloud:
+    def _resident(self, scene: Scene | SplatCloud | Store | ResidentCloud) -> ResidentCloud:
         resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
         check_process(self._process, "Renderer")
         if resident._renderer is not self:
@@ -298,9 +336,13 @@ class Renderer:
         return resident
 
     def _draw(self, resident: ResidentCloud, capture: Capture) -> Frame:
-        features, view = prepare(resident._data, capture)
+        whole = resident._data
+        features, view = prepare(whole.scene if isinstance(whole, Residency) else whole, capture)
         with self._lock:  # scratch buffers and kernels' arguments belong to one picture at a time
-            return Frame(self.backend.pipeline(features).render(resident._data, view), capture.outputs)
+            data, ids = whole, None
+            if isinstance(whole, Residency):
+                data, ids = whole.of([view], features, 0.0)
+            return Frame(self.backend.pipeline(features).render(data, view), capture.outputs, ids)
 
 
 def _asked(

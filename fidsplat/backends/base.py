@@ -5,7 +5,7 @@ Nobody outside a backend asks for its name: a capability is asked for with `isin
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -384,9 +384,12 @@ class TrainingKernels(Protocol):
         """The splats as they are drawn, with SH of this degree; it changes as they do."""
         ...
 
-    def loss(self, images: Any, view: int, dssim_weight: float) -> tuple[float, float, Any]:
-        """Compare a picture with that of a view, by its number: the loss, the mean squared difference, and
-        the loss's derivative (h, w, 3) as an array of the device, which holds until the next call."""
+    def loss(
+        self, images: Any, view: int, dssim_weight: float
+    ) -> tuple[Callable[[], tuple[float, float]], Any]:
+        """Compare a picture with that of a view, by its number: what waits for the loss and the mean squared
+        difference, to be called before the next picture, and the loss's derivative (h, w, 3) as an array of
+        the device, which holds until the next call."""
         ...
 
     def count(self, screen: Any, camera: Camera, origin: np.ndarray) -> None:

@@ -18,6 +18,7 @@ from fidsplat.commands.info import Info
 from fidsplat.commands.marker import Marker
 from fidsplat.commands.render import Render
 from fidsplat.commands.source import Source
+from fidsplat.commands.store import Store
 from fidsplat.commands.tradeoff import Tradeoff
 from fidsplat.commands.train import Train
 from fidsplat.commands.view import View
@@ -40,6 +41,7 @@ COMMANDS = {
     "experiment": Experiment,
     "greenhouse": Greenhouse,
     "train": Train,
+    "store": Store,
     "source": Source,
 }
 """Every command by its name, in the order in which help lists them."""

@@ -53,7 +53,7 @@ class Fly:
       fidsplat fly scene.toml --trajectory flight.tum --outputs rgb,label --log run.mcap --coco truth.json
     """
 
-    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply", "what to draw")]
+    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply|STORE.fss", "what to draw")]
     trajectory: Annotated[
         str | None, option("FILE", "the camera's poses (default: the scene's [[camera.motion]])")
     ] = None

@@ -62,7 +62,7 @@ class Render:
       fidsplat render scene.toml --max-ms 20
     """
 
-    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply", "what to draw")]
+    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply|STORE.fss", "what to draw")]
     out: Annotated[
         str | None, option("OUT", "PNG file or folder (default: the source's name with .png, here)", "-o")
     ] = None
@@ -197,6 +197,7 @@ def load_source(source: str, quality: str | None, progress: "Progress") -> "Scen
     import fidsplat as fs
     from fidsplat.commands.framing import framing_camera
     from fidsplat.formats.files import FORMATS
+    from fidsplat.store.layout import SUFFIX
 
     suffix = Path(source).suffix.lower()
     if suffix == ".toml":
@@ -206,7 +207,12 @@ def load_source(source: str, quality: str | None, progress: "Progress") -> "Scen
                 f"{source} has no [camera] table; add one with width, height, fov_x_deg, position, look_at"
             )
         return scene
+    if suffix == SUFFIX:
+        store = fs.Store(source)
+        return fs.Scene(stores=(store,), camera=framing_camera(store))
     if suffix in FORMATS:
         cloud = fs.load_splats(source, progress)
         return fs.Scene([cloud], camera=framing_camera(cloud))
-    raise InputError(f"cannot draw {source}: give a scene file (.toml) or a splat file (.ply)")
+    raise InputError(
+        f"cannot draw {source}: give a scene file (.toml), a splat file (.ply) or a store (.fss)"
+    )

@@ -31,7 +31,7 @@ class View:
       fidsplat view room.ply --port 9000 --device opencl:nvidia
     """
 
-    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply", "what to show")]
+    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply|STORE.fss", "what to show")]
     trajectory: Annotated[
         str | None,
         option(

@@ -36,6 +36,8 @@ def write_scene(scene: SceneParts, path: str | os.PathLike[str]) -> None:
         name = f"{file.stem}-splats-{i}.ply"
         save_ply(cloud, file.parent / name)
         splats.append({"file": name, **motions.get(i, {})})
+    for store in scene.stores:
+        splats.append({"file": os.path.relpath(store.path.resolve(), file.parent.resolve())})
     parts = [] if scene.camera is None else [_table("[camera]", _camera(scene))]
     lens = None if scene.camera is None else lens_table(scene.camera)
     parts += [] if lens is None else [_table(f"[camera.{lens[0]}]", lens[1])]

@@ -328,8 +328,9 @@ def _distance(scene: Scene, pose: np.ndarray) -> float:
     """Metres before the camera about which the page turns: to the nearest marker, else to the middle of the
     splats."""
     targets = [placed.pose[:3, 3] for placed in scene.markers]
-    cloud = scene.cloud()
-    if not targets and len(cloud):
+    if not targets and scene.streamed is not None:
+        targets = [sum(scene.streamed.bounds()) / 2]
+    elif not targets and len(cloud := scene.cloud()):
         targets = [np.median(cloud.means, axis=0) + cloud.origin]
     ahead = [float((target - pose[:3, 3]) @ pose[:3, 2]) for target in targets]
     return min((distance for distance in ahead if distance > 0), default=1.0)

@@ -165,10 +165,10 @@ class Session:
         device = settings.device or default_device()
         camera = _FIRST.camera(scene, settings.lens)
         captures = [settings.capture(scene, camera, outputs) for outputs in (MOVING, AT_REST)]
-        features = frozenset(select(scene.cloud(), capture) for capture in captures)
+        features = frozenset(select(scene.splats, capture) for capture in captures)
         version = 0 if before is None else before.version + 1
         if before is not None and before.device == device and features <= before.compiled:
-            same = scene.cloud() is before.scene.cloud()
+            same = scene.splats is before.scene.splats
             resident = before.resident if same else before.renderer.upload(scene)
             return replace(before, scene=scene, settings=settings, resident=resident, version=version)
         renderer = Renderer(device, self._budget)

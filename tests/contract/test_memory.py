@@ -11,6 +11,7 @@ import pytest
 from agreement import ALL_OUTPUTS, random_splats, some_thick
 
 import fidsplat as fs
+from fidsplat.backends.bands import cut
 from fidsplat.backends.opencl import batch
 from fidsplat.backends.opencl.memory_plan import plan_of
 from fidsplat.backends.opencl.shapes import gpu_shape
@@ -71,6 +72,24 @@ def cloud():
     third = np.where((number >= 200) & (number % 3 == 0), 0.05, 0)
     made = some_thick(made, third)
     return made.with_planes(np.where(number < 200, 0, -1))
+
+
+def test_one_pair_more_than_the_budget_makes_a_second_band(opencl, cloud, whole, monkeypatch):
+    """Lists are never longer than the memory that is planned for them."""
+    images, stats = whole
+    budget = stats["pairs"] - 1
+    bands = []
+
+    def noted(*asked):
+        bands.extend(cut(*asked))
+        return bands
+
+    monkeypatch.setattr(opencl.backend, "pair_budget", budget)
+    monkeypatch.setattr("fidsplat.backends.opencl.lists.cut", noted)
+    frame = opencl.render(cloud, CAMERA, ALL_OUTPUTS)
+    assert len(bands) == 2
+    assert max(pairs for _, _, pairs in bands) <= budget
+    assert all(np.array_equal(frame[name], image) for name, image in images.items())
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """Data sets from disk: what is read, and what is said about those that cannot be trained on."""
 
 import json
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -82,6 +83,30 @@ def test_a_model_of_pycolmap_is_read_as_pycolmap_reads_it(folder):
         camera = ours.cameras[ours.names.index(image.name)]
         np.testing.assert_allclose(camera.world_to_camera[:3], image.cam_from_world().matrix(), atol=1e-12)
     assert len(ours.points) == len(theirs.points3D)
+
+
+def test_what_colmap_found_in_its_pictures_is_passed_over(folder):
+    """Two points in each, which our own files have none of, as text and as binary."""
+    model = folder / "sparse/0"
+    before = load_colmap(model)
+    lines = (model / "images.txt").read_text().splitlines()
+    images = [line.split() for line in lines if line and not line.startswith("#")]
+    (model / "images.bin").unlink()
+    text = "".join(f"{' '.join(words)}\n9.5 8.5 1 7.5 6.5 -1\n" for words in images)
+    (model / "images.txt").write_text(text)
+    assert_same(load_colmap(model), before)
+    packed = struct.pack("<Q", len(images))
+    for number, *pose, camera, name in images:
+        packed += struct.pack("<i7di", int(number), *map(float, pose), int(camera)) + name.encode() + b"\0"
+        packed += struct.pack("<QddqddQ", 2, 9.5, 8.5, 1, 7.5, 6.5, 2**64 - 1)
+    (model / "images.bin").write_bytes(packed)
+    assert_same(load_colmap(model), before)
+
+
+def assert_same(model, wanted):
+    assert model.names == wanted.names
+    for one, other in zip(model.cameras, wanted.cameras, strict=True):
+        np.testing.assert_array_equal(one.world_to_camera, other.world_to_camera)
 
 
 def test_transforms_with_the_points_that_they_name(made, tmp_path):

@@ -79,15 +79,15 @@ class OpenCLGradients:
         picture = images.picture
         try:
             with picture.workspace.lock:
-                return self._backward(picture, gradients, images.stats["pairs"])
+                return self._backward(picture, gradients)
         except cl.Error as error:
             title = picture.workspace.info.title
             raise DeviceError(f"{title} failed while taking derivatives: {error}") from error
 
-    def _backward(self, drawn: Picture, gradients: Mapping[str, Any], pairs: int) -> dict[str, Any]:
+    def _backward(self, drawn: Picture, gradients: Mapping[str, Any]) -> dict[str, Any]:
         picture = copy(drawn)  # its buffers and events, with other kernels
         picture.program = self.program
-        view, shape, count = picture.view, self._pipeline.shape, picture.resident.count
+        view, shape, count, pairs = picture.view, self._pipeline.shape, picture.resident.count, picture.pairs
         self._take_gradients(picture, gradients)
         groups = -(-count // _GROUP)
         record = self.source.records["Moments"].itemsize
