@@ -1,17 +1,18 @@
 // For GPUs: one work-group draws one tile, ROWS pixels of a column per work-item; splats are staged in local memory.
 // Barriers stand in loops whose bounds are the same for the whole group (numerics F5).
 //
-// Eight neighbours in a group draw a cell of CELL_W x CELL_H pixels, and walk through those of the staged splats alone that can
+// ITEMS neighbours in a group draw a cell of CELL_W x CELL_H pixels, and walk through those of the staged splats alone that can
 // touch it: work-items of a GPU that go in step with them have cells and splats of their own, side by side.
 // Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile of each view.
 // Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 channels: r, g, b, transmittance) and the outputs' samples, whole tiles.
 #define GROUP (TILE_W * TILE_H / ROWS)
-#define CELL_W 4
+#define ITEMS 4                              // work-items of a cell
+#define CELL_W 2
 #define CELL_H (2 * ROWS)
 #define CELLS_X (TILE_W / CELL_W)
 #define CELLS_Y (TILE_H / CELL_H)
+#define BLOCK_X (8 / CELL_W)
 #define STAGED 128
-#define ITEMS 8                              // work-items of a cell
 #define SHARE (STAGED / ITEMS)
 #define CELLS_PAD 0.02f                      // of chords, in samples
 enum { VECTORS = sizeof(Splat) / 16 };       // of 16 bytes, in a record
@@ -25,7 +26,7 @@ typedef union {              // what is staged of a splat, as vectors for fewer 
 
 // Which cells of the tile at (left, top) the splat can touch: for each row of cells, of which it touches those from `first_row` to
 // `last_row`, the cells as bits. Conservative; the test of each pixel decides.
-static inline void touched_cells(local const Splat *s, int left, int top, wide half_r2, wide filter, local uchar *cells) {
+static inline void touched_cells(local const Splat *s, int left, int top, wide half_r2, wide filter, local ushort *cells) {
     int first_row = max(s->y0 - top, 0) / CELL_H, last_row = (min(s->y1 - top, TILE_H) - 1) / CELL_H;
     float shift = (float)s->ax - (float)left;
 //@@ cells_start
@@ -37,7 +38,7 @@ static inline void touched_cells(local const Splat *s, int left, int top, wide h
 //@@ cells_dot
         int first = max((int)clamp(ceil(low + shift), 0.0f, (float)TILE_W), s->x0 - left);
         int last = min((int)clamp(floor(high + shift), -1.0f, (float)(TILE_W - 1)), s->x1 - left - 1);
-        if (first <= last) cells[cell_row] = (uchar)((2u << (last / CELL_W)) - (1u << (first / CELL_W)));
+        if (first <= last) cells[cell_row] = (ushort)((2u << (last / CELL_W)) - (1u << (first / CELL_W)));
     }
 }
 
@@ -45,8 +46,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
 //@@ arguments blend
 ) {
     local Staged staged[STAGED];
-    local uchar cells[STAGED + STAGED / SHARE][CELLS_Y];    // of each splat; of shares in other banks
-    local ushort touched[CELLS_X * CELLS_Y][ITEMS];         // by cell and work-item: bits of a share of the staged splats
+    local ushort cells[STAGED + STAGED / SHARE][CELLS_Y];    // of each splat; of shares in other banks
+    local uint touched[CELLS_X * CELLS_Y][ITEMS];           // by cell and work-item: bits of a share of the staged splats
     local uchar places[CELLS_X * CELLS_Y][STAGED];          // those that can touch a cell, in order
     local int alive;
     const BlendConstants constants = {log_cut, ceiling, stop, filter};
@@ -54,10 +55,10 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
     uint number = tile / (uint)(tiles_x * tiles_y), here = tile - number * (uint)(tiles_x * tiles_y);
     int x0 = (int)(here % (uint)tiles_x) * TILE_W, y0 = (int)(here / (uint)tiles_x) * TILE_H;
-    // four cells that go in step lie two by two
-    uint four = item / 32, part = item % 32 / ITEMS, own = item % ITEMS;
-    uint cell_x = four % (CELLS_X / 2) * 2 + part % 2, cell_y = four / (CELLS_X / 2) * 2 + part / 2;
-    uint cell = cell_y * CELLS_X + cell_x;
+    // cells that go in step lie side by side: BLOCK_X by two, of 8 x 4 ROWS pixels
+    uint block = item / 32, part = item % 32 / ITEMS, own = item % ITEMS;
+    uint cell_x = block % (CELLS_X / BLOCK_X) * BLOCK_X + part % BLOCK_X;
+    uint cell_y = block / (CELLS_X / BLOCK_X) * 2 + part / BLOCK_X, cell = cell_y * CELLS_X + cell_x;
     int px = x0 + (int)(cell_x * CELL_W + own % CELL_W), py = y0 + (int)(cell_y * CELL_H + own / CELL_W * ROWS);
 
     Pixel pixels[ROWS];
@@ -90,11 +91,11 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
         uint bits = 0, listed = 0, before = 0;
         for (uint k = 0, first = own * SHARE, count = min(max(length, first) - first, (uint)SHARE); k < count; k++)
             bits |= (cells[own * (SHARE + 1) + k][cell_y] >> cell_x & 1u) << k;
-        touched[cell][own] = (ushort)bits;
+        touched[cell][own] = bits;
         barrier(CLK_LOCAL_MEM_FENCE);
         for (uint other = 0; other < ITEMS; other++) {
             if (other == own) before = listed;
-            listed += popcount((uint)touched[cell][other]);
+            listed += popcount(touched[cell][other]);
         }
         for (; bits != 0; bits &= bits - 1) places[cell][before++] = (uchar)(own * SHARE + 31 - clz(bits & -bits));
         barrier(CLK_LOCAL_MEM_FENCE);
