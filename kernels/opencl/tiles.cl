@@ -108,20 +108,13 @@ typedef struct {
     uint start, capacity;
 } Band;
 
-#define NOWHERE 0xFFFFFFFFu      // no place of a pair: beyond every capacity
-
-// Takes a place in a tile's list.
-static inline uint take_place(int tile, const Band *band, global uint *restrict cursors) {
-    if (tile < band->first || tile >= band->end) return NOWHERE;
+static inline void emit_pair(int tile, const Band *band, uint key, uint splat, global uint *restrict cursors,
+                             global uint2 *restrict pairs) {
+    if (tile < band->first || tile >= band->end) return;
     // modulo 2^32: a place within the band is right even where the picture has more pairs than that
-    return atomic_inc(cursors + tile) - band->start;
-}
-
-static inline void put_pair(uint place, const Band *band, uint key, uint splat, global uint2 *restrict pairs) {
+    uint place = atomic_inc(cursors + tile) - band->start;
     if (place < band->capacity) pairs[place] = (uint2)(splat, key);
 }
-
-#define TOGETHER 4               // places that are asked for before the first is waited for
 
 // Index space: for each view `splat_groups` work-groups, a work-item per splat, and then the same number of work-groups as for
 // every other view; these share out the big splats.
@@ -142,7 +135,7 @@ kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void emit(
             int before = (int)(splat / count) * tiles_of(width, height);
             for (int cell = item; cell < walk.cells; cell += WALK_ITEMS) {
                 int tile = walk_tile(&walk, cell, &b, width, height);
-                if (tile >= 0) put_pair(take_place(before + tile, &band, cursors), &band, key, splat, pairs);
+                if (tile >= 0) emit_pair(before + tile, &band, key, splat, cursors, pairs);
             }
         }
         return;   // the whole group
@@ -154,12 +147,8 @@ kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void emit(
     if (key != CULLED) {
         int before = (int)number * tiles_of(width, height);
         if (first_band) atomic_inc(&visible);
-        for (uint2 window = windows[splat]; window.y != 0;) {
-            uint places[TOGETHER];
-            for (int k = 0; k < TOGETHER; k++, window.y &= window.y - 1)
-                places[k] = window.y != 0 ? take_place(before + window_tile(window, band.tiles_x), &band, cursors) : NOWHERE;
-            for (int k = 0; k < TOGETHER; k++) put_pair(places[k], &band, key, splat, pairs);
-        }
+        for (uint2 window = windows[splat]; window.y != 0; window.y &= window.y - 1)
+            emit_pair(before + window_tile(window, band.tiles_x), &band, key, splat, cursors, pairs);
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     if (item == 0 && visible != 0) atomic_add(counts + COUNT_VISIBLE, visible);
@@ -195,40 +184,6 @@ static inline void comparator(uint t, uint stride, bool mirrored, uint *i, uint 
     }                                                                                       \
     barrier(fence)
 
-static inline ulong sort_read(local const ulong *items, uint length, uint i) { return i < length ? items[i] : ULONG_MAX; }
-
-static inline void sort_write(local ulong *items, uint length, uint i, ulong item) {
-    if (i < length) items[i] = item;
-}
-
-static inline void sort_two(ulong *first, ulong *second) {
-    ulong least = min(*first, *second);
-    *second = max(*first, *second);
-    *first = least;
-}
-
-// Two steps at once, whose partners are `stride` and then stride / 2 apart: each takes four places of its own.
-static inline void sort_step_4(local ulong *items, uint length, uint padded, uint stride, bool mirrored) {
-    uint closer = stride / 2;
-    for (uint t = get_local_id(0); t < padded / 4; t += SORT_ITEMS) {
-        uint inside = t & (closer - 1), i0 = 4 * t - 3 * inside, i1 = i0 + closer;
-        if (i0 >= length) continue;
-        // the upper two, in order
-        uint j0 = mirrored ? i0 + 2 * (stride - inside) - 1 - closer : i0 + stride, j1 = j0 + closer;
-        ulong a0 = items[i0], a1 = sort_read(items, length, i1);
-        ulong b0 = sort_read(items, length, j0), b1 = sort_read(items, length, j1);
-        sort_two(&a0, mirrored ? &b1 : &b0);
-        sort_two(&a1, mirrored ? &b0 : &b1);
-        sort_two(&a0, &a1);
-        sort_two(&b0, &b1);
-        items[i0] = a0;
-        sort_write(items, length, i1, a1);
-        sort_write(items, length, j0, b0);
-        sort_write(items, length, j1, b1);
-    }
-    barrier(CLK_LOCAL_MEM_FENCE);
-}
-
 kernel __attribute__((reqd_work_group_size(SORT_ITEMS, 1, 1))) void sort_tiles(
 //@@ arguments sort_tiles
 ) {
@@ -250,13 +205,10 @@ kernel __attribute__((reqd_work_group_size(SORT_ITEMS, 1, 1))) void sort_tiles(
             uint here = min(length - from, block);
             for (uint k = item; k < here; k += SORT_ITEMS) items[k] = list[from + k];
             barrier(CLK_LOCAL_MEM_FENCE);
-            for (uint stage = whole ? 2 : block; stage <= block; stage *= 2) {
-                uint stride = stage / 2;
-                for (; stride > 1; stride /= 4) sort_step_4(items, here, block, stride, whole && stride == stage / 2);
-                if (stride == 1) {
-                    SORT_STEP(items, here, block / 2, stride, whole && stage == 2, CLK_LOCAL_MEM_FENCE);
+            for (uint stage = whole ? 2 : block; stage <= block; stage *= 2)
+                for (uint stride = stage / 2; stride > 0; stride /= 2) {
+                    SORT_STEP(items, here, block / 2, stride, whole && stride == stage / 2, CLK_LOCAL_MEM_FENCE);
                 }
-            }
             for (uint k = item; k < here; k += SORT_ITEMS) {
                 if (size == padded) lists[start + from + k] = (uint)items[k];
                 else list[from + k] = items[k];

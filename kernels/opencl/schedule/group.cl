@@ -7,13 +7,14 @@
 // Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 channels: r, g, b, transmittance) and the outputs' samples, whole tiles.
 #define GROUP (TILE_W * TILE_H / ROWS)
 #define ITEMS 4                              // work-items of a cell
-#define CELL_W 2
-#define CELL_H (2 * ROWS)
-#define CELLS_X (TILE_W / CELL_W)
+#define CELLS_X 8                            // cells side by side: as bits of a byte, four splats' bytes in a word
+#define CELL_W (TILE_W / CELLS_X)
+#define CELL_H (ITEMS / CELL_W * ROWS)
 #define CELLS_Y (TILE_H / CELL_H)
-#define BLOCK_X (8 / CELL_W)
+#define BLOCK_X (CELLS_X / CELL_W)           // cells side by side of 8 that go in step, which are 8 pixels wide
 #define STAGED 128
-#define SHARE (STAGED / ITEMS)
+#define SHARE (STAGED / ITEMS)               // of the staged splats: 32
+#define CELLS_STRIDE (STAGED + 4)             // bytes; rows of cells lie in other banks
 #define CELLS_PAD 0.02f                      // of chords, in samples
 enum { VECTORS = sizeof(Splat) / 16 };       // of 16 bytes, in a record
 
@@ -26,11 +27,11 @@ typedef union {              // what is staged of a splat, as vectors for fewer 
 
 // Which cells of the tile at (left, top) the splat can touch: for each row of cells, of which it touches those from `first_row` to
 // `last_row`, the cells as bits. Conservative; the test of each pixel decides.
-static inline void touched_cells(local const Splat *s, int left, int top, wide half_r2, wide filter, local ushort *cells) {
+static inline void touched_cells(local const Splat *s, int left, int top, wide half_r2, wide filter, local uchar *cells) {
     int first_row = max(s->y0 - top, 0) / CELL_H, last_row = (min(s->y1 - top, TILE_H) - 1) / CELL_H;
     float shift = (float)s->ax - (float)left;
 //@@ cells_start
-    for (int cell_row = 0; cell_row < CELLS_Y; cell_row++) cells[cell_row] = 0;
+    for (int cell_row = 0; cell_row < CELLS_Y; cell_row++) cells[cell_row * CELLS_STRIDE] = 0;
     for (int cell_row = first_row; cell_row <= last_row; cell_row++) {
         // columns between which its rows of samples have fragments
         float y0 = (float)(top + cell_row * CELL_H) - (float)s->ay, y1 = y0 + (float)(CELL_H - 1), low = -INFINITY, high = INFINITY;
@@ -38,7 +39,7 @@ static inline void touched_cells(local const Splat *s, int left, int top, wide h
 //@@ cells_dot
         int first = max((int)clamp(ceil(low + shift), 0.0f, (float)TILE_W), s->x0 - left);
         int last = min((int)clamp(floor(high + shift), -1.0f, (float)(TILE_W - 1)), s->x1 - left - 1);
-        if (first <= last) cells[cell_row] = (ushort)((2u << (last / CELL_W)) - (1u << (first / CELL_W)));
+        if (first <= last) cells[cell_row * CELLS_STRIDE] = (uchar)((2u << (last / CELL_W)) - (1u << (first / CELL_W)));
     }
 }
 
@@ -46,7 +47,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
 //@@ arguments blend
 ) {
     local Staged staged[STAGED];
-    local ushort cells[STAGED + STAGED / SHARE][CELLS_Y];    // of each splat; of shares in other banks
+    local uint cells[CELLS_Y * CELLS_STRIDE / 4];           // by row of cells, a byte for each splat: bits of the cells that it can touch
     local uint touched[CELLS_X * CELLS_Y][ITEMS];           // by cell and work-item: bits of a share of the staged splats
     local uchar places[CELLS_X * CELLS_Y][STAGED];          // those that can touch a cell, in order
     local int alive;
@@ -55,10 +56,9 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
     uint number = tile / (uint)(tiles_x * tiles_y), here = tile - number * (uint)(tiles_x * tiles_y);
     int x0 = (int)(here % (uint)tiles_x) * TILE_W, y0 = (int)(here / (uint)tiles_x) * TILE_H;
-    // cells that go in step lie side by side: BLOCK_X by two, of 8 x 4 ROWS pixels
     uint block = item / 32, part = item % 32 / ITEMS, own = item % ITEMS;
-    uint cell_x = block % (CELLS_X / BLOCK_X) * BLOCK_X + part % BLOCK_X;
-    uint cell_y = block / (CELLS_X / BLOCK_X) * 2 + part / BLOCK_X, cell = cell_y * CELLS_X + cell_x;
+    uint cell_x = block % CELL_W * BLOCK_X + part % BLOCK_X, cell_y = block / CELL_W * CELL_W + part / BLOCK_X;
+    uint cell = cell_y * CELLS_X + cell_x;
     int px = x0 + (int)(cell_x * CELL_W + own % CELL_W), py = y0 + (int)(cell_y * CELL_H + own / CELL_W * ROWS);
 
     Pixel pixels[ROWS];
@@ -82,15 +82,19 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
             if (px < width && py + row < height && pixel_unfinished(&pixels[row], &constants)) alive = 1;
         for (uint which = item; which < length; which += GROUP) {
             local const Splat *s = &staged[which].splat;
-            touched_cells(s, x0, y0, s->log_opacity - constants.log_cut, constants.filter, cells[which + which / SHARE]);
+            touched_cells(s, x0, y0, s->log_opacity - constants.log_cut, constants.filter, (local uchar *)cells + which);
         }
         barrier(CLK_LOCAL_MEM_FENCE);
         // uniform: every work-item reads the same vote, taken before this batch is drawn
         if (!alive) break;
         // the list of each cell, by its work-items
         uint bits = 0, listed = 0, before = 0;
-        for (uint k = 0, first = own * SHARE, count = min(max(length, first) - first, (uint)SHARE); k < count; k++)
-            bits |= (cells[own * (SHARE + 1) + k][cell_y] >> cell_x & 1u) << k;
+        for (uint k = 0; k < SHARE / 4; k++) {
+            uint four = cells[cell_y * (CELLS_STRIDE / 4) + own * (SHARE / 4) + k] >> cell_x & 0x01010101u;
+            bits |= (four * 0x01020408u >> 24 & 15u) << (4 * k);
+        }
+        uint first = own * SHARE, rest = max(length, first) - first;
+        if (rest < SHARE) bits &= (1u << rest) - 1u;     // bytes that an earlier batch has left
         touched[cell][own] = bits;
         barrier(CLK_LOCAL_MEM_FENCE);
         for (uint other = 0; other < ITEMS; other++) {
