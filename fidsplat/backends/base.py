@@ -5,7 +5,7 @@ Nobody outside a backend asks for its name: a capability is asked for with `isin
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -144,6 +144,19 @@ class GivesFloat64(Protocol):
 
     def read_float64(self, name: str) -> np.ndarray:
         """The image as a NumPy array in float64."""
+        ...
+
+
+@runtime_checkable
+class DrawsEvery(Protocol):
+    """A pipeline that draws pixels one by one: it can leave some out, and say how far it is."""
+
+    def render_every(
+        self, cloud: Any, view: Any, step: int, tell: Callable[[float], object] | None = None
+    ) -> Images:
+        """Every step-th pixel in both directions, beginning with the first: images of (ceil(h / step),
+        ceil(w / step)) with the bits that `render` gives those pixels. tell: called with the share that is
+        done, 0 to 1."""
         ...
 
 
@@ -384,9 +397,12 @@ class TrainingKernels(Protocol):
         """The splats as they are drawn, with SH of this degree; it changes as they do."""
         ...
 
-    def loss(self, images: Any, view: int, dssim_weight: float) -> tuple[float, float, Any]:
-        """Compare a picture with that of a view, by its number: the loss, the mean squared difference, and
-        the loss's derivative (h, w, 3) as an array of the device, which holds until the next call."""
+    def loss(
+        self, images: Any, view: int, dssim_weight: float
+    ) -> tuple[Callable[[], tuple[float, float]], Any]:
+        """Compare a picture with that of a view, by its number: what waits for the loss and the mean squared
+        difference, to be called before the next picture, and the loss's derivative (h, w, 3) as an array of
+        the device, which holds until the next call."""
         ...
 
     def count(self, screen: Any, camera: Camera, origin: np.ndarray) -> None:

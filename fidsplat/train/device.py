@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -55,10 +55,11 @@ class DeviceWork:
         """The splats as the device draws them, with SH of this degree."""
         return self._kernels.resident(degree, origin)
 
-    def loss(self, images: Images, view: int) -> tuple[Loss, Any]:
-        """The loss of a picture of a view, by its number, and its derivative (h, w, 3) on the device."""
-        value, squared, slope = self._kernels.loss(images, view, self._settings.dssim_weight)
-        return Loss(value, squared), slope
+    def loss(self, images: Images, view: int) -> tuple[Callable[[], Loss], Any]:
+        """What waits for the loss of a picture of a view, by its number; and its derivative (h, w, 3) on the
+        device."""
+        value, slope = self._kernels.loss(images, view, self._settings.dssim_weight)
+        return lambda: Loss(*value()), slope
 
     def count(self, gradients: Mapping[str, Any], camera: Camera, origin: np.ndarray) -> None:
         """Adds the gradients on the screen to their sums."""

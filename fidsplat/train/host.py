@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -42,11 +42,12 @@ class HostWork:
         """The splats as the device draws them, with SH of this degree."""
         return self._backend.upload(self._splats.cloud(degree, origin, shared=True))
 
-    def loss(self, images: Images, view: int) -> tuple[Loss, np.ndarray]:
-        """The loss of a picture of a view, by its number, and its derivative (h, w, 3)."""
+    def loss(self, images: Images, view: int) -> tuple[Callable[[], Loss], np.ndarray]:
+        """What gives the loss of a picture of a view, by its number, and its derivative (h, w, 3)."""
         of = self._views[view]
         truth = of.picture * np.float32(1 / 255)
-        return picture_loss(images.read("rgb"), truth, of.mask, self._settings.dssim_weight)
+        loss, slope = picture_loss(images.read("rgb"), truth, of.mask, self._settings.dssim_weight)
+        return lambda: loss, slope
 
     def count(self, gradients: Mapping[str, Any], camera: Camera, origin: np.ndarray) -> None:
         """Adds the gradients on the screen to their sums."""

@@ -152,13 +152,14 @@ class Trainer:
         features, seen = prepare(resident, self._captures[number])
         pipeline = self._differentiate(features)
         images = pipeline.forward(resident, seen)
-        loss, slope = self._work.loss(images, number)
+        value, slope = self._work.loss(images, number)
+        gradients = pipeline.backward(images, {"rgb": slope})
+        loss = value()  # not before: the device goes on meanwhile
         if not math.isfinite(loss.value):
             raise TrainingError(
                 f"the loss is {loss.value} at iteration {iteration}, in the view {view.name}; "
                 + self._what_is_kept()
             )
-        gradients = pipeline.backward(images, {"rgb": slope})
         self._change(gradients, iteration, view)
         made.iteration = iteration
         self._note(iteration, loss.value, loss.psnr)
@@ -203,7 +204,7 @@ class Trainer:
         self._made.splats.check(f"after iteration {self.iteration}; {self._what_is_kept()}")
         kept = Progressed(self.iteration, self._made.adam_step, self._made.splats, self.history)
         title = self.renderer.device.title
-        save_checkpoint(self.checkpoint, kept, self.settings, self.dataset.digest, title)
+        save_checkpoint(self.checkpoint, kept, self.settings, self.dataset, title)
 
     def evaluate(self, views: tuple[TrainingView, ...] | None = None) -> list[ViewScore]:
         """Compare the splats with views: those that were held out, unless others are given."""

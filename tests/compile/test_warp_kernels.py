@@ -34,7 +34,7 @@ def made(name, *arguments):
 
 def compiled(kernel, folder, block=256, assembly=False):
     """Source text, without comments, that NVRTC compiled for a GPU of 2020; or the PTX that it made of it."""
-    kernel.module.options["block_dim"] = block
+    kernel.module.options.update(block_dim=block, optimization_level=3 if assembly else 0)
     with runtime.quiet():
         wp.compile_aot_module(kernel.module, arch=80, module_dir=folder, use_ptx=True)
     (result,) = folder.glob("*.ptx")
@@ -43,7 +43,7 @@ def compiled(kernel, folder, block=256, assembly=False):
 
 def measured(kernel, folder, block):
     """The source text, and what the machine code for an H100 takes."""
-    kernel.module.options["block_dim"] = block
+    kernel.module.options.update(block_dim=block, optimization_level=3)
     with runtime.quiet():
         wp.compile_aot_module(kernel.module, arch=90, module_dir=folder, use_ptx=False)
     (result,) = folder.glob("*.cubin")

@@ -3,7 +3,7 @@ host."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -119,7 +119,9 @@ class OpenCLTraining:
             self._drawn = degree, ResidentArrays(buffers, count, degree, origin)
         return self._drawn[1]
 
-    def loss(self, images: Any, view: int, dssim_weight: float) -> tuple[float, float, Any]:
+    def loss(
+        self, images: Any, view: int, dssim_weight: float
+    ) -> tuple[Callable[[], tuple[float, float]], Any]:
         """As `TrainingKernels`."""
         image = images.device_array("rgb")
         height, columns, _ = image.shape
@@ -137,12 +139,18 @@ class OpenCLTraining:
         self._launch_rows("loss_take", 3 * columns, height, given)
         for name in ("loss_rows", "loss_columns", "loss_rows_backward", "loss_columns_backward"):
             self._launch_rows(name, -(-3 * columns // self._lanes), height, given)
-        self._enqueue("loss_sums", (_SUMS * _SUMMED,), (_SUMMED,), given)
-        sums = np.empty((_SUMS, 3), np.float32)
-        cl.enqueue_copy(self._queue, sums, given["sums"])
-        absolute, squared, similar = sums.sum(axis=0, dtype=np.float64)
-        value = (1 - dssim_weight) * absolute / number + dssim_weight * (1 - similar / image.size)
-        return float(value), float(squared / number), slope
+        added = self._enqueue("loss_sums", (_SUMS * _SUMMED,), (_SUMMED,), given)
+
+        def value() -> tuple[float, float]:
+            sums = np.empty((_SUMS, 3), np.float32)
+            self._queue.flush()
+            with self._workspace.failing("training"):
+                cl.enqueue_copy(self._workspace.side_queue, sums, given["sums"], wait_for=[added])
+            absolute, squared, similar = sums.sum(axis=0, dtype=np.float64)
+            loss = (1 - dssim_weight) * absolute / number + dssim_weight * (1 - similar / image.size)
+            return float(loss), float(squared / number)
+
+        return value, slope
 
     def count(self, screen: Any, camera: Camera, origin: np.ndarray) -> None:
         """As `TrainingKernels`."""
@@ -196,11 +204,11 @@ class OpenCLTraining:
 
     def _enqueue(
         self, kernel: str, size: tuple[int, ...], group: tuple[int, ...], given: Mapping[str, Any]
-    ) -> None:
+    ) -> cl.Event:
         every = {**self._held, "count": self._count, **given}
         values = [every[one.name] for one in self._program.source.arguments[kernel]]
         try:
-            self._program.launch(self._queue, kernel, size, group, values)
+            return self._program.launch(self._queue, kernel, size, group, values)
         except cl.Error as error:
             raise DeviceError(f"{self._workspace.info.title} failed while training: {error}") from error
 
