@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class PlacedMarker(PickledByFields):
-    """A marker somewhere in the world. Raises InputError when the pose is not rigid, or the motion is no
-    function."""
+    """A marker somewhere in the world. Raises InputError when the pose is not rigid, the motion is no
+    function, or the bundle no name."""
 
     marker: Marker
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -39,6 +39,8 @@ class PlacedMarker(PickledByFields):
     """label of its splats; a Scene numbers its markers 1, 2, ..."""
     motion: Pose | None = None
     """its pose at a time in seconds; None: it stays at `pose`"""
+    bundle: str | None = None
+    """name of the rigid thing that it is a part of; markers of one bundle give one pose"""
 
     def __post_init__(self) -> None:
         check_similarity(self.pose, "a marker's pose", rigid=True)
@@ -47,6 +49,8 @@ class PlacedMarker(PickledByFields):
                 f"a marker's motion is a {type(self.motion).__name__}; it must be an fs.Trajectory or a "
                 "function of the time"
             )
+        if self.bundle is not None and not (isinstance(self.bundle, str) and self.bundle):
+            raise InputError(f"a marker's bundle is {self.bundle!r}; it must be a name, or None")
         if not isinstance(getattr(self.marker, "cloud", None), SplatCloud):
             raise InputError(
                 f"marker is {self.marker!r}; it must be an fs.Marker, e.g. fs.marker('apriltag:36h11:5')"

@@ -35,7 +35,7 @@ CAMERA = ("width", "height", "fov_x_deg", "fx", "fy", "cx", "cy")
 CAMERA += ("position", "look_at", "up", "world_to_camera", "near", "far", *TABLES, "shutter", "motion")
 CAMERA_POSE = ("position", "look_at", "up", "world_to_camera")
 SPLATS = ("file", "position", "quaternion", "scale", "motion")
-MARKER = ("spec", "size", "position", "quaternion", "quiet_zone", "max_splats", "motion")
+MARKER = ("spec", "size", "position", "quaternion", "quiet_zone", "max_splats", "motion", "bundle")
 MARKERS = (*MARKER, *knobs(MarkerQuality))
 RENDER = ("outputs", "background", "quality", "samples", "lowpass", "first_hit", "device")
 
@@ -206,4 +206,4 @@ def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progre
     with table.at():
         spec = with_file(spec, lambda name: str(folder / name))
         made = marker(spec, size, **known, **own)
-        return PlacedMarker(made, pose, motion=motion)
+        return PlacedMarker(made, pose, motion=motion, bundle=table.text("bundle", None))

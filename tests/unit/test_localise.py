@@ -138,7 +138,7 @@ def test_the_command_measures_once(tmp_path, monkeypatch, capsys):
     guess = fs.load_trajectory(tmp_path / "out/odometry.tum")
     off = np.linalg.norm(truth.poses[:, :2, 3] - guess.poses[:, :2, 3], axis=1)
     assert np.sqrt((off**2).mean()) == pytest.approx(first["variants"]["odometry"]["ate_m"], rel=1e-6)
-    monkeypatch.setattr(Localise, "run", lambda self: pytest.fail("measured again"))
+    monkeypatch.setattr(Localise, "run", lambda self, speed=None: pytest.fail("measured again"))
     assert main([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == first
     assert "<svg" in (tmp_path / "out/localise.svg").read_text()

@@ -330,6 +330,11 @@ LAYOUTS: dict[str, Layout] = {
         parts=("ray_depth", "shown"),
         samples=(Samples("float", "depth_raw", 2, "sum w z, sum w"),),
     ),
+    "distortion": Layout(
+        "output/distortion.cl",
+        parts=("ray_depth",),
+        samples=(Samples("float", "distortion_raw", 4, "the first m, W, sum w m, sum w m^2"),),
+    ),
     "depth_median": Layout(
         "output/depth_median.cl",
         parts=("ray_depth", "shown"),
