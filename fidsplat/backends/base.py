@@ -148,6 +148,19 @@ class GivesFloat64(Protocol):
 
 
 @runtime_checkable
+class DrawsEvery(Protocol):
+    """A pipeline that draws pixels one by one: it can leave some out, and say how far it is."""
+
+    def render_every(
+        self, cloud: Any, view: Any, step: int, tell: Callable[[float], object] | None = None
+    ) -> Images:
+        """Every step-th pixel in both directions, beginning with the first: images of (ceil(h / step),
+        ceil(w / step)) with the bits that `render` gives those pixels. tell: called with the share that is
+        done, 0 to 1."""
+        ...
+
+
+@runtime_checkable
 class DrawsBatches(Protocol):
     """A pipeline that draws many views together."""
 

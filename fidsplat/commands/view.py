@@ -11,7 +11,9 @@ import tyro
 
 from fidsplat.commands.output import MemoryBudget, bytes_of, console, late_progress, option, say
 from fidsplat.commands.render import load_source
+from fidsplat.commands.runs import TrainingRun, checkpoint_of, flown
 from fidsplat.errors import InputError
+from fidsplat.files import path_of
 
 
 @dataclass
@@ -26,12 +28,17 @@ class View:
 
     Only this machine reaches the page. From elsewhere: ssh -L 8080:localhost:8080 THAT_MACHINE
 
+    A RUN is a folder of `fidsplat fly`, whose poses stand there as keyframes, or of `fidsplat train`, or its
+    checkpoint, whose splats are shown anew as they grow.
+
     Examples:
       fidsplat view fidsplat-demo/scene.toml
       fidsplat view room.ply --port 9000 --device opencl:nvidia
+      fidsplat view fidsplat-flight
+      fidsplat view yard.training.npz --trajectory yard/sparse/0       a training, and its cameras
     """
 
-    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply|STORE.fss", "what to show")]
+    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply|STORE.fss|RUN", "what to show")]
     trajectory: Annotated[
         str | None,
         option(
@@ -60,16 +67,30 @@ class View:
         if not 0 < self.rate <= 1000:
             raise InputError(f"--rate is {self.rate:g}; give pictures a second, up to 1000")
         check_port(self.host, self.port)
-        path = None if self.trajectory is None else load_trajectory(self.trajectory)
+        source, trajectory, run = self._shown()
+        path = None if trajectory is None else load_trajectory(trajectory)
         where = console(True)
         with late_progress(where) as progress:
-            scene = load_source(self.source, self.quality, progress)
-        file = Path(self.source) if self.source.lower().endswith(".toml") else None
+            scene = load_source(source, self.quality, progress) if run is None else run.scene
+        file = Path(source) if source.lower().endswith(".toml") else None
+        again = None if run is None else run.again
         with where.status("compiling"):
-            viewer = Viewer(scene, file, self.device, budget, self.host, self.port, self.rate, path)
+            viewer = Viewer(scene, file, self.device, budget, self.host, self.port, self.rate, path, again)
         say(console(False), f"{viewer.address} shows {self.source}; Ctrl-C ends it")
         try:
             while True:
                 time.sleep(1.0)
         finally:
             viewer.close()
+
+    def _shown(self) -> tuple[str, str | None, TrainingRun | None]:
+        """What to load, the poses to show, and the run that is followed."""
+        from fidsplat.store.layout import SUFFIX
+
+        folder = path_of(self.source)
+        if checkpoint := checkpoint_of(folder):
+            return self.source, self.trajectory, TrainingRun(checkpoint)
+        if not folder.is_dir() or folder.suffix.lower() == SUFFIX:
+            return self.source, self.trajectory, None
+        source, poses = flown(folder)
+        return source, self.trajectory or poses, None

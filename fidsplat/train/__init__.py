@@ -1,5 +1,6 @@
 """Training: splats from pictures with known cameras, on any device that has gradients."""
 
+from fidsplat.train.checkpoint import splats_of
 from fidsplat.train.dataset import Dataset, TrainingView
 from fidsplat.train.memory import splats_within
 from fidsplat.train.parameters import TrainingError
@@ -16,5 +17,6 @@ __all__ = [
     "TrainingView",
     "ViewScore",
     "load_dataset",
+    "splats_of",
     "splats_within",
 ]

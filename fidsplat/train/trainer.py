@@ -204,7 +204,7 @@ class Trainer:
         self._made.splats.check(f"after iteration {self.iteration}; {self._what_is_kept()}")
         kept = Progressed(self.iteration, self._made.adam_step, self._made.splats, self.history)
         title = self.renderer.device.title
-        save_checkpoint(self.checkpoint, kept, self.settings, self.dataset.digest, title)
+        save_checkpoint(self.checkpoint, kept, self.settings, self.dataset, title)
 
     def evaluate(self, views: tuple[TrainingView, ...] | None = None) -> list[ViewScore]:
         """Compare the splats with views: those that were held out, unless others are given."""

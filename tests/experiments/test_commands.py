@@ -15,6 +15,7 @@ from fidsplat.experiments.run import Options
 from fidsplat.experiments.sweep import read_records
 from fidsplat.vision.images import write_png
 
+pytestmark = pytest.mark.usefixtures("optimised")
 SMALL = ["--category", "apriltag", "--markers", "1"]
 
 
