@@ -54,6 +54,7 @@ MAY_IMPORT = {
     "logs": BASE | {"cameras", "vision"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
     "train": PLAIN | {"formats", "vision", "render", "backends", "effects"},
+    "detail": PLAIN | {"store", "render", "backends", "accuracy"},
     "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__", "__main__"}
