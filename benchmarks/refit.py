@@ -1,9 +1,10 @@
 """A splat file fitted anew from pictures of it, drawn here: what training gets back of a scene that is known.
 
-    python benchmarks/refit.py FILE.ply [--device opencl] [--views 60] [--points 5000] [--iterations 7000] [-o OUT]
+    python benchmarks/refit.py FILE.ply [--device opencl] [--views 60] [--points 5000] [-o OUT]
 
 Cameras look from all around, up to 50 degrees above and below, at the middle of what lies within 90 % of the
-splats; one more for every ten stands between them and is held out. Training begins with random points in that box.
+splats; one more for every ten stands between them and is held out. Training begins with random points in
+that box.
 Prints seconds, splats, and PSNR and SSIM of the views held out; -o keeps the splats and sheets of pictures.
 """
 
