@@ -17,7 +17,7 @@ from fidsplat.backends.reference.gradients import ReferenceGradients
 from fidsplat.backends.reference.resolve import resolve
 from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
-from fidsplat.effects import OUTPUTS, FeatureSet
+from fidsplat.effects import IMAGES, FeatureSet
 from fidsplat.effects.differentiable import check_differentiable
 from fidsplat.errors import InputError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
@@ -114,7 +114,7 @@ class ReferenceImages:
 
     def read(self, name: str) -> np.ndarray:
         """The image in the type that every device gives."""
-        return self.images[name].astype(OUTPUTS[name].dtype)
+        return self.images[name].astype(IMAGES[name].dtype)
 
     def read_float64(self, name: str) -> np.ndarray:
         """The image as it was computed; label and splat_id are integers all the same."""
