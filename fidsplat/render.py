@@ -33,7 +33,6 @@ from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
 from fidsplat.store.residency import Residency
 from fidsplat.store.store import Store
-from fidsplat.store.streamed import Streamed
 from fidsplat.surroundings import Fog, Gradient, Panorama, background_of
 from fidsplat.views import Views, views_of
 
@@ -125,9 +124,8 @@ class Renderer:
         nothing is read before a view needs it."""
         check_process(self._process, "Renderer")
         capture = scene.capture if isinstance(scene, Scene) else _PLAIN
-        streamed = Streamed([scene]) if isinstance(scene, Store) else None
-        if isinstance(scene, Scene):
-            streamed = scene.streamed
+        stored = Scene(stores=(scene,)) if isinstance(scene, Store) else scene
+        streamed = stored.streamed if isinstance(stored, Scene) else None
         if streamed is not None:
             return ResidentCloud(self, Residency(streamed, self.backend), capture)
         cloud = scene.cloud() if isinstance(scene, Scene) else scene
@@ -267,7 +265,7 @@ class Renderer:
         parts = (outputs, quality, background, motion, shutter, sensor, fog)
         asked = (_asked(scene, one, None, *parts) for one in rest)
         if isinstance(resident._data, Residency):
-            asked = self._read_ahead(resident._data, asked)
+            asked = resident._data.read_ahead(asked)
         waiting: Frame | None = None
         failure: Exception | None = None
         while True:
@@ -285,25 +283,6 @@ class Renderer:
             yield waiting
         if failure is not None:
             raise failure
-
-    def _read_ahead(self, store: Residency, captures: Iterator[Capture]) -> Iterator[Capture]:
-        """The captures, each once what the next needs is being read."""
-        waiting: Capture | None = None
-        while True:
-            try:
-                following = next(captures, None)
-                if following is not None and waiting is not None:
-                    features, view = prepare(store.scene, following)
-                    store.fetch(view, features, 0.0)
-            except Exception:
-                if waiting is not None:
-                    yield waiting
-                raise
-            if waiting is not None:
-                yield waiting
-            if following is None:
-                return
-            waiting = following
 
     def render_batch(
         self,
@@ -358,7 +337,7 @@ class Renderer:
             data, ids = whole, None
             if isinstance(whole, Residency):
                 drawn = [batch.one(number) for number in range(len(batch.slots))]
-                data, ids = whole.of(drawn, features, 0.0)
+                data, ids = whole.of(drawn, features, [capture.quality for capture in views.captures])
             pipeline = self.backend.pipeline(features)
             if isinstance(pipeline, DrawsBatches):
                 images = pipeline.render_batch(data, batch)
@@ -389,7 +368,7 @@ class Renderer:
         with self._lock:  # scratch buffers and kernels' arguments belong to one picture at a time
             data, ids = whole, None
             if isinstance(whole, Residency):
-                data, ids = whole.of([view], features, 0.0)
+                data, ids = whole.of([view], features, [capture.quality])
             return Frame(draw(self.backend.pipeline(features), data, view), capture.outputs, ids)
 
 

@@ -21,8 +21,9 @@ from fidsplat.errors import FidsplatError, InputError
 from fidsplat.formats import save_trajectory
 from fidsplat.scenes import Scene
 from fidsplat.viewer.controls import NOBODY, Controls
-from fidsplat.viewer.edits import SceneFile
+from fidsplat.viewer.edits import Body, SceneFile
 from fidsplat.viewer.guard import guarded
+from fidsplat.viewer.held import Held, held_by, movable
 from fidsplat.viewer.nodes import Nodes
 from fidsplat.viewer.session import Session, View
 from fidsplat.viewer.settings import Viewpoint
@@ -86,7 +87,7 @@ class Viewer:
         self._keyframes: list[np.ndarray] = [] if keyframes is None else list(keyframes.poses)
         self._file = None if file is None else SceneFile(file)
         self._again = again
-        self._held: int | None = None
+        self._held: Held | None = None
         self.session = Session(scene, device, memory_budget, self._changed)
         with _silent():
             self.server: Any = guarded(
@@ -247,16 +248,23 @@ class Viewer:
         except FidsplatError as error:
             self._controls.say(str(error))
 
+    def movable(self, scene: Scene) -> list[str]:
+        """Names of what the gizmo may move."""
+        return movable(scene, self._bodies)
+
+    @property
+    def _bodies(self) -> list[Body]:
+        return [] if self._file is None else self._file.bodies()
+
     def hold(self, name: str) -> None:
-        """Put the gizmo at a marker, by its name in the selector."""
+        """Put the gizmo at a marker or a splat file, by its name in the selector."""
         scene, _ = self.session.wanted()
-        number = None if name == NOBODY else int(name.partition(":")[0]) - 1
-        self._held = number if number in range(len(scene.markers)) else None
-        placed = None if self._held is None else scene.markers[self._held]
-        if placed is not None and placed.motion is not None:
-            self._controls.say(f"{placed.marker.spec} moves by keyframes; it is not moved by hand")
-            placed = None
-        self._nodes.hold(placed, self._move)
+        self._held = None if name == NOBODY else held_by(scene, self._bodies, name)
+        if self._held is not None and self._held.moves:
+            self._controls.say(f"{name} moves by keyframes; it is not moved by hand")
+            self._held = None
+        held = self._held
+        self._nodes.hold(None if held is None else held.pose, 0.0 if held is None else held.size, self._move)
 
     def overlay(self, visible: bool) -> None:
         """Show or hide outlines, names and frusta."""
@@ -267,17 +275,20 @@ class Viewer:
         """The gizmo is dragged; once it is let go its pose is written into the scene file."""
         with self._lock:
             scene, _ = self.session.wanted()
-            if self._held is None or self._held >= len(scene.markers):
+            held = self._held
+            if held is None or not (let_go or held.light):
                 return
-            markers = list(scene.markers)
-            markers[self._held] = replace(markers[self._held], pose=pose)
+            moved = held.moved(scene, pose)
+            if moved is None:
+                return
             problem = ""
             if let_go and self._file is not None:
                 try:
-                    self._file.place(self._held, pose)
+                    self._file.place(held.number, pose, held.kind)
                 except FidsplatError as error:
                     problem = str(error)
-            moved = replace(scene, markers=tuple(markers))
+                    if held.splats is not None:  # where they are is known from the file alone
+                        moved = held.moved(scene, held.pose)
             self.session.wish(scene=moved, done=lambda why: self._controls.say(why or problem))
 
     def _watch(self) -> None:
@@ -301,7 +312,7 @@ class Viewer:
             with self._lock:
                 self._file.text = text
             self.hold(NOBODY)
-            self._controls.offer(scene)
+            self._controls.offer(self.movable(scene))
         self._controls.say(problem or "")
 
 

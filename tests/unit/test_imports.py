@@ -47,13 +47,15 @@ MAY_IMPORT = {
     "views": PLAIN,
     "batch": BASE | {"backends", "effects", "frame"},
     "render": PLAIN | {"store", "scenes", "effects", "backends", "frame", "views", "batch"},
-    "viewer": PLAIN | {"scenes", "effects", "backends", "render", "frame", "vision", "formats"},
+    "viewer": PLAIN | {"store", "scenes", "effects", "backends", "render", "frame", "vision", "formats"},
     "flights": PLAIN | {"store", "scenes", "render", "vision", "formats", "frame", "provenance"},
+    "remote": BASE | {"provenance", "flights", "render", "vision", "experiments"},
     "sim": PLAIN | {"batch", "scenes", "markers", "render", "vision", "formats"},
     "logs": BASE | {"cameras", "vision"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
     "train": PLAIN | {"formats", "vision", "render", "backends", "effects"},
-    "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
+    "detail": PLAIN | {"store", "render", "backends", "accuracy"},
+    "budget": PLAIN | {"store", "scenes", "render", "accuracy", "provenance", "timing"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__", "__main__"}
 
@@ -66,6 +68,7 @@ HOME_OF = {
     "viser": ("viewer.server",),
     "websockets": ("viewer.guard",),
     "torch": ("frame",),
+    "ray": ("remote.ray_engine",),
     "pxr": ("formats.usd",),
     "imageio_ffmpeg": ("vision.video",),
     "bpy": ("experiments.blender_worker",),

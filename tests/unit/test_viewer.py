@@ -15,7 +15,7 @@ import fidsplat as fs
 from fidsplat.rotations import rigid_matrix
 from fidsplat.scenes import PlacedMarker
 from fidsplat.viewer import session as session_module
-from fidsplat.viewer.edits import SceneFile, placed
+from fidsplat.viewer.edits import Body, SceneFile, placed
 from fidsplat.viewer.guard import guarded, refused
 from fidsplat.viewer.session import Session
 from fidsplat.viewer.settings import AT_REST, Settings, Viewpoint
@@ -456,6 +456,71 @@ def test_a_gizmo_moves_a_marker_and_its_file(viewer, tmp_path):
     viewer.hold("none")
     viewer._move(np.eye(4), True)
     np.testing.assert_allclose(fs.Scene.load(tmp_path / "scene.toml").markers[0].pose, pose, atol=1e-8)
+
+
+def test_a_gizmo_moves_a_splat_file(viewer, tmp_path):
+    """Its scale stays, and what the file says is what is shown."""
+    viewer.close()
+    path = tmp_path / "scene.toml"
+    cloud = fs.SplatCloud(
+        [[0, 0, 0], [1, 0, 0]], [[1, 0, 0, 0]] * 2, [[0.1, 0.1]] * 2, [1, 1], colors=[[1, 0, 0]] * 2
+    )
+    fs.save_ply(cloud, tmp_path / "box.ply")
+    path.write_text(
+        path.read_text() + '[[splats]]\nfile = "box.ply"\n\n'
+        '[[splats]]\nfile = "box.ply"\nscale = 2.0 # twice\nposition = [0, 0, 1]\n'
+        '[[splats]]\nfile = "box.ply"\nmotion = [{time = 0, position = [0, 0, 5]}, '
+        "{time = 1, position = [0, 0, 6]}]\n"
+    )
+    viewer = type(viewer)(fs.Scene.load(path), path, "reference", port=0)
+    viewer._closed.set()  # nobody looks at the file meanwhile
+    try:
+        assert viewer._controls._held.options[2:] == ("file 1: box.ply", "file 2: box.ply", "file 3: box.ply")
+        viewer.hold("file 2: box.ply")
+        np.testing.assert_allclose(viewer._held.pose, rigid_matrix((0, 0, 1)))
+        pose = rigid_matrix((0.5, 0, 2), (0, 0, 1, 0))
+        for let_go in (False, True):
+            viewer._move(pose, let_go)
+            assert viewer.session.settle()
+            moved = viewer.session.drawn.scene.clouds
+            np.testing.assert_allclose(moved[1].world_means(), [(0.5, 0, 2), (-1.5, 0, 2)], atol=1e-6)
+            assert ("0.5" in path.read_text()) == let_go
+        assert "scale = 2.0 # twice" in path.read_text()
+        again = fs.Scene.load(path)
+        for one, other in zip(again.clouds, moved, strict=True):
+            np.testing.assert_allclose(one.world_means(), other.world_means(), atol=1e-6)
+        viewer.hold("file 1: box.ply")  # which has no pose in the file
+        viewer._move(rigid_matrix((0, 3, 0)), True)
+        assert viewer.session.settle()
+        np.testing.assert_allclose(fs.Scene.load(path).clouds[0].world_means()[0], (0, 3, 0))
+        viewer.hold("file 3: box.ply")
+        assert viewer._held is None
+        assert "moves by keyframes" in viewer._controls.status.content
+        # what cannot be written stays where the file says that it is
+        viewer.hold("file 2: box.ply")
+        before = path.read_text()
+        path.write_text(before + "# edited\n")
+        viewer._move(rigid_matrix((9, 9, 9)), True)
+        assert viewer.session.settle()
+        assert "nothing was written" in viewer._controls.status.content
+        np.testing.assert_allclose(
+            viewer.session.drawn.scene.clouds[1].world_means()[0], (0.5, 0, 2), atol=1e-6
+        )
+        assert path.read_text() == before + "# edited\n"
+        viewer.hold("file 9: none")
+        viewer._move(np.eye(4), True)
+    finally:
+        viewer.close()
+
+
+def test_large_splat_files_move_once_they_are_let_go(monkeypatch):
+    from fidsplat.viewer import held
+
+    cloud = fs.SplatCloud([[0, 0, 0]], [[1, 0, 0, 0]], [[0.1, 0.1]], [1], colors=[[1, 0, 0]])
+    taken = held.held_by(fs.Scene([cloud]), [Body(0, "a.ply", np.eye(4))], "file 1: a.ply")
+    assert taken.light
+    monkeypatch.setattr(held, "LIGHT", 0)
+    assert not taken.light
 
 
 def test_a_file_that_is_edited_is_shown(viewer, tmp_path):
