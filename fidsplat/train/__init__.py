@@ -4,11 +4,13 @@ from fidsplat.train.dataset import Dataset, TrainingView
 from fidsplat.train.memory import splats_within
 from fidsplat.train.parameters import TrainingError
 from fidsplat.train.read import load_dataset
+from fidsplat.train.refining import RefineStep, refine
 from fidsplat.train.settings import TrainSettings
 from fidsplat.train.trainer import Step, Trainer, ViewScore
 
 __all__ = [
     "Dataset",
+    "RefineStep",
     "Step",
     "TrainSettings",
     "Trainer",
@@ -16,5 +18,6 @@ __all__ = [
     "TrainingView",
     "ViewScore",
     "load_dataset",
+    "refine",
     "splats_within",
 ]
