@@ -54,16 +54,21 @@ def arc(views: int) -> np.ndarray:
     return np.array(poses)
 
 
-def measure(renderer: fs.Renderer, name: str, repeats: int) -> dict:
-    """One row's figures, per view."""
-    row = ROWS[name]
+def scene_of(row: Row) -> tuple[fs.SplatCloud, fs.Capture, np.ndarray]:
+    """The splats of a batch, how its pictures are taken, and from where."""
     every = load_scene("r100k_720p")[0]
     some = {field: getattr(every, field)[: row.splats] for field in ARRAYS}
     cloud = fs.SplatCloud(**some, labels=np.arange(row.splats) % 50)
     focal = row.width / 2 / np.tan(0.5)
     camera = fs.Camera.pinhole(row.width, row.height, focal, focal, row.width / 2, row.height / 2)
-    resident, poses = renderer.upload(cloud), arc(row.views)
-    capture = fs.Capture(camera, row.outputs, TIMED)
+    return cloud, fs.Capture(camera, row.outputs, TIMED), arc(row.views)
+
+
+def measure(renderer: fs.Renderer, name: str, repeats: int) -> dict:
+    """One row's figures, per view."""
+    row = ROWS[name]
+    cloud, capture, poses = scene_of(row)
+    resident = renderer.upload(cloud)
     host: list[float] = []
 
     def draw() -> fs.FrameBatch:

@@ -12,7 +12,7 @@ from fidsplat.backends.base import BatchImages, GivesArrays, Images, Waits
 from fidsplat.backends.blank import blank
 from fidsplat.effects import OUTPUTS
 from fidsplat.errors import InputError, MissingOutputError
-from fidsplat.frame import Frame, check_process
+from fidsplat.frame import Frame, check_process, numbered, refuse_numbered
 
 
 class FrameBatch(Mapping):
@@ -23,8 +23,9 @@ class FrameBatch(Mapping):
     and 0 in all else. View i has the bits that `Renderer.render` gives it alone.
     """
 
-    def __init__(self, images: BatchImages, outputs: tuple[str, ...]) -> None:
-        self._images, self._process = images, os.getpid()
+    def __init__(self, images: BatchImages, outputs: tuple[str, ...], ids: np.ndarray | None = None) -> None:
+        """ids: as those of a Frame."""
+        self._images, self._process, self._ids = images, os.getpid(), ids
         self._arrays: dict[str, np.ndarray] = {}
         self.outputs = outputs
         """Names of the images, in the order in which they were asked for."""
@@ -38,7 +39,7 @@ class FrameBatch(Mapping):
         self._check(name)
         if name not in self._arrays:
             check_process(self._process, "batch")
-            self._arrays[name] = images = self._images.read(name)
+            self._arrays[name] = images = numbered(name, self._images.read(name), self._ids)
             images.flags.writeable = False  # what is kept is what was drawn
         return self._arrays[name]
 
@@ -53,6 +54,7 @@ class FrameBatch(Mapping):
         """
         self._check(name)
         check_process(self._process, "batch")
+        refuse_numbered(name, self._ids)
         if not isinstance(self._images, GivesArrays):
             raise InputError(
                 f"this device keeps {name} of a batch in no array that others can use; take batch[{name!r}], "
@@ -72,7 +74,7 @@ class FrameBatch(Mapping):
             or not 0 <= number < self.views
         ):
             raise InputError(f"there is no view {number!r}; this batch has views 0 to {self.views - 1}")
-        return Frame(_OneOf(self._images, int(number)), self.outputs)
+        return Frame(_OneOf(self._images, int(number)), self.outputs, self._ids)
 
     def wait(self) -> FrameBatch:
         """This batch, once the device has drawn it; nothing is copied."""

@@ -24,8 +24,10 @@ class Frame(Mapping):
     `Quality.first_hit`, labels and ids are -1, the others of these 0.
     """
 
-    def __init__(self, images: Images, outputs: tuple[str, ...]) -> None:
-        self._images, self._process = images, os.getpid()
+    def __init__(self, images: Images, outputs: tuple[str, ...], ids: np.ndarray | None = None) -> None:
+        """ids: (n,) int32, the indices that `splat_id` shows for those of the splats that were drawn; None:
+        these themselves."""
+        self._images, self._process, self._ids = images, os.getpid(), ids
         self._arrays: dict[str, np.ndarray] = {}
         self.outputs = outputs
         """Names of the images, in the order in which they were asked for."""
@@ -34,7 +36,7 @@ class Frame(Mapping):
         self._check(name)
         if name not in self._arrays:
             check_process(self._process, "frame")
-            self._arrays[name] = image = self._images.read(name)
+            self._arrays[name] = image = numbered(name, self._images.read(name), self._ids)
             image.flags.writeable = False  # what is kept is what was drawn
         return self._arrays[name]
 
@@ -49,6 +51,7 @@ class Frame(Mapping):
         """
         self._check(name)
         check_process(self._process, "frame")
+        refuse_numbered(name, self._ids)
         if not isinstance(self._images, GivesArrays):
             raise InputError(
                 f"this device keeps {name} in no array that others can use; draw with device='warp:cuda' or "
@@ -70,7 +73,7 @@ class Frame(Mapping):
             raise InputError(
                 "to_torch makes tensors of torch, which is not installed; pip install torch"
             ) from None
-        if isinstance(self._images, GivesArrays):
+        if isinstance(self._images, GivesArrays) and (name != "splat_id" or self._ids is None):
             check_process(self._process, "frame")
             return torch.from_dlpack(self._images.device_array(name))
         return torch.from_numpy(self[name].copy())  # torch has no arrays that are read-only
@@ -78,13 +81,33 @@ class Frame(Mapping):
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         """The image of a frame with one output, as NumPy, PIL and OpenCV ask for it. Raises InputError where
         there are several."""
+        image = self[self._only()]
+        return image.astype(dtype or image.dtype) if copy or (dtype and dtype != image.dtype) else image
+
+    def __dlpack__(self, **words: Any) -> Any:
+        """The image of a frame with one output, for `from_dlpack` of torch, CuPy, JAX and NumPy: without a
+        copy where the device has arrays to give, else copied to the host. Raises InputError where there are
+        several."""
+        return self._exchanged().__dlpack__(**words)
+
+    def __dlpack_device__(self) -> tuple[int, int]:
+        """Where that is, in DLPack's numbers."""
+        return self._exchanged().__dlpack_device__()
+
+    def _exchanged(self) -> Any:
+        name = self._only()
+        if isinstance(self._images, GivesArrays):
+            return self.device_array(name)
+        return self[name].copy()  # what is read-only cannot be given away
+
+    def _only(self) -> str:
+        """The name of the one output."""
         if len(self.outputs) != 1:
             raise InputError(
                 f"this frame has {len(self.outputs)} images ({', '.join(self.outputs)}); take one by its "
                 "name, frame['rgb'] say"
             )
-        image = self[self.outputs[0]]
-        return image.astype(dtype or image.dtype) if copy or (dtype and dtype != image.dtype) else image
+        return self.outputs[0]
 
     def __repr__(self) -> str:
         took = sum(self.timings.values())
@@ -154,6 +177,21 @@ class _KeptImages:
 
 def _kept_frame(arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int]) -> Frame:
     return Frame(_KeptImages(arrays, timings, stats), tuple(arrays))
+
+
+def numbered(name: str, image: np.ndarray, ids: np.ndarray | None) -> np.ndarray:
+    """An image with the whole scene's indices (n,) in the place of those of its part; -1 stays."""
+    if name != "splat_id" or ids is None:
+        return image
+    return np.append(ids, np.int32(-1))[image]
+
+
+def refuse_numbered(name: str, ids: np.ndarray | None) -> None:
+    """Raises InputError for indices of a part on a device, which the whole's are not."""
+    if name == "splat_id" and ids is not None:
+        raise InputError(
+            "splat_id of a store is numbered on the host; take frame['splat_id'], which is copied there"
+        )
 
 
 def check_process(opened_by: int, what: str) -> None:

@@ -143,6 +143,11 @@ class Quality:
     """n, 1 to 8, default 1: each pixel is the mean of n x n samples on a regular grid. More smooth edges, and
     cost n^2 times the blending."""
 
+    detail_error: float = 0.0
+    """Of stores: how far rgb may be off from the exact picture where cells of splats are drawn as one, in
+    [0, 1). Nodes are chosen by what was measured with the store and this low-pass (docs/large-scenes.md); 0
+    is the exact scene. Scenes in memory are always exact."""
+
     first_hit: float = 0.1
     """Opacity at which the outputs depth_first and distance_first see a surface, (0, 1): the first fragment
     or layer behind which the transmittance is at most 1 less this."""
@@ -189,6 +194,7 @@ class Quality:
         within("transmittance_stop", 0.0, 1.0, False, True)
         within("opacity_ceiling", 0.0, 1.0, True, False)
         within("first_hit", 0.0, 1.0, True, True)
+        within("detail_error", 0.0, 1.0, False, True)
         for name, known in (
             ("stop_rule", STOP_RULES),
             ("lowpass", LOWPASS),

@@ -4,25 +4,35 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import Adopts, DeviceInfo, DrawsBatches, ResidentData
+from fidsplat.backends.base import (
+    Adopts,
+    DeviceInfo,
+    DrawsBatches,
+    DrawsEvery,
+    Images,
+    Pipeline,
+    ResidentData,
+)
 from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.registry import open_backend
-from fidsplat.backends.view import NO_CAMERA
+from fidsplat.backends.view import NO_CAMERA, View
 from fidsplat.batch import FrameBatch, ViewByView
 from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.capture import Capture, output_names
 from fidsplat.errors import InputError, unknown
 from fidsplat.frame import Frame, check_process
-from fidsplat.quality import Quality
+from fidsplat.quality import Quality, whole_number
 from fidsplat.scenes import Scene
 from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
+from fidsplat.store.residency import Residency
+from fidsplat.store.store import Store
 from fidsplat.surroundings import Fog, Gradient, Panorama, background_of
 from fidsplat.views import Views, views_of
 
@@ -35,10 +45,15 @@ def default_device() -> str:
 
 
 class ResidentCloud:
-    """A cloud on a renderer's device; rendering it transfers no splat."""
+    """A cloud on a renderer's device; rendering it transfers no splat. Of a store, or a scene with stores,
+    what views need is brought there when they are drawn, and what the last one needed stays."""
 
     def __init__(
-        self, renderer: Renderer, data: ResidentData, capture: Capture, labels: np.ndarray | None = None
+        self,
+        renderer: Renderer,
+        data: ResidentData | Residency,
+        capture: Capture,
+        labels: np.ndarray | None = None,
     ) -> None:
         self._renderer, self._data, self._labels = renderer, data, labels
         self.capture = capture
@@ -60,7 +75,7 @@ class ResidentCloud:
 
     @cached_property
     def labels(self) -> frozenset[int] | None:
-        """The labels that its splats have; None where they are on the device alone."""
+        """The labels that its splats have; None where they are on the device, or on disk."""
         return None if self._labels is None else frozenset(np.unique(self._labels).tolist())
 
 
@@ -104,13 +119,18 @@ class Renderer:
         """The device that draws."""
         return self.backend.info
 
-    def upload(self, scene: Scene | SplatCloud) -> ResidentCloud:
-        """Put a scene's splats on the device, to be rendered many times. A scene's capture is kept."""
+    def upload(self, scene: Scene | SplatCloud | Store) -> ResidentCloud:
+        """Put a scene's splats on the device, to be rendered many times. A scene's capture is kept. Of stores
+        nothing is read before a view needs it."""
         check_process(self._process, "Renderer")
+        capture = scene.capture if isinstance(scene, Scene) else _PLAIN
+        stored = Scene(stores=(scene,)) if isinstance(scene, Store) else scene
+        streamed = stored.streamed if isinstance(stored, Scene) else None
+        if streamed is not None:
+            return ResidentCloud(self, Residency(streamed, self.backend), capture)
         cloud = scene.cloud() if isinstance(scene, Scene) else scene
         if not isinstance(cloud, SplatCloud):
-            raise InputError(f"cannot render a {type(scene).__name__}; give a Scene or a SplatCloud")
-        capture = scene.capture if isinstance(scene, Scene) else _PLAIN
+            raise InputError(f"cannot render a {type(scene).__name__}; give a Scene, a SplatCloud or a Store")
         with self._lock:
             return ResidentCloud(self, self.backend.upload(cloud), capture, cloud.labels)
 
@@ -154,7 +174,7 @@ class Renderer:
 
     def render(
         self,
-        scene: Scene | SplatCloud | ResidentCloud,
+        scene: Scene | SplatCloud | Store | ResidentCloud,
         capture: Capture | Camera | None = None,
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
@@ -183,9 +203,42 @@ class Renderer:
         asked = _asked(scene, capture, camera, outputs, quality, background, motion, shutter, sensor, fog)
         return self._draw(self._resident(scene), asked)
 
+    def render_every(
+        self,
+        step: int,
+        scene: Scene | SplatCloud | ResidentCloud,
+        capture: Capture | Camera | None = None,
+        outputs: Iterable[str] | None = None,
+        quality: Quality | str | None = None,
+        tell: Callable[[float], object] | None = None,
+    ) -> Frame:
+        """Every step-th pixel of a picture, in both directions: what `render` gives those pixels, in a share
+        of the time. The reference alone draws so.
+
+        Args:
+            step: 1 or more.
+            scene, capture, outputs, quality: as `render`.
+            tell: called meanwhile with the share that is done, 0 to 1.
+
+        Raises:
+            InputError: as `render`; the device draws whole pictures only.
+        """
+        whole_number("step", step, 1, 2**31 - 1)
+        asked = _asked(scene, capture, None, outputs, quality, *[None] * 5)
+
+        def draw(pipeline: Pipeline, data: Any, view: View) -> Images:
+            if not isinstance(pipeline, DrawsEvery):
+                raise InputError(
+                    f"{self.device.name} draws whole pictures only; device='reference' draws some of their "
+                    "pixels"
+                )
+            return pipeline.render_every(data, view, step, tell)
+
+        return self._draw(self._resident(scene), asked, draw)
+
     def render_views(
         self,
-        scene: Scene | SplatCloud | ResidentCloud,
+        scene: Scene | SplatCloud | Store | ResidentCloud,
         captures: Iterable[Capture | Camera],
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
@@ -209,14 +262,15 @@ class Renderer:
         except TypeError:
             raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera") from None
         resident = self._resident(scene)
+        parts = (outputs, quality, background, motion, shutter, sensor, fog)
+        asked = (_asked(scene, one, None, *parts) for one in rest)
+        if isinstance(resident._data, Residency):
+            asked = resident._data.read_ahead(asked)
         waiting: Frame | None = None
         failure: Exception | None = None
         while True:
             try:
-                asked = _asked(
-                    scene, next(rest), None, outputs, quality, background, motion, shutter, sensor, fog
-                )
-                frame = self._draw(resident, asked)
+                frame = self._draw(resident, next(asked))
             except StopIteration:
                 break
             except Exception as error:
@@ -232,7 +286,7 @@ class Renderer:
 
     def render_batch(
         self,
-        scene: Scene | SplatCloud | ResidentCloud,
+        scene: Scene | SplatCloud | Store | ResidentCloud,
         captures: Iterable[Capture | Camera] | Capture | Camera,
         *,
         poses: Any = None,
@@ -277,18 +331,22 @@ class Renderer:
                     )
 
     def _draw_batch(self, resident: ResidentCloud, views: Views) -> FrameBatch:
-        data = resident._data
-        features, batch = prepare_batch(data, views)
+        whole = resident._data
+        features, batch = prepare_batch(whole.scene if isinstance(whole, Residency) else whole, views)
         with self._lock:
+            data, ids = whole, None
+            if isinstance(whole, Residency):
+                drawn = [batch.one(number) for number in range(len(batch.slots))]
+                data, ids = whole.of(drawn, features, [capture.quality for capture in views.captures])
             pipeline = self.backend.pipeline(features)
             if isinstance(pipeline, DrawsBatches):
                 images = pipeline.render_batch(data, batch)
             else:
                 each = {int(k): pipeline.render(data, batch.one(n)) for n, k in enumerate(batch.slots)}
                 images = ViewByView(each, batch.total, batch.size, len(resident))
-        return FrameBatch(images, views.captures[0].outputs)
+        return FrameBatch(images, views.captures[0].outputs, ids)
 
-    def _resident(self, scene: Scene | SplatCloud | ResidentCloud) -> ResidentCloud:
+    def _resident(self, scene: Scene | SplatCloud | Store | ResidentCloud) -> ResidentCloud:
         resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
         check_process(self._process, "Renderer")
         if resident._renderer is not self:
@@ -297,10 +355,21 @@ class Renderer:
             )
         return resident
 
-    def _draw(self, resident: ResidentCloud, capture: Capture) -> Frame:
-        features, view = prepare(resident._data, capture)
+    def _draw(
+        self,
+        resident: ResidentCloud,
+        capture: Capture,
+        draw: Callable[[Pipeline, Any, View], Images] = lambda pipeline, data, view: pipeline.render(
+            data, view
+        ),
+    ) -> Frame:
+        whole = resident._data
+        features, view = prepare(whole.scene if isinstance(whole, Residency) else whole, capture)
         with self._lock:  # scratch buffers and kernels' arguments belong to one picture at a time
-            return Frame(self.backend.pipeline(features).render(resident._data, view), capture.outputs)
+            data, ids = whole, None
+            if isinstance(whole, Residency):
+                data, ids = whole.of([view], features, [capture.quality])
+            return Frame(draw(self.backend.pipeline(features), data, view), capture.outputs, ids)
 
 
 def _asked(

@@ -1,15 +1,11 @@
 """Every device that can be opened here, the reference excepted: contract tests run on each."""
 
 import pytest
-from certificates import (  # noqa: F401 (hooks)
-    pytest_addoption,
-    pytest_configure,
-    pytest_sessionfinish,
-    pytest_terminal_summary,
-)
 from sampling import take_turns
 
 import fidsplat as fs
+
+pytest_plugins = ["certificates", "optimisation"]
 
 USABLE = [info for info in fs.devices() if info.usable and info.name != "reference"]
 

@@ -61,13 +61,44 @@ def assert_as_good(error, ideal, distance):
     assert error < 0.01 * distance or ideal >= 0.01 * distance, (error, ideal, distance)
 
 
+_COARSE = 8
+"""samples between those at which a window is looked for"""
+_MARGIN = 8
+"""modules around the texture that a window has besides: more than lie between two such samples"""
+
+
 def _samples(placed: PlacedMarker, view: View) -> np.ndarray:
     """What the samples of one pose see (h, w, 3)."""
-    y, x = (grid.ravel() + 0.5 for grid in np.mgrid[: view.height, : view.width])
-    rays, seen = rays_of(view, x, y)
-    behind = np.broadcast_to(np.asarray(view.background), (len(x), 3))
+    y, x = np.mgrid[: view.height, : view.width] + 0.5
+    light = np.empty((view.height, view.width, 3))
+    light[:] = view.background
     if view.surroundings is not None:
-        behind = background_at(view, x, y)[0]
+        light = background_at(view, x.ravel(), y.ravel())[0].reshape(light.shape)
+    window = _window(placed, view)
+    x, y = x[window].ravel(), y[window].ravel()
+    place, along = _printed(placed, view, x, y)
+    grid = placed.marker.grid
+    column, row = np.floor(place[:, 0] + grid.shape[1] / 2), np.floor(place[:, 1] + grid.shape[0] / 2)
+    on = (along > 0) & (column >= 0) & (row >= 0) & (column < grid.shape[1]) & (row < grid.shape[0])
+    value = 1.0 - grid[row[on].astype(int), column[on].astype(int), None]
+    left = np.exp(-view.fog_density * along[on] * ray_lengths(x[on], y[on], view))[:, None]
+    light[window][on.reshape(light[window].shape[:2])] = left * value + (1 - left) * view.background
+    return light
+
+
+def _window(placed: PlacedMarker, view: View) -> tuple[slice, slice]:
+    """Rows and columns outside which no sample sees the texture: a small part of a panorama."""
+    y, x = np.mgrid[: view.height : _COARSE, : view.width : _COARSE] + 0.5
+    place, along = _printed(placed, view, x.ravel(), y.ravel())
+    near = (along > 0) & (np.abs(place) < np.array(placed.marker.grid.shape[::-1]) / 2 + _MARGIN).all(1)
+    ends = [axes.ravel()[near] for axes in (y, x)]
+    return tuple(slice(max(int(one.min()) - _COARSE, 0), int(one.max()) + _COARSE) for one in ends)
+
+
+def _printed(placed: PlacedMarker, view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where the rays of samples x, y (n,) meet the texture's plane: (n, 2) in modules from its middle, and
+    (n,) how far along the rays; NaN where a sample has no ray."""
+    rays, seen = rays_of(view, x, y)
     moved = dict(view.groups).get(placed.label, view)
     turn = moved.rotation @ placed.pose[:3, :3]
     middle = moved.rotation @ placed.pose[:3, 3] + moved.translation
@@ -77,11 +108,4 @@ def _samples(placed: PlacedMarker, view: View) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):
         along = (middle - start) @ turn[:, 2] / (rays @ turn[:, 2])
         place = (start + along[:, None] * rays - middle) @ turn[:, :2] / placed.marker.module
-    grid = placed.marker.grid
-    column, row = np.floor(place[:, 0] + grid.shape[1] / 2), np.floor(place[:, 1] + grid.shape[0] / 2)
-    on = seen & (along > 0) & (column >= 0) & (row >= 0) & (column < grid.shape[1]) & (row < grid.shape[0])
-    value = 1.0 - grid[row[on].astype(int), column[on].astype(int), None]
-    left = np.exp(-view.fog_density * along[on] * ray_lengths(x[on], y[on], view))[:, None]
-    light = behind.copy()
-    light[on] = left * value + (1 - left) * view.background
-    return light.reshape(view.height, view.width, 3)
+    return place, np.where(seen, along, np.nan)

@@ -11,9 +11,10 @@
 What was found stands in mutations.jsonl, a line for each plant, and is not run again (but with --again), so
 that a run that was stopped goes on where it was. Each file's first plants come first. A plant is caught when
 a test fails, crashes, or hangs, and that test passes without the plant; a test that fails then too is passed
-over. A plant that was caught before is first shown to the test that caught it. The tree is copied as a source
-distribution has it, changes that are not committed among them, and nothing in it is touched. All plants take
-hours on two cores; those of formats, cameras, scenes, markers and splats seconds each.
+over. A plant is first shown to the test that caught it before, then to those that it names itself. The tree
+is copied as a source distribution has it, changes that are not committed among them, and nothing in it is
+touched. All plants take hours on two cores; those of formats, cameras, scenes, markers and splats seconds
+each.
 """
 
 from __future__ import annotations
@@ -63,6 +64,8 @@ class Plant:
     new: str
     wrong: str
     """what is wrong then"""
+    first: tuple[str, ...] = ()
+    """arguments of pytest for the few of these tests that are tried first, if any"""
 
     @property
     def name(self) -> str:
@@ -79,14 +82,21 @@ def read_plants(file: Path = PLANTS, device: str | None = None) -> list[Plant]:
     """The plants of a file, in its order; their tests on every device, or on one with that in its name."""
     data = tomllib.loads(file.read_text("utf-8"))
     only = data["only"]
-    here = [f"({device} or not (opencl or warp))"] if device else []
+    here = [f"({device} or not (opencl: or warp:))"] if device else []
     plants = []
     for entry in data["files"]:
         expression = entry.get("only", only.get(entry["area"]))
-        wanted = " and ".join([*([f"({expression})"] if expression else []), *here])
-        tests = (*entry["tests"], *(("-k", wanted) if wanted else ()))
-        plants += [Plant(entry["path"], entry["area"], tests, *plant) for plant in entry["plants"]]
+        wanted = [*([f"({expression})"] if expression else []), *here]
+        tests = _of(entry["tests"], wanted)
+        for old, new, wrong, *first in entry["plants"]:
+            few = _of(entry["tests"], [*wanted, f"({first[0]})"]) if first else ()
+            plants.append(Plant(entry["path"], entry["area"], tests, old, new, wrong, few))
     return plants
+
+
+def _of(tests: list[str], wanted: list[str]) -> tuple[str, ...]:
+    """Arguments of pytest for those of the tests that are wanted."""
+    return (*tests, *(("-k", " and ".join(wanted)) if wanted else ()))
 
 
 def planted(text: str, plant: Plant) -> str:
@@ -198,6 +208,12 @@ def copy_tree(to: Path) -> None:
             shutil.copy2(ROOT / name, to / name)
 
 
+def _alone(test: str) -> tuple[str, ...]:
+    """Arguments of pytest for one test, which may be marked as left out of sweeps once it is by itself
+    (`in_turn` of tests/sampling.py)."""
+    return (test, "-m", "")
+
+
 class Garden:
     """Copies of the tree in which plants are tried, one for each job."""
 
@@ -212,9 +228,11 @@ class Garden:
     def try_plant(self, plant: Plant, before: str | None = None) -> Found | None:
         """What becomes of it, `before` being the test that caught it once; None when time is over."""
         tree, begun = self._free.get(), time.monotonic()
+        likely = [tests for tests in (_alone(before) if before else (), plant.first) if tests]
         try:
-            if before and (found := self._try(tree, plant, (before,))) and found[0] == "caught":
-                return Found(*found, time.monotonic() - begun)
+            for tests in likely:
+                if (found := self._try(tree, plant, tests)) and found[0] == "caught":
+                    return Found(*found, time.monotonic() - begun)
             found = self._try(tree, plant, plant.tests)
             return Found(*found, time.monotonic() - begun) if found else None
         finally:
@@ -259,7 +277,7 @@ class Garden:
     def _passes_without(self, tree: Path, test: str) -> bool | None:
         """Whether a test, or the import of a module of tests, passes without a bug. None: too late."""
         if test not in self._passes:
-            run = run_tests(tree, (test,) if "::" in test else (test, "--collect-only"), self._deadline)
+            run = run_tests(tree, _alone(test) if "::" in test else (test, "--collect-only"), self._deadline)
             if run.how == TOO_LATE:
                 return None
             self._passes[test] = run.how == PASSED

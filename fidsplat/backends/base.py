@@ -5,7 +5,7 @@ Nobody outside a backend asks for its name: a capability is asked for with `isin
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -144,6 +144,19 @@ class GivesFloat64(Protocol):
 
     def read_float64(self, name: str) -> np.ndarray:
         """The image as a NumPy array in float64."""
+        ...
+
+
+@runtime_checkable
+class DrawsEvery(Protocol):
+    """A pipeline that draws pixels one by one: it can leave some out, and say how far it is."""
+
+    def render_every(
+        self, cloud: Any, view: Any, step: int, tell: Callable[[float], object] | None = None
+    ) -> Images:
+        """Every step-th pixel in both directions, beginning with the first: images of (ceil(h / step),
+        ceil(w / step)) with the bits that `render` gives those pixels. tell: called with the share that is
+        done, 0 to 1."""
         ...
 
 
@@ -384,9 +397,19 @@ class TrainingKernels(Protocol):
         """The splats as they are drawn, with SH of this degree; it changes as they do."""
         ...
 
-    def loss(self, images: Any, view: int, dssim_weight: float) -> tuple[float, float, Any]:
-        """Compare a picture with that of a view, by its number: the loss, the mean squared difference, and
-        the loss's derivative (h, w, 3) as an array of the device, which holds until the next call."""
+    def loss(
+        self, images: Any, view: int, dssim_weight: float
+    ) -> tuple[Callable[[], tuple[float, float]], Any]:
+        """Compare a picture with that of a view, by its number: what waits for the loss and the mean squared
+        difference, to be called before the next picture, and the loss's derivative (h, w, 3) as an array of
+        the device, which holds until the next call."""
+        ...
+
+    def surface(
+        self, images: Any, view: int, camera: Camera, normal_weight: float, distortion_weight: float
+    ) -> dict[str, Any]:
+        """Derivatives by `depth`, `normal` and `distortion` of `fidsplat.train.losses.normal_loss` and of the
+        mean distortion, so weighted; as arrays of the device, which hold until the next call."""
         ...
 
     def count(self, screen: Any, camera: Camera, origin: np.ndarray) -> None:
@@ -401,7 +424,8 @@ class TrainingKernels(Protocol):
         Args:
             sizes: of the step, by `means`, `scales`, `quats`, `logits`, `sh` (of degree 0), `rest`.
             numbers: `beta1`, `beta2`, `epsilon`, `root` (of 1 - beta2^step); `scale_penalty` and
-                `opacity_penalty`, added to the derivatives.
+                `opacity_penalty`, added to the derivatives; `sparse`: 1 where splats rest that the picture
+                does not depend on.
         """
         ...
 

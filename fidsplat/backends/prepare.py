@@ -3,25 +3,36 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Protocol
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from fidsplat.backends.base import ResidentData
 from fidsplat.backends.stack import ViewBatch, ViewStack
 from fidsplat.backends.view import FAR_EYE, Shot, View
 from fidsplat.capture import Capture
 from fidsplat.effects import FeatureSet, select
+from fidsplat.effects.select import Traits
 from fidsplat.errors import InputError
 from fidsplat.splats import SplatCloud
 from fidsplat.views import Views
 
+
+class Origined(Traits, Protocol):
+    """What decides the kernels, and where the zero of its means is."""
+
+    @property
+    def origin(self) -> np.ndarray:
+        """(3,) float64 metres."""
+        ...
+
+
 _Prepared = tuple[FeatureSet, View]
-_prepared: WeakKeyDictionary[Capture, WeakKeyDictionary[ResidentData, _Prepared]] = WeakKeyDictionary()
+_prepared: WeakKeyDictionary[Capture, WeakKeyDictionary[Origined, _Prepared]] = WeakKeyDictionary()
 """of captures in which nothing moves: a motion's functions may answer otherwise the next time"""
 
 
-def prepare(cloud: ResidentData | SplatCloud, capture: Capture) -> _Prepared:
+def prepare(cloud: Origined, capture: Capture) -> _Prepared:
     """What a capture of a cloud calls for, and its view; kept for a resident cloud that is drawn again.
 
     Raises:
@@ -38,7 +49,7 @@ def prepare(cloud: ResidentData | SplatCloud, capture: Capture) -> _Prepared:
     return held[cloud]
 
 
-def prepare_batch(cloud: ResidentData, views: Views) -> tuple[FeatureSet, ViewBatch]:
+def prepare_batch(cloud: Origined, views: Views) -> tuple[FeatureSet, ViewBatch]:
     """What the views of a batch call for, and those that are drawn.
 
     Raises:

@@ -13,11 +13,13 @@ from fidsplat.commands.detect import Detect
 from fidsplat.commands.devices import Devices
 from fidsplat.commands.experiment import Experiment
 from fidsplat.commands.fly import Fly
+from fidsplat.commands.gallery import Gallery
 from fidsplat.commands.greenhouse import Greenhouse
 from fidsplat.commands.info import Info
 from fidsplat.commands.marker import Marker
 from fidsplat.commands.render import Render
 from fidsplat.commands.source import Source
+from fidsplat.commands.store import Store
 from fidsplat.commands.tradeoff import Tradeoff
 from fidsplat.commands.train import Train
 from fidsplat.commands.view import View
@@ -38,8 +40,10 @@ COMMANDS = {
     "tradeoff": Tradeoff,
     "warm": Warm,
     "experiment": Experiment,
+    "gallery": Gallery,
     "greenhouse": Greenhouse,
     "train": Train,
+    "store": Store,
     "source": Source,
 }
 """Every command by its name, in the order in which help lists them."""

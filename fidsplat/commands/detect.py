@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from fidsplat.scenes import Scene
+    from fidsplat.vision.bundles import BundleReading
     from fidsplat.vision.readback import Reading
 
 
@@ -25,7 +26,8 @@ class Detect:
     Prints what they say and the corners of each, in pixels: top left, top right, bottom right, bottom left as
     printed, the centre of the first pixel at (0.5, 0.5). With --scene also where each marker and board of
     that scene was seen from its camera, how far that is from the truth, and the means: of a scene that moves,
-    from where things are at its shutter's time, when the middle row is exposed.
+    from where things are at its shutter's time, when the middle row is exposed. Boards, and markers of one
+    bundle, give one pose.
 
     Examples:
       fidsplat detect photo.jpg
@@ -64,11 +66,13 @@ class Detect:
         scene = None if self.scene is None else _load_scene(self.scene)
         results: list[dict[str, Any]] = []
         readings: list[Reading] = []
+        bundles: list[BundleReading] = []
         for path in self.images:
             for name, image in self._pictures(path):
-                result, read = self._one(name, image, scene)
+                result, read, bundled = self._one(name, image, scene)
                 results.append(result)
                 readings += read
+                bundles += bundled
         single = len(results) == 1
         mean = {} if scene is None else {"means": means(readings)}
         if self.json:
@@ -98,6 +102,7 @@ class Detect:
             against = [reading_row(reading) for reading in readings]
             if len(readings) > 1:
                 against.append(_mean_row(mean["means"]))
+            against += map(_bundle_row, bundles)
             print_table(where, f"Against {self.scene}: distance, and errors", heads, against)
         return 0
 
@@ -112,15 +117,16 @@ class Detect:
 
     def _one(
         self, name: str, image: "np.ndarray", scene: "Scene | None"
-    ) -> tuple[dict[str, Any], list["Reading"]]:
-        """What one picture shows, for JSON, and the readings of the scene's markers."""
+    ) -> tuple[dict[str, Any], list["Reading"], list["BundleReading"]]:
+        """What one picture shows, for JSON, and the readings of the scene's markers and bundles."""
+        from fidsplat.vision.bundles import read_bundles
         from fidsplat.vision.detect import detect
         from fidsplat.vision.readback import read_back
 
         families = self.family or None
         facts: dict[str, Any] = {"image": name, "width": image.shape[1], "height": image.shape[0]}
         if scene is None:
-            return facts | {"detections": [_said(code) for code in detect(image, families)]}, []
+            return facts | {"detections": [_said(code) for code in detect(image, families)]}, [], []
         try:
             readings, others = read_back(image, scene, families=families)
         except InputError as error:
@@ -129,7 +135,11 @@ class Detect:
         facts["detections"] = [_said(code) for code in (*found, *others)]
         facts["markers"] = [reading.as_dict() for reading in readings]
         facts["not_in_scene"] = [code.name for code in others]
-        return facts, readings
+        assert scene.camera is not None
+        bundles = read_bundles(readings, scene.camera)
+        if bundles:
+            facts["bundles"] = [bundle.as_dict() for bundle in bundles]
+        return facts, readings, bundles
 
 
 def _load_scene(path: str) -> "Scene":
@@ -159,6 +169,12 @@ def reading_row(reading: "Reading") -> tuple[str, ...]:
     found, share = "yes" if facts["found"] else "no", facts["visible"]
     found += "" if share > 0.995 else f", {100 * share:.0f} % in view"
     return (facts["marker"], found, f"{facts['distance_m']:.3f}", *_errors(facts))
+
+
+def _bundle_row(reading: "BundleReading") -> tuple[str, ...]:
+    facts = reading.as_dict() | {"corner_error_px": None}
+    found = f"{facts['found']} of {facts['markers']}"
+    return (f"bundle {facts['bundle']}", found, f"{facts['distance_m']:.3f}", *_errors(facts))
 
 
 def _mean_row(mean: dict[str, Any]) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from fidsplat.commands.output import Device, Json, console, option, switch, tell
-from fidsplat.commands.sweeps import Folders, Names, Overwrite, ReportTo, Seed, need_reports, run_sweeps
+from fidsplat.commands.sweeps import Folders, Names, Overwrite, ReportTo, Seed, need_reports, run_in_turn
 from fidsplat.errors import InputError
 
 CATEGORY_HELP = "apriltag, small, medium, large or huge, once more for each (default: all)"
@@ -74,13 +74,15 @@ class Baseline:
     """Train the paper's baseline: 2DGS on 3, 5, 9 and 17 views of each marker, 7,000 iterations.
 
     Writes the data set's scenes where they are missing, the splats as 2dgs-17/small-0.ply and the like, and
-    trained.jsonl with seconds, splats, PSNR and SSIM. A run that was stopped goes on where it was. What was
-    trained is then measured by `experiment views --trained DIR` and `angles --trained DIR`.
+    trained.jsonl with seconds, splats, PSNR and SSIM. What is trained is at once shown to the metrics and
+    detectors, as `experiment views` and `angles` do (views.jsonl, angles.jsonl). One marker of each category
+    comes first. A run that was stopped goes on where it was.
 
     Examples:
       fidsplat experiment baseline --device opencl:nvidia
+      fidsplat experiment baseline --shard 2/8 --seeds 3            several at once on one GPU, then `merge`
       fidsplat experiment baseline --category small --markers 1 --views 17 --iterations 1000 -o rough
-      fidsplat experiment views --trained fidsplat-baseline
+      fidsplat experiment report fidsplat-experiments fidsplat-baseline
     """
 
     out: Annotated[str, option("DIR", "folder for splats and results (default: fidsplat-baseline)", "-o")] = (
@@ -97,17 +99,17 @@ class Baseline:
         option("N", "3, 5, 9 or 17, once more for each (default: all)"),
     ] = ()
     iterations: Annotated[int, option("N", "of each training (default: 7000)")] = 7000
+    seeds: Annotated[int, option("N", "trainings of each, by other random numbers (default: 1)")] = 1
     seed: Seed = 0
+    shard: Annotated[str | None, option("i/n", "train the i-th of n shares, then see `merge`")] = None
+    workers: Annotated[int, option("N", "threads that look at pictures (default: 2)")] = 2
     overwrite: Overwrite = False
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.experiments.dataset import dataset_scenes
         from fidsplat.experiments.setup import COLLECTIONS, MARKERS, chosen_categories
-        from fidsplat.experiments.sweep import Results, Sweep
-        from fidsplat.experiments.trained import NAME, train_marker
-        from fidsplat.files import writable_folder
-        from fidsplat.provenance import run_facts
+        from fidsplat.experiments.trained import Baseline as Wanted
+        from fidsplat.experiments.trained import baseline_sweeps
         from fidsplat.render import Renderer
         from fidsplat.train import TrainSettings
 
@@ -116,22 +118,28 @@ class Baseline:
         for number in self.views:
             if number not in COLLECTIONS:
                 raise InputError(f"--views is {number}; known: {', '.join(map(str, COLLECTIONS))}")
-        settings = TrainSettings(iterations=self.iterations, seed=self.seed)
-        points = [
-            {**point, "iterations": self.iterations}
-            for point in dataset_scenes(chosen_categories(self.category), self.markers)
-            if not self.views or point["views"] in self.views
-        ]
-        out = writable_folder(self.out)
-        renderer = Renderer(self.device)
-        facts = run_facts(f"{renderer.device.title}, {renderer.device.version}", self.seed)
-        results = Results(out / f"{NAME}.jsonl", facts, self.overwrite)
-
-        def begin(point):
-            return lambda: train_marker(point, self.dataset, out, settings, renderer)
-
-        run_sweeps([Sweep(NAME, results, points, begin)])
-        return tell(self.json, {"file": str(results.file)}, str(results.file))
+        if self.seeds < 1 or self.workers < 1:
+            raise InputError(
+                f"--seeds is {self.seeds} and --workers is {self.workers}; both must be at least 1"
+            )
+        TrainSettings(iterations=self.iterations)  # says what is wrong before the device is opened
+        wanted = Wanted(
+            Path(self.out),
+            self.dataset,
+            chosen_categories(self.category),
+            self.markers,
+            self.views or COLLECTIONS,
+            self.iterations,
+            self.seeds,
+            self.seed,
+            self.shard,
+            self.workers,
+            self.overwrite,
+        )
+        with baseline_sweeps(wanted, Renderer(self.device)) as sweeps:
+            run_in_turn("baseline", sweeps)
+            files = {sweep.name: str(sweep.results.file) for sweep in sweeps}
+        return tell(self.json, {"files": files}, *files.values())
 
 
 @dataclass
@@ -220,11 +228,12 @@ class Merge:
     json: Json = False
 
     def run(self) -> int:
+        from fidsplat.experiments import trained
         from fidsplat.experiments.run import NAMES
         from fidsplat.experiments.sweep import merge, missing_shards
 
         result = {}
-        for name in NAMES:
+        for name in (*NAMES, trained.NAME):
             files = [f for folder in self.folders for f in sorted(Path(folder).glob(f"{name}-*-of-*.jsonl"))]
             files += [f for folder in self.folders for f in [Path(folder) / f"{name}.jsonl"] if f.is_file()]
             if files:

@@ -6,6 +6,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera
 from fidsplat.splats import SplatCloud
+from fidsplat.store.store import Store
 
 WIDTH, HEIGHT = 1280, 720
 FOV_X = math.radians(60.0)
@@ -17,8 +18,8 @@ REACH = 1.5
 MANY = 10_000
 
 
-def framing_camera(cloud: SplatCloud) -> Camera:
-    """A camera on the -z side, y down, that sees all of the cloud; 1280 x 720 pixels, 60 degrees wide."""
+def framing_camera(cloud: SplatCloud | Store) -> Camera:
+    """A camera on the -z side, y down, that sees all of the splats; 1280 x 720 pixels, 60 degrees wide."""
     low, high = _extent(cloud)
     middle, half = (low + high) / 2, np.maximum((high - low) / 2, 1e-6)
     tangent = math.tan(FOV_X / 2)
@@ -26,9 +27,11 @@ def framing_camera(cloud: SplatCloud) -> Camera:
     return Camera.look_at(WIDTH, HEIGHT, FOV_X, middle - [0, 0, away], middle, near=min(0.01, away / 100))
 
 
-def _extent(cloud: SplatCloud) -> tuple[np.ndarray, np.ndarray]:
+def _extent(cloud: SplatCloud | Store) -> tuple[np.ndarray, np.ndarray]:
     if len(cloud) == 0:
         return -np.ones(3), np.ones(3)
+    if isinstance(cloud, Store):  # its chunks are small against it
+        return cloud.bounds(REACH)
     reach = REACH * cloud.reach(1.0)
     share = 0.5 if len(cloud) >= MANY else 0.0
     low = np.percentile(cloud.means - reach, share, axis=0)

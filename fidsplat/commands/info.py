@@ -34,12 +34,16 @@ class Info:
       fidsplat info scene.ply --json
     """
 
-    file: Annotated[tyro.conf.Positional[str], option("FILE", "a splat file: PLY, .splat, SPZ, glTF, USD")]
+    file: Annotated[tyro.conf.Positional[str], option("FILE", "splats: PLY, .splat, SPZ, glTF, USD, a store")]
     json: Json = False
 
     def run(self) -> int:
         import fidsplat as fs
+        from fidsplat.commands.store import tell_store
+        from fidsplat.store.layout import SUFFIX
 
+        if Path(self.file).suffix.lower() == SUFFIX:
+            return tell_store(self.file, self.json)
         with late_progress(console(True)) as progress:
             cloud = fs.load_splats(self.file, progress)
         facts = {"file": self.file, "bytes": Path(self.file).stat().st_size, **describe(cloud)}

@@ -20,9 +20,10 @@ class Localise:
     """A robot drives through a greenhouse and finds its way by tags: how far a simulated camera moves that.
 
     MuJoCo drives it up one aisle and down the next; wheels, gyroscope and tags go through an error-state
-    filter. Compared are odometry alone, ideal corners, the markers' mixtures, and lens, blur, rolling shutter
-    and noise: absolute and relative trajectory errors, trajectories as TUM for evo, a page. A run that was
-    stopped goes on where it was. Needs the extra `sim`.
+    filter. Compared are odometry alone, ideal corners, an ideal texture, the markers' mixtures, lens, blur,
+    rolling shutter, noise, speeds, and how far away tags are used: absolute and relative trajectory errors,
+    errors of corners by distance, trajectories as TUM for evo, a page. A run that was stopped goes on where
+    it was. Needs the extra `sim`.
 
     Examples:
       fidsplat experiment localise --quick
@@ -31,7 +32,7 @@ class Localise:
 
     out: Annotated[str, option("DIR", "folder (default: fidsplat-localise)", "-o")] = "fidsplat-localise"
     quick: Annotated[bool, switch("one row of four plants, and the first three variants")] = False
-    rows: Annotated[int, option("N", "of plants (default: 4, a path of 50 m)")] = 4
+    rows: Annotated[int, option("N", "of plants (default: 5, a path of 60 m)")] = 5
     plants: Annotated[int, option("N", "in each row (default: 12)")] = 12
     variant: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
@@ -53,8 +54,9 @@ class Localise:
 
         import fidsplat as fs
         from fidsplat.commands.sweeps import need_reports
-        from fidsplat.experiments.localise import HEADS, VARIANTS, LocaliseFolder
+        from fidsplat.experiments.localise import VARIANTS
         from fidsplat.experiments.localise import Localise as Asked
+        from fidsplat.experiments.localise_folder import HEADS, LocaliseFolder
         from fidsplat.vision.video import check_video
 
         asked = Asked(1, 4, self.seed) if self.quick else Asked(self.rows, self.plants, self.seed)

@@ -68,7 +68,7 @@ class Source:
         with late_progress(console(True)) as progress:
             scene = load_source(self.source, self.quality, progress)
         names = None if self.outputs is None else tuple(name.strip() for name in self.outputs.split(","))
-        return select(scene.cloud(), scene.capture.with_(outputs=names, quality=self.quality))
+        return select(scene.splats, scene.capture.with_(outputs=names, quality=self.quality))
 
     def _backend(self) -> "OpenCLBackend":
         import fidsplat as fs

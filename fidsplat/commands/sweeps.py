@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,6 +12,8 @@ from fidsplat.commands.output import console, option, switch
 from fidsplat.errors import InputError
 
 if TYPE_CHECKING:
+    from rich.progress import Progress
+
     from fidsplat.experiments.sweep import Key, Record, Sweep
 
 Names = tyro.conf.UseAppendAction[tuple[str, ...]]
@@ -33,6 +35,35 @@ def need_reports() -> None:
 
 def run_sweeps(sweeps: Iterable[Sweep]) -> list[Record]:
     """Measure what is left of each, with a progress bar on stderr; returns what was measured."""
+    found = []
+    for sweep in sweeps:
+        with bars() as progress:
+            total = len(sweep.points)
+            bar = progress.add_task(sweep.name, total=total, completed=total - len(sweep.left))
+            for record in sweep.run():
+                progress.update(bar, advance=1, description=f"{sweep.name} {words(record.key)}")
+                found.append(record)
+            progress.update(bar, description=sweep.name)
+    return found
+
+
+def run_in_turn(name: str, sweeps: Sequence[Sweep]) -> list[Record]:
+    """As `run_sweeps`, the first point of each before the second of any, with one progress bar."""
+    from fidsplat.experiments.sweep import in_turn
+
+    found = []
+    with bars() as progress:
+        total, left = sum(len(sweep.points) for sweep in sweeps), sum(len(sweep.left) for sweep in sweeps)
+        bar = progress.add_task(name, total=total, completed=total - left)
+        for record in in_turn(sweeps):
+            progress.update(bar, advance=1, description=f"{name} {words(record.key)}")
+            found.append(record)
+        progress.update(bar, description=name)
+    return found
+
+
+def bars() -> Progress:
+    """Progress by points, on stderr."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -42,19 +73,8 @@ def run_sweeps(sweeps: Iterable[Sweep]) -> list[Record]:
         TimeRemainingColumn,
     )
 
-    found = []
-    for sweep in sweeps:
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-        with Progress(
-            *columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console(True)
-        ) as progress:
-            total = len(sweep.points)
-            bar = progress.add_task(sweep.name, total=total, completed=total - len(sweep.left))
-            for record in sweep.run():
-                progress.update(bar, advance=1, description=f"{sweep.name} {words(record.key)}")
-                found.append(record)
-            progress.update(bar, description=sweep.name)
-    return found
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    return Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console(True))
 
 
 def words(key: Key) -> str:

@@ -104,11 +104,13 @@ def run_demo(
     scene = demo_scene(mixture=mixture)
     progress("opening the device")
     renderer = Renderer(device)
-    resident = renderer.upload(scene)
     files = [folder / "scene.toml", folder / "scene.ply"]
     scene.save(files[0])
     files += sorted(folder.glob("scene-splats-*.ply"))
     save_ply((scene if mixture != "exact" else demo_scene(mixture="fitted")).cloud(), files[1])
+    # files round logarithms and logits to single precision: what is drawn is what stands in them, to the bit
+    scene = Scene.load(files[0])
+    resident = renderer.upload(scene)
 
     sightings, unexpected, frame_ms, visible, seen = [], [], {}, {}, {}
     for view, camera in demo_views().items():

@@ -2,33 +2,36 @@
 
 from __future__ import annotations
 
-import json
 import math
+import os
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fidsplat.cameras import BrownConrady, Camera, Motion, Shutter, Trajectory
 from fidsplat.capture import Capture
-from fidsplat.errors import InputError, unknown
-from fidsplat.files import atomic_write, writable_folder
-from fidsplat.formats import load_trajectory, save_trajectory
-from fidsplat.provenance import run_facts
+from fidsplat.errors import InputError
+from fidsplat.experiments.ideal_tags import tag_layer
 from fidsplat.render import Renderer
+from fidsplat.scenes import PlacedMarker
 from fidsplat.sensor import Sensor
 from fidsplat.sim.greenhouse import AISLE, Greenhouse
 from fidsplat.sim.localiser import Localiser
 from fidsplat.sim.robot import BODY, Errors, Run, camera_at, drive
 from fidsplat.vision.detect import Detection, detect
 from fidsplat.vision.images import to_uint8
+from fidsplat.vision.pose import marker_pose
+from fidsplat.vision.readback import corner_error
 
 RATE = 4.0
 """pictures a second"""
-RESULTS, REPORT, CHART = "localise.json", "localise.md", "localise.svg"
+DISTANCES = 1.0, 2.0, 3.0
+"""metres between which errors of corners are counted apart"""
 FAMILY = "apriltag:36h11"
 CAMERA = "eye"
 """name of the camera in logs"""
@@ -47,13 +50,25 @@ class Variant:
     readout: float = 0.0
     sensor: Sensor | None = None
     ideal: bool = False
-    """no pictures: the tags that `exact` sees, with corners where they are"""
+    """the tags that are seen, with corners where they are"""
+    texture: bool = False
+    """tags are no splats but printed, every pixel the mean of what it shows; by a pinhole, at one moment"""
+    reach: float = math.inf
+    """metres beyond which tags are not used"""
+    speed: float | None = None
+    """metres a second; None: the experiment's"""
+
+    @property
+    def taken(self) -> Variant | None:
+        """What its pictures depend on; None where it needs none."""
+        return None if self.mixture is None else replace(self, ideal=False, reach=math.inf)
 
 
 VARIANTS = {
     "odometry": Variant(mixture=None),
-    "ideal corners": Variant(mixture=None, ideal=True),
+    "ideal corners": Variant(ideal=True),
     "exact": Variant(),
+    "ideal texture": Variant(texture=True),
     "fitted": Variant("fitted"),
     "paper": Variant("paper"),
     "lens": Variant(lens=_LENS),
@@ -61,16 +76,20 @@ VARIANTS = {
     "rolling shutter": Variant(readout=0.03),
     "noise": Variant(sensor=_SENSOR),
     "all of these": Variant("exact", _LENS, 0.03, 0.03, _SENSOR),
+    "0.25 m/s, blur": Variant(exposure_time=0.03, speed=0.25),
+    "1 m/s, blur": Variant(exposure_time=0.03, speed=1.0),
+    "up to 1 m": Variant(reach=1.0),
+    "up to 2 m": Variant(reach=2.0),
 }
-"""What is compared, by name: wheels and gyroscope alone; corners without error; mixtures; and effects on
-`exact`"""
+"""What is compared, by name: wheels and gyroscope alone; corners without error; mixtures; and of `exact`
+effects, speeds, and how far away tags are used"""
 
 
 @dataclass(frozen=True)
 class Localise:
     """The experiment. Raises InputError for a greenhouse that cannot be."""
 
-    rows: int = 4
+    rows: int = 5
     plants: int = 12
     seed: int = 0
     speed: float = 0.5
@@ -86,13 +105,18 @@ class Localise:
         """640 x 480, 80 degrees across."""
         return Camera.look_at(640, 480, math.radians(80), (0, 0, 0), (0, 0, 1))
 
-    def run(self) -> Run:
-        """The drive: up one aisle, down the next."""
+    @property
+    def tags(self) -> dict[int, PlacedMarker]:
+        """By their ids."""
+        return {placed.marker.id: placed for placed in self.house.markers if placed.marker.id is not None}
+
+    def run(self, speed: float | None = None) -> Run:
+        """The drive: up one aisle, down the next; at a speed of its own if that is given."""
         ends, path = (-0.8, self.house.length + 0.8), []
         for aisle in range(self.rows + 1):
             y = (aisle - 0.5) * AISLE
             path += [(x, y) for x in (ends if aisle % 2 == 0 else ends[::-1])]
-        return drive(self.house.mjcf(BODY), np.array(path), self.speed, Errors(seed=self.seed))
+        return drive(self.house.mjcf(BODY), np.array(path), speed or self.speed, Errors(seed=self.seed))
 
     def shots(self, run: Run) -> np.ndarray:
         """Numbers of the moments of a drive at which pictures are taken."""
@@ -101,6 +125,8 @@ class Localise:
     def pictures(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[np.ndarray]:
         """What the camera sees at each moment, (480, 640, 3) uint8."""
         scene = replace(self.house, mixture=variant.mixture).scene
+        if variant.texture:
+            scene = replace(scene, markers=tuple(each for each in scene.markers if each.marker.id is None))
         plain = Capture(
             replace(self.camera, lens=variant.lens),
             background=scene.background,
@@ -113,31 +139,53 @@ class Localise:
             )
             sensor = None if variant.sensor is None else replace(variant.sensor, seed=int(k))
             captures.append(plain.with_(shutter=shutter, sensor=sensor))
-        for frame in renderer.render_views(renderer.upload(scene), captures):
+        splats, tags = renderer.upload(scene), self.tags
+        for capture, k, frame in zip(
+            captures, self.shots(run), renderer.render_views(splats, captures), strict=True
+        ):
+            if variant.texture:
+                layer = tag_layer(tags.values(), camera_at(self.camera, run.poses[k]), frame["rgb"])
+                frame = renderer.render(splats, capture.with_(layer=layer))
             yield to_uint8(frame["rgb"])
 
     def sightings(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[list[Detection]]:
-        """The tags in each picture of a variant."""
-        for picture in self.pictures(variant, run, renderer):
-            yield detect(picture, (FAMILY,), qr=False)
+        """The tags in each picture of a variant; they are looked for while the next pictures are drawn."""
+        workers = len(os.sched_getaffinity(0))
+        waiting = deque()
+        with ThreadPoolExecutor(workers) as pool:
+            for picture in self.pictures(variant, run, renderer):
+                waiting.append(pool.submit(detect, picture, (FAMILY,), qr=False))
+                if len(waiting) > 2 * workers:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
 
     def localised(
-        self, run: Run, sightings: list[list[Detection]] | None, camera: Camera, noise: float = 0.5
+        self,
+        run: Run,
+        sightings: list[list[Detection]] | None,
+        camera: Camera,
+        noise: float = 0.5,
+        reach: float = math.inf,
     ) -> tuple[Trajectory, dict[str, Any]]:
-        """Where the robot takes itself to be, and how far off that is."""
+        """Where the robot takes itself to be, and how far off that is.
+
+        Args:
+            sightings: the tags in each picture; None: it has no camera.
+            noise: pixels, standard deviation of a corner.
+            reach: metres beyond which tags are not used.
+        """
         first = run.poses[0]
         filtered = Localiser(np.array([*first[:2, 3], math.atan2(first[1, 0], first[0, 0])]), noise)
-        tags = {
-            placed.marker.id: placed.corners for placed in self.house.markers if placed.marker.id is not None
-        }
+        tags = self.tags
         at = {} if sightings is None else dict(zip(self.shots(run).tolist(), sightings, strict=True))
         standing = partial(camera_at, camera)
         poses, seen = [first], 0
         for k in range(1, len(run.times)):
             filtered.move(run.wheels[k], float(run.gyro[k]), float(run.times[k] - run.times[k - 1]))
             for tag in at.get(k, []):
-                if tag.id in tags:
-                    seen += filtered.see(tag.corners, tags[tag.id], standing)
+                if tag.id in tags and _away(tag, tags[tag.id], camera) <= reach:
+                    seen += filtered.see(tag.corners, tags[tag.id].corners, standing)
             poses.append(filtered.pose)
         facts = errors_of(run, np.array(poses))
         facts |= {"tags": seen, "refused": filtered.refused}
@@ -145,16 +193,35 @@ class Localise:
 
     def ideal(self, run: Run, sightings: list[list[Detection]]) -> list[list[Detection]]:
         """The same tags with corners where they are."""
-        tags = {
-            placed.marker.id: placed.corners for placed in self.house.markers if placed.marker.id is not None
-        }
-        found = []
+        tags, found = self.tags, []
         for k, codes in zip(self.shots(run).tolist(), sightings, strict=True):
             camera = camera_at(self.camera, run.poses[k])
-            found.append(
-                [replace(code, corners=camera.project(tags[code.id])) for code in codes if code.id in tags]
-            )
+            known = [(code, tags[code.id]) for code in codes if code.id is not None and code.id in tags]
+            found.append([replace(code, corners=camera.project(tag.corners)) for code, tag in known])
         return found
+
+    def corner_errors(
+        self, run: Run, sightings: list[list[Detection]], camera: Camera
+    ) -> list[dict[str, Any]]:
+        """By `DISTANCES`: how many tags were seen, and how far their corners were from where they are: the
+        median of each tag's root mean square, pixels; None where none was seen."""
+        tags, found = self.tags, []
+        for k, codes in zip(self.shots(run).tolist(), sightings, strict=True):
+            standing = camera_at(camera, run.poses[k])
+            for code in codes:
+                if code.id in tags:
+                    away = np.linalg.norm(tags[code.id].pose[:3, 3] - standing.position)
+                    off = corner_error(code, standing.project(tags[code.id].corners))
+                    found.append((int(np.searchsorted(DISTANCES, away)), off))
+        return [
+            {"tags": len(own), "median_px": float(np.median(own)) if own else None}
+            for own in ([off for place, off in found if place == k] for k in range(len(DISTANCES) + 1))
+        ]
+
+
+def _away(tag: Detection, placed: PlacedMarker, camera: Camera) -> float:
+    """Metres to a tag, by its corners."""
+    return float(np.linalg.norm(marker_pose(tag.corners, placed.marker.size, camera)[:3, 3]))
 
 
 def errors_of(run: Run, poses: np.ndarray) -> dict[str, float]:
@@ -174,124 +241,6 @@ def errors_of(run: Run, poses: np.ndarray) -> dict[str, float]:
         "rpe_m": float(np.sqrt((relative**2).sum(1).mean())) if len(pairs) else 0.0,
         "heading_deg": float(np.sqrt((heading**2).mean())),
     }
-
-
-class LocaliseFolder:
-    """Results on disk: one entry for each variant, trajectories as TUM, a chart and a page. What is there is
-    not measured again.
-
-    Raises InputError where the folder holds another experiment, or cannot be written.
-    """
-
-    def __init__(self, folder: Path, asked: Localise, device: str, overwrite: bool = False) -> None:
-        self.folder, self.asked = writable_folder(folder), asked
-        self.key = {"rows": asked.rows, "plants": asked.plants, "seed": asked.seed, "speed": asked.speed}
-        self.results: dict[str, Any] = {
-            "run": run_facts(device, asked.seed),
-            "asked": self.key,
-            "variants": {},
-        }
-        file = self.folder / RESULTS
-        if file.exists() and not overwrite:
-            try:
-                before = json.loads(file.read_text("utf-8"))
-            except (OSError, ValueError) as error:
-                raise InputError(f"{file} cannot be read ({error}); --overwrite measures again") from None
-            if before.get("asked") != self.key:
-                raise InputError(
-                    f"{file} is of another drive, {before.get('asked')}; give another folder, or --overwrite"
-                )
-            self.results = before
-
-    def measure(self, names: list[str], renderer: Renderer) -> Iterator[tuple[str, float]]:
-        """Measure what is left of the variants; yields words and the share of them that is done."""
-        for name in names:
-            if name not in VARIANTS:
-                raise InputError(unknown("variant", name, VARIANTS))
-        left = [name for name in names if name not in self.results["variants"]]
-        if not left:
-            return
-        run = self.asked.run()
-        self.results["length_m"] = run.length
-        save_trajectory(Trajectory(run.times, run.poses), self.folder / _tum("truth"))
-        seen: dict[str, list[list[Detection]]] = {}
-        count = len(self.asked.shots(run))
-        for done, name in enumerate(left):
-            variant = VARIANTS[name]
-            source = "exact" if variant.ideal else name
-            if (variant.mixture or variant.ideal) and source not in seen:
-                found = []
-                for codes in self.asked.sightings(VARIANTS[source], run, renderer):
-                    found.append(codes)
-                    yield name, (done + len(found) / count) / len(left)
-                seen[source] = found
-            sightings = seen.get(source)
-            if variant.ideal and sightings is not None:
-                sightings = self.asked.ideal(run, sightings)
-            camera = replace(self.asked.camera, lens=variant.lens)
-            path, facts = self.asked.localised(run, sightings, camera, 0.05 if variant.ideal else 0.5)
-            save_trajectory(path, self.folder / _tum(name))
-            self.results["variants"][name] = facts
-            with atomic_write(self.folder / RESULTS) as stream:
-                stream.write(json.dumps(self.results, indent=2).encode())
-            yield name, (done + 1) / len(left)
-
-    def rows(self) -> list[tuple[str, ...]]:
-        """A row of text for each variant: name, errors in centimetres and degrees, tags."""
-        return [
-            (
-                name,
-                f"{100 * facts['ate_m']:.2f}",
-                f"{100 * facts['worst_m']:.2f}",
-                f"{100 * facts['rpe_m']:.2f}",
-                f"{facts['heading_deg']:.3f}",
-                str(facts["tags"]),
-                str(facts["refused"]),
-            )
-            for name, facts in self.results["variants"].items()
-        ]
-
-    def write_chart(self) -> Path:
-        """The drive from above, as it was and as it was taken to be. Needs matplotlib."""
-        from fidsplat.experiments.charts import COLOURS, chart, legend_above
-
-        names = [name for name in self.results["variants"] if (self.folder / _tum(name)).exists()]
-        with chart(self.folder / CHART, size=(9.0, 5.0)) as (figure, axes):
-            for number, name in enumerate(["truth", *names]):
-                path = load_trajectory(self.folder / _tum(name)).poses[::10, :2, 3]  # every fifth of a second
-                width, colour = (3.0, "#bbbbbb") if number == 0 else (1.0, COLOURS[number % len(COLOURS)])
-                axes[0].plot(path[:, 0], path[:, 1], label=name, color=colour, linewidth=width)
-            axes[0].set_aspect("equal")
-            axes[0].set_xlabel("x [m]")
-            axes[0].set_ylabel("y [m]")
-            legend_above(figure, axes[0])
-        return self.folder / CHART
-
-    def write_page(self) -> Path:
-        """The table as a page."""
-        lines = [
-            "# A robot among tags",
-            "",
-            f"{self.results['length_m']:.1f} m through a greenhouse of {self.asked.rows} rows, "
-            f"{RATE:g} pictures a second of 640 x 480, on {self.results['run']['device']}.",
-            "",
-            f"| {' | '.join(HEADS)} |",
-            f"|{'---|' * len(HEADS)}",
-            *(f"| {' | '.join(row)} |" for row in self.rows()),
-            "",
-            f"![The drive from above]({CHART})",
-            "",
-        ]
-        with atomic_write(self.folder / REPORT) as stream:
-            stream.write("\n".join(lines).encode())
-        return self.folder / REPORT
-
-
-HEADS = ("", "ATE [cm]", "worst [cm]", "RPE over 1 m [cm]", "heading [deg]", "tags", "refused")
-
-
-def _tum(name: str) -> str:
-    return f"{name.replace(' ', '-')}.tum"
 
 
 def write_log(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from fidsplat.experiments import angles, counts, localisation, views
+from fidsplat.experiments import angles, counts, localisation, trained, views
 from fidsplat.experiments.charts import bars, chart, legend_above
 from fidsplat.experiments.methods import FILTERS, IDEAL, mixtures, with_linear_light
 from fidsplat.experiments.pages import NOTHING, fixed, number, places, write_page
@@ -50,7 +50,7 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
     with atomic_write(missed) as stream:
         stream.write(reached[~reached["reached"]].drop(columns="reached").to_csv(index=False).encode())
     rows = {name: summary.rows for name, summary in summaries.items()}
-    context: dict = {name: None for name in (counts.NAME, angles.NAME, views.NAME, localisation.NAME)}
+    context: dict = dict.fromkeys((counts.NAME, angles.NAME, views.NAME, localisation.NAME, trained.NAME))
     for name, tables in (
         (counts.NAME, _counts),
         (angles.NAME, _angles),
@@ -59,6 +59,8 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
     ):
         if name in rows:
             context[name] = tables(rows[name], folder)
+    if trained.NAME in rows:
+        context[trained.NAME] = _trained(rows[trained.NAME], rows.get(angles.NAME))
     sheets = next((found for place in (*folders, folder) if (found := sheet_files(place))), [])
     for sheet in sheets:
         if sheet.parent.resolve() != folder.resolve():
@@ -148,12 +150,7 @@ def _counts(rows: Frame, folder: Path) -> dict[str, Frame]:
 
 def _angles(rows: Frame, folder: Path) -> dict[str, Frame]:
     """Table 3 by protocol, and its chart."""
-    there = set(rows["reader"])
-    furthest = {
-        kind: next((name for name in names if name in there), "") for kind, names in _FURTHEST.items()
-    }
-    kinds = rows["category"].map(lambda name: CATEGORIES[name].kind)
-    rows = rows[rows["reader"] == kinds.map(furthest)]
+    rows = _of_furthest(rows)
     categories, methods = category_order(rows["category"]), method_order(rows["method"])
     tables, means = {}, {}
     for protocol in (name for name in PROTOCOLS if name in set(rows["protocol"])):
@@ -181,6 +178,16 @@ def _angles(rows: Frame, folder: Path) -> dict[str, Frame]:
     }
     _panels(folder / "angles.svg", categories, series, "largest tilt that is read, degrees")
     return tables
+
+
+def _of_furthest(rows: Frame) -> Frame:
+    """What the detector of each kind saw that reads furthest."""
+    there = set(rows["reader"])
+    furthest = {
+        kind: next((name for name in names if name in there), "") for kind, names in _FURTHEST.items()
+    }
+    kinds = rows["category"].map(lambda name: CATEGORIES[name].kind)
+    return rows[rows["reader"] == kinds.map(furthest)]
 
 
 def _angle(values: Row) -> str:
@@ -221,6 +228,45 @@ def _views(rows: Frame, folder: Path) -> dict:
     _panels(folder / "psnr.svg", categories, series, "PSNR, dB")
     measured = {name: int(rows[name].notna().sum()) for name in ("flip", "lpips")}
     return {"tables": tables, "views": int(rows["amount"].max()), "rows": len(rows), "measured": measured}
+
+
+def _trained(rows: Frame, scans: Frame | None) -> dict:
+    """The paper's baseline: a row for each category and number of views, the paper's figures beside ours."""
+    table = []
+    read = {} if scans is None else _read_of(scans)
+    for category in category_order(rows["category"]):
+        for count in sorted(set(rows["views"])):
+            own = rows[(rows["category"] == category) & (rows["views"] == count)]
+            if own.empty:
+                continue
+            theirs = ANGLES.get(category, {}).get(count)
+            ratio, similar, _ = VIEWS[category][count]
+            method = f"2dgs-{count}"
+            table.append(
+                {
+                    "marker, views": f"{CATEGORIES[category].title}, {count}",
+                    "PSNR/SSIM, paper": f"{ratio:.1f}/{similar:.2f}",
+                    "ours": f"{own['psnr'].mean():.1f}/{own['ssim'].mean():.3f}",
+                    "read to, paper": NOTHING if theirs is None else f"{theirs[1]:.1f}",
+                    "read to, ours": read.get((category, method), NOTHING),
+                    "read to, training-free": read.get((category, "exact/best"), NOTHING),
+                    "splats": fixed(own["splats"].mean(), 0),
+                    "seconds, paper": f"{TRAINING_SECONDS[count]:.0f}",
+                    "seconds, ours": fixed(own["seconds"].median(), 1),
+                }
+            )
+    each = rows.groupby(["category", "views", "marker"])["psnr"]
+    seeds = int(each.size().max())
+    spread = float((each.max() - each.min()).max()) if seeds > 1 else None
+    trainings, iterations = len(rows), int(rows["amount"].max())
+    rows = pd.DataFrame(table)
+    return {"rows": rows, "trainings": trainings, "iterations": iterations, "seeds": seeds, "spread": spread}
+
+
+def _read_of(scans: Frame) -> dict[tuple[str, str], str]:
+    """The largest tilt that is read on the paper's plane, by category and method."""
+    scans = _of_furthest(scans[scans["protocol"] == "fixed-plane"])
+    return {place: _angle(own["read"]) for place, own in scans.groupby(["category", "method"])}
 
 
 def _localisation(rows: Frame, folder: Path) -> Frame:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from fidsplat.errors import InputError
-from fidsplat.experiments import angles, counts, localisation, views
+from fidsplat.experiments import angles, counts, localisation, trained, views
 from fidsplat.experiments.methods import IDEAL
 from fidsplat.experiments.summary import Summary, join, read_summary, records_of, summarise
 from fidsplat.experiments.sweep import Record
@@ -174,6 +174,15 @@ def _localisation_rows(ideals: Ideals, record: Record) -> Rows:
         yield row
 
 
+def _trained_rows(ideals: Ideals, record: Record) -> Rows:
+    """What was stopped and went on has no time of its whole training."""
+    key, found = record.key, dict(record.result)
+    whole = found["iterations"] == key["iterations"]
+    row = {name: key[name] for name in ("category", "views", "seed")} | {"marker": key["index"]}
+    row |= {name: found[name] for name in ("psnr", "ssim", "splats")}
+    yield row | {"amount": key["iterations"], "seconds": found["seconds"] if whole else None}
+
+
 KINDS = {
     counts.NAME: Kind(
         ("category", "marker", "mixture"),
@@ -196,5 +205,8 @@ KINDS = {
         ("category", "method", "marker", "distance_m"),
         ("read", "position_mm", "angle_deg", "corners_px"),
         _localisation_rows,
+    ),
+    trained.NAME: Kind(
+        ("category", "views", "marker", "seed"), ("psnr", "ssim", "splats", "seconds"), _trained_rows
     ),
 }  # fmt: skip

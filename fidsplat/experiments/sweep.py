@@ -11,10 +11,10 @@ import json
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import groupby, zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -134,6 +134,15 @@ class Sweep:
                 yield self.results.append(key, result)
 
 
+def in_turn(sweeps: Sequence[Sweep]) -> Iterator[Record]:
+    """Measure what is left, the first point of each sweep before the second of any; yields each record when
+    it is in its file."""
+    for keys in zip_longest(*(sweep.points for sweep in sweeps)):
+        for sweep, key in zip(sweeps, keys, strict=True):
+            if key is not None and sweep.results.left([key]):
+                yield sweep.results.append(key, sweep.begin(key)())
+
+
 def read_records(file: Path) -> list[Record]:
     """Every record of a file, none when it is missing; a last line that was cut short is left out.
 
@@ -224,7 +233,7 @@ def missing_shards(files: Iterable[Path]) -> list[str]:
 
 def _differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     """The facts on which numbers depend and that are not the same. A run that draws nothing has no device."""
-    names = [name for name in ("versions", "code", "seed") if old.get(name) != new.get(name)]
+    names = [name for name in ("versions", "code", "seed", "scene") if old.get(name) != new.get(name)]
     devices = (old.get("device"), new.get("device"))
     return names + (["device"] if None not in devices and devices[0] != devices[1] else [])
 

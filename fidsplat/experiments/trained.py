@@ -1,28 +1,149 @@
-"""The paper's baseline: 2DGS trained on 3, 5, 9 and 17 views of each marker (`experiment views --trained` and
-`angles --trained` then draw and read what was trained)."""
+"""The paper's baseline: 2DGS trained on 3, 5, 9 and 17 views of each marker, and what its splats show: novel
+views (table 4) and the largest tilts at which they are read (table 3)."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from fidsplat.experiments import angles, views
 from fidsplat.experiments.dataset import write_scene
-from fidsplat.experiments.sweep import Key
+from fidsplat.experiments.methods import Painter
+from fidsplat.experiments.setup import COLLECTIONS, SEED, TEST_VIEWS, Category
+from fidsplat.experiments.sweep import Key, Results, Sweep, shard
 from fidsplat.files import writable_folder
+from fidsplat.provenance import run_facts
 from fidsplat.render import Renderer
 from fidsplat.train import Step, Trainer, TrainSettings, load_dataset
+from fidsplat.vision.metrics import has_flip, metric_versions
+from fidsplat.vision.readers import reader_versions
 
 NAME = "trained"
+_TILTS = "0:40:5,40.2:89.8:0.2"
+"""of the scans: all of them where reading ends"""
+_PROTOCOL = "fixed-plane"
+"""the paper's, of which the training views are"""
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """What is to be trained, and where it goes."""
+
+    out: Path
+    dataset: Path
+    """folder of the scenes"""
+    categories: tuple[Category, ...]
+    markers: int
+    """of each category"""
+    collections: tuple[int, ...] = COLLECTIONS
+    iterations: int = 7000
+    seeds: int = 1
+    """trainings of each, by random numbers of their own; the first is shown to the detectors"""
+    texts: int = SEED
+    """seed of texts and views"""
+    shard: str | None = None
+    """"i/n\""""
+    workers: int = 1
+    """threads that look at pictures"""
+    overwrite: bool = False
+
+    def file(self, name: str) -> Path:
+        """Where the results of an experiment go."""
+        ending = "" if self.shard is None else "-" + self.shard.replace("/", "-of-")
+        return self.out / f"{name}{ending}.jsonl"
+
+    @property
+    def points(self) -> list[Key]:
+        """The trainings, one marker of each category first."""
+        every = [
+            {
+                **{"category": category.name, "index": index, "views": number},
+                **{"iterations": self.iterations, "seed": seed},
+            }
+            for seed in range(self.seeds)
+            for index in range(self.markers)
+            for category in self.categories
+            for number in self.collections
+        ]
+        return shard(every, self.shard)
+
+
+@contextmanager
+def baseline_sweeps(wanted: Baseline, renderer: Renderer) -> Iterator[list[Sweep]]:
+    """The trainings, and the views and angles of those of the first seed, to be measured in turn: a run that
+    is stopped has all of what it has trained.
+
+    Raises InputError for what cannot be written, or holds results of another device, version, code or seed.
+    """
+    points = wanted.points
+    shown = [point for point in points if point["seed"] == 0]
+    folder, painter = writable_folder(wanted.out), Painter(renderer, wanted.out)
+    device = f"{renderer.device.title}, {renderer.device.version}"
+
+    def results(name: str, versions: dict[str, str] | None = None) -> Results:
+        facts = run_facts(device, wanted.texts, versions)
+        return Results(wanted.file(name), facts, wanted.overwrite)
+
+    pool, kept = ThreadPoolExecutor(wanted.workers), views.Kept()
+    train = partial(train_marker, folder=wanted.dataset, out=folder, texts=wanted.texts, renderer=renderer)
+    look = partial(
+        views.measure_views, painter=painter, seed=wanted.texts, blender=Path(), pool=pool, kept=kept
+    )
+    scan = partial(
+        angles.measure_angles, painter=painter, seed=wanted.texts, pool=pool, workers=wanted.workers
+    )
+    readers = reader_versions()
+    try:
+        yield [
+            Sweep(NAME, results(NAME), points, partial(partial, train)),
+            Sweep(
+                views.NAME,
+                results(views.NAME, readers | metric_versions()),
+                [_view_point(p) for p in shown],
+                partial(partial, look),
+            ),
+            Sweep(
+                angles.NAME,
+                results(angles.NAME, readers),
+                [_angle_point(p) for p in shown],
+                partial(partial, scan),
+            ),
+        ]
+    finally:
+        # an interrupt must not wait for pictures that nobody will look at
+        pool.shutdown(cancel_futures=True)
+
+
+def _view_point(point: Key) -> Key:
+    """Of `experiment views`: against what was trained on."""
+    of = {"category": point["category"], "index": point["index"], "method": f"2dgs-{point['views']}"}
+    return of | {"truth": "exact", "views": TEST_VIEWS, "flip": has_flip(), "lpips": None}
+
+
+def _angle_point(point: Key) -> Key:
+    """Of `experiment angles`."""
+    of = {"protocol": _PROTOCOL, "category": point["category"], "index": point["index"]}
+    return of | {"method": f"2dgs-{point['views']}", "tilts": _TILTS}
+
+
+def model_file(out: Path, point: Key) -> Path:
+    """Where the splats of a training go: those of the first seed where `Painter` looks."""
+    folder = out if point["seed"] == 0 else out / f"seed-{point['seed']}"
+    return folder / f"2dgs-{point['views']}" / f"{point['category']}-{point['index']}.ply"
 
 
 def train_marker(
     point: Key,
     folder: Path,
     out: Path,
-    settings: TrainSettings,
+    texts: int,
     renderer: Renderer,
     tell: Callable[[Step], None] | None = None,
 ) -> dict:
@@ -31,10 +152,10 @@ def train_marker(
     A training that was stopped goes on from its checkpoint, which goes when the splats are written.
 
     Args:
-        point: of `fidsplat.experiments.dataset.dataset_scenes`.
+        point: of `Baseline.points`.
         folder: of the data set; the scene is written where it is missing, with the ideal pictures.
-        out: gets 2dgs-17/small-0.ply and the like.
-        settings: of the training; its seed is that of the marker's text too.
+        out: gets 2dgs-17/small-0.ply and the like, of other seeds than 0 in seed-1 and so on.
+        texts: seed of the marker's text and views.
 
     Returns:
         `splats`, `seconds` of the training, `iterations` that these took, and of the views held out the means
@@ -43,9 +164,10 @@ def train_marker(
     Raises:
         InputError: the scene cannot be written or read, or a checkpoint is of another run.
     """
-    scene = write_scene(point, folder, settings.seed, "exact", Path())
-    place = writable_folder(out / f"2dgs-{point['views']}")
-    file = place / f"{point['category']}-{point['index']}.ply"
+    scene = write_scene(point, folder, texts, "exact", Path())
+    file = model_file(out, point)
+    writable_folder(file.parent)
+    settings = TrainSettings(iterations=point["iterations"], seed=point["seed"])
     checkpoint = file.with_suffix(".training.npz")
     trainer = Trainer(load_dataset(scene), renderer, settings, checkpoint)
     begun, before = time.perf_counter(), trainer.iteration

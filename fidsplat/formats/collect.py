@@ -21,7 +21,7 @@ _FIRST_ROOM = 1_000_000  # splats; only a file of more rows makes its arrays gro
 
 Progress = Callable[[str, float], Any]
 """called now and then with what is being done and the share of it that is done, 0 to 1"""
-_CHECKED = ("means", "quats", "scales", "opacities", "sh")
+_CHECKED = ("means", "quats", "scales", "opacities", "sh", "colors")
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,21 @@ class Rows:
     path: Path
     count: int
     columns: dict[str, tuple[tuple[int, ...], type]]
-    """shape and type of a splat's part of each array: means, quats, scales (2 or 3), opacities, sh, and where
-    the file has them labels and planes"""
+    """shape and type of a splat's part of each array: means, quats, scales (2 or 3), opacities, sh or colors,
+    and where the file has them labels and planes"""
     fill: Callable[[int, dict[str, np.ndarray]], None]
     """reads the rows from the given one on into arrays, as many as these have"""
+
+    @property
+    def thick(self) -> bool:
+        """Whether they have three scales."""
+        return self.columns["scales"][0] == (3,)
+
+    @property
+    def splat_columns(self) -> dict[str, tuple[tuple[int, ...], type]]:
+        """Shape and type of a splat's part of each array of a cloud."""
+        thickness: dict[str, tuple[tuple[int, ...], type]] = {"thickness": ((), np.float32)}
+        return self.columns | {"scales": ((2,), np.float32)} | (thickness if self.thick else {})
 
 
 def collect(rows: Rows, progress: Progress | None = None) -> tuple[dict[str, np.ndarray], dict[str, int]]:
@@ -43,25 +54,40 @@ def collect(rows: Rows, progress: Progress | None = None) -> tuple[dict[str, np.
     A third scale becomes `thickness`, which is 0 for a disk: where the third scale is 1e-6, as it is padded
     with, or where one of the three is 0.
     """
-    thick = rows.columns["scales"][0] == (3,)
-    columns = rows.columns | {"scales": ((2,), np.float32)}
-    kept = _Kept(columns | ({"thickness": ((), np.float32)} if thick else {}), rows.count)
+    thick, columns = rows.thick, rows.splat_columns
+    kept = _Kept(columns, rows.count)
     scratch = np.empty((min(WINDOW, rows.count), 3), np.float32)
     dropped: dict[str, int] = {}
     for first in range(0, rows.count, WINDOW):
         part = kept.room(min(WINDOW, rows.count - first), first)
-        given = part | {"scales": scratch[: len(part["scales"])]} if thick else part
-        with np.errstate(over="ignore", invalid="ignore"):
-            rows.fill(first, given)
-        if thick:
-            _split(given["quats"], given["scales"], part)
-        good, reasons = find_defects({name: given[name] for name in _CHECKED})
+        good, reasons = _filled(rows, first, part, scratch if thick else None)
         kept.keep(part, good)
         for reason, count in reasons.items():
             dropped[reason] = dropped.get(reason, 0) + count
         if progress is not None:
             progress(f"reading {rows.path.name}", min(1.0, (first + WINDOW) / rows.count))
     return kept.finished(), dropped
+
+
+def window(rows: Rows, first: int, end: int) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    """As `collect`, of the rows [first, end) alone: for who cannot hold them all."""
+    count = end - first
+    part = {name: np.empty((count, *shape), kind) for name, (shape, kind) in rows.splat_columns.items()}
+    good, dropped = _filled(rows, first, part, np.empty((count, 3), np.float32) if rows.thick else None)
+    return part if good is None else {name: array[good] for name, array in part.items()}, dropped
+
+
+def _filled(
+    rows: Rows, first: int, part: dict[str, np.ndarray], scratch: np.ndarray | None
+) -> tuple[np.ndarray | None, dict[str, int]]:
+    """Reads rows from `first` on into the arrays of splats: which can be drawn, (n,) bool or None for all,
+    and how many cannot for each reason. scratch: room for three scales, where rows have them."""
+    given = part if scratch is None else part | {"scales": scratch[: len(part["scales"])]}
+    with np.errstate(over="ignore", invalid="ignore"):
+        rows.fill(first, given)
+    if scratch is not None:
+        _split(given["quats"], given["scales"], part)
+    return find_defects({name: given[name] for name in _CHECKED if name in given})
 
 
 def _split(quats: np.ndarray, three: np.ndarray, part: dict[str, np.ndarray]) -> None:

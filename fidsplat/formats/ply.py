@@ -37,15 +37,21 @@ def load_ply(path: str | os.PathLike[str], progress: Progress | None = None) -> 
 
     Raises InputError for a file that is missing, damaged, of another kind, or lacks a property.
     """
-    header = read_header(path)
-    origin = _origin(header)
-    rows = compressed_rows(header) if is_compressed(header) else _plain_rows(header)
+    rows, origin = ply_rows(path)
     arrays, dropped = collect(rows, progress)
     if dropped:
-        warnings.warn(drop_report(dropped, rows.count, header.path), stacklevel=2)
+        warnings.warn(drop_report(dropped, rows.count, rows.path), stacklevel=2)
     planes = arrays.pop("planes", None)
     cloud = SplatCloud.of_checked(**arrays, origin=origin, dropped=dropped)
     return cloud if planes is None else cloud.with_planes(planes)
+
+
+def ply_rows(path: str | os.PathLike[str]) -> tuple[Rows, np.ndarray | None]:
+    """The rows of a splat file and the origin (3,) float64 that it names, if it does: for who reads it in
+    parts. Raises InputError as `load_ply`."""
+    header = read_header(path)
+    origin = _origin(header)
+    return compressed_rows(header) if is_compressed(header) else _plain_rows(header), origin
 
 
 def _plain_rows(header: Header) -> Rows:

@@ -18,6 +18,8 @@ from fidsplat.rotations import check_similarity
 from fidsplat.scalars import PickledByFields
 from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
+from fidsplat.store.store import Store
+from fidsplat.store.streamed import Streamed
 from fidsplat.surroundings import Background, Fog, background_of
 
 if TYPE_CHECKING:
@@ -27,8 +29,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class PlacedMarker(PickledByFields):
-    """A marker somewhere in the world. Raises InputError when the pose is not rigid, or the motion is no
-    function."""
+    """A marker somewhere in the world. Raises InputError when the pose is not rigid, the motion is no
+    function, or the bundle no name."""
 
     marker: Marker
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -37,6 +39,8 @@ class PlacedMarker(PickledByFields):
     """label of its splats; a Scene numbers its markers 1, 2, ..."""
     motion: Pose | None = None
     """its pose at a time in seconds; None: it stays at `pose`"""
+    bundle: str | None = None
+    """name of the rigid thing that it is a part of; markers of one bundle give one pose"""
 
     def __post_init__(self) -> None:
         check_similarity(self.pose, "a marker's pose", rigid=True)
@@ -45,6 +49,8 @@ class PlacedMarker(PickledByFields):
                 f"a marker's motion is a {type(self.motion).__name__}; it must be an fs.Trajectory or a "
                 "function of the time"
             )
+        if self.bundle is not None and not (isinstance(self.bundle, str) and self.bundle):
+            raise InputError(f"a marker's bundle is {self.bundle!r}; it must be a name, or None")
         if not isinstance(getattr(self.marker, "cloud", None), SplatCloud):
             raise InputError(
                 f"marker is {self.marker!r}; it must be an fs.Marker, e.g. fs.marker('apriltag:36h11:5')"
@@ -89,6 +95,8 @@ class SceneParts(PickledByFields):
     """what becomes of rgb on its way out"""
     fog: Fog | None = None
     """between the camera and what it sees"""
+    stores: tuple[Store, ...] = ()
+    """splats on disk, in the world, with labels of their own: views read what they see of them"""
     cloud_motions: Mapping[int, Pose] = field(default_factory=dict)
     """number of a cloud that moves: the rigid motion of the world, at a time in seconds, that it makes from
     where it is. Its splats have one label for all, above the markers', that no other splat has"""
@@ -96,6 +104,7 @@ class SceneParts(PickledByFields):
     def __post_init__(self) -> None:
         put = object.__setattr__
         put(self, "clouds", _all_of(self.clouds, SplatCloud, "clouds"))
+        put(self, "stores", _all_of(self.stores, Store, "stores"))
         Motion(self.camera_motion)  # which is refused here rather than when the scene is drawn
         moving = self.cloud_motions
         if not isinstance(moving, Mapping) or not all(map(callable, moving.values())):
@@ -141,9 +150,19 @@ class SceneParts(PickledByFields):
         )  # fmt: skip
 
     def cloud(self) -> SplatCloud:
-        """All splats in one cloud: the clouds' in their order, with their own labels if they do not move by
-        themselves, then each marker's."""
-        return self._merged
+        """All splats in one cloud: those of stores, all of which are read, then the clouds' in their order,
+        with their own labels if they do not move by themselves, then each marker's."""
+        return self._merged if self.streamed is None else self.streamed.cloud()
+
+    @cached_property
+    def streamed(self) -> Streamed | None:
+        """All splats as views see them, of a scene with stores; None without any."""
+        return Streamed(self.stores, self._merged) if self.stores else None
+
+    @property
+    def splats(self) -> SplatCloud | Streamed:
+        """What is drawn: all splats in one cloud, or as views see them where some are on disk."""
+        return self.streamed or self._merged
 
     @cached_property
     def _merged(self) -> SplatCloud:
@@ -156,10 +175,11 @@ class SceneParts(PickledByFields):
     @cached_property
     def _labels(self) -> dict[int, int]:
         """The labels of clouds that move, by their numbers."""
+        if not self.cloud_motions:
+            return {}
         still = [cloud.labels for i, cloud in enumerate(self.clouds) if i not in self.cloud_motions]
-        taken = (
-            {int(label) for labels in still for label in np.unique(labels)} if self.cloud_motions else set()
-        )
+        taken = {int(label) for labels in still for label in np.unique(labels)}
+        taken |= {label for store in self.stores for label in store.labels()}
         free = (label for label in itertools.count(len(self.markers) + 1) if label not in taken)
         return dict(zip(sorted(self.cloud_motions), free, strict=False))
 

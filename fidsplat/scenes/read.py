@@ -22,6 +22,8 @@ from fidsplat.scenes.parts import PlacedMarker
 from fidsplat.scenes.table import Table
 from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
+from fidsplat.store.layout import SUFFIX
+from fidsplat.store.store import Store
 from fidsplat.surroundings import Fog
 
 MAX_BYTES = 16 * 2**20
@@ -33,7 +35,7 @@ CAMERA = ("width", "height", "fov_x_deg", "fx", "fy", "cx", "cy")
 CAMERA += ("position", "look_at", "up", "world_to_camera", "near", "far", *TABLES, "shutter", "motion")
 CAMERA_POSE = ("position", "look_at", "up", "world_to_camera")
 SPLATS = ("file", "position", "quaternion", "scale", "motion")
-MARKER = ("spec", "size", "position", "quaternion", "quiet_zone", "max_splats", "motion")
+MARKER = ("spec", "size", "position", "quaternion", "quiet_zone", "max_splats", "motion", "bundle")
 MARKERS = (*MARKER, *knobs(MarkerQuality))
 RENDER = ("outputs", "background", "quality", "samples", "lowpass", "first_hit", "device")
 
@@ -76,9 +78,12 @@ def read_scene(
         raise render.error("background", "and the table [background] exclude each other")
     quality = quality_of(top, render) if quality is None else quality
     made_with = Quality.of(quality).marker
-    splats = [_splats(table, file.parent, progress) for table in top.tables("splats", SPLATS)]
+    tables = top.tables("splats", SPLATS)
+    on_disk = [table for table in tables if table.text("file").lower().endswith(SUFFIX)]
+    splats = [_splats(table, file.parent, progress) for table in tables if table not in on_disk]
     return dict(
         clouds=tuple(cloud for cloud, _ in splats),
+        stores=tuple(_store(table, file.parent) for table in on_disk),
         camera=camera,
         markers=tuple(
             _marker(table, file.parent, made_with, progress) for table in top.tables("markers", MARKERS)
@@ -162,6 +167,15 @@ def _pose(table: Table, scale: float = 1.0):
         return rigid_matrix(position, quaternion, scale)
 
 
+def _store(table: Table, folder: Path) -> Store:
+    """A store, which stands where it was built."""
+    for key in SPLATS[1:]:
+        if key in table:
+            raise table.error(key, "is not for a store, which `fidsplat store place` moves")
+    with table.at("file"):
+        return Store(folder / table.text("file"))
+
+
 def _splats(table: Table, folder: Path, progress: Progress | None) -> tuple[SplatCloud, Trajectory | None]:
     """A file's splats where they are put, and how they move from there."""
     name, scale = table.text("file"), table.number("scale", 1.0)
@@ -192,4 +206,4 @@ def _marker(table: Table, folder: Path, quality: MarkerQuality, progress: Progre
     with table.at():
         spec = with_file(spec, lambda name: str(folder / name))
         made = marker(spec, size, **known, **own)
-        return PlacedMarker(made, pose, motion=motion)
+        return PlacedMarker(made, pose, motion=motion, bundle=table.text("bundle", None))

@@ -16,12 +16,13 @@ class Scene(SceneParts, Summarised):
     """What is drawn and how. Raises InputError for a part of the wrong kind."""
 
     def __repr__(self) -> str:
-        words = (f"{len(cloud):,} splats" for cloud in self.clouds)
+        words = (f"{len(cloud):,} splats" for cloud in (*self.stores, *self.clouds))
         return f"Scene({', '.join([*words, *(placed.marker.spec for placed in self.markers)])})"
 
     def summary(self) -> dict[str, str]:
         """What it holds, in words."""
-        rows = {f"cloud {i}": f"{len(cloud):,} splats" for i, cloud in enumerate(self.clouds)}
+        rows = {f"store {i}": f"{len(s):,} splats in {s.path}" for i, s in enumerate(self.stores)}
+        rows |= {f"cloud {i}": f"{len(cloud):,} splats" for i, cloud in enumerate(self.clouds)}
         for placed in self.markers:
             moves = "" if placed.motion is None else ", moves"
             size, place = f"{placed.marker.size:g} m", point(placed.pose[:3, 3])

@@ -36,6 +36,8 @@ def write_scene(scene: SceneParts, path: str | os.PathLike[str]) -> None:
         name = f"{file.stem}-splats-{i}.ply"
         save_ply(cloud, file.parent / name)
         splats.append({"file": name, **motions.get(i, {})})
+    for store in scene.stores:
+        splats.append({"file": os.path.relpath(store.path.resolve(), file.parent.resolve())})
     parts = [] if scene.camera is None else [_table("[camera]", _camera(scene))]
     lens = None if scene.camera is None else lens_table(scene.camera)
     parts += [] if lens is None else [_table(f"[camera.{lens[0]}]", lens[1])]
@@ -73,6 +75,7 @@ def _marker(placed: PlacedMarker, folder: Path, quality: Quality | str | None) -
     spec = with_file(marker.spec, lambda name: os.path.relpath(name, folder))
     motion = {} if placed.motion is None else {"motion": keyframe_tables(placed.motion, marker.spec)}
     limit = {} if marker.max_splats == MAX_SPLATS else {"max_splats": marker.max_splats}
+    bundle = {} if placed.bundle is None else {"bundle": placed.bundle}
     return {
         "spec": spec,
         "size": float(marker.size),
@@ -81,6 +84,7 @@ def _marker(placed: PlacedMarker, folder: Path, quality: Quality | str | None) -
         **marker_knobs(marker.quality, quality),
         "quiet_zone": int(marker.quiet_zone),
         **limit,
+        **bundle,
         **motion,
     }
 

@@ -1,5 +1,6 @@
 """Training: splats from pictures with known cameras, on any device that has gradients."""
 
+from fidsplat.train.checkpoint import splats_of
 from fidsplat.train.dataset import Dataset, TrainingView
 from fidsplat.train.memory import splats_within
 from fidsplat.train.parameters import TrainingError
@@ -19,5 +20,6 @@ __all__ = [
     "ViewScore",
     "load_dataset",
     "refine",
+    "splats_of",
     "splats_within",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,7 @@ class DeviceWork:
     ) -> None:
         self._kernels, self._settings = kernels, settings
         kernels.take_views([(view.picture, view.mask) for view in views])
+        self._cameras = [view.camera for view in views]
         self._number = 0
 
     def load(self, splats: Splats) -> None:
@@ -55,10 +56,15 @@ class DeviceWork:
         """The splats as the device draws them, with SH of this degree."""
         return self._kernels.resident(degree, origin)
 
-    def loss(self, images: Images, view: int) -> tuple[Loss, Any]:
-        """The loss of a picture of a view, by its number, and its derivative (h, w, 3) on the device."""
-        value, squared, slope = self._kernels.loss(images, view, self._settings.dssim_weight)
-        return Loss(value, squared), slope
+    def loss(self, images: Images, view: int) -> tuple[Callable[[], Loss], Any]:
+        """What waits for the loss of a picture of a view, by its number; and its derivative (h, w, 3) on the
+        device."""
+        value, slope = self._kernels.loss(images, view, self._settings.dssim_weight)
+        return lambda: Loss(*value()), slope
+
+    def surface(self, images: Images, view: int, weights: tuple[float, float]) -> dict[str, Any]:
+        """Derivatives by depths, normals and distortions; weights: of normals and of distortions."""
+        return self._kernels.surface(images, view, self._cameras[view], *weights)
 
     def count(self, gradients: Mapping[str, Any], camera: Camera, origin: np.ndarray) -> None:
         """Adds the gradients on the screen to their sums."""
@@ -81,6 +87,7 @@ class DeviceWork:
         numbers = {
             **{"beta1": settings.beta1, "beta2": settings.beta2, "epsilon": settings.epsilon},
             "root": math.sqrt(1 - settings.beta2**step),
+            "sparse": float(settings.sparse_adam),
             "scale_penalty": settings.scale_penalty / (2 * count) if mcmc else 0.0,
             "opacity_penalty": settings.opacity_penalty / count if mcmc else 0.0,
         }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,8 @@ from fidsplat.backends.base import Backend, Images, ResidentData
 from fidsplat.cameras import Camera
 from fidsplat.train import mcmc
 from fidsplat.train.dataset import TrainingView
-from fidsplat.train.losses import Loss, picture_loss
-from fidsplat.train.optimiser import adam_step, inner_gradients
+from fidsplat.train.losses import Loss, normal_loss, picture_loss
+from fidsplat.train.optimiser import adam_step, inner_gradients, moved_by, sparse_adam_step
 from fidsplat.train.parameters import Splats
 from fidsplat.train.settings import TrainSettings
 
@@ -42,11 +42,28 @@ class HostWork:
         """The splats as the device draws them, with SH of this degree."""
         return self._backend.upload(self._splats.cloud(degree, origin, shared=True))
 
-    def loss(self, images: Images, view: int) -> tuple[Loss, np.ndarray]:
-        """The loss of a picture of a view, by its number, and its derivative (h, w, 3)."""
+    def loss(self, images: Images, view: int) -> tuple[Callable[[], Loss], np.ndarray]:
+        """What gives the loss of a picture of a view, by its number, and its derivative (h, w, 3)."""
         of = self._views[view]
         truth = of.picture * np.float32(1 / 255)
-        return picture_loss(images.read("rgb"), truth, of.mask, self._settings.dssim_weight)
+        loss, slope = picture_loss(images.read("rgb"), truth, of.mask, self._settings.dssim_weight)
+        return lambda: loss, slope
+
+    def surface(self, images: Images, view: int, weights: tuple[float, float]) -> dict[str, np.ndarray]:
+        """Derivatives by depths, normals and distortions; weights: of normals and of distortions."""
+        of = self._views[view]
+        counts = np.ones(of.picture.shape[:2], np.float32) if of.mask is None else of.mask.astype(np.float32)
+        read = {name: images.read(name) for name in ("depth", "normal", "alpha")}
+        camera = of.camera
+        _, by_depth, by_normal = normal_loss(
+            read["depth"],
+            read["normal"],
+            weights[0] * counts * read["alpha"],
+            (camera.fx, camera.fy),
+            (camera.cx, camera.cy),
+        )
+        by_distortion = counts * np.float32(weights[1] / counts.size)
+        return {"depth": by_depth, "normal": by_normal, "distortion": by_distortion}
 
     def count(self, gradients: Mapping[str, Any], camera: Camera, origin: np.ndarray) -> None:
         """Adds the gradients on the screen to their sums."""
@@ -58,7 +75,10 @@ class HostWork:
         """One step of Adam."""
         given = {name: on_host(array) for name, array in gradients.items()}
         inner = inner_gradients(self._splats, given, self._settings)
-        adam_step(self._splats, inner, rate, self._settings, step)
+        if self._settings.sparse_adam:
+            sparse_adam_step(self._splats, moved_by(given), inner, rate, self._settings, step)
+        else:
+            adam_step(self._splats, inner, rate, self._settings, step)
 
     def shake(self, iteration: int, rate: float) -> None:
         """Moves the means at random."""

@@ -59,6 +59,30 @@ def inner_gradients(splats: Splats, gradients: Mapping[str, np.ndarray], setting
     }
 
 
+def moved_by(gradients: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Which splats (n,) a picture depends on, by its derivatives as a `DifferentiablePipeline` gives them."""
+    color = gradients["sh"][:, 0] if "sh" in gradients else gradients["colors"]
+    return (gradients["opacities"] != 0) | gradients["means"].any(axis=1) | color.any(axis=1)
+
+
+def sparse_adam_step(
+    splats: Splats,
+    rows: np.ndarray,
+    gradients: Arrays,
+    rate: Mapping[str, float],
+    settings: TrainSettings,
+    step: int,
+) -> None:
+    """As `adam_step`, of the splats `rows` (n,) bool alone: the others rest, with what is remembered of
+    them."""
+    part = splats.chosen(rows)
+    adam_step(part, {name: array[rows] for name, array in gradients.items()}, rate, settings, step)
+    for name in gradients:
+        splats.values[name][rows] = part.values[name]
+        splats.first[name][rows] = part.first[name]
+        splats.second[name][rows] = part.second[name]
+
+
 def adam_step(
     splats: Splats, gradients: Arrays, rate: Mapping[str, float], settings: TrainSettings, step: int
 ) -> None:

@@ -49,6 +49,12 @@ def plane_pose(points: np.ndarray, corners: np.ndarray, camera: Camera) -> np.nd
     )
 
 
+def points_pose(points: np.ndarray, corners: np.ndarray, camera: Camera) -> np.ndarray:
+    """`marker_pose` from any points of a rigid thing, at least four: (n, 3) metres and (n, 2) pixels. SQPnP
+    (Terzakis and Lourakis 2020) gives the poses that are settled."""
+    return _pose(points * [1, -1, -1], corners, camera, cv2.SOLVEPNP_SQPNP)
+
+
 def _pose(points: np.ndarray, corners: np.ndarray, camera: Camera, method: int) -> np.ndarray:
     """camera_from_marker from points (n, 3) in OpenCV's axes."""
     seen, matrix, turned = np.ascontiguousarray(corners, np.float64), camera.matrix, np.eye(4)

@@ -34,8 +34,8 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
     )
     pixels = make_pixel(effects, outputs, room)
     Rays, Pixel, start, unfinished = pixels.Rays, pixels.Pixel, pixels.start, pixels.unfinished
-    blend_one, end_pass, finish = pixels.blend, pixels.end, pixels.finish
-    repeats = end_pass is not None
+    blend_one, end_pass, cover, finish = pixels.blend, pixels.end, pixels.cover, pixels.finish
+    repeats, opaque = end_pass is not None, cover is not None
     limits = make_bounds("lowpass_screen" in effects)
     Samples = make_samples(tuple(sample_fields(outputs).items()))
     stores, mark = output.functions(outputs, "store"), output.digest(outputs)
@@ -113,6 +113,8 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
             if wp.static(repeats):
                 p = end_pass(p, lines, lists, view)
                 again = stage(records, lines, lists, end, 0, unfinished(p, view))
+        if wp.static(opaque):
+            p = cover(p, x0, y0, rays, view)
         at = y0 * view.tiles_x * view.tile_w + x0
         store(finish(p), at, samples)
 
@@ -186,6 +188,8 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         for row in range(view.tile_h):
             for column in range(view.tile_w):
                 p = state[state_first + row * view.tile_w + column]
+                if wp.static(opaque):
+                    p = cover(p, x0 + column, y0 + row, rays, view)
                 at = (y0 + row) * stride + x0 + column
                 store(finish(p), at, samples)
 

@@ -1,8 +1,10 @@
 """One sample: its fragments, and what it keeps of them. Front to back, C = sum_k c_k alpha_k prod_{j<k} (1 -
 alpha_j).
 
-Fragments may wait for nearer ones (waiting.py), splats of one plane together (layers.py). What outputs keep
-stands in their files (output/).
+Fragments may wait for nearer ones (waiting.py), splats of one plane together (layers.py). A picture with
+depths of another renderer may be an opaque surface among them: of a fragment at its depth or behind it
+nothing is seen, and it is composited itself after the last. What outputs keep stands in their files
+(output/).
 """
 
 from functools import cache
@@ -23,7 +25,7 @@ from .waiting import make_queue, make_waiting
 @cache
 def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) -> SimpleNamespace:
     """The state of a sample, and what is done with it: Rays, Pixel; start, unfinished, blend, end (None
-    without a second pass), finish, store (of outputs). room: for fragments that wait.
+    without a second pass), cover (None without an opaque surface), finish. room: for fragments that wait.
     """
     Splat, crossing = make_splat(effects, outputs).Splat, make_crossing(effects, outputs)
     Crossing, is_box = crossing.Crossing, crossing.is_box
@@ -33,11 +35,12 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) ->
     exclusive, has_depth, waits, layered, bent = (
         name in effects for name in ("stop_exclusive", "ray_depth", "compose_pixel", "compose_planes", "rays")
     )
-    boxes = any(name in effects for name in BOXES)
-    rays = make_rays(bent, "rays_length" in effects, bent and boxes)
+    boxes, opaque = any(name in effects for name in BOXES), "opaque_layer" in effects
+    rays = make_rays(bent, "rays_length" in effects, bent and boxes, opaque)
     Rays, length_of = rays.Rays, rays.length_of
-    starts, sees, attenuates, composites, clears = (
-        output.functions(outputs, part) for part in ("start", "see", "attenuate", "composite", "clear")
+    starts, sees, attenuates, composites, covers, clears = (
+        output.functions(outputs, part)
+        for part in ("start", "see", "attenuate", "composite", "cover", "clear")
     )
     measured = bool(output.having(output.having(outputs, "start"), "length"))
     readers = [make_reader(layout, output.declared(name).record) for name in output.having(outputs, "see")]
@@ -47,9 +50,15 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) ->
     layer = make_layer(Seen, effects, outputs) if layered else None
     fields = {"t": wp.float32, "r": wp.float32, "g": wp.float32, "b": wp.float32}
     fields |= {"finished": wp.int32} if exclusive else {}
+    fields |= {"opaque_z": wp.float32} if opaque else {}
     fields |= output.fields(outputs, "state")
     fields |= {"queue": make_queue(layer, room)} if waits else {}
     Pixel = struct_of("Pixel", "What a sample keeps.", fields)
+
+    @wp.func
+    def pixel_at(x: int, y: int, view: View) -> int:
+        """Number of the pixel that a sample belongs to, row by row."""
+        return y / view.samples * (view.width / view.samples) + x / view.samples
 
     @wp.func
     def start(x: int, y: int, rays: Rays, view: View):
@@ -61,6 +70,11 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) ->
         length = float(1.0)
         if wp.static(measured):
             length = length_of(x, y, rays, view)
+        if wp.static(opaque):
+            p.opaque_z = wp.inf
+            # a tile has samples beyond the picture too
+            if x < view.width and y < view.height:
+                p.opaque_z = rays.layer_depth[pixel_at(x, y, view)]
         for k in range(wp.static(len(starts))):
             p = wp.static(starts[k])(p, length, view)
         return p
@@ -144,6 +158,12 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) ->
         z = float(0.0)
         if wp.static(has_depth):
             z = depth_of(lines, index, c, inverse_d)
+        if wp.static(opaque):
+            nearer = z
+            if wp.static(layered):
+                nearer = wp.max(z, nearest_of(lines, index))
+            if not (nearer < pixel.opaque_z):
+                return pixel
         color = wp.vec3(s.c[1], s.c[2], s.c[3])
         if wp.static(layered):
             p = pixel
@@ -168,6 +188,25 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) ->
             return composite(pixel, see(color, z, lines, index), opacity, view)
 
     @wp.func
+    def cover(pixel: Pixel, x: int, y: int, rays: Rays, view: View):
+        """The pixel with the opaque surface behind all that is drawn of it: it takes all the light that is
+        left, also where that is so little that splats would not be drawn.
+        """
+        p = pixel
+        if p.opaque_z < wp.inf:
+            seen = Seen()
+            seen.rgb = rays.layer_rgb[pixel_at(x, y, view)]
+            seen.z = p.opaque_z
+            for k in range(wp.static(len(covers))):
+                seen = wp.static(covers[k])(seen)
+            if wp.static(exclusive):
+                p.finished = 0
+            unstopped = view
+            unstopped.stop = -1.0
+            p = composite(p, seen, 1.0, unstopped)
+        return p
+
+    @wp.func
     def finish(pixel: Pixel):
         """The pixel after the last fragment."""
         p = pixel
@@ -183,6 +222,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) ->
         unfinished=unfinished,
         blend=blend,
         end=waiting.end if waits else None,
+        cover=cover if opaque else None,
         finish=finish,
     )
 

@@ -1,4 +1,5 @@
-"""The ray through a sample: it follows from the view, or a lens gives each sample its own."""
+"""What a sample reads of its place in the picture: its ray, which follows from the view, or which a lens
+gives each sample, and what a layer of another renderer has there."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -12,25 +13,30 @@ SLOPES = wp.types.matrix((2, 3), wp.float32)
 
 
 @cache
-def struct_of_rays(bent: bool, sloped: bool = False):
+def struct_of_rays(bent: bool, sloped: bool = False, opaque: bool = False):
     """The struct of what a sample reads: nothing, if all rays follow from the view; with their derivatives,
-    if `sloped`.
+    if `sloped`; with a layer, if `opaque`.
     """
-    # X, Y, Z along the rows of samples; NaN where nothing is seen
-    fields = {"rays": wp.array(dtype=wp.vec3)}
-    fields |= {"slopes": wp.array(dtype=SLOPES)} if sloped else {}
-    return struct_of("Rays", "The samples' rays.", fields if bent else {})
+    fields = {}
+    if bent:  # X, Y, Z along the rows of samples; NaN where nothing is seen
+        fields |= {"rays": wp.array(dtype=wp.vec3)}
+        fields |= {"slopes": wp.array(dtype=SLOPES)} if sloped else {}
+    if opaque:  # of each pixel, row by row; a depth that is infinite where there is none
+        fields |= {"layer_depth": wp.array(dtype=wp.float32), "layer_rgb": wp.array(dtype=wp.vec3)}
+    return struct_of("Rays", "The samples' rays, and a layer.", fields)
 
 
 @cache
-def make_rays(bent: bool, stretched: bool = False, sloped: bool = False) -> SimpleNamespace:
+def make_rays(
+    bent: bool, stretched: bool = False, sloped: bool = False, opaque: bool = False
+) -> SimpleNamespace:
     """Rays; ray_of(column, row, rays, view), NaN where nothing is seen; length_of(column, row, rays, view),
     what turns depths there into distances, 1 where nothing is seen.
 
     bent: rays are a lens's own. stretched: so are their lengths; else they follow from the view. sloped: Rays
-    has the rays' derivatives too.
+    has the rays' derivatives too. opaque: and a layer.
     """
-    Rays = struct_of_rays(bent, sloped)
+    Rays = struct_of_rays(bent, sloped, opaque)
 
     @wp.func
     def ray_in(column: int, row: int, view: View) -> wp.vec3:

@@ -22,7 +22,9 @@ def make_resolve(
     rays = make_rays(stretched, stretched)
     Rays, length_of = rays.Rays, rays.length_of
     asked = {name for name, _ in images}
-    resolving = output.having([name for name in outputs if name in asked], "resolve")
+    own = [name for name in outputs if name in asked]
+    over = [name for name in outputs if output.declared(name).over in asked]
+    resolving = output.having([*own, *over], "resolve")
     resolves, hiddens = output.functions(resolving, "resolve"), output.functions(outputs, "hidden")
     measured = bool(output.having(resolving, "length"))
     n = samples

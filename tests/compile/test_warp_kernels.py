@@ -34,7 +34,7 @@ def made(name, *arguments):
 
 def compiled(kernel, folder, block=256, assembly=False):
     """Source text, without comments, that NVRTC compiled for a GPU of 2020; or the PTX that it made of it."""
-    kernel.module.options["block_dim"] = block
+    kernel.module.options.update(block_dim=block, optimization_level=3 if assembly else 0)
     with runtime.quiet():
         wp.compile_aot_module(kernel.module, arch=80, module_dir=folder, use_ptx=True)
     (result,) = folder.glob("*.ptx")
@@ -43,7 +43,7 @@ def compiled(kernel, folder, block=256, assembly=False):
 
 def measured(kernel, folder, block):
     """The source text, and what the machine code for an H100 takes."""
-    kernel.module.options["block_dim"] = block
+    kernel.module.options.update(block_dim=block, optimization_level=3)
     with runtime.quiet():
         wp.compile_aot_module(kernel.module, arch=90, module_dir=folder, use_ptx=False)
     (result,) = folder.glob("*.cubin")
@@ -78,7 +78,7 @@ def resolving(stretched, samples):
 
 
 LONG = pytest.mark.exhaustive
-"""of blending with every output: 13 s each. Plain runs compile it for rays and boxes, and without either"""
+"""of blending with every output: 13 s each. Plain runs compile it with boxes, of rays and in a test below"""
 
 
 @pytest.fixture(autouse=True)
@@ -102,7 +102,7 @@ def started():
         ),
         pytest.param(lambda: projecting(*LENSES[2], "footprint_mixed"), id="project-fisheye-mixed"),
         pytest.param(lambda: projecting(*LENSES[0], "footprint_mixed"), id="project-parallel-mixed"),
-        pytest.param(lambda: blending(*RECORD), id="blend-all"),
+        pytest.param(lambda: blending(*RECORD), id="blend-all", marks=LONG),
         pytest.param(lambda: blending(*RECORD, "arithmetic_fast"), id="blend-fast", marks=LONG),
         pytest.param(lambda: blending(*MIXED), id="blend-mixed", marks=LONG),
         pytest.param(lambda: blending("footprint_box", outputs=()), id="blend-boxes"),

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from agreement import compare, random_splats
+from sampling import in_turn
 
 import fidsplat as fs
 from fidsplat.backends.opencl.assemble import assemble
@@ -14,7 +15,6 @@ from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.effects import select
 from fidsplat.rotations import rigid_matrix
 
-BACKEND = "opencl"  # Warp has no layers, and says so
 SIZE = WIDTH, HEIGHT = 37, 22
 OUTPUTS = ("rgb", "alpha", "depth", "depth_median", "depth_first", "normal", "label", "splat_id", "blended")
 CAMERA = fs.Camera.pinhole(*SIZE, 30.0, 30.0, 18.0, 11.0)
@@ -34,11 +34,11 @@ def a_cloud():
 
 CASES = {
     "centre": (a_cloud(), {}),
-    "pixel": (a_cloud(), {"quality": "standard,order=pixel"}),
     "planes, fog, 2 x 2 samples": (
         a_cloud().with_planes(np.arange(24) // 4 - 1),
         {"quality": "standard,samples=2", "fog": fs.Fog(0.2, (0.6, 0.65, 0.7))},
     ),
+    "pixel": (a_cloud(), {"quality": "standard,order=pixel"}),
     "exclusive stop, gradient, fisheye": (
         a_cloud(),
         {
@@ -60,6 +60,7 @@ def differences(pipeline, resident, cloud, capture):
     return compare(found, truth.render(reference.upload(cloud), view).images, capture.outputs)
 
 
+@in_turn()
 @pytest.mark.parametrize("case", CASES)
 def test_every_output_is_the_references(renderer, case):
     cloud, asked = CASES[case]
@@ -80,6 +81,7 @@ def test_both_schedules_agree(renderer):
         assert not wrong, wrong
 
 
+@in_turn()
 def test_a_plane_that_goes_through_the_layer_is_hidden_where_it_is_behind(renderer):
     """Not by its centre: pixel by pixel, by its own depth there."""
     plane = fs.SplatCloud([[0, 0, 0]], [[1, 0, 0, 0]], [[3.0, 3.0]], [0.9], colors=[[1, 0, 0]]).with_boxes()
@@ -156,14 +158,6 @@ def test_a_scene_without_a_layer_has_none_of_its_text(shape):
     text = assemble(select(a_cloud(), plain), shape).text
     assert "opaque" not in text
     assert "opaque" in assemble(select(a_cloud(), replace(plain, layer=a_layer())), shape).text
-
-
-def test_warp_says_that_it_has_no_layers():
-    warp = next((info for info in fs.devices() if info.name == "warp:cpu" and info.usable), None)
-    if warp is None:
-        pytest.skip("no Warp here")
-    with pytest.raises(fs.DeviceError, match="has no opaque_layer; use an OpenCL device"):
-        fs.Renderer("warp:cpu").render(a_cloud(), fs.Capture(CAMERA, layer=a_layer()))
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import pytest
 from agreement import ALL_OUTPUTS, random_splats, some_thick
 
 import fidsplat as fs
+from fidsplat.backends.bands import cut
 from fidsplat.backends.opencl import batch
 from fidsplat.backends.opencl.memory_plan import plan_of
 from fidsplat.backends.opencl.shapes import gpu_shape
@@ -73,12 +74,31 @@ def cloud():
     return made.with_planes(np.where(number < 200, 0, -1))
 
 
+def test_one_pair_more_than_the_budget_makes_a_second_band(opencl, cloud, whole, monkeypatch):
+    """Lists are never longer than the memory that is planned for them."""
+    images, stats = whole
+    budget = stats["pairs"] - 1
+    bands = []
+
+    def noted(*asked):
+        bands.extend(cut(*asked))
+        return bands
+
+    monkeypatch.setattr(opencl.backend, "pair_budget", budget)
+    monkeypatch.setattr("fidsplat.backends.opencl.lists.cut", noted)
+    frame = opencl.render(cloud, CAMERA, ALL_OUTPUTS)
+    assert len(bands) == 2
+    assert max(pairs for _, _, pairs in bands) <= budget
+    assert all(np.array_equal(frame[name], image) for name, image in images.items())
+
+
 @pytest.fixture(scope="module")
 def whole(opencl, cloud):
     frame = opencl.render(cloud, CAMERA, ALL_OUTPUTS)
     return {name: frame[name] for name in frame}, dict(frame.stats)
 
 
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize("mebibytes", [3.6, 4, 4.75])
 @pytest.mark.parametrize("streamed", [False, True])
 def test_little_memory_gives_the_same_bits(opencl, cloud, whole, mebibytes, streamed):
@@ -171,6 +191,7 @@ def test_pictures_of_many_sizes_leave_no_heap_of_buffers(opencl):
     assert max(held) <= held[0]
 
 
+@pytest.mark.usefixtures("optimised")
 @machines
 def test_a_pool_keeps_to_the_budget_whatever_was_drawn_before(opencl, machine):
     """Pictures at once and in chunks, few and many outputs: what one kind has left does not count against

@@ -84,30 +84,56 @@ def test_loss(renderer, views, works, weight):
     for number in (0, 1, 0):
         truth = views[number].picture / 255.0
         image = (truth + random.normal(0, 0.2, truth.shape)).astype(np.float32)
-        found, slope = work.loss(drawn(renderer, image), number)
+        value, slope = work.loss(drawn(renderer, image), number)
+        found = value()
         wanted, wanted_slope = picture_loss(image.astype(np.float64), truth, views[number].mask, weight)
         assert found.value == pytest.approx(wanted.value, rel=1e-5)
         assert found.squared == pytest.approx(wanted.squared, rel=1e-5)
         np.testing.assert_allclose(slope.get(), wanted_slope, rtol=1e-3, atol=2e-7)
         again, same = work.loss(drawn(renderer, image), number)
-        assert (again, same.get().tobytes()) == (found, slope.get().tobytes())
+        assert (again(), same.get().tobytes()) == (found, slope.get().tobytes())
 
 
 def test_masked_values_that_are_not_finite_do_not_count(renderer, views, works):
     work, _ = works()
     image = np.full((18, 31, 3), 0.5, np.float32)
     image[~views[1].mask] = np.nan
-    found, slope = work.loss(drawn(renderer, image), 1)
-    assert np.isfinite(found.value)
+    value, slope = work.loss(drawn(renderer, image), 1)
+    assert np.isfinite(value().value)
     assert not slope.get()[~views[1].mask].any()
     image[tuple(np.argwhere(views[1].mask)[0])] = np.nan
-    assert np.isnan(work.loss(drawn(renderer, image), 1)[0].value)
+    assert np.isnan(work.loss(drawn(renderer, image), 1)[0]().value)
 
 
-@pytest.mark.parametrize("strategy", ["default", "mcmc"])
-def test_adam_and_what_is_drawn(renderer, works, strategy):
-    """At degree 0, which has plain colours, then at degrees 1 and 2."""
-    device, host = works(strategy=strategy, sh_degree=2)
+def test_losses_of_depths(renderer, views, works):
+    """With a mask and without, holes among the depths."""
+    device, host = works()
+    random = np.random.default_rng(5)
+    for number, (height, width) in enumerate(((9, 11), (18, 31))):
+        normals = random.normal(size=(height, width, 3)).astype(np.float32)
+        shown = {
+            "depth": np.where(
+                random.uniform(size=(height, width)) < 0.1, 0, random.uniform(1, 2, (height, width))
+            ),
+            "normal": normals / np.linalg.norm(normals, axis=2, keepdims=True),
+            "alpha": random.uniform(size=(height, width)),
+        }
+        shown = {name: array.astype(np.float32) for name, array in shown.items()}
+        images = SimpleNamespace(
+            device_array=lambda name, shown=shown: on_device(renderer, shown[name]),
+            read=lambda name, shown=shown: shown[name],
+        )
+        found, wanted = (work.surface(images, number, (0.3, 2.0)) for work in (device, host))
+        for name, array in wanted.items():
+            assert np.abs(array).max() > 0
+            np.testing.assert_allclose(found[name].get(), array, rtol=1e-4, atol=1e-5 * np.abs(array).max())
+
+
+@pytest.mark.parametrize(("strategy", "sparse"), [("default", False), ("default", True), ("mcmc", False)])
+def test_adam_and_what_is_drawn(renderer, works, strategy, sparse):
+    """At degree 0, which has plain colours, then at degrees 1 and 2; every third splat has no derivative but
+    in the last step; one has none but by its mean, one none but by its colour."""
+    device, host = works(strategy=strategy, sh_degree=2, sparse_adam=sparse)
     random, rate = np.random.default_rng(2), rates(TrainSettings(), 100, 1.5)
     for step, degree in ((1, 0), (2, 0), (3, 1), (4, 2)):
         shown = [work.resident(degree, np.zeros(3)) for work in (device, host)]
@@ -119,9 +145,18 @@ def test_adam_and_what_is_drawn(renderer, works, strategy):
         shapes = {"means": (3,), "quats": (4,), "scales": (2,), "opacities": ()}
         shapes[color] = ((degree + 1) ** 2, 3) if degree else (3,)
         gradients = {name: random.normal(0, 0.1, (COUNT, *shape)) for name, shape in shapes.items()}
+        for name, array in gradients.items():
+            if step < 4:
+                array[::3] = 0
+            for row in {1, 2} - {{"means": 1, color: 2}.get(name)}:
+                array[row] = 0
+        before = host.store().chosen(np.arange(0, COUNT, 3))
         device.step({name: on_device(renderer, array) for name, array in gradients.items()}, rate, step)
         host.step(gradients, rate, step)
         agree(device, host)
+        rested = device.store().chosen(np.arange(0, COUNT, 3))
+        same = [np.array_equal(rested.first[name], before.first[name]) for name in NAMES]
+        assert all(same) == (sparse and step < 4)
 
 
 def test_what_is_drawn_is_that_of_a_run_that_goes_on(renderer, works):

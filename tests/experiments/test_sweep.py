@@ -7,7 +7,15 @@ from pathlib import Path
 import pytest
 
 import fidsplat as fs
-from fidsplat.experiments.sweep import Results, Sweep, merge, missing_shards, read_records, shard
+from fidsplat.experiments.sweep import (
+    Results,
+    Sweep,
+    in_turn,
+    merge,
+    missing_shards,
+    read_records,
+    shard,
+)
 from fidsplat.provenance import run_facts
 
 POINTS = [{"category": "small", "index": i} for i in range(5)]
@@ -77,6 +85,21 @@ def test_a_point_that_was_refused_is_tried_again(tmp_path):
     assert read_records(file) == [record]
     list(sweep(file, lambda key: {"value": 1}, POINTS[:1]).run())
     assert [record.result for record in read_records(file)] == [{"value": 1}]
+
+
+def test_sweeps_in_turn_go_point_by_point(tmp_path):
+    """What is stopped has all of what it began with; what is there already is not measured again."""
+    order = []
+
+    def measured(name, points):
+        return sweep(tmp_path / f"{name}.jsonl", lambda key: order.append((name, key["index"])) or {}, points)
+
+    list(measured("b", POINTS[:1]).run())
+    order.clear()
+    found = list(in_turn([measured("a", POINTS[:3]), measured("b", POINTS[:2])]))
+    assert order == [("a", 0), ("a", 1), ("b", 1), ("a", 2)]
+    assert [record.key["index"] for record in found] == [0, 1, 1, 2]
+    assert [record.key for record in read_records(tmp_path / "b.jsonl")] == POINTS[:2]
 
 
 @pytest.mark.parametrize(

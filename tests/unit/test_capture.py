@@ -116,6 +116,7 @@ GROUP = fs.Motion(None, {1: lambda time: np.eye(4)})
     [
         (Traits(sh_degree=0), {}, "color_rgb", "color_sh"),
         (Traits(sh_degree=1), {}, "color_sh", "color_rgb"),
+        (Traits(), {}, "compose_ordered", "compose_pixel"),
         (OF_PLANES, {}, "compose_planes", "compose_ordered"),
         (OF_PLANES, {"quality": ORDERED}, "compose_ordered", "compose_planes"),
         (Traits(), {"quality": BY_PIXEL}, "compose_pixel", "compose_ordered"),
@@ -123,6 +124,8 @@ GROUP = fs.Motion(None, {1: lambda time: np.eye(4)})
         (Traits(ellipsoids="some"), {"quality": BY_PIXEL}, "compose_pixel", "compose_ordered"),
         (THICK, {"quality": BY_PIXEL.with_(ellipsoid="exact")}, "compose_pixel", "compose_ordered"),
         (THICK, {"quality": BY_PIXEL.with_(blend_precision="float64")}, "compose_pixel", "compose_ordered"),
+        (THICK, {}, "ellipsoid_ewa", "ellipsoid_exact"),
+        (THICK, {"camera": PANORAMIC}, "ellipsoid_exact", "ellipsoid_ewa"),  # 3DGS has no such lens
         (OF_BOXES, {}, "lowpass_none", "lowpass_screen"),  # they are filtered by themselves
         (Traits(footprint="mixed"), {}, "lowpass_screen", "lowpass_none"),
         (Traits(), {"motion": GROUP}, "motion_groups", "shutter_exposure"),

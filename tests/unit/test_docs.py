@@ -21,7 +21,12 @@ TREE = Path(__file__).resolve().parents[2]
 README = TREE / "README.md"
 EXAMPLES = TREE / "examples"
 PAGES = [README, TREE / "CONTRIBUTING.md", *sorted((TREE / "docs").glob("*.md"))]
-GIVEN = {"README.md", "rendering.md", "scene-files.md"}  # their blocks read a room.ply, which readers have
+GIVEN = {
+    "large-scenes.md",
+    "README.md",
+    "rendering.md",
+    "scene-files.md",
+}  # their blocks read a room.ply, which readers have
 
 
 def load_scene(example: Example) -> None:

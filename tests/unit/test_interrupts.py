@@ -59,6 +59,15 @@ def test_logs_and_figures_by_their_values(tmp_path):
         interrupt.facts(figures)
 
 
+def test_charts_of_times_need_only_be_whole(tmp_path):
+    chart = tmp_path / "seconds.svg"
+    chart.write_text("<svg>\n</svg>\n")
+    assert interrupt.facts(chart) == {}
+    chart.write_text("<svg>\n</sv")
+    with pytest.raises(ValueError, match="cut off"):
+        interrupt.facts(chart)
+
+
 def test_how_a_run_may_end():
     assert interrupt.is_clear(0, "")
     assert interrupt.is_clear(143, "half of a bar\nfidsplat: terminated")

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -138,7 +139,7 @@ def test_the_command_measures_once(tmp_path, monkeypatch, capsys):
     guess = fs.load_trajectory(tmp_path / "out/odometry.tum")
     off = np.linalg.norm(truth.poses[:, :2, 3] - guess.poses[:, :2, 3], axis=1)
     assert np.sqrt((off**2).mean()) == pytest.approx(first["variants"]["odometry"]["ate_m"], rel=1e-6)
-    monkeypatch.setattr(Localise, "run", lambda self: pytest.fail("measured again"))
+    monkeypatch.setattr(Localise, "run", lambda self, speed=None: pytest.fail("measured again"))
     assert main([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == first
     assert "<svg" in (tmp_path / "out/localise.svg").read_text()
@@ -194,3 +195,13 @@ def test_with_ideal_corners_it_knows_its_way():
     assert seeing["tags"] > 5
     assert seeing["refused"] == 0
     assert seeing["ate_m"] < 0.01 < blind["ate_m"]
+    _, near = asked.localised(moved, sightings, asked.camera, 0.05, reach=1.0)
+    assert 0 < near["tags"] < seeing["tags"]
+    aside = np.array([0.6, 0.8])
+    off = [[replace(tag, corners=tag.corners + aside) for tag in tags] for tags in sightings]
+    bins = asked.corner_errors(moved, off, asked.camera)
+    assert [each["tags"] > 0 for each in bins] == [True, True, False, False]
+    assert [each["median_px"] for each in bins] == pytest.approx([1.0, 1.0, None, None])
+    assert sum(each["tags"] for each in bins) == sum(map(len, sightings))
+    back = asked.corner_errors(moved, asked.ideal(moved, off), asked.camera)
+    assert [each["median_px"] for each in back] == pytest.approx([0.0, 0.0, None, None])

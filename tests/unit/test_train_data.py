@@ -1,6 +1,8 @@
 """Data sets from disk: what is read, and what is said about those that cannot be trained on."""
 
 import json
+import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.formats.colmap_read import load_colmap
-from fidsplat.train import Dataset, TrainingView, TrainSettings, load_dataset
+from fidsplat.train import Dataset, TrainingView, load_dataset
 from fidsplat.train.dataset import looked_at
 from fidsplat.vision.images import read_rgba, write_png
 
@@ -81,6 +83,30 @@ def test_a_model_of_pycolmap_is_read_as_pycolmap_reads_it(folder):
         camera = ours.cameras[ours.names.index(image.name)]
         np.testing.assert_allclose(camera.world_to_camera[:3], image.cam_from_world().matrix(), atol=1e-12)
     assert len(ours.points) == len(theirs.points3D)
+
+
+def test_what_colmap_found_in_its_pictures_is_passed_over(folder):
+    """Two points in each, which our own files have none of, as text and as binary."""
+    model = folder / "sparse/0"
+    before = load_colmap(model)
+    lines = (model / "images.txt").read_text().splitlines()
+    images = [line.split() for line in lines if line and not line.startswith("#")]
+    (model / "images.bin").unlink()
+    text = "".join(f"{' '.join(words)}\n9.5 8.5 1 7.5 6.5 -1\n" for words in images)
+    (model / "images.txt").write_text(text)
+    assert_same(load_colmap(model), before)
+    packed = struct.pack("<Q", len(images))
+    for number, *pose, camera, name in images:
+        packed += struct.pack("<i7di", int(number), *map(float, pose), int(camera)) + name.encode() + b"\0"
+        packed += struct.pack("<QddqddQ", 2, 9.5, 8.5, 1, 7.5, 6.5, 2**64 - 1)
+    (model / "images.bin").write_bytes(packed)
+    assert_same(load_colmap(model), before)
+
+
+def assert_same(model, wanted):
+    assert model.names == wanted.names
+    for one, other in zip(model.cameras, wanted.cameras, strict=True):
+        np.testing.assert_array_equal(one.world_to_camera, other.world_to_camera)
 
 
 def test_transforms_with_the_points_that_they_name(made, tmp_path):
@@ -296,15 +322,32 @@ def test_the_baseline_of_a_marker(folder, tmp_path, monkeypatch):
     from fidsplat.experiments import trained
 
     monkeypatch.setattr(trained, "write_scene", lambda *_: folder)
-    point = {"category": "small", "index": 2, "views": 9}
-    settings, renderer = TrainSettings(iterations=2), fs.Renderer("reference")
-    steps = []
-    found = trained.train_marker(point, tmp_path, tmp_path / "out", settings, renderer, steps.append)
+    point = {"category": "small", "index": 2, "views": 9, "iterations": 2, "seed": 0}
+    renderer, steps = fs.Renderer("reference"), []
+    found = trained.train_marker(point, tmp_path, tmp_path / "out", 0, renderer, steps.append)
     assert [step.iteration for step in steps] == [1, 2]
     assert (found["splats"], found["iterations"]) == (6, 2)
     assert found["psnr"] > 5
     assert [each.name for each in (tmp_path / "out").rglob("*.*")] == ["small-2.ply"]
-    assert (tmp_path / "out" / "2dgs-9" / "small-2.ply").is_file()
+    first = tmp_path / "out" / "2dgs-9" / "small-2.ply"
+    trained.train_marker(point | {"seed": 1}, tmp_path, tmp_path / "out", 0, renderer)
+    other = tmp_path / "out" / "seed-1" / "2dgs-9" / "small-2.ply"
+    assert first.read_bytes() != other.read_bytes()
+
+
+def test_the_baseline_begins_with_one_marker_of_each_category(tmp_path):
+    """So that a run that is stopped says something of all; what is shared among machines is all of it."""
+    from fidsplat.experiments.setup import CATEGORIES
+    from fidsplat.experiments.trained import Baseline
+
+    wanted = Baseline(tmp_path, tmp_path, tuple(CATEGORIES.values()), markers=2, seeds=3)
+    assert len(wanted.points) == 5 * 2 * 4 * 3
+    first = wanted.points[:20]
+    assert {(p["category"], p["views"]) for p in first} == {(c, n) for c in CATEGORIES for n in (3, 5, 9, 17)}
+    assert {(p["index"], p["seed"]) for p in first} == {(0, 0)}
+    shares = [replace(wanted, shard=f"{i}/7").points for i in range(1, 8)]
+    assert sorted(map(str, wanted.points)) == sorted(str(p) for share in shares for p in share)
+    assert replace(wanted, shard="2/7").file("views").name == "views-2-of-7.jsonl"
 
 
 def test_the_command_trains_resumes_and_reports(folder, tmp_path, capsys):

@@ -19,7 +19,7 @@ from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.view import View
-from fidsplat.effects import OUTPUTS
+from fidsplat.effects import IMAGES
 from fidsplat.effects.differentiable import GRADIENT_OUTPUTS, check_gradients
 from fidsplat.errors import DeviceError, InputError
 
@@ -45,7 +45,7 @@ class DifferentiableImages:
 
     def device_array(self, name: str) -> Array:
         """The image as an array of the device, (h, w) or (h, w, channels); no copy."""
-        shape, dtype = gradient_shape(name, self.picture.view), np.dtype(OUTPUTS[name].dtype)
+        shape, dtype = gradient_shape(name, self.picture.view), np.dtype(IMAGES[name].dtype)
         return Array(self.picture.queue, shape, dtype, data=self.picture.held[f"{name}_out"])
 
     @property
@@ -79,15 +79,15 @@ class OpenCLGradients:
         picture = images.picture
         try:
             with picture.workspace.lock:
-                return self._backward(picture, gradients, images.stats["pairs"])
+                return self._backward(picture, gradients)
         except cl.Error as error:
             title = picture.workspace.info.title
             raise DeviceError(f"{title} failed while taking derivatives: {error}") from error
 
-    def _backward(self, drawn: Picture, gradients: Mapping[str, Any], pairs: int) -> dict[str, Any]:
+    def _backward(self, drawn: Picture, gradients: Mapping[str, Any]) -> dict[str, Any]:
         picture = copy(drawn)  # its buffers and events, with other kernels
         picture.program = self.program
-        view, shape, count = picture.view, self._pipeline.shape, picture.resident.count
+        view, shape, count, pairs = picture.view, self._pipeline.shape, picture.resident.count, picture.pairs
         self._take_gradients(picture, gradients)
         groups = -(-count // _GROUP)
         record = self.source.records["Moments"].itemsize
@@ -117,7 +117,7 @@ class OpenCLGradients:
         ):
             given: dict[str, Any] = {"parts": picture.held[name], "sums": found[sums].data}
             given |= {"rows": rows, "columns": columns}
-            picture.launch("project backward", "add_up", _GROUP, _GROUP, **given)
+            picture.launch("project backward", "add_up", columns * _GROUP, _GROUP, **given)
         return found
 
     def _take_gradients(self, picture: Picture, gradients: Mapping[str, Any]) -> None:

@@ -88,6 +88,7 @@ class OrderedLists(Lists):
                 break
         pairs = int(words[_PAIRS]) | int(words[_PAIRS + 1]) << 32
         self._stats = {"splats": picture.resident.count, "visible": visible, "pairs": pairs}
+        picture.pairs = pairs
         yield from self._list(0, picture.tiles, pairs)
 
     def _list(self, first: int, end: int, pairs: int) -> Iterator[tuple[int, int]]:
@@ -265,6 +266,7 @@ class TiledLists(Lists):
             self._project(big)
             counted, capacity = self._starts(0), 0
             big, self._pairs = self._read(counted)
+        picture.pairs = self._pairs
         if self._pairs > capacity or not capacity:
             yield from self._again()
 

@@ -74,6 +74,8 @@ class Picture:
         self.leased: list[tuple[str, cl.Buffer]] = []
         self.in_bands = False
         """whether its lists were too long for one band"""
+        self.pairs = 0
+        """of splats and tiles that were listed, where the host has been told"""
         self.stats: Callable[[], dict[str, int]] = dict
         self._uniforms: dict[str, tuple[Any, ...]] = {}
 

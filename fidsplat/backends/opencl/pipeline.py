@@ -109,7 +109,7 @@ class OpenCLPipeline:
         """A picture that is drawn at once, not in chunks or bands."""
         plan = self._plan(resident, view)
         picture = None if plan.chunk else self._first(resident, view, plan)
-        if picture is None or picture.stats()["pairs"] > self.workspace.pair_budget:
+        if picture is None or picture.pairs > self.workspace.pair_budget:
             raise DeviceError(
                 f"{resident.count:,} splats are drawn in chunks or bands within the memory budget, and such "
                 "pictures have no gradient; raise memory_budget, or use fewer splats or smaller pictures"

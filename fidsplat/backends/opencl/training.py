@@ -3,7 +3,8 @@ host."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+import math
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,8 +18,8 @@ from fidsplat.cameras import Camera
 from fidsplat.errors import DeviceError
 
 _GROUP = 64
-_SUMS = 1024
-"""work-items that add up the loss"""
+_SUMS, _SUMMED = 512, 128
+"""work-groups that add up the loss, and their work-items (SUMMED of kernels/opencl/train/loss.cl)"""
 
 
 class _Truth(NamedTuple):
@@ -88,6 +89,8 @@ class OpenCLTraining:
     def load(self, arrays: Mapping[str, np.ndarray]) -> None:
         """As `TrainingKernels`."""
         self._count = len(arrays["means"])
+        if arrays["sh"].size >= 2**32:  # kernels count coefficients in 32 bits
+            raise DeviceError(f"{self._count:,} splats are too many to train; use fewer")
         for name, array in arrays.items():
             self._held[name] = self._put(f"the splats' {name}", array)
             self._shapes[name] = array.shape
@@ -117,7 +120,9 @@ class OpenCLTraining:
             self._drawn = degree, ResidentArrays(buffers, count, degree, origin)
         return self._drawn[1]
 
-    def loss(self, images: Any, view: int, dssim_weight: float) -> tuple[float, float, Any]:
+    def loss(
+        self, images: Any, view: int, dssim_weight: float
+    ) -> tuple[Callable[[], tuple[float, float]], Any]:
         """As `TrainingKernels`."""
         image = images.device_array("rgb")
         height, columns, _ = image.shape
@@ -135,12 +140,45 @@ class OpenCLTraining:
         self._launch_rows("loss_take", 3 * columns, height, given)
         for name in ("loss_rows", "loss_columns", "loss_rows_backward", "loss_columns_backward"):
             self._launch_rows(name, -(-3 * columns // self._lanes), height, given)
-        self._launch("loss_sums", _SUMS, given)
-        sums = np.empty((_SUMS, 3), np.float32)
-        cl.enqueue_copy(self._queue, sums, given["sums"])
-        absolute, squared, similar = sums.sum(axis=0, dtype=np.float64)
-        value = (1 - dssim_weight) * absolute / number + dssim_weight * (1 - similar / image.size)
-        return float(value), float(squared / number), slope
+        added = self._enqueue("loss_sums", (_SUMS * _SUMMED,), (_SUMMED,), given)
+
+        def value() -> tuple[float, float]:
+            sums = np.empty((_SUMS, 3), np.float32)
+            self._queue.flush()
+            with self._workspace.failing("training"):
+                cl.enqueue_copy(self._workspace.side_queue, sums, given["sums"], wait_for=[added])
+            absolute, squared, similar = sums.sum(axis=0, dtype=np.float64)
+            loss = (1 - dssim_weight) * absolute / number + dssim_weight * (1 - similar / image.size)
+            return float(loss), float(squared / number)
+
+        return value, slope
+
+    def surface(
+        self, images: Any, view: int, camera: Camera, normal_weight: float, distortion_weight: float
+    ) -> dict[str, Any]:
+        """As `TrainingKernels`."""
+        depth, truth = images.device_array("depth"), self._truths[view]
+        height, width = depth.shape
+        shapes = {"depth": (height, width), "normal": (height, width, 3), "distortion": (height, width)}
+        found = {
+            name: Array(
+                self._queue, shape, np.float32, data=self._scratch(f"by {name}", 4 * math.prod(shape))
+            )
+            for name, shape in shapes.items()
+        }
+        given = {
+            **{"width": width, "height": height, "mask": truth.mask, "masked": int(truth.masked)},
+            **{"inverse_x": 1 / camera.fx, "inverse_y": 1 / camera.fy},
+            **{"middle_x": camera.cx, "middle_y": camera.cy},
+            **{name: images.device_array(name).data for name in ("depth", "normal", "alpha")},
+            **{f"by_{name}": array.data for name, array in found.items()},
+            "normal_share": normal_weight / (width * height),
+            "distortion_share": distortion_weight / (width * height),
+            "differences": self._scratch("differences", 24 * width * height),
+        }
+        self._launch_rows("surface_normals", width, height, given)
+        self._launch_rows("surface_depths", width, height, given)
+        return found
 
     def count(self, screen: Any, camera: Camera, origin: np.ndarray) -> None:
         """As `TrainingKernels`."""
@@ -166,6 +204,7 @@ class OpenCLTraining:
             "by_sh": by_color.data,
             **{f"size_{name}": size for name, size in sizes.items()},
             **numbers,
+            "sparse": int(numbers["sparse"]),
             "rest1": 1 - numbers["beta1"],
             "rest2": 1 - numbers["beta2"],
         }
@@ -193,11 +232,11 @@ class OpenCLTraining:
 
     def _enqueue(
         self, kernel: str, size: tuple[int, ...], group: tuple[int, ...], given: Mapping[str, Any]
-    ) -> None:
+    ) -> cl.Event:
         every = {**self._held, "count": self._count, **given}
         values = [every[one.name] for one in self._program.source.arguments[kernel]]
         try:
-            self._program.launch(self._queue, kernel, size, group, values)
+            return self._program.launch(self._queue, kernel, size, group, values)
         except cl.Error as error:
             raise DeviceError(f"{self._workspace.info.title} failed while training: {error}") from error
 

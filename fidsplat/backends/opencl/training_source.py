@@ -11,7 +11,7 @@ PLANES = 11
 """of the loss (kernels/opencl/train/loss.cl)"""
 MARGIN, MARGIN_ROWS = 16, 5
 """zeros around a plane, floats of a row and rows"""
-_FILES = ("prelude.cl", "math.cl", "train/loss.cl", "train/adam.cl", "train/shake.cl")
+_FILES = ("prelude.cl", "math.cl", "train/loss.cl", "train/surface.cl", "train/adam.cl", "train/shake.cl")
 
 _PICTURE = takes(
     "int width height  // values of a row: three of a pixel; rows",
@@ -20,7 +20,15 @@ _PICTURE = takes(
 )
 _MASK = takes("int masked", "in uchar mask  // (rows, pixels), where `masked`")
 _PLANES = takes("out float planes")
-_ADAM = takes("float beta1 beta2 rest1 rest2 root epsilon")
+_SURFACE = takes(
+    "int width height  // of the picture",
+    "float inverse_x inverse_y middle_x middle_y  // 1 / focal lengths, and the principal point [px]",
+)
+_ADAM = takes(
+    "float beta1 beta2 rest1 rest2 root epsilon",
+    "int sparse  // splats that the picture does not depend on rest",
+    "in float by_means by_opacities by_sh",
+)
 _DRAWN_SH = takes("uint count drawn all", "int plain")
 
 KERNELS: dict[str, tuple[Argument, ...]] = {
@@ -31,7 +39,16 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "loss_columns_backward": takes(
         _PICTURE, "float l1_share ssim_share", _MASK, "in float planes", "out float by_rgb"
     ),
-    "loss_sums": takes("uint plane", "in float planes", "out float sums  // (work-items, 3)"),
+    "loss_sums": takes("uint plane", "in float planes", "out float sums  // (work-groups, 3)"),
+    "surface_normals": takes(
+        _SURFACE,
+        _MASK,
+        "float normal_share distortion_share  // of each pixel",
+        "in float depth normal alpha",
+        "out float by_normal by_distortion",
+        "out float differences  // (rows, columns, 2, 3)",
+    ),
+    "surface_depths": takes(_SURFACE, "in float differences", "out float by_depth"),
     "activate": takes(
         "uint count",
         "in float quats log_scales logits",
@@ -39,11 +56,11 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     "activate_sh": takes(_DRAWN_SH, "in float sh", "out float drawn_sh"),
     "adam_shapes": takes(
-        "uint count",
+        "uint count drawn",
         _ADAM,
         "float size_means size_scales size_quats size_logits  // rates of this step",
         "float scale_penalty opacity_penalty",
-        "in float by_means by_scales by_quats by_opacities",
+        "in float by_scales by_quats",
         "out float means first_means second_means",
         "out float log_scales first_log_scales second_log_scales",
         "out float quats first_quats second_quats",
@@ -54,7 +71,6 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         _DRAWN_SH,
         _ADAM,
         "float size_sh size_rest  // rates of this step, of degree 0 and above",
-        "in float by_sh",
         "out float sh first_sh second_sh drawn_sh",
     ),
     "count_seen": takes(

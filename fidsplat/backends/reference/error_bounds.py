@@ -103,8 +103,9 @@ def span_of(s: Setup, view: View, f: Fragments) -> Span:
     z_high = np.clip(z_high, s.pz - s.reach, s.pz + s.reach)
     missed = d_high <= 0
     z_low, z_high = np.where(missed, s.pz, z_low), np.where(missed, s.pz, z_high)
-    # the ends of the disk's depth range are a sum and a difference of float32
-    off = 2.0**-23 * (np.abs(s.pz) + s.reach)
+    # the ends of the disk's depth range are a sum and a difference of float32; of one that faces the camera
+    # exactly they are its one depth
+    off = np.where(s.reach > 0, 2.0**-23 * (np.abs(s.pz) + s.reach), 0.0)
     z_low = np.where(z_low <= s.pz - s.reach, z_low - off, z_low)
     z_high = np.where(z_high >= s.pz + s.reach, z_high + off, z_high)
     return Span.of(low, high, z_low, z_high)
@@ -126,7 +127,14 @@ def of_color(s: Setup, view: View, span: Span, before: np.ndarray, moved: np.nda
     may_stop = (span.high > 0) & (t_low <= view.stop) & (t_high >= view.stop)
     # an exclusive stop drops a fragment, an inclusive one only what follows
     lost = span.front_high * span.high if s.exclusive else np.full_like(before, view.stop)
-    bound += np.where(may_stop, lost, 0.0).max(1, initial=0.0)
+    # where things change places, whether one is drawn at all is decided by what then lies in front of it
+    may_miss = (
+        (span.high > 0)
+        & (span.front_low * (1 - STOP) <= view.stop)
+        & (span.front_high * (1 + STOP) >= view.stop)
+    )
+    unsure = np.maximum(np.where(may_stop, lost, 0.0), np.where(may_miss, view.stop, 0.0))
+    bound += unsure.max(1, initial=0.0)
     return bound + (span.front_high * moved).sum(1)
 
 
@@ -184,12 +192,15 @@ def of_order(span: Span, lift: np.ndarray) -> tuple[Span, np.ndarray]:
     how much each counts as nearer.
 
     Two neighbours that change places change a colour by the product of their opacities and the light in front
-    of them, at most; any order that is possible comes from such changes, of pairs whose depths meet.
+    of them, at most; any order that is possible comes from such changes, of pairs whose depths meet. Those
+    that have one and the same depth, both of them exactly, are told apart by their places in the cloud: no
+    rounding changes that.
     """
     k, m = span.low.shape
     may = span.high > 0
     near = np.where(may, span.z_low - lift - _DEPTH * np.abs(span.z_low), np.inf)
     far = np.where(may, span.z_high - lift + _DEPTH * np.abs(span.z_high), -np.inf)
+    exact = span.z_low == span.z_high
     furthest = np.maximum.accumulate(far, axis=1)
     nearest = np.minimum.accumulate(near[:, ::-1], axis=1)[:, ::-1]
     dimmed = np.log1p(-np.minimum(span.low, 1 - 2.0**-53))
@@ -201,6 +212,7 @@ def of_order(span: Span, lift: np.ndarray) -> tuple[Span, np.ndarray]:
         if not (furthest[first] >= nearest[second]).any():
             break
         meet = may[first] & may[second] & (far[first] >= near[second])
+        meet &= ~(exact[first] & exact[second] & (near[first] == near[second]))
         pairs.append((first, second, meet))
         light[second] -= np.where(meet, dimmed[first], 0.0)
         least[first] *= np.where(meet, 1 - span.high[second], 1.0)

@@ -139,7 +139,7 @@ class Picture:
         self._take("lines", n * program.layout.lines, wp.vec4)
         self.launcher.stage("project")
         self.held["lens"] = lens_of(self.view, self.workspace)
-        rays = rays_of(self.view, self.workspace, sloped=program.sloped)
+        rays = rays_of(self.view, self.workspace, sloped=program.sloped, opaque=program.opaque)
         visible, pairs = self._project() if n else (0, 0)
         self.launcher.stage("sort")
         if pairs:

@@ -21,7 +21,7 @@ SLOTS = frozenset(
     | {"compose_ordered", "compose_pixel", "compose_planes"}
     | {"footprint_gaussian", "footprint_box", "footprint_mixed"}
     | {"background_constant", "background_gradient", "background_panorama"}
-    | {"arithmetic_precise", "arithmetic_fast", "motion_groups", "shutter_exposure"}
+    | {"arithmetic_precise", "arithmetic_fast", "motion_groups", "shutter_exposure", "opaque_layer"}
     # they change no picture, and nothing here
     | {"shutter_rows", "ellipsoids_alone"}
 )
@@ -35,7 +35,7 @@ _PROJECT = (
     *(*_RECORD, "lowpass_pixel", "motion_groups", "ellipsoid_ewa", "ellipsoid_ewa_antialiased"),
     *("camera_brown_conrady", "camera_fisheye", "camera_equirectangular"),
 )
-_SAMPLE = (*_RECORD, "stop_exclusive", "arithmetic_fast", "rays_length")
+_SAMPLE = (*_RECORD, "stop_exclusive", "arithmetic_fast", "rays_length", "opaque_layer")
 
 
 def known() -> frozenset[str]:
@@ -66,10 +66,10 @@ class _Needs:
     @classmethod
     def of(cls, features: FeatureSet) -> _Needs:
         output = kernels("output")
-        posts = set(features.posts)
-        outputs = output.with_needed((*features.outputs, *(posts & output.known())))
+        posts, effects = set(features.posts), set(features.slots)
+        surface = {"surface_label"} if "opaque_layer" in effects and "label" in features.outputs else set()
+        outputs = output.with_needed((*features.outputs, *(posts & output.known()), *surface))
         measured = output.having(output.having(outputs, "start"), "length")
-        effects = set(features.slots)
         if not effects.isdisjoint(kernels("lens").LENSES):
             effects.add("rays")
         # rays of other lenses have a length of 1
@@ -77,7 +77,7 @@ class _Needs:
             effects.add("rays_length")
         if "compose_planes" in effects:
             effects.add("compose_pixel")
-        if "compose_pixel" in effects or output.having(outputs, "depth"):
+        if not effects.isdisjoint({"compose_pixel", "opaque_layer"}) or output.having(outputs, "depth"):
             effects.add("ray_depth")
         steps = tuple(name for name in features.posts if name in kernels("post").known())
         blending = output.having(outputs, "seen", "state", "samples")
@@ -134,6 +134,8 @@ class Program:
         boxes = not needs.effects.isdisjoint(kernels("records").BOXES)
         self.sloped = boxes and "rays" in needs.effects
         """whether blending reads the derivatives of a lens's rays"""
+        self.opaque = "opaque_layer" in needs.effects
+        """whether it reads a layer of another renderer"""
         self.blend, self.state = kernels("blend").make_blend(
             needs.among(_SAMPLE), blending, self.shape.schedule == "group", self.block_dim, self.shape.waiting
         )

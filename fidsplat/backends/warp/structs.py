@@ -61,17 +61,23 @@ def uniforms(view: View, shape: WarpShape, sloped: bool) -> Any:
     return filled
 
 
-def rays_of(view: View, workspace: Workspace, bent: bool = True, sloped: bool = False) -> Any:
-    """The struct `Rays` of a view, with derivatives if `sloped`; an empty one if it has no raster, or unless
-    `bent`.
+def rays_of(
+    view: View, workspace: Workspace, bent: bool = True, sloped: bool = False, opaque: bool = False
+) -> Any:
+    """The struct `Rays` of a view, with derivatives if `sloped`, with its layer if `opaque`; without rays if
+    it has no raster, or unless `bent`.
 
     Raises:
         DeviceError: the device has no memory for them.
     """
-    struct_of_rays, raster = kernels("rays").struct_of_rays, view.raster
-    if raster is None or not bent:
-        return struct_of_rays(False)()
-    rays, arrays = struct_of_rays(True, sloped)(), _arrays(raster, workspace)
+    wp, raster = load(), view.raster if bent else None
+    rays = kernels("rays").struct_of_rays(raster is not None, raster is not None and sloped, opaque)()
+    if opaque:
+        for name, dtype in (("layer_depth", wp.float32), ("layer_rgb", wp.vec3)):
+            setattr(rays, name, workspace.pool.filled(name, view.array(name), dtype))
+    if raster is None:
+        return rays
+    arrays = _arrays(raster, workspace)
     first = raster.top * raster.width
     rays.rays = arrays["rays"][first:]
     if sloped:
@@ -135,10 +141,12 @@ def surroundings_of(view: View, workspace: Workspace) -> Any:
 
 
 def memory_bytes(view: View, workspace: Workspace) -> int:
-    """Bytes that the arrays of a view's lens and panorama take on the device."""
-    around, raster = view.surroundings, view.raster
+    """Bytes that the arrays of a view's lens, panorama and layer take on the device."""
+    around, raster, layer = view.surroundings, view.raster, view.layer
     held = {} if raster is None else workspace.lenses.get(raster.whole or raster, {})
-    return sum(map(nbytes, held.values())) + (around.image.nbytes if isinstance(around, Panorama) else 0)
+    taken = [around.image] if isinstance(around, Panorama) else []
+    taken += [] if layer is None else [layer.rgb, layer.depth, layer.label]
+    return sum(map(nbytes, held.values())) + sum(array.nbytes for array in taken)
 
 
 def _arrays(raster: RayRaster, workspace: Workspace) -> dict[str, Any]:

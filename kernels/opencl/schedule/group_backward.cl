@@ -1,13 +1,15 @@
-// For GPUs: one work-group takes a tile back, CHUNK splats at a time. A work-item walks its ROWS pixels through the chunk, forward
-// and back, and leaves in local memory what each fragment takes and what its opacity is worth; then it adds up one column of
-// pixels of one splat. So no sum runs across work-items but that of a splat's columns, in a fixed order and without atomics.
-// Barriers stand in loops whose bounds are the same for the whole group.
+// For GPUs: one work-group takes a tile back, CHUNK splats at a time of STAGED that are fetched at once. A work-item walks its ROWS
+// pixels through the chunk, forward and back, and leaves in local memory what each fragment takes and what its opacity is worth; then
+// it adds up one column of pixels of one splat. So no sum runs across work-items but that of a splat's columns, in a fixed order and
+// without atomics. Barriers stand in loops whose bounds are the same for the whole group.
 // Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile.
 // Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, splat_slots, and the images' derivatives.
 // Writes: moments, a slot for each splat of the tile; tile_sums. Uses up: checkpoints.
 #define GROUP (TILE_W * TILE_H / ROWS)
+#define STAGED (4 * CHUNK)         // no more than GROUP
 #define PIXELS (TILE_W * TILE_H)
 #define STRIDE (PIXELS + TILE_W)   // of one splat's fragments: neighbours among the splats lie in other banks
+#define PARTS (GROUP + 1)          // of one field's sums: neighbours among the fields lie in other banks
 
 static inline Crossing cross_at(const Splat *s, int px, int py, const BlendConstants *constants, wide *x, wide *y,
                                 wide *nu_x, wide *nv_x, wide *half_r2) {
@@ -19,9 +21,22 @@ static inline Crossing cross_at(const Splat *s, int px, int py, const BlendConst
     return cross_row(s, *nu_x, *nv_x, FMA(s->dx, *x, s->d0), *y, *half_r2);
 }
 
-// Lets the splat take its light at a pixel; returns its opacity there.
+// Which splats of a chunk may touch a pixel, as bits. Of the others nothing is computed, kept or added up for it.
+static inline uint near_pixel(local const Splat *chunk, uint count, int px, int py) {
+    uint bits = 0;
+    for (uint place = 0; place < count; place++) {
+        local const Splat *s = chunk + place;
+        bits |= (uint)(px >= s->x0 && px < s->x1 && py >= s->y0 && py < s->y1) << place;
+    }
+    return bits;
+}
+
+#define FIRST_BIT(bits) (31 - clz((bits) & -(bits)))
+#define LAST_BIT(bits) (31 - clz(bits))
+
+// Lets the splat take its light at a pixel that it may touch; returns its opacity there.
 static inline wide walk_fragment(const Splat *s, int px, int py, Pixel *pixel, const BlendConstants *constants) {
-    if (px < s->x0 || px >= s->x1 || py < s->y0 || py >= s->y1 || !(pixel->t > constants->stop)) return 0.0f;
+    if (!(pixel->t > constants->stop)) return 0.0f;
     wide x, y, nu_x, nv_x, half_r2, screen;
     Crossing c = cross_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
     int mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
@@ -33,11 +48,11 @@ static inline wide walk_fragment(const Splat *s, int px, int py, Pixel *pixel, c
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
 //@@ arguments blend_backward
 ) {
-    local Splat staged[CHUNK];
-    local float weights[CHUNK * STRIDE], by_logs[CHUNK * STRIDE];   // by splat and pixel: opacity and light, then these
-    local float parts[GROUP * FIELDS];
+    local Splat staged[STAGED];
+    local float weights[CHUNK * STRIDE], by_logs[CHUNK * STRIDE];   // by splat and pixel that it may touch; `by_logs` begins as opacity
+    local float parts[PARTS * FIELDS];
     local Loss shared[PIXELS];
-    local uint places[CHUNK];
+    local uint places[STAGED], reached;
     local int alive;
     const BlendConstants constants = {log_cut, ceiling, stop, filter, log_ceiling};
     uint number = get_group_id(0), item = get_local_id(0);
@@ -64,9 +79,10 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
     Pixel pixels[ROWS];
     for (int row = 0; row < ROWS; row++) pixel_start(&pixels[row], 1.0f);
     global float *own = checkpoints + (size_t)(start / CHUNK + number) * PIXELS + top * TILE_W + column;
-    uint chunks = 0;
-    for (uint first = start; first < end; first += CHUNK) {
-        uint length = min(end - first, (uint)CHUNK);
+    uint lit = 0;               // chunks that light of this work-item's pixels comes to
+    if (item == 0) reached = 0;
+    for (uint first = start; first < end; first += STAGED) {
+        uint length = min(end - first, (uint)STAGED);
         barrier(CLK_LOCAL_MEM_FENCE);
         if (item == 0) alive = 0;
         barrier(CLK_LOCAL_MEM_FENCE);
@@ -75,14 +91,22 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
             if (px < width && py + row < height && pixels[row].t > stop) alive = 1;
         barrier(CLK_LOCAL_MEM_FENCE);
         if (!alive) break;
-        for (int row = 0; row < ROWS; row++) own[(size_t)chunks * PIXELS + row * TILE_W] = pixel_light(&pixels[row]);
-        chunks++;
-        for (uint place = 0; place < length; place++) {
-            const Splat s = staged[place];
-            for (int row = 0; row < ROWS; row++) walk_fragment(&s, px, py + row, &pixels[row], &constants);
+        for (uint base = 0; base < length; base += CHUNK) {
+            uint chunk = (first - start + base) / CHUNK;
+            for (int row = 0; row < ROWS; row++) {
+                own[(size_t)chunk * PIXELS + row * TILE_W] = pixel_light(&pixels[row]);
+                if (px < width && py + row < height && pixels[row].t > stop) lit = chunk + 1;
+                uint bits = near_pixel(staged + base, min(length - base, (uint)CHUNK), px, py + row);
+                for (; bits != 0; bits &= bits - 1) {
+                    const Splat s = staged[base + FIRST_BIT(bits)];
+                    walk_fragment(&s, px, py + row, &pixels[row], &constants);
+                }
+            }
         }
     }
+    atomic_max(&reached, lit);
     barrier(CLK_LOCAL_MEM_FENCE);
+    const uint chunks = reached;
     float behind_r = 0, behind_g = 0, behind_b = 0;
     for (int row = 0; row < ROWS; row++) {
         behind_r = FMA((float)pixels[row].t, (float)losses[row].r, behind_r);
@@ -90,12 +114,12 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
         behind_b = FMA((float)pixels[row].t, (float)losses[row].b, behind_b);
     }
     parts[item] = behind_r;
-    parts[GROUP + item] = behind_g;
-    parts[2 * GROUP + item] = behind_b;
+    parts[PARTS + item] = behind_g;
+    parts[2 * PARTS + item] = behind_b;
     barrier(CLK_LOCAL_MEM_FENCE);
     if (item < 3) {
         real sum = 0;
-        for (uint other = 0; other < GROUP; other++) sum += parts[item * GROUP + other];
+        for (uint other = 0; other < GROUP; other++) sum += parts[item * PARTS + other];
         tile_sums[3 * number + item] = sum;
     }
 
@@ -105,8 +129,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
         for (uint field = 0; field < FIELDS; field++) moments[(size_t)slot * FIELDS + field] = 0.0f;
     }
     // back, chunk by chunk
-    for (uint chunk = chunks; chunk-- > 0;) {
-        uint first = start + chunk * CHUNK, length = min(end - first, (uint)CHUNK);
+    for (uint block = (chunks * CHUNK + STAGED - 1) / STAGED; block-- > 0;) {
+        uint first = start + block * STAGED, length = min(min(end, start + chunks * CHUNK) - first, (uint)STAGED);
         barrier(CLK_LOCAL_MEM_FENCE);
         if (item < length) {
             uint index = lists[first + item];
@@ -114,56 +138,64 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
             places[item] = splat_slots[index] + tile_rank(windows[index], big_bounds, tile_column, tile_row, width, height);
         }
         barrier(CLK_LOCAL_MEM_FENCE);
-        for (int row = 0; row < ROWS; row++) {
-            uint mine = (top + row) * TILE_W + column;
-            Pixel pixel;
-            pixel_start(&pixel, own[(size_t)chunk * PIXELS + row * TILE_W]);
-            for (uint place = 0; place < length; place++) {
-                const Splat s = staged[place];
-                weights[place * STRIDE + mine] = pixel.t;
-                by_logs[place * STRIDE + mine] = walk_fragment(&s, px, py + row, &pixel, &constants);
-            }
-            for (uint place = length; place-- > 0;) {
-                wide opacity = by_logs[place * STRIDE + mine], weight = weights[place * STRIDE + mine] * opacity, by_log = 0.0f;
-                if (opacity > 0.0f) {
-                    const Splat s = staged[place];
+        for (uint chunk = (length + CHUNK - 1) / CHUNK; chunk-- > 0;) {
+            uint base = chunk * CHUNK, count = min(length - base, (uint)CHUNK);
+            for (int row = 0; row < ROWS; row++) {
+                uint mine = (top + row) * TILE_W + column;
+                Pixel pixel;
+                pixel_start(&pixel, own[(size_t)(block * (STAGED / CHUNK) + chunk) * PIXELS + row * TILE_W]);
+                uint drawn = 0;
+                for (uint bits = near_pixel(staged + base, count, px, py + row); bits != 0; bits &= bits - 1) {
+                    uint place = FIRST_BIT(bits);
+                    const Splat s = staged[base + place];
+                    wide light = pixel.t, opacity = walk_fragment(&s, px, py + row, &pixel, &constants);
+                    weights[place * STRIDE + mine] = light * opacity;
+                    by_logs[place * STRIDE + mine] = opacity;
+                    drawn |= (uint)(opacity > 0.0f) << place;
+                }
+                while (drawn != 0) {
+                    uint place = LAST_BIT(drawn);
+                    drawn ^= 1u << place;
+                    const Splat s = staged[base + place];
+                    wide opacity = by_logs[place * STRIDE + mine], weight = weights[place * STRIDE + mine];
                     wide x, y, nu_x, nv_x, half_r2, screen;
                     Crossing c = cross_at(&s, px, py + row, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
                     fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
                     const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, screen);
-                    by_log = take_back(&losses[row], fragment_worth(&s, &losses[row], &g), weight, opacity);
+                    by_logs[place * STRIDE + mine] = take_back(&losses[row], fragment_worth(&s, &losses[row], &g), weight, opacity);
                 }
-                weights[place * STRIDE + mine] = weight;
-                by_logs[place * STRIDE + mine] = by_log;
             }
-        }
-        barrier(CLK_LOCAL_MEM_FENCE);
-        // a column of a splat
-        uint place = item / TILE_W;
-        if (place < length) {
-            const Splat s = staged[place];
-            Sums sums = {0};
-            wide x = (wide)(px - s.ax);
-            for (int row = 0; row < TILE_H; row++) {
-                uint at = row * TILE_W + column;
-                wide weight = weights[place * STRIDE + at], by_log = by_logs[place * STRIDE + at];
-                if (weight == 0.0f) continue;
-                wide y, nu_x, nv_x, half_r2, screen;
-                Crossing c = cross_at(&s, px, tile_row * TILE_H + row, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
-                fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
-                const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, screen);
-                const Loss loss = shared[at];
-                add_fragment(&sums, &s, &loss, &g, weight, by_log, screen, y, &constants);
+            barrier(CLK_LOCAL_MEM_FENCE);
+            // a column of a splat
+            uint place = item / TILE_W;
+            if (place < count && px >= staged[base + place].x0 && px < staged[base + place].x1) {
+                const Splat s = staged[base + place];
+                Sums sums = {0};
+                wide x = (wide)(px - s.ax);
+                int above = tile_row * TILE_H, last = min(s.y1 - above, TILE_H);
+                for (int row = max(s.y0 - above, 0); row < last; row++) {
+                    uint at = row * TILE_W + column;
+                    wide weight = weights[place * STRIDE + at], by_log = by_logs[place * STRIDE + at];
+                    if (weight == 0.0f) continue;
+                    wide y, nu_x, nv_x, half_r2, screen;
+                    Crossing c = cross_at(&s, px, above + row, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
+                    fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
+                    const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, screen);
+                    const Loss loss = shared[at];
+                    add_fragment(&sums, &s, &loss, &g, weight, by_log, screen, y, &constants);
+                }
+                const Moments m = moments_of(&sums, &s, x, &constants);
+                for (uint field = 0; field < FIELDS; field++) parts[field * PARTS + item] = ((const float *)&m)[field];
             }
-            const Moments m = moments_of(&sums, &s, x, &constants);
-            for (uint field = 0; field < FIELDS; field++) parts[field * GROUP + item] = ((const float *)&m)[field];
-        }
-        barrier(CLK_LOCAL_MEM_FENCE);
-        for (uint cell = item; cell < length * FIELDS; cell += GROUP) {
-            uint field = cell % FIELDS, splat = cell / FIELDS;
-            float sum = 0;
-            for (uint other = 0; other < TILE_W; other++) sum += parts[field * GROUP + splat * TILE_W + other];
-            moments[(size_t)places[splat] * FIELDS + field] = sum;
+            barrier(CLK_LOCAL_MEM_FENCE);
+            for (uint cell = item; cell < count * FIELDS; cell += GROUP) {
+                uint field = cell % FIELDS, splat = cell / FIELDS;
+                local const Splat *s = staged + base + splat;
+                int left = tile_column * TILE_W, last = min(s->x1 - left, TILE_W);
+                float sum = 0;
+                for (int other = max(s->x0 - left, 0); other < last; other++) sum += parts[field * PARTS + splat * TILE_W + other];
+                moments[(size_t)places[base + splat] * FIELDS + field] = sum;
+            }
         }
     }
 }

@@ -36,10 +36,19 @@ kernel void activate(
 kernel void activate_sh(
 //@@ arguments activate_sh
 ) {
-    size_t k = get_global_id(0);
-    if (k >= (size_t)count * 3 * drawn) return;
+    uint k = get_global_id(0);
+    if (k >= count * 3 * drawn) return;
     float value = sh[k / (3 * drawn) * 3 * all + k % (3 * drawn)];
     drawn_sh[k] = plain ? fmax(SH_C0 * value + 0.5f, 0.0f) : value;
+}
+
+// Whether a splat stays as it is, its running means too: where `sparse`, one that the picture does not depend on.
+static inline bool rests(
+    uint i, uint drawn, int sparse, global const float *by_means, global const float *by_opacities, global const float *by_sh
+) {
+    if (!sparse || by_opacities[i] != 0.0f) return false;
+    float3 mean = vload3(i, by_means), color = vload3(i * (size_t)drawn, by_sh);
+    return !(any(mean != 0.0f) || any(color != 0.0f));
 }
 
 // Index space: one work-item per splat. Reads: the derivatives by means, scales, quaternions and opacities. Changes: the values and
@@ -48,7 +57,7 @@ kernel void adam_shapes(
 //@@ arguments adam_shapes
 ) {
     size_t i = get_global_id(0);
-    if (i >= count) return;
+    if (i >= count || rests(i, drawn, sparse, by_means, by_opacities, by_sh)) return;
     for (size_t k = 3 * i; k < 3 * i + 3; k++) ADAM(means, k, by_means[k], size_means);
     for (size_t k = 2 * i; k < 2 * i + 2; k++) {
         ADAM(log_scales, k, (by_scales[k] + scale_penalty) * drawn_scales[k], size_scales);
@@ -72,9 +81,10 @@ kernel void adam_shapes(
 kernel void adam_sh(
 //@@ arguments adam_sh
 ) {
-    size_t k = get_global_id(0);
-    if (k >= (size_t)count * 3 * drawn) return;
-    size_t within = k % (3 * drawn), at = k / (3 * drawn) * 3 * all + within;
+    uint k = get_global_id(0);
+    if (k >= count * 3 * drawn) return;
+    uint i = k / (3 * drawn), within = k % (3 * drawn), at = i * 3 * all + within;
+    if (rests(i, drawn, sparse, by_means, by_opacities, by_sh)) return;
     float gradient = by_sh[k];
     if (plain) gradient = SH_C0 * sh[at] + 0.5f > 0.0f ? SH_C0 * gradient : 0.0f;
     float value = ADAM(sh, at, gradient, within < 3 ? size_sh : size_rest);

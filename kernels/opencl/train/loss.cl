@@ -129,11 +129,14 @@ kernel void loss_columns_backward(
     }
 }
 
-// Index space: any number of work-items. Reads: planes 0, 1 and 10, margins of zeros too. Writes: each work-item's sums of |a - b|,
-// (a - b)^2 and the SSIM, in the order of the values: the same on every run.
-kernel void loss_sums(
+// Index space: any number of work-groups of SUMMED. Reads: planes 0, 1 and 10, margins of zeros too. Writes: each work-group's sums
+// of |a - b|, (a - b)^2 and the SSIM, in a fixed order: the same on every run.
+#define SUMMED 128
+kernel __attribute__((reqd_work_group_size(SUMMED, 1, 1))) void loss_sums(
 //@@ arguments loss_sums
 ) {
+    local real kept[3][SUMMED];
+    uint item = get_local_id(0);
     real absolute = 0, squared = 0, similar = 0;
     for (size_t at = get_global_id(0); at < plane; at += get_global_size(0)) {
         float difference = planes[at] - planes[plane + at];
@@ -141,7 +144,13 @@ kernel void loss_sums(
         squared += difference * difference;
         similar += planes[10 * plane + at];
     }
-    sums[3 * get_global_id(0)] = (float)absolute;
-    sums[3 * get_global_id(0) + 1] = (float)squared;
-    sums[3 * get_global_id(0) + 2] = (float)similar;
+    kept[0][item] = absolute;
+    kept[1][item] = squared;
+    kept[2][item] = similar;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (item < 3) {
+        real sum = 0;
+        for (uint other = 0; other < SUMMED; other++) sum += kept[item][other];
+        sums[3 * get_group_id(0) + item] = (float)sum;
+    }
 }

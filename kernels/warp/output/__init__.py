@@ -57,6 +57,8 @@ class Output:
     """(pixel, seen, shown): how much of a fragment's weight shows as its colour, of `shown`"""
     composite: Any = None
     """(pixel, seen, weight, shown, view): a fragment or a layer of this weight, before `pixel.t` changes"""
+    cover: Any = None
+    """(seen): what an opaque surface of another renderer shows, where that is not 0"""
     clear: Any = None
     """(pixel): where less than 1/255 of the sample is covered, which shows nothing"""
     samples: Mapping[str, Any] = field(default_factory=dict)
@@ -75,6 +77,8 @@ class Output:
     resolve: Any = None
     """(grid, samples, lengths, out): a pixel of the output image out.NAME from its samples; lengths: a
     vector with a float for each of them, of rays if `length`"""
+    over: str = ""
+    """the output whose image `resolve` changes once that is resolved, of a file without one of its own"""
 
 
 def known() -> frozenset[str]:

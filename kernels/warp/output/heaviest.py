@@ -1,4 +1,5 @@
-"""The splat of the largest weight, -1 for none: labels and splat ids are this one's. No output by itself."""
+"""The splat of the largest weight, -1 for none, and where what has it is no splat: labels and splat ids are
+this one's. No output by itself."""
 
 from typing import Any
 
@@ -42,6 +43,13 @@ def composite(pixel: Any, seen: Any, weight: float, shown: float, view: View):
 
 
 @wp.func
+def cover(seen: Any):
+    s = seen
+    s.heaviest = -1
+    return s
+
+
+@wp.func
 def clear(pixel: Any):
     p = pixel
     p.weight = 0.0
@@ -75,6 +83,7 @@ OUTPUT = Output(
     state={"weight": wp.float32, "heaviest": wp.int32},
     start=start,
     composite=composite,
+    cover=cover,
     clear=clear,
     samples={"heaviest": wp.int32, "weight": wp.float32},
     store=store,

@@ -1,0 +1,153 @@
+"""Batches of fidsplat beside gsplat's on one NVIDIA GPU, the same views in the same run: disks.
+
+    pip install . torch gsplat       # 1.5.3
+    python benchmarks/peers/gsplat_batches.py --rows scenes --json gsplat-batches.json
+
+What it needs, and how constants differ: gsplat_cuda.py. gsplat draws as many cameras in a call of
+`rasterization_2dgs` as is quickest of CAMERAS, colours and what it draws with them in any case, median
+depths among it (its mean depths take longer); it has no labels, which ours draw where the row has them. Its
+images are dropped call by call, ours stay. Both are timed from the first call until the GPU is done.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import gsplat
+import numpy as np
+import torch
+
+import fidsplat as fs
+from fidsplat.rotations import quaternion_to_matrix
+from fidsplat.timing import Timer, take_turns
+from fidsplat.vision.metrics import psnr
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from batches import ROWS, scene_of
+from measuring import PROGRESS, facts, keep, options, show
+
+CAMERAS = 4, 16, 64, 256
+"""in a call of gsplat"""
+SAME = fs.Quality.named("gsplat").with_(opacity_ceiling=0.999)
+"""the constants of gsplat 1.5.3"""
+
+
+def on_gpu(array: np.ndarray) -> torch.Tensor:
+    """As float32."""
+    return torch.tensor(np.asarray(array, np.float32), device="cuda")
+
+
+def peer(cloud: fs.SplatCloud, capture: fs.Capture, poses: np.ndarray) -> Callable[[int], torch.Tensor]:
+    """What draws all views by gsplat, so many cameras in a call, and gives the first view (h, w, 3)."""
+    camera, colors = capture.camera, cloud.colors
+    if camera is None or colors is None:
+        raise SystemExit("gsplat_batches: it draws plain colours from the cameras of a batch")
+    stands = np.tile(np.eye(4), (len(poses), 1, 1))
+    stands[:, :3, :3], stands[:, :3, 3] = quaternion_to_matrix(poses[:, 3:]), poses[:, :3]
+    views = on_gpu(np.linalg.inv(stands))
+    matrix = on_gpu(camera.matrix)
+    given = {
+        "means": on_gpu(cloud.means + cloud.origin),
+        "quats": on_gpu(cloud.quats),
+        "scales": on_gpu(np.column_stack([cloud.scales, np.ones(len(cloud))])),
+        "opacities": on_gpu(cloud.opacities),
+        "width": camera.width,
+        "height": camera.height,
+    }
+    shown = on_gpu(colors)
+
+    def draw(cameras: int) -> torch.Tensor:
+        first = None
+        for some in views.split(cameras):
+            each = {"viewmats": some, "Ks": matrix.expand(len(some), 3, 3)}
+            each["colors"] = shown.expand(len(some), *shown.shape)
+            images, *_ = gsplat.rasterization_2dgs(**given, **each)
+            first = images[0].clone() if first is None else first
+        torch.cuda.synchronize()
+        assert first is not None
+        return first
+
+    return torch.no_grad()(draw)
+
+
+def measure(renderer: fs.Renderer, name: str, repeats: int) -> list[dict]:
+    """The figures of one row, ours and gsplat's, per view."""
+    row = ROWS[name]
+    cloud, capture, poses = scene_of(row)
+    resident, draw = renderer.upload(cloud), peer(cloud, capture, poses)
+    ours = Timer(
+        lambda: renderer.render_batch(resident, capture, poses=poses).wait(),
+        parts=lambda batch: batch.timings,
+    )
+    ours.run(counts=False)
+    by_cameras = {}
+    for cameras in CAMERAS:
+        try:
+            draw(cameras)  # what is made on first use does not count
+            by_cameras[cameras] = Timer(lambda cameras=cameras: draw(cameras)).run()
+        except torch.cuda.OutOfMemoryError:
+            break
+        finally:
+            torch.cuda.empty_cache()
+    best = min(by_cameras, key=by_cameras.__getitem__)
+    theirs = Timer(lambda: draw(best))
+    take_turns([ours, theirs], repeats)
+    same = renderer.render_batch(resident, capture.with_(quality=SAME, outputs=("rgb",)), poses=poses[:1])
+    error = psnr(same["rgb"][0], draw(best).cpu().numpy())
+    shared = {
+        "batch": name,
+        "views": row.views,
+        "splats": row.splats,
+        "width": row.width,
+        "height": row.height,
+    }
+    records = []
+    for timer, who in ((ours, f"fidsplat {fs.__version__}"), (theirs, f"gsplat {gsplat.__version__}")):
+        low, middle, high = (1e3 * each / row.views for each in timer.quartiles)
+        own = {"renderer": who, "us_per_view": middle, "quartiles_us": [low, high], "repeats": repeats}
+        records.append(shared | own | facts(renderer))
+    records[0]["outputs"] = list(row.outputs)
+    records[1] |= {
+        "outputs": ["rgb", "alpha", "normal", "depth_median"],
+        "cameras": best,
+        "us_per_view_by_cameras": {each: 1e3 * ms / row.views for each, ms in by_cameras.items()},
+        "times_ours": records[1]["us_per_view"] / records[0]["us_per_view"],
+        "psnr_same_constants_db": error,
+    }
+    return records
+
+
+def main() -> None:
+    parser = options(__doc__, "opencl:nvidia", repeats=5)
+    parser.add_argument("--rows", nargs="*", default=["scenes"], choices=[*ROWS], metavar="ROW")
+    asked = parser.parse_args()
+    if not torch.cuda.is_available():
+        raise SystemExit("gsplat_batches: PyTorch sees no CUDA device; gsplat draws on nothing else")
+    renderer, records = fs.Renderer(asked.device), []
+    for name in asked.rows:
+        with PROGRESS.status(f"drawing {name}"):
+            records += measure(renderer, name, max(asked.repeats, 1))
+    if keep(records, asked.json):
+        return
+
+    def cells(record: dict) -> tuple[str, ...]:
+        size = f"{record['views']} x {record['width']} x {record['height']}"
+        times = record.get("times_ours")
+        rate = f"{1e6 / record['us_per_view']:,.0f}"
+        return (
+            size,
+            record["renderer"],
+            ", ".join(record["outputs"]),
+            rate,
+            "" if times is None else f"{times:.1f}",
+        )
+
+    show(
+        renderer.device.title, ("views", "renderer", "outputs", "a second", "times ours"), map(cells, records)
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,177 @@
+"""Which boxes of splats a view may see: boxes that it cannot see need not be on the device.
+
+A box that is left out must not have a splat that the picture shows, whatever camera, low-pass or shutter:
+what the kernels ask of each splat (`project.cl`) is asked here of all that a box may hold. Where that cannot
+be answered for a box as a whole, the box counts as seen.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+
+from fidsplat.backends.view import View
+from fidsplat.cameras.lenses import Equirectangular, Fisheye
+from fidsplat.cameras.raster import RayRaster
+from fidsplat.effects import FeatureSet
+
+Boxes = Callable[[float], tuple[np.ndarray, np.ndarray]]
+"""corners (n, 3) float64 [m], lowest and highest, of boxes around splats to so many standard deviations"""
+
+_ROOM = 1.01
+"""how much further splats are taken to reach: for rounding, and what bounds are padded with"""
+_ROUNDING = 1e-5
+"""of a coordinate: what a set-up in float32 may be off"""
+
+
+def seen(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, exact: bool = True) -> np.ndarray:
+    """(n,) bool: the boxes whose splats may show in the picture, or in one of the poses of which it is made.
+
+    Args:
+        boxes: of the splats that move with the camera's view and of those that move by themselves alike.
+        reach: (n,) metres: largest standard deviation of a box's splats.
+        exact: whether even fragments count that a low-pass in the plane (`lowpass="pixel"`) spreads far along
+            the line of sight: splats that are seen edge-on, hardly more opaque than the alpha cut-off.
+    """
+    if view.shots:
+        made = np.zeros(len(reach), bool)
+        for shot in view.shots:
+            made |= seen(shot.view, features, boxes, reach, exact)
+        return made
+    made = _seen_by(view, features, boxes, reach, exact)
+    for _, own in view.groups:
+        made |= _seen_by(own, features, boxes, reach, exact)
+    return made
+
+
+def _seen_by(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, exact: bool) -> np.ndarray:
+    radius = _ROOM * math.sqrt(max(-2.0 * view.log_cut, 0.0))
+    spread = "lowpass_pixel" in features.names
+    ewa = bool({"ellipsoid_ewa", "ellipsoid_ewa_antialiased"} & features.names)
+    centers = _Turned(view, *boxes(0.0))
+    whole = _Turned(view, *boxes(radius))
+    # a dot of the low-pass, or what it widens a splat by, in samples
+    margin = radius * view.samples + 2.0
+    if spread and exact:
+        # a centre before the near plane is widened, however far; what lies behind is not
+        return whole.furthest(view) >= view.near * (1 - _ROUNDING) if not view.along_ray else reach >= 0
+    made = whole.nearest(view) <= view.far * (1 + _ROUNDING)
+    made &= whole.furthest(view) >= view.near * (1 - _ROUNDING)
+    if view.raster is None:
+        half_spaces, slope = _pinhole_sides(view, margin)
+        for normal, offset in half_spaces:
+            inside = whole.beyond(normal) + offset >= 0
+            if ewa:  # the derivative at the centre may draw a splat larger than it is
+                focal = max(view.focal_x, view.focal_y)
+                inside |= centers.beyond(normal) + offset + focal * slope * radius * reach >= 0
+            made &= inside
+        return made
+    lens = view.raster.lens
+    if isinstance(lens, Equirectangular):
+        return made
+    step = view.raster.step * margin
+    if isinstance(lens, Fisheye):
+        return made & whole.within(_widest(view.raster) + step)
+    low, high = _slopes(view.raster)
+    for axis in (0, 1):
+        for sign, side in ((1.0, low[axis] - step), (-1.0, high[axis] + step)):
+            normal = np.zeros(3)
+            normal[axis], normal[2] = sign, -sign * side
+            made &= whole.beyond(normal) >= 0
+    return made
+
+
+class _Turned:
+    """Boxes in the camera's frame."""
+
+    def __init__(self, view: View, low: np.ndarray, high: np.ndarray) -> None:
+        middle, half = (low + high) / 2, (high - low) / 2
+        self.middle = middle @ view.rotation.T + view.translation
+        self.half = half @ np.abs(view.rotation.T)
+        self._low, self._high, self._view = low, high, view
+        # of the sums that make a coordinate
+        self.room = _ROUNDING * (np.abs(middle).sum(1) + half.sum(1) + np.abs(view.translation).sum())
+        self._half = half
+
+    def beyond(self, normal: np.ndarray) -> np.ndarray:
+        """(n,) the largest product of a box's points with a vector (3,) of the camera's frame."""
+        reach = self._half @ np.abs(self._view.rotation.T @ normal)
+        return self.middle @ normal + reach + self.room * np.abs(normal).sum()
+
+    def nearest(self, view: View) -> np.ndarray:
+        """(n,) metres: the least depth of a box, as the view means depth."""
+        if view.along_ray:
+            return np.maximum(np.linalg.norm(self.middle, axis=1) - self._radius, 0.0)
+        return -self.beyond(np.array([0.0, 0.0, -1.0]))
+
+    def furthest(self, view: View) -> np.ndarray:
+        """(n,) metres: the largest."""
+        if view.along_ray:
+            return np.linalg.norm(self.middle, axis=1) + self._radius
+        return self.beyond(np.array([0.0, 0.0, 1.0]))
+
+    @property
+    def _radius(self) -> np.ndarray:
+        return np.linalg.norm(self._half, axis=1) + self.room
+
+    def within(self, angle: float) -> np.ndarray:
+        """(n,) bool: which may have points at most so far [rad] from the optical axis."""
+        distance = np.linalg.norm(self.middle, axis=1)
+        around = np.arcsin(np.minimum(self._radius / np.maximum(distance, 1e-300), 1.0))
+        off = np.arctan2(np.hypot(self.middle[:, 0], self.middle[:, 1]), self.middle[:, 2])
+        return (distance <= self._radius) | (off - around <= angle)
+
+
+def _pinhole_sides(view: View, margin: float) -> tuple[list[tuple[np.ndarray, float]], float]:
+    """The sides of the picture as half spaces of the camera's frame, normal . p + offset >= 0 within, wider
+    by `margin` samples; and the largest factor by which EWA stretches a splat."""
+    sides = []
+    grid = ((0, view.focal_x, view.center_x, view.width), (1, view.focal_y, view.center_y, view.height))
+    for axis, focal, center, size in grid:
+        for sign, side in ((1.0, -margin), (-1.0, size + margin)):
+            # sign (focal x / z + center - side) >= 0, times z where rays meet
+            normal = np.zeros(3)
+            normal[axis] = sign * focal
+            if view.parallel:
+                sides.append((normal, sign * (center - side)))
+                continue
+            normal[2] = sign * (center - side)
+            sides.append((normal, 0.0))
+    steepest = max(map(abs, view.slopes))
+    return sides, 1.0 if view.parallel else math.hypot(1.0, steepest)
+
+
+@lru_cache(maxsize=8)
+def _widest(raster: RayRaster) -> float:
+    """The largest angle [rad] of a sample's ray from the optical axis."""
+    rays = raster.rays.astype(np.float64)
+    return float(np.nanmax(np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2])))
+
+
+@lru_cache(maxsize=8)
+def _slopes(raster: RayRaster) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the largest x / z and y / z, (2,) each, of the samples' rays."""
+    rays = raster.rays.astype(np.float64)
+    slopes = rays[..., :2] / rays[..., 2:]
+    return np.nanmin(slopes, axis=(0, 1)), np.nanmax(slopes, axis=(0, 1))
+
+
+def sizes(view: View, boxes: Boxes, edges: np.ndarray) -> np.ndarray:
+    """(n,) samples: how large lengths (n,) [m] are at most on the picture where a box is nearest. Shutters
+    and splats that move by themselves count, and infinity where a box reaches to the camera."""
+    if view.shots:
+        return np.max([sizes(shot.view, boxes, edges) for shot in view.shots], axis=0)
+    made = np.zeros(len(edges))
+    for one in (view, *(own for _, own in view.groups)):
+        focal = max(one.focal_x, one.focal_y)
+        if one.parallel:
+            made = np.maximum(made, edges * focal)
+            continue
+        nearest = _Turned(one, *boxes(0.0)).nearest(one)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            size = np.where(nearest > 0, edges * focal / np.maximum(nearest, 1e-300), np.inf)
+        made = np.maximum(made, np.where(edges > 0, size, 0.0))
+    return made

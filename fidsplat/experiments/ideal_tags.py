@@ -1,0 +1,73 @@
+"""Printed tags among splats, every pixel the exact mean of what it shows of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.experiments.plane import plane_picture
+from fidsplat.scenes import PlacedMarker
+from fidsplat.surroundings import Layer
+
+_LEAST = 1 / 512
+"""share of a pixel that a tag must cover to be there"""
+
+
+def tag_layer(tags: Iterable[PlacedMarker], camera: Camera, behind: np.ndarray) -> Layer:
+    """What a camera sees of printed tags, as a layer for the picture that it took without them.
+
+    Where a tag covers a part of a pixel, the rest is what is behind it, and the layer is at the tag's depth.
+
+    Args:
+        tags: markers of one bit. Those that are seen from behind, or reach behind the camera, are left out.
+        camera: a pinhole.
+        behind: (h, w, 3) what it sees without them.
+    """
+    rgb, depth = np.array(behind, np.float64), np.zeros(behind.shape[:2])
+    poses = [(camera.world_to_camera @ tag.pose, tag) for tag in tags]
+    for pose, tag in sorted(poses, key=lambda pair: -float(np.linalg.norm(pair[0][:3, 3]))):
+        window = _window(pose, tag, camera)
+        if window is None:
+            continue
+        left, top, right, bottom = window
+        part = replace(
+            camera,
+            **{"width": right - left, "height": bottom - top, "cx": camera.cx - left, "cy": camera.cy - top},
+            **{"world_to_camera": pose, "position": None},
+        )
+        grid, module = tag.marker.grid, tag.marker.module
+        light = plane_picture(grid, module, part, 0.0, 1.0, 0.0)
+        covered = plane_picture(np.zeros_like(grid), module, part, 0.0, 1.0, 0.0)
+        far = _depth(pose, part)
+        there = (covered > _LEAST) & (far > 0)
+        white, black = tag.marker.palette
+        shown = light[..., None] * white + (covered - light)[..., None] * black
+        rows = slice(top, bottom), slice(left, right)
+        mixed = shown + (1 - covered)[..., None] * rgb[rows]
+        rgb[rows] = np.where(there[..., None], mixed, rgb[rows])
+        depth[rows] = np.where(there, far, depth[rows])
+    return Layer(rgb, depth)
+
+
+def _window(pose: np.ndarray, tag: PlacedMarker, camera: Camera) -> tuple[int, int, int, int] | None:
+    """Pixels left, top, right, bottom that may show a tag at `pose`, camera from marker; None for none."""
+    height, width = np.array(tag.marker.grid.shape) * tag.marker.module / 2
+    corners = np.array([(x, y, 0.0) for x in (-width, width) for y in (-height, height)])
+    seen = corners @ pose[:3, :3].T + pose[:3, 3]
+    if seen[:, 2].min() <= camera.near or pose[:3, 2] @ pose[:3, 3] <= 0:
+        return None
+    pixels = replace(camera, world_to_camera=np.eye(4), position=None).project(seen)
+    low = np.maximum(np.floor(pixels.min(0)).astype(int), 0)
+    high = np.minimum(np.ceil(pixels.max(0)).astype(int), (camera.width, camera.height))
+    return (*low.tolist(), *high.tolist()) if (low < high).all() else None
+
+
+def _depth(pose: np.ndarray, camera: Camera) -> np.ndarray:
+    """Depth along z of a marker's plane at each pixel, (h, w) metres."""
+    y, x = np.mgrid[0.5 : camera.height, 0.5 : camera.width]
+    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
+    with np.errstate(divide="ignore"):
+        return pose[:3, 2] @ pose[:3, 3] / (rays @ pose[:3, 2])

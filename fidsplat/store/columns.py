@@ -1,0 +1,77 @@
+"""The columns of a store while it is built, and the records of its nodes."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.store.layout import FAR, NODE, NPY_HEADER, checksum, column_file, row_bytes
+
+
+class Columns:
+    """Files of arrays, whose rows are written in any order; threads may share them."""
+
+    def __init__(self, folder: Path, kinds: dict[str, str], shapes: dict[str, tuple[int, ...]]) -> None:
+        self._folder, self.kinds, self._shapes = folder, kinds, shapes
+        self._files: dict[str, int] = {}
+
+    def __enter__(self) -> Columns:
+        for name in self.kinds:
+            file = column_file(self._folder, name)
+            self._files[name] = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        while self._files:
+            os.close(self._files.popitem()[1])
+
+    def write(self, first: int, splats: dict[str, np.ndarray]) -> None:
+        """Put splats at rows from `first` on."""
+        for name, descriptor in self._files.items():
+            data = np.ascontiguousarray(splats[name]).view(np.uint8).reshape(-1).data
+            at = NPY_HEADER + first * self._row(name)
+            while data:
+                written = os.pwrite(descriptor, data, at)
+                data, at = data[written:], at + written
+
+    def read(self, first: int, end: int) -> dict[str, np.ndarray]:
+        """The splats of rows [first, end)."""
+        made = {}
+        for name, descriptor in self._files.items():
+            row = self._row(name)
+            array = np.empty((end - first, *self._shapes[name]), self.kinds[name])
+            view, at = array.view(np.uint8).reshape(-1).data, NPY_HEADER + first * row
+            while view:
+                got = os.preadv(descriptor, [view], at)
+                if not got:
+                    raise OSError(f"{column_file(self._folder, name)} ends before row {end}")
+                view, at = view[got:], at + got
+            made[name] = array
+        return made
+
+    def finish(self, name: str, header: bytes, rows: int) -> None:
+        """Put the header of a column before its rows, and cut off what follows them."""
+        os.pwrite(self._files[name], header, 0)
+        os.ftruncate(self._files[name], NPY_HEADER + rows * self._row(name))
+
+    def _row(self, name: str) -> int:
+        return row_bytes(self.kinds[name], self._shapes[name])
+
+
+def nodes_of(splats: dict[str, np.ndarray], first: int) -> np.ndarray:
+    """(1,) of `NODE`: the record of a chunk of these splats, whose first is the row `first`."""
+    node = np.zeros(1, NODE)
+    means, largest = splats["means"], splats["scales"].max(axis=1)
+    if "thickness" in splats:
+        largest = np.maximum(largest, splats["thickness"])
+    node["first"], node["count"], node["parent"], node["crc"] = first, len(means), -1, checksum(splats)
+    # rounded away from the splats
+    far = np.float32(FAR * 1.0001) * largest[:, None]
+    node["reach"] = np.nextafter(largest.max(), np.float32(np.inf))
+    node["low"], node["high"] = means.min(axis=0), means.max(axis=0)
+    below, above = (means - far).min(axis=0), (means + far).max(axis=0)
+    node["far_low"] = np.nextafter(below, np.float32(-np.inf))
+    node["far_high"] = np.nextafter(above, np.float32(np.inf))
+    return node

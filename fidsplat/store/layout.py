@@ -1,0 +1,223 @@
+"""What a store is on disk: a folder of NumPy files that others can map, and a header that says what is there.
+
+    city.fss/store.json       the layout's version, counts, origin, traits, what it was made of
+    city.fss/nodes.npy        a record for each chunk and for each node above the chunks (`NODE`)
+    city.fss/means.npy ...    a column for each array: the splats of all chunks in their order, then those
+                              that stand for others (levels of detail)
+    city.fss/places.npy       instead of columns: the poses (p, 4, 4) at which another store stands
+    city.fss/detail.json      what levels of detail were measured to cost, where they were
+
+The index of a splat is its row. A chunk is a run of rows, so what is drawn of a store keeps the order of the
+whole, by which ties of depth are decided.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fidsplat.errors import InputError
+from fidsplat.files import atomic_write
+
+FORMAT, VERSION = "fidsplat store", 1
+SUFFIX = ".fss"
+HEADER, NODES, PLACES = "store.json", "nodes.npy", "places.npy"
+CHUNK = 32768
+"""splats of a chunk: small enough that what lies beside a picture is left out, large enough that reading one
+is a sequential read of some 2 MB"""
+FAR = 5.0
+"""standard deviations to which the larger boxes of a node reach"""
+NPY_HEADER = 128
+"""bytes of a column's own header, whatever its shape"""
+
+NODE = np.dtype(
+    [
+        ("first", "<i8"),  # row
+        ("count", "<i4"),  # splats
+        ("level", "<i4"),  # 0: a chunk of the scene itself; above: splats that stand for others
+        ("parent", "<i4"),  # the node that stands for it and its neighbours; -1: none
+        ("crc", "<u4"),  # of its rows of all columns, one after the other
+        ("size", "<f4"),  # metres: edge of the cells whose splats were merged into one; 0 on level 0
+        ("reach", "<f4"),  # metres: largest standard deviation
+        ("low", "<f4", 3),  # metres from the origin: box around the centres
+        ("high", "<f4", 3),
+        ("far_low", "<f4", 3),  # the same around splats of `FAR` standard deviations
+        ("far_high", "<f4", 3),
+    ]
+)
+
+
+@dataclass(frozen=True)
+class Header:
+    """What `store.json` says."""
+
+    splats: int
+    """of the scene itself"""
+    rows: int
+    """with those that stand for others"""
+    pinned: int
+    """the first row of splats that are printed on planes, which every picture has"""
+    chunk: int
+    """splats of a chunk, at most"""
+    origin: tuple[float, float, float]
+    """metres: the world's position of the means' zero"""
+    sh_degree: int
+    """-1: plain colours"""
+    columns: dict[str, str]
+    """NumPy's type of each array, e.g. {"means": "<f4"}"""
+    ellipsoids: str
+    """which splats are 3D Gaussians: none, some, all"""
+    nodes_crc: int
+    """of the bytes of nodes.npy"""
+    identity: str
+    """hexadecimal digits that tell its content from every other's"""
+    dropped: dict[str, int] = field(default_factory=dict)
+    """splats of the sources that cannot be drawn, by the reason"""
+    sources: tuple[str, ...] = ()
+    """names of the files that it was made of"""
+    store: str | None = None
+    """of a store of places: the store that stands there, seen from this one's folder"""
+
+    def save(self, folder: Path) -> None:
+        """Write it; what is there without it is no store."""
+        text = json.dumps({"format": FORMAT, "version": VERSION, **asdict(self)}, indent=1)
+        with atomic_write(folder / HEADER) as stream:
+            stream.write(text.encode())
+
+
+def read_header(folder: Path) -> Header:
+    """Raises InputError for what is no store, or one of a newer version."""
+    file = folder / HEADER
+    try:
+        said = json.loads(file.read_bytes())
+    except FileNotFoundError:
+        raise InputError(f"{folder} is not a store: it has no {HEADER}") from None
+    except OSError as error:
+        raise InputError(f"cannot read {file}: {error.strerror or error}") from error
+    except ValueError:
+        raise InputError(f"{file} is damaged: it is not JSON; build the store again") from None
+    if not isinstance(said, dict) or said.get("format") != FORMAT:
+        raise InputError(f"{folder} is not a store: its {HEADER} is of another kind")
+    version = said.get("version")
+    if version != VERSION:
+        raise InputError(
+            f"{folder} is a store of version {version!r}, and this fidsplat reads version {VERSION}; "
+            "use the fidsplat that wrote it, or build it again"
+        )
+    try:
+        known: dict[str, Any] = {each.name: said[each.name] for each in fields(Header)}
+        known |= {name: tuple(known[name]) for name in ("sources", "origin")}
+        header = Header(**known)
+        _check(header)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{file} is damaged ({error}); build the store again") from None
+    return header
+
+
+def _check(header: Header) -> None:
+    counts = (header.splats, header.rows, header.pinned, header.chunk, header.sh_degree, header.nodes_crc)
+    if not all(type(value) is int for value in counts):
+        raise ValueError("a count is no whole number")
+    if not (0 <= header.splats <= header.rows and header.chunk > 0 and -1 <= header.sh_degree <= 3):
+        raise ValueError("a count is out of range")
+    if len(header.origin) != 3 or not np.isfinite(header.origin).all():
+        raise ValueError("the origin is no point")
+    if header.store is None:
+        shapes = column_shapes(header)
+        for name, kind in header.columns.items():
+            if name not in shapes or np.dtype(kind).kind not in "fi":
+                raise ValueError(f"the column {name}")
+        if missing := {"means", "quats", "scales", "opacities"} - set(header.columns):
+            raise ValueError(f"no column {min(missing)}")
+    elif not isinstance(header.store, str):
+        raise ValueError("the store that is placed has no name")
+
+
+def column_shapes(header: Header) -> dict[str, tuple[int, ...]]:
+    """Shape of a splat's part of each array that a store may have."""
+    return shapes_of(header.sh_degree)
+
+
+def shapes_of(sh_degree: int) -> dict[str, tuple[int, ...]]:
+    """As `column_shapes`."""
+    shapes: dict[str, tuple[int, ...]] = {"means": (3,), "quats": (4,), "scales": (2,), "opacities": ()}
+    shapes |= {"labels": (), "planes": (), "thickness": ()}
+    return shapes | ({"colors": (3,)} if sh_degree < 0 else {"sh": ((sh_degree + 1) ** 2, 3)})
+
+
+def npy_header(kind: str, shape: tuple[int, ...]) -> bytes:
+    """The header of a .npy file, always as long: it is written before anybody knows how many rows follow."""
+    text = f"{{'descr': '{np.dtype(kind).str}', 'fortran_order': False, 'shape': {shape!r}, }}"
+    body = text.encode("ascii").ljust(NPY_HEADER - 11) + b"\n"
+    return b"\x93NUMPY\x01\x00" + (NPY_HEADER - 10).to_bytes(2, "little") + body
+
+
+def column_file(folder: Path, name: str) -> Path:
+    """Where a column lies."""
+    return folder / f"{name}.npy"
+
+
+def row_bytes(kind: str, shape: tuple[int, ...]) -> int:
+    """Bytes of a splat's part of a column."""
+    return np.dtype(kind).itemsize * int(np.prod(shape, dtype=np.int64))
+
+
+def checksum(parts: Mapping[str, np.ndarray]) -> int:
+    """CRC-32 of a chunk: of its arrays as they are stored, in the order of the header's columns."""
+    crc = 0
+    for array in parts.values():
+        crc = zlib.crc32(np.ascontiguousarray(array).view(np.uint8).reshape(-1).data, crc)
+    return crc
+
+
+def map_column(folder: Path, name: str, kind: str, shape: tuple[int, ...]) -> np.ndarray:
+    """A column (rows, ...) as it lies in its file, mapped and read-only.
+
+    Raises InputError where the file is missing, or shorter or of another kind than the header says.
+    """
+    file, wanted = column_file(folder, name), npy_header(kind, shape)
+    size = NPY_HEADER + row_bytes(kind, shape[1:]) * shape[0]
+    try:
+        with file.open("rb") as stream:
+            begins, found = stream.read(NPY_HEADER), os.fstat(stream.fileno()).st_size
+    except OSError as error:
+        raise InputError(f"cannot read {file}: {error.strerror or error}; the store is not whole") from error
+    if found < size:
+        lost = max(found - NPY_HEADER, 0) // max(row_bytes(kind, shape[1:]), 1)
+        raise InputError(
+            f"{file} is cut short: it has {found} bytes of {size}, so that rows from {lost} on are missing; "
+            "build the store again"
+        )
+    if begins != wanted or found > size:
+        raise InputError(f"{file} is not of this store, or its header is damaged; build the store again")
+    if not shape[0]:
+        return np.empty(shape, kind)
+    return np.memmap(file, kind, "r", NPY_HEADER, shape).view(np.ndarray)
+
+
+def write_nodes(folder: Path, nodes: np.ndarray) -> int:
+    """Write the index; returns the CRC-32 of its records."""
+    with atomic_write(folder / NODES) as stream:
+        np.save(stream, nodes)
+    return zlib.crc32(nodes.tobytes())
+
+
+def read_nodes(folder: Path, crc: int) -> np.ndarray:
+    """The index, (n,) of `NODE`. Raises InputError where it is missing or damaged."""
+    file = folder / NODES
+    try:
+        nodes = np.load(file, allow_pickle=False)
+    except OSError as error:
+        raise InputError(f"cannot read {file}: {error.strerror or error}; the store is not whole") from error
+    except (ValueError, EOFError):
+        nodes = np.empty(0)
+    if nodes.dtype != NODE or nodes.ndim != 1 or zlib.crc32(nodes.tobytes()) != crc:
+        raise InputError(f"{file} is damaged: its checksum is another; build the store again")
+    return nodes

@@ -1,0 +1,145 @@
+"""Levels of detail: fewer splats that stand for those of neighbouring nodes.
+
+Splats of a cell whose normals have the same main axis become one by moments in its plane: weighted by opacity
+times area, it has their mean, their covariance without the direction in which that is least, their mean
+colour, and the opacity with which its area has theirs. So far away, where cells are smaller than pixels, it
+takes the same light; what it gets wrong is measured (fidsplat/detail.py).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fidsplat.store.morton import BITS, Grid
+
+REDUCTION = 4
+"""how many splats become one, in the mean: what halving the resolution leaves of a surface"""
+_CLASSES = 3
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+def merged(splats: dict[str, np.ndarray], grid: Grid) -> tuple[dict[str, np.ndarray], float]:
+    """Splats that stand for these, at most a quarter as many where cells allow it, and the edge [m] of the
+    cells. `labels` is that of the heaviest. splats: columns as a store has them."""
+    u, v, normal = _frames(splats["quats"])
+    sides = np.abs(normal)
+    classes = np.where(sides[0] > sides[1], np.where(sides[0] > sides[2], 0, 2), 1 + (sides[2] > sides[1]))
+    keys, shift = _cells(grid.codes(splats["means"]), classes.astype(np.uint64))
+    order = np.argsort(keys, kind="stable")
+    keys = keys[order]
+    starts = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
+    given = {name: array[order] for name, array in splats.items()}
+    made = _by_moments(given, (u[:, order], v[:, order], normal[:, order]), starts)
+    return made, grid.size(shift)
+
+
+def _frames(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two tangents and the normal, each (3, n) float64, of unit quaternions (n, 4)."""
+    w, x, y, z = quats.T.astype(np.float64)
+    u = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)])
+    v = np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)])
+    return u, v, np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+
+
+def _cells(codes: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, int]:
+    """(n,) a key for each splat, the same for those that become one, and how many levels of the grid's cells
+    are gone in it."""
+    target = max(1, len(codes) // REDUCTION)
+    ordered = np.sort(codes)
+    # where neighbours in order differ: at how many levels at least
+    _, exponents = np.frexp((ordered[1:] ^ ordered[:-1]).astype(np.float64))
+    differing = np.bincount((exponents + 2) // 3, minlength=BITS + 2)
+    cells = 1 + np.cumsum(differing[::-1])[::-1]  # at [s + 1]: cells where s levels are gone
+    shift = int(np.argmax(np.append(cells[1:], 0) <= target))
+    while True:
+        keys = (codes >> np.uint64(3 * min(shift, BITS))) * np.uint64(_CLASSES) + classes
+        if shift >= BITS:
+            return keys, BITS
+        ordered = np.sort(keys)
+        if 1 + int(np.count_nonzero(ordered[1:] != ordered[:-1])) <= target:
+            return keys, shift
+        shift += 1
+
+
+def _by_moments(
+    splats: dict[str, np.ndarray], frames: tuple[np.ndarray, np.ndarray, np.ndarray], starts: np.ndarray
+) -> dict[str, np.ndarray]:
+    """One splat for each run of splats; a run of one stays as it is. frames: as `_frames`."""
+    count = len(splats["means"])
+    lengths = np.diff(np.append(starts, count))
+    scales = splats["scales"].T.astype(np.float64)
+    thickness = splats.get("thickness")
+    area = scales[0] * scales[1]
+    third = np.zeros(count) if thickness is None else thickness.astype(np.float64)
+    # what a 3D Gaussian covers, in the mean over directions, is near this
+    area = np.maximum(area, third * np.maximum(scales[0], scales[1]))
+    light = splats["opacities"] * area
+    weights = np.maximum(light, 1e-300)
+    total = np.add.reduceat(weights, starts)
+    # from a run's first splat, so that nothing cancels
+    base = splats["means"][starts].astype(np.float64).T
+    away = splats["means"].T - np.repeat(base, lengths, axis=1)
+    u, v = frames[0] * scales[0], frames[1] * scales[1]
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.add.reduceat(values * weights, starts, axis=1) / total
+
+    moments = [u[i] * u[j] + v[i] * v[j] + away[i] * away[j] for i, j in _PAIRS]
+    if thickness is not None:
+        moments = [
+            m + third * third * frames[2][i] * frames[2][j] for m, (i, j) in zip(moments, _PAIRS, strict=True)
+        ]
+    middle, second = mean(away), mean(np.stack(moments))
+    spread = np.empty((len(starts), 3, 3))
+    for (i, j), values in zip(_PAIRS, second, strict=True):
+        spread[:, i, j] = spread[:, j, i] = values - middle[i] * middle[j]
+    sizes, vectors = np.linalg.eigh(spread)
+    sigma = np.sqrt(np.maximum(sizes[:, ::-1], 1e-24))
+    turns = vectors[:, :, ::-1].copy()
+    turns[:, :, 2] = np.cross(turns[:, :, 0], turns[:, :, 1])
+    opacities = np.add.reduceat(light, starts) / (sigma[:, 0] * sigma[:, 1])
+    # what lies on top of each other takes more light than an opaque splat: then it is wider instead
+    sigma[:, :2] *= np.sqrt(np.maximum(opacities, 1.0))[:, None]
+    made = {"means": (base + middle).T, "quats": quaternions_of(turns), "scales": sigma[:, :2]}
+    made["opacities"] = np.minimum(opacities, 1.0)
+    for name in {"colors", "sh"} & set(splats):
+        flat = splats[name].reshape(count, -1).T.astype(np.float64)
+        made[name] = mean(flat).T.reshape(-1, *splats[name].shape[1:])
+    if thickness is not None:
+        made["thickness"] = np.where(np.logical_or.reduceat(thickness > 0, starts), sigma[:, 2], 0.0)
+    alone, heaviest = lengths == 1, _first_of_largest(weights, starts, lengths)
+    result = {}
+    for name, array in splats.items():
+        if name not in made:  # labels, planes
+            result[name] = array[heaviest]
+            continue
+        result[name] = made[name].astype(array.dtype)
+        result[name][alone] = array[starts[alone]]
+    return result
+
+
+def _first_of_largest(weights: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Of each run the first index of its largest weight."""
+    largest = np.repeat(np.maximum.reduceat(weights, starts), lengths)
+    places = np.where(weights == largest, np.arange(len(weights)), len(weights))
+    return np.minimum.reduceat(places, starts)
+
+
+def quaternions_of(frames: np.ndarray) -> np.ndarray:
+    """(n, 4) float64 unit quaternions w x y z of rotations (n, 3, 3), as `matrix_to_quaternion` of each."""
+    r = frames
+    xx, yy, zz = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
+    a, b, c = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]
+    d, e, f = r[:, 1, 0] + r[:, 0, 1], r[:, 0, 2] + r[:, 2, 0], r[:, 2, 1] + r[:, 1, 2]
+    rows = np.stack(
+        [
+            np.stack([1 + xx + yy + zz, a, b, c], 1),
+            np.stack([a, 1 + xx - yy - zz, d, e], 1),
+            np.stack([b, d, 1 - xx + yy - zz, f], 1),
+            np.stack([c, e, f, 1 - xx - yy + zz], 1),
+        ],
+        axis=1,
+    )
+    largest = np.argmax(np.diagonal(rows, axis1=1, axis2=2), axis=1)
+    chosen = rows[np.arange(len(rows)), largest]
+    return chosen / np.linalg.norm(chosen, axis=1, keepdims=True)

@@ -1,0 +1,58 @@
+"""A spatial order: Morton codes of splats on a cubic grid of 2^21 cells a side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+BITS = 21
+"""of a code per axis"""
+
+
+def _spread(bits: int) -> np.ndarray:
+    """(2^bits,) uint64: the bits of an index with two zeros between each."""
+    index = np.arange(1 << bits, dtype=np.uint64)
+    made = np.zeros_like(index)
+    for bit in range(bits):
+        made |= ((index >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit)
+    return made
+
+
+_LOW_BITS = 11
+_TABLE = _spread(_LOW_BITS)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A cube that is cut into cells; what lies outside counts to the cells at its sides."""
+
+    low: tuple[float, float, float]
+    """metres from the origin"""
+    side: float
+    """metres"""
+
+    def codes(self, means: np.ndarray) -> np.ndarray:
+        """(n,) uint64 of centres (n, 3), by which neighbours stand near each other."""
+        scale = (1 << BITS) / self.side
+        codes = np.zeros(len(means), np.uint64)
+        for axis in range(3):
+            cells = (means[:, axis].astype(np.float64) - self.low[axis]) * scale
+            index = np.clip(cells, 0, (1 << BITS) - 1).astype(np.int64)
+            high, low = index >> _LOW_BITS, index & ((1 << _LOW_BITS) - 1)
+            codes |= (_TABLE[high] << np.uint64(3 * _LOW_BITS) | _TABLE[low]) << np.uint64(axis)
+        return codes
+
+    def size(self, shift: int) -> float:
+        """Metres: edge of the cells whose codes agree but for their last 3 `shift` bits."""
+        return self.side / (1 << BITS) * (1 << shift)
+
+
+def grid_around(means: np.ndarray) -> Grid:
+    """A grid for centres (n, 3) like these: a sample of them."""
+    if not len(means):
+        return Grid((0.0, 0.0, 0.0), 1.0)
+    low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
+    side = max(float((high - low).max()) * 1.01, 1e-6)
+    corner = (low + high) / 2 - side / 2
+    return Grid((float(corner[0]), float(corner[1]), float(corner[2])), side)

@@ -1,0 +1,87 @@
+"""Parts of stores on a device: what the last view was drawn of stays there, and what the next one needs is
+read while this one is drawn."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+
+from fidsplat.backends.base import Backend, ResidentData
+from fidsplat.backends.prepare import prepare
+from fidsplat.backends.view import View
+from fidsplat.capture import Capture
+from fidsplat.effects import FeatureSet
+from fidsplat.quality import Quality
+from fidsplat.store.streamed import Selection, Streamed
+
+
+class Residency:
+    """What of a scene that is on disk lies on a device. Used by one thread at a time."""
+
+    def __init__(self, scene: Streamed, backend: Backend) -> None:
+        self.scene, self._backend = scene, backend
+        self._there: tuple[Selection, ResidentData, np.ndarray] | None = None
+        self._fetching: threading.Thread | None = None
+        self.nodes = 0
+        """of the last views"""
+
+    @property
+    def count(self) -> int:
+        """Splats of the whole."""
+        return len(self.scene)
+
+    @property
+    def memory_bytes(self) -> int:
+        """Device memory of what is there."""
+        return 0 if self._there is None else self._there[1].memory_bytes
+
+    def of(
+        self, views: Sequence[View], features: FeatureSet, qualities: Iterable[Quality]
+    ) -> tuple[ResidentData, np.ndarray]:
+        """The splats that these views see, on the device, and their indices in the whole (n,) int32; the
+        quality that needs most decides for all views.
+
+        Raises:
+            InputError: a quality allows an error that was not measured.
+        """
+        pixels = min(self.scene.pixels_of(quality) for quality in qualities)
+        selection = self.scene.select(views, features, pixels)
+        self.nodes = len(selection)
+        if self._there is None or self._there[0] != selection:
+            self._there = None  # before the next is there, so that both need not fit
+            part, ids = self.scene.part(selection)
+            self._there = selection, self._backend.upload(part), ids
+        return self._there[1:]
+
+    def read_ahead(self, captures: Iterator[Capture]) -> Iterator[Capture]:
+        """The captures, each when what the next needs is being read."""
+        waiting: Capture | None = None
+        while True:
+            try:
+                following = next(captures, None)
+                if following is not None and waiting is not None:
+                    self._fetch(following)
+            except Exception:
+                if waiting is not None:
+                    yield waiting
+                raise
+            if waiting is not None:
+                yield waiting
+            if following is None:
+                return
+            waiting = following
+
+    def _fetch(self, capture: Capture) -> None:
+        """Read what a view will need, beside what goes on; nothing, while the last such reading goes on."""
+        features, view = prepare(self.scene, capture)
+        pixels = self.scene.pixels_of(capture.quality)
+        if self._fetching is not None and self._fetching.is_alive():
+            return
+
+        def work() -> None:
+            self.scene.fetch(self.scene.select([view], features, pixels))
+
+        self._fetching = threading.Thread(target=work, name="fidsplat-fetch", daemon=True)
+        self._fetching.start()

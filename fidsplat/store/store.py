@@ -1,0 +1,274 @@
+"""Store: splats on disk, opened."""
+
+from __future__ import annotations
+
+import os
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.errors import InputError
+from fidsplat.files import path_of
+from fidsplat.formats.collect import Progress
+from fidsplat.quality import Quality
+from fidsplat.rotations import check_similarity
+from fidsplat.splats import SplatCloud
+from fidsplat.store import layout
+from fidsplat.store.detail import Detail, load_details
+from fidsplat.store.part import StorePart, joined, moved
+from fidsplat.summaries import Summarised, point
+
+
+class Store(Summarised):
+    """A store that `fidsplat store build` made, or one of places at which another stands. Nothing of its
+    splats is read before it is drawn, and then what a view needs.
+
+    A store of places (`fidsplat store place`) has the splats of the other as many times, the first place's
+    first. Threads may share one; it is pickled by its path.
+
+    Args:
+        path: its folder, e.g. city.fss.
+
+    Raises:
+        InputError: it is no store, not whole, damaged, or of a newer version.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = path_of(path)
+        if not self.path.is_dir():
+            raise InputError(f"{self.path} is not a store: there is no such folder")
+        header = self.header = layout.read_header(self.path)
+        self.poses: np.ndarray | None = None
+        """(p, 4, 4) float64 places, of a store of places"""
+        self._folder, own = self.path, header
+        if header.store is not None:
+            self._folder = self.path / header.store
+            own = layout.read_header(self._folder)
+            if own.identity != header.identity or own.store is not None:
+                raise InputError(f"{self._folder} is not what {self.path} was made of; place the store again")
+            self.poses = _read_poses(self.path)
+        self._own = own
+        self.nodes = layout.read_nodes(self._folder, own.nodes_crc)
+        """(n,) records of `layout.NODE`: chunks and the nodes above them, of one place"""
+        self._columns = self._mapped()
+
+    def __reduce__(self):
+        return Store, (str(self.path),)
+
+    def __len__(self) -> int:
+        return self.header.splats
+
+    def __repr__(self) -> str:
+        places = "" if self.poses is None else f", at {len(self.poses)} places"
+        return f"Store({str(self.path)!r}, {len(self):,} splats{places})"
+
+    def summary(self) -> dict[str, str]:
+        """What it holds, in words."""
+        rows = {"splats": f"{len(self):,}", "chunks": f"{self.chunks:,}"}
+        rows["colours"] = "plain" if self.sh_degree < 0 else f"SH of degree {self.sh_degree}"
+        if self.poses is not None:
+            rows["places"] = f"{len(self.poses):,} of {self.header.store}"
+        if len(self):
+            rows["bounds"] = " to ".join(map(point, self.bounds())) + " m"
+        return rows | {f"left out: {why}": f"{n:,}" for why, n in self.header.dropped.items()}
+
+    # traits, as those of a cloud
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree 0 to 3 of the SH colours, -1 for plain colours."""
+        return self.header.sh_degree
+
+    @property
+    def has_planes(self) -> bool:
+        """Whether some splats are printed on planes."""
+        return "planes" in self._own.columns
+
+    @property
+    def footprint(self) -> str:
+        """gaussian: a store holds no boxes."""
+        return "gaussian"
+
+    @property
+    def ellipsoids(self) -> str:
+        """Which splats are 3D Gaussians: `none`, `some` or `all`."""
+        return self.header.ellipsoids
+
+    @property
+    def origin(self) -> np.ndarray:
+        """(3,) float64 metres: the world's position of the means' zero."""
+        return np.array(self.header.origin)
+
+    @property
+    def identity(self) -> str:
+        """Hexadecimal digits that tell its content from that of every other store."""
+        places = "" if self.poses is None else self.poses.tobytes().hex()
+        return self.header.identity + places
+
+    @property
+    def places(self) -> int:
+        """How many times its chunks are drawn: 1 for a store of its own splats."""
+        return 1 if self.poses is None else len(self.poses)
+
+    @property
+    def chunks(self) -> int:
+        """Chunks of all places."""
+        return self.places * int(np.count_nonzero(self.nodes["level"] == 0))
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of its files; of a store of places those of the store that stands there."""
+        return sum(file.stat().st_size for file in self._folder.iterdir() if file.is_file())
+
+    @property
+    def splat_bytes(self) -> int:
+        """Bytes of a splat in memory."""
+        shapes = layout.shapes_of(self.sh_degree)
+        return sum(layout.row_bytes("<f4", shapes[name]) for name in {*self._own.columns, "labels"})
+
+    def bounds(self, sigmas: float = 3.0) -> tuple[np.ndarray, np.ndarray]:
+        """Axis-aligned box (min (3,), max (3,)) float64, world, around all splats to that many standard
+        deviations; somewhat larger than that of a cloud, since it is made of the boxes of chunks.
+
+        Raises InputError for an empty store.
+        """
+        low, high = self.boxes(sigmas)
+        leaves = np.tile(self.nodes["level"] == 0, self.places)
+        if not leaves.any():
+            raise InputError("an empty store has no bounds")
+        return low[leaves].min(axis=0) + self.origin, high[leaves].max(axis=0) + self.origin
+
+    @cached_property
+    def details(self) -> list[Detail]:
+        """What its levels of detail were measured to cost; those of a store that is placed are its own."""
+        return load_details(self._folder, self.header.identity)
+
+    def pixels_of(self, quality: Quality) -> float:
+        """How small [samples] cells must be not to be told apart, by a quality's `detail_error`.
+
+        Raises InputError where it was not measured.
+        """
+        for detail in self.details:
+            if detail.lowpass == quality.lowpass:
+                return detail.pixels(quality.detail_error)
+        raise InputError(
+            f"detail_error is {quality.detail_error:g}, but what levels of detail cost {self.path} with "
+            f"lowpass={quality.lowpass} was not measured; run `fidsplat store measure {self._folder} "
+            f"--lowpass {quality.lowpass}`, or draw with detail_error=0"
+        )
+
+    # nodes of all places: node i of place p has the number p * len(nodes) + i
+
+    def boxes(self, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corners, (places * nodes, 3) float64 [m] from the origin, of boxes around the
+        splats of each node to that many standard deviations; 0: around their centres."""
+        nodes, share = self.nodes, min(sigmas / layout.FAR, 1.0)
+        beyond = np.maximum(sigmas - layout.FAR, 0.0) * nodes["reach"].astype(np.float64)[:, None]
+        # what a box reaches is convex in the number of standard deviations: below its chord
+        low = (1 - share) * nodes["low"].astype(np.float64) + share * nodes["far_low"] - beyond
+        high = (1 - share) * nodes["high"].astype(np.float64) + share * nodes["far_high"] + beyond
+        if self.poses is None:
+            return low, high
+        center, half = (low + high) / 2, (high - low) / 2
+        turns = self.poses[:, :3, :3]
+        middles = center @ np.swapaxes(turns, 1, 2) + self._moves[:, None]
+        # 1e-6 of the way for the rounding of placed centres to float32
+        around = half @ np.swapaxes(np.abs(turns), 1, 2)
+        around = around + 1e-6 * (np.abs(middles) + around)
+        return (middles - around).reshape(-1, 3), (middles + around).reshape(-1, 3)
+
+    @cached_property
+    def _moves(self) -> np.ndarray:
+        """(p, 3) float64 metres: where each place has the zero of the placed store's means."""
+        assert self.poses is not None
+        inner, outer = np.array(self._own.origin), self.origin
+        return self.poses[:, :3, :3] @ inner + self.poses[:, :3, 3] - outer
+
+    def first_of(self, numbers: np.ndarray) -> np.ndarray:
+        """(k,) int64: the index in the whole scene of the first splat of chunks, by their numbers; -1 for
+        nodes that stand for others."""
+        place, node = np.divmod(numbers, max(len(self.nodes), 1))
+        own = self.nodes[node]
+        return np.where(own["level"] == 0, own["first"] + place * self._own.splats, -1)
+
+    def counts(self, numbers: np.ndarray) -> np.ndarray:
+        """(k,) splats of nodes, by their numbers."""
+        return self.nodes["count"][numbers % max(len(self.nodes), 1)]
+
+    def load(self, number: int) -> dict[str, np.ndarray]:
+        """The splats of a node, by its number: arrays as a cloud has them, relative to `origin`."""
+        place, node = divmod(int(number), len(self.nodes))
+        first = int(self.nodes["first"][node])
+        return self._rows(first, first + int(self.nodes["count"][node]), place)
+
+    def labels(self) -> set[int]:
+        """The labels that its splats have; all of that column is read."""
+        if "labels" not in self._columns:
+            return {0} if len(self) else set()
+        return set(np.unique(self._columns["labels"][: self._own.splats]).tolist())
+
+    def last_plane(self) -> int:
+        """The largest id of its planes; -1 without."""
+        if not self.has_planes:
+            return -1
+        return int(self._columns["planes"][self._own.pinned : self._own.splats].max(initial=-1))
+
+    def cloud(self) -> SplatCloud:
+        """All of its splats in one cloud, mapped where the files have them as they are drawn, else in memory:
+        the scene that its pictures are bit for bit those of."""
+        parts = [self._rows(0, self._own.splats, place) for place in range(self.places)]
+        return StorePart.of(joined(parts), self, self.header.dropped)
+
+    def verify(self, progress: Progress | None = None) -> list[str]:
+        """What is damaged, in words: every chunk is read and compared with its checksum. Empty: it is
+        whole."""
+        wrong = []
+        for number, node in enumerate(self.nodes):
+            first, end = int(node["first"]), int(node["first"] + node["count"])
+            if (
+                layout.checksum({name: array[first:end] for name, array in self._columns.items()})
+                != node["crc"]
+            ):
+                kind = "chunk" if node["level"] == 0 else "node"
+                wrong.append(
+                    f"{kind} {number}, rows {first} to {end - 1}, is damaged: its checksum is another"
+                )
+            if progress is not None:
+                progress(f"checking {self.path.name}", (number + 1) / len(self.nodes))
+        return wrong
+
+    def _mapped(self) -> dict[str, np.ndarray]:
+        own, shapes = self._own, layout.shapes_of(self._own.sh_degree)
+        ends = self.nodes["first"] + self.nodes["count"]
+        if len(self.nodes) and (ends.max() > own.rows or self.nodes["first"].min() < 0):
+            raise InputError(f"{self._folder}: its index does not fit its header; build the store again")
+        return {
+            name: layout.map_column(self._folder, name, kind, (own.rows, *shapes[name]))
+            for name, kind in own.columns.items()
+        }
+
+    def _rows(self, first: int, end: int, place: int) -> dict[str, np.ndarray]:
+        """Splats of rows [first, end) at a place."""
+        made = {name: array[first:end] for name, array in self._columns.items()}
+        for name in {"sh", "colors"} & set(made):
+            made[name] = made[name].astype(np.float32, copy=False)
+        if "labels" not in made:
+            made["labels"] = np.zeros(end - first, np.int32)
+        if self.poses is None:
+            return made
+        return moved(made, self.poses[place], self._moves[place])
+
+
+def _read_poses(folder: Path) -> np.ndarray:
+    try:
+        poses = np.load(folder / layout.PLACES, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(
+            f"{folder / layout.PLACES} cannot be read ({error}); place the store again"
+        ) from None
+    if poses.dtype != np.float64 or poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
+        raise InputError(f"{folder / layout.PLACES} is damaged; place the store again")
+    for pose in poses:
+        check_similarity(pose, f"a pose of {folder / layout.PLACES}", rigid=True)
+    return poses

@@ -1,0 +1,201 @@
+"""What of stores and of splats beside them a view is drawn of: the chunks that it may see, in the order of
+the whole, so that the picture is bit for bit that of all splats in memory."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from fidsplat.backends.seen import seen, sizes
+from fidsplat.backends.view import View
+from fidsplat.effects import FeatureSet
+from fidsplat.quality import Quality
+from fidsplat.splats import SplatCloud
+from fidsplat.store.part import StorePart, colors_of, joined
+from fidsplat.store.store import Store
+
+KEPT_BYTES = 2 * 2**30
+"""of chunks that were made for a view and are kept for the next, where the files do not hold them as they are
+drawn"""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What views are drawn of: numbers of each store's nodes, in the order of their splats."""
+
+    nodes: tuple[tuple[int, ...], ...]
+
+    def __len__(self) -> int:
+        return sum(map(len, self.nodes))
+
+
+class Streamed:
+    """Stores, then other splats, as one scene of which views see parts.
+
+    Its traits are those of the whole. Threads may share one.
+    """
+
+    def __init__(self, stores: Sequence[Store], beside: SplatCloud | None = None) -> None:
+        self.stores = tuple(stores)
+        self.beside = SplatCloud.empty() if beside is None else beside
+        self.origin = self.stores[0].origin
+        """(3,) float64 metres: the world's position of the means' zero"""
+        whole = [*self.stores, self.beside] if len(self.beside) else list(self.stores)
+        self.sh_degree = max(max(part.sh_degree for part in whole), -1)
+        if self.sh_degree == 0:
+            self.sh_degree = -1
+        self.has_planes = any(part.has_planes for part in whole)
+        kinds = {part.footprint for part in whole if len(part)} or {"gaussian"}
+        self.footprint = kinds.pop() if len(kinds) == 1 else "mixed"
+        thick = {part.ellipsoids for part in whole if len(part)} or {"none"}
+        self.ellipsoids = thick.pop() if len(thick) == 1 else "some"
+        self._kept: OrderedDict[tuple[int, int], dict[str, np.ndarray]] = OrderedDict()
+        self._kept_bytes, self._lock = 0, threading.Lock()
+
+    def __len__(self) -> int:
+        return sum(map(len, self.stores)) + len(self.beside)
+
+    @property
+    def content(self) -> tuple:
+        """What tells it from every other scene: of stores not their splats but their identities."""
+        return (*(store.identity for store in self.stores), self.beside)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Axis-aligned box (min (3,), max (3,)) float64, world, around all splats, as that of a cloud."""
+        boxes = [part.bounds() for part in (*self.stores, self.beside) if len(part)]
+        low, high = zip(*boxes, strict=True)
+        return np.min(low, axis=0), np.max(high, axis=0)
+
+    def cloud(self) -> SplatCloud:
+        """All splats in one cloud."""
+        if len(self.stores) == 1 and not len(self.beside):
+            return self.stores[0].cloud()
+        return self.part(self.everything())[0]
+
+    def everything(self) -> Selection:
+        """All chunks, and no node that stands for others."""
+        every = (np.flatnonzero(np.tile(store.nodes["level"] == 0, store.places)) for store in self.stores)
+        return Selection(tuple(tuple(numbers.tolist()) for numbers in every))
+
+    def pixels_of(self, quality: Quality) -> float:
+        """How small [samples] cells must be not to be told apart, by a quality's `detail_error`; 0: exact.
+
+        Raises:
+            InputError: an error is allowed, but what levels of detail cost a store was not measured.
+        """
+        if not quality.detail_error:
+            return 0.0
+        return min(store.pixels_of(quality) for store in self.stores)
+
+    def select(self, views: Sequence[View], features: FeatureSet, pixels: float = 0.0) -> Selection:
+        """What these views see. pixels: cells smaller than so many samples need not be told apart; 0: exactly
+        the scene itself."""
+        return Selection(
+            tuple(tuple(_chosen(store, views, features, pixels).tolist()) for store in self.stores)
+        )
+
+    def part(self, selection: Selection) -> tuple[StorePart, np.ndarray]:
+        """The splats of a selection, and their indices in the whole (n,) int32; -1 for those that stand for
+        others."""
+        parts, ids, first = [], [], 0
+        for number, (store, nodes) in enumerate(zip(self.stores, selection.nodes, strict=True)):
+            numbers = np.array(nodes, np.int64)
+            for node, at, count in zip(nodes, store.first_of(numbers), store.counts(numbers), strict=True):
+                parts.append(self._chunk(number, node))
+                ids.append(np.full(count, -1) if at < 0 else np.arange(first + at, first + at + count))
+            first += len(store)
+        if len(self.beside) or not parts:
+            parts.append(self._beside)
+            ids.append(np.arange(first, first + len(self.beside)))
+        return StorePart.of(joined(parts), self), np.concatenate(ids).astype(np.int32)
+
+    def fetch(self, selection: Selection) -> None:
+        """Bring what a selection needs into memory."""
+        for number, nodes in enumerate(selection.nodes):
+            for node in nodes:
+                for array in self._chunk(number, node).values():
+                    # a byte of each page is enough
+                    array.reshape(-1).view(np.uint8)[:: 1 << 12].max(initial=0)
+
+    def _chunk(self, number: int, node: int) -> dict[str, np.ndarray]:
+        store, key = self.stores[number], (number, node)
+        with self._lock:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+                return self._kept[key]
+        made = self._fitted(store.load(node), self._planes_before[number])
+        own = sum(array.nbytes for array in made.values() if array.base is None)
+        if own * 4 >= sum(array.nbytes for array in made.values()):
+            with self._lock:
+                self._kept_bytes += 0 if key in self._kept else own
+                self._kept[key] = made
+                while self._kept_bytes > KEPT_BYTES and len(self._kept) > 1:
+                    _, gone = self._kept.popitem(last=False)
+                    self._kept_bytes -= sum(a.nbytes for a in gone.values() if a.base is None)
+        return made
+
+    @cached_property
+    def _planes_before(self) -> list[int]:
+        """What each store's ids of planes are raised by, and last those of the splats beside."""
+        made = [0]
+        for store in self.stores:
+            made.append(made[-1] + store.last_plane() + 1)
+        return made
+
+    @cached_property
+    def _beside(self) -> dict[str, np.ndarray]:
+        cloud = self.beside
+        arrays = {name: getattr(cloud, name) for name in ("quats", "scales", "opacities", "labels")}
+        if np.array_equal(cloud.origin, self.origin):
+            arrays["means"] = cloud.means
+        else:
+            arrays["means"] = (cloud.means + (cloud.origin - self.origin)).astype(np.float32)
+        some = {"sh": cloud.sh, "colors": cloud.colors, "planes": cloud.planes}
+        some |= {"thickness": cloud.thickness, "boxes": cloud.boxes}
+        arrays |= {name: array for name, array in some.items() if array is not None}
+        return self._fitted(arrays, self._planes_before[-1])
+
+    def _fitted(self, given: dict[str, np.ndarray], first_plane: int) -> dict[str, np.ndarray]:
+        """Splats with the arrays that the whole has."""
+        count = len(given["means"])
+        made = {name: given[name] for name in ("means", "quats", "scales", "opacities", "labels")}
+        made |= colors_of(given, self.sh_degree)
+        if self.has_planes:
+            ids = given.get("planes", np.full(count, -1, np.int32))
+            made["planes"] = np.where(ids >= 0, ids + np.int32(first_plane), np.int32(-1))
+        if self.ellipsoids != "none":
+            made["thickness"] = given.get("thickness", np.zeros(count, np.float32))
+        if self.footprint != "gaussian":
+            made["boxes"] = given.get("boxes", np.zeros(count, bool))
+        return made
+
+
+def _chosen(store: Store, views: Sequence[View], features: FeatureSet, pixels: float) -> np.ndarray:
+    """Numbers of the nodes of a store that views are drawn of, in the order of their splats."""
+    if not len(store.nodes):
+        return np.zeros(0, np.int64)
+    nodes, places = store.nodes, store.places
+    level = np.tile(nodes["level"], places)
+    reach = np.tile(nodes["reach"].astype(np.float64), places)
+    visible = np.zeros(len(level), bool)
+    for view in views:
+        visible |= seen(view, features, store.boxes, reach, exact=pixels == 0)
+    pinned = np.tile((nodes["level"] == 0) & (nodes["first"] >= store.header.pinned), places)
+    if pixels == 0:
+        return np.flatnonzero((visible | pinned) & (level == 0))
+    parents = np.tile(nodes["parent"].astype(np.int64), places)
+    parents = np.where(parents >= 0, parents + np.repeat(np.arange(places), len(nodes)) * len(nodes), -1)
+    edges = np.tile(nodes["size"].astype(np.float64), places)
+    refined = np.zeros(len(level), bool)
+    for view in views:
+        refined |= sizes(view, store.boxes, edges) > pixels
+    reached = parents < 0
+    for above in range(int(level.max()), 0, -1):
+        children = np.flatnonzero((level == above - 1) & (parents >= 0))
+        reached[children] = (reached & refined & visible)[parents[children]]
+    return np.flatnonzero(((reached & visible) | pinned) & (~refined | (level == 0)))

@@ -1,0 +1,74 @@
+"""Markers of one rigid thing in a picture: one pose from all that is read of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.vision.pose import points_pose, pose_error
+from fidsplat.vision.readback import Reading
+
+
+@dataclass(frozen=True, eq=False)
+class BundleReading:
+    """A bundle of a scene's markers, where it is, and how it was read. Its frame is that of its first marker
+    in the scene's order."""
+
+    name: str
+    markers: int
+    found: int
+    """markers that were read"""
+    truth: np.ndarray
+    """(4, 4) camera_from_bundle"""
+    pose: np.ndarray | None = None
+    """(4, 4) camera_from_bundle from the corners of all markers that were read; None without any"""
+    position_error: float | None = None
+    """metres"""
+    angle_error: float | None = None
+    """radians"""
+
+    @property
+    def distance(self) -> float:
+        """Metres from the camera."""
+        return float(np.linalg.norm(self.truth[:3, 3]))
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON: millimetres, degrees; None where nothing was read."""
+        return {
+            "bundle": self.name,
+            "markers": self.markers,
+            "found": self.found,
+            "distance_m": self.distance,
+            "position_error_mm": None if self.position_error is None else self.position_error * 1e3,
+            "angle_error_deg": None if self.angle_error is None else math.degrees(self.angle_error),
+            "camera_from_bundle": None if self.pose is None else self.pose.tolist(),
+        }
+
+
+def read_bundles(readings: Iterable[Reading], camera: Camera) -> list[BundleReading]:
+    """The bundles of a scene (`PlacedMarker.bundle`), from what was read of its markers in one picture.
+
+    camera: that took it; its intrinsics and lens are used.
+    """
+    members: dict[str, list[Reading]] = {}
+    for reading in readings:
+        if reading.placed.bundle is not None:
+            members.setdefault(reading.placed.bundle, []).append(reading)
+    return [_read(name, own, camera) for name, own in members.items()]
+
+
+def _read(name: str, readings: list[Reading], camera: Camera) -> BundleReading:
+    first = np.linalg.inv(readings[0].placed.pose)
+    seen = [(each.placed.corners, each.detection) for each in readings]
+    points = [at @ first[:3, :3].T + first[:3, 3] for at, code in seen if code is not None]
+    corners = [code.corners for _, code in seen if code is not None]
+    facts = name, len(readings), len(corners), readings[0].truth
+    pose = points_pose(np.concatenate(points), np.concatenate(corners), camera) if corners else None
+    if pose is None or not np.isfinite(pose).all():
+        return BundleReading(*facts)
+    return BundleReading(*facts, pose, *pose_error(pose, readings[0].truth))

@@ -1,0 +1,22 @@
+"""The label of an opaque surface of another renderer, where that has the largest weight. No output by itself:
+it changes `label`."""
+
+from typing import Any
+
+import warp as wp
+
+from ..pixel_grid import PixelGrid, sample_at
+from . import Output
+from .heaviest import heaviest_of
+
+
+@wp.func
+def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
+    weight = float(0.0)
+    for k in range(grid.count):
+        weight = wp.max(weight, samples.weight[sample_at(grid, k)])
+    if weight > 0.0 and heaviest_of(grid, samples) < 0:
+        out.label[grid.pixel] = out.layer_label[grid.pixel]
+
+
+OUTPUT = Output(needs=("heaviest",), view_arrays={"layer_label": wp.int32}, resolve=resolve, over="label")

@@ -1,0 +1,69 @@
+"""Kernels that tests compile for processors are hardly optimised: that takes half the time and gives the same
+bits, which tests/compile/test_optimised.py holds. `pytest --optimised` compiles them as users do.
+
+A plugin of pytest, which conftest.py names.
+"""
+
+import gc
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+import fidsplat as fs
+from fidsplat.backends.warp import runtime
+
+_OPENCL = {"PYOPENCL_BUILD_OPTIONS": "-cl-opt-disable"}
+"""read by pyopencl at each build, and by processes that tests start"""
+
+
+def pytest_addoption(parser):
+    words = "compile kernels as users do; without it they are hardly optimised, unless there is a GPU"
+    parser.addoption("--optimised", action="store_true", help=words)
+
+
+def pytest_configure(config):
+    if not config.getoption("--optimised") and not _has_gpu():
+        os.environ.update(_OPENCL)
+        if runtime.installed():
+            config = runtime.load().config
+            # and without its thresholds for inlining. Level 0 compiles in yet half the time, but there
+            # a picture of 320 x 240 pixels takes 3 s
+            config.optimization_level, config.cpu_compiler_flags = 1, "-march=native"
+
+
+def pytest_collection_finish():
+    # Warp makes and drops syntax trees while it compiles: going through all tests' objects each time that the
+    # interpreter looks for garbage would take a sixth of that
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 50)
+
+
+@contextmanager
+def as_users_compile() -> Iterator[None]:
+    """Within it OpenCL kernels are compiled as users have them, and in processes that it starts all are."""
+    kept = {name: os.environ.pop(name) for name in _OPENCL if name in os.environ}
+    try:
+        yield
+    finally:
+        os.environ.update(kept)
+
+
+@pytest.fixture
+def optimised():
+    """For tests of large pictures, which take PoCL longer than to compile: within `as_users_compile`."""
+    with as_users_compile():
+        yield
+
+
+def level() -> str:
+    """How this process compiles kernels."""
+    warp = runtime.load().config.optimization_level if runtime.installed() else None
+    found = (os.environ.get("PYOPENCL_BUILD_OPTIONS"), warp)
+    return "as users have it" if found == (None, None) else "hardly"
+
+
+def _has_gpu() -> bool:
+    return any(info.usable and info.kind == "gpu" for info in fs.devices())

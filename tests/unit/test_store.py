@@ -1,0 +1,386 @@
+"""Stores: built out of core, stopped and gone on with, damaged, placed."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.random_clouds import random_splats
+from fidsplat.rotations import rigid_matrix
+from fidsplat.store import build, plan
+from fidsplat.store.layout import FAR, NODE, NPY_HEADER
+from fidsplat.store.merge import REDUCTION, merged, quaternions_of
+from fidsplat.store.morton import Grid, grid_around
+from tests.full_disk import small_files
+
+COUNT = 9_000
+SMALL = {"chunk": 500, "memory": 1 << 20}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _many_buckets():
+    """Small scenes are cut as large ones are."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plan, "_LEAST_MEMORY", 0)
+        patch.setattr(build, "_NOTED", 3)
+        yield
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Two files: with SH of degree 1 and planes, and with labels and 3D Gaussians."""
+    folder = tmp_path_factory.mktemp("splats")
+    first = random_splats(COUNT, 1, sh_degree=1).with_labels(0)
+    first = first.with_planes(np.where(np.arange(COUNT) % 1000 < 3, np.arange(COUNT) // 3000, -1))
+    fs.save_ply(first, folder / "a.ply")
+    other = random_splats(COUNT, 2)
+    thick = np.where(np.arange(COUNT) % 2, 0.01, 0.0)[:, None]
+    other = fs.SplatCloud(
+        other.means + np.array([5.0, 0, 0]),
+        other.quats,
+        np.hstack([other.scales, thick]),
+        other.opacities,
+        colors=other.colors,
+        labels=other.labels,
+    )
+    fs.save_ply(other, folder / "b.ply")
+    return [folder / "a.ply", folder / "b.ply"]
+
+
+@pytest.fixture(scope="module")
+def store(files, tmp_path_factory):
+    return fs.Store(fs.build_store(files, tmp_path_factory.mktemp("store") / "both.fss", **SMALL))
+
+
+def contents(folder):
+    return {file.name: file.read_bytes() for file in folder.iterdir()}
+
+
+def sorted_by_place(cloud):
+    order = np.lexsort((*cloud.means.T, cloud.opacities))
+    arrays = ("means", "quats", "scales", "opacities", "sh", "labels", "thickness")
+    return {name: getattr(cloud, name)[order] for name in arrays}
+
+
+def test_a_store_holds_the_splats_of_its_files_and_nothing_else(files, store):
+    made, given = store.cloud(), fs.SplatCloud.concatenate([fs.load_ply(file) for file in files])
+    assert len(store) == len(given) == 2 * COUNT
+    assert store.ellipsoids == "some"
+    assert store.sh_degree == 1
+    ours, theirs = sorted_by_place(made), sorted_by_place(given)
+    for name, array in theirs.items():
+        assert np.array_equal(ours[name], array), name
+    # planes of both files stay apart, and stand last
+    assert np.array_equal(np.unique(made.planes), np.unique(given.planes))
+    assert (made.planes[store.header.pinned :] >= 0).all()
+    assert (made.planes[: store.header.pinned] < 0).all()
+
+
+def test_neighbours_stand_near_each_other(store):
+    chunks = store.nodes[store.nodes["level"] == 0]
+    assert chunks["count"].max() <= 500
+    assert chunks["count"].sum() == len(store)
+    sides = (chunks["high"] - chunks["low"]).prod(axis=1)
+    low, high = store.bounds()
+    assert np.median(sides) < np.prod(high - low) / 20
+
+
+@pytest.mark.parametrize("sigmas", [0.0, 2.0, 5.0, 9.0])
+def test_boxes_hold_their_splats(store, sigmas):
+    low, high = store.boxes(sigmas)
+    for number in range(len(store.nodes)):
+        part = store.load(number)
+        reach = sigmas * np.maximum(part["scales"].max(axis=1), part["thickness"])[:, None]
+        assert (part["means"] - reach >= low[number] - 1e-12).all()
+        assert (part["means"] + reach <= high[number] + 1e-12).all()
+
+
+def test_every_node_stands_for_the_four_below_it(store):
+    nodes, inner = store.nodes, store.nodes["level"] > 0
+    pinned = (nodes["level"] == 0) & (nodes["first"] >= store.header.pinned)
+    roots = np.flatnonzero((nodes["parent"] < 0) & ~pinned)
+    assert len(roots) == 1
+    assert nodes["level"][roots[0]] == nodes["level"].max()
+    assert (nodes["parent"][pinned] < 0).all()
+    for number in np.flatnonzero(inner):
+        children = nodes[nodes["parent"] == number]
+        assert 1 <= len(children) <= REDUCTION
+        assert (children["level"] == nodes["level"][number] - 1).all()
+        assert nodes["count"][number] <= max(1, children["count"].sum() // REDUCTION)
+        for name, furthest in (("size", np.max), ("reach", np.max), ("high", np.max), ("far_high", np.max)):
+            assert (nodes[name][number] >= furthest(children[name], axis=0)).all()
+        assert (nodes["far_low"][number] <= children["far_low"].min(axis=0)).all()
+
+
+def test_merged_splats_have_the_light_and_the_place_of_those_they_stand_for():
+    generator = np.random.default_rng(3)
+    means = generator.normal(0, 0.2, (400, 3)).astype(np.float32) * [1, 1, 0]
+    turns = np.tile(np.float32([1, 0, 0, 0]), (400, 1))
+    scales = np.full((400, 2), 0.01, np.float32)
+    splats = {"means": means.astype(np.float32), "quats": turns, "scales": scales}
+    splats |= {"opacities": np.full(400, 0.1, np.float32), "colors": generator.random((400, 3), np.float32)}
+    made, size = merged(splats, Grid((-4.0, -4.0, -4.0), 8.0))
+    assert 1 < len(made["means"]) <= 100
+    assert size > 0
+    light = (made["opacities"] * made["scales"].prod(axis=1)).astype(np.float64)
+    assert light.sum() == pytest.approx(400 * 0.1 * 1e-4, rel=1e-5)
+    assert np.average(made["means"], axis=0, weights=light) == pytest.approx(means.mean(axis=0), abs=1e-6)
+    assert np.average(made["colors"], axis=0, weights=light) == pytest.approx(splats["colors"].mean(axis=0))
+    # flat as they are, and as wide: the mean square along x is that of the splats
+    spread = made["scales"].max(axis=1) ** 2
+    assert (np.abs(fs.SplatCloud(**made).reach(1.0)[:, 2]) < 1e-6).all()
+    assert spread.max() < size**2
+
+
+def test_quaternions_of_many_rotations():
+    quats = np.random.default_rng(0).normal(size=(200, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    from fidsplat.rotations import quaternion_to_matrix
+
+    again = quaternions_of(quaternion_to_matrix(quats))
+    assert np.abs((again * quats).sum(axis=1)) == pytest.approx(1)
+
+
+def test_codes_follow_the_bits_of_the_cells():
+    grid = Grid((0.0, 0.0, 0.0), 1.0)
+    cells = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0], [1 << 20, 1 << 20, 1 << 20]])
+    codes = grid.codes((cells + 0.5) / (1 << 21))
+    assert codes.tolist() == [1, 2, 4, 8, 7 << 60]
+    assert (
+        grid.codes(np.array([[-5.0, 2.0, np.nextafter(1, 0)]])).tolist()
+        == grid.codes(np.array([[0.0, 0.9999999, 0.9999999]])).tolist()
+    )
+    assert grid_around(np.zeros((0, 3), np.float32)).side > 0
+
+
+class Stopped(Exception):
+    pass
+
+
+STOPS = [("reading splats", 1), ("sorting", 3), ("level of detail 1", 5), ("level of detail 2", 2)]
+
+
+@pytest.mark.parametrize(("words", "after"), STOPS)
+def test_a_build_that_is_stopped_goes_on(files, store, tmp_path, words, after):
+    calls = []
+
+    def stop(what, share):
+        calls.extend([what] * (what == words))
+        if len(calls) == after:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        fs.build_store(files, tmp_path / "both.fss", progress=stop, **SMALL)
+    assert not (tmp_path / "both.fss").exists()
+    again = []
+    fs.build_store(files, tmp_path / "both.fss", progress=lambda what, share: again.append(what), **SMALL)
+    assert contents(tmp_path / "both.fss") == contents(store.path)
+    assert list(tmp_path.iterdir()) == [tmp_path / "both.fss"]
+    if words != "reading splats":
+        assert "reading splats" not in again
+
+
+def test_what_is_begun_from_other_files_is_begun_anew(files, store, tmp_path):
+    def stop(what, share):
+        if what == "sorting":
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        fs.build_store(files[:1], tmp_path / "both.fss", progress=stop, **SMALL)
+    fs.build_store(files, tmp_path / "both.fss", **SMALL)
+    assert contents(tmp_path / "both.fss") == contents(store.path)
+
+
+def test_a_full_disk_is_said_and_gone_on_with(files, store, tmp_path):
+    with (
+        small_files(100_000),
+        pytest.raises(fs.InputError, match="make room, then give the same command again"),
+    ):
+        fs.build_store(files, tmp_path / "both.fss", **SMALL)
+    assert not (tmp_path / "both.fss").exists()
+    fs.build_store(files, tmp_path / "both.fss", **SMALL)
+    assert contents(tmp_path / "both.fss") == contents(store.path)
+
+
+def test_a_disk_without_room_is_said_first(files, tmp_path, monkeypatch):
+    monkeypatch.setattr(build.shutil, "disk_usage", lambda folder: type("", (), {"free": 10_000})())
+    with pytest.raises(fs.InputError, match="make room, or build elsewhere"):
+        fs.build_store(files, tmp_path / "both.fss", **SMALL)
+
+
+def test_a_file_that_lies_about_its_count_builds_nothing(files, tmp_path):
+    content = files[0].read_bytes()
+    liar = tmp_path / "liar.ply"
+    liar.write_bytes(content.replace(b"element vertex 9000", b"element vertex 9001"))
+    with pytest.raises(fs.InputError, match="cut short"):
+        fs.build_store([liar], tmp_path / "liar.fss")
+    assert list(tmp_path.iterdir()) == [liar]
+
+
+def copied(store, tmp_path):
+    folder = tmp_path / "copy.fss"
+    folder.mkdir()
+    for name, content in contents(store.path).items():
+        (folder / name).write_bytes(content)
+    return folder
+
+
+@pytest.mark.parametrize(("column", "row"), [("means", 0), ("sh", 700), ("labels", 2 * COUNT - 1)])
+def test_a_flipped_bit_is_found_and_its_chunk_named(store, tmp_path, column, row):
+    folder = copied(store, tmp_path)
+    file, content = folder / f"{column}.npy", bytearray((folder / f"{column}.npy").read_bytes())
+    size = np.load(file, mmap_mode="r")[0].nbytes
+    content[NPY_HEADER + row * size + 1] ^= 4
+    file.write_bytes(content)
+    wrong = fs.Store(folder).verify()
+    ends = store.nodes["first"] + store.nodes["count"]
+    chunk = int(np.flatnonzero((store.nodes["first"] <= row) & (row < ends))[0])
+    assert len(wrong) == 1
+    assert wrong[0].startswith(f"chunk {chunk}, rows ")
+    assert store.verify() == []
+
+
+def test_what_is_no_whole_store_is_refused(store, tmp_path):
+    def refused(match):
+        with pytest.raises(fs.InputError, match=match):
+            fs.Store(folder)
+
+    folder = tmp_path / "none.fss"
+    refused("there is no such folder")
+    folder = copied(store, tmp_path)
+    whole = contents(folder)
+    for name in whole:
+        (folder / name).unlink()
+        refused("no store.json|cannot read")
+        (folder / name).write_bytes(whole[name][: len(whole[name]) * 2 // 3])
+        refused("damaged|cut short")
+        (folder / name).write_bytes(whole[name])
+    header = json.loads(whole["store.json"])
+    for change, match in [
+        ({"version": 2}, "a store of version 2, and this fidsplat reads version 1"),
+        ({"format": "zip"}, "of another kind"),
+        ({"rows": -1}, "out of range"),
+        ({"rows": header["rows"] + 1}, "cut short"),
+        ({"columns": {"means": "<f4"}}, "no column"),
+        ({"nodes_crc": 1}, "checksum"),
+        ({"origin": [0, 0]}, "origin"),
+    ]:
+        (folder / "store.json").write_text(json.dumps(header | change))
+        refused(match)
+    (folder / "store.json").write_bytes(whole["store.json"])
+    nodes = np.load(folder / "nodes.npy")
+    assert nodes.dtype == NODE
+    nodes["count"][0] += 1
+    np.save(folder / "nodes.npy", nodes)
+    refused("its checksum is another")
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"chunk": 3}, "chunk is 3"),
+        ({"memory": "2"}, "memory is '2'"),
+        ({"colors": "uint8"}, "known: float32, float16"),
+        ({"sh_degree": 4}, "sh_degree is 4"),
+    ],
+)
+def test_numbers_that_make_no_store(files, tmp_path, options, match):
+    with pytest.raises(fs.InputError, match=match):
+        fs.build_store(files, tmp_path / "a.fss", **options)
+
+
+def test_names_that_make_no_store(files, store, tmp_path):
+    with pytest.raises(fs.InputError, match="no name for a store"):
+        fs.build_store(files, tmp_path / "a.ply")
+    with pytest.raises(fs.InputError, match="give one at least"):
+        fs.build_store([], tmp_path / "a.fss")
+    with pytest.raises(fs.InputError, match="--overwrite"):
+        fs.build_store(files, store.path)
+    folder = copied(store, tmp_path)
+    fs.build_store(files[1:], folder, overwrite=True, **SMALL)
+    assert len(fs.Store(folder)) == COUNT
+
+
+def test_colours_are_kept_as_asked(files, store, tmp_path):
+    half = fs.Store(fs.build_store(files, tmp_path / "half.fss", colors="float16", **SMALL))
+    error = np.abs(half.cloud().sh - store.cloud().sh).max()
+    assert half.cloud().sh.dtype == np.float32
+    assert 0 < error < 2e-3
+    assert half.header.columns["sh"] == "<f2"
+    assert half.nbytes < 0.8 * store.nbytes
+    plain = fs.Store(fs.build_store(files, tmp_path / "plain.fss", sh_degree=0, levels=False, **SMALL))
+    assert plain.sh_degree == -1
+    assert (plain.nodes["level"] == 0).all()
+    kept = fs.harmonics.C0 * store.cloud().sh[:, 0] + 0.5
+    assert plain.cloud().colors == pytest.approx(np.maximum(kept, 0), abs=1e-6)
+
+
+def test_a_store_of_places_has_the_splats_as_many_times(store, files, tmp_path):
+    flat = fs.Store(fs.build_store(files[1:], tmp_path / "one.fss", **SMALL))
+    with pytest.raises(fs.InputError, match="printed on planes"):
+        fs.place_store(store, tmp_path / "p.fss", [np.eye(4)])
+    poses = [np.eye(4), rigid_matrix((30, 1, 2), (1, 0.2, -0.5, 0.1))]
+    street = fs.Store(fs.place_store(flat, tmp_path / "street.fss", poses))
+    assert len(street) == 2 * len(flat)
+    assert street.chunks == 2 * flat.chunks
+    cloud, moved = street.cloud(), flat.cloud().transformed(poses[1])
+    assert np.array_equal(cloud.means[: len(flat)], flat.cloud().means)
+    assert cloud.means[len(flat) :] == pytest.approx(moved.means, abs=1e-5)
+    assert np.abs((cloud.quats[len(flat) :] * moved.quats).sum(axis=1)) == pytest.approx(1, abs=1e-6)
+    low, high = street.boxes(FAR)
+    for number in range(2 * len(flat.nodes)):
+        part, one = street.load(number), number % len(flat.nodes)
+        reach = FAR * np.maximum(part["scales"].max(axis=1), part["thickness"])[:, None]
+        assert (part["means"] - reach >= low[number]).all()
+        assert (part["means"] + reach <= high[number]).all()
+        if flat.nodes["level"][one] == 0:
+            first = int(street.first_of(np.array([number]))[0])
+            assert np.array_equal(cloud.means[first : first + len(part["means"])], part["means"])
+    with pytest.raises(fs.InputError, match="store of places itself"):
+        fs.place_store(street, tmp_path / "q.fss", poses)
+    with pytest.raises(fs.InputError, match="pose 1 must be rigid"):
+        fs.place_store(flat, tmp_path / "q.fss", [np.eye(4), np.diag([2.0, 2, 2, 1])])
+    with pytest.raises(fs.InputError, match="one at least"):
+        fs.place_store(flat, tmp_path / "q.fss", [])
+    fs.build_store(files[1:], flat.path, overwrite=True, chunk=400, memory=1 << 20)
+    with pytest.raises(fs.InputError, match="place the store again"):
+        fs.Store(street.path)
+
+
+def test_sh_turns_with_its_splats(store, files, tmp_path):
+    from fidsplat.store.part import moved
+
+    part = store.load(0)
+    pose = rigid_matrix((1, 2, 3), (0.3, 0.1, -0.7, 0.2))
+    turned = moved(part, pose, pose[:3, 3])
+    cloud = fs.SplatCloud(
+        part["means"], part["quats"], part["scales"], part["opacities"], sh=part["sh"]
+    ).transformed(pose)
+    assert turned["sh"] == pytest.approx(cloud.sh, abs=1e-5)
+    few = moved({name: array[7:9] for name, array in part.items()}, pose, pose[:3, 3])
+    assert all(np.array_equal(few[name], turned[name][7:9]) for name in few)
+
+
+def test_what_cannot_be_drawn_is_left_out_and_counted(tmp_path):
+    cloud = random_splats(3000, 5)
+    fs.save_ply(cloud, tmp_path / "a.ply")
+    content = bytearray((tmp_path / "a.ply").read_bytes())
+    row = (len(content) - content.index(b"end_header\n") - 11) // 3000
+    content[-row : -row + 4] = np.float32(math.nan).tobytes()
+    (tmp_path / "a.ply").write_bytes(content)
+    store = fs.Store(fs.build_store([tmp_path / "a.ply"], tmp_path / "a.fss", **SMALL))
+    assert len(store) == 2999
+    assert store.header.dropped == {"means not finite": 1}
+    assert store.ellipsoids == "none"
+    assert "thickness" not in store.header.columns
+
+
+def test_an_empty_file_makes_an_empty_store(tmp_path):
+    fs.save_ply(fs.SplatCloud.empty(), tmp_path / "none.ply")
+    store = fs.Store(fs.build_store([tmp_path / "none.ply"], tmp_path / "none.fss"))
+    assert len(store) == 0
+    assert len(store.cloud()) == 0
+    assert store.verify() == []
+    assert "splats" in store.summary()

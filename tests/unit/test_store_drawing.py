@@ -1,0 +1,208 @@
+"""Pictures of stores: what a view does not see is not read, and the picture is that of all splats in memory,
+bit for bit."""
+
+import math
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.backends.prepare import prepare
+from fidsplat.backends.seen import seen
+from fidsplat.random_clouds import random_splats
+from fidsplat.rotations import rigid_matrix
+from fidsplat.store import plan
+from fidsplat.store.sources import source_of
+from fidsplat.store.streamed import Streamed
+from tests.unit.test_store import contents
+
+COUNT = 3000
+SIZE = 40, 30
+
+
+def splats(seed, thick=False, sh_degree=None):
+    """Small splats on all sides of the origin."""
+    cloud = random_splats(COUNT, seed, depth=(-4, 4), scale=(3e-3, 0.1), across=4.0, sh_degree=sh_degree)
+    if not thick:
+        return cloud
+    scales = np.column_stack([cloud.scales, np.where(np.arange(COUNT) % 2, cloud.scales[:, 0], 0)])
+    return fs.SplatCloud(cloud.means, cloud.quats, scales, cloud.opacities, colors=cloud.colors)
+
+
+def made_store(folder, cloud, name):
+    source = source_of(cloud, folder / name, "test")
+    return fs.Store(fs.build_store([source], folder / f"{name}.fss", chunk=64))
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stores")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plan, "_LEAST_MEMORY", 0)
+        clouds = {"disks": splats(1), "thick": splats(2, thick=True), "sh": splats(3, sh_degree=2)}
+        return {name: made_store(folder, cloud, name) for name, cloud in clouds.items()}
+
+
+def look(fov=60.0, turn=(1.0, 0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0), **given):
+    camera = fs.Camera.look_at(*SIZE, math.radians(fov), position=(0, 0, 0), target=(0, 0, 1))
+    pose = np.linalg.inv(rigid_matrix(at, turn))
+    focal = given.pop("focal", camera.fx)
+    center = given.pop("center", (SIZE[0] / 2, SIZE[1] / 2))
+    return fs.Camera.pinhole(*SIZE, focal, focal, *center, pose, **given)
+
+
+TURNED = (0.8, 0.1, -0.5, 0.2)
+CAPTURES = {
+    "pinhole": fs.Capture(look(turn=TURNED)),
+    "off-centre": fs.Capture(look(center=(-30.0, 50.0), turn=TURNED)),
+    "near and far": fs.Capture(look(90, near=0.5, far=2.0)),
+    "no low-pass": fs.Capture(look(at=(2, 1, -1), turn=TURNED), quality="lowpass=none"),
+    "high cut-off": fs.Capture(look(turn=TURNED), quality="gsplat"),
+    "samples": fs.Capture(look(), quality="samples=2"),
+    "pixel": fs.Capture(look(turn=TURNED), quality="lowpass=pixel"),
+    "distorted": fs.Capture(look(turn=TURNED, lens=fs.BrownConrady(k1=-0.2, k2=0.02, p1=0.01))),
+    "fisheye": fs.Capture(look(focal=16.0, turn=TURNED, lens=fs.Fisheye())),
+    "wide fisheye": fs.Capture(look(focal=9.0, lens=fs.Fisheye(k1=0.05))),
+    "panorama": fs.Capture(look(focal=SIZE[0] / (2 * math.pi), near=0.5, far=3.0, lens=fs.Equirectangular())),
+    "parallel": fs.Capture(look(focal=20.0, turn=TURNED, lens=fs.Orthographic())),
+    "exposure": fs.Capture(
+        look(), motion=fs.Motion(lambda t: rigid_matrix((0, 0, 0), (1, 0, t, 0))),
+        shutter=fs.Shutter(exposure_time=0.4, sub_poses=3),
+    ),
+    "groups": fs.Capture(
+        look(turn=TURNED), motion=fs.Motion(groups={3: lambda t: rigid_matrix((3, 2, 1), (1, 1, 0, 0))})
+    ),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def reference():
+    return fs.Renderer("reference")
+
+
+@pytest.mark.parametrize("name", CAPTURES)
+def test_views_are_drawn_of_what_they_see(stores, reference, name):
+    kinds = ["thick"] if name in ("pinhole", "off-centre", "fisheye") else []
+    for kind in ["disks", *kinds]:
+        store, capture = stores[kind], CAPTURES[name].with_(outputs=("rgb", "splat_id", "label"))
+        streamed = reference.upload(store)
+        ours, whole = reference.render(streamed, capture), reference.render(store.cloud(), capture)
+        for output in ours:
+            assert np.array_equal(ours[output], whole[output]), output
+        assert whole["rgb"].any()
+        read, every = streamed._data.nodes, store.chunks
+        assert 0 < read <= every
+        if name in ("pinhole", "distorted"):
+            assert read < 0.75 * every
+
+
+def test_a_box_around_each_splat_is_seen_where_the_splat_is(stores, reference):
+    """What is left out shows nowhere: splat by splat."""
+    cloud = stores["thick"].cloud()
+    for name in ("pinhole", "off-centre", "near and far", "distorted", "fisheye", "parallel"):
+        capture = CAPTURES[name]
+        features, view = prepare(cloud, capture)
+        largest = np.maximum(cloud.scales.max(axis=1), cloud.thickness).astype(np.float64)
+
+        def boxes(sigmas, largest=largest):
+            return cloud.means - sigmas * largest[:, None], cloud.means + sigmas * largest[:, None]
+
+        left_out = ~seen(view, features, boxes, largest)
+        assert left_out.mean() > 0.2
+        rest = np.flatnonzero(left_out)
+        arrays = {n: getattr(cloud, n)[rest] for n in ("means", "quats", "opacities", "colors")}
+        scales = np.column_stack([cloud.scales, cloud.thickness])[rest]
+        unseen = fs.SplatCloud(scales=scales, **arrays)
+        assert not reference.render(unseen, capture, outputs=("alpha",))["alpha"].any(), name
+
+
+def test_a_device_draws_stores_bit_for_bit(stores, tmp_path):
+    renderer = fs.Renderer("opencl")
+    for kind in ("disks", "sh"):
+        store = stores[kind]
+        poses = [np.eye(4), rigid_matrix((9, 0, 1), (1, 0, 0.3, 0))]
+        for one in (store, fs.Store(fs.place_store(store, tmp_path / f"{kind}.fss", poses))):
+            cloud, resident = one.cloud(), renderer.upload(one)
+            cameras = [look(), look(turn=TURNED), look(at=(9, 0, 0)), look()]
+            frames = renderer.render_views(resident, cameras)
+            for camera, frame in zip(cameras, frames, strict=True):
+                assert np.array_equal(frame["rgb"], renderer.render(cloud, camera)["rgb"])
+            batch = renderer.render_batch(resident, cameras[:3])
+            for number, camera in enumerate(cameras[:3]):
+                assert np.array_equal(batch["rgb"][number], renderer.render(cloud, camera)["rgb"])
+
+
+def test_nothing_is_transferred_for_the_same_part(stores, reference, monkeypatch):
+    uploads = []
+    upload = reference.backend.upload
+    monkeypatch.setattr(
+        reference.backend, "upload", lambda cloud: uploads.append(len(cloud)) or upload(cloud)
+    )
+    resident = reference.upload(stores["disks"])
+    assert uploads == []
+    assert len(resident) == COUNT
+    for _ in range(2):
+        reference.render(resident, look())
+    assert len(uploads) == 1
+    assert uploads[0] < COUNT
+
+
+def test_scenes_hold_stores_beside_markers_and_clouds(stores, reference, tmp_path):
+    marker = fs.marker("apriltag:36h11:5", size=0.4, mixture="exact")
+    placed = fs.scenes.PlacedMarker(marker, rigid_matrix((0, 0, 1.5)))
+    other = random_splats(50, 8, depth=(1.0, 2.0), scale=(0.02, 0.1), across=0.5)
+    far = fs.SplatCloud(
+        other.means, other.quats, other.scales, other.opacities, colors=other.colors, origin=(0.25, 0, 0)
+    )
+    scene = fs.Scene([far], look(), (placed,), stores=(stores["sh"],))
+    ours = reference.render(scene, outputs=("rgb", "label", "splat_id"))
+    whole = reference.render(scene.cloud(), scene.camera, outputs=("rgb", "label", "splat_id"))
+    for output in ours:
+        assert np.array_equal(ours[output], whole[output]), output
+    assert (ours["label"] == 1).any()
+    # behind the scene there is nothing but what every picture has
+    away = look(at=(0, 0, 50))
+    assert len(np.unique(reference.render(scene, away)["rgb"])) == 1
+    scene.save(tmp_path / "scene.toml")
+    again = fs.Scene.load(tmp_path / "scene.toml")
+    assert again.stores[0].identity == stores["sh"].identity
+    assert len(again.clouds) == 1
+    assert "store" in str(again.summary())
+    text = (tmp_path / "scene.toml").read_text().replace("[[splats]]", "[[splats]]\nscale = 2.0")
+    (tmp_path / "scene.toml").write_text(text)
+    with pytest.raises(fs.InputError, match="store place"):
+        fs.Scene.load(tmp_path / "scene.toml")
+
+
+def test_planes_of_stores_are_always_whole(tmp_path, reference):
+    marker = fs.marker("apriltag:36h11:5", size=0.4, mixture="fitted").cloud.transformed(
+        rigid_matrix((0, 0, 2))
+    )
+    cloud = fs.SplatCloud.concatenate([marker, random_splats(500, 4, depth=(1.5, 4), scale=(0.01, 0.05))])
+    store = made_store(tmp_path, cloud, "tag")
+    near = look(5, at=(0.19, 0.19, 1.0))
+    ours, whole = (reference.render(each, near)["rgb"] for each in (store, store.cloud()))
+    assert np.array_equal(ours, whole)
+    selection = Streamed([store]).select(
+        [prepare(store, fs.Capture(look(at=(0, 0, 90))))[1]], prepare(store, fs.Capture(near))[0]
+    )
+    part, ids = Streamed([store]).part(selection)
+    assert len(part) == len(marker)
+    assert ids.tolist() == list(range(len(store) - len(marker), len(store)))
+
+
+def test_a_flight_over_a_store_goes_on_by_its_content(stores, tmp_path):
+    from fidsplat.flights import Flight
+
+    path = fs.Trajectory([0.0, 1.0], [np.eye(4), rigid_matrix((0, 0, 1))])
+
+    def key(store):
+        return Flight(fs.Scene(stores=(store,), camera=look()), path, [0.0, 1.0], fs.Capture(look())).key(
+            "device"
+        )
+
+    copy = tmp_path / "copy.fss"
+    copy.mkdir()
+    for name, content in contents(stores["disks"].path).items():
+        (copy / name).write_bytes(content)
+    assert key(fs.Store(copy)) == key(stores["disks"]) != key(stores["sh"])
