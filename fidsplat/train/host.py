@@ -11,7 +11,7 @@ from fidsplat.backends.base import Backend, Images, ResidentData
 from fidsplat.cameras import Camera
 from fidsplat.train import mcmc
 from fidsplat.train.dataset import TrainingView
-from fidsplat.train.losses import Loss, picture_loss
+from fidsplat.train.losses import Loss, normal_loss, picture_loss
 from fidsplat.train.optimiser import adam_step, inner_gradients, moved_by, sparse_adam_step
 from fidsplat.train.parameters import Splats
 from fidsplat.train.settings import TrainSettings
@@ -48,6 +48,22 @@ class HostWork:
         truth = of.picture * np.float32(1 / 255)
         loss, slope = picture_loss(images.read("rgb"), truth, of.mask, self._settings.dssim_weight)
         return lambda: loss, slope
+
+    def surface(self, images: Images, view: int, weights: tuple[float, float]) -> dict[str, np.ndarray]:
+        """Derivatives by depths, normals and distortions; weights: of normals and of distortions."""
+        of = self._views[view]
+        counts = np.ones(of.picture.shape[:2], np.float32) if of.mask is None else of.mask.astype(np.float32)
+        read = {name: images.read(name) for name in ("depth", "normal", "alpha")}
+        camera = of.camera
+        _, by_depth, by_normal = normal_loss(
+            read["depth"],
+            read["normal"],
+            weights[0] * counts * read["alpha"],
+            (camera.fx, camera.fy),
+            (camera.cx, camera.cy),
+        )
+        by_distortion = counts * np.float32(weights[1] / counts.size)
+        return {"depth": by_depth, "normal": by_normal, "distortion": by_distortion}
 
     def count(self, gradients: Mapping[str, Any], camera: Camera, origin: np.ndarray) -> None:
         """Adds the gradients on the screen to their sums."""

@@ -55,7 +55,7 @@ MAY_IMPORT = {
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
     "train": PLAIN | {"formats", "vision", "render", "backends", "effects"},
     "detail": PLAIN | {"store", "render", "backends", "accuracy"},
-    "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
+    "budget": PLAIN | {"store", "scenes", "render", "accuracy", "provenance", "timing"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__", "__main__"}
 
