@@ -59,8 +59,8 @@ def flown(folder: Path) -> tuple[str, str]:
 class TrainingRun:
     """The splats of a training run, by its checkpoint, which grows while the run goes on."""
 
-    def __init__(self, file: Path) -> None:
-        self.file = file
+    def __init__(self, file: Path, quality: str | None = None) -> None:
+        self.file, self._quality = file, quality
         self._seen = self._stamp()
         self.scene = self._load()
 
@@ -80,7 +80,7 @@ class TrainingRun:
         from fidsplat.train import splats_of
 
         cloud, background = splats_of(self.file)
-        return Scene((cloud,), camera=framing_camera(cloud), background=background)
+        return Scene((cloud,), camera=framing_camera(cloud), background=background, quality=self._quality)
 
     def _stamp(self) -> tuple[int, int] | None:
         try:

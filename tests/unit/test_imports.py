@@ -53,9 +53,9 @@ MAY_IMPORT = {
     "sim": PLAIN | {"batch", "scenes", "markers", "render", "vision", "formats"},
     "logs": BASE | {"cameras", "vision"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
-    "train": PLAIN | {"formats", "vision", "render", "backends", "effects"},
+    "train": PLAIN | {"formats", "markers", "vision", "render", "backends", "effects"},
     "detail": PLAIN | {"store", "render", "backends", "accuracy"},
-    "budget": PLAIN | {"scenes", "render", "accuracy", "provenance", "timing"},
+    "budget": PLAIN | {"store", "scenes", "render", "accuracy", "provenance", "timing"},
 }
 ANYTHING = {"cli", "commands", "experiments", "__init__", "__main__"}
 

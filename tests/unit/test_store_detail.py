@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
+from fidsplat.accuracy import truth
 from fidsplat.backends.prepare import prepare
 from fidsplat.detail import SIZES, cameras_around, errors_of, measure_detail
 from fidsplat.store import plan
@@ -182,6 +183,18 @@ def test_a_city_is_the_same_however_it_is_read():
     camera, path = flight(city)
     assert camera.width == 1280
     assert path.times[-1] == 8.0
+
+
+def test_a_budget_of_error_turns_detail_too(store, renderer):
+    measure_detail(store, renderer, views=6)
+    capture = fs.Capture(seen_from(1500.0), quality="lowpass=pixel")
+    quality = fs.quality_within(error=0.08, scene=fs.Store(store.path), capture=capture, device=renderer)
+    assert quality.detail_error == 0.04
+    exact = truth(renderer, store, capture.with_(quality=quality))
+    frame = renderer.render(fs.Store(store.path), capture, quality=quality)
+    assert np.abs(frame["rgb"] - exact).max() <= 0.08
+    assert frame.stats["splats"] < len(store)
+    assert np.array_equal(exact, truth(renderer, store.cloud(), capture))
 
 
 def test_a_cloud_in_memory_knows_no_detail(renderer):

@@ -10,7 +10,7 @@ from training_scene import BACKGROUND, QUICK, scene
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.commands.runs import TrainingRun, checkpoint_of
-from fidsplat.commands.view import View
+from fidsplat.commands.view import Shown, View
 from fidsplat.train import Trainer, splats_of
 
 SCENE = (
@@ -32,12 +32,25 @@ def flight(tmp_path, monkeypatch):
 
 def test_a_flight_is_its_scene_and_its_poses(flight, monkeypatch):
     monkeypatch.chdir(flight.parent)  # the scene is found from wherever one stands
-    source, poses, run = View("one")._shown()
-    assert run is None
-    assert os.path.samefile(source, "../scene.toml")
-    assert len(fs.load_trajectory(poses)) == 1
-    assert View("one", trajectory="other.tum")._shown()[1] == "other.tum"
-    assert View("../scene.toml")._shown() == ("../scene.toml", None, None)
+    shown = View("one")._shown()
+    assert shown.run is None
+    assert os.path.samefile(shown.source, "../scene.toml")
+    assert len(fs.load_trajectory(shown.trajectory)) == 1
+    assert View("one", trajectory="other.tum")._shown().trajectory == "other.tum"
+    assert View("../scene.toml")._shown() == Shown("../scene.toml", None)
+
+
+def test_without_a_scene_the_demo_is_shown():
+    scene = View()._shown().scene("fast", lambda words, share: None)
+    assert [placed.marker.kind for placed in scene.markers] == ["apriltag", "aruco", "qr"]
+    assert scene.capture.quality == fs.Quality.named("fast")
+
+
+def test_a_splat_file_is_shown_by_the_quality_that_is_given(tmp_path):
+    file = tmp_path / "a.ply"
+    fs.save_ply(fs.marker("aruco:4x4_50:7", size=0.4).gaussians, file)
+    scene = View(str(file))._shown().scene("samples=2", lambda words, share: None)
+    assert scene.capture.quality.samples == 2
 
 
 def test_what_is_no_run_is_said(flight, capsys):
@@ -76,11 +89,12 @@ def test_a_checkpoint_holds_what_is_drawn(trainer):
 def test_a_training_is_shown_as_it_grows(trainer):
     folder = trainer.checkpoint.parent
     for source in (folder, trainer.checkpoint):
-        _, _, run = View(str(source))._shown()
+        run = View(str(source), quality="fast")._shown().run
         assert isinstance(run, TrainingRun)
         assert run.file == trainer.checkpoint
     first = run.scene
     assert first.capture.background == BACKGROUND
+    assert first.capture.quality == fs.Quality.named("fast")
     assert run.again() is None
     trainer.step()
     trainer.save_checkpoint()
