@@ -157,9 +157,9 @@ class Fly:
         self, flight: Flight, budget: int | None, where: Console
     ) -> Iterator[tuple[str, Callable[[FlightFolder], Iterator[int]]]]:
         """What draws, in words, and how it draws what is left of a flight."""
-        from fidsplat.render import Renderer
+        from fidsplat.render import Renderer, default_device
 
-        device = self.device or flight.scene.device
+        device = self.device or flight.scene.device or default_device()
         if self.ray is None:
             with where.status("opening the device"):
                 renderer = Renderer(device, budget)
