@@ -21,7 +21,7 @@ from fidsplat.random_clouds import SCENES, random_cloud, standard_camera
 from fidsplat.rotations import matrix_to_quaternion
 from fidsplat.viewer.server import JPEG
 from fidsplat.viewer.session import Session
-from fidsplat.viewer.settings import AT_REST, Viewpoint
+from fidsplat.viewer.settings import Viewpoint
 from fidsplat.viewer.stream import Stream
 from fidsplat.vision.images import to_uint8
 
@@ -65,13 +65,13 @@ def measured(session: Session, start: Viewpoint, rate: float, seconds: float) ->
     latencies, sizes, scales, asked = [], [], [], 0.0
 
     def moving(viewpoint: Viewpoint, scale: float) -> None:
-        rgb = to_uint8(session.draw(viewpoint, scale).frame["rgb"])
+        rgb = to_uint8(session.draw_moving(viewpoint, scale)["rgb"])
         sizes.append(len(cv2.imencode(".jpg", rgb, [cv2.IMWRITE_JPEG_QUALITY, JPEG])[1]))
         scales.append(scale)
         latencies.append(time.perf_counter() - asked)
 
     def rest(viewpoint: Viewpoint) -> None:
-        cv2.imencode(".png", to_uint8(session.draw(viewpoint, 1.0, AT_REST).frame["rgb"]))
+        cv2.imencode(".png", to_uint8(session.draw(viewpoint).frame["rgb"]))
 
     stream = Stream(moving, rest, rate=rate)
     for warm in range(10):  # the scale finds its place

@@ -83,6 +83,7 @@ def full_precision(capture: Capture, renderer: Renderer) -> Capture:
     """
     best = capture.quality.with_(
         alpha_cutoff=TRUTH_CUTOFF,
+        detail_error=0.0,
         transmittance_stop=0.0,
         opacity_ceiling=1.0,
         stop_rule="inclusive",

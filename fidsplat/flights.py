@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
+import os
 import pickle
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +19,7 @@ from fidsplat.capture import Capture
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write, path_of, writable_folder
 from fidsplat.formats import save_trajectory
+from fidsplat.provenance import digest_of
 from fidsplat.render import Renderer
 from fidsplat.scalars import real_array
 from fidsplat.scenes import Scene
@@ -74,28 +75,14 @@ class Flight:
 
     def key(self, device: str) -> str:
         """16 hexadecimal digits of all that its pictures depend on: splats, captures, device, version."""
-        digest = _Digest()
         splats = self.scene.splats if self.scene.streamed is None else self.scene.streamed.content
         content = (splats, self.capture, self.trajectory, self.path, device, __version__)
         try:
-            pickle.Pickler(digest, protocol=5).dump(content)
+            return digest_of(content)
         except (pickle.PicklingError, AttributeError, TypeError) as error:
             raise InputError(
                 f"a flight must be made of data, so that it can go on after a stop: {error}"
             ) from None
-        return digest.sha.hexdigest()[:16]
-
-
-class _Digest:
-    """A stream that keeps a hash of what is written to it: large clouds are not copied."""
-
-    def __init__(self) -> None:
-        self.sha = hashlib.sha256()
-
-    def write(self, data: Any) -> int:
-        content = memoryview(data)  # bytes, or a large array where it lies
-        self.sha.update(content)
-        return content.nbytes
 
 
 class FlightFolder:
@@ -105,13 +92,22 @@ class FlightFolder:
 
     Args:
         overwrite: whether pictures of another flight are replaced.
+        source: file of what is drawn, of which the record tells `fidsplat view`.
 
     Raises:
         InputError: it holds another flight, or cannot be written.
     """
 
-    def __init__(self, folder: str | Path, flight: Flight, device: str, overwrite: bool = False) -> None:
+    def __init__(
+        self,
+        folder: str | Path,
+        flight: Flight,
+        device: str,
+        overwrite: bool = False,
+        source: str | Path | None = None,
+    ) -> None:
         self.folder, self.flight, self.device = path_of(folder), flight, device
+        self._source = None if source is None else os.path.relpath(source, self.folder)
         self.key = flight.key(device)
         before = self._recorded()
         if before is not None and before.get("key") != self.key and not overwrite:
@@ -200,6 +196,7 @@ class FlightFolder:
             "fidsplat": __version__,
             "key": self.key,
             "device": self.device,
+            "source": self._source,
             "frames": len(path),
             "outputs": list(self.flight.capture.outputs),
             "times": np.asarray(path.times).tolist(),

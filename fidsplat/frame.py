@@ -81,13 +81,33 @@ class Frame(Mapping):
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         """The image of a frame with one output, as NumPy, PIL and OpenCV ask for it. Raises InputError where
         there are several."""
+        image = self[self._only()]
+        return image.astype(dtype or image.dtype) if copy or (dtype and dtype != image.dtype) else image
+
+    def __dlpack__(self, **words: Any) -> Any:
+        """The image of a frame with one output, for `from_dlpack` of torch, CuPy, JAX and NumPy: without a
+        copy where the device has arrays to give, else copied to the host. Raises InputError where there are
+        several."""
+        return self._exchanged().__dlpack__(**words)
+
+    def __dlpack_device__(self) -> tuple[int, int]:
+        """Where that is, in DLPack's numbers."""
+        return self._exchanged().__dlpack_device__()
+
+    def _exchanged(self) -> Any:
+        name = self._only()
+        if isinstance(self._images, GivesArrays):
+            return self.device_array(name)
+        return self[name].copy()  # what is read-only cannot be given away
+
+    def _only(self) -> str:
+        """The name of the one output."""
         if len(self.outputs) != 1:
             raise InputError(
                 f"this frame has {len(self.outputs)} images ({', '.join(self.outputs)}); take one by its "
                 "name, frame['rgb'] say"
             )
-        image = self[self.outputs[0]]
-        return image.astype(dtype or image.dtype) if copy or (dtype and dtype != image.dtype) else image
+        return self.outputs[0]
 
     def __repr__(self) -> str:
         took = sum(self.timings.values())

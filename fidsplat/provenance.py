@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import pickle
 import platform
 import subprocess
 from collections.abc import Mapping
@@ -11,6 +12,7 @@ from datetime import date
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from fidsplat import __version__
 from fidsplat.kernel_files import kernels_folder
@@ -18,6 +20,28 @@ from fidsplat.kernel_files import kernels_folder
 _PACKAGE = Path(__file__).resolve().parent
 _WITHOUT_SOURCES = {"__pycache__", "_kernels"}
 """folders of the package whose files are not sources of its own; a wheel carries the kernels in one"""
+
+
+def digest_of(content: object) -> str:
+    """16 hexadecimal digits of all that plain data hold; large arrays are not copied.
+
+    Raises what pickle does for content that is no data: PicklingError, AttributeError, TypeError.
+    """
+    digest = _Digest()
+    pickle.Pickler(digest, protocol=5).dump(content)
+    return digest.sha.hexdigest()[:16]
+
+
+class _Digest:
+    """A stream that keeps a hash of what is written to it."""
+
+    def __init__(self) -> None:
+        self.sha = hashlib.sha256()
+
+    def write(self, data: Any) -> int:
+        content = memoryview(data)  # bytes, or a large array where it lies
+        self.sha.update(content)
+        return content.nbytes
 
 
 @cache

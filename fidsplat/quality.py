@@ -24,10 +24,10 @@ ARITHMETIC = ("precise", "fast")
 BLEND_PRECISIONS = ("float32", "float64")
 MAX_SAMPLES = 8
 MIXTURES = ("exact", "fitted", "paper")
-NESTED = 562
-TEMPLATE_SIZES = (1, 5, 9, 13, 25, 41, NESTED)
-"""Gaussians of a rectangle in the templates that are shipped (fidsplat/markers/templates.json), and in the
-opaque one (fidsplat/markers/nested.py)"""
+BY_FORMULA = LADDER, NESTED = 121, 562
+TEMPLATE_SIZES = (1, 5, 9, 13, 25, 41, *BY_FORMULA)
+"""Gaussians of a rectangle in the templates that are shipped (fidsplat/markers/templates.json), and in those
+by a formula (fidsplat/markers/nested.py)"""
 MAX_LEVELS, MAX_DENSITY = 8, 100
 
 
@@ -77,8 +77,9 @@ class MarkerQuality:
 
     template: int = 25
     """Of `fitted`, and of the Gaussians that stand for `exact` in files: Gaussians of a rectangle up to an
-    aspect ratio of 6, one of `TEMPLATE_SIZES`: 1, 5, 9, 13, 25, 41 or 562. Fewer are drawn faster and leave
-    edges blurred and corners round; 562 are opaque and clean, under a low-pass from 24 px a module on."""
+    aspect ratio of 6, one of `TEMPLATE_SIZES`: 1, 5, 9, 13, 25, 41, 121 or 562. Fewer are drawn faster and
+    leave edges blurred and corners round; 562 are opaque and clean, under a low-pass from 24 px a module on;
+    121 are to be refined (`fs.train.refine`)."""
 
     def __post_init__(self) -> None:
         _one_of("marker quality: mixture", self.mixture, MIXTURES)
@@ -142,6 +143,11 @@ class Quality:
     """n, 1 to 8, default 1: each pixel is the mean of n x n samples on a regular grid. More smooth edges, and
     cost n^2 times the blending."""
 
+    detail_error: float = 0.0
+    """Of stores: how far rgb may be off from the exact picture where cells of splats are drawn as one, in
+    [0, 1). Nodes are chosen by what was measured with the store and this low-pass (docs/large-scenes.md); 0
+    is the exact scene. Scenes in memory are always exact."""
+
     first_hit: float = 0.1
     """Opacity at which the outputs depth_first and distance_first see a surface, (0, 1): the first fragment
     or layer behind which the transmittance is at most 1 less this."""
@@ -188,6 +194,7 @@ class Quality:
         within("transmittance_stop", 0.0, 1.0, False, True)
         within("opacity_ceiling", 0.0, 1.0, True, False)
         within("first_hit", 0.0, 1.0, True, True)
+        within("detail_error", 0.0, 1.0, False, True)
         for name, known in (
             ("stop_rule", STOP_RULES),
             ("lowpass", LOWPASS),

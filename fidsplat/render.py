@@ -4,28 +4,35 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import Adopts, DeviceInfo, DrawsBatches, ResidentData
+from fidsplat.backends.base import (
+    Adopts,
+    DeviceInfo,
+    DrawsBatches,
+    DrawsEvery,
+    Images,
+    Pipeline,
+    ResidentData,
+)
 from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.registry import open_backend
-from fidsplat.backends.view import NO_CAMERA
+from fidsplat.backends.view import NO_CAMERA, View
 from fidsplat.batch import FrameBatch, ViewByView
 from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.capture import Capture, output_names
 from fidsplat.errors import InputError, unknown
 from fidsplat.frame import Frame, check_process
-from fidsplat.quality import Quality
+from fidsplat.quality import Quality, whole_number
 from fidsplat.scenes import Scene
 from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
 from fidsplat.store.residency import Residency
 from fidsplat.store.store import Store
-from fidsplat.store.streamed import Streamed
 from fidsplat.surroundings import Fog, Gradient, Panorama, background_of
 from fidsplat.views import Views, views_of
 
@@ -117,9 +124,8 @@ class Renderer:
         nothing is read before a view needs it."""
         check_process(self._process, "Renderer")
         capture = scene.capture if isinstance(scene, Scene) else _PLAIN
-        streamed = Streamed([scene]) if isinstance(scene, Store) else None
-        if isinstance(scene, Scene):
-            streamed = scene.streamed
+        stored = Scene(stores=(scene,)) if isinstance(scene, Store) else scene
+        streamed = stored.streamed if isinstance(stored, Scene) else None
         if streamed is not None:
             return ResidentCloud(self, Residency(streamed, self.backend), capture)
         cloud = scene.cloud() if isinstance(scene, Scene) else scene
@@ -197,6 +203,39 @@ class Renderer:
         asked = _asked(scene, capture, camera, outputs, quality, background, motion, shutter, sensor, fog)
         return self._draw(self._resident(scene), asked)
 
+    def render_every(
+        self,
+        step: int,
+        scene: Scene | SplatCloud | ResidentCloud,
+        capture: Capture | Camera | None = None,
+        outputs: Iterable[str] | None = None,
+        quality: Quality | str | None = None,
+        tell: Callable[[float], object] | None = None,
+    ) -> Frame:
+        """Every step-th pixel of a picture, in both directions: what `render` gives those pixels, in a share
+        of the time. The reference alone draws so.
+
+        Args:
+            step: 1 or more.
+            scene, capture, outputs, quality: as `render`.
+            tell: called meanwhile with the share that is done, 0 to 1.
+
+        Raises:
+            InputError: as `render`; the device draws whole pictures only.
+        """
+        whole_number("step", step, 1, 2**31 - 1)
+        asked = _asked(scene, capture, None, outputs, quality, *[None] * 5)
+
+        def draw(pipeline: Pipeline, data: Any, view: View) -> Images:
+            if not isinstance(pipeline, DrawsEvery):
+                raise InputError(
+                    f"{self.device.name} draws whole pictures only; device='reference' draws some of their "
+                    "pixels"
+                )
+            return pipeline.render_every(data, view, step, tell)
+
+        return self._draw(self._resident(scene), asked, draw)
+
     def render_views(
         self,
         scene: Scene | SplatCloud | Store | ResidentCloud,
@@ -226,7 +265,7 @@ class Renderer:
         parts = (outputs, quality, background, motion, shutter, sensor, fog)
         asked = (_asked(scene, one, None, *parts) for one in rest)
         if isinstance(resident._data, Residency):
-            asked = self._read_ahead(resident._data, asked)
+            asked = resident._data.read_ahead(asked)
         waiting: Frame | None = None
         failure: Exception | None = None
         while True:
@@ -244,25 +283,6 @@ class Renderer:
             yield waiting
         if failure is not None:
             raise failure
-
-    def _read_ahead(self, store: Residency, captures: Iterator[Capture]) -> Iterator[Capture]:
-        """The captures, each once what the next needs is being read."""
-        waiting: Capture | None = None
-        while True:
-            try:
-                following = next(captures, None)
-                if following is not None and waiting is not None:
-                    features, view = prepare(store.scene, following)
-                    store.fetch(view, features, 0.0)
-            except Exception:
-                if waiting is not None:
-                    yield waiting
-                raise
-            if waiting is not None:
-                yield waiting
-            if following is None:
-                return
-            waiting = following
 
     def render_batch(
         self,
@@ -317,7 +337,7 @@ class Renderer:
             data, ids = whole, None
             if isinstance(whole, Residency):
                 drawn = [batch.one(number) for number in range(len(batch.slots))]
-                data, ids = whole.of(drawn, features, 0.0)
+                data, ids = whole.of(drawn, features, [capture.quality for capture in views.captures])
             pipeline = self.backend.pipeline(features)
             if isinstance(pipeline, DrawsBatches):
                 images = pipeline.render_batch(data, batch)
@@ -335,14 +355,21 @@ class Renderer:
             )
         return resident
 
-    def _draw(self, resident: ResidentCloud, capture: Capture) -> Frame:
+    def _draw(
+        self,
+        resident: ResidentCloud,
+        capture: Capture,
+        draw: Callable[[Pipeline, Any, View], Images] = lambda pipeline, data, view: pipeline.render(
+            data, view
+        ),
+    ) -> Frame:
         whole = resident._data
         features, view = prepare(whole.scene if isinstance(whole, Residency) else whole, capture)
         with self._lock:  # scratch buffers and kernels' arguments belong to one picture at a time
             data, ids = whole, None
             if isinstance(whole, Residency):
-                data, ids = whole.of([view], features, 0.0)
-            return Frame(self.backend.pipeline(features).render(data, view), capture.outputs, ids)
+                data, ids = whole.of([view], features, [capture.quality])
+            return Frame(draw(self.backend.pipeline(features), data, view), capture.outputs, ids)
 
 
 def _asked(

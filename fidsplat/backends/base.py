@@ -5,7 +5,7 @@ Nobody outside a backend asks for its name: a capability is asked for with `isin
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -142,6 +142,19 @@ class GivesFloat64(Protocol):
 
     def read_float64(self, name: str) -> np.ndarray:
         """The image as a NumPy array in float64."""
+        ...
+
+
+@runtime_checkable
+class DrawsEvery(Protocol):
+    """A pipeline that draws pixels one by one: it can leave some out, and say how far it is."""
+
+    def render_every(
+        self, cloud: Any, view: Any, step: int, tell: Callable[[float], object] | None = None
+    ) -> Images:
+        """Every step-th pixel in both directions, beginning with the first: images of (ceil(h / step),
+        ceil(w / step)) with the bits that `render` gives those pixels. tell: called with the share that is
+        done, 0 to 1."""
         ...
 
 

@@ -86,6 +86,11 @@ class TrainingKernels(Protocol):
         the device, which holds until the next call."""
         ...
 
+    def surface(self, images: Any, view: int, camera: Camera, weight: float) -> dict[str, Any]:
+        """Derivatives by `depth` and `normal` of `fidsplat.train.losses.normal_loss`, times its weight; as
+        arrays of the device, which hold until the next call."""
+        ...
+
     def count(self, screen: Any, camera: Camera, origin: np.ndarray) -> None:
         """Add derivatives (n,) by places on the screen to their sums, and who was seen."""
         ...

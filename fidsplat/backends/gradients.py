@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fidsplat.backends.view import View
-from fidsplat.effects import OUTPUTS
+from fidsplat.effects import IMAGES
 from fidsplat.errors import InputError
 
 NOT_THE_LAST = (
@@ -13,7 +13,7 @@ NOT_THE_LAST = (
 
 def gradient_shape(name: str, view: View) -> tuple[int, ...]:
     """The shape of an output's gradient: that of its image."""
-    channels = OUTPUTS[name].channels
+    channels = IMAGES[name].channels
     return (view.height, view.width) if channels == 1 else (view.height, view.width, channels)
 
 

@@ -20,6 +20,8 @@ from fidsplat.render import Renderer, default_device
 from fidsplat.scenes import Scene
 from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
+from fidsplat.store.store import Store
+from fidsplat.store.streamed import Streamed
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ def quality_within(
     error: float | None = None,
     ms: float | None = None,
     *,
-    scene: Scene | SplatCloud | None = None,
+    scene: Scene | SplatCloud | Store | None = None,
     capture: Capture | Camera | None = None,
     device: str | Renderer | None = None,
 ) -> Quality:
@@ -79,7 +81,8 @@ def quality_within(
         error: largest error allowed.
         ms: milliseconds that nine frames of ten may take, with the splats on the device and the picture left
             there; needs a scene and a camera.
-        scene: what is drawn.
+        scene: what is drawn. Of a store half of the error goes to levels of detail (`Quality.detail_error`),
+            if what they cost was measured.
         capture: how; or a camera alone. By default a Scene's own.
         device: a device's name or a Renderer; by default that of `Renderer()`.
 
@@ -94,7 +97,7 @@ def quality_within(
 def choose(
     error: float | None = None,
     ms: float | None = None,
-    scene: Scene | SplatCloud | None = None,
+    scene: Scene | SplatCloud | Store | None = None,
     capture: Capture | Camera | None = None,
     device: str | Renderer | None = None,
     tell: Callable[[str], None] = lambda text: None,
@@ -105,8 +108,10 @@ def choose(
         InputError: as `quality_within`. DeviceError: the device cannot be used or fails.
     """
     check_bounds(error, ms)
-    if scene is not None and not isinstance(scene, (Scene, SplatCloud)):
-        raise InputError(f"scene is a {type(scene).__name__}; give a SplatCloud or a Scene")
+    if scene is not None and not isinstance(scene, (Scene, SplatCloud, Store)):
+        raise InputError(f"scene is a {type(scene).__name__}; give a SplatCloud, a Scene or a Store")
+    if isinstance(scene, Store):
+        scene = Scene(stores=(scene,))
     own = scene.capture if isinstance(scene, Scene) else Capture()
     asked = capture if isinstance(capture, Capture) else own.with_(camera=capture)
     asked = replace(asked, camera=asked.camera or own.camera, outputs=("rgb",), sensor=Sensor())
@@ -118,10 +123,13 @@ def choose(
     if scene is None:
         assert error is not None
         return _from_list(error, candidates, asked.quality, renderer)
-    splats = scene.cloud() if isinstance(scene, Scene) else scene
+    streamed = scene.streamed if isinstance(scene, Scene) else None
+    if streamed is not None:
+        asked = replace(asked, quality=_with_detail(streamed, asked.quality, error))
+    splats = scene.cloud() if isinstance(scene, Scene) and streamed is None else scene
     info = renderer.device
     drawn_by = (info.name, info.title, info.platform, info.version, code_hash())
-    key = store.digest(drawn_by, (error, ms), asked, splats)
+    key = store.digest(drawn_by, (error, ms), asked, streamed.content if streamed else splats)
     kept = _kept(key, asked.quality, info.name)
     if kept is not None:
         return kept
@@ -130,6 +138,15 @@ def choose(
     numbers = {"error": choice.error, "ms": choice.ms, "ms_late": choice.ms_late}
     store.save(key, {"knobs": choice.knobs, **numbers})
     return choice
+
+
+def _with_detail(streamed: Streamed, quality: Quality, error: float | None) -> Quality:
+    """A quality that may spend half of an error on levels of detail, where what they cost was measured."""
+    detailed = quality.with_(detail_error=min((error or 0.0) / 2, 0.5))
+    try:
+        return detailed if streamed.pixels_of(detailed) else quality.with_(detail_error=0.0)
+    except InputError:
+        return quality.with_(detail_error=0.0)
 
 
 def check_bounds(error: float | None, ms: float | None) -> None:

@@ -17,6 +17,7 @@ from fidsplat.capture import Capture
 from fidsplat.errors import DeviceError, InputError
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer
+from fidsplat.scenes import Scene
 from fidsplat.splats import SplatCloud
 from fidsplat.timing import Timer, frame_timer, take_turns
 
@@ -58,7 +59,7 @@ class Calibration:
     def __init__(
         self,
         renderer: Renderer,
-        cloud: SplatCloud,
+        cloud: SplatCloud | Scene,
         capture: Capture,
         tell: Callable[[str], None],
     ) -> None:

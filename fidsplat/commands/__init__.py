@@ -13,6 +13,7 @@ from fidsplat.commands.detect import Detect
 from fidsplat.commands.devices import Devices
 from fidsplat.commands.experiment import Experiment
 from fidsplat.commands.fly import Fly
+from fidsplat.commands.gallery import Gallery
 from fidsplat.commands.greenhouse import Greenhouse
 from fidsplat.commands.info import Info
 from fidsplat.commands.marker import Marker
@@ -39,6 +40,7 @@ COMMANDS = {
     "tradeoff": Tradeoff,
     "warm": Warm,
     "experiment": Experiment,
+    "gallery": Gallery,
     "greenhouse": Greenhouse,
     "train": Train,
     "store": Store,

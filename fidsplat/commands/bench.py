@@ -1,6 +1,8 @@
 """`fidsplat bench`."""
 
 from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
@@ -8,19 +10,18 @@ import tyro
 from fidsplat.commands.output import (
     console,
     json_text,
-    late_progress,
     option,
     print_table,
     say,
     writable_file,
 )
+from fidsplat.commands.own_scenes import Cameras, OwnScenes, own_scenes_of
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from fidsplat.experiments.bench.catalogue import BenchScene
     from fidsplat.experiments.bench.measure import Bench as Measuring
     from fidsplat.experiments.bench.measure import Result
 
@@ -59,19 +60,15 @@ class Bench:
       fidsplat bench --device opencl:nvidia --device opencl:pocl --json figures.json
       fidsplat bench --scenes all --json -
       fidsplat bench --scene room.ply --cameras poses.tum
+      fidsplat bench --scene room.ply --device opencl:nvidia --device opencl:pocl --plot room.svg
     """
 
     scenes: Annotated[
         tuple[str, ...],
         option("NAME...", "scenes, or all (default: tag r100k_720p r1m_1080p tag_in_million)"),
     ] = ()
-    scene: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]],
-        option("SCENE.toml|FILE.ply", "one's own, instead of --scenes; once more for each"),
-    ] = ()
-    cameras: Annotated[
-        str | None, option("FILE", "poses, camera to world, for --scene (docs/trajectories.md)")
-    ] = None
+    scene: OwnScenes = ()
+    cameras: Cameras = None
     device: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
         option("D", "see `fidsplat devices`; once more for each (default: FIDSPLAT_DEVICE, or opencl)"),
@@ -80,6 +77,10 @@ class Bench:
     json: Annotated[
         str | None,
         option("FILE", "write all figures to a file as well, after each scene; - for stdout alone"),
+    ] = None
+    plot: Annotated[
+        str | None,
+        option("FILE.svg", "a chart of the frames' times as well, or FILE.png (extra: experiments)"),
     ] = None
 
     def run(self) -> int:
@@ -91,7 +92,9 @@ class Bench:
 
         if self.repeats < 1:
             raise InputError(f"--repeats is {self.repeats}; give a number of frames, at least 1")
-        known = self._own_scenes() or BENCH_SCENES
+        if self.plot is not None:
+            _check_plot(self.plot)
+        known = own_scenes_of(self.scene, self.cameras, self.scenes) or BENCH_SCENES
         scenes = tuple(known) if self.scene else scene_names(self.scenes)
         if self.json not in (None, "-"):
             writable_file(self.json)
@@ -118,6 +121,10 @@ class Bench:
         results = measuring.results if measuring else []
         if measuring:
             self._save(measuring, scenes, interrupted)
+        if self.plot is not None and any(result.timer.ms for result in results):
+            from fidsplat.experiments.bench.plot import write_plot
+
+            write_plot(results, Path(self.plot))
         if self.json == "-":
             print(json_text(_record(results, scenes, interrupted)))
         else:
@@ -128,29 +135,21 @@ class Bench:
             raise KeyboardInterrupt
         return 1 if any(result.timer.error for result in results) else 0
 
-    def _own_scenes(self) -> "dict[str, BenchScene]":
-        """The scenes of --scene, from the poses of --cameras."""
-        from fidsplat.commands.render import load_source
-        from fidsplat.experiments.bench.catalogue import own_scenes
-        from fidsplat.formats import load_trajectory
-
-        if self.scene and self.scenes:
-            raise InputError("--scene and --scenes exclude each other; give one of them")
-        if self.cameras is not None and not self.scene:
-            raise InputError("--cameras are those of --scene; give that as well")
-        path = None if self.cameras is None else load_trajectory(self.cameras)
-        found: dict[str, BenchScene] = {}
-        for name in self.scene:
-            with late_progress(console(True)) as progress:
-                found |= own_scenes(name, load_source(name, None, progress), path)
-        return found
-
     def _save(self, measuring: "Measuring", scenes: tuple[str, ...], interrupted: bool) -> None:
         if self.json in (None, "-"):
             return
         with atomic_write(self.json) as stream:
             stream.write(json_text(_record(measuring.results, scenes, interrupted)).encode())
             stream.write(b"\n")
+
+
+def _check_plot(name: str) -> None:
+    """Raises InputError for a chart that cannot be written, before anything is measured."""
+    if Path(name).suffix.lower() not in (".svg", ".png"):
+        raise InputError(f"--plot is {name}; charts are written as SVG or PNG: name a file that ends so")
+    if find_spec("matplotlib") is None:
+        raise InputError("--plot needs matplotlib; pip install 'fidsplat[experiments]'")
+    writable_file(name)
 
 
 def _record(results: "list[Result]", scenes: tuple[str, ...], interrupted: bool) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from fidsplat.commands.experiment_files import CATEGORY_HELP, write_report
 from fidsplat.commands.localise import Localise
 from fidsplat.commands.output import Json, console, option, say, switch, tell
+from fidsplat.commands.remote import RayAddress, measure_by
 from fidsplat.commands.sweeps import Names, Overwrite, Seed, need_reports, run_sweeps
 from fidsplat.errors import InputError
 
@@ -76,6 +77,7 @@ class Threaded(Drawn, Measuring):
     workers: Annotated[
         int | None, option("N", "threads that look at pictures (default: one for each core)")
     ] = None
+    ray: RayAddress = None
 
 
 @dataclass
@@ -91,13 +93,17 @@ class Compared(Threaded):
     ] = None
 
 
-def measure(names: tuple[str, ...], options: Options, as_json: bool) -> int:
-    """Run experiments, each to its file, and say where."""
+def measure(names: tuple[str, ...], options: Options, as_json: bool, ray: str | None = None) -> int:
+    """Run experiments, each to its file, and say where; what is no time by the cluster of --ray, if there is
+    one."""
+    from fidsplat.experiments import counts
     from fidsplat.experiments.run import prepared
 
-    with prepared(names, options) as sweeps:
+    away = tuple(name for name in names if ray is not None and name != counts.NAME)
+    files = {} if ray is None else measure_by(ray, away, options)
+    with prepared([name for name in names if name not in away], options) as sweeps:
         run_sweeps(sweeps)
-        files = {sweep.name: str(sweep.results.file) for sweep in sweeps if sweep.points}
+        files |= {sweep.name: str(sweep.results.file) for sweep in sweeps if sweep.points}
     return tell(as_json, {"files": files}, *files.values())
 
 
@@ -122,7 +128,7 @@ class Angles(Threaded):
     ideal: Annotated[bool, switch("only the ideal texture: the ceiling of the detectors")] = False
 
     def run(self) -> int:
-        return measure(("angles",), self.options(), self.json)
+        return measure(("angles",), self.options(), self.json, self.ray)
 
 
 @dataclass
@@ -140,7 +146,7 @@ class Views(Compared):
     """
 
     def run(self) -> int:
-        return measure(("views",), self.options(), self.json)
+        return measure(("views",), self.options(), self.json, self.ray)
 
 
 @dataclass
@@ -177,7 +183,7 @@ class Localisation(Threaded):
 
         if self.category and not set(self.category) & set(LOCATED):
             raise InputError(f"localisation is of {' and '.join(LOCATED)}, not of {', '.join(self.category)}")
-        return measure(("localisation",), self.options(), self.json)
+        return measure(("localisation",), self.options(), self.json, self.ray)
 
 
 @dataclass
@@ -225,6 +231,7 @@ class All(Compared):
       fidsplat experiment all --quick
       fidsplat experiment all -o results --device opencl:nvidia
       fidsplat experiment all --shard 2/8 -o shards
+      fidsplat experiment all --ray ray://HOST:10001
     """
 
     def run(self) -> int:
@@ -234,7 +241,7 @@ class All(Compared):
         check(options)
         if self.shard is None:
             need_reports()
-        status = measure(NAMES, options, self.json)
+        status = measure(NAMES, options, self.json, self.ray)
         if self.shard is not None:
             return status
         draw_sheets(options)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -25,15 +26,18 @@ from fidsplat.commands.output import (
     switch,
     writable_file,
 )
+from fidsplat.commands.remote import RayAddress, Workers, check_workers
 from fidsplat.commands.render import load_source
 from fidsplat.commands.sweeps import Overwrite
 from fidsplat.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable, Iterator
+
+    from rich.console import Console
 
     from fidsplat.cameras import Trajectory
-    from fidsplat.flights import FlightFolder
+    from fidsplat.flights import Flight, FlightFolder
     from fidsplat.scenes import Scene
 
 DEFAULT_FOLDER = "fidsplat-flight"
@@ -55,6 +59,7 @@ class Fly:
       fidsplat fly room.ply --trajectory poses.txt --file-rate 10 --smooth --outputs rgb,depth
       fidsplat fly moving.toml --times 0,0.5,1
       fidsplat fly scene.toml --trajectory flight.tum --outputs rgb,label --log run.mcap --coco truth.json
+      fidsplat fly scene.toml --trajectory flight.tum --ray ray://HOST:10001       by a cluster
     """
 
     source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply|STORE.fss", "what to draw")]
@@ -91,6 +96,8 @@ class Fly:
     device: SceneDevice = None
     quality: SceneQuality = None
     memory_budget: MemoryBudget = None
+    ray: RayAddress = None
+    workers: Workers = None
     overwrite: Overwrite = False
     json: Json = False
 
@@ -106,6 +113,7 @@ class Fly:
         # what is wrong with the words is said before anything is read or opened
         select(fs.SplatCloud.empty(), fs.Capture(outputs=names or "rgb", quality=fs.Quality.of(self.quality)))
         budget = bytes_of("--memory-budget", self.memory_budget)
+        check_workers(self.ray, self.workers)
         if self.out.endswith(".mcap"):
             self.log, self.out = self.log or self.out, self.out.removesuffix(".mcap")
         check_rate(self.rate)
@@ -125,13 +133,12 @@ class Fly:
         path = path or _own_motion(self.source, scene, self.smooth)
         times = path.sampled(self.rate).times if self.times is None else _times(self.times)
         flight = Flight(scene, path, times, scene.capture.with_(outputs=names, quality=self.quality))
-        with where.status("opening the device"):
-            renderer = fs.Renderer(self.device or scene.device, budget)
-        folder = FlightFolder(self.out, flight, renderer.device.title, self.overwrite)
-        begun = time.perf_counter()
-        left = len(folder.left())
-        self._steps("pictures", folder.draw(renderer), len(flight), len(flight) - left)
-        seconds = time.perf_counter() - begun
+        with self._drawn_by(flight, budget, where) as (title, draw):
+            folder = FlightFolder(self.out, flight, title, self.overwrite, self.source)
+            begun = time.perf_counter()
+            left = len(folder.left())
+            self._steps("pictures", draw(folder), len(flight), len(flight) - left)
+            seconds = time.perf_counter() - begun
         sheet = folder.write_sheet()
         if self.video is not None:
             self._steps("video", folder.write_video(self.video, self.rate), len(flight), 0)
@@ -141,6 +148,28 @@ class Fly:
             self._steps("truth", write_truth(folder, self.coco), len(flight), 0)
         self._tell(folder, sheet, left, seconds)
         return 0
+
+    @contextmanager
+    def _drawn_by(
+        self, flight: Flight, budget: int | None, where: Console
+    ) -> Iterator[tuple[str, Callable[[FlightFolder], Iterator[int]]]]:
+        """What draws, in words, and how it draws what is left of a flight."""
+        from fidsplat.render import Renderer, default_device
+
+        device = self.device or flight.scene.device or default_device()
+        if self.ray is None:
+            with where.status("opening the device"):
+                renderer = Renderer(device, budget)
+            yield renderer.device.title, lambda folder: folder.draw(renderer)
+            return
+        from fidsplat.remote.flights import FlightWork, draw
+        from fidsplat.remote.ray_engine import ray_engine
+
+        with ExitStack() as stack:
+            with where.status("starting workers"):
+                work = FlightWork(flight, device, budget)
+                engine = stack.enter_context(ray_engine(self.ray, work, self.workers))
+            yield engine.title, lambda folder: draw(folder, engine, engine.workers)
 
     def _steps(self, what: str, steps: Iterable[int], total: int, done: int) -> None:
         from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn

@@ -27,6 +27,9 @@ from fidsplat.files import path_of, writable_folder
 
 if TYPE_CHECKING:
     from fidsplat.formats import Progress
+    from fidsplat.frame import Frame
+    from fidsplat.quality import Quality
+    from fidsplat.render import Renderer
     from fidsplat.scenes import Scene
 
 _OTHER_PICTURES = (".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".exr", ".gif", ".npy")
@@ -60,6 +63,7 @@ class Render:
       fidsplat render scene.toml --quality standard,alpha_cutoff=1e-3,samples=2
       fidsplat render scene.toml -o frames --outputs rgb,depth,normal,label
       fidsplat render tag.ply -o tag.png --device reference --quality gsplat
+      fidsplat render scene.toml --device reference --every 8      every 8th pixel, in a 64th of the time
       fidsplat render scene.toml --max-error 1e-3        measures first, and keeps what it found
       fidsplat render scene.toml --max-ms 20
     """
@@ -84,6 +88,10 @@ class Render:
     max_ms: Annotated[
         float | None,
         option("T", "draw with the most accurate quality that takes at most T milliseconds a frame"),
+    ] = None
+    every: Annotated[
+        int | None,
+        option("N", "of the reference: every Nth pixel in both directions, as a picture of those alone"),
     ] = None
     memory_budget: MemoryBudget = None
     json: Json = False
@@ -123,11 +131,8 @@ class Render:
                     tell=status.update,
                 )
         begun = time.perf_counter()
-        with where.status("drawing"):
-            frame = renderer.render(
-                scene, outputs=names, quality=self.quality if choice is None else choice.quality
-            )
-            images = {name: frame[name] for name in frame.outputs}
+        frame = self._drawn(renderer, scene, names, self.quality if choice is None else choice.quality)
+        images = {name: frame[name] for name in frame.outputs}
         seconds = time.perf_counter() - begun
         bits = None if scene.sensor is None else scene.sensor.bits
         files = [file for name, image in images.items() for file in save_output(name, image, name_of, bits)]
@@ -136,8 +141,8 @@ class Render:
                 {
                     "source": self.source,
                     "device": renderer.device.name,
-                    "width": scene.camera.width if scene.camera else None,
-                    "height": scene.camera.height if scene.camera else None,
+                    "width": images[frame.outputs[0]].shape[1],
+                    "height": images[frame.outputs[0]].shape[0],
                     "outputs": list(frame.outputs),
                     "chosen": None if choice is None else choice.as_dict(),
                     "stats": dict(frame.stats),
@@ -155,6 +160,23 @@ class Render:
             say(where, f"chosen: {choice.summary}")
         say(where, *map(str, files))
         return 0
+
+    def _drawn(
+        self,
+        renderer: "Renderer",
+        scene: "Scene",
+        names: tuple[str, ...] | None,
+        quality: "Quality | str | None",
+    ) -> "Frame":
+        """The picture; the reference says how far it is."""
+        if renderer.device.name == "reference" or self.every is not None:
+            with late_progress(console(True)) as progress:
+                step = 1 if self.every is None else self.every
+                return renderer.render_every(
+                    step, scene, None, names, quality, lambda share: progress("drawing", share)
+                )
+        with console(self.json).status("drawing"):
+            return renderer.render(scene, outputs=names, quality=quality)
 
 
 @contextmanager

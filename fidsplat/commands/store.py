@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import tyro
 
 from fidsplat.commands.output import (
+    Device,
     Json,
     bytes_of,
     console,
@@ -21,6 +22,7 @@ from fidsplat.commands.output import (
     tell,
 )
 from fidsplat.errors import InputError
+from fidsplat.files import writable_folder
 
 if TYPE_CHECKING:
     import fidsplat as fs
@@ -217,6 +219,98 @@ def _print_facts(name: str, facts: dict[str, Any]) -> None:
 
 
 @dataclass
+class Measure:
+    """Measure what levels of detail cost: pictures with cells merged up to a size against the exact ones.
+
+    From random places around and inside the store, at 320 x 180 pixels. What is found is kept beside the
+    store, and lets Quality.detail_error choose: fidsplat render city.fss --quality
+    lowpass=pixel,detail_error=0.004
+
+    Examples:
+      fidsplat store measure city.fss
+      fidsplat store measure city.fss --views 40 --lowpass pixel,screen
+    """
+
+    store: StorePath
+    views: Annotated[int, option("N", "places to look from (default: 12)")] = 12
+    lowpass: Annotated[str, option("A,B,...", "of pixel, screen, none (default: pixel)")] = "pixel"
+    seed: Annotated[int, option("N", "of the places (default: 0)")] = 0
+    device: Device = None
+    json: Json = False
+
+    def run(self) -> int:
+        import fidsplat as fs
+        from fidsplat.detail import measure_detail
+
+        store, names = fs.Store(self.store), [name.strip() for name in self.lowpass.split(",")]
+        with late_progress(console(True)) as progress:
+            renderer = fs.Renderer(self.device)
+            made = measure_detail(store, renderer, self.views, names, self.seed, progress)
+        if self.json:
+            print_json({"store": self.store, "details": [vars(one) for one in made]})
+            return 0
+        for one in made:
+            rows = (
+                (f"{size:.3f}", "not met" if error is None else f"{error:.4f}")
+                for size, error in zip(one.sizes, one.errors, strict=True)
+            )
+            title = f"lowpass {one.lowpass}, {one.views} views, {one.device}"
+            print_table(console(False), title, ("cells up to [px]", "largest error of rgb"), rows)
+        return 0
+
+
+@dataclass
+class StoreDemo:
+    """Make a city of 20 million splats to fly through, with its levels of detail measured.
+
+    DIR/city.fss is the store; DIR/city.toml a scene with a flight through a street and up over the roofs.
+
+    Examples:
+      fidsplat store demo -o city
+      fidsplat fly city/city.toml -o flight --rate 2
+    """
+
+    out: Annotated[str, option("DIR", "folder (default: fidsplat-city)", "-o")] = "fidsplat-city"
+    splats: Annotated[float, option("N", "of the city (default: 20e6)")] = 20e6
+    houses: Annotated[int, option("N", "along a side (default: 8)")] = 8
+    seed: Annotated[int, option("N", "of houses and splats (default: 0)")] = 0
+    views: Annotated[int, option("N", "places to measure from; 0: do not measure (default: 4)")] = 4
+    device: Device = None
+    overwrite: Overwrite = False
+    json: Json = False
+
+    def run(self) -> int:
+        import fidsplat as fs
+        from fidsplat.detail import measure_detail
+        from fidsplat.store.city import City, flight
+
+        if not self.splats == int(self.splats):
+            raise InputError(f"--splats is {self.splats:g}; give a whole number")
+        city, folder = City(int(self.splats), self.houses, self.seed), writable_folder(self.out)
+        begun = time.perf_counter()
+        with late_progress(console(True)) as progress:
+            path = fs.build_store(
+                [city.source], folder / "city.fss", overwrite=self.overwrite, progress=progress
+            )
+            store = fs.Store(path)
+            if self.views and len(store.nodes) > store.chunks:
+                measure_detail(store, fs.Renderer(self.device), self.views, progress=progress)
+        camera, motion = flight(city)
+        error = DEMO_ERROR if self.views else 0.0
+        quality = fs.Quality(lowpass="pixel", detail_error=error)
+        scene = folder / "city.toml"
+        fs.Scene(stores=(store,), camera=camera, camera_motion=motion, quality=quality).save(scene)
+        seconds = time.perf_counter() - begun
+        facts = {"store": str(path), "scene": str(scene), "splats": len(store), "seconds": seconds}
+        words = f"{len(store):,} splats in {store.chunks:,} chunks, in {seconds:.0f} s: {path}"
+        return tell(self.json, facts, words, f"fly through it: fidsplat fly {scene}")
+
+
+DEMO_ERROR = 1 / 255
+"""of the demo's pictures: below what eight bits show"""
+
+
+@dataclass
 class Verify:
     """Read all of a store and compare every chunk with its checksum; exit status 1 if one is damaged.
 
@@ -252,4 +346,11 @@ class Store:
       fidsplat render street.fss
     """
 
-    PARTS: ClassVar[dict[str, type]] = {"build": Build, "place": Place, "info": StoreInfo, "verify": Verify}
+    PARTS: ClassVar[dict[str, type]] = {
+        "build": Build,
+        "place": Place,
+        "info": StoreInfo,
+        "verify": Verify,
+        "measure": Measure,
+        "demo": StoreDemo,
+    }

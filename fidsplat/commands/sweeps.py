@@ -37,7 +37,7 @@ def run_sweeps(sweeps: Iterable[Sweep]) -> list[Record]:
     """Measure what is left of each, with a progress bar on stderr; returns what was measured."""
     found = []
     for sweep in sweeps:
-        with _bars() as progress:
+        with bars() as progress:
             total = len(sweep.points)
             bar = progress.add_task(sweep.name, total=total, completed=total - len(sweep.left))
             for record in sweep.run():
@@ -52,7 +52,7 @@ def run_in_turn(name: str, sweeps: Sequence[Sweep]) -> list[Record]:
     from fidsplat.experiments.sweep import in_turn
 
     found = []
-    with _bars() as progress:
+    with bars() as progress:
         total, left = sum(len(sweep.points) for sweep in sweeps), sum(len(sweep.left) for sweep in sweeps)
         bar = progress.add_task(name, total=total, completed=total - left)
         for record in in_turn(sweeps):
@@ -62,7 +62,8 @@ def run_in_turn(name: str, sweeps: Sequence[Sweep]) -> list[Record]:
     return found
 
 
-def _bars() -> Progress:
+def bars() -> Progress:
+    """Progress by points, on stderr."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,

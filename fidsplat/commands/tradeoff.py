@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 from fidsplat.commands.output import Device, Json, option, switch, tell
+from fidsplat.commands.own_scenes import Cameras, OwnScenes, own_scenes_of
 from fidsplat.commands.sweeps import Folders, Overwrite, ReportTo, need_reports, run_sweeps, words
 from fidsplat.errors import InputError
 
@@ -48,7 +49,7 @@ class Tradeoff:
     then several together. A setting draws in turn with the base, frame by frame, and its picture is compared
     with a float64 one that leaves nothing out. Markers are also compared with the ideal printed texture, and
     tilted until nobody reads them. Results are JSON lines, written as they come; a run that was stopped goes
-    on where it was. Keep the machine quiet.
+    on where it was. Keep the machine quiet. --scene takes one's own scene instead, as for `fidsplat bench`.
 
       r100k_720p, r1m_1080p            random splats, as in `fidsplat bench`
       r100k_720p_3d, r1m_1080p_3d      of 3D Gaussians: the ways of drawing them
@@ -60,6 +61,7 @@ class Tradeoff:
       fidsplat tradeoff --quick                              a rough picture, under 3 minutes on two cores
       fidsplat tradeoff -o gpu --device opencl:nvidia        everything
       fidsplat tradeoff --scenes hard --knobs alpha_cutoff transmittance_stop
+      fidsplat tradeoff --scene room.ply --cameras poses.tum --quick -o room
       fidsplat tradeoff report cpu gpu -o docs/accuracy.md   a page from results
     """
 
@@ -75,6 +77,8 @@ class Tradeoff:
     ] = None
     device: Device = None
     scenes: Annotated[tuple[str, ...], option("NAME...", "scenes (default: all; --quick: four)")] = ()
+    scene: OwnScenes = ()
+    cameras: Cameras = None
     knobs: Annotated[
         tuple[str, ...],
         option("NAME...", "knobs of Quality, or preset, marker, together (default: all)"),
@@ -84,6 +88,7 @@ class Tradeoff:
     json: Json = False
 
     def run(self) -> int:
+        from fidsplat.experiments.tradeoff.own import own_pictures
         from fidsplat.experiments.tradeoff.run import Options, prepared
         from fidsplat.render import default_device
 
@@ -91,7 +96,8 @@ class Tradeoff:
         device = default_device() if self.device is None else self.device
         if device == "reference":
             raise InputError("the reference is what others are measured against; give another --device")
-        options = Options(folder, device, self.scenes, self.knobs, self.quick, self.overwrite)
+        own = own_pictures(own_scenes_of(self.scene, self.cameras, self.scenes))
+        options = Options(folder, device, self.scenes, self.knobs, self.quick, self.overwrite, own)
         with prepared(options) as sweep:
             measured = run_sweeps([sweep])
             file, points = sweep.results.file, len(sweep.points)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -20,7 +20,13 @@ from fidsplat.commands.output import (
     say,
 )
 from fidsplat.commands.render import load_source
+from fidsplat.commands.runs import TrainingRun, checkpoint_of, flown
 from fidsplat.errors import InputError
+from fidsplat.files import path_of
+
+if TYPE_CHECKING:
+    from fidsplat.formats import Progress
+    from fidsplat.scenes import Scene
 
 
 @dataclass
@@ -29,18 +35,27 @@ class View:
 
     Small pictures while the view moves, an exact one at rest, none while nothing changes; no GPU is needed,
     here or in the browser's machine. Drag to turn, right-drag to shift, wheel to come near; click to ask
-    what is there. Controls for device, quality, lens, fog and sensor; a gizmo moves a marker and writes its
-    pose into the scene file, which is read again when it is edited meanwhile; keyframes become a trajectory
-    for `fidsplat fly`. Needs pip install 'fidsplat[viewer]'.
+    what is there. Controls for device, quality, lens, fog and sensor; a gizmo moves a marker or a splat file
+    and writes its pose into the scene file, which is read again when it is edited meanwhile; keyframes become
+    a trajectory for `fidsplat fly`. Needs pip install 'fidsplat[viewer]'.
 
     Only this machine reaches the page. From elsewhere: ssh -L 8080:localhost:8080 THAT_MACHINE
 
+    A RUN is a folder of `fidsplat fly`, whose poses stand there as keyframes, or of `fidsplat train`, or its
+    checkpoint, whose splats are shown anew as they grow.
+
     Examples:
-      fidsplat view fidsplat-demo/scene.toml
+      fidsplat view                                                      the demo's scene
+      fidsplat view scene.toml
       fidsplat view room.ply --port 9000 --device opencl:nvidia
+      fidsplat view fidsplat-flight
+      fidsplat view yard.training.npz --trajectory yard/sparse/0       a training, and its cameras
     """
 
-    source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply|STORE.fss", "what to show")]
+    source: Annotated[
+        tyro.conf.Positional[str | None],
+        option("SCENE.toml|FILE.ply|STORE.fss|RUN", "what to show (default: the demo's scene)"),
+    ] = None
     trajectory: Annotated[
         str | None,
         option(
@@ -64,16 +79,57 @@ class View:
         if not 0 < self.rate <= 1000:
             raise InputError(f"--rate is {self.rate:g}; give pictures a second, up to 1000")
         check_port(self.host, self.port)
-        path = None if self.trajectory is None else load_trajectory(self.trajectory)
+        shown = self._shown()
+        path = None if shown.trajectory is None else load_trajectory(shown.trajectory)
         where = console(True)
         with late_progress(where) as progress:
-            scene = load_source(self.source, self.quality, progress)
-        file = Path(self.source) if self.source.lower().endswith(".toml") else None
+            scene = shown.scene(self.quality, progress)
+        file = Path(shown.source) if shown.source.lower().endswith(".toml") else None
+        again = None if shown.run is None else shown.run.again
         with where.status("compiling"):
-            viewer = Viewer(scene, file, self.device, budget, self.host, self.port, self.rate, path)
-        say(console(False), f"{viewer.address} shows {self.source}; Ctrl-C ends it")
+            viewer = Viewer(scene, file, self.device, budget, self.host, self.port, self.rate, path, again)
+        say(console(False), f"{viewer.address} shows {self.source or 'the demo'}; Ctrl-C ends it")
         try:
             while True:
                 time.sleep(1.0)
         finally:
             viewer.close()
+
+    def _shown(self) -> Shown:
+        from fidsplat.store.layout import SUFFIX
+
+        if self.source is None:
+            return Shown("", self.trajectory)
+        folder = path_of(self.source)
+        if checkpoint := checkpoint_of(folder):
+            return Shown(self.source, self.trajectory, TrainingRun(checkpoint, self.quality))
+        if not folder.is_dir() or folder.suffix.lower() == SUFFIX:
+            return Shown(self.source, self.trajectory)
+        source, poses = flown(folder)
+        return Shown(source, self.trajectory or poses)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What is to be shown."""
+
+    source: str
+    """file; empty for the demo"""
+    trajectory: str | None
+    """file of the poses that stand there as keyframes"""
+    run: TrainingRun | None = None
+    """that is followed"""
+
+    def scene(self, quality: str | None, progress: Progress) -> Scene:
+        """The scene; quality: instead of its own."""
+        if self.run is not None:
+            return self.run.scene
+        if self.source:
+            return replace(load_source(self.source, quality, progress), **_of(quality))
+        from fidsplat.experiments.demo_scene import demo_scene
+
+        return replace(demo_scene(), **_of(quality))
+
+
+def _of(quality: str | None) -> dict[str, str]:
+    return {} if quality is None else {"quality": quality}

@@ -17,7 +17,7 @@ class Output:
     channels: int
     dtype: str
     public: bool = True
-    """False: for measuring only; users cannot ask for it."""
+    """False: for measuring and training only; captures cannot ask for it."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,7 @@ _IMAGES = (
     _image("normal_world", 3, needs="normal"),
     _image("splat_id", dtype="int32"),
     _image("blended", dtype="int32"),
+    _image("distortion", public=False),
 )
 
 CATALOGUE: dict[str, Effect] = {effect.name: effect for effect in (*map(Effect, _PLAIN), *_IMAGES)}

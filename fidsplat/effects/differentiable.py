@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 from fidsplat.effects.select import FeatureSet
 from fidsplat.errors import InputError
@@ -15,8 +16,8 @@ DIFFERENTIABLE = frozenset(
     )
 )
 """effects through which gradients go"""
-GRADIENT_OUTPUTS = ("rgb", "alpha", "depth", "normal")
-"""outputs whose gradients backends take"""
+GRADIENT_OUTPUTS = ("rgb", "alpha", "depth", "normal", "distortion")
+"""outputs whose gradients backends take; captures cannot ask for `distortion` (`with_distortion`)"""
 _REMEDIES = {
     "camera": "a pinhole camera",
     "lowpass": "lowpass='screen' or 'none'",
@@ -45,6 +46,12 @@ def check_differentiable(features: FeatureSet) -> None:
         raise InputError(f"{features.samples} x {features.samples} samples have no gradient; use samples=1")
     if features.posts:
         raise InputError(f"{features.posts[0]} has no gradient; use a capture without fog and sensor steps")
+
+
+def with_distortion(features: FeatureSet) -> FeatureSet:
+    """These features and the output `distortion` (h, w): how far apart in depth the fragments of a pixel lie,
+    a loss of the 2DGS authors'. Sum over pairs of w_i w_j (m_i - m_j)^2, m the depth in a depth buffer."""
+    return replace(features, outputs=tuple(sorted({*features.outputs, "distortion"})))
 
 
 def check_gradients(features: FeatureSet, names: Iterable[str]) -> None:

@@ -15,14 +15,13 @@ from fidsplat.quality import Quality
 from fidsplat.surroundings import Gradient, Panorama
 
 RGB = Output("rgb", 3, "float32")
-OUTPUTS: dict[str, Output] = {
+IMAGES: dict[str, Output] = {
     "rgb": RGB,
-    **{
-        effect.output.name: effect.output
-        for effect in CATALOGUE.values()
-        if effect.output and effect.output.public
-    },
+    **{effect.output.name: effect.output for effect in CATALOGUE.values() if effect.output},
 }
+"""all output images"""
+OUTPUTS = {name: output for name, output in IMAGES.items() if output.public}
+"""those that users ask for"""
 
 _KINDS = {Gradient: "gradient", Panorama: "panorama"}
 

@@ -87,17 +87,23 @@ def prepared(names: Iterable[str], options: Options) -> Iterator[list[Sweep]]:
     Raises InputError for options that cannot be used, DeviceError when the device cannot be opened.
     """
     check(options)
-    points = {name: share_of(_points(name, options), options.shard) for name in names}
+    points = {name: points_of(name, options) for name in names}
     writable_folder(options.out)
     draws = not options.ideal and any(name != counts.NAME for name in points)
     renderer = Renderer(options.device) if draws else None
+    device = None if renderer is None else device_words(renderer)
     painter = Painter(renderer, options.trained)
     pool = ThreadPoolExecutor(options.workers)
     try:
         # first, for it reads files: --overwrite drops nothing for a run that cannot begin
         measures = {name: _measure(name, options, painter, pool) for name in points}
         yield [
-            Sweep(name, _results(name, options, renderer), points[name], partial(partial, measures[name]))
+            Sweep(
+                name,
+                results_of(name, options, device if name != counts.NAME else None),
+                points[name],
+                partial(partial, measures[name]),
+            )
             for name in points
         ]
     finally:
@@ -105,10 +111,13 @@ def prepared(names: Iterable[str], options: Options) -> Iterator[list[Sweep]]:
         pool.shutdown(cancel_futures=True)
 
 
-def _results(name: str, options: Options, renderer: Renderer | None) -> Results:
-    device = None
-    if renderer is not None and name != counts.NAME:
-        device = f"{renderer.device.title}, {renderer.device.version}"
+def device_words(renderer: Renderer) -> str:
+    """A device in the facts of a run: title and driver."""
+    return f"{renderer.device.title}, {renderer.device.version}"
+
+
+def results_of(name: str, options: Options, device: str | None) -> Results:
+    """The file of an experiment's results; device: `device_words` of what draws, None where nothing does."""
     versions = reader_versions() | (metric_versions() if name == views.NAME else {})
     return Results(options.file(name), run_facts(device, options.seed, versions), options.overwrite)
 
@@ -152,6 +161,11 @@ def _check_trained(options: Options) -> None:
                     raise InputError(
                         f"{file} is missing; --category and --markers leave out what was not trained"
                     )
+
+
+def points_of(name: str, options: Options) -> list[Key]:
+    """The points of an experiment, or a run's share of them."""
+    return share_of(_points(name, options), options.shard)
 
 
 def _points(name: str, options: Options) -> list[Key]:

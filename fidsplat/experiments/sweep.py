@@ -233,7 +233,7 @@ def missing_shards(files: Iterable[Path]) -> list[str]:
 
 def _differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     """The facts on which numbers depend and that are not the same. A run that draws nothing has no device."""
-    names = [name for name in ("versions", "code", "seed") if old.get(name) != new.get(name)]
+    names = [name for name in ("versions", "code", "seed", "scene") if old.get(name) != new.get(name)]
     devices = (old.get("device"), new.get("device"))
     return names + (["device"] if None not in devices and devices[0] != devices[1] else [])
 

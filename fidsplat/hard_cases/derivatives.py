@@ -13,7 +13,7 @@ from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
 from fidsplat.capture import Capture
 from fidsplat.effects import FeatureSet
-from fidsplat.effects.differentiable import GRADIENT_OUTPUTS
+from fidsplat.effects.differentiable import with_distortion
 from fidsplat.random_clouds import random_splats
 from fidsplat.splats import SplatCloud
 
@@ -37,7 +37,7 @@ def random_picture(
     count: int = 90,
     size: tuple[int, int] = (61, 43),
     degree: int | None = 1,
-    outputs: tuple[str, ...] = GRADIENT_OUTPUTS,
+    outputs: tuple[str, ...] = ("rgb", "alpha", "depth", "normal"),
     quality: Any = None,
     **splats: Any,
 ) -> tuple[SplatCloud, Capture]:
@@ -67,9 +67,12 @@ def derivatives(
 ) -> dict[str, np.ndarray]:
     """A picture's derivatives in NumPy; those of a random loss unless `by_images` says by which images.
 
-    build: further arguments of `Differentiates.differentiate`, that some backends have.
+    Pictures of depths have their distortion too. build: further arguments of `Differentiates.differentiate`,
+    that some backends have.
     """
     features, view = prepare(cloud, capture)
+    if "depth" in features.names:
+        features = with_distortion(features)
     pipeline = backend.differentiate(features, **build)
     images = pipeline.forward(backend.upload(cloud), view)
     given = random_loss(features, view) if by_images is None else by_images

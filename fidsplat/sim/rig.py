@@ -255,7 +255,9 @@ class Pictures(Mapping):
                     raise MissingOutputError(
                         f"the camera {camera!r} has no {name!r}; it gives {', '.join(batch)}; name it there"
                     )
-            stacked = np.stack([batch[name] for batch in self._batches.values()], axis=1)
+            each = [batch[name] for batch in self._batches.values()]
+            # one camera's are not copied: of thousands of environments that takes longer than to draw them
+            stacked = each[0][:, None] if len(each) == 1 else np.stack(each, axis=1)
             stacked.flags.writeable = False
             self._arrays[name] = stacked
         return self._arrays[name]
@@ -265,6 +267,12 @@ class Pictures(Mapping):
 
     def __len__(self) -> int:
         return len(self._outputs)
+
+    def wait(self) -> Pictures:
+        """These pictures, once the device has drawn them; nothing is copied."""
+        for batch in self._batches.values():
+            batch.wait()
+        return self
 
     def of(self, camera: str) -> FrameBatch:
         """What one camera sees: (env, h, w[, c]). Raises InputError for a camera that the rig has not."""

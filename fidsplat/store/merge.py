@@ -98,6 +98,8 @@ def _by_moments(
     turns = vectors[:, :, ::-1].copy()
     turns[:, :, 2] = np.cross(turns[:, :, 0], turns[:, :, 1])
     opacities = np.add.reduceat(light, starts) / (sigma[:, 0] * sigma[:, 1])
+    # what lies on top of each other takes more light than an opaque splat: then it is wider instead
+    sigma[:, :2] *= np.sqrt(np.maximum(opacities, 1.0))[:, None]
     made = {"means": (base + middle).T, "quats": quaternions_of(turns), "scales": sigma[:, :2]}
     made["opacities"] = np.minimum(opacities, 1.0)
     for name in {"colors", "sh"} & set(splats):

@@ -4,13 +4,16 @@ read while this one is drawn."""
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
 from fidsplat.backends.base import Backend, ResidentData
+from fidsplat.backends.prepare import prepare
 from fidsplat.backends.view import View
+from fidsplat.capture import Capture
 from fidsplat.effects import FeatureSet
+from fidsplat.quality import Quality
 from fidsplat.store.streamed import Selection, Streamed
 
 
@@ -35,9 +38,15 @@ class Residency:
         return 0 if self._there is None else self._there[1].memory_bytes
 
     def of(
-        self, views: Sequence[View], features: FeatureSet, pixels: float
+        self, views: Sequence[View], features: FeatureSet, qualities: Iterable[Quality]
     ) -> tuple[ResidentData, np.ndarray]:
-        """The splats that these views see, on the device, and their indices in the whole (n,) int32."""
+        """The splats that these views see, on the device, and their indices in the whole (n,) int32; the
+        quality that needs most decides for all views.
+
+        Raises:
+            InputError: a quality allows an error that was not measured.
+        """
+        pixels = min(self.scene.pixels_of(quality) for quality in qualities)
         selection = self.scene.select(views, features, pixels)
         self.nodes = len(selection)
         if self._there is None or self._there[0] != selection:
@@ -46,8 +55,28 @@ class Residency:
             self._there = selection, self._backend.upload(part), ids
         return self._there[1:]
 
-    def fetch(self, view: View, features: FeatureSet, pixels: float) -> None:
+    def read_ahead(self, captures: Iterator[Capture]) -> Iterator[Capture]:
+        """The captures, each when what the next needs is being read."""
+        waiting: Capture | None = None
+        while True:
+            try:
+                following = next(captures, None)
+                if following is not None and waiting is not None:
+                    self._fetch(following)
+            except Exception:
+                if waiting is not None:
+                    yield waiting
+                raise
+            if waiting is not None:
+                yield waiting
+            if following is None:
+                return
+            waiting = following
+
+    def _fetch(self, capture: Capture) -> None:
         """Read what a view will need, beside what goes on; nothing, while the last such reading goes on."""
+        features, view = prepare(self.scene, capture)
+        pixels = self.scene.pixels_of(capture.quality)
         if self._fetching is not None and self._fetching.is_alive():
             return
 

@@ -11,9 +11,11 @@ import numpy as np
 from fidsplat.errors import InputError
 from fidsplat.files import path_of
 from fidsplat.formats.collect import Progress
+from fidsplat.quality import Quality
 from fidsplat.rotations import check_similarity
 from fidsplat.splats import SplatCloud
 from fidsplat.store import layout
+from fidsplat.store.detail import Detail, load_details
 from fidsplat.store.part import StorePart, joined, moved
 from fidsplat.summaries import Summarised, point
 
@@ -136,6 +138,25 @@ class Store(Summarised):
         if not leaves.any():
             raise InputError("an empty store has no bounds")
         return low[leaves].min(axis=0) + self.origin, high[leaves].max(axis=0) + self.origin
+
+    @cached_property
+    def details(self) -> list[Detail]:
+        """What its levels of detail were measured to cost; those of a store that is placed are its own."""
+        return load_details(self._folder, self.header.identity)
+
+    def pixels_of(self, quality: Quality) -> float:
+        """How small [samples] cells must be not to be told apart, by a quality's `detail_error`.
+
+        Raises InputError where it was not measured.
+        """
+        for detail in self.details:
+            if detail.lowpass == quality.lowpass:
+                return detail.pixels(quality.detail_error)
+        raise InputError(
+            f"detail_error is {quality.detail_error:g}, but what levels of detail cost {self.path} with "
+            f"lowpass={quality.lowpass} was not measured; run `fidsplat store measure {self._folder} "
+            f"--lowpass {quality.lowpass}`, or draw with detail_error=0"
+        )
 
     # nodes of all places: node i of place p has the number p * len(nodes) + i
 

@@ -14,6 +14,7 @@ import numpy as np
 from fidsplat.backends.seen import seen, sizes
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
+from fidsplat.quality import Quality
 from fidsplat.splats import SplatCloud
 from fidsplat.store.part import StorePart, colors_of, joined
 from fidsplat.store.store import Store
@@ -80,6 +81,16 @@ class Streamed:
         """All chunks, and no node that stands for others."""
         every = (np.flatnonzero(np.tile(store.nodes["level"] == 0, store.places)) for store in self.stores)
         return Selection(tuple(tuple(numbers.tolist()) for numbers in every))
+
+    def pixels_of(self, quality: Quality) -> float:
+        """How small [samples] cells must be not to be told apart, by a quality's `detail_error`; 0: exact.
+
+        Raises:
+            InputError: an error is allowed, but what levels of detail cost a store was not measured.
+        """
+        if not quality.detail_error:
+            return 0.0
+        return min(store.pixels_of(quality) for store in self.stores)
 
     def select(self, views: Sequence[View], features: FeatureSet, pixels: float = 0.0) -> Selection:
         """What these views see. pixels: cells smaller than so many samples need not be told apart; 0: exactly

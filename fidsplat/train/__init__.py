@@ -1,14 +1,17 @@
 """Training: splats from pictures with known cameras, on any device that has gradients."""
 
+from fidsplat.train.checkpoint import splats_of
 from fidsplat.train.dataset import Dataset, TrainingView
 from fidsplat.train.memory import splats_within
 from fidsplat.train.parameters import TrainingError
 from fidsplat.train.read import load_dataset
+from fidsplat.train.refining import RefineStep, refine
 from fidsplat.train.settings import TrainSettings
 from fidsplat.train.trainer import Step, Trainer, ViewScore
 
 __all__ = [
     "Dataset",
+    "RefineStep",
     "Step",
     "TrainSettings",
     "Trainer",
@@ -16,5 +19,7 @@ __all__ = [
     "TrainingView",
     "ViewScore",
     "load_dataset",
+    "refine",
+    "splats_of",
     "splats_within",
 ]

@@ -12,6 +12,8 @@ import numpy as np
 
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
+from fidsplat.splats import SplatCloud
+from fidsplat.train.dataset import Dataset
 from fidsplat.train.parameters import NAMES, Splats
 from fidsplat.train.settings import TrainSettings
 
@@ -37,11 +39,13 @@ class Progressed:
     """`losses` and `psnrs` (iteration,) float32, `counts` (iteration,) int32 of splats"""
 
 
-def save_checkpoint(file: Path, made: Progressed, settings: TrainSettings, digest: str, device: str) -> None:
+def save_checkpoint(
+    file: Path, made: Progressed, settings: TrainSettings, dataset: Dataset, device: str
+) -> None:
     """Write a checkpoint.
 
     Args:
-        digest: of the data set.
+        dataset: that is trained on; its digest, origin and background are kept.
         device: title of what draws.
 
     Raises InputError when the file cannot be written, as when the disk is full; an older one then stays.
@@ -51,13 +55,31 @@ def save_checkpoint(file: Path, made: Progressed, settings: TrainSettings, diges
         "iteration": made.iteration,
         "adam_step": made.adam_step,
         "settings": asdict(settings),
-        "dataset": digest,
+        "dataset": dataset.digest,
+        "origin": dataset.origin.tolist(),
+        "background": list(dataset.background),
         "device": device,
     }
     arrays = {f"{group}.{name}": getattr(made.splats, group)[name] for group in _GROUPS for name in NAMES}
     arrays |= {"gradients": made.splats.gradients, "seen": made.splats.seen, **made.history}
     with atomic_write(file) as stream:
         np.savez(stream, facts=np.frombuffer(json.dumps(facts).encode(), np.uint8), **arrays)
+
+
+def splats_of(file: Path) -> tuple[SplatCloud, tuple[float, float, float]]:
+    """The splats of a checkpoint as they are drawn, and the background before which they are trained.
+
+    Raises InputError for a file that is damaged or of another version.
+    """
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            facts = json.loads(bytes(arrays["facts"]))
+            red, green, blue = map(float, facts["background"])
+            splats = Splats.of({name: arrays[f"values.{name}"] for name in NAMES})
+        cloud = splats.cloud(int(facts["settings"]["sh_degree"]), np.array(facts["origin"], np.float64))
+    except _DAMAGED as error:
+        raise InputError(f"{file} is no checkpoint of `fidsplat train` that can be read: {error}") from error
+    return cloud, (red, green, blue)
 
 
 def load_checkpoint(file: Path, settings: TrainSettings, digest: str) -> tuple[Progressed, str]:

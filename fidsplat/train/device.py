@@ -30,6 +30,7 @@ class DeviceWork:
     ) -> None:
         self._kernels, self._settings = kernels, settings
         kernels.take_views([(view.picture, view.mask) for view in views])
+        self._cameras = [view.camera for view in views]
         self._number = 0
 
     def load(self, splats: Splats) -> None:
@@ -61,6 +62,10 @@ class DeviceWork:
         device."""
         value, slope = self._kernels.loss(images, view, self._settings.dssim_weight)
         return lambda: Loss(*value()), slope
+
+    def surface(self, images: Images, view: int, weight: float) -> dict[str, Any]:
+        """Derivatives of the loss of normals by depths and normals, times its weight."""
+        return self._kernels.surface(images, view, self._cameras[view], weight)
 
     def count(self, gradients: Mapping[str, Any], camera: Camera, origin: np.ndarray) -> None:
         """Adds the gradients on the screen to their sums."""

@@ -23,6 +23,7 @@ class Actions(Protocol):
     def add_keyframe(self, client: Any) -> None: ...
     def save_keyframes(self, client: Any) -> None: ...
     def clear_keyframes(self, client: Any) -> None: ...
+    def movable(self, scene: Scene) -> list[str]: ...
     def hold(self, name: str) -> None: ...
     def overlay(self, visible: bool) -> None: ...
 
@@ -54,7 +55,8 @@ class Controls:
                 self._slider("exposure_ms", "exposure time [ms]", 0.0, 200.0, 1.0)
                 self._slider("readout_ms", "readout [ms]", 0.0, 100.0, 1.0)
         with gui.add_folder("Scene"):
-            self._held = held = gui.add_dropdown("move", _names(drawn.scene), initial_value=NOBODY)
+            names = [NOBODY, *actions.movable(drawn.scene)]
+            self._held = held = gui.add_dropdown("move", names, initial_value=NOBODY)
             held.on_update(lambda _: actions.hold(held.value))
             shown = gui.add_checkbox("outlines", True)
             shown.on_update(lambda _: actions.overlay(shown.value))
@@ -72,10 +74,10 @@ class Controls:
         lines = [f"{len(drawn.resident):,} splats, {drawn.renderer.device.title}"]
         self.status.content = "\n\n".join(lines + ([f"**{problem}**"] if problem else []))
 
-    def offer(self, scene: Scene) -> None:
-        """Let the markers of another scene be moved; none of them is held at first."""
+    def offer(self, names: list[str]) -> None:
+        """Let what another scene has be moved; none of it is held at first."""
         self._held.value = NOBODY
-        self._held.options = _names(scene)
+        self._held.options = [NOBODY, *names]
 
     def _change(self, **changes: Any) -> None:
         _, settings = self._session.wanted()
@@ -94,11 +96,6 @@ class Controls:
 
     def _button(self, label: str, act: Callable[[Any], None]) -> None:
         self._gui.add_button(label).on_click(lambda event: act(event.client))
-
-
-def _names(scene: Scene) -> list[str]:
-    """Of the markers that may be moved, after nobody's."""
-    return [NOBODY, *(f"{placed.label}: {placed.marker.spec}"[:60] for placed in scene.markers)]
 
 
 def _span(scene: Scene) -> tuple[float, float]:

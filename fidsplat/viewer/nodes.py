@@ -52,18 +52,19 @@ class Nodes:
             self._frustum(f"/keyframes/{k}", camera, pose, _KEYFRAME, 0.05) for k, pose in enumerate(some)
         ]
 
-    def hold(self, placed: PlacedMarker | None, moved: Callable[[np.ndarray, bool], None]) -> None:
-        """A gizmo at a marker; moved is called with its pose (4, 4) and whether it was let go. None: none."""
+    def hold(self, pose: np.ndarray | None, size: float, moved: Callable[[np.ndarray, bool], None]) -> None:
+        """A gizmo of so many metres at a pose (4, 4); moved is called with the pose to which it was dragged
+        and whether it was let go. None: none."""
         if self._gizmo is not None:
             self._gizmo.remove()
             self._gizmo = None
-        if placed is None:
+        if pose is None:
             return
         gizmo = self._page.add_transform_controls(
             "/gizmo",
-            scale=1.5 * placed.marker.size,
-            wxyz=matrix_to_quaternion(placed.pose[:3, :3]),
-            position=placed.pose[:3, 3],
+            scale=size,
+            wxyz=matrix_to_quaternion(pose[:3, :3]),
+            position=pose[:3, 3],
             depth_test=False,
         )
         self._gizmo = gizmo
@@ -84,7 +85,9 @@ class Nodes:
             name, around, _OUTLINE, thickness=2.0, thickness_units="screen", **frame
         )
         spec = placed.marker.spec
-        self._page.add_label(f"{name}/name", spec if len(spec) <= 40 else f"{spec[:37]}...")
+        top = (corners[0] + corners[1]) / 2  # above its upper edge, where it covers no module
+        text = spec if len(spec) <= 40 else f"{spec[:37]}..."
+        self._page.add_label(f"{name}/name", text, position=top, anchor="bottom-center")
         return lines
 
     def _frustum(self, name: str, camera: Camera | None, pose: np.ndarray, color: Any, scale: float) -> Any:

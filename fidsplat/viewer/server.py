@@ -7,6 +7,7 @@ import io
 import logging
 import socket
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,10 +21,12 @@ from fidsplat.errors import FidsplatError, InputError
 from fidsplat.formats import save_trajectory
 from fidsplat.scenes import Scene
 from fidsplat.viewer.controls import NOBODY, Controls
-from fidsplat.viewer.edits import SceneFile
+from fidsplat.viewer.edits import Body, SceneFile
+from fidsplat.viewer.guard import guarded
+from fidsplat.viewer.held import Held, held_by, movable
 from fidsplat.viewer.nodes import Nodes
 from fidsplat.viewer.session import Session, View
-from fidsplat.viewer.settings import AT_REST, Viewpoint
+from fidsplat.viewer.settings import Viewpoint
 from fidsplat.viewer.stream import Stream
 from fidsplat.vision.images import png_bytes, to_uint8
 from fidsplat.vision.readback import read_back
@@ -56,6 +59,7 @@ class Viewer:
         port: 0 takes a free one.
         rate: pictures a second to aim at while moving.
         keyframes: whose poses, camera to world, stand there at first.
+        again: asked once a second for another scene to show, None where there is none: of a run that goes on.
 
     Raises:
         InputError: the port is in use, or the extra `viewer` is missing.
@@ -72,6 +76,7 @@ class Viewer:
         port: int = 8080,
         rate: float = 30.0,
         keyframes: Trajectory | None = None,
+        again: Callable[[], Scene | None] | None = None,
     ) -> None:
         viser = _viser()
         check_port(host, port)
@@ -81,10 +86,13 @@ class Viewer:
         self._said: dict[int, Any] = {}
         self._keyframes: list[np.ndarray] = [] if keyframes is None else list(keyframes.poses)
         self._file = None if file is None else SceneFile(file)
-        self._held: int | None = None
+        self._again = again
+        self._held: Held | None = None
         self.session = Session(scene, device, memory_budget, self._changed)
         with _silent():
-            self.server: Any = viser.ViserServer(host, port, label="fidsplat", verbose=False)
+            self.server: Any = guarded(
+                lambda: viser.ViserServer(host, port, label="fidsplat", verbose=False), host
+            )
         self.server.gui.configure_theme(dark_mode=True, show_logo=False)
         self.server.gui.main_panel.dock_right()
         self._nodes = Nodes(self.server.scene)
@@ -139,11 +147,11 @@ class Viewer:
         self._said.pop(client.client_id, None)
 
     def _send(self, client: Any, viewpoint: Viewpoint, scale: float) -> None:
-        view = self.session.draw(viewpoint, scale)
-        client.scene.set_background_image(to_uint8(view.frame["rgb"]), "jpeg", jpeg_quality=JPEG)
+        frame = self.session.draw_moving(viewpoint, scale)
+        client.scene.set_background_image(to_uint8(frame["rgb"]), "jpeg", jpeg_quality=JPEG)
 
     def _send_exact(self, client: Any, viewpoint: Viewpoint) -> None:
-        view = self.session.draw(viewpoint, 1.0, AT_REST)
+        view = self.session.draw(viewpoint)
         client.scene.set_background_image(to_uint8(view.frame["rgb"]), "png")
         if client.client_id in self._streams:  # else it has left meanwhile
             self._views[client.client_id] = view
@@ -240,16 +248,23 @@ class Viewer:
         except FidsplatError as error:
             self._controls.say(str(error))
 
+    def movable(self, scene: Scene) -> list[str]:
+        """Names of what the gizmo may move."""
+        return movable(scene, self._bodies)
+
+    @property
+    def _bodies(self) -> list[Body]:
+        return [] if self._file is None else self._file.bodies()
+
     def hold(self, name: str) -> None:
-        """Put the gizmo at a marker, by its name in the selector."""
+        """Put the gizmo at a marker or a splat file, by its name in the selector."""
         scene, _ = self.session.wanted()
-        number = None if name == NOBODY else int(name.partition(":")[0]) - 1
-        self._held = number if number in range(len(scene.markers)) else None
-        placed = None if self._held is None else scene.markers[self._held]
-        if placed is not None and placed.motion is not None:
-            self._controls.say(f"{placed.marker.spec} moves by keyframes; it is not moved by hand")
-            placed = None
-        self._nodes.hold(placed, self._move)
+        self._held = None if name == NOBODY else held_by(scene, self._bodies, name)
+        if self._held is not None and self._held.moves:
+            self._controls.say(f"{name} moves by keyframes; it is not moved by hand")
+            self._held = None
+        held = self._held
+        self._nodes.hold(None if held is None else held.pose, 0.0 if held is None else held.size, self._move)
 
     def overlay(self, visible: bool) -> None:
         """Show or hide outlines, names and frusta."""
@@ -260,23 +275,28 @@ class Viewer:
         """The gizmo is dragged; once it is let go its pose is written into the scene file."""
         with self._lock:
             scene, _ = self.session.wanted()
-            if self._held is None or self._held >= len(scene.markers):
+            held = self._held
+            if held is None or not (let_go or held.light):
                 return
-            markers = list(scene.markers)
-            markers[self._held] = replace(markers[self._held], pose=pose)
+            moved = held.moved(scene, pose)
+            if moved is None:
+                return
             problem = ""
             if let_go and self._file is not None:
                 try:
-                    self._file.place(self._held, pose)
+                    self._file.place(held.number, pose, held.kind)
                 except FidsplatError as error:
                     problem = str(error)
-            moved = replace(scene, markers=tuple(markers))
+                    if held.splats is not None:  # where they are is known from the file alone
+                        moved = held.moved(scene, held.pose)
             self.session.wish(scene=moved, done=lambda why: self._controls.say(why or problem))
 
     def _watch(self) -> None:
-        """Read the scene file again when somebody else has written it."""
+        """Read the scene file again when somebody else has written it, and ask for a run's newest splats."""
         while not self._closed.wait(LOOK):
             try:
+                if self._again is not None and (newer := self._again()) is not None:
+                    self.session.wish(scene=newer, done=lambda why: self._controls.say(why or ""))
                 with self._lock:
                     text = None if self._file is None else self._file.changed()
                 if self._file is not None and text is not None:
@@ -292,7 +312,7 @@ class Viewer:
             with self._lock:
                 self._file.text = text
             self.hold(NOBODY)
-            self._controls.offer(scene)
+            self._controls.offer(self.movable(scene))
         self._controls.say(problem or "")
 
 

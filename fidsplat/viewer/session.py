@@ -14,7 +14,7 @@ from fidsplat.errors import FidsplatError
 from fidsplat.frame import Frame
 from fidsplat.render import Renderer, ResidentCloud, default_device
 from fidsplat.scenes import Scene
-from fidsplat.viewer.settings import AT_REST, MOVING, Settings, Viewpoint
+from fidsplat.viewer.settings import Settings, Viewpoint
 
 _FIRST = Viewpoint((0.0, 0.0, -1.0), (1.0, 0.0, 0.0, 0.0), 1.0, 64, 48)
 
@@ -116,12 +116,18 @@ class Session:
         with self._wake:
             return self._wake.wait_for(lambda: not (self._working or self._wanted()), timeout)
 
-    def draw(self, viewpoint: Viewpoint, scale: float = 1.0, outputs: tuple[str, ...] = MOVING) -> View:
-        """A picture from there, that much smaller than the page."""
+    def draw(self, viewpoint: Viewpoint) -> View:
+        """The picture from there that is looked at and asked."""
+        drawn = self.drawn
+        camera = viewpoint.camera(drawn.scene, drawn.settings.lens)
+        frame = drawn.renderer.render(drawn.resident, drawn.settings.capture(drawn.scene, camera))
+        return View(frame, drawn, viewpoint)
+
+    def draw_moving(self, viewpoint: Viewpoint, scale: float) -> Frame:
+        """The colours from there while one moves, that much smaller than the page, by coarser constants."""
         drawn = self.drawn
         camera = viewpoint.camera(drawn.scene, drawn.settings.lens, scale)
-        frame = drawn.renderer.render(drawn.resident, drawn.settings.capture(drawn.scene, camera, outputs))
-        return View(frame, drawn, viewpoint)
+        return drawn.renderer.render(drawn.resident, drawn.settings.moving(drawn.scene, camera))
 
     def close(self) -> None:
         """Grant no more wishes."""
@@ -164,7 +170,7 @@ class Session:
         else another renderer is opened, whose lock holds no picture up."""
         device = settings.device or default_device()
         camera = _FIRST.camera(scene, settings.lens)
-        captures = [settings.capture(scene, camera, outputs) for outputs in (MOVING, AT_REST)]
+        captures = settings.moving(scene, camera), settings.capture(scene, camera)
         features = frozenset(select(scene.splats, capture) for capture in captures)
         version = 0 if before is None else before.version + 1
         if before is not None and before.device == device and features <= before.compiled:

@@ -17,9 +17,10 @@ from fidsplat.surroundings import Fog
 
 LENSES = ("pinhole", "fisheye", "panorama", "parallel", "scene")
 """`fisheye` sees 180 degrees across; `scene` is the lens of the scene's own camera"""
-MOVING = ("rgb",)
 AT_REST = ("rgb", "depth", "label", "splat_id")
 """outputs of the picture that one looks at and asks: what is there?"""
+_MOVING = Quality.named("fast")
+"""constants of the small pictures that are drawn while one moves, where the quality asked for is finer"""
 _FOG_COLOR = (0.7, 0.7, 0.7)
 _LEAST = 16  # pixels a side
 
@@ -112,8 +113,27 @@ class Settings:
             readout_ms=1e3 * capture.shutter.readout,
         )
 
-    def capture(self, scene: Scene, camera: Camera, outputs: tuple[str, ...]) -> Capture:
-        """How a scene's picture is taken from a camera that the browser moves.
+    def moving(self, scene: Scene, camera: Camera) -> Capture:
+        """How a picture is taken that is gone at once: its colours alone, by the constants of `fast` where
+        those asked for are finer, one sample a pixel.
+
+        Raises:
+            InputError: a value out of range.
+        """
+        capture = self.capture(scene, camera)
+        asked = capture.quality
+        coarse = asked.with_(
+            alpha_cutoff=max(asked.alpha_cutoff, _MOVING.alpha_cutoff),
+            transmittance_stop=max(asked.transmittance_stop, _MOVING.transmittance_stop),
+            setup_precision=_MOVING.setup_precision,
+            arithmetic=_MOVING.arithmetic,
+            blend_precision=_MOVING.blend_precision,
+            samples=1,
+        )
+        return replace(capture, outputs=("rgb",), quality=coarse)
+
+    def capture(self, scene: Scene, camera: Camera) -> Capture:
+        """How a scene's picture at rest is taken from a camera that the browser moves.
 
         Raises:
             InputError: a value out of range.
@@ -133,7 +153,7 @@ class Settings:
         return replace(
             own,
             camera=camera,
-            outputs=outputs,
+            outputs=AT_REST,
             quality=own.quality if self.quality is None else Quality.of(self.quality),
             motion=Motion(None, scene.motion.groups),
             shutter=Shutter() if still else shutter,

@@ -144,8 +144,10 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
         return image
     if image.dtype == bool:
         return image.astype(np.uint8) * 255
-    # NaN would become an undefined integer
-    return np.rint(np.clip(np.nan_to_num(image, nan=0.0), 0.0, 1.0) * 255.0).astype(np.uint8)
+    scaled = np.fmax(image, 0.0)  # NaN too, which would become an undefined integer
+    np.minimum(scaled, 1.0, out=scaled)
+    scaled *= 255.0
+    return np.rint(scaled, out=scaled).astype(np.uint8)
 
 
 def write_png(path: str | os.PathLike[str], image: np.ndarray) -> Path:

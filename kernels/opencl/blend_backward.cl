@@ -75,6 +75,7 @@ typedef struct {
 //@@ geometry
 } Geometry;
 
+//@@ fragment_functions
 // The fragment's place on the splat, of the rows' forms and the low-pass's own.
 static inline Geometry geometry_of(const Splat *s, Crossing c, vfloat nu_x, vfloat nv_x, wide y, vfloat screen) {
     Geometry g;

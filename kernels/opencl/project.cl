@@ -134,8 +134,8 @@ kernel void project(
     record.d0 = (wide)(k0.z * facing); record.dx = (wide)(kx.z * facing); record.dy = (wide)(ky.z * facing);
     record.d_near = (wide)(z_numerator / near);
     record.log_opacity = log_opacity;
-    record.ax = (short)anchor_i;
-    record.ay = (short)anchor_j;
+    record.ax = (float)anchor_i;
+    record.ay = (float)anchor_j;
     record.y0 = (short)y0;
     record.y1 = (short)y1;
     record.x0 = (short)max(to_pixel(ceil(x0 - 0.5f), width), 0);

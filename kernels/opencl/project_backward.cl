@@ -136,22 +136,19 @@ kernel __attribute__((reqd_work_group_size(POSED, 1, 1))) void project_backward(
 }
 
 // Sums of rows, in a fixed order.
-// Index space: one work-group of ADDED. Reads: parts. Writes: sums.
+// Index space: work-groups of ADDED, one per column. Reads: parts. Writes: sums.
 #define ADDED 64
 kernel __attribute__((reqd_work_group_size(ADDED, 1, 1))) void add_up(
 //@@ arguments add_up
 ) {
     local real kept[ADDED];
-    uint item = get_local_id(0);
-    for (uint column = 0; column < columns; column++) {
-        real sum = 0;
-        for (uint row = item; row < rows; row += ADDED) sum += parts[(size_t)row * columns + column];
-        kept[item] = sum;
-        barrier(CLK_LOCAL_MEM_FENCE);
-        if (item == 0) {
-            for (uint other = 1; other < ADDED; other++) sum += kept[other];
-            sums[column] = (float)sum;
-        }
-        barrier(CLK_LOCAL_MEM_FENCE);
+    uint item = get_local_id(0), column = get_group_id(0);
+    real sum = 0;
+    for (uint row = item; row < rows; row += ADDED) sum += parts[(size_t)row * columns + column];
+    kept[item] = sum;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (item == 0) {
+        for (uint other = 1; other < ADDED; other++) sum += kept[other];
+        sums[column] = (float)sum;
     }
 }

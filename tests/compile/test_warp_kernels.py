@@ -78,7 +78,7 @@ def resolving(stretched, samples):
 
 
 LONG = pytest.mark.exhaustive
-"""of blending with every output: 13 s each. Plain runs compile it for rays and boxes, and without either"""
+"""of blending with every output: 13 s each. Plain runs compile it with boxes, of rays and in a test below"""
 
 
 @pytest.fixture(autouse=True)
@@ -102,7 +102,7 @@ def started():
         ),
         pytest.param(lambda: projecting(*LENSES[2], "footprint_mixed"), id="project-fisheye-mixed"),
         pytest.param(lambda: projecting(*LENSES[0], "footprint_mixed"), id="project-parallel-mixed"),
-        pytest.param(lambda: blending(*RECORD), id="blend-all"),
+        pytest.param(lambda: blending(*RECORD), id="blend-all", marks=LONG),
         pytest.param(lambda: blending(*RECORD, "arithmetic_fast"), id="blend-fast", marks=LONG),
         pytest.param(lambda: blending(*MIXED), id="blend-mixed", marks=LONG),
         pytest.param(lambda: blending("footprint_box", outputs=()), id="blend-boxes"),

@@ -4,13 +4,12 @@ import pickle
 
 import numpy as np
 import pytest
-from agreement import random_splats
+from agreement import ALL_OUTPUTS, random_splats
 
 import fidsplat as fs
 from fidsplat.rotations import rigid_matrix
 from fidsplat.views import views_of
 
-OUTPUTS = ("rgb", "depth", "label")
 CAMERA = fs.Camera.look_at(50, 40, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 CAMERAS = [fs.Camera.look_at(50, 40, 1.0, (x, 0.1, -0.1), (0.0, 0.0, 3.0)) for x in (-0.4, 0.0, 0.3)]
 POSES = np.array([[0.1, 0, -0.2, 1, 0, 0, 0], [0, 0.1, 0, 1, 0.02, 0, 0.1], [0, 0, 0.2, 2, 0, -0.1, 0]])
@@ -46,7 +45,7 @@ def camera_at(pose):
 
 
 def test_views_have_the_bits_of_themselves_alone(renderer, cloud):
-    captures = [fs.Capture(camera, OUTPUTS) for camera in CAMERAS]
+    captures = [fs.Capture(camera, ALL_OUTPUTS) for camera in CAMERAS]
     batch = renderer.render_batch(cloud, captures)
     assert batch["rgb"].shape == (3, 40, 50, 3)
     assert batch["depth"].shape == (3, 40, 50)
@@ -58,19 +57,19 @@ def test_views_have_the_bits_of_themselves_alone(renderer, cloud):
 
 
 def test_poses_take_the_place_of_the_cameras_own(renderer, cloud):
-    batch = renderer.render_batch(cloud, fs.Capture(CAMERA, OUTPUTS), poses=POSES)
-    assert_same(batch, [renderer.render(cloud, camera_at(pose), OUTPUTS) for pose in POSES])
+    batch = renderer.render_batch(cloud, fs.Capture(CAMERA, ALL_OUTPUTS), poses=POSES)
+    assert_same(batch, [renderer.render(cloud, camera_at(pose), ALL_OUTPUTS) for pose in POSES])
 
 
 def test_groups_move_in_each_view_by_themselves(renderer, cloud):
     groups = {1: POSES, 2: POSES[::-1]}
-    batch = renderer.render_batch(cloud, fs.Capture(CAMERA, OUTPUTS), groups=groups)
+    batch = renderer.render_batch(cloud, fs.Capture(CAMERA, ALL_OUTPUTS), groups=groups)
     motions = [fs.Motion(groups={label: moved(each[k]) for label, each in groups.items()}) for k in range(3)]
-    assert_same(batch, [renderer.render(cloud, CAMERA, OUTPUTS, motion=motion) for motion in motions])
+    assert_same(batch, [renderer.render(cloud, CAMERA, ALL_OUTPUTS, motion=motion) for motion in motions])
 
 
 def test_masked_views_are_not_drawn(renderer, cloud):
-    captures = [fs.Capture(camera, OUTPUTS, background=(0.5, 0.5, 0.5)) for camera in CAMERAS]
+    captures = [fs.Capture(camera, ALL_OUTPUTS, background=(0.5, 0.5, 0.5)) for camera in CAMERAS]
     mask = np.array([False, True, False])
     batch = renderer.render_batch(cloud, captures, mask=mask)
     assert_same(batch, [None, renderer.render(cloud, captures[1]), None])
@@ -80,23 +79,23 @@ def test_masked_views_are_not_drawn(renderer, cloud):
 
 
 def test_a_batch_outlives_the_next(renderer, cloud):
-    first = renderer.render_batch(cloud, [fs.Capture(camera, OUTPUTS) for camera in CAMERAS])
-    frame = renderer.render(cloud, CAMERA, OUTPUTS)
-    renderer.render_batch(cloud, [fs.Capture(camera, OUTPUTS) for camera in CAMERAS[::-1]])
-    assert_same(first, [renderer.render(cloud, camera, OUTPUTS) for camera in CAMERAS])
+    first = renderer.render_batch(cloud, [fs.Capture(camera, ALL_OUTPUTS) for camera in CAMERAS])
+    frame = renderer.render(cloud, CAMERA, ALL_OUTPUTS)
+    renderer.render_batch(cloud, [fs.Capture(camera, ALL_OUTPUTS) for camera in CAMERAS[::-1]])
+    assert_same(first, [renderer.render(cloud, camera, ALL_OUTPUTS) for camera in CAMERAS])
     assert np.array_equal(frame["rgb"], renderer.render(cloud, CAMERA)["rgb"])
 
 
 def test_a_batch_is_given_where_it_was_drawn(renderer, cloud):
-    batch = renderer.render_batch(cloud, fs.Capture(CAMERA, OUTPUTS), poses=POSES).wait()
-    arrays = {name: batch.device_array(name) for name in OUTPUTS}
+    batch = renderer.render_batch(cloud, fs.Capture(CAMERA, ALL_OUTPUTS), poses=POSES).wait()
+    arrays = {name: batch.device_array(name) for name in ALL_OUTPUTS}
     for name, array in arrays.items():
         assert tuple(array.shape) == batch[name].shape
         on_host = array.numpy() if hasattr(array, "numpy") else array.get()
         assert np.array_equal(on_host, batch[name])
     assert set(batch.timings) >= {"project", "blend", "resolve"}
-    with pytest.raises(fs.InputError, match="no 'alpha'"):
-        batch.device_array("alpha")
+    with pytest.raises(fs.InputError, match="no 'distance'"):
+        batch.device_array("distance")
 
 
 def test_a_view_as_a_frame_and_a_batch_as_arrays(renderer, cloud):

@@ -161,7 +161,7 @@ def test_light_is_that_of_the_image(renderer, camera, size):
 def test_boxes_through_lenses_in_single_precision(renderer, name):
     """The set-up of devices without float64, held as Gaussians are: to a tenth of an 8-bit step."""
     cloud = random_splats(100, 0, depth=(0.5, 6.0)).with_boxes()
-    frame = renderer.render(cloud, CAMERAS[name], quality="fast")
+    frame = renderer.render(cloud, CAMERAS[name], ALL_OUTPUTS, "fast")
     truth = reference_pixels(cloud, CAMERAS[name], ("rgb",), "fast")
     excess = np.abs(frame["rgb"] - truth["rgb"]).max(2) - truth["certificate"]
     assert np.quantile(excess, 0.995) < 0.1 / 255

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from agreement import against_reference, random_splats
+from agreement import ALL_OUTPUTS, against_reference, random_splats
 from sampling import SAMPLES, alternate, in_turn
 
 import fidsplat as fs
@@ -93,7 +93,7 @@ def test_effects_of_the_picture_under_a_shutter(renderer, around, shutter):
     behind = {"sky": SKY, "panorama": PANORAMA}.get(around, (0.1, 0.2, 0.3))
     fog = FOG if around == "fog" else None
     motion = fs.Motion(turning, {0: sliding})
-    outputs = ("rgb", "alpha", "distance", "splat_id", "normal_world")
+    outputs = ("rgb", "alpha", "distance", "depth_median", "splat_id", "normal_world")
     capture = fs.Capture(PLAIN, outputs, quality, behind, motion, shutter, SENSOR, fog)
     frame = renderer.render(cloud, capture)
     features, view = prepare(cloud, capture)
@@ -115,7 +115,7 @@ def test_fog_is_averaged_over_the_poses_of_a_shutter(renderer):
     def middle(**when):
         camera = replace(PLAIN, far=100.0)
         motion = {} if not when else {"motion": fs.Motion(away), "shutter": fs.Shutter(**when)}
-        return renderer.render(wall, camera, fog=FOG, **motion)["rgb"][14, 20].astype(float)
+        return renderer.render(wall, camera, ("rgb", "depth"), fog=FOG, **motion)["rgb"][14, 20].astype(float)
 
     near, none, both = middle(), np.array(FOG.color), middle(exposure_time=1.0, sub_poses=2)
     assert (near < none - 0.1).all()
@@ -128,7 +128,7 @@ def test_fog_is_averaged_over_the_poses_of_a_shutter(renderer):
 )
 def test_backgrounds_behind_every_lens(renderer, camera, behind, samples):
     picture = {"camera": camera, "background": behind, "quality": fs.Quality(samples=samples)}
-    assert_agrees(renderer, outputs=("rgb", "normal_world"), **picture)
+    assert_agrees(renderer, outputs=(*ALL_OUTPUTS, "normal_world"), **picture)
 
 
 @pytest.mark.skipif(WARP is None, reason="no Warp device here")

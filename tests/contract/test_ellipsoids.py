@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from agreement import against_reference, assert_agrees, random_splats
+from agreement import ALL_OUTPUTS, against_reference, assert_agrees, random_splats
 from sampling import in_turn
 
 import fidsplat as fs
@@ -48,7 +48,7 @@ def test_each_fragment_by_its_own_depth(renderer, way):
     disks = random_splats(20, 3, depth=(0.5, 4.0), scale=(0.05, 0.5), across=1.2)
     cloud = fs.SplatCloud.concatenate([thick(1), disks])
     quality = fs.Quality(ellipsoid=way, order="pixel")
-    assert_agrees(renderer, cloud, CAMERA, ("rgb", "alpha", "depth"), quality)
+    assert_agrees(renderer, cloud, CAMERA, quality=quality)
 
 
 @pytest.mark.parametrize("order", ["centre", "pixel"])
@@ -58,7 +58,7 @@ def test_alone_or_among_others_they_have_the_same_bits(renderer, order):
     alone, quality = thick(3), fs.Quality(lowpass="none", order=order)
     behind = fs.SplatCloud([[0, 0, -5]], [[1, 0, 0, 0]], [[0.1, 0.1]], [1.0], colors=[[1, 1, 1]])
     both = fs.SplatCloud.concatenate([alone, behind])
-    images = [renderer.render(cloud, CAMERA, quality=quality)["rgb"] for cloud in (alone, both)]
+    images = [renderer.render(cloud, CAMERA, ALL_OUTPUTS, quality)["rgb"] for cloud in (alone, both)]
     assert images[0].any()
     assert np.array_equal(*images)
 
@@ -66,9 +66,9 @@ def test_alone_or_among_others_they_have_the_same_bits(renderer, order):
 def test_several_samples_are_widened_as_one_pixel(renderer):
     """By 0.3 square pixels, not samples; and a Gaussian whose centre lies behind the camera is not drawn."""
     cloud, quality = mixed(5), fs.Quality(ellipsoid="ewa", samples=2)
-    assert_agrees(renderer, cloud, CAMERA, ("rgb", "alpha", "depth"), quality)
+    assert_agrees(renderer, cloud, CAMERA, quality=quality)
     behind = fs.SplatCloud([[0, 0, -0.1]], [[1, 0, 0, 0]], [[1.0] * 3], [0.9], colors=[[1, 1, 1]])
-    assert not renderer.render(behind, CAMERA, ("alpha",), quality)["alpha"].any()
+    assert not renderer.render(behind, CAMERA, ALL_OUTPUTS, quality)["alpha"].any()
 
 
 def test_exact_behind_a_fisheye(renderer):
@@ -125,10 +125,8 @@ def test_a_flat_ellipsoid_is_a_disk(renderer):
         colors=cloud.colors,
     )
     quality = fs.Quality(ellipsoid="exact")
-    error = (
-        renderer.render(thick, CAMERA, quality=quality)["rgb"]
-        - renderer.render(cloud, CAMERA, quality=quality)["rgb"]
-    )
+    one, other = (renderer.render(each, CAMERA, ALL_OUTPUTS, quality)["rgb"] for each in (thick, cloud))
+    error = one - other
     assert -10 * math.log10(max(float((error**2).mean()), 1e-20)) > 80
 
 

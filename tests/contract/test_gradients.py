@@ -7,6 +7,7 @@ import fidsplat as fs
 from fidsplat.backends.derivatives import Differentiates
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
+from fidsplat.effects.differentiable import with_distortion
 from fidsplat.hard_cases.derivatives import (
     COSINE,
     NORM,
@@ -20,15 +21,16 @@ from fidsplat.hard_cases.derivatives import (
 BACKEND = "opencl"
 
 
-def assert_same(backend, cloud, capture, **build):
-    found = derivatives(backend, cloud, capture, **build)
-    expected = derivatives(ReferenceBackend(), cloud, capture)
+def assert_same(backend, cloud, capture, by_images=None, **build):
+    found = derivatives(backend, cloud, capture, by_images, **build)
+    expected = derivatives(ReferenceBackend(), cloud, capture, by_images)
     assert found.keys() == expected.keys()
     for name, array in found.items():
         assert array.shape == expected[name].shape, name
     off = list(differences(found, expected))
     if any(one.norm > NORM or one.turned > COSINE for one in off):
-        known = differences(derivatives(ReferenceBackend(), last_place(cloud), capture), expected)
+        moved = derivatives(ReferenceBackend(), last_place(cloud), capture, by_images)
+        known = differences(moved, expected)
         for one, place in zip(off, known, strict=True):
             assert one.norm <= max(NORM, 2 * place.norm), (one, place)
             assert one.turned <= max(COSINE, 2 * place.turned), (one, place)
@@ -66,6 +68,23 @@ def test_derivatives_of_random_scenes_are_the_references(backend, seeds):
 def test_the_schedule_of_gpus_has_the_references_derivatives(backend):
     for shape in backend.shapes("schedule").values():
         assert_same(backend, *random_picture(2), shape=shape)
+
+
+def test_distortions_and_their_derivatives_are_the_references(backend):
+    """Of splats a thousandth of their depth apart as of those that are far apart. The derivatives by
+    distortions are small beside others, and are asked for by themselves."""
+    cases: list[dict] = [{"depth": (2.0, 2.002)}, {"depth": (0.3, 30.0), "scale": (0.1, 1.0)}]
+    for case in cases:
+        cloud, capture = random_picture(3, **case)
+        by_distortion = {"distortion": np.random.default_rng(1).normal(size=(43, 61)).astype(np.float32)}
+        assert_same(backend, cloud, capture, by_distortion)
+        features, view = prepare(cloud, capture)
+        found, wanted = (
+            each.differentiate(with_distortion(features)).forward(each.upload(cloud), view).read("distortion")
+            for each in (backend, ReferenceBackend())
+        )
+        assert wanted.max() > 0
+        assert np.abs(found - wanted).max() < 1e-4 * wanted.max()
 
 
 def test_opaque_splats_have_derivatives(backend):

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from agreement import ALL_OUTPUTS
 
 import fidsplat as fs
 from fidsplat.quality import PRESETS
@@ -41,8 +42,8 @@ def test_a_marker_s_file_is_opaque_enough_and_read(renderer, pair, tilt, azimuth
     made, read = pair
     assert PRESETS["gsplat"] == PRESETS["surfel"]
     camera = towards(tilt, azimuth)
-    ideal = renderer.render(made.cloud, camera, ("rgb", "alpha"), "gsplat", GREY)
-    shown = renderer.render(read, camera, ("rgb", "alpha"), "gsplat", GREY)
+    ideal = renderer.render(made.cloud, camera, ALL_OUTPUTS, "gsplat", GREY)
+    shown = renderer.render(read, camera, ALL_OUTPUTS, "gsplat", GREY)
     inside = ideal["alpha"] > 0.98
     assert shown["alpha"][inside].mean() > 0.94
     assert psnr(shown["rgb"], ideal["rgb"]) > 21

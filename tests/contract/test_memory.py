@@ -98,6 +98,7 @@ def whole(opencl, cloud):
     return {name: frame[name] for name in frame}, dict(frame.stats)
 
 
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize("mebibytes", [3.6, 4, 4.75])
 @pytest.mark.parametrize("streamed", [False, True])
 def test_little_memory_gives_the_same_bits(opencl, cloud, whole, mebibytes, streamed):
@@ -190,6 +191,7 @@ def test_pictures_of_many_sizes_leave_no_heap_of_buffers(opencl):
     assert max(held) <= held[0]
 
 
+@pytest.mark.usefixtures("optimised")
 @machines
 def test_a_pool_keeps_to_the_budget_whatever_was_drawn_before(opencl, machine):
     """Pictures at once and in chunks, few and many outputs: what one kind has left does not count against

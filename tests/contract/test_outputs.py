@@ -165,6 +165,17 @@ def test_a_layer_of_a_thousand_faint_splats(renderer):
     assert rgb[0] + rgb[1] == pytest.approx(1 - math.exp(-red - green), rel=1e-4)
 
 
+def test_a_cutoff_below_all_floats(renderer):
+    """Opacities that are 0 as float32 are in no layer's mean, which would be 0 / 0."""
+    disk = fs.SplatCloud([(0, 0, 2)], [(1, 0, 0, 0)], [(0.05, 0.05)], [0.9], colors=[(1, 0.5, 0)])
+    flat = disk.with_planes([0])
+    faint, fainter = (
+        renderer.render(flat, CAMERA, ALL, fs.Quality(alpha_cutoff=cutoff)) for cutoff in (1e-20, 1e-90)
+    )
+    assert all(np.isfinite(fainter[name]).all() for name in ("rgb", "alpha", "depth", "normal"))
+    assert fainter["rgb"] == pytest.approx(faint["rgb"], abs=1e-6)
+
+
 def test_a_wall_that_the_camera_almost_lies_in(renderer):
     """Its centre 10^9 m ahead, its plane 0.1 m aside: it covers all that lies on that side."""
     wall = fs.SplatCloud([(-0.1, 0, 1e9)], [(0.5, 0.5, 0.5, 0.5)], [(1e9, 1e9)], [1.0], colors=[(1, 1, 1)])

@@ -90,7 +90,7 @@ def test_normals_in_the_world_are_those_of_each_rows_pose(renderer):
     """A wall that stands still has one normal, however the camera turns while it is read out."""
     wall = fs.SplatCloud([(0, 0, 4)], [(0.97, 0.2, 0.1, 0)], [(9, 9)], [0.9], colors=[(1, 1, 1)])
     motion = fs.Motion(pose_at)
-    outputs = ("normal", "normal_world")
+    outputs = (*ALL_OUTPUTS, "normal_world")
     frame = renderer.render(wall, CAMERAS["pinhole"], outputs, motion=motion, shutter=SHUTTERS["rolling"])
     first = frame["normal_world"][0, 0]
     assert np.linalg.norm(first) == pytest.approx(1, abs=1e-5)
@@ -212,9 +212,7 @@ def test_the_same_bits_again_and_in_bands_of_tiles(renderer):
     cloud, camera = random_splats(200, 7, depth=(-1, 5)), CAMERAS["fisheye"]
 
     def draw():
-        frame = renderer.render(
-            cloud, camera, ("rgb", "depth", "label"), motion=MOTION, shutter=SHUTTERS["both"]
-        )
+        frame = renderer.render(cloud, camera, ALL_OUTPUTS, motion=MOTION, shutter=SHUTTERS["both"])
         return [frame[name] for name in frame]
 
     first = draw()

@@ -15,6 +15,7 @@ from fidsplat.experiments.run import Options
 from fidsplat.experiments.sweep import read_records
 from fidsplat.vision.images import write_png
 
+pytestmark = pytest.mark.usefixtures("optimised")
 SMALL = ["--category", "apriltag", "--markers", "1"]
 
 
@@ -93,10 +94,16 @@ def test_shards_merge_into_what_one_run_gives(capsys, tmp_path):
     assert found("both") == found("whole")
 
 
-def test_everything_quick_and_its_report(capsys, tmp_path):
-    status, out, err = run(
-        capsys, "all", "--quick", *SMALL, "--mixture", "fitted", "--device", "opencl", "-o", tmp_path
-    )
+def test_a_quick_run_has_few_tilts(tmp_path):
+    for quick, tilts in ((False, angles.FULL_TILTS), (True, angles.QUICK_TILTS)):
+        points = run_module._points(angles.NAME, Options(tmp_path, quick=quick))
+        assert {point["tilts"] for point in points} == {tilts}
+
+
+def test_everything_quick_and_its_report(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr(angles, "QUICK_TILTS", "0:80:40")
+    words = ("all", "--quick", *SMALL, "--mixture", "fitted", "-o", tmp_path)
+    status, out, err = run(capsys, *words, "--device", "opencl")
     assert status == 0, err
     for name in ("counts", "localisation", "views", "angles"):
         assert read_records(tmp_path / f"{name}.jsonl")
@@ -105,9 +112,7 @@ def test_everything_quick_and_its_report(capsys, tmp_path):
     assert (tmp_path / "sheet-apriltag.png").is_file()
     assert "(sheet-apriltag.png)" in text
     before = {file: file.read_bytes() for file in tmp_path.glob("*.jsonl")}
-    status, out, _ = run(
-        capsys, "all", "--quick", *SMALL, "--mixture", "fitted", "-o", tmp_path, "--json"
-    )  # nothing is left to do
+    status, out, _ = run(capsys, *words, "--json")  # nothing is left to do
     assert status == 0
     assert set(json.loads(out)["files"]) == {"counts", "localisation", "views", "angles"}
     assert {file: file.read_bytes() for file in tmp_path.glob("*.jsonl")} == before

@@ -13,6 +13,7 @@ from fidsplat.experiments.setup import CATEGORIES, PROTOCOLS, novel_cameras
 from fidsplat.vision.images import to_uint8, write_png
 from fidsplat.vision.metrics import psnr
 
+pytestmark = pytest.mark.usefixtures("optimised")
 CEILING = Painter(None)
 
 

@@ -26,9 +26,12 @@ from fidsplat.experiments.tradeoff.points import (
 )
 from fidsplat.experiments.tradeoff.scenes import NAMES, TradeScene, make, scene_names
 from fidsplat.experiments.tradeoff.session import QUICK, Session, memory_of, time_point
+from fidsplat.experiments.tradeoff.summary import load
 from fidsplat.hard_cases.clouds import camera, splats
 from fidsplat.quality import ELLIPSOID, PRESETS, MarkerQuality
+from fidsplat.random_clouds import random_cloud
 
+pytestmark = pytest.mark.usefixtures("optimised")
 FACING = (1.0, 0.0, 0.0, 0.0)
 WORDS = ("tradeoff", "--quick", "--scenes", "apriltag", "--knobs", "opacity_ceiling")
 
@@ -267,6 +270,48 @@ def test_an_interrupted_run_goes_on(capsys, tmp_path, monkeypatch):
     before = file.read_bytes()
     assert main(words) == 0  # nothing is left to do
     assert file.read_bytes() == before
+
+
+def test_ones_own_scene_is_measured_from_each_of_its_poses(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scene_file = tmp_path / "own.toml"
+    fs.save_ply(random_cloud(200, 0.2), "own.ply")
+    scene_file.write_text(
+        "[camera]\nwidth = 64\nheight = 48\nfov_x_deg = 60.0\nposition = [0.0, 0.0, 0.0]\n"
+        'look_at = [0.0, 0.0, 1.0]\n[[splats]]\nfile = "own.ply"\n'
+    )
+    (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n1 0.2 0 0 0 0 0 1\n")
+    words = ["tradeoff", "--quick", "--scene", "own.toml", "--cameras", "poses.tum", "-o", "out"]
+    words += ["--knobs", "opacity_ceiling"]
+    assert main(words) == 0
+    records = read_records(tmp_path / "out" / run.FILE)
+    views = ("own.toml@0", "own.toml@1")
+    found = {(r.key["scene"], r.key["what"], r.key.get("value")): r.result for r in records}
+    assert {key[0] for key in found} == set(views)
+    assert {key[1] for key in found} == {"point", "truth"}
+    for view in views:
+        assert found[view, "truth", None]["maximum"] < 1e-5
+        assert 1e-4 < found[view, "point", "base"]["maximum"] < 0.05
+    # pictures differ, so do their errors; the ceiling lets light through
+    assert found[views[0], "point", "base"]["rmse"] != found[views[1], "point", "base"]["rmse"]
+    assert found[views[0], "point", "0.99"]["maximum"] >= found[views[0], "point", "base"]["maximum"]
+    capsys.readouterr()
+    assert load([tmp_path / "out"])[0].scenes == list(views)
+    assert main(words) == 0  # nothing is left to do
+    fs.save_ply(random_cloud(201, 0.2), "own.ply")
+    assert main(words) == 2
+    assert "holds results of another scene; give another folder" in capsys.readouterr().err
+    assert main(["tradeoff", "--scene", "own.toml", "--scenes", "hard"]) == 2
+    assert "exclude each other" in capsys.readouterr().err
+
+
+def test_ones_own_3d_gaussians_are_held_against_themselves_as_they_are_drawn():
+    """Captures look as they did to their trainer, who drew them by EWA."""
+    scene = make("r100k_720p_3d", BASE.marker)
+    own = Session(fs.Renderer("reference"), {"own.ply": dataclasses.replace(scene, name="own.ply")})
+    assert own.definition("own.ply", BASE).ellipsoid == "ewa"
+    assert own.definition("own.ply", BASE.with_(ellipsoid="exact")).ellipsoid == "exact"
+    assert own.definition("r100k_720p_3d", BASE).ellipsoid == "exact"
 
 
 def test_what_a_device_refuses_is_a_result(tmp_path, monkeypatch):

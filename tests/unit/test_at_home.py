@@ -65,6 +65,28 @@ def test_torch_itself_takes_a_frame():
     torch = pytest.importorskip("torch", reason="torch is not installed")
     drawn = frame("rgb")
     assert torch.equal(drawn.to_torch(), torch.tensor(drawn["rgb"]))
+    assert torch.equal(torch.from_dlpack(drawn), torch.tensor(drawn["rgb"]))
+
+
+def test_a_frame_of_one_output_goes_through_dlpack():
+    one = frame("label")
+    there = np.from_dlpack(one)
+    np.testing.assert_array_equal(there, one["label"])
+    assert not np.shares_memory(there, one["label"])
+    given = np.arange(6.0).reshape(2, 3)
+    images = SimpleNamespace(read=None, timings={}, stats={}, device_array=lambda name: given)
+    assert np.shares_memory(np.from_dlpack(fs.Frame(images, ("depth",))), given)  # no copy
+    with pytest.raises(fs.InputError, match="this frame has 2 images"):
+        np.from_dlpack(frame("rgb", "depth"))
+
+
+def test_pil_and_opencv_take_a_frame():
+    """As docs/rendering.md says."""
+    drawn = frame("rgb")
+    image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
+    np.testing.assert_array_equal(np.asarray(image.fromarray(to_uint8(drawn["rgb"]))), to_uint8(drawn["rgb"]))
+    bgr = cv2.cvtColor(to_uint8(drawn["rgb"]), cv2.COLOR_RGB2BGR)
+    np.testing.assert_array_equal(bgr[:, :, ::-1], to_uint8(drawn["rgb"]))
 
 
 def test_clouds_and_scenes_say_what_they_hold():

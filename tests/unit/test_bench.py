@@ -1,10 +1,10 @@
 """fidsplat bench: what is measured, what becomes of errors and interrupts, the record for programs."""
 
 import json
+import xml.dom.minidom
 
 import numpy as np
 import pytest
-from optimisation import as_users_compile
 
 import fidsplat as fs
 from fidsplat.backends.base import Measurable
@@ -67,10 +67,10 @@ def measurable(renderer):
     return renderer.backend
 
 
+@pytest.mark.usefixtures("optimised")  # else each takes as long as the loop around it
 def test_rates_of_a_device_are_those_of_a_computer(renderer):
     assert renderer.device.platform == "NVIDIA Warp" or isinstance(renderer.backend, Measurable)
-    with as_users_compile():  # without optimisation each takes as long as the loop around it
-        rates = measurable(renderer).rates()
+    rates = measurable(renderer).rates()
     assert 1e8 < rates.copy_bytes < 1e14
     # results per second: a multiply-add is never slower than an exponential or a division
     assert 1e7 < rates.exp < rates.fma < 1e16
@@ -303,3 +303,21 @@ def test_ones_own_scene_from_ones_own_cameras(tmp_path, monkeypatch, capsys):
     ):
         assert bench(*wrong) == 2
         assert why in capsys.readouterr().err
+
+
+def test_the_plot_has_a_bar_for_each_scene_and_device(tmp_path):
+    pytest.importorskip("matplotlib", reason="the extra experiments is not installed")
+    file = tmp_path / "times.svg"
+    words = ("--device", "reference", "--device", "opencl:pocl")
+    assert bench("--scenes", "small", "other", *words, "--plot", file) == 0
+    drawn = xml.dom.minidom.parse(str(file)).toxml()
+    for words in ("small", "other", "opencl:pocl", "reference", "ms a frame"):
+        assert f"<!-- {words}" in drawn, words
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("times.pdf", "ends so"), ("no/../\0.svg", "names no file"), (".", "ends so")]
+)
+def test_a_plot_that_cannot_be_written_is_said_first(name, words, capsys):
+    assert bench("--scenes", "small", "--plot", name) == 2
+    assert words in capsys.readouterr().err

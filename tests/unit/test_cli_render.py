@@ -9,7 +9,7 @@ import pytest
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.commands.framing import framing_camera
-from fidsplat.vision.images import read_image
+from fidsplat.vision.images import read_image, to_uint8
 
 SCENE = """
 [camera]
@@ -257,3 +257,18 @@ def test_the_frame_leaves_strays_out_only_when_there_are_many():
     few = fs.SplatCloud(means[:5], many.quats[:5], many.scales[:5], np.ones(5), colors=np.zeros((5, 3)))
     inside = framing_camera(few).project(means[:5])
     assert ((inside > 0) & (inside < (1280, 720))).all()
+
+
+def test_every_eighth_pixel_of_the_reference(scene, tmp_path, capsys):
+    assert main(["render", scene, "--device", "reference", "--every", "8", "-o", "some.png", "--json"]) == 0
+    facts = said(capsys)
+    assert (facts["width"], facts["height"]) == (20, 15)
+    loaded = fs.Scene.load(scene)
+    pixels = fs.Renderer("reference").render_every(8, loaded)["rgb"]
+    np.testing.assert_array_equal(read_image(tmp_path / "some.png"), to_uint8(pixels))
+    for words, why in (
+        (("--device", "opencl:pocl", "--every", "8"), "draws whole pictures only"),
+        (("--device", "reference", "--every", "0"), "step is 0"),
+    ):
+        assert main(["render", scene, *words]) == 2
+        assert why in capsys.readouterr().err

@@ -10,6 +10,8 @@ from fidsplat.cli import main
 from fidsplat.experiments.demo_scene import demo_scene
 from fidsplat.vision.images import read_image
 
+pytestmark = pytest.mark.usefixtures("optimised")
+
 
 @pytest.fixture(scope="module")
 def scene():

@@ -9,8 +9,9 @@ import fidsplat as fs
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
 from fidsplat.backends.reference.gradients import FrozenPicture
+from fidsplat.effects.differentiable import with_distortion
 
-OUTPUTS = ("rgb", "alpha", "depth", "normal")
+OUTPUTS = ("rgb", "alpha", "depth", "normal", "distortion")
 CAMERA = fs.Camera.pinhole(14, 11, 12.0, 13.0, 6.6, 5.2, near=0.3)
 
 
@@ -61,14 +62,16 @@ SCENES = {
 
 def pictured(name, background=(0.2, 0.5, 0.1)):
     cloud, quality = SCENES[name]
-    capture = fs.Capture(CAMERA, outputs=OUTPUTS, quality=quality, background=background)
-    return cloud, *prepare(cloud, capture)
+    capture = fs.Capture(CAMERA, outputs=OUTPUTS[:4], quality=quality, background=background)
+    features, view = prepare(cloud, capture)
+    return cloud, with_distortion(features), view
 
 
 def weights_of(images, seed=0):
     """A loss that is linear in all images."""
     rng = np.random.default_rng(seed)
-    return {name: rng.normal(size=images[name].shape) for name in OUTPUTS}
+    large = {"distortion": 100.0}  # where others are about 1
+    return {name: large.get(name, 1.0) * rng.normal(size=images[name].shape) for name in OUTPUTS}
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -147,6 +148,9 @@ def test_the_command_measures_once(tmp_path, monkeypatch, capsys):
     assert "is of another drive" in capsys.readouterr().err
     assert main([*words[:-1], "odometri"]) == 2
     assert "unknown variant 'odometri' (did you mean 'odometry'?)" in capsys.readouterr().err
+    (tmp_path / "out/localise.json").write_text("[]")
+    assert main(words) == 2
+    assert "localise.json holds no results of a drive" in capsys.readouterr().err
 
 
 def test_the_drive_as_a_log(tmp_path, monkeypatch):
@@ -194,3 +198,13 @@ def test_with_ideal_corners_it_knows_its_way():
     assert seeing["tags"] > 5
     assert seeing["refused"] == 0
     assert seeing["ate_m"] < 0.01 < blind["ate_m"]
+    _, near = asked.localised(moved, sightings, asked.camera, 0.05, reach=1.0)
+    assert 0 < near["tags"] < seeing["tags"]
+    aside = np.array([0.6, 0.8])
+    off = [[replace(tag, corners=tag.corners + aside) for tag in tags] for tags in sightings]
+    bins = asked.corner_errors(moved, off, asked.camera)
+    assert [each["tags"] > 0 for each in bins] == [True, True, False, False]
+    assert [each["median_px"] for each in bins] == pytest.approx([1.0, 1.0, None, None])
+    assert sum(each["tags"] for each in bins) == sum(map(len, sightings))
+    back = asked.corner_errors(moved, asked.ideal(moved, off), asked.camera)
+    assert [each["median_px"] for each in back] == pytest.approx([0.0, 0.0, None, None])

@@ -9,6 +9,7 @@ import fidsplat as fs
 from fidsplat.backends.reference import backend
 from fidsplat.effects import OUTPUTS
 from fidsplat.hard_cases.agreement import Picture, truth_of
+from fidsplat.rotations import rigid_matrix
 
 CAMERAS = {"pinhole": fs.Camera.pinhole(37, 22, 30.0, 30.0, 18.0, 11.0)}
 CAMERAS |= {name: SWITCHES[name].camera for name in LENSES}
@@ -54,3 +55,34 @@ def test_a_splat_that_is_left_out_of_a_tile_is_not_seen_there(monkeypatch, camer
         for name, image in truth_of(picture).items():
             assert np.allclose(fewer[name], image, rtol=1e-11, atol=1e-11, equal_nan=True), (lowpass, name)
     assert np.mean(shares) < 0.8
+
+
+@pytest.mark.parametrize("exposed", [False, True])
+def test_every_third_pixel_is_that_of_the_whole_picture(monkeypatch, exposed):
+    monkeypatch.setattr(backend, "_BLOCK", 500)
+    motion = fs.Motion(lambda time: rigid_matrix((time, 0, 0)))
+    shutter = fs.Shutter(exposure_time=0.1, sub_poses=2, readout=0.1, rows_per_band=8)
+    capture = fs.Capture(
+        fs.Camera.look_at(20, 16, 1.0, (0, 0, -2), (0, 0, 0)),
+        ("rgb", "depth", "label"),
+        "samples=2",
+        **({"motion": motion, "shutter": shutter} if exposed else {}),
+    )
+    renderer, cloud, told = fs.Renderer("reference"), random_splats(40, 3), []
+    whole = renderer.render(cloud, capture)
+    some = renderer.render_every(3, cloud, capture, tell=told.append)
+    for name in some.outputs:
+        np.testing.assert_array_equal(some[name], whole[name][::3, ::3])
+    assert some["rgb"].shape == (6, 7, 3)
+    assert told == sorted(told)
+    assert len(told) > 3
+    assert told[-1] == pytest.approx(1)
+    assert renderer.render_every(100, cloud, capture)["label"].shape == (1, 1)
+
+
+def test_what_cannot_be_drawn_in_part():
+    camera = fs.Camera.look_at(20, 16, 1.0, (0, 0, -2), (0, 0, 0))
+    with pytest.raises(fs.InputError, match="step is 0"):
+        fs.Renderer("reference").render_every(0, random_splats(4, 3), camera)
+    with pytest.raises(fs.InputError, match=r"draws whole pictures only; device=.reference. draws some"):
+        fs.Renderer("opencl:pocl").render_every(2, random_splats(4, 3), camera)

@@ -176,6 +176,19 @@ def test_batched_data_stands_where_its_worlds_do(model, rig):
         np.testing.assert_allclose(batched, single, atol=1e-6)
 
 
+def test_mujoco_warps_own_data(model, rig):
+    """Worlds that were stepped differently, on the processor."""
+    warp = pytest.importorskip("mujoco_warp", reason="pip install mujoco-warp")
+    states = [moved(model, seed) for seed in (7, 8)]
+    there = warp.put_model(model)
+    worlds = warp.put_data(model, states[0], nworld=2)
+    worlds.qpos.assign(np.stack([data.qpos for data in states]).astype(np.float32))
+    warp.kinematics(there, worlds)
+    warp.camlight(there, worlds)
+    for batched, single in zip(rig.poses(worlds), rig.poses(states), strict=True):
+        np.testing.assert_allclose(batched, single, atol=1e-5)
+
+
 def test_data_without_poses(rig):
     with pytest.raises(fs.InputError, match=r"must be a mujoco\.MjData"):
         rig.render("data")
@@ -218,13 +231,14 @@ def test_gymnasium_observes_what_the_cameras_see(model, scene):
     assert near[0] - near[1] == pytest.approx(0.1, abs=0.01)
 
 
-def test_the_ten_lines_of_the_page_draw_a_tag_that_is_read():
-    page = Path(__file__).resolve().parents[2] / "docs/simulation.md"
-    names = {}
-    exec(
-        re.search(r"## MuJoCo in ten lines.*?```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL)[1],
-        names,
+def test_the_ten_lines_of_the_pages_draw_a_tag_that_is_read():
+    root, names = Path(__file__).resolve().parents[2], {}
+    readme, page = (
+        re.search(r"```python\n(import mujoco.*?)```", (root / name).read_text("utf-8"), re.DOTALL)[1]
+        for name in ("README.md", "docs/simulation.md")
     )
+    assert readme == page
+    exec(readme, names)
     pictures = names["pictures"]
     (reading,) = read_back(pictures.of("eye").frame(0), pictures.scene("eye")).readings
     assert reading.position_error < 0.003  # 0.2 % of 1.4 m

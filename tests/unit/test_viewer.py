@@ -15,7 +15,8 @@ import fidsplat as fs
 from fidsplat.rotations import rigid_matrix
 from fidsplat.scenes import PlacedMarker
 from fidsplat.viewer import session as session_module
-from fidsplat.viewer.edits import SceneFile, placed
+from fidsplat.viewer.edits import Body, SceneFile, placed
+from fidsplat.viewer.guard import guarded, refused
 from fidsplat.viewer.session import Session
 from fidsplat.viewer.settings import AT_REST, Settings, Viewpoint
 from fidsplat.viewer.stream import REST, SMALLEST, Pace, Stream
@@ -66,11 +67,11 @@ def test_a_scene_looks_as_its_file_says_until_a_control_is_moved():
         sensor=fs.Sensor(exposure=1.5, full_well=1e4, read_noise=3.0, bits=8),
     )
     settings = Settings.of(given)
-    capture = settings.capture(given, HERE.camera(given), ("rgb",))
+    capture = settings.capture(given, HERE.camera(given))
     assert capture.fog == given.fog
     assert capture.sensor == given.sensor
     other = replace(settings, fog=0.0, noise=0.0, exposure=2.0, quality="fast")
-    capture = other.capture(given, HERE.camera(given), ("rgb",))
+    capture = other.capture(given, HERE.camera(given))
     assert capture.fog is None
     assert capture.sensor == fs.Sensor(exposure=2.0, bits=8)
     assert capture.quality == fs.Quality.named("fast")
@@ -79,15 +80,29 @@ def test_a_scene_looks_as_its_file_says_until_a_control_is_moved():
 def test_only_what_moves_has_a_shutter():
     moving = fs.Scene(markers=[PlacedMarker(TAG, motion=lambda time: rigid_matrix((time, 0, 0)))])
     settings = replace(Settings.of(moving), time=0.5, exposure_ms=20.0)
-    assert settings.capture(moving, HERE.camera(moving), ("rgb",)).exposed
-    assert not settings.capture(scene(), HERE.camera(scene()), ("rgb",)).exposed
+    assert settings.capture(moving, HERE.camera(moving)).exposed
+    assert not settings.capture(scene(), HERE.camera(scene())).exposed
+
+
+def test_a_moving_picture_has_coarser_constants_and_its_colours_alone():
+    settings, camera = Settings.of(scene()), HERE.camera(scene())
+    moving, rest = settings.moving(scene(), camera), settings.capture(scene(), camera)
+    assert moving.outputs == ("rgb",)
+    assert moving.quality == fs.Quality.named("fast")
+    assert (rest.outputs, rest.quality) == (AT_REST, fs.Quality())
+    asked = (
+        "reference,samples=3,transmittance_stop=0.01,lowpass=none"  # coarser in one, a definition in another
+    )
+    fine = replace(settings, quality=asked).moving(scene(), camera).quality
+    wanted = fs.Quality.of("fast,transmittance_stop=0.01,lowpass=none")
+    assert fine == wanted.with_(order=fine.order, marker=fine.marker)
 
 
 # the session
 
 
 def test_a_picture_is_that_of_the_renderer(session):
-    view = session.draw(HERE, 1.0, AT_REST)
+    view = session.draw(HERE)
     camera = fs.Camera.look_at(48, 36, 2 * math.atan(48 / 36 * math.tan(0.4)), (0, 0, -1), (0, 0, 0))
     frame = fs.Renderer("reference").render(scene(), camera, outputs=AT_REST)
     np.testing.assert_allclose(view.frame["rgb"], frame["rgb"], atol=1e-6)
@@ -110,7 +125,7 @@ def test_settings_and_scenes_are_exchanged(session):
     moved = replace(session.drawn.scene, markers=[PlacedMarker(TAG, rigid_matrix((0.2, 0, 0)))])
     session.wish(scene=moved, done=told.append)
     assert session.settle()
-    assert session.draw(HERE, 1.0, AT_REST).at(0.05, 0.5)["label"] == -1
+    assert session.draw(HERE).at(0.05, 0.5)["label"] == -1
     assert session.drawn.settings == settings  # a new scene keeps the controls
     assert session.drawn.version == 2
     assert told == [None, None]
@@ -443,6 +458,71 @@ def test_a_gizmo_moves_a_marker_and_its_file(viewer, tmp_path):
     np.testing.assert_allclose(fs.Scene.load(tmp_path / "scene.toml").markers[0].pose, pose, atol=1e-8)
 
 
+def test_a_gizmo_moves_a_splat_file(viewer, tmp_path):
+    """Its scale stays, and what the file says is what is shown."""
+    viewer.close()
+    path = tmp_path / "scene.toml"
+    cloud = fs.SplatCloud(
+        [[0, 0, 0], [1, 0, 0]], [[1, 0, 0, 0]] * 2, [[0.1, 0.1]] * 2, [1, 1], colors=[[1, 0, 0]] * 2
+    )
+    fs.save_ply(cloud, tmp_path / "box.ply")
+    path.write_text(
+        path.read_text() + '[[splats]]\nfile = "box.ply"\n\n'
+        '[[splats]]\nfile = "box.ply"\nscale = 2.0 # twice\nposition = [0, 0, 1]\n'
+        '[[splats]]\nfile = "box.ply"\nmotion = [{time = 0, position = [0, 0, 5]}, '
+        "{time = 1, position = [0, 0, 6]}]\n"
+    )
+    viewer = type(viewer)(fs.Scene.load(path), path, "reference", port=0)
+    viewer._closed.set()  # nobody looks at the file meanwhile
+    try:
+        assert viewer._controls._held.options[2:] == ("file 1: box.ply", "file 2: box.ply", "file 3: box.ply")
+        viewer.hold("file 2: box.ply")
+        np.testing.assert_allclose(viewer._held.pose, rigid_matrix((0, 0, 1)))
+        pose = rigid_matrix((0.5, 0, 2), (0, 0, 1, 0))
+        for let_go in (False, True):
+            viewer._move(pose, let_go)
+            assert viewer.session.settle()
+            moved = viewer.session.drawn.scene.clouds
+            np.testing.assert_allclose(moved[1].world_means(), [(0.5, 0, 2), (-1.5, 0, 2)], atol=1e-6)
+            assert ("0.5" in path.read_text()) == let_go
+        assert "scale = 2.0 # twice" in path.read_text()
+        again = fs.Scene.load(path)
+        for one, other in zip(again.clouds, moved, strict=True):
+            np.testing.assert_allclose(one.world_means(), other.world_means(), atol=1e-6)
+        viewer.hold("file 1: box.ply")  # which has no pose in the file
+        viewer._move(rigid_matrix((0, 3, 0)), True)
+        assert viewer.session.settle()
+        np.testing.assert_allclose(fs.Scene.load(path).clouds[0].world_means()[0], (0, 3, 0))
+        viewer.hold("file 3: box.ply")
+        assert viewer._held is None
+        assert "moves by keyframes" in viewer._controls.status.content
+        # what cannot be written stays where the file says that it is
+        viewer.hold("file 2: box.ply")
+        before = path.read_text()
+        path.write_text(before + "# edited\n")
+        viewer._move(rigid_matrix((9, 9, 9)), True)
+        assert viewer.session.settle()
+        assert "nothing was written" in viewer._controls.status.content
+        np.testing.assert_allclose(
+            viewer.session.drawn.scene.clouds[1].world_means()[0], (0.5, 0, 2), atol=1e-6
+        )
+        assert path.read_text() == before + "# edited\n"
+        viewer.hold("file 9: none")
+        viewer._move(np.eye(4), True)
+    finally:
+        viewer.close()
+
+
+def test_large_splat_files_move_once_they_are_let_go(monkeypatch):
+    from fidsplat.viewer import held
+
+    cloud = fs.SplatCloud([[0, 0, 0]], [[1, 0, 0, 0]], [[0.1, 0.1]], [1], colors=[[1, 0, 0]])
+    taken = held.held_by(fs.Scene([cloud]), [Body(0, "a.ply", np.eye(4))], "file 1: a.ply")
+    assert taken.light
+    monkeypatch.setattr(held, "LIGHT", 0)
+    assert not taken.light
+
+
 def test_a_file_that_is_edited_is_shown(viewer, tmp_path):
     text = (tmp_path / "scene.toml").read_text()
     (tmp_path / "scene.toml").write_text(text.replace("0.4\n", "0.2\n", 1))
@@ -511,6 +591,66 @@ def test_a_trajectory_stands_there_as_keyframes(tmp_path):
         assert len(viewer._keyframes) == 101
     finally:
         viewer.close()
+
+
+# who may speak to it
+
+
+@pytest.mark.parametrize(
+    ("origin", "host", "listens", "words"),
+    [
+        (None, "localhost:8080", "127.0.0.1", ""),  # no browser
+        ("http://localhost:8080", "localhost:8080", "127.0.0.1", ""),
+        ("http://127.0.0.1:9", "127.0.0.1:9", "127.0.0.1", ""),  # a tunnel has a port of its own
+        ("http://[::1]:8080", "[::1]:8080", "::1", ""),
+        ("https://LOCALHOST", "localhost", "localhost", ""),
+        ("http://evil.test", "localhost:8080", "127.0.0.1", "of another site"),
+        ("http://localhost:3000", "localhost:8080", "127.0.0.1", "of another site"),
+        ("null", "localhost:8080", "127.0.0.1", "of another site"),
+        ("http://localhost:8080", None, "127.0.0.1", "of another site"),
+        ("null", None, "127.0.0.1", "another name"),
+        ("http://[x", "localhost:8080", "127.0.0.1", "no address"),
+        # a name of theirs that was made to point here
+        ("http://evil.test:8080", "evil.test:8080", "127.0.0.1", "another name"),
+        ("http://evil.test:8080", "evil.test:8080", "0.0.0.0", "another name"),
+        ("http://10.0.0.7:8080", "10.0.0.7:8080", "127.0.0.1", "another name"),
+        ("http://10.0.0.7:8080", "10.0.0.7:8080", "0.0.0.0", ""),
+        ("http://lab.test:8080", "lab.test:8080", "lab.test", ""),
+        (f"http://{socket.gethostname()}:1", f"{socket.gethostname()}:1", "0.0.0.0", ""),
+    ],
+)
+def test_pages_of_others_are_refused(origin, host, listens, words):
+    found = refused(origin, host, listens)
+    assert words in found
+    assert bool(words) == bool(found)
+
+
+def test_a_page_of_another_site_gets_no_socket(viewer):
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    port = viewer.server.get_port()
+    for words in (
+        {"origin": "http://evil.test"},
+        {"origin": f"http://evil.test:{port}", "host": "evil.test"},  # a name that was made to point here
+    ):
+        host = words.pop("host", "127.0.0.1")
+        with (
+            socket.create_connection(("127.0.0.1", port)) as line,
+            pytest.raises(InvalidStatus, match="403") as found,
+        ):
+            connect(f"ws://{host}:{port}", sock=line, **words)
+        assert b"this" in found.value.response.body
+    assert not viewer._streams
+    connect(f"ws://127.0.0.1:{port}", origin=f"http://127.0.0.1:{port}").close()
+
+
+def test_a_server_that_is_not_guarded_is_stopped():
+    pytest.importorskip("websockets", reason="the extra viewer is not installed")
+    stopped = []
+    with pytest.raises(fs.FidsplatError, match="cannot guard"):
+        guarded(lambda: SimpleNamespace(stop=lambda: stopped.append(True)), "127.0.0.1")
+    assert stopped == [True]
 
 
 def test_a_port_in_use_is_said():

@@ -19,7 +19,7 @@ from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.program import Program
 from fidsplat.backends.opencl.resident import Resident
 from fidsplat.backends.view import View
-from fidsplat.effects import OUTPUTS
+from fidsplat.effects import IMAGES
 from fidsplat.effects.differentiable import GRADIENT_OUTPUTS, check_gradients
 from fidsplat.errors import DeviceError, InputError
 
@@ -45,7 +45,7 @@ class DifferentiableImages:
 
     def device_array(self, name: str) -> Array:
         """The image as an array of the device, (h, w) or (h, w, channels); no copy."""
-        shape, dtype = gradient_shape(name, self.picture.view), np.dtype(OUTPUTS[name].dtype)
+        shape, dtype = gradient_shape(name, self.picture.view), np.dtype(IMAGES[name].dtype)
         return Array(self.picture.queue, shape, dtype, data=self.picture.held[f"{name}_out"])
 
     @property
@@ -117,7 +117,7 @@ class OpenCLGradients:
         ):
             given: dict[str, Any] = {"parts": picture.held[name], "sums": found[sums].data}
             given |= {"rows": rows, "columns": columns}
-            picture.launch("project backward", "add_up", _GROUP, _GROUP, **given)
+            picture.launch("project backward", "add_up", columns * _GROUP, _GROUP, **given)
         return found
 
     def _take_gradients(self, picture: Picture, gradients: Mapping[str, Any]) -> None:

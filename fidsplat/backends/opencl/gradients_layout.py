@@ -81,11 +81,17 @@ LAYOUTS: dict[str, BackwardLayout] = {
         "slot/lowpass_screen_backward.cl", moments=(member("float dot_x dot_y", "by the dot's place"),)
     ),
     "stop_exclusive": BackwardLayout("slot/stop_exclusive_backward.cl"),
+    "ray_depth": BackwardLayout(
+        "part/ray_depth_backward.cl", moments=(member("float z_numerator z_center z_reach"),)
+    ),
     "alpha": BackwardLayout("output/alpha_backward.cl", blend_backward=takes("in float by_alpha  // (h, w)")),
     "depth": BackwardLayout(
         "output/depth_backward.cl",
-        moments=(member("float z_numerator z_center z_reach"),),
         blend_backward=takes("in float depth_raw  // 2 channels", "in float by_depth  // (h, w)"),
+    ),
+    "distortion": BackwardLayout(
+        "output/distortion_backward.cl",
+        blend_backward=takes("in float distortion_raw  // 4 channels", "in float by_distortion  // (h, w)"),
     ),
     "normal": BackwardLayout(
         "output/normal_backward.cl",

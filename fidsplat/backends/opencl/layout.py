@@ -36,7 +36,7 @@ SPLAT = Record(
         member("wide d_near", "D at depth `near`: a fragment is in front of the near plane if D <= d_near"),
         member("wide log_opacity"),
         member("wide r g b"),
-        member("short ax ay", "anchor pixel"),
+        member("float ax ay", "anchor pixel, a whole number"),
         member("short y0 y1", "rows [y0, y1) that the splat can touch"),
         member("short x0 x1", "columns [x0, x1)"),
     ),
@@ -156,7 +156,7 @@ _OWN_RAYS = ("camera_brown_conrady", "camera_fisheye", "camera_equirectangular")
 
 LAYOUTS: dict[str, Layout] = {
     # one of each kind
-    "camera_pinhole": Layout("slot/camera_pinhole.cl", parts=("perspective",)),
+    "camera_pinhole": Layout("slot/camera_pinhole.cl", parts=("conic", "perspective")),
     "camera_brown_conrady": Layout(
         "slot/camera_brown_conrady.cl",
         parts=("perspective", "ray_map", "rays"),
@@ -176,6 +176,7 @@ LAYOUTS: dict[str, Layout] = {
     "camera_equirectangular": Layout("slot/camera_equirectangular.cl", parts=("polygon", "rays")),
     "camera_orthographic": Layout(
         "slot/camera_orthographic.cl",
+        parts=("conic",),
         splat=(member("wide z0 zx zy", "depth times D = z0 + zx x + zy y"), member("wide z_near")),
     ),
     "color_rgb": Layout("slot/color_rgb.cl", project=takes("cloud float colors  // (n, 3)")),
@@ -264,6 +265,7 @@ LAYOUTS: dict[str, Layout] = {
     "shutter_rows": Layout("slot/shutter_rows.cl"),
     "blend_double": Layout(),
     # what several of them share
+    "conic": Layout("part/conic.cl"),
     "perspective": Layout("part/perspective.cl"),
     "polygon": Layout("part/polygon.cl"),
     "ray_map": Layout(
@@ -327,6 +329,11 @@ LAYOUTS: dict[str, Layout] = {
         "output/depth.cl",
         parts=("ray_depth", "shown"),
         samples=(Samples("float", "depth_raw", 2, "sum w z, sum w"),),
+    ),
+    "distortion": Layout(
+        "output/distortion.cl",
+        parts=("ray_depth",),
+        samples=(Samples("float", "distortion_raw", 4, "the first m, W, sum w m, sum w m^2"),),
     ),
     "depth_median": Layout(
         "output/depth_median.cl",

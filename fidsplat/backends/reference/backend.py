@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,7 @@ from fidsplat.backends.reference.gradients import ReferenceGradients
 from fidsplat.backends.reference.resolve import resolve
 from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
-from fidsplat.effects import OUTPUTS, FeatureSet
+from fidsplat.effects import IMAGES, FeatureSet
 from fidsplat.effects.differentiable import check_differentiable
 from fidsplat.errors import InputError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
@@ -114,7 +114,7 @@ class ReferenceImages:
 
     def read(self, name: str) -> np.ndarray:
         """The image in the type that every device gives."""
-        return self.images[name].astype(OUTPUTS[name].dtype)
+        return self.images[name].astype(IMAGES[name].dtype)
 
     def read_float64(self, name: str) -> np.ndarray:
         """The image as it was computed; label and splat_id are integers all the same."""
@@ -125,15 +125,27 @@ class ReferencePipeline:
     """Draws whole pictures (`render`) or chosen pixels (`pixels`)."""
 
     def __init__(self, features: FeatureSet) -> None:
-        self.features = features
+        self.features, self._progress = features, _Progress()
 
     def render(self, resident: ReferenceCloud, view: View) -> ReferenceImages:
         """Draw every pixel, in float64."""
-        height, width = view.height // view.samples, view.width // view.samples
-        rows, columns = np.mgrid[0:height, 0:width]
+        return self.render_every(resident, view, 1)
+
+    def render_every(
+        self,
+        resident: ReferenceCloud,
+        view: View,
+        step: int,
+        tell: Callable[[float], object] | None = None,
+    ) -> ReferenceImages:
+        """As `DrawsEvery`."""
+        rows, columns = np.mgrid[
+            0 : view.height // view.samples : step, 0 : view.width // view.samples : step
+        ]
         start = time.perf_counter()
+        self._progress = _Progress(tell, rows.size * view.samples**2)
         flat = self.pixels(resident, view, rows.ravel(), columns.ravel())
-        images = {name: image.reshape(height, width, *image.shape[1:]) for name, image in flat.items()}
+        images = {name: image.reshape(*rows.shape, *image.shape[1:]) for name, image in flat.items()}
         took = (time.perf_counter() - start) * 1e3
         count = len(resident.cloud)
         return ReferenceImages(images, {"reference": took}, {"splats": count, "visible": count, "pairs": 0})
@@ -174,6 +186,7 @@ class ReferencePipeline:
             for k in range(0, len(mine), step):
                 block = mine[k : k + step]
                 parts.append(composite(seen, view, self.features, x[block], y[block]))
+                self._progress.add(len(block))
         back = np.argsort(places)
         return {name: np.concatenate([part[name] for part in parts])[back] for name in parts[0]}
 
@@ -183,8 +196,9 @@ class ReferencePipeline:
         """The same of a picture of several shots: the mean of colours, fog and transmittances, all else from
         the middle one; `certificate_middle` is that one's certificate."""
         out: dict[str, np.ndarray] = {}
-        for shot in view.shots:
-            mine = (y > shot.top) & (y < shot.top + shot.view.height)
+        seen_by = [(y > shot.top) & (y < shot.top + shot.view.height) for shot in view.shots]
+        self._progress.total = sum(int(mine.sum()) for mine in seen_by)
+        for shot, mine in zip(view.shots, seen_by, strict=True):
             seen = self._samples(resident, shot.view, x[mine], y[mine] - shot.top)
             seen["certificate_middle"] = seen["certificate"]
             for name, values in seen.items():
@@ -194,3 +208,17 @@ class ReferencePipeline:
                 elif shot.middle:
                     plane[mine] = values
         return out
+
+
+@dataclass
+class _Progress:
+    """How many samples of a picture are drawn."""
+
+    tell: Callable[[float], object] | None = None
+    total: int = 1
+    done: int = 0
+
+    def add(self, count: int) -> None:
+        self.done += count
+        if self.tell is not None:
+            self.tell(self.done / self.total)

@@ -15,6 +15,8 @@ from fidsplat.backends.reference.shown import LEAST_ALPHA, median_of
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 
+INVERSE_DEPTH = 0.2 * 100 / (100 - 0.2)
+"""metres, by which inverse depths are multiplied for the depth distortion"""
 _SURE = 5e-5
 """share of a depth within which rounding may move one that is still compared: half of what is tolerated"""
 
@@ -57,6 +59,10 @@ def composite(
         out["rgb"] = out["rgb"] + final[:, None] * behind
         out["behind_bound"] = final * moved
     drawn = live & (alpha > 0)
+    if "distortion" in features.names:
+        inverse = inverse_depth(z)
+        sums = [(weight * np.where(z > 0, inverse**k, 0.0)).sum(1) for k in range(3)]
+        out["distortion"] = sums[0] * sums[2] - sums[1] ** 2
     if {"depth", "depth_median", "depth_first"} & features.names:
         out["weight"] = weight.sum(1)
         out["depth"] = (weight * z).sum(1)
@@ -90,6 +96,12 @@ def composite(
         out["blended"] = np.where(drawn, stack.count, 0).sum(1)
         out["blended_bound"] = error_bounds.of_count(span, stack.count, stack.count_bound, view.stop)
     return out
+
+
+def inverse_depth(z: np.ndarray) -> np.ndarray:
+    """1 / z in the units of the depth distortion, those of a depth buffer from 0.2 to 100 m as the 2DGS
+    authors have it; anything where z is not positive."""
+    return INVERSE_DEPTH / np.where(z > 0, z, 1.0)
 
 
 def _sum(weight: np.ndarray, values: np.ndarray) -> np.ndarray:

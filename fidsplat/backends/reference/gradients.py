@@ -14,7 +14,7 @@ from fidsplat.backends.reference.gradients_scene import Parameters, Placed, plac
 from fidsplat.backends.reference.setup import Setup
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
-from fidsplat.effects.differentiable import check_gradients
+from fidsplat.effects.differentiable import GRADIENT_OUTPUTS, check_gradients
 from fidsplat.errors import InputError
 
 _BLOCK = 1 << 16  # (sample, splat) pairs that are evaluated at once
@@ -68,7 +68,7 @@ class FrozenPicture:
         """Derivatives of a loss by the parameters, and `screen`, from those by the images."""
         view, parameters = self._view, self.parameters
         flat = {}
-        for name in ("rgb", "alpha", "depth", "normal"):
+        for name in GRADIENT_OUTPUTS:
             given = gradients[name] if name in gradients else np.zeros(gradient_shape(name, view))
             check_shape(name, given.shape, view)
             flat[name] = given.reshape(view.height * view.width, *given.shape[2:])
@@ -105,6 +105,7 @@ def _images(samples: Samples, made: Decisions, parameters: Parameters) -> dict[s
         "rgb": samples.rgb + samples.t[:, None] * parameters.background,
         "alpha": 1 - samples.t,
         "depth": np.where(made.shown, samples.depth / np.where(made.shown, samples.weight, 1), 0.0),
+        "distortion": samples.weight * samples.squares - samples.inverse**2,
         "normal": np.where(seen[:, None], samples.normal / np.where(seen, length, 1)[:, None], 0.0),
     }
 
@@ -122,6 +123,8 @@ def _images_backward(
         rgb=by["rgb"],
         t=by["rgb"] @ parameters.background - by["alpha"],
         depth=by["depth"] / weight,
-        weight=-by["depth"] * depth / weight,
+        weight=by["distortion"] * samples.squares - by["depth"] * depth / weight,
+        inverse=-2 * by["distortion"] * samples.inverse,
+        squares=by["distortion"] * samples.weight,
         normal=(by["normal"] - normal * (normal * by["normal"]).sum(1, keepdims=True)) / length,
     )

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.reference.blend import transmittance
+from fidsplat.backends.reference.blend import INVERSE_DEPTH, inverse_depth, transmittance
 from fidsplat.backends.reference.fragments import fragments_of
 from fidsplat.backends.reference.gradients_scene import Placed
 from fidsplat.backends.reference.optics import rays_of
@@ -74,6 +74,10 @@ class Samples:
     """sum of weights"""
     normal: np.ndarray
     """(k, 3) sum of weights times normals"""
+    inverse: np.ndarray
+    """sum of weights times inverse depths (`inverse_depth`)"""
+    squares: np.ndarray
+    """sum of weights times their squares"""
 
 
 class Blend:
@@ -104,6 +108,7 @@ class Blend:
         self._steep = np.hypot(self._su * self._unit_a[:, 2], self._sv * self._unit_b[:, 2])
         z = np.where(made.beyond == 0, self._z_plane, pz + made.beyond * self._radius * self._steep)
         self._z = np.where(made.drawn, np.where(made.missed, pz, z), 0.0)
+        self._inverse = np.where(made.drawn, inverse_depth(self._z), 0.0)
         self._alpha = np.where(made.drawn, opacity, 0.0)
         after = np.cumprod(1 - self._alpha, axis=1)
         self._before = np.concatenate([np.ones((len(x), 1)), after], axis=1)
@@ -118,13 +123,16 @@ class Blend:
             (self._weight * self._z).sum(1),
             self._weight.sum(1),
             self._weight @ (self._normal * self._towards),
+            (self._weight * self._inverse).sum(1),
+            (self._weight * self._inverse**2).sum(1),
         )
 
     def backward(self, by: Samples) -> Placed:
         """Derivatives of a loss by what is placed, from those by the samples."""
         made, view = self._made, self._view
         facing = self._normal * self._towards
-        by_z = self._weight * by.depth[:, None]
+        by_inverse = by.inverse[:, None] + 2 * by.squares[:, None] * self._inverse
+        by_z = self._weight * (by.depth[:, None] - by_inverse * self._inverse**2 / INVERSE_DEPTH)
         by_alpha = np.where(made.drawn, self._by_opacity(by, facing), 0.0)
         by_log = np.where(made.clamped, 0.0, by_alpha * self._alpha)
 
@@ -178,7 +186,8 @@ class Blend:
         """Derivatives (k, m) by the fragments' opacities: what their light is worth, less what is worth that
         which they hide; from back to front, without a division by what is left of the light."""
         worth = by.rgb @ self._rgb.T + by.normal @ facing.T + by.depth[:, None] * self._z
-        worth = worth + by.weight[:, None]
+        worth = worth + by.weight[:, None] + by.inverse[:, None] * self._inverse
+        worth = worth + by.squares[:, None] * self._inverse**2
         hidden, slopes = by.t.copy(), np.zeros_like(worth)
         for k in range(worth.shape[1] - 1, -1, -1):
             gain = worth[:, k] - hidden

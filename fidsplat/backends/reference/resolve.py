@@ -37,6 +37,8 @@ def resolve(samples: dict[str, np.ndarray], view: View, features: FeatureSet) ->
     bound = samples.get("certificate_middle", bound)  # the other outputs show one shot
     if "alpha" in features.names:
         out["alpha"] = 1 - t
+    if "distortion" in features.names:
+        out["distortion"] = samples["distortion"].mean(1)
     covered, unsure = samples["shown"], np.asarray(samples["shown_may_flip"].any(1))
     bound_covered = np.where(covered, bound, 0.0).sum(1)
     # of the ray through each sample, per metre of depth

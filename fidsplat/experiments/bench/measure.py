@@ -21,6 +21,7 @@ from fidsplat.frame import Frame
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer, ResidentCloud
 from fidsplat.splats import SplatCloud
+from fidsplat.store.residency import Residency
 from fidsplat.timing import Timer, take_turns
 
 
@@ -199,6 +200,7 @@ def overdraw(renderer: Renderer, resident: ResidentCloud, camera: Camera, qualit
         FidsplatError: the device fails, or its backend has no such count.
     """
     data = resident._data
+    assert not isinstance(data, Residency), "of splats in memory"
     features, view = prepare(data, Capture(camera, quality=quality))
     features = replace(features, outputs=("overdraw",))
     return renderer.backend.pipeline(features).render(data, view).read("overdraw")

@@ -173,7 +173,8 @@ def constants_table(devices: Sequence[Device]) -> Frame:
     for constant in CONSTANTS:
         row: dict[str, str] = {"constant": constant.words, "who has it": constant.users}
         there = False
-        for scene in (_shared(devices), HARD):
+        shared = _shared(devices)
+        for scene in (shared, HARD) if any(HARD in device.scenes for device in devices) else (shared,):
             worst = []
             for device in devices:
                 point = device.at(scene, constant.knob, constant.value)
@@ -263,7 +264,8 @@ def choices(devices: Sequence[Device]) -> list[dict[str, str]]:
     found = []
     for device in devices:
         plain = _plain(device)
-        for words, scenes in (("random scenes", [s for s in plain if s != HARD]), ("all scenes", plain)):
+        kind = "one's own scenes" if device.own else "random scenes"
+        for words, scenes in ((kind, [s for s in plain if s != HARD]), ("all scenes", plain)):
             best = device.cheapest_within(scenes, INVISIBLE) if scenes else []
             if best:
                 costs = ", ".join(f"{row['scene']} {percent(row['ratio'])}" for row in best)
@@ -303,13 +305,14 @@ def _worst(device: Device, preset: str) -> float:
 
 
 def _plain(device: Device) -> list[str]:
-    """Random scenes of disks, the largest first, and the hard cases."""
-    order = [*reversed(RANDOM), HARD]
+    """Users' own scenes, random scenes of disks, the largest first, and the hard cases."""
+    order = [*device.own, *reversed(RANDOM), HARD]
     return sorted((s for s in device.scenes if s in order), key=order.index)
 
 
 def _shared(devices: Sequence[Device]) -> str:
-    """The scene that stands for all: the largest random one that every device has."""
+    """The scene that stands for all: of those that every device has the first, a user's own or the largest
+    random one."""
     common = [s for s in _plain(devices[0]) if all(s in device.scenes for device in devices)]
     return common[0] if common else HARD
 

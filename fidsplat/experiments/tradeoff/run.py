@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from fidsplat.accuracy import TRUTH_CUTOFF
 from fidsplat.errors import FidsplatError
 from fidsplat.experiments.sweep import Key, Results, Sweep
 from fidsplat.experiments.tradeoff import compare, linear, points, scenes
+from fidsplat.experiments.tradeoff.own import Own, digests
 from fidsplat.experiments.tradeoff.points import ALONE, BASE, MARKER_KNOB, PRESETS_KNOB
 from fidsplat.experiments.tradeoff.session import DEFINITION, FULL, QUICK, Session, time_point
 from fidsplat.files import writable_folder
@@ -41,6 +42,8 @@ class Options:
     knobs: tuple[str, ...] = ()
     quick: bool = False
     overwrite: bool = False
+    own: Own = field(default_factory=dict)
+    """one's own pictures, instead of scenes"""
     workers: int = min(_BATCH, os.cpu_count() or 1)
     """threads that look at pictures, while nothing is timed"""
 
@@ -51,14 +54,20 @@ def prepared(options: Options) -> Iterator[Sweep]:
 
     Raises InputError for options that cannot be used, DeviceError when the device cannot be opened.
     """
-    keys = all_points(options.scenes, options.knobs, options.quick)
+    own = options.own
+    keys = (
+        own_points(own, options.knobs, options.quick)
+        if own
+        else all_points(options.scenes, options.knobs, options.quick)
+    )
     writable_folder(options.out)
     renderer = Renderer(options.device)
     info = renderer.device
     versions = reader_versions() | metric_versions() | {"pyopencl": version("pyopencl")}
     facts = run_facts(f"{info.title}, {info.version}", scenes.SEED, versions)
-    results = Results(options.out / FILE, facts | {"kind": info.kind, "title": info.title}, options.overwrite)
-    session = Session(renderer)
+    facts |= {"kind": info.kind, "title": info.title} | ({"scene": digests(own)} if own else {})
+    results = Results(options.out / FILE, facts, options.overwrite)
+    session = Session(renderer, own)
 
     def begin(key: Key) -> Callable[[], dict]:
         try:
@@ -87,18 +96,13 @@ def all_points(names: tuple[str, ...], knobs: tuple[str, ...], quick: bool) -> l
         marked = scenes.is_marker(name)
         every = name not in scenes.FEW_KNOBS and not (marked and quick)
         for view in scenes.views_of(name):
-            defined: set[tuple] = set()
             thick = name in scenes.THICK
             settings = points.thick_points(turned) if thick else points.points(turned, marked, quick, every)
-            for point in settings:
-                if name == "r1m_1080p" and point.quality.samples > 2:
-                    continue  # 18 million samples: minutes on a CPU for what the smaller scene shows too
-                tier = 0 if point.knob in _EARLY else 2
-                found.append((tier, {"what": POINT, "scene": view, **point.key(), "quick": quick}))
-                definition = tuple(getattr(point.quality, name) for name in DEFINITION)
-                if point.knob != MARKER_KNOB and definition not in defined:
-                    defined.add(definition)
-                    found.append((tier + 1, _truth_key(view, definition)))
+            if (
+                name == "r1m_1080p"
+            ):  # 18 million samples: minutes on a CPU for what the smaller scene shows too
+                settings = [point for point in settings if point.quality.samples <= 2]
+            found += _view_points(view, settings, quick)
         if marked:
             tilts = compare.QUICK_TILTS if quick else compare.FULL_TILTS
             ideal = {"knob": IDEAL, "value": IDEAL, "quality": None}
@@ -110,6 +114,34 @@ def all_points(names: tuple[str, ...], knobs: tuple[str, ...], quick: bool) -> l
             for distance in linear.DISTANCES
             for degrees in linear.ANGLES
         ]
+    return _in_order(found)
+
+
+def own_points(views: Iterable[str], knobs: tuple[str, ...], quick: bool) -> list[Key]:
+    """The points of a run on one's own pictures, by the names of their views.
+
+    Raises:
+        InputError: an unknown knob.
+    """
+    settings = points.points(points.knob_names(knobs), on_marker=False, quick=quick)
+    return _in_order([pair for view in views for pair in _view_points(view, settings, quick)])
+
+
+def _view_points(view: str, settings: Iterable[points.Point], quick: bool) -> list[tuple[int, Key]]:
+    """The points of a picture and the checks of their truths, each behind how late it comes."""
+    found: list[tuple[int, Key]] = []
+    defined: set[tuple] = set()
+    for point in settings:
+        tier = 0 if point.knob in _EARLY else 2
+        found.append((tier, {"what": POINT, "scene": view, **point.key(), "quick": quick}))
+        definition = tuple(getattr(point.quality, name) for name in DEFINITION)
+        if point.knob != MARKER_KNOB and definition not in defined:
+            defined.add(definition)
+            found.append((tier + 1, _truth_key(view, definition)))
+    return found
+
+
+def _in_order(found: list[tuple[int, Key]]) -> list[Key]:
     return [key for _, key in sorted(found, key=lambda pair: pair[0])]
 
 

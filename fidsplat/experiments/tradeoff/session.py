@@ -11,8 +11,9 @@ import numpy as np
 from fidsplat.accuracy import full_precision, reference_for, truth
 from fidsplat.backends.base import Measurable
 from fidsplat.capture import Capture
+from fidsplat.experiments.tradeoff.own import Own
 from fidsplat.experiments.tradeoff.points import BASE
-from fidsplat.experiments.tradeoff.scenes import make
+from fidsplat.experiments.tradeoff.scenes import TradeScene, make
 from fidsplat.frame import Frame
 from fidsplat.quality import MarkerQuality, Quality
 from fidsplat.render import Renderer, ResidentCloud
@@ -31,16 +32,26 @@ class Session:
     Truths are drawn by the renderer itself, or by OpenCL on the processor where it cannot blend in float64.
     """
 
-    def __init__(self, renderer: Renderer) -> None:
+    def __init__(self, renderer: Renderer, own: Own | None = None) -> None:
+        """own: one's own pictures, which have the splats of their files, whatever the knobs of markers."""
         self.renderer, self._reference = renderer, reference_for(renderer, Capture())
-        self.scene = lru_cache(_SCENES)(make)
-        """(view, knobs of markers) -> a picture's scene"""
+        self._own, self._uploaded = own or {}, {}
+        self._made = lru_cache(_SCENES)(make)
         self.resident = lru_cache(_SCENES)(self._resident)
         """(view, knobs of markers) -> its splats on the device"""
         self._truth = lru_cache(_TRUTHS)(self._draw_truth)
 
+    def scene(self, view: str, knobs: MarkerQuality) -> TradeScene:
+        """A picture's scene."""
+        return self._own[view] if view in self._own else self._made(view, knobs)
+
     def _resident(self, view: str, knobs: MarkerQuality) -> ResidentCloud:
-        return self.renderer.upload(self.scene(view, knobs).cloud)
+        cloud = self.scene(view, knobs).cloud
+        if view not in self._own:
+            return self.renderer.upload(cloud)
+        if id(cloud) not in self._uploaded:  # the views of a file show the same splats
+            self._uploaded[id(cloud)] = self.renderer.upload(cloud)
+        return self._uploaded[id(cloud)]
 
     def draw(self, view: str, quality: Quality) -> Frame:
         """The picture at a setting, not waited for."""
@@ -57,9 +68,11 @@ class Session:
         return truth(self._reference, what, scene.capture.with_(quality=like))
 
     def definition(self, view: str, quality: Quality) -> Quality:
-        """The base with what `quality` says of the definition, 3D Gaussians as they are."""
+        """The base with what `quality` says of the definition; 3D Gaussians as they are, in one's own
+        pictures as the setting draws them: captures look as they did to their trainer."""
         asked = {name: getattr(quality, name) for name in DEFINITION}
-        return BASE.with_(**asked, ellipsoid="exact", marker=quality.marker)
+        ellipsoid = quality.ellipsoid if view in self._own else "exact"
+        return BASE.with_(**asked, ellipsoid=ellipsoid, marker=quality.marker)
 
     def full(self, view: str, quality: Quality) -> Quality:
         """The setting at which `truth` is drawn."""

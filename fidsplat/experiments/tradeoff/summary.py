@@ -115,7 +115,10 @@ class Device:
             points = pd.concat([points, named]).drop_duplicates(["scene", "knob", "value"])
         names = pd.MultiIndex.from_frame(points[["scene", "knob", "value"]], names=[None] * 3)
         self.points = points.set_index(names)
-        self.scenes = [view for name in NAMES for view in views_of(name) if (view, "base", "base") in self]
+        known = [view for name in NAMES for view in views_of(name)]
+        self.own = [view for view in points["scene"].unique() if view not in known]
+        """names of pictures that users brought"""
+        self.scenes = [view for view in (*self.own, *known) if (view, "base", "base") in self]
 
     def __contains__(self, point: tuple[str, str, str]) -> bool:
         return point in self.points.index

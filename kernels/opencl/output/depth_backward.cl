@@ -1,5 +1,4 @@
-// depth = sum w z / sum w. A fragment's depth is z_numerator / D; where that leaves the depth range of the disk (in the dot of the
-// low-pass) an end of the range, and the centre's where the ray does not meet the plane in front.
+// depth = sum w z / sum w.
 //@ loss
     vfloat depth, depth_weight;
 //@ loss_start
@@ -8,41 +7,7 @@
         weight_sum = VSELECT((vfloat)1.0f, weight_sum, has_depth);
         loss->depth = VSELECT((vfloat)0.0f, pixels_of(by_depth, 1, 0, x, y, width, height) / weight_sum, has_depth);
         loss->depth_weight = -loss->depth * (depth_sum / weight_sum);
-//@ geometry
-    vfloat z;
-    vint met, beyond;       // the ray meets the plane in front; the depth is beyond the disk's range
-//@ geometry_make
-    g.met = VMASK(c.d > 0.0f);
-    vfloat z_plane = s->z_numerator * g.inverse_d;
-    vfloat z_low = s->z_center - s->z_reach, z_high = s->z_center + s->z_reach;
-    g.z = VSELECT((vfloat)s->z_center, clamp(z_plane, z_low, z_high), g.met);
-    g.beyond = g.met & (VMASK(z_plane < z_low) | VMASK(z_plane > z_high));
 //@ worth
     worth += FMA(loss->depth, g->z, loss->depth_weight);
-//@ sums
-    vfloat z_numerator, z_center, z_reach;
 //@ fragment_backward
-    vfloat by_z = weight * loss->depth;
-    vfloat by_met = VSELECT((vfloat)0.0f, by_z * g->inverse_d, g->met & ~g->beyond);
-    sums->z_numerator += by_met;
-    by_d -= VSELECT((vfloat)0.0f, by_met * g->z, g->met & ~g->beyond);
-    sums->z_center += VSELECT(by_z, (vfloat)0.0f, g->met & ~g->beyond);
-    sums->z_reach += VSELECT((vfloat)0.0f, VSELECT(by_z, -by_z, VMASK(g->z < s->z_center)), g->beyond);
-//@ moments
-    m.z_numerator = lane_sum(sums->z_numerator);
-    m.z_center = lane_sum(sums->z_center);
-    m.z_reach = lane_sum(sums->z_reach);
-//@ camera_backward
-        // z_numerator is the determinant of M, with its sign
-        real by_volume = facing * total.z_numerator;
-        by_tu = add3(by_tu, scaled(by_volume, kx));
-        by_tv = add3(by_tv, scaled(by_volume, ky));
-        by_tw = add3(by_tw, scaled(by_volume, k0));
-//@ disk_backward
-        real reach_radius = sqrt(2 * (log((real)opacities[i]) - view->log_cut)), steep = sqrt(a.z * a.z + b.z * b.z);
-        by_p.z += total.z_center;
-        by_log += total.z_reach * steep / reach_radius;
-        if (steep > 0) {
-            by_a.z += total.z_reach * reach_radius * a.z / steep;
-            by_b.z += total.z_reach * reach_radius * b.z / steep;
-        }
+    by_d += add_depth(sums, s, g, weight * loss->depth);

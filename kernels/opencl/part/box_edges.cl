@@ -11,6 +11,8 @@ static inline vfloat between(vfloat d, vfloat n, wide edge_0, wide edge_1) {
         c.cover = between(c.d, nu, s->edge_u0, s->edge_u1) * between(c.d, nv, s->edge_v0, s->edge_v1);
         c.inside = VMASK(c.cover > 0.0f) & VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);
     }
+//@ footprint_conic
+    if (IS_BOX(s)) conic_h = INFINITY;
 //@ functions
 #define BOX_SIDES 6
 #define BOX_CORNERS (4 + BOX_SIDES)

@@ -1,13 +1,21 @@
 // For GPUs: one work-group draws one tile, ROWS pixels of a column per work-item; splats are staged in local memory.
 // Barriers stand in loops whose bounds are the same for the whole group (numerics F5).
+//
+// ITEMS neighbours in a group draw a cell of CELL_W x CELL_H pixels, and walk through those of the staged splats alone that can
+// touch it: work-items of a GPU that go in step with them have cells and splats of their own, side by side.
 // Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile of each view.
 // Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 channels: r, g, b, transmittance) and the outputs' samples, whole tiles.
 #define GROUP (TILE_W * TILE_H / ROWS)
-// Neighbours in a group draw a block of BLOCK_W x BLOCK_H pixels, so that a splat that misses it costs it nothing.
-#define BLOCK_W 8
-#define BLOCK_H (4 * ROWS)
-#define BLOCKS (TILE_W * TILE_H / (BLOCK_W * BLOCK_H))
+#define ITEMS 4                              // work-items of a cell
+#define CELLS_X 8                            // cells side by side: as bits of a byte, four splats' bytes in a word
+#define CELL_W (TILE_W / CELLS_X)
+#define CELL_H (ITEMS / CELL_W * ROWS)
+#define CELLS_Y (TILE_H / CELL_H)
+#define BLOCK_X (CELLS_X / CELL_W)           // cells side by side of 8 that go in step, which are 8 pixels wide
 #define STAGED 128
+#define SHARE (STAGED / ITEMS)               // of the staged splats: 32
+#define CELLS_STRIDE (STAGED + 4)             // bytes; rows of cells lie in other banks
+#define CELLS_PAD 0.02f                      // of chords, in samples
 enum { VECTORS = sizeof(Splat) / 16 };       // of 16 bytes, in a record
 
 typedef union {              // what is staged of a splat, as vectors for fewer reads
@@ -15,20 +23,43 @@ typedef union {              // what is staged of a splat, as vectors for fewer 
     float4 words[VECTORS];
 } Staged;
 
+//@@ cells_functions
+
+// Which cells of the tile at (left, top) the splat can touch: for each row of cells, of which it touches those from `first_row` to
+// `last_row`, the cells as bits. Conservative; the test of each pixel decides.
+static inline void touched_cells(local const Splat *s, int left, int top, wide half_r2, wide filter, local uchar *cells) {
+    int first_row = max(s->y0 - top, 0) / CELL_H, last_row = (min(s->y1 - top, TILE_H) - 1) / CELL_H;
+    float shift = (float)s->ax - (float)left;
+//@@ cells_start
+    for (int cell_row = 0; cell_row < CELLS_Y; cell_row++) cells[cell_row * CELLS_STRIDE] = 0;
+    for (int cell_row = first_row; cell_row <= last_row; cell_row++) {
+        // columns between which its rows of samples have fragments
+        float y0 = (float)(top + cell_row * CELL_H) - (float)s->ay, y1 = y0 + (float)(CELL_H - 1), low = -INFINITY, high = INFINITY;
+//@@ cells_row
+//@@ cells_dot
+        int first = max((int)clamp(ceil(low + shift), 0.0f, (float)TILE_W), s->x0 - left);
+        int last = min((int)clamp(floor(high + shift), -1.0f, (float)(TILE_W - 1)), s->x1 - left - 1);
+        if (first <= last) cells[cell_row * CELLS_STRIDE] = (uchar)((2u << (last / CELL_W)) - (1u << (first / CELL_W)));
+    }
+}
+
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
 //@@ arguments blend
 ) {
     local Staged staged[STAGED];
-    local uint touched[BLOCKS][STAGED / 32]; // bits: which staged splats can touch a block
+    local uint cells[CELLS_Y * CELLS_STRIDE / 4];           // by row of cells, a byte for each splat: bits of the cells that it can touch
+    local uint touched[CELLS_X * CELLS_Y][ITEMS];           // by cell and work-item: bits of a share of the staged splats
+    local uchar places[CELLS_X * CELLS_Y][STAGED];          // those that can touch a cell, in order
     local int alive;
     const BlendConstants constants = {log_cut, ceiling, stop, filter};
     uint tile = band_first + get_group_id(0), item = get_local_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H;
     uint number = tile / (uint)(tiles_x * tiles_y), here = tile - number * (uint)(tiles_x * tiles_y);
     int x0 = (int)(here % (uint)tiles_x) * TILE_W, y0 = (int)(here / (uint)tiles_x) * TILE_H;
-    uint block = item / 32;
-    int px = x0 + (int)(block % (TILE_W / BLOCK_W) * BLOCK_W + item % BLOCK_W);
-    int py = y0 + (int)(block / (TILE_W / BLOCK_W) * BLOCK_H + item % 32 / BLOCK_W * ROWS);
+    uint block = item / 32, part = item % 32 / ITEMS, own = item % ITEMS;
+    uint cell_x = block % CELL_W * BLOCK_X + part % BLOCK_X, cell_y = block / CELL_W * CELL_W + part / BLOCK_X;
+    uint cell = cell_y * CELLS_X + cell_x;
+    int px = x0 + (int)(cell_x * CELL_W + own % CELL_W), py = y0 + (int)(cell_y * CELL_H + own / CELL_W * ROWS);
 
     Pixel pixels[ROWS];
     for (int row = 0; row < ROWS; row++) pixel_start(&pixels[row]);
@@ -41,49 +72,59 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
         uint length = min(end - batch, (uint)STAGED);
         barrier(CLK_LOCAL_MEM_FENCE);
         if (item == 0) alive = 0;
-        for (uint word = item; word < BLOCKS * (STAGED / 32); word += GROUP) touched[word / (STAGED / 32)][word % (STAGED / 32)] = 0;
-        barrier(CLK_LOCAL_MEM_FENCE);
         // vector by vector, so that neighbours in the group read neighbours in memory
         for (uint word = item; word < length * VECTORS; word += GROUP) {
             uint which = word / VECTORS, part = word % VECTORS;
             staged[which].words[part] = ((global const float4 *)(splats + lists[batch + which]))[part];
         }
+        barrier(CLK_LOCAL_MEM_FENCE);
         for (int row = 0; row < ROWS; row++)
             if (px < width && py + row < height && pixel_unfinished(&pixels[row], &constants)) alive = 1;
-        barrier(CLK_LOCAL_MEM_FENCE);
-        for (uint cell = item; cell < length * BLOCKS; cell += GROUP) {
-            uint which = cell / BLOCKS, other = cell % BLOCKS;
-            int left = x0 + (int)(other % (TILE_W / BLOCK_W)) * BLOCK_W, top = y0 + (int)(other / (TILE_W / BLOCK_W)) * BLOCK_H;
+        for (uint which = item; which < length; which += GROUP) {
             local const Splat *s = &staged[which].splat;
-            if (s->x0 < left + BLOCK_W && s->x1 > left && s->y0 < top + BLOCK_H && s->y1 > top)
-                atomic_or(&touched[other][which / 32], 1u << (which % 32));
+            touched_cells(s, x0, y0, s->log_opacity - constants.log_cut, constants.filter, (local uchar *)cells + which);
         }
         barrier(CLK_LOCAL_MEM_FENCE);
         // uniform: every work-item reads the same vote, taken before this batch is drawn
         if (!alive) break;
-        for (uint word = 0; word < STAGED / 32; word++)
-            for (uint bits = touched[block][word]; bits != 0; bits &= bits - 1) {
-                uint which = word * 32 + 31 - clz(bits & -bits);
-                Staged copy;
-                for (int part = 0; part < VECTORS; part++) copy.words[part] = staged[which].words[part];
-                const Splat s = copy.splat;
-                wide half_r2 = s.log_opacity - constants.log_cut;
-                wide x = (wide)(px - s.ax);
-                wide nu_x = FMA(s.nux, x, s.nu0), nv_x = FMA(s.nvx, x, s.nv0), d_x = FMA(s.dx, x, s.d0);
-                for (int row = 0; row < ROWS; row++) {
-                    if (!pixel_unfinished(&pixels[row], &constants)) continue;
-                    wide y = (wide)(py + row - s.ay);
-                    Crossing c = cross_row(&s, nu_x, nv_x, d_x, y, half_r2);
+        // the list of each cell, by its work-items
+        uint bits = 0, listed = 0, before = 0;
+        for (uint k = 0; k < SHARE / 4; k++) {
+            uint four = cells[cell_y * (CELLS_STRIDE / 4) + own * (SHARE / 4) + k] >> cell_x & 0x01010101u;
+            bits |= (four * 0x01020408u >> 24 & 15u) << (4 * k);
+        }
+        uint first = own * SHARE, rest = max(length, first) - first;
+        if (rest < SHARE) bits &= (1u << rest) - 1u;     // bytes that an earlier batch has left
+        touched[cell][own] = bits;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (uint other = 0; other < ITEMS; other++) {
+            if (other == own) before = listed;
+            listed += popcount(touched[cell][other]);
+        }
+        for (; bits != 0; bits &= bits - 1) places[cell][before++] = (uchar)(own * SHARE + 31 - clz(bits & -bits));
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (uint k = 0; k < listed; k++) {
+            uint which = places[cell][k];
+            Staged copy;
+            for (int part = 0; part < VECTORS; part++) copy.words[part] = staged[which].words[part];
+            const Splat s = copy.splat;
+            wide half_r2 = s.log_opacity - constants.log_cut;
+            wide x = (wide)(px - s.ax);
+            wide nu_x = FMA(s.nux, x, s.nu0), nv_x = FMA(s.nvx, x, s.nv0), d_x = FMA(s.dx, x, s.d0);
+            for (int row = 0; row < ROWS; row++) {
+                if (!pixel_unfinished(&pixels[row], &constants)) continue;
+                wide y = (wide)(py + row - s.ay);
+                Crossing c = cross_row(&s, nu_x, nv_x, d_x, y, half_r2);
 //@@ cross
-                    wide screen;
-                    int mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
+                wide screen;
+                int mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
 //@@ mask
-                    if (!VANY(mask)) continue;
-                    pixel_blend(&pixels[row], &s, c, mask, screen, &constants
+                if (!VANY(mask)) continue;
+                pixel_blend(&pixels[row], &s, c, mask, screen, &constants
 //@@ blend_arguments
-                    );
-                }
+                );
             }
+        }
     }
 //@@ pass_end
 

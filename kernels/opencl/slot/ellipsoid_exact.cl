@@ -77,5 +77,8 @@ static inline real conjugate_disk(real3_ towards, real3_ c, const real *lengths,
         c.d = squared * inverse;
         c.q = c.q * c.d * inverse;
     }
+//@ footprint_conic
+    // q <= h (D^2 + bulge q)
+    if (s->bulge > 0.0f) conic_h = (float)s->bulge * conic_h < 0.999f ? conic_h / (1.0f - (float)s->bulge * conic_h) : INFINITY;
 //@ project
     record.bulge = (wide)(2 * inverse_m2);

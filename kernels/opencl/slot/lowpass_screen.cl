@@ -24,6 +24,15 @@
         record.dot_y = pz >= near ? (wide)(center_y - anchor_y) : 1e18f;
 //@@ camera_dot
 //@@ footprint_dot
+//@ cells_start
+    const float dot_square = (float)(half_r2 / filter) * (1.0f + 1e-4f);
+//@ cells_dot
+            float dot_y = clamp((float)s->dot_y, y0, y1) - (float)s->dot_y, dot_rest = dot_square - dot_y * dot_y;
+            if (dot_rest >= 0.0f) {
+                float half_chord = sqrt(dot_rest) + CELLS_PAD;
+                low = fmin(low, (float)s->dot_x - half_chord);
+                high = fmax(high, (float)s->dot_x + half_chord);
+            }
 //@ fragment_mask
 // Vectors of pixels pass over a dot that is far away; to single pixels the question costs what it saves.
 #if LANES > 1

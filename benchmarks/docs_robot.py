@@ -1,0 +1,79 @@
+"""The robot's loop in the README: what its camera sees on its way down an aisle of the greenhouse, the tags
+that it reads, and where it takes itself to be, as an animated WebP.
+
+pip install '.[sim,video]' && PYTHONPATH=. python benchmarks/docs_robot.py docs/images/robot.webp
+"""
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import cv2
+import imageio_ffmpeg
+import numpy as np
+
+import fidsplat as fs
+from fidsplat.experiments.localise import FAMILY, RATE, VARIANTS, Localise
+from fidsplat.sim.greenhouse import BENCH
+from fidsplat.sim.robot import Run
+from fidsplat.vision.detect import detect
+from fidsplat.vision.images import write_png
+from fidsplat.vision.paint import outlined, shrunk
+
+START, END, FASTER = 23.0, 43.0, 3.0
+"""seconds of the drive, and how much faster it is shown"""
+WIDTH, MAP = 480, 260
+"""pixels: of the camera's picture, and of the map beside it"""
+GROUND, WOOD, TAG = (245, 243, 238), (205, 190, 165), (60, 60, 60)
+WAYS = {"as it was": (150, 150, 150), "by wheels and gyroscope": (209, 73, 91), "by tags": (0, 121, 140)}
+
+
+def main(out: str) -> None:
+    """Draw it and write the file."""
+    asked, whole, renderer = Localise(), Localise().run(), fs.Renderer()
+    part = slice(*np.searchsorted(whole.times, (START, END)).tolist())
+    run = Run(whole.times[part], whole.poses[part], whole.wheels[part], whole.gyro[part])
+    pictures, sightings = [], []
+    for picture in asked.pictures(VARIANTS["exact"], run, renderer):
+        codes = detect(picture, (FAMILY,), qr=False)
+        marks = [(code.corners, str(code.id)) for code in codes]
+        pictures.append(shrunk(outlined(picture, marks, thickness=2, size=0.6), WIDTH))
+        sightings.append(codes)
+        print(f"{len(pictures)} of {len(asked.shots(run))}", end="\r", file=sys.stderr)
+    ways = [run.poses, *(asked.localised(run, seen, asked.camera)[0].poses for seen in (None, sightings))]
+    with tempfile.TemporaryDirectory() as folder:
+        for number, (picture, k) in enumerate(zip(pictures, asked.shots(run).tolist(), strict=True)):
+            sheet = floor_plan(asked, [way[: k + 1, :2, 3] for way in ways], picture.shape[0])
+            write_png(Path(folder) / f"{number:06d}.png", np.concatenate([picture, sheet], axis=1))
+        words = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
+        words += ["-framerate", str(FASTER * RATE), "-i", f"{folder}/%06d.png"]
+        subprocess.run([*words, "-c:v", "libwebp_anim", "-quality", "55", "-loop", "0", out], check=True)
+
+
+def floor_plan(asked: Localise, ways: list[np.ndarray], height: int) -> np.ndarray:
+    """The greenhouse from above with the ways (n, 2) [m] so far, (height, MAP, 3) uint8; x is up."""
+    house = asked.house
+    sheet = np.full((height, MAP, 3), GROUND, np.uint8)
+    scale = min((height - 90) / (house.length + 2), MAP / (house.middles[-1] + 2))
+
+    def pixel(x: float, y: float) -> tuple[int, int]:
+        return round(MAP / 2 + (house.middles[-1] / 2 - y) * scale), round(height - 70 - (x + 1) * scale)
+
+    for y in house.middles:
+        half = BENCH[0] / 2
+        cv2.rectangle(sheet, pixel(0, y + half), pixel(house.length, y - half), WOOD, -1)
+    for tag in asked.tags.values():
+        cv2.circle(sheet, pixel(*tag.pose[:2, 3]), 2, TAG, -1, cv2.LINE_AA)
+    for number, ((name, colour), way) in enumerate(zip(WAYS.items(), ways, strict=True)):
+        points = np.array([pixel(x, y) for x, y in way[::5]], np.int32)
+        cv2.polylines(sheet, [points], False, colour, 4 if number == 0 else 1, cv2.LINE_AA)
+        foot = height - 44 + 16 * number
+        cv2.line(sheet, (12, foot - 4), (34, foot - 4), colour, 3)
+        cv2.putText(sheet, name, (42, foot), cv2.FONT_HERSHEY_SIMPLEX, 0.42, TAG, 1, cv2.LINE_AA)
+    cv2.circle(sheet, pixel(*ways[0][-1]), 4, TAG, -1, cv2.LINE_AA)
+    return sheet
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

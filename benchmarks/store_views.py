@@ -1,0 +1,146 @@
+"""Pictures of stores: splats against time, error and memory.
+
+    python benchmarks/store_views.py [--splats 20e6] [--places 1 5 50] [--errors 0.004 0.016] [--json FILE]
+
+Builds a city once (`fidsplat.store.city`; under --folder it is kept), measures its levels of detail, and
+places it on a grid. For each number of places a camera comes down from where all is in the picture to a
+street. Of each view and allowed error: seconds of the first frame and of one more, splats and nodes that it
+is drawn of, of how many; its largest difference from the exact picture, where that is drawn: of scenes of at
+most --exact splats in sight; what the device holds, and the process's peak memory.
+"""
+
+from __future__ import annotations
+
+import math
+import resource
+import time
+from pathlib import Path
+
+import numpy as np
+from measuring import PROGRESS, facts, keep, options, show
+
+import fidsplat as fs
+from fidsplat.accuracy import TRUTH_CUTOFF
+from fidsplat.backends.prepare import prepare
+from fidsplat.detail import measure_detail
+from fidsplat.store.city import City
+from fidsplat.store.streamed import Streamed
+
+
+def placed(store: fs.Store, city: City, places: int, folder: Path) -> fs.Store:
+    """The city so many times, on a grid of streets."""
+    if places == 1:
+        return store
+    side = math.ceil(math.sqrt(places))
+    poses = np.tile(np.eye(4), (places, 1, 1))
+    numbers = np.arange(places)
+    poses[:, 0, 3], poses[:, 2, 3] = numbers % side * city.side, numbers // side * city.side
+    return fs.Store(fs.place_store(store, folder / f"city-{places}.fss", poses, overwrite=True))
+
+
+def views(store: fs.Store, size: tuple[int, int]) -> dict[str, fs.Camera]:
+    """From above all, over the roofs at one side, and in a street."""
+    low, high = store.bounds()
+    middle, side = (low + high) / 2, float((high - low).max())
+    street = np.array([middle[0], -1.7, low[2] - 4.0])
+    at = {
+        "all": middle + side * np.array([0.0, -0.9, -1.1]),
+        "roofs": np.array([middle[0], -60.0, low[2] - 40.0]),
+        "street": street,
+    }
+    towards = {"all": middle, "roofs": middle, "street": street + np.array([0, 0, 50.0])}
+    return {name: fs.Camera.look_at(*size, math.radians(60), at[name], towards[name]) for name in at}
+
+
+def timed(renderer: fs.Renderer, resident, capture: fs.Capture) -> tuple[np.ndarray, list[float], dict]:
+    """A picture, seconds of its first frame and of one more, and its counts."""
+    seconds, frame, picture = [], None, np.empty(0)
+    for _ in range(2):
+        begun = time.perf_counter()
+        frame = renderer.render(resident, capture)
+        picture = frame["rgb"]
+        seconds.append(time.perf_counter() - begun)
+    assert frame is not None
+    return picture, seconds, dict(frame.stats)
+
+
+def measure(store: fs.Store, renderer: fs.Renderer, asked) -> list[dict]:
+    """A row for each view and allowed error."""
+    rows, streamed = [], Streamed([store])
+    width, height = map(int, asked.size.split("x"))
+    for name, camera in views(store, (width, height)).items():
+        exact = None
+        for error in (0.0, *asked.errors):
+            quality = fs.Quality(lowpass="pixel", alpha_cutoff=TRUTH_CUTOFF, detail_error=error)
+            capture = fs.Capture(camera, quality=quality)
+            features, view = prepare(streamed, capture)
+            begun = time.perf_counter()
+            selection = streamed.select([view], features, streamed.pixels_of(quality))
+            chosen = time.perf_counter() - begun
+            seen = sum(int(store.counts(np.array(nodes)).sum()) for nodes in selection.nodes if nodes)
+            row = {"view": name, "splats": len(store), "error": error, "drawn": seen}
+            row |= {"nodes": len(selection), "choose_s": chosen}
+            if seen <= asked.exact:
+                resident = renderer.upload(store)
+                picture, row["s"], row["stats"] = timed(renderer, resident, capture)
+                row["device_bytes"] = resident.memory_bytes
+                exact = picture if not error else exact
+                if error and exact is not None:
+                    row["off"] = float(np.abs(picture - exact).max())
+            row["peak_bytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+            rows.append(row)
+            PROGRESS.print(f"{len(store):,} {name} {error:.4f}: {seen:,} splats, {row.get('s')}")
+    return rows
+
+
+def main() -> None:
+    parser = options(__doc__)
+    parser.add_argument("--splats", type=float, default=20e6)
+    parser.add_argument("--houses", type=int, default=8)
+    parser.add_argument("--places", type=int, nargs="+", default=[1, 5, 50])
+    parser.add_argument("--errors", type=float, nargs="+", default=[1 / 255, 4 / 255])
+    parser.add_argument("--exact", type=float, default=1e8, help="most splats in sight that are drawn")
+    parser.add_argument("--measured", type=int, default=8, help="views that errors are measured with")
+    parser.add_argument("--size", default="1920x1080")
+    parser.add_argument("--folder", default="fidsplat-stores", help="where stores are kept")
+    asked = parser.parse_args()
+    city, folder = City(int(asked.splats), asked.houses), Path(asked.folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    path, built = folder / f"city-{int(asked.splats)}-{asked.houses}.fss", None
+    renderer = fs.Renderer(asked.device)
+    if not path.exists():
+        begun, cpu = time.perf_counter(), time.process_time()
+        fs.build_store([city.source], path)
+        built = {"s": time.perf_counter() - begun, "cpu_s": time.process_time() - cpu}
+        PROGRESS.print(f"built: {built}")
+    store = fs.Store(path)
+    if not store.details:
+        measure_detail(store, renderer, asked.measured)
+    rows = []
+    about = {**facts(renderer), "built": built, "bytes": store.nbytes, "size": asked.size}
+    about["details"] = [vars(one) for one in store.details]
+    for places in asked.places:
+        rows += measure(placed(store, city, places, folder), renderer, asked)
+        keep({**about, "rows": rows}, asked.json)
+    show(
+        f"{about['device']}, {asked.size}",
+        ("splats", "view", "error allowed", "drawn", "first [s]", "next [s]", "off by", "device", "peak"),
+        (
+            (
+                f"{row['splats']:,}",
+                row["view"],
+                f"{row['error']:.4f}",
+                f"{row['drawn']:,}",
+                *(f"{value:.2f}" for value in row.get("s", ())),
+                *([] if "s" in row else ["-", "-"]),
+                f"{row['off']:.4f}" if "off" in row else "-",
+                f"{row.get('device_bytes', 0) / 2**30:.2f} GiB",
+                f"{row['peak_bytes'] / 2**30:.2f} GiB",
+            )
+            for row in rows
+        ),
+    )
+
+
+if __name__ == "__main__":
+    main()

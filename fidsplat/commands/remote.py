@@ -1,0 +1,45 @@
+"""--ray ADDRESS: the options of commands whose work the machines of a cluster do."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+from fidsplat.commands.output import option
+from fidsplat.commands.sweeps import bars, words
+from fidsplat.errors import InputError
+
+if TYPE_CHECKING:
+    from fidsplat.experiments.run import Options
+
+RayAddress = Annotated[
+    str | None,
+    option("ADDRESS", "let a Ray cluster do it: local, auto, ray://HOST:10001 (extra: ray; docs/remote.md)"),
+]
+Workers = Annotated[
+    int | None, option("N", "of --ray (default: one for each GPU, or for each machine without any)")
+]
+
+
+def check_workers(ray: str | None, workers: int | None) -> None:
+    """Raises InputError for a number of workers that cannot be, before anything is read."""
+    if workers is not None and (ray is None or workers < 1):
+        raise InputError(f"--workers is {workers}; give at least 1, and --ray ADDRESS")
+
+
+def measure_by(ray: str, names: tuple[str, ...], options: Options) -> dict[str, str]:
+    """Let a cluster measure experiments; returns the files of their results."""
+    from fidsplat.experiments.run import points_of, results_of
+    from fidsplat.remote.experiments import ExperimentWork, measure
+    from fidsplat.remote.ray_engine import ray_engine
+
+    work = ExperimentWork(names, options)
+    with ray_engine(ray, work) as engine, bars() as progress:
+        device = engine.title or None
+        results = {name: results_of(name, options, device) for name in names}
+        points = {name: points_of(name, options) for name in names}
+        total = sum(len(each) for each in points.values())
+        left = sum(len(results[name].left(points[name])) for name in names)
+        bar = progress.add_task("", total=total, completed=total - left)
+        for name, record in measure(points, results, engine, engine.workers):
+            progress.update(bar, advance=1, description=f"{name} {words(record.key)}")
+    return {name: str(results[name].file) for name in names if points[name]}

@@ -1,0 +1,107 @@
+"""A page of pictures: scenes, as this machine draws them, with the text that each is made of."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from fidsplat import __version__
+from fidsplat.files import atomic_write, writable_folder
+from fidsplat.frame import Frame
+from fidsplat.provenance import digest_of
+from fidsplat.render import Renderer
+from fidsplat.scenes import Scene
+from fidsplat.vision.images import write_png
+from fidsplat.vision.output_files import picture_of
+
+PAGE = "index.html"
+_STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 80rem; padding: 0 1rem;
+       background: #fff; color: #222 }
+main { display: grid; grid-template-columns: repeat(auto-fill, minmax(22rem, 1fr)); gap: 2rem }
+img { max-width: 100%; border-radius: 4px } .more img { width: 48% }
+pre { overflow: auto; font-size: 12px; background: #8881; padding: 0.5rem }
+p { color: #777; margin: 0.3rem 0 }
+@media (prefers-color-scheme: dark) { body { background: #16181c; color: #ddd } }
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A scene of a gallery."""
+
+    name: str
+    """of its pictures' files"""
+    title: str
+    scene: Scene
+    text: str = field(default="", repr=False)
+    """the scene file; empty for splats alone"""
+
+
+def piece_of(source: Path, scene: Scene) -> Piece:
+    """A scene that was read from a file; its title is the first line's comment."""
+    text = source.read_text("utf-8", "replace") if source.suffix.lower() == ".toml" else ""
+    first = text.partition("\n")[0]
+    title = first.lstrip("# ").partition(". fidsplat")[0] if first.startswith("#") else source.stem
+    return Piece(source.stem, title.rstrip("."), scene, text)
+
+
+def write_gallery(folder: Path, pieces: Sequence[Piece], device: str | None = None) -> Iterator[Path]:
+    """Draw the pieces into a folder, and write index.html, which shows them; yields each file when it is
+    there. What was drawn before of the same splats, in the same way, is not drawn again.
+
+    Args:
+        device: instead of the scenes' own.
+
+    Raises:
+        InputError: the folder cannot be written, or a scene's camera is missing.
+        DeviceError: a device fails.
+    """
+    writable_folder(folder)
+    renderers: dict[str | None, Renderer] = {}
+    parts = []
+    for number, piece in enumerate(pieces):
+        wanted = device or piece.scene.device
+        if wanted not in renderers:
+            renderers[wanted] = Renderer(wanted)
+        renderer = renderers[wanted]
+        names = piece.scene.capture.outputs
+        splats = piece.scene.splats if piece.scene.streamed is None else piece.scene.streamed.content
+        key = digest_of((splats, piece.scene.capture, renderer.device.title, __version__))
+        files = [folder / f"{number:03d}-{piece.name}-{name}-{key}.png" for name in names]
+        if not all(file.exists() for file in files):
+            _draw(renderer.render(piece.scene), files)
+        parts.append(_figure(piece, files, renderer.device.title))
+        yield files[0]
+    with atomic_write(folder / PAGE) as stream:
+        stream.write(_page(parts).encode())
+    yield folder / PAGE
+
+
+def _draw(frame: Frame, files: Sequence[Path]) -> None:
+    for name, file in zip(frame.outputs, files, strict=True):
+        write_png(file, picture_of(name, frame[name]))
+
+
+def _figure(piece: Piece, files: Sequence[Path], device: str) -> str:
+    said = html.escape
+    first, *more = [said(file.name) for file in files]
+    markers = ", ".join(placed.marker.spec for placed in piece.scene.markers)
+    facts = f"{len(piece.scene.splats):,} splats{': ' if markers else ''}{markers[:200]}. {device}"
+    images = "".join(f'<a href="{name}"><img src="{name}" loading="lazy" alt=""></a> ' for name in more)
+    text = f"<details><summary>scene file</summary><pre>{said(piece.text)}</pre></details>"
+    return (
+        f'<figure style="margin:0"><a href="{first}"><img src="{first}" alt="{said(piece.title)}"></a>'
+        f"<figcaption>{said(piece.title)}<p>{said(facts)}</p></figcaption>"
+        f'<div class="more">{images}</div>{text if piece.text else ""}</figure>'
+    )
+
+
+def _page(parts: Sequence[str]) -> str:
+    return (
+        '<!doctype html><html lang="en"><meta charset="utf-8"><title>fidsplat</title>'
+        '<meta name="viewport" content="width=device-width">'
+        f"<style>{_STYLE}</style><h1>fidsplat</h1><main>{''.join(parts)}</main></html>\n"
+    )

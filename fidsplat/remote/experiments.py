@@ -1,0 +1,72 @@
+"""The paper's experiments, point by point by workers."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from fidsplat.errors import InputError
+from fidsplat.experiments import counts
+from fidsplat.experiments.run import Options, check, device_words, prepared
+from fidsplat.experiments.sweep import Key, Record, Results
+from fidsplat.remote.queue import Engine, drain
+from fidsplat.render import Renderer
+
+
+@dataclass(frozen=True)
+class ExperimentWork:
+    """What a worker needs to measure points of experiments; called there, it opens the device.
+
+    Raises InputError for options that name files of this machine, or what is no picture but a time.
+    """
+
+    names: tuple[str, ...]
+    options: Options
+
+    def __post_init__(self) -> None:
+        options = self.options
+        check(options)
+        if counts.NAME in self.names:
+            raise InputError("counts measures times of one quiet machine; run it without --ray")
+        blender = options.blender_folder if options.blender_folder.exists() else None
+        for path in (options.trained, options.lpips, blender):
+            if path is not None:
+                raise InputError(
+                    f"{path} is on the disk of this machine, which workers do not share; run it without "
+                    "--ray, in shares by --shard say"
+                )
+
+    def __call__(self) -> ExperimentDoer:
+        return ExperimentDoer(self)
+
+
+class ExperimentDoer:
+    """Measures points of experiments by their numbers."""
+
+    def __init__(self, work: ExperimentWork) -> None:
+        self._open = ExitStack()
+        folder = self._open.enter_context(tempfile.TemporaryDirectory())
+        options = replace(work.options, out=Path(folder))
+        self._sweeps = {s.name: s for s in self._open.enter_context(prepared(work.names, options))}
+        self.title = "" if options.ideal else device_words(Renderer(options.device))
+
+    def __call__(self, item: tuple[str, int]) -> dict:
+        """The result of an experiment's point, counted from 0."""
+        name, number = item
+        sweep = self._sweeps[name]
+        return sweep.begin(sweep.points[number])()
+
+
+def measure(
+    points: Mapping[str, list[Key]], results: Mapping[str, Results], engine: Engine, workers: int
+) -> Iterator[tuple[str, Record]]:
+    """Let workers measure what is left of experiments, whose points and results are given by name; yields the
+    name of each and a record of it once that is in its file. Raises FidsplatError as `drain` does."""
+    for kept in results.values():
+        kept.run["machine"] = f"a Ray cluster, {workers} workers"
+    left = [(name, points[name].index(key)) for name in points for key in results[name].left(points[name])]
+    for (name, number), result in drain(engine, left, workers):
+        yield name, results[name].append(points[name][number], result)

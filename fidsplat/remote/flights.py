@@ -1,0 +1,77 @@
+"""Flights that are drawn by workers: pictures come back as the bytes of their files, as no disk is shared."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from fidsplat.errors import InputError
+from fidsplat.files import atomic_write
+from fidsplat.flights import Flight, FlightFolder
+from fidsplat.remote.queue import Engine, drain
+from fidsplat.render import Renderer
+from fidsplat.vision.output_files import save_output
+
+Files = dict[tuple[str, str], bytes]
+"""content of a picture's files by output and suffix"""
+
+
+@dataclass(frozen=True, eq=False)
+class FlightWork:
+    """What a worker needs to draw pictures of a flight; called there, it opens the device.
+
+    Raises InputError for a scene with stores, which are on this machine's disk.
+    """
+
+    flight: Flight
+    device: str
+    memory_budget: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.flight.scene.streamed is not None:
+            raise InputError(
+                "a store is read from the disk of this machine, which workers do not share; draw it without "
+                "--ray"
+            )
+
+    def __call__(self) -> FlightDrawer:
+        return FlightDrawer(self)
+
+
+class FlightDrawer:
+    """Draws pictures of a flight, whose splats stay on the device."""
+
+    def __init__(self, work: FlightWork) -> None:
+        self._flight = work.flight
+        self._renderer = Renderer(work.device, work.memory_budget)
+        self._resident = self._renderer.upload(work.flight.scene)
+        self.title = self._renderer.device.title
+
+    def __call__(self, k: int) -> Files:
+        """The files of picture k."""
+        flight = self._flight
+        frame = self._renderer.render(self._resident, flight.captures[k])
+        found: Files = {}
+        with tempfile.TemporaryDirectory() as folder:
+            for name in frame.outputs:
+                files: dict[Path, str] = {}
+
+                def place(output: str, suffix: str, files: dict[Path, str] = files) -> Path:
+                    files[path := Path(folder, f"{output}{suffix}")] = suffix
+                    return path
+
+                save_output(name, frame[name], place, flight.capture.sensor.bits)
+                found |= {(name, suffix): path.read_bytes() for path, suffix in files.items()}
+        return found
+
+
+def draw(folder: FlightFolder, engine: Engine, workers: int) -> Iterator[int]:
+    """Let workers draw what is left of a flight; yields the number of each picture once its files are whole
+    here. Raises FidsplatError as `drain` does."""
+    for k, files in drain(engine, folder.left(), workers):
+        for (name, suffix), content in files.items():
+            with atomic_write(folder.file(k, name, suffix)) as stream:
+                stream.write(content)
+        yield k

@@ -1,0 +1,77 @@
+"""What levels of detail were measured to cost: of each low-pass the largest error of pictures by the size on
+the picture below which cells are not told apart."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from fidsplat.errors import InputError
+from fidsplat.files import atomic_write
+
+FILE = "detail.json"
+MARGIN = 1.5
+"""how many times below the error that is asked for the largest measured one must lie: that of other views is
+a little larger"""
+
+
+@dataclass(frozen=True)
+class Detail:
+    """Errors by sizes, as they were measured with a store."""
+
+    lowpass: str
+    """of the pictures"""
+    sizes: tuple[float, ...]
+    """samples, rising: cells that are smaller are not told apart"""
+    errors: tuple[float | None, ...]
+    """largest difference of rgb from the exact picture over all views, of each size; None where no view had
+    cells of about this size"""
+    views: int
+    device: str
+    date: str
+
+    def pixels(self, error: float) -> float:
+        """The largest size [samples] whose pictures are off by at most `error`; 0: only the exact scene.
+        Nothing is promised of a size that was not met."""
+        largest, found = 0.0, 0.0
+        for size, measured in zip(self.sizes, self.errors, strict=True):
+            if measured is not None:
+                largest = max(largest, measured)
+                found = size if largest * MARGIN <= error else found
+        return found
+
+
+def save_details(folder: Path, identity: str, details: Sequence[Detail]) -> None:
+    """Write what was measured beside a store; of low-passes that were measured before what is not replaced
+    stays."""
+    known = {one.lowpass: one for one in load_details(folder, identity)} | {
+        one.lowpass: one for one in details
+    }
+    rows = [vars(one) for _, one in sorted(known.items())]
+    with atomic_write(folder / FILE) as stream:
+        stream.write(json.dumps({"identity": identity, "details": rows}, indent=1).encode())
+
+
+def load_details(folder: Path, identity: str) -> list[Detail]:
+    """What was measured with a store; nothing, if it was another one then. Raises InputError for a file that
+    is damaged."""
+    file = folder / FILE
+    try:
+        said = json.loads(file.read_bytes())
+        if said["identity"] != identity:
+            return []
+        rows = [row | {name: tuple(row[name]) for name in ("sizes", "errors")} for row in said["details"]]
+        made = [Detail(**row) for row in rows]
+        for one in made:
+            if len(one.sizes) != len(one.errors) or list(one.sizes) != sorted(map(float, one.sizes)):
+                raise ValueError
+            _ = [float(error) for error in one.errors if error is not None]
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise InputError(f"cannot read {file}: {error.strerror or error}") from error
+    except (ValueError, KeyError, TypeError):
+        raise InputError(f"{file} is damaged; remove it, and run `fidsplat store measure` again") from None
+    return made

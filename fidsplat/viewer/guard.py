@@ -1,0 +1,99 @@
+"""Who may speak to a viewer's server: its own pages, and programs that are no browser.
+
+A browser lets any page open a WebSocket to any address, this machine's among them, and viser does not ask
+which page it was: another site in the same browser could move markers in an open scene. Browsers name the
+page's origin, and the host that was asked for, so both are checked.
+"""
+
+from __future__ import annotations
+
+import inspect
+import ipaddress
+import socket
+import threading
+from collections.abc import Callable
+from functools import partial
+from http import HTTPStatus
+from typing import Any
+from urllib.parse import urlsplit
+
+from fidsplat.errors import FidsplatError
+
+_LOCK = threading.Lock()
+
+
+def refused(origin: str | None, host: str | None, listens: str) -> str:
+    """Why a request is refused; empty where it is not.
+
+    Args:
+        origin, host: headers of the request; a browser sends both.
+        listens: address that the server listens on. On this machine's own, pages that were asked for by
+            another name are refused: their name was made to point here.
+    """
+    if origin is None:
+        return ""
+    try:
+        site, name = urlsplit(origin).netloc, urlsplit(f"//{host}").hostname
+    except ValueError:
+        return "this page says of itself what is no address"
+    if site.lower() != (host or "").lower():
+        return "this page is of another site"
+    if not _ours(name or "", listens):
+        return "this machine is known by another name; open the address that fidsplat view printed"
+    return ""
+
+
+def _ours(name: str, listens: str) -> bool:
+    if name in ("localhost", listens.lower()):
+        return True
+    try:
+        address = ipaddress.ip_address(name)
+    except ValueError:
+        return not _local(listens) and name in (socket.gethostname().lower(), socket.getfqdn().lower())
+    return address.is_loopback or not _local(listens)
+
+
+def _local(listens: str) -> bool:
+    try:
+        return ipaddress.ip_address(listens).is_loopback
+    except ValueError:
+        return listens.lower() == "localhost"
+
+
+def guarded(make: Callable[[], Any], listens: str) -> Any:
+    """The server of websockets that `make` starts and returns, which answers pages of others with 403. viser
+    has no setting for it, so what it starts its server with is exchanged meanwhile.
+
+    Raises:
+        FidsplatError: what was started is not guarded, and was stopped.
+    """
+    from websockets.asyncio import server
+
+    with _LOCK:
+        serve, started = server.serve, []
+
+        def guarding(*words: Any, process_request: Callable[..., Any] | None = None, **options: Any) -> Any:
+            started.append(True)
+            return serve(*words, process_request=partial(_answer, listens, process_request), **options)
+
+        server.serve = guarding  # type: ignore[misc, assignment]
+        try:
+            made = make()
+        finally:
+            server.serve = serve  # type: ignore[misc]
+    if not started:
+        made.stop()
+        raise FidsplatError(
+            "this version of viser starts its server in a way that fidsplat cannot guard against pages of "
+            "other sites; pip install 'viser==1.1.1'"
+        )
+    return made
+
+
+async def _answer(listens: str, further: Callable[..., Any] | None, connection: Any, request: Any) -> Any:
+    """The refusal of a request, or what the server itself says to it."""
+    headers = request.headers
+    if why := refused(headers.get("Origin"), headers.get("Host"), listens):
+        return connection.respond(HTTPStatus.FORBIDDEN, f"{why}\n")
+    found = None if further is None else further(connection, request)
+    return await found if inspect.isawaitable(found) else found

@@ -1,0 +1,32 @@
+// distortion (h, w): how far apart in depth the fragments lie whose light is seen, sum over pairs of w_i w_j (m_i - m_j)^2 with m the
+// depth in a depth buffer from 0.2 to 100 m, as the 2DGS authors have it: m = constant - INVERSE_DEPTH / z.
+// It is W sum w m^2 - (sum w m)^2, which does not change with the zero of m: that is the first fragment's, so that little cancels.
+//@ compose_types
+#define INVERSE_DEPTH WIDE(0.2004008016032064)  // 0.2 * 100 / (100 - 0.2)
+//@ state
+    vfloat spread_first, spread_weight, spread_sum, spread_squares;
+//@ start
+    pixel->spread_first = 0.0f;
+    pixel->spread_weight = 0.0f;
+    pixel->spread_sum = 0.0f;
+    pixel->spread_squares = 0.0f;
+//@ composite
+    vint spreads = VMASK(weight > 0.0f) & VMASK(seen->z > 0.0f);
+    vfloat spread_share = VSELECT((vfloat)0.0f, weight, spreads), inverse = INVERSE_DEPTH / VSELECT((vfloat)1.0f, seen->z, spreads);
+    pixel->spread_first = VSELECT(pixel->spread_first, inverse, spreads & VMASK(pixel->spread_weight == 0.0f));
+    vfloat nearer = inverse - pixel->spread_first;
+    pixel->spread_weight += spread_share;
+    pixel->spread_sum = FMA(spread_share, nearer, pixel->spread_sum);
+    pixel->spread_squares = FMA(spread_share * nearer, nearer, pixel->spread_squares);
+//@ store
+        VSTORE(pixel->spread_first, distortion_raw + at);
+        VSTORE(pixel->spread_weight, distortion_raw + plane + at);
+        VSTORE(pixel->spread_sum, distortion_raw + 2 * (size_t)plane + at);
+        VSTORE(pixel->spread_squares, distortion_raw + 3 * (size_t)plane + at);
+//@ resolve_start
+    float distortion = 0;
+//@ resolve_sample
+            float spread_sum = distortion_raw[at + 2 * (size_t)plane];
+            distortion += distortion_raw[at + plane] * distortion_raw[at + 3 * (size_t)plane] - spread_sum * spread_sum;
+//@ resolve_end
+    distortion_out[out] = mean * distortion;

@@ -1,0 +1,67 @@
+// Between which columns some rows of samples meet a disk. Its fragments lie where f = n_u^2 + n_v^2 - h D^2 <= 0, h half the squared
+// radius, and n_u, n_v, D are affine in the sample. So along a row, with a = (n_u, n_v, D) per x and b = (n_u, n_v, D) at x = 0,
+//     f = <a, a> x^2 + 2 <a, b> x + <b, b>,   q = <a, b>^2 - <a, a> <b, b> = h |(a x b)_uD, (a x b)_vD|^2 - (a x b)_uv^2
+// in the product <a, b> = a_u b_u + a_v b_v - h a_D b_D: the row meets it where q >= 0. a x b is affine in y, so that nothing
+// large cancels in q. `slack` is more than rounding can change f by at any sample of the tile, here and where fragments are
+// tested.
+//@ cells_functions
+#define CONIC_SLACK 2e-5f
+
+typedef struct {                        // an ellipse, relative to the splat's anchor
+    bool is;                            // false: there is none, or the horizon is near, or rows or columns run along the splat
+    float middle, slope;                // middles of chords: middle + slope y
+    float y, half_height;
+    float square, bend;                 // squares of half chords: square - bend (y - its y)^2
+    float tip;                          // height above y at which it is widest to the right
+    float pad;
+} Conic;
+
+static inline Conic conic_of(local const Splat *s, float h, float far_x, float far_y) {
+    float u0 = s->nu0, ux = s->nux, uy = s->nuy, v0 = s->nv0, vx = s->nvx, vy = s->nvy, d0 = s->d0, dx = s->dx, dy = s->dy;
+    float u = fabs(u0) + fabs(ux) * far_x + fabs(uy) * far_y, v = fabs(v0) + fabs(vx) * far_x + fabs(vy) * far_y;
+    float d = fabs(d0) + fabs(dx) * far_x + fabs(dy) * far_y;
+    float steep = ux * ux + vx * vx, bent = h * dx * dx, aa = steep - bent, inverse = 1.0f / aa;
+    float ud = ux * d0 - dx * u0, vd = vx * d0 - dx * v0, uv = ux * v0 - vx * u0;               // of a x b: at y = 0,
+    float ud_y = ux * dy - dx * uy, vd_y = vx * dy - dx * vy, uv_y = ux * vy - vx * uy;         // per y
+    // q = q0 + 2 q1 y - q2 y^2
+    float q0 = h * (ud * ud + vd * vd) - uv * uv + CONIC_SLACK * (u * u + v * v + h * d * d) * aa;
+    float q1 = h * (ud * ud_y + vd * vd_y) - uv * uv_y, grows = h * (ud_y * ud_y + vd_y * vd_y), q2 = uv_y * uv_y - grows;
+    float shrinks = 1.0f / q2;
+    Conic c;
+    c.is = steep > 1e-12f && bent <= 0.5f * steep && uv_y * uv_y > 1e-12f * steep && grows <= 0.5f * uv_y * uv_y;
+    c.middle = (h * dx * d0 - ux * u0 - vx * v0) * inverse;
+    c.slope = (h * dx * dy - ux * uy - vx * vy) * inverse;
+    c.y = q1 * shrinks;
+    float square_height = fmax(q0 * shrinks + c.y * c.y, 0.0f);
+    c.bend = q2 * inverse * inverse;
+    c.square = square_height * c.bend;
+    c.pad = CELLS_PAD + 1e-4f * far_x;
+    c.half_height = sqrt(square_height) + CELLS_PAD + 1e-4f * far_y;
+    c.tip = c.slope * square_height / sqrt(c.slope * c.slope * square_height + c.square + 1e-12f);
+    return c;
+}
+
+static inline float conic_half_chord(const Conic *c, float y) {
+    float above = y - c->y;
+    return sqrt(fmax(c->square - c->bend * above * above, 0.0f)) + c->pad;
+}
+
+// Of the rows from y0 to y1.
+static inline void conic_chord(const Conic *c, float y0, float y1, float *x0, float *x1) {
+    if (!c->is) return;
+    if (y0 - c->y > c->half_height || c->y - y1 > c->half_height) {
+        *x0 = INFINITY;
+        *x1 = -INFINITY;
+        return;
+    }
+    float left = clamp(c->y - c->tip, y0, y1), right = clamp(c->y + c->tip, y0, y1);
+    *x0 = c->middle + c->slope * left - conic_half_chord(c, left);
+    *x1 = c->middle + c->slope * right + conic_half_chord(c, right);
+}
+//@ cells_start
+    float conic_h = (float)half_r2;
+//@@ footprint_conic
+    const Conic conic = conic_of(s, conic_h, fmax(fabs(shift), fabs(shift - (float)TILE_W)),
+                                 fmax(fabs((float)top - (float)s->ay), fabs((float)(top + TILE_H) - (float)s->ay)));
+//@ cells_row
+            conic_chord(&conic, y0, y1, &low, &high);

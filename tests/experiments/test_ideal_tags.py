@@ -1,0 +1,58 @@
+"""Printed tags among splats: what each pixel shows of them, and where they are."""
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.experiments.ideal_tags import tag_layer
+from fidsplat.experiments.plane import plane_picture
+from fidsplat.rotations import rigid_matrix
+from fidsplat.scenes import PlacedMarker
+
+CAMERA = fs.Camera.pinhole(120, 90, 110, 110, 61, 44)
+BEHIND = np.full((90, 120, 3), (0.2, 0.4, 0.6))
+POSE = rigid_matrix((0.03, -0.02, 0.8), (1, 0.2, 0.3, 0.1))
+
+
+@pytest.fixture(scope="module")
+def tag():
+    return fs.marker("apriltag:36h11:5", size=0.3)
+
+
+def test_a_pixel_is_the_mean_of_what_it_shows(tag):
+    layer = tag_layer([PlacedMarker(tag, POSE)], CAMERA, BEHIND)
+    there = np.isfinite(layer.depth)
+    camera = fs.Camera.pinhole(120, 90, 110, 110, 61, 44, world_to_camera=POSE)
+    for channel, value in enumerate(BEHIND[0, 0]):
+        whole = plane_picture(tag.grid, tag.module, camera, background=value)
+        np.testing.assert_allclose(layer.rgb[..., channel][there], whole[there], atol=1e-6)
+        assert np.abs(whole[~there] - value).max() < 1 / 256
+    np.testing.assert_allclose(layer.rgb[~there], BEHIND[~there], atol=1e-6)
+
+
+def test_it_is_where_the_tag_is(tag):
+    layer = tag_layer([PlacedMarker(tag, POSE)], CAMERA, BEHIND)
+    y, x = np.nonzero(np.isfinite(layer.depth))
+    rays = CAMERA.rays(np.column_stack([x, y]) + 0.5)
+    points = (rays / rays[:, 2:]) * layer.depth[y, x, None]
+    local = (points - POSE[:3, 3]) @ POSE[:3, :3]
+    assert np.abs(local[:, 2]).max() < 1e-6
+    assert np.abs(local[:, :2]).max() < tag.grid.shape[0] * tag.module / 2 + 0.02
+
+
+def test_the_nearer_of_two_tags_is_seen(tag):
+    near, far = (PlacedMarker(tag, rigid_matrix((0, 0, z))) for z in (0.7, 1.0))
+    for tags in ((near, far), (far, near)):
+        depth = tag_layer(tags, CAMERA, BEHIND).depth
+        assert depth[np.isfinite(depth)] == pytest.approx(0.7)
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [rigid_matrix((0, 0, -1.0)), rigid_matrix((0, 0, 1.0), (0, 1, 0, 0)), rigid_matrix((5, 0, 1.0))],
+    ids=["behind the camera", "from behind", "beside the picture"],
+)
+def test_what_is_not_seen_leaves_the_picture_as_it_is(tag, pose):
+    layer = tag_layer([PlacedMarker(tag, pose)], CAMERA, BEHIND)
+    assert not np.isfinite(layer.depth).any()
+    np.testing.assert_allclose(layer.rgb, BEHIND, atol=1e-6)

@@ -1,0 +1,118 @@
+"""Work for other processes: the queue by itself, and flights whose pictures come back as bytes."""
+
+import pickle
+from collections import Counter
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.cli import main
+from fidsplat.flights import Flight, FlightFolder
+from fidsplat.remote.flights import FlightWork, draw
+from fidsplat.remote.queue import ATTEMPTS, WorkerLost, drain
+from fidsplat.remote.ray_engine import _share
+from fidsplat.scenes import PlacedMarker
+
+
+class Here:
+    """An engine of this process, whose workers die where they are told to: at their n-th item."""
+
+    def __init__(self, work=lambda item: item, dies=()):
+        self.work, self.dies = work, list(dies)
+        self.started, self.waits, self.had = 0, 0, Counter()
+
+    def start(self):
+        self.started += 1
+        return self.started
+
+    def submit(self, worker, item):
+        self.had[worker] += 1
+        return worker, item, (worker, self.had[worker]) in self.dies
+
+    def wait(self, tickets):
+        self.waits += 1
+        return tickets[-self.waits % len(tickets)]  # not in their order
+
+    def result(self, ticket):
+        _, item, dead = ticket
+        if dead:
+            raise WorkerLost("killed")
+        return self.work(item)
+
+
+def test_every_item_is_done_and_none_twice_though_workers_die():
+    done = Counter()
+
+    def work(item):
+        done[item] += 1
+        return 10 * item
+
+    engine = Here(work, dies=[(1, 1), (2, 3), (4, 2)])
+    found = list(drain(engine, range(20), workers=3))
+    assert set(done.values()) == {1}
+    assert sorted(found) == [(k, 10 * k) for k in range(20)]
+    assert engine.started == 3 + 3  # another for each that died
+
+
+def test_there_are_no_more_workers_than_items():
+    engine = Here()
+    assert sorted(item for item, _ in drain(engine, range(2), workers=8)) == [0, 1]
+    assert engine.started == 2
+    assert list(drain(engine, [], workers=8)) == []
+
+
+def test_an_item_that_kills_its_workers_is_named():
+    dies = [(worker, 1) for worker in range(1, 9)]
+    engine = Here(dies=dies)
+    with pytest.raises(fs.FidsplatError, match=f"7 has lost {ATTEMPTS} workers, the last of which: killed"):
+        list(drain(engine, [7], workers=1))
+    assert engine.started == ATTEMPTS
+
+
+@pytest.mark.parametrize(
+    ("count", "workers", "share"), [(8, 3, 1), (2, 2, 1), (2, 3, 0.5), (2, 5, 1 / 3), (0, 4, 0)]
+)
+def test_every_worker_finds_a_place(count, workers, share):
+    assert _share(count, workers) == share
+    assert count == 0 or count * int(1 / share) >= workers  # however they are spread
+
+
+def flight(**parts) -> Flight:
+    scene = fs.Scene(
+        markers=[PlacedMarker(fs.marker("aruco:4x4_50:7", size=0.4))],
+        camera=fs.Camera.look_at(16, 12, 1.0, (0, 0, -1), (0, 0, 0)),
+        outputs=("rgb", "depth"),
+        **parts,
+    )
+    path = fs.Trajectory([0.0, 1.0], [[0, 0, -1, 1, 0, 0, 0], [0.3, 0, -1, 1, 0, 0, 0]])
+    return Flight(scene, path, np.linspace(0, 1, 5), scene.capture)
+
+
+def test_pictures_come_back_as_the_files_that_one_process_writes(tmp_path):
+    flown = flight(sensor=fs.Sensor(bits=16))
+    renderer = fs.Renderer("reference")
+    alone = FlightFolder(tmp_path / "alone", flown, renderer.device.title)
+    list(alone.draw(renderer))
+    work = pickle.loads(pickle.dumps(FlightWork(flown, "reference")))()
+    assert work.title == renderer.device.title
+    folder = FlightFolder(tmp_path / "many", flown, work.title)
+    folder.file(3, "rgb", ".png").write_bytes(alone.file(3, "rgb", ".png").read_bytes())
+    drawn = list(draw(folder, Here(work, dies=[(1, 2), (3, 1)]), 2))
+    assert sorted(drawn) == [0, 1, 2, 3, 4]  # of picture 3 the depth was missing
+    files = {file.relative_to(alone.folder): file.read_bytes() for file in alone.folder.glob("*/*")}
+    assert len(files) == 5 * 4  # rgb, and of depth an array and two pictures
+    assert {file.relative_to(folder.folder): file.read_bytes() for file in folder.folder.glob("*/*")} == files
+    assert list(draw(folder, Here(work), 2)) == []
+
+
+def test_words_that_cannot_be_used(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for words in (("--workers", "2"), ("--ray", "local", "--workers", "0")):
+        assert main(["fly", "none.toml", *words]) == 2
+        assert "give at least 1, and --ray ADDRESS" in capsys.readouterr().err
+    monkeypatch.setitem(__import__("sys").modules, "ray", None)
+    from fidsplat.remote.ray_engine import ray_engine
+
+    with pytest.raises(fs.InputError, match=r"pip install 'fidsplat\[ray\]'"), ray_engine("local", int):
+        pass

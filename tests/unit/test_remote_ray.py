@@ -1,0 +1,108 @@
+"""Flights by Ray, on a cluster of this machine. Skipped without the extra."""
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.cli import main
+from fidsplat.experiments.sweep import read_records
+from fidsplat.flights import Flight, FlightFolder
+from fidsplat.remote import ray_engine as module
+from fidsplat.remote.flights import FlightWork, draw
+from fidsplat.remote.ray_engine import ray_engine
+from fidsplat.scenes import PlacedMarker
+
+ray = pytest.importorskip("ray", reason="the extra ray is not installed")
+VIEWS = 12
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cluster():
+    """Kept open, as one that others started."""
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    yield
+    ray.shutdown()
+
+
+def flight() -> Flight:
+    scene = fs.Scene(
+        markers=[PlacedMarker(fs.marker("aruco:4x4_50:7", size=0.4))],
+        camera=fs.Camera.look_at(16, 12, 1.0, (0, 0, -1), (0, 0, 0)),
+    )
+    path = fs.Trajectory([0.0, 1.0], [[0, 0, -1, 1, 0, 0, 0], [0.3, 0, -1, 1, 0, 0, 0]])
+    return Flight(scene, path, np.linspace(0, 1, VIEWS), scene.capture)
+
+
+def test_a_worker_that_is_killed_costs_no_picture_and_none_is_drawn_twice(tmp_path):
+    flown = flight()
+    with ray_engine("local", FlightWork(flown, "reference"), workers=3) as engine:  # of two cores
+        folder = FlightFolder(tmp_path / "many", flown, engine.title)
+        drawn = []
+        for k in draw(folder, engine, engine.workers):
+            drawn.append(k)
+            if len(drawn) == 3:
+                ray.kill(engine._actors[0])
+        assert len(engine._actors) == 4
+    assert sorted(drawn) == list(range(VIEWS))
+    assert folder.left() == []
+    alone = FlightFolder(tmp_path / "alone", flown, engine.title)
+    list(alone.draw(fs.Renderer("reference")))
+    for k in range(VIEWS):
+        assert folder.file(k, "rgb", ".png").read_bytes() == alone.file(k, "rgb", ".png").read_bytes()
+
+
+def test_a_worker_with_another_fidsplat_is_refused(monkeypatch):
+    monkeypatch.setattr(module, "identity", lambda: ("0.0.1", "1234"))
+    with (
+        pytest.raises(
+            fs.InputError, match=r"has fidsplat .*, and this is 0\.0\.1, code 1234; install the same"
+        ),
+        ray_engine("local", FlightWork(flight(), "reference"), workers=1),
+    ):
+        pass
+
+
+def test_what_a_device_refuses_is_said_once(tmp_path):
+    with (
+        pytest.raises(fs.DeviceError, match="nowhere"),
+        ray_engine("local", FlightWork(flight(), "opencl:nowhere"), workers=2),
+    ):
+        pass
+
+
+def test_the_command_draws_by_workers(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(
+        "[camera]\nwidth = 16\nheight = 12\nfov_x_deg = 60.0\nposition = [0.0, 0.0, -1.0]\n"
+        'look_at = [0.0, 0.0, 0.0]\n[[markers]]\nspec = "aruco:4x4_50:7"\nsize = 0.4\n'
+    )
+    (tmp_path / "poses.tum").write_text("0 0 0 -1 0 0 0 1\n1 0.3 0 -1 0 0 0 1\n")
+    words = ["fly", "scene.toml", "--trajectory", "poses.tum", "--rate", "3", "--device", "reference"]
+    assert main([*words, "-o", "many", "--ray", "local", "--workers", "1"]) == 0
+    assert "4 pictures" in capsys.readouterr().out
+    assert main([*words, "-o", "one"]) == 0
+    for name in ("rgb/000003.png", "contact-sheet.png", "trajectory.tum"):
+        assert (tmp_path / "many" / name).read_bytes() == (tmp_path / "one" / name).read_bytes()
+    assert main([*words, "-o", "many"]) == 0  # the same flight, whoever draws it
+    assert "4 were there already" in capsys.readouterr().out
+
+
+def test_an_experiment_by_workers_finds_what_one_process_does(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["experiment", "angles", "--ideal", "--category", "small", "--markers", "2"]
+    words += ["--tilts", "0:60:60", "--protocol", "fixed-plane"]
+    assert main([*words, "-o", "one"]) == 0
+    assert main([*words, "-o", "many", "--ray", "local"]) == 0
+    one, many = (
+        {record.name: record.result for record in read_records(tmp_path / folder / "angles.jsonl")}
+        for folder in ("one", "many")
+    )
+    assert many == one
+    assert len(many) > 1
+    before = (tmp_path / "many" / "angles.jsonl").read_bytes()
+    assert main([*words, "-o", "many", "--ray", "local"]) == 0
+    assert (tmp_path / "many" / "angles.jsonl").read_bytes() == before
+    (tmp_path / "pictures").mkdir()
+    capsys.readouterr()
+    assert main(["experiment", "views", "--ray", "local", "--blender", "pictures", "-o", "v"]) == 2
+    assert "pictures is on the disk of this machine" in capsys.readouterr().err

@@ -1,0 +1,206 @@
+"""Levels of detail: what they are chosen by, what is measured of them, the city that they are tried on."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.accuracy import truth
+from fidsplat.backends.prepare import prepare
+from fidsplat.detail import SIZES, cameras_around, errors_of, measure_detail
+from fidsplat.store import plan
+from fidsplat.store.city import PITCH, City, flight
+from fidsplat.store.detail import MARGIN, Detail, load_details, save_details
+from fidsplat.store.sources import sample, splats_of
+from fidsplat.store.streamed import Streamed
+from tests.unit.test_store_drawing import splats
+
+QUALITY = fs.Quality(lowpass="pixel", alpha_cutoff=1e-8)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plan, "_LEAST_MEMORY", 0)
+        city = City(6000, houses=2)
+        return fs.Store(fs.build_store([city.source], tmp_path_factory.mktemp("city") / "c.fss", chunk=128))
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return fs.Renderer("opencl")
+
+
+def seen_from(away, size=(48, 32)):
+    middle = np.array([PITCH, 0, PITCH])
+    return fs.Camera.look_at(*size, 1.0, middle + away * np.array([0.6, -0.5, 0.6]), middle)
+
+
+def chosen(store, camera, pixels):
+    streamed = Streamed([store])
+    features, view = prepare(streamed, fs.Capture(camera, quality=QUALITY))
+    return streamed.select([view], features, pixels).nodes[0], view
+
+
+@pytest.mark.parametrize("pixels", [0.05, 0.3, 1.0, 4.0])
+@pytest.mark.parametrize("away", [20.0, 200.0, 2000.0])
+def test_nodes_stand_for_every_chunk_once_and_for_none_that_is_too_near(store, pixels, away):
+    numbers, view = chosen(store, seen_from(away), pixels)
+    nodes = store.nodes
+    covered: list[int] = []
+    for number in numbers:
+        stack = [number]
+        while stack:
+            here = stack.pop()
+            children = np.flatnonzero(nodes["parent"] == here)
+            stack.extend(children.tolist())
+            if nodes["level"][here] == 0:
+                covered.append(here)
+        if nodes["level"][number]:
+            depth = (nodes["low"][number] + nodes["high"][number]) / 2 @ view.rotation[2] + view.translation[
+                2
+            ]
+            # the middle lies no nearer than the nearest point, by which it was chosen
+            assert nodes["size"][number] * view.focal_x / depth <= pixels
+    assert len(covered) == len(set(covered))
+    if away >= 200:  # all of the city is in the picture
+        assert sorted(covered) == np.flatnonzero(nodes["level"] == 0).tolist()
+    assert list(numbers) == sorted(numbers)
+
+
+def test_less_is_drawn_of_what_is_further_away(store):
+    counts = [sum(store.counts(np.array(chosen(store, seen_from(away), 0.5)[0]))) for away in (60, 600, 6000)]
+    assert len(store) >= counts[0] > counts[1] > counts[2]
+
+
+def test_errors_grow_with_the_size_of_cells_and_are_kept_beside_the_store(store, renderer):
+    (made,) = measure_detail(store, renderer, views=4)
+    met = [(size, error) for size, error in zip(made.sizes, made.errors, strict=True) if error is not None]
+    assert made.sizes == SIZES
+    assert len(met) >= 4
+    assert met[-1][1] > 0.02 > 1.5 * met[0][1]
+    again = fs.Store(store.path)
+    assert again.details == [made]
+    allowed = MARGIN * met[0][1] + 1e-9
+    assert again.pixels_of(QUALITY.with_(detail_error=allowed)) >= met[0][0]
+    assert again.pixels_of(QUALITY.with_(detail_error=1e-9)) == 0.0
+    assert Streamed([again]).pixels_of(QUALITY) == 0.0
+    with pytest.raises(fs.InputError, match=r"store measure .* --lowpass none"):
+        again.pixels_of(fs.Quality(lowpass="none", detail_error=0.1))
+
+
+def test_pictures_keep_to_the_error_that_is_allowed(store, renderer):
+    measure_detail(store, renderer, views=6)
+    resident = renderer.upload(fs.Store(store.path))
+    for away in (300.0, 1500.0):
+        camera = seen_from(away)
+        exact = renderer.render(resident, camera, quality=QUALITY)
+        for error in (0.01, 0.05):
+            frame = renderer.render(resident, camera, quality=QUALITY.with_(detail_error=error))
+            assert np.abs(frame["rgb"] - exact["rgb"]).max() <= error
+        assert away < 1000 or frame.stats["splats"] < exact.stats["splats"]
+        ids = renderer.render(resident, camera, ("splat_id",), QUALITY.with_(detail_error=0.05))["splat_id"]
+        assert ids.max() < len(store)
+
+
+def test_a_picture_at_no_allowed_error_is_exact(store, renderer):
+    resident, camera = renderer.upload(store), seen_from(2000.0)
+    ours = renderer.render(resident, camera, quality=QUALITY)["rgb"]
+    assert np.array_equal(ours, renderer.render(store.cloud(), camera, quality=QUALITY)["rgb"])
+
+
+def test_sizes_that_no_view_met_are_not_promised():
+    detail = Detail("pixel", (0.1, 0.2, 0.4, 0.8), (None, 0.002, None, 0.1), 3, "here", "today")
+    assert detail.pixels(0.001) == 0.0
+    assert detail.pixels(MARGIN * 0.002) == 0.2
+    assert detail.pixels(0.1) == 0.2
+    assert detail.pixels(MARGIN * 0.1) == 0.8
+    # what was worse at a smaller size counts at a larger one
+    assert Detail("pixel", (0.1, 0.2), (0.5, 0.001), 3, "here", "today").pixels(0.01) == 0.0
+
+
+def test_what_was_measured_with_another_store_does_not_count(tmp_path):
+    details = [Detail(name, (0.1,), (0.2,), 1, "here", "today") for name in ("pixel", "screen")]
+    save_details(tmp_path, "a", details)
+    save_details(tmp_path, "a", [Detail("pixel", (0.3,), (None,), 1, "here", "today")])
+    kept = load_details(tmp_path, "a")
+    assert [(one.lowpass, one.sizes) for one in kept] == [("pixel", (0.3,)), ("screen", (0.1,))]
+    assert load_details(tmp_path, "b") == []
+    for damage in (
+        b"{",
+        b"[]",
+        json.dumps({"identity": "a", "details": [{"sizes": 1, "errors": 2}]}).encode(),
+    ):
+        (tmp_path / "detail.json").write_bytes(damage)
+        with pytest.raises(fs.InputError, match="store measure"):
+            load_details(tmp_path, "a")
+
+
+def test_what_cannot_be_measured_is_said(store, renderer, tmp_path):
+    placed = fs.Store(fs.place_store(store, tmp_path / "p.fss", [np.eye(4)]))
+    with pytest.raises(fs.InputError, match="a store of places; measure"):
+        measure_detail(placed, renderer)
+    with pytest.raises(fs.InputError, match="views is 0"):
+        measure_detail(store, renderer, views=0)
+    with pytest.raises(fs.InputError, match="known: screen, pixel, none"):
+        measure_detail(store, renderer, lowpass=("box",))
+    flat = fs.Store(fs.build_store([City(300).source], tmp_path / "flat.fss", levels=False))
+    with pytest.raises(fs.InputError, match="no levels of detail"):
+        measure_detail(flat, renderer)
+    with pytest.raises(fs.InputError, match="detail_error is 1"):
+        fs.Quality(detail_error=1.0)
+
+
+def test_views_of_a_measurement_meet_all_sizes(store):
+    focal = 160 / math.tan(math.radians(30))
+    edge = np.median(store.nodes["size"][store.nodes["level"] == 1])
+    middle = sum(store.bounds(0.0)) / 2
+    sizes = [edge * focal / np.linalg.norm(camera.position - middle) for camera in cameras_around(store, 8)]
+    assert min(sizes) < 0.15
+    assert max(sizes) > 0.7
+    errors = errors_of(store, fs.Renderer("reference"), fs.Capture(seen_from(50.0, (8, 6))), [1e-6, 1e-5])
+    assert errors == [None, None]
+
+
+def test_a_city_is_the_same_however_it_is_read():
+    city = City(150_000, houses=3, seed=4)
+    source = city.source
+    kinds = {"means": "<f4", "colors": "<f4", "quats": "<f4", "scales": "<f4", "opacities": "<f4"}
+    whole, dropped = splats_of(source, (0, 150_000), np.zeros(3), kinds, -1)
+    part, _ = splats_of(source, (65_000, 70_000), np.zeros(3), kinds, -1)
+    assert dropped == {}
+    for name, array in part.items():
+        assert np.array_equal(array, whole[name][65_000:70_000]), name
+    assert whole["means"].min() > -1e-3 - 24
+    assert whole["means"][:, [0, 2]].max() < city.side + 1e-3
+    assert (whole["means"][:, 1] <= 1e-3).all()
+    assert len(sample([source])[0])
+    for bad in ({"splats": 0}, {"splats": 10, "houses": 101}, {"splats": 10, "seed": -1}):
+        with pytest.raises(fs.InputError, match="of a city is"):
+            City(**bad)
+    camera, path = flight(city)
+    assert camera.width == 1280
+    assert path.times[-1] == 8.0
+
+
+def test_a_budget_of_error_turns_detail_too(store, renderer):
+    measure_detail(store, renderer, views=6)
+    capture = fs.Capture(seen_from(1500.0), quality="lowpass=pixel")
+    quality = fs.quality_within(error=0.08, scene=fs.Store(store.path), capture=capture, device=renderer)
+    assert quality.detail_error == 0.04
+    exact = truth(renderer, store, capture.with_(quality=quality))
+    frame = renderer.render(fs.Store(store.path), capture, quality=quality)
+    assert np.abs(frame["rgb"] - exact).max() <= 0.08
+    assert frame.stats["splats"] < len(store)
+    assert np.array_equal(exact, truth(renderer, store.cloud(), capture))
+
+
+def test_a_cloud_in_memory_knows_no_detail(renderer):
+    cloud = splats(7)
+    camera = fs.Camera.look_at(48, 32, 1.0, (0, 0, 0), (0, 0, 1))
+    exact = renderer.render(cloud, camera, quality=QUALITY)["rgb"]
+    assert np.array_equal(
+        exact, renderer.render(cloud, camera, quality=QUALITY.with_(detail_error=0.5))["rgb"]
+    )

@@ -1,0 +1,139 @@
+"""`fidsplat view RUN`: a flight's folder, and a training that goes on while one looks."""
+
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from training_scene import BACKGROUND, QUICK, scene
+
+import fidsplat as fs
+from fidsplat.cli import main
+from fidsplat.commands.runs import TrainingRun, checkpoint_of
+from fidsplat.commands.view import Shown, View
+from fidsplat.train import Trainer, splats_of
+
+SCENE = (
+    "[camera]\nwidth = 12\nheight = 9\nfov_x_deg = 60.0\nposition = [0.0, 0.0, -1.0]\n"
+    'look_at = [0.0, 0.0, 0.0]\n[[markers]]\nspec = "aruco:4x4_50:7"\nsize = 0.4\n'
+)
+
+
+@pytest.fixture
+def flight(tmp_path, monkeypatch):
+    """A folder of one picture."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "poses.tum").write_text("0 0 0 -1 0 0 0 1\n")
+    words = ["scene.toml", "--trajectory", "poses.tum", "-o", "runs/one", "--device", "reference"]
+    assert main(["fly", *words]) == 0
+    return tmp_path / "runs" / "one"
+
+
+def test_a_flight_is_its_scene_and_its_poses(flight, monkeypatch):
+    monkeypatch.chdir(flight.parent)  # the scene is found from wherever one stands
+    shown = View("one")._shown()
+    assert shown.run is None
+    assert os.path.samefile(shown.source, "../scene.toml")
+    assert len(fs.load_trajectory(shown.trajectory)) == 1
+    assert View("one", trajectory="other.tum")._shown().trajectory == "other.tum"
+    assert View("../scene.toml")._shown() == Shown("../scene.toml", None)
+
+
+def test_without_a_scene_the_demo_is_shown():
+    scene = View()._shown().scene("fast", lambda words, share: None)
+    assert [placed.marker.kind for placed in scene.markers] == ["apriltag", "aruco", "qr"]
+    assert scene.capture.quality == fs.Quality.named("fast")
+
+
+def test_a_splat_file_is_shown_by_the_quality_that_is_given(tmp_path):
+    file = tmp_path / "a.ply"
+    fs.save_ply(fs.marker("aruco:4x4_50:7", size=0.4).gaussians, file)
+    scene = View(str(file))._shown().scene("samples=2", lambda words, share: None)
+    assert scene.capture.quality.samples == 2
+
+
+def test_what_is_no_run_is_said(flight, capsys):
+    (flight.parents[1] / "scene.toml").unlink()
+    for folder, words in (
+        (flight, "is a flight through ../../scene.toml, which is not there any more"),
+        (flight.parent, "is the folder of no run"),
+    ):
+        assert main(["view", str(folder)]) == 2
+        assert words in capsys.readouterr().err
+    for damaged in ("{", "[]", '{"source": null}'):
+        (flight / "flight.json").write_text(damaged)
+        assert main(["view", str(flight)]) == 2
+        assert "is the folder of no run" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def trainer(tmp_path_factory):
+    """A run of one step."""
+    dataset = scene(views=2, held_out=0, size=(12, 9))
+    file = tmp_path_factory.mktemp("run") / "yard.training.npz"
+    made = Trainer(dataset, fs.Renderer("reference"), iterations=9, checkpoint=file, **QUICK)
+    made.step()
+    made.save_checkpoint()
+    return made
+
+
+def test_a_checkpoint_holds_what_is_drawn(trainer):
+    cloud, background = splats_of(trainer.checkpoint)
+    assert background == BACKGROUND
+    wanted = trainer.cloud()
+    for name in ("means", "quats", "scales", "opacities", "sh", "origin"):
+        np.testing.assert_array_equal(getattr(cloud, name), getattr(wanted, name))
+
+
+def test_a_training_is_shown_as_it_grows(trainer):
+    folder = trainer.checkpoint.parent
+    for source in (folder, trainer.checkpoint):
+        run = View(str(source), quality="fast")._shown().run
+        assert isinstance(run, TrainingRun)
+        assert run.file == trainer.checkpoint
+    first = run.scene
+    assert first.capture.background == BACKGROUND
+    assert first.capture.quality == fs.Quality.named("fast")
+    assert run.again() is None
+    trainer.step()
+    trainer.save_checkpoint()
+    os.utime(run.file, ns=(1, 1))  # however coarse the file system's clock is
+    second = run.again()
+    assert second.camera is first.camera
+    assert not np.array_equal(second.cloud().means, first.cloud().means)
+    assert run.again() is None
+    kept = run.file.read_bytes()
+    run.file.unlink()
+    assert run.again() is None  # as while another takes its place
+    run.file.write_bytes(kept[:-9])
+    with pytest.raises(fs.InputError, match="no checkpoint of `fidsplat train` that can be read"):
+        run.again()
+    run.file.write_bytes(kept)
+
+
+def test_the_page_shows_the_newest_splats(trainer):
+    pytest.importorskip("viser", reason="the extra viewer is not installed")
+    from fidsplat.viewer.server import Viewer
+
+    first = TrainingRun(trainer.checkpoint).scene
+    newer = [replace(first, background=(1, 1, 1))]
+    viewer = Viewer(first, device="reference", port=0, again=lambda: newer.pop() if newer else None)
+    try:
+        for _ in range(100):
+            if viewer.session.drawn.scene is not first:
+                break
+            viewer._closed.wait(0.05)
+        assert viewer.session.drawn.scene.capture.background == (1, 1, 1)
+    finally:
+        viewer.close()
+
+
+def test_several_runs_in_a_folder_are_named(tmp_path):
+    assert checkpoint_of(tmp_path) is None
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.training.npz").touch()
+    with pytest.raises(fs.InputError, match=r"several training runs; name one of a.training.npz, b.training"):
+        checkpoint_of(tmp_path)
+    with pytest.raises(fs.InputError, match="no checkpoint"):
+        TrainingRun(tmp_path / "a.training.npz")
