@@ -405,11 +405,9 @@ class TrainingKernels(Protocol):
         the device, which holds until the next call."""
         ...
 
-    def surface(
-        self, images: Any, view: int, camera: Camera, normal_weight: float, distortion_weight: float
-    ) -> dict[str, Any]:
-        """Derivatives by `depth`, `normal` and `distortion` of `fidsplat.train.losses.normal_loss` and of the
-        mean distortion, so weighted; as arrays of the device, which hold until the next call."""
+    def surface(self, images: Any, view: int, camera: Camera, weight: float) -> dict[str, Any]:
+        """Derivatives by `depth` and `normal` of `fidsplat.train.losses.normal_loss`, times its weight; as
+        arrays of the device, which hold until the next call."""
         ...
 
     def count(self, screen: Any, camera: Camera, origin: np.ndarray) -> None:
