@@ -19,16 +19,13 @@ CLOSE = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(
 def main(source: str, out: str) -> None:
     """The page at rest, turned a little, with the errors of what was read."""
     viewer = Viewer(fs.Scene.load(source), Path(source), port=0)
-    with chromium.Page(viewer.address, 1160, 640) as page:
+    with chromium.Page(viewer.address, 1240, 780) as page:
         rests(viewer)
         page.drag((420.0, 500.0), (480.0, 490.0))
         page.evaluate(CLOSE)
         time.sleep(1.0)
         rests(viewer)
         viewer.read(next(iter(viewer.server.get_clients().values())))
-        page.evaluate(
-            "document.querySelectorAll('.mantine-ScrollArea-viewport').forEach(e => e.scrollTo(0, 9999))"
-        )
         time.sleep(1.0)
         cv2.imwrite(out, page.picture()[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
     viewer.close()

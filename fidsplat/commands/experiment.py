@@ -100,11 +100,10 @@ def measure(names: tuple[str, ...], options: Options, as_json: bool, ray: str | 
     from fidsplat.experiments.run import prepared
 
     away = tuple(name for name in names if ray is not None and name != counts.NAME)
+    files = {} if ray is None else measure_by(ray, away, options)
     with prepared([name for name in names if name not in away], options) as sweeps:
         run_sweeps(sweeps)
-        files = {sweep.name: str(sweep.results.file) for sweep in sweeps if sweep.points}
-    if ray is not None:
-        files |= measure_by(ray, away, options)
+        files |= {sweep.name: str(sweep.results.file) for sweep in sweeps if sweep.points}
     return tell(as_json, {"files": files}, *files.values())
 
 

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -95,7 +95,7 @@ class Localise:
     speed: float = 0.5
     """metres a second"""
 
-    @property
+    @cached_property
     def house(self) -> Greenhouse:
         """Where it takes place."""
         return Greenhouse(self.rows, self.plants, self.seed)
@@ -105,7 +105,7 @@ class Localise:
         """640 x 480, 80 degrees across."""
         return Camera.look_at(640, 480, math.radians(80), (0, 0, 0), (0, 0, 1))
 
-    @property
+    @cached_property
     def tags(self) -> dict[int, PlacedMarker]:
         """By their ids."""
         return {placed.marker.id: placed for placed in self.house.markers if placed.marker.id is not None}
@@ -150,7 +150,7 @@ class Localise:
 
     def sightings(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[list[Detection]]:
         """The tags in each picture of a variant; they are looked for while the next pictures are drawn."""
-        workers = len(os.sched_getaffinity(0))
+        workers = os.cpu_count() or 1
         waiting = deque()
         with ThreadPoolExecutor(workers) as pool:
             for picture in self.pictures(variant, run, renderer):

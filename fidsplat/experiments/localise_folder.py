@@ -29,8 +29,8 @@ _SPANS = (
     f"beyond {DISTANCES[-1]:g} m",
 )
 HEADS = (
-    *("", "ATE [cm]", "worst [cm]", "RPE over 1 m [cm]", "heading [deg]", "tags", "refused"),
-    *(f"corners [px] {span}" for span in _SPANS),
+    *("", "ATE [cm]", "worst", "RPE", "heading [deg]", "tags", "refused"),
+    *(f"[px] {span}" for span in _SPANS),
 )
 
 
@@ -55,6 +55,8 @@ class LocaliseFolder:
                 before = json.loads(file.read_text("utf-8"))
             except (OSError, ValueError) as error:
                 raise InputError(f"{file} cannot be read ({error}); --overwrite measures again") from None
+            if not isinstance(before, dict) or not isinstance(before.get("variants"), dict):
+                raise InputError(f"{file} holds no results of a drive; --overwrite measures again")
             if before.get("asked") != self.key:
                 raise InputError(
                     f"{file} is of another drive, {before.get('asked')}; give another folder, or --overwrite"
@@ -69,7 +71,7 @@ class LocaliseFolder:
         left = [name for name in names if name not in self.results["variants"]]
         if not left:
             return
-        runs: dict[float | None, Run] = {}
+        runs: dict[float | None, Run] = {None: self._driven(None)}
         seen: dict[Variant, list[list[Detection]]] = {}
         for done, name in enumerate(left):
             variant = VARIANTS[name]
@@ -152,7 +154,8 @@ class LocaliseFolder:
             "# A robot among tags",
             "",
             f"{self.results['length_m']:.1f} m through a greenhouse of {self.asked.rows} rows, "
-            f"{RATE:g} pictures a second of 640 x 480, on {self.results['run']['device']}.",
+            f"{RATE:g} pictures a second of 640 x 480, on {self.results['run']['device']}. RPE over a metre; "
+            "[px]: the median error of tags' corners, by how far away these are.",
             "",
             f"| {' | '.join(HEADS)} |",
             f"|{'---|' * len(HEADS)}",

@@ -26,7 +26,7 @@ class FlightWork:
     """
 
     flight: Flight
-    device: str | None = None
+    device: str
     memory_budget: int | None = None
 
     def __post_init__(self) -> None:

@@ -58,12 +58,16 @@ class RayEngine:
 
     def __init__(self, make: Make, workers: int | None) -> None:
         ray = _ray()
-        gpus = int(ray.cluster_resources().get("GPU", 0))
+        there = ray.cluster_resources()
+        gpus, cores = int(there.get("GPU", 0)), int(there.get("CPU", 0))
         machines = sum(node["Alive"] for node in ray.nodes())
         self.workers = workers or gpus or machines
-        share = min(1.0, gpus / self.workers)
+        # of what there are fewer of than workers several share one; what finds no place would wait for ever
         self._actor = ray.remote(Worker).options(
-            num_cpus=1, num_gpus=share, max_restarts=0, scheduling_strategy="SPREAD"
+            num_cpus=_share(cores, self.workers),
+            num_gpus=_share(gpus, self.workers),
+            max_restarts=0,
+            scheduling_strategy="SPREAD",
         )
         self._make, self._asked_by = ray.put(make), identity()
         self._actors: list[Any] = []
@@ -115,6 +119,11 @@ class RayEngine:
             if isinstance(cause, FidsplatError):
                 raise cause from None
             raise FidsplatError(f"a worker failed with {type(cause).__name__}: {cause}") from error
+
+
+def _share(count: int, workers: int) -> float:
+    """What of a core or a GPU a worker gets, so that all find a place."""
+    return 1 / -(-workers // count) if count else 0
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from fidsplat.backends.base import Backend, Images, ResidentData
 from fidsplat.cameras import Camera
 from fidsplat.train import mcmc
 from fidsplat.train.dataset import TrainingView
-from fidsplat.train.losses import Loss, picture_loss
+from fidsplat.train.losses import Loss, normal_loss, picture_loss
 from fidsplat.train.optimiser import adam_step, inner_gradients, moved_by, sparse_adam_step
 from fidsplat.train.parameters import Splats
 from fidsplat.train.settings import TrainSettings
@@ -48,6 +48,16 @@ class HostWork:
         truth = of.picture * np.float32(1 / 255)
         loss, slope = picture_loss(images.read("rgb"), truth, of.mask, self._settings.dssim_weight)
         return lambda: loss, slope
+
+    def surface(self, images: Images, view: int, weight: float) -> dict[str, np.ndarray]:
+        """Derivatives of the loss of normals by depths and normals, times its weight."""
+        of = self._views[view]
+        camera, counted = of.camera, np.float32(weight) * images.read("alpha")
+        if of.mask is not None:
+            counted *= of.mask
+        lens = (camera.fx, camera.fy), (camera.cx, camera.cy)
+        _, by_depth, by_normal = normal_loss(images.read("depth"), images.read("normal"), counted, *lens)
+        return {"depth": by_depth, "normal": by_normal}
 
     def count(self, gradients: Mapping[str, Any], camera: Camera, origin: np.ndarray) -> None:
         """Adds the gradients on the screen to their sums."""

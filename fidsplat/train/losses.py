@@ -93,3 +93,58 @@ def _ssim(image: np.ndarray, truth: np.ndarray) -> tuple[float, np.ndarray]:
     slope = blurred(by_mean - 2 * mean_a * by_var - mean_b * by_shared)
     slope += 2 * image * blurred(by_var) + truth * blurred(by_shared)
     return float(similar.mean(dtype=np.float64)), slope / image.dtype.type(image.size)
+
+
+def normal_loss(
+    depth: np.ndarray,
+    normal: np.ndarray,
+    alpha: np.ndarray,
+    focal: tuple[float, float],
+    middle: tuple[float, float],
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """How far a picture's normals are from those of the surface that its depths make: the mean over all
+    pixels of alpha (1 - n . N), much as the 2DGS authors have it (their n is a mean, not made unit).
+
+    N is the direction of the cross product of the differences of the points that neighbours below and above,
+    right and left show; it is towards the camera. Pixels at the rim, and those of which a neighbour or they
+    themselves have no depth, add nothing. Nothing goes back through alpha. The kernels' twin is
+    kernels/opencl/train/surface.cl.
+
+    Args:
+        depth: (h, w) metres along z, 0 where there is none.
+        normal: (h, w, 3) unit, camera frame, towards the camera.
+        alpha: (h, w); 0 where the picture does not matter.
+        focal, middle: pixels, of x and y.
+
+    Returns:
+        the loss, and its derivatives by `depth` and `normal`, of their shapes.
+    """
+    h, w = depth.shape
+    by_depth, by_normal = np.zeros_like(depth), np.zeros_like(normal)
+    if h < 3 or w < 3:
+        return 0.0, by_depth, by_normal
+    rows, columns = np.mgrid[:h, :w].astype(depth.dtype)
+    rays = np.stack(
+        [(columns + 0.5 - middle[0]) / focal[0], (rows + 0.5 - middle[1]) / focal[1], np.ones_like(depth)], 2
+    )
+    points = rays * depth[:, :, None]
+    down, across = points[2:, 1:-1] - points[:-2, 1:-1], points[1:-1, 2:] - points[1:-1, :-2]
+    crossed = np.cross(down, across)
+    length = np.linalg.norm(crossed, axis=2, keepdims=True)
+    seen = depth > 0
+    there = seen[1:-1, 1:-1] & seen[2:, 1:-1] & seen[:-2, 1:-1] & seen[1:-1, 2:] & seen[1:-1, :-2]
+    there = there[:, :, None] & (length > 0)
+    unit = np.where(there, crossed, 0) / np.where(there, length, 1)
+    own = normal[1:-1, 1:-1]
+    share = np.where(there, alpha[1:-1, 1:-1, None], 0) / depth.size
+    along = (unit * own).sum(2, keepdims=True)
+    by_normal[1:-1, 1:-1] = -share * unit
+    by_crossed = -share * (own - along * unit) / np.where(there, length, 1)
+    by_down, by_across = np.cross(across, by_crossed), np.cross(by_crossed, down)
+    by_points = np.zeros_like(points)
+    by_points[2:, 1:-1] += by_down
+    by_points[:-2, 1:-1] -= by_down
+    by_points[1:-1, 2:] += by_across
+    by_points[1:-1, :-2] -= by_across
+    by_depth = (by_points * rays).sum(2)
+    return float((share * (1 - along)).sum(dtype=np.float64)), by_depth, by_normal

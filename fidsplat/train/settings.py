@@ -20,6 +20,8 @@ _COUNTS = {
     "max_splats": (1, 2**31 - 1),
     "sh_degree": (0, MAX_DEGREE),
     "sh_every": (1, MOST_ITERATIONS),
+    "distortion_from": (0, MOST_ITERATIONS),
+    "normal_from": (0, MOST_ITERATIONS),
     "position_steps": (1, MOST_ITERATIONS),
     "densify_from": (0, MOST_ITERATIONS),
     "densify_until": (0, MOST_ITERATIONS),
@@ -59,6 +61,15 @@ class TrainSettings:
 
     dssim_weight: float = 0.2
     """share of 1 - SSIM in the loss; the rest is the mean absolute difference"""
+
+    distortion_weight: float = 0.0
+    """of the mean depth distortion in the loss, after `distortion_from` iterations; the authors take 100 to
+    1000 for bounded scenes"""
+    distortion_from: int = 3000
+    normal_weight: float = 0.05
+    """of the mean difference of normals and surfaces (`fidsplat.train.losses.normal_loss`) in the loss, after
+    `normal_from` iterations"""
+    normal_from: int = 7000
 
     position_rate: float = 1.6e-4
     """learning rate of the means at first, in units of the scene's extent"""
@@ -152,6 +163,11 @@ class TrainSettings:
     def degree_at(self, iteration: int) -> int:
         """SH degree that is trained at this iteration."""
         return min(self.sh_degree, iteration // self.sh_every)
+
+    def surface_weights_at(self, iteration: int) -> tuple[float, float]:
+        """Weights of normals and of distortions at this iteration."""
+        normal = self.normal_weight if iteration > self.normal_from else 0.0
+        return normal, self.distortion_weight if iteration > self.distortion_from else 0.0
 
     @property
     def first_opacity(self) -> float:

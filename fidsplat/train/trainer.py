@@ -6,15 +6,16 @@ import math
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.backends.base import Differentiates, Trains
+from fidsplat.backends.derivatives import Differentiates, Trains
 from fidsplat.backends.prepare import prepare
 from fidsplat.capture import Capture
+from fidsplat.effects.differentiable import with_distortion
 from fidsplat.errors import DeviceError, InputError, unknown
 from fidsplat.files import ordinary_file, writable_folder
 from fidsplat.formats import save_ply
@@ -33,6 +34,8 @@ from fidsplat.train.settings import TrainSettings
 from fidsplat.vision.images import to_uint8
 from fidsplat.vision.metrics import psnr, ssim
 
+_SOLID = ("rgb", "alpha", "depth", "normal")
+"""outputs of pictures whose depths and normals are in the loss"""
 CHECKPOINT_SECONDS = 30.0
 """a run writes a checkpoint when this has passed since the last"""
 
@@ -45,6 +48,7 @@ class Step(NamedTuple):
     view: str
     """name of the view that was looked at"""
     loss: float
+    """of the picture's colours"""
     psnr: float
     """dB, of that view before the step"""
     splats: int
@@ -108,6 +112,7 @@ class Trainer:
             )
         self._differentiate = backend.differentiate
         self._captures = [self._capture(view) for view in dataset.views]
+        self._solid = [replace(each, outputs=_SOLID) for each in self._captures]
         self._work = (
             DeviceWork(backend.training(), dataset.views, self.settings)
             if isinstance(backend, Trains)
@@ -149,11 +154,20 @@ class Trainer:
         number = self._view_at(iteration)
         view = self.dataset.views[number]
         resident = self._work.resident(settings.degree_at(iteration), self.dataset.origin)
-        features, seen = prepare(resident, self._captures[number])
+        by_normals, by_distortions = settings.surface_weights_at(iteration)
+        features, seen = prepare(resident, (self._solid if by_normals else self._captures)[number])
+        if by_distortions:
+            features = with_distortion(features)
         pipeline = self._differentiate(features)
         images = pipeline.forward(resident, seen)
         value, slope = self._work.loss(images, number)
-        gradients = pipeline.backward(images, {"rgb": slope})
+        slopes = {"rgb": slope}
+        if by_normals:
+            slopes |= self._work.surface(images, number, by_normals)
+        if by_distortions:
+            counts = np.ones(view.picture.shape[:2], np.float32) if view.mask is None else view.mask
+            slopes["distortion"] = counts * np.float32(by_distortions / counts.size)
+        gradients = pipeline.backward(images, slopes)
         loss = value()  # not before: the device goes on meanwhile
         if not math.isfinite(loss.value):
             raise TrainingError(

@@ -61,14 +61,17 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
 // shares the tiles.
 #define WALK_ITEMS 256
 
-// The rows of tiles that a big splat may touch. Counts and lists both come from this, so they agree.
-typedef struct { int top, cells, tiles_x; } Walk;
+// The rectangle of tiles that a big splat may touch. Counts and lists both come from this, so they agree.
+typedef struct { int top, left, columns, cells, tiles_x; } Walk;
 
 static inline Walk walk_of(const Bounds *b, int width, int height) {
     int y0, y1;
+    float x0, x1;
     bounds_rows(b, height, &y0, &y1);
-    Walk walk = {y0 / TILE_H, 0, (width + TILE_W - 1) / TILE_W};
-    walk.cells = ((y1 - 1) / TILE_H - walk.top + 1) * walk.tiles_x;
+    bounds_span(b, -INFINITY, INFINITY, &x0, &x1);
+    int first = clamp(to_pixel(ceil(x0 - 0.5f), width), 0, width - 1), last = clamp(to_pixel(floor(x1 - 0.5f), width), first, width - 1);
+    Walk walk = {y0 / TILE_H, first / TILE_W, last / TILE_W - first / TILE_W + 1, 0, (width + TILE_W - 1) / TILE_W};
+    walk.cells = ((y1 - 1) / TILE_H - walk.top + 1) * walk.columns;
     return walk;
 }
 
@@ -79,7 +82,7 @@ static inline int tiles_of(int width, int height) {
 
 // The tile of one cell of these rows; -1 if the splat cannot touch it.
 static inline int walk_tile(const Walk *walk, int cell, const Bounds *b, int width, int height) {
-    int row = walk->top + cell / walk->tiles_x, column = cell % walk->tiles_x;
+    int row = walk->top + cell / walk->columns, column = walk->left + cell % walk->columns;
     TileSpan span = tile_span(b, row, width, height);
     return column >= span.first && column <= span.last ? row * walk->tiles_x + column : -1;
 }

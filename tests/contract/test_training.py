@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from training_scene import QUICK, scene
 
-from fidsplat.backends.base import Differentiates, Trains
+from fidsplat.backends.derivatives import Differentiates, Trains
 from fidsplat.formats import load_ply
 from fidsplat.train import Trainer
+from fidsplat.train.losses import normal_loss
 
 BACKEND = "opencl"
 ITERATIONS = 40
@@ -50,14 +51,35 @@ def test_a_run_raises_the_psnr_and_repeats_to_the_byte(renderer, dataset, settin
     assert load_ply(tmp_path / "a.ply").sh_degree == 1
 
 
-def test_kernels_and_numpy_train_alike(renderer, dataset, monkeypatch):
+SOLID = {"distortion_weight": 50.0, "distortion_from": 2, "normal_weight": 0.5, "normal_from": 4}
+
+
+@pytest.mark.parametrize("losses", [{}, SOLID])
+def test_kernels_and_numpy_train_alike(renderer, dataset, monkeypatch, losses):
     """Ten steps by the kernels and by their twins, which round otherwise."""
     steps = {}
+    settings = {**QUICK, "densify_from": 99, **losses}
     for name in ("kernels", "numpy"):
         if name == "numpy":
             monkeypatch.setattr("fidsplat.train.trainer.Trains", type("Nobody", (), {}))
-        trainer = Trainer(dataset, renderer, iterations=10, sh_degree=1, **{**QUICK, "densify_from": 99})
+        trainer = Trainer(dataset, renderer, iterations=10, sh_degree=1, **settings)
         trainer.run()
         steps[name] = trainer.history["losses"]
         assert type(trainer._work).__name__ == {"kernels": "DeviceWork", "numpy": "HostWork"}[name]
     np.testing.assert_allclose(steps["kernels"], steps["numpy"], rtol=1e-4)
+
+
+def test_the_loss_of_normals_does_what_it_is_for(renderer, dataset):
+    """With it normals are closer to those of the surface that the depths make."""
+    off = []
+    for weight in (0.0, 0.2):
+        losses = {"normal_weight": weight, "normal_from": 0, "densify_from": 99}
+        trainer = Trainer(dataset, renderer, **{**QUICK, "iterations": 40, **losses})
+        cloud, found = trainer.run(), []
+        for view in dataset.views:
+            camera = view.camera
+            frame = renderer.render(cloud, camera, ("rgb", "alpha", "depth", "normal"), "surfel")
+            lens = (camera.fx, camera.fy), (camera.cx, camera.cy)
+            found.append(normal_loss(frame["depth"], frame["normal"], frame["alpha"], *lens)[0])
+        off.append(np.mean(found))
+    assert off[1] < 0.8 * off[0]

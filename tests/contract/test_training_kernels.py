@@ -8,7 +8,7 @@ import pyopencl.array
 import pytest
 from training_scene import scene
 
-from fidsplat.backends.base import Trains
+from fidsplat.backends.derivatives import Trains
 from fidsplat.train import TrainSettings
 from fidsplat.train.device import DeviceWork
 from fidsplat.train.host import HostWork, on_host
@@ -103,6 +103,30 @@ def test_masked_values_that_are_not_finite_do_not_count(renderer, views, works):
     assert not slope.get()[~views[1].mask].any()
     image[tuple(np.argwhere(views[1].mask)[0])] = np.nan
     assert np.isnan(work.loss(drawn(renderer, image), 1)[0]().value)
+
+
+def test_loss_of_normals(renderer, views, works):
+    """With a mask and without, holes among the depths."""
+    device, host = works()
+    random = np.random.default_rng(5)
+    for number, (height, width) in enumerate(((9, 11), (18, 31))):
+        normals = random.normal(size=(height, width, 3)).astype(np.float32)
+        shown = {
+            "depth": np.where(
+                random.uniform(size=(height, width)) < 0.1, 0, random.uniform(1, 2, (height, width))
+            ),
+            "normal": normals / np.linalg.norm(normals, axis=2, keepdims=True),
+            "alpha": random.uniform(size=(height, width)),
+        }
+        shown = {name: array.astype(np.float32) for name, array in shown.items()}
+        images = SimpleNamespace(
+            device_array=lambda name, shown=shown: on_device(renderer, shown[name]),
+            read=lambda name, shown=shown: shown[name],
+        )
+        found, wanted = (work.surface(images, number, 0.3) for work in (device, host))
+        for name, array in wanted.items():
+            assert np.abs(array).max() > 0
+            np.testing.assert_allclose(found[name].get(), array, rtol=1e-4, atol=1e-5 * np.abs(array).max())
 
 
 @pytest.mark.parametrize(("strategy", "sparse"), [("default", False), ("default", True), ("mcmc", False)])

@@ -148,6 +148,9 @@ def test_the_command_measures_once(tmp_path, monkeypatch, capsys):
     assert "is of another drive" in capsys.readouterr().err
     assert main([*words[:-1], "odometri"]) == 2
     assert "unknown variant 'odometri' (did you mean 'odometry'?)" in capsys.readouterr().err
+    (tmp_path / "out/localise.json").write_text("[]")
+    assert main(words) == 2
+    assert "localise.json holds no results of a drive" in capsys.readouterr().err
 
 
 def test_the_drive_as_a_log(tmp_path, monkeypatch):

@@ -11,6 +11,7 @@ from fidsplat.cli import main
 from fidsplat.flights import Flight, FlightFolder
 from fidsplat.remote.flights import FlightWork, draw
 from fidsplat.remote.queue import ATTEMPTS, WorkerLost, drain
+from fidsplat.remote.ray_engine import _share
 from fidsplat.scenes import PlacedMarker
 
 
@@ -67,6 +68,14 @@ def test_an_item_that_kills_its_workers_is_named():
     with pytest.raises(fs.FidsplatError, match=f"7 has lost {ATTEMPTS} workers, the last of which: killed"):
         list(drain(engine, [7], workers=1))
     assert engine.started == ATTEMPTS
+
+
+@pytest.mark.parametrize(
+    ("count", "workers", "share"), [(8, 3, 1), (2, 2, 1), (2, 3, 0.5), (2, 5, 1 / 3), (0, 4, 0)]
+)
+def test_every_worker_finds_a_place(count, workers, share):
+    assert _share(count, workers) == share
+    assert count == 0 or count * int(1 / share) >= workers  # however they are spread
 
 
 def flight(**parts) -> Flight:

@@ -6,7 +6,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.train import TrainSettings, densify, mcmc, neighbours
-from fidsplat.train.losses import C1, C2, blurred, picture_loss, window
+from fidsplat.train.losses import C1, C2, blurred, normal_loss, picture_loss, window
 from fidsplat.train.neighbours import mean_square_distances
 from fidsplat.train.optimiser import adam_step, inner_gradients
 from fidsplat.train.parameters import Splats, TrainingError, logit, sigmoid
@@ -45,6 +45,47 @@ def test_the_gradient_of_the_loss_is_that_of_central_differences(weight, masked)
         assert gradient[place] == pytest.approx((values[0] - values[1]) / 2e-5, abs=1e-9)
         if masked and not mask[place[:2]]:
             assert gradient[place] == 0
+
+
+def solid(size=(7, 9)):
+    """Depths of a bent surface with a hole, normals in any direction, coverage."""
+    random = np.random.default_rng(4)
+    rows, columns = np.mgrid[: size[0], : size[1]]
+    depth = 2 + 0.05 * rows - 0.03 * columns + 0.02 * random.normal(size=size)
+    depth[2, 6] = 0
+    normals = random.normal(size=(*size, 3))
+    return depth, normals / np.linalg.norm(normals, axis=2, keepdims=True), random.uniform(0.2, 1, size)
+
+
+def test_the_gradient_of_the_loss_of_normals_is_that_of_central_differences():
+    depth, normals, alpha = solid()
+    lens = (6.0, 7.0), (4.2, 3.1)
+    _, by_depth, by_normal = normal_loss(depth, normals, alpha, *lens)
+    for array, found in ((depth, by_depth), (normals, by_normal)):
+        for place in np.ndindex(array.shape):
+            if array is depth and depth[place] == 0:
+                assert found[place] == 0
+                continue
+            ends = []
+            for change in (1e-6, -1e-6):
+                kept, array[place] = array[place], array[place] + change
+                ends.append(normal_loss(depth, normals, alpha, *lens)[0])
+                array[place] = kept
+            assert found[place] == pytest.approx((ends[0] - ends[1]) / 2e-6, abs=1e-9)
+        assert np.abs(found).max() > 1e-3
+
+
+def test_a_plane_has_the_normals_of_its_depths():
+    """Of a slanted plane the loss is 0 with its own normal, and twice the share of pixels inside with the
+    opposite one."""
+    rows, columns = np.mgrid[:8, :10]
+    normal = np.array([0.2, -0.3, -1.0]) / np.linalg.norm([0.2, -0.3, -1.0])
+    rays = np.stack([(columns + 0.5 - 5) / 9, (rows + 0.5 - 4) / 9, np.ones((8, 10))], 2)
+    depth = -2.0 / (rays @ normal)
+    normals, alpha = np.tile(normal, (8, 10, 1)), np.ones((8, 10))
+    lens = (9.0, 9.0), (5.0, 4.0)
+    assert normal_loss(depth, normals, alpha, *lens)[0] == pytest.approx(0, abs=1e-12)
+    assert normal_loss(depth, -normals, alpha, *lens)[0] == pytest.approx(2 * 6 * 8 / 80)
 
 
 def test_the_loss_is_what_its_definition_says():

@@ -201,6 +201,29 @@ def test_a_full_disk_leaves_the_last_checkpoint(dataset, tmp_path, monkeypatch):
     assert [each.name for each in tmp_path.iterdir()] == [file.name]
 
 
+def test_memory_that_runs_out_leaves_the_last_checkpoint(whole, dataset, tmp_path, monkeypatch):
+    """The same command goes on from it, to the bytes of a run that had enough."""
+    _, _, _, file = whole
+    checkpoint, renderer = tmp_path / "run.training.npz", fs.Renderer("reference")
+    trainer = Trainer(dataset, renderer, iterations=ITERATIONS, checkpoint=checkpoint, **QUICK)
+    while trainer.iteration < 10:
+        trainer.step()
+    trainer.save_checkpoint()
+
+    def full(*_):
+        raise fs.DeviceError("no memory for moments (12 MiB)")
+
+    monkeypatch.setattr(trainer._work, "count", full)
+    with pytest.raises(fs.DeviceError, match="no memory for moments"):
+        trainer.run()
+    assert not list(tmp_path.glob("*.tmp*"))
+    again = Trainer(dataset, renderer, iterations=ITERATIONS, checkpoint=checkpoint, **QUICK)
+    assert again.iteration == 10
+    again.run()
+    again.save(tmp_path / "again.ply")
+    assert sha(tmp_path / "again.ply") == sha(file)
+
+
 def test_mcmc_grows_to_its_limit(dataset):
     trainer = Trainer(
         dataset,

@@ -3,6 +3,7 @@ host."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -151,6 +152,30 @@ class OpenCLTraining:
             return float(loss), float(squared / number)
 
         return value, slope
+
+    def surface(self, images: Any, view: int, camera: Camera, weight: float) -> dict[str, Any]:
+        """As `TrainingKernels`."""
+        depth, truth = images.device_array("depth"), self._truths[view]
+        height, width = depth.shape
+        shapes = {"depth": (height, width), "normal": (height, width, 3)}
+        found = {
+            name: Array(
+                self._queue, shape, np.float32, data=self._scratch(f"by {name}", 4 * math.prod(shape))
+            )
+            for name, shape in shapes.items()
+        }
+        given = {
+            **{"width": width, "height": height, "mask": truth.mask, "masked": int(truth.masked)},
+            **{"inverse_x": 1 / camera.fx, "inverse_y": 1 / camera.fy},
+            **{"middle_x": camera.cx, "middle_y": camera.cy},
+            **{name: images.device_array(name).data for name in ("depth", "normal", "alpha")},
+            **{f"by_{name}": array.data for name, array in found.items()},
+            "normal_share": weight / (width * height),
+            "differences": self._scratch("differences", 24 * width * height),
+        }
+        self._launch_rows("surface_normals", width, height, given)
+        self._launch_rows("surface_depths", width, height, given)
+        return found
 
     def count(self, screen: Any, camera: Camera, origin: np.ndarray) -> None:
         """As `TrainingKernels`."""

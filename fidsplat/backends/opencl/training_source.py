@@ -11,7 +11,7 @@ PLANES = 11
 """of the loss (kernels/opencl/train/loss.cl)"""
 MARGIN, MARGIN_ROWS = 16, 5
 """zeros around a plane, floats of a row and rows"""
-_FILES = ("prelude.cl", "math.cl", "train/loss.cl", "train/adam.cl", "train/shake.cl")
+_FILES = ("prelude.cl", "math.cl", "train/loss.cl", "train/surface.cl", "train/adam.cl", "train/shake.cl")
 
 _PICTURE = takes(
     "int width height  // values of a row: three of a pixel; rows",
@@ -20,6 +20,10 @@ _PICTURE = takes(
 )
 _MASK = takes("int masked", "in uchar mask  // (rows, pixels), where `masked`")
 _PLANES = takes("out float planes")
+_SURFACE = takes(
+    "int width height  // of the picture",
+    "float inverse_x inverse_y middle_x middle_y  // 1 / focal lengths, and the principal point [px]",
+)
 _ADAM = takes(
     "float beta1 beta2 rest1 rest2 root epsilon",
     "int sparse  // splats that the picture does not depend on rest",
@@ -36,6 +40,15 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         _PICTURE, "float l1_share ssim_share", _MASK, "in float planes", "out float by_rgb"
     ),
     "loss_sums": takes("uint plane", "in float planes", "out float sums  // (work-groups, 3)"),
+    "surface_normals": takes(
+        _SURFACE,
+        _MASK,
+        "float normal_share  // of each pixel",
+        "in float depth normal alpha",
+        "out float by_normal",
+        "out float differences  // (rows, columns, 2, 3)",
+    ),
+    "surface_depths": takes(_SURFACE, "in float differences", "out float by_depth"),
     "activate": takes(
         "uint count",
         "in float quats log_scales logits",

@@ -1,0 +1,57 @@
+// How far a picture's normals are from those of the surface that its depths make; its twin in NumPy, with the formulas: `normal_loss` in
+// fidsplat/train/losses.py.
+
+// The point that a pixel shows.
+static inline float3 point_at(
+    int x, int y, int width, global const float *depth, float inverse_x, float inverse_y, float middle_x, float middle_y
+) {
+    float3 ray = {(x + 0.5f - middle_x) * inverse_x, (y + 0.5f - middle_y) * inverse_y, 1.0f};
+    return ray * depth[y * (size_t)width + x];
+}
+
+#define POINT(x, y) point_at(x, y, width, depth, inverse_x, inverse_y, middle_x, middle_y)
+#define HAS_DEPTH(x, y) (depth[(y) * (size_t)width + (x)] > 0.0f)
+
+// Index space: (columns, rows). Reads: the images, the mask. Writes: the derivatives by normals and, of each pixel, those by the
+// differences of the points below and above it, right and left of it.
+kernel void surface_normals(
+//@@ arguments surface_normals
+) {
+    int x = get_global_id(0), y = get_global_id(1);
+    if (x >= width || y >= height) return;
+    size_t at = y * (size_t)width + x;
+    bool counts = !masked || mask[at];
+    float3 by_n = 0.0f, by_down = 0.0f, by_across = 0.0f;
+    if (counts && x > 0 && y > 0 && x + 1 < width && y + 1 < height && HAS_DEPTH(x, y) && HAS_DEPTH(x - 1, y) && HAS_DEPTH(x + 1, y)
+        && HAS_DEPTH(x, y - 1) && HAS_DEPTH(x, y + 1)) {
+        float3 down = POINT(x, y + 1) - POINT(x, y - 1), across = POINT(x + 1, y) - POINT(x - 1, y);
+        float3 crossed = cross(down, across);
+        float size = sqrt(dot(crossed, crossed));
+        if (size > 0.0f) {
+            float3 unit_n = crossed / size, own = vload3(at, normal);
+            float share = normal_share * alpha[at];
+            by_n = -share * unit_n;
+            float3 by_crossed = (-share / size) * (own - dot(unit_n, own) * unit_n);
+            by_down = cross(across, by_crossed);
+            by_across = cross(by_crossed, down);
+        }
+    }
+    vstore3(by_n, at, by_normal);
+    vstore3(by_down, 2 * at, differences);
+    vstore3(by_across, 2 * at + 1, differences);
+}
+
+// Index space: (columns, rows). Reads: differences. Writes: the derivatives by depths.
+kernel void surface_depths(
+//@@ arguments surface_depths
+) {
+    int x = get_global_id(0), y = get_global_id(1);
+    if (x >= width || y >= height) return;
+    size_t at = y * (size_t)width + x;
+    float3 by = 0.0f;
+    if (y > 0) by += vload3(2 * (at - width), differences);
+    if (y + 1 < height) by -= vload3(2 * (at + width), differences);
+    if (x > 0) by += vload3(2 * (at - 1) + 1, differences);
+    if (x + 1 < width) by -= vload3(2 * (at + 1) + 1, differences);
+    by_depth[at] = (x + 0.5f - middle_x) * inverse_x * by.x + (y + 0.5f - middle_y) * inverse_y * by.y + by.z;
+}
