@@ -73,7 +73,10 @@ def files(tmp_path):
         "peer.json": {"results": [RECORD | {"frame_ms": 1.2}, PEER]},
         "first.json": [FIRST],
         "batches.json": [BATCH],
-        "peer_batches.json": [BATCH | {"renderer": "fidsplat 1"}, BATCH | PEER_BATCH | {"renderer": "Peer 1"}],
+        "peer_batches.json": [
+            BATCH | {"renderer": "fidsplat 1"},
+            BATCH | PEER_BATCH | {"renderer": "Peer 1"},
+        ],
     }
     for name, content in kinds.items():
         (tmp_path / name).write_text(json.dumps(content))
