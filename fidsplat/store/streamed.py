@@ -184,7 +184,7 @@ def _chosen(store: Store, views: Sequence[View], features: FeatureSet, pixels: f
     reach = np.tile(nodes["reach"].astype(np.float64), places)
     visible = np.zeros(len(level), bool)
     for view in views:
-        visible |= seen(view, features, store.boxes, reach, exact=pixels == 0)
+        visible |= seen(view, features, store.boxes, reach)
     pinned = np.tile((nodes["level"] == 0) & (nodes["first"] >= store.header.pinned), places)
     if pixels == 0:
         return np.flatnonzero((visible | pinned) & (level == 0))
