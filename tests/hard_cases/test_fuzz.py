@@ -30,7 +30,7 @@ def test_seeds_that_failed_once(renderer, seed):
 
 @pytest.mark.parametrize("seed", [56, 107, 739])
 def test_seeds_with_ties(renderer, seed):
-    """Of splats of one plane: cut off by the stop in one order alone, turned, face to face with the camera."""
+    """Of splats of one plane: cut off by the stop in one order; turned; face to face with the camera."""
     state = fuzz.FuzzState("")
     state.add(seed, renderer)
     assert state.passed
