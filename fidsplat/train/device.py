@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import Images, ResidentData, TrainingKernels
+from fidsplat.backends.base import Images, ResidentData
+from fidsplat.backends.derivatives import TrainingKernels
 from fidsplat.cameras import Camera
 from fidsplat.train.dataset import TrainingView
 from fidsplat.train.losses import Loss

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from training_scene import QUICK, scene
 
-from fidsplat.backends.base import Differentiates, Trains
+from fidsplat.backends.derivatives import Differentiates, Trains
 from fidsplat.formats import load_ply
 from fidsplat.train import Trainer
 from fidsplat.train.losses import normal_loss

@@ -8,7 +8,7 @@ import pyopencl.array
 import pytest
 from training_scene import scene
 
-from fidsplat.backends.base import Trains
+from fidsplat.backends.derivatives import Trains
 from fidsplat.train import TrainSettings
 from fidsplat.train.device import DeviceWork
 from fidsplat.train.host import HostWork, on_host

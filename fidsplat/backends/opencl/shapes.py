@@ -60,7 +60,7 @@ def shape_for(features: FeatureSet, shape: DeviceShape) -> DeviceShape:
 
 
 def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
-    """Build constants by name, for tests: `Reshapes.shapes` of fidsplat/backends/base.py."""
+    """Build constants by name, for tests: `Reshapes.shapes` of fidsplat/backends/probing.py."""
     if kind == "schedule":
         return {"groups": _groups(own, 8)}
     if kind == "waiting":
