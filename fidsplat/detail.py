@@ -28,7 +28,7 @@ WIDTH, HEIGHT, FOV_X = 320, 180, math.radians(60.0)
 def measure_detail(
     store: Store,
     renderer: Renderer,
-    views: int = 12,
+    views: int = 20,
     lowpass: Sequence[str] = ("pixel",),
     seed: int = 0,
     progress: Callable[[str, float], object] = lambda words, share: None,
@@ -94,18 +94,22 @@ def errors_of(
 
 
 def cameras_around(store: Store, count: int, seed: int = 0) -> Iterator[Camera]:
-    """Cameras that look at random chunks, from where the cells above chunks are of all sizes of `SIZES` on
-    the picture."""
+    """Cameras that look at random chunks, from where the cells of each level in turn are of all sizes of
+    `SIZES` on the picture."""
     generator = np.random.default_rng(seed)
     nodes = store.nodes
-    chunks, above = nodes[nodes["level"] == 0], nodes[nodes["level"] == 1]
+    chunks = nodes[nodes["level"] == 0]
+    levels = range(1, int(nodes["level"].max()) + 1)
+    edges = [float(np.median(nodes["size"][nodes["level"] == level])) for level in levels]
+    rounds = -(-count // len(edges))
     focal = WIDTH / 2 / math.tan(FOV_X / 2)
     for number in range(count):
         chunk = chunks[generator.integers(len(chunks))]
         target = (chunk["low"] + chunk["high"]).astype(np.float64) / 2 + store.origin
-        share = (number + generator.random()) / count  # spread over the sizes, so that each is met
+        # spread over the sizes, so that each is met
+        share = (number // len(edges) + generator.random()) / rounds
         size = SIZES[0] * (SIZES[-1] / SIZES[0]) ** share
-        away = float(np.median(above["size"])) * focal / size
+        away = edges[number % len(edges)] * focal / size
         towards = generator.normal(size=3)
         position = target + away * towards / np.linalg.norm(towards)
         near = min(0.01, away / 100)

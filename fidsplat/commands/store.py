@@ -232,7 +232,7 @@ class Measure:
     """
 
     store: StorePath
-    views: Annotated[int, option("N", "places to look from (default: 12)")] = 12
+    views: Annotated[int, option("N", "places to look from (default: 20)")] = 20
     lowpass: Annotated[str, option("A,B,...", "of pixel, screen, none (default: pixel)")] = "pixel"
     seed: Annotated[int, option("N", "of the places (default: 0)")] = 0
     device: Device = None
@@ -274,7 +274,7 @@ class StoreDemo:
     splats: Annotated[float, option("N", "of the city (default: 20e6)")] = 20e6
     houses: Annotated[int, option("N", "along a side (default: 8)")] = 8
     seed: Annotated[int, option("N", "of houses and splats (default: 0)")] = 0
-    views: Annotated[int, option("N", "places to measure from; 0: do not measure (default: 4)")] = 4
+    views: Annotated[int, option("N", "places to measure from; 0: do not measure (default: 6)")] = 6
     device: Device = None
     overwrite: Overwrite = False
     json: Json = False

@@ -155,11 +155,16 @@ def test_what_cannot_be_measured_is_said(store, renderer, tmp_path):
 
 def test_views_of_a_measurement_meet_all_sizes(store):
     focal = 160 / math.tan(math.radians(30))
-    edge = np.median(store.nodes["size"][store.nodes["level"] == 1])
+    nodes = store.nodes
+    edges = [
+        np.median(nodes["size"][nodes["level"] == level]) for level in range(1, nodes["level"].max() + 1)
+    ]
     middle = sum(store.bounds(0.0)) / 2
-    sizes = [edge * focal / np.linalg.norm(camera.position - middle) for camera in cameras_around(store, 8)]
-    assert min(sizes) < 0.15
-    assert max(sizes) > 0.7
+    away = [np.linalg.norm(camera.position - middle) for camera in cameras_around(store, 5 * len(edges))]
+    for first, edge in enumerate(edges):
+        sizes = [edge * focal / distance for distance in away[first :: len(edges)]]
+        assert min(sizes) < 0.15
+        assert max(sizes) > 0.4
     errors = errors_of(store, fs.Renderer("reference"), fs.Capture(seen_from(50.0, (8, 6))), [1e-6, 1e-5])
     assert errors == [None, None]
 
