@@ -63,7 +63,7 @@ def write_gallery(folder: Path, pieces: Sequence[Piece], device: str | None = No
     writable_folder(folder)
     renderers: dict[str | None, Renderer] = {}
     parts = []
-    for number, piece in enumerate(pieces):
+    for piece in pieces:
         wanted = device or piece.scene.device
         if wanted not in renderers:
             renderers[wanted] = Renderer(wanted)
@@ -71,7 +71,7 @@ def write_gallery(folder: Path, pieces: Sequence[Piece], device: str | None = No
         names = piece.scene.capture.outputs
         splats = piece.scene.splats if piece.scene.streamed is None else piece.scene.streamed.content
         key = digest_of((splats, piece.scene.capture, renderer.device.title, __version__))
-        files = [folder / f"{number:03d}-{piece.name}-{name}-{key}.png" for name in names]
+        files = [folder / f"{piece.name[:60]}-{name}-{key}.png" for name in names]
         if not all(file.exists() for file in files):
             _draw(renderer.render(piece.scene), files)
         parts.append(_figure(piece, files, renderer.device.title))
