@@ -68,7 +68,7 @@ def main() -> None:
     parser.add_argument("--splats", type=float, default=4e5)
     parser.add_argument("--houses", type=int, default=8)
     parser.add_argument("--views", type=int, default=200)
-    parser.add_argument("--measured", type=int, default=20, help="views that errors are measured with")
+    parser.add_argument("--measured", type=int, default=30, help="views that errors are measured with")
     parser.add_argument("--size", default="160x90")
     parser.add_argument("--chunk", type=int, default=4096, help="splats of a chunk; small, as the city is")
     asked = parser.parse_args()
