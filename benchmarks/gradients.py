@@ -19,7 +19,7 @@ from measuring import PROGRESS, facts, keep, options, show
 from rich.progress import track
 
 import fidsplat as fs
-from fidsplat.backends.base import Differentiates
+from fidsplat.backends.derivatives import Differentiates
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
 from fidsplat.errors import InputError

@@ -28,8 +28,8 @@ from fidsplat.files import atomic_write
 
 
 def load(files: Iterable[Path]) -> dict[str, list[dict]]:
-    """Records by kind; of `peers`, a fidsplat's is followed by the peer's."""
-    kinds = ("frames", "peers", "first", "ways", "large", "growth", "batches")
+    """Records by kind; of `peers` and `peer_batches`, a fidsplat's is followed by the peer's."""
+    kinds = ("frames", "peers", "first", "ways", "large", "growth", "batches", "peer_batches")
     found: dict[str, list[dict]] = {kind: [] for kind in kinds}
     for file in files:
         if file.suffix == ".jsonl":
@@ -37,7 +37,8 @@ def load(files: Iterable[Path]) -> dict[str, list[dict]]:
             continue
         content = json.loads(file.read_text("utf-8"))
         if isinstance(content, list):
-            kinds = {"way": "ways", "millions": "large", "caches": "first", "batch": "batches"}
+            batches = "peer_batches" if "renderer" in content[0] else "batches"
+            kinds = {"way": "ways", "millions": "large", "caches": "first", "batch": batches}
             for kind in (kinds[key] for key in kinds if key in content[0]):
                 found[kind] += content
             continue
@@ -176,6 +177,22 @@ def batches(record: dict) -> dict[str, str]:
     }
 
 
+def peer_batches(pair: tuple[dict, dict]) -> dict[str, str]:
+    """Another's batches of views beside ours in one run."""
+    ours, its = pair
+    return {
+        "views": f"{its['views']} of {its['width']} x {its['height']}",
+        "splats": f"{its['splats']:,}",
+        "peer, its outputs": f"{its['renderer']}: {', '.join(its['outputs'])}",
+        "its us per view": ms(its["us_per_view"]),
+        "our outputs": ", ".join(ours["outputs"]),
+        "our us per view": ms(ours["us_per_view"]),
+        "its / ours": f"{its['times_ours']:.3g}",
+        "PSNR of the two pictures": f"{its['psnr_same_constants_db']:.1f} dB",
+        "date": its["date"],
+    }
+
+
 def growth(curve: tuple[str, str, dict[str, float | None]]) -> dict[str, str]:
     """Exponents of a growth curve."""
     title, series, found = curve
@@ -192,7 +209,10 @@ def first_of_each_scene(records: list[dict]) -> list[dict]:
 def tables(records: dict[str, list[dict]]) -> dict[str, str]:
     """Every table for which something was measured, by its name."""
     drawn = records["frames"]
-    pairs = [pair for pair in pairwise(records["peers"]) if pair[1]["renderer"] != "fidsplat"]
+    pairs, batch_pairs = (
+        [pair for pair in pairwise(records[kind]) if not pair[1]["renderer"].startswith("fidsplat")]
+        for kind in ("peers", "peer_batches")
+    )
     rows = {
         "counts": map(counts, first_of_each_scene(drawn)),
         "rates": map(rates, {record["title"]: record for record in drawn if record.get("rates")}.values()),
@@ -203,12 +223,16 @@ def tables(records: dict[str, list[dict]]) -> dict[str, str]:
         "ways": map(ways, records["ways"]),
         "large": map(large, records["large"]),
         "batches": map(batches, records["batches"]),
+        "peer_batches": map(peer_batches, batch_pairs),
         "growth": map(growth, exponents(records["growth"])),
     }
     return {name: text for name in TABLES if (text := markdown(rows[name]))}
 
 
-TABLES = ("counts", "rates", "frames", "stages", "peers", "first", "ways", "large", "batches", "growth")
+TABLES = (
+    *("counts", "rates", "frames", "stages", "peers", "first", "ways", "large", "batches", "peer_batches"),
+    "growth",
+)
 
 
 def insert(page: str, name: str, text: str) -> str:

@@ -16,7 +16,7 @@ from fidsplat.capture import Capture
 from fidsplat.errors import InputError
 from fidsplat.quality import LOWPASS, Quality
 from fidsplat.render import Renderer
-from fidsplat.store.detail import Detail, save_details
+from fidsplat.store.detail import Detail, load_details, save_details
 from fidsplat.store.store import Store
 from fidsplat.store.streamed import Streamed
 
@@ -28,7 +28,7 @@ WIDTH, HEIGHT, FOV_X = 320, 180, math.radians(60.0)
 def measure_detail(
     store: Store,
     renderer: Renderer,
-    views: int = 12,
+    views: int = 30,
     lowpass: Sequence[str] = ("pixel",),
     seed: int = 0,
     progress: Callable[[str, float], object] = lambda words, share: None,
@@ -37,7 +37,8 @@ def measure_detail(
     beside it, for `Quality.detail_error`.
 
     Args:
-        views: places. lowpass: those of `Quality.lowpass` to measure. seed: of the places.
+        views: places, by turns for each level. lowpass: those of `Quality.lowpass` to measure.
+        seed: of the places.
         progress: called with what is being done and the share of it that is done, 0 to 1.
 
     Raises:
@@ -54,36 +55,40 @@ def measure_detail(
         raise InputError(f"views is {views!r}; it must be a whole number from 1 to 10,000")
     if unknown := set(lowpass) - set(LOWPASS):
         raise InputError(f"lowpass is {min(unknown)!r}; known: {', '.join(LOWPASS)}")
-    made = []
+    made, levels = [], range(1, store.levels + 1)
     for number, one in enumerate(lowpass):
-        worst: list[float | None] = [None] * len(SIZES)
-        for done, camera in enumerate(cameras_around(store, views, seed), 1):
+        worst: dict[int, list[float | None]] = {level: [None] * len(SIZES) for level in levels}
+        for done, camera in enumerate(cameras_around(store, views, seed)):
+            level = levels[done % len(levels)]
             # a cut-off leaves out more of small splats than of those that stand for them
             capture = Capture(camera, quality=Quality(lowpass=one, alpha_cutoff=TRUTH_CUTOFF))
-            found = errors_of(store, renderer, capture, SIZES)
-            worst = [
-                max((e for e in pair if e is not None), default=None)
-                for pair in zip(worst, found, strict=True)
-            ]
-            progress("measuring levels of detail", (number + done / views) / len(lowpass))
-        made.append(Detail(one, SIZES, tuple(worst), views, renderer.device.title, date.today().isoformat()))
+            found = errors_of(store, renderer, capture, SIZES, level)
+            worst[level] = [_larger(*pair) for pair in zip(worst[level], found, strict=True)]
+            progress("measuring levels of detail", (number + (done + 1) / views) / len(lowpass))
+        about = -(-views // len(levels)), renderer.device.title, date.today().isoformat()
+        made += [Detail(one, level, SIZES, tuple(errors), *about) for level, errors in worst.items()]
     save_details(store.path, store.identity, made)
-    store.details = made
+    store.details = load_details(store.path, store.identity)
     return made
 
 
+def _larger(one: float | None, other: float | None) -> float | None:
+    return max((error for error in (one, other) if error is not None), default=None)
+
+
 def errors_of(
-    store: Store, renderer: Renderer, capture: Capture, sizes: Sequence[float]
+    store: Store, renderer: Renderer, capture: Capture, sizes: Sequence[float], level: int
 ) -> list[float | None]:
-    """The largest difference of rgb from the exact picture for each size [samples], rising; None where no
-    cells are merged that larger sizes would not leave apart too."""
+    """The largest difference of rgb from the exact picture for each size [samples], rising, with nodes up to
+    a level; None where no cells are merged that smaller sizes would leave apart."""
     streamed = Streamed([store])
     features, view = prepare(streamed, capture)
-    before, exact = streamed.select([view], features, 0.0), None
+    before, exact = streamed.select([view], features), None
     whole = before
     worst: list[float | None] = [None] * len(sizes)
     for number, size in enumerate(sizes):
-        selection = streamed.select([view], features, size)
+        limits = tuple(size if 0 < at <= level else 0.0 for at in range(store.levels + 1))
+        selection = streamed.select([view], features, (limits,))
         if selection == before:
             continue
         if exact is None:
@@ -94,18 +99,22 @@ def errors_of(
 
 
 def cameras_around(store: Store, count: int, seed: int = 0) -> Iterator[Camera]:
-    """Cameras that look at random chunks, from where the cells above chunks are of all sizes of `SIZES` on
-    the picture."""
+    """Cameras that look at random chunks, from where the cells of each level in turn are of all sizes of
+    `SIZES` on the picture."""
     generator = np.random.default_rng(seed)
     nodes = store.nodes
-    chunks, above = nodes[nodes["level"] == 0], nodes[nodes["level"] == 1]
+    chunks = nodes[nodes["level"] == 0]
+    levels = range(1, int(nodes["level"].max()) + 1)
+    edges = [float(np.median(nodes["size"][nodes["level"] == level])) for level in levels]
+    rounds = -(-count // len(edges))
     focal = WIDTH / 2 / math.tan(FOV_X / 2)
     for number in range(count):
         chunk = chunks[generator.integers(len(chunks))]
         target = (chunk["low"] + chunk["high"]).astype(np.float64) / 2 + store.origin
-        share = (number + generator.random()) / count  # spread over the sizes, so that each is met
+        # spread over the sizes, so that each is met
+        share = (number // len(edges) + generator.random()) / rounds
         size = SIZES[0] * (SIZES[-1] / SIZES[0]) ** share
-        away = float(np.median(above["size"])) * focal / size
+        away = edges[number % len(edges)] * focal / size
         towards = generator.normal(size=3)
         position = target + away * towards / np.linalg.norm(towards)
         near = min(0.01, away / 100)

@@ -24,10 +24,10 @@ ARITHMETIC = ("precise", "fast")
 BLEND_PRECISIONS = ("float32", "float64")
 MAX_SAMPLES = 8
 MIXTURES = ("exact", "fitted", "paper")
-NESTED = 562
-TEMPLATE_SIZES = (1, 5, 9, 13, 25, 41, NESTED)
-"""Gaussians of a rectangle in the templates that are shipped (fidsplat/markers/templates.json), and in the
-opaque one (fidsplat/markers/nested.py)"""
+BY_FORMULA = LADDER, NESTED = 121, 562
+TEMPLATE_SIZES = (1, 5, 9, 13, 25, 41, *BY_FORMULA)
+"""Gaussians of a rectangle in the templates that are shipped (fidsplat/markers/templates.json), and in those
+by a formula (fidsplat/markers/nested.py)"""
 MAX_LEVELS, MAX_DENSITY = 8, 100
 
 
@@ -77,8 +77,9 @@ class MarkerQuality:
 
     template: int = 25
     """Of `fitted`, and of the Gaussians that stand for `exact` in files: Gaussians of a rectangle up to an
-    aspect ratio of 6, one of `TEMPLATE_SIZES`: 1, 5, 9, 13, 25, 41 or 562. Fewer are drawn faster and leave
-    edges blurred and corners round; 562 are opaque and clean, under a low-pass from 24 px a module on."""
+    aspect ratio of 6, one of `TEMPLATE_SIZES`: 1, 5, 9, 13, 25, 41, 121 or 562. Fewer are drawn faster and
+    leave edges blurred and corners round; 562 are opaque and clean, under a low-pass from 24 px a module on;
+    121 are to be refined (`fs.train.refine`)."""
 
     def __post_init__(self) -> None:
         _one_of("marker quality: mixture", self.mixture, MIXTURES)

@@ -91,6 +91,8 @@ def _window(placed: PlacedMarker, view: View) -> tuple[slice, slice]:
     y, x = np.mgrid[: view.height : _COARSE, : view.width : _COARSE] + 0.5
     place, along = _printed(placed, view, x.ravel(), y.ravel())
     near = (along > 0) & (np.abs(place) < np.array(placed.marker.grid.shape[::-1]) / 2 + _MARGIN).all(1)
+    if not near.any():  # a band of rows that sees nothing of it
+        return slice(0), slice(0)
     ends = [axes.ravel()[near] for axes in (y, x)]
     return tuple(slice(max(int(one.min()) - _COARSE, 0), int(one.max()) + _COARSE) for one in ends)
 

@@ -18,8 +18,8 @@ import numpy as np
 from rich.progress import track
 
 import fidsplat as fs
-from fidsplat.backends.base import Probed
 from fidsplat.backends.opencl.device import OpenCLBackend
+from fidsplat.backends.probing import Probed
 from fidsplat.hard_cases.f_arithmetic import worst
 
 AT_ONCE = 1 << 22

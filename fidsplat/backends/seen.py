@@ -27,27 +27,25 @@ _ROUNDING = 1e-5
 """of a coordinate: what a set-up in float32 may be off"""
 
 
-def seen(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, exact: bool = True) -> np.ndarray:
+def seen(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) -> np.ndarray:
     """(n,) bool: the boxes whose splats may show in the picture, or in one of the poses of which it is made.
 
     Args:
         boxes: of the splats that move with the camera's view and of those that move by themselves alike.
         reach: (n,) metres: largest standard deviation of a box's splats.
-        exact: whether even fragments count that a low-pass in the plane (`lowpass="pixel"`) spreads far along
-            the line of sight: splats that are seen edge-on, hardly more opaque than the alpha cut-off.
     """
     if view.shots:
         made = np.zeros(len(reach), bool)
         for shot in view.shots:
-            made |= seen(shot.view, features, boxes, reach, exact)
+            made |= seen(shot.view, features, boxes, reach)
         return made
-    made = _seen_by(view, features, boxes, reach, exact)
+    made = _seen_by(view, features, boxes, reach)
     for _, own in view.groups:
-        made |= _seen_by(own, features, boxes, reach, exact)
+        made |= _seen_by(own, features, boxes, reach)
     return made
 
 
-def _seen_by(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, exact: bool) -> np.ndarray:
+def _seen_by(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) -> np.ndarray:
     radius = _ROOM * math.sqrt(max(-2.0 * view.log_cut, 0.0))
     spread = "lowpass_pixel" in features.names
     ewa = bool({"ellipsoid_ewa", "ellipsoid_ewa_antialiased"} & features.names)
@@ -55,8 +53,9 @@ def _seen_by(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, 
     whole = _Turned(view, *boxes(radius))
     # a dot of the low-pass, or what it widens a splat by, in samples
     margin = radius * view.samples + 2.0
-    if spread and exact:
-        # a centre before the near plane is widened, however far; what lies behind is not
+    if spread:
+        # of a splat that is seen edge-on the low-pass in its plane makes a streak along the line of sight, of
+        # any length; but not of one whose centre lies behind the near plane
         return whole.furthest(view) >= view.near * (1 - _ROUNDING) if not view.along_ray else reach >= 0
     made = whole.nearest(view) <= view.far * (1 + _ROUNDING)
     made &= whole.furthest(view) >= view.near * (1 - _ROUNDING)

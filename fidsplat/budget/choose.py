@@ -144,7 +144,9 @@ def _with_detail(streamed: Streamed, quality: Quality, error: float | None) -> Q
     """A quality that may spend half of an error on levels of detail, where what they cost was measured."""
     detailed = quality.with_(detail_error=min((error or 0.0) / 2, 0.5))
     try:
-        return detailed if streamed.pixels_of(detailed) else quality.with_(detail_error=0.0)
+        pixels = streamed.pixels_of(detailed)
+        useful = isinstance(pixels, tuple) and any(map(any, pixels))
+        return detailed if useful else quality.with_(detail_error=0.0)
     except InputError:
         return quality.with_(detail_error=0.0)
 

@@ -13,9 +13,13 @@ import tyro
 from fidsplat.commands.output import (
     Json,
     MemoryBudget,
+    SceneDevice,
+    SceneOutputs,
+    SceneQuality,
     bytes_of,
     console,
     late_progress,
+    names_of,
     option,
     print_json,
     say,
@@ -88,16 +92,9 @@ class Fly:
     coco: Annotated[
         str | None, option("FILE.json", "where markers are in each picture as well, as COCO annotations")
     ] = None
-    outputs: Annotated[
-        str | None, option("A,B,...", "outputs, as for `fidsplat render` (default: the scene's, or rgb)")
-    ] = None
-    device: Annotated[
-        str | None,
-        option("D", "see `fidsplat devices` (default: the scene's, or FIDSPLAT_DEVICE, or opencl)"),
-    ] = None
-    quality: Annotated[
-        str | None, option("Q", "as for `fidsplat render` (default: the scene's, or standard)")
-    ] = None
+    outputs: SceneOutputs = None
+    device: SceneDevice = None
+    quality: SceneQuality = None
     memory_budget: MemoryBudget = None
     ray: RayAddress = None
     workers: Workers = None
@@ -112,7 +109,7 @@ class Fly:
         from fidsplat.flights import Flight, FlightFolder
         from fidsplat.vision.video import check_video
 
-        names = None if self.outputs is None else tuple(n.strip() for n in self.outputs.split(","))
+        names = names_of(self.outputs)
         # what is wrong with the words is said before anything is read or opened
         select(fs.SplatCloud.empty(), fs.Capture(outputs=names or "rgb", quality=fs.Quality.of(self.quality)))
         budget = bytes_of("--memory-budget", self.memory_budget)

@@ -1,7 +1,10 @@
 """`fidsplat marker`."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -15,6 +18,10 @@ from fidsplat.commands.output import (
     writable_file,
 )
 from fidsplat.errors import InputError
+from fidsplat.quality import LADDER
+
+if TYPE_CHECKING:
+    import fidsplat as fs
 
 
 @dataclass
@@ -33,11 +40,12 @@ class Marker:
       aprilgrid:CxR:FAMILY the same with corner squares     aprilgrid:6x6:36h11
 
     The mixture exact, the default, draws every rectangle as one box with sharp edges. A PLY file has no
-    boxes: -o then writes the Gaussians of fitted, and says so.
+    boxes: -o then writes the Gaussians of fitted, and says so. refined optimises Gaussians as a whole by
+    gradient, half a minute for a tag: those of marker.template=121 if --quality is not given.
 
     Knobs of the mixtures (fs.MarkerQuality) are part of a quality: marker.levels (1 to 8) and marker.density
-    (1 to 100) of paper, marker.template of fitted (Gaussians of a rectangle: 1, 5, 9, 13, 25, 41 or 562), and
-    marker.growth (modules).
+    (1 to 100) of paper, marker.template of fitted (Gaussians of a rectangle: 1, 5, 9, 13, 25, 41, 121 or
+    562), and marker.growth (modules).
 
     A picture of noise becomes tens of millions of splats; more than a million are refused unless --max-splats
     allows them.
@@ -46,6 +54,7 @@ class Marker:
       fidsplat marker apriltag:36h11:5 --size 0.16 -o tag.ply
       fidsplat marker qr:hello --quality marker.template=9
       fidsplat marker "qr:hello" --mixture paper --json
+      fidsplat marker apriltag:36h11:5 --mixture refined -o tag.ply
     """
 
     spec: Annotated[tyro.conf.Positional[str], option("SPEC", "what to make, as above")]
@@ -55,7 +64,12 @@ class Marker:
         option("M", "edge of the code (a board's width) in metres, quiet zone not counted (default: 1)"),
     ] = 1.0
     mixture: Annotated[
-        str | None, option("NAME", "how rectangles become splats: exact, fitted or paper (default: exact)")
+        str | None,
+        option("NAME", "how rectangles become splats: exact, fitted, paper or refined (default: exact)"),
+    ] = None
+    iterations: Annotated[int | None, option("N", "pictures that refined looks at (default: 1000)")] = None
+    device: Annotated[
+        str | None, option("D", "that refined draws on (default: FIDSPLAT_DEVICE, or opencl)")
     ] = None
     quality: Annotated[
         str | None, option("Q", "as `fidsplat render` takes it; what it says of markers, as above, holds")
@@ -77,10 +91,18 @@ class Marker:
         file = writable_file(self.out) if self.out is not None else None
         if file is not None and file.suffix.lower() != ".ply":
             raise InputError(f"splats are written as PLY: name {file.with_suffix('.ply')}, not {file}")
-        quality = fs.Quality.of(self.quality).marker
         limit = {} if self.max_splats is None else {"max_splats": self.max_splats}
+        refined = self.mixture == "refined"
+        if not refined and (self.iterations is not None or self.device is not None):
+            raise InputError("--iterations and --device are about --mixture refined; write that too")
+        mixture = "fitted" if refined else self.mixture
+        quality = fs.Quality.of(self.quality).marker
+        if refined and self.quality is None:
+            quality = fs.MarkerQuality(template=LADDER)
         with late_progress(console(self.json)) as progress:
-            made = fs.marker(self.spec, self.size, self.mixture, quality=quality, progress=progress, **limit)
+            made = fs.marker(self.spec, self.size, mixture, quality=quality, progress=progress, **limit)
+            if refined:
+                made = self._refined(made, progress)
         if file is not None:
             fs.save_ply(made.gaussians, file, native_2dgs=self.native_2dgs)
         written = "fitted" if made.mixture == "exact" else made.mixture
@@ -120,3 +142,16 @@ class Marker:
             rows.append(("", f"as {len(made.gaussians)} Gaussians (fitted): a PLY file has no boxes"))
         print_table(console(False), made.spec, ("", ""), rows)
         return 0
+
+    def _refined(self, made: fs.Marker, progress: Callable[[str, float], None]) -> fs.Marker:
+        """The marker's Gaussians, optimised on a device."""
+        import fidsplat as fs
+        from fidsplat.train.refining import ITERATIONS, refine
+
+        iterations = ITERATIONS if self.iterations is None else self.iterations
+        return refine(
+            made,
+            fs.Renderer(self.device),
+            iterations,
+            progress=lambda step: progress(f"refined, {step.psnr:.1f} dB", step.iteration / iterations),
+        )

@@ -29,6 +29,22 @@ def option(metavar: str, text: str, short: str | None = None):
 
 Device = Annotated[str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")]
 
+SceneDevice = Annotated[
+    str | None, option("D", "see `fidsplat devices` (default: the scene's, or FIDSPLAT_DEVICE, or opencl)")
+]
+SceneOutputs = Annotated[
+    str | None, option("A,B,...", "outputs, as for `fidsplat render` (default: the scene's, or rgb)")
+]
+SceneQuality = Annotated[
+    str | None, option("Q", "as for `fidsplat render` (default: the scene's, or standard)")
+]
+"""of commands that draw a scene, which may say these itself"""
+
+
+def names_of(text: str | None) -> tuple[str, ...] | None:
+    """Names with commas between, as of --outputs; None where nothing is given."""
+    return None if text is None else tuple(name.strip() for name in text.split(","))
+
 
 MemoryBudget = Annotated[
     str | None,

@@ -12,9 +12,11 @@ import tyro
 from fidsplat.commands.output import (
     Json,
     MemoryBudget,
+    SceneDevice,
     bytes_of,
     console,
     late_progress,
+    names_of,
     option,
     print_json,
     print_table,
@@ -74,10 +76,7 @@ class Render:
         str | None,
         option("A,B,...", "output images, named above (default: the scene's, or rgb)"),
     ] = None
-    device: Annotated[
-        str | None,
-        option("D", "see `fidsplat devices` (default: the scene's, or FIDSPLAT_DEVICE, or opencl)"),
-    ] = None
+    device: SceneDevice = None
     quality: Annotated[
         str | None,
         option("Q", "a preset, knobs as key=value, or both, as below (default: the scene's, or standard)"),
@@ -104,7 +103,7 @@ class Render:
         from fidsplat.quality import Quality
         from fidsplat.vision.output_files import save_output
 
-        names = None if self.outputs is None else tuple(n.strip() for n in self.outputs.split(","))
+        names = names_of(self.outputs)
         # what is wrong with the words is said before anything is read or opened
         select(fs.SplatCloud.empty(), fs.Capture(outputs=names or "rgb", quality=Quality.of(self.quality)))
         memory = bytes_of("--memory-budget", self.memory_budget)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from fidsplat.commands.output import console, late_progress, option
+from fidsplat.commands.output import SceneOutputs, SceneQuality, console, late_progress, names_of, option
 from fidsplat.commands.render import load_source
 from fidsplat.errors import InputError
 
@@ -36,12 +36,8 @@ class Source:
     """
 
     source: Annotated[tyro.conf.Positional[str], option("SCENE.toml|FILE.ply", "what would be drawn")]
-    outputs: Annotated[
-        str | None, option("A,B,...", "outputs, as for `fidsplat render` (default: the scene's, or rgb)")
-    ] = None
-    quality: Annotated[
-        str | None, option("Q", "as for `fidsplat render` (default: the scene's, or standard)")
-    ] = None
+    outputs: SceneOutputs = None
+    quality: SceneQuality = None
     schedule: Annotated[
         Literal["lanes", "group"],
         option("S", "lanes: for CPUs, a tile per work-item; group: for GPUs, a work-group per tile"),
@@ -67,7 +63,7 @@ class Source:
 
         with late_progress(console(True)) as progress:
             scene = load_source(self.source, self.quality, progress)
-        names = None if self.outputs is None else tuple(name.strip() for name in self.outputs.split(","))
+        names = names_of(self.outputs)
         return select(scene.splats, scene.capture.with_(outputs=names, quality=self.quality))
 
     def _backend(self) -> "OpenCLBackend":

@@ -232,7 +232,7 @@ class Measure:
     """
 
     store: StorePath
-    views: Annotated[int, option("N", "places to look from (default: 12)")] = 12
+    views: Annotated[int, option("N", "places to look from (default: 30)")] = 30
     lowpass: Annotated[str, option("A,B,...", "of pixel, screen, none (default: pixel)")] = "pixel"
     seed: Annotated[int, option("N", "of the places (default: 0)")] = 0
     device: Device = None
@@ -254,7 +254,7 @@ class Measure:
                 (f"{size:.3f}", "not met" if error is None else f"{error:.4f}")
                 for size, error in zip(one.sizes, one.errors, strict=True)
             )
-            title = f"lowpass {one.lowpass}, {one.views} views, {one.device}"
+            title = f"lowpass {one.lowpass}, level {one.level}, {one.views} views, {one.device}"
             print_table(console(False), title, ("cells up to [px]", "largest error of rgb"), rows)
         return 0
 
@@ -274,7 +274,7 @@ class StoreDemo:
     splats: Annotated[float, option("N", "of the city (default: 20e6)")] = 20e6
     houses: Annotated[int, option("N", "along a side (default: 8)")] = 8
     seed: Annotated[int, option("N", "of houses and splats (default: 0)")] = 0
-    views: Annotated[int, option("N", "places to measure from; 0: do not measure (default: 4)")] = 4
+    views: Annotated[int, option("N", "places to measure from; 0: do not measure (default: 12)")] = 12
     device: Device = None
     overwrite: Overwrite = False
     json: Json = False

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.output import MemoryBudget, bytes_of, console, late_progress, option, say
+from fidsplat.commands.output import (
+    MemoryBudget,
+    SceneDevice,
+    SceneQuality,
+    bytes_of,
+    console,
+    late_progress,
+    option,
+    say,
+)
 from fidsplat.commands.render import load_source
 from fidsplat.commands.runs import TrainingRun, checkpoint_of, flown
 from fidsplat.errors import InputError
@@ -57,13 +66,8 @@ class View:
     host: Annotated[
         str, option("ADDRESS", "to listen on; 0.0.0.0 lets the whole network in (default: 127.0.0.1)")
     ] = "127.0.0.1"
-    device: Annotated[
-        str | None,
-        option("D", "see `fidsplat devices` (default: the scene's, or FIDSPLAT_DEVICE, or opencl)"),
-    ] = None
-    quality: Annotated[
-        str | None, option("Q", "as for `fidsplat render` (default: the scene's, or standard)")
-    ] = None
+    device: SceneDevice = None
+    quality: SceneQuality = None
     rate: Annotated[float, option("HZ", "pictures a second to aim at while moving (default: 30)")] = 30.0
     memory_budget: MemoryBudget = None
 

@@ -6,6 +6,7 @@ import html
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from urllib.parse import quote
 
 from fidsplat import __version__
 from fidsplat.files import atomic_write, writable_folder
@@ -62,7 +63,7 @@ def write_gallery(folder: Path, pieces: Sequence[Piece], device: str | None = No
     writable_folder(folder)
     renderers: dict[str | None, Renderer] = {}
     parts = []
-    for number, piece in enumerate(pieces):
+    for piece in pieces:
         wanted = device or piece.scene.device
         if wanted not in renderers:
             renderers[wanted] = Renderer(wanted)
@@ -70,7 +71,7 @@ def write_gallery(folder: Path, pieces: Sequence[Piece], device: str | None = No
         names = piece.scene.capture.outputs
         splats = piece.scene.splats if piece.scene.streamed is None else piece.scene.streamed.content
         key = digest_of((splats, piece.scene.capture, renderer.device.title, __version__))
-        files = [folder / f"{number:03d}-{piece.name}-{name}-{key}.png" for name in names]
+        files = [folder / f"{piece.name[:60]}-{name}-{key}.png" for name in names]
         if not all(file.exists() for file in files):
             _draw(renderer.render(piece.scene), files)
         parts.append(_figure(piece, files, renderer.device.title))
@@ -87,7 +88,7 @@ def _draw(frame: Frame, files: Sequence[Path]) -> None:
 
 def _figure(piece: Piece, files: Sequence[Path], device: str) -> str:
     said = html.escape
-    first, *more = [said(file.name) for file in files]
+    first, *more = [quote(file.name) for file in files]
     markers = ", ".join(placed.marker.spec for placed in piece.scene.markers)
     facts = f"{len(piece.scene.splats):,} splats{': ' if markers else ''}{markers[:200]}. {device}"
     images = "".join(f'<a href="{name}"><img src="{name}" loading="lazy" alt=""></a> ' for name in more)

@@ -25,6 +25,8 @@ _FURTHEST = {"apriltag": ("pupil", "aruco"), "qr": ("zxing-tall", "zxing", "cv2"
 """the detectors of each kind by how far they read on the ideal texture: the first that is there is shown"""
 _SHOWN_TRUTHS = (("exact", "blender-raw"), ("blender-standard", "exact-linear"))
 """of display values and of linear light: the first that is there is shown"""
+_COMMANDS = {trained.NAME: "baseline"}
+"""of experiments that have another name"""
 PAPER, TRAINED = "paper, its own", "paper, 2DGS 17 views"
 
 
@@ -71,7 +73,9 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
         "reached": int(reached["reached"].sum()),
         "kinds": _kinds(reached),
         "sheets": [sheet.name for sheet in sheets],
-        "runs": provenance({f"`experiment {name}`": summary for name, summary in summaries.items()}),
+        "runs": provenance(
+            {f"`experiment {_COMMANDS.get(name, name)}`": summary for name, summary in summaries.items()}
+        ),
         "training_seconds": TRAINING_SECONDS,
     }
     write_page(page, folder, "results.md.j2", context)
@@ -154,11 +158,12 @@ def _angles(rows: Frame, folder: Path) -> dict[str, Frame]:
     categories, methods = category_order(rows["category"]), method_order(rows["method"])
     tables, means = {}, {}
     for protocol in (name for name in PROTOCOLS if name in set(rows["protocol"])):
-        own = rows[rows["protocol"] == protocol].groupby(["category", "method"])
+        there = rows[rows["protocol"] == protocol]
+        own = there.groupby(["category", "method"])
         means[protocol] = own["read"].mean()
         tables[protocol] = _beside_paper(
             categories,
-            methods,
+            method_order(there["method"]),
             lambda place, own=own: (
                 "/".join(_angle(own.get_group(place)[c]) for c in ("found", "read"))
                 if place in own.groups
@@ -181,13 +186,11 @@ def _angles(rows: Frame, folder: Path) -> dict[str, Frame]:
 
 
 def _of_furthest(rows: Frame) -> Frame:
-    """What the detector of each kind saw that reads furthest."""
-    there = set(rows["reader"])
-    furthest = {
-        kind: next((name for name in names if name in there), "") for kind, names in _FURTHEST.items()
-    }
-    kinds = rows["category"].map(lambda name: CATEGORIES[name].kind)
-    return rows[rows["reader"] == kinds.map(furthest)]
+    """What the detector of each kind saw that reads furthest, of those to which a method was shown."""
+    places = {name: place for names in _FURTHEST.values() for place, name in enumerate(names)}
+    place = rows["reader"].map(places)
+    each = place.groupby([rows["protocol"], rows["category"], rows["method"]])
+    return rows[place == each.transform("min")]
 
 
 def _angle(values: Row) -> str:
@@ -245,6 +248,7 @@ def _trained(rows: Frame, scans: Frame | None) -> dict:
             table.append(
                 {
                     "marker, views": f"{CATEGORIES[category].title}, {count}",
+                    "markers": own["marker"].nunique(),
                     "PSNR/SSIM, paper": f"{ratio:.1f}/{similar:.2f}",
                     "ours": f"{own['psnr'].mean():.1f}/{own['ssim'].mean():.3f}",
                     "read to, paper": NOTHING if theirs is None else f"{theirs[1]:.1f}",
@@ -252,7 +256,7 @@ def _trained(rows: Frame, scans: Frame | None) -> dict:
                     "read to, training-free": read.get((category, "exact/best"), NOTHING),
                     "splats": fixed(own["splats"].mean(), 0),
                     "seconds, paper": f"{TRAINING_SECONDS[count]:.0f}",
-                    "seconds, ours": fixed(own["seconds"].median(), 1),
+                    "seconds, several at once": fixed(own["seconds"].median(), 1),
                 }
             )
     each = rows.groupby(["category", "views", "marker"])["psnr"]

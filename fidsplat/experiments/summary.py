@@ -105,7 +105,7 @@ def provenance(summaries: Mapping[str, Summary]) -> Frame:
             {
                 "measured": f"{name}, {run['points']} points",
                 "on": run["device"] or run["machine"],
-                "commit/code": f"{run['commit']}/{run['code']}",
+                "commit/code": f"{run['commit'] or 'no'}/{run['code']}",
                 "date": run["date"],
             }
             for name, summary in summaries.items()

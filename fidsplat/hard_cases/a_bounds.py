@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from fidsplat.backends.base import Reshapes
+from fidsplat.backends.probing import Reshapes
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, CULLED, Picture, differing, draw, trace
 from fidsplat.hard_cases.case import Finding, Found, case
 from fidsplat.hard_cases.clouds import camera, quaternion, splats, taken, turned

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.base import Reshapes
 from fidsplat.backends.prepare import prepare
+from fidsplat.backends.probing import Reshapes
 from fidsplat.backends.reference import ReferenceBackend
 from fidsplat.backends.view import View
 from fidsplat.cameras import Camera

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from fidsplat.backends.base import Reshapes
 from fidsplat.backends.prepare import view_of
+from fidsplat.backends.probing import Reshapes
 from fidsplat.cameras import Camera
 from fidsplat.hard_cases.agreement import (
     ALL_OUTPUTS,

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.backends.base import Differentiates
+from fidsplat.backends.derivatives import Differentiates
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.view import View
 from fidsplat.cameras import Camera

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import Probed
+from fidsplat.backends.probing import Probed
 from fidsplat.cameras import Camera
 from fidsplat.capture import Capture
 from fidsplat.effects import select

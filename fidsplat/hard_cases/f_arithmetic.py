@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.base import Probed, Reshapes
 from fidsplat.backends.prepare import prepare
+from fidsplat.backends.probing import Probed, Reshapes
 from fidsplat.capture import Capture
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, CULLED, Picture, out_of_order
 from fidsplat.hard_cases.case import Finding, Found, case

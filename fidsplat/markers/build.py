@@ -74,7 +74,7 @@ class Marker(PickledByFields):
     size: float
     """metres, the code's edge; its width where it is not square"""
     mixture: str
-    """"exact", "fitted" or "paper\""""
+    """"exact", "fitted", "paper", or "refined" (`fidsplat.train.refine`)"""
     quality: MarkerQuality
     """all knobs that it was made with; `growth` is None where the mixture's own was taken"""
     grid: np.ndarray = field(repr=False)
@@ -187,7 +187,7 @@ def marker(
             drawings.
         levels, density, duplicates: of the mixture `paper` only, see `paper_template`; default 4, 3, False.
         template: of the mixtures `fitted` and (for `Marker.gaussians`) `exact` only: Gaussians of a
-            rectangle, 1, 5, 9, 13, 25, 41 or 562; default 25.
+            rectangle, 1, 5, 9, 13, 25, 41, 121 or 562; default 25.
         growth: modules, 0 to 1, by which a rectangle reaches into its own colour beyond a side that is wholly
             shared with it, against seams; default what the fitted templates were optimised with, and 0 for
             paper.
@@ -284,6 +284,11 @@ def _chosen(
             f"quality is {quality!r}; it must be an fs.MarkerQuality, e.g. fs.Quality(...).marker"
         )
     name = quality.mixture if mixture is None else mixture
+    if name == "refined":
+        raise InputError(
+            "the mixture 'refined' is made on a device: give what is made as 'fitted' to fs.train.refine, or "
+            "write `fidsplat marker --mixture refined`"
+        )
     if not isinstance(name, str) or name not in MIXTURES:
         raise InputError(f"unknown mixture {name!r}; known: {', '.join(MIXTURES)}")
     given = {key: value for key, value in given.items() if value is not None}

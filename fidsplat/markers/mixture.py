@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fidsplat.markers.nested import CLASSES, nested_gaussians
-from fidsplat.quality import MAX_DENSITY, MAX_LEVELS, NESTED, MarkerQuality, whole_number
+from fidsplat.markers.nested import CLASSES, LADDERS, nested_gaussians
+from fidsplat.quality import MAX_DENSITY, MAX_LEVELS, MarkerQuality, whole_number
 
 GAMMA = 3.0
 """The paper's cut-off: a Gaussian ends at 3 standard deviations."""
@@ -79,8 +79,9 @@ def _fitted() -> tuple[dict[int, tuple[Template, ...]], float]:
 
 
 @cache
-def _nested() -> tuple[Template, ...]:
-    return tuple(Template(limit, nested_gaussians(aspect)) for limit, aspect in CLASSES)
+def _nested(size: int) -> tuple[Template, ...]:
+    ladder = LADDERS[size]
+    return tuple(Template(limit, nested_gaussians(aspect, ladder)) for limit, aspect in CLASSES)
 
 
 def _template(entry: dict) -> Template:
@@ -98,7 +99,7 @@ def _mirrors(row: list[float]) -> list[list[float]]:
 def fitted_templates(size: int = MarkerQuality.template) -> tuple[Template, ...]:
     """The shipped templates of a size (`TEMPLATE_SIZES`) in rising order of aspect ratio. Longer rectangles
     than the last is for are cut, see `place`."""
-    return _nested() if size == NESTED else _fitted()[0][size]
+    return _nested(size) if size in LADDERS else _fitted()[0][size]
 
 
 def fitted_growth() -> float:

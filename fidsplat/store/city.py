@@ -155,4 +155,4 @@ def flight(city: City) -> tuple[Camera, Trajectory]:
     ]
     poses = [look_at_matrix(position, target) for _, position, target in ways]
     camera = Camera.look_at(1280, 720, math.radians(70.0), ways[0][1], ways[0][2])
-    return camera, Trajectory([time for time, _, _ in ways], poses)
+    return camera, Trajectory([time for time, _, _ in ways], np.stack(poses))

@@ -23,6 +23,8 @@ class Detail:
 
     lowpass: str
     """of the pictures"""
+    level: int
+    """of the nodes that were drawn, and those below it"""
     sizes: tuple[float, ...]
     """samples, rising: cells that are smaller are not told apart"""
     errors: tuple[float | None, ...]
@@ -33,7 +35,7 @@ class Detail:
     date: str
 
     def pixels(self, error: float) -> float:
-        """The largest size [samples] whose pictures are off by at most `error`; 0: only the exact scene.
+        """The largest size [samples] whose pictures are off by at most `error`; 0: none.
         Nothing is promised of a size that was not met."""
         largest, found = 0.0, 0.0
         for size, measured in zip(self.sizes, self.errors, strict=True):
@@ -46,9 +48,8 @@ class Detail:
 def save_details(folder: Path, identity: str, details: Sequence[Detail]) -> None:
     """Write what was measured beside a store; of low-passes that were measured before what is not replaced
     stays."""
-    known = {one.lowpass: one for one in load_details(folder, identity)} | {
-        one.lowpass: one for one in details
-    }
+    every = [*load_details(folder, identity), *details]
+    known = {(one.lowpass, one.level): one for one in every}
     rows = [vars(one) for _, one in sorted(known.items())]
     with atomic_write(folder / FILE) as stream:
         stream.write(json.dumps({"identity": identity, "details": rows}, indent=1).encode())

@@ -14,6 +14,8 @@ from fidsplat.store.morton import BITS, Grid
 
 REDUCTION = 4
 """how many splats become one, in the mean: what halving the resolution leaves of a surface"""
+WIDER = 1.5
+"""most area of a splat that stands for others, in that of theirs together"""
 _CLASSES = 3
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -64,7 +66,8 @@ def _cells(codes: np.ndarray, classes: np.ndarray) -> tuple[np.ndarray, int]:
 def _by_moments(
     splats: dict[str, np.ndarray], frames: tuple[np.ndarray, np.ndarray, np.ndarray], starts: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """One splat for each run of splats; a run of one stays as it is. frames: as `_frames`."""
+    """One splat for each run of splats, or some where they lie on top of each other; a run of one stays as it
+    is. frames: as `_frames`."""
     count = len(splats["means"])
     lengths = np.diff(np.append(starts, count))
     scales = splats["scales"].T.astype(np.float64)
@@ -98,7 +101,10 @@ def _by_moments(
     turns = vectors[:, :, ::-1].copy()
     turns[:, :, 2] = np.cross(turns[:, :, 0], turns[:, :, 1])
     opacities = np.add.reduceat(light, starts) / (sigma[:, 0] * sigma[:, 1])
-    # what lies on top of each other takes more light than an opaque splat: then it is wider instead
+    # what lies on top of each other takes more light than an opaque splat: then several stand for it, each
+    # opaque and a little wider
+    copies = np.maximum(np.ceil(opacities / WIDER), 1).astype(np.int64)
+    opacities /= copies
     sigma[:, :2] *= np.sqrt(np.maximum(opacities, 1.0))[:, None]
     made = {"means": (base + middle).T, "quats": quaternions_of(turns), "scales": sigma[:, :2]}
     made["opacities"] = np.minimum(opacities, 1.0)
@@ -115,7 +121,7 @@ def _by_moments(
             continue
         result[name] = made[name].astype(array.dtype)
         result[name][alone] = array[starts[alone]]
-    return result
+    return {name: np.repeat(array, copies, axis=0) for name, array in result.items()}
 
 
 def _first_of_largest(weights: np.ndarray, starts: np.ndarray, lengths: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import Any, Protocol
 
 import numpy as np
@@ -48,6 +49,10 @@ class StorePart(SplatCloud):
         object.__setattr__(made, "_whole", whole)
         return made
 
+    def __reduce__(self):
+        """Pickled and copied as a cloud of its own."""
+        return _cloud_of, ({each.name: getattr(self, each.name) for each in fields(self)},)
+
     @property
     def has_planes(self) -> bool:
         """As the whole."""
@@ -62,6 +67,12 @@ class StorePart(SplatCloud):
     def ellipsoids(self) -> str:
         """As the whole."""
         return self._whole.ellipsoids
+
+
+def _cloud_of(values: dict[str, Any]) -> SplatCloud:
+    cloud = object.__new__(SplatCloud)
+    cloud._set(**values)
+    return cloud
 
 
 def joined(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:

@@ -46,7 +46,7 @@ class Residency:
         Raises:
             InputError: a quality allows an error that was not measured.
         """
-        pixels = min(self.scene.pixels_of(quality) for quality in qualities)
+        pixels = self.scene.pixels_of(*qualities)
         selection = self.scene.select(views, features, pixels)
         self.nodes = len(selection)
         if self._there is None or self._there[0] != selection:

@@ -144,14 +144,21 @@ class Store(Summarised):
         """What its levels of detail were measured to cost; those of a store that is placed are its own."""
         return load_details(self._folder, self.header.identity)
 
-    def pixels_of(self, quality: Quality) -> float:
-        """How small [samples] cells must be not to be told apart, by a quality's `detail_error`.
+    @property
+    def levels(self) -> int:
+        """Levels of detail above the chunks."""
+        return int(self.nodes["level"].max(initial=0))
+
+    def pixels_of(self, quality: Quality) -> tuple[float, ...]:
+        """Of each level, from 0, how small [samples] its cells must be to be drawn, by a quality's
+        `detail_error`; 0: never.
 
         Raises InputError where it was not measured.
         """
-        for detail in self.details:
-            if detail.lowpass == quality.lowpass:
-                return detail.pixels(quality.detail_error)
+        measured = [detail for detail in self.details if detail.lowpass == quality.lowpass]
+        if measured:
+            found = {detail.level: detail.pixels(quality.detail_error) for detail in measured}
+            return tuple(found.get(level, 0.0) for level in range(self.levels + 1))
         raise InputError(
             f"detail_error is {quality.detail_error:g}, but what levels of detail cost {self.path} with "
             f"lowpass={quality.lowpass} was not measured; run `fidsplat store measure {self._folder} "

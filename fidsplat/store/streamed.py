@@ -24,6 +24,11 @@ KEPT_BYTES = 2 * 2**30
 drawn"""
 
 
+Pixels = float | tuple[tuple[float, ...], ...]
+"""samples: how small cells are that need not be told apart; one size for all, or one for each level of each
+store"""
+
+
 @dataclass(frozen=True)
 class Selection:
     """What views are drawn of: numbers of each store's nodes, in the order of their splats."""
@@ -82,22 +87,26 @@ class Streamed:
         every = (np.flatnonzero(np.tile(store.nodes["level"] == 0, store.places)) for store in self.stores)
         return Selection(tuple(tuple(numbers.tolist()) for numbers in every))
 
-    def pixels_of(self, quality: Quality) -> float:
-        """How small [samples] cells must be not to be told apart, by a quality's `detail_error`; 0: exact.
+    def pixels_of(self, *qualities: Quality) -> Pixels:
+        """How small [samples] cells must be not to be told apart, by the `detail_error` of qualities; the one
+        that needs most decides. 0: exact.
 
         Raises:
             InputError: an error is allowed, but what levels of detail cost a store was not measured.
         """
-        if not quality.detail_error:
+        if not all(quality.detail_error for quality in qualities):
             return 0.0
-        return min(store.pixels_of(quality) for store in self.stores)
+        each = ([store.pixels_of(quality) for quality in qualities] for store in self.stores)
+        return tuple(tuple(np.min(limits, axis=0).tolist()) for limits in each)
 
-    def select(self, views: Sequence[View], features: FeatureSet, pixels: float = 0.0) -> Selection:
+    def select(self, views: Sequence[View], features: FeatureSet, pixels: Pixels = 0.0) -> Selection:
         """What these views see. pixels: cells smaller than so many samples need not be told apart; 0: exactly
         the scene itself."""
-        return Selection(
-            tuple(tuple(_chosen(store, views, features, pixels).tolist()) for store in self.stores)
-        )
+        chosen = []
+        for number, store in enumerate(self.stores):
+            own = pixels[number] if isinstance(pixels, tuple) else (pixels,) * (store.levels + 1)
+            chosen.append(tuple(_chosen(store, views, features, np.array(own)).tolist()))
+        return Selection(tuple(chosen))
 
     def part(self, selection: Selection) -> tuple[StorePart, np.ndarray]:
         """The splats of a selection, and their indices in the whole (n,) int32; -1 for those that stand for
@@ -175,7 +184,7 @@ class Streamed:
         return made
 
 
-def _chosen(store: Store, views: Sequence[View], features: FeatureSet, pixels: float) -> np.ndarray:
+def _chosen(store: Store, views: Sequence[View], features: FeatureSet, pixels: np.ndarray) -> np.ndarray:
     """Numbers of the nodes of a store that views are drawn of, in the order of their splats."""
     if not len(store.nodes):
         return np.zeros(0, np.int64)
@@ -184,16 +193,16 @@ def _chosen(store: Store, views: Sequence[View], features: FeatureSet, pixels: f
     reach = np.tile(nodes["reach"].astype(np.float64), places)
     visible = np.zeros(len(level), bool)
     for view in views:
-        visible |= seen(view, features, store.boxes, reach, exact=pixels == 0)
+        visible |= seen(view, features, store.boxes, reach)
     pinned = np.tile((nodes["level"] == 0) & (nodes["first"] >= store.header.pinned), places)
-    if pixels == 0:
+    if not pixels.any():
         return np.flatnonzero((visible | pinned) & (level == 0))
     parents = np.tile(nodes["parent"].astype(np.int64), places)
     parents = np.where(parents >= 0, parents + np.repeat(np.arange(places), len(nodes)) * len(nodes), -1)
     edges = np.tile(nodes["size"].astype(np.float64), places)
     refined = np.zeros(len(level), bool)
     for view in views:
-        refined |= sizes(view, store.boxes, edges) > pixels
+        refined |= sizes(view, store.boxes, edges) > pixels[level]
     reached = parents < 0
     for above in range(int(level.max()), 0, -1):
         children = np.flatnonzero((level == above - 1) & (parents >= 0))

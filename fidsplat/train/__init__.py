@@ -5,11 +5,13 @@ from fidsplat.train.dataset import Dataset, TrainingView
 from fidsplat.train.memory import splats_within
 from fidsplat.train.parameters import TrainingError
 from fidsplat.train.read import load_dataset
+from fidsplat.train.refining import RefineStep, refine
 from fidsplat.train.settings import TrainSettings
 from fidsplat.train.trainer import Step, Trainer, ViewScore
 
 __all__ = [
     "Dataset",
+    "RefineStep",
     "Step",
     "TrainSettings",
     "Trainer",
@@ -17,6 +19,7 @@ __all__ = [
     "TrainingView",
     "ViewScore",
     "load_dataset",
+    "refine",
     "splats_of",
     "splats_within",
 ]

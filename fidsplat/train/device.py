@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import Images, ResidentData, TrainingKernels
+from fidsplat.backends.base import Images, ResidentData
+from fidsplat.backends.derivatives import TrainingKernels
 from fidsplat.cameras import Camera
 from fidsplat.train.dataset import TrainingView
 from fidsplat.train.losses import Loss
@@ -62,9 +63,9 @@ class DeviceWork:
         value, slope = self._kernels.loss(images, view, self._settings.dssim_weight)
         return lambda: Loss(*value()), slope
 
-    def surface(self, images: Images, view: int, weights: tuple[float, float]) -> dict[str, Any]:
-        """Derivatives by depths, normals and distortions; weights: of normals and of distortions."""
-        return self._kernels.surface(images, view, self._cameras[view], *weights)
+    def surface(self, images: Images, view: int, weight: float) -> dict[str, Any]:
+        """Derivatives of the loss of normals by depths and normals, times its weight."""
+        return self._kernels.surface(images, view, self._cameras[view], weight)
 
     def count(self, gradients: Mapping[str, Any], camera: Camera, origin: np.ndarray) -> None:
         """Adds the gradients on the screen to their sums."""

@@ -49,21 +49,15 @@ class HostWork:
         loss, slope = picture_loss(images.read("rgb"), truth, of.mask, self._settings.dssim_weight)
         return lambda: loss, slope
 
-    def surface(self, images: Images, view: int, weights: tuple[float, float]) -> dict[str, np.ndarray]:
-        """Derivatives by depths, normals and distortions; weights: of normals and of distortions."""
+    def surface(self, images: Images, view: int, weight: float) -> dict[str, np.ndarray]:
+        """Derivatives of the loss of normals by depths and normals, times its weight."""
         of = self._views[view]
-        counts = np.ones(of.picture.shape[:2], np.float32) if of.mask is None else of.mask.astype(np.float32)
-        read = {name: images.read(name) for name in ("depth", "normal", "alpha")}
-        camera = of.camera
-        _, by_depth, by_normal = normal_loss(
-            read["depth"],
-            read["normal"],
-            weights[0] * counts * read["alpha"],
-            (camera.fx, camera.fy),
-            (camera.cx, camera.cy),
-        )
-        by_distortion = counts * np.float32(weights[1] / counts.size)
-        return {"depth": by_depth, "normal": by_normal, "distortion": by_distortion}
+        camera, counted = of.camera, np.float32(weight) * images.read("alpha")
+        if of.mask is not None:
+            counted *= of.mask
+        lens = (camera.fx, camera.fy), (camera.cx, camera.cy)
+        _, by_depth, by_normal = normal_loss(images.read("depth"), images.read("normal"), counted, *lens)
+        return {"depth": by_depth, "normal": by_normal}
 
     def count(self, gradients: Mapping[str, Any], camera: Camera, origin: np.ndarray) -> None:
         """Adds the gradients on the screen to their sums."""

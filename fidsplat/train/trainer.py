@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.backends.base import Differentiates, Trains
+from fidsplat.backends.derivatives import Differentiates, Trains
 from fidsplat.backends.prepare import prepare
 from fidsplat.capture import Capture
 from fidsplat.effects.differentiable import with_distortion
@@ -154,16 +154,19 @@ class Trainer:
         number = self._view_at(iteration)
         view = self.dataset.views[number]
         resident = self._work.resident(settings.degree_at(iteration), self.dataset.origin)
-        weights = settings.surface_weights_at(iteration)
-        features, seen = prepare(resident, (self._solid if any(weights) else self._captures)[number])
-        if any(weights):
+        by_normals, by_distortions = settings.surface_weights_at(iteration)
+        features, seen = prepare(resident, (self._solid if by_normals else self._captures)[number])
+        if by_distortions:
             features = with_distortion(features)
         pipeline = self._differentiate(features)
         images = pipeline.forward(resident, seen)
         value, slope = self._work.loss(images, number)
         slopes = {"rgb": slope}
-        if any(weights):
-            slopes |= self._work.surface(images, number, weights)
+        if by_normals:
+            slopes |= self._work.surface(images, number, by_normals)
+        if by_distortions:
+            counts = np.ones(view.picture.shape[:2], np.float32) if view.mask is None else view.mask
+            slopes["distortion"] = counts * np.float32(by_distortions / counts.size)
         gradients = pipeline.backward(images, slopes)
         loss = value()  # not before: the device goes on meanwhile
         if not math.isfinite(loss.value):

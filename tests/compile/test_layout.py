@@ -16,6 +16,7 @@ from fidsplat.backends.opencl.declare import Layout, Samples, member, uniforms
 from fidsplat.backends.opencl.layout import LAYOUTS
 from fidsplat.backends.opencl.program import build
 from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
+from fidsplat.cli import main
 from fidsplat.effects import CATALOGUE, OUTPUTS, Effect, Output, select
 
 BACKEND = "opencl"
@@ -219,32 +220,35 @@ def test_the_text_needs_no_opencl():
     assert len(done.stdout.strip()) == 64
 
 
-def source(*words, block=""):
-    code = f"import sys\n{block}\nfrom fidsplat.cli import main\nsys.exit(main(sys.argv[1:]))"
-    return subprocess.run([sys.executable, "-c", code, "source", *words], capture_output=True, text=True)
+SOURCES = """import sys
+sys.modules["pyopencl"] = None
+from fidsplat.cli import main
+for more in (["--outputs", "rgb,depth"], ["--schedule", "group"]):
+    assert main(["source", sys.argv[1], *more]) == 0
+    print("=" * 80)
+"""
 
 
-def test_a_scene_s_program_is_printed_without_opencl(tmp_path):
+def test_a_scene_s_program_is_printed_without_opencl(tmp_path, capsys):
     cloud, file = random_splats(5, seed=1, depth=(1, 3)), tmp_path / "cloud.ply"
     fs.save_ply(cloud, str(file))
-    blocked = "sys.modules['pyopencl'] = None"
-    lanes = source(str(file), "--outputs", "rgb,depth", block=blocked)
-    assert (lanes.returncode, lanes.stderr) == (0, "")
-    assert '"opencl/output/depth.cl"' in lanes.stdout
-    assert "// depth = z_numerator / D" in lanes.stdout
-    assert "output/normal.cl" not in lanes.stdout
-    group = source(str(file), "--schedule", "group", block=blocked)
-    assert "schedule/group.cl" in group.stdout
-    assert "schedule/group.cl" not in lanes.stdout
-    without = source(str(file), "--device", "reference")
-    assert without.returncode == 2
-    assert "reference is no OpenCL device" in without.stderr
+    done = subprocess.run([sys.executable, "-c", SOURCES, str(file)], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    lanes, group, _ = done.stdout.split("=" * 80)
+    assert '"opencl/output/depth.cl"' in lanes
+    assert "// depth = z_numerator / D" in lanes
+    assert "output/normal.cl" not in lanes
+    assert "schedule/group.cl" in group
+    assert "schedule/group.cl" not in lanes
+    assert main(["source", str(file), "--device", "reference"]) == 2
+    assert "reference is no OpenCL device" in capsys.readouterr().err
 
 
-def test_the_program_of_a_device_is_what_it_compiles(renderer, tmp_path):
+def test_the_program_of_a_device_is_what_it_compiles(renderer, tmp_path, capsys):
     cloud, file = random_splats(5, seed=1, depth=(1, 3)), tmp_path / "cloud.ply"
     fs.save_ply(cloud, str(file))
     frame = renderer.render(cloud, fs.Camera.pinhole(8, 8, 8.0, 8.0, 4.0, 4.0))
     assert frame["rgb"].shape == (8, 8, 3)
     compiled = {pipeline.source.listing for pipeline in renderer.backend._pipelines.values()}
-    assert source(str(file), "--device", renderer.device.name).stdout in compiled
+    assert main(["source", str(file), "--device", renderer.device.name]) == 0
+    assert capsys.readouterr().out in compiled

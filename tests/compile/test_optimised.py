@@ -51,8 +51,8 @@ def found(device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_what_users_have_draws_the_same_bits(device, request):
-    if request.config.getoption("--optimised"):
+def test_what_users_have_draws_the_same_bits(device):
+    if level() == "as users have it":
         pytest.skip("all tests run what users have")
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         with as_users_compile():

@@ -34,7 +34,7 @@ def made(name, *arguments):
 
 def compiled(kernel, folder, block=256, assembly=False):
     """Source text, without comments, that NVRTC compiled for a GPU of 2020; or the PTX that it made of it."""
-    kernel.module.options.update(block_dim=block, optimization_level=3 if assembly else 0)
+    kernel.module.options.update(block_dim=block, optimization_level=3)  # below it the long ones take minutes
     with runtime.quiet():
         wp.compile_aot_module(kernel.module, arch=80, module_dir=folder, use_ptx=True)
     (result,) = folder.glob("*.ptx")

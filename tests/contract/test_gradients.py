@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.base import Differentiates
+from fidsplat.backends.derivatives import Differentiates
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
 from fidsplat.effects.differentiable import with_distortion

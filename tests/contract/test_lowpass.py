@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, assert_agrees, random_splats
-from test_lens_pictures import EVERY_TERM
+from test_lens_pictures import CAMERAS, EVERY_TERM
 
 import fidsplat as fs
 from fidsplat.rotations import quaternion_to_matrix
@@ -64,6 +64,12 @@ def test_tilted_to_edge_on(renderer, tilt):
 def test_splats_of_every_size_through_every_lens(renderer, camera, scale):
     cloud = random_splats(200, seed=8, depth=(-4.0, 5.0), scale=scale)
     assert_agrees(renderer, cloud, camera, quality=PIXEL)
+
+
+def test_splats_whose_centres_lie_beyond_the_fold(renderer):
+    """There is no image of theirs to be widened."""
+    cloud = random_splats(150, 1, depth=(0.3, 4.0), scale=(0.02, 0.5), across=3.0)
+    assert_agrees(renderer, cloud, CAMERAS["fold"], quality=PIXEL)
 
 
 @pytest.mark.parametrize(("name", "mean"), [("fisheye", (0, 0, 1.5)), ("panorama", (0, -1.5, 0))])

@@ -8,7 +8,7 @@ import pytest
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.commands.experiment import Experiment
-from fidsplat.experiments import angles
+from fidsplat.experiments import angles, localisation
 from fidsplat.experiments import run as run_module
 from fidsplat.experiments.blender import check_pictures, note_pictures
 from fidsplat.experiments.run import Options
@@ -94,14 +94,20 @@ def test_shards_merge_into_what_one_run_gives(capsys, tmp_path):
     assert found("both") == found("whole")
 
 
-def test_a_quick_run_has_few_tilts(tmp_path):
-    for quick, tilts in ((False, angles.FULL_TILTS), (True, angles.QUICK_TILTS)):
-        points = run_module._points(angles.NAME, Options(tmp_path, quick=quick))
-        assert {point["tilts"] for point in points} == {tilts}
+def test_a_quick_run_has_few_tilts_and_distances(tmp_path):
+    quick, full = (Options(tmp_path, quick=quick) for quick in (True, False))
+    for options, tilts in ((full, angles.FULL_TILTS), (quick, angles.QUICK_TILTS)):
+        assert {point["tilts"] for point in run_module._points(angles.NAME, options)} == {tilts}
+    spans = (localisation.DISTANCES, localisation.TILTS)
+    few = (localisation.QUICK_DISTANCES, localisation.QUICK_TILTS)
+    for options, (distances, tilts) in ((full, spans), (quick, few)):
+        for point in run_module._points(localisation.NAME, options):
+            assert (tuple(point["distances"]), tuple(point["tilts"])) == (distances, tilts)
 
 
 def test_everything_quick_and_its_report(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(angles, "QUICK_TILTS", "0:80:40")
+    monkeypatch.setattr(localisation, "QUICK_DISTANCES", (1.0,))
     words = ("all", "--quick", *SMALL, "--mixture", "fitted", "-o", tmp_path)
     status, out, err = run(capsys, *words, "--device", "opencl")
     assert status == 0, err

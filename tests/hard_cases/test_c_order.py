@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from agreement import assert_agrees, random_splats
+from agreement import against_reference, assert_agrees, random_splats
 
 import fidsplat as fs
 from fidsplat.cameras import Camera
@@ -95,9 +95,12 @@ def test_of_equal_depths_that_wait_the_first_is_in_front(renderer):
 
 @pytest.mark.exhaustive
 def test_every_pixel_of_a_hundred_thousand_splats(renderer):
-    """Against the sort of every pixel in float64; docs/order.md has the largest error."""
+    """Against the sort of every pixel in float64; docs/order.md has what `-s` prints."""
     cloud, _ = load_scene("r100k_720p")
-    assert_agrees(renderer, cloud, standard_camera(320, 180), ("rgb", "depth"), fs.Quality(order="pixel"))
+    camera, quality = standard_camera(320, 180), fs.Quality(order="pixel")
+    differences = against_reference(renderer, Picture(cloud, camera, quality, ("rgb", "depth")))
+    print(renderer.device.name, *differences, sep="\n")
+    assert all(difference.agrees for difference in differences)
 
 
 def test_a_faint_splat_between_decides_nothing(renderer):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
-from fidsplat.backends.base import Reshapes
+from fidsplat.backends.probing import Reshapes
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, CULLED, Picture, differing, draw, trace
 from fidsplat.hard_cases.c_order import tag
 from fidsplat.hard_cases.clouds import camera, splats, taken, turned

@@ -7,9 +7,9 @@ import pytest
 from agreement import ALL_OUTPUTS, random_splats
 
 import fidsplat as fs
-from fidsplat.backends.base import Reshapes
 from fidsplat.backends.planes import PlaneTable
 from fidsplat.backends.prepare import prepare
+from fidsplat.backends.probing import Reshapes
 from fidsplat.backends.view import View
 from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import out_of_order

@@ -55,6 +55,8 @@ BATCH = {
     **{"alone_us_per_view": 5000.0, "stages_us": {"blend": 600.0}},
 }
 
+PEER_BATCH = {"outputs": ["rgb"], "us_per_view": 1800.0, "times_ours": 2.0, "psnr_same_constants_db": 69.6}
+
 
 @pytest.fixture
 def files(tmp_path):
@@ -71,6 +73,10 @@ def files(tmp_path):
         "peer.json": {"results": [RECORD | {"frame_ms": 1.2}, PEER]},
         "first.json": [FIRST],
         "batches.json": [BATCH],
+        "peer_batches.json": [
+            BATCH | {"renderer": "fidsplat 1"},
+            BATCH | PEER_BATCH | {"renderer": "Peer 1"},
+        ],
     }
     for name, content in kinds.items():
         (tmp_path / name).write_text(json.dumps(content))
@@ -112,6 +118,9 @@ def test_each_kind_of_figures_becomes_its_table(files):
     ]
     assert rows(made["batches"]) == [
         "| 64 of 128 x 96 | rgb, depth | 10,000 | a CPU | 900 (800 to 1000) | 5000 | 600 | 2026-11-22 |"
+    ]
+    assert rows(made["peer_batches"]) == [
+        "| 64 of 128 x 96 | 10,000 | Peer 1: rgb | 1800 | rgb, depth | 900 | 2 | 69.6 dB | 2026-11-22 |"
     ]
     assert rows(made["growth"]) == ["| a CPU | splats | 0.50 | 1.00 |"]
 

@@ -18,6 +18,7 @@ import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.commands import COMMANDS
 from fidsplat.commands.output import late_progress
+from fidsplat.quality import LADDER
 from fidsplat.vision.dictionaries import dictionary_bits
 from fidsplat.vision.images import read_image, write_png
 
@@ -253,6 +254,20 @@ def test_marker_says_what_it_is_made_of(capsys, tmp_path):
     assert 0 < facts["seconds"] < 30
     assert main(["marker", "apriltag:36h11:5"]) == 0
     assert "rectangles" in capsys.readouterr().out
+
+
+def test_a_marker_is_refined_on_a_device(capsys, tmp_path):
+    words = ("marker", "aruco:4x4_50:7", "--mixture", "refined", "--iterations", "2", "--device", "opencl")
+    facts = prints_json(capsys, *words, "-o", tmp_path / "tag.ply")
+    more = fs.marker("aruco:4x4_50:7", mixture="fitted", template=LADDER)
+    assert facts["mixture"] == "refined"
+    assert facts["written"] == {"mixture": "refined", "splats": len(more.cloud)}
+    assert len(fs.load_ply(tmp_path / "tag.ply")) == len(more.cloud)
+    few = prints_json(capsys, *words, "--quality", "marker.template=5")
+    assert few["splats"] < len(more.cloud)
+    status, line = fails(capsys, "marker", "aruco:4x4_50:7", "--iterations", "2")
+    assert status == 2
+    assert "--mixture refined" in line
 
 
 def test_a_marker_of_more_splats_than_allowed(capsys, tmp_path):

@@ -1,6 +1,7 @@
 """`fidsplat gallery`: a page of pictures."""
 
 import json
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -27,8 +28,8 @@ def here(tmp_path, monkeypatch):
 
 
 def test_a_page_shows_scenes_with_their_outputs_and_text(here, capsys):
-    (here / "c.toml").write_text(SCENE.replace("# A", "#A second").replace('["rgb", "depth"]', '["rgb"]'))
-    assert main(["gallery", "a.toml", "c.toml", "-o", "out", "--json"]) == 0
+    (here / "c#2.toml").write_text(SCENE.replace("# A", "#A second").replace('["rgb", "depth"]', '["rgb"]'))
+    assert main(["gallery", "a.toml", "c#2.toml", "-o", "out", "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     page = (here / "out" / "index.html").read_text()
     assert "A tag &lt;b&gt;, alone" in page
@@ -37,13 +38,14 @@ def test_a_page_shows_scenes_with_their_outputs_and_text(here, capsys):
     assert "position = [0.0, 0.0, -1.0]" in page
     images = sorted(file.name for file in (here / "out").glob("*.png"))
     assert len(images) == 3
-    assert all(f'src="{name}"' in page for name in images)
+    assert all(f'src="{quote(name)}"' in page for name in images)
+    assert any("#" in name for name in images)
     rgb = fs.Renderer("reference").render(fs.Scene.load("a.toml"))["rgb"]
     np.testing.assert_array_equal(read_image(facts["pictures"][0]), to_uint8(rgb))
     # what has not changed is not drawn again, what has is
     before = {file: file.stat().st_mtime_ns for file in (here / "out").glob("*.png")}
-    (here / "c.toml").write_text(SCENE.replace("0.4", "0.3"))
-    assert main(["gallery", "a.toml", "c.toml", "-o", "out"]) == 0
+    (here / "c#2.toml").write_text(SCENE.replace("0.4", "0.3"))
+    assert main(["gallery", "a.toml", "c#2.toml", "-o", "out"]) == 0
     after = {file: file.stat().st_mtime_ns for file in (here / "out").glob("*.png")}
     assert {file: after[file] for file in before} == before
     assert len(after) == 5

@@ -53,7 +53,7 @@ MAY_IMPORT = {
     "sim": PLAIN | {"batch", "scenes", "markers", "render", "vision", "formats"},
     "logs": BASE | {"cameras", "vision"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
-    "train": PLAIN | {"formats", "vision", "render", "backends", "effects"},
+    "train": PLAIN | {"formats", "markers", "vision", "render", "backends", "effects"},
     "detail": PLAIN | {"store", "render", "backends", "accuracy"},
     "budget": PLAIN | {"store", "scenes", "render", "accuracy", "provenance", "timing"},
 }

@@ -73,3 +73,37 @@ def test_bugs_are_caught_survive_or_are_not_tested(tmp_path, monkeypatch):
     assert known.of(dataclasses.replace(caught, new="b")) is None
     assert "| sums | 3 | 2 | 1 | 1 |" in mutate.table(list(bugs.values()), known)
     assert (tmp_path / "copies" / "0" / "sum.py").read_text() == (tmp_path / "sum.py").read_text()
+
+
+def test_the_likeliest_tests_come_first(tmp_path, monkeypatch):
+    """What caught it before, though a sweep leaves that out; then what the plant names; then all."""
+    (tmp_path / "sum.py").write_text("def plus(a, b):\n    return a + b\n")
+    (tmp_path / "test_sum.py").write_text(
+        "import pytest\nfrom sum import plus\n\n"
+        "def test_all():\n    assert plus(2, 1) == 3\n\n"
+        "def test_few():\n    assert plus(2, 1) == 3\n\n"
+        "@pytest.mark.exhaustive\ndef test_swept():\n    assert plus(2, 1) == 3\n"
+    )
+    (tmp_path / "pyproject.toml").write_text(
+        '[tool.hatch.build.targets.sdist]\ninclude = ["/sum.py", "/test_sum.py"]\n[tool.pytest.ini_options]\n'
+        "addopts = '-ra -m \"not exhaustive\"'\nmarkers = ['exhaustive']\n"
+    )
+    monkeypatch.setattr(mutate, "ROOT", tmp_path)
+    garden = mutate.Garden(tmp_path / "copies", 1)
+    plant = mutate.Plant("sum.py", "sums", ("test_sum.py",), "a + b", "a - b", "sign")
+    named = dataclasses.replace(plant, first=("test_sum.py", "-k", "few"))
+    nowhere = dataclasses.replace(plant, first=("test_sum.py", "-k", "none"))
+    tried = [(plant, "test_sum.py::test_swept"), (named, None), (nowhere, None)]
+    found = [garden.try_plant(bug, before) for bug, before in tried]
+    assert [one.test.partition("_sum.py::")[2] for one in found if one] == [
+        "test_swept",
+        "test_few",
+        "test_all",
+    ]
+
+
+def test_tests_without_a_device_run_beside_those_of_one():
+    """Their names may hold a backend's."""
+    (plant,) = (p for p in mutate.read_plants(device="warp:cpu") if p.wrong.endswith("read past the rays"))
+    assert plant.tests[-1].endswith("(warp:cpu or not (opencl: or warp:))")
+    assert plant.first[-1] == f"{plant.tests[-1]} and (reads_no_ray_beyond)"

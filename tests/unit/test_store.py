@@ -11,7 +11,7 @@ from fidsplat.random_clouds import random_splats
 from fidsplat.rotations import rigid_matrix
 from fidsplat.store import build, plan
 from fidsplat.store.layout import FAR, NODE, NPY_HEADER
-from fidsplat.store.merge import REDUCTION, merged, quaternions_of
+from fidsplat.store.merge import REDUCTION, WIDER, merged, quaternions_of
 from fidsplat.store.morton import Grid, grid_around
 from tests.full_disk import small_files
 
@@ -108,7 +108,8 @@ def test_every_node_stands_for_the_four_below_it(store):
         children = nodes[nodes["parent"] == number]
         assert 1 <= len(children) <= REDUCTION
         assert (children["level"] == nodes["level"][number] - 1).all()
-        assert nodes["count"][number] <= max(1, children["count"].sum() // REDUCTION)
+        # a quarter, but where splats lie on top of each other
+        assert nodes["count"][number] < children["count"].sum() or children["count"].sum() < 2 * REDUCTION
         for name, furthest in (("size", np.max), ("reach", np.max), ("high", np.max), ("far_high", np.max)):
             assert (nodes[name][number] >= furthest(children[name], axis=0)).all()
         assert (nodes["far_low"][number] <= children["far_low"].min(axis=0)).all()
@@ -132,6 +133,20 @@ def test_merged_splats_have_the_light_and_the_place_of_those_they_stand_for():
     spread = made["scales"].max(axis=1) ** 2
     assert (np.abs(fs.SplatCloud(**made).reach(1.0)[:, 2]) < 1e-6).all()
     assert spread.max() < size**2
+
+
+def test_splats_on_top_of_each_other_become_several():
+    count = 64
+    generator = np.random.default_rng(4)
+    means = np.column_stack([generator.uniform(0, 0.01, (count, 2)), np.zeros(count)]).astype(np.float32)
+    splats = {"means": means, "quats": np.tile(np.float32([1, 0, 0, 0]), (count, 1))}
+    splats |= {"scales": np.full((count, 2), 0.02, np.float32), "opacities": np.full(count, 0.9, np.float32)}
+    made, _ = merged(splats, Grid((-1.0, -1.0, -1.0), 2.0))
+    light = made["opacities"] * made["scales"].prod(axis=1)
+    assert light.sum() == pytest.approx(count * 0.9 * 4e-4, rel=1e-5)
+    assert 0.9 * count / WIDER - 1 < len(light) < 0.9 * count
+    assert made["opacities"].max() <= 1
+    assert made["scales"].max() < 0.02 * 1.4
 
 
 def test_quaternions_of_many_rotations():

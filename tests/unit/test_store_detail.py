@@ -76,23 +76,28 @@ def test_less_is_drawn_of_what_is_further_away(store):
 
 
 def test_errors_grow_with_the_size_of_cells_and_are_kept_beside_the_store(store, renderer):
-    (made,) = measure_detail(store, renderer, views=4)
+    made, *coarser = measure_detail(store, renderer, views=4 * store.levels)
+    assert [one.level for one in (made, *coarser)] == list(range(1, store.levels + 1))
     met = [(size, error) for size, error in zip(made.sizes, made.errors, strict=True) if error is not None]
     assert made.sizes == SIZES
     assert len(met) >= 4
     assert met[-1][1] > 0.02 > 1.5 * met[0][1]
     again = fs.Store(store.path)
-    assert again.details == [made]
+    assert again.details == [made, *coarser]
     allowed = MARGIN * met[0][1] + 1e-9
-    assert again.pixels_of(QUALITY.with_(detail_error=allowed)) >= met[0][0]
-    assert again.pixels_of(QUALITY.with_(detail_error=1e-9)) == 0.0
+    limits = again.pixels_of(QUALITY.with_(detail_error=allowed))
+    assert limits[0] == 0.0
+    assert limits[1] >= met[0][0]
+    assert set(again.pixels_of(QUALITY.with_(detail_error=1e-9))) == {0.0}
+    loose, tight = QUALITY.with_(detail_error=0.3), QUALITY.with_(detail_error=allowed)
+    assert Streamed([again]).pixels_of(loose, tight) == (limits,)
     assert Streamed([again]).pixels_of(QUALITY) == 0.0
     with pytest.raises(fs.InputError, match=r"store measure .* --lowpass none"):
         again.pixels_of(fs.Quality(lowpass="none", detail_error=0.1))
 
 
 def test_pictures_keep_to_the_error_that_is_allowed(store, renderer):
-    measure_detail(store, renderer, views=6)
+    measure_detail(store, renderer, views=4 * store.levels)
     resident = renderer.upload(fs.Store(store.path))
     for away in (300.0, 1500.0):
         camera = seen_from(away)
@@ -112,19 +117,19 @@ def test_a_picture_at_no_allowed_error_is_exact(store, renderer):
 
 
 def test_sizes_that_no_view_met_are_not_promised():
-    detail = Detail("pixel", (0.1, 0.2, 0.4, 0.8), (None, 0.002, None, 0.1), 3, "here", "today")
+    detail = Detail("pixel", 1, (0.1, 0.2, 0.4, 0.8), (None, 0.002, None, 0.1), 3, "here", "today")
     assert detail.pixels(0.001) == 0.0
     assert detail.pixels(MARGIN * 0.002) == 0.2
     assert detail.pixels(0.1) == 0.2
     assert detail.pixels(MARGIN * 0.1) == 0.8
     # what was worse at a smaller size counts at a larger one
-    assert Detail("pixel", (0.1, 0.2), (0.5, 0.001), 3, "here", "today").pixels(0.01) == 0.0
+    assert Detail("pixel", 1, (0.1, 0.2), (0.5, 0.001), 3, "here", "today").pixels(0.01) == 0.0
 
 
 def test_what_was_measured_with_another_store_does_not_count(tmp_path):
-    details = [Detail(name, (0.1,), (0.2,), 1, "here", "today") for name in ("pixel", "screen")]
+    details = [Detail(name, 1, (0.1,), (0.2,), 1, "here", "today") for name in ("pixel", "screen")]
     save_details(tmp_path, "a", details)
-    save_details(tmp_path, "a", [Detail("pixel", (0.3,), (None,), 1, "here", "today")])
+    save_details(tmp_path, "a", [Detail("pixel", 1, (0.3,), (None,), 1, "here", "today")])
     kept = load_details(tmp_path, "a")
     assert [(one.lowpass, one.sizes) for one in kept] == [("pixel", (0.3,)), ("screen", (0.1,))]
     assert load_details(tmp_path, "b") == []
@@ -155,12 +160,17 @@ def test_what_cannot_be_measured_is_said(store, renderer, tmp_path):
 
 def test_views_of_a_measurement_meet_all_sizes(store):
     focal = 160 / math.tan(math.radians(30))
-    edge = np.median(store.nodes["size"][store.nodes["level"] == 1])
+    nodes = store.nodes
+    edges = [
+        np.median(nodes["size"][nodes["level"] == level]) for level in range(1, nodes["level"].max() + 1)
+    ]
     middle = sum(store.bounds(0.0)) / 2
-    sizes = [edge * focal / np.linalg.norm(camera.position - middle) for camera in cameras_around(store, 8)]
-    assert min(sizes) < 0.15
-    assert max(sizes) > 0.7
-    errors = errors_of(store, fs.Renderer("reference"), fs.Capture(seen_from(50.0, (8, 6))), [1e-6, 1e-5])
+    away = [np.linalg.norm(camera.position - middle) for camera in cameras_around(store, 5 * len(edges))]
+    for first, edge in enumerate(edges):
+        sizes = [edge * focal / distance for distance in away[first :: len(edges)]]
+        assert min(sizes) < 0.15
+        assert max(sizes) > 0.4
+    errors = errors_of(store, fs.Renderer("reference"), fs.Capture(seen_from(50.0, (8, 6))), [1e-6, 1e-5], 1)
     assert errors == [None, None]
 
 
@@ -186,7 +196,7 @@ def test_a_city_is_the_same_however_it_is_read():
 
 
 def test_a_budget_of_error_turns_detail_too(store, renderer):
-    measure_detail(store, renderer, views=6)
+    measure_detail(store, renderer, views=4 * store.levels)
     capture = fs.Capture(seen_from(1500.0), quality="lowpass=pixel")
     quality = fs.quality_within(error=0.08, scene=fs.Store(store.path), capture=capture, device=renderer)
     assert quality.detail_error == 0.04

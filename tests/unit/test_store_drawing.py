@@ -1,7 +1,9 @@
 """Pictures of stores: what a view does not see is not read, and the picture is that of all splats in memory,
 bit for bit."""
 
+import copy
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -132,6 +134,17 @@ def test_a_device_draws_stores_bit_for_bit(stores, tmp_path):
                 assert np.array_equal(batch["rgb"][number], renderer.render(cloud, camera)["rgb"])
 
 
+def test_what_is_pickled_of_a_store_is_its_path_and_of_its_cloud_the_splats(stores):
+    store, cloud = stores["thick"], stores["thick"].cloud()
+    assert pickle.loads(pickle.dumps(store)).identity == store.identity
+    for again in (pickle.loads(pickle.dumps(cloud)), copy.deepcopy(cloud)):
+        assert type(again) is fs.SplatCloud
+        assert np.array_equal(again.means, cloud.means)
+        assert (again.ellipsoids, again.footprint) == (cloud.ellipsoids, cloud.footprint)
+    scene = fs.Scene(stores=(store,), camera=look())
+    assert len(pickle.loads(pickle.dumps(scene)).splats) == COUNT
+
+
 def test_nothing_is_transferred_for_the_same_part(stores, reference, monkeypatch):
     uploads = []
     upload = reference.backend.upload
@@ -201,8 +214,8 @@ def test_a_flight_over_a_store_goes_on_by_its_content(stores, tmp_path):
             "device"
         )
 
-    copy = tmp_path / "copy.fss"
-    copy.mkdir()
+    other = tmp_path / "other.fss"
+    other.mkdir()
     for name, content in contents(stores["disks"].path).items():
-        (copy / name).write_bytes(content)
-    assert key(fs.Store(copy)) == key(stores["disks"]) != key(stores["sh"])
+        (other / name).write_bytes(content)
+    assert key(fs.Store(other)) == key(stores["disks"]) != key(stores["sh"])

@@ -78,6 +78,8 @@ def test_groups_are_the_pixels_of_their_labels(truth, frame):
     assert block.mask.sum() == (frame["label"] == BOX).sum()
     # 0.4 m wide at 1 m: 44 px, from 82 - 55 to 82 - 11
     np.testing.assert_allclose(block.box, (27, 35, 71, 79), atol=1)
+    rows, columns = np.nonzero(block.mask)
+    assert block.box == (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)  # edges of its pixels
     empty = groups_of(np.full((4, 5), -1))
     assert empty == {}
 

@@ -157,7 +157,7 @@ class OpenCLBackend(Workspace):
         return OpenCLProbe(self)
 
     def shapes(self, kind: str) -> dict[str, DeviceShape]:
-        """As `Reshapes` (fidsplat/backends/base.py)."""
+        """As `Reshapes` (fidsplat/backends/probing.py)."""
         return other_shapes(self.shape, kind)
 
     def pieces(self, shape: DeviceShape) -> int:

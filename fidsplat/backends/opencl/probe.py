@@ -97,7 +97,7 @@ kernel void probe(global const float *x, global int *unequal, global int *named,
 
 class OpenCLProbe:
     """Small kernels under the build options and the pragmas of the stages, single stages on made-up input,
-    and buffers that are filled with rubbish first: `Probe` of fidsplat/backends/base.py."""
+    and buffers that are filled with rubbish first: `Probe` of fidsplat/backends/probing.py."""
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace

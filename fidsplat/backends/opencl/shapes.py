@@ -60,9 +60,9 @@ def shape_for(features: FeatureSet, shape: DeviceShape) -> DeviceShape:
 
 
 def other_shapes(own: DeviceShape, kind: str) -> dict[str, DeviceShape]:
-    """Build constants by name, for tests: `Reshapes.shapes` of fidsplat/backends/base.py."""
+    """Build constants by name, for tests: `Reshapes.shapes` of fidsplat/backends/probing.py."""
     if kind == "schedule":
-        return {"groups": _groups(own, 8)}
+        return {"groups": _groups(own, 16 if own.schedule == "lanes" else 8)}
     if kind == "waiting":
         # less than what groups keep in registers, and a little more
         few = replace(_groups(own, 8), waiting=1), replace(_groups(own, 8), waiting=4)

@@ -153,13 +153,11 @@ class OpenCLTraining:
 
         return value, slope
 
-    def surface(
-        self, images: Any, view: int, camera: Camera, normal_weight: float, distortion_weight: float
-    ) -> dict[str, Any]:
+    def surface(self, images: Any, view: int, camera: Camera, weight: float) -> dict[str, Any]:
         """As `TrainingKernels`."""
         depth, truth = images.device_array("depth"), self._truths[view]
         height, width = depth.shape
-        shapes = {"depth": (height, width), "normal": (height, width, 3), "distortion": (height, width)}
+        shapes = {"depth": (height, width), "normal": (height, width, 3)}
         found = {
             name: Array(
                 self._queue, shape, np.float32, data=self._scratch(f"by {name}", 4 * math.prod(shape))
@@ -172,8 +170,7 @@ class OpenCLTraining:
             **{"middle_x": camera.cx, "middle_y": camera.cy},
             **{name: images.device_array(name).data for name in ("depth", "normal", "alpha")},
             **{f"by_{name}": array.data for name, array in found.items()},
-            "normal_share": normal_weight / (width * height),
-            "distortion_share": distortion_weight / (width * height),
+            "normal_share": weight / (width * height),
             "differences": self._scratch("differences", 24 * width * height),
         }
         self._launch_rows("surface_normals", width, height, given)

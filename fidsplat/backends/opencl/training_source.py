@@ -43,9 +43,9 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "surface_normals": takes(
         _SURFACE,
         _MASK,
-        "float normal_share distortion_share  // of each pixel",
+        "float normal_share  // of each pixel",
         "in float depth normal alpha",
-        "out float by_normal by_distortion",
+        "out float by_normal",
         "out float differences  // (rows, columns, 2, 3)",
     ),
     "surface_depths": takes(_SURFACE, "in float differences", "out float by_depth"),

@@ -101,7 +101,7 @@ class WarpBackend(Workspace):
         return WarpProbe(self)
 
     def shapes(self, kind: str) -> dict[str, WarpShape]:
-        """As `Reshapes` (fidsplat/backends/base.py)."""
+        """As `Reshapes` (fidsplat/backends/probing.py)."""
         return other_shapes(self.shape, kind)
 
     def pieces(self, shape: WarpShape) -> int:

@@ -17,7 +17,7 @@ from fidsplat.errors import DeviceError
 
 
 class WarpProbe:
-    """`Probe` of fidsplat/backends/base.py, for the device of a workspace."""
+    """`Probe` of fidsplat/backends/probing.py, for the device of a workspace."""
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace

@@ -11,8 +11,8 @@ from typing import Any
 from fidsplat.errors import InputError, unknown
 from fidsplat.experiments.bench.catalogue import TIMED
 from fidsplat.quality import (
+    BY_FORMULA,
     ELLIPSOID,
-    NESTED,
     PRESETS,
     TEMPLATE_SIZES,
     MarkerQuality,
@@ -28,7 +28,7 @@ SHARP = {"lowpass": "none", "samples": 3}
 """for markers: exact splats, the mean of 3 x 3 samples"""
 
 # knob -> (its values, in which kinds of scenes: r random and hard, m markers, t of 3D Gaussians)
-_LADDERS: dict[str, tuple[tuple[Any, ...], str]] = {
+_BY_FORMULA: dict[str, tuple[tuple[Any, ...], str]] = {
     "alpha_cutoff": (
         (1e-6, 1e-5, 1e-4, 1 / 4096, 1 / 2048, 1 / 1024, 1 / 512, 2 / 255, math.exp(-4.5), 4 / 255),
         "rm",
@@ -53,7 +53,11 @@ _QUICK = {
 _MARKER_LADDER = (
     *(MarkerQuality("paper", levels=levels, density=1) for levels in (1, 2, 3, 4, 5)),
     MarkerQuality("paper"),
-    *(replace(BASE.marker, template=k) for k in TEMPLATE_SIZES if k not in (BASE.marker.template, NESTED)),
+    *(
+        replace(BASE.marker, template=k)
+        for k in TEMPLATE_SIZES
+        if k not in (BASE.marker.template, *BY_FORMULA)
+    ),
     *(replace(BASE.marker, growth=growth) for growth in (0.0, 0.2)),
     MarkerQuality("exact"),
 )
@@ -83,7 +87,7 @@ _FRACTIONS = {
 }  # fmt: skip
 
 PRESETS_KNOB, ALONE, TOGETHER, MARKER_KNOB = "preset", "alone", "together", "marker"
-KNOBS = (PRESETS_KNOB, ALONE, *_LADDERS, MARKER_KNOB, TOGETHER)
+KNOBS = (PRESETS_KNOB, ALONE, *_BY_FORMULA, MARKER_KNOB, TOGETHER)
 """what --knobs takes"""
 
 
@@ -150,7 +154,7 @@ def points(
         found += [alone(changes) for changes in (_ALONE[:6] if quick else _ALONE)]
     if MARKER_KNOB in chosen and on_marker:
         found += _marker_points(quick)
-    for knob, (values, kinds) in _LADDERS.items() if every_ladder else ():
+    for knob, (values, kinds) in _BY_FORMULA.items() if every_ladder else ():
         if knob in chosen and ("m" if on_marker else "r") in kinds:
             for value in _QUICK.get(knob, values) if quick else values:
                 found.append(_turned(knob, value))
@@ -162,7 +166,7 @@ def points(
 def thick_points(knobs: Iterable[str]) -> list[Point]:
     """The settings for scenes of 3D Gaussians: the base, and the ways of drawing them in pictures that are
     exact otherwise."""
-    values = _LADDERS["ellipsoid"][0] if "ellipsoid" in tuple(knobs) else ()
+    values = _BY_FORMULA["ellipsoid"][0] if "ellipsoid" in tuple(knobs) else ()
     ways = (Point("ellipsoid", value, EXACT.with_(ellipsoid=value)) for value in values)
     return [Point("base", "base", BASE), *ways]
 
@@ -177,7 +181,7 @@ def decode_points(knobs: Iterable[str], quick: bool = False) -> list[Point]:
         found += _marker_points(quick)
     for knob in ("lowpass", "samples"):
         if knob in chosen and not quick:
-            found += [_turned(knob, value) for value in _LADDERS[knob][0]]
+            found += [_turned(knob, value) for value in _BY_FORMULA[knob][0]]
     return found
 
 

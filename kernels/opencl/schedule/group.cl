@@ -87,7 +87,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
         barrier(CLK_LOCAL_MEM_FENCE);
         // uniform: every work-item reads the same vote, taken before this batch is drawn
         if (!alive) break;
-        // the list of each cell, by its work-items
+        // the list of each cell, by its work-items; a word's lowest byte is its first, as on every device
         uint bits = 0, listed = 0, before = 0;
         for (uint k = 0; k < SHARE / 4; k++) {
             uint four = cells[cell_y * (CELLS_STRIDE / 4) + own * (SHARE / 4) + k] >> cell_x & 0x01010101u;

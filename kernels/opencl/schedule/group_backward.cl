@@ -21,22 +21,9 @@ static inline Crossing cross_at(const Splat *s, int px, int py, const BlendConst
     return cross_row(s, *nu_x, *nv_x, FMA(s->dx, *x, s->d0), *y, *half_r2);
 }
 
-// Which splats of a chunk may touch a pixel, as bits. Of the others nothing is computed, kept or added up for it.
-static inline uint near_pixel(local const Splat *chunk, uint count, int px, int py) {
-    uint bits = 0;
-    for (uint place = 0; place < count; place++) {
-        local const Splat *s = chunk + place;
-        bits |= (uint)(px >= s->x0 && px < s->x1 && py >= s->y0 && py < s->y1) << place;
-    }
-    return bits;
-}
-
-#define FIRST_BIT(bits) (31 - clz((bits) & -(bits)))
-#define LAST_BIT(bits) (31 - clz(bits))
-
-// Lets the splat take its light at a pixel that it may touch; returns its opacity there.
+// Lets the splat take its light at a pixel; returns its opacity there.
 static inline wide walk_fragment(const Splat *s, int px, int py, Pixel *pixel, const BlendConstants *constants) {
-    if (!(pixel->t > constants->stop)) return 0.0f;
+    if (px < s->x0 || px >= s->x1 || py < s->y0 || py >= s->y1 || !(pixel->t > constants->stop)) return 0.0f;
     wide x, y, nu_x, nv_x, half_r2, screen;
     Crossing c = cross_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
     int mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
@@ -49,7 +36,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
 //@@ arguments blend_backward
 ) {
     local Splat staged[STAGED];
-    local float weights[CHUNK * STRIDE], by_logs[CHUNK * STRIDE];   // by splat and pixel that it may touch; `by_logs` begins as opacity
+    local float weights[CHUNK * STRIDE], by_logs[CHUNK * STRIDE];   // by splat and pixel: opacity and light, then these
     local float parts[PARTS * FIELDS];
     local Loss shared[PIXELS];
     local uint places[STAGED], reached;
@@ -91,17 +78,16 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
             if (px < width && py + row < height && pixels[row].t > stop) alive = 1;
         barrier(CLK_LOCAL_MEM_FENCE);
         if (!alive) break;
-        for (uint base = 0; base < length; base += CHUNK) {
-            uint chunk = (first - start + base) / CHUNK;
-            for (int row = 0; row < ROWS; row++) {
-                own[(size_t)chunk * PIXELS + row * TILE_W] = pixel_light(&pixels[row]);
-                if (px < width && py + row < height && pixels[row].t > stop) lit = chunk + 1;
-                uint bits = near_pixel(staged + base, min(length - base, (uint)CHUNK), px, py + row);
-                for (; bits != 0; bits &= bits - 1) {
-                    const Splat s = staged[base + FIRST_BIT(bits)];
-                    walk_fragment(&s, px, py + row, &pixels[row], &constants);
+        for (uint place = 0; place < length; place++) {
+            if (place % CHUNK == 0) {
+                uint chunk = (first - start + place) / CHUNK;
+                for (int row = 0; row < ROWS; row++) {
+                    own[(size_t)chunk * PIXELS + row * TILE_W] = pixel_light(&pixels[row]);
+                    if (px < width && py + row < height && pixels[row].t > stop) lit = chunk + 1;
                 }
             }
+            const Splat s = staged[place];
+            for (int row = 0; row < ROWS; row++) walk_fragment(&s, px, py + row, &pixels[row], &constants);
         }
     }
     atomic_max(&reached, lit);
@@ -144,31 +130,29 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
                 uint mine = (top + row) * TILE_W + column;
                 Pixel pixel;
                 pixel_start(&pixel, own[(size_t)(block * (STAGED / CHUNK) + chunk) * PIXELS + row * TILE_W]);
-                uint drawn = 0;
-                for (uint bits = near_pixel(staged + base, count, px, py + row); bits != 0; bits &= bits - 1) {
-                    uint place = FIRST_BIT(bits);
+                for (uint place = 0; place < count; place++) {
                     const Splat s = staged[base + place];
-                    wide light = pixel.t, opacity = walk_fragment(&s, px, py + row, &pixel, &constants);
-                    weights[place * STRIDE + mine] = light * opacity;
-                    by_logs[place * STRIDE + mine] = opacity;
-                    drawn |= (uint)(opacity > 0.0f) << place;
+                    weights[place * STRIDE + mine] = pixel.t;
+                    by_logs[place * STRIDE + mine] = walk_fragment(&s, px, py + row, &pixel, &constants);
                 }
-                while (drawn != 0) {
-                    uint place = LAST_BIT(drawn);
-                    drawn ^= 1u << place;
-                    const Splat s = staged[base + place];
-                    wide opacity = by_logs[place * STRIDE + mine], weight = weights[place * STRIDE + mine];
-                    wide x, y, nu_x, nv_x, half_r2, screen;
-                    Crossing c = cross_at(&s, px, py + row, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
-                    fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
-                    const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, screen);
-                    by_logs[place * STRIDE + mine] = take_back(&losses[row], fragment_worth(&s, &losses[row], &g), weight, opacity);
+                for (uint place = count; place-- > 0;) {
+                    wide opacity = by_logs[place * STRIDE + mine], weight = weights[place * STRIDE + mine] * opacity, by_log = 0.0f;
+                    if (opacity > 0.0f) {
+                        const Splat s = staged[base + place];
+                        wide x, y, nu_x, nv_x, half_r2, screen;
+                        Crossing c = cross_at(&s, px, py + row, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
+                        fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
+                        const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, screen);
+                        by_log = take_back(&losses[row], fragment_worth(&s, &losses[row], &g), weight, opacity);
+                    }
+                    weights[place * STRIDE + mine] = weight;
+                    by_logs[place * STRIDE + mine] = by_log;
                 }
             }
             barrier(CLK_LOCAL_MEM_FENCE);
             // a column of a splat
             uint place = item / TILE_W;
-            if (place < count && px >= staged[base + place].x0 && px < staged[base + place].x1) {
+            if (place < count) {
                 const Splat s = staged[base + place];
                 Sums sums = {0};
                 wide x = (wide)(px - s.ax);
@@ -190,10 +174,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
             barrier(CLK_LOCAL_MEM_FENCE);
             for (uint cell = item; cell < count * FIELDS; cell += GROUP) {
                 uint field = cell % FIELDS, splat = cell / FIELDS;
-                local const Splat *s = staged + base + splat;
-                int left = tile_column * TILE_W, last = min(s->x1 - left, TILE_W);
                 float sum = 0;
-                for (int other = max(s->x0 - left, 0); other < last; other++) sum += parts[field * PARTS + splat * TILE_W + other];
+                for (uint other = 0; other < TILE_W; other++) sum += parts[field * PARTS + splat * TILE_W + other];
                 moments[(size_t)places[base + splat] * FIELDS + field] = sum;
             }
         }

@@ -1,5 +1,5 @@
-// The losses by depths: how far a picture's normals are from those of the surface that its depths make (its twin in NumPy, with the
-// formulas: `normal_loss` in fidsplat/train/losses.py), and the weight of its depth distortion.
+// How far a picture's normals are from those of the surface that its depths make; its twin in NumPy, with the formulas: `normal_loss` in
+// fidsplat/train/losses.py.
 
 // The point that a pixel shows.
 static inline float3 point_at(
@@ -13,7 +13,7 @@ static inline float3 point_at(
 #define HAS_DEPTH(x, y) (depth[(y) * (size_t)width + (x)] > 0.0f)
 
 // Index space: (columns, rows). Reads: the images, the mask. Writes: the derivatives by normals and, of each pixel, those by the
-// differences of the points below and above it, right and left of it; by distortions, `distortion_share`.
+// differences of the points below and above it, right and left of it.
 kernel void surface_normals(
 //@@ arguments surface_normals
 ) {
@@ -21,7 +21,6 @@ kernel void surface_normals(
     if (x >= width || y >= height) return;
     size_t at = y * (size_t)width + x;
     bool counts = !masked || mask[at];
-    by_distortion[at] = counts ? distortion_share : 0.0f;
     float3 by_n = 0.0f, by_down = 0.0f, by_across = 0.0f;
     if (counts && x > 0 && y > 0 && x + 1 < width && y + 1 < height && HAS_DEPTH(x, y) && HAS_DEPTH(x - 1, y) && HAS_DEPTH(x + 1, y)
         && HAS_DEPTH(x, y - 1) && HAS_DEPTH(x, y + 1)) {
