@@ -281,6 +281,7 @@ class StoreDemo:
 
     def run(self) -> int:
         import fidsplat as fs
+        from fidsplat.accuracy import TRUTH_CUTOFF
         from fidsplat.detail import measure_detail
         from fidsplat.store.city import City, flight
 
@@ -297,7 +298,7 @@ class StoreDemo:
                 measure_detail(store, fs.Renderer(self.device), self.views, progress=progress)
         camera, motion = flight(city)
         error = DEMO_ERROR if self.views else 0.0
-        quality = fs.Quality(lowpass="pixel", detail_error=error)
+        quality = fs.Quality(lowpass="pixel", alpha_cutoff=TRUTH_CUTOFF, detail_error=error)
         scene = folder / "city.toml"
         fs.Scene(stores=(store,), camera=camera, camera_motion=motion, quality=quality).save(scene)
         seconds = time.perf_counter() - begun
