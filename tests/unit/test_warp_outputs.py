@@ -3,6 +3,7 @@ the kernels' own do not know."""
 
 import sys
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -102,6 +103,15 @@ def drawn(outputs, posts):
     return {name: images.read(name) for name in ("rgb", *outputs)}
 
 
+def make_anew(stage, monkeypatch):
+    """Kernels of a stage are made again until the test ends; those of pipelines that live on stay theirs."""
+    made = getattr(runtime.kernels(stage), f"make_{stage}")
+    fresh = cache(made.__wrapped__)
+    for module in list(sys.modules.values()):
+        if vars(module).get(made.__name__) is made:
+            monkeypatch.setattr(module, made.__name__, fresh)
+
+
 def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch, tmp_path):
     features = FeatureSet(SLOTS, ("strongest",), 0, 1, "float64", ("negative",))
     backend = fs.Renderer("warp:cpu").backend
@@ -124,7 +134,7 @@ def test_an_output_and_a_step_are_one_file_each(beside, monkeypatch, tmp_path):
     (tmp_path / "output" / "strongest.py").write_text(STRONGEST.replace(largest, sum_of_all), "utf-8")
     del sys.modules[f"{runtime.kernels('output').__name__}.strongest"]
     for stage in ("pixel", "blend", "resolve"):
-        getattr(runtime.kernels(stage), f"make_{stage}").cache_clear()
+        make_anew(stage, monkeypatch)
     changed = drawn(("strongest",), ())["strongest"]
     assert np.array_equal(changed, plain["rgb"][..., :2].sum(-1))
     assert not np.array_equal(changed, toys["strongest"])
