@@ -98,6 +98,8 @@ class Marker:
         mixture = "fitted" if refined else self.mixture
         quality = fs.Quality.of(self.quality).marker
         if refined and self.quality is None:
+            from fidsplat.quality import LADDER
+
             quality = fs.MarkerQuality(template=LADDER)
         with late_progress(console(self.json)) as progress:
             made = fs.marker(self.spec, self.size, mixture, quality=quality, progress=progress, **limit)

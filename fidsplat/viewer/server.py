@@ -60,6 +60,7 @@ class Viewer:
         rate: pictures a second to aim at while moving.
         keyframes: whose poses, camera to world, stand there at first.
         again: asked once a second for another scene to show, None where there is none: of a run that goes on.
+        quality: instead of the scene file's, when it is read again.
 
     Raises:
         InputError: the port is in use, or the extra `viewer` is missing.
@@ -77,6 +78,7 @@ class Viewer:
         rate: float = 30.0,
         keyframes: Trajectory | None = None,
         again: Callable[[], Scene | None] | None = None,
+        quality: str | None = None,
     ) -> None:
         viser = _viser()
         check_port(host, port)
@@ -86,7 +88,7 @@ class Viewer:
         self._said: dict[int, Any] = {}
         self._keyframes: list[np.ndarray] = [] if keyframes is None else list(keyframes.poses)
         self._file = None if file is None else SceneFile(file)
-        self._again = again
+        self._again, self._quality = again, quality
         self._held: Held | None = None
         self.session = Session(scene, device, memory_budget, self._changed)
         with _silent():
@@ -300,8 +302,10 @@ class Viewer:
                 with self._lock:
                     text = None if self._file is None else self._file.changed()
                 if self._file is not None and text is not None:
-                    scene = Scene.load(self._file.path)
-                    self.session.wish(scene=scene, done=partial(self._edited, scene, text))
+                    scene = Scene.load(self._file.path, self._quality)
+                    shown, settings = self.session.wanted()
+                    settings = settings.following(shown, scene)
+                    self.session.wish(scene, settings, partial(self._edited, scene, text))
             except FidsplatError as error:
                 self._controls.say(f"{error}; what was read before is shown")
 
@@ -313,6 +317,7 @@ class Viewer:
                 self._file.text = text
             self.hold(NOBODY)
             self._controls.offer(self.movable(scene))
+            self._controls.follow(scene, self.session.wanted()[1])
         self._controls.say(problem or "")
 
 

@@ -533,6 +533,30 @@ def test_a_file_that_is_edited_is_shown(viewer, tmp_path):
     assert viewer.session.drawn.scene.markers[0].marker.size == 0.2
 
 
+def test_what_an_edit_changes_is_taken_and_the_controls_follow(viewer, tmp_path):
+    """What it leaves stays as the controls have it."""
+    path, sliders = tmp_path / "scene.toml", viewer._controls._sliders
+    sliders["exposure"].value = 2.0
+    assert viewer.session.settle()
+    edited = (
+        path.read_text()
+        + "[fog]\ndensity = 3\n[camera]\nwidth = 48\nheight = 36\nfov_x_deg = 60\n"
+        + "position = [0, 0, -1]\nlook_at = [0, 0, 0]\n[camera.distortion]\nk1 = -0.1\n"
+    )
+    path.write_text(edited)
+    assert until(lambda: viewer._controls._lens.value == "scene")
+    assert until(lambda: not viewer._controls._session._working)
+    settings = viewer.session.drawn.settings
+    assert (settings.fog, settings.lens, settings.exposure) == (3.0, "scene", 2.0)
+    assert (sliders["fog"].value, sliders["exposure"].value) == (3.0, 2.0)
+    assert sliders["fog"].max >= 3.0
+    path.write_text(edited.partition("[camera.distortion]")[0])
+    assert until(lambda: "scene" not in viewer._controls._lens.options)
+    assert viewer.session.settle()
+    settings = viewer.session.drawn.settings
+    assert (settings.fog, settings.lens, settings.exposure) == (3.0, "pinhole", 2.0)
+
+
 def test_a_marker_is_not_written_into_a_file_that_cannot_be_shown(viewer, tmp_path):
     """Its tables may be those of other markers."""
     file, table = tmp_path / "scene.toml", '[[markers]]\nspec = "aruco:4x4_50:8"\nsize = 0.4\n'
