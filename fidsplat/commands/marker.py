@@ -84,6 +84,7 @@ class Marker:
 
     def run(self) -> int:
         import fidsplat as fs
+        from fidsplat.quality import LADDER
 
         if self.native_2dgs and self.out is None:
             raise InputError("--native-2dgs is about the file that -o names; give -o FILE.ply")
