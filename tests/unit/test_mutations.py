@@ -45,7 +45,7 @@ def test_a_sample_is_that_of_its_seed(plants):
 
 @pytest.fixture
 def quick_pytest(monkeypatch):
-    """Runs of pytest load what they need alone; reading in all plugins takes most of the time of a small one."""
+    """Small runs of pytest spend most of their time on plugins that they do not need."""
     monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
     monkeypatch.setenv("PYTEST_PLUGINS", "xdist.plugin")
 
