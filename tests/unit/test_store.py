@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from full_disk import small_files
 
 import fidsplat as fs
 from fidsplat.random_clouds import random_splats
@@ -14,7 +15,6 @@ from fidsplat.rotations import rigid_matrix
 from fidsplat.store import build, plan
 from fidsplat.store.layout import FAR, NODE, NPY_HEADER, header_crc
 from fidsplat.store.merge import REDUCTION
-from tests.full_disk import small_files
 
 COUNT = 9_000
 SMALL = {"chunk": 500, "memory": 1 << 20}

@@ -7,6 +7,7 @@ import pickle
 
 import numpy as np
 import pytest
+from test_store import contents
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
@@ -16,7 +17,6 @@ from fidsplat.rotations import rigid_matrix
 from fidsplat.store import plan, streamed
 from fidsplat.store.sources import source_of
 from fidsplat.store.streamed import Streamed
-from tests.unit.test_store import contents
 
 COUNT = 3000
 SIZE = 40, 30
@@ -219,9 +219,9 @@ def test_scenes_hold_stores_beside_markers_and_clouds(stores, reference, tmp_pat
 def test_stores_with_origins_of_their_own_stand_where_they_were_built(tmp_path, reference):
     ahead = [random_splats(300, seed, depth=(1, 4), scale=(0.01, 0.1), across=0.8) for seed in (11, 12)]
     given = {name: getattr(ahead[1], name) for name in ("quats", "scales", "opacities", "colors")}
-    moved = fs.SplatCloud(ahead[1].means - np.float32([2, 0, 0]), origin=(2.0, 0, 0), **given)
+    moved = fs.SplatCloud(ahead[1].means - np.float32([8, 0, 0]), origin=(8.0, 0, 0), **given)
     stores = (made_store(tmp_path, ahead[0], "here"), made_store(tmp_path, moved, "there"))
-    assert stores[1].origin.tolist() == [2, 0, 0]
+    assert stores[1].origin.tolist() == [8, 0, 0]
     scene = fs.Scene(stores=stores, camera=look())
     ours = reference.render(scene, outputs=("rgb", "splat_id"))
     whole = reference.render(scene.cloud(), scene.camera, outputs=("rgb", "splat_id"))
