@@ -34,8 +34,8 @@ class DifferentiablePipeline(Protocol):
 
         Args:
             images: what `forward` has made last on this device.
-            gradients: by the names of outputs (rgb, alpha, depth, normal) float32 arrays of their shape, of
-                the device or NumPy's; outputs that are missing have gradients of 0.
+            gradients: by the names of outputs (rgb, alpha, depth, normal, distortion) float32 arrays of their
+                shape, of the device or NumPy's; outputs that are missing have gradients of 0.
 
         Returns:
             Arrays of the device in the cloud's shapes and units: `means` (n, 3), `quats` (n, 4), `scales`

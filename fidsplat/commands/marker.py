@@ -18,7 +18,6 @@ from fidsplat.commands.output import (
     writable_file,
 )
 from fidsplat.errors import InputError
-from fidsplat.quality import LADDER
 
 if TYPE_CHECKING:
     import fidsplat as fs
@@ -85,6 +84,7 @@ class Marker:
 
     def run(self) -> int:
         import fidsplat as fs
+        from fidsplat.quality import LADDER
 
         if self.native_2dgs and self.out is None:
             raise InputError("--native-2dgs is about the file that -o names; give -o FILE.ply")
@@ -98,6 +98,8 @@ class Marker:
         mixture = "fitted" if refined else self.mixture
         quality = fs.Quality.of(self.quality).marker
         if refined and self.quality is None:
+            from fidsplat.quality import LADDER
+
             quality = fs.MarkerQuality(template=LADDER)
         with late_progress(console(self.json)) as progress:
             made = fs.marker(self.spec, self.size, mixture, quality=quality, progress=progress, **limit)

@@ -46,7 +46,8 @@ def flown(folder: Path) -> tuple[str, str]:
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(
             f"{folder} is the folder of no run: it holds neither *{CHECKPOINT}, of `fidsplat train`, nor a "
-            f"{RECORD}, of `fidsplat fly`, that says what was drawn"
+            f"{RECORD}, of `fidsplat fly`, that says what was drawn; "
+            "to see a scene, give its file"
         ) from None
     if not file.exists():
         raise InputError(

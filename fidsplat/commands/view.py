@@ -87,7 +87,8 @@ class View:
         file = Path(shown.source) if shown.source.lower().endswith(".toml") else None
         again = None if shown.run is None else shown.run.again
         with where.status("compiling"):
-            viewer = Viewer(scene, file, self.device, budget, self.host, self.port, self.rate, path, again)
+            words = (self.device, budget, self.host, self.port, self.rate, path, again)
+            viewer = Viewer(scene, file, *words, quality=self.quality)
         say(console(False), f"{viewer.address} shows {self.source or 'the demo'}; Ctrl-C ends it")
         try:
             while True:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -37,13 +38,18 @@ class Summary:
     """what a reader must know of these numbers besides"""
 
     def write(self, file: Path) -> Summary:
-        """Write the table, numbers to four digits; returns what a reader of the file gets, so that pages are
-        the same whether they are made of raw results or of their summary.
+        """Write the table, numbers to four digits, columns without any by their names alone; returns what a
+        reader of the file gets, so that pages are the same whether they are made of raw results or of their
+        summary.
 
         Raises InputError when the file cannot be written."""
-        heads = [{"run": run} for run in self.runs] + [{"note": note} for note in self.notes]
+        empty = [name for name in self.rows if len(self.rows) and self.rows[name].isna().all()]
+        heads: list[dict[str, Any]] = [{"run": run} for run in self.runs]
+        heads += [{"note": note} for note in self.notes]
+        heads += [{"empty": empty}] if empty else []
         text = "".join(f"{_MARK}{json.dumps(head)}\n" for head in heads)
-        text += self.rows.to_csv(index=False, float_format="%.4g", lineterminator="\n")
+        rows = self.rows.drop(columns=empty)
+        text += rows.to_csv(index=False, float_format="%.4g", lineterminator="\n")
         with atomic_write(file) as stream:
             stream.write(text.encode())
         return read_summary(file)
@@ -78,6 +84,8 @@ def read_summary(file: Path) -> Summary:
     if "run" not in rows or not any("run" in head for head in heads):
         raise InputError(f"{file} is no summary of results of fidsplat; give another folder")
     runs = [head["run"] for head in heads if "run" in head]
+    for name in (name for head in heads for name in head.get("empty", ())):
+        rows[name] = math.nan
     return Summary(rows, runs, [head["note"] for head in heads if "note" in head])
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fidsplat.errors import InputError
 from fidsplat.experiments import angles, views
 from fidsplat.experiments.dataset import write_scene
 from fidsplat.experiments.methods import Painter
@@ -80,7 +81,8 @@ def baseline_sweeps(wanted: Baseline, renderer: Renderer) -> Iterator[list[Sweep
     """The trainings, and the views and angles of those of the first seed, to be measured in turn: a run that
     is stopped has all of what it has trained.
 
-    Raises InputError for what cannot be written, or holds results of another device, version, code or seed.
+    Raises InputError for what cannot be written, or holds results of another device, version, code, seed or
+    number of iterations.
     """
     points = wanted.points
     shown = [point for point in points if point["seed"] == 0]
@@ -91,8 +93,22 @@ def baseline_sweeps(wanted: Baseline, renderer: Renderer) -> Iterator[list[Sweep
         facts = run_facts(device, wanted.texts, versions)
         return Results(wanted.file(name), facts, wanted.overwrite)
 
+    trainings = results(NAME)
+    if other := {record.key["iterations"] for record in trainings.done.values()} - {wanted.iterations}:
+        # of views and tilts the files do not say after how many they were
+        raise InputError(
+            f"{trainings.file} holds trainings of {min(other)} iterations, not {wanted.iterations}; give "
+            "another folder with -o, or --overwrite to train again"
+        )
     pool, kept = ThreadPoolExecutor(wanted.workers), views.Kept()
-    train = partial(train_marker, folder=wanted.dataset, out=folder, texts=wanted.texts, renderer=renderer)
+    train = partial(
+        train_marker,
+        folder=wanted.dataset,
+        out=folder,
+        texts=wanted.texts,
+        renderer=renderer,
+        restart=wanted.overwrite,
+    )
     look = partial(
         views.measure_views, painter=painter, seed=wanted.texts, blender=Path(), pool=pool, kept=kept
     )
@@ -102,7 +118,7 @@ def baseline_sweeps(wanted: Baseline, renderer: Renderer) -> Iterator[list[Sweep
     readers = reader_versions()
     try:
         yield [
-            Sweep(NAME, results(NAME), points, partial(partial, train)),
+            Sweep(NAME, trainings, points, partial(partial, train)),
             Sweep(
                 views.NAME,
                 results(views.NAME, readers | metric_versions()),
@@ -146,6 +162,7 @@ def train_marker(
     texts: int,
     renderer: Renderer,
     tell: Callable[[Step], None] | None = None,
+    restart: bool = False,
 ) -> dict:
     """Train one marker on one collection of views, and write its splats as `Painter` finds them.
 
@@ -156,6 +173,7 @@ def train_marker(
         folder: of the data set; the scene is written where it is missing, with the ideal pictures.
         out: gets 2dgs-17/small-0.ply and the like, of other seeds than 0 in seed-1 and so on.
         texts: seed of the marker's text and views.
+        restart: begin anew though there is a checkpoint.
 
     Returns:
         `splats`, `seconds` of the training, `iterations` that these took, and of the views held out the means
@@ -169,7 +187,7 @@ def train_marker(
     writable_folder(file.parent)
     settings = TrainSettings(iterations=point["iterations"], seed=point["seed"])
     checkpoint = file.with_suffix(".training.npz")
-    trainer = Trainer(load_dataset(scene), renderer, settings, checkpoint)
+    trainer = Trainer(load_dataset(scene), renderer, settings, checkpoint, restart=restart)
     begun, before = time.perf_counter(), trainer.iteration
     trainer.run(tell)
     seconds = time.perf_counter() - begun

@@ -108,17 +108,17 @@ class RayEngine:
             _ray().kill(actor)
 
     def _get(self, ticket: Any) -> Any:
-        from ray.exceptions import RayActorError, RayTaskError
+        from ray.exceptions import RayError, RayTaskError
 
         try:
             return _ray().get(ticket)
-        except RayActorError as error:
-            raise WorkerLost(" ".join(str(error).split())[:500]) from error
         except RayTaskError as error:
             cause = error.cause
             if isinstance(cause, FidsplatError):
                 raise cause from None
             raise FidsplatError(f"a worker failed with {type(cause).__name__}: {cause}") from error
+        except RayError as error:  # killed, for its memory too, or its machine is gone with what it had made
+            raise WorkerLost(" ".join(str(error).split())[:500]) from error
 
 
 def _share(count: int, workers: int) -> float:

@@ -17,16 +17,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fidsplat.backends.derivatives import Differentiates
-from fidsplat.backends.prepare import prepare
 from fidsplat.cameras import Camera
 from fidsplat.capture import Capture
-from fidsplat.errors import DeviceError, InputError
+from fidsplat.errors import InputError
 from fidsplat.markers import Marker
 from fidsplat.quality import Quality, whole_number
 from fidsplat.render import Renderer
 from fidsplat.splats import SplatCloud
-from fidsplat.train.host import on_host
+from fidsplat.train.derivatives import drawn
 
 ITERATIONS = 1000
 PIXELS = 12
@@ -98,25 +96,15 @@ def refine(
     if made.regions is not None:
         raise InputError(f"{made.spec} has edges across its modules; only markers of modules are refined")
     renderer = Renderer() if renderer is None else renderer
-    backend = renderer.backend
-    if not isinstance(backend, Differentiates):
-        raise DeviceError(
-            f"{renderer.device.name} has no gradients to refine by; use device='opencl' or 'reference'"
-        )
     sheet = _Sheet(made, float(leak))
     splats = _Free.of(made)
     rng = np.random.default_rng(seed)
     for iteration in range(1, iterations + 1):
         camera, grey = sheet.camera(rng), np.full(3, rng.random())
-        resident = backend.upload(splats.cloud())
-        features, view = prepare(
-            resident, Capture(camera, outputs=("rgb", "alpha"), quality=QUALITY, background=tuple(grey))
-        )
-        pipeline = backend.differentiate(features)
-        images = pipeline.forward(resident, view)
-        slopes, psnr, through = sheet.slopes(camera, images.read("rgb"), images.read("alpha"), grey)
-        gradients = {name: on_host(each) for name, each in pipeline.backward(images, slopes).items()}
-        splats.step(gradients, iteration, _share(iteration / iterations))
+        capture = Capture(camera, outputs=("rgb", "alpha"), quality=QUALITY, background=tuple(grey))
+        images, backward = drawn(renderer, splats.cloud(), capture)
+        slopes, psnr, through = sheet.slopes(camera, images["rgb"], images["alpha"], grey)
+        splats.step(backward(slopes), iteration, _share(iteration / iterations))
         if progress is not None:
             progress(RefineStep(iteration, psnr, through))
     return replace(

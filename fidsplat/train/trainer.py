@@ -28,7 +28,7 @@ from fidsplat.train.dataset import Dataset, TrainingView
 from fidsplat.train.device import DeviceWork
 from fidsplat.train.host import HostWork
 from fidsplat.train.optimiser import rates
-from fidsplat.train.parameters import TrainingError, first_splats, splats_of
+from fidsplat.train.parameters import Splats, TrainingError, first_splats, splats_of
 from fidsplat.train.random_numbers import Purpose, permutation
 from fidsplat.train.settings import TrainSettings
 from fidsplat.vision.images import to_uint8
@@ -198,11 +198,12 @@ class Trainer:
         return self.cloud()
 
     def cloud(self) -> SplatCloud:
-        """The splats as they are now."""
-        return self._work.store().cloud(self.settings.sh_degree, self.dataset.origin)
+        """The splats as they are now. Raises TrainingError where a value is not finite."""
+        return self._stored().cloud(self.settings.sh_degree, self.dataset.origin)
 
     def save(self, path: str | Path) -> None:
-        """Write the splats as they are now to a PLY file. Raises InputError when it cannot be written."""
+        """Write the splats as they are now to a PLY file. Raises InputError when it cannot be written,
+        TrainingError where a value is not finite."""
         save_ply(self.cloud(), path)
 
     def save_checkpoint(self) -> None:
@@ -214,8 +215,7 @@ class Trainer:
         """
         if self.checkpoint is None:
             return
-        self._made.splats = self._work.store()
-        self._made.splats.check(f"after iteration {self.iteration}; {self._what_is_kept()}")
+        self._made.splats = self._stored()
         kept = Progressed(self.iteration, self._made.adam_step, self._made.splats, self.history)
         title = self.renderer.device.title
         save_checkpoint(self.checkpoint, kept, self.settings, self.dataset, title)
@@ -226,6 +226,11 @@ class Trainer:
         captures = [self._capture(view) for view in views]
         frames = self.renderer.render_views(self.cloud(), captures)
         return [_score(view, frame["rgb"]) for view, frame in zip(views, frames, strict=True)]
+
+    def _stored(self) -> Splats:
+        splats = self._work.store()
+        splats.check(f"after iteration {self.iteration}; {self._what_is_kept()}")
+        return splats
 
     def _capture(self, view: TrainingView) -> Capture:
         return Capture(

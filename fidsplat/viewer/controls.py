@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from fidsplat.quality import PRESETS
 from fidsplat.scenes import Scene
 from fidsplat.viewer.session import Session
-from fidsplat.viewer.settings import LENSES
+from fidsplat.viewer.settings import LENSES, Settings
 
 NOBODY = "none"
 OF_SCENE = "the scene's"
@@ -37,6 +37,7 @@ class Controls:
 
     def __init__(self, gui: Any, session: Session, devices: list[str], actions: Actions) -> None:
         self._gui, self._session = gui, session
+        self._sliders: dict[str, Any] = {}
         drawn = session.drawn
         with gui.add_folder("Drawing"):
             self.status = gui.add_markdown("")
@@ -44,9 +45,9 @@ class Controls:
             self._choice(
                 "quality", [OF_SCENE, *PRESETS], OF_SCENE, lambda v: {"quality": None if v == OF_SCENE else v}
             )
-            own = drawn.scene.camera is not None and drawn.scene.camera.lens is not None
-            lenses = [lens for lens in LENSES if lens != "scene" or own]
-            self._choice("lens", lenses, drawn.settings.lens, lambda value: {"lens": value})
+            self._lens = self._choice(
+                "lens", _lenses(drawn.scene), drawn.settings.lens, lambda value: {"lens": value}
+            )
             self._slider("fog", "fog [1/m]", 0.0, 2.0, 0.01)
             self._slider("exposure", "exposure", 0.0, 4.0, 0.05)
             self._slider("noise", "shot noise", 0.0, 0.3, 0.005)
@@ -79,23 +80,40 @@ class Controls:
         self._held.value = NOBODY
         self._held.options = [NOBODY, *names]
 
+    def follow(self, scene: Scene, settings: Settings) -> None:
+        """Stand where settings are that came with another scene, not from here."""
+        for name, slider in self._sliders.items():
+            value = float(getattr(settings, name))
+            slider.min, slider.max = min(slider.min, value), max(slider.max, value)
+            slider.value = value
+        if self._lens.value != settings.lens or self._lens.options != tuple(_lenses(scene)):
+            self._lens.options = list(dict.fromkeys([*_lenses(scene), settings.lens]))
+            self._lens.value = settings.lens
+
     def _change(self, **changes: Any) -> None:
         _, settings = self._session.wanted()
-        self._session.wish(settings=replace(settings, **changes), done=lambda why: self.say(why or ""))
+        changed = replace(settings, **changes)
+        if changed != settings:
+            self._session.wish(settings=changed, done=lambda why: self.say(why or ""))
 
-    def _choice(
-        self, label: str, options: list[str], value: str, of: Callable[[str], dict[str, Any]]
-    ) -> None:
+    def _choice(self, label: str, options: list[str], value: str, of: Callable[[str], dict[str, Any]]) -> Any:
         handle = self._gui.add_dropdown(label, options, initial_value=value)
         handle.on_update(lambda _: self._change(**of(handle.value)))
+        return handle
 
     def _slider(self, name: str, label: str, low: float, high: float, step: float) -> None:
-        value = getattr(self._session.drawn.settings, name)
+        value = float(getattr(self._session.drawn.settings, name))
         handle = self._gui.add_slider(label, min(low, value), max(high, value), step, value)
         handle.on_update(lambda _: self._change(**{name: float(handle.value)}))
+        self._sliders[name] = handle
 
     def _button(self, label: str, act: Callable[[Any], None]) -> None:
         self._gui.add_button(label).on_click(lambda event: act(event.client))
+
+
+def _lenses(scene: Scene) -> list[str]:
+    own = scene.camera is not None and scene.camera.lens is not None
+    return [lens for lens in LENSES if lens != "scene" or own]
 
 
 def _span(scene: Scene) -> tuple[float, float]:

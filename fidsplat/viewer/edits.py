@@ -73,7 +73,7 @@ class SceneFile:
         if self._read() != self.text:
             raise InputError(f"{self.path} was edited meanwhile; it is read again, and nothing was written")
         text = placed(self.text, number, pose, str(self.path), kind)
-        with atomic_write(self.path) as stream:
+        with atomic_write(self.path.resolve()) as stream:  # a link stays one
             stream.write(text.encode("utf-8"))
         self.text = self._seen = text
 

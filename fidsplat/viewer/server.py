@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import logging
 import socket
@@ -10,6 +11,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -38,14 +40,19 @@ JPEG = 75
 
 
 def check_port(host: str, port: int) -> None:
-    """Raises InputError where the port cannot be had: viser would take the next one in silence."""
+    """Raises InputError where the port cannot be had: viser would take the next one in silence; likewise for
+    a host that is empty, by which the whole network would be let in."""
+    if not host:
+        raise InputError("--host is empty; give an address to listen on, 127.0.0.1 for this machine alone")
     try:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
-    except (OSError, OverflowError) as error:
+    except (OSError, OverflowError, UnicodeError) as error:
         why = getattr(error, "strerror", None) or error
-        raise InputError(f"cannot listen on {host}, port {port}: {why}; give another --port") from None
+        of_host = isinstance(error, (socket.gaierror, UnicodeError)) or error.args[0] == errno.EADDRNOTAVAIL
+        remedy = "--host must be an address of this machine" if of_host else "give another --port"
+        raise InputError(f"cannot listen on {host}, port {port}: {why}; {remedy}") from None
 
 
 class Viewer:
@@ -60,6 +67,7 @@ class Viewer:
         rate: pictures a second to aim at while moving.
         keyframes: whose poses, camera to world, stand there at first.
         again: asked once a second for another scene to show, None where there is none: of a run that goes on.
+        quality: instead of the scene file's, when it is read again.
 
     Raises:
         InputError: the port is in use, or the extra `viewer` is missing.
@@ -77,6 +85,7 @@ class Viewer:
         rate: float = 30.0,
         keyframes: Trajectory | None = None,
         again: Callable[[], Scene | None] | None = None,
+        quality: str | None = None,
     ) -> None:
         viser = _viser()
         check_port(host, port)
@@ -86,8 +95,9 @@ class Viewer:
         self._said: dict[int, Any] = {}
         self._keyframes: list[np.ndarray] = [] if keyframes is None else list(keyframes.poses)
         self._file = None if file is None else SceneFile(file)
-        self._again = again
+        self._again, self._quality = again, quality
         self._held: Held | None = None
+        self._saved: Path | None = None
         self.session = Session(scene, device, memory_budget, self._changed)
         with _silent():
             self.server: Any = guarded(
@@ -112,7 +122,8 @@ class Viewer:
     @property
     def address(self) -> str:
         """Where browsers find it."""
-        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+        host = self.server.get_host()
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
 
     def close(self) -> None:
         """Let all go."""
@@ -201,7 +212,10 @@ class Viewer:
     def read(self, client: Any) -> None:
         """Read the markers in the picture at rest, with their errors."""
         said, view = self._said.get(client.client_id), self._views.get(client.client_id)
-        if said is None or view is None:
+        if said is None:
+            return
+        if view is None:
+            said.content = "Wait until the picture is still, then ask again."
             return
         try:
             camera = view.viewpoint.camera(view.drawn.scene, view.drawn.settings.lens)
@@ -221,9 +235,14 @@ class Viewer:
     def picture(self, client: Any) -> None:
         """The picture as this browser sees it, for its user to keep."""
         stream = self._streams.get(client.client_id)
-        if stream is not None:
+        if stream is None:
+            return
+        try:
             image = self.session.draw(_viewpoint(client.camera)).frame["rgb"]
-            client.send_file_download("fidsplat.png", png_bytes(image))
+        except (FidsplatError, MemoryError) as error:
+            self._controls.say(str(error) or "not enough memory for this picture")
+            return
+        client.send_file_download("fidsplat.png", png_bytes(image))
 
     def add_keyframe(self, client: Any) -> None:
         """Keep where this browser looks from."""
@@ -240,13 +259,18 @@ class Viewer:
         if not self._keyframes:
             self._controls.say("no keyframe to save; add some first")
             return
-        stem = Path("view") if self._file is None else self._file.path.with_suffix("")
-        file = stem.with_name(f"{stem.name}-trajectory.tum")
+        file = self._saved = self._saved or self._free_name()
         try:
             save_trajectory(Trajectory(range(len(self._keyframes)), np.array(self._keyframes)), file)
             self._controls.say(f"{file}: fidsplat fly SCENE --trajectory {file} --smooth")
         except FidsplatError as error:
             self._controls.say(str(error))
+
+    def _free_name(self) -> Path:
+        """Of the file of keyframes; another's is not written over."""
+        stem = Path("view") if self._file is None else self._file.path.with_suffix("")
+        names = (f"{stem.name}-trajectory{'' if k == 1 else f'-{k}'}.tum" for k in count(1))
+        return next(file for name in names if not (file := stem.with_name(name)).exists())
 
     def movable(self, scene: Scene) -> list[str]:
         """Names of what the gizmo may move."""
@@ -300,8 +324,10 @@ class Viewer:
                 with self._lock:
                     text = None if self._file is None else self._file.changed()
                 if self._file is not None and text is not None:
-                    scene = Scene.load(self._file.path)
-                    self.session.wish(scene=scene, done=partial(self._edited, scene, text))
+                    scene = Scene.load(self._file.path, self._quality)
+                    shown, settings = self.session.wanted()
+                    settings = settings.following(shown, scene)
+                    self.session.wish(scene, settings, partial(self._edited, scene, text))
             except FidsplatError as error:
                 self._controls.say(f"{error}; what was read before is shown")
 
@@ -313,6 +339,7 @@ class Viewer:
                 self._file.text = text
             self.hold(NOBODY)
             self._controls.offer(self.movable(scene))
+            self._controls.follow(scene, self.session.wanted()[1])
         self._controls.say(problem or "")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -112,6 +112,13 @@ class Settings:
             exposure_ms=1e3 * capture.shutter.exposure_time,
             readout_ms=1e3 * capture.shutter.readout,
         )
+
+    def following(self, before: Scene, after: Scene) -> Settings:
+        """These for a scene file that was edited: what it says otherwise than before is taken from it, and
+        what it says as before stays as the controls have it; so does the device."""
+        old, new = asdict(Settings.of(before)), asdict(Settings.of(after))
+        said = {name: value for name, value in new.items() if value != old[name] and name != "device"}
+        return replace(self, **said)
 
     def moving(self, scene: Scene, camera: Camera) -> Capture:
         """How a picture is taken that is gone at once: its colours alone, by the constants of `fast` where

@@ -71,9 +71,10 @@ def test_the_schedule_of_gpus_has_the_references_derivatives(backend):
 
 
 def test_distortions_and_their_derivatives_are_the_references(backend):
-    """Of splats a thousandth of their depth apart as of those that are far apart. The derivatives by
+    """Of splats a thousandth of their depth apart, far apart, and before the depth buffer. The derivatives by
     distortions are small beside others, and are asked for by themselves."""
-    cases: list[dict] = [{"depth": (2.0, 2.002)}, {"depth": (0.3, 30.0), "scale": (0.1, 1.0)}]
+    near = {"depth": (0.1, 0.4), "scale": (0.1, 1.0), "across": 0.3}
+    cases: list[dict] = [{"depth": (2.0, 2.002)}, {"depth": (0.3, 30.0), "scale": (0.1, 1.0)}, near]
     for case in cases:
         cloud, capture = random_picture(3, **case)
         by_distortion = {"distortion": np.random.default_rng(1).normal(size=(43, 61)).astype(np.float32)}

@@ -5,7 +5,10 @@ import numpy as np
 import pytest
 from training_scene import QUICK, scene
 
+import fidsplat as fs
 from fidsplat.backends.derivatives import Differentiates, Trains
+from fidsplat.backends.prepare import prepare
+from fidsplat.effects.differentiable import with_distortion
 from fidsplat.formats import load_ply
 from fidsplat.train import Trainer
 from fidsplat.train.losses import normal_loss
@@ -83,3 +86,30 @@ def test_the_loss_of_normals_does_what_it_is_for(renderer, dataset):
             found.append(normal_loss(frame["depth"], frame["normal"], frame["alpha"], *lens)[0])
         off.append(np.mean(found))
     assert off[1] < 0.8 * off[0]
+
+
+def test_the_loss_of_distortions_does_what_it_is_for(renderer, dataset):
+    """With it fragments are closer together than they were, and than without it. One disk of the scene lies
+    nearly along its plane to the first camera, and reaches up to it."""
+    assert isinstance(renderer.backend, Differentiates)
+    after = {}
+    for weight in (0.0, 10.0):
+        losses = {"distortion_weight": weight, "distortion_from": 0, "densify_from": 99, "sh_degree": 0}
+        trainer = Trainer(dataset, renderer, **{**QUICK, "iterations": 40, **losses})
+        before = distortion_of(trainer)
+        trainer.run()
+        after[weight] = distortion_of(trainer)
+    assert after[10.0] < 0.5 * before
+    assert after[10.0] < 0.9 * after[0.0]
+
+
+def distortion_of(trainer):
+    """Mean over the views that are trained on."""
+    backend, found = trainer.renderer.backend, []
+    resident = backend.upload(trainer.cloud())
+    for view in trainer.dataset.views:
+        capture = fs.Capture(view.camera, quality="surfel")
+        features, seen = prepare(resident, capture)
+        pipeline = backend.differentiate(with_distortion(features))
+        found.append(pipeline.forward(resident, seen).read("distortion").mean())
+    return np.mean(found)

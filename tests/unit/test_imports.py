@@ -67,7 +67,7 @@ HOME_OF = {
     "flip_evaluator": ("vision",),
     "viser": ("viewer.server",),
     "websockets": ("viewer.guard",),
-    "torch": ("frame",),
+    "torch": ("frame", "train.torch_bridge"),
     "ray": ("remote.ray_engine",),
     "pxr": ("formats.usd",),
     "imageio_ffmpeg": ("vision.video",),

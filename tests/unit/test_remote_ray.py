@@ -9,6 +9,7 @@ from fidsplat.experiments.sweep import read_records
 from fidsplat.flights import Flight, FlightFolder
 from fidsplat.remote import ray_engine as module
 from fidsplat.remote.flights import FlightWork, draw
+from fidsplat.remote.queue import WorkerLost
 from fidsplat.remote.ray_engine import ray_engine
 from fidsplat.scenes import PlacedMarker
 
@@ -106,3 +107,25 @@ def test_an_experiment_by_workers_finds_what_one_process_does(tmp_path, monkeypa
     capsys.readouterr()
     assert main(["experiment", "views", "--ray", "local", "--blender", "pictures", "-o", "v"]) == 2
     assert "pictures is on the disk of this machine" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ray.exceptions.OutOfMemoryError("the system's memory ran out"),
+        ray.exceptions.NodeDiedError("the machine is gone"),
+        ray.exceptions.ObjectLostError("00ffff", None, ""),
+        ray.exceptions.WorkerCrashedError(),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_a_worker_is_lost_in_whatever_way_it_ends(monkeypatch, error):
+    """Ray says not only of an actor that it died."""
+
+    def gone(ticket):
+        raise error
+
+    monkeypatch.setattr(ray, "get", gone)
+    engine = object.__new__(module.RayEngine)
+    with pytest.raises(WorkerLost):
+        engine.result("ticket")

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from full_disk import small_files
 
 import fidsplat as fs
 from fidsplat.random_clouds import random_splats
@@ -13,7 +14,6 @@ from fidsplat.store import build, plan
 from fidsplat.store.layout import FAR, NODE, NPY_HEADER
 from fidsplat.store.merge import REDUCTION, WIDER, merged, quaternions_of
 from fidsplat.store.morton import Grid, grid_around
-from tests.full_disk import small_files
 
 COUNT = 9_000
 SMALL = {"chunk": 500, "memory": 1 << 20}

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from test_store_drawing import splats
 
 import fidsplat as fs
 from fidsplat.accuracy import truth
@@ -15,7 +16,6 @@ from fidsplat.store.city import PITCH, City, flight
 from fidsplat.store.detail import MARGIN, Detail, load_details, save_details
 from fidsplat.store.sources import sample, splats_of
 from fidsplat.store.streamed import Streamed
-from tests.unit.test_store_drawing import splats
 
 QUALITY = fs.Quality(lowpass="pixel", alpha_cutoff=1e-8)
 

@@ -7,6 +7,7 @@ import pickle
 
 import numpy as np
 import pytest
+from test_store import contents
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
@@ -16,7 +17,6 @@ from fidsplat.rotations import rigid_matrix
 from fidsplat.store import plan
 from fidsplat.store.sources import source_of
 from fidsplat.store.streamed import Streamed
-from tests.unit.test_store import contents
 
 COUNT = 3000
 SIZE = 40, 30

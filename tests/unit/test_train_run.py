@@ -183,6 +183,11 @@ def test_what_is_not_finite_ends_the_run_and_leaves_the_checkpoint(dataset, tmp_
     with pytest.raises(TrainingError, match=r"sh of 16 splats .* are not finite after iteration 1"):
         trainer.save_checkpoint()
     assert sha(file) == kept
+    alone = Trainer(dataset, renderer, iterations=9, **QUICK)
+    alone._work.store().values["means"][3] = np.nan
+    with pytest.raises(TrainingError, match=r"means of 1 splats \(the first is 3\).*nothing was kept"):
+        alone.save(tmp_path / "scene.ply")
+    assert [each.name for each in tmp_path.iterdir()] == [file.name]
 
 
 def test_a_full_disk_leaves_the_last_checkpoint(dataset, tmp_path, monkeypatch):

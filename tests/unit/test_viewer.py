@@ -362,6 +362,15 @@ def test_a_file_that_was_edited_meanwhile_is_not_written(tmp_path):
         file.changed()
 
 
+def test_a_link_to_a_scene_file_stays_one(tmp_path):
+    (tmp_path / "real.toml").write_text(FILE)
+    link = tmp_path / "scene.toml"
+    link.symlink_to("real.toml")
+    SceneFile(link).place(0, POSE)
+    assert link.is_symlink()
+    assert "position = [0.25" in (tmp_path / "real.toml").read_text()
+
+
 # the page, with a client that is none
 
 
@@ -440,6 +449,23 @@ def test_what_a_browser_gets_and_asks(viewer):
     viewer._leave(client)
     viewer._leave(client)
     viewer.read(client)
+
+
+def test_what_a_button_cannot_do_is_said(viewer, monkeypatch):
+    client = Client()
+    viewer._said[1] = client.said
+    viewer.read(client)
+    assert client.said.content == "Wait until the picture is still, then ask again."
+    viewer.picture(client)  # of a browser that has left
+    viewer._streams[1] = Stream(lambda *_: None, lambda *_: None)
+
+    def fails(viewpoint):
+        raise MemoryError
+
+    monkeypatch.setattr(viewer.session, "draw", fails)
+    viewer.picture(client)
+    assert "**not enough memory for this picture**" in viewer._controls.status.content
+    assert client.files == []
 
 
 def test_a_gizmo_moves_a_marker_and_its_file(viewer, tmp_path):
@@ -533,6 +559,30 @@ def test_a_file_that_is_edited_is_shown(viewer, tmp_path):
     assert viewer.session.drawn.scene.markers[0].marker.size == 0.2
 
 
+def test_what_an_edit_changes_is_taken_and_the_controls_follow(viewer, tmp_path):
+    """What it leaves stays as the controls have it."""
+    path, sliders = tmp_path / "scene.toml", viewer._controls._sliders
+    sliders["exposure"].value = 2.0
+    assert viewer.session.settle()
+    edited = (
+        path.read_text()
+        + "[fog]\ndensity = 3\n[camera]\nwidth = 48\nheight = 36\nfov_x_deg = 60\n"
+        + "position = [0, 0, -1]\nlook_at = [0, 0, 0]\n[camera.distortion]\nk1 = -0.1\n"
+    )
+    path.write_text(edited)
+    assert until(lambda: viewer._controls._lens.value == "scene")
+    assert until(lambda: not viewer._controls._session._working)
+    settings = viewer.session.drawn.settings
+    assert (settings.fog, settings.lens, settings.exposure) == (3.0, "scene", 2.0)
+    assert (sliders["fog"].value, sliders["exposure"].value) == (3.0, 2.0)
+    assert sliders["fog"].max >= 3.0
+    path.write_text(edited.partition("[camera.distortion]")[0])
+    assert until(lambda: "scene" not in viewer._controls._lens.options)
+    assert viewer.session.settle()
+    settings = viewer.session.drawn.settings
+    assert (settings.fog, settings.lens, settings.exposure) == (3.0, "pinhole", 2.0)
+
+
 def test_a_marker_is_not_written_into_a_file_that_cannot_be_shown(viewer, tmp_path):
     """Its tables may be those of other markers."""
     file, table = tmp_path / "scene.toml", '[[markers]]\nspec = "aruco:4x4_50:8"\nsize = 0.4\n'
@@ -576,6 +626,17 @@ def test_keyframes_become_a_trajectory(viewer, tmp_path):
     np.testing.assert_allclose(path.poses[:, :3, 3], [(0, 0, -1), (0.5, 0, -1)])
     viewer.clear_keyframes(client)
     assert viewer._keyframes == []
+
+
+def test_keyframes_do_not_take_the_place_of_another_file(viewer, tmp_path):
+    (tmp_path / "scene-trajectory.tum").write_text("0.5 0 0 0 0 0 0 1\n")
+    client = Client()
+    for count in (1, 2):
+        viewer.add_keyframe(client)
+        viewer.save_keyframes(client)
+        assert len(fs.load_trajectory(tmp_path / "scene-trajectory-2.tum")) == count
+    assert (tmp_path / "scene-trajectory.tum").read_text() == "0.5 0 0 0 0 0 0 1\n"
+    assert len(list(tmp_path.glob("*.tum"))) == 2
 
 
 def test_a_trajectory_stands_there_as_keyframes(tmp_path):
@@ -665,3 +726,28 @@ def test_a_port_in_use_is_said():
     check_port("127.0.0.1", port)
     with pytest.raises(fs.InputError, match="port 70000"):
         check_port("127.0.0.1", 70000)
+
+
+@pytest.mark.parametrize(
+    ("host", "words"),
+    [
+        ("", "--host is empty"),  # which would let the whole network in
+        ("192.0.2.1", "--host must be an address of this machine"),
+        ("a..b", "--host must be an address of this machine"),
+    ],
+)
+def test_a_host_that_is_none_of_ours_is_said(host, words):
+    from fidsplat.viewer.server import check_port
+
+    with pytest.raises(fs.InputError, match=words):
+        check_port(host, 0)
+
+
+@pytest.mark.parametrize(
+    ("host", "address"), [("127.0.0.1", "http://127.0.0.1:80"), ("::1", "http://[::1]:80")]
+)
+def test_the_address_can_be_opened(host, address):
+    from fidsplat.viewer.server import Viewer
+
+    server = SimpleNamespace(get_host=lambda: host, get_port=lambda: 80)
+    assert Viewer.address.fget(SimpleNamespace(server=server)) == address

@@ -53,6 +53,32 @@ def test_a_splat_file_is_shown_by_the_quality_that_is_given(tmp_path):
     assert scene.capture.quality.samples == 2
 
 
+def test_a_scene_file_that_is_edited_keeps_the_quality_that_was_given(flight, monkeypatch):
+    pytest.importorskip("viser", reason="the extra viewer is not installed")
+    from fidsplat.viewer import server
+
+    made = []
+
+    class Page(server.Viewer):
+        def __init__(self, *words, **more):
+            super().__init__(*words, **more)
+            made.append(self.session)
+            file = self._file.path
+            file.write_text(file.read_text().replace("0.4", "0.2"))
+            for _ in range(100):
+                if self.session.drawn.scene.markers[0].marker.size == 0.2:
+                    break
+                self._closed.wait(0.05)
+            self.close()
+            raise fs.InputError("enough")
+
+    monkeypatch.setattr(server, "Viewer", Page)
+    words = ["--quality", "samples=2", "--device", "reference", "--port", "0"]
+    assert main(["view", str(flight.parents[1] / "scene.toml"), *words]) == 2
+    scene = made[0].drawn.scene
+    assert (scene.markers[0].marker.size, scene.capture.quality.samples) == (0.2, 2)
+
+
 def test_what_is_no_run_is_said(flight, capsys):
     (flight.parents[1] / "scene.toml").unlink()
     for folder, words in (

@@ -17,6 +17,8 @@ from fidsplat.effects import FeatureSet
 
 INVERSE_DEPTH = 0.2 * 100 / (100 - 0.2)
 """metres, by which inverse depths are multiplied for the depth distortion"""
+SPREAD_NEAR = 0.2
+"""metres; what is nearer counts as there for the depth distortion"""
 _SURE = 5e-5
 """share of a depth within which rounding may move one that is still compared: half of what is tolerated"""
 
@@ -100,8 +102,8 @@ def composite(
 
 def inverse_depth(z: np.ndarray) -> np.ndarray:
     """1 / z in the units of the depth distortion, those of a depth buffer from 0.2 to 100 m as the 2DGS
-    authors have it; anything where z is not positive."""
-    return INVERSE_DEPTH / np.where(z > 0, z, 1.0)
+    authors have it; what lies before the buffer counts as at its front."""
+    return INVERSE_DEPTH / np.maximum(z, SPREAD_NEAR)
 
 
 def _sum(weight: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fidsplat.backends.reference.blend import INVERSE_DEPTH, inverse_depth, transmittance
+from fidsplat.backends.reference.blend import INVERSE_DEPTH, SPREAD_NEAR, inverse_depth, transmittance
 from fidsplat.backends.reference.fragments import fragments_of
 from fidsplat.backends.reference.gradients_scene import Placed
 from fidsplat.backends.reference.optics import rays_of
@@ -132,6 +132,7 @@ class Blend:
         made, view = self._made, self._view
         facing = self._normal * self._towards
         by_inverse = by.inverse[:, None] + 2 * by.squares[:, None] * self._inverse
+        by_inverse = np.where(self._z > SPREAD_NEAR, by_inverse, 0.0)
         by_z = self._weight * (by.depth[:, None] - by_inverse * self._inverse**2 / INVERSE_DEPTH)
         by_alpha = np.where(made.drawn, self._by_opacity(by, facing), 0.0)
         by_log = np.where(made.clamped, 0.0, by_alpha * self._alpha)

@@ -1,8 +1,10 @@
 // distortion (h, w): how far apart in depth the fragments lie whose light is seen, sum over pairs of w_i w_j (m_i - m_j)^2 with m the
-// depth in a depth buffer from 0.2 to 100 m, as the 2DGS authors have it: m = constant - INVERSE_DEPTH / z.
+// depth in a depth buffer from 0.2 to 100 m, as the 2DGS authors have it: m = constant - INVERSE_DEPTH / z. What is nearer counts as at
+// 0.2 m: 1 / z has no bound, and one disk seen along its plane would be all of the loss.
 // It is W sum w m^2 - (sum w m)^2, which does not change with the zero of m: that is the first fragment's, so that little cancels.
 //@ compose_types
 #define INVERSE_DEPTH WIDE(0.2004008016032064)  // 0.2 * 100 / (100 - 0.2)
+#define SPREAD_NEAR WIDE(0.2)
 //@ state
     vfloat spread_first, spread_weight, spread_sum, spread_squares;
 //@ start
@@ -12,7 +14,7 @@
     pixel->spread_squares = 0.0f;
 //@ composite
     vint spreads = VMASK(weight > 0.0f) & VMASK(seen->z > 0.0f);
-    vfloat spread_share = VSELECT((vfloat)0.0f, weight, spreads), inverse = INVERSE_DEPTH / VSELECT((vfloat)1.0f, seen->z, spreads);
+    vfloat spread_share = VSELECT((vfloat)0.0f, weight, spreads), inverse = INVERSE_DEPTH / max(seen->z, (vfloat)SPREAD_NEAR);
     pixel->spread_first = VSELECT(pixel->spread_first, inverse, spreads & VMASK(pixel->spread_weight == 0.0f));
     vfloat nearer = inverse - pixel->spread_first;
     pixel->spread_weight += spread_share;

@@ -1,0 +1,110 @@
+"""Pictures as functions of PyTorch's tensors: forward and backward on our devices, for loops of one's own.
+
+Arrays pass through the host's memory. Derivatives are those of docs/gradients.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from fidsplat.capture import Capture
+from fidsplat.errors import InputError
+from fidsplat.harmonics import C0
+from fidsplat.render import Renderer
+from fidsplat.splats import SplatCloud
+from fidsplat.train.derivatives import by_pose, drawn, moved
+
+try:
+    import torch as _torch  # type: ignore[import-not-found]
+except ImportError as error:
+    raise InputError(f"PyTorch is not here ({error}); pip install 'fidsplat[torch]'") from None
+
+torch: Any = _torch  # whose names its types do not tell where it is not installed
+_INPUTS = ("means", "quats", "scales", "opacities", "colors", "sh", "background", "pose")
+
+
+def draw(
+    renderer: Renderer,
+    capture: Capture,
+    means: Any,
+    quats: Any,
+    scales: Any,
+    opacities: Any,
+    *,
+    colors: Any = None,
+    sh: Any = None,
+    background: Any = None,
+    pose: Any = None,
+) -> dict[str, Any]:
+    """Draw splats that are tensors; gradients go back to each of them.
+
+    `backward` belongs to the picture that was drawn last on the device: call it before the next one, and let
+    the gradients of several views add up.
+
+    Args:
+        renderer: of a device with gradients.
+        capture: camera, outputs (`rgb`, `alpha`, `depth`, `normal`), quality; see docs/gradients.md.
+        means, quats, scales, opacities: (n, 3), (n, 4) wxyz of any length, (n, 2), (n,), as a `SplatCloud`
+            has them.
+        colors, sh: (n, 3), or (n, k, 3) harmonics; one of them.
+        background: (3,), in place of the capture's.
+        pose: (6,) rotation vector [rad] and translation [m] of a motion after the camera's
+            `world_to_camera`, in its axes.
+
+    Returns:
+        the capture's outputs as float32 tensors, where `means` is.
+
+    Raises:
+        DeviceError: the device has no gradients, or fails.
+        InputError: splats that cannot be drawn, or something without a gradient; from `backward`, where
+            another picture has been drawn since.
+    """
+    if sh is not None and sh.shape[1] == 1:  # drawn as plain colours, which end at 0
+        colors, sh = torch.clamp(C0 * sh[:, 0] + 0.5, min=0), None
+    quats = torch.nn.functional.normalize(quats, dim=1)
+    given = (means, quats, scales, opacities, colors, sh, background, pose)
+    images = _Picture.apply(renderer, capture, *given)
+    return dict(zip(capture.outputs, images, strict=True))
+
+
+class _Picture(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, renderer: Renderer, capture: Capture, *tensors: Any) -> tuple[Any, ...]:
+        arrays = {
+            name: tensor.detach().cpu().numpy()
+            for name, tensor in zip(_INPUTS, tensors, strict=True)
+            if tensor is not None
+        }
+        background, pose = arrays.pop("background", None), arrays.pop("pose", None)
+        if background is not None:
+            capture = replace(capture, background=tuple(background.tolist()))
+        if pose is not None:
+            if capture.camera is None or pose.shape != (6,):
+                raise InputError(f"pose must be 6 numbers, for a capture with a camera, not {pose!r}")
+            capture = replace(capture, camera=moved(capture.camera, pose.astype(np.float64)))
+        images, ctx.derivatives = drawn(renderer, SplatCloud(**arrays), capture)
+        ctx.outputs, ctx.pose = capture.outputs, pose
+        ctx.like = [None if tensor is None else (tensor.device, tensor.dtype) for tensor in tensors]
+        ctx.set_materialize_grads(False)
+        return tuple(torch.from_numpy(np.array(image)).to(tensors[0].device) for image in images.values())
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *by_images: Any) -> tuple[Any, ...]:
+        given = {
+            name: by.cpu().numpy() for name, by in zip(ctx.outputs, by_images, strict=True) if by is not None
+        }
+        found = ctx.derivatives(given)
+        if ctx.pose is not None:
+            found["pose"] = by_pose(found["pose"].astype(np.float64), ctx.pose.astype(np.float64))
+        gradients: list[Any] = [None, None]  # of the renderer and the capture
+        for name, like, wanted in zip(_INPUTS, ctx.like, ctx.needs_input_grad[2:], strict=True):
+            if like is None or not wanted:
+                gradients.append(None)
+                continue
+            device, dtype = like
+            gradients.append(torch.from_numpy(np.array(found[name])).to(device=device, dtype=dtype))
+        return tuple(gradients)

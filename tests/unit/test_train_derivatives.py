@@ -1,0 +1,199 @@
+"""Pictures and their derivatives for loops of one's own; a pose as six numbers, and PyTorch's tensors."""
+
+import sys
+from importlib import import_module
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.train.derivatives import by_pose, drawn, moved
+
+CAMERA = fs.Camera.look_at(24, 18, 0.9, (0.2, 0.1, -2.0), (0.0, 0.0, 0.0))
+OUTPUTS = ("rgb", "alpha", "depth")
+POSES = [np.zeros(6), np.array([1e-4, 0, 0, 0.1, 0, 0]), np.array([0.2, -0.5, 1.1, 0.3, -0.2, 0.4])]
+
+
+def arrays(degree=None):
+    random, n = np.random.default_rng(0), 6
+    color = {"colors": random.uniform(0, 1, (n, 3))}
+    if degree is not None:
+        color = {"sh": random.normal(0, 0.3, (n, (degree + 1) ** 2, 3))}
+    return {
+        "means": random.uniform(-0.4, 0.4, (n, 3)),
+        "quats": random.normal(size=(n, 4)),
+        "scales": random.uniform(0.2, 0.4, (n, 2)),
+        "opacities": random.uniform(0.4, 0.8, n),
+        **color,
+    }
+
+
+def motion(pose):
+    """(4, 4)."""
+    still = fs.Camera.pinhole(4, 4, 4, 4, 2, 2)
+    return moved(still, pose).world_to_camera
+
+
+def screw(matrix):
+    """Rotation vector and translation of a small motion."""
+    turn = matrix[:3, :3] - matrix[:3, :3].T
+    return np.array([turn[2, 1] / 2, turn[0, 2] / 2, turn[1, 0] / 2, *matrix[:3, 3]])
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_derivatives_by_a_pose_are_those_of_central_differences(pose):
+    """Of what follows a motion, by the motion's own numbers."""
+    by_motion, step = np.array([0.3, -1.2, 0.7, 2.0, 0.5, -0.9]), 1e-6
+    back = np.linalg.inv(motion(pose))
+    for k, found in enumerate(by_pose(by_motion, pose)):
+        ends = [screw(motion(pose + sign * step * np.eye(6)[k]) @ back) for sign in (1, -1)]
+        assert found == pytest.approx(by_motion @ (ends[0] - ends[1]) / (2 * step), rel=1e-6, abs=1e-8)
+
+
+def test_a_rotation_vector_turns_about_itself_by_its_length():
+    turned = motion(np.array([0, 0, np.pi / 2, 0, 0, 0]))
+    np.testing.assert_allclose(turned[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
+
+
+def test_a_picture_goes_back_to_a_pose_that_is_not_0():
+    """Central differences of the float32 images: what they round is 1e-4 of these derivatives."""
+    renderer, cloud, pose = fs.Renderer("reference"), fs.SplatCloud(**arrays()), np.array(POSES[2] / 10)
+
+    def seen(at):
+        return drawn(renderer, cloud, fs.Capture(moved(CAMERA, at), OUTPUTS[:1]))
+
+    images, backward = seen(pose)
+    weights = np.random.default_rng(1).normal(size=images["rgb"].shape)
+    found = by_pose(backward({"rgb": weights})["pose"], pose)
+    for k in range(6):
+        ends = [(weights * seen(pose + sign * 1e-3 * np.eye(6)[k])[0]["rgb"]).sum() for sign in (1, -1)]
+        assert found[k] == pytest.approx((ends[0] - ends[1]) / 2e-3, abs=5e-3 * np.abs(found).max())
+
+
+def test_what_has_no_gradient_is_said_before_it_is_drawn():
+    renderer, cloud = fs.Renderer("reference"), fs.SplatCloud(**arrays())
+    with pytest.raises(fs.InputError, match="the output 'label' has no gradient"):
+        drawn(renderer, cloud, fs.Capture(CAMERA, ("rgb", "label")))
+    with pytest.raises(fs.InputError, match="samples=1"):
+        drawn(renderer, cloud, fs.Capture(CAMERA, quality="samples=2"))
+
+
+def test_without_torch_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.delitem(sys.modules, "fidsplat.train.torch_bridge", raising=False)
+    with pytest.raises(fs.InputError, match=r"pip install 'fidsplat\[torch\]'"):
+        import_module("fidsplat.train.torch_bridge")
+
+
+class Tensor:
+    """As much of PyTorch's as the bridge needs."""
+
+    device = "cpu"
+
+    def __init__(self, array):
+        self.array = np.asarray(array)
+        self.dtype, self.shape = self.array.dtype, self.array.shape
+
+    def detach(self):
+        return self
+
+    cpu = detach
+
+    def numpy(self):
+        return self.array
+
+    def to(self, device, dtype=None):
+        return Tensor(self.array.astype(dtype or self.dtype))
+
+
+class Function:
+    @classmethod
+    def apply(cls, *given):
+        cls.context = SimpleNamespace(set_materialize_grads=lambda whether: None)
+        cls.context.needs_input_grad = [isinstance(each, Tensor) for each in given]
+        return cls.forward(cls.context, *given)
+
+
+def test_the_bridge_without_torch_itself(monkeypatch):
+    """A stand-in for PyTorch, which is too large to be installed for tests: what goes through and back."""
+    torch = SimpleNamespace(
+        autograd=SimpleNamespace(
+            Function=Function, function=SimpleNamespace(once_differentiable=lambda f: f)
+        ),
+        nn=SimpleNamespace(functional=SimpleNamespace(normalize=lambda tensor, dim: tensor)),
+        from_numpy=Tensor,
+    )
+    monkeypatch.setitem(sys.modules, "torch", torch)
+    monkeypatch.setitem(sys.modules, "fidsplat.train.torch_bridge", None)  # what is there comes back
+    del sys.modules["fidsplat.train.torch_bridge"]
+    bridge = import_module("fidsplat.train.torch_bridge")
+    renderer, given, pose = fs.Renderer("reference"), arrays(), POSES[2] / 10
+    tensors = {name: Tensor(array) for name, array in (given | {"pose": pose}).items()}
+    images = bridge.draw(renderer, fs.Capture(CAMERA, OUTPUTS), **tensors)
+    by_depth = np.random.default_rng(1).normal(size=(18, 24))
+    context = bridge._Picture.context
+    context.needs_input_grad[3] = False  # quats
+    back = bridge._Picture.backward(context, None, None, Tensor(by_depth))
+
+    wanted_images, backward = drawn(
+        renderer, fs.SplatCloud(**given), fs.Capture(moved(CAMERA, pose), OUTPUTS)
+    )
+    wanted = backward({"depth": by_depth})
+    wanted["pose"] = by_pose(wanted["pose"], pose)
+    assert np.abs(wanted["pose"]).min() > 0
+    for name, image in images.items():
+        np.testing.assert_array_equal(image.numpy(), wanted_images[name])
+    assert [each is None for each in back] == [True, True, False, True, *[False] * 3, True, True, False]
+    for place, name in ((2, "means"), (4, "scales"), (5, "opacities"), (6, "colors"), (9, "pose")):
+        np.testing.assert_array_equal(back[place].numpy(), wanted[name])
+    with pytest.raises(fs.InputError, match="pose must be 6 numbers"):
+        bridge.draw(renderer, fs.Capture(CAMERA), **(tensors | {"pose": Tensor(np.zeros(7))}))
+
+
+@pytest.mark.parametrize("degree", [None, 0, 1])
+def test_tensors_have_the_gradients_of_the_backend(degree):
+    torch = pytest.importorskip("torch", reason="torch is not installed")
+    from fidsplat.train.torch_bridge import draw
+
+    renderer, given = fs.Renderer("reference"), arrays(degree)
+    given |= {"background": np.array([0.2, 0.3, 0.4]), "pose": POSES[2] / 10}
+    tensors = {name: torch.tensor(array, requires_grad=True) for name, array in given.items()}
+    images = draw(renderer, fs.Capture(CAMERA, OUTPUTS), **tensors)
+    assert [tuple(image.shape) for image in images.values()] == [(18, 24, 3), (18, 24), (18, 24)]
+    random = np.random.default_rng(1)
+    weights = {name: random.normal(size=tuple(images[name].shape)) for name in ("rgb", "depth")}
+    sum((torch.tensor(weights[name]) * images[name]).sum() for name in weights).backward()
+
+    background, pose = given.pop("background"), given.pop("pose")
+    capture = fs.Capture(moved(CAMERA, pose), OUTPUTS, background=tuple(background))
+    wanted_images, backward = drawn(renderer, fs.SplatCloud(**given), capture)
+    wanted = backward(weights)
+    wanted["pose"] = by_pose(wanted["pose"], pose)
+    if degree == 0:
+        shade = 0.28209479177387814 * given["sh"][:, 0] + 0.5
+        wanted["sh"] = 0.28209479177387814 * (wanted.pop("colors") * (shade > 0))[:, None]
+    length = np.linalg.norm(given["quats"], axis=1, keepdims=True)
+    wanted["quats"] = wanted["quats"] / length  # a cloud's are unit
+    for name, image in images.items():
+        np.testing.assert_allclose(image.detach().numpy(), wanted_images[name], rtol=1e-5, atol=1e-6)
+    for name, tensor in tensors.items():
+        np.testing.assert_allclose(tensor.grad.numpy(), wanted[name], rtol=1e-4, atol=1e-5)
+
+
+def test_tensors_learn_a_picture():
+    torch = pytest.importorskip("torch", reason="torch is not installed")
+    from fidsplat.train.torch_bridge import draw
+
+    renderer, given, capture = fs.Renderer("reference"), arrays(), fs.Capture(CAMERA)
+    truth = torch.tensor(renderer.render(fs.SplatCloud(**given), capture)["rgb"])
+    tensors = {name: torch.tensor(array, dtype=torch.float32) for name, array in given.items()}
+    tensors["colors"] = torch.full((6, 3), 0.5, requires_grad=True)
+    optimiser, losses = torch.optim.Adam([tensors["colors"]], lr=0.1), []
+    for _ in range(15):
+        optimiser.zero_grad()
+        loss = ((draw(renderer, capture, **tensors)["rgb"] - truth) ** 2).mean()
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.2 * losses[0]
