@@ -138,7 +138,7 @@ def first_splats(dataset: Dataset, settings: TrainSettings) -> Splats:
     )
 
 
-def splats_of(cloud: SplatCloud, settings: TrainSettings, origin: np.ndarray) -> Splats:
+def splats_from(cloud: SplatCloud, settings: TrainSettings, origin: np.ndarray) -> Splats:
     """The splats of a cloud, with zeros for SH coefficients that it lacks; those beyond `sh_degree` go.
 
     Raises:

@@ -28,7 +28,7 @@ from fidsplat.train.dataset import Dataset, TrainingView
 from fidsplat.train.device import DeviceWork
 from fidsplat.train.host import HostWork
 from fidsplat.train.optimiser import rates
-from fidsplat.train.parameters import Splats, TrainingError, first_splats, splats_of
+from fidsplat.train.parameters import Splats, TrainingError, first_splats, splats_from
 from fidsplat.train.random_numbers import Purpose, permutation
 from fidsplat.train.settings import TrainSettings
 from fidsplat.vision.images import to_uint8
@@ -254,7 +254,7 @@ class Trainer:
             splats = (
                 first_splats(dataset, settings)
                 if start is None
-                else splats_of(start, settings, dataset.origin)
+                else splats_from(start, settings, dataset.origin)
             )
             made = Progressed(0, 0, splats, history)
         left = settings.iterations - made.iteration

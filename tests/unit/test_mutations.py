@@ -43,6 +43,14 @@ def test_a_sample_is_that_of_its_seed(plants):
     assert mutate.chosen(plants, [], None, 0) == plants
 
 
+@pytest.fixture
+def quick_pytest(monkeypatch):
+    """Small runs of pytest spend most of their time on plugins that they do not need."""
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
+    monkeypatch.setenv("PYTEST_PLUGINS", "xdist.plugin")
+
+
+@pytest.mark.usefixtures("quick_pytest")
 def test_bugs_are_caught_survive_or_are_not_tested(tmp_path, monkeypatch):
     """In a tree of three files; a second run knows what the first found."""
     (tmp_path / "sum.py").write_text("def plus(a, b):\n    return a + b\n")
@@ -75,6 +83,7 @@ def test_bugs_are_caught_survive_or_are_not_tested(tmp_path, monkeypatch):
     assert (tmp_path / "copies" / "0" / "sum.py").read_text() == (tmp_path / "sum.py").read_text()
 
 
+@pytest.mark.usefixtures("quick_pytest")
 def test_the_likeliest_tests_come_first(tmp_path, monkeypatch):
     """What caught it before, though a sweep leaves that out; then what the plant names; then all."""
     (tmp_path / "sum.py").write_text("def plus(a, b):\n    return a + b\n")
