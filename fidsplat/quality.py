@@ -145,8 +145,9 @@ class Quality:
 
     detail_error: float = 0.0
     """Of stores: how far rgb may be off from the exact picture where cells of splats are drawn as one, in
-    [0, 1). Nodes are chosen by what was measured with the store and this low-pass (docs/large-scenes.md); 0
-    is the exact scene. Scenes in memory are always exact."""
+    [0, 1). Nodes are chosen by what was measured with the store, this low-pass and an `alpha_cutoff` of 1e-8:
+    with a larger one more may be lost (docs/large-scenes.md). 0 is the exact scene. Scenes in memory are
+    always exact."""
 
     first_hit: float = 0.1
     """Opacity at which the outputs depth_first and distance_first see a surface, (0, 1): the first fragment

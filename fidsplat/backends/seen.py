@@ -112,6 +112,10 @@ class _Turned:
             return np.linalg.norm(self.middle, axis=1) + self._radius
         return self.beyond(np.array([0.0, 0.0, 1.0]))
 
+    def off_axis(self) -> np.ndarray:
+        """(n,) metres: the least distance from the vertical axis, around which panoramas are stretched."""
+        return np.maximum(np.hypot(self.middle[:, 0], self.middle[:, 2]) - self._radius, 0.0)
+
     @property
     def _radius(self) -> np.ndarray:
         return np.linalg.norm(self._half, axis=1) + self.room
@@ -169,7 +173,9 @@ def sizes(view: View, boxes: Boxes, edges: np.ndarray) -> np.ndarray:
         if one.parallel:
             made = np.maximum(made, edges * focal)
             continue
-        nearest = _Turned(one, *boxes(0.0)).nearest(one)
+        turned = _Turned(one, *boxes(0.0))
+        panorama = one.raster is not None and isinstance(one.raster.lens, Equirectangular)
+        nearest = turned.off_axis() if panorama else turned.nearest(one)
         with np.errstate(divide="ignore", invalid="ignore"):
             size = np.where(nearest > 0, edges * focal / np.maximum(nearest, 1e-300), np.inf)
         made = np.maximum(made, np.where(edges > 0, size, 0.0))

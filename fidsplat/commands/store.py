@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -223,8 +224,8 @@ class Measure:
     """Measure what levels of detail cost: pictures with cells merged up to a size against the exact ones.
 
     From random places around and inside the store, at 320 x 180 pixels. What is found is kept beside the
-    store, and lets Quality.detail_error choose: fidsplat render city.fss --quality
-    lowpass=pixel,detail_error=0.004
+    store, and lets Quality.detail_error choose, with the cut-off that it was measured with: fidsplat render
+    city.fss --quality lowpass=pixel,alpha_cutoff=1e-8,detail_error=0.004
 
     Examples:
       fidsplat store measure city.fss
@@ -285,8 +286,10 @@ class StoreDemo:
         from fidsplat.detail import measure_detail
         from fidsplat.store.city import City, flight
 
-        if not self.splats == int(self.splats):
+        if not (math.isfinite(self.splats) and self.splats == int(self.splats)):
             raise InputError(f"--splats is {self.splats:g}; give a whole number")
+        if not 0 <= self.views <= 10_000:
+            raise InputError(f"--views is {self.views}; give 0 to 10,000")
         city, folder = City(int(self.splats), self.houses, self.seed), writable_folder(self.out)
         begun = time.perf_counter()
         with late_progress(console(True)) as progress:
@@ -297,7 +300,7 @@ class StoreDemo:
             if self.views and len(store.nodes) > store.chunks:
                 measure_detail(store, fs.Renderer(self.device), self.views, progress=progress)
         camera, motion = flight(city)
-        error = DEMO_ERROR if self.views else 0.0
+        error = DEMO_ERROR if store.details else 0.0
         quality = fs.Quality(lowpass="pixel", alpha_cutoff=TRUTH_CUTOFF, detail_error=error)
         scene = folder / "city.toml"
         fs.Scene(stores=(store,), camera=camera, camera_motion=motion, quality=quality).save(scene)

@@ -270,5 +270,5 @@ def write_log(
             yield picture
         path_taken, _ = asked.localised(run, sightings, camera)
         for k, time in enumerate(run.times.tolist()):
-            log.imu(time, (0, 0, run.gyro[k]), (0, 0, 9.81), frame="base_link")
+            log.imu(time, (0, 0, run.gyro[k]), frame="base_link")
             log.odometry(time, path_taken.poses[k])

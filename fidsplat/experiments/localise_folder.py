@@ -13,6 +13,7 @@ from typing import Any
 from fidsplat.cameras import Trajectory
 from fidsplat.errors import InputError, unknown
 from fidsplat.experiments.localise import DISTANCES, RATE, VARIANTS, Localise, Variant
+from fidsplat.experiments.sweep import differences
 from fidsplat.files import atomic_write, writable_folder
 from fidsplat.formats import load_trajectory, save_trajectory
 from fidsplat.provenance import run_facts
@@ -38,7 +39,8 @@ class LocaliseFolder:
     """Results on disk: one entry for each variant, trajectories as TUM, a chart and a page. What is there is
     not measured again.
 
-    Raises InputError where the folder holds another experiment, or cannot be written.
+    Raises InputError where the folder holds another experiment or results of another device or code, or
+    cannot be written.
     """
 
     def __init__(self, folder: Path, asked: Localise, device: str, overwrite: bool = False) -> None:
@@ -60,6 +62,12 @@ class LocaliseFolder:
             if before.get("asked") != self.key:
                 raise InputError(
                     f"{file} is of another drive, {before.get('asked')}; give another folder, or --overwrite"
+                )
+            ran = before.get("run")
+            if differ := differences(ran if isinstance(ran, dict) else {}, self.results["run"]):
+                raise InputError(
+                    f"{file} holds results of another {' and '.join(differ)}; give another folder, or "
+                    "--overwrite"
                 )
             self.results = before
 

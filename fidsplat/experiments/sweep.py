@@ -66,7 +66,7 @@ class Results:
         self.file, self.run = ordinary_file(file), run
         records = [] if overwrite else read_records(file)
         for record in records:
-            if differ := _differences(record.run, run):
+            if differ := differences(record.run, run):
                 raise InputError(
                     f"{file} holds results of another {' and '.join(differ)}; give another folder with -o, "
                     "or --overwrite to measure again"
@@ -216,7 +216,7 @@ def merge(files: list[Path], target: Path) -> Merged:
     runs = [record.run for record in found.values()]
     # one that draws nothing has no device to differ from
     first = next((run for run in runs if run.get("device")), runs[0] if runs else {})
-    differ = {name for run in runs for name in _differences(run, first)}
+    differ = {name for run in runs for name in differences(run, first)}
     writable_folder(target.parent)
     _write(target, found.values())
     return Merged(len(found), repeated, tuple(sorted(differ)))
@@ -231,7 +231,7 @@ def missing_shards(files: Iterable[Path]) -> list[str]:
     return [f"{i}/{n}" for n, found in sorted(there.items()) for i in range(1, n + 1) if i not in found]
 
 
-def _differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     """The facts on which numbers depend and that are not the same. A run that draws nothing has no device."""
     names = [name for name in ("versions", "code", "seed", "scene") if old.get(name) != new.get(name)]
     devices = (old.get("device"), new.get("device"))

@@ -136,16 +136,17 @@ class RobotLog:
         self._write(topic, time, message)
 
     def imu(
-        self, time: float, turning: Any, acceleration: Any, frame: str = "imu", topic: str = "/imu"
+        self, time: float, turning: Any, acceleration: Any = None, frame: str = "imu", topic: str = "/imu"
     ) -> None:
-        """Angular velocity (3,) radians and acceleration (3,) metres a second (squared), without
-        orientation."""
+        """Angular velocity (3,) radians and acceleration (3,) metres a second (squared), None where it was
+        not measured; without orientation."""
         vector, none = self._of("geometry_msgs/msg/Vector3"), np.zeros(9)
-        unknown_turn = np.array([-1.0, *np.zeros(8)])
+        unknown = np.array([-1.0, *np.zeros(8)])  # what ROS takes as: no such reading
         message = self._of("sensor_msgs/msg/Imu")(
             self._header(time, frame), self._of("geometry_msgs/msg/Quaternion")(0.0, 0.0, 0.0, 1.0),
-            unknown_turn, vector(*_three("turning", turning)), none,
-            vector(*_three("acceleration", acceleration)), none,
+            unknown, vector(*_three("turning", turning)), none,
+            vector(*_three("acceleration", (0, 0, 0) if acceleration is None else acceleration)),
+            unknown if acceleration is None else none,
         )  # fmt: skip
         self._write(topic, time, message)
 

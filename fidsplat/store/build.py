@@ -21,10 +21,11 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, path_of, writable_folder
+from fidsplat.files import atomic_write
 from fidsplat.formats.collect import Progress
 from fidsplat.store.columns import Columns, nodes_of
-from fidsplat.store.layout import CHUNK, NODE, SUFFIX, Header, npy_header, write_nodes
+from fidsplat.store.folders import emptied, filled, refuse_existing, store_folder
+from fidsplat.store.layout import CHUNK, NODE, Header, npy_header, write_nodes
 from fidsplat.store.merge import REDUCTION, merged
 from fidsplat.store.plan import ON_PLANE, Plan, plan_of
 from fidsplat.store.sources import Source, open_sources, splats_of
@@ -62,49 +63,15 @@ def build_store(
         progress: called now and then with what is being done and the share of it that is done, 0 to 1.
 
     Raises:
-        InputError: an input that cannot be used, a store that is there, a disk without room.
+        InputError: an input that cannot be used, a store that is there or that another process builds, a disk
+            without room.
     """
     folder = store_folder(out)
     refuse_existing(folder, overwrite)
     plan = plan_of(open_sources(inputs), chunk, memory, levels, sh_degree, colors)
-    part = folder.with_name(f".{folder.name}.part")
-    writable_folder(part)
-    try:
+    with filled(folder) as part:
         _Build(plan, part, progress or (lambda words, share: None)).run()
-        put_in_place(part, folder)
-    except OSError as error:
-        raise InputError(
-            f"cannot write {folder}: {error.strerror or error}; make room, then give the same command again: "
-            "it goes on where it was"
-        ) from error
     return folder
-
-
-def store_folder(out: str | os.PathLike[str]) -> Path:
-    """The folder of a store that is to be. Raises InputError for a name that is none's."""
-    folder = path_of(out)
-    if folder.suffix.lower() != SUFFIX or not folder.stem:
-        raise InputError(
-            f"{os.fspath(out)!r} is no name for a store; it ends with {SUFFIX}, e.g. city{SUFFIX}"
-        )
-    return folder
-
-
-def refuse_existing(folder: Path, overwrite: bool) -> None:
-    """Raises InputError for a store that is there and is not to be replaced, or what is no folder."""
-    if folder.exists() and not overwrite:
-        raise InputError(f"{folder} is there already; give another name, or --overwrite")
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder} is not a folder, so it is no store; give another name")
-
-
-def put_in_place(part: Path, folder: Path) -> None:
-    """Give a finished folder its name; what has it is removed only then."""
-    old = folder.with_name(f".{folder.name}.old")
-    if folder.exists():
-        os.replace(folder, old)
-    os.replace(part, folder)
-    shutil.rmtree(old, ignore_errors=True)
 
 
 class _Build:
@@ -138,12 +105,11 @@ class _Build:
         """What is done; nothing, if it was begun from other inputs or not at all."""
         try:
             state = json.loads((self.folder / "state.json").read_bytes())
-            if state["plan"] == self.plan.digest:
+            if state["plan"] == self.plan.digest and self._there(state):
                 return state
         except (OSError, ValueError, KeyError, TypeError):
             pass
-        for file in self.folder.iterdir():
-            file.unlink()
+        emptied(self.folder)
         free, needed = shutil.disk_usage(self.folder).free, self.plan.disk_bytes
         if needed > free:
             raise InputError(
@@ -152,6 +118,14 @@ class _Build:
             )
         fresh = {"plan": self.plan.digest, "lengths": [0] * self.buckets, "dropped": {}}
         return fresh | dict.fromkeys(("windows", "thick", "sorted", "nodes", "level", "merged"), 0)
+
+    def _there(self, state: dict[str, Any]) -> bool:
+        """Whether what is noted is on disk: after a power cut it need not be. Raises OSError for a file that
+        is missing."""
+        left = list(enumerate(state["lengths"]))[state["sorted"] :]
+        needed = [(self._bucket(number), count * self.plan.record.itemsize) for number, count in left]
+        needed += [(self.folder / "nodes", state["nodes"] * NODE.itemsize)] if state["nodes"] else []
+        return all(file.stat().st_size >= size for file, size in needed)
 
     def _note(self, **done: Any) -> None:
         self.state |= done
@@ -318,8 +292,10 @@ class _Build:
             dropped=dict(self.state["dropped"]),
             sources=tuple(source.rows.path.name for source in plan.sources),
         ).save(self.folder)
-        for name in ("nodes", "state.json"):
-            (self.folder / name).unlink(missing_ok=True)
+        # the note first: what it says is done must be there
+        (self.folder / "state.json").unlink()
+        for file in (self.folder / "nodes", *map(self._bucket, range(self.buckets))):
+            file.unlink(missing_ok=True)
 
 
 def _groups(nodes: np.ndarray, level: int, pinned: int) -> list[np.ndarray]:

@@ -34,6 +34,8 @@ CHUNK = 32768
 is a sequential read of some 2 MB"""
 FAR = 5.0
 """standard deviations to which the larger boxes of a node reach"""
+MOST_SPLATS = 2**31 - 1
+"""of a scene: their indices are int32"""
 NPY_HEADER = 128
 """bytes of a column's own header, whatever its shape"""
 
@@ -84,12 +86,20 @@ class Header:
     """names of the files that it was made of"""
     store: str | None = None
     """of a store of places: the store that stands there, seen from this one's folder"""
+    places_crc: int | None = None
+    """of the bytes of its poses"""
 
     def save(self, folder: Path) -> None:
         """Write it; what is there without it is no store."""
-        text = json.dumps({"format": FORMAT, "version": VERSION, **asdict(self)}, indent=1)
+        said = {"format": FORMAT, "version": VERSION, **asdict(self)}
         with atomic_write(folder / HEADER) as stream:
-            stream.write(text.encode())
+            stream.write(json.dumps(said | {"crc": header_crc(said)}, indent=1).encode())
+
+
+def header_crc(said: Mapping[str, Any]) -> int:
+    """CRC-32 of what a header says, beside the checksum itself."""
+    rest = {name: value for name, value in said.items() if name != "crc"}
+    return zlib.crc32(json.dumps(rest, sort_keys=True).encode())
 
 
 def read_header(folder: Path) -> Header:
@@ -112,6 +122,8 @@ def read_header(folder: Path) -> Header:
             "use the fidsplat that wrote it, or build it again"
         )
     try:
+        if said.get("crc") != header_crc(said):
+            raise ValueError("its checksum is another")
         known: dict[str, Any] = {each.name: said[each.name] for each in fields(Header)}
         known |= {name: tuple(known[name]) for name in ("sources", "origin")}
         header = Header(**known)
@@ -127,6 +139,8 @@ def _check(header: Header) -> None:
         raise ValueError("a count is no whole number")
     if not (0 <= header.splats <= header.rows and header.chunk > 0 and -1 <= header.sh_degree <= 3):
         raise ValueError("a count is out of range")
+    if not isinstance(header.columns, dict) or not isinstance(header.dropped, dict):
+        raise ValueError("the columns, or what was left out, are no table")
     if len(header.origin) != 3 or not np.isfinite(header.origin).all():
         raise ValueError("the origin is no point")
     if header.store is None:

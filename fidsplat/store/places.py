@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, writable_folder
+from fidsplat.files import atomic_write
 from fidsplat.rotations import check_similarity
-from fidsplat.store.build import put_in_place, refuse_existing, store_folder
-from fidsplat.store.layout import PLACES
+from fidsplat.store.folders import emptied, filled, refuse_existing, store_folder
+from fidsplat.store.layout import MOST_SPLATS, PLACES
 from fidsplat.store.store import Store
 
 
@@ -53,15 +54,14 @@ def place_store(
         raise InputError("poses must be a list of rigid 4x4 matrices, one at least")
     for number, pose in enumerate(given):
         check_similarity(pose, f"pose {number}", rigid=True)
-    if len(given) * len(source) >= 1 << 31:
+    if len(given) * len(source) > MOST_SPLATS:
         raise InputError(
-            f"{len(given)} places of {len(source):,} splats are too many: a scene has at most 2,147,483,647"
+            f"{len(given)} places of {len(source):,} splats are too many: a scene has at most {MOST_SPLATS:,}"
         )
     folder = store_folder(out)
     refuse_existing(folder, overwrite)
-    part = folder.with_name(f".{folder.name}.part")
-    writable_folder(part)
-    try:
+    with filled(folder) as part:
+        emptied(part)  # of a build that was stopped
         with atomic_write(part / PLACES) as stream:
             np.save(stream, given)
         header = replace(
@@ -69,9 +69,7 @@ def place_store(
             splats=len(source) * len(given),
             rows=source.header.rows * len(given),
             store=os.path.relpath(source.path.resolve(), folder.resolve()),
+            places_crc=zlib.crc32(given.tobytes()),
         )
         header.save(part)
-        put_in_place(part, folder)
-    except OSError as error:
-        raise InputError(f"cannot write {folder}: {error.strerror or error}") from error
     return folder

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zlib
 from functools import cached_property
 from pathlib import Path
 
@@ -47,7 +48,7 @@ class Store(Summarised):
             own = layout.read_header(self._folder)
             if own.identity != header.identity or own.store is not None:
                 raise InputError(f"{self._folder} is not what {self.path} was made of; place the store again")
-            self.poses = _read_poses(self.path)
+            self.poses = _read_poses(self.path, header.places_crc)
         self._own = own
         self.nodes = layout.read_nodes(self._folder, own.nodes_crc)
         """(n,) records of `layout.NODE`: chunks and the nodes above them, of one place"""
@@ -155,6 +156,8 @@ class Store(Summarised):
 
         Raises InputError where it was not measured.
         """
+        if not self.levels:
+            return (0.0,)  # nothing stands for others: always exact
         measured = [detail for detail in self.details if detail.lowpass == quality.lowpass]
         if measured:
             found = {detail.level: detail.pixels(quality.detail_error) for detail in measured}
@@ -213,7 +216,11 @@ class Store(Summarised):
         """The labels that its splats have; all of that column is read."""
         if "labels" not in self._columns:
             return {0} if len(self) else set()
-        return set(np.unique(self._columns["labels"][: self._own.splats]).tolist())
+        made: set[int] = set()
+        for node in self.nodes[self.nodes["level"] == 0]:  # a chunk at a time: all may not fit
+            rows = self._columns["labels"][node["first"] : node["first"] + node["count"]]
+            made.update(np.unique(rows).tolist())
+        return made
 
     def last_plane(self) -> int:
         """The largest id of its planes; -1 without."""
@@ -267,14 +274,15 @@ class Store(Summarised):
         return moved(made, self.poses[place], self._moves[place])
 
 
-def _read_poses(folder: Path) -> np.ndarray:
+def _read_poses(folder: Path, crc: int | None) -> np.ndarray:
     try:
         poses = np.load(folder / layout.PLACES, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise InputError(
             f"{folder / layout.PLACES} cannot be read ({error}); place the store again"
         ) from None
-    if poses.dtype != np.float64 or poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
+    shaped = poses.dtype == np.float64 and poses.ndim == 3 and poses.shape[1:] == (4, 4) and len(poses) > 0
+    if not shaped or zlib.crc32(poses.tobytes()) != crc:
         raise InputError(f"{folder / layout.PLACES} is damaged; place the store again")
     for pose in poses:
         check_similarity(pose, f"a pose of {folder / layout.PLACES}", rigid=True)

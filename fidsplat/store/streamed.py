@@ -11,11 +11,13 @@ from functools import cached_property
 
 import numpy as np
 
-from fidsplat.backends.seen import seen, sizes
+from fidsplat.backends.seen import Boxes, seen, sizes
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
+from fidsplat.errors import InputError
 from fidsplat.quality import Quality
 from fidsplat.splats import SplatCloud
+from fidsplat.store.layout import MOST_SPLATS
 from fidsplat.store.part import StorePart, colors_of, joined
 from fidsplat.store.store import Store
 
@@ -59,6 +61,8 @@ class Streamed:
         self.footprint = kinds.pop() if len(kinds) == 1 else "mixed"
         thick = {part.ellipsoids for part in whole if len(part)} or {"none"}
         self.ellipsoids = thick.pop() if len(thick) == 1 else "some"
+        if len(self) > MOST_SPLATS:
+            raise InputError(f"{len(self):,} splats are too many: a scene has at most {MOST_SPLATS:,}")
         self._kept: OrderedDict[tuple[int, int], dict[str, np.ndarray]] = OrderedDict()
         self._kept_bytes, self._lock = 0, threading.Lock()
 
@@ -73,6 +77,8 @@ class Streamed:
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Axis-aligned box (min (3,), max (3,)) float64, world, around all splats, as that of a cloud."""
         boxes = [part.bounds() for part in (*self.stores, self.beside) if len(part)]
+        if not boxes:
+            raise InputError("a scene without splats has no bounds")
         low, high = zip(*boxes, strict=True)
         return np.min(low, axis=0), np.max(high, axis=0)
 
@@ -105,7 +111,8 @@ class Streamed:
         chosen = []
         for number, store in enumerate(self.stores):
             own = pixels[number] if isinstance(pixels, tuple) else (pixels,) * (store.levels + 1)
-            chosen.append(tuple(_chosen(store, views, features, np.array(own)).tolist()))
+            numbers = _chosen(store, self._boxes(number), views, features, np.array(own))
+            chosen.append(tuple(numbers.tolist()))
         return Selection(tuple(chosen))
 
     def part(self, selection: Selection) -> tuple[StorePart, np.ndarray]:
@@ -137,7 +144,7 @@ class Streamed:
             if key in self._kept:
                 self._kept.move_to_end(key)
                 return self._kept[key]
-        made = self._fitted(store.load(node), self._planes_before[number])
+        made = self._fitted(self._brought(store.load(node), store.origin), self._planes_before[number])
         own = sum(array.nbytes for array in made.values() if array.base is None)
         if own * 4 >= sum(array.nbytes for array in made.values()):
             with self._lock:
@@ -159,15 +166,30 @@ class Streamed:
     @cached_property
     def _beside(self) -> dict[str, np.ndarray]:
         cloud = self.beside
-        arrays = {name: getattr(cloud, name) for name in ("quats", "scales", "opacities", "labels")}
-        if np.array_equal(cloud.origin, self.origin):
-            arrays["means"] = cloud.means
-        else:
-            arrays["means"] = (cloud.means + (cloud.origin - self.origin)).astype(np.float32)
+        arrays = {name: getattr(cloud, name) for name in ("means", "quats", "scales", "opacities", "labels")}
+        arrays = self._brought(arrays, cloud.origin)
         some = {"sh": cloud.sh, "colors": cloud.colors, "planes": cloud.planes}
         some |= {"thickness": cloud.thickness, "boxes": cloud.boxes}
         arrays |= {name: array for name, array in some.items() if array is not None}
         return self._fitted(arrays, self._planes_before[-1])
+
+    def _boxes(self, number: int) -> Boxes:
+        """Boxes of a store's nodes as `Store.boxes`, from the origin of the whole."""
+        store = self.stores[number]
+        move = store.origin - self.origin
+
+        def boxes(sigmas: float) -> tuple[np.ndarray, np.ndarray]:
+            low, high = store.boxes(sigmas)
+            return low + move, high + move
+
+        return boxes
+
+    def _brought(self, given: dict[str, np.ndarray], origin: np.ndarray) -> dict[str, np.ndarray]:
+        """Splats relative to an origin (3,) float64, relative to that of the whole."""
+        move = origin - self.origin
+        if not move.any():
+            return given
+        return given | {"means": (given["means"] + move).astype(np.float32)}
 
     def _fitted(self, given: dict[str, np.ndarray], first_plane: int) -> dict[str, np.ndarray]:
         """Splats with the arrays that the whole has."""
@@ -184,8 +206,11 @@ class Streamed:
         return made
 
 
-def _chosen(store: Store, views: Sequence[View], features: FeatureSet, pixels: np.ndarray) -> np.ndarray:
-    """Numbers of the nodes of a store that views are drawn of, in the order of their splats."""
+def _chosen(
+    store: Store, boxes: Boxes, views: Sequence[View], features: FeatureSet, pixels: np.ndarray
+) -> np.ndarray:
+    """Numbers of the nodes of a store that views are drawn of, in the order of their splats. boxes: as
+    `Store.boxes`, from the origin that views see it from."""
     if not len(store.nodes):
         return np.zeros(0, np.int64)
     nodes, places = store.nodes, store.places
@@ -193,7 +218,7 @@ def _chosen(store: Store, views: Sequence[View], features: FeatureSet, pixels: n
     reach = np.tile(nodes["reach"].astype(np.float64), places)
     visible = np.zeros(len(level), bool)
     for view in views:
-        visible |= seen(view, features, store.boxes, reach)
+        visible |= seen(view, features, boxes, reach)
     pinned = np.tile((nodes["level"] == 0) & (nodes["first"] >= store.header.pinned), places)
     if not pixels.any():
         return np.flatnonzero((visible | pinned) & (level == 0))
@@ -202,7 +227,7 @@ def _chosen(store: Store, views: Sequence[View], features: FeatureSet, pixels: n
     edges = np.tile(nodes["size"].astype(np.float64), places)
     refined = np.zeros(len(level), bool)
     for view in views:
-        refined |= sizes(view, store.boxes, edges) > pixels[level]
+        refined |= sizes(view, boxes, edges) > pixels[level]
     reached = parents < 0
     for above in range(int(level.max()), 0, -1):
         children = np.flatnonzero((level == above - 1) & (parents >= 0))

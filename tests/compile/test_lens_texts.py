@@ -29,8 +29,8 @@ CAMERAS = {
 BEFORE_LENSES = {
     ("lanes", ("rgb",)): "c11c67282aceee571b84452e614c63f3654a68c448ce52da5a61e26a4a5a2fee",
     ("lanes", TAPS): "2ce029b5bb140cdb5144c8326ebb42317090b1f0184d82716523113682a771db",
-    ("group", ("rgb",)): "58210f265009a8c1cf5b683bc7e556df1112b13ef06a098825cb35de5ef94b6d",
-    ("group", TAPS): "97e04273bd0db5a0381a0a831b2fae9e5d8569a39b1357fd0b9cab1ec6a23ff6",
+    ("group", ("rgb",)): "d2b12a553ad6f5de9219a04b79613c3247faee510440e824875e4aa091240417",
+    ("group", TAPS): "422c127fc1194688b8ae9997ecaacc36a8135e71befe02fea5bd4f7e22ac8ba8",
 }
 
 

@@ -148,6 +148,10 @@ def test_the_command_measures_once(tmp_path, monkeypatch, capsys):
     assert "is of another drive" in capsys.readouterr().err
     assert main([*words[:-1], "odometri"]) == 2
     assert "unknown variant 'odometri' (did you mean 'odometry'?)" in capsys.readouterr().err
+    found = first | {"run": first["run"] | {"code": "yesterday's"}}
+    (tmp_path / "out/localise.json").write_text(json.dumps(found))
+    assert main(words) == 2
+    assert "localise.json holds results of another code" in capsys.readouterr().err
     (tmp_path / "out/localise.json").write_text("[]")
     assert main(words) == 2
     assert "localise.json holds no results of a drive" in capsys.readouterr().err
@@ -167,6 +171,11 @@ def test_the_drive_as_a_log(tmp_path, monkeypatch):
         stream.seek(0)
         topics = {k: each.topic for k, each in reader.make_reader(stream).get_summary().channels.items()}
     counts = {topics[k]: count for k, count in counts.items()}
+    ros2 = pytest.importorskip("mcap_ros2.decoder", reason="pip install mcap-ros2-support")
+    with (tmp_path / "run.mcap").open("rb") as stream:
+        made = reader.make_reader(stream, decoder_factories=[ros2.DecoderFactory()])
+        turned = next(made.iter_decoded_messages(topics=["/imu"]))[-1]
+    assert turned.linear_acceleration_covariance[0] == -1  # no accelerometer
     assert (
         counts["/eye/image_raw/compressed"] == counts["/tf"] == counts["/eye/detections"] == len(pictures) > 3
     )

@@ -37,7 +37,7 @@ def written(path):
             log.camera_info(time, "front", LENS)
             log.transform(time, "front", POSE)
             log.odometry(time, POSE, velocity=(1, 0, 0), turning=(0, 0, 0.5))
-            log.imu(time, (0, 0, 0.5), (0, 0, 9.81))
+            log.imu(time, (0, 0, 0.5), (0, 0, 9.81) if time < 1 else None)
             log.detections(time, "front", [TAG])
     return path
 
@@ -89,6 +89,8 @@ def test_their_own_readers_read_what_we_write(tmp_path, name, read):
     odometry = first["/odom"]
     assert (odometry.pose.pose.position.z, odometry.twist.twist.angular.z) == (3, 0.5)
     assert (first["/imu"].linear_acceleration.z, first["/imu"].orientation_covariance[0]) == (9.81, -1)
+    not_measured = [each.linear_acceleration_covariance[0] for _, each in found["/imu"]]
+    assert not_measured == [0, -1]
     (tag,) = first["/front/detections"].detections
     assert (tag.family, tag.id, tag.corners[2].x, tag.centre.y) == ("36h11", 5, 2.5, 2.5)
 

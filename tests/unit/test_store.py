@@ -1,7 +1,9 @@
 """Stores: built out of core, stopped and gone on with, damaged, placed."""
 
 import json
-import math
+import os
+import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,12 +13,12 @@ import fidsplat as fs
 from fidsplat.random_clouds import random_splats
 from fidsplat.rotations import rigid_matrix
 from fidsplat.store import build, plan
-from fidsplat.store.layout import FAR, NODE, NPY_HEADER
-from fidsplat.store.merge import REDUCTION, WIDER, merged, quaternions_of
-from fidsplat.store.morton import Grid, grid_around
+from fidsplat.store.layout import FAR, NODE, NPY_HEADER, header_crc
+from fidsplat.store.merge import REDUCTION
 
 COUNT = 9_000
 SMALL = {"chunk": 500, "memory": 1 << 20}
+WINDOW, NOTED = 1000, 3
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -24,7 +26,8 @@ def _many_buckets():
     """Small scenes are cut as large ones are."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plan, "_LEAST_MEMORY", 0)
-        patch.setattr(build, "_NOTED", 3)
+        patch.setattr(plan, "WINDOW", WINDOW)
+        patch.setattr(build, "_NOTED", NOTED)
         yield
 
 
@@ -115,66 +118,11 @@ def test_every_node_stands_for_the_four_below_it(store):
         assert (nodes["far_low"][number] <= children["far_low"].min(axis=0)).all()
 
 
-def test_merged_splats_have_the_light_and_the_place_of_those_they_stand_for():
-    generator = np.random.default_rng(3)
-    means = generator.normal(0, 0.2, (400, 3)).astype(np.float32) * [1, 1, 0]
-    turns = np.tile(np.float32([1, 0, 0, 0]), (400, 1))
-    scales = np.full((400, 2), 0.01, np.float32)
-    splats = {"means": means.astype(np.float32), "quats": turns, "scales": scales}
-    splats |= {"opacities": np.full(400, 0.1, np.float32), "colors": generator.random((400, 3), np.float32)}
-    made, size = merged(splats, Grid((-4.0, -4.0, -4.0), 8.0))
-    assert 1 < len(made["means"]) <= 100
-    assert size > 0
-    light = (made["opacities"] * made["scales"].prod(axis=1)).astype(np.float64)
-    assert light.sum() == pytest.approx(400 * 0.1 * 1e-4, rel=1e-5)
-    assert np.average(made["means"], axis=0, weights=light) == pytest.approx(means.mean(axis=0), abs=1e-6)
-    assert np.average(made["colors"], axis=0, weights=light) == pytest.approx(splats["colors"].mean(axis=0))
-    # flat as they are, and as wide: the mean square along x is that of the splats
-    spread = made["scales"].max(axis=1) ** 2
-    assert (np.abs(fs.SplatCloud(**made).reach(1.0)[:, 2]) < 1e-6).all()
-    assert spread.max() < size**2
-
-
-def test_splats_on_top_of_each_other_become_several():
-    count = 64
-    generator = np.random.default_rng(4)
-    means = np.column_stack([generator.uniform(0, 0.01, (count, 2)), np.zeros(count)]).astype(np.float32)
-    splats = {"means": means, "quats": np.tile(np.float32([1, 0, 0, 0]), (count, 1))}
-    splats |= {"scales": np.full((count, 2), 0.02, np.float32), "opacities": np.full(count, 0.9, np.float32)}
-    made, _ = merged(splats, Grid((-1.0, -1.0, -1.0), 2.0))
-    light = made["opacities"] * made["scales"].prod(axis=1)
-    assert light.sum() == pytest.approx(count * 0.9 * 4e-4, rel=1e-5)
-    assert 0.9 * count / WIDER - 1 < len(light) < 0.9 * count
-    assert made["opacities"].max() <= 1
-    assert made["scales"].max() < 0.02 * 1.4
-
-
-def test_quaternions_of_many_rotations():
-    quats = np.random.default_rng(0).normal(size=(200, 4))
-    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
-    from fidsplat.rotations import quaternion_to_matrix
-
-    again = quaternions_of(quaternion_to_matrix(quats))
-    assert np.abs((again * quats).sum(axis=1)) == pytest.approx(1)
-
-
-def test_codes_follow_the_bits_of_the_cells():
-    grid = Grid((0.0, 0.0, 0.0), 1.0)
-    cells = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0], [1 << 20, 1 << 20, 1 << 20]])
-    codes = grid.codes((cells + 0.5) / (1 << 21))
-    assert codes.tolist() == [1, 2, 4, 8, 7 << 60]
-    assert (
-        grid.codes(np.array([[-5.0, 2.0, np.nextafter(1, 0)]])).tolist()
-        == grid.codes(np.array([[0.0, 0.9999999, 0.9999999]])).tolist()
-    )
-    assert grid_around(np.zeros((0, 3), np.float32)).side > 0
-
-
 class Stopped(Exception):
     pass
 
 
-STOPS = [("reading splats", 1), ("sorting", 3), ("level of detail 1", 5), ("level of detail 2", 2)]
+STOPS = [("reading splats", NOTED + 1), ("sorting", 3), ("level of detail 1", 5), ("level of detail 2", 2)]
 
 
 @pytest.mark.parametrize(("words", "after"), STOPS)
@@ -193,8 +141,90 @@ def test_a_build_that_is_stopped_goes_on(files, store, tmp_path, words, after):
     fs.build_store(files, tmp_path / "both.fss", progress=lambda what, share: again.append(what), **SMALL)
     assert contents(tmp_path / "both.fss") == contents(store.path)
     assert list(tmp_path.iterdir()) == [tmp_path / "both.fss"]
-    if words != "reading splats":
-        assert "reading splats" not in again
+    left = 2 * COUNT // WINDOW - NOTED if words == "reading splats" else 0
+    assert again.count("reading splats") == left
+
+
+def test_a_build_that_was_killed_between_two_steps_leaves_nothing_behind(files, store, tmp_path, monkeypatch):
+    calls, folder = [], tmp_path / "both.fss"
+
+    def stop(what, share):
+        calls.extend([what] * (what == "sorting"))
+        if len(calls) == 3:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        fs.build_store(files, folder, progress=stop, **SMALL)
+    (tmp_path / ".both.fss.part" / "bucket-0000").touch()  # sorted and noted, and not yet removed
+    remove = Path.unlink
+
+    def killed(file, missing_ok=False):
+        remove(file, missing_ok)
+        if file.name in ("nodes", "state.json"):
+            raise Stopped
+
+    monkeypatch.setattr(Path, "unlink", killed)
+    with pytest.raises(Stopped):
+        fs.build_store(files, folder, **SMALL)
+    monkeypatch.undo()
+    fs.build_store(files, folder, **SMALL)
+    # what a process that was killed while it replaced a store has left
+    (tmp_path / ".both.fss.old").mkdir()
+    (tmp_path / ".both.fss.old" / "means.npy").touch()
+    fs.build_store(files, folder, overwrite=True, **SMALL)
+    assert contents(folder) == contents(store.path)
+    assert list(tmp_path.iterdir()) == [folder]
+
+
+@pytest.mark.parametrize("words", ["reading splats", "sorting"])
+def test_a_build_whose_files_were_lost_in_a_power_cut_is_begun_anew(files, store, tmp_path, words):
+    calls = []
+
+    def stop(what, share):
+        calls.extend([what] * (what == words))
+        if len(calls) == NOTED + 1:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        fs.build_store(files, tmp_path / "both.fss", progress=stop, **SMALL)
+    last = max((tmp_path / ".both.fss.part").glob("bucket-*"), key=lambda file: file.stat().st_size)
+    os.truncate(last, last.stat().st_size // 3)
+    fs.build_store(files, tmp_path / "both.fss", **SMALL)
+    assert contents(tmp_path / "both.fss") == contents(store.path)
+
+
+def test_labels_are_read_a_chunk_at_a_time(store):
+    tracemalloc.start()
+    labels = store.labels()
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert labels == set(store.cloud().labels.tolist())
+    assert peak < len(store) * 4 / 2
+
+
+def test_two_builds_of_one_store_at_once(files, store, tmp_path):
+    refused = []
+
+    def second(what, share):
+        if not refused:
+            with pytest.raises(fs.InputError, match="another process is building"):
+                fs.build_store(files[1:], tmp_path / "both.fss", **SMALL)
+            refused.append(what)
+
+    fs.build_store(files, tmp_path / "both.fss", progress=second, **SMALL)
+    assert refused
+    assert contents(tmp_path / "both.fss") == contents(store.path)
+
+
+def test_places_hold_nothing_of_a_build_that_was_stopped(files, tmp_path):
+    def stop(what, share):
+        raise Stopped
+
+    flat = fs.build_store(files[1:], tmp_path / "one.fss", **SMALL)
+    with pytest.raises(Stopped):
+        fs.build_store(files, tmp_path / "both.fss", progress=stop, **SMALL)
+    fs.place_store(flat, tmp_path / "both.fss", [np.eye(4)])
+    assert set(contents(tmp_path / "both.fss")) == {"store.json", "places.npy"}
 
 
 def test_what_is_begun_from_other_files_is_begun_anew(files, store, tmp_path):
@@ -223,15 +253,6 @@ def test_a_disk_without_room_is_said_first(files, tmp_path, monkeypatch):
     monkeypatch.setattr(build.shutil, "disk_usage", lambda folder: type("", (), {"free": 10_000})())
     with pytest.raises(fs.InputError, match="make room, or build elsewhere"):
         fs.build_store(files, tmp_path / "both.fss", **SMALL)
-
-
-def test_a_file_that_lies_about_its_count_builds_nothing(files, tmp_path):
-    content = files[0].read_bytes()
-    liar = tmp_path / "liar.ply"
-    liar.write_bytes(content.replace(b"element vertex 9000", b"element vertex 9001"))
-    with pytest.raises(fs.InputError, match="cut short"):
-        fs.build_store([liar], tmp_path / "liar.fss")
-    assert list(tmp_path.iterdir()) == [liar]
 
 
 def copied(store, tmp_path):
@@ -277,13 +298,17 @@ def test_what_is_no_whole_store_is_refused(store, tmp_path):
         ({"version": 2}, "a store of version 2, and this fidsplat reads version 1"),
         ({"format": "zip"}, "of another kind"),
         ({"rows": -1}, "out of range"),
+        ({"columns": []}, "no table"),
         ({"rows": header["rows"] + 1}, "cut short"),
         ({"columns": {"means": "<f4"}}, "no column"),
         ({"nodes_crc": 1}, "checksum"),
         ({"origin": [0, 0]}, "origin"),
     ]:
-        (folder / "store.json").write_text(json.dumps(header | change))
+        said = header | change
+        (folder / "store.json").write_text(json.dumps(said | {"crc": header_crc(said)}))
         refused(match)
+    (folder / "store.json").write_text(json.dumps(header | {"pinned": header["pinned"] - 1}))
+    refused(r"store.json is damaged \(its checksum is another\)")
     (folder / "store.json").write_bytes(whole["store.json"])
     nodes = np.load(folder / "nodes.npy")
     assert nodes.dtype == NODE
@@ -313,6 +338,11 @@ def test_names_that_make_no_store(files, store, tmp_path):
         fs.build_store([], tmp_path / "a.fss")
     with pytest.raises(fs.InputError, match="--overwrite"):
         fs.build_store(files, store.path)
+    other = tmp_path / "notes.fss"
+    other.mkdir()
+    (other / "notes.txt").touch()
+    with pytest.raises(fs.InputError, match="something else than a store"):
+        fs.build_store(files, other, overwrite=True)
     folder = copied(store, tmp_path)
     fs.build_store(files[1:], folder, overwrite=True, **SMALL)
     assert len(fs.Store(folder)) == COUNT
@@ -359,6 +389,13 @@ def test_a_store_of_places_has_the_splats_as_many_times(store, files, tmp_path):
         fs.place_store(flat, tmp_path / "q.fss", [np.eye(4), np.diag([2.0, 2, 2, 1])])
     with pytest.raises(fs.InputError, match="one at least"):
         fs.place_store(flat, tmp_path / "q.fss", [])
+    file, content = street.path / "places.npy", bytearray((street.path / "places.npy").read_bytes())
+    content[-40] ^= 1  # of a translation: as rigid as before
+    file.write_bytes(content)
+    with pytest.raises(fs.InputError, match=r"places\.npy is damaged"):
+        fs.Store(street.path)
+    content[-40] ^= 1
+    file.write_bytes(content)
     fs.build_store(files[1:], flat.path, overwrite=True, chunk=400, memory=1 << 20)
     with pytest.raises(fs.InputError, match="place the store again"):
         fs.Store(street.path)
@@ -376,26 +413,3 @@ def test_sh_turns_with_its_splats(store, files, tmp_path):
     assert turned["sh"] == pytest.approx(cloud.sh, abs=1e-5)
     few = moved({name: array[7:9] for name, array in part.items()}, pose, pose[:3, 3])
     assert all(np.array_equal(few[name], turned[name][7:9]) for name in few)
-
-
-def test_what_cannot_be_drawn_is_left_out_and_counted(tmp_path):
-    cloud = random_splats(3000, 5)
-    fs.save_ply(cloud, tmp_path / "a.ply")
-    content = bytearray((tmp_path / "a.ply").read_bytes())
-    row = (len(content) - content.index(b"end_header\n") - 11) // 3000
-    content[-row : -row + 4] = np.float32(math.nan).tobytes()
-    (tmp_path / "a.ply").write_bytes(content)
-    store = fs.Store(fs.build_store([tmp_path / "a.ply"], tmp_path / "a.fss", **SMALL))
-    assert len(store) == 2999
-    assert store.header.dropped == {"means not finite": 1}
-    assert store.ellipsoids == "none"
-    assert "thickness" not in store.header.columns
-
-
-def test_an_empty_file_makes_an_empty_store(tmp_path):
-    fs.save_ply(fs.SplatCloud.empty(), tmp_path / "none.ply")
-    store = fs.Store(fs.build_store([tmp_path / "none.ply"], tmp_path / "none.fss"))
-    assert len(store) == 0
-    assert len(store.cloud()) == 0
-    assert store.verify() == []
-    assert "splats" in store.summary()

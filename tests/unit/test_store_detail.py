@@ -10,6 +10,8 @@ from test_store_drawing import splats
 import fidsplat as fs
 from fidsplat.accuracy import truth
 from fidsplat.backends.prepare import prepare
+from fidsplat.backends.seen import sizes
+from fidsplat.cli import main
 from fidsplat.detail import SIZES, cameras_around, errors_of, measure_detail
 from fidsplat.store import plan
 from fidsplat.store.city import PITCH, City, flight
@@ -68,6 +70,26 @@ def test_nodes_stand_for_every_chunk_once_and_for_none_that_is_too_near(store, p
     if away >= 200:  # all of the city is in the picture
         assert sorted(covered) == np.flatnonzero(nodes["level"] == 0).tolist()
     assert list(numbers) == sorted(numbers)
+
+
+def test_what_a_node_stands_for_is_not_drawn_beside_it_whatever_is_allowed_below(store):
+    # cells of the first level are too large, those of all others are small enough
+    limits = (0.0, 1e-9, *[1e9] * (store.levels - 1))
+    numbers, _ = chosen(store, seen_from(200.0), (limits,))
+    assert store.levels > 1
+    assert store.nodes["level"][list(numbers)].tolist() == [store.levels]
+
+
+def test_cells_above_a_panorama_are_as_wide_as_it_shows_them(store):
+    camera = fs.Camera.pinhole(80, 40, 80 / math.tau, 80 / math.tau, 40, 20, lens=fs.Equirectangular())
+    _, view = prepare(store, fs.Capture(camera))
+    corners = np.array([[0.1, -5.0, 0.0], [5.0, 0.1, 0.0], [-1.0, -5.0, -1.0]])
+    high = corners + np.array([[0.01], [0.01], [2.0]])
+    above, beside, around = sizes(view, lambda sigmas: (corners, high), np.full(3, 0.05))
+    # by the longitudes from which they are seen
+    assert above > 0.9 * 80 / math.tau * 0.05 / 0.11
+    assert beside < 0.2
+    assert around == math.inf
 
 
 def test_less_is_drawn_of_what_is_further_away(store):
@@ -154,6 +176,7 @@ def test_what_cannot_be_measured_is_said(store, renderer, tmp_path):
     flat = fs.Store(fs.build_store([City(300).source], tmp_path / "flat.fss", levels=False))
     with pytest.raises(fs.InputError, match="no levels of detail"):
         measure_detail(flat, renderer)
+    assert flat.pixels_of(QUALITY.with_(detail_error=0.1)) == (0.0,)  # beside others it stays exact
     with pytest.raises(fs.InputError, match="detail_error is 1"):
         fs.Quality(detail_error=1.0)
 
@@ -193,6 +216,15 @@ def test_a_city_is_the_same_however_it_is_read():
     camera, path = flight(city)
     assert camera.width == 1280
     assert path.times[-1] == 8.0
+
+
+def test_a_city_that_is_too_small_for_levels_is_drawn_exactly(tmp_path, capsys):
+    assert main(["store", "demo", "-o", str(tmp_path), "--splats", "50", "--houses", "1"]) == 0
+    assert fs.Scene.load(tmp_path / "city.toml").capture.quality.detail_error == 0
+    for options in (["--splats", "nan"], ["--splats", "inf"], ["--splats", "0.5"], ["--views", "-1"]):
+        assert main(["store", "demo", "-o", str(tmp_path / "none"), *options]) == 2
+        assert options[0] in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
 
 
 def test_a_budget_of_error_turns_detail_too(store, renderer):

@@ -14,7 +14,7 @@ from fidsplat.backends.prepare import prepare
 from fidsplat.backends.seen import seen
 from fidsplat.random_clouds import random_splats
 from fidsplat.rotations import rigid_matrix
-from fidsplat.store import plan
+from fidsplat.store import plan, streamed
 from fidsplat.store.sources import source_of
 from fidsplat.store.streamed import Streamed
 
@@ -118,6 +118,35 @@ def test_a_box_around_each_splat_is_seen_where_the_splat_is(stores, reference):
         assert not reference.render(unseen, capture, outputs=("alpha",))["alpha"].any(), name
 
 
+def test_a_needle_that_ewa_draws_into_a_wide_picture_is_seen(reference):
+    focal = 1000 / math.tan(math.radians(80))
+    camera = fs.Camera.pinhole(2000, 2, focal, focal, 1000, 1)
+    capture = fs.Capture(camera, quality=fs.Quality(ellipsoid="ewa"), outputs=("alpha",))
+    sigmas = np.float32([[1e-3, 1e-3, 0.26 / 4.8]])
+    means = np.float32([[-7.3, 0, 1]])
+    needle = fs.SplatCloud(means, [[1, 0, 0, 0]], sigmas, [0.99], colors=[[1, 1, 1]])
+    assert reference.render(needle, capture)["alpha"].any()
+    features, view = prepare(needle, capture)
+
+    def boxes(count):
+        return means.astype(np.float64) - count * sigmas, means.astype(np.float64) + count * sigmas
+
+    assert seen(view, features, boxes, sigmas.max(axis=1).astype(np.float64)).all()
+    exact, _ = prepare(needle, capture.with_(quality=fs.Quality(ellipsoid="exact")))
+    assert not seen(view, exact, boxes, sigmas.max(axis=1).astype(np.float64)).any()
+
+
+def test_what_moves_into_the_picture_by_itself_is_read(tmp_path, reference):
+    behind = random_splats(200, 6, depth=(-4, -2), scale=(0.05, 0.1), across=0.5).with_labels(3)
+    store = made_store(tmp_path, behind, "behind")
+    half_turn = rigid_matrix((0, 0, 0), (0, 0, 1, 0))
+    capture = fs.Capture(look(), motion=fs.Motion(groups={3: lambda t: half_turn}))
+    ours, whole = (reference.render(each, capture)["rgb"] for each in (store, store.cloud()))
+    assert ours.any()
+    assert np.array_equal(ours, whole)
+    assert not reference.render(store, look())["rgb"].any()
+
+
 def test_a_device_draws_stores_bit_for_bit(stores, tmp_path):
     renderer = fs.Renderer("opencl")
     for kind in ("disks", "sh"):
@@ -185,6 +214,31 @@ def test_scenes_hold_stores_beside_markers_and_clouds(stores, reference, tmp_pat
     (tmp_path / "scene.toml").write_text(text)
     with pytest.raises(fs.InputError, match="store place"):
         fs.Scene.load(tmp_path / "scene.toml")
+
+
+def test_stores_with_origins_of_their_own_stand_where_they_were_built(tmp_path, reference):
+    ahead = [random_splats(300, seed, depth=(1, 4), scale=(0.01, 0.1), across=0.8) for seed in (11, 12)]
+    given = {name: getattr(ahead[1], name) for name in ("quats", "scales", "opacities", "colors")}
+    moved = fs.SplatCloud(ahead[1].means - np.float32([8, 0, 0]), origin=(8.0, 0, 0), **given)
+    stores = (made_store(tmp_path, ahead[0], "here"), made_store(tmp_path, moved, "there"))
+    assert stores[1].origin.tolist() == [8, 0, 0]
+    scene = fs.Scene(stores=stores, camera=look())
+    ours = reference.render(scene, outputs=("rgb", "splat_id"))
+    whole = reference.render(scene.cloud(), scene.camera, outputs=("rgb", "splat_id"))
+    for output in ours:
+        assert np.array_equal(ours[output], whole[output]), output
+    assert ours["splat_id"].max() >= len(stores[0])
+    apart = reference.render(fs.Scene([ahead[0], moved], look()), outputs=("rgb",))
+    assert ours["rgb"] == pytest.approx(apart["rgb"], abs=1e-4)
+
+
+def test_a_scene_has_no_more_splats_than_indices(stores, monkeypatch):
+    monkeypatch.setattr(streamed, "MOST_SPLATS", 2 * COUNT - 1)
+    with pytest.raises(fs.InputError, match="6,000 splats are too many"):
+        Streamed([stores["disks"], stores["thick"]])
+    monkeypatch.setattr(plan, "MOST_SPLATS", COUNT - 1)
+    with pytest.raises(fs.InputError, match="3,000 splats are too many for a store"):
+        plan.plan_of([source_of(splats(1), stores["disks"].path, "test")])
 
 
 def test_planes_of_stores_are_always_whole(tmp_path, reference):

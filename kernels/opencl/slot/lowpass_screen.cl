@@ -25,7 +25,7 @@
 //@@ camera_dot
 //@@ footprint_dot
 //@ cells_start
-    const float dot_square = (float)(half_r2 / filter) * (1.0f + 1e-4f);
+    const float dot_square = s->dot_x < 1e17f ? (float)(half_r2 / filter) * (1.0f + 1e-4f) : -1.0f;   // none counts
 //@ cells_dot
             float dot_y = clamp((float)s->dot_y, y0, y1) - (float)s->dot_y, dot_rest = dot_square - dot_y * dot_y;
             if (dot_rest >= 0.0f) {

@@ -1,0 +1,65 @@
+"""Splats that become fewer: their light and their place, and the order in which neighbours are found."""
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.rotations import quaternion_to_matrix
+from fidsplat.store.merge import WIDER, merged, quaternions_of
+from fidsplat.store.morton import Grid, grid_around
+
+
+def test_merged_splats_have_the_light_and_the_place_of_those_they_stand_for():
+    generator = np.random.default_rng(3)
+    means = generator.normal(0, 0.2, (400, 3)).astype(np.float32) * [1, 1, 0]
+    turns = np.tile(np.float32([1, 0, 0, 0]), (400, 1))
+    scales = np.full((400, 2), 0.01, np.float32)
+    splats = {"means": means.astype(np.float32), "quats": turns, "scales": scales}
+    splats |= {"opacities": np.full(400, 0.1, np.float32), "colors": generator.random((400, 3), np.float32)}
+    made, size = merged(splats, Grid((-4.0, -4.0, -4.0), 8.0))
+    assert 1 < len(made["means"]) <= 100
+    assert size > 0
+    light = (made["opacities"] * made["scales"].prod(axis=1)).astype(np.float64)
+    assert light.sum() == pytest.approx(400 * 0.1 * 1e-4, rel=1e-5)
+    assert np.average(made["means"], axis=0, weights=light) == pytest.approx(means.mean(axis=0), abs=1e-6)
+    assert np.average(made["colors"], axis=0, weights=light) == pytest.approx(splats["colors"].mean(axis=0))
+    # flat as they are, and as wide: the mean square about the middle of all is that of the splats
+    square = (made["scales"] ** 2).sum(axis=1) + (made["means"][:, :2] ** 2).sum(axis=1)
+    given = 2 * 0.01**2 + (means[:, :2] ** 2).sum(axis=1)
+    assert np.average(square, weights=light) == pytest.approx(given.mean(), rel=1e-5)
+    spread = made["scales"].max(axis=1) ** 2
+    assert (np.abs(fs.SplatCloud(**made).reach(1.0)[:, 2]) < 1e-6).all()
+    assert spread.max() < size**2
+
+
+def test_splats_on_top_of_each_other_become_several():
+    count = 64
+    generator = np.random.default_rng(4)
+    means = np.column_stack([generator.uniform(0, 0.01, (count, 2)), np.zeros(count)]).astype(np.float32)
+    splats = {"means": means, "quats": np.tile(np.float32([1, 0, 0, 0]), (count, 1))}
+    splats |= {"scales": np.full((count, 2), 0.02, np.float32), "opacities": np.full(count, 0.9, np.float32)}
+    made, _ = merged(splats, Grid((-1.0, -1.0, -1.0), 2.0))
+    light = made["opacities"] * made["scales"].prod(axis=1)
+    assert light.sum() == pytest.approx(count * 0.9 * 4e-4, rel=1e-5)
+    assert 0.9 * count / WIDER - 1 < len(light) < 0.9 * count
+    assert made["opacities"].max() <= 1
+    assert made["scales"].max() < 0.02 * 1.4
+
+
+def test_quaternions_of_many_rotations():
+    quats = np.random.default_rng(0).normal(size=(200, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    again = quaternions_of(quaternion_to_matrix(quats))
+    assert np.abs((again * quats).sum(axis=1)) == pytest.approx(1)
+
+
+def test_codes_follow_the_bits_of_the_cells():
+    grid = Grid((0.0, 0.0, 0.0), 1.0)
+    cells = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0], [1 << 20, 1 << 20, 1 << 20]])
+    codes = grid.codes((cells + 0.5) / (1 << 21))
+    assert codes.tolist() == [1, 2, 4, 8, 7 << 60]
+    assert (
+        grid.codes(np.array([[-5.0, 2.0, np.nextafter(1, 0)]])).tolist()
+        == grid.codes(np.array([[0.0, 0.9999999, 0.9999999]])).tolist()
+    )
+    assert grid_around(np.zeros((0, 3), np.float32)).side > 0
