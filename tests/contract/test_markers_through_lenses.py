@@ -106,7 +106,7 @@ def test_a_tag_that_moves_is_found_in_blur_and_noise_through_every_lens(renderer
     )
 
 
-@in_turn()
+@in_turn(1)
 @pytest.mark.parametrize("blurred", [False, True])
 @pytest.mark.parametrize("turn_deg", [0, 30])
 def test_parallel_rays_show_where_a_tag_is_across_them_and_how_it_is_turned(renderer, turn_deg, blurred):

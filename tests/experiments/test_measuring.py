@@ -98,7 +98,7 @@ def test_every_mixture_is_a_row_with_both_filters():
         method_names(("boxes",))
 
 
-@in_turn(1)
+@in_turn()
 def test_every_method_puts_the_marker_where_the_ideal_has_it(renderer):
     spec = CATEGORIES["small"].spec(0)
     protocol = PROTOCOLS["fixed-plane"]
@@ -179,7 +179,7 @@ def test_pictures_are_drawn_once_for_all_truths(pool, tmp_path):
     assert drawn == ["small-0", "small-0", "small-1", "small-1"]
 
 
-@in_turn(1)
+@in_turn()
 def test_views_by_the_renderer_with_every_metric(renderer, pool, tmp_path):
     point = part_of("fitted/best", "exact")
     found = views.measure_views(
