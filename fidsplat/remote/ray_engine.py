@@ -108,7 +108,7 @@ class RayEngine:
             _ray().kill(actor)
 
     def _get(self, ticket: Any) -> Any:
-        from ray.exceptions import RayError, RayTaskError
+        from ray.exceptions import RayError, RayTaskError  # type: ignore[import-not-found]
 
         try:
             return _ray().get(ticket)
@@ -166,7 +166,7 @@ def ray_engine(address: str, make: Make, workers: int | None = None) -> Iterator
 
 def _ray() -> Any:
     try:
-        import ray
+        import ray  # type: ignore[import-not-found]
     except ImportError:
         raise InputError("--ray needs Ray; pip install 'fidsplat[ray]', here and on the workers") from None
     return ray
