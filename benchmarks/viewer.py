@@ -26,8 +26,8 @@ from fidsplat.viewer.settings import Viewpoint
 from fidsplat.viewer.stream import Stream
 from fidsplat.vision.images import to_uint8
 
-STEP = 0.01
-"""radians of the orbit from picture to picture"""
+STEP, SWING = 0.01, 0.3
+"""radians that the view turns from picture to picture, to and fro, and how far: the splats stay in view"""
 
 
 def main() -> None:
@@ -84,7 +84,7 @@ def measured(session: Session, start: Viewpoint, rate: float, seconds: float) ->
     del latencies[:], sizes[:], scales[:]
     begun, worked = time.perf_counter(), time.process_time()
     while time.perf_counter() - begun < seconds:
-        stream.look(turned(start, STEP * len(latencies)))
+        stream.look(turned(start, SWING * math.sin(STEP / SWING * len(latencies))))
         asked = time.perf_counter()
         stream.step()
     fps = len(latencies) / (time.perf_counter() - begun)
