@@ -25,6 +25,7 @@ from fidsplat.backends.view import NO_CAMERA, View
 from fidsplat.batch import FrameBatch, ViewByView
 from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.capture import Capture, output_names
+from fidsplat.effects import FeatureSet
 from fidsplat.errors import InputError, unknown
 from fidsplat.frame import Frame, check_process
 from fidsplat.quality import Quality, whole_number
@@ -77,6 +78,20 @@ class ResidentCloud:
     def labels(self) -> frozenset[int] | None:
         """The labels that its splats have; None where they are on the device, or on disk."""
         return None if self._labels is None else frozenset(np.unique(self._labels).tolist())
+
+    @property
+    def _whole(self) -> Any:
+        """What a capture is prepared for: all splats, wherever they are."""
+        return self._data.scene if isinstance(self._data, Residency) else self._data
+
+    def _seen(
+        self, views: Iterable[View], features: FeatureSet, qualities: Iterable[Quality]
+    ) -> tuple[Any, np.ndarray | None]:
+        """The splats on the device that these views are drawn from, and their indices in the whole where
+        these are not their own."""
+        if isinstance(self._data, Residency):
+            return self._data.of(list(views), features, qualities)
+        return self._data, None
 
 
 class Renderer:
@@ -331,13 +346,10 @@ class Renderer:
                     )
 
     def _draw_batch(self, resident: ResidentCloud, views: Views) -> FrameBatch:
-        whole = resident._data
-        features, batch = prepare_batch(whole.scene if isinstance(whole, Residency) else whole, views)
+        features, batch = prepare_batch(resident._whole, views)
         with self._lock:
-            data, ids = whole, None
-            if isinstance(whole, Residency):
-                drawn = [batch.one(number) for number in range(len(batch.slots))]
-                data, ids = whole.of(drawn, features, [capture.quality for capture in views.captures])
+            drawn = (batch.one(number) for number in range(len(batch.slots)))
+            data, ids = resident._seen(drawn, features, (capture.quality for capture in views.captures))
             pipeline = self.backend.pipeline(features)
             if isinstance(pipeline, DrawsBatches):
                 images = pipeline.render_batch(data, batch)
@@ -363,12 +375,9 @@ class Renderer:
             data, view
         ),
     ) -> Frame:
-        whole = resident._data
-        features, view = prepare(whole.scene if isinstance(whole, Residency) else whole, capture)
+        features, view = prepare(resident._whole, capture)
         with self._lock:  # scratch buffers and kernels' arguments belong to one picture at a time
-            data, ids = whole, None
-            if isinstance(whole, Residency):
-                data, ids = whole.of([view], features, [capture.quality])
+            data, ids = resident._seen([view], features, [capture.quality])
             return Frame(draw(self.backend.pipeline(features), data, view), capture.outputs, ids)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.base import Backend, Images, ResidentData
+from fidsplat.backends.gradients import on_host
 from fidsplat.cameras import Camera
 from fidsplat.train import mcmc
 from fidsplat.train.dataset import TrainingView
@@ -111,9 +112,3 @@ def seen(splats: Splats, camera: Camera, origin: np.ndarray) -> np.ndarray:
         wide = np.float32(focal) * reach
         inside &= (at + wide > 0) & (at - wide < np.float32(size) * z)
     return inside
-
-
-def on_host(array: Any) -> np.ndarray:
-    """An array of a device as NumPy's float32."""
-    get = getattr(array, "get", None) or getattr(array, "numpy", None)
-    return np.asarray(array if get is None else get(), np.float32)

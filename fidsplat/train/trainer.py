@@ -107,7 +107,7 @@ class Trainer:
         backend = self.renderer.backend
         if not isinstance(backend, Differentiates):
             raise DeviceError(
-                f"{self.renderer.device.name} has no gradients to train by; use device='opencl' or "
+                f"{self.renderer.device.name} has no gradients to train by; use device='opencl', 'warp' or "
                 "'reference'"
             )
         self._differentiate = backend.differentiate

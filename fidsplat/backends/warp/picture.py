@@ -95,13 +95,16 @@ class Picture:
         self.grid = u.tiles_y * u.tile_h, u.tiles_x * u.tile_w
         self.held: dict[str, Any] = {"view": u}
         """arrays and structs by the names that kernels' signatures have for them"""
+        self.bands = 0
+        """of tiles, in which it was drawn"""
         self.stats: dict[str, int] = {"splats": resident.count, "visible": 0, "pairs": 0}
 
     def draw(self) -> None:
         """All stages; `images` are the finished ones."""
-        samples = self._exposed() if self.view.shots else self._drawn()
+        self.workspace.pictures += 1
+        self.samples = self._exposed() if self.view.shots else self._drawn()
         self.launcher.stage("resolve")
-        self.images = self._resolve(samples)
+        self.images = self._resolve(self.samples)
         self.launcher.stage(None)
 
     def _exposed(self) -> Any:
@@ -146,6 +149,7 @@ class Picture:
             self._sort(visible)
         samples = self._samples("raw")
         for first, end, listed in self._bands(visible, pairs):
+            self.bands += 1
             self.launcher.stage("bin")
             self._list(visible, first, end, listed, whole=listed == pairs)
             self.launcher.stage("blend")

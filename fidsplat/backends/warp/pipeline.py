@@ -31,7 +31,18 @@ class WarpPipeline:
         Raises:
             DeviceError: the device runs out of memory or fails.
         """
-        return self._drawn(resident, view).images
+        return self.drawn(resident, view).images
+
+    def drawn(self, resident: Resident, view: View) -> Picture:
+        """One picture with all that its stages have left on the device, until another is drawn.
+
+        Raises:
+            DeviceError: as `render`.
+        """
+        with self.drawing():
+            picture = Picture(self.program, self.workspace, resident, view, Launcher(self._commands))
+            picture.draw()
+            return picture
 
     def render_batch(self, resident: Resident, batch: ViewBatch) -> WarpBatch:
         """Draw many views, one after another.
@@ -39,7 +50,7 @@ class WarpPipeline:
         Raises:
             DeviceError: the device runs out of memory or fails.
         """
-        with self._drawing():
+        with self.drawing():
             images = WarpBatch(self.workspace, self.program.images, batch, resident.count)
             for number, slot in enumerate(batch.slots.tolist()):
                 launcher, into = Launcher(self._commands), images.part(slot)
@@ -56,7 +67,7 @@ class WarpPipeline:
         the last band; records (n, words) float32 (undefined for culled splats); raw (4, rows, columns)
         float32: r, g, b, transmittance of the padded sample grid; and the finished outputs by name.
         """
-        picture = self._drawn(resident, view)
+        picture = self.drawn(resident, view)
         held, stats, n = picture.held, picture.images.stats, resident.count
         rows, stride = picture.grid
         raw = held["raw color"].numpy()[: rows * stride]
@@ -71,19 +82,13 @@ class WarpPipeline:
             **{output.name: picture.images.read(output.name) for output in self.program.images},
         }
 
-    def _drawn(self, resident: Resident, view: View) -> Picture:
-        with self._drawing():
-            picture = Picture(self.program, self.workspace, resident, view, Launcher(self._commands))
-            picture.draw()
-            return picture
-
     @contextmanager
-    def _drawing(self) -> Iterator[None]:
-        """On the device, whose failures are those of drawing."""
+    def drawing(self, doing: str = "while drawing") -> Iterator[None]:
+        """On the device, whose failures are those of what is done there."""
         try:
             with load().ScopedDevice(self.workspace.device):
                 yield
         except RuntimeError as error:
             if isinstance(error, DeviceError):
                 raise
-            raise DeviceError(f"{self.workspace.name} failed while drawing: {error}") from error
+            raise DeviceError(f"{self.workspace.name} failed {doing}: {error}") from error

@@ -78,6 +78,8 @@ class Workspace:
         """bytes of the device that a picture and its cloud may take"""
         self.pair_budget = 2**30 - 1
         """Most pairs of splats and tiles that are listed at once; tests make it small."""
+        self.pictures = 0
+        """how many have been begun: what they leave is there until the next"""
         self.lenses: WeakKeyDictionary[RayRaster, dict[str, Any]] = WeakKeyDictionary()
         """arrays of the whole rasters that are in use, by name"""
         self.panoramas: WeakKeyDictionary[Panorama, Any] = WeakKeyDictionary()
