@@ -282,10 +282,9 @@ class Trainer:
         settings, iteration = self.settings, self.iteration
         if settings.strategy == "mcmc" or not self._due(iteration):
             return
-        splats = densify.densified(self._work.store(), settings, iteration, self.dataset.extent)
+        self._work.make(densify.plan(self._work.shapes(), settings, iteration, self.dataset.extent))
         if iteration % settings.reset_every == 0:
-            splats = densify.with_opacities_reset(splats, settings)
-        self._work.load(splats)
+            self._work.reset()
 
     def _change(self, gradients: dict[str, Any], iteration: int, view: TrainingView) -> None:
         """The optimiser's step; none where the default rule makes splats next, as in the authors' trainer, in
