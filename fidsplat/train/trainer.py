@@ -240,11 +240,12 @@ class Trainer:
     def _begin(self, start: SplatCloud | None, restart: bool) -> Progressed:
         settings = self.settings
         if self.checkpoint is not None and self.checkpoint.exists() and not restart:
-            made, device = load_checkpoint(self.checkpoint, settings, self.dataset.digest)
-            if device != self.renderer.device.title:
+            title = self.renderer.device.title
+            made, others = load_checkpoint(self.checkpoint, settings, self.dataset.digest, title)
+            if others:
                 warnings.warn(
-                    f"{self.checkpoint} is of {device}, and the run goes on on {self.renderer.device.title}: "
-                    "its bits will not be those of a run on one device",
+                    f"{self.checkpoint} was made by {' and '.join(others)}; the run goes on, but its "
+                    "bits will not be those of a run that was made by one: --overwrite begins again",
                     stacklevel=3,
                 )
         else:
