@@ -178,7 +178,19 @@ def within_any(names, package) -> bool:
 
 
 # modules of the package that every backend may import
-SHARED = ("base", "stack", "blank", "caches", "view", "prepare", "registry", "planes", "bands", "gradients")
+SHARED = (
+    "base",
+    "stack",
+    "blank",
+    "caches",
+    "view",
+    "prepare",
+    "registry",
+    "planes",
+    "bands",
+    "gradients",
+    "chunks",
+)
 
 
 def test_backends_do_not_import_each_other():
