@@ -72,7 +72,7 @@ HOME_OF = {
     "ray": ("remote.ray_engine",),
     "pxr": ("formats.usd",),
     "imageio_ffmpeg": ("vision.video",),
-    "bpy": ("experiments.blender_worker",),
+    "bpy": ("experiments.blender_worker", "experiments.blender_plants"),
     "shapely": ("markers", "vision.visible"),
     "networkx": ("markers",),
     "segno": ("markers",),

@@ -128,9 +128,11 @@ class Launcher:
         """Milliseconds by stage, in the order in which they ran first."""
         timings: dict[str, float] = {}
         for (name, begin), (_, end) in pairwise(self._marks):
+            if name is None:  # between a picture and its derivatives
+                continue
             if self._workers is None:
                 took = self._wp.get_event_elapsed_time(begin, end)
             else:
                 took = (end - begin) * 1e3
-            timings[str(name)] = timings.get(str(name), 0.0) + took
+            timings[name] = timings.get(name, 0.0) + took
         return timings
