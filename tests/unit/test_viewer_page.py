@@ -184,6 +184,31 @@ def test_what_an_edit_changes_is_taken_and_the_controls_follow(viewer, tmp_path)
     assert (settings.fog, settings.lens, settings.exposure) == (3.0, "pinhole", 2.0)
 
 
+def test_a_scene_that_begins_to_move_gets_a_clock(viewer, tmp_path):
+    path, sliders = tmp_path / "scene.toml", viewer._controls._sliders
+    still, shown = path.read_text(), viewer.server.gui._gui_input_handle_from_uuid
+    before, place = len(shown), "position = [0, 0, 0], quaternion = [1, 0, 0, 0]"
+
+    def moving(end):
+        keys = f"{{time = 0.5, {place}}}, {{time = {end}, {place.replace('[0, 0, 0]', '[0.3, 0, 0]')}}}"
+        return still.replace("size = 0.4\n", f"size = 0.4\nmotion = [{keys}]\n")
+
+    assert "time" not in sliders
+    path.write_text(moving(2.5))
+    assert until(lambda: "readout_ms" in sliders and len(shown) == before + 3)
+    assert (sliders["time"].min, sliders["time"].max) == (0.0, 2.5), "of keyframes, and where the clock is"
+    sliders["time"].value = 2.5
+    assert until(lambda: viewer.session.drawn.settings.time == 2.5)
+    path.write_text(moving(4.0))
+    assert until(lambda: sliders["time"].max == 4.0)
+    assert (sliders["time"].min, sliders["time"].value, len(shown)) == (0.5, 2.5, before + 3)
+    path.write_text(still)
+    assert until(lambda: not sliders.keys() & {"time", "exposure_ms", "readout_ms"})
+    assert until(lambda: len(shown) == before)
+    path.write_text(moving(2.5))
+    assert until(lambda: "time" in sliders)
+
+
 def test_a_marker_is_not_written_into_a_file_that_cannot_be_shown(viewer, tmp_path):
     """Its tables may be those of other markers."""
     file, table = tmp_path / "scene.toml", '[[markers]]\nspec = "aruco:4x4_50:8"\nsize = 0.4\n'
