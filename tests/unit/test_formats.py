@@ -267,6 +267,12 @@ def test_files_that_are_cut_short_or_something_else(tmp_path, suffix):
         fs.load_splats(path)
 
 
+def test_an_spz_file_of_a_later_version(tmp_path):
+    (tmp_path / "a.spz").write_bytes(struct.pack("<4sI", b"NGSP", 4) + bytes(24))
+    with pytest.raises(fs.InputError, match=r"a\.spz: SPZ of version 4; versions 2 and 3 are read"):
+        fs.load_splats(tmp_path / "a.spz")
+
+
 def test_an_spz_file_that_promises_more_than_gzip_can_hold(tmp_path):
     head = struct.pack("<IIIBBBB", 0x5053474E, 3, 2**32 - 1, 3, 12, 0, 0)
     (tmp_path / "a.spz").write_bytes(gzip.compress(head))
