@@ -47,6 +47,7 @@ MAY_IMPORT = {
     "views": PLAIN,
     "batch": BASE | {"backends", "effects", "frame"},
     "render": PLAIN | {"store", "scenes", "effects", "backends", "frame", "views", "batch"},
+    "several": PLAIN | {"render", "scenes", "store", "frame"},
     "viewer": PLAIN | {"store", "scenes", "effects", "backends", "render", "frame", "vision", "formats"},
     "flights": PLAIN | {"store", "scenes", "render", "vision", "formats", "frame", "provenance"},
     "remote": BASE | {"provenance", "flights", "render", "vision", "experiments"},
