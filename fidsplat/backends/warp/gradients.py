@@ -81,7 +81,7 @@ class WarpGradients:
         check_gradients(picture.program.features, gradients)
         if not images.last:
             raise InputError(NOT_THE_LAST)
-        with self._pipeline.drawing("while taking derivatives"):
+        with picture.workspace.working("while taking derivatives"):
             return _Backward(picture, self._kernels, gradients).results()
 
 
