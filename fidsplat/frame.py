@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import GivesArrays, Images, Waits
+from fidsplat.backends.base import GivesArrays, Images, ReadsRows, Waits
 from fidsplat.errors import InputError, MissingOutputError
 
 Ids = Callable[[], np.ndarray] | None
@@ -149,6 +149,13 @@ class Frame(Mapping):
         if isinstance(self._images, Waits):
             self._images.wait()
         return self
+
+    def read_rows(self, name: str, first: int, end: int) -> np.ndarray:
+        """Rows of pixels [first, end) of an output, which alone are copied where the device can do that."""
+        self._check(name)
+        if not isinstance(self._images, ReadsRows):
+            return self[name][first:end]
+        return numbered(name, self._images.read_rows(name, first, end), self._ids)
 
     @property
     def timings(self) -> Mapping[str, float]:
