@@ -71,6 +71,21 @@ def blending(*effects, outputs=None, on_gpu=True, threads=256):
     return made("blend.make_blend", effects, outputs, on_gpu, threads, 8)[0]
 
 
+GRADIENTS = ("rgb", "alpha", "depth", "normal", "distortion")
+OF_GRADIENTS = (("lowpass_screen", "ray_depth"), ("depth", "distortion", "normal"))
+
+
+def blending_back(*effects):
+    """The derivatives of blending, of a tile as large as the device's."""
+    drawn = ((*effects, *OF_GRADIENTS[0]), OF_GRADIENTS[1])
+    return made("blend_backward.make_blend_backward", *drawn, GRADIENTS, True, 256).kernel
+
+
+def projecting_back(terms):
+    names = made("fragment_backward.moments_of", *OF_GRADIENTS)
+    return made("project_backward.make_project_backward", OF_GRADIENTS[0], NORMAL, names, terms)
+
+
 def resolving(stretched, samples):
     """The kernel for all outputs."""
     images = tuple((output.name, getattr(wp, output.dtype)) for output in OUTPUTS.values())
@@ -109,6 +124,10 @@ def started():
         pytest.param(lambda: blending("rays", *RECORD, "rays_length"), id="blend-rays", marks=LONG),
         pytest.param(lambda: blending("camera_orthographic", *RECORD), id="blend-parallel", marks=LONG),
         pytest.param(lambda: blending("lowpass_screen", "stop_exclusive", outputs=()), id="blend-exclusive"),
+        pytest.param(lambda: blending_back("stop_exclusive", "arithmetic_fast"), id="blend-backward"),
+        pytest.param(lambda: projecting_back(16), id="project-backward"),
+        pytest.param(lambda: made("blend_backward.make_slots", True), id="slots"),
+        pytest.param(lambda: made("column_sums.add_rows"), id="sums"),
         pytest.param(lambda: resolving(False, 3), id="resolve"),
         pytest.param(lambda: resolving(True, 1), id="resolve-stretched"),
         pytest.param(lambda: made("surroundings.make_backdrop", "gradient", False), id="backdrop-gradient"),
