@@ -92,8 +92,8 @@ def errors_of(
         if selection == before:
             continue
         if exact is None:
-            exact = renderer.render(streamed.part(whole)[0], capture)["rgb"].astype(np.float64)
-        picture = renderer.render(streamed.part(selection)[0], capture)["rgb"]
+            exact = renderer.render(streamed.part(whole), capture)["rgb"].astype(np.float64)
+        picture = renderer.render(streamed.part(selection), capture)["rgb"]
         worst[number], before = float(np.abs(picture - exact).max()), selection
     return worst
 

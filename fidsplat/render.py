@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -27,7 +28,7 @@ from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.capture import Capture, output_names
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import InputError, unknown
-from fidsplat.frame import Frame, check_process
+from fidsplat.frame import Frame, Ids, check_process
 from fidsplat.quality import Quality, whole_number
 from fidsplat.scenes import Scene
 from fidsplat.sensor import Sensor
@@ -86,7 +87,7 @@ class ResidentCloud:
 
     def _seen(
         self, views: Iterable[View], features: FeatureSet, qualities: Iterable[Quality]
-    ) -> tuple[Any, np.ndarray | None]:
+    ) -> tuple[Any, Ids]:
         """The splats on the device that these views are drawn from, and their indices in the whole where
         these are not their own."""
         if isinstance(self._data, Residency):
@@ -251,6 +252,27 @@ class Renderer:
 
         return self._draw(self._resident(scene), asked, draw)
 
+    def render_band(
+        self,
+        band: tuple[int, int],
+        scene: Scene | SplatCloud | Store | ResidentCloud,
+        capture: Capture | Camera | None = None,
+        outputs: Iterable[str] | None = None,
+        quality: Quality | str | None = None,
+    ) -> Frame:
+        """A picture of which rows of pixels [first, end) alone are wanted: they have the bits of the whole
+        picture, and of the other rows nothing is promised. `fs.SeveralDevices` puts pictures together so.
+
+        Raises:
+            InputError: as `render`; rows that the picture does not have.
+        """
+        asked = _asked(scene, capture, None, outputs, quality, *[None] * 5)
+        rows = asked.camera.height if asked.camera is not None else 0
+        first, end = band
+        whole_number("the first row of a band", first, 0, rows - 1)
+        whole_number("the end of a band", end, first + 1, rows)
+        return self._draw(self._resident(scene), asked, band=band)
+
     def render_views(
         self,
         scene: Scene | SplatCloud | Store | ResidentCloud,
@@ -374,8 +396,11 @@ class Renderer:
         draw: Callable[[Pipeline, Any, View], Images] = lambda pipeline, data, view: pipeline.render(
             data, view
         ),
+        band: tuple[int, int] | None = None,
     ) -> Frame:
         features, view = prepare(resident._whole, capture)
+        if band is not None:
+            view = replace(view, band=(band[0] * view.samples, band[1] * view.samples))
         with self._lock:  # scratch buffers and kernels' arguments belong to one picture at a time
             data, ids = resident._seen([view], features, [capture.quality])
             return Frame(draw(self.backend.pipeline(features), data, view), capture.outputs, ids)

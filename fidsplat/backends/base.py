@@ -146,6 +146,15 @@ class GivesFloat64(Protocol):
 
 
 @runtime_checkable
+class ReadsRows(Protocol):
+    """Images of which some rows can be read alone."""
+
+    def read_rows(self, name: str, first: int, end: int) -> np.ndarray:
+        """Rows of pixels [first, end) of an image, as `read` gives them."""
+        ...
+
+
+@runtime_checkable
 class DrawsEvery(Protocol):
     """A pipeline that draws pixels one by one: it can leave some out, and say how far it is."""
 

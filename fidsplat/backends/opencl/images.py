@@ -108,12 +108,17 @@ class OpenCLImages:
         Raises:
             DeviceError: the device has failed, in this or while it was drawing.
         """
-        output = self._outputs[name]
-        shape = self._size if output.channels == 1 else (*self._size, output.channels)
-        image = np.empty(shape, output.dtype)
+        return self.read_rows(name, 0, self._size[0])
+
+    def read_rows(self, name: str, first: int, end: int) -> np.ndarray:
+        """As `ReadsRows`. Raises DeviceError as `read`."""
+        output, columns = self._outputs[name], self._size[1]
+        size = (end - first, columns)
+        image = np.empty(size if output.channels == 1 else (*size, output.channels), output.dtype)
         with self._workspace.failing(f"drawing {name}"):
             drawn = self.settle()
-            cl.enqueue_copy(drawn.queue, image, drawn.buffer(f"{name}_out"))
+            above = first * columns * output.channels * image.itemsize
+            cl.enqueue_copy(drawn.queue, image, drawn.buffer(f"{name}_out"), src_offset=above)
         return image
 
     def wait(self) -> None:
