@@ -259,7 +259,8 @@ def test_a_report_that_is_made_again_has_the_same_tables(tmp_path):
 
 def test_a_table_with_words_for_numbers_is_one_line(tmp_path):
     whole = (Path(__file__).parents[2] / "docs" / "results" / "counts.csv").read_text().splitlines()
-    (tmp_path / "counts.csv").write_text("\n".join([*whole[:2], whole[2].replace(",48,52,", ",x,52,")]))
+    assert ",48,52," in whole[3]
+    (tmp_path / "counts.csv").write_text("\n".join([*whole[:3], whole[3].replace(",48,52,", ",x,52,")]))
     with pytest.raises(fs.InputError, match=r"results of counts .* are damaged .* measure again"):
         load([tmp_path])
 
@@ -287,6 +288,10 @@ def test_a_summary_is_what_its_file_says(tmp_path):
     assert read.rows.equals(again.rows)
     assert (again.runs, again.notes) == (summary.runs, summary.notes)
     assert again.rows["read"].tolist()[:2] == [82, 83]
+    words = pd.DataFrame({"run": 0, "name": ["a", "a", "b", "b"], "holes": ["x", None, "x", "x"]})
+    read = Summary(words, summary.runs).write(tmp_path / "b.csv")
+    assert read.rows.astype(object).where(read.rows.notna(), None).equals(words.astype(object))
+    assert (tmp_path / "b.csv").read_text().splitlines()[-4:] == ["0,a,x", "0,,", "0,b,x", "0,,x"]
 
 
 def load_rows(folder: Path):
