@@ -78,7 +78,7 @@ def derivatives(
     images = pipeline.forward(backend.upload(cloud), view)
     given = random_loss(features, view) if by_images is None else by_images
     found = pipeline.backward(images, given)
-    # the reference gives float64
+    # the reference's stay float64
     return {name: one if isinstance(one, np.ndarray) else on_host(one) for name, one in found.items()}
 
 

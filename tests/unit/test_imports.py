@@ -21,6 +21,7 @@ MAY_IMPORT = {
     "files": BASE,
     "rotations": BASE,
     "scalars": {"errors"},
+    "interrupts": set(),
     "summaries": set(),
     "harmonics": BASE,
     "quality": BASE,
