@@ -62,9 +62,7 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
         if name in rows:
             context[name] = tables(rows[name], folder)
     if trained.NAME in rows:
-        context[trained.NAME] = _trained(
-            *(rows.get(name) for name in (trained.NAME, views.NAME, angles.NAME))
-        )
+        context[trained.NAME] = _trained(rows[trained.NAME], rows.get(views.NAME), rows.get(angles.NAME))
     sheets = next((found for place in (*folders, folder) if (found := sheet_files(place))), [])
     for sheet in sheets:
         if sheet.parent.resolve() != folder.resolve():
