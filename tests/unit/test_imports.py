@@ -51,7 +51,7 @@ MAY_IMPORT = {
     "several": PLAIN | {"render", "scenes", "store", "frame"},
     "viewer": PLAIN | {"store", "scenes", "effects", "backends", "render", "frame", "vision", "formats"},
     "flights": PLAIN | {"store", "scenes", "render", "vision", "formats", "frame", "provenance"},
-    "remote": BASE | {"provenance", "flights", "render", "vision", "experiments"},
+    "remote": BASE | {"provenance", "flights", "render", "vision", "experiments", "store"},
     "sim": PLAIN | {"batch", "scenes", "markers", "render", "vision", "formats"},
     "logs": BASE | {"cameras", "vision"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
