@@ -51,11 +51,11 @@ MAY_IMPORT = {
     "several": PLAIN | {"render", "scenes", "store", "frame"},
     "viewer": PLAIN | {"store", "scenes", "effects", "backends", "render", "frame", "vision", "formats"},
     "flights": PLAIN | {"store", "scenes", "render", "vision", "formats", "frame", "provenance"},
-    "remote": BASE | {"provenance", "flights", "render", "vision", "experiments"},
+    "remote": BASE | {"provenance", "flights", "render", "vision", "experiments", "store"},
     "sim": PLAIN | {"batch", "scenes", "markers", "render", "vision", "formats"},
     "logs": BASE | {"cameras", "vision"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
-    "train": PLAIN | {"formats", "markers", "vision", "render", "backends", "effects"},
+    "train": PLAIN | {"formats", "markers", "vision", "render", "backends", "effects", "provenance"},
     "detail": PLAIN | {"store", "render", "backends", "accuracy"},
     "budget": PLAIN | {"store", "scenes", "render", "accuracy", "provenance", "timing"},
 }
