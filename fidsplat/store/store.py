@@ -55,7 +55,7 @@ class Store(Summarised):
         self._columns = self._mapped()
 
     def __reduce__(self):
-        return Store, (str(self.path),)
+        return Store, (str(self.path.absolute()),)
 
     def __len__(self) -> int:
         return self.header.splats

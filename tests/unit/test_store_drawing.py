@@ -187,6 +187,7 @@ def test_a_device_without_room_for_a_view_is_sent_its_chunks_again(stores, monke
     renderer, store = fs.Renderer("opencl"), stores["disks"]
     # two chunks fit, and no picture is put together as a whole
     monkeypatch.setattr(chunks, "_SHARE", renderer.backend.memory_budget // 8000)
+    monkeypatch.setattr(chunks, "_WHOLE", renderer.backend.memory_budget // 8000)
     resident, outputs = renderer.upload(store), ("rgb", "splat_id")
     for camera in (look(), look(turn=TURNED)):
         ours, whole = (renderer.render(each, camera, outputs) for each in (resident, store.cloud()))

@@ -20,7 +20,9 @@ from fidsplat.backends.opencl.program import build
 from fidsplat.backends.opencl.workspace import Workspace
 
 _SHARE = 4
-"""the cache takes at most this part of the memory budget, and what a picture is drawn of as much again"""
+"""the cache takes at most this part of the memory budget"""
+_WHOLE = 3
+"""and what a picture is drawn of at most this, if it is put together as a whole"""
 _FIRST_SLOTS = 16
 _LAUNCH = 1 << 15
 """chunks of a launch: what every device takes as the second dimension of one"""
@@ -198,7 +200,7 @@ class GatheredChunks:
         self._buffers: dict[str, cl.Buffer] = {}
         total, widest = self.count * sum(cache.widths.values()), self.count * max(cache.widths.values())
         self.streamed = (
-            total > workspace.memory_budget // _SHARE or widest > workspace.device.max_mem_alloc_size
+            total > workspace.memory_budget // _WHOLE or widest > workspace.device.max_mem_alloc_size
         )
 
     def bytes_for(self, names: Iterable[str]) -> tuple[int, int]:
