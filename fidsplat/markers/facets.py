@@ -21,8 +21,8 @@ from fidsplat.splats import SplatCloud
 DISH = 0.005
 """by how much the middles of the dish's longest edges lie before its middle, in those edges"""
 RIM = (0.3, 1.5)
-"""modules from the sheet's edge at which its two outermost rings of modules are cut: small facets reach little
-outside, dark ones behind a quiet zone of one module too"""
+"""modules from the sheet's edge at which its two outermost rings of modules are cut: small facets reach
+little outside, dark ones behind a quiet zone of one module too"""
 SIGMA = 0.9
 """standard deviation of a facet's Gaussians, in its widths"""
 COPIES = 3
