@@ -100,6 +100,8 @@ def measure(store: fs.Store, renderer: fs.Renderer, asked) -> list[dict]:
     rows, streamed = [], Streamed([store])
     width, height = map(int, asked.size.split("x"))
     for name, camera in views(store, (width, height)).items():
+        if name not in asked.views:
+            continue
         exact = None
         for error in ("standard", 0.0, *asked.errors):
             quality = fs.Quality()
@@ -133,6 +135,7 @@ def main() -> None:
     parser.add_argument("--places", type=int, nargs="+", default=[1, 5, 50])
     parser.add_argument("--errors", type=float, nargs="+", default=[1 / 255, 4 / 255])
     parser.add_argument("--exact", type=float, default=1e8, help="most splats in sight that are drawn")
+    parser.add_argument("--views", nargs="+", default=["all", "roofs", "street"], help="of these three")
     parser.add_argument("--path", type=int, default=0, help="views of a path, for each error")
     parser.add_argument("--measured", type=int, default=8, help="views that errors are measured with")
     parser.add_argument("--size", default="1920x1080")

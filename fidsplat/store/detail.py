@@ -12,7 +12,7 @@ from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
 
 FILE = "detail.json"
-MARGIN = 2.0
+MARGIN = 1.5
 """how many times below the error that is asked for the largest measured one must lie: that of other views is
 a little larger"""
 

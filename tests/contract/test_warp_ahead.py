@@ -1,9 +1,13 @@
 """Warp's pictures that are drawn without waiting for what their lists take: CUDA's, here on the CPU too."""
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 
 import fidsplat as fs
+from fidsplat.backends.prepare import prepare
 from fidsplat.hard_cases.derivatives import random_picture
 
 BACKEND = "warp"
@@ -90,3 +94,21 @@ def test_a_budget_without_room_is_waited_for(renderer, ahead):
     finally:
         ahead.pair_budget = before
     assert np.array_equal(frame["rgb"], waiting(renderer, [CAPTURE.camera])[0]["rgb"])
+
+
+def test_images_that_nobody_reads_leave_at_once(ahead):
+    """A loop that draws and never looks takes no more of the device."""
+    resident = ahead.upload(CLOUD)
+    features, view = prepare(resident, CAPTURE)
+    pipeline = ahead.pipeline(features)
+    pipeline.render(resident, view)
+    images = pipeline.render(resident, view)
+    assert images.settle
+    array = weakref.ref(images.arrays["rgb"])
+    gc.disable()
+    try:
+        images = pipeline.render(resident, view)  # whose launches take the place of the others'
+        assert array() is None
+    finally:
+        gc.enable()
+    assert images.settle

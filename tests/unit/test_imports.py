@@ -55,7 +55,7 @@ MAY_IMPORT = {
     "sim": PLAIN | {"batch", "scenes", "markers", "render", "vision", "formats"},
     "logs": BASE | {"cameras", "vision"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
-    "train": PLAIN | {"formats", "markers", "vision", "render", "backends", "effects"},
+    "train": PLAIN | {"formats", "markers", "vision", "render", "backends", "effects", "provenance"},
     "detail": PLAIN | {"store", "render", "backends", "accuracy"},
     "budget": PLAIN | {"store", "scenes", "render", "accuracy", "provenance", "timing"},
 }
