@@ -117,6 +117,13 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     declared = Declarations(layouts, features, at_once)
     files = [layout.file for layout in layouts.values() if layout.file]
     files.append(LAYOUTS["resolve_pixel"].file)
+    # 3D Gaussians may be drawn by a picture that is larger than they
+    if (
+        shape.schedule == "lanes"
+        and {"camera_pinhole", "lowpass_screen"} <= layouts.keys()
+        and "thickness" not in layouts
+    ):
+        files.append(LAYOUTS["away"].file)
     if at_once:
         files.append(LAYOUTS["resolve_at_once"].file)
     if shape.lists == "tiled":
