@@ -61,7 +61,7 @@ kernel void project(
     real3_ mean = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
     real3_ p = rotate_to_camera(view, mean);
     p.x += view->translation[0]; p.y += view->translation[1]; p.z += view->translation[2];
-//@@ away
+//@@ beside
     wide log_opacity = (wide)log((real)opacities[i]);
     wide half_r2 = log_opacity - (wide)view->log_cut;
     if (!(half_r2 > 0.0f)) return;

@@ -123,7 +123,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         and {"camera_pinhole", "lowpass_screen"} <= layouts.keys()
         and "thickness" not in layouts
     ):
-        files.append(LAYOUTS["away"].file)
+        files.append(LAYOUTS["beside"].file)
     if at_once:
         files.append(LAYOUTS["resolve_at_once"].file)
     if shape.lists == "tiled":
@@ -149,7 +149,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
 
 
 def _at_once(features: FeatureSet, shape: DeviceShape, layouts: Mapping[str, Layout]) -> bool:
-    """Whether a GPU's work-item that has drawn a pixel resolves it too, which saves a launch: where a pixel is one
+    """Whether who has drawn a pixel on a GPU resolves it too, which saves a launch: where a pixel is one
     sample of one pose, and nothing but blending adds to it."""
     alone = features.samples == 1 and "background_constant" in layouts and "rays" not in layouts
     return shape.schedule == "group" and alone and not any(name.startswith("shutter_") for name in layouts)

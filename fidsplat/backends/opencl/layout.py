@@ -265,7 +265,7 @@ LAYOUTS: dict[str, Layout] = {
     "shutter_rows": Layout("slot/shutter_rows.cl"),
     "blend_double": Layout(),
     # what several of them share
-    "away": Layout("part/away.cl"),
+    "beside": Layout("part/beside.cl"),
     "conic": Layout("part/conic.cl"),
     "perspective": Layout("part/perspective.cl"),
     "polygon": Layout("part/polygon.cl"),

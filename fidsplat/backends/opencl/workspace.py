@@ -44,7 +44,8 @@ class BufferPool:
     def __init__(self, context: cl.Context, device: cl.Device) -> None:
         self._context = context
         self._device = device
-        # NumPy asks for large pages, OpenCL's drivers do not: what lies anywhere is then found without a walk through tables
+        # NumPy asks for large pages, PoCL does not: records that lie anywhere are then found without a walk
+        # through the tables of pages
         self._in_large_pages = bool(device.type & cl.device_type.CPU) and bool(device.host_unified_memory)
         self._buffers: dict[str, cl.Buffer] = {}
         self._contents: dict[str, weakref.ref[np.ndarray]] = {}
@@ -152,7 +153,7 @@ class BufferPool:
                 flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
                 return DeviceBuffer(self._context, flags, hostbuf=memory[start : start + size])
             return DeviceBuffer(self._context, cl.mem_flags.READ_WRITE, max(size, _LEAST))
-        except cl.Error as error:
+        except (cl.Error, MemoryError) as error:
             raise DeviceError(f"no memory for {name} ({size / 2**20:.0f} MiB): {error}") from error
 
 
