@@ -87,7 +87,7 @@ def main() -> None:
     given = parser.parse_args()
     renderer = fs.Renderer(given.device)
     if not isinstance(renderer.backend, Differentiates):
-        raise InputError(f"{given.device} has no derivatives; use an OpenCL device")
+        raise InputError(f"{given.device} has no derivatives; use an OpenCL or a Warp device")
     backend = renderer.backend
     if given.time:
         rows = [times(backend, scene, given.quality, given.repeats) for scene in given.time]

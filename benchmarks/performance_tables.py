@@ -186,6 +186,7 @@ def peer_batches(pair: tuple[dict, dict]) -> dict[str, str]:
         "peer, its outputs": f"{its['renderer']}: {', '.join(its['outputs'])}",
         "its us per view": ms(its["us_per_view"]),
         "our outputs": ", ".join(ours["outputs"]),
+        "our constants": ours.get("constants", "batches.py's"),
         "our us per view": ms(ours["us_per_view"]),
         "its / ours": f"{its['times_ours']:.3g}",
         "PSNR of the two pictures": f"{its['psnr_same_constants_db']:.1f} dB",

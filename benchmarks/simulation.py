@@ -56,7 +56,7 @@ def readings(renderer: fs.Renderer, count: int) -> list[Reading]:
 
 
 def environments_a_second(
-    renderer: fs.Renderer, count: int, side: int, splats: int, repeats: int
+    renderer: fs.Renderer, count: int, side: int, splats: int, repeats: int, quality: str
 ) -> dict[str, float]:
     """The median of steps in which every environment's tag has moved: a second, and a second that the process
     had of a core, which on a busy machine tells more, rgb on the host; and a second, rgb left on the device.
@@ -64,7 +64,8 @@ def environments_a_second(
     room = random_splats(splats, 3, depth=(2.0, 6.0), scale=(0.02, 0.2), across=1.5)
     tag = PlacedMarker(fs.marker("apriltag:36h11:5", size=0.5), rigid_matrix((0, 0, 0)))
     camera = fs.Camera.look_at(side, side, math.radians(60), (0, 0, 0), (0, 0, 1))
-    rig = Rig(fs.Scene((room.with_labels(0),), markers=(tag,)), {1: "tag"}, {"c": camera}, renderer=renderer)
+    scene = fs.Scene((room.with_labels(0),), markers=(tag,), quality=quality)
+    rig = Rig(scene, {1: "tag"}, {"c": camera}, renderer=renderer)
     rng = np.random.default_rng(1)
     seconds: list[tuple[float, float, float]] = []
     for _ in range(repeats + 1):
@@ -89,13 +90,16 @@ def main() -> int:
     parser.add_argument("--environments", type=int, default=64)
     parser.add_argument("--side", type=int, default=128, help="pixels")
     parser.add_argument("--splats", type=int, default=2000, help="of the room that environments share")
+    parser.add_argument("--quality", default="standard", help="of environments: standard,order=centre ...")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--json", default=None, help="file for the figures")
     asked = parser.parse_args()
     renderer = fs.Renderer(asked.device)
     read = [one for one in readings(renderer, asked.tags) if one.position_error is not None]
     errors = np.array([(one.position_error, one.angle_error, one.corner_error) for one in read], float)
-    rates = environments_a_second(renderer, asked.environments, asked.side, asked.splats, asked.repeats)
+    rates = environments_a_second(
+        renderer, asked.environments, asked.side, asked.splats, asked.repeats, asked.quality
+    )
     facts = {
         "run": run_facts(renderer.device.title, 0),
         "tags": asked.tags,
@@ -108,6 +112,7 @@ def main() -> int:
         "environments": asked.environments,
         "side": asked.side,
         "splats": asked.splats,
+        "quality": asked.quality,
         **rates,
     }
     if asked.json:

@@ -4,9 +4,11 @@
 
 Builds a city once (`fidsplat.store.city`; under --folder it is kept), measures its levels of detail, and
 places it on a grid. For each number of places a camera comes down from where all is in the picture to a
-street. Of each view and allowed error: seconds of the first frame and of one more, splats and nodes that it
-is drawn of, of how many; its largest difference from the exact picture, where that is drawn: of scenes of at
-most --exact splats in sight; what the device holds, and the process's peak memory.
+street. Of each view and allowed error: seconds of the first frame, of the next view, 1 % of its distance
+further, and of that once more; splats and nodes that it is drawn of, of how many; its largest difference from
+the exact picture, where that is drawn: of scenes of at most --exact splats in sight; what the device holds,
+and the process's peak memory. With --path also the milliseconds of so many views from the first to the last,
+each once. `standard` are exact pictures at the default quality, which leave out what lies beside the picture.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from __future__ import annotations
 import math
 import resource
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -52,16 +55,44 @@ def views(store: fs.Store, size: tuple[int, int]) -> dict[str, fs.Camera]:
     return {name: fs.Camera.look_at(*size, math.radians(60), at[name], towards[name]) for name in at}
 
 
+def further(camera: fs.Camera) -> fs.Camera:
+    """The camera moved by 1 % of its distance from the ground."""
+    pose = camera.world_to_camera.copy()
+    pose[0, 3] += 0.01 * abs(camera.position[1])
+    return replace(camera, world_to_camera=pose, position=None)
+
+
 def timed(renderer: fs.Renderer, resident, capture: fs.Capture) -> tuple[np.ndarray, list[float], dict]:
-    """A picture, seconds of its first frame and of one more, and its counts."""
-    seconds, frame, picture = [], None, np.empty(0)
-    for _ in range(2):
+    """A picture; seconds of it, of the next view and of that once more; and its counts."""
+    seconds, pictures, frame = [], [], None
+    next_view = capture.with_(camera=further(capture.camera))
+    for one in (capture, next_view, next_view):
         begun = time.perf_counter()
-        frame = renderer.render(resident, capture)
-        picture = frame["rgb"]
+        frame = renderer.render(resident, one)
+        pictures.append(frame["rgb"])
         seconds.append(time.perf_counter() - begun)
     assert frame is not None
-    return picture, seconds, dict(frame.stats)
+    return pictures[0], seconds, dict(frame.stats)
+
+
+def along(store: fs.Store, renderer: fs.Renderer, asked, error: float) -> dict:
+    """Milliseconds of each view of a path from above all to the street."""
+    width, height = map(int, asked.size.split("x"))
+    size = width, height
+    places = [camera.position for camera in views(store, size).values()]
+    towards = np.mean(store.bounds(), axis=0)
+    shares = np.linspace(0, len(places) - 1, asked.path)
+    steps = np.column_stack([np.interp(shares, range(len(places)), axis) for axis in np.transpose(places)])
+    quality = fs.Quality(lowpass="pixel", alpha_cutoff=TRUTH_CUTOFF, detail_error=error)
+    cameras = [fs.Camera.look_at(*size, math.radians(60), at, towards) for at in steps]
+    made, begun = [], time.perf_counter()
+    for frame in renderer.render_views(renderer.upload(store), cameras, quality=quality):
+        _ = frame["rgb"]
+        made.append((1e3 * (time.perf_counter() - begun), frame.stats["splats"]))
+        begun = time.perf_counter()
+    times, splats = np.transpose(made)
+    PROGRESS.print(f"path, {error:.4f}: median {np.median(times):.0f} ms, largest {times.max():.0f} ms")
+    return {"error": error, "splats": len(store), "ms": times.tolist(), "drawn": splats.tolist()}
 
 
 def measure(store: fs.Store, renderer: fs.Renderer, asked) -> list[dict]:
@@ -69,9 +100,13 @@ def measure(store: fs.Store, renderer: fs.Renderer, asked) -> list[dict]:
     rows, streamed = [], Streamed([store])
     width, height = map(int, asked.size.split("x"))
     for name, camera in views(store, (width, height)).items():
+        if name not in asked.views:
+            continue
         exact = None
-        for error in (0.0, *asked.errors):
-            quality = fs.Quality(lowpass="pixel", alpha_cutoff=TRUTH_CUTOFF, detail_error=error)
+        for error in ("standard", 0.0, *asked.errors):
+            quality = fs.Quality()
+            if error != "standard":
+                quality = fs.Quality(lowpass="pixel", alpha_cutoff=TRUTH_CUTOFF, detail_error=error)
             capture = fs.Capture(camera, quality=quality)
             features, view = prepare(streamed, capture)
             begun = time.perf_counter()
@@ -84,12 +119,12 @@ def measure(store: fs.Store, renderer: fs.Renderer, asked) -> list[dict]:
                 resident = renderer.upload(store)
                 picture, row["s"], row["stats"] = timed(renderer, resident, capture)
                 row["device_bytes"] = resident.memory_bytes
-                exact = picture if not error else exact
-                if error and exact is not None:
+                exact = picture if error == 0 else exact
+                if exact is not None:
                     row["off"] = float(np.abs(picture - exact).max())
             row["peak_bytes"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
             rows.append(row)
-            PROGRESS.print(f"{len(store):,} {name} {error:.4f}: {seen:,} splats, {row.get('s')}")
+            PROGRESS.print(f"{len(store):,} {name} {error}: {seen:,} splats, {row.get('s')}")
     return rows
 
 
@@ -100,6 +135,8 @@ def main() -> None:
     parser.add_argument("--places", type=int, nargs="+", default=[1, 5, 50])
     parser.add_argument("--errors", type=float, nargs="+", default=[1 / 255, 4 / 255])
     parser.add_argument("--exact", type=float, default=1e8, help="most splats in sight that are drawn")
+    parser.add_argument("--views", nargs="+", default=["all", "roofs", "street"], help="of these three")
+    parser.add_argument("--path", type=int, default=0, help="views of a path, for each error")
     parser.add_argument("--measured", type=int, default=8, help="views that errors are measured with")
     parser.add_argument("--size", default="1920x1080")
     parser.add_argument("--folder", default="fidsplat-stores", help="where stores are kept")
@@ -116,23 +153,25 @@ def main() -> None:
     store = fs.Store(path)
     if not store.details:
         measure_detail(store, renderer, asked.measured)
-    rows = []
+    rows, paths = [], []
     about = {**facts(renderer), "built": built, "bytes": store.nbytes, "size": asked.size}
     about["details"] = [vars(one) for one in store.details]
     for places in asked.places:
-        rows += measure(placed(store, city, places, folder), renderer, asked)
-        keep({**about, "rows": rows}, asked.json)
+        whole = placed(store, city, places, folder)
+        rows += measure(whole, renderer, asked)
+        paths += [along(whole, renderer, asked, error) for error in asked.errors if asked.path]
+        keep({**about, "rows": rows, "paths": paths}, asked.json)
     show(
         f"{about['device']}, {asked.size}",
-        ("splats", "view", "error allowed", "drawn", "first [s]", "next [s]", "off by", "device", "peak"),
+        ("splats", "view", "error", "drawn", "first [s]", "next [s]", "same [s]", "off by", "device", "peak"),
         (
             (
                 f"{row['splats']:,}",
                 row["view"],
-                f"{row['error']:.4f}",
+                f"{row['error']:.4}",
                 f"{row['drawn']:,}",
                 *(f"{value:.2f}" for value in row.get("s", ())),
-                *([] if "s" in row else ["-", "-"]),
+                *([] if "s" in row else ["-", "-", "-"]),
                 f"{row['off']:.4f}" if "off" in row else "-",
                 f"{row.get('device_bytes', 0) / 2**30:.2f} GiB",
                 f"{row['peak_bytes'] / 2**30:.2f} GiB",

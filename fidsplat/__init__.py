@@ -40,6 +40,7 @@ _HOME = {
     "build_store": "fidsplat.store.build",
     "place_store": "fidsplat.store.places",
     "Renderer": "fidsplat.render",
+    "SeveralDevices": "fidsplat.several",
     "Frame": "fidsplat.frame",
     "FrameBatch": "fidsplat.batch",
     "devices": "fidsplat.backends",

@@ -12,7 +12,7 @@ from fidsplat.backends.base import BatchImages, GivesArrays, Images, Waits
 from fidsplat.backends.blank import blank
 from fidsplat.effects import OUTPUTS
 from fidsplat.errors import InputError, MissingOutputError
-from fidsplat.frame import Frame, check_process, numbered, refuse_numbered
+from fidsplat.frame import Frame, Ids, check_process, numbered, refuse_numbered
 
 
 class FrameBatch(Mapping):
@@ -23,7 +23,7 @@ class FrameBatch(Mapping):
     and 0 in all else. View i has the bits that `Renderer.render` gives it alone.
     """
 
-    def __init__(self, images: BatchImages, outputs: tuple[str, ...], ids: np.ndarray | None = None) -> None:
+    def __init__(self, images: BatchImages, outputs: tuple[str, ...], ids: Ids = None) -> None:
         """ids: as those of a Frame."""
         self._images, self._process, self._ids = images, os.getpid(), ids
         self._arrays: dict[str, np.ndarray] = {}

@@ -10,13 +10,13 @@ import inspect
 import io
 import operator
 import os
-import signal
 import sys
-import threading
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any
+
+from fidsplat.interrupts import Terminated, raised_in_time
 
 ABOUT = """Fiducial markers made of 2D Gaussian splats: make them, set them in scenes, draw them, read them
 back.
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
     try:
-        with warnings.catch_warnings(), _sigterm_raises():
+        with warnings.catch_warnings(), raised_in_time():
             warnings.showwarning = _show_warning
             status = _parse(words).run()
         sys.stdout.flush()
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as stop:
         if not debug:  # what was stopped while it was made may complain when it is thrown away
             sys.unraisablehook = lambda _: None
-        return _fail(*(("terminated", 143) if isinstance(stop, _Terminated) else ("interrupted", 130)))
+        return _fail(*(("terminated", 143) if isinstance(stop, Terminated) else ("interrupted", 130)))
     except BrokenPipeError:
         _drop_output()  # whoever read it has gone; nothing is left to say to them
         return 1
@@ -106,25 +106,6 @@ def _drop_output() -> None:
     """Say no more on stdout, not even by Python at its end."""
     with contextlib.suppress(OSError, ValueError):  # what has no descriptor is not flushed there either
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-class _Terminated(KeyboardInterrupt):
-    """SIGTERM, which stops a command where it stands as Ctrl-C does: half-written files are removed."""
-
-
-@contextlib.contextmanager
-def _sigterm_raises() -> Iterator[None]:
-    def stop(*_: object) -> None:
-        raise _Terminated
-
-    if threading.current_thread() is not threading.main_thread():  # only that one may handle signals
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _parse(words: list[str]):

@@ -80,7 +80,7 @@ def errors_of(
     store: Store, renderer: Renderer, capture: Capture, sizes: Sequence[float], level: int
 ) -> list[float | None]:
     """The largest difference of rgb from the exact picture for each size [samples], rising, with nodes up to
-    a level; None where no cells are merged that smaller sizes would leave apart."""
+    a level; None where no cells are merged that smaller sizes would leave apart, or none that shows."""
     streamed = Streamed([store])
     features, view = prepare(streamed, capture)
     before, exact = streamed.select([view], features), None
@@ -92,9 +92,10 @@ def errors_of(
         if selection == before:
             continue
         if exact is None:
-            exact = renderer.render(streamed.part(whole)[0], capture)["rgb"].astype(np.float64)
-        picture = renderer.render(streamed.part(selection)[0], capture)["rgb"]
-        worst[number], before = float(np.abs(picture - exact).max()), selection
+            exact = renderer.render(streamed.part(whole), capture)["rgb"].astype(np.float64)
+        picture = renderer.render(streamed.part(selection), capture)["rgb"]
+        # what is merged where nobody sees it says nothing about this size
+        worst[number], before = float(np.abs(picture - exact).max()) or None, selection
     return worst
 
 

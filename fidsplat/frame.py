@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.base import GivesArrays, Images, Waits
+from fidsplat.backends.base import GivesArrays, Images, ReadsRows, Waits
 from fidsplat.errors import InputError, MissingOutputError
+
+Ids = Callable[[], np.ndarray] | None
+"""gives the indices (n,) int32 of the splats that were drawn in the whole scene; None: these themselves"""
 
 
 class Frame(Mapping):
@@ -24,9 +27,8 @@ class Frame(Mapping):
     `Quality.first_hit`, labels and ids are -1, the others of these 0.
     """
 
-    def __init__(self, images: Images, outputs: tuple[str, ...], ids: np.ndarray | None = None) -> None:
-        """ids: (n,) int32, the indices that `splat_id` shows for those of the splats that were drawn; None:
-        these themselves."""
+    def __init__(self, images: Images, outputs: tuple[str, ...], ids: Ids = None) -> None:
+        """ids: the indices that `splat_id` shows for those of the splats that were drawn."""
         self._images, self._process, self._ids = images, os.getpid(), ids
         self._arrays: dict[str, np.ndarray] = {}
         self.outputs = outputs
@@ -148,6 +150,20 @@ class Frame(Mapping):
             self._images.wait()
         return self
 
+    def read_rows(self, name: str, first: int, end: int, into: np.ndarray | None = None) -> np.ndarray:
+        """An array for an output, `into` or a new one, in which rows of pixels [first, end) are those of the
+        picture: they alone are copied where the device can do that."""
+        self._check(name)
+        if not isinstance(self._images, ReadsRows):
+            into = np.empty_like(self[name]) if into is None else into
+            into[first:end] = self[name][first:end]
+            return into
+        into = self._images.empty(name) if into is None else into
+        self._images.read_rows(name, first, end, into)
+        if name == "splat_id":
+            into[first:end] = numbered(name, into[first:end], self._ids)
+        return into
+
     @property
     def timings(self) -> Mapping[str, float]:
         """Milliseconds on the device by stage: project, sort, bin, blend, resolve.
@@ -179,14 +195,14 @@ def _kept_frame(arrays: dict[str, np.ndarray], timings: dict[str, float], stats:
     return Frame(_KeptImages(arrays, timings, stats), tuple(arrays))
 
 
-def numbered(name: str, image: np.ndarray, ids: np.ndarray | None) -> np.ndarray:
+def numbered(name: str, image: np.ndarray, ids: Ids) -> np.ndarray:
     """An image with the whole scene's indices (n,) in the place of those of its part; -1 stays."""
     if name != "splat_id" or ids is None:
         return image
-    return np.append(ids, np.int32(-1))[image]
+    return np.append(ids(), np.int32(-1))[image]
 
 
-def refuse_numbered(name: str, ids: np.ndarray | None) -> None:
+def refuse_numbered(name: str, ids: Ids) -> None:
     """Raises InputError for indices of a part on a device, which the whole's are not."""
     if name == "splat_id" and ids is not None:
         raise InputError(

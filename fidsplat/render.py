@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -25,8 +26,9 @@ from fidsplat.backends.view import NO_CAMERA, View
 from fidsplat.batch import FrameBatch, ViewByView
 from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.capture import Capture, output_names
+from fidsplat.effects import FeatureSet
 from fidsplat.errors import InputError, unknown
-from fidsplat.frame import Frame, check_process
+from fidsplat.frame import Frame, Ids, check_process
 from fidsplat.quality import Quality, whole_number
 from fidsplat.scenes import Scene
 from fidsplat.sensor import Sensor
@@ -77,6 +79,20 @@ class ResidentCloud:
     def labels(self) -> frozenset[int] | None:
         """The labels that its splats have; None where they are on the device, or on disk."""
         return None if self._labels is None else frozenset(np.unique(self._labels).tolist())
+
+    @property
+    def _whole(self) -> Any:
+        """What a capture is prepared for: all splats, wherever they are."""
+        return self._data.scene if isinstance(self._data, Residency) else self._data
+
+    def _seen(
+        self, views: Iterable[View], features: FeatureSet, qualities: Iterable[Quality]
+    ) -> tuple[Any, Ids]:
+        """The splats on the device that these views are drawn from, and their indices in the whole where
+        these are not their own."""
+        if isinstance(self._data, Residency):
+            return self._data.of(list(views), features, qualities)
+        return self._data, None
 
 
 class Renderer:
@@ -236,6 +252,27 @@ class Renderer:
 
         return self._draw(self._resident(scene), asked, draw)
 
+    def render_band(
+        self,
+        band: tuple[int, int],
+        scene: Scene | SplatCloud | Store | ResidentCloud,
+        capture: Capture | Camera | None = None,
+        outputs: Iterable[str] | None = None,
+        quality: Quality | str | None = None,
+    ) -> Frame:
+        """A picture of which rows of pixels [first, end) alone are wanted: they have the bits of the whole
+        picture, and of the other rows nothing is promised. `fs.SeveralDevices` puts pictures together so.
+
+        Raises:
+            InputError: as `render`; rows that the picture does not have.
+        """
+        asked = _asked(scene, capture, None, outputs, quality, *[None] * 5)
+        rows = asked.camera.height if asked.camera is not None else 0
+        first, end = band
+        whole_number("the first row of a band", first, 0, rows - 1)
+        whole_number("the end of a band", end, first + 1, rows)
+        return self._draw(self._resident(scene), asked, band=band)
+
     def render_views(
         self,
         scene: Scene | SplatCloud | Store | ResidentCloud,
@@ -331,13 +368,10 @@ class Renderer:
                     )
 
     def _draw_batch(self, resident: ResidentCloud, views: Views) -> FrameBatch:
-        whole = resident._data
-        features, batch = prepare_batch(whole.scene if isinstance(whole, Residency) else whole, views)
+        features, batch = prepare_batch(resident._whole, views)
         with self._lock:
-            data, ids = whole, None
-            if isinstance(whole, Residency):
-                drawn = [batch.one(number) for number in range(len(batch.slots))]
-                data, ids = whole.of(drawn, features, [capture.quality for capture in views.captures])
+            drawn = (batch.one(number) for number in range(len(batch.slots)))
+            data, ids = resident._seen(drawn, features, (capture.quality for capture in views.captures))
             pipeline = self.backend.pipeline(features)
             if isinstance(pipeline, DrawsBatches):
                 images = pipeline.render_batch(data, batch)
@@ -362,13 +396,13 @@ class Renderer:
         draw: Callable[[Pipeline, Any, View], Images] = lambda pipeline, data, view: pipeline.render(
             data, view
         ),
+        band: tuple[int, int] | None = None,
     ) -> Frame:
-        whole = resident._data
-        features, view = prepare(whole.scene if isinstance(whole, Residency) else whole, capture)
+        features, view = prepare(resident._whole, capture)
+        if band is not None:
+            view = replace(view, band=(band[0] * view.samples, band[1] * view.samples))
         with self._lock:  # scratch buffers and kernels' arguments belong to one picture at a time
-            data, ids = whole, None
-            if isinstance(whole, Residency):
-                data, ids = whole.of([view], features, [capture.quality])
+            data, ids = resident._seen([view], features, [capture.quality])
             return Frame(draw(self.backend.pipeline(features), data, view), capture.outputs, ids)
 
 

@@ -15,6 +15,8 @@ from fidsplat.backends.reference.backend import ReferencePipeline
 
 THRESHOLDS = 2e-5, 1e-3, 0.05
 """the tolerance of colours, a quarter of an 8-bit step, and what a thousandth of a picture may exceed"""
+FILES = 5
+"""that have a row of their own"""
 _found = defaultdict(lambda: np.zeros(2 + len(THRESHOLDS), int))
 """pictures, pixels, pixels above each threshold, by the file of the test"""
 
@@ -60,16 +62,27 @@ def pytest_terminal_summary(terminalreporter, config):
 
 
 def table(file):
-    """Markdown, of what each process has written."""
-    total = defaultdict(lambda: np.zeros(2 + len(THRESHOLDS), int))
+    """Markdown, of what each process has written: by folder, and the files with most above the second
+    threshold."""
+    files, folders = (defaultdict(lambda: np.zeros(2 + len(THRESHOLDS), int)) for _ in range(2))
     for line in file.read_text("utf-8").splitlines():
         for name, counts in json.loads(line).items():
-            total[name] += counts
-            total["all"] += counts
+            files[name.removeprefix("tests/")] += counts
+    for name, counts in files.items():
+        folders[name.rpartition("/")[0]] += counts
+    widest = sorted(files, key=lambda name: files[name][3] / max(files[name][1], 1), reverse=True)[:FILES]
     heads = "".join(f" above {threshold:g} |" for threshold in THRESHOLDS)
-    rows = [f"| tests | pictures | pixels |{heads}", "|---|" + "---|" * (2 + len(THRESHOLDS))]
-    for name in sorted(total, key=lambda name: (name == "all", name)):
-        pictures, pixels, *above = total[name].tolist()
-        shares = "".join(f" {count / max(pixels, 1):.4%} |" for count in above)
-        rows.append(f"| {name.removeprefix('tests/')} | {pictures} | {pixels:,} |{shares}")
+    rows = [
+        f"| certificates | pictures | pixels |{heads}",
+        "|---|" + "---|" * (2 + len(THRESHOLDS)),
+        *(_row(name, folders[name]) for name in sorted(folders)),
+        *(_row(name, files[name]) for name in widest),
+        _row("all", sum(folders.values(), np.zeros(2 + len(THRESHOLDS), int))),
+    ]
     return "\n".join(rows)
+
+
+def _row(name, counts):
+    pictures, pixels, *above = counts.tolist()
+    shares = "".join(f" {count / max(pixels, 1):.4%} |" for count in above)
+    return f"| {name} | {pictures:,} | {pixels:,} |{shares}"

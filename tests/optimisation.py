@@ -25,12 +25,20 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     if not config.getoption("--optimised") and not _has_gpu():
-        os.environ.update(_OPENCL)
-        if runtime.installed():
-            config = runtime.load().config
-            # and without its thresholds for inlining. Level 0 compiles in yet half the time, but there
-            # a picture of 320 x 240 pixels takes 3 s
-            config.optimization_level, config.cpu_compiler_flags = 1, "-march=native"
+        hardly()
+
+
+def hardly() -> None:
+    """From now on this process compiles with hardly any optimisation."""
+    os.environ.update(_OPENCL)
+    if runtime.installed():
+        config = runtime.load().config
+        # and without its thresholds for inlining. Level 0 compiles in yet half the time, but there a picture
+        # of 320 x 240 pixels takes 3 s
+        config.optimization_level, config.cpu_compiler_flags = 1, "-march=native"
+        # so 0 is for what runs once per splat, a third of all that is compiled
+        project = runtime.kernels("project")
+        project.STRICT = {**project.STRICT, "optimization_level": 0}
 
 
 def pytest_collection_finish():

@@ -11,10 +11,10 @@
 What was found stands in mutations.jsonl, a line for each plant, and is not run again (but with --again), so
 that a run that was stopped goes on where it was. Each file's first plants come first. A plant is caught when
 a test fails, crashes, or hangs, and that test passes without the plant; a test that fails then too is passed
-over. A plant is first shown to the test that caught it before, then to those that it names itself. The tree
-is copied as a source distribution has it, changes that are not committed among them, and nothing in it is
-touched. All plants take hours on two cores; those of formats, cameras, scenes, markers and splats seconds
-each.
+over. A plant is first shown to the test that caught it before, even if its text has changed since, then to
+those that it names itself. The tree is copied as a source distribution has it, changes that are not committed
+among them, and nothing in it is touched. All plants take hours on two cores; those of formats, cameras,
+scenes, markers and splats seconds each.
 """
 
 from __future__ import annotations
@@ -113,15 +113,17 @@ class Results:
     def __init__(self, file: Path) -> None:
         self._file, self._lock = file, threading.Lock()
         lines = file.read_text("utf-8").splitlines() if file.exists() else []
-        self._known = {row["key"]: row for row in map(json.loads, lines)}
+        rows = [json.loads(line) for line in lines]
+        self._known = {row["key"]: row for row in rows}
+        self._tests = {row["plant"]: row["test"] for row in rows if row["result"] == "caught"}
 
     def of(self, plant: Plant) -> str | None:
         """`caught`, `survived`, `untested`, or None where it has not been run."""
         return self._known.get(plant.key, {}).get("result")
 
     def test_of(self, plant: Plant) -> str | None:
-        """The test that has caught it."""
-        return self._known.get(plant.key, {}).get("test")
+        """The test that has caught it, or what had its name before the text there changed."""
+        return self._tests.get(plant.name)
 
     def add(self, plant: Plant, found: Found) -> None:
         row = {
@@ -130,6 +132,8 @@ class Results:
         }
         with self._lock:
             self._known[plant.key] = row
+            if found.result == "caught":
+                self._tests[plant.name] = found.test
             with self._file.open("a", encoding="utf-8") as stream:
                 stream.write(json.dumps(row) + "\n")
 

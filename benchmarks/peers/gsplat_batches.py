@@ -5,8 +5,10 @@
 
 What it needs, and how constants differ: gsplat_cuda.py. gsplat draws as many cameras in a call of
 `rasterization_2dgs` as is quickest of CAMERAS, colours and what it draws with them in any case, median
-depths among it (its mean depths take longer); it has no labels, which ours draw where the row has them. Its
-images are dropped call by call, ours stay. Both are timed from the first call until the GPU is done.
+depths among it (its mean depths take longer); it has no labels. Ours draw the row's outputs as
+benchmarks/batches.py times them, the same with gsplat's constants and float32 for set-up, as it has, and its
+outputs with these. Its images are dropped call by call, ours stay. All are timed from the first call until
+the GPU is done.
 """
 
 from __future__ import annotations
@@ -32,6 +34,8 @@ CAMERAS = 4, 16, 64, 256
 """in a call of gsplat"""
 SAME = fs.Quality.named("gsplat").with_(opacity_ceiling=0.999)
 """the constants of gsplat 1.5.3"""
+ITS_OUTPUTS = "rgb", "alpha", "normal", "depth_median"
+"""what gsplat draws in any case, by our names"""
 
 
 def on_gpu(array: np.ndarray) -> torch.Tensor:
@@ -72,50 +76,68 @@ def peer(cloud: fs.SplatCloud, capture: fs.Capture, poses: np.ndarray) -> Callab
     return torch.no_grad()(draw)
 
 
-def measure(renderer: fs.Renderer, name: str, repeats: int) -> list[dict]:
-    """The figures of one row, ours and gsplat's, per view."""
-    row = ROWS[name]
-    cloud, capture, poses = scene_of(row)
-    resident, draw = renderer.upload(cloud), peer(cloud, capture, poses)
-    ours = Timer(
-        lambda: renderer.render_batch(resident, capture, poses=poses).wait(),
-        parts=lambda batch: batch.timings,
-    )
-    ours.run(counts=False)
-    by_cameras = {}
+def ways(capture: fs.Capture) -> list[fs.Capture]:
+    """How ours are drawn."""
+    same = capture.with_(quality=SAME.with_(setup_precision="float32"))
+    return [capture, same, same.with_(outputs=ITS_OUTPUTS)]
+
+
+def quickest(draw: Callable[[int], torch.Tensor]) -> dict[int, float]:
+    """Milliseconds of gsplat by how many cameras are in a call, as far as memory goes."""
+    found = {}
     for cameras in CAMERAS:
         try:
             draw(cameras)  # what is made on first use does not count
-            by_cameras[cameras] = Timer(lambda cameras=cameras: draw(cameras)).run()
+            found[cameras] = Timer(lambda cameras=cameras: draw(cameras)).run()
         except torch.cuda.OutOfMemoryError:
             break
         finally:
             torch.cuda.empty_cache()
+    return found
+
+
+def measure(renderer: fs.Renderer, name: str, repeats: int) -> list[dict]:
+    """The figures of one row per view: each of ours, and gsplat's after it."""
+    row = ROWS[name]
+    cloud, capture, poses = scene_of(row)
+    resident, draw = renderer.upload(cloud), peer(cloud, capture, poses)
+    captures = ways(capture)
+    ours = [
+        Timer(lambda taken=taken: renderer.render_batch(resident, taken, poses=poses).wait())
+        for taken in captures
+    ]
+    for timer in ours:
+        timer.run(counts=False)
+    by_cameras = quickest(draw)
     best = min(by_cameras, key=by_cameras.__getitem__)
     theirs = Timer(lambda: draw(best))
-    take_turns([ours, theirs], repeats)
+    take_turns([*ours, theirs], repeats)
     same = renderer.render_batch(resident, capture.with_(quality=SAME, outputs=("rgb",)), poses=poses[:1])
     error = psnr(same["rgb"][0], draw(best).cpu().numpy())
-    shared = {
-        "batch": name,
-        "views": row.views,
-        "splats": row.splats,
-        "width": row.width,
-        "height": row.height,
-    }
-    records = []
-    for timer, who in ((ours, f"fidsplat {fs.__version__}"), (theirs, f"gsplat {gsplat.__version__}")):
+
+    def record(who: str, timer: Timer, outputs: tuple[str, ...]) -> dict:
         low, middle, high = (1e3 * each / row.views for each in timer.quartiles)
-        own = {"renderer": who, "us_per_view": middle, "quartiles_us": [low, high], "repeats": repeats}
-        records.append(shared | own | facts(renderer))
-    records[0]["outputs"] = list(row.outputs)
-    records[1] |= {
-        "outputs": ["rgb", "alpha", "normal", "depth_median"],
+        return {
+            "batch": name,
+            **{what: getattr(row, what) for what in ("views", "splats", "width", "height")},
+            "renderer": who,
+            "us_per_view": middle,
+            "quartiles_us": [low, high],
+            "repeats": repeats,
+            "outputs": list(outputs),
+            **facts(renderer),
+        }
+
+    its = record(f"gsplat {gsplat.__version__}", theirs, ITS_OUTPUTS) | {
         "cameras": best,
         "us_per_view_by_cameras": {each: 1e3 * ms / row.views for each, ms in by_cameras.items()},
-        "times_ours": records[1]["us_per_view"] / records[0]["us_per_view"],
         "psnr_same_constants_db": error,
     }
+    records = []
+    for timer, taken in zip(ours, captures, strict=True):
+        own = record(f"fidsplat {fs.__version__}", timer, taken.outputs)
+        own["constants"] = "its, float32" if taken.quality.setup_precision == "float32" else "batches.py's"
+        records += [own, its | {"times_ours": its["us_per_view"] / own["us_per_view"]}]
     return records
 
 
@@ -139,13 +161,16 @@ def main() -> None:
         return (
             size,
             record["renderer"],
+            record.get("constants", ""),
             ", ".join(record["outputs"]),
             rate,
             "" if times is None else f"{times:.1f}",
         )
 
     show(
-        renderer.device.title, ("views", "renderer", "outputs", "a second", "times ours"), map(cells, records)
+        renderer.device.title,
+        ("views", "renderer", "constants", "outputs", "a second", "times ours"),
+        map(cells, records),
     )
 
 

@@ -146,6 +146,19 @@ class GivesFloat64(Protocol):
 
 
 @runtime_checkable
+class ReadsRows(Protocol):
+    """Images of which some rows can be read alone."""
+
+    def empty(self, name: str) -> np.ndarray:
+        """An array for the whole image."""
+        ...
+
+    def read_rows(self, name: str, first: int, end: int, into: np.ndarray) -> None:
+        """Copies rows of pixels [first, end) of an image, as `read` gives them, to those of such an array."""
+        ...
+
+
+@runtime_checkable
 class DrawsEvery(Protocol):
     """A pipeline that draws pixels one by one: it can leave some out, and say how far it is."""
 

@@ -67,11 +67,16 @@ class TrainingKernels(Protocol):
         ...
 
     def load(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Hold these splats from now on."""
+        """Hold these splats from now on; arrays that are not given stay as they are."""
         ...
 
-    def store(self) -> dict[str, np.ndarray]:
-        """The splats as they are now."""
+    def store(self, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """The splats as they are now; `names`: of the arrays that are wanted."""
+        ...
+
+    def pick(self, rows: np.ndarray, kept: int) -> None:
+        """Hold the splats `rows` (m,) uint32 of those that there are, with nothing remembered of those from
+        `kept` on."""
         ...
 
     def resident(self, degree: int, origin: np.ndarray) -> ResidentData:

@@ -1,6 +1,10 @@
-"""What backends that have derivatives share: the checks of what they are given."""
+"""What backends that have derivatives share: the checks of what they are given; reading what they give."""
 
 from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
 
 from fidsplat.backends.view import View
 from fidsplat.effects import IMAGES
@@ -23,3 +27,12 @@ def check_shape(name: str, given: tuple[int, ...], view: View) -> None:
         raise InputError(
             f"the gradient of {name} has the shape {tuple(given)}; it must be {gradient_shape(name, view)}"
         )
+
+
+def on_host(array: Any) -> np.ndarray:
+    """An array of a device as NumPy's float32, whose memory no later picture changes."""
+    if hasattr(array, "get"):
+        return np.asarray(array.get(), np.float32)
+    if hasattr(array, "numpy"):  # of a wp.array on the CPU that is its own memory
+        return np.array(array.numpy(), np.float32)
+    return np.asarray(array, np.float32)

@@ -132,9 +132,10 @@ def _pinhole_sides(view: View, margin: float) -> tuple[list[tuple[np.ndarray, fl
     """The sides of the picture as half spaces of the camera's frame, normal . p + offset >= 0 within, wider
     by `margin` samples; and the largest factor by which EWA stretches a splat."""
     sides = []
-    grid = ((0, view.focal_x, view.center_x, view.width), (1, view.focal_y, view.center_y, view.height))
-    for axis, focal, center, size in grid:
-        for sign, side in ((1.0, -margin), (-1.0, size + margin)):
+    rows = (0, view.height) if view.band is None else view.band
+    grid = ((0, view.focal_x, view.center_x, (0, view.width)), (1, view.focal_y, view.center_y, rows))
+    for axis, focal, center, (first, end) in grid:
+        for sign, side in ((1.0, first - margin), (-1.0, end + margin)):
             # sign (focal x / z + center - side) >= 0, times z where rays meet
             normal = np.zeros(3)
             normal[axis] = sign * focal

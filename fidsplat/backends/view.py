@@ -80,6 +80,8 @@ class View:
     """(label, the view that its splats have), for splats that move by themselves"""
     shots: tuple[Shot, ...] = ()
     """the sub-pictures of which this picture is made; none: it is one"""
+    band: tuple[int, int] | None = None
+    """rows of samples [first, end) that are wanted, with the bits of the whole; None: all"""
 
     @property
     def lens(self) -> Lens | None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from fidsplat.commands.experiment_files import CATEGORY_HELP, write_report
 from fidsplat.commands.localise import Localise
 from fidsplat.commands.output import Json, console, option, say, switch, tell
+from fidsplat.commands.plants import Plants
 from fidsplat.commands.remote import RayAddress, measure_by
 from fidsplat.commands.sweeps import Names, Overwrite, Seed, need_reports, run_sweeps
 from fidsplat.errors import InputError
@@ -273,6 +274,7 @@ class Experiment:
         "dataset": Dataset,
         "baseline": Baseline,
         "blender": Blender,
+        "plants": Plants,
         "merge": Merge,
         "report": Report,
     }

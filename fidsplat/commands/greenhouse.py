@@ -13,12 +13,13 @@ class Greenhouse:
     """Make a greenhouse of splats: rows of plants on benches under glass, with AprilTags and QR codes.
 
     DIR/greenhouse.toml is a scene for every command, with its splat files; DIR/greenhouse.xml is a MuJoCo
-    model of what a robot collides with. Tomatoes, cucumbers and lettuces are grown from the seed; tags of
-    0.16 m hang on the benches' sides and ends, a QR code above each row.
+    model of what a robot collides with. Tomatoes, cucumbers and lettuces are grown from the seed, or taken
+    from a folder of plants; tags of 0.16 m hang on the benches' sides and ends, a QR code above each row.
 
     Examples:
       fidsplat greenhouse
       fidsplat greenhouse -o small --rows 2 --plants 6 --seed 3
+      fidsplat greenhouse -o real --plants-from plants   of fidsplat experiment plants
       fidsplat render greenhouse/greenhouse.toml
     """
 
@@ -29,13 +30,18 @@ class Greenhouse:
     mixture: Annotated[
         Literal["exact", "fitted", "paper"] | None, option("NAME", "of the markers (default: exact)")
     ] = None
+    plants_from: Annotated[
+        str | None, option("DIR", "KIND-NUMBER.ply to take plants from (default: grown as disks)")
+    ] = None
     overwrite: Annotated[bool, switch("replace the greenhouse that is there")] = False
     json: Json = False
 
     def run(self) -> int:
         from fidsplat.sim.greenhouse import Greenhouse as Made
+        from fidsplat.sim.plants import load_plants
 
-        made = Made(self.rows, self.plants, self.seed, self.mixture)
+        stock = None if self.plants_from is None else load_plants(self.plants_from)
+        made = Made(self.rows, self.plants, self.seed, self.mixture, stock)
         folder = path_of(self.out)
         scene_file, model = folder / "greenhouse.toml", folder / "greenhouse.xml"
         if scene_file.exists() and not self.overwrite:

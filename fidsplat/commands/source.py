@@ -20,8 +20,9 @@ class Source:
     """Print the OpenCL program that a scene calls for, put together of the files of kernels/opencl.
 
     Comments are kept, and #line directives say from which file and line each piece comes; "layout.py: NAME"
-    is what fidsplat/backends/opencl/layout.py declares: structs, and the arguments of kernels. What is
-    compiled is this text without its comments, line for line, so a compiler's messages name the same places.
+    is what layout.py of fidsplat/backends/opencl declares, with what effects add to it: structs, and the
+    arguments of kernels. What is compiled is this text without its comments, line for line, so a compiler's
+    messages name the same places.
     Only what the scene asks for is there: compare two scenes, or two sets of outputs, with diff.
 
     No device is opened and no OpenCL is needed, unless --device asks for the program of one device, with its

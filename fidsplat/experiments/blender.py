@@ -172,44 +172,49 @@ def render(
     Raises InputError when Blender is not installed, DeviceError when it fails; pictures done stay.
     """
     python = ready(view, environment)
-    missing = []
-    for marker in markers:
-        there = [Path(shot["file"]) for shot in marker["shots"] if Path(shot["file"]).is_file()]
-        yield from there
-        left = [shot for shot in marker["shots"] if Path(shot["file"]) not in there]
-        if left:
-            missing.append({**marker, "shots": left})
-    if not missing:
-        return
-    for folder in {Path(shot["file"]).parent for marker in missing for shot in marker["shots"]}:
-        writable_folder(folder)
     job = {
-        "markers": missing,
         "view": view,
         "samples": samples,
         "filter": pixel_filter,
         "threads": threads or os.cpu_count() or 1,
         "background": BACKGROUND,
     }
+    yield from drawn(python, WORKER, markers, job)
+
+
+def drawn(python: Path, worker: Path, things: Iterable[dict], job: dict) -> Iterator[Path]:
+    """Let a worker draw every shot of some things that is not there yet; yields each file as it is done,
+    those that are there first. Raises DeviceError when Blender fails; pictures done stay."""
+    missing = []
+    for thing in things:
+        there = [Path(shot["file"]) for shot in thing["shots"] if Path(shot["file"]).is_file()]
+        yield from there
+        left = [shot for shot in thing["shots"] if Path(shot["file"]) not in there]
+        if left:
+            missing.append({**thing, "shots": left})
+    if not missing:
+        return
+    for folder in {Path(shot["file"]).parent for thing in missing for shot in thing["shots"]}:
+        writable_folder(folder)
     with tempfile.TemporaryDirectory() as work:
         file = Path(work) / "job.json"
-        file.write_text(json.dumps(job), "utf-8")
+        file.write_text(json.dumps({**job, "things": missing}), "utf-8")
         log = Path(work) / "stderr.txt"
         with open(log, "wb") as errors:
-            worker = subprocess.Popen(
-                [str(python), str(WORKER), str(file)],
+            process = subprocess.Popen(
+                [str(python), str(worker), str(file)],
                 stdout=subprocess.PIPE, stderr=errors, text=True, env=_clean_environment(),
             )  # fmt: skip
             try:
-                assert worker.stdout is not None
-                for line in worker.stdout:
+                assert process.stdout is not None
+                for line in process.stdout:
                     if line.startswith("done "):  # Blender says much else
                         yield Path(line.removeprefix("done ").rstrip("\n"))
-                status = worker.wait()
+                status = process.wait()
             finally:
-                if worker.poll() is None:
-                    worker.terminate()
-                    worker.wait()
+                if process.poll() is None:
+                    process.terminate()
+                    process.wait()
         if status:
             lines = log.read_text("utf-8", "replace").strip().splitlines() or ["no message"]
             raise DeviceError(f"Blender stopped with status {status}: {lines[-1]}")

@@ -17,17 +17,22 @@ from mathutils import Matrix  # type: ignore[import-not-found]
 def main(job: dict) -> None:
     """Draw every shot of every marker."""
     scene = prepare(job)
-    for marker in job["markers"]:
+    for marker in job["things"]:
         plane = build(marker, job["view"])
         for shot in marker["shots"]:
-            aim(scene, shot)
-            # a killed run may have left a worker that still draws the same picture
-            part = f"{shot['file']}.{os.getpid()}.part.png"
-            scene.render.filepath = part
-            bpy.ops.render.render(write_still=True)
-            os.replace(part, shot["file"])
-            print("done", shot["file"], flush=True)
+            shoot(scene, shot)
         bpy.data.objects.remove(plane, do_unlink=True)
+
+
+def shoot(scene, shot: dict) -> None:
+    """Draw one picture into its file, and say so."""
+    aim(scene, shot)
+    # a killed run may have left a worker that still draws the same picture
+    part = f"{shot['file']}.{os.getpid()}.part.png"
+    scene.render.filepath = part
+    bpy.ops.render.render(write_still=True)
+    os.replace(part, shot["file"])
+    print("done", shot["file"], flush=True)
 
 
 def prepare(job: dict):

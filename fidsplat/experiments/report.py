@@ -62,7 +62,7 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
         if name in rows:
             context[name] = tables(rows[name], folder)
     if trained.NAME in rows:
-        context[trained.NAME] = _trained(rows[trained.NAME], rows.get(angles.NAME))
+        context[trained.NAME] = _trained(rows[trained.NAME], rows.get(views.NAME), rows.get(angles.NAME))
     sheets = next((found for place in (*folders, folder) if (found := sheet_files(place))), [])
     for sheet in sheets:
         if sheet.parent.resolve() != folder.resolve():
@@ -233,10 +233,11 @@ def _views(rows: Frame, folder: Path) -> dict:
     return {"tables": tables, "views": int(rows["amount"].max()), "rows": len(rows), "measured": measured}
 
 
-def _trained(rows: Frame, scans: Frame | None) -> dict:
+def _trained(rows: Frame, seen: Frame | None, scans: Frame | None) -> dict:
     """The paper's baseline: a row for each category and number of views, the paper's figures beside ours."""
     table = []
     read = {} if scans is None else _read_of(scans)
+    flips = {} if seen is None else _flips(seen)
     for category in category_order(rows["category"]):
         for count in sorted(set(rows["views"])):
             own = rows[(rows["category"] == category) & (rows["views"] == count)]
@@ -251,6 +252,7 @@ def _trained(rows: Frame, scans: Frame | None) -> dict:
                     "markers": own["marker"].nunique(),
                     "PSNR/SSIM, paper": f"{ratio:.1f}/{similar:.2f}",
                     "ours": f"{own['psnr'].mean():.1f}/{own['ssim'].mean():.3f}",
+                    "FLIP": flips.get((category, method), NOTHING),
                     "read to, paper": NOTHING if theirs is None else f"{theirs[1]:.1f}",
                     "read to, ours": read.get((category, method), NOTHING),
                     "read to, training-free": read.get((category, "exact/best"), NOTHING),
@@ -264,7 +266,25 @@ def _trained(rows: Frame, scans: Frame | None) -> dict:
     spread = float((each.max() - each.min()).max()) if seeds > 1 else None
     trainings, iterations = len(rows), int(rows["amount"].max())
     rows = pd.DataFrame(table)
-    return {"rows": rows, "trainings": trainings, "iterations": iterations, "seeds": seeds, "spread": spread}
+    found = {"rows": rows, "trainings": trainings, "iterations": iterations}
+    return found | {"seeds": seeds, "spread": spread, "behind": _behind(rows)}
+
+
+def _behind(table: Frame) -> Frame:
+    """How far reading ends below that of the marker that is not trained: of each category the training that
+    reads furthest."""
+    ours, free = (
+        pd.to_numeric(table[f"read to, {what}"], errors="coerce") for what in ("ours", "training-free")
+    )
+    kinds = table["marker, views"].str.rpartition(", ")
+    rows = pd.DataFrame({"marker": kinds[0], "views": kinds[2], "behind": free - ours}).dropna()
+    return rows.sort_values("behind", kind="stable").drop_duplicates("marker").sort_index()
+
+
+def _flips(seen: Frame) -> dict[tuple[str, str], str]:
+    """FLIP of novel views against what trainings saw, by category and method."""
+    means = seen[seen["truth"] == "exact"].groupby(["category", "method"])["flip"].mean()
+    return {place: fixed(mean, 3) for place, mean in means.items()}
 
 
 def _read_of(scans: Frame) -> dict[tuple[str, str], str]:

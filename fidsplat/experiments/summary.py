@@ -1,7 +1,9 @@
 """Results as tables that are small enough to be kept beside a page: CSV below lines of facts.
 
 A summary has a row for each thing that was measured, with the `amount` of measurements in it and the number
-of the `run` that it is of. The facts of the runs stand first, each in a line that begins with "# ".
+of the `run` that it is of. The facts of the runs stand first, each in a line that begins with "# ", and how
+to read the rest: columns that are `empty`, and those of words that are `repeated` from row to row, where an
+empty cell means what the one above does.
 """
 
 from __future__ import annotations
@@ -47,8 +49,12 @@ class Summary:
         heads: list[dict[str, Any]] = [{"run": run} for run in self.runs]
         heads += [{"note": note} for note in self.notes]
         heads += [{"empty": empty}] if empty else []
-        text = "".join(f"{_MARK}{json.dumps(head)}\n" for head in heads)
         rows = self.rows.drop(columns=empty)
+        repeated = [name for name in rows if _words(rows[name])]
+        heads += [{"repeated": repeated}] if repeated else []
+        for name in repeated:
+            rows[name] = rows[name].mask(rows[name].eq(rows[name].shift()), "")
+        text = "".join(f"{_MARK}{json.dumps(head)}\n" for head in heads)
         text += rows.to_csv(index=False, float_format="%.4g", lineterminator="\n")
         with atomic_write(file) as stream:
             stream.write(text.encode())
@@ -86,7 +92,14 @@ def read_summary(file: Path) -> Summary:
     runs = [head["run"] for head in heads if "run" in head]
     for name in (name for head in heads for name in head.get("empty", ())):
         rows[name] = math.nan
+    for name in (name for head in heads for name in head.get("repeated", ())):
+        rows[name] = rows[name].ffill()
     return Summary(rows, runs, [head["note"] for head in heads if "note" in head])
+
+
+def _words(column: Frame) -> bool:
+    """Whether a column has words in every row."""
+    return pd.api.types.is_string_dtype(column) and bool(column.notna().all() and (column != "").all())
 
 
 def join(summaries: Sequence[Summary], about: Sequence[str]) -> Summary:

@@ -35,6 +35,10 @@ _FEW = 2**20
 def load_spz(path: Path) -> SplatCloud:
     """Read an SPZ file. Raises InputError where it is none, is cut short, or has another version."""
     data = content(path, "an SPZ file")
+    if data[:4] == _MAGIC.to_bytes(4, "little"):  # without gzip around it
+        raise InputError(
+            f"{path}: SPZ of version {int.from_bytes(data[4:8], 'little')}; versions 2 and 3 are read"
+        )
     try:
         head = zlib.decompressobj(31).decompress(data, _HEAD.size)
         magic, version, n, degree, point, _, _ = _HEAD.unpack(head)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fidsplat.backends.derivatives import Differentiates
+from fidsplat.backends.gradients import on_host
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.view import View
 from fidsplat.cameras import Camera
@@ -77,7 +78,8 @@ def derivatives(
     images = pipeline.forward(backend.upload(cloud), view)
     given = random_loss(features, view) if by_images is None else by_images
     found = pipeline.backward(images, given)
-    return {name: one if isinstance(one, np.ndarray) else one.get() for name, one in found.items()}
+    # the reference's stay float64
+    return {name: one if isinstance(one, np.ndarray) else on_host(one) for name, one in found.items()}
 
 
 def last_place(cloud: SplatCloud) -> SplatCloud:

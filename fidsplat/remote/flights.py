@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+import socket
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,6 +14,7 @@ from fidsplat.files import atomic_write
 from fidsplat.flights import Flight, FlightFolder
 from fidsplat.remote.queue import Engine, drain
 from fidsplat.render import Renderer
+from fidsplat.store.store import Store
 from fidsplat.vision.output_files import save_output
 
 Files = dict[tuple[str, str], bytes]
@@ -20,24 +23,47 @@ Files = dict[tuple[str, str], bytes]
 
 @dataclass(frozen=True, eq=False)
 class FlightWork:
-    """What a worker needs to draw pictures of a flight; called there, it opens the device.
-
-    Raises InputError for a scene with stores, which are on this machine's disk.
-    """
+    """What a worker needs to draw pictures of a flight; called there, it opens the device. Stores are not
+    sent: a worker reads them where they are here."""
 
     flight: Flight
     device: str
     memory_budget: int | None = None
 
-    def __post_init__(self) -> None:
-        if self.flight.scene.streamed is not None:
-            raise InputError(
-                "a store is read from the disk of this machine, which workers do not share; draw it without "
-                "--ray"
-            )
-
     def __call__(self) -> FlightDrawer:
         return FlightDrawer(self)
+
+    def __reduce__(self):
+        stores = {str(store.path.resolve()): store.identity for store in self.flight.scene.stores}
+        return PackedWork, (pickle.dumps(self.flight), stores, self.device, self.memory_budget)
+
+
+@dataclass(frozen=True)
+class PackedWork:
+    """Work as it is sent. It is unpacked where it is called, so that what is missing there can be said."""
+
+    flight: bytes
+    stores: dict[str, str]
+    """identities by path"""
+    device: str
+    memory_budget: int | None
+
+    def __call__(self) -> FlightDrawer:
+        """Raises InputError where a store is not at its path, or another one is."""
+        for path, identity in self.stores.items():
+            try:
+                same = Store(path).identity == identity
+            except InputError as error:
+                raise InputError(
+                    f"workers read stores from a disk that they share, and on {socket.gethostname()} "
+                    f"{error}; put it there, or draw without --ray"
+                ) from None
+            if not same:
+                raise InputError(
+                    f"on {socket.gethostname()} {path} is another store than here; put the same there, or "
+                    "draw without --ray"
+                )
+        return FlightWork(pickle.loads(self.flight), self.device, self.memory_budget)()
 
 
 class FlightDrawer:

@@ -4,7 +4,8 @@ it collides with. z is up; rows run along x, the first at y = 0."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -49,6 +50,9 @@ class Greenhouse:
     seed: int = 0
     mixture: str | None = None
     """of the markers; None: exact"""
+    stock: Mapping[str, Sequence[SplatCloud]] | None = field(default=None, compare=False, repr=False)
+    """plants to take from, by kind, each in its own frame (`fidsplat.sim.plants.load_plants`), a kind a row;
+    None: they are grown as disks"""
 
     def __post_init__(self) -> None:
         for name, most in (("rows", MOST), ("plants", MOST), ("seed", 2**32 - 1)):
@@ -56,6 +60,8 @@ class Greenhouse:
             least = 0 if name == "seed" else 1
             if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
                 raise InputError(f"{name} of a greenhouse is {value!r}; it must be {least} to {most}")
+        if self.stock is not None and not (self.stock and all(self.stock.values())):
+            raise InputError("the stock of a greenhouse has no plants of a kind; None grows them")
 
     @property
     def length(self) -> float:
@@ -101,15 +107,16 @@ class Greenhouse:
 
     def _plants(self) -> SplatCloud:
         rng = np.random.default_rng([self.seed, 1])
-        kinds = list(KINDS.values())
+        kinds = list(KINDS if self.stock is None else self.stock)
         found = []
         for row, y in enumerate(self.middles):
-            grow = kinds[row % len(kinds)]
+            kind = kinds[row % len(kinds)]
             for k in range(self.plants):
                 turn = rng.uniform(0, 2 * math.pi)
                 foot = ((k + 0.5) * SPACING + rng.normal(0, 0.03), y + rng.normal(0, 0.02), BENCH[1])
                 pose = rigid_matrix(foot, (math.cos(turn / 2), 0, 0, math.sin(turn / 2)))
-                found.append(grow(rng).transformed(pose))
+                plant = KINDS[kind](rng) if self.stock is None else _one_of(self.stock[kind], rng)
+                found.append(plant.transformed(pose))
         return SplatCloud.concatenate(found)
 
     def _ground(self) -> SplatCloud:
@@ -169,6 +176,10 @@ class Greenhouse:
             f'  <worldbody>\n    <geom name="floor" type="plane" size="0 0 1"/>\n{boxes}\n{robot}'
             "  </worldbody>\n</mujoco>\n"
         )
+
+
+def _one_of(plants: Sequence[SplatCloud], rng: np.random.Generator) -> SplatCloud:
+    return plants[int(rng.integers(len(plants)))]
 
 
 def facing(place: tuple[float, float, float], towards: tuple[float, float]) -> np.ndarray:

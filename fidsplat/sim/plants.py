@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 
+from fidsplat.errors import InputError
+from fidsplat.formats import load_ply
 from fidsplat.sim.poses import quaternions_of
 from fidsplat.splats import SplatCloud
 
@@ -68,6 +72,35 @@ KINDS: dict[str, Callable[[np.random.Generator], SplatCloud]] = {
     "cucumber": cucumber,
     "lettuce": lettuce,
 }
+
+
+def load_plants(folder: str | Path) -> dict[str, list[SplatCloud]]:
+    """Plants that are there, by kind: KIND-NUMBER.ply of a folder, each in its own frame, z up, its foot at
+    the origin.
+
+    Raises InputError where there is none, or one cannot be read.
+    """
+    found: dict[str, list[SplatCloud]] = {}
+    files = {file: re.fullmatch(r"(.+)-(\d+)", file.stem) for file in Path(folder).glob("*.ply")}
+    numbered = [(match[1], int(match[2]), file) for file, match in files.items() if match]
+    for kind, _, file in sorted(numbered):
+        found.setdefault(kind, []).append(_plain(load_ply(file)))
+    if not found:
+        raise InputError(
+            f"{folder} holds no plants; they are KIND-NUMBER.ply, e.g. tomato-0.ply, as "
+            "`fidsplat experiment plants` writes them"
+        )
+    return found
+
+
+def _plain(cloud: SplatCloud) -> SplatCloud:
+    """With colours in place of SH of degree 0, which would make SH of a whole scene."""
+    colors = cloud.plain_colors
+    if cloud.sh is None or colors is None:
+        return cloud
+    thick = () if cloud.thickness is None else (cloud.thickness,)
+    scales = np.column_stack([cloud.scales, *thick])
+    return SplatCloud(cloud.means, cloud.quats, scales, cloud.opacities, colors, origin=cloud.origin)
 
 
 def _whole(*parts: SplatCloud) -> SplatCloud:

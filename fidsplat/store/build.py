@@ -317,6 +317,6 @@ def _enclose(node: np.ndarray, children: np.ndarray) -> None:
 
 
 def _settled(nodes: np.ndarray, level: int) -> bool:
-    """Whether nothing is gained by a node above the only one of this level."""
+    """Whether little is gained by a node above the only one of this level: not half of its splats."""
     counts = [int(nodes["count"][nodes["level"] == at].sum()) for at in (level - 1, level)]
-    return counts[1] <= _ROOT or (level > 0 and counts[1] >= counts[0])
+    return counts[1] <= _ROOT or (level > 0 and 2 * counts[1] > counts[0])

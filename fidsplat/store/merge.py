@@ -4,18 +4,24 @@ Splats of a cell whose normals have the same main axis become one by moments in 
 times area, it has their mean, their covariance without the direction in which that is least, their mean
 colour, and the opacity with which its area has theirs. So far away, where cells are smaller than pixels, it
 takes the same light; what it gets wrong is measured (fidsplat/detail.py).
+
+That opacity may be above 1: below a pixel, where alone it is drawn, the low-pass makes a small alpha of it.
+Across an edge of brightness a cell has two splats: one would move the edge by up to an eighth of the cell.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from fidsplat.harmonics import C0
 from fidsplat.store.morton import BITS, Grid
 
 REDUCTION = 4
 """how many splats become one, in the mean: what halving the resolution leaves of a surface"""
-WIDER = 1.5
-"""most area of a splat that stands for others, in that of theirs together"""
+DENSEST = 4.0
+"""most opacity of a splat that stands for others; where they lie closer on top of each other several do"""
+EDGE = 0.06
+"""standard deviation of the brightness of a cell's splats from which on bright and dark ones stay apart"""
 _CLASSES = 3
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -27,12 +33,32 @@ def merged(splats: dict[str, np.ndarray], grid: Grid) -> tuple[dict[str, np.ndar
     sides = np.abs(normal)
     classes = np.where(sides[0] > sides[1], np.where(sides[0] > sides[2], 0, 2), 1 + (sides[2] > sides[1]))
     keys, shift = _cells(grid.codes(splats["means"]), classes.astype(np.uint64))
-    order = np.argsort(keys, kind="stable")
-    keys = keys[order]
-    starts = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
+    keys = _apart(keys, splats)
+    order, starts = _runs(keys)
     given = {name: array[order] for name, array in splats.items()}
     made = _by_moments(given, (u[:, order], v[:, order], normal[:, order]), starts)
     return made, grid.size(shift)
+
+
+def _runs(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The order by keys (n,), and where in it each key's run starts."""
+    order = np.argsort(keys, kind="stable")
+    ordered = keys[order]
+    return order, np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+
+
+def _apart(keys: np.ndarray, splats: dict[str, np.ndarray]) -> np.ndarray:
+    """(n,) other keys, two in the place of one where an edge of brightness goes through its splats."""
+    colors = splats["colors"] if "colors" in splats else C0 * splats["sh"][:, 0]
+    order, starts = _runs(keys)
+    light = colors.astype(np.float64).mean(axis=1)[order]
+    lengths = np.diff(np.append(starts, len(keys)))
+    mean = np.add.reduceat(light, starts) / lengths
+    away = light - np.repeat(mean, lengths)
+    edge = np.add.reduceat(away * away, starts) > EDGE**2 * lengths
+    made = np.empty(len(keys), np.int64)
+    made[order] = np.repeat(2 * np.arange(len(starts)), lengths) + ((away > 0) & np.repeat(edge, lengths))
+    return made
 
 
 def _frames(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -101,13 +127,9 @@ def _by_moments(
     turns = vectors[:, :, ::-1].copy()
     turns[:, :, 2] = np.cross(turns[:, :, 0], turns[:, :, 1])
     opacities = np.add.reduceat(light, starts) / (sigma[:, 0] * sigma[:, 1])
-    # what lies on top of each other takes more light than an opaque splat: then several stand for it, each
-    # opaque and a little wider
-    copies = np.maximum(np.ceil(opacities / WIDER), 1).astype(np.int64)
-    opacities /= copies
-    sigma[:, :2] *= np.sqrt(np.maximum(opacities, 1.0))[:, None]
+    copies = np.maximum(np.ceil(opacities / DENSEST), 1).astype(np.int64)
     made = {"means": (base + middle).T, "quats": quaternions_of(turns), "scales": sigma[:, :2]}
-    made["opacities"] = np.minimum(opacities, 1.0)
+    made["opacities"] = opacities / copies
     for name in {"colors", "sh"} & set(splats):
         flat = splats[name].reshape(count, -1).T.astype(np.float64)
         made[name] = mean(flat).T.reshape(-1, *splats[name].shape[1:])

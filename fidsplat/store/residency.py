@@ -1,14 +1,16 @@
-"""Parts of stores on a device: what the last view was drawn of stays there, and what the next one needs is
-read while this one is drawn."""
+"""Parts of stores on a device: what views were drawn of stays there, and what the next one needs is brought
+while this one is drawn."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 
 from fidsplat.backends.base import Backend, ResidentData
+from fidsplat.backends.chunks import KeepsChunks
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.view import View
 from fidsplat.capture import Capture
@@ -22,7 +24,10 @@ class Residency:
 
     def __init__(self, scene: Streamed, backend: Backend) -> None:
         self.scene, self._backend = scene, backend
-        self._there: tuple[Selection, ResidentData, np.ndarray] | None = None
+        self._cache = (
+            backend.chunk_cache(scene, scene.largest_chunk) if isinstance(backend, KeepsChunks) else None
+        )
+        self._there: tuple[Selection, ResidentData] | None = None
         self._fetching: threading.Thread | None = None
         self.nodes = 0
         """of the last views"""
@@ -39,9 +44,9 @@ class Residency:
 
     def of(
         self, views: Sequence[View], features: FeatureSet, qualities: Iterable[Quality]
-    ) -> tuple[ResidentData, np.ndarray]:
-        """The splats that these views see, on the device, and their indices in the whole (n,) int32; the
-        quality that needs most decides for all views.
+    ) -> tuple[ResidentData, Callable[[], np.ndarray]]:
+        """The splats that these views see, on the device, and what gives their indices in the whole (n,)
+        int32; the quality that needs most decides for all views.
 
         Raises:
             InputError: a quality allows an error that was not measured.
@@ -51,12 +56,16 @@ class Residency:
         self.nodes = len(selection)
         if self._there is None or self._there[0] != selection:
             self._there = None  # before the next is there, so that both need not fit
-            part, ids = self.scene.part(selection)
-            self._there = selection, self._backend.upload(part), ids
-        return self._there[1:]
+            self._there = selection, self._brought(selection)
+        return self._there[1], partial(self.scene.ids, selection)
+
+    def _brought(self, selection: Selection) -> ResidentData:
+        if self._cache is None:
+            return self._backend.upload(self.scene.part(selection))
+        return self._cache.gather(self.scene.chunks(selection, self._cache.places))
 
     def read_ahead(self, captures: Iterator[Capture]) -> Iterator[Capture]:
-        """The captures, each when what the next needs is being read."""
+        """The captures, each when what the next needs is being brought."""
         waiting: Capture | None = None
         while True:
             try:
@@ -74,14 +83,18 @@ class Residency:
             waiting = following
 
     def _fetch(self, capture: Capture) -> None:
-        """Read what a view will need, beside what goes on; nothing, while the last such reading goes on."""
+        """Bring what a view will need, beside what goes on; nothing, while the last such work goes on."""
         features, view = prepare(self.scene, capture)
         pixels = self.scene.pixels_of(capture.quality)
         if self._fetching is not None and self._fetching.is_alive():
             return
 
         def work() -> None:
-            self.scene.fetch(self.scene.select([view], features, pixels))
+            selection = self.scene.select([view], features, pixels)
+            if self._cache is None:
+                self.scene.fetch(selection)
+            else:
+                self._cache.bring(self.scene.chunks(selection, self._cache.places))
 
         self._fetching = threading.Thread(target=work, name="fidsplat-fetch", daemon=True)
         self._fetching.start()

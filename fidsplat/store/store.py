@@ -13,7 +13,7 @@ from fidsplat.errors import InputError
 from fidsplat.files import path_of
 from fidsplat.formats.collect import Progress
 from fidsplat.quality import Quality
-from fidsplat.rotations import check_similarity
+from fidsplat.rotations import check_similarity, matrix_to_quaternion
 from fidsplat.splats import SplatCloud
 from fidsplat.store import layout
 from fidsplat.store.detail import Detail, load_details
@@ -55,7 +55,7 @@ class Store(Summarised):
         self._columns = self._mapped()
 
     def __reduce__(self):
-        return Store, (str(self.path),)
+        return Store, (str(self.path.absolute()),)
 
     def __len__(self) -> int:
         return self.header.splats
@@ -206,11 +206,21 @@ class Store(Summarised):
         """(k,) splats of nodes, by their numbers."""
         return self.nodes["count"][numbers % max(len(self.nodes), 1)]
 
-    def load(self, number: int) -> dict[str, np.ndarray]:
-        """The splats of a node, by its number: arrays as a cloud has them, relative to `origin`."""
+    def load(self, number: int, placed: bool = True) -> dict[str, np.ndarray]:
+        """The splats of a node, by its number: arrays as a cloud has them, relative to `origin`. placed:
+        whether where the node is placed, or as the store has them that stands there."""
         place, node = divmod(int(number), len(self.nodes))
         first = int(self.nodes["first"][node])
-        return self._rows(first, first + int(self.nodes["count"][node]), place)
+        return self._rows(first, first + int(self.nodes["count"][node]), place if placed else None)
+
+    @cached_property
+    def pose_rows(self) -> np.ndarray:
+        """(p, 16) float64: each place as `Chunk.pose` says it; (0, 16) of a store of its own splats."""
+        if self.poses is None:
+            return np.empty((0, 16))
+        turns = self.poses[:, :3, :3]
+        quats = np.stack([matrix_to_quaternion(turn) for turn in turns])
+        return np.concatenate([turns.reshape(-1, 9), self._moves, quats], axis=1)
 
     def labels(self) -> set[int]:
         """The labels that its splats have; all of that column is read."""
@@ -262,14 +272,14 @@ class Store(Summarised):
             for name, kind in own.columns.items()
         }
 
-    def _rows(self, first: int, end: int, place: int) -> dict[str, np.ndarray]:
-        """Splats of rows [first, end) at a place."""
+    def _rows(self, first: int, end: int, place: int | None) -> dict[str, np.ndarray]:
+        """Splats of rows [first, end) at a place; None: as they are stored."""
         made = {name: array[first:end] for name, array in self._columns.items()}
         for name in {"sh", "colors"} & set(made):
             made[name] = made[name].astype(np.float32, copy=False)
         if "labels" not in made:
             made["labels"] = np.zeros(end - first, np.int32)
-        if self.poses is None:
+        if self.poses is None or place is None:
             return made
         return moved(made, self.poses[place], self._moves[place])
 

@@ -7,10 +7,12 @@ import threading
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
+from fidsplat.backends.chunks import Chunk
+from fidsplat.backends.planes import PlaneTable
 from fidsplat.backends.seen import Boxes, seen, sizes
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
@@ -86,7 +88,7 @@ class Streamed:
         """All splats in one cloud."""
         if len(self.stores) == 1 and not len(self.beside):
             return self.stores[0].cloud()
-        return self.part(self.everything())[0]
+        return self.part(self.everything())
 
     def everything(self) -> Selection:
         """All chunks, and no node that stands for others."""
@@ -115,20 +117,86 @@ class Streamed:
             chosen.append(tuple(numbers.tolist()))
         return Selection(tuple(chosen))
 
-    def part(self, selection: Selection) -> tuple[StorePart, np.ndarray]:
-        """The splats of a selection, and their indices in the whole (n,) int32; -1 for those that stand for
-        others."""
-        parts, ids, first = [], [], 0
-        for number, (store, nodes) in enumerate(zip(self.stores, selection.nodes, strict=True)):
-            numbers = np.array(nodes, np.int64)
-            for node, at, count in zip(nodes, store.first_of(numbers), store.counts(numbers), strict=True):
-                parts.append(self._chunk(number, node))
-                ids.append(np.full(count, -1) if at < 0 else np.arange(first + at, first + at + count))
-            first += len(store)
+    def part(self, selection: Selection) -> StorePart:
+        """The splats of a selection."""
+        parts = [self._chunk(number, node) for number, nodes in enumerate(selection.nodes) for node in nodes]
         if len(self.beside) or not parts:
             parts.append(self._beside)
-            ids.append(np.arange(first, first + len(self.beside)))
-        return StorePart.of(joined(parts), self), np.concatenate(ids).astype(np.int32)
+        return StorePart.of(joined(parts), self)
+
+    def ids(self, selection: Selection) -> np.ndarray:
+        """Indices in the whole (n,) int32 of the splats of a selection; -1 of those that stand for others."""
+        made, first = [np.empty(0, np.int32)], 0
+        for store, nodes in zip(self.stores, selection.nodes, strict=True):
+            numbers = np.array(nodes, np.int64)
+            for at, count in zip(store.first_of(numbers), store.counts(numbers), strict=True):
+                own = np.full(count, -1) if at < 0 else np.arange(first + at, first + at + count)
+                made.append(own.astype(np.int32))
+            first += len(store)
+        made.append(np.arange(first, first + len(self.beside), dtype=np.int32))
+        return np.concatenate(made)
+
+    @property
+    def largest_chunk(self) -> int:
+        """Splats of the largest node, or of those beside."""
+        return max(len(self.beside), *(int(store.nodes["count"].max(initial=0)) for store in self.stores))
+
+    @property
+    def planes(self) -> PlaneTable | None:
+        """Of all splats that are printed on planes: those are in every part."""
+        return self._plane_table if self.has_planes else None
+
+    def chunks(self, selection: Selection, places: bool) -> list[Chunk]:
+        """The splats of a selection for a device that keeps them. places: whether it moves chunks to their
+        places."""
+        made = []
+        for number, (store, nodes) in enumerate(zip(self.stores, selection.nodes, strict=True)):
+            counts = store.counts(np.array(nodes, np.int64)).tolist()
+            # harmonics turn with their splats, and means of another origin are rounded once more
+            moved = places and store.poses is not None and self.sh_degree < 0
+            moved = moved and not (store.origin - self.origin).any()
+            each = len(store.nodes)
+            for node, count in zip(nodes, counts, strict=True):
+                key = (number, node % each if moved else node)
+                pose = store.pose_rows[node // each] if moved else None
+                made.append(Chunk(key, count, partial(self._laid_out, key, moved), pose))
+        if len(self.beside) or not made:
+            made.append(Chunk("beside", len(self.beside), partial(self._on_device, self._beside)))
+        return made
+
+    def _laid_out(self, key: tuple[int, int], unplaced: bool) -> dict[str, np.ndarray]:
+        """The arrays of a chunk on a device."""
+        if not unplaced:
+            return self._on_device(self._chunk(*key))
+        number, node = key
+        given = self.stores[number].load(node, placed=False)
+        return self._on_device(self._fitted(given, self._planes_before[number]))
+
+    def _on_device(self, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        made = dict(arrays)
+        if "planes" in made:
+            known = np.append(self._plane_ids, np.iinfo(np.int32).max)
+            dense = np.searchsorted(known, made["planes"]).astype(np.int32)
+            made["planes"] = np.where(made["planes"] < 0, np.int32(-1), dense)
+        if "boxes" in made:
+            made["boxes"] = made["boxes"].astype(np.int32)
+        return made
+
+    @cached_property
+    def _plane_table(self) -> PlaneTable:
+        return PlaneTable(self._on_planes)
+
+    @cached_property
+    def _on_planes(self) -> StorePart:
+        """The chunks that every picture has, and the splats beside."""
+        none = (np.flatnonzero(_pinned(store)) for store in self.stores)
+        return self.part(Selection(tuple(tuple(numbers.tolist()) for numbers in none)))
+
+    @cached_property
+    def _plane_ids(self) -> np.ndarray:
+        ids = self._on_planes.planes
+        assert ids is not None
+        return np.unique(ids[ids >= 0])
 
     def fetch(self, selection: Selection) -> None:
         """Bring what a selection needs into memory."""
@@ -206,6 +274,12 @@ class Streamed:
         return made
 
 
+def _pinned(store: Store) -> np.ndarray:
+    """(n,) bool: the nodes with splats on planes, which every picture has."""
+    nodes = store.nodes
+    return np.tile((nodes["level"] == 0) & (nodes["first"] >= store.header.pinned), store.places)
+
+
 def _chosen(
     store: Store, boxes: Boxes, views: Sequence[View], features: FeatureSet, pixels: np.ndarray
 ) -> np.ndarray:
@@ -219,7 +293,7 @@ def _chosen(
     visible = np.zeros(len(level), bool)
     for view in views:
         visible |= seen(view, features, boxes, reach)
-    pinned = np.tile((nodes["level"] == 0) & (nodes["first"] >= store.header.pinned), places)
+    pinned = _pinned(store)
     if not pixels.any():
         return np.flatnonzero((visible | pinned) & (level == 0))
     parents = np.tile(nodes["parent"].astype(np.int64), places)

@@ -10,14 +10,16 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from fidsplat import __version__
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
+from fidsplat.provenance import code_hash
 from fidsplat.splats import SplatCloud
 from fidsplat.train.dataset import Dataset
 from fidsplat.train.parameters import NAMES, Splats
 from fidsplat.train.settings import TrainSettings
 
-_FORMAT = 1
+_FORMAT = 2
 _GROUPS = ("values", "first", "second")
 _HISTORY = ("losses", "psnrs", "counts")
 _DAMAGED = (OSError, ValueError, KeyError, EOFError, BadZipFile, TypeError, AttributeError, RuntimeError)
@@ -58,7 +60,7 @@ def save_checkpoint(
         "dataset": dataset.digest,
         "origin": dataset.origin.tolist(),
         "background": list(dataset.background),
-        "device": device,
+        "by": _made_by(device),
     }
     arrays = {f"{group}.{name}": getattr(made.splats, group)[name] for group in _GROUPS for name in NAMES}
     arrays |= {"gradients": made.splats.gradients, "seen": made.splats.seen, **made.history}
@@ -82,8 +84,18 @@ def splats_of(file: Path) -> tuple[SplatCloud, tuple[float, float, float]]:
     return cloud, (red, green, blue)
 
 
-def load_checkpoint(file: Path, settings: TrainSettings, digest: str) -> tuple[Progressed, str]:
-    """Read a checkpoint of the same run; how far it came, and the device that it ran on.
+def load_checkpoint(
+    file: Path, settings: TrainSettings, digest: str, device: str
+) -> tuple[Progressed, list[str]]:
+    """Read a checkpoint of the same run.
+
+    Args:
+        digest: of the data set.
+        device: title of what draws from now on.
+
+    Returns:
+        how far it came; and by what else it was made, if not by this device and these sources: "another
+        device (PoCL, not H100)".
 
     Raises InputError for a file that is damaged or of another run, which it names the difference of.
     """
@@ -95,6 +107,7 @@ def load_checkpoint(file: Path, settings: TrainSettings, digest: str) -> tuple[P
             values, first, second = ({name: arrays[f"{group}.{name}"] for name in NAMES} for group in _GROUPS)
             splats = Splats(values, first, second, arrays["gradients"], arrays["seen"])
             history = {name: arrays[name] for name in _HISTORY}
+            before = [str(facts["by"][name]) for name in _made_by(device)]
     except _DAMAGED as error:
         raise InputError(
             f"{file} is no checkpoint that can be read: {error}; remove it, or give --overwrite to begin "
@@ -105,7 +118,14 @@ def load_checkpoint(file: Path, settings: TrainSettings, digest: str) -> tuple[P
             f"{file} is of a run with another {' and another '.join(differ)}; give another name with -o, or "
             "--overwrite to begin again"
         )
-    return Progressed(facts["iteration"], facts["adam_step"], splats, history), facts["device"]
+    now = zip(_made_by(device).items(), before, strict=True)
+    others = [f"another {name} ({was}, not {here})" for (name, here), was in now if was != here]
+    return Progressed(facts["iteration"], facts["adam_step"], splats, history), others
+
+
+def _made_by(device: str) -> dict[str, str]:
+    """On what the bits of a run depend beside its settings and its data."""
+    return {"device": device, "fidsplat": f"{__version__}, sources {code_hash()}"}
 
 
 def _differences(facts: dict[str, Any], settings: TrainSettings, digest: str) -> list[str]:

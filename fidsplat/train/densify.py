@@ -6,10 +6,12 @@ The order of splats that stay is kept and new ones stand behind them, so that a 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from fidsplat.rotations import quaternion_to_matrix
-from fidsplat.train.parameters import Splats, TrainingError, logit
+from fidsplat.train.parameters import Splats, TrainingError, logit, sigmoid
 from fidsplat.train.random_numbers import Purpose, normal
 from fidsplat.train.settings import TrainSettings
 
@@ -19,10 +21,33 @@ _SHRINK = 0.8 * COPIES
 """by which their scales are smaller"""
 
 
-def densified(splats: Splats, settings: TrainSettings, iteration: int, extent: float) -> Splats:
-    """The splats after a round of cloning, splitting and pruning.
+class Plan(NamedTuple):
+    """What a round of cloning, splitting and pruning makes of splats."""
+
+    rows: np.ndarray
+    """(m,) uint32: of which splat each is made; first those that stay, in their order"""
+    kept: int
+    """how many stay; of the others nothing is remembered"""
+    means: np.ndarray
+    """(m, 3) float32"""
+    log_scales: np.ndarray
+    """(m, 2) float32"""
+
+    def made(self, splats: Splats) -> Splats:
+        """The splats after the round."""
+        made = splats.chosen(self.rows)
+        made.values |= {"means": self.means, "log_scales": self.log_scales}
+        for remembered in (made.first, made.second):
+            for array in remembered.values():
+                array[self.kept :] = 0
+        return forgotten(made)
+
+
+def plan(splats: Splats, settings: TrainSettings, iteration: int, extent: float) -> Plan:
+    """A round of cloning, splitting and pruning.
 
     Args:
+        splats: their harmonics and what is remembered of them may be missing.
         extent: metres, of the scene: sizes are compared with it.
 
     Raises:
@@ -34,31 +59,26 @@ def densified(splats: Splats, settings: TrainSettings, iteration: int, extent: f
     chosen = _within_limit(mean, mean >= settings.gradient_threshold, settings.max_splats - len(splats))
     large = splats.scales.max(axis=1) > settings.dense_share * extent
     clones, splits = np.flatnonzero(chosen & ~large), np.flatnonzero(chosen & large)
-    more = {
-        name: np.concatenate([array[clones], *[array[splits]] * COPIES])
-        for name, array in splats.values.items()
-    }
-    _scatter(more, len(clones), splats, splits, settings, iteration)
     kept = np.ones(len(splats), bool)
     kept[splits] = False
-    made = splats.chosen(kept).with_more(more)
-    fit = made.opacities >= settings.prune_opacity
+    rows = np.concatenate([np.flatnonzero(kept), clones, *[splits] * COPIES])
+    means, log_scales = (splats.values[name][rows] for name in ("means", "log_scales"))
+    _scatter(means, log_scales, len(rows) - COPIES * len(splits), splats, splits, settings, iteration)
+    fit = sigmoid(splats.values["logits"][rows]) >= settings.prune_opacity
     if iteration > settings.reset_every:
-        fit &= made.scales.max(axis=1) <= settings.prune_scale * extent
+        fit &= np.exp(log_scales).max(axis=1) <= settings.prune_scale * extent
     if not fit.any():
         raise TrainingError(
             f"no splat is left after iteration {iteration}: all are fainter than {settings.prune_opacity:g} "
             f"or larger than {settings.prune_scale * extent:g} m; check the data set's cameras and points"
         )
-    return forgotten(made.chosen(fit))
+    stay = int(np.count_nonzero(fit[: np.count_nonzero(kept)]))
+    return Plan(rows[fit].astype(np.uint32), stay, means[fit], log_scales[fit])
 
 
-def with_opacities_reset(splats: Splats, settings: TrainSettings) -> Splats:
-    """The splats with opacities of at most `reset_opacity`, so that only those that are needed come back."""
-    splats.values["logits"] = np.minimum(splats.values["logits"], np.float32(logit(settings.reset_opacity)))
-    for remembered in (splats.first, splats.second):
-        remembered["logits"][:] = 0
-    return splats
+def reset_logits(logits: np.ndarray, settings: TrainSettings) -> np.ndarray:
+    """Logits of opacities of at most `reset_opacity`, so that only those that are needed come back."""
+    return np.minimum(logits, np.float32(logit(settings.reset_opacity)))
 
 
 def forgotten(splats: Splats) -> Splats:
@@ -79,7 +99,8 @@ def _within_limit(mean: np.ndarray, wanted: np.ndarray, room: int) -> np.ndarray
 
 
 def _scatter(
-    more: dict[str, np.ndarray],
+    means: np.ndarray,
+    log_scales: np.ndarray,
     first: int,
     splats: Splats,
     splits: np.ndarray,
@@ -90,9 +111,9 @@ def _scatter(
     smaller."""
     turns = quaternion_to_matrix(splats.values["quats"][splits])[:, :, :2]
     scales = splats.scales[splits].astype(np.float64)
-    draws = normal(settings.seed, Purpose.SPLITS, iteration, len(splats))[splits]
+    draws = normal(settings.seed, Purpose.SPLITS, iteration, splits)
     for copy in range(COPIES):
         rows = slice(first + copy * len(splits), first + (copy + 1) * len(splits))
         offset = scales * draws[:, 2 * copy : 2 * copy + 2]
-        more["means"][rows] += np.einsum("nij,nj->ni", turns, offset).astype(np.float32)
-        more["log_scales"][rows] -= np.float32(np.log(_SHRINK))
+        means[rows] += np.einsum("nij,nj->ni", turns, offset).astype(np.float32)
+        log_scales[rows] -= np.float32(np.log(_SHRINK))

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from fidsplat.backends.derivatives import Differentiates
+from fidsplat.backends.gradients import on_host
 from fidsplat.backends.prepare import prepare
 from fidsplat.cameras import Camera
 from fidsplat.capture import Capture
@@ -16,7 +17,6 @@ from fidsplat.errors import DeviceError
 from fidsplat.render import Renderer
 from fidsplat.rotations import quaternion_to_matrix
 from fidsplat.splats import SplatCloud
-from fidsplat.train.host import on_host
 
 Arrays = dict[str, np.ndarray]
 _STRAIGHT = 1e-3
@@ -36,7 +36,7 @@ def drawn(
     backend = renderer.backend
     if not isinstance(backend, Differentiates):
         raise DeviceError(
-            f"{renderer.device.name} has no gradients; use device='opencl' or device='reference'"
+            f"{renderer.device.name} has no gradients; use device='opencl', 'warp' or 'reference'"
         )
     resident = backend.upload(cloud)
     features, view = prepare(resident, capture)

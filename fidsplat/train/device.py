@@ -12,14 +12,16 @@ from fidsplat.backends.base import Images, ResidentData
 from fidsplat.backends.derivatives import TrainingKernels
 from fidsplat.cameras import Camera
 from fidsplat.train.dataset import TrainingView
+from fidsplat.train.densify import Plan, reset_logits
 from fidsplat.train.losses import Loss
 from fidsplat.train.mcmc import CLEAR, STEEP
 from fidsplat.train.optimiser import REST_SHARE
-from fidsplat.train.parameters import NAMES, Splats
+from fidsplat.train.parameters import NAMES, SHAPES, Splats
 from fidsplat.train.random_numbers import Purpose
 from fidsplat.train.settings import TrainSettings
 
 _PREFIXES = ("", "first_", "second_")
+_COUNTED = ("gradients", "seen")
 
 
 class DeviceWork:
@@ -49,6 +51,24 @@ class DeviceWork:
         arrays = self._kernels.store()
         values, first, second = ({name: arrays[prefix + name] for name in NAMES} for prefix in _PREFIXES)
         return Splats(values, first, second, arrays["gradients"], arrays["seen"])
+
+    def shapes(self) -> Splats:
+        """As `store`, without harmonics and what is remembered."""
+        arrays = self._kernels.store((*SHAPES, *_COUNTED))
+        return Splats({name: arrays[name] for name in SHAPES}, {}, {}, *(arrays[name] for name in _COUNTED))
+
+    def make(self, made: Plan) -> None:
+        """Goes on with the splats of a plan, most of which never leaves the device."""
+        counted = {name: np.zeros(len(made.rows), np.float32) for name in _COUNTED}
+        self._kernels.pick(made.rows, made.kept)
+        self._kernels.load({"means": made.means, "log_scales": made.log_scales, **counted})
+        self._number = len(made.rows)
+
+    def reset(self) -> None:
+        """Makes all faint, and forgets how their opacities moved."""
+        logits = reset_logits(self._kernels.store(("logits",))["logits"], self._settings)
+        nothing = np.zeros_like(logits)
+        self._kernels.load({"logits": logits, "first_logits": nothing, "second_logits": nothing})
 
     def __len__(self) -> int:
         return self._number

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 
 from fidsplat.backends.base import Backend, Images, ResidentData
+from fidsplat.backends.gradients import on_host
 from fidsplat.cameras import Camera
 from fidsplat.train import mcmc
 from fidsplat.train.dataset import TrainingView
+from fidsplat.train.densify import Plan, reset_logits
 from fidsplat.train.losses import Loss, normal_loss, picture_loss
 from fidsplat.train.optimiser import adam_step, inner_gradients, moved_by, sparse_adam_step
 from fidsplat.train.parameters import Splats
@@ -34,6 +36,21 @@ class HostWork:
     def store(self) -> Splats:
         """The splats as they are now."""
         return self._splats
+
+    def shapes(self) -> Splats:
+        """As `store`, to look at: harmonics and what is remembered may be missing."""
+        return self._splats
+
+    def make(self, made: Plan) -> None:
+        """Goes on with the splats of a plan."""
+        self._splats = made.made(self._splats)
+
+    def reset(self) -> None:
+        """Makes all faint, and forgets how their opacities moved."""
+        splats = self._splats
+        splats.values["logits"] = reset_logits(splats.values["logits"], self._settings)
+        for remembered in (splats.first, splats.second):
+            remembered["logits"][:] = 0
 
     def __len__(self) -> int:
         return len(self._splats)
@@ -95,9 +112,3 @@ def seen(splats: Splats, camera: Camera, origin: np.ndarray) -> np.ndarray:
         wide = np.float32(focal) * reach
         inside &= (at + wide > 0) & (at - wide < np.float32(size) * z)
     return inside
-
-
-def on_host(array: Any) -> np.ndarray:
-    """An array of a device as NumPy's float32."""
-    get = getattr(array, "get", None) or getattr(array, "numpy", None)
-    return np.asarray(array if get is None else get(), np.float32)

@@ -14,7 +14,8 @@ from fidsplat.train.neighbours import mean_square_distances
 from fidsplat.train.random_numbers import Purpose, uniform
 from fidsplat.train.settings import TrainSettings
 
-NAMES = ("means", "log_scales", "quats", "logits", "sh")
+SHAPES = ("means", "log_scales", "quats", "logits")
+NAMES = (*SHAPES, "sh")
 """the arrays of a `Splats`"""
 _LEAST_SQUARE = 1e-7
 """m^2, of the mean squared distance that first scales are made of"""

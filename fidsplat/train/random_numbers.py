@@ -47,20 +47,23 @@ def philox(counters: np.ndarray, key: int) -> np.ndarray:
     return np.stack([c0, c1, c2, c3], axis=1).astype(np.uint32)
 
 
-def uniform(seed: int, purpose: Purpose, iteration: int, count: int, draw: int = 0) -> np.ndarray:
-    """Four numbers (count, 4) float64 for each index, in (0, 1).
+def uniform(seed: int, purpose: Purpose, iteration: int, of: int | np.ndarray, draw: int = 0) -> np.ndarray:
+    """Four numbers (n, 4) float64 for each index, in (0, 1).
 
-    draw: tells several calls of one purpose and iteration apart.
+    Args:
+        of: the indices (n,), or their number where they are the first n.
+        draw: tells several calls of one purpose and iteration apart.
     """
-    counters = np.empty((count, 4), np.uint32)
-    counters[:, 0] = np.arange(count, dtype=np.uint32)
+    indices = np.arange(of) if isinstance(of, int) else of
+    counters = np.empty((len(indices), 4), np.uint32)
+    counters[:, 0] = indices
     counters[:, 1:] = iteration, purpose, draw
     return (philox(counters, seed) + 0.5) * 2.0**-32
 
 
-def normal(seed: int, purpose: Purpose, iteration: int, count: int, draw: int = 0) -> np.ndarray:
-    """Four numbers (count, 4) float64 for each index of the standard normal distribution (Box and Muller)."""
-    u = uniform(seed, purpose, iteration, count, draw)
+def normal(seed: int, purpose: Purpose, iteration: int, of: int | np.ndarray, draw: int = 0) -> np.ndarray:
+    """As `uniform`, of the standard normal distribution (Box and Muller)."""
+    u = uniform(seed, purpose, iteration, of, draw)
     radius, angle = np.sqrt(-2 * np.log(u[:, :2])), 2 * np.pi * u[:, 2:]
     return np.concatenate([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 

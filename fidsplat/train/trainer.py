@@ -107,7 +107,7 @@ class Trainer:
         backend = self.renderer.backend
         if not isinstance(backend, Differentiates):
             raise DeviceError(
-                f"{self.renderer.device.name} has no gradients to train by; use device='opencl' or "
+                f"{self.renderer.device.name} has no gradients to train by; use device='opencl', 'warp' or "
                 "'reference'"
             )
         self._differentiate = backend.differentiate
@@ -240,11 +240,12 @@ class Trainer:
     def _begin(self, start: SplatCloud | None, restart: bool) -> Progressed:
         settings = self.settings
         if self.checkpoint is not None and self.checkpoint.exists() and not restart:
-            made, device = load_checkpoint(self.checkpoint, settings, self.dataset.digest)
-            if device != self.renderer.device.title:
+            title = self.renderer.device.title
+            made, others = load_checkpoint(self.checkpoint, settings, self.dataset.digest, title)
+            if others:
                 warnings.warn(
-                    f"{self.checkpoint} is of {device}, and the run goes on on {self.renderer.device.title}: "
-                    "its bits will not be those of a run on one device",
+                    f"{self.checkpoint} was made by {' and '.join(others)}; the run goes on, but its "
+                    "bits will not be those of a run that was made by one: --overwrite begins again",
                     stacklevel=3,
                 )
         else:
@@ -282,10 +283,9 @@ class Trainer:
         settings, iteration = self.settings, self.iteration
         if settings.strategy == "mcmc" or not self._due(iteration):
             return
-        splats = densify.densified(self._work.store(), settings, iteration, self.dataset.extent)
+        self._work.make(densify.plan(self._work.shapes(), settings, iteration, self.dataset.extent))
         if iteration % settings.reset_every == 0:
-            splats = densify.with_opacities_reset(splats, settings)
-        self._work.load(splats)
+            self._work.reset()
 
     def _change(self, gradients: dict[str, Any], iteration: int, view: TrainingView) -> None:
         """The optimiser's step; none where the default rule makes splats next, as in the authors' trainer, in

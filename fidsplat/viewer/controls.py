@@ -39,7 +39,8 @@ class Controls:
         self._gui, self._session = gui, session
         self._sliders: dict[str, Any] = {}
         drawn = session.drawn
-        with gui.add_folder("Drawing"):
+        self._drawing = gui.add_folder("Drawing")
+        with self._drawing:
             self.status = gui.add_markdown("")
             self._choice("device", devices, drawn.device, lambda value: {"device": value})
             self._choice(
@@ -51,10 +52,7 @@ class Controls:
             self._slider("fog", "fog [1/m]", 0.0, 2.0, 0.01)
             self._slider("exposure", "exposure", 0.0, 4.0, 0.05)
             self._slider("noise", "shot noise", 0.0, 0.3, 0.005)
-            if drawn.scene.motion.groups:
-                self._slider("time", "time [s]", *_span(drawn.scene), 0.01)
-                self._slider("exposure_ms", "exposure time [ms]", 0.0, 200.0, 1.0)
-                self._slider("readout_ms", "readout [ms]", 0.0, 100.0, 1.0)
+        self._offer_times(drawn.scene)
         with gui.add_folder("Scene"):
             names = [NOBODY, *actions.movable(drawn.scene)]
             self._held = held = gui.add_dropdown("move", names, initial_value=NOBODY)
@@ -82,6 +80,7 @@ class Controls:
 
     def follow(self, scene: Scene, settings: Settings) -> None:
         """Stand where settings are that came with another scene, not from here."""
+        self._offer_times(scene)
         for name, slider in self._sliders.items():
             value = float(getattr(settings, name))
             slider.min, slider.max = min(slider.min, value), max(slider.max, value)
@@ -89,6 +88,19 @@ class Controls:
         if self._lens.value != settings.lens or self._lens.options != tuple(_lenses(scene)):
             self._lens.options = list(dict.fromkeys([*_lenses(scene), settings.lens]))
             self._lens.value = settings.lens
+
+    def _offer_times(self, scene: Scene) -> None:
+        """Have sliders of the clock where something moves, and none elsewhere."""
+        if not scene.motion.groups:
+            for name in {"time", "exposure_ms", "readout_ms"} & self._sliders.keys():
+                self._sliders.pop(name).remove()
+        elif "time" in self._sliders:
+            self._sliders["time"].min, self._sliders["time"].max = _span(scene)
+        else:
+            with self._drawing:
+                self._slider("time", "time [s]", *_span(scene), 0.01)
+                self._slider("exposure_ms", "exposure time [ms]", 0.0, 200.0, 1.0)
+                self._slider("readout_ms", "readout [ms]", 0.0, 100.0, 1.0)
 
     def _change(self, **changes: Any) -> None:
         _, settings = self._session.wanted()

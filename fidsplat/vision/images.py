@@ -135,6 +135,10 @@ def pixels_of(image: np.ndarray) -> np.ndarray:
     return array
 
 
+_PART = 1 << 14
+"""values that are converted at a time: few enough to stay in a core's cache from step to step"""
+
+
 def to_uint8(image: np.ndarray) -> np.ndarray:
     """Floats in [0, 1] to uint8, clamped and rounded; uint8 as it is; bool to 0 and 255.
 
@@ -144,10 +148,15 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
         return image
     if image.dtype == bool:
         return image.astype(np.uint8) * 255
-    scaled = np.fmax(image, 0.0)  # NaN too, which would become an undefined integer
-    np.minimum(scaled, 1.0, out=scaled)
-    scaled *= 255.0
-    return np.rint(scaled, out=scaled).astype(np.uint8)
+    made, values = np.empty(image.shape, np.uint8), image.reshape(-1)
+    flat = made.reshape(-1)
+    for first in range(0, len(values), _PART):
+        part = np.clip(values[first : first + _PART], 0.0, 1.0)
+        if np.isnan(part.sum()):  # NaN would become an undefined integer
+            part[np.isnan(part)] = 0.0
+        part *= 255.0
+        flat[first : first + _PART] = np.rint(part, out=part)
+    return made
 
 
 def write_png(path: str | os.PathLike[str], image: np.ndarray) -> Path:

@@ -25,14 +25,16 @@ def compact(
     keys: wp.array(dtype=wp.uint32),  # (n)
     drawn: wp.array(dtype=wp.int32),  # (n)
     places: wp.array(dtype=wp.int32),  # (n) inclusive sums of drawn
+    room: int,  # for so many of those drawn; the rest is left out
     sorted_keys: wp.array(dtype=wp.uint32),  # out: keys of those drawn, by index
     order: wp.array(dtype=wp.int32),  # out: their indices
 ):
     i = wp.tid() + first
     if drawn[i] != 0:
         k = places[i] - 1
-        sorted_keys[k] = keys[i]
-        order[k] = i
+        if k < room:
+            sorted_keys[k] = keys[i]
+            order[k] = i
 
 
 @wp.kernel(enable_backward=False)
@@ -40,10 +42,15 @@ def gather(
     first: int,
     order: wp.array(dtype=wp.int32),
     counts: wp.array(dtype=wp.int64),
-    lengths: wp.array(dtype=wp.int64),  # out: counts in depth order
+    totals: wp.array(dtype=wp.int64),  # (2) splats drawn, pairs
+    room: int,  # for so many splats
+    pairs: int,  # and so many pairs
+    lengths: wp.array(dtype=wp.int64),  # out: counts in depth order; all 0 where the room is too small
 ):
     k = wp.tid() + first
-    lengths[k] = counts[order[k]]
+    lengths[k] = wp.int64(0)
+    if wp.int64(k) < totals[0] and totals[0] <= wp.int64(room) and totals[1] <= wp.int64(pairs):
+        lengths[k] = counts[order[k]]
 
 
 @wp.kernel(enable_backward=False)
@@ -154,6 +161,8 @@ def make_lists(screen: bool) -> SimpleNamespace:
         lists: wp.array(dtype=wp.int32),  # out: their splats
     ):
         k = wp.tid() + first
+        if lengths[k] == wp.int64(0):
+            return  # what `order` has here may be nothing
         index = order[k]
         place = int(ends[k] - lengths[k])
         corner, bits = window_of(windows[index])

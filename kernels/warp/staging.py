@@ -69,7 +69,8 @@ _LINE = """
 """
 
 
-def _with(text: str, numbers: dict[str, int]) -> str:
+def with_numbers(text: str, numbers: dict[str, int]) -> str:
+    """The text with these names as their numbers."""
     return re.sub("|".join(numbers), lambda name: str(numbers[name[0]]), text)
 
 
@@ -78,12 +79,12 @@ def make_staging(layout: Layout) -> SimpleNamespace:
     numbers = {"SPLATS": STAGED, "LINES": layout.lines, "BOX": layout.names.index("columns")}
     numbers |= {"BLOCK_W": BLOCK_W, "BLOCK_H": BLOCK_H}
 
-    @wp.func_native(_with(_POOL, numbers))
+    @wp.func_native(with_numbers(_POOL, numbers))
     def pool() -> wp.uint64:
         """Where the block's records lie in shared memory."""
         ...
 
-    @wp.func_native(_with(_STAGE, numbers))
+    @wp.func_native(with_numbers(_STAGE, numbers))
     def stage(
         pool: wp.uint64,
         lines: wp.array(dtype=wp.vec4),
@@ -97,14 +98,14 @@ def make_staging(layout: Layout) -> SimpleNamespace:
         """
         ...
 
-    @wp.func_native(_with(_TOUCHED, numbers))
+    @wp.func_native(with_numbers(_TOUCHED, numbers))
     def touched(pool: wp.uint64, word: int, length: int, left: int, top: int, open: bool) -> wp.uint32:
         """Bits of those of the staged splats 32 word to 32 word + 31 that can touch the warp's samples, whose
         first is (left, top); none if nobody in the warp is open.
         """
         ...
 
-    @wp.func_native(_with(_LINE, numbers))
+    @wp.func_native(with_numbers(_LINE, numbers))
     def line(
         pool: wp.uint64,
         lines: wp.array(dtype=wp.vec4),

@@ -12,7 +12,7 @@ from traits import Traits
 import fidsplat as fs
 from fidsplat.backends.opencl import assemble as assembly
 from fidsplat.backends.opencl.assemble import assemble
-from fidsplat.backends.opencl.layout import LAYOUTS
+from fidsplat.backends.opencl.effect_layouts import LAYOUTS
 from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
 from fidsplat.effects import OUTPUTS, select
 

@@ -13,7 +13,7 @@ from combined import LENSES, combination, everything
 import fidsplat as fs
 from fidsplat.backends.opencl.assemble import Source, assemble, layouts_of
 from fidsplat.backends.opencl.declare import Layout, Samples, member, uniforms
-from fidsplat.backends.opencl.layout import LAYOUTS
+from fidsplat.backends.opencl.effect_layouts import LAYOUTS
 from fidsplat.backends.opencl.program import build
 from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
 from fidsplat.cli import main

@@ -11,7 +11,7 @@ from traits import Traits
 
 import fidsplat as fs
 from fidsplat.backends.opencl.assemble import assemble
-from fidsplat.backends.opencl.layout import LAYOUTS
+from fidsplat.backends.opencl.effect_layouts import LAYOUTS
 from fidsplat.effects import select
 
 BACKEND = "opencl"

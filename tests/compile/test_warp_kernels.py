@@ -71,6 +71,21 @@ def blending(*effects, outputs=None, on_gpu=True, threads=256):
     return made("blend.make_blend", effects, outputs, on_gpu, threads, 8)[0]
 
 
+GRADIENTS = ("rgb", "alpha", "depth", "normal", "distortion")
+OF_GRADIENTS = (("lowpass_screen", "ray_depth"), ("depth", "distortion", "normal"))
+
+
+def blending_back(*effects):
+    """The derivatives of blending, of a tile as large as the device's."""
+    drawn = ((*effects, *OF_GRADIENTS[0]), OF_GRADIENTS[1])
+    return made("blend_backward.make_blend_backward", *drawn, GRADIENTS, True, 256).kernel
+
+
+def projecting_back(terms):
+    names = made("fragment_backward.moments_of", *OF_GRADIENTS)
+    return made("project_backward.make_project_backward", OF_GRADIENTS[0], NORMAL, names, terms)
+
+
 def resolving(stretched, samples):
     """The kernel for all outputs."""
     images = tuple((output.name, getattr(wp, output.dtype)) for output in OUTPUTS.values())
@@ -78,7 +93,7 @@ def resolving(stretched, samples):
 
 
 LONG = pytest.mark.exhaustive
-"""of blending with every output: 13 s each. Plain runs compile it with boxes, of rays and in a test below"""
+"""of blending with every output: 13 s each. Plain runs compile it with boxes in a test below"""
 
 
 @pytest.fixture(autouse=True)
@@ -89,14 +104,12 @@ def started():
 @pytest.mark.parametrize(
     "kernel",
     [
-        pytest.param(lambda: projecting(*RECORD, terms=16), id="project"),
         pytest.param(
             lambda: projecting(*RECORD, "motion_groups", precision="float32", every_bounds=True),
             id="project-float32",
         ),
         *(pytest.param(lambda effects=effects: projecting(*effects), id=effects[0]) for effects in LENSES),
         pytest.param(lambda: projecting(*LENSES[1], "lowpass_pixel"), id="project-filtered"),
-        pytest.param(lambda: projecting(*MIXED, "lowpass_pixel"), id="project-mixed"),
         pytest.param(
             lambda: projecting("footprint_box", outputs=(), precision="float32"), id="project-boxes"
         ),
@@ -107,10 +120,14 @@ def started():
         pytest.param(lambda: blending(*MIXED), id="blend-mixed", marks=LONG),
         pytest.param(lambda: blending("footprint_box", outputs=()), id="blend-boxes"),
         pytest.param(lambda: blending("rays", "footprint_box", outputs=()), id="blend-rays-boxes"),
-        pytest.param(lambda: blending("rays", *MIXED), id="blend-rays-mixed"),
+        pytest.param(lambda: blending("rays", *MIXED), id="blend-rays-mixed", marks=LONG),
         pytest.param(lambda: blending("rays", *RECORD, "rays_length"), id="blend-rays", marks=LONG),
         pytest.param(lambda: blending("camera_orthographic", *RECORD), id="blend-parallel", marks=LONG),
         pytest.param(lambda: blending("lowpass_screen", "stop_exclusive", outputs=()), id="blend-exclusive"),
+        pytest.param(lambda: blending_back("stop_exclusive", "arithmetic_fast"), id="blend-backward"),
+        pytest.param(lambda: projecting_back(16), id="project-backward"),
+        pytest.param(lambda: made("blend_backward.make_slots", True), id="slots"),
+        pytest.param(lambda: made("column_sums.add_rows"), id="sums"),
         pytest.param(lambda: resolving(False, 3), id="resolve"),
         pytest.param(lambda: resolving(True, 1), id="resolve-stretched"),
         pytest.param(lambda: made("surroundings.make_backdrop", "gradient", False), id="backdrop-gradient"),
@@ -124,6 +141,7 @@ def started():
     ],
 )
 def test_the_kernels_compile_for_cuda(kernel, tmp_path):
+    """Those that tests below compile excepted."""
     assert "wp::launch_bounds_t" in compiled(kernel(), tmp_path)
 
 
@@ -146,7 +164,7 @@ def test_the_base_has_nothing_of_absent_effects_and_takes_no_more_of_a_gpu(tmp_p
 
 def test_records_move_as_whole_lines(tmp_path):
     """Field by field, each store would touch 32 records of a warp."""
-    project = compiled(projecting(*RECORD), tmp_path / "project", 128, assembly=True)
+    project = compiled(projecting(*RECORD, terms=16), tmp_path / "project", 128, assembly=True)
     assert project.count("st.global.v4") == 7
     blend = compiled(blending(*RECORD, outputs=NORMAL), tmp_path / "blend", assembly=True)
     assert blend.count("ld.shared.v4") >= 5

@@ -145,6 +145,7 @@ def test_the_least_and_the_longest_focal_lengths(renderer, focal):
     assert_agrees(renderer, random_splats(60, seed=3, depth=(2, 4), scale=(0.05, 0.8)), camera)
 
 
+@pytest.mark.usefixtures("optimised")
 def test_a_hundred_thousand_splats_at_720p(renderer):
     """r100k_720p at 300 pixels: at least 50 dB (the figure of its issue), and within the usual tolerance."""
     cloud, camera = load_scene("r100k_720p")

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, assert_agrees, random_splats
+from sampling import in_turn
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
@@ -60,6 +61,7 @@ def test_the_bits_are_the_same_on_every_device():
         assert np.array_equal(logarithm, found[0][1])
 
 
+@in_turn()
 @pytest.mark.parametrize("cloud", [AROUND, coplanar_cloud(1)], ids=["around", "planes"])
 def test_pictures_move_by_the_rounding_of_opacities(renderer, cloud):
     for quality in (FAST, PRECISE):
@@ -84,6 +86,7 @@ def test_faint_fragments_stay_faint(renderer):
         assert np.abs(precise[name] - fast[name]).max() <= 2e-6
 
 
+@in_turn(1)
 @pytest.mark.parametrize("cloud", [AROUND, coplanar_cloud(1)], ids=["around", "planes"])
 def test_both_schedules_draw_the_same_bits(renderer, cloud):
     picture = Picture(cloud, CAMERA, FAST, ALL_OUTPUTS)

@@ -9,6 +9,7 @@ import multiprocessing
 import numpy as np
 import pytest
 from agreement import random_splats, truth_of
+from optimisation import hardly
 from sampling import in_turn
 from test_lens_pictures import CAMERAS
 
@@ -78,6 +79,7 @@ def draw_with_guarded_rays():
     """The picture "distortion" on Warp's CPU."""
     import warp as wp
 
+    hardly()
     backend = fs.Renderer("warp:cpu").backend
     kept = []
 

@@ -18,7 +18,7 @@ from fidsplat.hard_cases.derivatives import (
     random_picture,
 )
 
-BACKEND = "opencl"
+BACKEND = ("opencl", "warp")
 
 
 def assert_same(backend, cloud, capture, by_images=None, **build):
@@ -112,7 +112,7 @@ def test_the_same_bits_on_every_run_and_those_of_render(backend, renderer):
     for name, array in first.items():
         assert array.tobytes() == again[name].tobytes(), name
     features, view = prepare(cloud, capture)
-    images = backend.differentiate(features).forward(backend.upload(cloud), view)
+    images = backend.differentiate(with_distortion(features)).forward(backend.upload(cloud), view)
     drawn = {name: images.read(name) for name in capture.outputs}
     frame = renderer.render(cloud, capture)
     assert all(np.array_equal(drawn[name], frame[name]) for name in drawn)
@@ -129,11 +129,14 @@ def test_outputs_without_a_gradient_given_have_one_of_zero(backend):
         assert np.array_equal(alone[name], beside[name]), name
 
 
-def test_another_picture_in_between_is_an_error(backend, renderer):
+def test_derivatives_are_timed_and_another_picture_in_between_is_an_error(backend, renderer):
     cloud, capture = random_picture(6)
     features, view = prepare(cloud, capture)
-    pipeline = backend.differentiate(features)
+    pipeline = backend.differentiate(with_distortion(features))
     images = pipeline.forward(backend.upload(cloud), view)
+    pipeline.backward(images, {})
+    assert {"blend", "blend backward", "project backward"} <= images.timings.keys()
+    assert all(isinstance(name, str) and ms >= 0 for name, ms in images.timings.items())
     renderer.render(cloud, capture)
     with pytest.raises(fs.InputError, match="made last"):
         pipeline.backward(images, {})

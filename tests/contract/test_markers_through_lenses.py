@@ -15,7 +15,7 @@ from fidsplat.vision.undistort import pinhole_towards, undistort
 
 pytestmark = pytest.mark.usefixtures("optimised")
 SIZE, SPEC = 0.4, "apriltag:36h11:5"
-DENSE = fs.Quality(lowpass="none", samples=3)
+DENSE = fs.Quality(lowpass="none", samples=2)
 GREY = (0.5, 0.5, 0.5)
 
 

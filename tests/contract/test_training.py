@@ -10,7 +10,8 @@ from fidsplat.backends.derivatives import Differentiates, Trains
 from fidsplat.backends.prepare import prepare
 from fidsplat.effects.differentiable import with_distortion
 from fidsplat.formats import load_ply
-from fidsplat.train import Trainer
+from fidsplat.train import Trainer, TrainSettings, densify
+from fidsplat.train.host import HostWork
 from fidsplat.train.losses import normal_loss
 
 BACKEND = "opencl"
@@ -70,6 +71,30 @@ def test_kernels_and_numpy_train_alike(renderer, dataset, monkeypatch, losses):
         steps[name] = trainer.history["losses"]
         assert type(trainer._work).__name__ == {"kernels": "DeviceWork", "numpy": "HostWork"}[name]
     np.testing.assert_allclose(steps["kernels"], steps["numpy"], rtol=1e-4)
+
+
+def test_splats_are_made_by_kernels_as_by_numpy(renderer, dataset):
+    """Bit for bit: a round of densification, and a reset of opacities."""
+    settings = TrainSettings(**{**QUICK, "iterations": 20, "sh_degree": 1, "densify_from": 99})
+    trainer = Trainer(dataset, renderer, settings)
+    for _ in range(17):  # harmonics too have moved
+        trainer.step()
+    work = trainer._work
+    made = densify.plan(work.shapes(), settings, 8, dataset.extent)
+    assert 0 < made.kept < 16 < len(made.rows)
+    expected = HostWork(renderer.backend, dataset.views, settings)
+    expected.load(work.store())
+    for each in (work, expected):
+        each.make(made)
+        each.reset()
+    assert len(work) == len(made.rows)
+    for group in ("values", "first", "second"):
+        for name, array in getattr(expected.store(), group).items():
+            assert np.array_equal(getattr(work.store(), group)[name], array), (group, name)
+    found = work.store()
+    assert found.first["sh"][:, 1:].any()
+    assert found.opacities.max() <= 0.5 + 1e-6
+    assert all(not array.any() for array in (found.first["logits"], found.gradients, found.seen))
 
 
 def test_the_loss_of_normals_does_what_it_is_for(renderer, dataset):

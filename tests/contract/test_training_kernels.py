@@ -9,9 +9,10 @@ import pytest
 from training_scene import scene
 
 from fidsplat.backends.derivatives import Trains
+from fidsplat.backends.gradients import on_host
 from fidsplat.train import TrainSettings
 from fidsplat.train.device import DeviceWork
-from fidsplat.train.host import HostWork, on_host
+from fidsplat.train.host import HostWork
 from fidsplat.train.losses import picture_loss
 from fidsplat.train.optimiser import rates
 from fidsplat.train.parameters import NAMES, Splats

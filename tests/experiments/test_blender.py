@@ -56,11 +56,11 @@ FAKE = """
 import json, pathlib, sys
 job = json.load(open(sys.argv[1]))
 print("Blender says much else")
-for marker in job["markers"]:
+for marker in job["things"]:
     for shot in marker["shots"]:
         if "broken" in shot["file"]:
             sys.exit("Error: no device")
-        pathlib.Path(shot["file"]).write_text(json.dumps({**job, "markers": marker["name"]}))
+        pathlib.Path(shot["file"]).write_text(json.dumps({**job, "things": marker["name"]}))
         print("done", shot["file"], flush=True)
 """
 

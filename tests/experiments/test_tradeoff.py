@@ -29,7 +29,7 @@ from fidsplat.experiments.tradeoff.session import QUICK, Session, memory_of, tim
 from fidsplat.experiments.tradeoff.summary import load
 from fidsplat.hard_cases.clouds import camera, splats
 from fidsplat.quality import ELLIPSOID, PRESETS, MarkerQuality
-from fidsplat.random_clouds import random_cloud
+from fidsplat.random_clouds import SCENES, random_cloud
 
 pytestmark = pytest.mark.usefixtures("optimised")
 FACING = (1.0, 0.0, 0.0, 0.0)
@@ -121,8 +121,11 @@ def test_the_hard_scene_is_the_same_each_time_and_fills_its_cells(session):
     assert np.abs(dropped - picture)[cell_window(CELLS.index("opaque"))].max() > 0.5
 
 
-def test_3d_gaussians_are_held_against_the_gaussians_themselves(session):
-    """What EWA widens and what its linear image is wrong by are errors."""
+def test_3d_gaussians_are_held_against_the_gaussians_themselves(monkeypatch):
+    """What EWA widens and what its linear image is wrong by are errors. A tenth of the scene's splats."""
+    small = dataclasses.replace(SCENES["r100k_720p_3d"], count=10_000, width=320, height=180)
+    monkeypatch.setitem(SCENES, "r100k_720p_3d", small)
+    session = Session(fs.Renderer("opencl"))
     truth = session.truth("r100k_720p_3d", EXACT)
     by_way = {
         point.quality.ellipsoid: np.abs(session.draw("r100k_720p_3d", point.quality)["rgb"] - truth).max()

@@ -21,6 +21,7 @@ MAY_IMPORT = {
     "files": BASE,
     "rotations": BASE,
     "scalars": {"errors"},
+    "interrupts": set(),
     "summaries": set(),
     "harmonics": BASE,
     "quality": BASE,
@@ -47,13 +48,14 @@ MAY_IMPORT = {
     "views": PLAIN,
     "batch": BASE | {"backends", "effects", "frame"},
     "render": PLAIN | {"store", "scenes", "effects", "backends", "frame", "views", "batch"},
+    "several": PLAIN | {"render", "scenes", "store", "frame"},
     "viewer": PLAIN | {"store", "scenes", "effects", "backends", "render", "frame", "vision", "formats"},
     "flights": PLAIN | {"store", "scenes", "render", "vision", "formats", "frame", "provenance"},
-    "remote": BASE | {"provenance", "flights", "render", "vision", "experiments"},
+    "remote": BASE | {"provenance", "flights", "render", "vision", "experiments", "store"},
     "sim": PLAIN | {"batch", "scenes", "markers", "render", "vision", "formats"},
     "logs": BASE | {"cameras", "vision"},
     "accuracy": PLAIN | {"scenes", "effects", "render", "backends"},
-    "train": PLAIN | {"formats", "markers", "vision", "render", "backends", "effects"},
+    "train": PLAIN | {"formats", "markers", "vision", "render", "backends", "effects", "provenance"},
     "detail": PLAIN | {"store", "render", "backends", "accuracy"},
     "budget": PLAIN | {"store", "scenes", "render", "accuracy", "provenance", "timing"},
 }
@@ -71,7 +73,7 @@ HOME_OF = {
     "ray": ("remote.ray_engine",),
     "pxr": ("formats.usd",),
     "imageio_ffmpeg": ("vision.video",),
-    "bpy": ("experiments.blender_worker",),
+    "bpy": ("experiments.blender_worker", "experiments.blender_plants"),
     "shapely": ("markers", "vision.visible"),
     "networkx": ("markers",),
     "segno": ("markers",),
@@ -178,7 +180,19 @@ def within_any(names, package) -> bool:
 
 
 # modules of the package that every backend may import
-SHARED = ("base", "stack", "blank", "caches", "view", "prepare", "registry", "planes", "bands", "gradients")
+SHARED = (
+    "base",
+    "stack",
+    "blank",
+    "caches",
+    "view",
+    "prepare",
+    "registry",
+    "planes",
+    "bands",
+    "gradients",
+    "chunks",
+)
 
 
 def test_backends_do_not_import_each_other():

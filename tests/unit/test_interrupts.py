@@ -3,9 +3,26 @@
 import json
 import os
 import subprocess
+import sys
 
 import interrupt
 import pytest
+
+IN_A_LIBRARY = """
+import os, signal, sys
+from fidsplat.cli import main
+
+def stop(frame, event, argument):
+    caller = frame.f_back and frame.f_back.f_back
+    if event == "call" and caller and caller.f_code.co_qualname == "ExtensionFileLoader.exec_module":
+        if caller.f_locals["self"].name == "pyopencl._cl":
+            sys.setprofile(None)
+            os.kill(os.getpid(), signal.{name})
+
+sys.setprofile(stop)
+sys.exit(main(["devices"]))
+"""
+"""sends a signal when PyOpenCL calls Python while it is loaded"""
 
 
 @pytest.fixture(scope="module")
@@ -17,6 +34,17 @@ def test_an_interrupted_command_loses_nothing(trial):
     found = [interrupt.disturb(trial, how, how, 0.8) for how in interrupt.SIGNALS]
     assert [row["lost"] for row in found] == [[]] * 3
     assert any(row["stopped"] for row in found)
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "said"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")]
+)
+def test_a_library_that_is_being_loaded_is_not_interrupted(name, status, said):
+    """PyOpenCL aborted the process then."""
+    ended = subprocess.run(
+        [sys.executable, "-c", IN_A_LIBRARY.format(name=name)], capture_output=True, text=True, check=False
+    )
+    assert (ended.returncode, ended.stderr) == (status, f"fidsplat: {said}\n")
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount a small file system")

@@ -78,6 +78,9 @@ def test_bugs_are_caught_survive_or_are_not_tested(tmp_path, monkeypatch):
         results.add(plant, found)
     known = mutate.Results(tmp_path / "found.jsonl")
     assert [known.of(plant) for plant in bugs.values()] == list(bugs)
+    changed = dataclasses.replace(caught, old="return a + b", new="return a - b")
+    assert known.of(changed) is None
+    assert known.test_of(changed) == "test_sum.py::test_it"
     assert known.of(dataclasses.replace(caught, new="b")) is None
     assert "| sums | 3 | 2 | 1 | 1 |" in mutate.table(list(bugs.values()), known)
     assert (tmp_path / "copies" / "0" / "sum.py").read_text() == (tmp_path / "sum.py").read_text()

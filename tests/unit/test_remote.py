@@ -106,6 +106,23 @@ def test_pictures_come_back_as_the_files_that_one_process_writes(tmp_path):
     assert list(draw(folder, Here(work), 2)) == []
 
 
+def test_workers_read_stores_where_they_are_here(tmp_path):
+    cloud = fs.marker("aruco:4x4_50:7", size=0.4, mixture="fitted").cloud
+    fs.save_ply(cloud, tmp_path / "a.ply")
+    store = fs.Store(fs.build_store([tmp_path / "a.ply"], tmp_path / "a.fss"))
+    flown = flight(stores=(store,))
+    sent = pickle.dumps(FlightWork(flown, "reference"))
+    ours, here = pickle.loads(sent)()(2), FlightWork(flown, "reference")()(2)
+    assert ours == here
+    store.path.rename(tmp_path / "b.fss")
+    with pytest.raises(fs.InputError, match=r"a disk that they share, and on .*a\.fss is not a store"):
+        pickle.loads(sent)()
+    fs.save_ply(fs.marker("aruco:4x4_50:3", size=0.4, mixture="fitted").cloud, tmp_path / "a.ply")
+    fs.build_store([tmp_path / "a.ply"], tmp_path / "a.fss")
+    with pytest.raises(fs.InputError, match=r"a\.fss is another store than here"):
+        pickle.loads(sent)()
+
+
 def test_words_that_cannot_be_used(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for words in (("--workers", "2"), ("--ray", "local", "--workers", "0")):

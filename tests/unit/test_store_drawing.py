@@ -10,6 +10,7 @@ import pytest
 from test_store import contents
 
 import fidsplat as fs
+from fidsplat.backends.opencl import chunks
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.seen import seen
 from fidsplat.random_clouds import random_splats
@@ -163,6 +164,40 @@ def test_a_device_draws_stores_bit_for_bit(stores, tmp_path):
                 assert np.array_equal(batch["rgb"][number], renderer.render(cloud, camera)["rgb"])
 
 
+def test_a_device_keeps_the_chunks_that_it_was_sent(stores, tmp_path, monkeypatch):
+    sent, put = [], chunks.OpenCLChunks._put
+    monkeypatch.setattr(
+        chunks.OpenCLChunks, "_put", lambda self, key, *rest: sent.append(key) or put(self, key, *rest)
+    )
+    renderer, store = fs.Renderer("opencl"), stores["disks"]
+    resident, cameras = renderer.upload(store), [look(), look(turn=TURNED), look()]
+    for camera in cameras:
+        assert np.array_equal(
+            renderer.render(resident, camera)["rgb"], renderer.render(store.cloud(), camera)["rgb"]
+        )
+    assert 0 < len(sent) == len(set(sent)) <= store.chunks
+    # of a store of places the splats are there once
+    sent.clear()
+    placed = fs.Store(fs.place_store(store, tmp_path / "p.fss", [np.eye(4), rigid_matrix((0, 0, 0.5))]))
+    renderer.render(renderer.upload(placed), look())
+    assert len(sent) == len(set(sent)) <= store.chunks
+
+
+def test_a_device_without_room_for_a_view_is_sent_its_chunks_again(stores, monkeypatch):
+    renderer, store = fs.Renderer("opencl"), stores["disks"]
+    # two chunks fit, and no picture is put together as a whole
+    monkeypatch.setattr(chunks, "_SHARE", renderer.backend.memory_budget // 8000)
+    monkeypatch.setattr(chunks, "_WHOLE", renderer.backend.memory_budget // 8000)
+    resident, outputs = renderer.upload(store), ("rgb", "splat_id")
+    for camera in (look(), look(turn=TURNED)):
+        ours, whole = (renderer.render(each, camera, outputs) for each in (resident, store.cloud()))
+        for output in outputs:
+            assert np.array_equal(ours[output], whole[output]), output
+    assert 0 < len(resident._data._cache._slots) <= 2
+    resident._data._cache.bring(resident._data.scene.chunks(resident._data.scene.everything(), True))
+    assert len(resident._data._cache._slots) <= 2
+
+
 def test_what_is_pickled_of_a_store_is_its_path_and_of_its_cloud_the_splats(stores):
     store, cloud = stores["thick"], stores["thick"].cloud()
     assert pickle.loads(pickle.dumps(store)).identity == store.identity
@@ -253,9 +288,9 @@ def test_planes_of_stores_are_always_whole(tmp_path, reference):
     selection = Streamed([store]).select(
         [prepare(store, fs.Capture(look(at=(0, 0, 90))))[1]], prepare(store, fs.Capture(near))[0]
     )
-    part, ids = Streamed([store]).part(selection)
+    part = Streamed([store]).part(selection)
     assert len(part) == len(marker)
-    assert ids.tolist() == list(range(len(store) - len(marker), len(store)))
+    assert Streamed([store]).ids(selection).tolist() == list(range(len(store) - len(marker), len(store)))
 
 
 def test_a_flight_over_a_store_goes_on_by_its_content(stores, tmp_path):

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 import fidsplat as fs
+from fidsplat.harmonics import C0
 from fidsplat.rotations import quaternion_to_matrix
-from fidsplat.store.merge import WIDER, merged, quaternions_of
+from fidsplat.store.merge import DENSEST, merged, quaternions_of
 from fidsplat.store.morton import Grid, grid_around
 
 
@@ -15,7 +16,8 @@ def test_merged_splats_have_the_light_and_the_place_of_those_they_stand_for():
     turns = np.tile(np.float32([1, 0, 0, 0]), (400, 1))
     scales = np.full((400, 2), 0.01, np.float32)
     splats = {"means": means.astype(np.float32), "quats": turns, "scales": scales}
-    splats |= {"opacities": np.full(400, 0.1, np.float32), "colors": generator.random((400, 3), np.float32)}
+    splats |= {"opacities": np.full(400, 0.1, np.float32)}
+    splats["colors"] = 0.5 + 0.1 * generator.random((400, 3), np.float32)
     made, size = merged(splats, Grid((-4.0, -4.0, -4.0), 8.0))
     assert 1 < len(made["means"]) <= 100
     assert size > 0
@@ -38,12 +40,30 @@ def test_splats_on_top_of_each_other_become_several():
     means = np.column_stack([generator.uniform(0, 0.01, (count, 2)), np.zeros(count)]).astype(np.float32)
     splats = {"means": means, "quats": np.tile(np.float32([1, 0, 0, 0]), (count, 1))}
     splats |= {"scales": np.full((count, 2), 0.02, np.float32), "opacities": np.full(count, 0.9, np.float32)}
+    splats["colors"] = np.ones((count, 3), np.float32)
     made, _ = merged(splats, Grid((-1.0, -1.0, -1.0), 2.0))
     light = made["opacities"] * made["scales"].prod(axis=1)
     assert light.sum() == pytest.approx(count * 0.9 * 4e-4, rel=1e-5)
-    assert 0.9 * count / WIDER - 1 < len(light) < 0.9 * count
-    assert made["opacities"].max() <= 1
+    assert 0.9 * count / DENSEST - 1 < len(light) < 0.9 * count
+    assert 1 < made["opacities"].max() <= DENSEST
     assert made["scales"].max() < 0.02 * 1.4
+
+
+def test_bright_and_dark_splats_of_a_cell_stay_apart():
+    means = np.zeros((40, 3), np.float32)
+    means[:, 0] = np.linspace(0.01, 0.02, 40)
+    splats = {"means": means, "quats": np.tile(np.float32([1, 0, 0, 0]), (40, 1))}
+    splats |= {"scales": np.full((40, 2), 1e-3, np.float32), "opacities": np.full(40, 0.1, np.float32)}
+    light = np.where(means[:, :1] < 0.014, np.float32(0.2), np.float32(0.7))
+    plain, _ = merged(splats | {"colors": np.full((40, 3), 0.2, np.float32)}, Grid((-1.0, -1.0, -1.0), 2.0))
+    harmonics = ((light - np.float32(0.5)) / np.float32(C0))[:, None] * np.ones((1, 1, 3), np.float32)
+    for colors in ({"colors": light * np.ones((1, 3), np.float32)}, {"sh": harmonics}):
+        made, _ = merged(splats | colors, Grid((-1.0, -1.0, -1.0), 2.0))
+        assert len(made["means"]) > len(plain["means"])
+        name, values = next(iter(colors.items()))
+        known = {float(value) for value in values.ravel()}
+        assert {min(known, key=lambda k, v=v: abs(k - v)) for v in made[name].ravel()} == known
+        assert np.abs(made[name].ravel()[:, None] - sorted(known)).min(axis=1).max() < 1e-6
 
 
 def test_quaternions_of_many_rotations():

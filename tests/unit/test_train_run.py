@@ -5,6 +5,8 @@ import json
 import os
 import subprocess
 import sys
+import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -140,6 +142,24 @@ def test_a_run_that_was_killed_goes_on_to_the_same_bytes(whole, dataset, tmp_pat
     again.run()
     again.save(tmp_path / "scene.ply")
     assert sha(tmp_path / "scene.ply") == sha(whole[3])
+
+
+def test_a_run_says_that_a_checkpoint_is_of_another_device_or_other_sources(dataset, tmp_path, monkeypatch):
+    file, renderer = tmp_path / "scene.training.npz", fs.Renderer("reference")
+    settings = {"iterations": 2, "checkpoint": file, **QUICK}
+    Trainer(dataset, renderer, **settings).run()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert Trainer(dataset, renderer, **settings).done
+    monkeypatch.setattr("fidsplat.train.checkpoint.code_hash", lambda: "f00d")
+    with pytest.warns(UserWarning, match=r"another fidsplat \(.*, not .*f00d\); the run goes on") as seen:
+        assert Trainer(dataset, renderer, **settings).done
+    assert "another device" not in str(seen[0].message)
+    file.unlink()
+    Trainer(dataset, renderer, **settings).run()
+    monkeypatch.setattr(renderer.backend, "info", replace(renderer.device, title="abacus"))
+    with pytest.warns(UserWarning, match=r"another device \(.*, not abacus\); the run goes on"):
+        assert Trainer(dataset, renderer, **settings).done
 
 
 def test_a_checkpoint_of_another_run_is_refused(dataset, tmp_path):

@@ -22,7 +22,8 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.backends.opencl.declare import Argument, Layout, Record, Samples, Scalars, output_argument
-from fidsplat.backends.opencl.layout import BOUNDS, KERNELS, LAYOUTS, SPLAT, VIEW
+from fidsplat.backends.opencl.effect_layouts import LAYOUTS
+from fidsplat.backends.opencl.layout import BOUNDS, KERNELS, SPLAT, VIEW
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError

@@ -1,5 +1,6 @@
 """What declarations of the kernels' data are made of, and what is made from them: C text, NumPy types, and
-the kinds of arguments that the host binds. The declarations themselves stand in layout.py.
+the kinds of arguments that the host binds. The declarations themselves stand in layout.py, those of effects
+in effect_layouts.py.
 """
 
 from __future__ import annotations

@@ -8,8 +8,10 @@ from dataclasses import replace
 import pyopencl as cl
 
 from fidsplat.backends.base import DeviceInfo, Rates
+from fidsplat.backends.chunks import WholeScene
 from fidsplat.backends.opencl import pocl_cache, pocl_target
 from fidsplat.backends.opencl.assemble import Source, assemble
+from fidsplat.backends.opencl.chunks import OpenCLChunks
 from fidsplat.backends.opencl.gradients import OpenCLGradients
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.probe import OpenCLProbe
@@ -84,6 +86,10 @@ class OpenCLBackend(Workspace):
     def upload(self, cloud: SplatCloud) -> Resident:
         """The cloud in device buffers."""
         return Resident(self, cloud)
+
+    def chunk_cache(self, whole: WholeScene, rows: int) -> OpenCLChunks:
+        """As `KeepsChunks`."""
+        return OpenCLChunks(self, whole, rows)
 
     def unsupported(self, features: FeatureSet) -> str:
         """Blending in float64 where the device has none; empty for all else."""

@@ -14,8 +14,8 @@ from fidsplat.backends.opencl.assemble import (
     numbers_of,
 )
 from fidsplat.backends.opencl.declare import Argument, Record, member
+from fidsplat.backends.opencl.effect_layouts import LAYOUTS as DRAWN
 from fidsplat.backends.opencl.gradients_layout import KERNELS, LAYOUTS, MOMENTS, BackwardLayout
-from fidsplat.backends.opencl.layout import LAYOUTS as DRAWN
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.effects import FeatureSet
 

@@ -1,14 +1,14 @@
-"""What host and kernels both know, declared once: records, arguments of kernels, and what effects add to
-them.
+"""What the stages of drawing pass on and take, declared once: records, and the arguments of kernels.
 
 The C structs and signatures of kernels/opencl/ are printed from this (assemble.py), and the host binds
-arguments by these names (program.py). Buffers are (channels, rows, columns) of the padded grid of samples,
-unless they say otherwise.
+arguments by these names (program.py). What effects and outputs add to both stands in
+effect_layouts.py. Buffers are (channels, rows, columns) of the padded grid of samples, unless they say
+otherwise.
 """
 
 from __future__ import annotations
 
-from fidsplat.backends.opencl.declare import Argument, Layout, Record, Samples, member, takes, uniforms
+from fidsplat.backends.opencl.declare import Argument, Record, member, takes, uniforms
 
 VIEW = Record(
     "View",
@@ -72,7 +72,7 @@ _EXPOSED = takes(
     "uint plane  // samples per channel of a shot",
     *("int whole_stride", "uint whole_plane", "int top planes"),
 )
-_RAY = uniforms(
+RAY_UNIFORMS = uniforms(
     "ray",
     "float ray_focal_x ray_focal_y ray_center_x ray_center_y",
     note="of the sample grid; infinite where depths are distances",
@@ -133,7 +133,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "expose": takes(_EXPOSED, "float weight", "int first", "in float raw", "out float exposed"),
     "expose_middle": takes(_EXPOSED, "in uint raw", "out uint exposed"),
     "backdrop": takes(
-        *(_SIZE, "int stride", "uint plane", _RAY),
+        *(_SIZE, "int stride", "uint plane", RAY_UNIFORMS),
         uniforms(
             "rotation",
             "float turn_00 turn_01 turn_02 turn_10 turn_11 turn_12 turn_20 turn_21 turn_22",
@@ -150,273 +150,3 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
 }
 """The arguments of each kernel; those of effects and outputs follow them."""
-
-_RAYS = takes("in float rays  // 3 channels X, Y, Z; NaN where nothing is seen")
-_OWN_RAYS = ("camera_brown_conrady", "camera_fisheye", "camera_equirectangular")
-
-LAYOUTS: dict[str, Layout] = {
-    # one of each kind
-    "camera_pinhole": Layout("slot/camera_pinhole.cl", parts=("conic", "perspective")),
-    "camera_brown_conrady": Layout(
-        "slot/camera_brown_conrady.cl",
-        parts=("perspective", "ray_map", "rays"),
-        view=(
-            member("real lens[12]", "k1 to k6, p1, p2, s1 to s4"),
-            member("real lens_fold", "square of the radius where the polynomial turns back"),
-        ),
-    ),
-    "camera_fisheye": Layout(
-        "slot/camera_fisheye.cl",
-        parts=("polygon", "ray_map", "rays"),
-        view=(
-            member("real lens[4]", "k1 to k4"),
-            member("real lens_limit", "largest angle that is seen [rad]"),
-        ),
-    ),
-    "camera_equirectangular": Layout("slot/camera_equirectangular.cl", parts=("polygon", "rays")),
-    "camera_orthographic": Layout(
-        "slot/camera_orthographic.cl",
-        parts=("conic",),
-        splat=(member("wide z0 zx zy", "depth times D = z0 + zx x + zy y"), member("wide z_near")),
-    ),
-    "color_rgb": Layout("slot/color_rgb.cl", project=takes("cloud float colors  // (n, 3)")),
-    "color_sh": Layout("slot/color_sh.cl", project=takes("cloud float sh  // (n, (SH_DEGREE + 1)^2, 3)")),
-    "lowpass_none": Layout("slot/lowpass_none.cl"),
-    "lowpass_pixel": Layout("slot/lowpass_pixel.cl", parts=("lowpass_none",)),
-    "lowpass_screen": Layout(
-        "slot/lowpass_screen.cl",
-        splat=(
-            member(
-                "wide dot_x dot_y", "projected centre relative to the anchor's; far away if it is not drawn"
-            ),
-        ),
-        bounds=(
-            member("float px py pr", "the filter's support: centre and radius [samples]; radius < 0: none"),
-        ),
-    ),
-    "stop_inclusive": Layout(),
-    "stop_exclusive": Layout("slot/stop_exclusive.cl"),
-    "compose_ordered": Layout("slot/compose_ordered.cl"),
-    "compose_pixel": Layout(
-        "slot/compose_pixel.cl",
-        parts=("ray_depth",),
-        splat=(member("wide nearest", "depth before which no fragment of the splat lies"),),
-    ),
-    "compose_planes": Layout(
-        "slot/compose_planes.cl",
-        parts=("compose_pixel",),
-        splat=(member("int plane"),),
-        project=takes(
-            "cloud int planes  // (n) index of the splat's plane; -1: none",
-            "in float plane_keys  // (planes, views) depth at which its splats are sorted in [m]",
-        ),
-    ),
-    "footprint_gaussian": Layout(),
-    "footprint_box": Layout("slot/footprint_box.cl", parts=("box_edges",)),
-    "footprint_mixed": Layout(
-        "slot/footprint_mixed.cl",
-        parts=("box_edges",),
-        splat=(member("int box"),),
-        project=takes("cloud int boxes  // (n) 1: box, 0: Gaussian"),
-    ),
-    "ellipsoid_exact": Layout(
-        "slot/ellipsoid_exact.cl",
-        parts=("thickness",),
-        splat=(member("wide bulge", "2 / m^2 of a 3D Gaussian, 0 of a disk"),),
-    ),
-    "ellipsoid_ewa": Layout(
-        "slot/ellipsoid_ewa.cl",
-        parts=("thickness",),
-        view=(member("real slopes[4]", "of rays, -x, x, -y, y: where derivatives are taken at most"),),
-    ),
-    "ellipsoid_ewa_antialiased": Layout("slot/ellipsoid_ewa_antialiased.cl", parts=("ellipsoid_ewa",)),
-    "ellipsoids_alone": Layout("slot/ellipsoids_alone.cl"),
-    "background_constant": Layout(),
-    "background_gradient": Layout(
-        "slot/background_gradient.cl",
-        parts=("world_ray",),
-        backdrop=uniforms(
-            "gradient", "float sky_r sky_g sky_b", "float ground_r ground_g ground_b", "float up_x up_y up_z"
-        ),
-    ),
-    "background_panorama": Layout(
-        "slot/background_panorama.cl",
-        parts=("world_ray",),
-        backdrop=takes(
-            uniforms("panorama_size", "int panorama_width panorama_height"),
-            "array float panorama  // (panorama_height, panorama_width, 3)",
-        ),
-    ),
-    "arithmetic_precise": Layout("slot/arithmetic_precise.cl"),
-    "arithmetic_fast": Layout("slot/arithmetic_fast.cl"),
-    "motion_groups": Layout(
-        "slot/motion_groups.cl",
-        project=takes("cloud int labels  // (n)", "in int moving  // number of groups, then their labels"),
-    ),
-    "opaque_layer": Layout(
-        "slot/opaque_layer.cl",
-        parts=("ray_depth",),
-        blend=takes(
-            "array float layer_depth layer_rgb  // (h, w) infinite where there is none, (h, w, 3)",
-            "array int layer_label  // (h, w)",
-        ),
-    ),
-    "shutter_exposure": Layout("slot/shutter_exposure.cl"),
-    "shutter_rows": Layout("slot/shutter_rows.cl"),
-    "blend_double": Layout(),
-    # what several of them share
-    "beside": Layout("part/beside.cl"),
-    "conic": Layout("part/conic.cl"),
-    "perspective": Layout("part/perspective.cl"),
-    "polygon": Layout("part/polygon.cl"),
-    "ray_map": Layout(
-        "part/ray_map.cl",
-        view=(member("real map[6]", "low corner, cells per unit along x and y, cells a side, first row"),),
-        project=takes("in short4 ray_map"),
-    ),
-    "rays": Layout(
-        "part/rays.cl",
-        splat=(
-            member("wide nuz nvz dz", "n_u = nu0 + nux X + nuy Y + nuz Z, likewise n_v and D"),
-            member("wide ray_x ray_y ray_z", "X, Y, Z are relative to this ray"),
-        ),
-        project=_RAYS,
-        blend=_RAYS,
-        backdrop=_RAYS,
-    ),
-    "thickness": Layout("part/thickness.cl", project=takes("cloud float thickness  // (n) [m]; 0: a disk")),
-    "box_cover": Layout("part/box_cover.cl"),
-    "box_edges": Layout(
-        "part/box_edges.cl",
-        parts=("box_cover",),
-        splat=(
-            member(
-                "wide edge_u0 edge_u1 edge_v0 edge_v1",
-                "1 / |grad| of the forms D + n_u, D - n_u, D + n_v, D - n_v",
-            ),
-        ),
-        behind=tuple((camera, "rays_box") for camera in _OWN_RAYS),
-    ),
-    "rays_box": Layout(
-        "part/rays_box.cl",
-        parts=("box_cover",),
-        project=takes("in float ray_step  // (1) how far a ray turns from a sample to the next, at most"),
-        blend=takes("in float ray_slopes  // 6 channels dX/dx, dY/dx, dZ/dx, dX/dy, dY/dy, dZ/dy"),
-    ),
-    "ray_depth": Layout(
-        "part/ray_depth.cl",
-        splat=(member("wide z_numerator", "depth = z_numerator / D"), member("wide z_center z_reach")),
-    ),
-    # how pixels are made of samples, and by whom
-    "resolve_pixel": Layout("part/resolve_pixel.cl"),
-    "resolve_at_once": Layout("part/resolve_at_once.cl"),
-    # how fragments wait for nearer ones, by the schedule
-    "waiting_lanes": Layout("part/waiting_lanes.cl"),
-    "waiting_group": Layout("part/waiting_group.cl"),
-    "opaque_layer_end": Layout("part/opaque_layer_end.cl"),
-    "shown": Layout("part/shown.cl"),
-    "ray": Layout(resolve=_RAY),
-    "turn": Layout("part/turn.cl", resolve=takes("array float turns  // (h, 3, 3)")),
-    # rays of fisheyes and panoramas have a length of 1
-    "ray_length": Layout("part/ray_length.cl", behind=(("camera_brown_conrady", "rays_length"),)),
-    "rays_length": Layout("part/rays_length.cl"),
-    "sample_length": Layout(
-        "part/sample_length.cl",
-        parts=("ray", "ray_length"),
-        behind=(("camera_brown_conrady", "rays_sample_length"),),
-    ),
-    "rays_sample_length": Layout("part/rays_sample_length.cl", parts=("rays_length",), resolve=_RAYS),
-    "world_ray": Layout("part/world_ray.cl"),
-    # outputs
-    "alpha": Layout("output/alpha.cl"),
-    "depth": Layout(
-        "output/depth.cl",
-        parts=("ray_depth", "shown"),
-        samples=(Samples("float", "depth_raw", 2, "sum w z, sum w"),),
-    ),
-    "distortion": Layout(
-        "output/distortion.cl",
-        parts=("ray_depth",),
-        samples=(Samples("float", "distortion_raw", 4, "the first m, W, sum w m, sum w m^2"),),
-    ),
-    "depth_median": Layout(
-        "output/depth_median.cl",
-        parts=("ray_depth", "shown"),
-        samples=(Samples("float", "depth_median_raw"),),
-    ),
-    "depth_first": Layout(
-        "output/depth_first.cl",
-        parts=("ray_depth",),
-        blend=uniforms("first_light", "float first_light"),
-        samples=(Samples("float", "depth_first_raw"),),
-    ),
-    "distance": Layout("output/distance.cl", parts=("depth", "sample_length")),
-    "distance_median": Layout("output/distance_median.cl", parts=("depth_median", "sample_length")),
-    "distance_first": Layout("output/distance_first.cl", parts=("depth_first", "sample_length")),
-    "normal": Layout(
-        "output/normal.cl",
-        parts=("shown",),
-        splat=(member("wide nx ny nz"),),
-        samples=(Samples("float", "normal_raw", 3),),
-    ),
-    "normal_world": Layout("output/normal_world.cl", parts=("normal", "turn")),
-    "label": Layout(
-        "output/label.cl",
-        parts=("shown",),
-        splat=(member("int label"),),
-        project=takes("cloud int labels  // (n)"),
-        samples=(Samples("float", "label_raw"), Samples("int", "label_id_raw")),
-    ),
-    "splat_id": Layout(
-        "output/splat_id.cl",
-        parts=("shown",),
-        splat=(member("int splat_id"),),
-        project=takes("cloud int splat_ids  // (n)"),
-        samples=(Samples("float", "splat_id_raw"), Samples("int", "splat_id_index_raw")),
-    ),
-    "overdraw": Layout("output/overdraw.cl", samples=(Samples("int", "overdraw_raw"),)),
-    "blended": Layout("output/blended.cl", samples=(Samples("int", "blended_raw"),)),
-    # what changes rgb on its way out
-    "fog": Layout(
-        "output/fog.cl",
-        parts=("ray_depth", "ray_length"),
-        blend=takes(uniforms("fog_density", "float fog_density"), _RAY),
-        samples=(Samples("float", "fog_raw"),),
-        averaged=True,
-    ),
-    "exposure": Layout("post/exposure.cl", resolve=uniforms("exposure", "float exposure")),
-    "vignetting": Layout(
-        "post/vignetting.cl",
-        resolve=takes(
-            uniforms(
-                "vignette_center",
-                "float vignette_x vignette_y vignette_scale",
-                note="principal point [px], 1 / (half diagonal [px])",
-            ),
-            uniforms("vignetting", "float vignette_a vignette_b vignette_c"),
-        ),
-    ),
-    "noise": Layout(
-        "post/noise.cl",
-        resolve=uniforms(
-            "noise",
-            "float shot_variance read_variance",
-            "uint noise_seed",
-            note="at value 1, and at every value",
-        ),
-    ),
-    "gain": Layout("post/gain.cl", resolve=uniforms("gain", "float gain")),
-    "response_gamma": Layout(
-        "post/response_gamma.cl", resolve=uniforms("inverse_gamma", "float inverse_gamma")
-    ),
-    "response_srgb": Layout("post/response_srgb.cl"),
-    "response_table": Layout(
-        "post/response_table.cl",
-        resolve=takes(
-            uniforms("response_count", "int response_count"),
-            "array float response  // (response_count)",
-        ),
-    ),
-    "quantise": Layout("post/quantise.cl", resolve=uniforms("quantise_steps", "float quantise_steps")),
-}
-"""How each effect is laid out, and the parts that several share."""

@@ -54,7 +54,10 @@ class Lists:
         source, places = picture.program.source, picture.views * count
         picture.take("splats", places * source.records["Splat"].itemsize)
         picture.take("keys", KEYS * places)
-        picture.take("windows", WINDOWS * places)
+        windows = picture.take("windows", WINDOWS * places)
+        if picture.view.band is not None and places:
+            # splats beside the band get no window of their own: one that touches no tile
+            cl.enqueue_fill_buffer(picture.queue, windows, np.zeros(1, np.uint32), 0, WINDOWS * places)
         if count == 0:
             return
         wanted = [one.name for one in source.arguments["project"] if one.source == "cloud"]

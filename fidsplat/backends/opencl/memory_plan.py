@@ -9,6 +9,8 @@ from fidsplat.errors import DeviceError
 CHUNK = 1 << 20
 """most splats that are projected at once where a cloud is taken in chunks; a power of two, so that pieces of
 every array start where any device lets a buffer start"""
+_LARGE = 1 << 23
+"""as many, where that takes a small part of the memory: the host has less to do"""
 _LEAST = 1 << 10
 
 KEYS, WINDOWS, SORTED, PAIR = 4, 8, 16, {"ordered": 4, "tiled": 12}
@@ -61,6 +63,8 @@ def plan_of(
     free = budget - fixed_bytes - pairs
     each = record_bytes + KEYS + WINDOWS
     chunk = CHUNK
+    while chunk < _LARGE and chunk * (each + upload_bytes) < free // 64:
+        chunk *= 2
     while chunk > _LEAST and (chunk * (each + upload_bytes) > free // 4 or chunk > 2 * count):
         chunk //= 2
     capacity = (free - chunk * (each + upload_bytes)) // (each + SORTED)

@@ -159,8 +159,10 @@ class Picture:
         return self.held[name]
 
     def put_view(self, row: int, end: int) -> None:
-        """The uniforms of the projection, for rows of samples [row, end)."""
+        """The uniforms of the projection, for rows of samples [row, end), of those that are wanted."""
         view, record = self.view, self.program.source.records["View"]
+        if view.band is not None:
+            row, end = max(row, view.band[0]), min(end, view.band[1])
         self.put_rays()
         self.put("view", _kept(packed(self.stack or view, row, end, record)))
         if view.groups:

@@ -85,7 +85,8 @@ class OpenCLPipeline:
         """
         workspace = self.workspace
         with workspace.lock:
-            key = self._kind(view)
+            # launches are kept of whole pictures alone
+            key = self._kind(view) if view.band is None else None
             kept = resident.kept.get(key)
             if kept is not None and (repeated := self._tried(self._repeat, resident, view, kept)) is not None:
                 return repeated

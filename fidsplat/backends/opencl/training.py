@@ -20,6 +20,7 @@ from fidsplat.errors import DeviceError
 _GROUP = 64
 _SUMS, _SUMMED = 512, 128
 """work-groups that add up the loss, and their work-items (SUMMED of kernels/opencl/train/loss.cl)"""
+_REMEMBERED = ("first_", "second_")
 
 
 class _Truth(NamedTuple):
@@ -88,19 +89,34 @@ class OpenCLTraining:
 
     def load(self, arrays: Mapping[str, np.ndarray]) -> None:
         """As `TrainingKernels`."""
-        self._count = len(arrays["means"])
-        if arrays["sh"].size >= 2**32:  # kernels count coefficients in 32 bits
-            raise DeviceError(f"{self._count:,} splats are too many to train; use fewer")
         for name, array in arrays.items():
             self._held[name] = self._put(f"the splats' {name}", array)
             self._shapes[name] = array.shape
-        self._drawn = None
+        self._begin()
 
-    def store(self) -> dict[str, np.ndarray]:
+    def pick(self, rows: np.ndarray, kept: int) -> None:
+        """As `TrainingKernels`."""
+        self._held["rows"], self._count = self._put("rows", rows), len(rows)
+        for name, shape in self._shapes.items():
+            made = len(rows), *shape[1:]
+            picked = self._workspace.pool.fresh(f"the splats' {name}", 4 * math.prod(made))
+            remembered = name.startswith(_REMEMBERED)
+            given = {"row": math.prod(shape[1:]), "kept": kept if remembered else len(rows)}
+            self._launch("pick", math.prod(made), given | {"before": self._held[name], "picked": picked})
+            self._held[name], self._shapes[name] = picked, made
+        self._begin()
+
+    def _begin(self) -> None:
+        """Other splats are there."""
+        self._count, self._drawn = self._shapes["means"][0], None
+        if math.prod(self._shapes["sh"]) >= 2**32:  # kernels count coefficients in 32 bits
+            raise DeviceError(f"{self._count:,} splats are too many to train; use fewer")
+
+    def store(self, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """As `TrainingKernels`."""
         found = {}
-        for name, shape in self._shapes.items():
-            found[name] = np.empty(shape, np.float32)
+        for name in self._shapes if names is None else names:
+            found[name] = np.empty(self._shapes[name], np.float32)
             cl.enqueue_copy(self._queue, found[name], self._held[name])
         return found
 

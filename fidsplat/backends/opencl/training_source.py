@@ -11,7 +11,8 @@ PLANES = 11
 """of the loss (kernels/opencl/train/loss.cl)"""
 MARGIN, MARGIN_ROWS = 16, 5
 """zeros around a plane, floats of a row and rows"""
-_FILES = ("prelude.cl", "math.cl", "train/loss.cl", "train/surface.cl", "train/adam.cl", "train/shake.cl")
+_STEPS = ("loss", "surface", "adam", "pick", "shake")
+_FILES = ("prelude.cl", "math.cl", *(f"train/{step}.cl" for step in _STEPS))
 
 _PICTURE = takes(
     "int width height  // values of a row: three of a pixel; rows",
@@ -72,6 +73,12 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         _ADAM,
         "float size_sh size_rest  // rates of this step, of degree 0 and above",
         "out float sh first_sh second_sh drawn_sh",
+    ),
+    "pick": takes(
+        "uint count row kept",
+        "in uint rows",
+        "in float before",
+        "out float picked",
     ),
     "count_seen": takes(
         "uint count",

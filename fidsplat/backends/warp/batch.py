@@ -55,8 +55,14 @@ class WarpBatch:
         """A view that was drawn."""
         self._pictures.append(images)
 
+    def _settle(self) -> None:
+        """Views that were drawn ahead are drawn."""
+        for images in self._pictures:
+            images.wait()
+
     def device_array(self, name: str) -> Any:
         """The images as a wp.array (views, h, w) or (views, h, w, 3) on the device; no copy."""
+        self._settle()
         output, array = self._images[name]
         shape = self.views, *self._size
         return array.reshape(shape if output.channels == 1 else (*shape, output.channels))
@@ -67,12 +73,14 @@ class WarpBatch:
 
     def read_one(self, name: str, number: int) -> np.ndarray:
         """The image of one view."""
+        self._settle()
         output = self._images[name][0]
         shape = self._size if output.channels == 1 else (*self._size, output.channels)
         return np.array(self.part(number)[name].numpy()).reshape(shape)
 
     def wait(self) -> None:
         """Until the device has drawn all views."""
+        self._settle()
         load().synchronize_device(self._workspace.device)
 
     @property

@@ -10,6 +10,7 @@ import numpy as np
 
 from fidsplat.backends.base import DeviceInfo
 from fidsplat.backends.warp import runtime
+from fidsplat.backends.warp.gradients import WarpGradients
 from fidsplat.backends.warp.launch import Commands
 from fidsplat.backends.warp.pipeline import WarpPipeline
 from fidsplat.backends.warp.probe import WarpProbe
@@ -18,6 +19,7 @@ from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.shapes import WarpShape, other_shapes, shape_for
 from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.effects import FeatureSet
+from fidsplat.effects.differentiable import check_differentiable
 from fidsplat.errors import DeviceError, UnknownDeviceError
 from fidsplat.splats import SplatCloud
 
@@ -63,6 +65,7 @@ class WarpBackend(Workspace):
         self.shape = shape_for(device)
         self._commands = Commands(device, 1 if device.is_cuda else self.info.compute_units)
         self._pipelines: dict[tuple[FeatureSet, WarpShape], WarpPipeline] = {}
+        self._gradients: dict[tuple[FeatureSet, WarpShape], WarpGradients] = {}
 
     def limit_memory(self, budget: int) -> None:
         """Let a picture and its cloud take at most `budget` bytes of the device.
@@ -95,6 +98,14 @@ class WarpBackend(Workspace):
             program = Program(self.device, self.info.name, *key)
             self._pipelines[key] = WarpPipeline(program, self, self._commands)
         return self._pipelines[key]
+
+    def differentiate(self, features: FeatureSet, shape: WarpShape | None = None) -> WarpGradients:
+        """As `Differentiates`; `shape` replaces the device's own tiles (tests)."""
+        check_differentiable(features)
+        key = (features, shape or self.shape)
+        if key not in self._gradients:
+            self._gradients[key] = WarpGradients(self.pipeline(*key))
+        return self._gradients[key]
 
     def probe(self) -> WarpProbe:
         """What tests look into the device with."""

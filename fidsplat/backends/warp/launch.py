@@ -67,6 +67,7 @@ class Launcher:
         self._device, self._workers, self._commands = commands.device, commands.workers, commands
         self.pieces = 8 * commands.threads
         """into which a CPU launch is cut, so that threads share uneven work"""
+        self._stream = None if self._workers else self._device.stream  # which may be another one later
         self._marks: list[tuple[str | None, Any]] = []
 
     def launch(self, kernel: Any, count: int, given: Mapping[str, Any], block: int = BLOCK) -> None:
@@ -112,8 +113,8 @@ class Launcher:
 
     def finish(self) -> None:
         """Waits for all that was launched."""
-        if self._workers is None:
-            self._wp.synchronize_stream(self._device.stream)
+        if self._stream is not None:
+            self._wp.synchronize_stream(self._stream)
 
     def stage(self, name: str | None) -> None:
         """What is launched from here on belongs to the stage `name`; None ends the last."""
@@ -128,9 +129,11 @@ class Launcher:
         """Milliseconds by stage, in the order in which they ran first."""
         timings: dict[str, float] = {}
         for (name, begin), (_, end) in pairwise(self._marks):
+            if name is None:  # between a picture and its derivatives
+                continue
             if self._workers is None:
                 took = self._wp.get_event_elapsed_time(begin, end)
             else:
                 took = (end - begin) * 1e3
-            timings[str(name)] = timings.get(str(name), 0.0) + took
+            timings[name] = timings.get(name, 0.0) + took
         return timings

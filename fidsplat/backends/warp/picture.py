@@ -3,11 +3,15 @@
 The host reads two numbers between the stages, how many splats are drawn and how many pairs of splats and
 tiles there are: they size arrays and launches. A picture with more pairs than the device's budget is drawn in
 bands of tiles, with the same bits.
+
+A picture of a kind that was drawn before does not wait for them: it is given `Room`, and says itself in
+`counts` what it would have taken. Where that is more its lists are empty (ahead.py draws it again).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -45,11 +49,31 @@ class WarpImages:
         launcher: Launcher,
         stats: dict[str, int],
     ) -> None:
-        self._images, self._size, self._launcher = images, size, launcher
-        self.stats: Mapping[str, int] = stats
+        self._images, self._size, self._launcher, self._stats = images, size, launcher, stats
+        self.settle: Callable[[], WarpImages | None] | None = None
+        """of a picture that was drawn ahead: waits for it; what it is drawn again as, in the same arrays"""
+
+    def _settled(self) -> None:
+        if self.settle:
+            again = self.settle()
+            self.settle = None
+            if again:
+                self._launcher, self._stats = again._launcher, again._stats
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        """How many splats there were, were drawn, and pairs of splats and tiles."""
+        self._settled()
+        return self._stats
+
+    @property
+    def arrays(self) -> dict[str, Any]:
+        """What holds the images, drawn or not."""
+        return {name: array for name, (_, array) in self._images.items()}
 
     def device_array(self, name: str) -> Any:
         """The image as a wp.array (h, w) or (h, w, 3) on the device; no copy."""
+        self._settled()
         output, array = self._images[name]
         return array.reshape(self._size if output.channels == 1 else (*self._size, output.channels))
 
@@ -60,12 +84,24 @@ class WarpImages:
 
     def wait(self) -> None:
         """Until the device has drawn it."""
+        self._settled()
         self._launcher.finish()
 
     @property
     def timings(self) -> dict[str, float]:
         """Milliseconds on the device by stage, in the order in which they ran."""
+        self._settled()
         return self._launcher.timings()
+
+
+@dataclass(frozen=True)
+class Room:
+    """For the lists of a picture."""
+
+    visible: int
+    """splats that are drawn"""
+    pairs: int
+    """of splats and tiles"""
 
 
 class Picture:
@@ -80,29 +116,37 @@ class Picture:
         launcher: Launcher,
         beside: int = 0,
         into: Mapping[str, Any] | None = None,
+        room: Room | None = None,
     ) -> None:
         """
         Args:
             beside: bytes on the device that belong to the picture or batch of which this one is a part.
             into: arrays for the output images, by name, instead of fresh ones.
+            room: of its lists, instead of waiting for what they take.
         """
         self.program, self.workspace, self.pool = program, workspace, workspace.pool
         self.resident, self.view, self.launcher, self.beside = resident, view, launcher, beside
-        self.into = into or {}
+        self.into, self.room = into or {}, room
+        self.counts: Any = None
+        """of a picture with `room`: an array of the host, in which it says what its lists would take"""
         self.wp = load()
         u = uniforms(view, program.shape, program.sloped)
         self.tiles = u.tiles_x * u.tiles_y
         self.grid = u.tiles_y * u.tile_h, u.tiles_x * u.tile_w
         self.held: dict[str, Any] = {"view": u}
         """arrays and structs by the names that kernels' signatures have for them"""
+        self.bands = 0
+        """of tiles, in which it was drawn"""
         self.stats: dict[str, int] = {"splats": resident.count, "visible": 0, "pairs": 0}
 
-    def draw(self) -> None:
-        """All stages; `images` are the finished ones."""
-        samples = self._exposed() if self.view.shots else self._drawn()
+    def draw(self) -> WarpImages:
+        """All stages; the finished images."""
+        self.workspace.pictures += 1
+        self.samples = self._exposed() if self.view.shots else self._drawn()
         self.launcher.stage("resolve")
-        self.images = self._resolve(samples)
+        images = self._resolve(self.samples)
         self.launcher.stage(None)
+        return images
 
     def _exposed(self) -> Any:
         """All stages but the last of each shot, and what their samples are together."""
@@ -146,6 +190,7 @@ class Picture:
             self._sort(visible)
         samples = self._samples("raw")
         for first, end, listed in self._bands(visible, pairs):
+            self.bands += 1
             self.launcher.stage("bin")
             self._list(visible, first, end, listed, whole=listed == pairs)
             self.launcher.stage("blend")
@@ -176,6 +221,10 @@ class Picture:
         wp.utils.array_scan(counts, ends, inclusive=True)
         totals = self._take("totals", 2, wp.int64)
         self.launcher.once(sort.sum_up, 1, {**self.held, "splats": n})
+        if self.room:
+            self.counts = self.pool.lend("totals", 2, wp.int64)
+            wp.copy(self.counts, totals)
+            return self.room.visible, self.room.pairs
         visible, pairs = self.launcher.read_back(totals, self.pool.host("totals", 2, wp.int64))
         return visible, pairs
 
@@ -193,12 +242,14 @@ class Picture:
         # the sort takes the second half as its scratch
         keys = self._take("sorted_keys", 2 * visible, self.wp.uint32)
         order = self._take("order", 2 * visible, self.wp.int32)
-        self._launch(self.program.sort.compact, self.resident.count)
+        if self.room:
+            keys.fill_(0xFFFFFFFF)  # behind all that are drawn
+        self._launch(self.program.sort.compact, self.resident.count, room=visible)
         self.wp.utils.radix_sort_pairs(keys, order, visible)
 
     def _bands(self, visible: int, pairs: int) -> Iterator[tuple[int, int, int]]:
         """Ranges of tiles (first, end, pairs) whose lists fit the budgets; one, unless they are long."""
-        most = self._room(visible)
+        most = self._most_pairs(visible)
         if pairs <= most:
             return iter([(0, self.tiles, pairs)])
         totals = self._take("tile_totals", self.tiles, self.wp.int32)
@@ -215,7 +266,24 @@ class Picture:
         channels = sum(output.channels for output in self.program.images)
         return self.grid[0] * self.grid[1] * sum(sizes) + 4 * pixels * channels
 
-    def _room(self, visible: int) -> int:
+    def fits(self, room: Room) -> bool:
+        """Whether a picture with this room keeps to the budgets."""
+        try:
+            return room.pairs <= self._most_pairs(room.visible)
+        except DeviceError:
+            return False
+
+    def settle(self) -> dict[str, int]:
+        """What the lists of a picture with `room` would take, once it is done."""
+        if self.counts is not None:
+            self.launcher.finish()
+            visible, pairs = self.counts.numpy().tolist()
+            self.stats |= {"visible": visible, "pairs": pairs}
+            self.pool.give_back("totals", self.counts)
+            self.counts = None
+        return self.stats
+
+    def _most_pairs(self, visible: int) -> int:
         """How many pairs may be listed at once within the budgets.
 
         Raises:
@@ -243,10 +311,12 @@ class Picture:
         band = {"band_first": first, "band_end": end}
         if pairs:
             lengths, ends = (self._exact(name, visible, wp.int64) for name in ("lengths", "ends"))
-            self._launch(sort.gather if whole else lists.count, visible, **band)
+            self._launch(sort.gather if whole else lists.count, visible, **band, room=visible, pairs=pairs)
             wp.utils.array_scan(lengths, ends, inclusive=True)
+            if self.room:
+                tiles.fill_(self.tiles)  # behind the last
             self._launch(lists.emit, visible, **band)
-            wp.utils.radix_sort_pairs(tiles, listed, pairs, 0, max(self.tiles - 1, 1).bit_length())
+            wp.utils.radix_sort_pairs(tiles, listed, pairs, 0, self.tiles.bit_length())
         self._launch(sort.find_starts, end - first + 1, **band, pairs=pairs)
 
     def _samples(self, kind: str) -> Any:

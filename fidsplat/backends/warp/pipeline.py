@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import numpy as np
 
 from fidsplat.backends.stack import ViewBatch
 from fidsplat.backends.view import View
+from fidsplat.backends.warp.ahead import Drawing
 from fidsplat.backends.warp.batch import WarpBatch
-from fidsplat.backends.warp.launch import Commands, Launcher
+from fidsplat.backends.warp.launch import Commands
 from fidsplat.backends.warp.picture import Picture, WarpImages
 from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.resident import Resident
-from fidsplat.backends.warp.runtime import load
 from fidsplat.backends.warp.workspace import Workspace
-from fidsplat.errors import DeviceError
 
 
 class WarpPipeline:
     """Draws pictures that call for these features."""
 
     def __init__(self, program: Program, workspace: Workspace, commands: Commands) -> None:
-        self.program, self.workspace, self._commands = program, workspace, commands
+        self.program, self.workspace = program, workspace
+        self._drawing = Drawing(program, workspace, commands)
 
     def render(self, resident: Resident, view: View) -> WarpImages:
         """Draw one picture.
@@ -31,7 +28,17 @@ class WarpPipeline:
         Raises:
             DeviceError: the device runs out of memory or fails.
         """
-        return self._drawn(resident, view).images
+        with self.workspace.working("while drawing"):
+            return self._drawing.images(resident, view)
+
+    def drawn(self, resident: Resident, view: View) -> tuple[Picture, WarpImages]:
+        """One picture with all that its stages have left on the device, until another is drawn; its images.
+
+        Raises:
+            DeviceError: as `render`.
+        """
+        with self.workspace.working("while drawing"):
+            return self._drawing.picture(resident, view)
 
     def render_batch(self, resident: Resident, batch: ViewBatch) -> WarpBatch:
         """Draw many views, one after another.
@@ -39,14 +46,11 @@ class WarpPipeline:
         Raises:
             DeviceError: the device runs out of memory or fails.
         """
-        with self._drawing():
+        with self.workspace.working("while drawing"):
             images = WarpBatch(self.workspace, self.program.images, batch, resident.count)
             for number, slot in enumerate(batch.slots.tolist()):
-                launcher, into = Launcher(self._commands), images.part(slot)
-                view, beside = batch.one(number), images.nbytes
-                picture = Picture(self.program, self.workspace, resident, view, launcher, beside, into)
-                picture.draw()
-                images.add(picture.images)
+                given = {"beside": images.nbytes, "into": images.part(slot)}
+                images.add(self._drawing.images(resident, batch.one(number), **given))
             return images
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
@@ -56,8 +60,8 @@ class WarpPipeline:
         the last band; records (n, words) float32 (undefined for culled splats); raw (4, rows, columns)
         float32: r, g, b, transmittance of the padded sample grid; and the finished outputs by name.
         """
-        picture = self._drawn(resident, view)
-        held, stats, n = picture.held, picture.images.stats, resident.count
+        picture, images = self.drawn(resident, view)
+        held, stats, n = picture.held, images.stats, resident.count
         rows, stride = picture.grid
         raw = held["raw color"].numpy()[: rows * stride]
         lines = held["lines"].numpy()[: n * self.program.layout.lines]
@@ -68,22 +72,5 @@ class WarpPipeline:
             "lists": held["lists"].numpy()[: stats["pairs"]].astype(np.uint32),
             "records": lines.reshape(n, -1).copy(),
             "raw": raw.reshape(rows, stride, 4).transpose(2, 0, 1).copy(),
-            **{output.name: picture.images.read(output.name) for output in self.program.images},
+            **{output.name: images.read(output.name) for output in self.program.images},
         }
-
-    def _drawn(self, resident: Resident, view: View) -> Picture:
-        with self._drawing():
-            picture = Picture(self.program, self.workspace, resident, view, Launcher(self._commands))
-            picture.draw()
-            return picture
-
-    @contextmanager
-    def _drawing(self) -> Iterator[None]:
-        """On the device, whose failures are those of drawing."""
-        try:
-            with load().ScopedDevice(self.workspace.device):
-                yield
-        except RuntimeError as error:
-            if isinstance(error, DeviceError):
-                raise
-            raise DeviceError(f"{self.workspace.name} failed while drawing: {error}") from error

@@ -11,6 +11,7 @@ from fidsplat.backends.warp.runtime import kernels, load, quiet
 from fidsplat.backends.warp.shapes import WarpShape
 from fidsplat.backends.warp.workspace import ArrayPool
 from fidsplat.effects import FeatureSet
+from fidsplat.effects.differentiable import GRADIENT_OUTPUTS
 from fidsplat.errors import DeviceError
 
 SLOTS = frozenset(
@@ -99,13 +100,13 @@ class Program:
         """
         if why := unsupported(features, name):
             raise DeviceError(why)
-        self.device, self.shape, self._name = device, shape, name
+        self.device, self.shape, self.features, self._name = device, shape, features, name
         self.images = tuple(each for each in features.images if each.name in {"rgb", *features.outputs})
         """the output images"""
         self.project_block = kernels("project").BLOCK
         self.block_dim = shape.tile_width * shape.tile_height
         """threads that draw a tile on a GPU"""
-        needs = _Needs.of(features)
+        self.needs = needs = _Needs.of(features)
         with quiet():
             self._make_lists(features, needs)
             self._make_blend(needs)
@@ -113,8 +114,9 @@ class Program:
             made = (self.project, self.lists.emit, self.blend, self.resolve, *self.expose.values())
             common = (self.sort.compact, self.sort.gather, self.sort.find_starts, self.sort.sum_up)
             further = (self.backdrop, self.sensor and self.sensor.kernel)
+            blocks = {self.blend: self.block_dim, self.project: self.project_block}
             for kernel in (*made, *common, *filter(None, further)):
-                self._compile(kernel)
+                self.compile(kernel, blocks.get(kernel, BLOCK))
 
     def _make_lists(self, features: FeatureSet, needs: _Needs) -> None:
         self.project = kernels("project").make_project(
@@ -165,9 +167,13 @@ class Program:
         )
         self.sensor = SensorKernel(needs.steps) if needs.steps else None
 
-    def _compile(self, kernel: Any) -> None:
+    def compile(self, kernel: Any, block: int = BLOCK) -> None:
+        """Compile a kernel for the device. block: its threads on a GPU.
+
+        Raises:
+            DeviceError: the compiler refuses.
+        """
         # here rather than at the first launch: several threads launch it
-        block = {self.blend: self.block_dim, self.project: self.project_block}.get(kernel, BLOCK)
         try:
             loaded = kernel.module.load(self.device, block if self.device.is_cuda else 1)
         except Exception as error:
@@ -178,8 +184,35 @@ class Program:
     def load_banding(self) -> None:
         """Compile what only a picture with more pairs than the budget needs."""
         with quiet():
-            self._compile(self.lists.histogram)
-            self._compile(self.lists.count)
+            self.compile(self.lists.histogram)
+            self.compile(self.lists.count)
+
+
+class GradientKernels:
+    """The kernels of derivatives, compiled when they are asked for."""
+
+    def __init__(self, program: Program) -> None:
+        """
+        Raises:
+            DeviceError: the compiler refuses.
+        """
+        features, needs, shape = program.features, program.needs, program.shape
+        drawn = {"rgb", *features.outputs}
+        self.losses = tuple(name for name in GRADIENT_OUTPUTS if name in drawn)
+        """outputs with derivatives"""
+        self.sh_terms = (features.sh_degree + 1) ** 2 if "color_sh" in needs.effects else 0
+        effects, outputs = needs.among(_SAMPLE), needs.blending
+        backward, names = kernels("blend_backward"), kernels("fragment_backward").moments_of(effects, outputs)
+        grouped, block = shape.schedule == "group", program.block_dim
+        with quiet():
+            self.blend = backward.make_blend_backward(effects, outputs, self.losses, grouped, block)
+            self.slots = backward.make_slots("lowpass_screen" in effects)
+            made = kernels("project_backward").make_project_backward
+            self.project = made(needs.among(_RECORD), outputs, names, self.sh_terms)
+            self.sums = kernels("column_sums")
+            program.compile(self.blend.kernel, block)
+            for kernel in (self.slots, self.project, self.sums.add_rows):
+                program.compile(kernel)
 
 
 class SensorKernel:

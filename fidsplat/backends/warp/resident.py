@@ -31,6 +31,8 @@ class Resident:
         self.arrays, self.count, self.origin = arrays, count, origin
         self.sh_degree, self.planes, self.has_planes = sh_degree, planes, planes is not None
         self.footprint, self.ellipsoids = footprint, ellipsoids
+        self.adopted = False
+        """whether somebody else may change the arrays"""
 
     @property
     def memory_bytes(self) -> int:
@@ -91,7 +93,9 @@ class Resident:
             if count and array.size != wanted:
                 raise InputError(f"{name} holds {array.size} elements, but {count} means need {wanted}")
         sh_degree = int(np.sqrt(terms)) - 1 if terms else -1
-        return cls(arrays, count, origin, sh_degree, ellipsoids=ellipsoids)
+        held = cls(arrays, count, origin, sh_degree, ellipsoids=ellipsoids)
+        held.adopted = True
+        return held
 
 
 def _dtype(name: str) -> Any:

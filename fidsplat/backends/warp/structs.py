@@ -71,7 +71,10 @@ def rays_of(
         DeviceError: the device has no memory for them.
     """
     wp, raster = load(), view.raster if bent else None
-    rays = kernels("rays").struct_of_rays(raster is not None, raster is not None and sloped, opaque)()
+    kind = kernels("rays").struct_of_rays(raster is not None, raster is not None and sloped, opaque)
+    if raster is None and not opaque:
+        return _empty(kind)
+    rays = kind()
     if opaque:
         for name, dtype in (("layer_depth", wp.float32), ("layer_rgb", wp.vec3)):
             setattr(rays, name, workspace.pool.filled(name, view.array(name), dtype))
@@ -96,7 +99,7 @@ def lens_of(view: View, workspace: Workspace) -> Any:
     """
     wp, declared, raster = load(), kernels("lens"), view.raster
     if raster is None:
-        return declared.make_lens(None)()
+        return _empty(declared.make_lens(None))
     camera, arrays = f"camera_{raster.lens.kind}", _arrays(raster, workspace)
     lens = declared.make_lens(camera)()
     lens.rays = arrays["rays"][raster.top * raster.width :]
@@ -112,14 +115,22 @@ def lens_of(view: View, workspace: Workspace) -> Any:
 def moving_of(resident: Resident, view: View, workspace: Workspace) -> Any:
     """The struct `Moving` of a picture; an empty one if nothing moves."""
     declared, pool = kernels("motion"), workspace.pool
-    held = declared.make_motion(bool(view.groups)).Moving()
-    if view.groups:
-        labels = np.array([label for label, _ in view.groups], np.int32)
-        poses = [(own.rotation, own.translation, own.eye) for _, own in view.groups]
-        held.labels = resident.arrays["labels"]
-        held.groups = pool.filled("groups", labels, load().int32)
-        held.poses = pool.filled("poses", np.array(poses, declared.Pose.numpy_dtype()), declared.Pose)
+    kind = declared.make_motion(bool(view.groups)).Moving
+    if not view.groups:
+        return _empty(kind)
+    held = kind()
+    labels = np.array([label for label, _ in view.groups], np.int32)
+    poses = [(own.rotation, own.translation, own.eye) for _, own in view.groups]
+    held.labels = resident.arrays["labels"]
+    held.groups = pool.filled("groups", labels, load().int32)
+    held.poses = pool.filled("poses", np.array(poses, declared.Pose.numpy_dtype()), declared.Pose)
     return held
+
+
+@cache
+def _empty(kind: Any) -> Any:
+    """A struct without arrays: the same from picture to picture, so that no launch packs it again."""
+    return kind()
 
 
 def surroundings_of(view: View, workspace: Workspace) -> Any:

@@ -3,6 +3,8 @@ take."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -20,6 +22,7 @@ class ArrayPool:
         self._arrays: dict[tuple[str, Any], Any] = {}
         self._parts: dict[tuple[str, Any], Any] = {}
         self._hosts: dict[str, Any] = {}
+        self._spare: dict[str, list[Any]] = {}
 
     def scratch(self, name: str, size: int, dtype: Any) -> Any:
         """An array of at least `size` elements whose content is undefined."""
@@ -51,6 +54,19 @@ class ArrayPool:
             self._hosts[name] = load().empty(size, dtype=dtype, device="cpu", pinned=self.device.is_cuda)
         return self._hosts[name]
 
+    def lend(self, name: str, size: int, dtype: Any) -> Any:
+        """As `host`, of which there are several at a time; `give_back` takes it again."""
+        spare = self._spare.setdefault(name, [])
+        return (
+            spare.pop()
+            if spare
+            else load().empty(size, dtype=dtype, device="cpu", pinned=self.device.is_cuda)
+        )
+
+    def give_back(self, name: str, array: Any) -> None:
+        """What `lend` gave, which nobody reads or writes any more."""
+        self._spare[name].append(array)
+
     def fresh(self, name: str, size: int, dtype: Any) -> Any:
         """An array that nobody else holds.
 
@@ -78,10 +94,29 @@ class Workspace:
         """bytes of the device that a picture and its cloud may take"""
         self.pair_budget = 2**30 - 1
         """Most pairs of splats and tiles that are listed at once; tests make it small."""
+        self.ahead = device.is_cuda
+        """Whether pictures of a kind that was drawn before are drawn without waiting for what they take."""
+        self.pictures = 0
+        """how many have been begun: what they leave is there until the next"""
         self.lenses: WeakKeyDictionary[RayRaster, dict[str, Any]] = WeakKeyDictionary()
         """arrays of the whole rasters that are in use, by name"""
         self.panoramas: WeakKeyDictionary[Panorama, Any] = WeakKeyDictionary()
         """on the device, each as long as it is somewhere else"""
+
+    @contextmanager
+    def working(self, doing: str) -> Iterator[None]:
+        """On the device, whose failures are those of what is done there.
+
+        Raises:
+            DeviceError: the device fails.
+        """
+        try:
+            with load().ScopedDevice(self.device):
+                yield
+        except RuntimeError as error:
+            if isinstance(error, DeviceError):
+                raise
+            raise DeviceError(f"{self.name} failed {doing}: {error}") from error
 
 
 def nbytes(array: Any) -> int:

@@ -1,12 +1,14 @@
 // For GPUs: one work-group takes a tile back, CHUNK splats at a time of STAGED that are fetched at once. A work-item walks its ROWS
 // pixels through the chunk, forward and back, and leaves in local memory what each fragment takes and what its opacity is worth; then
 // it adds up one column of pixels of one splat. So no sum runs across work-items but that of a splat's columns, in a fixed order and
-// without atomics. Barriers stand in loops whose bounds are the same for the whole group.
+// without atomics. Most splats have few of a tile's pixels: each walks through those alone in whose bounds it lies, and columns
+// beyond a splat's are not added. Barriers stand in loops whose bounds are the same for the whole group.
 // Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile.
 // Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, splat_slots, and the images' derivatives.
 // Writes: moments, a slot for each splat of the tile; tile_sums. Uses up: checkpoints.
 #define GROUP (TILE_W * TILE_H / ROWS)
-#define STAGED (4 * CHUNK)         // no more than GROUP
+#define STAGED (CHUNK < 8 ? 4 * CHUNK : 32) // no more than GROUP, and bits of a word
+#define OF_CHUNK ((2u << (CHUNK - 1)) - 1u)
 #define PIXELS (TILE_W * TILE_H)
 #define STRIDE (PIXELS + TILE_W)   // of one splat's fragments: neighbours among the splats lie in other banks
 #define PARTS (GROUP + 1)          // of one field's sums: neighbours among the fields lie in other banks
@@ -32,6 +34,21 @@ static inline wide walk_fragment(const Splat *s, int px, int py, Pixel *pixel, c
     return take_light(pixel, opacity, mask, constants);
 }
 
+// For each column of the tile, then each row, the staged splats in whose bounds it lies, as bits.
+static inline void find_bounds(local const Splat *staged, uint length, int left, int top, uint item, local uint *bounds) {
+    for (uint k = item; k < TILE_W + TILE_H; k += GROUP) {
+        bool across = k < TILE_W;
+        int at = across ? left + (int)k : top + (int)k - TILE_W;
+        uint bits = 0;
+        for (uint place = 0; place < length; place++) {
+            local const Splat *s = &staged[place];
+            int low = across ? s->x0 : s->y0, high = across ? s->x1 : s->y1;
+            if (at >= low && at < high) bits |= 1u << place;
+        }
+        bounds[k] = bits;
+    }
+}
+
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
 //@@ arguments blend_backward
 ) {
@@ -39,7 +56,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
     local float weights[CHUNK * STRIDE], by_logs[CHUNK * STRIDE];   // by splat and pixel: opacity and light, then these
     local float parts[PARTS * FIELDS];
     local Loss shared[PIXELS];
-    local uint places[STAGED], reached;
+    local uint places[STAGED], bounds[TILE_W + TILE_H], reached;
     local int alive;
     const BlendConstants constants = {log_cut, ceiling, stop, filter, log_ceiling};
     uint number = get_group_id(0), item = get_local_id(0);
@@ -78,16 +95,21 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
             if (px < width && py + row < height && pixels[row].t > stop) alive = 1;
         barrier(CLK_LOCAL_MEM_FENCE);
         if (!alive) break;
-        for (uint place = 0; place < length; place++) {
-            if (place % CHUNK == 0) {
-                uint chunk = (first - start + place) / CHUNK;
-                for (int row = 0; row < ROWS; row++) {
-                    own[(size_t)chunk * PIXELS + row * TILE_W] = pixel_light(&pixels[row]);
-                    if (px < width && py + row < height && pixels[row].t > stop) lit = chunk + 1;
-                }
+        find_bounds(staged, length, tile_column * TILE_W, tile_row * TILE_H, item, bounds);
+        barrier(CLK_LOCAL_MEM_FENCE);
+        uint mine = 0;
+        for (int row = 0; row < ROWS; row++) mine |= bounds[TILE_W + top + row];
+        mine &= bounds[column];
+        for (uint base = 0; base < length; base += CHUNK) {
+            uint chunk = (first - start + base) / CHUNK;
+            for (int row = 0; row < ROWS; row++) {
+                own[(size_t)chunk * PIXELS + row * TILE_W] = pixel_light(&pixels[row]);
+                if (px < width && py + row < height && pixels[row].t > stop) lit = chunk + 1;
             }
-            const Splat s = staged[place];
-            for (int row = 0; row < ROWS; row++) walk_fragment(&s, px, py + row, &pixels[row], &constants);
+            for (uint bits = mine >> base & OF_CHUNK; bits != 0; bits &= bits - 1) {
+                const Splat s = staged[base + 31 - clz(bits & -bits)];
+                for (int row = 0; row < ROWS; row++) walk_fragment(&s, px, py + row, &pixels[row], &constants);
+            }
         }
     }
     atomic_max(&reached, lit);
@@ -124,18 +146,23 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
             places[item] = splat_slots[index] + tile_rank(windows[index], big_bounds, tile_column, tile_row, width, height);
         }
         barrier(CLK_LOCAL_MEM_FENCE);
+        find_bounds(staged, length, tile_column * TILE_W, tile_row * TILE_H, item, bounds);
+        barrier(CLK_LOCAL_MEM_FENCE);
         for (uint chunk = (length + CHUNK - 1) / CHUNK; chunk-- > 0;) {
             uint base = chunk * CHUNK, count = min(length - base, (uint)CHUNK);
             for (int row = 0; row < ROWS; row++) {
                 uint mine = (top + row) * TILE_W + column;
+                uint within = (bounds[column] & bounds[TILE_W + top + row]) >> base & OF_CHUNK;
                 Pixel pixel;
                 pixel_start(&pixel, own[(size_t)(block * (STAGED / CHUNK) + chunk) * PIXELS + row * TILE_W]);
-                for (uint place = 0; place < count; place++) {
+                for (uint bits = within; bits != 0; bits &= bits - 1) {
+                    uint place = 31 - clz(bits & -bits);
                     const Splat s = staged[base + place];
                     weights[place * STRIDE + mine] = pixel.t;
                     by_logs[place * STRIDE + mine] = walk_fragment(&s, px, py + row, &pixel, &constants);
                 }
-                for (uint place = count; place-- > 0;) {
+                for (uint bits = within, place; bits != 0; bits ^= 1u << place) {
+                    place = 31 - clz(bits);
                     wide opacity = by_logs[place * STRIDE + mine], weight = weights[place * STRIDE + mine] * opacity, by_log = 0.0f;
                     if (opacity > 0.0f) {
                         const Splat s = staged[base + place];
@@ -152,7 +179,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
             barrier(CLK_LOCAL_MEM_FENCE);
             // a column of a splat
             uint place = item / TILE_W;
-            if (place < count) {
+            if (place < count && (bounds[column] >> (base + place) & 1u)) {
                 const Splat s = staged[base + place];
                 Sums sums = {0};
                 wide x = (wide)(px - s.ax);
@@ -174,8 +201,10 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
             barrier(CLK_LOCAL_MEM_FENCE);
             for (uint cell = item; cell < count * FIELDS; cell += GROUP) {
                 uint field = cell % FIELDS, splat = cell / FIELDS;
+                int before = tile_column * TILE_W, beyond = min(staged[base + splat].x1 - before, TILE_W);
                 float sum = 0;
-                for (uint other = 0; other < TILE_W; other++) sum += parts[field * PARTS + splat * TILE_W + other];
+                for (int other = max(staged[base + splat].x0 - before, 0); other < beyond; other++)
+                    sum += parts[field * PARTS + splat * TILE_W + other];
                 moments[(size_t)places[base + splat] * FIELDS + field] = sum;
             }
         }

@@ -1,0 +1,235 @@
+"""Pictures with their derivatives: the stages of picture.py, and the kernels that go back through what they
+have left (kernels/warp/*_backward.py)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends.gradients import NOT_THE_LAST, check_shape, gradient_shape
+from fidsplat.backends.view import View
+from fidsplat.backends.warp.launch import Launcher
+from fidsplat.backends.warp.picture import Picture, WarpImages
+from fidsplat.backends.warp.pipeline import WarpPipeline
+from fidsplat.backends.warp.program import GradientKernels
+from fidsplat.backends.warp.resident import Resident
+from fidsplat.backends.warp.runtime import kernels, load, quiet
+from fidsplat.effects.differentiable import check_gradients
+from fidsplat.errors import DeviceError, InputError
+
+_SHARES = 2048
+"""threads that share a sum over the whole picture or cloud; the order of additions is theirs"""
+
+
+class DifferentiableImages:
+    """Output images with what the stages have left, for `WarpGradients.backward`."""
+
+    def __init__(self, picture: Picture, images: WarpImages) -> None:
+        self.picture, self._images = picture, images
+        self._number = picture.workspace.pictures
+
+    @property
+    def last(self) -> bool:
+        """Whether no other picture has been begun on the device since."""
+        return self.picture.workspace.pictures == self._number
+
+    def read(self, name: str) -> np.ndarray:
+        """The image as a NumPy array of its own."""
+        return self._images.read(name)
+
+    def device_array(self, name: str) -> Any:
+        """The image as a wp.array of the device; no copy."""
+        return self._images.device_array(name)
+
+    def wait(self) -> None:
+        """Until the device has drawn it."""
+        self._images.wait()
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds by stage, those of `backward` among them."""
+        return self._images.timings
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        """As of every picture."""
+        return self._images.stats
+
+
+class WarpGradients:
+    """Compiled stages and their derivatives."""
+
+    def __init__(self, pipeline: WarpPipeline) -> None:
+        self._pipeline, self._kernels = pipeline, GradientKernels(pipeline.program)
+
+    def forward(self, resident: Resident, view: View) -> DifferentiableImages:
+        """As `DifferentiablePipeline`."""
+        picture, images = self._pipeline.drawn(resident, view)
+        if picture.bands > 1:
+            raise DeviceError(
+                f"{resident.count:,} splats are drawn in bands within the memory budget, and such pictures "
+                "have no gradient; raise memory_budget, or use fewer splats or smaller pictures"
+            )
+        return DifferentiableImages(picture, images)
+
+    def backward(self, images: DifferentiableImages, gradients: Mapping[str, Any]) -> dict[str, Any]:
+        """As `DifferentiablePipeline`: wp.arrays."""
+        picture = images.picture
+        check_gradients(picture.program.features, gradients)
+        if not images.last:
+            raise InputError(NOT_THE_LAST)
+        with picture.workspace.working("while taking derivatives"):
+            return _Backward(picture, self._kernels, gradients).results()
+
+
+class _Backward:
+    """The derivatives of one picture: the stages in order, each a method."""
+
+    def __init__(self, picture: Picture, made: GradientKernels, gradients: Mapping[str, Any]) -> None:
+        self._picture, self._made, self._wp = picture, made, load()
+        self._launcher: Launcher = picture.launcher
+        self._count, self._pairs = picture.resident.count, picture.stats["pairs"]
+        self._given = dict(picture.held) | picture.resident.arrays | {"by": self._by(gradients)}
+        self._given |= {
+            "samples": picture.samples,
+            "color": picture.samples.color,
+            "background": self._wp.vec3(*picture.view.background),
+            "log_ceiling": math.log(picture.view.ceiling),
+            "by_rgb": self._given["by"].rgb,
+        }
+
+    def results(self) -> dict[str, Any]:
+        """All stages; `DifferentiablePipeline.backward`'s arrays."""
+        found = self._room_for_results()
+        self._launcher.stage("blend backward")
+        self._blend()
+        self._launcher.stage("project backward")
+        if self._count:
+            self._launcher.launch(self._made.project, self._count, self._given)
+        view = self._picture.view
+        pixels = view.width * view.height
+        parts = self._take("background parts", 3 * _SHARES, self._wp.float64)
+        sizes = {"pixels": pixels, "width": view.width, "stride": self._picture.grid[1], "threads": _SHARES}
+        given = self._given | sizes | {"parts": parts}
+        self._launcher.launch(self._made.sums.background_parts, _SHARES, given)
+        self._add_up(parts, _SHARES, 3, found["background"])
+        self._add_up(flat_of(self._given["by_poses"]), self._count, 6, found["pose"])
+        self._launcher.stage(None)
+        return found
+
+    def _blend(self) -> None:
+        """Sums over samples, by slots."""
+        wp, picture, made, pairs = self._wp, self._picture, self._made, self._pairs
+        if not pairs:
+            return
+        self._given["slots"] = self._take("slots", pairs, wp.int32)
+        self._launcher.launch(made.slots, pairs, self._given)
+        self._given["moments"] = moments = picture.pool.exact("moments", pairs, made.blend.Moments)
+        moments.zero_()
+        shape = picture.program.shape
+        area = shape.tile_width * shape.tile_height
+        chunk = kernels("blend_backward").CHUNK
+        checkpoints = area * (pairs // chunk + picture.tiles + 1)
+        self._given["checkpoints"] = self._take("checkpoints", checkpoints, wp.float32)
+        kernel, tiles = made.blend.kernel, picture.tiles
+        if shape.schedule == "group":
+            given = self._given | {"band_first": 0}
+            self._launcher.once(kernel, tiles * area, given, area)
+            return
+        room = self._launcher.pieces * area
+        self._given["lights"] = self._take("lights", room, wp.float32)
+        self._given["losses"] = self._take("losses", room, made.blend.Loss)
+        self._given["fragments"] = self._take("fragments", room * chunk, wp.vec2)
+        self._launcher.tiles(kernel, 0, tiles, area, self._given)
+
+    def _add_up(self, parts: Any, rows: int, columns: int, result: Any) -> None:
+        """The sum of all rows, in a fixed order."""
+        sums = self._take("sums", columns * _SHARES, self._wp.float64)
+        total = self._take("total", columns, self._wp.float64)
+        made = self._made.sums
+        for given, length, stride, out in ((parts, rows, _SHARES, sums), (sums, _SHARES, 1, total)):
+            sizes = {"rows": length, "columns": columns, "stride": stride, "parts": given, "sums": out}
+            self._launcher.launch(made.add_rows, stride * columns, sizes)
+        self._launcher.launch(made.as_single, columns, {"sums": total, "singles": result})
+
+    def _by(self, gradients: Mapping[str, Any]) -> Any:
+        """The derivatives by the images as the kernels' struct; 0 where none are given."""
+        by = self._made.blend.By()
+        for name in self._made.losses:
+            view, given = self._picture.view, gradients.get(name)
+            size = math.prod(gradient_shape(name, view))
+            if given is None:
+                array = self._picture.pool.exact(f"by {name}", size, self._wp.float32)
+                array.zero_()
+            else:
+                check_shape(name, _shape_of(given), view)
+                array = self._taken(name, given)
+            setattr(by, name, array)
+        return by
+
+    def _taken(self, name: str, given: Any) -> Any:
+        """A derivative on the device, flat; no copy of one that is there."""
+        wp, pool = self._wp, self._picture.pool
+        if not isinstance(given, wp.array):
+            return pool.filled(f"by {name}", np.ascontiguousarray(given, np.float32).ravel(), wp.float32)
+        scalar = getattr(given.dtype, "_wp_scalar_type_", given.dtype)
+        if scalar is not wp.float32 or not given.is_contiguous or given.device != pool.device:
+            raise InputError(
+                f"the gradient of {name} must be a contiguous float32 array on {pool.device}, not "
+                f"{wp.types.type_repr(given.dtype)} on {given.device}"
+            )
+        return flat_of(given)
+
+    def _room_for_results(self) -> dict[str, Any]:
+        """Arrays for the results, the same from call to call."""
+        wp, count, terms = self._wp, self._count, max(self._made.sh_terms, 1)
+        kinds = {
+            "by_means": wp.vec3,
+            "by_quats": wp.vec4,
+            "by_scales": wp.vec2,
+            "by_opacities": wp.float32,
+            "screen": wp.float32,
+        }
+        found = {name.removeprefix("by_"): self._take(name, count, dtype) for name, dtype in kinds.items()}
+        colors = self._take("by_colors", count * terms, wp.vec3)
+        if self._made.sh_terms:
+            found["sh"] = colors.reshape((count, terms))
+        else:
+            found["colors"] = colors
+        self._take("by_poses", count, kernels("project_backward").SIX)
+        found["background"] = self._take("by_background", 3, wp.float32)
+        found["pose"] = self._take("by_pose", 6, wp.float32)
+        return found
+
+    def _take(self, name: str, size: int, dtype: Any) -> Any:
+        self._given[name] = array = self._picture.pool.exact(name, size, dtype)
+        return array
+
+
+def flat_of(array: Any) -> Any:
+    """The numbers of a contiguous array of numbers or vectors, on its memory."""
+    wp = load()
+    scalar = getattr(array.dtype, "_wp_scalar_type_", array.dtype)
+    size = math.prod(_shape_of(array))
+    flat = wp.array(ptr=array.ptr, dtype=scalar, shape=(size,), device=array.device)
+    flat._ref = array  # which it must not outlive
+    return flat
+
+
+def add_to(sums: Any, values: Any) -> None:
+    """Adds flat float32 arrays, as long, on their device."""
+    given = {"device": sums.device, "record_tape": False}
+    with quiet():
+        load().launch(kernels("column_sums").add_to, sums.size, [sums, values], **given)
+
+
+def _shape_of(array: Any) -> tuple[int, ...]:
+    """Of an array of numbers or of vectors."""
+    wp = load()
+    shape = tuple(array.shape)
+    if isinstance(array, wp.array) and wp.types.type_is_vector(array.dtype):
+        return (*shape, wp.types.type_size(array.dtype))
+    return shape

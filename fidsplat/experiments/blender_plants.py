@@ -1,0 +1,75 @@
+"""Runs inside Blender's own Python: draws plants that are given as meshes. Imports nothing of fidsplat.
+
+    python blender_plants.py JOB.json
+
+Prints "done FILE" for each picture.
+"""
+
+import json
+import math
+import sys
+
+import bpy  # type: ignore[import-not-found]
+import numpy as np
+from blender_worker import prepare, shoot  # type: ignore[import-not-found]
+
+
+def main(job: dict) -> None:
+    """Draw every shot of every plant, on nothing."""
+    scene = prepare(job)
+    light(scene)
+    for plant in job["things"]:
+        made = build(plant)
+        for shot in plant["shots"]:
+            shoot(scene, shot)
+        bpy.data.objects.remove(made, do_unlink=True)
+
+
+def light(scene) -> None:
+    """Soft light from above, the same from all sides, and what leaves pass on; a clear background."""
+    scene.cycles.max_bounces = 4
+    scene.cycles.use_denoising = True
+    scene.render.film_transparent = True
+    scene.render.use_persistent_data = True  # from picture to picture only the camera moves
+    scene.render.image_settings.color_mode = "RGBA"
+    sun = bpy.data.lights.new("sun", "SUN")
+    sun.energy, sun.angle = 3.0, math.radians(60)
+    scene.collection.objects.link(bpy.data.objects.new("sun", sun))  # shines down
+
+
+def build(plant: dict):
+    """The mesh, smooth, with its vertices' colours as those of its surface."""
+    vertices, colors = np.array(plant["vertices"]), np.array(plant["colors"])
+    mesh = bpy.data.meshes.new(plant["name"])
+    mesh.from_pydata(vertices.tolist(), [], plant["quads"])
+    mesh.shade_smooth()
+    linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+    painted = mesh.color_attributes.new("surface", "FLOAT_COLOR", "POINT")
+    painted.data.foreach_set("color", np.column_stack([linear, np.ones(len(linear))]).ravel())
+    mesh.materials.append(material())
+    made = bpy.data.objects.new(plant["name"], mesh)
+    bpy.context.scene.collection.objects.link(made)
+    return made
+
+
+def material():
+    """What lets some light through, with the colours of the mesh."""
+    made = bpy.data.materials.new("plant")
+    made.use_nodes = True
+    tree = made.node_tree
+    tree.nodes.clear()
+    colour = tree.nodes.new("ShaderNodeVertexColor")
+    colour.layer_name = "surface"
+    output, mixed = tree.nodes.new("ShaderNodeOutputMaterial"), tree.nodes.new("ShaderNodeMixShader")
+    mixed.inputs[0].default_value = 0.3
+    for place, kind in ((1, "ShaderNodeBsdfDiffuse"), (2, "ShaderNodeBsdfTranslucent")):
+        shader = tree.nodes.new(kind)
+        tree.links.new(colour.outputs["Color"], shader.inputs["Color"])
+        tree.links.new(shader.outputs[0], mixed.inputs[place])
+    tree.links.new(mixed.outputs[0], output.inputs["Surface"])
+    return made
+
+
+if __name__ == "__main__":
+    with open(sys.argv[1], encoding="utf-8") as stream:
+        main(json.load(stream))

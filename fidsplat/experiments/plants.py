@@ -1,0 +1,214 @@
+"""Plants from Blender: meshes grown from a seed, drawn by Cycles from many poses, and splats trained on the
+pictures, from disks on the mesh."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.errors import InputError, unknown
+from fidsplat.experiments.blender import camera_facts, drawn, ready
+from fidsplat.files import atomic_write, writable_folder
+from fidsplat.formats import save_ply
+from fidsplat.formats.colmap import save_colmap
+from fidsplat.quality import whole_number
+from fidsplat.render import Renderer
+from fidsplat.sim.plant_meshes import MESHES, Mesh
+from fidsplat.splats import SplatCloud
+from fidsplat.train import Step, Trainer, TrainSettings, load_dataset
+
+BACKGROUND = (0.9, 0.2, 0.9)
+"""behind plants in training: no plant has it, so that holes show"""
+WORKER = Path(__file__).with_name("blender_plants.py")
+NOTE = "plants.json"
+HEIGHT, FOCAL = 320, 480.0
+"""pixels of the pictures"""
+_LOW, _HIGH = math.radians(-15), math.radians(60)
+"""the cameras' elevation"""
+_FAINT = 0.05
+"""opacity below which trained splats go"""
+Tell = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Plants:
+    """What is to be made. Raises InputError for numbers out of range, or an unknown kind."""
+
+    kinds: tuple[str, ...] = tuple(MESHES)
+    each: int = 2
+    """plants of a kind"""
+    views: int = 24
+    """pictures to train on"""
+    test: int = 4
+    """pictures to compare with"""
+    samples: int = 16
+    """of Cycles for each pixel"""
+    splats: int = 5000
+    """of a plant"""
+    iterations: int = 1500
+    """of training; 0: the disks on the mesh as they are, and no pictures"""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for kind in self.kinds:
+            if kind not in MESHES:
+                raise InputError(unknown("kind of plant", kind, MESHES))
+        ranges = {"each": (1, 1000), "views": (2, 1000), "test": (1, 1000), "samples": (1, 10_000)}
+        ranges |= {"splats": (100, 1_000_000), "iterations": (0, 1_000_000), "seed": (0, 2**32 - 1)}
+        for name, (least, most) in ranges.items():
+            whole_number(f"plants: {name}", getattr(self, name), least, most)
+
+    @property
+    def names(self) -> list[tuple[str, int]]:
+        """Kind and number of each plant, one of every kind first."""
+        return [(kind, number) for number in range(self.each) for kind in self.kinds]
+
+    def mesh(self, kind: str, number: int) -> Mesh:
+        """A plant's surface."""
+        return MESHES[kind](np.random.default_rng([self.seed, list(MESHES).index(kind), number]))
+
+
+def cameras_around(mesh: Mesh, count: int, shift: float = 0.0) -> list[Camera]:
+    """Cameras on a spiral around a plant that see all of it, from a little below to far above; shift: by
+    which they lie between those of 0."""
+    middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
+    off = mesh.vertices - middle
+    reach, aside = (float(np.linalg.norm(part, axis=1).max()) for part in (off, off[:, :2]))
+    away = 1.01 * reach * math.hypot(1, 2 * FOCAL / HEIGHT)  # a ball around it fills the height
+    width = min(HEIGHT, 2 * math.ceil(FOCAL * aside / (away - reach)))
+    found = []
+    for i in range(count):
+        rise = _LOW + (_HIGH - _LOW) * (i + 0.5) / count
+        turn = 2.39996 * (i + shift)
+        ray = np.array([math.cos(rise) * math.cos(turn), math.cos(rise) * math.sin(turn), math.sin(rise)])
+        fov = 2 * math.atan(width / 2 / FOCAL)
+        found.append(Camera.look_at(width, HEIGHT, fov, middle + away * ray, middle, (0, 0, 1)))
+    return found
+
+
+def write_plants(
+    wanted: Plants,
+    folder: Path,
+    environment: Path,
+    device: str | None = None,
+    tell: Tell = lambda words, share: None,
+) -> Iterator[tuple[Path, float | None]]:
+    """Make what is not there yet: yields each plant's PLY file, and the mean PSNR of the views held out where
+    it was trained now.
+
+    Args:
+        folder: KIND-NUMBER.ply go there, and the pictures into folders KIND-NUMBER.
+        environment: Blender's, of `fidsplat.experiments.blender.install`.
+        tell: told what is done, and the share of all.
+
+    Raises:
+        InputError: Blender is not installed, or the folder holds plants of other numbers.
+        DeviceError: Blender fails; pictures done stay.
+    """
+    python = ready("standard", environment) if wanted.iterations else None
+    _note(wanted, writable_folder(folder))
+    renderer = Renderer(device) if wanted.iterations else None
+    for done, (kind, number) in enumerate(wanted.names):
+        file = folder / f"{kind}-{number}.ply"
+
+        def part(words: str, share: float, name: str = file.stem, done: int = done) -> None:
+            tell(f"{name}: {words}", (done + share) / len(wanted.names))
+
+        part("mesh", 0.0)
+        score = None
+        if not file.exists():
+            mesh = wanted.mesh(kind, number)
+            if python is None or renderer is None:
+                save_ply(mesh.splats(wanted.splats, wanted.seed), file)
+            else:
+                place = folder / file.stem
+                _draw(wanted, mesh, place, python, part)
+                score = _train(wanted, mesh, place, file, renderer, part)
+        yield file, score
+
+
+def _note(wanted: Plants, folder: Path) -> None:
+    """What the folder's plants are made with, kept beside them."""
+    file = folder / NOTE
+    # more of them, or of other kinds, may come to those that are there
+    own = {name: value for name, value in asdict(wanted).items() if name not in ("kinds", "each")}
+    try:
+        before = json.loads(file.read_text("utf-8"))
+    except FileNotFoundError:
+        before = own
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read {file}: {error}") from error
+    if before != own:
+        raise InputError(f"{folder} holds plants of {before}, not {own}; give another folder")
+    with atomic_write(file) as stream:
+        stream.write(json.dumps(own).encode())
+
+
+def _draw(wanted: Plants, mesh: Mesh, place: Path, python: Path, tell: Tell) -> None:
+    """The data set of a plant; pictures that are there stay."""
+    views, shots = [], []
+    for folder, stem, cameras in (
+        (place, "view", cameras_around(mesh, wanted.views)),
+        (place / "test", "test", cameras_around(mesh, wanted.test, 0.5)),
+    ):
+        names = [f"{stem}-{i:03d}.png" for i in range(len(cameras))]
+        views.append((folder, names, cameras))
+        files = [str((folder / "images" / name).absolute()) for name in names]
+        shots += [{"file": f, **camera_facts(c)} for f, c in zip(files, cameras, strict=True)]
+    plant = {
+        "name": place.name,
+        "vertices": mesh.vertices.tolist(),
+        "quads": mesh.quads.tolist(),
+        "colors": mesh.colors.tolist(),
+        "shots": shots,
+    }
+    job = {
+        "view": "standard",
+        "samples": wanted.samples,
+        "filter": "BOX",
+        "threads": os.cpu_count() or 1,
+        "background": 0.9,
+    }
+    for done, _ in enumerate(drawn(python, WORKER, [plant], job)):
+        tell("Blender", 0.5 * (done + 1) / len(shots))
+    disks = mesh.splats(wanted.splats, wanted.seed)
+    assert disks.colors is not None  # a mesh has no other
+    points, colors = disks.world_means(), np.rint(255 * disks.colors).astype(np.uint8)
+    for folder, names, cameras in views:
+        save_colmap(folder / "sparse" / "0", names, cameras, points, colors)
+    with atomic_write(place / "dataset.json") as stream:
+        stream.write(json.dumps({"background": BACKGROUND, "seed": wanted.seed}).encode())
+
+
+def _train(wanted: Plants, mesh: Mesh, place: Path, file: Path, renderer: Renderer, tell: Tell) -> float:
+    """Train on the pictures from disks on the mesh, and write those that show; the mean PSNR of the test
+    views."""
+    settings = TrainSettings(
+        iterations=wanted.iterations,
+        seed=wanted.seed,
+        sh_degree=0,  # plants are turned, and their light comes from above
+        densify_until=0,
+        position_steps=wanted.iterations,
+    )
+    dataset = load_dataset(place)
+    start = mesh.splats(wanted.splats, wanted.seed)
+    trainer = Trainer(dataset, renderer, settings, place / "training.npz", start)
+
+    def step(made: Step) -> None:
+        tell(f"training, {made.psnr:.1f} dB", 0.5 + 0.5 * made.iteration / wanted.iterations)
+
+    trainer.run(step)
+    score = float(np.mean([view.psnr for view in trainer.evaluate()]))
+    cloud = trainer.cloud()
+    assert cloud.sh is not None  # a trainer makes no other
+    seen = cloud.opacities > _FAINT
+    parts = (getattr(cloud, name)[seen] for name in ("means", "quats", "scales", "opacities"))
+    save_ply(SplatCloud(*parts, sh=cloud.sh[seen], origin=cloud.origin), file)
+    return score

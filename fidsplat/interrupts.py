@@ -1,0 +1,53 @@
+"""Ctrl-C and SIGTERM as exceptions, at moments that can bear one."""
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator
+from importlib.machinery import ExtensionFileLoader
+from types import FrameType
+
+_LOADING = frozenset({ExtensionFileLoader.create_module.__code__, ExtensionFileLoader.exec_module.__code__})
+_LATER = 0.01
+"""seconds"""
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, which stops a command where it stands as Ctrl-C does: half-written files are removed."""
+
+
+@contextlib.contextmanager
+def raised_in_time() -> Iterator[None]:
+    """SIGINT raises KeyboardInterrupt and SIGTERM Terminated, but not while a library is being loaded.
+
+    What such a library calls of Python on its way (NumPy to register types, nanobind for its enums) may
+    raise nothing that it does not expect: PyOpenCL aborts the process, NumPy reports a broken installation,
+    others forget the interrupt. It comes again a little later.
+    """
+    if threading.current_thread() is not threading.main_thread():  # only that one may handle signals
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    # what a shell starts behind ignores Ctrl-C; None: not set by Python
+    before = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
+    for number in before:
+        signal.signal(number, _stop)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _stop(number: int, frame: FrameType | None) -> None:
+    if not _loads_a_library(frame):
+        raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
+    again = threading.Timer(_LATER, signal.pthread_kill, (threading.main_thread().ident, number))
+    again.daemon = True
+    again.start()
+
+
+def _loads_a_library(frame: FrameType | None) -> bool:
+    while frame is not None and frame.f_code not in _LOADING:
+        frame = frame.f_back
+    return frame is not None

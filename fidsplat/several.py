@@ -1,0 +1,169 @@
+"""One picture by several devices: each draws a band of its rows, from the splats that the band sees."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from fidsplat.cameras import Camera
+from fidsplat.capture import Capture
+from fidsplat.errors import InputError
+from fidsplat.frame import Frame
+from fidsplat.quality import Quality
+from fidsplat.render import Renderer, ResidentCloud
+from fidsplat.scenes import Scene
+from fidsplat.splats import SplatCloud
+from fidsplat.store.store import Store
+
+_UNEVEN = 1.1
+"""how many times as long as the mean the slowest band may take before the bands are cut anew"""
+
+
+class SeveralDevices:
+    """Draws pictures with several devices of one kind, each a band of rows; a picture has the bits that one
+    device gives it.
+
+    Bands are cut so that all take as long, by the time that those of the last picture took. Of a store a
+    device holds the chunks that its band sees; of a cloud in memory each holds all.
+
+    Args:
+        devices: names as of `fs.Renderer`, e.g. ["opencl:nvidia", "opencl:nvidia-2"]; one may stand there
+            twice.
+        memory_budget: bytes, of each device.
+
+    Raises:
+        InputError: no device, or devices of different kinds, whose pictures differ in their last bits.
+        DeviceError: as `fs.Renderer`.
+    """
+
+    def __init__(self, devices: Iterable[str], memory_budget: int | None = None) -> None:
+        names = [devices] if isinstance(devices, str) else list(devices)
+        if not names:
+            raise InputError("devices is empty; name one device at least, e.g. ['opencl']")
+        self.renderers = [Renderer(name, memory_budget) for name in names]
+        titles = {renderer.device.title for renderer in self.renderers}
+        if len(titles) > 1:
+            raise InputError(
+                f"devices are of different kinds ({', '.join(sorted(titles))}), whose pictures differ in "
+                "their last bits; name devices of one kind"
+            )
+        self._shares = np.linspace(0.0, 1.0, len(names) + 1)
+        """where bands end, in parts of the picture's height"""
+        self._pool = ThreadPoolExecutor(len(names), "fidsplat-device")
+
+    def upload(self, scene: Scene | SplatCloud | Store) -> list[ResidentCloud]:
+        """A scene on all devices, for `render`."""
+        return list(self._pool.map(lambda renderer: renderer.upload(scene), self.renderers))
+
+    def render(
+        self,
+        scene: Scene | SplatCloud | Store | Sequence[ResidentCloud],
+        capture: Capture | Camera | None = None,
+        outputs: Iterable[str] | None = None,
+        quality: Quality | str | None = None,
+    ) -> Frame:
+        """Draw one picture. Arguments and errors as those of `Renderer.render`; scene: also what `upload` has
+        returned."""
+        given = scene if isinstance(scene, Sequence) else self.upload(scene)
+        if len(given) != len(self.renderers):
+            raise InputError(f"a scene on {len(given)} devices was given to {len(self.renderers)}")
+        camera = capture.camera if isinstance(capture, Capture) else capture
+        camera = camera or given[0].capture.camera
+        if camera is None:
+            raise InputError("no camera; give a Camera, or a Capture with one")
+        names = None if outputs is None else tuple(outputs)
+        bands = self._bands(camera.height)
+
+        def draw(number: int) -> tuple[Frame, float]:
+            begun = time.perf_counter()
+            frame = self.renderers[number].render_band(bands[number], given[number], capture, names, quality)
+            return frame.wait(), time.perf_counter() - begun
+
+        made = list(self._pool.map(draw, range(len(bands))))
+        self._cut_anew([end - first for first, end in bands], [seconds for _, seconds in made])
+        frames = [frame for frame, _ in made]
+        return Frame(_Banded(frames, bands, self._pool), frames[0].outputs)
+
+    def render_views(
+        self,
+        scene: Scene | SplatCloud | Store | Sequence[ResidentCloud],
+        captures: Iterable[Capture | Camera],
+        outputs: Iterable[str] | None = None,
+        quality: Quality | str | None = None,
+    ) -> Iterator[Frame]:
+        """Draw many pictures, each whole by one device, in their order: device k draws pictures k, k + n and
+        so on, of n devices. Arguments and errors as those of `render`."""
+        given = scene if isinstance(scene, Sequence) else self.upload(scene)
+        names, waiting = None if outputs is None else tuple(outputs), []
+
+        def draw(number: int, capture: Capture | Camera) -> Frame:
+            k = number % len(self.renderers)
+            frame = self.renderers[k].render(given[k], capture, names, quality)
+            for name in frame.outputs:  # brought to the host here, beside what other devices bring
+                _ = frame[name]
+            return frame
+
+        # a thread of its own for each device: its pictures are drawn in their order
+        pools = [ThreadPoolExecutor(1, "fidsplat-device") for _ in self.renderers]
+        try:
+            for number, capture in enumerate(captures):
+                waiting.append(pools[number % len(pools)].submit(draw, number, capture))
+                if len(waiting) > 2 * len(pools):
+                    yield waiting.pop(0).result()
+            while waiting:
+                yield waiting.pop(0).result()
+        finally:
+            for pool in pools:
+                pool.shutdown(cancel_futures=True)
+
+    def _bands(self, height: int) -> list[tuple[int, int]]:
+        """Rows of each device, one at least; devices that find none draw none."""
+        devices = min(len(self.renderers), height)
+        shares = self._shares if devices == len(self.renderers) else np.linspace(0, 1, devices + 1)
+        cuts = np.round(shares * height).astype(int)
+        for number in range(1, devices):
+            cuts[number] = min(max(cuts[number], cuts[number - 1] + 1), height - devices + number)
+        return list(pairwise(cuts.tolist()))
+
+    def _cut_anew(self, rows: list[int], seconds: list[float]) -> None:
+        """Bands that would have taken as long as each other, if rows of a band take the same."""
+        if len(rows) < len(self.renderers) or max(seconds) <= _UNEVEN * np.mean(seconds):
+            return
+        spent = np.concatenate([[0.0], np.cumsum(seconds)])
+        ends = np.concatenate([[0.0], np.cumsum(rows)]) / sum(rows)
+        self._shares = np.interp(np.linspace(0.0, spent[-1], len(spent)), spent, ends)
+
+
+@dataclass(frozen=True)
+class _Banded:
+    """Images of bands as those of one picture."""
+
+    frames: list[Frame]
+    bands: list[tuple[int, int]]
+    pool: ThreadPoolExecutor
+
+    def read(self, name: str) -> np.ndarray:
+        """The rows of all bands, one below the other."""
+        whole = self.frames[0].read_rows(name, 0, 0)
+        list(self.pool.map(lambda frame, band: frame.read_rows(name, *band, whole), self.frames, self.bands))
+        return whole
+
+    @property
+    def timings(self) -> dict[str, float]:
+        """Of each stage the slowest device's."""
+        each = [frame.timings for frame in self.frames]
+        return {stage: max(one.get(stage, 0.0) for one in each) for stage in each[0]}
+
+    @property
+    def stats(self) -> dict[str, Any]:
+        """Of the device that has most splats; visible and pairs of all, which count twice what two bands
+        see."""
+        each = [frame.stats for frame in self.frames]
+        most = max(one["splats"] for one in each)
+        return {"splats": most} | {name: sum(one[name] for one in each) for name in ("visible", "pairs")}

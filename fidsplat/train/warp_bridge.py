@@ -1,0 +1,104 @@
+"""Pictures on a `warp.Tape`: our rendering as a step of a Warp program that is differentiated as a whole.
+
+Arrays stay on the device. Derivatives are those of docs/gradients.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from fidsplat.backends.gradients import on_host
+from fidsplat.backends.prepare import prepare
+from fidsplat.backends.warp.device import WarpBackend
+from fidsplat.backends.warp.gradients import add_to, flat_of
+from fidsplat.backends.warp.runtime import load
+from fidsplat.capture import Capture
+from fidsplat.effects.differentiable import check_gradients
+from fidsplat.errors import DeviceError, InputError
+from fidsplat.render import Renderer
+from fidsplat.train.derivatives import by_pose, moved
+
+
+def draw(
+    tape: Any,
+    renderer: Renderer,
+    capture: Capture,
+    means: Any,
+    quats: Any,
+    scales: Any,
+    opacities: Any,
+    *,
+    colors: Any = None,
+    sh: Any = None,
+    background: Any = None,
+    pose: Any = None,
+) -> dict[str, Any]:
+    """Draw splats that are wp.arrays, and record it: `tape.backward` adds to the `grad` of each of them that
+    `requires_grad`.
+
+    It belongs to the picture that was drawn last on the device: call it before the next one. On CUDA all of
+    it runs on the stream of the device.
+
+    Args:
+        tape: a `warp.Tape`.
+        renderer: of a Warp device.
+        capture: camera, outputs (`rgb`, `alpha`, `depth`, `normal`), quality; see docs/gradients.md.
+        means, quats, scales, opacities: (n,) float32 vectors or (n, 3), (n, 4) wxyz of any length, (n, 2),
+            (n,), as a `SplatCloud` has them, on the renderer's device; read where they lie.
+        colors, sh: (n, 3), or (n, k, 3) harmonics of degree 1 to 3; one of them.
+        background: (3,), in place of the capture's.
+        pose: (6,) rotation vector [rad] and translation [m] of a motion after the camera's
+            `world_to_camera`, in its axes.
+
+    Returns:
+        the capture's outputs as float32 arrays (h, w) or (h, w, 3) of their own, with gradients.
+
+    Raises:
+        DeviceError: the renderer is not of a Warp device, or the device fails.
+        InputError: arrays that cannot be drawn, or something without a gradient; from `tape.backward`, where
+            another picture has been drawn since.
+    """
+    wp, backend = load(), renderer.backend
+    if not isinstance(backend, WarpBackend):
+        raise DeviceError(f"a tape records pictures of Warp devices, not of {renderer.device.name}")
+    if (colors is None) == (sh is None):
+        raise InputError("give either colors or sh")
+    given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+    given |= {"sh": sh} if colors is None else {"colors": colors}
+    known = given | {"background": background, "pose": pose}
+    wanted = {name: array for name, array in known.items() if getattr(array, "requires_grad", False)}
+    if background is not None:
+        capture = replace(capture, background=tuple(_numbers("background", background, 3).tolist()))
+    motion = None if pose is None else _numbers("pose", pose, 6)
+    if motion is not None:
+        if capture.camera is None:
+            raise InputError("a pose needs a capture with a camera")
+        capture = replace(capture, camera=moved(capture.camera, motion))
+    resident = backend.adopt(given, np.zeros(3))
+    features, view = prepare(resident, capture)
+    check_gradients(features, capture.outputs)
+    pipeline = backend.differentiate(features)
+    drawn = pipeline.forward(resident, view)
+    images = {name: wp.clone(drawn.device_array(name), requires_grad=True) for name in capture.outputs}
+
+    def backward() -> None:
+        found = pipeline.backward(drawn, {name: image.grad for name, image in images.items()})
+        if motion is not None:
+            of_pose = by_pose(on_host(found["pose"]).astype(np.float64), motion)
+            found["pose"] = wp.array(of_pose, dtype=wp.float32, device=backend.device)
+        for name, array in wanted.items():
+            add_to(flat_of(array.grad), flat_of(found[name]))
+
+    tape.record_func(backward, [*wanted.values(), *images.values()])
+    return images
+
+
+def _numbers(name: str, array: Any, count: int) -> np.ndarray:
+    """So many numbers, float64, of an array."""
+    numbers = on_host(array).astype(np.float64)
+    if numbers.shape != (count,):
+        raise InputError(f"{name} has the shape {numbers.shape}; it must be {count} numbers")
+    return numbers

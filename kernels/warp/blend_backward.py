@@ -1,0 +1,364 @@
+"""Tiles taken back: each walks its list forward once more for the light in front of every CHUNK splats, then
+back, a chunk at a time, and leaves of each of its splats the sums over its samples in a slot of their own
+(fragment_backward.py has the formulae). No atomics: a sum has one order, and so the same bits on every run.
+
+On a GPU a block of threads per tile, a sample per thread: fragments' sums are taken over a warp by shuffles,
+over the warps in shared memory. On a CPU a thread per tile that walks each splat's box within it.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from .bounds import Bounds, make_bounds, window_tile
+from .common import STRICT, View, lowest
+from .fragment_backward import make_fragments
+from .staging import BLOCK_H, BLOCK_W, with_numbers
+
+CHUNK = 32
+"""splats of a tile's list that are walked forward and then back"""
+NONE, ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
+_WINDOW, _BITS = wp.constant(wp.uint64(32)), wp.constant(wp.uint64(0xFFFFFFFF))
+
+_ANY_OF_BLOCK = """
+#if defined(__CUDA_ARCH__)
+    return __syncthreads_or(open);
+#else
+    return open;
+#endif
+"""
+_ANY_OF_WARP = """
+#if defined(__CUDA_ARCH__)
+    return __any_sync(0xffffffffu, open);
+#else
+    return open;
+#endif
+"""
+_POOL = """
+#if defined(__CUDA_ARCH__)
+    __shared__ float parts[CHUNK * WARPS * FIELDS];
+    return static_cast<wp::uint64>(__cvta_generic_to_shared(parts));
+#else
+    return 0;
+#endif
+"""
+# On the CPU the threads of a block run one after the other: they add to the slot, in their order.
+_LEAVE = """
+#if defined(__CUDA_ARCH__)
+    float* parts = reinterpret_cast<float*>(__cvta_shared_to_generic(pool));
+    parts += (place * WARPS + threadIdx.x / 32) * FIELDS;
+    const int lane = threadIdx.x & 31;
+    if (!__any_sync(0xffffffffu, drawn)) {
+        if (lane < FIELDS) parts[lane] = 0.0f;
+        return;
+    }
+    for (int field = 0; field < FIELDS; field++) {
+        float sum = values[field];
+        for (int apart = 16; apart > 0; apart /= 2) sum += __shfl_xor_sync(0xffffffffu, sum, apart);
+        if (lane == 0) parts[field] = sum;
+    }
+#else
+    if (drawn) for (int field = 0; field < FIELDS; field++) moments.data[slot][field] += values[field];
+#endif
+"""
+_GATHER = """
+#if defined(__CUDA_ARCH__)
+    const float* parts = reinterpret_cast<const float*>(__cvta_shared_to_generic(pool));
+    __syncthreads();
+    for (int cell = threadIdx.x; cell < count * FIELDS; cell += blockDim.x) {
+        const int place = cell / FIELDS, field = cell % FIELDS;
+        float sum = 0.0f;
+        for (int warp = 0; warp < WARPS; warp++) sum += parts[(place * WARPS + warp) * FIELDS + field];
+        moments.data[slots.data[first + place]][field] = sum;
+    }
+    __syncthreads();
+#endif
+"""
+
+
+@cache
+def make_slots(screen: bool):
+    """The kernel that finds where each pair of a splat and a tile leaves its sums; screen: as make_bounds.
+
+    A splat has as many slots as it has tiles, in their order, after those of the splats before it.
+    """
+    limits = make_bounds(screen)
+
+    @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+    def find_slots(
+        first: int,
+        view: View,
+        tiles: wp.array(dtype=wp.int32),  # (pairs) as they are listed
+        lists: wp.array(dtype=wp.int32),
+        windows: wp.array(dtype=wp.uint64),
+        bounds: wp.array(dtype=Bounds),
+        counts: wp.array(dtype=wp.int64),
+        ends_by_index: wp.array(dtype=wp.int64),  # inclusive sums
+        slots: wp.array(dtype=wp.int32),  # (pairs) out
+    ):
+        k = first + wp.tid()
+        index, tile = lists[k], tiles[k]
+        corner = int(windows[index] >> _WINDOW)
+        bits = wp.uint32(windows[index] & _BITS)
+        rank = int(0)
+        if bits == NONE:
+            b = bounds[index]
+            row, end = limits.tile_rows(b, view)
+            while row < end:
+                left, right = limits.tile_span(b, row, view)
+                base = row * view.tiles_x
+                rank += wp.clamp(tile - (left + base), 0, wp.max(right - left, 0))
+                row += 1
+        while bits != NONE and window_tile(corner, lowest(bits), view) != tile:
+            bits = bits & (bits - ONE)
+            rank += 1
+        slots[k] = int(ends_by_index[index] - counts[index]) + rank
+
+    return find_slots
+
+
+@cache
+def make_blend_backward(
+    effects: tuple[str, ...], outputs: tuple[str, ...], losses: tuple[str, ...], on_gpu: bool, threads: int
+) -> SimpleNamespace:
+    """kernel; By, Loss, Moments: structs of what it reads, keeps of a sample, and leaves. effects, outputs,
+    on_gpu, threads: as make_blend; losses: outputs with derivatives."""
+    made = make_fragments(effects, outputs, losses)
+    By, Samples, Loss, Moments = made.By, made.Samples, made.Loss, made.Moments
+    load, box_of, loss_at = made.load, made.box_of, made.loss_at
+    opacity_at, back = made.opacity_at, made.back
+    numbers = {"CHUNK": CHUNK, "WARPS": max(threads // 32, 1), "FIELDS": wp.types.type_size(Moments)}
+
+    @wp.func_native(with_numbers(_ANY_OF_BLOCK, numbers))
+    def any_of_block(open: bool) -> bool:
+        """Whether any thread of the block says so; all wait for each other."""
+        ...
+
+    @wp.func_native(with_numbers(_ANY_OF_WARP, numbers))
+    def any_of_warp(open: bool) -> bool:
+        """Whether any thread of the warp says so."""
+        ...
+
+    @wp.func_native(with_numbers(_POOL, numbers))
+    def pool() -> wp.uint64:
+        """Where the warps' sums lie in shared memory."""
+        ...
+
+    @wp.func_native(with_numbers(_LEAVE, numbers))
+    def leave(
+        pool: wp.uint64,
+        place: int,
+        drawn: bool,
+        values: Moments,
+        moments: wp.array(dtype=Moments),
+        slot: int,
+    ):
+        """Sums a fragment's values over the warp; those of threads that have drawn nothing are 0."""
+        ...
+
+    @wp.func_native(with_numbers(_GATHER, numbers))
+    def gather(
+        pool: wp.uint64,
+        first: int,
+        count: int,
+        moments: wp.array(dtype=Moments),
+        slots: wp.array(dtype=wp.int32),
+    ):
+        """Sums what the warps have left of `count` splats of the list into their slots; all wait."""
+        ...
+
+    chunk_of = wp.types.vector(CHUNK, wp.float32)
+    options = {"module": "unique", "module_options": STRICT, "enable_backward": False}
+
+    @wp.func
+    def beyond(light: float, opacity: float) -> float:
+        """The light behind a fragment; none behind one that ends the list."""
+        if opacity < 0.0:
+            return 0.0
+        return light - light * opacity
+
+    @wp.kernel(launch_bounds=threads, **options)
+    def blend_backward_gpu(
+        band_first: int,  # tile of block 0
+        view: View,
+        background: wp.vec3,
+        log_ceiling: float,
+        lines: wp.array(dtype=wp.vec4),
+        starts: wp.array(dtype=wp.int32),
+        lists: wp.array(dtype=wp.int32),
+        slots: wp.array(dtype=wp.int32),
+        by: By,
+        samples: Samples,
+        checkpoints: wp.array(dtype=wp.float32),  # scratch: light in front of every CHUNK splats of a tile
+        moments: wp.array(dtype=Moments),  # out, 0 before
+    ):
+        thread = wp.tid()
+        tile = band_first + thread / threads
+        item = thread % threads
+        block, lane = item / 32, item % 32
+        across = view.tile_w / BLOCK_W
+        left = (tile % view.tiles_x) * view.tile_w + (block % across) * BLOCK_W
+        top = (tile / view.tiles_x) * view.tile_h + (block / across) * BLOCK_H
+        x, y = left + lane % BLOCK_W, top + lane / BLOCK_W
+        loss = loss_at(x, y, by, samples, background, view)
+        light = float(1.0)
+        if x >= view.width or y >= view.height:
+            light = 0.0
+        start, end = starts[tile], starts[tile + 1]
+        own = (start / CHUNK + tile) * threads + item
+
+        chunks = int(0)
+        while start + chunks * CHUNK < end and any_of_block(light > view.stop):
+            first = start + chunks * CHUNK
+            checkpoints[own + chunks * threads] = light
+            for place in range(wp.min(CHUNK, end - first)):
+                box = box_of(lines, lists[first + place])
+                if box[0] < left + BLOCK_W and box[1] > left and box[2] < top + BLOCK_H and box[3] > top:
+                    s = load(wp.uint64(0), lines, lists, first + place, 0, view)
+                    light = beyond(light, opacity_at(s, x, y, light, view))
+            chunks += 1
+
+        parts = pool()
+        while chunks > 0:
+            chunks -= 1
+            first = start + chunks * CHUNK
+            count = wp.min(CHUNK, end - first)
+            light = checkpoints[own + chunks * threads]
+            lights, opacities = chunk_of(), chunk_of()
+            for place in range(count):
+                lights[place] = light
+                box = box_of(lines, lists[first + place])
+                if box[0] < left + BLOCK_W and box[1] > left and box[2] < top + BLOCK_H and box[3] > top:
+                    s = load(wp.uint64(0), lines, lists, first + place, 0, view)
+                    opacity = opacity_at(s, x, y, light, view)
+                    light = beyond(light, opacity)
+                    opacities[place] = opacity
+            place = count
+            while place > 0:
+                place -= 1
+                drawn = opacities[place] > 0.0
+                values = Moments()
+                if any_of_warp(drawn):
+                    s = load(wp.uint64(0), lines, lists, first + place, 0, view)
+                    if drawn:
+                        values, loss = back(
+                            s, lists[first + place], x, y, lights[place], opacities[place], loss, log_ceiling,
+                            lines, view,
+                        )  # fmt: skip
+                leave(parts, place, drawn, values, moments, slots[first + place])
+            gather(parts, first, count, moments, slots)
+
+    @wp.func
+    def reach(lines: wp.array(dtype=wp.vec4), index: int, x0: int, y0: int, view: View) -> wp.vec4i:
+        """Samples of the tile at (x0, y0) that the splat can touch, counted from there."""
+        box = box_of(lines, index)
+        return wp.vec4i(
+            wp.max(box[0] - x0, 0),
+            wp.min(box[1] - x0, view.tile_w),
+            wp.max(box[2] - y0, 0),
+            wp.min(box[3] - y0, view.tile_h),
+        )
+
+    @wp.func
+    def walk(
+        k: int,
+        place: int,
+        alive: int,
+        x0: int,
+        y0: int,
+        state_first: int,
+        lines: wp.array(dtype=wp.vec4),
+        lists: wp.array(dtype=wp.int32),
+        lights: wp.array(dtype=wp.float32),
+        fragments: wp.array(dtype=wp.vec2),
+        view: View,
+    ) -> int:
+        """Lets the splat lists[k] take its light, and keeps its fragments; how many samples stay alive."""
+        s = load(wp.uint64(0), lines, lists, k, 0, view)
+        area = reach(lines, lists[k], x0, y0, view)
+        left = alive
+        for row in range(area[2], area[3]):
+            for column in range(area[0], area[1]):
+                at = state_first + row * view.tile_w + column
+                light = lights[at]
+                opacity = opacity_at(s, x0 + column, y0 + row, light, view)
+                fragments[at * CHUNK + place] = wp.vec2(light, opacity)
+                if opacity != 0.0:
+                    lights[at] = beyond(light, opacity)
+                    if not (lights[at] > view.stop):
+                        left -= 1
+        return left
+
+    @wp.kernel(**options)
+    def blend_backward_cpu(
+        band_first: int,  # tile of thread 0
+        view: View,
+        background: wp.vec3,
+        log_ceiling: float,
+        lines: wp.array(dtype=wp.vec4),
+        starts: wp.array(dtype=wp.int32),
+        lists: wp.array(dtype=wp.int32),
+        slots: wp.array(dtype=wp.int32),
+        by: By,
+        samples: Samples,
+        checkpoints: wp.array(dtype=wp.float32),
+        moments: wp.array(dtype=Moments),  # out, 0 before
+        lights: wp.array(dtype=wp.float32),  # scratch of one tile, from `state_first` as blend_cpu has it
+        losses: wp.array(dtype=Loss),  # the same
+        fragments: wp.array(dtype=wp.vec2),  # the same, CHUNK for each sample: light and opacity
+        state_first: int,
+    ):
+        tile = band_first + wp.tid()
+        x0 = (tile % view.tiles_x) * view.tile_w
+        y0 = (tile / view.tiles_x) * view.tile_h
+        area = view.tile_w * view.tile_h
+        alive = int(0)
+        for k in range(area):
+            x, y = x0 + k % view.tile_w, y0 + k / view.tile_w
+            losses[state_first + k] = loss_at(x, y, by, samples, background, view)
+            lights[state_first + k] = 0.0
+            if x < view.width and y < view.height:
+                lights[state_first + k] = 1.0
+                alive += 1
+        start, end = starts[tile], starts[tile + 1]
+        own = (start / CHUNK + tile) * area
+        walked = start
+        while walked < end and alive > 0:
+            chunk, place = (walked - start) / CHUNK, (walked - start) % CHUNK
+            if place == 0:
+                for k in range(area):
+                    checkpoints[own + chunk * area + k] = lights[state_first + k]
+            alive = walk(walked, place, alive, x0, y0, state_first, lines, lists, lights, fragments, view)
+            walked += 1
+
+        reached = walked  # the last chunk's fragments are kept already
+        while walked > start:
+            chunk = (walked - 1 - start) / CHUNK
+            first = start + chunk * CHUNK
+            if walked < reached:
+                for k in range(area):
+                    lights[state_first + k] = checkpoints[own + chunk * area + k]
+                for place in range(CHUNK):
+                    walk(first + place, place, 0, x0, y0, state_first, lines, lists, lights, fragments, view)
+            while walked > first:
+                walked -= 1
+                s = load(wp.uint64(0), lines, lists, walked, 0, view)
+                touched = reach(lines, lists[walked], x0, y0, view)
+                total = Moments()
+                for row in range(touched[2], touched[3]):
+                    for column in range(touched[0], touched[1]):
+                        at = state_first + row * view.tile_w + column
+                        fragment = fragments[at * CHUNK + walked - first]
+                        if fragment[1] > 0.0:
+                            values, loss = back(
+                                s, lists[walked], x0 + column, y0 + row, fragment[0], fragment[1],
+                                losses[at], log_ceiling, lines, view,
+                            )  # fmt: skip
+                            losses[at] = loss
+                            total += values
+                moments[slots[walked]] = total
+
+    return SimpleNamespace(
+        kernel=blend_backward_gpu if on_gpu else blend_backward_cpu, By=By, Loss=Loss, Moments=Moments
+    )

@@ -1,0 +1,249 @@
+"""Derivatives of compositing, fragment by fragment. A pixel shows C = sum_k T_k alpha_k c_k + T_end C_behind.
+With g = dL / dC, and B_k what the light is worth that fragment k lets through, from the back to the front
+
+    B_end = g C_behind,   B_(k-1) = B_k + alpha_k (g c_k - B_k),   dL / d alpha_k = T_k (g c_k - B_k):
+
+nothing is divided by 1 - alpha, so that opaque fragments have derivatives as all others.
+"""
+
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from .buffers import make_samples, sample_fields
+from .common import View, fma, line_of, struct_of
+from .crossing import make_crossing
+from .output.distortion import INVERSE_DEPTH, SPREAD_NEAR
+from .records import Layout
+from .splat import make_splat
+
+_FORMS = ("nu0", "nux", "nuy", "nv0", "nvx", "nvy", "d0", "dx", "dy", "log_opacity", "r", "g", "b")
+
+
+def moments_of(effects: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[str, ...]:
+    """What a fragment adds to a loss's derivatives by its splat's record: by each form its derivative times
+    1, x, y from the anchor; by ln(opacity), by the colour, by the further numbers of the record."""
+    names = list(_FORMS)
+    names += ("dot_x", "dot_y") if "lowpass_screen" in effects else ()
+    names += ("z_numerator", "z_center", "z_reach") if "ray_depth" in effects else ()
+    names += ("nx", "ny", "nz") if "normal" in outputs else ()
+    return tuple(names)
+
+
+@cache
+def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: tuple[str, ...]):
+    """By (a struct of the derivatives by the images named in `losses`), Samples, Splat, Loss, Moments; load,
+    loss_at, opacity_at, back. effects and outputs: as blending has them.
+    """
+    splats, crossing = make_splat(effects, outputs), make_crossing(effects, outputs)
+    Splat, cross, row_of, opacity_of = splats.Splat, crossing.cross, crossing.row, crossing.opacity_of
+    screen, exclusive, has_depth = (
+        name in effects for name in ("lowpass_screen", "stop_exclusive", "ray_depth")
+    )
+    alpha, depth, normal, distortion = (name in losses for name in ("alpha", "depth", "normal", "distortion"))
+    names = moments_of(effects, outputs)
+    at = {name: place for place, name in enumerate(names)}
+    Moments = wp.types.vector(len(names), wp.float32)
+    layout = Layout(effects, outputs)
+    each = layout.lines
+    z_line, z_lane = layout.place("z_numerator")
+    zc_line, zc_lane = layout.place("z_center")
+    zr_line, zr_lane = layout.place("z_reach")
+    normals = [layout.place(name) for name in ("nx", "ny", "nz")]
+    box_line, box_lane = layout.place("columns")
+    rows_line, rows_lane = layout.place("rows")
+    Samples = make_samples(tuple(sample_fields(outputs).items()))
+    arrays = {name: wp.array(dtype=wp.float32) for name in losses}
+    By = struct_of("By", "A loss's derivatives by the images, (h w channels) each.", arrays)
+    fields = {"light": wp.vec3, "behind": wp.float32}
+    fields |= {"depth": wp.float32, "depth_weight": wp.float32} if depth else {}
+    fields |= {"normal": wp.vec3} if normal else {}
+    fields |= {"distortion": wp.float32, "spread": wp.vec4} if distortion else {}
+    Loss = struct_of("Loss", "Of a pixel: derivatives by what it shows; what light is worth behind.", fields)
+
+    @wp.func
+    def box_of(lines: wp.array(dtype=wp.vec4), index: int) -> wp.vec4i:
+        """Samples that the splat can touch: first and end of columns, then of rows."""
+        columns = wp.cast(line_of(lines, index * each + box_line)[box_lane], wp.uint32)
+        rows = wp.cast(line_of(lines, index * each + rows_line)[rows_lane], wp.uint32)
+        low, half = wp.uint32(0xFFFF), wp.uint32(16)
+        return wp.vec4i(int(columns & low), int(columns >> half), int(rows & low), int(rows >> half))
+
+    @wp.func
+    def loss_at(x: int, y: int, by: By, samples: Samples, background: wp.vec3, view: View):
+        """A pixel's; nothing beyond the picture."""
+        loss = Loss()
+        if x < view.width and y < view.height:
+            pixel = y * view.width + x
+            place = y * view.tiles_x * view.tile_w + x
+            loss.light = wp.vec3(by.rgb[3 * pixel], by.rgb[3 * pixel + 1], by.rgb[3 * pixel + 2])
+            loss.behind = wp.dot(loss.light, background)
+            if wp.static(alpha):
+                loss.behind -= by.alpha[pixel]
+            if wp.static(depth):
+                # sum w z / sum w
+                sums = samples.depth[place]
+                if sums[1] > 0.0:
+                    loss.depth = by.depth[pixel] / sums[1]
+                    loss.depth_weight = -loss.depth * (sums[0] / sums[1])
+            if wp.static(normal):
+                # the direction of sum w n
+                length = wp.length(samples.normal[place])
+                if length > 0.0:
+                    unit = samples.normal[place] / length
+                    by_unit = wp.vec3(
+                        by.normal[3 * pixel], by.normal[3 * pixel + 1], by.normal[3 * pixel + 2]
+                    )
+                    loss.normal = (by_unit - wp.dot(by_unit, unit) * unit) / length
+            if wp.static(distortion):
+                loss.distortion = by.distortion[pixel]
+                loss.spread = samples.distortion[place]
+        return loss
+
+    @wp.func
+    def crossed(s: Splat, x: float, y: float, view: View):
+        return cross(s, row_of(s.u, y), row_of(s.v, y), row_of(s.d, y), x, y, view)
+
+    @wp.func
+    def opacity_at(s: Splat, column: int, row: int, light: float, view: View) -> float:
+        """What is drawn of the splat at a sample that this much light comes to, with blending's decisions: 0
+        where nothing is; -1 where that ends the sample's list without being drawn."""
+        opacity = float(0.0)
+        if light > view.stop:
+            c = crossed(s, float(column) - s.d[3], float(row) - s.c[0], view)
+            if c.drawn:
+                opacity = opacity_of(s, c, 1.0 / c.d, view)
+                if wp.static(exclusive):
+                    if light * (1.0 - opacity) <= view.stop:
+                        opacity = -1.0
+        return opacity
+
+    @wp.func
+    def depth_at(lines: wp.array(dtype=wp.vec4), index: int, inverse_d: float) -> wp.vec4:
+        """Depth of a fragment, and which way it depends on the record: 1 where it is z_numerator / D; else 0,
+        by the centre, and -1, 1 at the ends of the disk's range, by its reach."""
+        place = index * each
+        center = line_of(lines, place + zc_line)[zc_lane]
+        reach = line_of(lines, place + zr_line)[zr_lane]
+        met = line_of(lines, place + z_line)[z_lane] * inverse_d
+        if not (inverse_d > 0.0):
+            return wp.vec4(center, 0.0, 1.0, 0.0)
+        if met < center - reach:
+            return wp.vec4(center - reach, 0.0, 1.0, -1.0)
+        if met > center + reach:
+            return wp.vec4(center + reach, 0.0, 1.0, 1.0)
+        return wp.vec4(met, 1.0, 0.0, 0.0)
+
+    @wp.func
+    def back(
+        s: Splat,
+        index: int,
+        column: int,
+        row: int,
+        light: float,
+        opacity: float,
+        before: Loss,
+        log_ceiling: float,
+        lines: wp.array(dtype=wp.vec4),
+        view: View,
+    ):
+        """What a fragment of this opacity, that this much light comes to, adds to the derivatives by its
+        record; and the pixel's loss in front of it."""
+        loss = before
+        x, y = float(column) - s.d[3], float(row) - s.c[0]
+        c = crossed(s, x, y, view)
+        nu, nv = fma(s.u[1], x, row_of(s.u, y)), fma(s.v[1], x, row_of(s.v, y))
+        inverse_d = float(0.0)
+        if c.d > 0.0:
+            inverse_d = 1.0 / c.d
+        half_rho = c.q * inverse_d * inverse_d
+        decides = half_rho
+        on_plane = c.inside
+        if wp.static(screen):
+            on_plane = c.inside and half_rho <= c.screen
+            if not on_plane:
+                decides = c.screen
+
+        weight = light * opacity
+        color = wp.vec3(s.c[1], s.c[2], s.c[3])
+        worth = wp.dot(loss.light, color)
+        z = wp.vec4()
+        by_z = float(0.0)
+        if wp.static(has_depth):
+            z = depth_at(lines, index, inverse_d)
+        if wp.static(depth):
+            worth += fma(loss.depth, z[0], loss.depth_weight)
+            by_z += weight * loss.depth
+        if wp.static(normal):
+            facing = wp.vec3(
+                line_of(lines, index * each + wp.static(normals[0][0]))[wp.static(normals[0][1])],
+                line_of(lines, index * each + wp.static(normals[1][0]))[wp.static(normals[1][1])],
+                line_of(lines, index * each + wp.static(normals[2][0]))[wp.static(normals[2][1])],
+            )
+            worth += wp.dot(loss.normal, facing)
+        if wp.static(distortion):
+            # dL / dw = g (sum w m^2 + W m^2 - 2 m sum w m), dL / dm = 2 g w (W m - sum w m)
+            spread = loss.spread
+            if z[0] > 0.0:
+                nearer = INVERSE_DEPTH / wp.max(z[0], SPREAD_NEAR) - spread[0]
+                worth += loss.distortion * fma(fma(spread[1], nearer, -2.0 * spread[2]), nearer, spread[3])
+            if z[0] > SPREAD_NEAR:
+                inverse_z = 1.0 / z[0]
+                outward = fma(spread[1], fma(INVERSE_DEPTH, inverse_z, -spread[0]), -spread[2])
+                by_z -= 2.0 * INVERSE_DEPTH * weight * loss.distortion * outward * inverse_z * inverse_z
+        gain = worth - loss.behind
+        loss.behind = fma(opacity, gain, loss.behind)
+        by_log = weight * gain
+        if not (s.u[3] - decides <= log_ceiling):
+            by_log = 0.0  # the ceiling holds it
+
+        by_nu, by_nv, by_d = float(0.0), float(0.0), float(0.0)
+        if on_plane:
+            plane = 2.0 * by_log * inverse_d
+            by_nu = -plane * nu * inverse_d
+            by_nv = -plane * nv * inverse_d
+            by_d = plane * half_rho
+        m = Moments()
+        if wp.static(has_depth):
+            by_met = z[1] * by_z * inverse_d
+            by_d -= by_met * z[0]
+            m[wp.static(at.get("z_numerator", 0))] = by_met
+            m[wp.static(at.get("z_center", 0))] = z[2] * by_z
+            m[wp.static(at.get("z_reach", 0))] = z[3] * by_z
+        if wp.static(screen):
+            by_dot = 2.0 * view.per_pixel * by_log
+            if on_plane:
+                by_dot = 0.0
+            m[wp.static(at.get("dot_x", 0))] = by_dot * (x - s.dot_x)
+            m[wp.static(at.get("dot_y", 0))] = by_dot * (y - s.dot_y)
+        if wp.static(normal):
+            for k in range(3):
+                m[wp.static(at.get("nx", 0)) + k] = weight * loss.normal[k]
+        m[0] = by_nu
+        m[1] = by_nu * x
+        m[2] = by_nu * y
+        m[3] = by_nv
+        m[4] = by_nv * x
+        m[5] = by_nv * y
+        m[6] = by_d
+        m[7] = by_d * x
+        m[8] = by_d * y
+        m[9] = by_log
+        m[10] = weight * loss.light[0]
+        m[11] = weight * loss.light[1]
+        m[12] = weight * loss.light[2]
+        return m, loss
+
+    return SimpleNamespace(
+        By=By,
+        Samples=Samples,
+        Splat=Splat,
+        Loss=Loss,
+        Moments=Moments,
+        load=splats.load,
+        box_of=box_of,
+        loss_at=loss_at,
+        opacity_at=opacity_at,
+        back=back,
+    )

@@ -1,0 +1,55 @@
+"""How far apart in depth the fragments of a sample lie whose light is seen: sum over pairs of w_i w_j (m_i -
+m_j)^2, m = constant - INVERSE_DEPTH / z the depth in a depth buffer from 0.2 to 100 m (the 2DGS authors'
+loss). What is nearer counts as at 0.2 m.
+
+It is W sum w m^2 - (sum w m)^2, whatever the zero of m: that is the first fragment's, so that little cancels.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from ..common import View, fma
+from ..pixel_grid import PixelGrid, sample_at
+from . import Output
+
+INVERSE_DEPTH = wp.constant(0.2004008016032064)  # 0.2 * 100 / (100 - 0.2)
+SPREAD_NEAR = wp.constant(0.2)
+
+
+@wp.func
+def composite(pixel: Any, seen: Any, weight: float, shown: float, view: View):
+    p = pixel
+    if weight > 0.0 and seen.z > 0.0:
+        inverse = INVERSE_DEPTH / wp.max(seen.z, SPREAD_NEAR)
+        if p.spread[1] == 0.0:
+            p.spread[0] = inverse
+        nearer = inverse - p.spread[0]
+        p.spread[1] = p.spread[1] + weight
+        p.spread[2] = fma(weight, nearer, p.spread[2])
+        p.spread[3] = fma(weight * nearer, nearer, p.spread[3])
+    return p
+
+
+@wp.func
+def store(pixel: Any, at: int, samples: Any):
+    samples.distortion[at] = pixel.spread
+
+
+@wp.func
+def resolve(grid: PixelGrid, samples: Any, lengths: Any, out: Any):
+    total = float(0.0)
+    for k in range(grid.count):
+        spread = samples.distortion[sample_at(grid, k)]
+        total += spread[1] * spread[3] - spread[2] * spread[2]
+    out.distortion[grid.pixel] = total * grid.mean
+
+
+OUTPUT = Output(
+    depth=True,
+    state={"spread": wp.vec4},  # the first's -m, sum w, sum w m, sum w m^2, the last two from the first's m
+    composite=composite,
+    samples={"distortion": wp.vec4},
+    store=store,
+    resolve=resolve,
+)

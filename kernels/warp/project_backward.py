@@ -1,0 +1,226 @@
+"""Derivatives of the set-up: from those by a splat's record, which its tiles have left in its slots, to those
+by its mean, rotation, scales, opacity and colour, and by the camera's pose. Decisions are taken as they were.
+
+With a = s_u t_u, b = s_v t_v a ray r meets the splat where n_u = (b x p) r, n_v = (p x a) r, D = (a x b) r,
+but for a common factor, on which nothing depends. A moment over the ray, g = sum dL/dn_u r, is by b then
+p x g, by p then g x b, and so on.
+"""
+
+import math
+from functools import cache
+
+import warp as wp
+
+from .color import basis_value
+from .common import CULLED, STRICT, View, line_of
+from .project import SMALLEST_SCALE
+from .records import Layout
+
+SIX = wp.types.vector(6, wp.float64)
+"""of a motion after world_to_camera: rotation vector [1 / rad], translation [1 / m]"""
+_ZERO, _HALF, _ONE, _TWO = (wp.constant(wp.float64(x)) for x in (0.0, 0.5, 1.0, 2.0))
+_SQRT_HALF = wp.constant(wp.float64(math.sqrt(0.5)))
+
+
+@wp.func
+def basis_slope(k: int, d: wp.vec3) -> wp.vec3:
+    """Gradient of `basis_value` by the direction."""
+    x, y, z = d[0], d[1], d[2]
+    if k == 1:
+        return wp.vec3(0.0, -0.48860251190291992, 0.0)
+    elif k == 2:
+        return wp.vec3(0.0, 0.0, 0.48860251190291992)
+    elif k == 3:
+        return wp.vec3(-0.48860251190291992, 0.0, 0.0)
+    elif k == 4:
+        return 1.0925484305920792 * wp.vec3(y, x, 0.0)
+    elif k == 5:
+        return -1.0925484305920792 * wp.vec3(0.0, z, y)
+    elif k == 6:
+        return 0.31539156525252005 * wp.vec3(-2.0 * x, -2.0 * y, 4.0 * z)
+    elif k == 7:
+        return -1.0925484305920792 * wp.vec3(z, 0.0, x)
+    elif k == 8:
+        return 0.54627421529603959 * wp.vec3(2.0 * x, -2.0 * y, 0.0)
+    elif k == 9:
+        return -0.59004358992664352 * wp.vec3(6.0 * x * y, 3.0 * (x * x - y * y), 0.0)
+    elif k == 10:
+        return 2.8906114426405538 * wp.vec3(y * z, x * z, x * y)
+    elif k == 11:
+        across = 4.0 * z * z - x * x - 3.0 * y * y
+        return -0.45704579946446572 * wp.vec3(-2.0 * x * y, across, 8.0 * y * z)
+    elif k == 12:
+        along = 6.0 * z * z - 3.0 * x * x - 3.0 * y * y
+        return 0.37317633259011546 * wp.vec3(-6.0 * x * z, -6.0 * y * z, along)
+    elif k == 13:
+        across = 4.0 * z * z - 3.0 * x * x - y * y
+        return -0.45704579946446572 * wp.vec3(across, -2.0 * x * y, 8.0 * x * z)
+    elif k == 14:
+        return 1.4453057213202769 * wp.vec3(2.0 * x * z, -2.0 * y * z, x * x - y * y)
+    elif k == 15:
+        return -0.59004358992664352 * wp.vec3(3.0 * (x * x - y * y), -6.0 * x * y, 0.0)
+    return wp.vec3()
+
+
+@cache
+def make_project_backward(
+    effects: tuple[str, ...], outputs: tuple[str, ...], names: tuple[str, ...], sh_terms: int
+):
+    """The kernel; effects, outputs: of the record; names: of its moments; sh_terms: coefficients per colour,
+    0 for plain colours."""
+    layout = Layout(effects, outputs)
+    each, fields = layout.lines, len(names)
+    at = {name: place for place, name in enumerate(names)}
+    Moments, Totals = (wp.types.vector(fields, real) for real in (wp.float32, wp.float64))
+    screen_filter, has_depth, normal = (name in at for name in ("dot_x", "z_reach", "nx"))
+    terms = max(sh_terms, 1)
+    dot_x, z_numerator, nx = (at.get(name, 0) for name in ("dot_x", "z_numerator", "nx"))
+
+    @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+    def project_backward(
+        first: int,  # splat of thread 0
+        view: View,
+        means: wp.array(dtype=wp.vec3),
+        quats: wp.array(dtype=wp.vec4),
+        scales: wp.array(dtype=wp.vec2),
+        opacities: wp.array(dtype=wp.float32),
+        colors: wp.array(dtype=wp.vec3),  # (n), or (n sh_terms)
+        lines: wp.array(dtype=wp.vec4),
+        keys: wp.array(dtype=wp.uint32),
+        counts: wp.array(dtype=wp.int64),
+        ends_by_index: wp.array(dtype=wp.int64),
+        moments: wp.array(dtype=Moments),  # by slots
+        by_means: wp.array(dtype=wp.vec3),  # out, as all below; 0 of splats that are not drawn
+        by_quats: wp.array(dtype=wp.vec4),
+        by_scales: wp.array(dtype=wp.vec2),
+        by_opacities: wp.array(dtype=wp.float32),
+        by_colors: wp.array(dtype=wp.vec3),
+        screen: wp.array(dtype=wp.float32),  # norm of that by the projected centre, in half pictures
+        by_poses: wp.array(dtype=SIX),
+    ):
+        i = first + wp.tid()
+        by_means[i] = wp.vec3()
+        by_quats[i] = wp.vec4()
+        by_scales[i] = wp.vec2()
+        by_opacities[i] = 0.0
+        screen[i] = 0.0
+        by_poses[i] = SIX()
+        for k in range(terms):
+            by_colors[i * terms + k] = wp.vec3()
+        if keys[i] == CULLED:
+            return
+        total = Totals()
+        for slot in range(int(ends_by_index[i] - counts[i]), int(ends_by_index[i])):
+            values = moments[slot]
+            for field in range(wp.static(fields)):
+                total[field] = total[field] + wp.float64(values[field])
+
+        # colour
+        mean = wp.vec3d(wp.float64(means[i][0]), wp.float64(means[i][1]), wp.float64(means[i][2]))
+        by_rgb = wp.vec3(float(total[10]), float(total[11]), float(total[12]))
+        by_ray = wp.vec3d()  # by the way from the eye to the centre, in the world's axes
+        if wp.static(sh_terms == 0):
+            by_colors[i] = by_rgb
+        else:
+            drawn = line_of(lines, i * each + 3)  # ay, r, g, b: what is clamped at 0 has no derivative
+            for channel in range(3):
+                if not (drawn[channel + 1] > 0.0):
+                    by_rgb[channel] = 0.0
+            away = mean - view.eye
+            length = wp.length(away)
+            if length > _ZERO:
+                away = away / length
+            direction = wp.vec3(float(away[0]), float(away[1]), float(away[2]))
+            slope = wp.vec3()
+            for k in range(terms):
+                by_colors[i * terms + k] = basis_value(k, direction) * by_rgb
+                slope += wp.dot(colors[i * terms + k], by_rgb) * basis_slope(k, direction)
+            if length > _ZERO:
+                by_away = wp.vec3d(wp.float64(slope[0]), wp.float64(slope[1]), wp.float64(slope[2]))
+                by_ray = (by_away - wp.dot(by_away, away) * away) / length
+
+        # the disk, in the camera's axes
+        q = quats[i]
+        w, x, y, z = wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]), wp.float64(q[3])
+        s = _TWO / (w * w + x * x + y * y + z * z)
+        turn = view.rotation
+        unit_a = turn * wp.vec3d(_ONE - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y))
+        unit_b = turn * wp.vec3d(s * (x * y - w * z), _ONE - s * (x * x + z * z), s * (y * z + w * x))
+        p = turn * mean + view.translation
+        size = scales[i]
+        su, sv = wp.float64(wp.max(size[0], SMALLEST_SCALE)), wp.float64(wp.max(size[1], SMALLEST_SCALE))
+        a, b = su * unit_a, sv * unit_b
+
+        # the record's forms, and their common factor
+        anchor = line_of(lines, i * each + 2)[3]
+        ray = wp.vec3d(
+            (wp.float64(anchor) + _HALF - view.center_x) * view.per_focal_x,
+            (wp.float64(line_of(lines, i * each + 3)[0]) + _HALF - view.center_y) * view.per_focal_y,
+            _ONE,
+        )
+        form_u, form_v, form_d = wp.cross(b, p), wp.cross(p, a), wp.cross(a, b)
+        steep_x = wp.max(wp.abs(form_u[0]), wp.abs(form_v[0])) * view.per_focal_x
+        steep_y = wp.max(wp.abs(form_u[1]), wp.abs(form_v[1])) * view.per_focal_y
+        height = wp.dot(form_d, p)
+        scale = wp.where(height < _ZERO, -_ONE, _ONE) / wp.max(steep_x, steep_y)
+        n_scale = scale * _SQRT_HALF
+        per_x, per_y = view.per_focal_x, view.per_focal_y
+        g_u = n_scale * (total[0] * ray + wp.vec3d(total[1] * per_x, total[2] * per_y, _ZERO))
+        g_v = n_scale * (total[3] * ray + wp.vec3d(total[4] * per_x, total[5] * per_y, _ZERO))
+        g_d = scale * (total[6] * ray + wp.vec3d(total[7] * per_x, total[8] * per_y, _ZERO))
+        by_a = wp.cross(g_v, p) + wp.cross(b, g_d)
+        by_b = wp.cross(p, g_u) + wp.cross(g_d, a)
+        by_p = wp.cross(g_u, b) + wp.cross(a, g_v)
+        by_log = total[9]
+        if wp.static(has_depth):
+            volume = scale * total[z_numerator]  # z_numerator is the height
+            by_a += volume * form_u
+            by_b += volume * form_v
+            by_p += volume * form_d
+        if wp.static(screen_filter):
+            by_x, by_y = total[dot_x] * view.focal_x / p[2], total[dot_x + 1] * view.focal_y / p[2]
+            by_p += wp.vec3d(by_x, by_y, -(by_x * p[0] + by_y * p[1]) / p[2])
+        # by the entries of the homography that place the centre, in half pictures
+        across = wp.float64(view.width) * by_p[0] * per_x
+        down = wp.float64(view.height) * by_p[1] * per_y
+        screen[i] = float(_HALF * p[2] * wp.sqrt(across * across + down * down))
+        if wp.static(has_depth):
+            radius = wp.sqrt(_TWO * (wp.log(wp.float64(opacities[i])) - wp.float64(view.log_cut)))
+            steep = wp.sqrt(a[2] * a[2] + b[2] * b[2])
+            by_reach = total[z_numerator + 2]
+            by_p[2] = by_p[2] + total[z_numerator + 1]
+            by_log += by_reach * steep / radius
+            if steep > _ZERO:
+                by_a[2] = by_a[2] + by_reach * radius * a[2] / steep
+                by_b[2] = by_b[2] + by_reach * radius * b[2] / steep
+        by_su, by_sv = wp.dot(by_a, unit_a), wp.dot(by_b, unit_b)
+        by_scales[i] = wp.vec2(
+            wp.where(size[0] >= SMALLEST_SCALE, float(by_su), 0.0),
+            wp.where(size[1] >= SMALLEST_SCALE, float(by_sv), 0.0),
+        )
+        by_unit_a, by_unit_b = su * by_a, sv * by_b
+        if wp.static(normal):
+            by_facet = wp.vec3d(total[nx], total[nx + 1], total[nx + 2])
+            by_facet *= wp.where(height > _ZERO, -_ONE, _ONE)
+            by_unit_a += wp.cross(unit_b, by_facet)
+            by_unit_b += wp.cross(by_facet, unit_a)
+
+        turned = wp.cross(p, by_p) + wp.cross(unit_a, by_unit_a) + wp.cross(unit_b, by_unit_b)
+        moved = by_p + turn * by_ray
+        by_poses[i] = SIX(turned[0], turned[1], turned[2], moved[0], moved[1], moved[2])
+        back = wp.transpose(turn)
+        by_mean = back * by_p + by_ray
+        u, v = back * by_unit_a, back * by_unit_b
+        # tangents are 1 - s (y y + z z) and so on with s = 2 / |q|^2
+        by_s = u[1] * (x * y + w * z) - u[0] * (y * y + z * z) + u[2] * (x * z - w * y)
+        by_s += v[0] * (x * y - w * z) - v[1] * (x * x + z * z) + v[2] * (y * z + w * x)
+        inward = -s * by_s
+        by_w = u[1] * z - u[2] * y - v[0] * z + v[2] * x + inward * w
+        by_x4 = u[1] * y + u[2] * z + v[0] * y - _TWO * v[1] * x + v[2] * w + inward * x
+        by_y4 = u[1] * x - _TWO * u[0] * y - u[2] * w + v[0] * x + v[2] * z + inward * y
+        by_z4 = u[1] * w - _TWO * u[0] * z + u[2] * x - v[0] * w - _TWO * v[1] * z + v[2] * y + inward * z
+        by_quats[i] = wp.vec4(float(s * by_w), float(s * by_x4), float(s * by_y4), float(s * by_z4))
+        by_means[i] = wp.vec3(float(by_mean[0]), float(by_mean[1]), float(by_mean[2]))
+        by_opacities[i] = float(by_log / wp.float64(opacities[i]))
+
+    return project_backward

@@ -1,0 +1,128 @@
+"""OpenCL launches a picture of a kind again, and draws a batch's views in parts: with the bits of pictures
+that are drawn alone."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from agreement import random_splats
+from test_memory import CAMERA, as_on_a_gpu, machines, own_device
+
+import fidsplat as fs
+from fidsplat.backends.opencl import batch
+from fidsplat.views import views_of
+
+
+@pytest.fixture(scope="module")
+def opencl(renderer):
+    if not renderer.device.name.startswith("opencl"):
+        pytest.skip("the OpenCL backend")
+    return renderer
+
+
+def test_kernels_see_new_buffers_at_old_addresses(opencl):
+    """Arguments are kept from picture to picture, buffers are not: each cloud is drawn, not the last one."""
+    wanted = [random_splats(50, seed=seed) for seed in range(6)]
+    first = [opencl.render(cloud, CAMERA)["rgb"] for cloud in wanted]
+    for _ in range(3):
+        for cloud, picture in zip(wanted, first, strict=True):
+            assert np.array_equal(opencl.render(cloud, CAMERA)["rgb"], picture)
+    assert len({picture.tobytes() for picture in first}) == 6
+
+
+def test_a_picture_is_launched_again_for_each_view(opencl):
+    """Of its kind, on a GPU: other poses, groups, colours and sizes come between, and frames are kept."""
+    machine, own = as_on_a_gpu(opencl), fs.Renderer(opencl.device.name)
+    some = random_splats(300, seed=4).with_labels(np.arange(300) % 2).with_planes(np.arange(300) // 250 - 1)
+    resident, places = machine.upload(some), (-0.3, 0.0, 0.2)
+    moved = [np.eye(4) + 0.1 * k * np.eye(4, k=3) for k in range(3)]
+    captures = [
+        fs.Capture(
+            fs.Camera.look_at(width, 40, 1.0, (x, 0.0, -0.1), (0.0, 0.0, 3.0)),
+            ("rgb", "depth"),
+            background=(0.1 * k, 0.2, 0.3),
+            motion=fs.Motion(groups={1: lambda time, k=k: moved[k]}),
+        )
+        for width in (50, 60)
+        for k, x in enumerate(places)
+    ]
+    kept = [machine.render(resident, capture) for _ in range(3) for capture in captures]
+    assert [each.recording is not None for each in resident._data.kept.values()] == [True, True]
+    for frame, capture in zip(kept, captures * 3, strict=True):
+        wanted = own.render(some, capture)
+        assert all(np.array_equal(frame[name], wanted[name]) for name in frame)
+        assert frame.stats == wanted.stats
+        assert set(frame.timings) == {"project", "sort", "bin", "blend", "resolve"}
+    assert kept[-1].wait() is kept[-1]
+
+
+@pytest.mark.parametrize("scale", [(1e-2, 0.3), (2.0, 3.0)], ids=["pairs", "big splats"])
+def test_a_picture_that_outgrows_the_last_is_drawn_again(opencl, scale):
+    """More pairs, or more splats of many tiles, than there is room for: found when the frame is read."""
+    machine, own = as_on_a_gpu(opencl), fs.Renderer(opencl.device.name)
+    some = random_splats(6000, seed=4, scale=scale, depth=(2.0, 6.0))
+    places = (-900, -800, 0, 1, -700)
+    cameras = [fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, z), (0.0, 0.0, 30.0)) for z in places]
+    resident = machine.upload(some)
+    frames = [machine.render(resident, camera) for camera in cameras]
+    pairs = [frame.stats["pairs"] for frame in frames]
+    assert max(pairs) > 1.5 * pairs[1], "it did outgrow it"
+    for frame, camera in zip(frames, cameras, strict=True):
+        assert np.array_equal(frame["rgb"], own.render(some, camera)["rgb"])
+
+
+def test_threads_share_launches_that_are_kept(opencl):
+    """Sixteen draw pictures of two kinds with a GPU's kernels, of a cloud that outgrows its room at times,
+    and read them, their times and their counts while others draw."""
+    machine, own = as_on_a_gpu(opencl), fs.Renderer(opencl.device.name)
+    some = random_splats(500, seed=4, scale=(1e-2, 0.3), depth=(2.0, 6.0))
+    captures = [
+        fs.Capture(fs.Camera.look_at(width, 40, 1.0, (0.0, 0.0, z), (0.0, 0.0, 30.0)))
+        for width in (50, 60)
+        for z in (-900, 0, 1)
+    ]
+    wanted = [own.render(some, capture) for capture in captures]
+    resident = machine.upload(some)
+
+    def draw(number):
+        frames = [machine.render(resident, captures[(number + k) % 6]) for k in range(6)]
+        return all(
+            np.array_equal(frame["rgb"], wanted[(number + k) % 6]["rgb"])
+            and frame.stats == wanted[(number + k) % 6].stats
+            and len(frame.timings) == 5
+            for k, frame in enumerate(frames)
+        )
+
+    with ThreadPoolExecutor(16) as pool:
+        assert all(pool.map(draw, range(32)))
+
+
+@machines
+def test_a_batch_in_parts_has_the_bits_of_its_views(opencl, monkeypatch, machine):
+    """Several views at a time, with planes, groups that move, a mask, and pictures of other kinds between."""
+    own, some = machine(opencl), random_splats(300, seed=4, scale=(1e-2, 2.0)).with_labels(np.arange(300) % 3)
+    some = some.with_planes(np.arange(300) // 250 - 1)
+    capture = fs.Capture(fs.Camera.look_at(50, 40, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0)), ("rgb", "label"))
+    poses = np.random.default_rng(0).normal(0, 0.05, (2, 7, 7))
+    poses[..., 3] += 1
+    asked = {"poses": poses[0], "groups": {2: poses[1]}, "mask": np.arange(7) != 3}
+    resident = own.upload(some)
+    for most in (1 << 31, 1 << 18):
+        monkeypatch.setattr(batch, "_MOST", {})
+        monkeypatch.setattr(batch, "_MOST_OTHERS", most)
+        drawn = own.render_batch(resident, capture, **asked)
+        alone = own.render(resident, capture)
+        for number in (0, 1, 2, 4, 5, 6):
+            one = {"poses": poses[0, [number]], "groups": {2: poses[1, [number]]}}
+            wanted = opencl.render(some, views_of([capture], **one).capture(0))
+            assert all(np.array_equal(drawn[name][number], wanted[name]) for name in drawn), (most, number)
+        assert (drawn["label"][3] == -1).all()
+        assert not drawn["rgb"][3].any()
+        assert np.array_equal(drawn.device_array("rgb").get(), drawn["rgb"])
+        assert np.array_equal(alone["rgb"], opencl.render(some, capture)["rgb"])
+
+
+def test_a_batch_whose_images_are_too_many_is_an_error(opencl):
+    own, poses = own_device(opencl, 2**23), np.tile([0, 0, 0, 1, 0, 0, 0.0], (400, 1))
+    with pytest.raises(fs.DeviceError, match=r"images of 400 views take .* draw fewer views"):
+        own.render_batch(random_splats(10, seed=1), CAMERA, poses=poses)

@@ -1,0 +1,122 @@
+"""SOG files: what is read, and what is refused."""
+
+import json
+import math
+import zipfile
+
+import cv2
+import numpy as np
+import pytest
+
+import fidsplat as fs
+
+
+def picture(kind: str, side: int) -> bytes:
+    return cv2.imencode(kind, np.zeros((side, side, 4), np.uint8))[1].tobytes()
+
+
+def sog(path, **changes):
+    """A SOG file by hand: two splats in pictures of 2 x 2, and a palette of SH of degree 1."""
+    book = np.linspace(-4, 4, 256)
+    red = lambda rows: np.array(rows, np.uint8).reshape(2, 2, -1)  # noqa: E731
+    nothing = [0, 0, 0, 255]
+    pictures = {
+        "l.webp": red([[0, 0, 255, 255], [255, 0, 0, 255], nothing, nothing]),
+        "u.webp": red([[128, 0, 255, 255], [255, 128, 0, 255], nothing, nothing]),
+        "s.webp": red([[64, 96, 128, 255], [0, 0, 0, 255], nothing, nothing]),
+        "q.webp": red([[128, 128, 128, 252], [255, 0, 128, 254], nothing, nothing]),
+        "c.webp": red([[128, 0, 255, 51], [128, 128, 128, 255], nothing, nothing]),
+        "n.webp": red([[65, 0, 0, 255], [1, 0, 0, 255], nothing, nothing]),
+        "p.webp": np.arange(2 * 192 * 4, dtype=np.uint32).reshape(2, 192, 4).astype(np.uint8),
+    }
+    pictures["p.webp"][:, :, 3] = 255
+    meta = {
+        "version": 2, "count": 2,
+        "means": {"mins": [-1, -2, 0], "maxs": [1, 2, 3], "files": ["l.webp", "u.webp"]},
+        "scales": {"codebook": book.tolist(), "files": ["s.webp"]},
+        "quats": {"files": ["q.webp"]},
+        "sh0": {"codebook": book.tolist(), "files": ["c.webp"]},
+        "shN": {"count": 66, "bands": 1, "codebook": book.tolist(), "files": ["p.webp", "n.webp"]},
+    }  # fmt: skip
+    for name, values in changes.items():
+        (pictures if name.endswith("webp") else meta)[name] = values
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("meta.json", json.dumps(meta))
+        for name, image in pictures.items():
+            data = image
+            if isinstance(image, np.ndarray):
+                bgra = cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA)
+                data = cv2.imencode(".webp", bgra, [cv2.IMWRITE_WEBP_QUALITY, 101])[1].tobytes()
+            if data is not None:
+                archive.writestr(name, data)
+    return book, pictures["p.webp"]
+
+
+def test_a_sog_file_by_hand(tmp_path):
+    book, palette = sog(tmp_path / "a.sog")
+    cloud = fs.load_splats(tmp_path / "a.sog")
+    x, y = -1 + 2 * 0x8000 / 65535, -2 + 4 * 0x8000 / 65535
+    places = [[math.expm1(x), -math.expm1(2), math.expm1(3)], [math.expm1(1 + 0 * x), math.expm1(y), 0]]
+    np.testing.assert_allclose(cloud.means, places, atol=1e-6)
+    np.testing.assert_allclose(cloud.scales[0], np.exp(book[[64, 96]]), rtol=1e-6)
+    np.testing.assert_allclose(cloud.thickness[0], np.exp(book[128]), rtol=1e-6)
+    np.testing.assert_allclose(cloud.opacities, [0.2, 1], rtol=1e-6)
+    np.testing.assert_allclose(cloud.sh[0, 0], book[[128, 0, 255]], rtol=1e-6)
+    # entry 65 is the second of the second row, entry 1 the second of the first
+    np.testing.assert_allclose(cloud.sh[0, 1:], book[palette[1, 3:6, :3]], rtol=1e-6)
+    np.testing.assert_allclose(cloud.sh[1, 1:], book[palette[0, 3:6, :3]], rtol=1e-6)
+    tiny, half = (2 * 128 / 255 - 1) / math.sqrt(2), math.sqrt(0.5)
+    np.testing.assert_allclose(cloud.quats[0], [1, tiny, tiny, tiny], atol=1e-4)
+    np.testing.assert_allclose(cloud.quats[1], [half, -half, 0, tiny], atol=3e-3)  # y was left out
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"version": 1}, "SOG of version 1; version 2 is read"),
+        ({"count": 5}, "has 4 pixels for 5 splats"),
+        ({"sh0": {}}, r"damaged \(KeyError"),
+        ({"q.webp": None}, "lacks q.webp"),
+        ({"q.webp": b"RIFF"}, "q.webp is not a picture of 8 bits"),
+        ({"q.webp": np.full((2, 2, 4), 251, np.uint8)}, "alpha is 251; it must be 252"),
+        ({"n.webp": np.full((2, 2, 4), 255, np.uint8)}, "65535, is none of the palette's 128 entries"),
+        ({"p.webp": np.full((2, 64, 4), 255, np.uint8)}, "64 pixels wide; 1 bands have 192"),
+        ({"count": math.inf}, r"damaged \(OverflowError"),
+        ({"means": "nothing"}, r"damaged \(TypeError"),
+        # small files of huge pictures
+        ({"q.webp": np.zeros((300, 300, 4), np.uint8)}, "q.webp has 90000 pixels for 2; it is not read"),
+        ({"q.webp": picture(".png", 300)}, "q.webp has 90000 pixels for 2; it is not read"),
+        ({"p.webp": np.zeros((2600, 192, 4), np.uint8)}, "p.webp has 499200 pixels for 196608"),
+        ({"q.webp": picture(".bmp", 2)}, "q.webp is not a picture of 8 bits"),
+    ],
+)
+def test_damaged_sog_files(tmp_path, changes, words):
+    sog(tmp_path / "a.sog", **changes)
+    with pytest.raises(fs.InputError, match=words):
+        fs.load_splats(tmp_path / "a.sog")
+    (tmp_path / "a.sog").write_bytes((tmp_path / "a.sog").read_bytes()[:-30])
+    with pytest.raises(fs.InputError, match="is not a SOG file: its zip is damaged"):
+        fs.load_splats(tmp_path / "a.sog")
+
+
+@pytest.mark.parametrize("way", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_a_sog_file_whose_parts_are_damaged(tmp_path, way):
+    path = tmp_path / "a.sog"
+    with zipfile.ZipFile(path, "w", way) as archive:
+        archive.writestr("meta.json", json.dumps({"version": 2, "words": list(range(500))}))
+    data = bytearray(path.read_bytes())
+    data[60:90] = bytes(30)
+    path.write_bytes(data)
+    with pytest.raises(fs.InputError, match="its zip is damaged"):
+        fs.load_splats(path)
+
+
+def test_a_sog_file_that_says_nothing_or_too_much(tmp_path, monkeypatch):
+    path = tmp_path / "a.sog"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("meta.json", "[]")
+    with pytest.raises(fs.InputError, match=r"damaged \(AttributeError"):
+        fs.load_splats(path)
+    monkeypatch.setattr("fidsplat.formats.sog.MAX_META", 1)
+    with pytest.raises(fs.InputError, match=r"meta\.json has 2 bytes"):
+        fs.load_splats(path)

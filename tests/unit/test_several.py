@@ -1,0 +1,82 @@
+"""Pictures by several devices: the bits of one, whichever rows each draws."""
+
+import numpy as np
+import pytest
+from test_store_drawing import TURNED, look, made_store, splats
+
+import fidsplat as fs
+from fidsplat.store import plan
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plan, "_LEAST_MEMORY", 0)
+        return made_store(tmp_path_factory.mktemp("several"), splats(1), "disks")
+
+
+@pytest.fixture(scope="module")
+def two():
+    return fs.SeveralDevices(["opencl", "opencl"])
+
+
+def test_bands_of_devices_have_the_bits_of_one(store, two):
+    outputs = ("rgb", "splat_id", "depth")
+    alone, cloud = fs.Renderer("opencl"), store.cloud()
+    for scene in (store, cloud, fs.Scene([cloud], look())):
+        given = two.upload(scene)
+        for share in (0.5, 0.2, 0.97):
+            two._shares = np.array([0.0, share, 1.0])
+            ours = two.render(given, look(turn=TURNED), outputs)
+            whole = alone.render(cloud, look(turn=TURNED), outputs)
+            for output in outputs:
+                assert np.array_equal(ours[output], whole[output]), (output, share)
+    assert ours.stats["visible"] >= whole.stats["visible"]
+    assert set(ours.timings) == set(whole.timings)
+
+
+def test_a_device_holds_the_chunks_that_its_band_sees(store, two):
+    given = two.upload(store)
+    two._shares = np.array([0.0, 0.5, 1.0])
+    two.render(given, look()).wait()
+    alone = fs.Renderer("opencl").upload(store)
+    alone._renderer.render(alone, look())
+    each = [one._data.nodes for one in given]
+    assert max(each) < alone._data.nodes <= sum(each)
+
+
+def test_views_are_shared_out_and_come_in_their_order(store, two):
+    cameras = [look(at=(x, 0, 0)) for x in (0.0, 0.3, 0.6, 0.9, 1.2, 1.5, 1.8)]
+    alone = fs.Renderer("opencl")
+    frames = two.render_views(two.upload(store), iter(cameras))
+    for camera, frame in zip(cameras, frames, strict=True):
+        assert np.array_equal(frame["rgb"], alone.render(store.cloud(), camera)["rgb"])
+
+
+def test_bands_are_cut_where_devices_take_as_long(two):
+    two._shares = np.array([0.0, 0.5, 1.0])
+    two._cut_anew([50, 50], [3.0, 1.0])
+    assert two._shares == pytest.approx([0, 1 / 3, 1])
+    two._cut_anew([33, 67], [1.0, 1.05])
+    assert two._shares == pytest.approx([0, 1 / 3, 1])
+    assert two._bands(3) == [(0, 1), (1, 3)]
+    two._shares = np.array([0.0, 0.001, 1.0])
+    assert two._bands(4) == [(0, 1), (1, 4)]
+    two._shares = np.array([0.0, 0.999, 1.0])
+    assert two._bands(4) == [(0, 3), (3, 4)]
+    assert two._bands(1) == [(0, 1)]
+
+
+def test_what_several_devices_cannot_draw_is_said(store, two):
+    with pytest.raises(fs.InputError, match="devices is empty"):
+        fs.SeveralDevices([])
+    with pytest.raises(fs.InputError, match="of different kinds"):
+        fs.SeveralDevices(["opencl", "reference"])
+    with pytest.raises(fs.InputError, match="no camera"):
+        two.render(store)
+    with pytest.raises(fs.InputError, match="a scene on 1 devices was given to 2"):
+        two.render(two.upload(store)[:1], look())
+    renderer = two.renderers[0]
+    for band in ((-1, 3), (3, 3), (0, 31)):
+        with pytest.raises(fs.InputError, match="of a band"):
+            renderer.render_band(band, store, look())

@@ -1,0 +1,85 @@
+"""Who may speak to the viewer, and where it listens."""
+
+import socket
+from types import SimpleNamespace
+
+import pytest
+
+import fidsplat as fs
+from fidsplat.viewer.guard import guarded, refused
+
+
+@pytest.mark.parametrize(
+    ("origin", "host", "listens", "words"),
+    [
+        (None, "localhost:8080", "127.0.0.1", ""),  # no browser
+        ("http://localhost:8080", "localhost:8080", "127.0.0.1", ""),
+        ("http://127.0.0.1:9", "127.0.0.1:9", "127.0.0.1", ""),  # a tunnel has a port of its own
+        ("http://[::1]:8080", "[::1]:8080", "::1", ""),
+        ("https://LOCALHOST", "localhost", "localhost", ""),
+        ("http://evil.test", "localhost:8080", "127.0.0.1", "of another site"),
+        ("http://localhost:3000", "localhost:8080", "127.0.0.1", "of another site"),
+        ("null", "localhost:8080", "127.0.0.1", "of another site"),
+        ("http://localhost:8080", None, "127.0.0.1", "of another site"),
+        ("null", None, "127.0.0.1", "another name"),
+        ("http://[x", "localhost:8080", "127.0.0.1", "no address"),
+        # a name of theirs that was made to point here
+        ("http://evil.test:8080", "evil.test:8080", "127.0.0.1", "another name"),
+        ("http://evil.test:8080", "evil.test:8080", "0.0.0.0", "another name"),
+        ("http://10.0.0.7:8080", "10.0.0.7:8080", "127.0.0.1", "another name"),
+        ("http://10.0.0.7:8080", "10.0.0.7:8080", "0.0.0.0", ""),
+        ("http://lab.test:8080", "lab.test:8080", "lab.test", ""),
+        (f"http://{socket.gethostname()}:1", f"{socket.gethostname()}:1", "0.0.0.0", ""),
+    ],
+)
+def test_pages_of_others_are_refused(origin, host, listens, words):
+    found = refused(origin, host, listens)
+    assert words in found
+    assert bool(words) == bool(found)
+
+
+def test_a_server_that_is_not_guarded_is_stopped():
+    pytest.importorskip("websockets", reason="the extra viewer is not installed")
+    stopped = []
+    with pytest.raises(fs.FidsplatError, match="cannot guard"):
+        guarded(lambda: SimpleNamespace(stop=lambda: stopped.append(True)), "127.0.0.1")
+    assert stopped == [True]
+
+
+def test_a_port_in_use_is_said():
+    from fidsplat.viewer.server import check_port
+
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(fs.InputError, match=rf"cannot listen on 127.0.0.1, port {port}: .*in use; give"):
+            check_port("127.0.0.1", port)
+    check_port("127.0.0.1", port)
+    with pytest.raises(fs.InputError, match="port 70000"):
+        check_port("127.0.0.1", 70000)
+
+
+@pytest.mark.parametrize(
+    ("host", "words"),
+    [
+        ("", "--host is empty"),  # which would let the whole network in
+        ("192.0.2.1", "--host must be an address of this machine"),
+        ("a..b", "--host must be an address of this machine"),
+    ],
+)
+def test_a_host_that_is_none_of_ours_is_said(host, words):
+    from fidsplat.viewer.server import check_port
+
+    with pytest.raises(fs.InputError, match=words):
+        check_port(host, 0)
+
+
+@pytest.mark.parametrize(
+    ("host", "address"), [("127.0.0.1", "http://127.0.0.1:80"), ("::1", "http://[::1]:80")]
+)
+def test_the_address_can_be_opened(host, address):
+    from fidsplat.viewer.server import Viewer
+
+    server = SimpleNamespace(get_host=lambda: host, get_port=lambda: 80)
+    assert Viewer.address.fget(SimpleNamespace(server=server)) == address

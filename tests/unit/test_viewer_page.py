@@ -1,0 +1,300 @@
+"""The viewer's page, with a client that is no browser."""
+
+import socket
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from viewing import HERE, Client, scene, until
+
+import fidsplat as fs
+from fidsplat.rotations import rigid_matrix
+from fidsplat.viewer.edits import Body
+from fidsplat.viewer.stream import Stream
+
+
+@pytest.fixture
+def viewer(tmp_path):
+    pytest.importorskip("viser", reason="the extra viewer is not installed")
+    from fidsplat.viewer.server import Viewer
+
+    (tmp_path / "scene.toml").write_text(
+        '[[markers]]\nspec = "aruco:4x4_50:7"\nsize = 0.4\n[render]\nbackground = [0.2, 0.3, 0.4]\n'
+    )
+    path = tmp_path / "scene.toml"
+    made = Viewer(fs.Scene.load(path), path, "reference", port=0)
+    yield made
+    made.close()
+
+
+def test_what_a_browser_gets_and_asks(viewer):
+    client = Client()
+    viewer._enter(client)
+    assert until(lambda: [kind for _, kind in client.sent][-1:] == ["png"])
+    assert client.sent[-1][0].shape == (36, 48, 3)
+    viewer._click(SimpleNamespace(client_id=1, screen_pos=(0.5, 0.5)))
+    assert "label 1" in client.said.content
+    assert "marker aruco:4x4_50:7" in client.said.content
+    assert "depth 1.0000 m" in client.said.content
+    viewer._click(SimpleNamespace(client_id=9, screen_pos=(0.5, 0.5)))  # a browser that has left
+    viewer.picture(client)
+    assert client.files[0][0] == "fidsplat.png"
+    assert client.files[0][1].startswith(b"\x89PNG")
+    client.camera.image_width, client.camera.image_height = 320, 240
+    count = len(client.sent)
+    client.turned(client.camera)
+    assert until(lambda: client.sent[count:] and client.sent[-1][0].shape == (240, 320, 3))
+    assert until(lambda: viewer._views[1].frame["rgb"].shape == (240, 320, 3))
+    viewer.read(client)
+    assert "| aruco:4x4_50:7 | 0." in client.said.content
+    viewer._leave(client)
+    viewer._leave(client)
+    viewer.read(client)
+
+
+def test_what_a_button_cannot_do_is_said(viewer, monkeypatch):
+    client = Client()
+    viewer._said[1] = client.said
+    viewer.read(client)
+    assert client.said.content == "Wait until the picture is still, then ask again."
+    viewer.picture(client)  # of a browser that has left
+    viewer._streams[1] = Stream(lambda *_: None, lambda *_: None)
+
+    def fails(viewpoint):
+        raise MemoryError
+
+    monkeypatch.setattr(viewer.session, "draw", fails)
+    viewer.picture(client)
+    assert "**not enough memory for this picture**" in viewer._controls.status.content
+    assert client.files == []
+
+
+def test_a_gizmo_moves_a_marker_and_its_file(viewer, tmp_path):
+    viewer.hold("1: aruco:4x4_50:7")
+    pose = rigid_matrix((0.1, 0.0, 0.2))
+    viewer._move(pose, False)
+    assert viewer.session.settle()
+    np.testing.assert_allclose(viewer.session.drawn.scene.markers[0].pose, pose)
+    assert "position" not in (tmp_path / "scene.toml").read_text()
+    viewer._move(pose, True)
+    assert viewer.session.settle()
+    again = fs.Scene.load(tmp_path / "scene.toml")
+    np.testing.assert_allclose(again.markers[0].pose, pose, atol=1e-8)
+    viewer.hold("none")
+    viewer._move(np.eye(4), True)
+    np.testing.assert_allclose(fs.Scene.load(tmp_path / "scene.toml").markers[0].pose, pose, atol=1e-8)
+
+
+def test_a_gizmo_moves_a_splat_file(viewer, tmp_path):
+    """Its scale stays, and what the file says is what is shown."""
+    viewer.close()
+    path = tmp_path / "scene.toml"
+    cloud = fs.SplatCloud(
+        [[0, 0, 0], [1, 0, 0]], [[1, 0, 0, 0]] * 2, [[0.1, 0.1]] * 2, [1, 1], colors=[[1, 0, 0]] * 2
+    )
+    fs.save_ply(cloud, tmp_path / "box.ply")
+    path.write_text(
+        path.read_text() + '[[splats]]\nfile = "box.ply"\n\n'
+        '[[splats]]\nfile = "box.ply"\nscale = 2.0 # twice\nposition = [0, 0, 1]\n'
+        '[[splats]]\nfile = "box.ply"\nmotion = [{time = 0, position = [0, 0, 5]}, '
+        "{time = 1, position = [0, 0, 6]}]\n"
+    )
+    viewer = type(viewer)(fs.Scene.load(path), path, "reference", port=0)
+    viewer._closed.set()  # nobody looks at the file meanwhile
+    try:
+        assert viewer._controls._held.options[2:] == ("file 1: box.ply", "file 2: box.ply", "file 3: box.ply")
+        viewer.hold("file 2: box.ply")
+        np.testing.assert_allclose(viewer._held.pose, rigid_matrix((0, 0, 1)))
+        pose = rigid_matrix((0.5, 0, 2), (0, 0, 1, 0))
+        for let_go in (False, True):
+            viewer._move(pose, let_go)
+            assert viewer.session.settle()
+            moved = viewer.session.drawn.scene.clouds
+            np.testing.assert_allclose(moved[1].world_means(), [(0.5, 0, 2), (-1.5, 0, 2)], atol=1e-6)
+            assert ("0.5" in path.read_text()) == let_go
+        assert "scale = 2.0 # twice" in path.read_text()
+        again = fs.Scene.load(path)
+        for one, other in zip(again.clouds, moved, strict=True):
+            np.testing.assert_allclose(one.world_means(), other.world_means(), atol=1e-6)
+        viewer.hold("file 1: box.ply")  # which has no pose in the file
+        viewer._move(rigid_matrix((0, 3, 0)), True)
+        assert viewer.session.settle()
+        np.testing.assert_allclose(fs.Scene.load(path).clouds[0].world_means()[0], (0, 3, 0))
+        viewer.hold("file 3: box.ply")
+        assert viewer._held is None
+        assert "moves by keyframes" in viewer._controls.status.content
+        # what cannot be written stays where the file says that it is
+        viewer.hold("file 2: box.ply")
+        before = path.read_text()
+        path.write_text(before + "# edited\n")
+        viewer._move(rigid_matrix((9, 9, 9)), True)
+        assert viewer.session.settle()
+        assert "nothing was written" in viewer._controls.status.content
+        np.testing.assert_allclose(
+            viewer.session.drawn.scene.clouds[1].world_means()[0], (0.5, 0, 2), atol=1e-6
+        )
+        assert path.read_text() == before + "# edited\n"
+        viewer.hold("file 9: none")
+        viewer._move(np.eye(4), True)
+    finally:
+        viewer.close()
+
+
+def test_large_splat_files_move_once_they_are_let_go(monkeypatch):
+    from fidsplat.viewer import held
+
+    cloud = fs.SplatCloud([[0, 0, 0]], [[1, 0, 0, 0]], [[0.1, 0.1]], [1], colors=[[1, 0, 0]])
+    taken = held.held_by(fs.Scene([cloud]), [Body(0, "a.ply", np.eye(4))], "file 1: a.ply")
+    assert taken.light
+    monkeypatch.setattr(held, "LIGHT", 0)
+    assert not taken.light
+
+
+def test_a_file_that_is_edited_is_shown(viewer, tmp_path):
+    text = (tmp_path / "scene.toml").read_text()
+    (tmp_path / "scene.toml").write_text(text.replace("0.4\n", "0.2\n", 1))
+    assert until(lambda: viewer.session.drawn.scene.markers[0].marker.size == 0.2)
+    (tmp_path / "scene.toml").write_text(text.replace("size", "sise"))
+    assert until(lambda: "what was read before is shown" in viewer._controls.status.content)
+    assert "did you mean 'size'" in viewer._controls.status.content
+    assert viewer.session.drawn.scene.markers[0].marker.size == 0.2
+
+
+def test_what_an_edit_changes_is_taken_and_the_controls_follow(viewer, tmp_path):
+    """What it leaves stays as the controls have it."""
+    path, sliders = tmp_path / "scene.toml", viewer._controls._sliders
+    sliders["exposure"].value = 2.0
+    assert viewer.session.settle()
+    edited = (
+        path.read_text()
+        + "[fog]\ndensity = 3\n[camera]\nwidth = 48\nheight = 36\nfov_x_deg = 60\n"
+        + "position = [0, 0, -1]\nlook_at = [0, 0, 0]\n[camera.distortion]\nk1 = -0.1\n"
+    )
+    path.write_text(edited)
+    assert until(lambda: viewer._controls._lens.value == "scene")
+    assert until(lambda: not viewer._controls._session._working)
+    settings = viewer.session.drawn.settings
+    assert (settings.fog, settings.lens, settings.exposure) == (3.0, "scene", 2.0)
+    assert (sliders["fog"].value, sliders["exposure"].value) == (3.0, 2.0)
+    assert sliders["fog"].max >= 3.0
+    path.write_text(edited.partition("[camera.distortion]")[0])
+    assert until(lambda: "scene" not in viewer._controls._lens.options)
+    assert viewer.session.settle()
+    settings = viewer.session.drawn.settings
+    assert (settings.fog, settings.lens, settings.exposure) == (3.0, "pinhole", 2.0)
+
+
+def test_a_scene_that_begins_to_move_gets_a_clock(viewer, tmp_path):
+    path, sliders = tmp_path / "scene.toml", viewer._controls._sliders
+    still, shown = path.read_text(), viewer.server.gui._gui_input_handle_from_uuid
+    before, place = len(shown), "position = [0, 0, 0], quaternion = [1, 0, 0, 0]"
+
+    def moving(end):
+        keys = f"{{time = 0.5, {place}}}, {{time = {end}, {place.replace('[0, 0, 0]', '[0.3, 0, 0]')}}}"
+        return still.replace("size = 0.4\n", f"size = 0.4\nmotion = [{keys}]\n")
+
+    assert "time" not in sliders
+    path.write_text(moving(2.5))
+    assert until(lambda: "readout_ms" in sliders and len(shown) == before + 3)
+    assert (sliders["time"].min, sliders["time"].max) == (0.0, 2.5), "of keyframes, and where the clock is"
+    sliders["time"].value = 2.5
+    assert until(lambda: viewer.session.drawn.settings.time == 2.5)
+    path.write_text(moving(4.0))
+    assert until(lambda: sliders["time"].max == 4.0)
+    assert (sliders["time"].min, sliders["time"].value, len(shown)) == (0.5, 2.5, before + 3)
+    path.write_text(still)
+    assert until(lambda: not sliders.keys() & {"time", "exposure_ms", "readout_ms"})
+    assert until(lambda: len(shown) == before)
+    path.write_text(moving(2.5))
+    assert until(lambda: "time" in sliders)
+
+
+def test_a_marker_is_not_written_into_a_file_that_cannot_be_shown(viewer, tmp_path):
+    """Its tables may be those of other markers."""
+    file, table = tmp_path / "scene.toml", '[[markers]]\nspec = "aruco:4x4_50:8"\nsize = 0.4\n'
+    edited = table.replace("0.4", "-1") + file.read_text()
+    viewer.hold("1: aruco:4x4_50:7")
+    file.write_text(edited)
+    assert until(lambda: "what was read before is shown" in viewer._controls.status.content)
+    viewer._move(rigid_matrix((0.1, 0.0, 0.2)), True)
+    assert viewer.session.settle()
+    assert file.read_text() == edited
+    assert "nothing was written" in viewer._controls.status.content
+    file.write_text(edited.replace("-1", "0.4"))
+    assert until(lambda: len(viewer._controls._held.options) == 3)
+    assert viewer._controls._held.options[2] == "2: aruco:4x4_50:7"
+    viewer._move(np.eye(4), True)  # nothing is held any more
+    assert "position" not in file.read_text()
+    viewer.hold("2: aruco:4x4_50:7")
+    viewer._move(rigid_matrix((0.1, 0.0, 0.2)), True)
+    assert viewer.session.settle()
+    np.testing.assert_allclose(fs.Scene.load(file).markers[1].pose[:3, 3], (0.1, 0, 0.2))
+    viewer.hold("9: nobody")
+    viewer._move(np.eye(4), True)
+
+
+def test_a_browser_that_left_keeps_nothing(viewer):
+    client = Client(5)
+    viewer._send_exact(client, HERE)
+    assert viewer._views == {}
+
+
+def test_keyframes_become_a_trajectory(viewer, tmp_path):
+    client = Client()
+    viewer.save_keyframes(client)
+    assert "no keyframe" in viewer._controls.status.content
+    viewer.add_keyframe(client)
+    client.camera.position = (0.5, 0, -1)
+    viewer.add_keyframe(client)
+    viewer.save_keyframes(client)
+    path = fs.load_trajectory(tmp_path / "scene-trajectory.tum")
+    assert path.times.tolist() == [0, 1]
+    np.testing.assert_allclose(path.poses[:, :3, 3], [(0, 0, -1), (0.5, 0, -1)])
+    viewer.clear_keyframes(client)
+    assert viewer._keyframes == []
+
+
+def test_keyframes_do_not_take_the_place_of_another_file(viewer, tmp_path):
+    (tmp_path / "scene-trajectory.tum").write_text("0.5 0 0 0 0 0 0 1\n")
+    client = Client()
+    for count in (1, 2):
+        viewer.add_keyframe(client)
+        viewer.save_keyframes(client)
+        assert len(fs.load_trajectory(tmp_path / "scene-trajectory-2.tum")) == count
+    assert (tmp_path / "scene-trajectory.tum").read_text() == "0.5 0 0 0 0 0 0 1\n"
+    assert len(list(tmp_path.glob("*.tum"))) == 2
+
+
+def test_a_trajectory_stands_there_as_keyframes(tmp_path):
+    pytest.importorskip("viser", reason="the extra viewer is not installed")
+    from fidsplat.viewer.server import Viewer
+
+    path = fs.Trajectory(range(100), [rigid_matrix((k, 0, 0)) for k in range(100)])
+    viewer = Viewer(scene(), None, "reference", port=0, keyframes=path)
+    try:
+        assert len(viewer._keyframes) == 100
+        assert len(viewer._nodes._frusta) == 50  # not all of many
+        viewer.add_keyframe(Client())
+        assert len(viewer._keyframes) == 101
+    finally:
+        viewer.close()
+
+
+def test_a_page_of_another_site_gets_no_socket(viewer):
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    port = viewer.server.get_port()
+    for words in (
+        {"origin": "http://evil.test"},
+        {"origin": f"http://evil.test:{port}", "host": "evil.test"},  # a name that was made to point here
+    ):
+        host = words.pop("host", "127.0.0.1")
+        with (
+            socket.create_connection(("127.0.0.1", port)) as line,
+            pytest.raises(InvalidStatus, match="403") as found,
+        ):
+            connect(f"ws://{host}:{port}", sock=line, **words)
+        assert b"this" in found.value.response.body
+    assert not viewer._streams
+    connect(f"ws://127.0.0.1:{port}", origin=f"http://127.0.0.1:{port}").close()

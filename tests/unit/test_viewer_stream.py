@@ -1,0 +1,120 @@
+"""Pacing: which pictures the viewer draws, how large and when."""
+
+import threading
+from dataclasses import replace
+
+import pytest
+from viewing import HERE
+
+import fidsplat as fs
+from fidsplat.viewer.settings import Viewpoint
+from fidsplat.viewer.stream import REST, SMALLEST, Pace, Stream
+
+
+class Clock:
+    def __init__(self):
+        self.now = 100.0
+
+    def __call__(self):
+        return self.now
+
+
+def looked_at(moving_takes=lambda scale: 0.0):
+    """A stream with a clock of its own, and what it drew."""
+    clock, drawn = Clock(), []
+
+    def moving(viewpoint, scale):
+        drawn.append((viewpoint.position[0], scale))
+        clock.now += moving_takes(scale)
+
+    stream = Stream(moving, lambda viewpoint: drawn.append((viewpoint.position[0], "exact")), clock=clock)
+    return stream, clock, drawn
+
+
+def at(x) -> Viewpoint:
+    return replace(HERE, position=(x, 0.0, 0.0))
+
+
+def test_the_newest_viewpoint_then_one_exact_picture_then_nothing():
+    stream, clock, drawn = looked_at()
+    assert stream.step() is None  # nobody looks yet
+    for x in (1.0, 2.0, 3.0):
+        stream.look(at(x))
+    assert stream.step() == 0.0
+    assert drawn == [(3.0, 0.5)]
+    assert stream.step() == pytest.approx(REST)
+    assert len(drawn) == 1
+    clock.now += REST
+    assert stream.step() == 0.0
+    assert drawn[1:] == [(3.0, "exact")]
+    for _ in range(3):
+        clock.now += 60
+        assert stream.step() is None
+    stream.look(at(3.0))  # the same again is no news
+    assert stream.step() is None
+    stream.refresh()
+    assert stream.step() == 0.0
+    assert drawn[2][0] == 3.0
+    assert len(drawn) == 3
+
+
+@pytest.mark.parametrize("full", [0.01, 0.05, 0.2])
+def test_the_scale_holds_the_rate(full):
+    """Of a machine that takes so long for a picture of the page's size."""
+    stream, _, drawn = looked_at(lambda scale: full * scale**2)
+    for k in range(40):
+        stream.look(at(float(k)))
+        stream.step()
+    last = drawn[-1][1]
+    assert last == stream.pace.steps
+    if full < 0.03:
+        assert last == 1.0
+    else:
+        assert full * last**2 == pytest.approx(0.9 / 30, rel=0.1)
+
+
+def test_the_scale_has_an_end():
+    pace = Pace()
+    for _ in range(50):
+        pace.took(10.0, pace.steps)
+    assert pace.steps == SMALLEST
+    for _ in range(50):
+        pace.took(1e-9, pace.steps)
+    assert pace.steps == 1.0
+
+
+def test_a_picture_that_fails_is_told_and_the_stream_goes_on():
+    told = []
+
+    def refused(*_):
+        raise fs.InputError("too large")
+
+    stream = Stream(refused, refused, told.append, clock=Clock())
+    stream.look(HERE)
+    assert stream.step() == 0.0
+    assert told == ["too large"]
+    assert stream.step() is not None
+
+
+def test_a_picture_that_is_too_large_for_the_memory_is_told():
+    told: list[str] = []
+
+    def draw(*_):
+        raise MemoryError
+
+    stream = Stream(draw, draw, told.append, clock=lambda: 0.0)
+    stream.look(HERE)
+    stream.step()
+    assert told == ["not enough memory for this picture"]
+
+
+def test_a_stream_runs_in_a_thread_until_it_is_closed():
+    seen = threading.Event()
+    stream = Stream(lambda *_: None, lambda *_: seen.set())
+    thread = threading.Thread(target=stream.run)
+    thread.start()
+    stream.look(HERE)
+    assert seen.wait(20)
+    stream.close()
+    thread.join(20)
+    assert not thread.is_alive()

@@ -1,0 +1,123 @@
+"""Pictures on a Warp tape: gradients through our rendering and somebody's own kernels; training on Warp."""
+
+import numpy as np
+import pytest
+from training_scene import QUICK, scene
+
+import fidsplat as fs
+from fidsplat.hard_cases.derivatives import derivatives, random_picture
+from fidsplat.train import Trainer
+from fidsplat.train.derivatives import by_pose, drawn, moved
+
+wp = pytest.importorskip("warp")
+POSE = np.array([0.02, -0.05, 0.1, 0.03, -0.02, 0.04])
+TYPES = {"means": "vec3", "quats": "vec4", "scales": "vec2", "opacities": "float32", "colors": "vec3"}
+
+
+@wp.kernel
+def squared(image: wp.array3d(dtype=float), wanted: wp.array3d(dtype=float), loss: wp.array(dtype=float)):
+    i, j, k = wp.tid()
+    off = image[i, j, k] - wanted[i, j, k]
+    wp.atomic_add(loss, 0, off * off)
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    return fs.Renderer("warp:cpu")
+
+
+@pytest.fixture
+def draw():
+    from fidsplat.train.warp_bridge import draw
+
+    return draw
+
+
+def picture():
+    """As tests/contract/test_gradients.py draws, whose kernels it shares."""
+    return random_picture(1, degree=None, quality="surfel", outputs=("rgb",))
+
+
+def on_device(cloud, gradients=tuple(TYPES)):
+    return {
+        name: wp.array(
+            getattr(cloud, name), dtype=getattr(wp, kind), device="cpu", requires_grad=name in gradients
+        )
+        for name, kind in TYPES.items()
+    }
+
+
+def test_a_tape_goes_back_through_pictures_and_kernels(renderer, draw):
+    """All gradients are those of the backend by the same loss; a second pass adds to them."""
+    cloud, capture = picture()
+    arrays = on_device(cloud)
+    wanted = wp.zeros((43, 61, 3), dtype=float, device="cpu")
+    loss = wp.zeros(1, dtype=float, device="cpu", requires_grad=True)
+    tape = wp.Tape()
+    with tape:
+        images = draw(tape, renderer, capture, **arrays)
+        wp.launch(squared, (43, 61, 3), [images["rgb"], wanted, loss], device="cpu")
+    tape.backward(loss)
+    rgb = images["rgb"].numpy()
+    assert np.array_equal(rgb, renderer.render(cloud, capture)["rgb"])
+    truth = derivatives(renderer.backend, cloud, capture, {"rgb": 2 * rgb})
+    for name, array in arrays.items():
+        assert np.abs(truth[name]).max() > 0
+        np.testing.assert_array_equal(array.grad.numpy(), truth[name], err_msg=name)
+
+
+def test_a_tape_has_the_gradients_of_pose_and_background(renderer, draw):
+    cloud, capture = picture()
+    arrays = on_device(cloud, ("colors",))
+    pose = wp.array(POSE, dtype=float, device="cpu", requires_grad=True)
+    behind = wp.array([0.2, 0.3, 0.4], dtype=float, device="cpu", requires_grad=True)
+    weights = np.random.default_rng(0).normal(size=(43, 61, 3)).astype(np.float32)
+    tape = wp.Tape()
+    images = draw(tape, renderer, capture, **arrays, pose=pose, background=behind)
+    tape.backward(grads={images["rgb"]: wp.array(weights, dtype=float, device="cpu")})
+    at = pose.numpy().astype(np.float64)
+    assert capture.camera
+    there = capture.with_(camera=moved(capture.camera, at), background=tuple(behind.numpy().tolist()))
+    _, backward = drawn(renderer, cloud, there)
+    truth = backward({"rgb": weights})
+    np.testing.assert_array_equal(behind.grad.numpy(), truth["background"])
+    np.testing.assert_allclose(pose.grad.numpy(), by_pose(truth["pose"].astype(float), at), rtol=1e-6)
+    assert np.abs(truth["pose"]).min() > 0
+    np.testing.assert_array_equal(arrays["colors"].grad.numpy(), truth["colors"])
+    assert arrays["means"].grad is None
+
+
+def test_what_a_tape_cannot_record_is_an_error(renderer, draw):
+    cloud, capture = picture()
+    arrays, tape = on_device(cloud), wp.Tape()
+    with pytest.raises(fs.DeviceError, match="not of reference"):
+        draw(tape, fs.Renderer("reference"), capture, **arrays)
+    with pytest.raises(fs.InputError, match="either colors or sh"):
+        draw(tape, renderer, capture, **arrays, sh=arrays["colors"])
+    with pytest.raises(fs.InputError, match=r"pose has the shape \(7,\)"):
+        draw(tape, renderer, capture, **arrays, pose=np.zeros(7))
+    with pytest.raises(fs.InputError, match="samples=1"):
+        draw(tape, renderer, capture.with_(quality="surfel,samples=2"), **arrays)
+    images = draw(tape, renderer, capture, **arrays)
+    renderer.render(cloud, capture)
+    with pytest.raises(fs.InputError, match="made last"):
+        tape.backward(grads={images["rgb"]: wp.zeros((43, 61, 3), dtype=float, device="cpu")})
+
+
+def test_training_on_warp_repeats_to_the_byte_and_after_a_stop(renderer, tmp_path):
+    """By the work of a step in NumPy, as Warp has no kernels of its own for it."""
+    settings = {**QUICK, "iterations": 20, "sh_degree": 0, "growth": 1.2}
+    dataset, checkpoint = scene(), tmp_path / "run.training.npz"
+    whole = Trainer(dataset, renderer, **settings)
+    before = np.mean([each.psnr for each in whole.evaluate(dataset.views)])
+    whole.run()
+    assert np.mean([each.psnr for each in whole.evaluate(dataset.views)]) > before + 1
+    first = Trainer(dataset, renderer, checkpoint=checkpoint, **settings)
+    for _ in range(11):
+        first.step()
+    first.save_checkpoint()
+    again = Trainer(dataset, renderer, checkpoint=checkpoint, **settings)
+    again.run()
+    for name, trainer in (("a", whole), ("b", again)):
+        trainer.save(tmp_path / f"{name}.ply")
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
