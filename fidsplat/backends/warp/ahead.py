@@ -15,7 +15,7 @@ from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.workspace import Workspace
 
-_LEAST = 1024
+_LEAST = 256
 """room is an eighth more than was taken, and so many more"""
 
 
