@@ -1,13 +1,15 @@
 """What the order of splats does to a picture, and what it costs (docs/order.md).
 
     python benchmarks/order.py [--device opencl] [--scene FILE] [--repeats 15]
-        [-o docs/images/order-jump.png] [--json FILE] [--times-only]
+        [-o docs/images/order-jump.png] [--json FILE] [--times-only | --jumps-only]
 
 Jumps: how far a pixel goes when a camera turns in steps of 1e-4 degrees, by the depth of centres and by
 depth at each pixel, and when the splats are shuffled. Markers of Gaussians alone and 5 cm before a wall of
 2000 splats of no plane, 1000 splats that cross, and the captured scene of --scene; 20 steps about the view
 in which the centres of a marker face to face change places; 240 x 192 pixels. The picture shows a QR code
-face to face before and after the worst step.
+face to face before and after the worst step. For `pixel`, the 16 pixels that jump furthest are drawn by the
+float64 reference too, along the same path: how far they jump there, and how far ours jump beyond that, in a
+step or in those beside it, as rounding may let an edge pass a pixel one step sooner.
 
 Times: frames of the standard scenes and of --scene in both orders, in turns, splats resident, with the
 standard cut-off and with 1/255; the median of the ratios, and its quartiles.
@@ -25,7 +27,7 @@ from real_scene import extent, views
 from rich.progress import track
 
 import fidsplat as fs
-from fidsplat.hard_cases.agreement import Picture, draw
+from fidsplat.hard_cases.agreement import Picture, draw, truth_of
 from fidsplat.hard_cases.c_order import STEP, largest_jump, turning, wall
 from fidsplat.hard_cases.clouds import taken
 from fidsplat.random_clouds import load_scene, random_splats
@@ -36,6 +38,8 @@ from fidsplat.vision.paint import contact_sheet
 ORDERS = ("centre", "pixel")
 SIZE = {"width": 240, "height": 192}
 STEPS = 10
+LOOKED_AT = 16
+"""pixels of a scene that the reference draws"""
 CUTOFFS = {"standard": 1e-5, "1/255": 1 / 255}
 TIMED = ("r100k_720p", "r1m_1080p")
 
@@ -70,6 +74,18 @@ def around_capture(cloud: fs.SplatCloud, order: str) -> Iterator[Picture]:
         yield Picture(cloud, camera, fs.Quality(order=order), ("rgb",))
 
 
+def beside_reference(renderer: fs.Renderer, pictures: list[Picture]) -> dict:
+    """The largest jump of the reference at the pixels that jump furthest, and of ours beyond it."""
+    drawn = np.stack([draw(renderer, picture)["rgb"] for picture in pictures])
+    furthest = np.abs(np.diff(drawn, axis=0)).max((0, 3))
+    at = np.unravel_index(np.argsort(-furthest, axis=None)[:LOOKED_AT], furthest.shape)
+    truth = np.stack([truth_of(picture, at)["rgb"] for picture in pictures])
+    ours, wanted = (np.abs(np.diff(rgb, axis=0)).max(2) for rgb in (drawn[:, *at], truth))
+    padded = np.pad(wanted, ((1, 1), (0, 0)))
+    allowed = np.max([padded[:-2], wanted, padded[2:]], axis=0)
+    return {"step_reference": float(wanted.max()), "beyond_reference": float((ours - allowed).max())}
+
+
 def jump_of(order: str, found: tuple[float, np.ndarray, np.ndarray]) -> dict:
     """The largest change of a pixel in the worst step, and how many change by more than 1/255 there."""
     jump, before, after = found
@@ -88,11 +104,13 @@ def jumps(renderer: fs.Renderer, capture: fs.SplatCloud | None, panels: dict) ->
             change = np.abs(draw(renderer, first)["rgb"] - draw(renderer, again)["rgb"]).max()
             row |= jump_of(order, found) | {f"shuffle_{order}": float(change)}
             panels[name, order] = found
+        row |= beside_reference(renderer, list(turning(cloud, "pixel", STEPS, tilt, **SIZE)))
         rows.append(row)
     if capture is not None:
         row = {"scene": "captured", "splats": len(capture)}
         for order in ORDERS:
             row |= jump_of(order, largest_jump(renderer, around_capture(capture, order)))
+        row |= beside_reference(renderer, list(around_capture(capture, "pixel")))
         rows.append(row)
     return rows
 
@@ -147,7 +165,9 @@ def main() -> None:
     parser = options(__doc__, repeats=15)
     parser.add_argument("--scene", metavar="FILE", help="a captured scene, y down, as in docs/real-scene.md")
     parser.add_argument("-o", "--out", type=Path, help="PNG file for the picture")
-    parser.add_argument("--times-only", action="store_true", help="no jumps, and so no picture")
+    part = parser.add_mutually_exclusive_group()
+    part.add_argument("--times-only", action="store_true", help="no jumps, and so no picture")
+    part.add_argument("--jumps-only", action="store_true", help="no times")
     asked = parser.parse_args()
     renderer = fs.Renderer(asked.device)
     capture = None if asked.scene is None else fs.load_ply(asked.scene)
@@ -155,11 +175,12 @@ def main() -> None:
     figures = {**facts(renderer), "jumps": [] if asked.times_only else jumps(renderer, capture, panels)}
     if asked.out is not None and panels:
         write_png(asked.out, picture(panels))
-    figures["times"] = times(renderer, capture, asked.repeats)
+    figures["times"] = [] if asked.jumps_only else times(renderer, capture, asked.repeats)
     if keep(figures, asked.json):
         return
     title = f"Largest jump of a pixel on {renderer.device.title}"
     columns = [f"{what}_{order}" for what in ("step", "pixels", "shuffle") for order in ORDERS]
+    columns[2:2] = ["step_reference", "beyond_reference"]
     cells = [
         (row["scene"], str(row["splats"]), *(_number(row.get(name)) for name in columns))
         for row in figures["jumps"]
@@ -174,7 +195,8 @@ def main() -> None:
         rows.append(
             (row["scene"], row["cutoff"], *times_of, f"{row['ratio']:.2f}", f"{low:.2f} to {high:.2f}")
         )
-    show("Milliseconds of a frame", ("scene", "cut-off", *ORDERS, "ratio", "quartiles"), rows)
+    if rows:
+        show("Milliseconds of a frame", ("scene", "cut-off", *ORDERS, "ratio", "quartiles"), rows)
 
 
 if __name__ == "__main__":

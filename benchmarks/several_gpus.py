@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from measuring import PROGRESS, facts, keep, options, show
-from store_views import further, views
+from store_views import further, placed, views
 
 import fidsplat as fs
 from fidsplat.store.city import City
@@ -54,7 +54,7 @@ def measure(
 
     def row_alone(k: int) -> np.ndarray:
         frame = one.render_band((middle, middle + 1), on_all[0], cameras[k])
-        return frame.read_rows("rgb", middle, middle + 1)
+        return frame.read_rows("rgb", middle, middle + 1)[middle]
 
     thin = seconds(row_alone, rounds)
     alone = row["picture_s"][0]
@@ -75,6 +75,7 @@ def main() -> None:
     parser = options(__doc__)
     parser.add_argument("--devices", nargs="+", help="all of one kind")
     parser.add_argument("--splats", type=float, default=20e6)
+    parser.add_argument("--places", type=int, default=1, help="of the city, so many times")
     parser.add_argument("--rounds", type=int, default=20)
     parser.add_argument("--size", default="3840x2160")
     asked = parser.parse_args()
@@ -86,6 +87,7 @@ def main() -> None:
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         store = fs.Store(fs.build_store([city.source], Path(folder) / "city.fss", levels=False))
+        store = placed(store, city, asked.places, Path(folder))
         for view, camera in views(store, (width, height)).items():
             for kind, scene in (("store", store), ("cloud", store.cloud())):
                 row = {"view": view, "scene": kind, **measure(scene, camera, several, asked.rounds)}
@@ -93,7 +95,7 @@ def main() -> None:
                 PROGRESS.print(str(row))
                 keep({**facts(first), "devices": names, "size": asked.size, "rows": rows}, asked.json)
     show(
-        f"{len(names)} x {first.device.title}, {int(asked.splats):,} splats, {asked.size}",
+        f"{len(names)} x {first.device.title}, {rows[0]['splats']:,} splats, {asked.size}",
         ("scene", "view", "one [ms]", "all [ms]", "picture", "views", "model 2/4/8/64", "same bits"),
         (
             (

@@ -150,12 +150,19 @@ class Frame(Mapping):
             self._images.wait()
         return self
 
-    def read_rows(self, name: str, first: int, end: int) -> np.ndarray:
-        """Rows of pixels [first, end) of an output, which alone are copied where the device can do that."""
+    def read_rows(self, name: str, first: int, end: int, into: np.ndarray | None = None) -> np.ndarray:
+        """An array for an output, `into` or a new one, in which rows of pixels [first, end) are those of the
+        picture: they alone are copied where the device can do that."""
         self._check(name)
         if not isinstance(self._images, ReadsRows):
-            return self[name][first:end]
-        return numbered(name, self._images.read_rows(name, first, end), self._ids)
+            into = np.empty_like(self[name]) if into is None else into
+            into[first:end] = self[name][first:end]
+            return into
+        into = self._images.empty(name) if into is None else into
+        self._images.read_rows(name, first, end, into)
+        if name == "splat_id":
+            into[first:end] = numbered(name, into[first:end], self._ids)
+        return into
 
     @property
     def timings(self) -> Mapping[str, float]:

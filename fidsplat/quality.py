@@ -23,7 +23,7 @@ SETUP_PRECISIONS = ("float64", "float32")
 ARITHMETIC = ("precise", "fast")
 BLEND_PRECISIONS = ("float32", "float64")
 MAX_SAMPLES = 8
-MIXTURES = ("exact", "fitted", "paper")
+MIXTURES = ("exact", "fitted", "paper", "facets")
 BY_FORMULA = LADDER, NESTED = 121, 562
 TEMPLATE_SIZES = (1, 5, 9, 13, 25, 41, *BY_FORMULA)
 """Gaussians of a rectangle in the templates that are shipped (fidsplat/markers/templates.json), and in those
@@ -61,7 +61,8 @@ class MarkerQuality:
     mixture: str = "exact"
     """`exact`: one box per rectangle, with edges that the pixel filters; opaque and clean at any distance.
     `fitted`: Gaussians by templates optimised for whole markers, which files hold and other renderers draw.
-    `paper`: Gaussians by the construction of the paper's section 3.2."""
+    `facets`: Gaussians in planes that cross along the edges of modules; opaque and sharp, but only where the
+    order is by depth at each pixel. `paper`: Gaussians by the construction of the paper's section 3.2."""
 
     levels: int = 4
     """Of `paper`: L, 1 to 8; 2^(L+2) - 7 Gaussians a rectangle at density 1, edges blurred over 2^-L half

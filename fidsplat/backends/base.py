@@ -149,8 +149,12 @@ class GivesFloat64(Protocol):
 class ReadsRows(Protocol):
     """Images of which some rows can be read alone."""
 
-    def read_rows(self, name: str, first: int, end: int) -> np.ndarray:
-        """Rows of pixels [first, end) of an image, as `read` gives them."""
+    def empty(self, name: str) -> np.ndarray:
+        """An array for the whole image."""
+        ...
+
+    def read_rows(self, name: str, first: int, end: int, into: np.ndarray) -> None:
+        """Copies rows of pixels [first, end) of an image, as `read` gives them, to those of such an array."""
         ...
 
 

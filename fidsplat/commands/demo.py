@@ -77,7 +77,10 @@ class Demo:
     ] = "fidsplat-demo"
     device: Device = None
     mixture: Annotated[
-        str, option("NAME", "of the markers: exact, fitted or paper, as `fidsplat marker` (default: exact)")
+        str,
+        option(
+            "NAME", "of the markers: exact, fitted, facets or paper, as `fidsplat marker` (default: exact)"
+        ),
     ] = "exact"
     json: Json = False
 

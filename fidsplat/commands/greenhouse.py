@@ -28,7 +28,8 @@ class Greenhouse:
     plants: Annotated[int, option("N", "in each row (default: 12)")] = 12
     seed: Annotated[int, option("N", "of the plants and the floor (default: 0)")] = 0
     mixture: Annotated[
-        Literal["exact", "fitted", "paper"] | None, option("NAME", "of the markers (default: exact)")
+        Literal["exact", "fitted", "facets", "paper"] | None,
+        option("NAME", "of the markers (default: exact)"),
     ] = None
     plants_from: Annotated[
         str | None, option("DIR", "KIND-NUMBER.ply to take plants from (default: grown as disks)")

@@ -39,8 +39,9 @@ class Marker:
       aprilgrid:CxR:FAMILY the same with corner squares     aprilgrid:6x6:36h11
 
     The mixture exact, the default, draws every rectangle as one box with sharp edges. A PLY file has no
-    boxes: -o then writes the Gaussians of fitted, and says so. refined optimises Gaussians as a whole by
-    gradient, half a minute for a tag: those of marker.template=121 if --quality is not given.
+    boxes: -o then writes the Gaussians of fitted, and says so. facets are Gaussians for renderers that
+    composite by depth at each pixel, opaque and sharp there and there only. refined optimises Gaussians as a
+    whole by gradient, half a minute for a tag: those of marker.template=121 if --quality is not given.
 
     Knobs of the mixtures (fs.MarkerQuality) are part of a quality: marker.levels (1 to 8) and marker.density
     (1 to 100) of paper, marker.template of fitted (Gaussians of a rectangle: 1, 5, 9, 13, 25, 41, 121 or
@@ -64,7 +65,7 @@ class Marker:
     ] = 1.0
     mixture: Annotated[
         str | None,
-        option("NAME", "how rectangles become splats: exact, fitted, paper or refined (default: exact)"),
+        option("NAME", "how it becomes splats: exact, fitted, facets, paper or refined (default: exact)"),
     ] = None
     iterations: Annotated[int | None, option("N", "pictures that refined looks at (default: 1000)")] = None
     device: Annotated[

@@ -61,7 +61,8 @@ def _by_colour(grid: np.ndarray, boxes: np.ndarray) -> dict[str, int]:
 
 
 def _gaussians(mixture: str, boxes: np.ndarray) -> int | None:
-    """How many a mixture would need for other rectangles; None for one that is not known here."""
+    """How many a mixture would need for other rectangles; None for one that is of modules, not rectangles, or
+    not known here."""
     if mixture == "exact":
         return len(boxes)
     if mixture == "paper":

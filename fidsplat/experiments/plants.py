@@ -20,7 +20,7 @@ from fidsplat.formats import save_ply
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.quality import whole_number
 from fidsplat.render import Renderer
-from fidsplat.sim.plant_meshes import MESHES, Mesh
+from fidsplat.sim.plant_meshes import GOLDEN, MESHES, Mesh
 from fidsplat.splats import SplatCloud
 from fidsplat.train import Step, Trainer, TrainSettings, load_dataset
 
@@ -86,7 +86,7 @@ def cameras_around(mesh: Mesh, count: int, shift: float = 0.0) -> list[Camera]:
     found = []
     for i in range(count):
         rise = _LOW + (_HIGH - _LOW) * (i + 0.5) / count
-        turn = 2.39996 * (i + shift)
+        turn = GOLDEN * (i + shift)
         ray = np.array([math.cos(rise) * math.cos(turn), math.cos(rise) * math.sin(turn), math.sin(rise)])
         fov = 2 * math.atan(width / 2 / FOCAL)
         found.append(Camera.look_at(width, HEIGHT, fov, middle + away * ray, middle, (0, 0, 1)))

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from fidsplat.errors import InputError
+from fidsplat.markers.facets import count_facets, facet_cloud
 from fidsplat.markers.kinds import bits_of, kind_of, parse_spec
 from fidsplat.markers.mixture import (
     Template,
@@ -74,7 +75,7 @@ class Marker(PickledByFields):
     size: float
     """metres, the code's edge; its width where it is not square"""
     mixture: str
-    """"exact", "fitted", "paper", or "refined" (`fidsplat.train.refine`)"""
+    """"exact", "fitted", "facets", "paper", or "refined" (`fidsplat.train.refine`)"""
     quality: MarkerQuality
     """all knobs that it was made with; `growth` is None where the mixture's own was taken"""
     grid: np.ndarray = field(repr=False)
@@ -182,7 +183,7 @@ def marker(
         size: metres, edge of the code itself, quiet zone not counted (the width of a board or a picture).
         mixture: "exact" (default), one box for each rectangle, which only this renderer draws
             (`SplatCloud.with_boxes`; `Marker.gaussians` are for others and for files); "fitted" or "paper":
-            Gaussians.
+            Gaussians; "facets": Gaussians for renderers that composite by depth at each pixel, modules only.
         quiet_zone: modules of white around it; default 1 for tags, 4 for QR, 2 for boards, 0 for images and
             drawings.
         levels, density, duplicates: of the mixture `paper` only, see `paper_template`; default 4, 3, False.
@@ -223,7 +224,9 @@ def marker(
     grid = np.pad(bits, quiet)
     each = 1 if exact else min(len(template.gaussians) for template in templates)
     palette = np.array(parsed.colors or ((1, 1, 1), (0, 0, 0)), np.float32)
-    if len(palette) == 2:
+    if chosen.mixture == "facets":
+        refuse_more(spec, count_facets(grid.shape), max_splats)
+    elif len(palette) == 2:
         refuse_more(spec, least_rectangles(grid) * each, max_splats, "at least ")
     progress("components", 0.0)
     labels, components = label_components(grid)
@@ -239,10 +242,15 @@ def marker(
         regions = with_margin(regions, quiet, grid.shape)
         components = sum(len(region.geoms) for region in regions)
         boxes, turns, values = cover_all(regions, grid.shape)
-    count = len(boxes) if exact else int(count_gaussians(aspect_of(boxes), templates).sum())
-    refuse_more(spec, count, max_splats)
     printed = Printed(grid, boxes, values, turns, regions, size / bits.shape[1], palette)
-    cloud = box_cloud(printed, progress) if exact else gaussian_cloud(printed, templates, growth, progress)
+    if chosen.mixture == "facets":
+        cloud = facet_cloud(spec, printed, progress)
+    elif exact:
+        refuse_more(spec, len(boxes), max_splats)
+        cloud = box_cloud(printed, progress)
+    else:
+        refuse_more(spec, int(count_gaussians(aspect_of(boxes), templates).sum()), max_splats)
+        cloud = gaussian_cloud(printed, templates, growth, progress)
     for array in (bits, grid, boxes, values, turns, labels, palette):
         if array is not None:
             array.flags.writeable = False
@@ -298,9 +306,11 @@ def _chosen(
         raise InputError(f"{', '.join(of_paper)}: only the mixture 'paper' has this; write mixture='paper'")
     if "template" in given and name == "paper":
         raise InputError("template: the mixture 'paper' has levels and density instead")
-    if "growth" in given and name == "exact":
+    if "template" in given and name == "facets":
+        raise InputError("template: the mixture 'facets' has none; leave it out, or write mixture='fitted'")
+    if "growth" in given and name in ("exact", "facets"):
         raise InputError(
-            "growth: the boxes of mixture='exact' meet without seams; leave it out, or write mixture='fitted'"
+            f"growth: the mixture {name!r} has no seams to close; leave it out, or write mixture='fitted'"
         )
     return replace(quality, mixture=name, **given)
 

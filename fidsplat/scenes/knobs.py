@@ -65,6 +65,6 @@ def marker_knobs(made: MarkerQuality, scene: Quality | str | None) -> dict[str, 
         from fidsplat.markers.mixture import fitted_growth
 
         changes["growth"] = fitted_growth() if made.mixture == "fitted" else 0.0
-    concern = {"fitted": ("growth", "template"), "paper": ("levels", "density", "growth")}
+    concern = {"fitted": ("growth", "template"), "paper": ("levels", "density", "growth"), "facets": ()}
     mine = concern.get(made.mixture, ("template",))
     return {"mixture": made.mixture} | {name: changes[name] for name in mine if name in changes}

@@ -13,7 +13,7 @@ from fidsplat.splats import SplatCloud
 
 LEAF, STALK, TOMATO, CUCUMBER = (0.2, 0.46, 0.13), (0.38, 0.5, 0.2), (0.85, 0.13, 0.07), (0.16, 0.4, 0.1)
 LETTUCE = (0.38, 0.62, 0.16)
-_GOLDEN = 2.39996
+GOLDEN = 2.39996
 """radians from leaf to leaf"""
 
 
@@ -108,7 +108,7 @@ def lettuce(rng: np.random.Generator) -> Mesh:
             _blade(
                 rng,
                 np.array([0, 0, 0.01]),
-                _GOLDEN * k,
+                GOLDEN * k,
                 length,
                 0.9,
                 _shade(rng, LETTUCE),
@@ -145,7 +145,7 @@ def _nodes(
 ) -> list[tuple[np.ndarray, float, float]]:
     """Where leaves leave a stem: place, direction, and share of its height."""
     shares = np.linspace(low, high, count) + rng.normal(0, 0.01, count)
-    turns = _GOLDEN * np.arange(count) + rng.uniform(0, 2 * math.pi) + rng.normal(0, 0.25, count)
+    turns = GOLDEN * np.arange(count) + rng.uniform(0, 2 * math.pi) + rng.normal(0, 0.25, count)
     line = [np.interp(shares, np.linspace(0, 1, len(stem)), axis) for axis in stem.T]
     return list(zip(np.column_stack(line), turns.tolist(), shares.tolist(), strict=True))
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
+from fidsplat.store.layout import header_crc
 
 FILE = "detail.json"
 MARGIN = 1.5
@@ -52,7 +53,8 @@ def save_details(folder: Path, identity: str, details: Sequence[Detail]) -> None
     known = {(one.lowpass, one.level): one for one in every}
     rows = [vars(one) for _, one in sorted(known.items())]
     with atomic_write(folder / FILE) as stream:
-        stream.write(json.dumps({"identity": identity, "details": rows}, indent=1).encode())
+        said = {"identity": identity, "details": rows}
+        stream.write(json.dumps(said | {"crc": header_crc(said)}, indent=1).encode())
 
 
 def load_details(folder: Path, identity: str) -> list[Detail]:
@@ -61,6 +63,8 @@ def load_details(folder: Path, identity: str) -> list[Detail]:
     file = folder / FILE
     try:
         said = json.loads(file.read_bytes())
+        if said["crc"] != header_crc(said):
+            raise ValueError
         if said["identity"] != identity:
             return []
         rows = [row | {name: tuple(row[name]) for name in ("sizes", "errors")} for row in said["details"]]

@@ -67,20 +67,24 @@ class Residency:
     def read_ahead(self, captures: Iterator[Capture]) -> Iterator[Capture]:
         """The captures, each when what the next needs is being brought."""
         waiting: Capture | None = None
-        while True:
-            try:
-                following = next(captures, None)
-                if following is not None and waiting is not None:
-                    self._fetch(following)
-            except Exception:
+        try:
+            while True:
+                try:
+                    following = next(captures, None)
+                    if following is not None and waiting is not None:
+                        self._fetch(following)
+                except Exception:
+                    if waiting is not None:
+                        yield waiting
+                    raise
                 if waiting is not None:
                     yield waiting
-                raise
-            if waiting is not None:
-                yield waiting
-            if following is None:
-                return
-            waiting = following
+                if following is None:
+                    return
+                waiting = following
+        finally:
+            if self._fetching is not None:  # it uses the device, which may be gone when the process ends
+                self._fetching.join()
 
     def _fetch(self, capture: Capture) -> None:
         """Bring what a view will need, beside what goes on; nothing, while the last such work goes on."""

@@ -138,8 +138,8 @@ class Streamed:
 
     @property
     def largest_chunk(self) -> int:
-        """Splats of the largest node, or of those beside."""
-        return max(len(self.beside), *(int(store.nodes["count"].max(initial=0)) for store in self.stores))
+        """Splats of the largest node; those beside are taken in as large parts."""
+        return max(int(store.nodes["count"].max(initial=1)) for store in self.stores)
 
     @property
     def planes(self) -> PlaneTable | None:
@@ -160,9 +160,14 @@ class Streamed:
                 key = (number, node % each if moved else node)
                 pose = store.pose_rows[node // each] if moved else None
                 made.append(Chunk(key, count, partial(self._laid_out, key, moved), pose))
-        if len(self.beside) or not made:
-            made.append(Chunk("beside", len(self.beside), partial(self._on_device, self._beside)))
+        most, count = self.largest_chunk, len(self.beside)
+        for first in range(0, count if made else max(count, 1), most):
+            end = min(first + most, count)
+            made.append(Chunk(("beside", first), end - first, partial(self._part_beside, first, end)))
         return made
+
+    def _part_beside(self, first: int, end: int) -> dict[str, np.ndarray]:
+        return self._on_device({name: array[first:end] for name, array in self._beside.items()})
 
     def _laid_out(self, key: tuple[int, int], unplaced: bool) -> dict[str, np.ndarray]:
         """The arrays of a chunk on a device."""

@@ -68,6 +68,7 @@ def test_derivatives_of_random_scenes_are_the_references(backend, seeds):
 def test_the_schedule_of_gpus_has_the_references_derivatives(backend):
     for shape in backend.shapes("schedule").values():
         assert_same(backend, *random_picture(2), shape=shape)
+        assert_same(backend, *long_lists(), shape=shape)
 
 
 def test_distortions_and_their_derivatives_are_the_references(backend):
@@ -97,14 +98,17 @@ def test_opaque_splats_have_derivatives(backend):
     assert all(np.isfinite(array).all() for array in found.values())
 
 
-def test_long_lists_are_taken_back_in_chunks(backend):
+def long_lists():
     """Hundreds of faint splats in each tile, in windows and beyond them: light is left at the end."""
     cloud, capture = random_picture(
         4, count=400, scale=(0.2, 1.5), depth=(2.0, 5.0), across=1.0, size=(150, 40)
     )
     faint = fs.SplatCloud(cloud.means, cloud.quats, cloud.scales, 0.004 + 0.01 * cloud.opacities, sh=cloud.sh)
-    for shape in backend.shapes("schedule").values():
-        assert_same(backend, faint, capture, shape=shape)
+    return faint, capture
+
+
+def test_long_lists_are_taken_back_in_chunks(backend):
+    assert_same(backend, *long_lists())
 
 
 def test_the_same_bits_on_every_run_and_those_of_render(backend, renderer):

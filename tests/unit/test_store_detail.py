@@ -155,10 +155,12 @@ def test_what_was_measured_with_another_store_does_not_count(tmp_path):
     kept = load_details(tmp_path, "a")
     assert [(one.lowpass, one.sizes) for one in kept] == [("pixel", (0.3,)), ("screen", (0.1,))]
     assert load_details(tmp_path, "b") == []
+    whole = (tmp_path / "detail.json").read_bytes()
     for damage in (
         b"{",
         b"[]",
         json.dumps({"identity": "a", "details": [{"sizes": 1, "errors": 2}]}).encode(),
+        whole.replace(b"0.3", b"0.4"),
     ):
         (tmp_path / "detail.json").write_bytes(damage)
         with pytest.raises(fs.InputError, match="store measure"):

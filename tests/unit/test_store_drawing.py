@@ -164,6 +164,18 @@ def test_a_device_draws_stores_bit_for_bit(stores, tmp_path):
                 assert np.array_equal(batch["rgb"][number], renderer.render(cloud, camera)["rgb"])
 
 
+def test_a_device_draws_splats_beside_stores_bit_for_bit(stores):
+    renderer = fs.Renderer("opencl")
+    beside = random_splats(200, 8, depth=(1.0, 2.0), scale=(0.02, 0.1), across=0.5)
+    scene = fs.Scene([beside], look(), stores=(stores["disks"],))
+    resident = renderer.upload(scene)
+    for camera in (look(), look(turn=TURNED)):
+        ours, whole = (renderer.render(each, camera)["rgb"] for each in (resident, scene.cloud()))
+        assert np.array_equal(ours, whole)
+    # in parts as large as the chunks of the store
+    assert resident._data._cache._rows < 200
+
+
 def test_a_device_keeps_the_chunks_that_it_was_sent(stores, tmp_path, monkeypatch):
     sent, put = [], chunks.OpenCLChunks._put
     monkeypatch.setattr(

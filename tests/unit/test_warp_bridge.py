@@ -5,6 +5,7 @@ import pytest
 from training_scene import QUICK, scene
 
 import fidsplat as fs
+from fidsplat.backends.prepare import prepare
 from fidsplat.hard_cases.derivatives import derivatives, random_picture
 from fidsplat.train import Trainer
 from fidsplat.train.derivatives import by_pose, drawn, moved
@@ -102,6 +103,29 @@ def test_what_a_tape_cannot_record_is_an_error(renderer, draw):
     renderer.render(cloud, capture)
     with pytest.raises(fs.InputError, match="made last"):
         tape.backward(grads={images["rgb"]: wp.zeros((43, 61, 3), dtype=float, device="cpu")})
+
+
+def test_derivatives_that_cannot_be_taken_are_errors(renderer):
+    """Pictures in bands; arrays of another type, which would be read as something else."""
+    cloud, capture = picture()
+    backend = renderer.backend
+    features, view = prepare(cloud, capture)
+    pipeline, resident = backend.differentiate(features), backend.upload(cloud)
+    images = pipeline.forward(resident, view)
+    for wrong in (
+        wp.zeros((43, 61, 3), dtype=wp.float64, device="cpu"),
+        wp.zeros((43, 122, 3), dtype=float, device="cpu")[:, ::2],
+    ):
+        with pytest.raises(fs.InputError, match="must be a contiguous float32 array on cpu"):
+            pipeline.backward(images, {"rgb": wrong})
+    with pytest.raises(fs.InputError, match=r"the gradient of rgb has the shape \(43, 61\)"):
+        pipeline.backward(images, {"rgb": wp.zeros((43, 61), dtype=float, device="cpu")})
+    before, backend.pair_budget = backend.pair_budget, images.stats["pairs"] - 1
+    try:
+        with pytest.raises(fs.DeviceError, match="drawn in bands"):
+            pipeline.forward(resident, view)
+    finally:
+        backend.pair_budget = before
 
 
 def test_training_on_warp_repeats_to_the_byte_and_after_a_stop(renderer, tmp_path):

@@ -108,18 +108,22 @@ class OpenCLImages:
         Raises:
             DeviceError: the device has failed, in this or while it was drawing.
         """
-        return self.read_rows(name, 0, self._size[0])
-
-    def read_rows(self, name: str, first: int, end: int) -> np.ndarray:
-        """As `ReadsRows`. Raises DeviceError as `read`."""
-        output, columns = self._outputs[name], self._size[1]
-        size = (end - first, columns)
-        image = np.empty(size if output.channels == 1 else (*size, output.channels), output.dtype)
-        with self._workspace.failing(f"drawing {name}"):
-            drawn = self.settle()
-            above = first * columns * output.channels * image.itemsize
-            cl.enqueue_copy(drawn.queue, image, drawn.buffer(f"{name}_out"), src_offset=above)
+        image = self.empty(name)
+        self.read_rows(name, 0, len(image), image)
         return image
+
+    def empty(self, name: str) -> np.ndarray:
+        """As `ReadsRows`."""
+        output = self._outputs[name]
+        return np.empty(self._size if output.channels == 1 else (*self._size, output.channels), output.dtype)
+
+    def read_rows(self, name: str, first: int, end: int, into: np.ndarray) -> None:
+        """As `ReadsRows`. Raises DeviceError as `read`."""
+        if first == end:
+            return
+        with self._workspace.failing(f"drawing {name}"):
+            drawn, above = self.settle(), first * into[:1].nbytes
+            cl.enqueue_copy(drawn.queue, into[first:end], drawn.buffer(f"{name}_out"), src_offset=above)
 
     def wait(self) -> None:
         """Until the device has drawn it.

@@ -12,7 +12,7 @@ import numpy as np
 from fidsplat.backends.gradients import NOT_THE_LAST, check_shape, gradient_shape
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.launch import Launcher
-from fidsplat.backends.warp.picture import Picture
+from fidsplat.backends.warp.picture import Picture, WarpImages
 from fidsplat.backends.warp.pipeline import WarpPipeline
 from fidsplat.backends.warp.program import GradientKernels
 from fidsplat.backends.warp.resident import Resident
@@ -27,8 +27,8 @@ _SHARES = 2048
 class DifferentiableImages:
     """Output images with what the stages have left, for `WarpGradients.backward`."""
 
-    def __init__(self, picture: Picture) -> None:
-        self.picture, self._images = picture, picture.images
+    def __init__(self, picture: Picture, images: WarpImages) -> None:
+        self.picture, self._images = picture, images
         self._number = picture.workspace.pictures
 
     @property
@@ -67,13 +67,13 @@ class WarpGradients:
 
     def forward(self, resident: Resident, view: View) -> DifferentiableImages:
         """As `DifferentiablePipeline`."""
-        picture = self._pipeline.drawn(resident, view)
+        picture, images = self._pipeline.drawn(resident, view)
         if picture.bands > 1:
             raise DeviceError(
                 f"{resident.count:,} splats are drawn in bands within the memory budget, and such pictures "
                 "have no gradient; raise memory_budget, or use fewer splats or smaller pictures"
             )
-        return DifferentiableImages(picture)
+        return DifferentiableImages(picture, images)
 
     def backward(self, images: DifferentiableImages, gradients: Mapping[str, Any]) -> dict[str, Any]:
         """As `DifferentiablePipeline`: wp.arrays."""

@@ -50,13 +50,15 @@ class WarpImages:
         stats: dict[str, int],
     ) -> None:
         self._images, self._size, self._launcher, self._stats = images, size, launcher, stats
-        self.settle: Callable[[], WarpImages] | None = None
-        """of a picture that was drawn ahead: once it is done, it or what replaces it"""
+        self.settle: Callable[[], WarpImages | None] | None = None
+        """of a picture that was drawn ahead: waits for it; what it is drawn again as, in the same arrays"""
 
     def _settled(self) -> None:
         if self.settle:
-            done = self.settle()
-            self._launcher, self._stats, self.settle = done._launcher, done._stats, None
+            again = self.settle()
+            self.settle = None
+            if again:
+                self._launcher, self._stats = again._launcher, again._stats
 
     @property
     def stats(self) -> Mapping[str, int]:
@@ -137,13 +139,14 @@ class Picture:
         """of tiles, in which it was drawn"""
         self.stats: dict[str, int] = {"splats": resident.count, "visible": 0, "pairs": 0}
 
-    def draw(self) -> None:
-        """All stages; `images` are the finished ones."""
+    def draw(self) -> WarpImages:
+        """All stages; the finished images."""
         self.workspace.pictures += 1
         self.samples = self._exposed() if self.view.shots else self._drawn()
         self.launcher.stage("resolve")
-        self.images = self._resolve(self.samples)
+        images = self._resolve(self.samples)
         self.launcher.stage(None)
+        return images
 
     def _exposed(self) -> Any:
         """All stages but the last of each shot, and what their samples are together."""

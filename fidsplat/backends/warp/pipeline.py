@@ -31,8 +31,8 @@ class WarpPipeline:
         with self.workspace.working("while drawing"):
             return self._drawing.images(resident, view)
 
-    def drawn(self, resident: Resident, view: View) -> Picture:
-        """One picture with all that its stages have left on the device, until another is drawn.
+    def drawn(self, resident: Resident, view: View) -> tuple[Picture, WarpImages]:
+        """One picture with all that its stages have left on the device, until another is drawn; its images.
 
         Raises:
             DeviceError: as `render`.
@@ -60,8 +60,8 @@ class WarpPipeline:
         the last band; records (n, words) float32 (undefined for culled splats); raw (4, rows, columns)
         float32: r, g, b, transmittance of the padded sample grid; and the finished outputs by name.
         """
-        picture = self.drawn(resident, view)
-        held, stats, n = picture.held, picture.images.stats, resident.count
+        picture, images = self.drawn(resident, view)
+        held, stats, n = picture.held, images.stats, resident.count
         rows, stride = picture.grid
         raw = held["raw color"].numpy()[: rows * stride]
         lines = held["lines"].numpy()[: n * self.program.layout.lines]
@@ -72,5 +72,5 @@ class WarpPipeline:
             "lists": held["lists"].numpy()[: stats["pairs"]].astype(np.uint32),
             "records": lines.reshape(n, -1).copy(),
             "raw": raw.reshape(rows, stride, 4).transpose(2, 0, 1).copy(),
-            **{output.name: picture.images.read(output.name) for output in self.program.images},
+            **{output.name: images.read(output.name) for output in self.program.images},
         }

@@ -1,0 +1,62 @@
+"""Markers of facets: Gaussians, opaque and sharp where splats are composited by depth at each pixel."""
+
+import math
+
+import numpy as np
+import pytest
+from agreement import ALL_OUTPUTS
+
+import fidsplat as fs
+from fidsplat.markers.facets import DISH
+from fidsplat.vision.detect import detect
+from fidsplat.vision.images import to_uint8
+
+GREY = (0.5, 0.5, 0.5)
+
+
+def frontal(made: fs.Marker, pixels: int) -> fs.Camera:
+    """Sees the sheet alone, along its modules, which are so many pixels wide and 80 of their widths away."""
+    rows, columns = made.grid.shape
+    pose, focal = np.eye(4), 80.0 * pixels
+    pose[2, 3] = 80 * made.module
+    width, height = columns * pixels, rows * pixels
+    return fs.Camera.pinhole(width, height, focal, focal, width / 2, height / 2, pose)
+
+
+def test_facets_are_opaque_and_clean_to_the_edge_of_every_module(renderer):
+    made = fs.marker("apriltag:36h11:5", mixture="facets")
+    assert len(made.cloud) <= 31 * len(made.boxes)
+    pixels = 8
+    frame = renderer.render(made.cloud, frontal(made, pixels), ALL_OUTPUTS, background=GREY)
+    error = frame["rgb"][..., 0] - np.kron(1.0 - made.grid, np.ones((pixels, pixels)))
+    assert frame["alpha"].min() > 0.999
+    assert -10 * math.log10(float(np.mean(error**2))) > 35
+    cells = error.reshape(len(made.grid), pixels, -1, pixels)[:, 2:-2, :, 2:-2]
+    assert np.abs(cells).max() < 1 / 255
+    # one sheet, a shallow dish: its corners before its plane, its middle behind
+    depth = frame["depth"] / made.module - 80
+    assert np.abs(depth).max() < 1.5 * DISH * len(made.grid)
+    assert depth[0, 0] < 0 < depth[len(depth) // 2, len(depth) // 2]
+
+
+def test_facets_are_read_from_aside(renderer):
+    made = fs.marker("qr-v1-L:splats", mixture="facets")
+    angle = math.radians(65)
+    position = (-10 * math.sin(angle), 0, -10 * math.cos(angle))
+    camera = fs.Camera.look_at(240, 240, 0.16, position, (0, 0, 0))
+    frame = renderer.render(made.cloud, camera, ALL_OUTPUTS, background=GREY)
+    assert [one.payload for one in detect(to_uint8(frame["rgb"]))] == ["splats"]
+
+
+def test_a_picture_keeps_its_colours_and_a_drawing_with_slants_is_refused(tmp_path):
+    drawing = tmp_path / "slant.svg"
+    drawing.write_text(
+        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 9 9"><path d="M1 1L8 2L3 8Z" fill="red"/></svg>'
+    )
+    with pytest.raises(fs.InputError, match="edges across its modules, which mixture='facets'"):
+        fs.marker(f"svg:{drawing}", mixture="facets")
+    drawing.write_text(
+        '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 9 9"><path d="M1 1H8V4H1Z" fill="red"/></svg>'
+    )
+    made = fs.marker(f"svg-9:{drawing}", mixture="facets")
+    assert np.array_equal(np.unique(made.cloud.colors, axis=0), np.unique(made.palette, axis=0))
