@@ -329,6 +329,22 @@ def test_a_setting_knows_whether_it_draws_another_picture():
         assert len(device(records).same_picture(scene)) == 1
 
 
+def test_the_price_of_order_is_pixel_over_centre_where_both_were_drawn():
+    def records(scene: str, **ratios: float) -> list[Record]:
+        turned = [Point("order", name, BASE.with_(order=name)) for name in ratios]
+        return [record(scene, one, result(ratios[one.value], 0.1 * ratios[one.value])) for one in turned]
+
+    drawn = device([*plain_records("hard"), *records("hard", pixel=3.0, centre=2.0), *marker_records()])
+    (row,) = report.orders_table([drawn]).to_dict("records")
+    assert row == {
+        "`pixel` beside `centre`": "hard",
+        f"time, {drawn.kind}": "+50 %",
+        "largest error, `pixel`": "0.3",
+        "largest error, `centre`": "0.2",
+    }
+    assert not len(report.orders_table([device(plain_records("hard"))]))
+
+
 def test_a_quality_in_words_is_the_same_for_the_same():
     point = Point("marker", "x", BASE.with_(marker={"template": 9}, alpha_cutoff=1e-5)).key()
     assert quality_text(point["quality"]) == "alpha_cutoff=1e-05 marker.template=9"
