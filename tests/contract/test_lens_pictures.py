@@ -110,7 +110,7 @@ def test_a_rim_ahead_of_a_disk_that_reaches_behind_the_camera(renderer):
     c, s = math.cos(math.pi / 16), math.sin(math.pi / 16)
     turn = np.array([[c, -s, 0], [0, 0, -1], [s, c, 0]])
     floor = fs.SplatCloud([(0, 0.5, 0.3)], [matrix_to_quaternion(turn)], [(1, 1)], [1.0], colors=[(1, 1, 1)])
-    camera = fs.Camera.pinhole(80, 60, 200.0, 200.0, 40.0, -50.0)
+    camera = fs.Camera.pinhole(80, 60, 8000.0, 8000.0, 40.0, -3050.0)
     alpha = assert_agrees(renderer, floor, camera, quality=TO_THE_RIM)["alpha"]
     assert (alpha > 0.6).any()
     assert (alpha == 0).any()
