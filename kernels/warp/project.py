@@ -22,7 +22,7 @@ from .disk import make_disk
 from .ellipsoids import EWA, EXACT, make_ellipsoids
 from .lens import LENSES, make_lens, make_optics
 from .lowpass import make_filter
-from .motion import make_motion
+from .placing import make_placing
 from .records import Layout
 from .slopes import make_slopes
 
@@ -53,11 +53,9 @@ def make_project(
     places = [layout.word(output.declared(name).record[0]) for name in recorded]
     real = wp.float64 if precision == "float64" else wp.float32
     vec2, vec3, vec4 = (wp.types.vector(n, real) for n in (2, 3, 4))
-    mat33 = wp.types.matrix((3, 3), real)
     words = wp.types.vector(4 * layout.lines, wp.float32)
     sqrt_half, sqrt_two = real(math.sqrt(0.5)), real(math.sqrt(2.0))
     edge_on = real(1e-13 if precision == "float64" else 1e-6)
-    range_radius, plane_radius = real(math.sqrt(2.0 * math.log(255.0))), real(64.0)
     one, two, half, zero = real(1.0), real(2.0), real(0.5), real(0.0)
     all_boxes, mixed = "footprint_box" in effects, "footprint_mixed" in effects
     boxes_too = all_boxes or mixed
@@ -66,9 +64,8 @@ def make_project(
     thick_too = exact or drawn_ewa
     ellipsoid = make_ellipsoids(effects, real)
     limits, color_of, widened = make_bounds(screen), make_color(sh_terms, real), make_filter(real)
-    moves = "motion_groups" in effects
-    motion = make_motion(moves)
-    Moving = motion.Moving
+    placing = make_placing(effects, real)
+    Moving = placing.Moving
     camera = next((name for name in effects if name in LENSES), None)
     parallel = "camera_orthographic" in effects
     ray_depths = camera in ("camera_fisheye", "camera_equirectangular")  # distances, not along z
@@ -136,18 +133,8 @@ def make_project(
         su = real(wp.max(size[0], SMALLEST_SCALE))
         sv = real(wp.max(size[1], SMALLEST_SCALE))
 
-        # tangents: the first two columns of the rotation of a quaternion of any length
-        q = quats[i]
-        w, x, y, z = real(q[0]), real(q[1]), real(q[2]), real(q[3])
-        s = two / (w * w + x * x + y * y + z * z)
-        turn, shift, eye = mat33(view.rotation), vec3(view.translation), vec3(view.eye)
-        if wp.static(moves):
-            group = motion.group_of(moving, i)
-            if group >= 0:
-                own = moving.poses[group]
-                turn, shift, eye = mat33(own.rotation), vec3(own.translation), vec3(own.eye)
-        tangent_u = turn * vec3(one - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y))
-        tangent_v = turn * vec3(s * (x * y - w * z), one - s * (x * x + z * z), s * (y * z + w * x))
+        turn, shift, eye = placing.pose(i, view, moving)
+        tangent_u, tangent_v = placing.tangents(turn, quats[i])
         center = means[i]
         mean = vec3(real(center[0]), real(center[1]), real(center[2]))
         p = turn * mean + shift
@@ -158,10 +145,10 @@ def make_project(
 
         near = real(view.near)
         itself = bool(False)  # whether it is filtered by its own footprint
+        boxed = bool(wp.static(all_boxes))
+        if wp.static(mixed):
+            boxed = boxes[i] != 0
         if wp.static(boxes_too):
-            boxed = bool(wp.static(all_boxes))
-            if wp.static(mixed):
-                boxed = boxes[i] != 0
             itself = boxed
         third = vec3()  # half axis of an ellipsoid that is conjugate to a and b
         inverse_m2 = zero
@@ -382,18 +369,10 @@ def make_project(
         if wp.static(has_depth):
             record[at_depth] = float(height * facing)
             record[at_depth + 1] = float(depth)
-            depth_reach = reach
-            if wp.static(waits):
-                # what is fainter than 1/255 of its splat lies within the rest, so that the order is the same
-                # at every cut-off
-                depth_reach = reach * (range_radius / radius)
-                if wp.static(layers):
-                    # on the plane wherever any cut-off and a low-pass let it be drawn
-                    if planes[i] >= 0:
-                        depth_reach = reach * (plane_radius / radius)
-                if wp.static(boxes_too):
-                    if boxed:
-                        depth_reach = reach
+            plane = int(-1)
+            if wp.static(layers):
+                plane = planes[i]
+            depth_reach = placing.depth_reach(reach, radius, plane, boxed)
             record[at_depth + 2] = float(depth_reach)
         key = float(depth)
         if wp.static(waits):

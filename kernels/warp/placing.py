@@ -1,0 +1,62 @@
+"""Where a splat stands before the camera: its pose, its tangents, and how far its fragments' depths reach."""
+
+import math
+from functools import cache
+from types import SimpleNamespace
+
+import warp as wp
+
+from .common import View
+from .motion import make_motion
+from .records import BOXES
+
+
+@cache
+def make_placing(effects: tuple[str, ...], real) -> SimpleNamespace:
+    """pose, tangents, depth_reach, and the struct Moving of what moves by itself."""
+    moves, waits, layers = (name in effects for name in ("motion_groups", "compose_pixel", "compose_planes"))
+    boxes_too = any(name in effects for name in BOXES)
+    vec3, mat33 = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
+    one, two = real(1.0), real(2.0)
+    range_radius, plane_radius = real(math.sqrt(2.0 * math.log(255.0))), real(64.0)
+    motion = make_motion(moves)
+    Moving = motion.Moving
+
+    @wp.func
+    def pose(i: int, view: View, moving: Moving):
+        """Rotation and translation to the camera, and the camera's centre relative to the cloud's origin."""
+        turn, shift, eye = mat33(view.rotation), vec3(view.translation), vec3(view.eye)
+        if wp.static(moves):
+            group = motion.group_of(moving, i)
+            if group >= 0:
+                own = moving.poses[group]
+                turn, shift, eye = mat33(own.rotation), vec3(own.translation), vec3(own.eye)
+        return turn, shift, eye
+
+    @wp.func
+    def tangents(turn: mat33, q: wp.vec4):
+        """The first two columns of the rotation of a quaternion of any length, turned."""
+        w, x, y, z = real(q[0]), real(q[1]), real(q[2]), real(q[3])
+        s = two / (w * w + x * x + y * y + z * z)
+        tangent_u = turn * vec3(one - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y))
+        tangent_v = turn * vec3(s * (x * y - w * z), one - s * (x * x + z * z), s * (y * z + w * x))
+        return tangent_u, tangent_v
+
+    @wp.func
+    def depth_reach(reach: real, radius: real, plane: int, boxed: bool) -> real:
+        """Half of a splat's depths as blending bounds them. reach: of what is drawn; plane: -1 for none."""
+        found = reach
+        if wp.static(waits):
+            # what is fainter than 1/255 of its splat lies within the rest, so that the order is the same at
+            # every cut-off
+            found = reach * (range_radius / radius)
+            if wp.static(layers):
+                # on the plane wherever any cut-off and a low-pass let it be drawn
+                if plane >= 0:
+                    found = reach * (plane_radius / radius)
+            if wp.static(boxes_too):
+                if boxed:
+                    found = reach
+        return found
+
+    return SimpleNamespace(Moving=Moving, pose=pose, tangents=tangents, depth_reach=depth_reach)
