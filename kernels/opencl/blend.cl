@@ -72,7 +72,7 @@ static inline void pixel_blend(Pixel *pixel, const Splat *s, Crossing c, vint ma
 
 // Writes LANES pixels at `at` of each channel of `raw`, which are `plane` samples long.
 #define PIXEL_STORE_BASE(pixel, raw, plane, at) \
-    VSTORE((pixel)->r, raw + (at)); \
-    VSTORE((pixel)->g, raw + (plane) + (at)); \
-    VSTORE((pixel)->b, raw + 2 * (plane) + (at)); \
-    VSTORE((pixel)->t, raw + 3 * (plane) + (at))
+    BLOCK_STORE((pixel)->r, raw + (at), stride); \
+    BLOCK_STORE((pixel)->g, raw + (plane) + (at), stride); \
+    BLOCK_STORE((pixel)->b, raw + 2 * (plane) + (at), stride); \
+    BLOCK_STORE((pixel)->t, raw + 3 * (plane) + (at), stride)

@@ -16,6 +16,9 @@ typedef int vint;
 #define VAS_FLOAT(x) as_float(x)
 #define VFLOAT(i) ((vfloat)(i))
 #define VLANE 0.0f
+#define BLOCK_W 1
+#define BLOCK_LOAD(p, stride) (*(p))
+#define BLOCK_STORE(v, p, stride) (*(p) = (v))
 #else
 typedef GLUE(float, LANES) vfloat;
 typedef GLUE(int, LANES) vint;
@@ -24,10 +27,17 @@ typedef GLUE(int, LANES) vint;
 #if defined(__has_builtin)
 #if __has_builtin(__builtin_reduce_or)
 #define VANY(mask) (__builtin_reduce_or(mask) != 0)
+#define VBITS(mask) ((uint)__builtin_reduce_or((mask) & (vint)1 << VINDEX))
 #endif
 #endif
 #ifndef VANY
 #define VANY(mask) any(mask)
+static inline uint lanes_set(vint mask) {
+    uint bits = 0;
+    for (int lane = 0; lane < LANES; lane++) bits |= (uint)((int *)&mask)[lane] & 1u << lane;
+    return bits;
+}
+#define VBITS(mask) lanes_set(mask)
 #endif
 #define VLOAD(p) GLUE(vload, LANES)(0, p)
 #define VSTORE(v, p) GLUE(vstore, LANES)(v, 0, p)
@@ -35,12 +45,35 @@ typedef GLUE(int, LANES) vint;
 #define VAS_INT(x) GLUE(as_int, LANES)(x)
 #define VAS_FLOAT(x) GLUE(as_float, LANES)(x)
 #define VFLOAT(i) GLUE(convert_float, LANES)(i)
+// VLANE, VINDEX: the lanes' numbers. Lanes are pixels of a block that is BLOCK_W wide, row by row; in memory its rows lie `stride`
+// apart.
 #if LANES == 16
 #define VLANE ((vfloat)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
+#define VINDEX ((vint)(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15))
+#define BLOCK_W 4
+#define BLOCK_X ((vfloat)(0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3))
+#define BLOCK_Y ((vfloat)(0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3))
+#define BLOCK_LOAD(p, stride) \
+    ((vfloat)(vload4(0, p), vload4(0, (p) + (stride)), vload4(0, (p) + 2 * (stride)), vload4(0, (p) + 3 * (stride))))
+#define BLOCK_STORE(v, p, stride) \
+    vstore4((v).s0123, 0, p), vstore4((v).s4567, 0, (p) + (stride)), vstore4((v).s89ab, 0, (p) + 2 * (stride)), \
+        vstore4((v).scdef, 0, (p) + 3 * (stride))
 #elif LANES == 8
 #define VLANE ((vfloat)(0, 1, 2, 3, 4, 5, 6, 7))
+#define VINDEX ((vint)(0, 1, 2, 3, 4, 5, 6, 7))
+#define BLOCK_W 4
+#define BLOCK_X ((vfloat)(0, 1, 2, 3, 0, 1, 2, 3))
+#define BLOCK_Y ((vfloat)(0, 0, 0, 0, 1, 1, 1, 1))
+#define BLOCK_LOAD(p, stride) ((vfloat)(vload4(0, p), vload4(0, (p) + (stride))))
+#define BLOCK_STORE(v, p, stride) vstore4((v).s0123, 0, p), vstore4((v).s4567, 0, (p) + (stride))
 #elif LANES == 4
 #define VLANE ((vfloat)(0, 1, 2, 3))
+#define VINDEX ((vint)(0, 1, 2, 3))
+#define BLOCK_W 2
+#define BLOCK_X ((vfloat)(0, 1, 0, 1))
+#define BLOCK_Y ((vfloat)(0, 0, 1, 1))
+#define BLOCK_LOAD(p, stride) ((vfloat)(vload2(0, p), vload2(0, (p) + (stride))))
+#define BLOCK_STORE(v, p, stride) vstore2((v).s01, 0, p), vstore2((v).s23, 0, (p) + (stride))
 #endif
 #endif
 

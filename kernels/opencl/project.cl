@@ -58,6 +58,10 @@ kernel void project(
     keys[at] = CULLED;
 //@@ splat_view
 
+    real3_ mean = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
+    real3_ p = rotate_to_camera(view, mean);
+    p.x += view->translation[0]; p.y += view->translation[1]; p.z += view->translation[2];
+//@@ beside
     wide log_opacity = (wide)log((real)opacities[i]);
     wide half_r2 = log_opacity - (wide)view->log_cut;
     if (!(half_r2 > 0.0f)) return;
@@ -67,11 +71,8 @@ kernel void project(
     real s = REAL(2.0) / (w * w + x * x + y * y + z * z);
     real3_ tangent_u = {1 - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y)};
     real3_ tangent_v = {s * (x * y - w * z), 1 - s * (x * x + z * z), s * (y * z + w * x)};
-    real3_ mean = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
 
     real3_ a = rotate_to_camera(view, tangent_u), b = rotate_to_camera(view, tangent_v);
-    real3_ p = rotate_to_camera(view, mean);
-    p.x += view->translation[0]; p.y += view->translation[1]; p.z += view->translation[2];
     real pz = p.z, near = view->near;
 //@@ camera_depth
     real3_ facet = cross3(a, b);        // unit normal

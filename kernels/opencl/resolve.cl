@@ -6,24 +6,8 @@ kernel void resolve(
     int x = get_global_id(0), y = get_global_id(1);
     if (x >= width || y >= height) return;
     uint number = get_global_id(2);
-    size_t before = number * (plane / get_global_size(2));      // samples of the views before
-    float r = 0, g = 0, b = 0, t = 0;
-//@@ resolve_start
-    for (int sub_y = 0; sub_y < SAMPLES; sub_y++)
-        for (int sub_x = 0; sub_x < SAMPLES; sub_x++) {
-            size_t at = before + (size_t)(y * SAMPLES + sub_y) * stride + (x * SAMPLES + sub_x);
-            r += raw[at];
-            g += raw[plane + at];
-            b += raw[2 * (size_t)plane + at];
-            t += raw[3 * (size_t)plane + at];
-//@@ resolve_sample
-        }
-    const float mean = 1.0f / (SAMPLES * SAMPLES);
-    t *= mean;
-    size_t out = ((size_t)slots[number] * height + y) * width + x;
-    rgb_out[3 * out] = FMA(t, background_r, r * mean);
-    rgb_out[3 * out + 1] = FMA(t, background_g, g * mean);
-    rgb_out[3 * out + 2] = FMA(t, background_b, b * mean);
-//@@ resolve_end
+    // after the samples of the views before
+    size_t first = number * (plane / get_global_size(2)) + (size_t)(y * SAMPLES) * stride + x * SAMPLES;
+//@@ resolve_pixel
 }
 //@@ kernels

@@ -19,12 +19,12 @@ typedef struct {
 //@@ footprint
 //@@ footprint_functions
 
-// Affine forms at a row: `*_x` are the parts that do not change along the tile's rows.
-static inline Crossing cross_row(const Splat *s, vfloat nu_x, vfloat nv_x, vfloat d_x, wide y, wide half_r2) {
+// Affine forms at heights y: `*_x` are the parts that only columns have a say in.
+static inline Crossing cross_row(const Splat *s, vfloat nu_x, vfloat nv_x, vfloat d_x, vfloat y, wide half_r2) {
     Crossing c;
-    vfloat nu = FMA((vfloat)s->nuy, (vfloat)y, nu_x);
-    vfloat nv = FMA((vfloat)s->nvy, (vfloat)y, nv_x);
-    c.d = FMA((vfloat)s->dy, (vfloat)y, d_x);
+    vfloat nu = FMA((vfloat)s->nuy, y, nu_x);
+    vfloat nv = FMA((vfloat)s->nvy, y, nv_x);
+    c.d = FMA((vfloat)s->dy, y, d_x);
     c.q = FMA(nu, nu, nv * nv);
     // product form: no division, and no special value of D (numerics B2)
     c.inside = VMASK(c.q <= half_r2 * (c.d * c.d)) & VMASK(c.d > 0.0f) & VMASK(c.d <= s->d_near);

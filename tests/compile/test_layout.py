@@ -111,7 +111,7 @@ TOY_OUTPUT = """// nearest (h, w): depth [m] of the nearest fragment that is dra
 //@ composite
     pixel->nearest = fmin(pixel->nearest, VSELECT((vfloat)INFINITY, seen->z, live & VMASK(weight > 0.0f)));
 //@ store
-        VSTORE(pixel->nearest, nearest_raw + at);
+        BLOCK_STORE(pixel->nearest, nearest_raw + at, stride);
 //@ resolve_start
     float nearest = 0.0f;
 //@ resolve_sample

@@ -27,10 +27,10 @@ CAMERAS = {
 
 # of the texts as they were before there were lenses; a change here changes what every plain picture runs
 BEFORE_LENSES = {
-    ("lanes", ("rgb",)): "c11c67282aceee571b84452e614c63f3654a68c448ce52da5a61e26a4a5a2fee",
-    ("lanes", TAPS): "2ce029b5bb140cdb5144c8326ebb42317090b1f0184d82716523113682a771db",
-    ("group", ("rgb",)): "d2b12a553ad6f5de9219a04b79613c3247faee510440e824875e4aa091240417",
-    ("group", TAPS): "422c127fc1194688b8ae9997ecaacc36a8135e71befe02fea5bd4f7e22ac8ba8",
+    ("lanes", ("rgb",)): "0d02d552916884a64f8874d29d3009718d7fcc9ddd878c90246358642352794d",
+    ("lanes", TAPS): "dcf93ff1d92be3ceda79c90b0b95fb6cd335a6605806df50b7451b5f2315153c",
+    ("group", ("rgb",)): "ca037f6d5e489ff107ddbf809c1320fb151aa4a1e0ab7ec53563ebe155ca09ff",
+    ("group", TAPS): "21a1f84ba647e5d862a8368f4df96527dbf2f4626dbec729007d459c254e014f",
 }
 
 

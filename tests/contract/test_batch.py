@@ -100,7 +100,7 @@ def test_a_batch_is_given_where_it_was_drawn(renderer, cloud):
         assert tuple(array.shape) == batch[name].shape
         on_host = array.numpy() if hasattr(array, "numpy") else array.get()
         assert np.array_equal(on_host, batch[name])
-    assert set(batch.timings) >= {"project", "blend", "resolve"}
+    assert set(batch.timings) >= {"project", "blend"}
     with pytest.raises(fs.InputError, match="no 'distance'"):
         batch.device_array("distance")
 

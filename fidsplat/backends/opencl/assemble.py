@@ -114,8 +114,19 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         DeviceError: an effect's file fills a hook that no file has.
     """
     layouts = layouts_of(features)
-    declared = Declarations(layouts, features)
+    at_once = _at_once(features, shape, layouts)
+    declared = Declarations(layouts, features, at_once)
     files = [layout.file for layout in layouts.values() if layout.file]
+    files.append(LAYOUTS["resolve_pixel"].file)
+    # 3D Gaussians may be drawn by a picture that is larger than they
+    if (
+        shape.schedule == "lanes"
+        and {"camera_pinhole", "lowpass_screen"} <= layouts.keys()
+        and "thickness" not in layouts
+    ):
+        files.append(LAYOUTS["beside"].file)
+    if at_once:
+        files.append(LAYOUTS["resolve_at_once"].file)
     if shape.lists == "tiled":
         files.append("list/tiled.cl")
     if "compose_pixel" in layouts:
@@ -125,7 +136,9 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     stages = {
         "lists": ("prelude", "math", "bounds", *_LISTS[shape.lists]),
         "picture": [
-            stage.format(shape.schedule) for stage in _DRAWN if stage != "pack" or shape.lists == "ordered"
+            stage.format(shape.schedule)
+            for stage in _DRAWN
+            if not (stage == "pack" and shape.lists == "tiled") and not (stage == "resolve" and at_once)
         ],
     }
     _refuse_unknown_hooks(files)
@@ -134,6 +147,13 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     kernels = (kernel for each in programs.values() for kernel in kernels_in(each))
     arguments = {kernel: declared.arguments(kernel) for kernel in kernels}
     return Source(programs, declared.records, arguments, declared.samples, declared.scalars)
+
+
+def _at_once(features: FeatureSet, shape: DeviceShape, layouts: Mapping[str, Layout]) -> bool:
+    """Whether who has drawn a pixel on a GPU resolves it too, which saves a launch: where a pixel is one
+    sample of one pose, and nothing but blending adds to it."""
+    alone = features.samples == 1 and "background_constant" in layouts and "rays" not in layouts
+    return shape.schedule == "group" and alone and not any(name.startswith("shutter_") for name in layouts)
 
 
 def numbers_of(features: FeatureSet, shape: DeviceShape) -> dict[str, int]:
@@ -206,11 +226,12 @@ def kernels_in(text: Text) -> list[str]:
 class Declarations:
     """What layout.py declares, with what the chosen effects add to it."""
 
-    def __init__(self, layouts: dict[str, Layout], features: FeatureSet) -> None:
+    def __init__(self, layouts: dict[str, Layout], features: FeatureSet, at_once: bool = False) -> None:
+        """at_once: blending resolves, with the arguments of both."""
         real = "double" if features.setup_precision == "float64" else "float"
         self.scalars = Scalars(real, "double" if "blend_double" in layouts else "float")
         self.samples = tuple((one, layout.averaged) for layout in layouts.values() for one in layout.samples)
-        self._layouts, self._outputs = layouts, features.images
+        self._layouts, self._outputs, self._at_once = layouts, features.images, at_once
         every = layouts.values()
         self._structs: dict[str, Record] = {
             "View": VIEW.with_members(one for layout in every for one in layout.view),
@@ -236,6 +257,9 @@ class Declarations:
             added += (Argument(one.ctype, one.name, access, note=one.note) for one, _ in self.samples)
         if kernel == "resolve":
             added += map(output_argument, self._outputs)
+        if kernel == "blend" and self._at_once:
+            own = {"stride", *(one.name for one in (*KERNELS[kernel], *added))}
+            added += [one for one in self.arguments("resolve") if one.name not in own]
         return tuple({one.name: one for one in (*KERNELS[kernel], *added)}.values())
 
     def text(self, hook: str, subject: str) -> str:

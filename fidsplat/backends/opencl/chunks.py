@@ -138,10 +138,14 @@ class OpenCLChunks:
         slot = self._slot(kept)
         if slot is None:
             return False
-        for name, width in self.widths.items():
-            if arrays[name].size:
-                array, place = np.ascontiguousarray(arrays[name]), slot * self._rows * width
-                cl.enqueue_copy(self._queue, self._arrays[name], array, dst_offset=place)
+        try:
+            for name, width in self.widths.items():
+                if arrays[name].size:
+                    array, place = np.ascontiguousarray(arrays[name]), slot * self._rows * width
+                    cl.enqueue_copy(self._queue, self._arrays[name], array, dst_offset=place)
+        except BaseException:
+            self._free.append(slot)
+            raise
         self._slots[key] = slot
         return True
 

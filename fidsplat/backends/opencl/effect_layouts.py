@@ -122,6 +122,7 @@ LAYOUTS: dict[str, Layout] = {
     "shutter_rows": Layout("slot/shutter_rows.cl"),
     "blend_double": Layout(),
     # what several of them share
+    "beside": Layout("part/beside.cl"),
     "conic": Layout("part/conic.cl"),
     "perspective": Layout("part/perspective.cl"),
     "polygon": Layout("part/polygon.cl"),
@@ -163,6 +164,9 @@ LAYOUTS: dict[str, Layout] = {
         "part/ray_depth.cl",
         splat=(member("wide z_numerator", "depth = z_numerator / D"), member("wide z_center z_reach")),
     ),
+    # how pixels are made of samples, and by whom
+    "resolve_pixel": Layout("part/resolve_pixel.cl"),
+    "resolve_at_once": Layout("part/resolve_at_once.cl"),
     # how fragments wait for nearer ones, by the schedule
     "waiting_lanes": Layout("part/waiting_lanes.cl"),
     "waiting_group": Layout("part/waiting_group.cl"),

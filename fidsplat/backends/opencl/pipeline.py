@@ -171,7 +171,7 @@ class OpenCLPipeline:
         every = [one for each in arguments.values() for one in each]
         if resident.streamed or "backdrop" in arguments or any(one.source == "array" for one in every):
             return False
-        if any(one.name == "rays" for one in arguments["resolve"]):
+        if any(one.name == "rays" for one in arguments.get("resolve", ())):
             return False
         return not (stack.numbers and any(one.uniform[0] in _OF_CAMERAS for one in every))
 

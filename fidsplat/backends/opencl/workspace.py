@@ -21,6 +21,8 @@ from fidsplat.cameras.raster import RayRaster
 from fidsplat.errors import DeviceError
 
 _LEAST = 16  # bytes; OpenCL has no empty buffers
+_LARGE = 1 << 22  # bytes from which NumPy asks for large pages
+_LINE = 64  # bytes of a line of a cache
 
 
 class DeviceBuffer(cl.Buffer):
@@ -42,6 +44,9 @@ class BufferPool:
     def __init__(self, context: cl.Context, device: cl.Device) -> None:
         self._context = context
         self._device = device
+        # NumPy asks for large pages, PoCL does not: records that lie anywhere are then found without a walk
+        # through the tables of pages
+        self._in_large_pages = bool(device.type & cl.device_type.CPU) and bool(device.host_unified_memory)
         self._buffers: dict[str, cl.Buffer] = {}
         self._contents: dict[str, weakref.ref[np.ndarray]] = {}
         self._spare: dict[str, list[cl.Buffer]] = {}
@@ -142,8 +147,13 @@ class BufferPool:
                 f"most {limit / 2**20:.0f} MiB; use fewer splats or a smaller picture"
             )
         try:
+            if self._in_large_pages and size >= _LARGE:
+                memory = np.empty(size + _LINE, np.uint8)
+                start = -memory.ctypes.data % _LINE
+                flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
+                return DeviceBuffer(self._context, flags, hostbuf=memory[start : start + size])
             return DeviceBuffer(self._context, cl.mem_flags.READ_WRITE, max(size, _LEAST))
-        except cl.Error as error:
+        except (cl.Error, MemoryError) as error:
             raise DeviceError(f"no memory for {name} ({size / 2**20:.0f} MiB): {error}") from error
 
 

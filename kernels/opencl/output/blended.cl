@@ -12,7 +12,7 @@
 //@ composite
     pixel->blended += live & seen->blended;
 //@ store
-        VSTORE(pixel->blended, blended_raw + at);
+        BLOCK_STORE(pixel->blended, blended_raw + at, stride);
 //@ resolve_start
     int blended = 0;
 //@ resolve_sample

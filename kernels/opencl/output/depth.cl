@@ -8,8 +8,8 @@
     pixel->depth = FMA(weight, seen->z, pixel->depth);
     pixel->depth_weight += weight;
 //@ store
-        VSTORE(VSELECT((vfloat)0.0f, pixel->depth, pixel_shown(pixel)), depth_raw + at);
-        VSTORE(VSELECT((vfloat)0.0f, pixel->depth_weight, pixel_shown(pixel)), depth_raw + plane + at);
+        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->depth, pixel_shown(pixel)), depth_raw + at, stride);
+        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->depth_weight, pixel_shown(pixel)), depth_raw + plane + at, stride);
 //@ resolve_start
     float depth = 0, depth_weight = 0;
 //@ resolve_sample

@@ -10,7 +10,7 @@
     pixel->depth_first = VSELECT(pixel->depth_first, seen->z,
                                  live & VMASK(pixel->depth_first == 0.0f) & VMASK(pixel->t - weight <= pixel->first_light));
 //@ store
-        VSTORE(pixel->depth_first, depth_first_raw + at);
+        BLOCK_STORE(pixel->depth_first, depth_first_raw + at, stride);
 //@ resolve_start
     float depth_first = INFINITY;
 //@ resolve_sample

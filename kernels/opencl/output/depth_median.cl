@@ -13,7 +13,7 @@
     pixel->depth_median = VSELECT(pixel->depth_median, seen->z, counts);
     pixel->median_light = VSELECT(pixel->median_light, behind, counts);
 //@ store
-        VSTORE(pixel->depth_median, depth_median_raw + at);
+        BLOCK_STORE(pixel->depth_median, depth_median_raw + at, stride);
 //@ resolve_start
     float depth_medians[SAMPLES * SAMPLES];
     int depth_median_hits = 0;

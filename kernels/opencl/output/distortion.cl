@@ -21,10 +21,10 @@
     pixel->spread_sum = FMA(spread_share, nearer, pixel->spread_sum);
     pixel->spread_squares = FMA(spread_share * nearer, nearer, pixel->spread_squares);
 //@ store
-        VSTORE(pixel->spread_first, distortion_raw + at);
-        VSTORE(pixel->spread_weight, distortion_raw + plane + at);
-        VSTORE(pixel->spread_sum, distortion_raw + 2 * (size_t)plane + at);
-        VSTORE(pixel->spread_squares, distortion_raw + 3 * (size_t)plane + at);
+        BLOCK_STORE(pixel->spread_first, distortion_raw + at, stride);
+        BLOCK_STORE(pixel->spread_weight, distortion_raw + plane + at, stride);
+        BLOCK_STORE(pixel->spread_sum, distortion_raw + 2 * (size_t)plane + at, stride);
+        BLOCK_STORE(pixel->spread_squares, distortion_raw + 3 * (size_t)plane + at, stride);
 //@ resolve_start
     float distortion = 0;
 //@ resolve_sample

@@ -12,7 +12,7 @@
             int fog_x = px, fog_y = py + row;
             pixels[row].fog_slope
 #else
-            int fog_x = x0 + lane, fog_y = y0 + row;
+            int fog_x = x0 + LANE_X(row, lane), fog_y = y0 + LANE_Y(row, lane);
             ((float *)&pixels[row].fog_slope)[lane]
 #endif
                 = -fog_density *
@@ -26,7 +26,7 @@
     pixel->b = FMA(-hidden, seen->b, pixel->b);
     pixel->fogged += hidden;
 //@ store
-        VSTORE(pixel->fogged, fog_raw + at);
+        BLOCK_STORE(pixel->fogged, fog_raw + at, stride);
 //@ resolve_start
     float fogged = 0;
 //@ resolve_sample

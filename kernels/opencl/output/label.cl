@@ -22,8 +22,8 @@
     pixel->label = VSELECT(pixel->label, seen->label, heavier);
     pixel->label_weight = fmax(pixel->label_weight, weight);
 //@ store
-        VSTORE(VSELECT((vfloat)0.0f, pixel->label_weight, pixel_shown(pixel)), label_raw + at);
-        VSTORE(pixel->label, label_id_raw + at);
+        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->label_weight, pixel_shown(pixel)), label_raw + at, stride);
+        BLOCK_STORE(pixel->label, label_id_raw + at, stride);
 //@ resolve_start
     float label_weight = 0;
     int label = -1;

@@ -27,9 +27,9 @@
     pixel->normal_y = FMA(weight, seen->ny, pixel->normal_y);
     pixel->normal_z = FMA(weight, seen->nz, pixel->normal_z);
 //@ store
-        VSTORE(VSELECT((vfloat)0.0f, pixel->normal_x, pixel_shown(pixel)), normal_raw + at);
-        VSTORE(VSELECT((vfloat)0.0f, pixel->normal_y, pixel_shown(pixel)), normal_raw + plane + at);
-        VSTORE(VSELECT((vfloat)0.0f, pixel->normal_z, pixel_shown(pixel)), normal_raw + 2 * plane + at);
+        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->normal_x, pixel_shown(pixel)), normal_raw + at, stride);
+        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->normal_y, pixel_shown(pixel)), normal_raw + plane + at, stride);
+        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->normal_z, pixel_shown(pixel)), normal_raw + 2 * plane + at, stride);
 //@ resolve_start
     float normal_x = 0, normal_y = 0, normal_z = 0;
 //@ resolve_sample

@@ -13,7 +13,7 @@
 //@ composite
     pixel->overdraw += seen->fragments & live;
 //@ store
-        VSTORE(pixel->overdraw, overdraw_raw + at);
+        BLOCK_STORE(pixel->overdraw, overdraw_raw + at, stride);
 //@ resolve_start
     int overdraw = 0;
 //@ resolve_sample

@@ -22,8 +22,8 @@
     pixel->splat_id = VSELECT(pixel->splat_id, seen->splat_id, heavier_id);
     pixel->splat_id_weight = fmax(pixel->splat_id_weight, weight);
 //@ store
-        VSTORE(VSELECT((vfloat)0.0f, pixel->splat_id_weight, pixel_shown(pixel)), splat_id_raw + at);
-        VSTORE(pixel->splat_id, splat_id_index_raw + at);
+        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->splat_id_weight, pixel_shown(pixel)), splat_id_raw + at, stride);
+        BLOCK_STORE(pixel->splat_id, splat_id_index_raw + at, stride);
 //@ resolve_start
     float splat_id_weight = 0;
     int splat_id = -1;

@@ -4,6 +4,29 @@
 // in the product <a, b> = a_u b_u + a_v b_v - h a_D b_D: the row meets it where q >= 0. a x b is affine in y, so that nothing
 // large cancels in q. `slack` is more than rounding can change f by at any sample of the tile, here and where fragments are
 // tested.
+//@ blocks_functions
+#define BLOCKS_PAD 0.01f                // of distances to a dot, in samples
+#define BLOCKS_SLACK 1e-6f              // of the forms' terms: more than rounding, here and where fragments are tested
+//@ blocks_touched
+    // f >= 0 all over a block where its forms are at least so large, D at most so large
+    float conic_h = (float)half_r2;
+//@@ footprint_conic
+    const float half_x = 0.5f * (BLOCK_W - 1), half_y = 0.5f * (BLOCK_H - 1);
+    float far_x = fmax(fabs(left - s->ax), fabs(left + TILE_W - s->ax)), far_y = fmax(fabs(top - s->ay), fabs(top + TILE_H - s->ay));
+#define AROUND(n0, nx, ny) \
+    (fabs(nx) * half_x + fabs(ny) * half_y + BLOCKS_SLACK * (fabs(n0) + fabs(nx) * far_x + fabs(ny) * far_y))
+    float around_u = AROUND(s->nu0, s->nux, s->nuy), around_v = AROUND(s->nv0, s->nvx, s->nvy);
+    float around_d = AROUND(s->d0, s->dx, s->dy);
+    for (int first = 0; first < BLOCKS; first += LANES) {
+        vfloat x = left - s->ax + half_x + VFLOAT(VINDEX % BLOCKS_X * BLOCK_W);
+        vfloat y = top - s->ay + half_y + VFLOAT((first + VINDEX) / BLOCKS_X * BLOCK_H);
+        vfloat u = fmax(fabs(FMA((vfloat)s->nuy, y, FMA((vfloat)s->nux, x, (vfloat)s->nu0))) - around_u, (vfloat)0.0f);
+        vfloat v = fmax(fabs(FMA((vfloat)s->nvy, y, FMA((vfloat)s->nvx, x, (vfloat)s->nv0))) - around_v, (vfloat)0.0f);
+        vfloat d = FMA((vfloat)s->dy, y, FMA((vfloat)s->dx, x, (vfloat)s->d0)) + around_d;
+        vint away = VMASK(FMA(u, u, v * v) > conic_h * (1.0f + BLOCKS_SLACK) * (d * d)) | VMASK(d < 0.0f);
+//@@ blocks_dot
+        touched &= ~(VBITS(away) << first);
+    }
 //@ cells_functions
 #define CONIC_SLACK 2e-5f
 

@@ -13,7 +13,7 @@
             int opaque_x = min(px, width - 1), opaque_y = min(py + row, height - 1);
 #define OPAQUE(type, of) of
 #else
-            int opaque_x = min(x0 + lane, width - 1), opaque_y = min(y0 + row, height - 1);
+            int opaque_x = min(x0 + LANE_X(row, lane), width - 1), opaque_y = min(y0 + LANE_Y(row, lane), height - 1);
 #define OPAQUE(type, of) ((type *)&(of))[lane]
 #endif
             size_t at = (size_t)(opaque_y / SAMPLES) * (width / SAMPLES) + opaque_x / SAMPLES;

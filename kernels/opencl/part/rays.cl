@@ -44,7 +44,7 @@ static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfl
     record.ray_z = anchor_ray[2];
 //@ lanes_start
     size_t ray_stride = (size_t)tiles_x * TILE_W, ray_plane = ray_stride * tiles_y * TILE_H;
-#define RAY(k) VLOAD(rays + (k) * ray_plane + (y0 + row) * ray_stride + x0)
+#define RAY(k) BLOCK_LOAD(rays + (k) * ray_plane + (y0 + TOP(block)) * ray_stride + x0 + LEFT(block), ray_stride)
 //@ group_start
     size_t ray_stride = (size_t)tiles_x * TILE_W, ray_plane = ray_stride * tiles_y * TILE_H;
     float own_rays[3][ROWS];

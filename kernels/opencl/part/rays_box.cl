@@ -31,7 +31,7 @@ static inline vfloat along(wide x, wide y, wide z, vfloat to_x, vfloat to_y, vfl
 //@ ray_cross_arguments
                               , SLOPE(0), SLOPE(1), SLOPE(2), SLOPE(3), SLOPE(4), SLOPE(5)
 //@ lanes_start
-#define SLOPE(k) VLOAD(ray_slopes + (k) * ray_plane + (y0 + row) * ray_stride + x0)
+#define SLOPE(k) BLOCK_LOAD(ray_slopes + (k) * ray_plane + (y0 + TOP(block)) * ray_stride + x0 + LEFT(block), ray_stride)
 //@ group_start
     float own_slopes[6][ROWS];
     for (int row = 0; row < ROWS; row++)

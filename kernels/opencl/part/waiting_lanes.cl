@@ -127,6 +127,6 @@ static inline vint waiting_end(Pixel *pixel, global const Splat *splats, const B
     do {
 //@ pass_end
         alive = 0;
-        for (int row = 0; row < rows; row++)
-            if (VANY(waiting_end(&pixels[row], splats, &constants))) alive |= 1u << row;
+        for (int block = 0; block < BLOCKS; block++)
+            if ((on_picture >> block & 1u) && VANY(waiting_end(&pixels[block], splats, &constants))) alive |= 1u << block;
     } while (alive);

@@ -134,5 +134,6 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
         Pixel *pixel = &pixels[row];
         PIXEL_STORE_BASE(pixel, raw, plane, at);
 //@@ store
+//@@ stored
     }
 }

@@ -1,8 +1,34 @@
-// For CPUs: one work-item draws one tile, a row of LANES pixels at a time; no barriers, no local memory.
+// For CPUs: one work-item draws one tile, a block of LANES pixels at a time; no barriers, no local memory.
 // Index space: one work-item (and work-group) per tile of each view.
 // Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 channels: r, g, b, transmittance) and the outputs' samples, whole tiles.
 // Splats of a tile lie anywhere in memory; the ones to come are fetched ahead.
 #define AHEAD_SPLATS 8
+
+// Blocks of a tile are BLOCK_W x BLOCK_H pixels, of which a small splat fills more than of a row; they are numbered row by row.
+#define BLOCK_H (LANES / BLOCK_W)
+#define BLOCKS_X (TILE_W / BLOCK_W)
+#define BLOCKS (TILE_H / BLOCK_H * BLOCKS_X)          // 32 at most
+#define LEFT(block) ((block) % BLOCKS_X * BLOCK_W)    // in the tile
+#define TOP(block) ((block) / BLOCKS_X * BLOCK_H)
+#define LANE_X(block, lane) (LEFT(block) + (lane) % BLOCK_W)
+#define LANE_Y(block, lane) (TOP(block) + (lane) / BLOCK_W)
+
+// A bit for each block whose columns meet [x0, x1) and whose rows meet [y0, y1), of the tile and not empty.
+static inline uint blocks_within(int x0, int x1, int y0, int y1) {
+    uint columns = (2u << (x1 - 1) / BLOCK_W) - (1u << x0 / BLOCK_W);
+    uint rows = (2u << ((y1 - 1) / BLOCK_H * BLOCKS_X + BLOCKS_X - 1)) - (1u << y0 / BLOCK_H * BLOCKS_X);
+    return columns * (0xFFFFFFFFu / ((1u << BLOCKS_X) - 1u)) & rows;
+}
+
+//@@ blocks_functions
+// Which blocks of the tile at (left, top) the splat can touch. Conservative; the test of each pixel decides.
+static inline uint touched_blocks(const Splat *s, int left, int top, wide half_r2, wide filter) {
+    int x0 = max(s->x0 - left, 0), x1 = min(s->x1 - left, TILE_W), y0 = max(s->y0 - top, 0), y1 = min(s->y1 - top, TILE_H);
+    if (x0 >= x1 || y0 >= y1) return 0;
+    uint touched = blocks_within(x0, x1, y0, y1);
+//@@ blocks_touched
+    return touched;
+}
 
 kernel void blend(
 //@@ arguments blend
@@ -13,13 +39,12 @@ kernel void blend(
     uint number = tile / (uint)(tiles_x * tiles_y), here = tile - number * (uint)(tiles_x * tiles_y);
     int x0 = (int)(here % (uint)tiles_x) * TILE_W, y0 = (int)(here / (uint)tiles_x) * TILE_H;
 
-    Pixel pixels[TILE_H];
-    for (int row = 0; row < TILE_H; row++) pixel_start(&pixels[row]);
+    Pixel pixels[BLOCKS];
+    for (int block = 0; block < BLOCKS; block++) pixel_start(&pixels[block]);
 //@@ lanes_start
 //@@ pixels_start
-    // rows that still let light through; those below the picture never do
-    int rows = min(height - y0, TILE_H);
-    uint alive = rows == 32 ? 0xFFFFFFFFu : (1u << rows) - 1u;
+    const uint on_picture = blocks_within(0, min(width - x0, TILE_W), 0, min(height - y0, TILE_H));
+    uint alive = on_picture;      // those that still let light through
 
     uint base = starts[band_first];
 //@@ pass
@@ -28,32 +53,30 @@ kernel void blend(
         FETCH_AHEAD((global const char *)(splats + lists[min(k + AHEAD_SPLATS, end - 1)]) + 64);
         const Splat s = splats[lists[k]];
         wide half_r2 = s.log_opacity - constants.log_cut;
-        int first = max(s.y0 - y0, 0), last = min(s.y1 - y0, TILE_H);
-        vfloat x = (vfloat)(float)(x0 - s.ax) + VLANE;
-        vfloat nu_x = FMA((vfloat)s.nux, x, (vfloat)s.nu0);
-        vfloat nv_x = FMA((vfloat)s.nvx, x, (vfloat)s.nv0);
-        vfloat d_x = FMA((vfloat)s.dx, x, (vfloat)s.d0);
-        for (int row = first; row < last; row++) {
-            if (!(alive >> row & 1u)) continue;
-            wide y = (wide)(y0 + row - s.ay);
+        for (uint touched = alive & touched_blocks(&s, x0, y0, half_r2, constants.filter); touched != 0; touched &= touched - 1) {
+            int block = 31 - clz((int)(touched & -touched));
+            vfloat x = (float)(x0 + LEFT(block) - s.ax) + BLOCK_X, y = (float)(y0 + TOP(block) - s.ay) + BLOCK_Y;
+            vfloat nu_x = FMA((vfloat)s.nux, x, (vfloat)s.nu0);
+            vfloat nv_x = FMA((vfloat)s.nvx, x, (vfloat)s.nv0);
+            vfloat d_x = FMA((vfloat)s.dx, x, (vfloat)s.d0);
             Crossing c = cross_row(&s, nu_x, nv_x, d_x, y, half_r2);
 //@@ cross
             vfloat screen;
             vint mask = fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
 //@@ mask
             if (!VANY(mask)) continue;
-            pixel_blend(&pixels[row], &s, c, mask, screen, &constants
+            pixel_blend(&pixels[block], &s, c, mask, screen, &constants
 //@@ blend_arguments
             );
-            if (!VANY(pixel_unfinished(&pixels[row], &constants))) alive &= ~(1u << row);
+            if (!VANY(pixel_unfinished(&pixels[block], &constants))) alive &= ~(1u << block);
         }
     }
 //@@ pass_end
 
     size_t stride = (size_t)tiles_x * TILE_W, top = (size_t)number * tiles_y * TILE_H;
-    for (int row = 0; row < TILE_H; row++) {
-        size_t at = (top + y0 + row) * stride + x0;
-        Pixel *pixel = &pixels[row];
+    for (int block = 0; block < BLOCKS; block++) {
+        size_t at = (top + y0 + TOP(block)) * stride + x0 + LEFT(block);
+        Pixel *pixel = &pixels[block];
         PIXEL_STORE_BASE(pixel, raw, plane, at);
 //@@ store
     }

@@ -1,4 +1,4 @@
-// For CPUs: one work-item takes a tile back, a row of LANES pixels at a time, as schedule/lanes.cl draws it.
+// For CPUs: one work-item takes a tile back, a row of LANES pixels at a time.
 // Index space: one work-item (and work-group) per tile.
 // Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, splat_slots, and the images' derivatives.
 // Writes: moments, a slot for each splat of the tile; tile_sums. Uses up: checkpoints.
@@ -40,9 +40,9 @@ static inline uint walk_splat(const Splat *s, const Tile *tile, Pixel *pixels, u
     for (int row = first; row < last; row++) {
         if (!(alive >> row & 1u)) continue;
         wide y = (wide)(tile->y0 + row - s->ay);
-        Crossing c = cross_row(s, columns.nu_x, columns.nv_x, columns.d_x, y, columns.half_r2);
+        Crossing c = cross_row(s, columns.nu_x, columns.nv_x, columns.d_x, (vfloat)y, columns.half_r2);
         vfloat screen;
-        vint mask = fragment_mask(s, c, columns.x, y, columns.half_r2, constants->filter, &screen);
+        vint mask = fragment_mask(s, c, columns.x, (vfloat)y, columns.half_r2, constants->filter, &screen);
         if (!VANY(mask)) continue;
         vfloat opacity = fragment_opacity(s, fragment_half_rho(s, c, 1.0f / c.d, screen), constants->ceiling);
         vfloat light = pixels[row].t;
@@ -64,9 +64,9 @@ static inline Moments back_splat(const Splat *s, const Tile *tile, const Tape *t
     for (uint rows = tape->rows[place]; rows != 0; rows &= rows - 1) {
         int row = 31 - clz(rows & -rows);
         wide y = (wide)(tile->y0 + row - s->ay);
-        Crossing c = cross_row(s, columns.nu_x, columns.nv_x, columns.d_x, y, columns.half_r2);
+        Crossing c = cross_row(s, columns.nu_x, columns.nv_x, columns.d_x, (vfloat)y, columns.half_r2);
         vfloat screen;
-        fragment_mask(s, c, columns.x, y, columns.half_r2, constants->filter, &screen);
+        fragment_mask(s, c, columns.x, (vfloat)y, columns.half_r2, constants->filter, &screen);
         const Geometry g = geometry_of(s, c, columns.nu_x, columns.nv_x, y, screen);
         vfloat opacity = tape->opacity[place][row], weight = tape->light[place][row] * opacity;
         vfloat by_log = take_back(&losses[row], fragment_worth(s, &losses[row], &g), weight, opacity);

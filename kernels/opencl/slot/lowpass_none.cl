@@ -1,6 +1,6 @@
 // No low-pass: the exact splat.
 //@ fragment_mask
-static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, wide y, wide half_r2, wide filter,
+static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, vfloat y, wide half_r2, wide filter,
                                  vfloat *screen) {
     return c.inside;
 }

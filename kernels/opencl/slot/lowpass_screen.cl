@@ -33,6 +33,12 @@
                 low = fmin(low, (float)s->dot_x - half_chord);
                 high = fmax(high, (float)s->dot_x + half_chord);
             }
+//@ blocks_dot
+        if (HAS_DOT(s)) {
+            vfloat dot_x = fmax(fabs(x - s->dot_x) - half_x - BLOCKS_PAD, (vfloat)0.0f);
+            vfloat dot_y = fmax(fabs(y - s->dot_y) - half_y - BLOCKS_PAD, (vfloat)0.0f);
+            away &= VMASK(FMA(dot_x, dot_x, dot_y * dot_y) * filter > half_r2);
+        }
 //@ fragment_mask
 // Vectors of pixels pass over a dot that is far away; to single pixels the question costs what it saves.
 #if LANES > 1
@@ -41,13 +47,13 @@
 #define HAS_DOT(s) true
 #endif
 
-static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, wide y, wide half_r2, wide filter,
+static inline vint fragment_mask(const Splat *s, Crossing c, vfloat x, vfloat y, wide half_r2, wide filter,
                                  vfloat *screen) {
     *screen = 0.0f;
     if (!HAS_DOT(s)) return c.inside;
     vfloat ex = x - s->dot_x;
-    wide ey = y - s->dot_y;
-    *screen = FMA(ex, ex, (vfloat)(ey * ey)) * filter;
+    vfloat ey = y - s->dot_y;
+    *screen = FMA(ex, ex, ey * ey) * filter;
     return c.inside | VMASK(*screen <= half_r2);
 }
 //@ fragment_half_rho

@@ -9,7 +9,7 @@
             int opaque_x = px, opaque_y = py + row;
             pixels[row].opaque_z
 #else
-            int opaque_x = x0 + lane, opaque_y = y0 + row;
+            int opaque_x = x0 + LANE_X(row, lane), opaque_y = y0 + LANE_Y(row, lane);
             ((float *)&pixels[row].opaque_z)[lane]
 #endif
                 = opaque_x < width && opaque_y < height
