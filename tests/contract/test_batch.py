@@ -62,10 +62,17 @@ def test_poses_take_the_place_of_the_cameras_own(renderer, cloud):
 
 
 def test_groups_move_in_each_view_by_themselves(renderer, cloud):
+    """About the world's origin, wherever the cloud has its own."""
+    origin = np.array([0.5, -0.25, 2.0])
+    own = fs.SplatCloud(
+        *((cloud.means - origin).astype(np.float32), cloud.quats, cloud.scales, cloud.opacities),
+        colors=cloud.colors, labels=cloud.labels, origin=origin,
+    )  # fmt: skip
     groups = {1: POSES, 2: POSES[::-1]}
-    batch = renderer.render_batch(cloud, fs.Capture(CAMERA, ALL_OUTPUTS), groups=groups)
     motions = [fs.Motion(groups={label: moved(each[k]) for label, each in groups.items()}) for k in range(3)]
-    assert_same(batch, [renderer.render(cloud, CAMERA, ALL_OUTPUTS, motion=motion) for motion in motions])
+    for each in (cloud, own):
+        batch = renderer.render_batch(each, fs.Capture(CAMERA, ALL_OUTPUTS), groups=groups)
+        assert_same(batch, [renderer.render(each, CAMERA, ALL_OUTPUTS, motion=motion) for motion in motions])
 
 
 def test_masked_views_are_not_drawn(renderer, cloud):

@@ -105,6 +105,17 @@ def test_rims_that_bulge_behind_a_fisheye(renderer, name):
     assert (alpha > 0.6).any()
 
 
+def test_a_rim_ahead_of_a_disk_that_reaches_behind_the_camera(renderer):
+    """A floor, half of it behind: its far end lies between two corners of the polygon that bounds it."""
+    c, s = math.cos(math.pi / 16), math.sin(math.pi / 16)
+    turn = np.array([[c, -s, 0], [0, 0, -1], [s, c, 0]])
+    floor = fs.SplatCloud([(0, 0.5, 0.3)], [matrix_to_quaternion(turn)], [(1, 1)], [1.0], colors=[(1, 1, 1)])
+    camera = fs.Camera.pinhole(80, 60, 8000.0, 8000.0, 40.0, -3050.0)
+    alpha = assert_agrees(renderer, floor, camera, quality=TO_THE_RIM)["alpha"]
+    assert (alpha > 0.6).any()
+    assert (alpha == 0).any()
+
+
 @pytest.mark.parametrize(("seed", "depth", "scale"), [(6, 4.0, (0.1, 3.0)), (18, 1.0, (0.05, 0.5))])
 def test_rims_in_a_panorama(renderer, seed, depth, scale):
     cloud = random_splats(60, seed, depth=(-depth, depth), scale=scale)

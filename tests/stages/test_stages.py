@@ -8,11 +8,12 @@ from agreement import ALL_OUTPUTS, random_splats
 
 import fidsplat as fs
 from fidsplat.backends.planes import PlaneTable
-from fidsplat.backends.prepare import prepare
+from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.probing import Reshapes
 from fidsplat.backends.view import View
 from fidsplat.effects import select
 from fidsplat.hard_cases.agreement import out_of_order
+from fidsplat.views import views_of
 
 CULLED = np.uint32(0xFFFFFFFF)
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
@@ -193,6 +194,20 @@ def test_the_box_of_a_record_holds_all_that_the_splat_touches(backend, lowpass):
     assert seen > 1000
 
 
+def test_the_bounds_of_a_box_are_its_corners(backend):
+    """And half a sample around them, where it fades."""
+    box = fs.SplatCloud([(0.2, 0.1, 3)], [(1, 0, 0, 0)], [(0.3, 0.2)], [1.0], colors=[(1, 1, 1)]).with_boxes()
+    features, view = prepare(box, fs.Capture(CAMERA, ALL_OUTPUTS))
+    pipeline = backend.pipeline(features)
+    bounds = backend.probe().boxes(pipeline, pipeline.trace(backend.upload(box), view))[0]
+    low, high = (view.rotation @ (x, y, 3) + view.translation for x, y in ((-0.1, -0.1), (0.5, 0.3)))
+    wanted = [
+        *(view.focal_x * corner[0] / corner[2] + view.center_x for corner in (low, high)),
+        *(view.focal_y * corner[1] / corner[2] + view.center_y for corner in (low, high)),
+    ]
+    assert np.abs(bounds - wanted).max() <= 1.5
+
+
 def test_layers_are_the_same_in_every_tile_size_and_schedule(backend, renderer):
     """Four planes whose layers wait for one another, and splats of none."""
     planes = np.random.default_rng(9).choice([-1, -1, -1, 0, 1, 2, 3], 300)
@@ -247,6 +262,21 @@ def test_both_ways_of_listing_give_the_same_lists(backend, scale):
         different += len(set(theirs) ^ set(ours))
     assert different <= 0.05 * len(ordered["lists"])
     assert np.array_equal(tiled["rgb"], ordered["rgb"])
+
+
+@pytest.mark.parametrize("lists", ["ordered", "tiled"])
+def test_views_of_a_batch_are_listed_apart(backend, lists):
+    cloud = random_splats(2500, seed=5, scale=(1e-3, 0.5))
+    quality = fs.Quality(lowpass="none")
+    captures = [
+        fs.Capture(fs.Camera.look_at(161, 117, 1.0, (x, 0.0, -0.1), (0.0, 0.0, 3.0)), ALL_OUTPUTS, quality)
+        for x in (-1.0, 0.5)
+    ]
+    features, batch = prepare_batch(cloud, views_of(captures))
+    pipeline, resident = backend.pipeline(features, listing(backend, lists)), backend.upload(cloud)
+    pictures = pipeline.render_batch(resident, batch).read("rgb")
+    for picture, capture in zip(pictures, captures, strict=True):
+        assert np.array_equal(picture, pipeline.trace(resident, prepare(cloud, capture)[1])["rgb"])
 
 
 def test_lists_that_outgrow_their_buffers_are_made_again(backend):

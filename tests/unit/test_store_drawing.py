@@ -6,6 +6,7 @@ import math
 import pickle
 
 import numpy as np
+import pyopencl as cl
 import pytest
 from test_store import contents
 
@@ -193,6 +194,15 @@ def test_a_device_keeps_the_chunks_that_it_was_sent(stores, tmp_path, monkeypatc
     placed = fs.Store(fs.place_store(store, tmp_path / "p.fss", [np.eye(4), rigid_matrix((0, 0, 0.5))]))
     renderer.render(renderer.upload(placed), look())
     assert len(sent) == len(set(sent)) <= store.chunks
+
+
+def test_a_part_of_what_is_gathered_may_begin_within_a_chunk(stores):
+    backend, scene = fs.Renderer("opencl").backend, Streamed([stores["disks"]])
+    gathered = backend.chunk_cache(scene, scene.largest_chunk).gather(scene.chunks(scene.everything(), True))
+    gathered.streamed = True
+    found = np.empty(130, np.float32)
+    cl.enqueue_copy(backend.queue, found, gathered.part("opacities", 70, 200))
+    assert np.array_equal(found, stores["disks"].cloud().opacities[70:200])
 
 
 def test_a_device_without_room_for_a_view_is_sent_its_chunks_again(stores, monkeypatch):
