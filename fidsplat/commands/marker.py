@@ -143,6 +143,8 @@ class Marker:
             rows.append(("written", file))
         if file is not None and made.mixture == "exact":
             rows.append(("", f"as {len(made.gaussians)} Gaussians (fitted): a PLY file has no boxes"))
+        if file is not None and made.mixture == "facets":
+            rows.append(("", "for --quality order=pixel: by the depth of centres they hide each other"))
         print_table(console(False), made.spec, ("", ""), rows)
         return 0
 

@@ -36,7 +36,8 @@ def assert_well_formed(names, shapes=SHAPES):
             lines = [line.strip(" ,") for line in heads[kernel].splitlines() if line and line[0] != "#"]
             declared = [one.text.replace("wide", source.scalars.wide) for one in arguments]
             assert lines == declared, kernel
-        taken = {one.name for one in source.arguments["resolve"]}
+        # GPUs resolve as they blend
+        taken = {one.name for one in source.arguments.get("resolve", source.arguments["blend"])}
         assert {f"{output.name}_out" for output in features.images} <= taken
         assert {one.name for one, _ in source.samples} <= taken
         assert {one.name for one, _ in source.samples} <= {one.name for one in source.arguments["blend"]}

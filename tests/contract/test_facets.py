@@ -39,6 +39,17 @@ def test_facets_are_opaque_and_clean_to_the_edge_of_every_module(renderer):
     assert depth[0, 0] < 0 < depth[len(depth) // 2, len(depth) // 2]
 
 
+def test_a_file_of_facets_is_opaque_and_clean_by_depth_at_each_pixel(renderer, tmp_path):
+    made = fs.marker("aruco:4x4_50:7", mixture="facets")
+    fs.save_ply(made.gaussians, tmp_path / "facets.ply")
+    read = fs.load_ply(tmp_path / "facets.ply")
+    quality = fs.Quality(order="pixel")
+    frame = renderer.render(read, frontal(made, 8), ALL_OUTPUTS, quality, GREY)
+    error = frame["rgb"][..., 0] - np.kron(1.0 - made.grid, np.ones((8, 8)))
+    assert frame["alpha"].min() > 0.999
+    assert -10 * math.log10(float(np.mean(error**2))) > 35
+
+
 def test_facets_are_read_from_aside(renderer):
     made = fs.marker("qr-v1-L:splats", mixture="facets")
     angle = math.radians(65)
