@@ -1,4 +1,4 @@
-"""`pytest --certificates FILE`: what the reference leaves open, over all pictures that a run compares.
+"""`pytest --certificates=FILE`: what the reference leaves open, over all pictures that a run compares.
 
 A certificate says what float32 may change in a pixel's colour (fidsplat/backends/reference/error_bounds.py):
 where it is large, a test sees little there. A plugin of pytest, which conftest.py names.

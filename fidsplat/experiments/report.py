@@ -274,7 +274,8 @@ def _behind(table: Frame) -> Frame:
     """How far reading ends below that of the marker that is not trained: of each category the training that
     reads furthest."""
     ours, free = (
-        pd.to_numeric(table[f"read to, {what}"], errors="coerce") for what in ("ours", "training-free")
+        pd.Series(pd.to_numeric(table[f"read to, {what}"], errors="coerce"))
+        for what in ("ours", "training-free")
     )
     kinds = table["marker, views"].str.rpartition(", ")
     rows = pd.DataFrame({"marker": kinds[0], "views": kinds[2], "behind": free - ours}).dropna()
