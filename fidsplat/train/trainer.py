@@ -107,8 +107,8 @@ class Trainer:
         backend = self.renderer.backend
         if not isinstance(backend, Differentiates):
             raise DeviceError(
-                f"{self.renderer.device.name} has no gradients to train by; use device='opencl', 'warp' or "
-                "'reference'"
+                f"{self.renderer.device.name} has no gradients to train by; use device='opencl', 'warp:cpu' "
+                "or 'reference'"
             )
         self._differentiate = backend.differentiate
         self._captures = [self._capture(view) for view in dataset.views]

@@ -126,7 +126,7 @@ def make_blend_backward(
     on_gpu, threads: as make_blend; losses: outputs with derivatives."""
     made = make_fragments(effects, outputs, losses)
     By, Samples, Loss, Moments = made.By, made.Samples, made.Loss, made.Moments
-    load, box_of, loss_at = made.load, made.box_of, made.loss_at
+    read, box_of, loss_at = made.read, made.box_of, made.loss_at
     opacity_at, back = made.opacity_at, made.back
     numbers = {"CHUNK": CHUNK, "WARPS": max(threads // 32, 1), "FIELDS": wp.types.type_size(Moments)}
 
@@ -215,7 +215,7 @@ def make_blend_backward(
             for place in range(wp.min(CHUNK, end - first)):
                 box = box_of(lines, lists[first + place])
                 if box[0] < left + BLOCK_W and box[1] > left and box[2] < top + BLOCK_H and box[3] > top:
-                    s = load(wp.uint64(0), lines, lists, first + place, 0, view)
+                    s = read(lines, lists, first + place, view)
                     light = beyond(light, opacity_at(s, x, y, light, view))
             chunks += 1
 
@@ -230,7 +230,7 @@ def make_blend_backward(
                 lights[place] = light
                 box = box_of(lines, lists[first + place])
                 if box[0] < left + BLOCK_W and box[1] > left and box[2] < top + BLOCK_H and box[3] > top:
-                    s = load(wp.uint64(0), lines, lists, first + place, 0, view)
+                    s = read(lines, lists, first + place, view)
                     opacity = opacity_at(s, x, y, light, view)
                     light = beyond(light, opacity)
                     opacities[place] = opacity
@@ -240,7 +240,7 @@ def make_blend_backward(
                 drawn = opacities[place] > 0.0
                 values = Moments()
                 if any_of_warp(drawn):
-                    s = load(wp.uint64(0), lines, lists, first + place, 0, view)
+                    s = read(lines, lists, first + place, view)
                     if drawn:
                         values, loss = back(
                             s, lists[first + place], x, y, lights[place], opacities[place], loss, log_ceiling,
@@ -275,7 +275,7 @@ def make_blend_backward(
         view: View,
     ) -> int:
         """Lets the splat lists[k] take its light, and keeps its fragments; how many samples stay alive."""
-        s = load(wp.uint64(0), lines, lists, k, 0, view)
+        s = read(lines, lists, k, view)
         area = reach(lines, lists[k], x0, y0, view)
         left = alive
         for row in range(area[2], area[3]):
@@ -343,7 +343,7 @@ def make_blend_backward(
                     walk(first + place, place, 0, x0, y0, state_first, lines, lists, lights, fragments, view)
             while walked > first:
                 walked -= 1
-                s = load(wp.uint64(0), lines, lists, walked, 0, view)
+                s = read(lines, lists, walked, view)
                 touched = reach(lines, lists[walked], x0, y0, view)
                 total = Moments()
                 for row in range(touched[2], touched[3]):

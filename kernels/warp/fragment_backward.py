@@ -33,7 +33,7 @@ def moments_of(effects: tuple[str, ...], outputs: tuple[str, ...]) -> tuple[str,
 
 @cache
 def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: tuple[str, ...]):
-    """By (a struct of the derivatives by the images named in `losses`), Samples, Splat, Loss, Moments; load,
+    """By (a struct of the derivatives by the images named in `losses`), Samples, Splat, Loss, Moments; read,
     loss_at, opacity_at, back. effects and outputs: as blending has them.
     """
     splats, crossing = make_splat(effects, outputs), make_crossing(effects, outputs)
@@ -241,7 +241,7 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
         Splat=Splat,
         Loss=Loss,
         Moments=Moments,
-        load=splats.load,
+        read=splats.read,
         box_of=box_of,
         loss_at=loss_at,
         opacity_at=opacity_at,

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .common import View, struct_of
+from .common import View, line_of, struct_of
 from .ellipsoids import EXACT
 from .records import BOXES, Layout
 from .staging import make_staging
@@ -14,12 +14,11 @@ from .staging import make_staging
 @cache
 def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
     """Splat; load, of the splat lists[first + which]; and `staging`, what brings splats to the threads of a
-    GPU block. There `load` finds what was staged; elsewhere it reads records where they lie, whatever the
-    pool.
+    GPU block. There `load` finds what was staged, and nothing else; on the CPU it reads records where they
+    lie, whatever the pool. read, of the splat lists[k], finds its record where it lies, on every device.
     """
     layout = Layout(effects, outputs)
-    staging = make_staging(layout)
-    staged_line = staging.line
+    each, staging = layout.lines, make_staging(layout)
     screen, bent, parallel = (name in effects for name in ("lowpass_screen", "rays", "camera_orthographic"))
     edged = not bent and any(name in effects for name in BOXES)
     flagged = bent and "footprint_mixed" in effects
@@ -42,37 +41,59 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
     bulge_line, bulge_lane = layout.place("bulge")
     ray_line, plane_line = layout.place("nuz")[0], layout.place("plane_z0")[0]
 
+    def made_of(line):
+        """`load` with a function that finds the record's lines."""
+
+        @wp.func
+        def load(
+            pool: wp.uint64,
+            lines: wp.array(dtype=wp.vec4),
+            lists: wp.array(dtype=wp.int32),
+            first: int,
+            which: int,
+            view: View,
+        ):
+            s = Splat()
+            s.u = line(pool, lines, lists, first, which, 0)
+            s.v = line(pool, lines, lists, first, which, 1)
+            s.d = line(pool, lines, lists, first, which, 2)
+            s.c = line(pool, lines, lists, first, which, 3)
+            if wp.static(screen):
+                dot = line(pool, lines, lists, first, which, dot_line)
+                s.dot_x = dot[dot_lane]
+                s.dot_y = dot[dot_y_lane]
+            if wp.static(edged):
+                s.edges = line(pool, lines, lists, first, which, edge_line)
+            if wp.static(flagged):
+                s.boxed = line(pool, lines, lists, first, which, boxed_line)[boxed_lane]
+            if wp.static(thick):
+                s.bulge = line(pool, lines, lists, first, which, bulge_line)[bulge_lane]
+            if wp.static(bent):
+                s.w = line(pool, lines, lists, first, which, ray_line)
+                rest = line(pool, lines, lists, first, which, ray_line + 1)
+                s.origin = wp.vec3(s.w[3], rest[0], rest[1])
+            if wp.static(parallel):
+                s.plane = line(pool, lines, lists, first, which, plane_line)
+            s.half_r2 = s.u[3] - view.log_cut
+            return s
+
+        return load
+
     @wp.func
-    def load(
+    def lying(
         pool: wp.uint64,
         lines: wp.array(dtype=wp.vec4),
         lists: wp.array(dtype=wp.int32),
         first: int,
         which: int,
-        view: View,
-    ):
-        s = Splat()
-        s.u = staged_line(pool, lines, lists, first, which, 0)
-        s.v = staged_line(pool, lines, lists, first, which, 1)
-        s.d = staged_line(pool, lines, lists, first, which, 2)
-        s.c = staged_line(pool, lines, lists, first, which, 3)
-        if wp.static(screen):
-            dot = staged_line(pool, lines, lists, first, which, dot_line)
-            s.dot_x = dot[dot_lane]
-            s.dot_y = dot[dot_y_lane]
-        if wp.static(edged):
-            s.edges = staged_line(pool, lines, lists, first, which, edge_line)
-        if wp.static(flagged):
-            s.boxed = staged_line(pool, lines, lists, first, which, boxed_line)[boxed_lane]
-        if wp.static(thick):
-            s.bulge = staged_line(pool, lines, lists, first, which, bulge_line)[bulge_lane]
-        if wp.static(bent):
-            s.w = staged_line(pool, lines, lists, first, which, ray_line)
-            rest = staged_line(pool, lines, lists, first, which, ray_line + 1)
-            s.origin = wp.vec3(s.w[3], rest[0], rest[1])
-        if wp.static(parallel):
-            s.plane = staged_line(pool, lines, lists, first, which, plane_line)
-        s.half_r2 = s.u[3] - view.log_cut
-        return s
+        line: int,
+    ) -> wp.vec4:
+        return line_of(lines, lists[first + which] * each + line)
 
-    return SimpleNamespace(Splat=Splat, load=load, staging=staging)
+    load_lying = made_of(lying)
+
+    @wp.func
+    def read(lines: wp.array(dtype=wp.vec4), lists: wp.array(dtype=wp.int32), k: int, view: View):
+        return load_lying(wp.uint64(0), lines, lists, k, 0, view)
+
+    return SimpleNamespace(Splat=Splat, load=made_of(staging.line), read=read, staging=staging)

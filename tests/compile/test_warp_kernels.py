@@ -124,7 +124,6 @@ def started():
         pytest.param(lambda: blending("rays", *RECORD, "rays_length"), id="blend-rays", marks=LONG),
         pytest.param(lambda: blending("camera_orthographic", *RECORD), id="blend-parallel", marks=LONG),
         pytest.param(lambda: blending("lowpass_screen", "stop_exclusive", outputs=()), id="blend-exclusive"),
-        pytest.param(lambda: blending_back("stop_exclusive", "arithmetic_fast"), id="blend-backward"),
         pytest.param(lambda: projecting_back(16), id="project-backward"),
         pytest.param(lambda: made("blend_backward.make_slots", True), id="slots"),
         pytest.param(lambda: made("column_sums.add_rows"), id="sums"),
@@ -169,6 +168,12 @@ def test_records_move_as_whole_lines(tmp_path):
     blend = compiled(blending(*RECORD, outputs=NORMAL), tmp_path / "blend", assembly=True)
     assert blend.count("ld.shared.v4") >= 5
     assert "vote.sync.ballot" in blend
+
+
+def test_derivatives_read_records_where_they_lie(tmp_path):
+    """They stage none: what `staging.line` finds in shared memory then is not a record."""
+    assert "staged" in compiled(blending(outputs=()), tmp_path / "blend")
+    assert "staged" not in compiled(blending_back("stop_exclusive", "arithmetic_fast"), tmp_path / "back")
 
 
 def test_a_record_grows_by_what_is_asked_for():
