@@ -16,13 +16,13 @@ import pyopencl as cl
 
 from fidsplat.backends.base import DeviceInfo
 from fidsplat.backends.opencl.memory_plan import PAIR
+from fidsplat.backends.opencl.pages import large_pages
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.cameras.raster import RayRaster
 from fidsplat.errors import DeviceError
 
 _LEAST = 16  # bytes; OpenCL has no empty buffers
-_LARGE = 1 << 22  # bytes from which NumPy asks for large pages
-_LINE = 64  # bytes of a line of a cache
+_LARGE = 1 << 22  # bytes from which large pages are asked for
 
 
 class DeviceBuffer(cl.Buffer):
@@ -44,8 +44,7 @@ class BufferPool:
     def __init__(self, context: cl.Context, device: cl.Device) -> None:
         self._context = context
         self._device = device
-        # NumPy asks for large pages, PoCL does not: records that lie anywhere are then found without a walk
-        # through the tables of pages
+        # records that lie anywhere are found in large pages without a walk through the tables of pages
         self._in_large_pages = bool(device.type & cl.device_type.CPU) and bool(device.host_unified_memory)
         self._buffers: dict[str, cl.Buffer] = {}
         self._contents: dict[str, weakref.ref[np.ndarray]] = {}
@@ -147,14 +146,21 @@ class BufferPool:
                 f"most {limit / 2**20:.0f} MiB; use fewer splats or a smaller picture"
             )
         try:
+            buffer = DeviceBuffer(self._context, cl.mem_flags.READ_WRITE, max(size, _LEAST))
             if self._in_large_pages and size >= _LARGE:
-                memory = np.empty(size + _LINE, np.uint8)
-                start = -memory.ctypes.data % _LINE
-                flags = cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR
-                return DeviceBuffer(self._context, flags, hostbuf=memory[start : start + size])
-            return DeviceBuffer(self._context, cl.mem_flags.READ_WRITE, max(size, _LEAST))
-        except (cl.Error, MemoryError) as error:
+                self._ask_for_large_pages(buffer)
+            return buffer
+        except cl.Error as error:
             raise DeviceError(f"no memory for {name} ({size / 2**20:.0f} MiB): {error}") from error
+
+    def _ask_for_large_pages(self, buffer: cl.Buffer) -> None:
+        """The memory stays the device's, which keeps it until no kernel needs it; this is advice."""
+        queue = cl.CommandQueue(self._context)  # of its own: what others hold is not waited for
+        memory, _ = cl.enqueue_map_buffer(
+            queue, buffer, cl.map_flags.WRITE, 0, (buffer.size,), np.dtype(np.uint8)
+        )
+        with memory.base:
+            large_pages(memory.ctypes.data, memory.nbytes)
 
 
 class Workspace:

@@ -1,0 +1,49 @@
+"""Large pages: advice for memory that stays the device's own."""
+
+import mmap
+import sys
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+import fidsplat as fs
+from fidsplat.backends.opencl import workspace
+from fidsplat.backends.opencl.pages import large_pages
+
+
+@pytest.mark.skipif(not hasattr(mmap, "MADV_HUGEPAGE"), reason="the system has no such advice")
+def test_advice_leaves_contents_as_they_are():
+    memory = np.arange(1 << 20, dtype=np.int64)
+    large_pages(memory.ctypes.data, memory.nbytes)
+    assert np.array_equal(memory, np.arange(1 << 20))
+    assert not large_pages(memory.ctypes.data + 8, mmap.PAGESIZE)  # no whole page
+
+
+def test_large_buffers_are_the_devices_own(monkeypatch):
+    """Memory of the host's would be gone with the Python object, though a kernel still writes there."""
+    asked = []
+    monkeypatch.setattr(workspace, "large_pages", lambda address, size: asked.append((address, size)))
+    pool = fs.Renderer("opencl:cpu").backend.pool
+    small, large = pool.fresh("small", 1 << 12), pool.fresh("large", (1 << 22) + 20)
+    for buffer in (small, large):
+        assert not buffer.flags & cl.mem_flags.USE_HOST_PTR
+    assert [size for _, size in asked] == [large.size]
+    assert all(address > 0 for address, _ in asked)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="counts pages by /proc/self/smaps")
+def test_a_large_buffer_lies_in_large_pages():
+    with open("/sys/kernel/mm/transparent_hugepage/enabled", encoding="ascii") as file:
+        if "[never]" in file.read():
+            pytest.skip("the system gives no large pages")
+    backend = fs.Renderer("opencl:cpu").backend
+    queue, size = cl.CommandQueue(backend.context), 64 << 20
+
+    def in_large_pages():
+        with open("/proc/self/smaps", encoding="ascii") as file:
+            return sum(int(line.split()[1]) for line in file if line.startswith("AnonHugePages:")) << 10
+
+    before, buffer = in_large_pages(), backend.pool.fresh("large", size)
+    cl.enqueue_fill_buffer(queue, buffer, np.zeros(1, np.uint32), 0, size).wait()
+    assert in_large_pages() - before > size // 2
