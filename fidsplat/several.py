@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.cameras import Camera
-from fidsplat.capture import Capture
+from fidsplat.capture import Capture, output_names
 from fidsplat.errors import InputError
 from fidsplat.frame import Frame
 from fidsplat.quality import Quality
@@ -70,14 +70,12 @@ class SeveralDevices:
     ) -> Frame:
         """Draw one picture. Arguments and errors as those of `Renderer.render`; scene: also what `upload` has
         returned."""
-        given = scene if isinstance(scene, Sequence) else self.upload(scene)
-        if len(given) != len(self.renderers):
-            raise InputError(f"a scene on {len(given)} devices was given to {len(self.renderers)}")
+        given = self._given(scene)
         camera = capture.camera if isinstance(capture, Capture) else capture
         camera = camera or given[0].capture.camera
         if camera is None:
             raise InputError("no camera; give a Camera, or a Capture with one")
-        names = None if outputs is None else tuple(outputs)
+        names = None if outputs is None else output_names(outputs)
         bands = self._bands(camera.height)
 
         def draw(number: int) -> tuple[Frame, float]:
@@ -99,8 +97,8 @@ class SeveralDevices:
     ) -> Iterator[Frame]:
         """Draw many pictures, each whole by one device, in their order: device k draws pictures k, k + n and
         so on, of n devices. Arguments and errors as those of `render`."""
-        given = scene if isinstance(scene, Sequence) else self.upload(scene)
-        names, waiting = None if outputs is None else tuple(outputs), []
+        given = self._given(scene)
+        names, waiting = None if outputs is None else output_names(outputs), []
 
         def draw(number: int, capture: Capture | Camera) -> Frame:
             k = number % len(self.renderers)
@@ -121,6 +119,13 @@ class SeveralDevices:
         finally:
             for pool in pools:
                 pool.shutdown(cancel_futures=True)
+
+    def _given(self, scene: Scene | SplatCloud | Store | Sequence[ResidentCloud]) -> Sequence[ResidentCloud]:
+        """A scene on all devices."""
+        given = scene if isinstance(scene, Sequence) else self.upload(scene)
+        if len(given) != len(self.renderers):
+            raise InputError(f"a scene on {len(given)} devices was given to {len(self.renderers)}")
+        return given
 
     def _bands(self, height: int) -> list[tuple[int, int]]:
         """Rows of each device, one at least; devices that find none draw none."""

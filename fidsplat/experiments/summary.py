@@ -84,7 +84,14 @@ def read_summary(file: Path) -> Summary:
         text = file.read_text("utf-8")
         lines = text.splitlines()
         heads = [json.loads(line.removeprefix(_MARK)) for line in lines if line.startswith(_MARK)]
-        rows = pd.read_csv(io.StringIO("\n".join(lines[len(heads) :])))
+        repeated = [name for head in heads for name in head.get("repeated", ())]
+        # an empty cell alone is none: the word "None" is one, and so is a number among words
+        rows = pd.read_csv(
+            io.StringIO("\n".join(lines[len(heads) :])),
+            dtype=dict.fromkeys(repeated, str),
+            keep_default_na=False,
+            na_values=[""],
+        )
     except (OSError, ValueError) as error:
         raise InputError(f"cannot read {file}: {error}") from error
     if "run" not in rows or not any("run" in head for head in heads):
@@ -92,7 +99,7 @@ def read_summary(file: Path) -> Summary:
     runs = [head["run"] for head in heads if "run" in head]
     for name in (name for head in heads for name in head.get("empty", ())):
         rows[name] = math.nan
-    for name in (name for head in heads for name in head.get("repeated", ())):
+    for name in repeated:
         rows[name] = rows[name].ffill()
     return Summary(rows, runs, [head["note"] for head in heads if "note" in head])
 

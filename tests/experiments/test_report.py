@@ -296,6 +296,9 @@ def test_a_summary_is_what_its_file_says(tmp_path):
     read = Summary(words, summary.runs).write(tmp_path / "b.csv")
     assert read.rows.astype(object).where(read.rows.notna(), None).equals(words.astype(object))
     assert (tmp_path / "b.csv").read_text().splitlines()[-4:] == ["0,a,x", "0,,", "0,b,x", "0,,x"]
+    words = pd.DataFrame({"run": 0, "name": ["a", "None", "None", "7"]})
+    read = Summary(words, summary.runs).write(tmp_path / "c.csv")
+    assert read.rows["name"].tolist() == words["name"].tolist()
 
 
 def load_rows(folder: Path):

@@ -51,6 +51,9 @@ def test_views_are_shared_out_and_come_in_their_order(store, two):
     frames = two.render_views(two.upload(store), iter(cameras))
     for camera, frame in zip(cameras, frames, strict=True):
         assert np.array_equal(frame["rgb"], alone.render(store.cloud(), camera)["rgb"])
+    # one output may be given by its name, as to a renderer
+    assert two.render(store, cameras[0], "rgb").outputs == ("rgb",)
+    assert [frame.outputs for frame in two.render_views(store, cameras[:1], "rgb")] == [("rgb",)]
 
 
 def test_bands_are_cut_where_devices_take_as_long(two):
@@ -76,6 +79,8 @@ def test_what_several_devices_cannot_draw_is_said(store, two):
         two.render(store)
     with pytest.raises(fs.InputError, match="a scene on 1 devices was given to 2"):
         two.render(two.upload(store)[:1], look())
+    with pytest.raises(fs.InputError, match="a scene on 1 devices was given to 2"):
+        list(two.render_views(two.upload(store)[:1], [look(), look()]))
     renderer = two.renderers[0]
     for band in ((-1, 3), (3, 3), (0, 31)):
         with pytest.raises(fs.InputError, match="of a band"):

@@ -221,6 +221,12 @@ def test_a_device_without_room_for_a_view_is_sent_its_chunks_again(stores, monke
     # what is drawn does not make room for what is fetched ahead
     cache.bring(scene.chunks(scene.everything(), True))
     assert set(cache._slots) == held
+    # nor does one chunk that is fetched ahead for another
+    every = scene.chunks(scene.everything(), True)
+    cache._drawn = set()
+    cache.bring(every[:2])
+    cache.bring(every)
+    assert set(cache._slots) == {chunk.key for chunk in every[:2]}
 
 
 def test_what_is_pickled_of_a_store_is_its_path_and_of_its_cloud_the_splats(stores):

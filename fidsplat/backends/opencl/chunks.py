@@ -66,13 +66,14 @@ class OpenCLChunks:
 
     def bring(self, chunks: Sequence[Chunk]) -> None:
         """As `ChunkCache.bring`."""
+        wanted = {chunk.key for chunk in chunks}  # one of these does not make room for another
         for chunk in chunks:
             with self._lock:
                 if chunk.key in self._slots or not self.widths:
                     continue
             arrays = chunk.load()
             with self._lock:
-                if chunk.key not in self._slots and not self._put(chunk.key, arrays, self._drawn):
+                if chunk.key not in self._slots and not self._put(chunk.key, arrays, self._drawn | wanted):
                     return
 
     def copy(self, name: str, chunks: Sequence[Chunk], spans: np.ndarray, target: cl.Buffer) -> None:
