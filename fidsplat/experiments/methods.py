@@ -45,7 +45,8 @@ def method_names(chosen: tuple[str, ...] = (), trained: Path | None = None) -> t
     """Rows: "ideal", "MIXTURE/FILTER" for every mixture, "2dgs-N" for trained models that are there.
 
     Args:
-        chosen: mixtures to take part, all when empty.
+        chosen: mixtures to take part; when empty all but `facets`, which is no mixture of the paper's kind
+            and drawn by true depth alone.
         trained: folder with trained models, see `Painter`.
 
     Raises InputError for an unknown mixture.
@@ -54,7 +55,7 @@ def method_names(chosen: tuple[str, ...] = (), trained: Path | None = None) -> t
     for name in chosen:
         if name not in known:
             raise InputError(f"unknown mixture {name!r}; known: {', '.join(known)}")
-    own = [f"{m}/{f}" for m in known if not chosen or m in chosen for f in FILTERS]
+    own = [f"{m}/{f}" for m in known if (m in chosen if chosen else m != "facets") for f in FILTERS]
     models = [] if trained is None else [f"2dgs-{n}" for n in COLLECTIONS if (trained / f"2dgs-{n}").is_dir()]
     return (IDEAL, *own, *models)
 

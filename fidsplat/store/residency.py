@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 
 import numpy as np
@@ -15,6 +16,7 @@ from fidsplat.backends.prepare import prepare
 from fidsplat.backends.view import View
 from fidsplat.capture import Capture
 from fidsplat.effects import FeatureSet
+from fidsplat.errors import FidsplatError
 from fidsplat.quality import Quality
 from fidsplat.store.streamed import Selection, Streamed
 
@@ -87,18 +89,22 @@ class Residency:
                 self._fetching.join()
 
     def _fetch(self, capture: Capture) -> None:
-        """Bring what a view will need, beside what goes on; nothing, while the last such work goes on."""
+        """Bring what a view will need, beside what goes on; nothing, while the last such work goes on.
+
+        What fails here fails again when that view is drawn, where it can be told.
+        """
         features, view = prepare(self.scene, capture)
         pixels = self.scene.pixels_of(capture.quality)
         if self._fetching is not None and self._fetching.is_alive():
             return
 
         def work() -> None:
-            selection = self.scene.select([view], features, pixels)
-            if self._cache is None:
-                self.scene.fetch(selection)
-            else:
-                self._cache.bring(self.scene.chunks(selection, self._cache.places))
+            with suppress(FidsplatError, OSError, MemoryError):
+                selection = self.scene.select([view], features, pixels)
+                if self._cache is None:
+                    self.scene.fetch(selection)
+                else:
+                    self._cache.bring(self.scene.chunks(selection, self._cache.places))
 
         self._fetching = threading.Thread(target=work, name="fidsplat-fetch", daemon=True)
         self._fetching.start()

@@ -88,11 +88,12 @@ def test_fitted_markers_are_read_wherever_the_ideal_is(renderer, pool, category,
     assert seen[1] == seen[0]
 
 
-def test_every_mixture_is_a_row_with_both_filters():
+def test_every_mixture_but_facets_is_a_row_with_both_filters():
     assert mixtures()[:2] == ("paper", "fitted")
     names = method_names()
     assert names[:5] == (IDEAL, "paper/screen", "paper/best", "fitted/screen", "fitted/best")
-    assert len(names) == 1 + 2 * len(mixtures())
+    assert len(names) == 1 + 2 * (len(mixtures()) - 1)
+    assert method_names(("facets",)) == (IDEAL, "facets/screen", "facets/best")
     assert method_names(("fitted",)) == (IDEAL, "fitted/screen", "fitted/best")
     with pytest.raises(fs.InputError, match="unknown mixture 'boxes'; known: paper, fitted"):
         method_names(("boxes",))

@@ -120,7 +120,8 @@ def test_each_kind_of_figures_becomes_its_table(files):
         "| 64 of 128 x 96 | rgb, depth | 10,000 | a CPU | 900 (800 to 1000) | 5000 | 600 | 2026-11-22 |"
     ]
     assert rows(made["peer_batches"]) == [
-        "| 64 of 128 x 96 | 10,000 | Peer 1: rgb | 1800 | rgb, depth | 900 | 2 | 69.6 dB | 2026-11-22 |"
+        "| 64 of 128 x 96 | 10,000 | Peer 1: rgb | 1800 "
+        "| rgb, depth | batches.py's | 900 | 2 | 69.6 dB | 2026-11-22 |"
     ]
     assert rows(made["growth"]) == ["| a CPU | splats | 0.50 | 1.00 |"]
 

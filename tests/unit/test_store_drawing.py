@@ -4,6 +4,7 @@ bit for bit."""
 import copy
 import math
 import pickle
+import threading
 
 import numpy as np
 import pyopencl as cl
@@ -163,6 +164,22 @@ def test_a_device_draws_stores_bit_for_bit(stores, tmp_path):
             batch = renderer.render_batch(resident, cameras[:3])
             for number, camera in enumerate(cameras[:3]):
                 assert np.array_equal(batch["rgb"][number], renderer.render(cloud, camera)["rgb"])
+
+
+def test_what_cannot_be_fetched_ahead_is_told_by_the_picture_that_needs_it(stores, reference, monkeypatch):
+    tried, told = [], []
+
+    def fetch(self, selection):
+        tried.append(selection)
+        raise fs.DeviceError("no memory")
+
+    monkeypatch.setattr(Streamed, "fetch", fetch)
+    monkeypatch.setattr(threading, "excepthook", told.append)
+    cameras = [look(), look(turn=TURNED)]
+    frames = list(reference.render_views(stores["disks"], cameras))
+    assert len(frames) == 2
+    assert tried
+    assert not told
 
 
 def test_a_device_draws_splats_beside_stores_bit_for_bit(stores):
