@@ -9,6 +9,7 @@ from agreement import ALL_OUTPUTS, assert_agrees, random_splats
 from sampling import SAMPLES, alternate
 
 import fidsplat as fs
+from fidsplat.hard_cases.clouds import quaternion, splats
 from fidsplat.rotations import quaternion_to_matrix
 
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
@@ -150,6 +151,20 @@ def corners_of(cloud):
 def test_boxes_around_and_behind_the_camera(renderer, seed, quality):
     """Bounds lose nothing: every device agrees with the reference, which asks every pixel."""
     assert_agrees(renderer, random_splats(60, seed=seed).with_boxes(), SMALL, quality=quality)
+
+
+def test_a_sharp_corner_beside_the_picture_reaches_into_it(renderer):
+    """A box beside a disk, almost edge-on and 42 pixels left of the picture: between edges that meet at so
+    sharp an angle lies a little of every sample far beyond the corner, in the picture's first columns too."""
+    along = np.array([-37, 0, 30]) / math.hypot(37, 30)  # of the ray to its middle
+    across = np.array([30, 0, 37]) / math.hypot(37, 30)
+    away = math.cos(0.016) * along + np.array([0, math.sin(0.016), 0])
+    means = np.array([(-37 / 30, 0.0, 1.0), (0.0, 0.2, 2.0)])
+    cloud = splats(means, quaternion(across + away, away - across), 0.05, 1.0)
+    cloud = cloud.with_boxes(np.array([True, False]))
+    camera = fs.Camera.pinhole(64, 48, 60.0, 60.0, 32.0, 24.5, np.eye(4))
+    frame = assert_agrees(renderer, cloud, camera, quality=fs.Quality(alpha_cutoff=1 / 255))
+    assert frame["alpha"][24, 0] > 5e-3
 
 
 def test_boxes_end_at_the_near_plane(renderer):
