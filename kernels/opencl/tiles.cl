@@ -157,12 +157,19 @@ kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void emit(
     if (item == 0 && visible != 0) atomic_add(counts + COUNT_VISIBLE, visible);
 }
 
-// Sorts each list by (depth key, splat): a bitonic network whose every comparison puts the smaller first, so a list of
-// any length is sorted as if it were followed by infinities.
+// Sorts each list by (depth key, splat), which are all different.
 // Index space: work-groups of SORT_ITEMS, one per tile of the band.
 // Reads: starts. Uses up: pairs. Writes: lists.
+//
+// A list that fits local memory is spread over ranges of depth. Where one of them is crowded, and for longer lists, there is a
+// bitonic network whose every comparison puts the smaller first, so that a list of any length is sorted as if it were followed by
+// infinities.
 #define SORT_ITEMS 256
 #define SORT_LOCAL 2048          // pairs that are sorted in local memory at once
+#define RANGES 1024              // of depth
+#define CROWDED 128              // pairs of one range: more are not compared each with all
+#define ROW 16                   // work-items whose sums are added up one after the other; SORT_ITEMS is its square
+enum { SORT_EACH = SORT_LOCAL / SORT_ITEMS, OWN_RANGES = RANGES / SORT_ITEMS };   // of one work-item
 
 // The places i < j of comparator t in the step whose partners are `stride` (a power of two) apart; in the first step of a
 // block of 2 * stride places (`mirrored`) partners are mirror images.
@@ -187,13 +194,108 @@ static inline void comparator(uint t, uint stride, bool mirrored, uint *i, uint 
     }                                                                                       \
     barrier(fence)
 
+// The depth that a key stands for: `sortable`, back.
+static inline float depth_of(uint key) { return as_float((key & 0x80000000u) ? key & 0x7FFFFFFFu : ~key); }
+
+// A pair's range of depth. Every step keeps the order of depths, so a pair of a later range is further. fmax: where all depths are
+// one, or without end, the product may be no number.
+static inline uint range_of(ulong pair, float nearest, float scale) {
+    return (uint)fmin(fmax((depth_of((uint)(pair >> 32)) - nearest) * scale, 0.0f), RANGES - 1.0f);
+}
+
+typedef struct {             // in local memory, while a list is spread
+    uint least, greatest, crowded;    // keys; whether a range is
+    uint rows[ROW];                   // pairs of each row of work-items
+    uint starts[RANGES];              // pairs in each range, then where it starts
+} Spread;
+
+// The least and the greatest key of `length` pairs. ends: SORT_ITEMS values for its own use.
+static inline void find_ends(global const ulong *pairs, uint length, local uint2 *ends, local Spread *spread) {
+    uint item = get_local_id(0), least = 0xFFFFFFFFu, greatest = 0;
+    for (uint k = item; k < length; k += SORT_ITEMS) {
+        uint key = (uint)(pairs[k] >> 32);
+        least = min(least, key);
+        greatest = max(greatest, key);
+    }
+    ends[item] = (uint2)(least, greatest);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (item < 2 * ROW) {    // few, as atomics of one place wait for each other
+        for (uint k = item + 2 * ROW; k < SORT_ITEMS; k += 2 * ROW) {
+            least = min(least, ends[k].x);
+            greatest = max(greatest, ends[k].y);
+        }
+        atomic_min(&spread->least, least);
+        atomic_max(&spread->greatest, greatest);
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+}
+
+// Turns the numbers of pairs in each range into where the range starts, unless one is crowded. sums: SORT_ITEMS values for its own
+// use.
+static inline void place_ranges(local uint *sums, local Spread *spread) {
+    uint item = get_local_id(0), numbers[OWN_RANGES], sum = 0, before = 0;
+    for (uint n = 0; n < OWN_RANGES; n++) {
+        numbers[n] = spread->starts[item * OWN_RANGES + n];
+        if (numbers[n] > CROWDED) spread->crowded = 1;
+        sum += numbers[n];
+    }
+    sums[item] = sum;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint k = item - item % ROW; k < item; k++) before += sums[k];
+    if (item % ROW == ROW - 1) spread->rows[item / ROW] = before + sum;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint row = 0; row < item / ROW; row++) before += spread->rows[row];
+    for (uint n = 0; n < OWN_RANGES; n++) {
+        spread->starts[item * OWN_RANGES + n] = before;
+        before += numbers[n];
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+}
+
+// Sorts at most SORT_LOCAL pairs into `list`: puts each into its range, where it counts those before it. Returns false, for the whole
+// group, if a range is crowded. items: SORT_LOCAL values for its own use.
+static inline bool sort_spread(global const ulong *pairs, uint length, local ulong *items, local Spread *spread,
+                               global uint *restrict list) {
+    uint item = get_local_id(0), places[SORT_EACH];
+    if (item == 0) {
+        spread->least = 0xFFFFFFFFu;
+        spread->greatest = spread->crowded = 0;
+    }
+    for (uint k = item; k < RANGES; k += SORT_ITEMS) spread->starts[k] = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    find_ends(pairs, length, (local uint2 *)items, spread);
+    float nearest = depth_of(spread->least), scale = RANGES / (depth_of(spread->greatest) - nearest);
+    for (uint n = 0; n < SORT_EACH; n++) {
+        uint k = item + n * SORT_ITEMS;
+        if (k < length) places[n] = atomic_inc(spread->starts + range_of(pairs[k], nearest, scale));
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    place_ranges((local uint *)items, spread);
+    if (spread->crowded) return false;
+    for (uint n = 0; n < SORT_EACH; n++) {
+        uint k = item + n * SORT_ITEMS;
+        if (k < length) items[spread->starts[range_of(pairs[k], nearest, scale)] + places[n]] = pairs[k];
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint k = item; k < length; k += SORT_ITEMS) {
+        ulong pair = items[k];
+        uint range = range_of(pair, nearest, scale), start = spread->starts[range], place = start;
+        uint end = range + 1 < RANGES ? spread->starts[range + 1] : length;
+        for (uint other = start; other < end; other++) place += items[other] < pair;
+        list[place] = (uint)pair;
+    }
+    return true;
+}
+
 kernel __attribute__((reqd_work_group_size(SORT_ITEMS, 1, 1))) void sort_tiles(
 //@@ arguments sort_tiles
 ) {
     local ulong items[SORT_LOCAL];
+    local Spread spread;
     uint tile = band_first + get_group_id(0), item = get_local_id(0);
     uint start = starts[tile] - starts[band_first], length = starts[tile + 1] - starts[tile];
     global ulong *list = pairs + start;
+    if (length <= SORT_LOCAL && sort_spread(list, length, items, &spread, lists + start)) return;
     uint padded = 1;
     while (padded < length) padded *= 2;
 
