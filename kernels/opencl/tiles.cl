@@ -2,20 +2,26 @@
 // there in any order, and a sort of each list. Keys are unique (the splat's index breaks ties), so the sorted lists are
 // the same on every run. The tiles of many views stand one view after the other.
 
-// Exclusive prefix sum of `mine` over a work-group of SCAN_ITEMS; *total is the sum of all. partial: SCAN_ITEMS values.
+#define SCAN_EACH 8              // tiles of a work-item
+#define SCAN_ROW 32              // work-items whose numbers are added up one after the other
+#define SCAN_ROWS ((SCAN_ITEMS + SCAN_ROW - 1) / SCAN_ROW)
+
+// Exclusive prefix sum of `mine` over a work-group of SCAN_ITEMS; *total is the sum of all. partial: SCAN_ITEMS + SCAN_ROWS values.
 static inline ulong scan_group(local ulong *partial, uint item, ulong mine, ulong *total) {
+    local ulong *rows = partial + SCAN_ITEMS;
     partial[item] = mine;
     barrier(CLK_LOCAL_MEM_FENCE);
-    for (uint step = 1; step < SCAN_ITEMS; step *= 2) {
-        ulong before = item >= step ? partial[item - step] : 0;
-        barrier(CLK_LOCAL_MEM_FENCE);
-        partial[item] += before;
-        barrier(CLK_LOCAL_MEM_FENCE);
-    }
-    *total = partial[SCAN_ITEMS - 1];
-    ulong exclusive = partial[item] - mine;
+    ulong before = 0, sum = 0;
+    for (uint other = item - item % SCAN_ROW; other < item; other++) before += partial[other];
+    if (item % SCAN_ROW == SCAN_ROW - 1 || item == SCAN_ITEMS - 1) rows[item / SCAN_ROW] = before + mine;
     barrier(CLK_LOCAL_MEM_FENCE);
-    return exclusive;
+    for (uint row = 0; row < SCAN_ROWS; row++) {
+        if (row == item / SCAN_ROW) before += sum;
+        sum += rows[row];
+    }
+    *total = sum;
+    barrier(CLK_LOCAL_MEM_FENCE);    // the next numbers may be written
+    return before;
 }
 
 // places in the buffer `counts`, which the host reads: numbers of big splats, of pairs (64 bits), of visible splats
@@ -28,18 +34,21 @@ enum { COUNT_BIG = 0, COUNT_PAIRS = 1, COUNT_VISIBLE = 3 };
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
 //@@ arguments tile_starts
 ) {
-    local ulong partial[SCAN_ITEMS];
+    local ulong partial[SCAN_ITEMS + SCAN_ROWS];
     uint item = get_local_id(0);
     ulong running = 0;
-    for (uint first = 0; first < tiles; first += 4 * SCAN_ITEMS) {
-        uint from = min(first + 4 * item, tiles), to = min(from + 4, tiles);
+    for (uint first = 0; first < tiles; first += SCAN_EACH * SCAN_ITEMS) {
+        uint from = first + SCAN_EACH * item, lengths[SCAN_EACH];
         ulong mine = 0, total;
-        for (uint tile = from; tile < to; tile++) mine += tallies[TALLIES + tile];
+        for (uint n = 0; n < SCAN_EACH; n++) {
+            lengths[n] = from + n < tiles ? tallies[TALLIES + from + n] : 0;
+            mine += lengths[n];
+        }
         ulong place = running + scan_group(partial, item, mine, &total);
-        for (uint tile = from; tile < to; tile++) {
-            starts[tile] = cursors[tile] = (uint)place;
-            place += tallies[TALLIES + tile];
-            if (clear) tallies[TALLIES + tile] = 0;
+        for (uint n = 0; n < SCAN_EACH && from + n < tiles; n++) {
+            starts[from + n] = cursors[from + n] = (uint)place;
+            place += lengths[n];
+            if (clear) tallies[TALLIES + from + n] = 0;
         }
         running += total;
     }
@@ -105,18 +114,21 @@ kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void tally_big(
     }
 }
 
+#define NO_PLACE 0xFFFFFFFFu
+#define NO_ENTRY 0xFFFFFFFFu
+#define WINDOW_TILES (WINDOW_W * WINDOW_H)
+#define AT_ONCE 4                // places that a work-item asks for before it waits
+
 // Lists of the tiles of the band [band_first, band_end), from 0; never beyond `capacity`.
 typedef struct {
     int tiles_x, first, end;
     uint start, capacity;
 } Band;
 
-static inline void emit_pair(int tile, const Band *band, uint key, uint splat, global uint *restrict cursors,
-                             global uint2 *restrict pairs) {
-    if (tile < band->first || tile >= band->end) return;
-    // modulo 2^32: a place within the band is right even where the picture has more pairs than that
-    uint place = atomic_inc(cursors + tile) - band->start;
-    if (place < band->capacity) pairs[place] = (uint2)(splat, key);
+// The next place in a tile's list, or one beyond all capacity. Modulo 2^32: a place within the band is right even where the picture
+// has more pairs than that.
+static inline uint place_of(int tile, const Band *band, global uint *restrict cursors) {
+    return tile < band->first || tile >= band->end ? NO_PLACE : atomic_inc(cursors + tile) - band->start;
 }
 
 // Index space: for each view `splat_groups` work-groups, a work-item per splat, and then the same number of work-groups as for
@@ -126,7 +138,9 @@ static inline void emit_pair(int tile, const Band *band, uint key, uint splat, g
 kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void emit(
 //@@ arguments emit
 ) {
-    local uint visible;
+    local uint visible, queued;
+    local ushort queue[WALK_ITEMS * WINDOW_TILES];     // of a splat of the group (by its work-item) and a tile of its window
+    local uint corners[WALK_ITEMS], depths[WALK_ITEMS];
     const Band band = {(width + TILE_W - 1) / TILE_W, band_first, band_end, starts[band_first], capacity};
     uint item = get_local_id(0), number = get_group_id(1), big_count = min(counts[COUNT_BIG], big_capacity);
     if (get_group_id(0) >= splat_groups) {
@@ -138,22 +152,41 @@ kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void emit(
             int before = (int)(splat / count) * tiles_of(width, height);
             for (int cell = item; cell < walk.cells; cell += WALK_ITEMS) {
                 int tile = walk_tile(&walk, cell, &b, width, height);
-                if (tile >= 0) emit_pair(before + tile, &band, key, splat, cursors, pairs);
+                uint place = tile < 0 ? NO_PLACE : place_of(before + tile, &band, cursors);
+                if (place < band.capacity) pairs[place] = (uint2)(splat, key);
             }
         }
         return;   // the whole group
     }
-    if (item == 0) visible = 0;
+    if (item == 0) visible = queued = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
     uint i = get_global_id(0), splat = number * count + i;
     uint key = i < count ? keys[splat] : CULLED;
     if (key != CULLED) {
-        int before = (int)number * tiles_of(width, height);
         if (first_band) atomic_inc(&visible);
-        for (uint2 window = windows[splat]; window.y != 0; window.y &= window.y - 1)
-            emit_pair(before + window_tile(window, band.tiles_x), &band, key, splat, cursors, pairs);
+        uint2 window = windows[splat];
+        corners[item] = window.x;
+        depths[item] = key;
+        for (uint at = window.y != 0 ? atomic_add(&queued, popcount(window.y)) : 0; window.y != 0; window.y &= window.y - 1)
+            queue[at++] = (ushort)(item * WINDOW_TILES + 31 - clz(window.y & -window.y));
     }
     barrier(CLK_LOCAL_MEM_FENCE);
+    // shared out evenly, since splats touch few tiles or many, and several at once, since each waits for its place
+    int before = (int)number * tiles_of(width, height);
+    for (uint from = item; from < queued; from += AT_ONCE * WALK_ITEMS) {
+        uint places[AT_ONCE], whose[AT_ONCE];
+        for (uint n = 0; n < AT_ONCE; n++) {
+            uint entry = from + n * WALK_ITEMS < queued ? queue[from + n * WALK_ITEMS] : NO_ENTRY;
+            whose[n] = entry / WINDOW_TILES;
+            places[n] = NO_PLACE;
+            if (entry != NO_ENTRY) {
+                uint2 one = (uint2)(corners[whose[n]], 1u << entry % WINDOW_TILES);
+                places[n] = place_of(before + window_tile(one, band.tiles_x), &band, cursors);
+            }
+        }
+        for (uint n = 0; n < AT_ONCE; n++)
+            if (places[n] < band.capacity) pairs[places[n]] = (uint2)(splat - item + whose[n], depths[whose[n]]);
+    }
     if (item == 0 && visible != 0) atomic_add(counts + COUNT_VISIBLE, visible);
 }
 

@@ -329,6 +329,21 @@ def test_a_list_longer_than_local_memory_is_sorted(backend):
     assert out_of_order(trace, visible[np.argsort(trace["keys"][visible], kind="stable")]) == 0
 
 
+def test_arrays_of_a_cloud_begin_anywhere(backend):
+    """Kernels read whole vectors, and a CPU reads a cloud's own arrays."""
+    base = random_splats(50, seed=6)
+    arrays = {"quats": base.quats, "scales": base.scales}
+    for name, array in arrays.items():
+        flat = np.empty(array.size + 1, np.float32)
+        flat[1:] = array.ravel()
+        flat.flags.writeable = False
+        arrays[name] = flat[1:].reshape(array.shape)
+    cloud = fs.SplatCloud(means=base.means, opacities=base.opacities, colors=base.colors, **arrays)
+    assert all(getattr(cloud, name).ctypes.data % 16 for name in arrays)
+    pictures = [traced(backend, each, fs.Quality())[0]["rgb"] for each in (base, cloud)]
+    assert np.array_equal(*pictures)
+
+
 DEPTHS = {
     "spread": lambda n: np.linspace(1.0, 9.0, n),
     "in pairs": lambda n: np.linspace(1.0, 9.0, n // 2).repeat(2),
