@@ -1,6 +1,10 @@
 """Derivatives of every device against the reference's in float64, and the same bits on every run."""
 
+import threading
+import weakref
+
 import numpy as np
+import pyopencl as cl
 import pytest
 
 import fidsplat as fs
@@ -123,6 +127,29 @@ def test_the_same_bits_on_every_run_and_those_of_render(backend, renderer):
     drawn = {name: images.read(name) for name in capture.outputs}
     frame = renderer.render(cloud, capture)
     assert all(np.array_equal(drawn[name], frame[name]) for name in drawn)
+
+
+def test_a_cloud_outlives_what_is_under_way(renderer, backend):
+    """A processor reads the host's arrays: they go when nobody reads them any more."""
+    if renderer.device.kind != "cpu" or not renderer.device.name.startswith("opencl"):
+        pytest.skip("reads no arrays of the host, or does not work beside it")
+    told, (cloud, capture) = [], random_picture(6)
+    weakref.finalize(cloud.quats, told.append, "gone")
+    features, view = prepare(cloud, capture)
+    gradients, resident = backend.differentiate(features), backend.upload(cloud)
+    images = gradients.forward(resident, view)
+    images.read("rgb")
+    held = cl.UserEvent(backend.context)
+    cl.enqueue_barrier(backend.queue, wait_for=[held])
+    gradients.backward(images, random_loss(features, view))
+
+    def go_on():
+        told.append("read")
+        held.set_status(cl.command_execution_status.COMPLETE)
+
+    threading.Timer(0.2, go_on).start()
+    del cloud, resident, images
+    assert told == ["read", "gone"]
 
 
 def test_outputs_without_a_gradient_given_have_one_of_zero(backend):
