@@ -1,5 +1,5 @@
-"""Host memory for images of a GPU: page-locked, so that it is written at the full rate of the bus beside what
-is drawn, and used again for the next image of its size, since to lock pages takes longer than to fill them."""
+"""Host memory for images of a GPU: page-locked, so that it is written at the full rate of the bus beside
+what is drawn, and used again for the next image of its size, since locking takes longer than writing."""
 
 from __future__ import annotations
 
@@ -80,12 +80,10 @@ class HostMemory:
         if self._held + size > _MOST:
             return None
         flags, queue = cl.mem_flags, cl.CommandQueue(self._context)
+        access: Any = cl.map_flags.READ | cl.map_flags.WRITE
         try:
             buffer = cl.Buffer(self._context, flags.READ_WRITE | flags.ALLOC_HOST_PTR, size)
-            # mapped to be read: that what the device copies there is seen is up to those copies
-            mapped, _ = cl.enqueue_map_buffer(
-                queue, buffer, cl.map_flags.READ, 0, (size,), np.dtype(np.uint8)
-            )
+            mapped, _ = cl.enqueue_map_buffer(queue, buffer, access, 0, (size,), np.dtype(np.uint8))
         except cl.Error:  # the system locks no more
             self.locks = False
             return None
