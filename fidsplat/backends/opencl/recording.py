@@ -108,7 +108,7 @@ class Recording:
         self._ready[id(picture.view)] = picture.view, self._arrays | picture.arrays, values
 
     def launch(self, queue: cl.CommandQueue, timed: bool = False) -> Launched:
-        """Draws the picture into leased buffers. Returns them by name, the last launch's event, and the events
+        """Draws the picture into leased buffers. Returns them by name, the last event, and the events
         of all launches with their stages if it is timed."""
         pool, bound = self._pool, self._bound
         leased = [(name, pool.lease(name, size)) for name, size in self._leases]
