@@ -1,6 +1,10 @@
 """Derivatives of every device against the reference's in float64, and the same bits on every run."""
 
+import threading
+import weakref
+
 import numpy as np
+import pyopencl as cl
 import pytest
 
 import fidsplat as fs
@@ -127,8 +131,8 @@ def test_the_same_bits_on_every_run_and_those_of_render(backend, renderer):
 
 
 def test_pictures_that_nobody_waits_for_have_the_same_derivatives(backend, renderer):
-    """Where lists are made before their length is known, one that had too little room says so when it is taken
-    back, and the next has enough."""
+    """Where lists are made before their length is known, one that had too little room says so when it is
+    taken back, and the next has enough."""
     (shape,) = backend.shapes("schedule").values()
     few, crowd = random_picture(2), random_picture(2, count=3000, scale=(0.2, 1.0))
     pipeline = backend.differentiate(with_distortion(prepare(*few)[0]), shape=shape)
@@ -147,6 +151,29 @@ def test_pictures_that_nobody_waits_for_have_the_same_derivatives(backend, rende
     many = taken_back(*crowd, waits=True)
     assert taken_back(*crowd, waits=False) == many
     assert taken_back(*few, waits=False) == first
+
+
+def test_a_cloud_outlives_what_is_under_way(renderer, backend):
+    """A processor reads the host's arrays: they go when nobody reads them any more."""
+    if renderer.device.kind != "cpu" or not renderer.device.name.startswith("opencl"):
+        pytest.skip("reads no arrays of the host, or does not work beside it")
+    told, (cloud, capture) = [], random_picture(6)
+    weakref.finalize(cloud.quats, told.append, "gone")
+    features, view = prepare(cloud, capture)
+    gradients, resident = backend.differentiate(features), backend.upload(cloud)
+    images = gradients.forward(resident, view)
+    images.read("rgb")
+    held = cl.UserEvent(backend.context)
+    cl.enqueue_barrier(backend.queue, wait_for=[held])
+    gradients.backward(images, random_loss(features, view))
+
+    def go_on():
+        told.append("read")
+        held.set_status(cl.command_execution_status.COMPLETE)
+
+    threading.Timer(0.2, go_on).start()
+    del cloud, resident, images
+    assert told == ["read", "gone"]
 
 
 def test_outputs_without_a_gradient_given_have_one_of_zero(backend):

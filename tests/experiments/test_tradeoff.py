@@ -264,7 +264,7 @@ def test_an_interrupted_run_goes_on(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(run, "_begin", real)
     assert main(words) == 0
     said = json.loads(capsys.readouterr().out)
-    assert said == {"file": str(file), "points": len(read_records(file)), "refused": []}
+    assert said == {"files": [str(file)], "points": len(read_records(file)), "refused": []}
     assert file.read_text().startswith(first)
     records = read_records(file)
     assert {record.key["what"] for record in records} == {"point", "decode", "truth"}
@@ -310,6 +310,40 @@ def test_ones_own_scene_is_measured_from_each_of_its_poses(capsys, tmp_path, mon
     assert "holds results of another scene; give another folder" in capsys.readouterr().err
     assert main(["tradeoff", "--scene", "own.toml", "--scenes", "hard"]) == 2
     assert "exclude each other" in capsys.readouterr().err
+
+
+def test_several_devices_measure_into_folders_of_their_names(capsys, tmp_path, monkeypatch):
+    found = {
+        "ratio": 1.0,
+        "ratio_quartiles": [0.9, 1.1],
+        "base_ms": 2.0,
+        "maximum": 0.01,
+        "maximum_sure": 0.01,
+    }
+    begun = []
+
+    def begin(session, key, quick):
+        begun.append(session.renderer.device.name)
+        return lambda: {**found, "read": "1" * 50}
+
+    monkeypatch.setattr(run, "_begin", begin)
+    words = ["tradeoff", "--quick", "--scenes", "hard", "--knobs", "opacity_ceiling", "-o", str(tmp_path)]
+    words += ["--device", "opencl:pocl", "--device", "warp:cpu"]
+    assert main([*words, "--plot", str(tmp_path / "times.pdf")]) == 2
+    assert "--plot is" in capsys.readouterr().err
+    assert main([*words[:-1], "opencl:nowhere"]) == 2
+    assert not begun  # a device that is not there is said first
+    capsys.readouterr()
+    assert main([*words, "--plot", str(tmp_path / "both.svg"), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["files"] == [str(tmp_path / name / run.FILE) for name in ("opencl-pocl", "warp-cpu")]
+    records = [read_records(tmp_path / name / run.FILE) for name in ("opencl-pocl", "warp-cpu")]
+    assert said["points"] == len(begun) == sum(map(len, records))
+    assert begun == ["opencl:pocl"] * len(records[0]) + ["warp:cpu"] * len(records[1])
+    titles = [device.title for device in load([tmp_path / "opencl-pocl", tmp_path / "warp-cpu"])]
+    drawn = (tmp_path / "both.svg").read_text()
+    assert len(set(titles)) == 2
+    assert all(f"<!-- hard on {title} -->" in drawn for title in titles)
 
 
 def test_ones_own_3d_gaussians_are_held_against_themselves_as_they_are_drawn():

@@ -246,9 +246,10 @@ class TiledLists(Lists):
 
     def stats(self) -> Callable[[], dict[str, int]]:
         """To be asked for after the last band, and called when splats, visible and pairs are wanted."""
-        queue, counts = self.picture.queue, self.picture.held["counts"]
-        splats = self.picture.resident.count
-        return lambda: stats_of(splats, read_counts(queue, counts))
+        picture, splats = self.picture, self.picture.resident.count
+        reader, counts, last = picture.workspace.read_queue, picture.held["counts"], picture.events[-1][1]
+        picture.queue.flush()
+        return lambda: stats_of(splats, read_counts(reader, counts, [last]))
 
     def bands(self) -> Iterator[tuple[int, int]]:
         """Projects; yields ranges of tiles (first, end), each when its lists are on the device."""

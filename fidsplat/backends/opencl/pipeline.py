@@ -247,14 +247,14 @@ class OpenCLPipeline:
             return Picture(workspace, self.program, self.shape, resident, view, plan, queue)
 
         if recording is not None and recording.fits(view, undrawn, queue):
-            leased, _ = recording.launch(queue)
-            stats = stats_later(queue, dict(leased)["counts"], resident.count)
-            drawn = Drawn(queue, leased, stats)
+            leased, last, _ = recording.launch(queue)
+            stats = stats_later(workspace, dict(leased)["counts"], last, resident.count)
+            drawn = Drawn(queue, leased, stats, last)
         else:
             picture = draw(undrawn, view, self.features.images)
-            drawn = Drawn(queue, picture.leased, picture.stats, uploads=picture.uploads)
+            drawn = Drawn.of(picture, timed=False)
             recording = kept.recording = Recording(picture)
-        repeat = Repeat(self._redrawn, self._timed, resident, view, recording)
+        repeat = Repeat(self._redrawn, self._timed, workspace, resident, view, recording)
         images = self._images(view, drawn, repeat)
         if not resident.fixed:
             images.settle()
@@ -273,8 +273,8 @@ class OpenCLPipeline:
             return Picture(workspace, self.program, self.shape, resident, view, MemoryPlan(0, 0, 0), queue)
 
         if recording.fits(view, undrawn, queue):
-            leased, events = recording.launch(queue, timed=True)
-            drawn = Drawn(queue, leased, dict, events)
+            leased, last, events = recording.launch(queue, timed=True)
+            drawn = Drawn(queue, leased, dict, last, events)
         else:
             drawn = self._redrawn(resident, view)
         workspace.finish()

@@ -17,6 +17,7 @@ import pyopencl as cl
 from pyopencl.array import Array
 
 from fidsplat.backends.base import DeviceInfo
+from fidsplat.backends.opencl.host_memory import HostMemory
 from fidsplat.backends.opencl.memory_plan import PAIR
 from fidsplat.backends.opencl.pages import large_pages
 from fidsplat.backends.opencl.shapes import DeviceShape
@@ -186,6 +187,8 @@ class Workspace:
         self.queue = cl.CommandQueue(self.context, properties=cl.command_queue_properties.PROFILING_ENABLE)
         self.side_queue = cl.CommandQueue(self.context)
         """for what the host reads while the stages run"""
+        self.read_queue = cl.CommandQueue(self.context)
+        """for what the host reads of pictures that are drawn, beside the next"""
         self.repeat_queue = cl.CommandQueue(self.context)
         """for pictures that were drawn before: without times, a launch takes the host a third less"""
         self._last, self._idle = self.queue, True
@@ -194,6 +197,7 @@ class Workspace:
         self.lock = threading.RLock()
         """held while a picture is put on a queue: scratch buffers and arguments belong to one at a time"""
         self.pool = BufferPool(self.context, device)
+        self.host_memory = HostMemory(self.context, device)
         self.ray_buffers = RayBuffers(self)
         self.limit_memory(info.memory_bytes * 9 // 10)
 

@@ -78,7 +78,7 @@ def prepared(options: Options) -> Iterator[Sweep]:
 
     pool = ThreadPoolExecutor(options.workers)
     try:
-        yield Sweep(NAME, results, keys, begin, options.workers, pool)
+        yield Sweep(f"{NAME} on {options.device}", results, keys, begin, options.workers, pool)
     finally:
         # an interrupt must not wait for pictures that nobody will look at
         pool.shutdown(cancel_futures=True)
