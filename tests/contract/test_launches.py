@@ -47,7 +47,7 @@ def test_a_picture_is_launched_again_for_each_view(opencl):
         for k, x in enumerate(places)
     ]
     kept = [machine.render(resident, capture) for _ in range(3) for capture in captures]
-    assert [each.recording is not None for each in resident._data.kept.values()] == [True, True]
+    assert [each.recording is not None for each in resident.data.kept.values()] == [True, True]
     for frame, capture in zip(kept, captures * 3, strict=True):
         wanted = own.render(some, capture)
         assert all(np.array_equal(frame[name], wanted[name]) for name in frame)

@@ -41,10 +41,11 @@ def test_a_device_holds_the_chunks_that_its_band_sees(store, two):
     given = two.upload(store)
     two._shares = np.array([0.0, 0.5, 1.0])
     two.render(given, look()).wait()
-    alone = fs.Renderer("opencl").upload(store)
-    alone._renderer.render(alone, look())
-    each = [one._data.nodes for one in given]
-    assert max(each) < alone._data.nodes <= sum(each)
+    one = fs.Renderer("opencl")
+    alone = one.upload(store)
+    one.render(alone, look())
+    each = [one.data.nodes for one in given]
+    assert max(each) < alone.data.nodes <= sum(each)
 
 
 def test_views_are_shared_out_and_come_in_their_order(store, two):
