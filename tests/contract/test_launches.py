@@ -62,7 +62,7 @@ def test_what_another_kind_of_picture_has_tallied_is_not_counted(opencl):
     machine = as_on_a_gpu(opencl)
     resident = machine.upload(random_splats(300, seed=4))
     first, *_ = (machine.render(resident, CAMERA)["rgb"] for _ in range(3))
-    (kept,) = resident._data.kept.values()
+    (kept,) = resident.data.kept.values()
     known, state = kept.recording, machine.backend.pool.state
     machine.render(resident, fs.Camera.look_at(50, 40, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0)))
     assert np.array_equal(machine.render(resident, CAMERA)["rgb"], first)

@@ -227,7 +227,7 @@ def test_slots_that_cannot_become_more_keep_what_they_hold(stores, monkeypatch):
     renderer, store = fs.Renderer("opencl"), stores["disks"]
     resident = renderer.upload(store)
     renderer.render(resident, look())
-    cache, pool, asked = resident._data._cache, renderer.backend.pool, []
+    cache, pool, asked = resident.data._cache, renderer.backend.pool, []
     fresh = pool.fresh
 
     def full(name, size):
