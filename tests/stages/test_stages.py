@@ -265,9 +265,11 @@ def test_both_ways_of_listing_give_the_same_lists(backend, scale):
     assert np.array_equal(tiled["rgb"], ordered["rgb"])
 
 
-@pytest.mark.parametrize(("lists", "budget"), [("ordered", 0), ("tiled", 0), ("gathered", 0), ("gathered", 5000)])
+@pytest.mark.parametrize(
+    ("lists", "budget"), [("ordered", 0), ("tiled", 0), ("gathered", 0), ("gathered", 5000)]
+)
 def test_views_of_a_batch_are_listed_apart(backend, monkeypatch, lists, budget):
-    """gathered: of tiles so few that they are counted in local memory, by groups of 4096 splats; with a budget
+    """gathered: tiles so few that they are counted in local memory, by groups of 4096 splats; with a budget
     of pairs in bands."""
     cloud = random_splats(5000, seed=5, scale=(1e-3, 0.5))
     quality = fs.Quality(lowpass="none")
