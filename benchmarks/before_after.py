@@ -53,6 +53,8 @@ def saved_scene(name: str, file: Path) -> Path:
     """A scene in a file that every commit can read."""
     cloud, camera = load_scene(name)
     arrays = {field: getattr(cloud, field) for field in ("means", "quats", "scales", "opacities", "colors")}
+    if cloud.thickness is not None:
+        arrays["scales"] = np.column_stack([cloud.scales, cloud.thickness])
     np.savez(file, camera=(camera.width, camera.height, camera.fx), **arrays)
     return file
 
