@@ -247,9 +247,10 @@ class TiledLists(Lists):
 
     def stats(self) -> Callable[[], dict[str, int]]:
         """To be asked for after the last band, and called when splats, visible and pairs are wanted."""
-        queue, counts = self.picture.queue, self.picture.held["counts"]
-        splats = self.picture.resident.count
-        return lambda: stats_of(splats, read_counts(queue, counts))
+        picture, splats = self.picture, self.picture.resident.count
+        reader, counts, last = picture.workspace.read_queue, picture.held["counts"], picture.events[-1][1]
+        picture.queue.flush()
+        return lambda: stats_of(splats, read_counts(reader, counts, [last]))
 
     def bands(self) -> Iterator[tuple[int, int]]:
         """Projects; yields ranges of tiles (first, end), each when its lists are on the device."""
@@ -258,12 +259,17 @@ class TiledLists(Lists):
         # what the host reads has a buffer of its own: `emit` adds to it meanwhile
         picture.lease("counts", 4 * _COUNTS)
         capacity = self.capacity(picture.workspace)
+        if picture.trusted:
+            capacity = min(capacity, picture.trusted)
         self._project()
         counted = self._starts(capacity)
         if capacity:
             self._list(0, picture.tiles, capacity, True)
             yield 0, picture.tiles
         if picture.repeats:
+            return
+        if capacity and picture.trusted:
+            picture.counted, picture.pairs = counted, capacity
             return
         big, self._pairs = self._read(counted)
         while big > self.big:
@@ -323,9 +329,21 @@ class TiledLists(Lists):
 
     def _read(self, counted: cl.Event) -> tuple[int, int]:
         """Numbers of big splats and of pairs as `counted` has left them, while later stages picture."""
-        self.picture.queue.flush()
-        side, counts = self.picture.workspace.side_queue, self.picture.held["counts"]
-        return fullness_of(read_counts(side, counts, [counted]))
+        return fullness_of(_counts_after(counted, self.picture))
+
+
+def pairs_of(picture: Picture) -> int | None:
+    """How many pairs a picture had; None where it was `trusted` to have fewer, so that nothing was drawn.
+    Waits until the device has counted, not until it has drawn."""
+    if picture.counted is None:
+        return picture.pairs
+    big, pairs = fullness_of(_counts_after(picture.counted, picture))
+    return pairs if big <= picture.held["big_capacity"] and pairs <= picture.pairs else None
+
+
+def _counts_after(counted: cl.Event, picture: Picture) -> np.ndarray:
+    picture.queue.flush()
+    return read_counts(picture.workspace.side_queue, picture.held["counts"], [counted])
 
 
 def read_counts(
