@@ -1,6 +1,6 @@
 """Interrupts and full disks: whether anything whole is lost, and whether the next run has the same bits.
 
-    python tools/interrupt.py trials.jsonl [--commands demo,render,...] [--most 20] [--seed 0]
+    python tools/interrupt.py trials.jsonl [--commands demo,render,...] [--most 20] [--jobs 1] [--seed 0]
 
 Each command runs twice undisturbed: what agrees is its result, bit for bit (of figures and logs each value
 and each line), and the rest (times, durations) need only parse. Then it is started again and again in an
@@ -24,6 +24,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -70,10 +71,10 @@ COMMANDS = {
     "marker": Command("marker qr-v22-L:text -o marker.ply", 61, 8),
     "counts": Command("experiment counts --quick --category small --category medium -o .", 57, 10),
     "compiling": Command(RENDER, 12, 4, own_cache=True),
-    "demo": Command("demo --out .", 16, 2),
+    "demo": Command("demo --out .", 51, 2),
     "dataset": Command("experiment dataset --category apriltag --markers 1 -o .", 8, 2),
-    "tradeoff": Command("tradeoff --quick --scenes apriltag --knobs transmittance_stop -o .", 4, 2),
-    "experiment": Command("experiment all --quick --category apriltag --mixture fitted -o .", 3, 1),
+    "tradeoff": Command("tradeoff --quick --scenes apriltag --knobs transmittance_stop -o .", 51, 2),
+    "experiment": Command("experiment all --quick --category apriltag --mixture fitted -o .", 51, 1),
 }
 Facts = dict[Any, Any]
 
@@ -241,6 +242,19 @@ def planned(name: str, seed: int) -> dict[str, tuple[str, float]]:
     }
 
 
+def run_all(name: str, trials: list[tuple[str, str, float]], jobs: int) -> Iterator[dict[str, Any]]:
+    """Trials (name, how, at) of a command, several at once: a row of each as it ends."""
+    with tempfile.TemporaryDirectory() as temporary:
+        trial, pool = Trial(COMMANDS[name], Path(temporary)), ThreadPoolExecutor(jobs)
+        try:
+            running = {pool.submit(disturb, trial, *one): one for one in trials}
+            for ended in as_completed(running):
+                part, how, at = running[ended]
+                yield {"command": name, "trial": part, "how": how, "at": round(at, 3), **ended.result()}
+        finally:
+            pool.shutdown(cancel_futures=True)  # Ctrl-C ends after what is under way
+
+
 def read(file: Path) -> list[dict[str, Any]]:
     """The trials that a file has."""
     return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
@@ -265,6 +279,7 @@ def main() -> int:
     parser.add_argument("file", type=Path, help="the trials, a line each")
     parser.add_argument("--commands", default=",".join(COMMANDS), help=f"of {', '.join(COMMANDS)}")
     parser.add_argument("--most", type=int, default=10**6, help="trials in this run (default: all)")
+    parser.add_argument("--jobs", type=int, default=1, help="trials of a command that run at once")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     names = given.commands.split(",")
@@ -278,13 +293,10 @@ def main() -> int:
         given.most -= len(left)
         if not left:
             continue
-        with tempfile.TemporaryDirectory() as temporary:
-            trial = Trial(COMMANDS[name], Path(temporary))
-            for part, how, at in left:
-                found = disturb(trial, part, how, at)
-                done.append({"command": name, "trial": part, "how": how, "at": round(at, 3), **found})
-                with given.file.open("a") as stream:
-                    stream.write(json.dumps(done[-1]) + "\n")
+        for row in run_all(name, left, given.jobs):
+            done.append(row)
+            with given.file.open("a") as stream:
+                stream.write(json.dumps(row) + "\n")
     for row in done:
         for words in row["lost"]:
             print(f"{row['command']}, {row['trial']} at {row['at']}: {words}")

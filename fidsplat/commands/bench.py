@@ -1,13 +1,11 @@
 """`fidsplat bench`."""
 
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import tyro
-
 from fidsplat.commands.output import (
+    Devices,
     console,
     json_text,
     option,
@@ -16,6 +14,7 @@ from fidsplat.commands.output import (
     writable_file,
 )
 from fidsplat.commands.own_scenes import Cameras, OwnScenes, own_scenes_of
+from fidsplat.commands.plots import check_plot
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
 
@@ -69,10 +68,7 @@ class Bench:
     ] = ()
     scene: OwnScenes = ()
     cameras: Cameras = None
-    device: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]],
-        option("D", "see `fidsplat devices`; once more for each (default: FIDSPLAT_DEVICE, or opencl)"),
-    ] = ()
+    device: Devices = ()
     repeats: Annotated[int, option("N", "frames of each scene on each device that count (default: 20)")] = 20
     json: Annotated[
         str | None,
@@ -93,7 +89,7 @@ class Bench:
         if self.repeats < 1:
             raise InputError(f"--repeats is {self.repeats}; give a number of frames, at least 1")
         if self.plot is not None:
-            _check_plot(self.plot)
+            check_plot(self.plot)
         known = own_scenes_of(self.scene, self.cameras, self.scenes) or BENCH_SCENES
         scenes = tuple(known) if self.scene else scene_names(self.scenes)
         if self.json not in (None, "-"):
@@ -141,15 +137,6 @@ class Bench:
         with atomic_write(self.json) as stream:
             stream.write(json_text(_record(measuring.results, scenes, interrupted)).encode())
             stream.write(b"\n")
-
-
-def _check_plot(name: str) -> None:
-    """Raises InputError for a chart that cannot be written, before anything is measured."""
-    if Path(name).suffix.lower() not in (".svg", ".png"):
-        raise InputError(f"--plot is {name}; charts are written as SVG or PNG: name a file that ends so")
-    if find_spec("matplotlib") is None:
-        raise InputError("--plot needs matplotlib; pip install 'fidsplat[experiments]'")
-    writable_file(name)
 
 
 def _record(results: "list[Result]", scenes: tuple[str, ...], interrupted: bool) -> dict[str, Any]:

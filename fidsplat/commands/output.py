@@ -29,6 +29,11 @@ def option(metavar: str, text: str, short: str | None = None):
 
 Device = Annotated[str | None, option("D", "see `fidsplat devices` (default: FIDSPLAT_DEVICE, or opencl)")]
 
+Devices = Annotated[
+    tyro.conf.UseAppendAction[tuple[str, ...]],
+    option("D", "see `fidsplat devices`; once more for each (default: FIDSPLAT_DEVICE, or opencl)"),
+]
+
 SceneDevice = Annotated[
     str | None, option("D", "see `fidsplat devices` (default: the scene's, or FIDSPLAT_DEVICE, or opencl)")
 ]

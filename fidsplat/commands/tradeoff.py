@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from fidsplat.commands.output import Device, Json, option, switch, tell
+from fidsplat.commands.output import Devices, Json, option, switch, tell
 from fidsplat.commands.own_scenes import Cameras, OwnScenes, own_scenes_of
+from fidsplat.commands.plots import check_plot
 from fidsplat.commands.sweeps import Folders, Overwrite, ReportTo, need_reports, run_sweeps, words
-from fidsplat.errors import InputError
 
 DEFAULT_FOLDER = "fidsplat-tradeoff"
 
@@ -49,7 +50,8 @@ class Tradeoff:
     then several together. A setting draws in turn with the base, frame by frame, and its picture is compared
     with a float64 one that leaves nothing out. Markers are also compared with the ideal printed texture, and
     tilted until nobody reads them. Results are JSON lines, written as they come; a run that was stopped goes
-    on where it was. Keep the machine quiet. --scene takes one's own scene instead, as for `fidsplat bench`.
+    on where it was. Several devices measure one after the other, each into a folder of its name in DIR. Keep
+    the machine quiet. --scene takes one's own scene instead, as for `fidsplat bench`.
 
       r100k_720p, r1m_1080p            random splats, as in `fidsplat bench`
       r100k_720p_3d, r1m_1080p_3d      of 3D Gaussians: the ways of drawing them
@@ -62,6 +64,7 @@ class Tradeoff:
       fidsplat tradeoff -o gpu --device opencl:nvidia        everything
       fidsplat tradeoff --scenes hard --knobs alpha_cutoff transmittance_stop
       fidsplat tradeoff --scene room.ply --cameras poses.tum --quick -o room
+      fidsplat tradeoff --device opencl:nvidia --device opencl:pocl --plot both.svg
       fidsplat tradeoff report cpu gpu -o docs/accuracy.md   a page from results
     """
 
@@ -75,7 +78,7 @@ class Tradeoff:
             "-o",
         ),
     ] = None
-    device: Device = None
+    device: Devices = ()
     scenes: Annotated[tuple[str, ...], option("NAME...", "scenes (default: all; --quick: four)")] = ()
     scene: OwnScenes = ()
     cameras: Cameras = None
@@ -85,6 +88,10 @@ class Tradeoff:
     ] = ()
     quick: Annotated[bool, switch("few values, few frames, four scenes")] = False
     overwrite: Overwrite = False
+    plot: Annotated[
+        str | None,
+        option("FILE.svg", "a chart of time against error as well, or FILE.png (extra: experiments)"),
+    ] = None
     json: Json = False
 
     def run(self) -> int:
@@ -92,15 +99,32 @@ class Tradeoff:
         from fidsplat.experiments.tradeoff.run import Options, prepared
         from fidsplat.render import default_device
 
+        if self.plot is not None:
+            check_plot(self.plot, ("pandas", "matplotlib"))
         folder = Path(self.out or DEFAULT_FOLDER + ("-quick" if self.quick else ""))
-        device = default_device() if self.device is None else self.device
-        if device == "reference":
-            raise InputError("the reference is what others are measured against; give another --device")
+        devices = tuple(dict.fromkeys(self.device)) or (default_device(),)
         own = own_pictures(own_scenes_of(self.scene, self.cameras, self.scenes))
-        options = Options(folder, device, self.scenes, self.knobs, self.quick, self.overwrite, own)
-        with prepared(options) as sweep:
-            measured = run_sweeps([sweep])
-            file, points = sweep.results.file, len(sweep.points)
-        refused = [f"{words(record.key)}: {record.result['error']}" for record in measured if record.failed]
-        lines = [*(f"not measured: {line}" for line in refused), f"{file}; fidsplat tradeoff report {folder}"]
-        return tell(self.json, {"file": str(file), "points": points, "refused": refused}, *lines)
+        folders = [folder / name.replace(":", "-") for name in devices] if len(devices) > 1 else [folder]
+        with ExitStack() as stack:
+            # all are opened first: one that is not there is said before minutes of another
+            sweeps = [
+                stack.enter_context(
+                    prepared(Options(out, device, self.scenes, self.knobs, self.quick, self.overwrite, own))
+                )
+                for out, device in zip(folders, devices, strict=True)
+            ]
+            measured = run_sweeps(sweeps)
+        if self.plot is not None:
+            from fidsplat.experiments.tradeoff.report import write_plot
+
+            write_plot(folders, Path(self.plot))
+        refused = [
+            f"{words(record.key)}, {record.run['device']}: {record.result['error']}"
+            for record in measured
+            if record.failed
+        ]
+        files = [str(sweep.results.file) for sweep in sweeps]
+        points = sum(len(sweep.points) for sweep in sweeps)
+        lines = [*(f"not measured: {line}" for line in refused), *files]
+        lines.append(f"a page of them: fidsplat tradeoff report {' '.join(map(str, folders))}")
+        return tell(self.json, {"files": files, "points": points, "refused": refused}, *lines)

@@ -143,6 +143,8 @@ kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void emit(
     local uint corners[WALK_ITEMS], depths[WALK_ITEMS];
     const Band band = {(width + TILE_W - 1) / TILE_W, band_first, band_end, starts[band_first], capacity};
     uint item = get_local_id(0), number = get_group_id(1), big_count = min(counts[COUNT_BIG], big_capacity);
+    if (item == 0) visible = queued = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
     if (get_group_id(0) >= splat_groups) {
         uint groups = get_num_groups(0) - splat_groups;
         for (uint k = number * groups + get_group_id(0) - splat_groups; k < big_count; k += groups * get_num_groups(1)) {
@@ -156,23 +158,22 @@ kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void emit(
                 if (place < band.capacity) pairs[place] = (uint2)(splat, key);
             }
         }
-        return;   // the whole group
-    }
-    if (item == 0) visible = queued = 0;
-    barrier(CLK_LOCAL_MEM_FENCE);
-    uint i = get_global_id(0), splat = number * count + i;
-    uint key = i < count ? keys[splat] : CULLED;
-    if (key != CULLED) {
-        if (first_band) atomic_inc(&visible);
-        uint2 window = windows[splat];
-        corners[item] = window.x;
-        depths[item] = key;
-        for (uint at = window.y != 0 ? atomic_add(&queued, popcount(window.y)) : 0; window.y != 0; window.y &= window.y - 1)
-            queue[at++] = (ushort)(item * WINDOW_TILES + 31 - clz(window.y & -window.y));
+    } else {
+        uint i = get_global_id(0), splat = number * count + i;
+        uint key = i < count ? keys[splat] : CULLED;
+        if (key != CULLED) {
+            if (first_band) atomic_inc(&visible);
+            uint2 window = windows[splat];
+            corners[item] = window.x;
+            depths[item] = key;
+            for (uint at = window.y != 0 ? atomic_add(&queued, popcount(window.y)) : 0; window.y != 0; window.y &= window.y - 1)
+                queue[at++] = (ushort)(item * WINDOW_TILES + 31 - clz(window.y & -window.y));
+        }
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     // shared out evenly, since splats touch few tiles or many, and several at once, since each waits for its place
     int before = (int)number * tiles_of(width, height);
+    uint first_splat = number * count + (uint)get_global_id(0) - item;
     for (uint from = item; from < queued; from += AT_ONCE * WALK_ITEMS) {
         uint places[AT_ONCE], whose[AT_ONCE];
         for (uint n = 0; n < AT_ONCE; n++) {
@@ -185,7 +186,7 @@ kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void emit(
             }
         }
         for (uint n = 0; n < AT_ONCE; n++)
-            if (places[n] < band.capacity) pairs[places[n]] = (uint2)(splat - item + whose[n], depths[whose[n]]);
+            if (places[n] < band.capacity) pairs[places[n]] = (uint2)(first_splat + whose[n], depths[whose[n]]);
     }
     if (item == 0 && visible != 0) atomic_add(counts + COUNT_VISIBLE, visible);
 }
@@ -194,11 +195,12 @@ kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void emit(
 // Index space: work-groups of SORT_ITEMS, one per tile of the band.
 // Reads: starts. Uses up: pairs. Writes: lists.
 //
-// A list that fits local memory is spread over ranges of depth. Where one of them is crowded, and for longer lists, there is a
-// bitonic network whose every comparison puts the smaller first, so that a list of any length is sorted as if it were followed by
+// A list that fits local memory is spread over ranges of depth. Where one of them is crowded, and for short and longer lists, there is
+// a bitonic network whose every comparison puts the smaller first, so that a list of any length is sorted as if it were followed by
 // infinities.
 #define SORT_ITEMS 256
 #define SORT_LOCAL 2048          // pairs that are sorted in local memory at once
+#define SHORT 64                 // pairs that the network sorts sooner
 #define RANGES 1024              // of depth
 #define CROWDED 128              // pairs of one range: more are not compared each with all
 #define ROW 16                   // work-items whose sums are added up one after the other; SORT_ITEMS is its square
@@ -328,7 +330,7 @@ kernel __attribute__((reqd_work_group_size(SORT_ITEMS, 1, 1))) void sort_tiles(
     uint tile = band_first + get_group_id(0), item = get_local_id(0);
     uint start = starts[tile] - starts[band_first], length = starts[tile + 1] - starts[tile];
     global ulong *list = pairs + start;
-    if (length <= SORT_LOCAL && sort_spread(list, length, items, &spread, lists + start)) return;
+    if (length > SHORT && length <= SORT_LOCAL && sort_spread(list, length, items, &spread, lists + start)) return;
     uint padded = 1;
     while (padded < length) padded *= 2;
 

@@ -11,9 +11,11 @@ from agreement import ALL_OUTPUTS, random_splats, some_thick
 
 import fidsplat as fs
 from fidsplat.backends.bands import cut
+from fidsplat.backends.opencl.lists import TiledLists
 from fidsplat.backends.opencl.memory_plan import plan_of
 from fidsplat.backends.opencl.shapes import gpu_shape
 
+UNTOUCHED = 0xFFFFFFFF
 CAMERA = fs.Camera.look_at(161, 117, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
 
 
@@ -89,6 +91,41 @@ def test_one_pair_more_than_the_budget_makes_a_second_band(opencl, cloud, whole,
     assert all(np.array_equal(frame[name], image) for name, image in images.items())
 
 
+@machines
+def test_nothing_is_written_beyond_the_room_for_lists(opencl, monkeypatch, machine):
+    """Neither where they just fit nor, on a GPU, where the picture has more pairs than there is room for."""
+    own, some = machine(opencl), random_splats(300, seed=4)
+    wanted = own.render(some, CAMERA)
+    pairs, pool, queue = wanted.stats["pairs"], own.backend.pool, own.backend.queue
+    words = {"lists": pairs}
+    if machine is as_on_a_gpu:
+        words, room, again = {"pairs": 200, "lists": 100}, TiledLists.capacity, TiledLists._again
+
+        def first_looked_at(self):
+            look()
+            monkeypatch.setattr(TiledLists, "capacity", room)
+            return again(self)
+
+        monkeypatch.setattr(TiledLists, "capacity", staticmethod(lambda workspace: 100))
+        monkeypatch.setattr(TiledLists, "_again", first_looked_at)
+    seen = []
+
+    def look():
+        for name, first in words.items():
+            rest = np.empty(pool.size(name) // 4 - first, np.uint32)
+            cl.enqueue_copy(queue, rest, pool._buffers[name], src_offset=4 * first)
+            seen.append((rest == UNTOUCHED).all())
+
+    for name in words:
+        buffer = pool.scratch(name, max(pool.size(name), 4 * pairs + 64))
+        cl.enqueue_fill_buffer(queue, buffer, np.uint32([UNTOUCHED]), 0, buffer.size)
+    frame = own.render(some, CAMERA)
+    assert np.array_equal(frame["rgb"], wanted["rgb"])
+    if machine is own_device:
+        look()
+    assert seen == [True] * len(words)
+
+
 @pytest.fixture(scope="module")
 def whole(opencl, cloud):
     frame = opencl.render(cloud, CAMERA, ALL_OUTPUTS)
@@ -103,8 +140,8 @@ def test_little_memory_gives_the_same_bits(opencl, cloud, whole, mebibytes, stre
     printed plane among them, so every fragment by its own depth."""
     own = small(opencl, mebibytes, None if streamed else cloud)
     resident = own.upload(cloud)
-    resident._data._shared &= not streamed  # a CPU reads the host's arrays; make it copy them
-    resident._data.streamed = streamed
+    resident.data._shared &= not streamed  # a CPU reads the host's arrays; make it copy them
+    resident.data.streamed = streamed
     for _ in range(2):
         frame = own.render(resident, CAMERA, ALL_OUTPUTS)
         assert frame.stats == whole[1]
@@ -119,7 +156,7 @@ def test_many_big_splats_in_chunks(opencl):
     wanted = opencl.render(crowd, CAMERA, ("rgb", "depth"))
     own = small(opencl, 3.2)
     resident = own.upload(crowd)
-    resident._data._shared, resident._data.streamed = False, True
+    resident.data._shared, resident.data.streamed = False, True
     frame = own.render(resident, CAMERA, ("rgb", "depth"))
     assert "packed splats" in own.backend.pool._buffers
     assert frame.stats == wanted.stats
@@ -291,7 +328,7 @@ def test_neither_frames_nor_kernels_keep_a_cloud(opencl):
     some = random_splats(100, seed=7)
     array, before = some.means, sys.getrefcount(some.means)
     resident = opencl.upload(some)
-    data = weakref.ref(resident._data)
+    data = weakref.ref(resident.data)
     frame = opencl.render(resident, CAMERA)
     del resident
     assert data() is None

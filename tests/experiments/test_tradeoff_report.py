@@ -238,12 +238,27 @@ def test_names_in_a_chart_cover_neither_each_other_nor_the_legend(tmp_path):
     for each in every:
         ratio, maximum = numbered.get((each.key["knob"], each.key["value"]), (1.05, 0.02))
         each.result.update(result(ratio, maximum))
-    report.draw_chart(device(every), "hard", tmp_path / "a.svg")
-    report.draw_chart(device(every), "hard", tmp_path / "b.svg")
+    report.draw_chart([device(every)], "hard", tmp_path / "a.svg")
+    report.draw_chart([device(every)], "hard", tmp_path / "b.svg")
     assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
     chart = xml.dom.minidom.parse(str(tmp_path / "a.svg"))
     comments = [node.data.strip() for node in walk(chart) if node.nodeType == node.COMMENT_NODE]
     assert {"standard", "gsplat", "reference", "cut-off 1/1024", "only alpha up to 0.99"} <= set(comments)
+
+
+def test_devices_stand_side_by_side_in_one_chart(tmp_path):
+    """Of a scene that all of them have drawn."""
+    write(tmp_path / "cpu", [*plain_records("hard"), *plain_records("r1m_1080p")])
+    write(tmp_path / "gpu", plain_records("hard", **GPU))
+    report.write_plot([tmp_path / "cpu", tmp_path / "gpu"], tmp_path / "both.svg")
+    chart = xml.dom.minidom.parse(str(tmp_path / "both.svg"))
+    comments = [node.data.strip() for node in walk(chart) if node.nodeType == node.COMMENT_NODE]
+    assert {"hard on A processor", "hard on A card", "half a step of 8 bits"} <= set(comments)
+    assert comments.count("gsplat") == 2
+    write(tmp_path / "other", plain_records("r100k_720p", **GPU))
+    with pytest.raises(fs.InputError, match="A processor and A card have no scene in common to plot"):
+        report.write_plot([tmp_path / "cpu", tmp_path / "other"], tmp_path / "none.svg")
+    assert not (tmp_path / "none.svg").exists()
 
 
 def walk(node):

@@ -55,6 +55,17 @@ def test_what_keeps_every_bit(tmp_path, suffix, thick):
     assert losses(cloud, f"a{suffix}") == []
 
 
+def test_a_gaussian_as_thin_as_a_disk_is_padded_is_no_disk(tmp_path):
+    """But for rounding: half a percent more than the third scale of disks is a thickness."""
+    disks, thin = some(4, thick=False), np.float32(1.005e-6)
+    scales = np.column_stack([disks.scales, [0, thin, 0, 0.01]])
+    cloud = fs.SplatCloud(disks.means, disks.quats, scales, disks.opacities, sh=disks.sh)
+    fs.save_splats(cloud, tmp_path / "a.glb")
+    thickness = fs.load_splats(tmp_path / "a.glb").thickness
+    assert thickness is not None
+    np.testing.assert_allclose(thickness, [0, thin, 0, 0.01], rtol=1e-6)
+
+
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_spz_is_as_near_as_its_bits(tmp_path, degree):
     cloud = some(degree=degree)

@@ -111,4 +111,6 @@ def test_how_a_run_may_end():
 def test_the_trials_are_planned_alike_each_time():
     plans = {name: interrupt.planned(name, 0) for name in interrupt.COMMANDS}
     assert plans == {name: interrupt.planned(name, 0) for name in interrupt.COMMANDS}
-    assert sum(map(len, plans.values())) == 300
+    kills = {name: sum(how != interrupt.DISK for how, _ in plan.values()) for name, plan in plans.items()}
+    assert all(kills[name] > 50 for name in ("render", "demo", "tradeoff", "experiment"))
+    assert sum(map(len, plans.values())) > 300

@@ -176,9 +176,9 @@ class OpenCLChunks:
             buffer = self.workspace.pool.fresh(f"chunks of {name}", size * self._rows * width)
             if self._size:
                 held = self._size * self._rows * width
-                cl.enqueue_copy(self._queue, buffer, self._arrays[name], byte_count=held)
+                # waited for one by one: where the next has no room, this one holds what it held
+                cl.enqueue_copy(self._queue, buffer, self._arrays[name], byte_count=held).wait()
             self._arrays[name] = buffer
-        self._queue.finish()
         self._free += range(size - 1, self._size - 1, -1)
         self._size = size
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import weakref
 from collections.abc import Hashable, Iterable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -60,6 +63,8 @@ class Resident:
         widest = max(array.nbytes for array in self._arrays.values())
         device = workspace.device
         self._shared = workspace.info.kind == "cpu" and bool(device.host_unified_memory)
+        if self._shared:
+            weakref.finalize(self, _finish, os.getpid(), workspace.queue, workspace.repeat_queue)
         self.streamed = not self._shared and (
             total > workspace.memory_budget // 2 or widest > device.max_mem_alloc_size
         )
@@ -122,6 +127,15 @@ class Resident:
                 cl.enqueue_copy(self._workspace.queue, buffer, array)
             self._buffers[name] = buffer
         return self._buffers[name]
+
+
+def _finish(process: int, *queues: cl.CommandQueue) -> None:
+    """Before the host's arrays go: kernels may be reading them, of pictures and derivatives that nobody waits
+    for. Queues of the process that this one was forked from are left alone."""
+    if process == os.getpid():
+        for queue in queues:
+            with suppress(cl.Error):
+                queue.finish()
 
 
 def _aligned(array: np.ndarray) -> np.ndarray:

@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from fidsplat.experiments.charts import chart, label_points, plain_ticks
+from fidsplat.errors import InputError
+from fidsplat.experiments.charts import Axes, chart, label_points, plain_ticks
 from fidsplat.experiments.pages import fixed, number, percent, places, write_page
 from fidsplat.experiments.summary import Frame, Row, provenance
 from fidsplat.experiments.tradeoff.linear import ANGLES, DISTANCES
@@ -98,7 +99,7 @@ def write_report(folders: Sequence[Path], out: Path) -> list[Path]:
     for device, name, scene in zip(devices, names, plotted, strict=True):
         if scene:
             files.append(folder / f"{name}.svg")
-            draw_chart(device, scene, files[-1])
+            draw_chart([device], scene, files[-1])
     context = {
         "devices": [
             {
@@ -134,8 +135,42 @@ def write_report(folders: Sequence[Path], out: Path) -> list[Path]:
     return [page, *files]
 
 
-def draw_chart(device: Device, scene: str, file: Path) -> None:
-    """Milliseconds against the largest error of every setting that draws the base's picture."""
+def write_plot(folders: Sequence[Path], file: Path) -> None:
+    """One chart of the results in folders, a panel for each device.
+
+    Raises InputError when there are no results, no scene that all devices have drawn, or the file cannot be
+    written.
+    """
+    devices = load(folders)
+    draw_chart(devices, plotted_scene(devices), file)
+
+
+def plotted_scene(devices: Sequence[Device]) -> str:
+    """The scene of a chart in which devices stand side by side: one that all have drawn, markers last.
+
+    Raises InputError where there is none.
+    """
+    first = devices[0]
+    for scene in dict.fromkeys((*_plain(first), *first.scenes)):
+        if all(scene in device.scenes for device in devices):
+            return scene
+    raise InputError(f"{' and '.join(device.title for device in devices)} have no scene in common to plot")
+
+
+def draw_chart(devices: Sequence[Device], scene: str, file: Path) -> None:
+    """Milliseconds against the largest error of every setting that draws the base's picture, a panel for each
+    device."""
+    with chart(file, len(devices), (9.0 * len(devices), 5.2)) as (figure, panels):
+        named = [_draw_panel(axes, device, scene) for axes, device in zip(panels, devices, strict=True)]
+        panels[0].set_ylabel("largest error (peak 1)")
+        handles, words = panels[0].get_legend_handles_labels()
+        figure.legend(handles, words, loc="outside lower center", ncols=4, frameon=False)
+        for axes, points in zip(panels, named, strict=True):
+            label_points(figure, axes, points)
+
+
+def _draw_panel(axes: Axes, device: Device, scene: str) -> list[tuple[float, float, str]]:
+    """Draw one device's settings; returns those that have names, with their places."""
     points = device.same_picture(scene)
     points = points[points["knob"] != "blend_precision"]  # for truths, and many times as slow
     points = points.assign(error=points["maximum"].clip(lower=_LEAST))
@@ -143,28 +178,26 @@ def draw_chart(device: Device, scene: str, file: Path) -> None:
     names = pd.Series(list(zip(points["knob"], points["value"], strict=True)), index=points.index).map(
         _LABELLED
     )
-    with chart(file, size=(9.0, 5.2)) as (figure, (axes,)):
-        axes.set(xscale="log", yscale="log", xlabel="milliseconds per frame", ylabel="largest error (peak 1)")
-        axes.plot(points["ms"], points["error"], ".", color="#bbbbbb", label="every setting")
-        axes.plot(ladder["ms"], ladder["error"], "-", color="#00798c", label="the cut-off alone")
-        for knob, style, colour, words in (
-            (PRESETS_KNOB, "o", "#d1495b", "presets"),
-            ("alpha_cutoff", "o", "#00798c", None),
-            (ALONE, "s", "#edae49", "one constant in an exact picture"),
-        ):
-            chosen = points[names.notna() & (points["knob"] == knob)]
-            axes.plot(chosen["ms"], chosen["error"], style, color=colour, label=words)
-        axes.axhline(INVISIBLE, color="#777777", linestyle="--", linewidth=0.8)
-        axes.annotate(
-            "half a step of 8 bits", (0, INVISIBLE), (4, 3), xycoords=("axes fraction", "data"),
-            textcoords="offset points", fontsize=9, color="#555555",
-        )  # fmt: skip
-        axes.margins(0.08)
-        plain_ticks(axes.xaxis)
-        axes.set_title(f"{scene} on {device.title}")
-        figure.legend(loc="outside lower center", ncols=4, frameon=False)
-        named = points[names.notna()]
-        label_points(figure, axes, list(zip(named["ms"], named["error"], names[names.notna()], strict=True)))
+    axes.set(xscale="log", yscale="log", xlabel="milliseconds per frame")
+    axes.plot(points["ms"], points["error"], ".", color="#bbbbbb", label="every setting")
+    axes.plot(ladder["ms"], ladder["error"], "-", color="#00798c", label="the cut-off alone")
+    for knob, style, colour, words in (
+        (PRESETS_KNOB, "o", "#d1495b", "presets"),
+        ("alpha_cutoff", "o", "#00798c", None),
+        (ALONE, "s", "#edae49", "one constant in an exact picture"),
+    ):
+        chosen = points[names.notna() & (points["knob"] == knob)]
+        axes.plot(chosen["ms"], chosen["error"], style, color=colour, label=words)
+    axes.axhline(INVISIBLE, color="#777777", linestyle="--", linewidth=0.8)
+    axes.annotate(
+        "half a step of 8 bits", (0, INVISIBLE), (4, 3), xycoords=("axes fraction", "data"),
+        textcoords="offset points", fontsize=9, color="#555555",
+    )  # fmt: skip
+    axes.margins(0.08)
+    plain_ticks(axes.xaxis)
+    axes.set_title(f"{scene} on {device.title}")
+    named = points[names.notna()]
+    return list(zip(named["ms"], named["error"], names[names.notna()], strict=True))
 
 
 def constants_table(devices: Sequence[Device]) -> Frame:

@@ -1,0 +1,64 @@
+"""The schedule for GPUs draws every effect and every output as the reference does, on whatever OpenCL device
+this is: where these run there is no GPU."""
+
+import numpy as np
+import pytest
+from agreement import compare, random_splats, some_thick
+from combined import LENSES, SIZE, Combination, combination, everything, sliding, turning
+
+import fidsplat as fs
+from fidsplat.backends.prepare import prepare
+from fidsplat.backends.reference import ReferenceBackend
+from fidsplat.effects import OUTPUTS
+from fidsplat.effects.catalogue import CATALOGUE
+
+BACKEND = "opencl"
+SPLATS = random_splats(40, 21, depth=(0.8, 4.0), scale=(0.05, 0.5), across=1.2)
+CAMERA = fs.Camera.pinhole(*SIZE, 30.0, 30.0, 18.0, 11.0)
+OF_TRAINING = {"distortion", "overdraw"}
+"""tests/contract/test_gradients.py has these"""
+
+
+def taken(cloud, outputs=tuple(OUTPUTS), **how):
+    return Combination(cloud, fs.Capture(CAMERA, outputs, **how))
+
+
+def gaussians_beside_a_layer():
+    rng = np.random.default_rng(0)
+    layer = fs.Layer(rng.random((*SIZE[::-1], 3)), rng.uniform(0.9, 3.0, SIZE[::-1]), 77)
+    thick = some_thick(SPLATS, SPLATS.scales[::-1, 0])
+    return taken(thick, quality="standard,ellipsoid=ewa_antialiased", layer=layer)
+
+
+PICTURES = {
+    **{f"all behind {lens}": lambda lens=lens: combination(everything(lens)) for lens in [None, *LENSES]},
+    "3D Gaussians beside a layer": gaussians_beside_a_layer,
+    "disks under a shutter": lambda: taken(
+        SPLATS,
+        quality="standard,order=pixel",
+        motion=fs.Motion(turning, {0: sliding}),
+        shutter=fs.Shutter(exposure_time=0.2, sub_poses=2, readout=0.4, rows_per_band=8),
+    ),
+    "boxes in float64": lambda: taken(SPLATS.with_boxes(), quality="standard,blend_precision=float64"),
+}
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_it_agrees_with_the_reference(renderer, name):
+    asked = PICTURES[name]()
+    backend, reference = renderer.backend, ReferenceBackend()
+    features, view = prepare(asked.cloud, asked.capture)
+    groups = backend.shapes("schedule")["groups"]
+    images = backend.pipeline(features, groups).render(backend.upload(asked.cloud), view)
+    drawn = {output: images.read(output) for output in asked.capture.outputs}
+    truth = reference.pipeline(asked.features("alpha")).render(reference.upload(asked.cloud), view).images
+    differences = compare(drawn, truth, asked.capture.outputs)
+    # of so few pixels a single one that is hard is too large a share
+    wrong = [one for one in differences if not (one.finite and one.excess <= 0)]
+    assert not wrong, wrong
+    assert drawn["rgb"].std() > 0.02
+
+
+def test_nothing_is_left_out():
+    every = [made().features() for made in PICTURES.values()]
+    assert set().union(*(features.names for features in every)) == set(CATALOGUE) - OF_TRAINING
