@@ -77,6 +77,7 @@ def main() -> None:
     parser.add_argument("--splats", type=float, default=20e6)
     parser.add_argument("--places", type=int, default=1, help="of the city, so many times")
     parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--views", nargs="+", default=["all", "roofs", "street"], help="of these three")
     parser.add_argument("--size", default="3840x2160")
     asked = parser.parse_args()
     first = fs.Renderer(asked.device)
@@ -89,6 +90,8 @@ def main() -> None:
         store = fs.Store(fs.build_store([city.source], Path(folder) / "city.fss", levels=False))
         store = placed(store, city, asked.places, Path(folder))
         for view, camera in views(store, (width, height)).items():
+            if view not in asked.views:
+                continue
             for kind, scene in (("store", store), ("cloud", store.cloud())):
                 row = {"view": view, "scene": kind, **measure(scene, camera, several, asked.rounds)}
                 rows.append(row)

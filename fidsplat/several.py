@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import cycle, pairwise
+from queue import SimpleQueue
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -16,13 +19,18 @@ from fidsplat.capture import Capture, output_names
 from fidsplat.errors import InputError
 from fidsplat.frame import Frame
 from fidsplat.quality import Quality
-from fidsplat.render import Renderer, ResidentCloud
+from fidsplat.render import Renderer
+from fidsplat.resident import ResidentCloud
 from fidsplat.scenes import Scene
 from fidsplat.splats import SplatCloud
 from fidsplat.store.store import Store
 
 _UNEVEN = 1.1
 """how many times as long as the mean the slowest band may take before the bands are cut anew"""
+
+_AHEAD = 3
+"""pictures that each device is asked for before the first of them is waited for: one that is brought to the
+host, one that is drawn, and one whose chunks are fetched"""
 
 
 class SeveralDevices:
@@ -96,29 +104,40 @@ class SeveralDevices:
         quality: Quality | str | None = None,
     ) -> Iterator[Frame]:
         """Draw many pictures, each whole by one device, in their order: device k draws pictures k, k + n and
-        so on, of n devices. Arguments and errors as those of `render`."""
+        so on, of n devices, and brings each to the host while it draws the next. Arguments and errors as
+        those of `render`; an error, of `captures` too, comes after the pictures of the captures before it."""
         given = self._given(scene)
-        names, waiting = None if outputs is None else output_names(outputs), []
-
-        def draw(number: int, capture: Capture | Camera) -> Frame:
-            k = number % len(self.renderers)
-            frame = self.renderers[k].render(given[k], capture, names, quality)
-            for name in frame.outputs:  # brought to the host here, beside what other devices bring
-                _ = frame[name]
-            return frame
-
-        # a thread of its own for each device: its pictures are drawn in their order
-        pools = [ThreadPoolExecutor(1, "fidsplat-device") for _ in self.renderers]
+        names = None if outputs is None else output_names(outputs)
         try:
-            for number, capture in enumerate(captures):
-                waiting.append(pools[number % len(pools)].submit(draw, number, capture))
-                if len(waiting) > 2 * len(pools):
-                    yield waiting.pop(0).result()
+            rest = iter(captures)
+        except TypeError:
+            raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera") from None
+        lines = [
+            _Line(renderer, one, names, quality) for renderer, one in zip(self.renderers, given, strict=True)
+        ]
+        waiting: deque[_Line] = deque()
+        failure: Exception | None = None
+        try:
+            for line in cycle(lines):
+                try:
+                    line.ask(next(rest))
+                except StopIteration:
+                    break
+                except Exception as error:
+                    failure = error
+                    break
+                waiting.append(line)
+                if len(waiting) > _AHEAD * len(lines):
+                    yield waiting.popleft().result()
+            for line in lines:
+                line.ask(None)
             while waiting:
-                yield waiting.pop(0).result()
+                yield waiting.popleft().result()
         finally:
-            for pool in pools:
-                pool.shutdown(cancel_futures=True)
+            for line in lines:
+                line.stop()
+        if failure is not None:
+            raise failure
 
     def _given(self, scene: Scene | SplatCloud | Store | Sequence[ResidentCloud]) -> Sequence[ResidentCloud]:
         """A scene on all devices."""
@@ -143,6 +162,60 @@ class SeveralDevices:
         spent = np.concatenate([[0.0], np.cumsum(seconds)])
         ends = np.concatenate([[0.0], np.cumsum(rows)]) / sum(rows)
         self._shares = np.interp(np.linspace(0.0, spent[-1], len(spent)), spent, ends)
+
+
+class _Line:
+    """One device's part of many pictures, on a thread of its own."""
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        scene: ResidentCloud,
+        outputs: tuple[str, ...] | None,
+        quality: Quality | str | None,
+    ) -> None:
+        self._asked: SimpleQueue[Capture | Camera | None] = SimpleQueue()
+        self._made: SimpleQueue[Frame | BaseException] = SimpleQueue()
+        self._stopped = False
+        given = renderer, scene, outputs, quality
+        self._thread = Thread(target=self._draw, args=given, name="fidsplat-device", daemon=True)
+        self._thread.start()
+
+    def ask(self, capture: Capture | Camera | None) -> None:
+        """For a picture; None: for no more."""
+        self._asked.put(capture)
+
+    def result(self) -> Frame:
+        """The next picture, once it is on the host. Raises what drawing it has raised."""
+        made = self._made.get()
+        if isinstance(made, BaseException):
+            raise made
+        return made
+
+    def stop(self) -> None:
+        """Draw nothing more, and wait for what is being drawn."""
+        self._stopped = True
+        self._asked.put(None)
+        self._thread.join()
+
+    def _captures(self) -> Iterator[Capture | Camera]:
+        while (capture := self._asked.get()) is not None and not self._stopped:
+            yield capture
+
+    def _draw(
+        self,
+        renderer: Renderer,
+        scene: ResidentCloud,
+        outputs: tuple[str, ...] | None,
+        quality: Quality | str | None,
+    ) -> None:
+        try:
+            for frame in renderer.render_views(scene, self._captures(), outputs, quality):
+                for name in frame.outputs:
+                    _ = frame[name]
+                self._made.put(frame)
+        except BaseException as error:
+            self._made.put(error)
 
 
 @dataclass(frozen=True)

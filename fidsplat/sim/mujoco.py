@@ -66,6 +66,8 @@ class MujocoRig(Rig):
     ) -> None:
         if not isinstance(model, mujoco.MjModel):
             raise InputError(f"model is {model!r}; it must be a mujoco.MjModel")
+        if isinstance(cameras, str):
+            raise InputError(f"cameras is {cameras!r}; it must be a list of names, [{cameras!r}]")
         there = [model.camera(i).name for i in range(model.ncam)]
         wanted = [name for name in there if name] if cameras is None else list(cameras)
         for name in wanted:
@@ -77,6 +79,7 @@ class MujocoRig(Rig):
         for name in self.bodies:
             if name not in names:
                 raise InputError(unknown("body", name, filter(None, names)))
+        self._counts = model.nbody, model.ncam
         self._body_ids = [names.index(name) for name in self.bodies]
         self._camera_ids = [there.index(name) for name in self.cameras]
 
@@ -85,7 +88,7 @@ class MujocoRig(Rig):
         many = data if isinstance(data, list | tuple) else [data]
         if not many:
             raise InputError("data is empty; give at least one MjData")
-        parts = [_arrays_of(each) for each in many]
+        parts = [_arrays_of(each, *self._counts) for each in many]
         position, turn, at, axes = (np.concatenate([part[k] for part in parts]) for k in range(4))
         bodies = np.concatenate([position, turn], -1)[:, self._body_ids]
         cameras = np.concatenate([at, quaternions_of(axes, turned=_OPENCV)], -1)[:, self._camera_ids]
@@ -145,17 +148,23 @@ def _outputs_of(model: Any, number: int) -> tuple[str, ...] | None:
     )
 
 
-def _arrays_of(data: Any) -> list[np.ndarray]:
-    """Positions (env, n, 3), quaternions (env, n, 4) of bodies, positions and axes (env, n, 3, 3) of
-    cameras."""
+def _arrays_of(data: Any, bodies: int, cameras: int) -> list[np.ndarray]:
+    """Positions (env, n, 3), quaternions (env, n, 4) of the model's bodies, positions and axes (env, n, 3, 3)
+    of its cameras."""
     found = []
-    for name, width in (("xpos", 3), ("xquat", 4), ("cam_xpos", 3), ("cam_xmat", 9)):
+    kinds = ("xpos", 3, bodies), ("xquat", 4, bodies), ("cam_xpos", 3, cameras), ("cam_xmat", 9, cameras)
+    for name, width, count in kinds:
         array = getattr(data, name, None)
         if array is None:
             raise InputError(f"data is {data!r}; it must be a mujoco.MjData or mujoco_warp's Data")
         host = array.numpy() if hasattr(array, "numpy") else array  # a wp.array, or NumPy
         numbers = np.asarray(host, np.float64)
-        numbers = numbers.reshape(-1, numbers.size // width if host.ndim == 2 else numbers.shape[1], width)
+        there = numbers.shape[0 if numbers.ndim == 2 else 1]  # worlds are first
+        if there != count:
+            raise InputError(
+                f"data.{name} has {there} rows, but the model of the rig has {count}; give data of that model"
+            )
+        numbers = numbers.reshape(-1, count, width)
         found.append(numbers)
     found[3] = found[3].reshape(*found[3].shape[:2], 3, 3)
     return found

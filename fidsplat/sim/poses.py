@@ -27,8 +27,8 @@ def check_poses(name: str, poses: Any, axes: tuple[str, ...]) -> np.ndarray:
     """
     array = real_array(name, poses, "poses x y z qw qx qy qz")
     if array.ndim != len(axes) + 1 or array.shape[-1] != 7:
-        wanted = ", ".join((*axes, "7"))
-        raise InputError(f"{name} must have the shape ({wanted}), but the shape is {array.shape}")
+        wanted = f"({', '.join(axes)}, 7)" if axes else "(7,)"
+        raise InputError(f"{name} must have the shape {wanted}, but the shape is {array.shape}")
     usable = np.isfinite(array).all(-1) & (np.abs(array[..., :3]) <= LARGEST).all(-1)
     if not usable.all():
         at = np.argwhere(~usable)[0].tolist()

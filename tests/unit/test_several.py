@@ -1,5 +1,7 @@
 """Pictures by several devices: the bits of one, whichever rows each draws."""
 
+import threading
+
 import numpy as np
 import pytest
 from test_store_drawing import TURNED, look, made_store, splats
@@ -35,14 +37,27 @@ def test_bands_of_devices_have_the_bits_of_one(store, two):
     assert set(ours.timings) == set(whole.timings)
 
 
+def test_splats_beside_a_band_are_not_taken_for_big_ones():
+    # what another picture has left on the device must not show where a big splat stands
+    big = fs.SplatCloud([[0.0, 0.0, 2.0]], [[1.0, 0, 0, 0]], [[3.0, 3.0]], [0.1], colors=np.ones((1, 3)))
+    cloud = fs.SplatCloud.concatenate([big, splats(1)])
+    lower, camera = (fs.Camera.look_at(320, 240, 1.0, (0, 0, 0), (0, y, 1)) for y in (0.5, 0))
+    renderer = fs.Renderer("opencl")
+    renderer.render(cloud, lower).wait()
+    for band in ((0, 20), (220, 240)):
+        whole, rows = fs.Renderer("opencl").render(cloud, camera)["rgb"], slice(*band)
+        assert np.array_equal(renderer.render_band(band, cloud, camera)["rgb"][rows], whole[rows])
+
+
 def test_a_device_holds_the_chunks_that_its_band_sees(store, two):
     given = two.upload(store)
     two._shares = np.array([0.0, 0.5, 1.0])
     two.render(given, look()).wait()
-    alone = fs.Renderer("opencl").upload(store)
-    alone._renderer.render(alone, look())
-    each = [one._data.nodes for one in given]
-    assert max(each) < alone._data.nodes <= sum(each)
+    one = fs.Renderer("opencl")
+    alone = one.upload(store)
+    one.render(alone, look())
+    each = [one.data.nodes for one in given]
+    assert max(each) < alone.data.nodes <= sum(each)
 
 
 def test_views_are_shared_out_and_come_in_their_order(store, two):
@@ -85,3 +100,34 @@ def test_what_several_devices_cannot_draw_is_said(store, two):
     for band in ((-1, 3), (3, 3), (0, 31)):
         with pytest.raises(fs.InputError, match="of a band"):
             renderer.render_band(band, store, look())
+
+
+def test_pictures_come_before_the_failure_of_what_asks_for_them(store, two):
+    def failing(count):
+        for x in range(count):
+            yield look(at=(0.1 * x, 0, 0))
+        raise OSError("the list of cameras ends here")
+
+    alone = fs.Renderer("opencl")
+    for count in (0, 1, 3, 12):
+        frames, made = two.render_views(two.upload(store), failing(count)), []
+        with pytest.raises(OSError, match="ends here"):
+            made.extend(frames)  # keeps those that came
+        assert len(made) == count
+        for x, frame in enumerate(made):
+            wanted = alone.render(store.cloud(), look(at=(0.1 * x, 0, 0)))["rgb"]
+            assert np.array_equal(frame["rgb"], wanted)
+    frames, made = two.render_views(store, [look(), look(), fs.Capture(), look()]), []
+    with pytest.raises(fs.InputError, match="no camera"):
+        made.extend(frames)
+    assert len(made) == 2
+    with pytest.raises(fs.InputError, match="must be a list of Capture or Camera"):
+        list(two.render_views(store, 3))
+
+
+def test_views_may_be_left_before_their_end(store, two):
+    before = threading.active_count()
+    frames = two.render_views(two.upload(store), (look() for _ in range(1000)))
+    next(frames)
+    frames.close()
+    assert threading.active_count() <= before

@@ -140,6 +140,7 @@ def test_outputs_of_the_model_are_what_is_drawn(model, rig):
         ({1: "bos"}, None, r"unknown body 'bos' \(did you mean 'box'\?\); known: world, box, robot"),
         ({1: "box"}, ["fron"], r"unknown camera 'fron' \(did you mean 'front'\?\); known: above, front"),
         ({2: "box"}, None, "the body 'box' has no splats"),
+        ({1: "box"}, "front", r"cameras is 'front'; it must be a list of names, \['front'\]"),
     ],
 )
 def test_names_that_the_model_does_not_have(model, scene, bodies, cameras, words):
@@ -194,6 +195,17 @@ def test_data_without_poses(rig):
         rig.render("data")
     with pytest.raises(fs.InputError, match="data is empty"):
         rig.render([])
+
+
+@pytest.mark.parametrize("nbody", [1, 9])
+def test_data_of_another_model(rig, nbody):
+    bodies = "<body/>" * nbody
+    other = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    data = mujoco.MjData(other)
+    mujoco.mj_forward(other, data)
+    words = rf"data\.xpos has {nbody + 1} rows, but the model of the rig has \d; give data of that model"
+    with pytest.raises(fs.InputError, match=words):
+        rig.render(data)
 
 
 class Pushed(gymnasium.Env):

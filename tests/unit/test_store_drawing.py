@@ -95,7 +95,7 @@ def test_views_are_drawn_of_what_they_see(stores, reference, name):
         for output in ours:
             assert np.array_equal(ours[output], whole[output]), output
         assert whole["rgb"].any()
-        read, every = streamed._data.nodes, store.chunks
+        read, every = streamed.data.nodes, store.chunks
         assert 0 < read <= every
         if name in ("pinhole", "distorted"):
             assert read < 0.75 * every
@@ -191,7 +191,7 @@ def test_a_device_draws_splats_beside_stores_bit_for_bit(stores):
         ours, whole = (renderer.render(each, camera)["rgb"] for each in (resident, scene.cloud()))
         assert np.array_equal(ours, whole)
     # in parts as large as the chunks of the store
-    assert resident._data._cache._rows < 200
+    assert resident.data._cache._rows < 200
 
 
 def test_a_device_keeps_the_chunks_that_it_was_sent(stores, tmp_path, monkeypatch):
@@ -227,7 +227,7 @@ def test_slots_that_cannot_become_more_keep_what_they_hold(stores, monkeypatch):
     renderer, store = fs.Renderer("opencl"), stores["disks"]
     resident = renderer.upload(store)
     renderer.render(resident, look())
-    cache, pool, asked = resident._data._cache, renderer.backend.pool, []
+    cache, pool, asked = resident.data._cache, renderer.backend.pool, []
     fresh = pool.fresh
 
     def full(name, size):
@@ -264,7 +264,7 @@ def test_a_device_without_room_for_a_view_is_sent_its_chunks_again(stores, monke
         ours, whole = (renderer.render(each, camera, outputs) for each in (resident, store.cloud()))
         for output in outputs:
             assert np.array_equal(ours[output], whole[output]), output
-    cache, scene = resident._data._cache, resident._data.scene
+    cache, scene = resident.data._cache, resident.data.scene
     held = set(cache._slots)
     assert 0 < len(held) <= 2
     # what is drawn does not make room for what is fetched ahead

@@ -27,19 +27,27 @@ class Drawn:
     leased: list[tuple[str, cl.Buffer]]
     """what is the picture's own, by name: output images and, of some ways of listing, counts"""
     stats: Callable[[], dict[str, int]]
+    last: cl.Event
+    """of its last launch: all of it is drawn then, whatever else is on the queue"""
     events: list[tuple[str, cl.Event]] | None = None
     """of each launch, with its stage; None where nobody has taken the time"""
     uploads: Any = None
     """kept until the device has read them"""
 
     @staticmethod
-    def of(picture: Picture) -> Drawn:
+    def of(picture: Picture, timed: bool = True) -> Drawn:
         """What a picture leaves."""
-        return Drawn(picture.queue, picture.leased, picture.stats, picture.events, picture.uploads)
+        events, last = picture.events if timed else None, picture.events[-1][1]
+        return Drawn(picture.queue, picture.leased, picture.stats, last, events, picture.uploads)
 
     def buffer(self, name: str) -> cl.Buffer:
         """A leased buffer."""
         return dict(self.leased)[name]
+
+    def done(self) -> list[cl.Event]:
+        """What is waited for by another queue that reads what it has left."""
+        self.queue.flush()
+        return [self.last]
 
     def timings(self) -> dict[str, float]:
         """Milliseconds by stage."""
@@ -58,12 +66,14 @@ class Repeat:
         self,
         draw: Callable[[Resident, View], Drawn],
         time: Callable[[Resident, View, Recording], dict[str, float]],
+        workspace: Workspace,
         resident: Resident,
         view: View,
         recording: Recording,
     ) -> None:
         """draw: draws it anew, with the room that it needs. time: tells how long its stages take."""
         self._draw, self._time, self._view, self._recording = draw, time, view, recording
+        self._workspace = workspace
         self._room = recording.big, recording.capacity
         self._resident: Resident | None = resident
         self._known = weakref.ref(resident)
@@ -73,7 +83,8 @@ class Repeat:
         resident = self._resident
         if resident is None:
             return None
-        big, pairs = fullness_of(read_counts(drawn.queue, drawn.buffer("counts")))
+        counts = read_counts(self._workspace.read_queue, drawn.buffer("counts"), drawn.done())
+        big, pairs = fullness_of(counts)
         again = None if big <= self._room[0] and pairs <= self._room[1] else self._draw(resident, self._view)
         self._resident = None  # it is held no longer than it may be needed
         return again
@@ -115,7 +126,8 @@ class OpenCLImages:
     def empty(self, name: str) -> np.ndarray:
         """As `ReadsRows`."""
         output = self._outputs[name]
-        return np.empty(self._size if output.channels == 1 else (*self._size, output.channels), output.dtype)
+        shape = self._size if output.channels == 1 else (*self._size, output.channels)
+        return self._workspace.host_memory.empty(shape, output.dtype)
 
     def read_rows(self, name: str, first: int, end: int, into: np.ndarray) -> None:
         """As `ReadsRows`. Raises DeviceError as `read`."""
@@ -123,7 +135,9 @@ class OpenCLImages:
             return
         with self._workspace.failing(f"drawing {name}"):
             drawn, above = self.settle(), first * into[:1].nbytes
-            cl.enqueue_copy(drawn.queue, into[first:end], drawn.buffer(f"{name}_out"), src_offset=above)
+            # beside what was put on its queue since: the next picture, say
+            queue, image = self._workspace.read_queue, drawn.buffer(f"{name}_out")
+            cl.enqueue_copy(queue, into[first:end], image, src_offset=above, wait_for=drawn.done())
 
     def wait(self) -> None:
         """Until the device has drawn it.
@@ -162,6 +176,9 @@ class OpenCLImages:
         return self._drawn
 
 
-def stats_later(queue: cl.CommandQueue, counts: cl.Buffer, splats: int) -> Callable[[], dict[str, int]]:
-    """What a frame tells, read from a picture's buffer `counts` when it is wanted."""
-    return lambda: stats_of(splats, read_counts(queue, counts))
+def stats_later(
+    workspace: Workspace, counts: cl.Buffer, last: cl.Event, splats: int
+) -> Callable[[], dict[str, int]]:
+    """What a frame tells, read from a picture's buffer `counts` when it is wanted. last: of its launches, on
+    a queue that is flushed."""
+    return lambda: stats_of(splats, read_counts(workspace.read_queue, counts, [last]))

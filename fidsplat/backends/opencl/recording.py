@@ -20,7 +20,7 @@ from fidsplat.backends.opencl.program import put_argument
 from fidsplat.backends.opencl.workspace import token_of
 from fidsplat.backends.view import View
 
-Launched: TypeAlias = tuple[list[tuple[str, cl.Buffer]], list[tuple[str, cl.Event]]]
+Launched: TypeAlias = tuple[list[tuple[str, cl.Buffer]], cl.Event, list[tuple[str, cl.Event]]]
 _VIEWS = 256
 """that are kept ready"""
 _VIEWS_BYTES = 1 << 26
@@ -108,8 +108,8 @@ class Recording:
         self._ready[id(picture.view)] = picture.view, self._arrays | picture.arrays, values
 
     def launch(self, queue: cl.CommandQueue, timed: bool = False) -> Launched:
-        """Draws the picture into leased buffers, which are returned by name; with the events of the launches
-        if it is timed."""
+        """Draws the picture into leased buffers. Returns them by name, the last event, and the events
+        of all launches with their stages if it is timed."""
         pool, bound = self._pool, self._bound
         leased = [(name, pool.lease(name, size)) for name, size in self._leases]
         for name, buffer in leased:
@@ -119,10 +119,11 @@ class Recording:
                 for kernel, index in self._takers[name]:
                     kernel.set_arg(index, buffer)
                 bound[name] = token
-        events: list[tuple[str, cl.Event]] = []
+        last, events = None, []
         for stage, kernel, size, group in self._launches:
-            event = cl.enqueue_nd_range_kernel(queue, kernel, size, group)
+            last = cl.enqueue_nd_range_kernel(queue, kernel, size, group)
             if timed:
-                events.append((stage, event))
+                events.append((stage, last))
         queue.flush()
-        return leased, events
+        assert last is not None  # a picture has launches
+        return leased, last, events

@@ -1,0 +1,58 @@
+"""Images of GPUs on the host: page-locked memory that is used again when nobody holds what lies there."""
+
+import math
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.backends.opencl import host_memory
+from fidsplat.random_clouds import random_splats
+
+
+@pytest.fixture
+def renderer(monkeypatch):
+    monkeypatch.setattr(host_memory, "_LEAST", 1)
+    renderer = fs.Renderer("opencl")
+    memory = renderer.backend.host_memory
+    monkeypatch.setattr(memory, "locks", True)  # as GPUs do
+    return renderer
+
+
+def addresses(frames):
+    return [frame["rgb"].ctypes.data for frame in frames]
+
+
+def test_images_that_are_kept_keep_their_memory(renderer):
+    cloud = random_splats(50, 1)
+    cameras = [fs.Camera.look_at(64, 48, 1.0, (0.05 * k, 0, -1), (0, 0, 2)) for k in range(6)]
+    there, plain = renderer.upload(cloud), fs.Renderer("opencl")
+    frames = list(renderer.render_views(there, cameras))
+    assert len(set(addresses(frames))) == len(frames)
+    for frame, camera in zip(frames, cameras, strict=True):
+        assert np.array_equal(frame["rgb"], plain.render(cloud, camera)["rgb"])
+    parts = [frame["rgb"][3:5, 7:9] for frame in frames]
+    before, held = [part.copy() for part in parts], addresses(frames)
+    del frames, frame
+    again = [renderer.render(there, camera) for camera in reversed(cameras)]
+    assert not set(addresses(again)) & set(held)  # parts of images hold them
+    assert all(np.array_equal(part, copy) for part, copy in zip(parts, before, strict=True))
+    del parts
+    last = [renderer.render(there, camera) for camera in cameras]
+    assert set(addresses(last)) & set(held)
+
+
+def test_no_more_is_locked_than_allowed(renderer, monkeypatch):
+    memory, shape = renderer.backend.host_memory, (10, 10)
+    monkeypatch.setattr(host_memory, "_MOST", 900)
+    first = memory.empty(shape, np.float32)
+    assert first.base is None  # the first of a size is in ordinary memory
+    kept = [memory.empty(shape, np.float32) for _ in range(4)]
+    assert [array.base is not None for array in kept] == [True, True, False, False]
+    assert all(array.shape == shape and array.dtype == np.float32 and array.flags.writeable for array in kept)
+    del kept
+    assert memory.empty((9, 9), np.int32).base is None
+    other = memory.empty((9, 9), np.int32)  # what lies idle makes room
+    assert other.base is not None
+    assert memory._held <= 900
+    assert math.prod(other.shape) == 81
