@@ -29,7 +29,7 @@ from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError
 from fidsplat.kernel_files import kernels_folder
 
-_LISTS = {"ordered": ("scan", "sort", "bin"), "tiled": ("tiles",)}
+_LISTS = {"ordered": ("scan", "sort", "bin"), "tiled": ("tiles",), "gathered": ("tiles", "gathered")}
 """stages of the program `lists`, by the way of listing"""
 _DRAWN = ("prelude", "math", "splat", "bounds", "project", "pack", "blend", "schedule/{}", "resolve")
 """stages of the program `picture`, with the way in which a device walks tiles; only splats that are listed in
@@ -138,7 +138,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         "picture": [
             stage.format(shape.schedule)
             for stage in _DRAWN
-            if not (stage == "pack" and shape.lists == "tiled") and not (stage == "resolve" and at_once)
+            if not (stage == "pack" and shape.lists != "ordered") and not (stage == "resolve" and at_once)
         ],
     }
     _refuse_unknown_hooks(files)
