@@ -25,6 +25,7 @@ from fidsplat.errors import DeviceError
 _VISIBLE, _PAIRS, _BIG, _TALLIES = 0, 2, 6, 8
 # words of the buffer `counts`, as in tiles.cl: big splats, pairs (two words), visible splats
 _COUNTS = 4
+_NO_WINDOW = np.array([0xFFFFFFFF, 0], np.uint32)
 
 
 class Lists:
@@ -56,8 +57,8 @@ class Lists:
         picture.take("keys", KEYS * places)
         windows = picture.take("windows", WINDOWS * places)
         if picture.view.band is not None and places:
-            # splats beside the band get no window of their own: one that touches no tile
-            cl.enqueue_fill_buffer(picture.queue, windows, np.zeros(1, np.uint32), 0, WINDOWS * places)
+            # splats beside the band get no window of their own: one without tiles, of no big splat
+            cl.enqueue_fill_buffer(picture.queue, windows, _NO_WINDOW, 0, WINDOWS * places)
         if count == 0:
             return
         wanted = [one.name for one in source.arguments["project"] if one.source == "cloud"]
