@@ -58,6 +58,8 @@ def saved_scene(name: str, file: Path) -> Path:
     """A scene of `fidsplat bench` in a file that every commit can read."""
     cloud, camera = BENCH_SCENES[name].make()
     arrays = {field: getattr(cloud, field) for field in ARRAYS}
+    if cloud.thickness is not None:
+        arrays["scales"] = np.column_stack([cloud.scales, cloud.thickness])
     given = {field: array for field, array in arrays.items() if array is not None}
     np.savez(file, camera=(camera.width, camera.height, camera.fx), **given)
     return file

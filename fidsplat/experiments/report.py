@@ -227,7 +227,8 @@ def _views(rows: Frame, folder: Path) -> dict:
         ending = "/light" if truth in LINEAR else "/best"
         drawn = [method for method in methods if "/" not in method or method.endswith(ending)]
         psnr = {c: {k: v[0] for k, v in row.items()} for c, row in VIEWS.items()}
-        series[f"MIXTURE{ending} against {truth}"] = _series(categories, drawn, mean["psnr"], psnr)
+        title = f"mixtures drawn as `{ending[1:]}` against\n{TRUTHS[truth]}"
+        series[title] = _series(categories, drawn, mean["psnr"], psnr)
     _panels(folder / "psnr.svg", categories, series, "PSNR, dB")
     measured = {name: int(rows[name].notna().sum()) for name in ("flip", "lpips")}
     return {"tables": tables, "views": int(rows["amount"].max()), "rows": len(rows), "measured": measured}

@@ -29,8 +29,8 @@ CAMERAS = {
 BEFORE_LENSES = {
     ("lanes", ("rgb",)): "05ec20caf8ba0db7c042966c0440cafa953d40eaedeeb6f81ba517fa0d7aac4e",
     ("lanes", OUTPUTS): "b3924db982e967a646c2ca707519e2d17bf39f1f872926fd047537158cee836c",
-    ("group", ("rgb",)): "ca037f6d5e489ff107ddbf809c1320fb151aa4a1e0ab7ec53563ebe155ca09ff",
-    ("group", OUTPUTS): "21a1f84ba647e5d862a8368f4df96527dbf2f4626dbec729007d459c254e014f",
+    ("group", ("rgb",)): "d4057165b4378f5244ed463107ffb01356723c3138e28d5db79e2e599a57e242",
+    ("group", OUTPUTS): "5c31d31bc2774882f396b2bccc3cfeda259ea6692c41d8cea1b0ede18b41ce98",
 }
 
 

@@ -317,15 +317,19 @@ class TiledLists(Lists):
 
     def _list(self, first: int, end: int, capacity: int, first_band: bool) -> None:
         """The sorted lists of the tiles of one band."""
-        picture, items, count = self.picture, self._ITEMS, self.picture.resident.count
+        picture, items = self.picture, self._ITEMS
         picture.take("pairs", 8 * capacity)
         picture.take("lists", 4 * capacity)
-        groups, views = -(-count // items), picture.views
-        walk = {"count": count, "splat_groups": groups, "first_band": first_band}
-        band = {"band_first": first, "band_end": end, "capacity": capacity}
-        all_groups = groups + -(-self._big_groups // views)
-        picture.launch("bin", "emit", all_groups * items, items, views, **walk, **band)
+        self._emit({"band_first": first, "band_end": end, "capacity": capacity, "first_band": first_band})
         picture.launch("sort", "sort_tiles", (end - first) * items, items, band_first=first)
+
+    def _emit(self, band: dict[str, Any]) -> None:
+        """The pairs of a band."""
+        picture, items, count = self.picture, self._ITEMS, self.picture.resident.count
+        groups, views = -(-count // items), picture.views
+        all_groups = groups + -(-self._big_groups // views)
+        walk = {"count": count, "splat_groups": groups}
+        picture.launch("bin", "emit", all_groups * items, items, views, **walk, **band)
 
     def _read(self, counted: cl.Event) -> tuple[int, int]:
         """Numbers of big splats and of pairs as `counted` has left them, while later stages picture."""
@@ -344,6 +348,35 @@ def pairs_of(picture: Picture) -> int | None:
 def _counts_after(counted: cl.Event, picture: Picture) -> np.ndarray:
     picture.queue.flush()
     return read_counts(picture.workspace.side_queue, picture.held["counts"], [counted])
+
+
+class GatheredLists(TiledLists):
+    """Kernels gathered.cl beside those of TiledLists: work-groups take many splats of a view each, and count
+    their pairs in local memory. For many views, of at most TILES tiles each.
+    """
+
+    TILES = 4096  # GATHER_TILES
+    _GATHERED = 4096  # as there
+
+    def _project(self, needed: int = 0) -> None:
+        """Projects and tallies."""
+        super()._project(needed)
+        self._gather("tally_gathered")
+
+    def _emit(self, band: dict[str, Any]) -> None:
+        """The pairs of a band: of the splats of many tiles, then of all others."""
+        picture, items, count = self.picture, self._ITEMS, self.picture.resident.count
+        big = {"count": count, "splat_groups": 0}
+        picture.launch("bin", "emit", self._big_groups * items, items, **big, **band)
+        self._gather("emit_gathered", **band)
+
+    def _gather(self, kernel: str, **given: Any) -> None:
+        """Launch of a kernel of gathered.cl."""
+        picture, count = self.picture, self.picture.resident.count
+        if count == 0:
+            return
+        groups, items = -(-count // self._GATHERED), picture.shape.scan_items
+        picture.launch("bin", kernel, groups * items, items, picture.views, count=count, **given)
 
 
 def read_counts(
@@ -365,4 +398,4 @@ def stats_of(splats: int, words: np.ndarray) -> dict[str, int]:
     return {"splats": splats, "visible": int(words[3]), "pairs": fullness_of(words)[1]}
 
 
-LISTS = {"ordered": OrderedLists, "chunked": ChunkedLists, "tiled": TiledLists}
+LISTS = {"ordered": OrderedLists, "chunked": ChunkedLists, "tiled": TiledLists, "gathered": GatheredLists}

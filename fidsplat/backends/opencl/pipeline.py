@@ -14,7 +14,7 @@ from fidsplat.backends.opencl.assemble import Source
 from fidsplat.backends.opencl.batch import OpenCLBatch, OutputBuffers, parts
 from fidsplat.backends.opencl.drawing import Slots, draw
 from fidsplat.backends.opencl.images import Drawn, OpenCLImages, Repeat, stats_later
-from fidsplat.backends.opencl.lists import TiledLists
+from fidsplat.backends.opencl.lists import GatheredLists, TiledLists
 from fidsplat.backends.opencl.memory_plan import (
     BIG,
     KEYS,
@@ -134,13 +134,11 @@ class OpenCLPipeline:
         buffers = OutputBuffers(workspace, outputs, batch)
         drawn: list[Drawn] = []
         for first, end, plan in self._parts(resident, batch, buffers.nbytes):
-            shape, views = self.shape, batch.views
-            if plan.chunk and shape.lists != "ordered":
-                # as `render`
-                shape = replace(shape, lists="ordered")
+            views = batch.views
+            stack = views.part(first, end) if isinstance(views, ViewStack) and end - first > 1 else None
+            shape = self._listing(plan, stack)
             pipeline = self if shape is self.shape else self._other(self.features, shape)
             pool.make_way((pipeline, "views", resident.count, plan), workspace.memory_budget - plan.held)
-            stack = views.part(first, end) if isinstance(views, ViewStack) and end - first > 1 else None
 
             def start(view: View, pipeline=pipeline, stack=stack, plan=plan) -> Picture:
                 return Picture(workspace, pipeline.program, pipeline.shape, resident, view, plan, stack=stack)
@@ -148,6 +146,19 @@ class OpenCLPipeline:
             into = Slots(batch.slots[first:end].copy(), buffers.held())
             drawn.append(Drawn.of(draw(start, batch.one(first), outputs, into)))
         return OpenCLBatch(workspace, buffers, drawn, resident.count)
+
+    def _listing(self, plan: MemoryPlan, stack: ViewStack | None) -> DeviceShape:
+        """The shape that lists a part of a batch in the least time."""
+        if self.shape.lists != "tiled":
+            return self.shape
+        if plan.chunk:
+            return replace(self.shape, lists="ordered")  # as `render`
+        few = stack is not None and self._tiles(stack.view) <= GatheredLists.TILES
+        return replace(self.shape, lists="gathered") if few else self.shape
+
+    def _tiles(self, view: View) -> int:
+        """That a view has."""
+        return -(-view.width // self.shape.tile_width) * -(-view.height // self.shape.tile_height)
 
     def _parts(
         self, resident: Resident, batch: ViewBatch, beside: int
@@ -180,7 +191,7 @@ class OpenCLPipeline:
     def _bytes_of_view(self, resident: Resident, view: View) -> tuple[int, int]:
         """What a view of a batch takes beside its images, and its samples."""
         shape, source = self.shape, self.source
-        tiles = -(-view.width // shape.tile_width) * -(-view.height // shape.tile_height)
+        tiles = self._tiles(view)
         samples = tiles * shape.tile_width * shape.tile_height
         splat = source.records["Splat"].itemsize + KEYS + WINDOWS
         splat += SORTED if shape.lists == "ordered" else 0
