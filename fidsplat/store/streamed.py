@@ -136,6 +136,12 @@ class Streamed:
         made.append(np.arange(first, first + len(self.beside), dtype=np.int32))
         return np.concatenate(made)
 
+    def count_of(self, selection: Selection) -> int:
+        """Splats of a selection."""
+        each = zip(self.stores, selection.nodes, strict=True)
+        chosen = sum(int(store.counts(np.array(nodes, np.int64)).sum()) for store, nodes in each)
+        return chosen + len(self.beside)
+
     @property
     def largest_chunk(self) -> int:
         """Splats of the largest node; those beside are taken in as large parts."""
