@@ -22,17 +22,22 @@ import numpy as np
 from measuring import PROGRESS, keep, options
 from rich.progress import Progress
 
-from fidsplat.random_clouds import load_scene
+from fidsplat.experiments.bench.catalogue import BENCH_SCENES
 from fidsplat.timing import Clock, Timer, quartiles, ratios, take_turns
 
+ARRAYS = ("means", "quats", "scales", "opacities", "colors", "boxes", "planes")
 ROOT = Path(__file__).resolve().parent.parent
 CHILD = """
 import hashlib, sys, time
 import numpy as np
 import fidsplat as fs
 scene = np.load(sys.argv[1])
-cloud = fs.SplatCloud(**{name: scene[name] for name in ("means", "quats", "scales", "opacities", "colors")})
-width, height, focal = scene["camera"]
+given = {name: scene[name] for name in scene.files}
+width, height, focal = given.pop("camera")
+boxes, planes = given.pop("boxes", None), given.pop("planes", None)
+cloud = fs.SplatCloud(**given)
+cloud = cloud if boxes is None else cloud.with_boxes(boxes)
+cloud = cloud if planes is None else cloud.with_planes(planes)
 camera = fs.Camera.pinhole(int(width), int(height), focal, focal, width / 2, height / 2)
 renderer = fs.Renderer(sys.argv[2])
 resident = renderer.upload(cloud)
@@ -50,10 +55,13 @@ for line in sys.stdin:
 
 
 def saved_scene(name: str, file: Path) -> Path:
-    """A scene in a file that every commit can read."""
-    cloud, camera = load_scene(name)
-    arrays = {field: getattr(cloud, field) for field in ("means", "quats", "scales", "opacities", "colors")}
-    np.savez(file, camera=(camera.width, camera.height, camera.fx), **arrays)
+    """A scene of `fidsplat bench` in a file that every commit can read."""
+    cloud, camera = BENCH_SCENES[name].make()
+    arrays = {field: getattr(cloud, field) for field in ARRAYS}
+    if cloud.thickness is not None:
+        arrays["scales"] = np.column_stack([cloud.scales, cloud.thickness])
+    given = {field: array for field, array in arrays.items() if array is not None}
+    np.savez(file, camera=(camera.width, camera.height, camera.fx), **given)
     return file
 
 
@@ -130,7 +138,7 @@ def measure(commit: str, scene: str, device: str, repeats: int) -> dict:
 def main() -> None:
     parser = options(__doc__, repeats=15)
     parser.add_argument("commit", help="any name that git knows, or a folder with its files")
-    parser.add_argument("--scene", default="r1m_1080p")
+    parser.add_argument("--scene", default="r1m_1080p", choices=BENCH_SCENES)
     asked = parser.parse_args()
     row = measure(asked.commit, asked.scene, asked.device, max(asked.repeats, 2))
     if keep(row, asked.json):

@@ -17,7 +17,8 @@ from fidsplat.capture import Capture
 from fidsplat.effects import select
 from fidsplat.errors import DeviceError, InputError
 from fidsplat.quality import Quality
-from fidsplat.render import Renderer, ResidentCloud
+from fidsplat.render import Renderer
+from fidsplat.resident import ResidentCloud
 from fidsplat.scenes import Scene
 from fidsplat.splats import SplatCloud
 
@@ -90,7 +91,7 @@ def full_precision(capture: Capture, renderer: Renderer) -> Capture:
         setup_precision="float64",
         arithmetic="precise",
     )
-    if not renderer.backend.always_float64 and draws_float64(renderer, capture):
+    if not renderer.device.always_float64 and draws_float64(renderer, capture):
         best = best.with_(blend_precision="float64")
     return capture.with_(quality=best)
 
@@ -98,7 +99,7 @@ def full_precision(capture: Capture, renderer: Renderer) -> Capture:
 def draws_float64(renderer: Renderer, capture: Capture) -> bool:
     """Whether its pictures at full precision are float64 throughout: the reference's, and those of devices
     that composite in float64, but for lenses and fog, whose rays are float32."""
-    if renderer.backend.always_float64:
+    if renderer.device.always_float64:
         return True
     try:
         double = Quality(blend_precision="float64")
@@ -110,7 +111,7 @@ def draws_float64(renderer: Renderer, capture: Capture) -> bool:
 
 def error_bound(reference: Renderer, capture: Capture) -> float:
     """What the truth that a renderer draws may be off itself."""
-    if reference.backend.always_float64:
+    if reference.device.always_float64:
         return 0.0
     return FLOAT32_OUTPUT if draws_float64(reference, capture) else FLOAT32_TRUTH
 

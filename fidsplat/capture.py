@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypedDict
 
 from fidsplat.cameras import Camera, Motion, Shutter
 from fidsplat.errors import InputError, unknown
@@ -83,6 +84,18 @@ class Capture(PickledByFields):
                 raise InputError(unknown("part of a capture", name, [part.name for part in fields(self)]))
         given = {name: value for name, value in changes.items() if value is not None}
         return replace(self, **given) if given else self
+
+
+class CaptureParts(TypedDict, total=False):
+    """Parts of a capture as arguments by name beside `outputs` and `quality`; None: as the capture has it."""
+
+    camera: Camera | None
+    background: Background | Iterable[float] | None
+    motion: Motion | None
+    shutter: Shutter | None
+    sensor: Sensor | None
+    fog: Fog | None
+    layer: Layer | None
 
 
 def output_names(outputs: Any) -> tuple[str, ...]:

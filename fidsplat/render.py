@@ -6,8 +6,7 @@ import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
-from functools import cached_property
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -18,25 +17,23 @@ from fidsplat.backends.base import (
     DrawsEvery,
     Images,
     Pipeline,
-    ResidentData,
 )
 from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.registry import open_backend
 from fidsplat.backends.view import NO_CAMERA, View
 from fidsplat.batch import FrameBatch, ViewByView
-from fidsplat.cameras import Camera, Motion, Shutter
-from fidsplat.capture import Capture, output_names
-from fidsplat.effects import FeatureSet
+from fidsplat.cameras import Camera
+from fidsplat.capture import Capture, CaptureParts, output_names
 from fidsplat.errors import InputError, unknown
-from fidsplat.frame import Frame, Ids, check_process, stacked
+from fidsplat.frame import Frame, check_process, stacked
 from fidsplat.quality import Quality, whole_number
+from fidsplat.resident import ResidentCloud
 from fidsplat.scenes import Scene
-from fidsplat.sensor import Sensor
 from fidsplat.splats import SplatCloud
 from fidsplat.store.bands import PartOfView
 from fidsplat.store.residency import Residency
 from fidsplat.store.store import Store
-from fidsplat.surroundings import Fog, Gradient, Panorama, background_of
+from fidsplat.surroundings import background_of
 from fidsplat.views import Views, views_of
 
 _PLAIN = Capture()
@@ -45,55 +42,6 @@ _PLAIN = Capture()
 def default_device() -> str:
     """The device that is used where none is named: FIDSPLAT_DEVICE, else opencl."""
     return os.environ.get("FIDSPLAT_DEVICE", "").strip() or "opencl"
-
-
-class ResidentCloud:
-    """A cloud on a renderer's device; rendering it transfers no splat. Of a store, or a scene with stores,
-    what views need is brought there when they are drawn, and what the last one needed stays."""
-
-    def __init__(
-        self,
-        renderer: Renderer,
-        data: ResidentData | Residency,
-        capture: Capture,
-        labels: np.ndarray | None = None,
-    ) -> None:
-        self._renderer, self._data, self._labels = renderer, data, labels
-        self.capture = capture
-        """how its pictures are taken unless `render` is given another: that of the scene it came from"""
-
-    def __len__(self) -> int:
-        return self._data.count
-
-    def __reduce__(self):
-        raise InputError(
-            "a ResidentCloud is on a device and cannot be pickled or copied; take the SplatCloud, and upload "
-            "it there"
-        )
-
-    @property
-    def memory_bytes(self) -> int:
-        """Device memory that it takes; 0 where the device reads the host's own arrays, as OpenCL on a CPU."""
-        return self._data.memory_bytes
-
-    @cached_property
-    def labels(self) -> frozenset[int] | None:
-        """The labels that its splats have; None where they are on the device, or on disk."""
-        return None if self._labels is None else frozenset(np.unique(self._labels).tolist())
-
-    @property
-    def _whole(self) -> Any:
-        """What a capture is prepared for: all splats, wherever they are."""
-        return self._data.scene if isinstance(self._data, Residency) else self._data
-
-    def _seen(
-        self, views: Iterable[View], features: FeatureSet, qualities: Iterable[Quality]
-    ) -> tuple[Any, Ids]:
-        """The splats on the device that these views are drawn from, and their indices in the whole where
-        these are not their own."""
-        if isinstance(self._data, Residency):
-            return self._data.of(list(views), features, qualities)
-        return self._data, None
 
 
 class Renderer:
@@ -144,12 +92,12 @@ class Renderer:
         stored = Scene(stores=(scene,)) if isinstance(scene, Store) else scene
         streamed = stored.streamed if isinstance(stored, Scene) else None
         if streamed is not None:
-            return ResidentCloud(self, Residency(streamed, self.backend), capture)
+            return ResidentCloud(self.backend, Residency(streamed, self.backend), capture)
         cloud = scene.cloud() if isinstance(scene, Scene) else scene
         if not isinstance(cloud, SplatCloud):
             raise InputError(f"cannot render a {type(scene).__name__}; give a Scene, a SplatCloud or a Store")
         with self._lock:
-            return ResidentCloud(self, self.backend.upload(cloud), capture, cloud.labels)
+            return ResidentCloud(self.backend, self.backend.upload(cloud), capture, cloud.labels)
 
     def adopt(
         self,
@@ -187,7 +135,7 @@ class Renderer:
         given |= {} if labels is None else {"labels": labels}
         with self._lock:
             data = self.backend.adopt(given, np.asarray(tuple(origin), dtype=np.float64))
-        return ResidentCloud(self, data, _PLAIN)
+        return ResidentCloud(self.backend, data, _PLAIN)
 
     def render(
         self,
@@ -195,13 +143,7 @@ class Renderer:
         capture: Capture | Camera | None = None,
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
-        background: Iterable[float] | Gradient | Panorama | None = None,
-        motion: Motion | None = None,
-        shutter: Shutter | None = None,
-        sensor: Sensor | None = None,
-        fog: Fog | None = None,
-        *,
-        camera: Camera | None = None,
+        **parts: Unpack[CaptureParts],
     ) -> Frame:
         """Draw one picture: `render(scene, Capture(camera, ...))`, or the parts of a capture as arguments.
 
@@ -209,15 +151,14 @@ class Renderer:
             scene: what to draw.
             capture: how; or a camera alone. Without a Capture a Scene's own is taken, which its ResidentCloud
                 has too.
-            outputs, quality, background, motion, shutter, sensor, fog, camera: take the place of the
-                capture's.
+            outputs, quality, and by name the other parts (`CaptureParts`): take the place of the capture's.
 
         Raises:
             InputError: no camera, an unknown output or preset, a picture that is too large, a cloud uploaded
                 elsewhere.
             DeviceError: the device fails or lacks memory.
         """
-        asked = _asked(scene, capture, camera, outputs, quality, background, motion, shutter, sensor, fog)
+        asked = _asked(scene, capture, outputs=outputs, quality=quality, **parts)
         return self._draw(self._resident(scene), asked)
 
     def render_every(
@@ -241,7 +182,7 @@ class Renderer:
             InputError: as `render`; the device draws whole pictures only.
         """
         whole_number("step", step, 1, 2**31 - 1)
-        asked = _asked(scene, capture, None, outputs, quality, *[None] * 5)
+        asked = _asked(scene, capture, outputs=outputs, quality=quality)
 
         def draw(pipeline: Pipeline, data: Any, view: View) -> Images:
             if not isinstance(pipeline, DrawsEvery):
@@ -267,7 +208,7 @@ class Renderer:
         Raises:
             InputError: as `render`; rows that the picture does not have.
         """
-        asked = _asked(scene, capture, None, outputs, quality, *[None] * 5)
+        asked = _asked(scene, capture, outputs=outputs, quality=quality)
         rows = asked.camera.height if asked.camera is not None else 0
         first, end = band
         whole_number("the first row of a band", first, 0, rows - 1)
@@ -280,11 +221,7 @@ class Renderer:
         captures: Iterable[Capture | Camera],
         outputs: Iterable[str] | None = None,
         quality: Quality | str | None = None,
-        background: Iterable[float] | Gradient | Panorama | None = None,
-        motion: Motion | None = None,
-        shutter: Shutter | None = None,
-        sensor: Sensor | None = None,
-        fog: Fog | None = None,
+        **parts: Unpack[CaptureParts],
     ) -> Iterator[Frame]:
         """Draw one cloud many times, one Frame for each capture or camera, in their order.
 
@@ -293,17 +230,18 @@ class Renderer:
         (a motion of the camera takes the place of each camera's pose); an error comes after the pictures of
         the captures before it.
         """
-        outputs = None if outputs is None else output_names(outputs)
-        background = None if background is None else background_of(background)  # an iterator ends at once
+        outputs = None if outputs is None else output_names(outputs)  # an iterator would end with the first
+        background = parts.get("background")
+        if background is not None:
+            parts["background"] = background_of(background)
         try:
             rest = iter(captures)
         except TypeError:
             raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera") from None
         resident = self._resident(scene)
-        parts = (outputs, quality, background, motion, shutter, sensor, fog)
-        asked = (_asked(scene, one, None, *parts) for one in rest)
-        if isinstance(resident._data, Residency):
-            asked = resident._data.read_ahead(asked)
+        asked = (_asked(scene, one, outputs=outputs, quality=quality, **parts) for one in rest)
+        if isinstance(resident.data, Residency):
+            asked = resident.data.read_ahead(asked)
         waiting: Frame | None = None
         failure: Exception | None = None
         while True:
@@ -355,7 +293,7 @@ class Renderer:
             each = list(given)
         except TypeError:
             raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera") from None
-        plain = [_asked(scene, one, *[None] * 8) for one in each]
+        plain = [_asked(scene, one) for one in each]
         views = views_of(plain, poses, groups, mask)
         self._refuse_unknown_labels(resident, views)
         return self._draw_batch(resident, views)
@@ -369,10 +307,10 @@ class Renderer:
                     )
 
     def _draw_batch(self, resident: ResidentCloud, views: Views) -> FrameBatch:
-        features, batch = prepare_batch(resident._whole, views)
+        features, batch = prepare_batch(resident.whole, views)
         with self._lock:
             drawn = (batch.one(number) for number in range(len(batch.slots)))
-            data, ids = resident._seen(drawn, features, (capture.quality for capture in views.captures))
+            data, ids = resident.seen(drawn, features, (capture.quality for capture in views.captures))
             pipeline = self.backend.pipeline(features)
             if isinstance(pipeline, DrawsBatches):
                 images = pipeline.render_batch(data, batch)
@@ -384,7 +322,7 @@ class Renderer:
     def _resident(self, scene: Scene | SplatCloud | Store | ResidentCloud) -> ResidentCloud:
         resident = scene if isinstance(scene, ResidentCloud) else self.upload(scene)
         check_process(self._process, "Renderer")
-        if resident._renderer is not self:
+        if resident.backend is not self.backend:
             raise InputError(
                 "this cloud was uploaded by another Renderer; upload it with the one that draws it"
             )
@@ -399,11 +337,11 @@ class Renderer:
         ),
         band: tuple[int, int] | None = None,
     ) -> Frame:
-        features, view = prepare(resident._whole, capture)
+        features, view = prepare(resident.whole, capture)
         if band is not None:
             view = replace(view, band=(band[0] * view.samples, band[1] * view.samples))
         with self._lock:  # scratch buffers and kernels' arguments belong to one picture at a time
-            pipeline, data = self.backend.pipeline(features), resident._data
+            pipeline, data = self.backend.pipeline(features), resident.data
             if not isinstance(data, Residency):
                 return Frame(draw(pipeline, data, view), capture.outputs)
 
@@ -413,30 +351,17 @@ class Renderer:
             return stacked(data.parts(view, features, capture.quality, pipeline), part)
 
 
-def _asked(
-    scene: Any,
-    capture: Capture | Camera | None,
-    camera: Camera | None,
-    outputs: Any,
-    quality: Any,
-    background: Any,
-    motion: Any,
-    shutter: Any,
-    sensor: Any,
-    fog: Any,
-) -> Capture:
+def _asked(scene: Any, capture: Capture | Camera | None, **parts: Any) -> Capture:
     """The capture that is given or the scene's own, changed by the parts that are given beside it.
 
     Raises:
-        InputError: a part of the wrong kind, or no camera.
+        InputError: an unknown part, one of the wrong kind, or no camera.
     """
     if not isinstance(capture, Capture):
-        camera = camera if capture is None else capture
+        if capture is not None:
+            parts["camera"] = capture
         capture = scene.capture if isinstance(scene, (Scene, ResidentCloud)) else _PLAIN
-    asked = capture.with_(
-        camera=camera, outputs=outputs, quality=quality, background=background, motion=motion,
-        shutter=shutter, sensor=sensor, fog=fog,
-    )  # fmt: skip
+    asked = capture.with_(**parts)
     if asked.camera is None:
         raise InputError(NO_CAMERA)
     return asked

@@ -19,7 +19,8 @@ from fidsplat.capture import Capture, output_names
 from fidsplat.errors import InputError
 from fidsplat.frame import Frame
 from fidsplat.quality import Quality
-from fidsplat.render import Renderer, ResidentCloud
+from fidsplat.render import Renderer
+from fidsplat.resident import ResidentCloud
 from fidsplat.scenes import Scene
 from fidsplat.splats import SplatCloud
 from fidsplat.store.store import Store

@@ -329,7 +329,7 @@ class SplatCloud(PickledByFields, Summarised):
             raise InputError("3D Gaussians lie in no plane; give their planes as -1, or a thickness of 0")
         return self._replaced(planes=ids if (ids >= 0).any() else None)
 
-    def with_boxes(self, boxes=True) -> "SplatCloud":
+    def with_boxes(self, boxes: bool | np.ndarray = True) -> "SplatCloud":
         """The same splats with box footprints where ``boxes``, one bool or (n,) bools, is True.
 
         A box is a rectangle of even opacity: its scales are half sides in metres, its edges are filtered by

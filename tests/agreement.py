@@ -46,7 +46,7 @@ def reference_pixels(cloud, camera, outputs, quality, background=(0.0, 0.0, 0.0)
 def assert_agrees(renderer, cloud, camera, outputs=ALL_OUTPUTS, quality=None, background=(0.1, 0.2, 0.3)):
     """Draw with a device and with the reference and compare every output; returns the frame."""
     picture = Picture(cloud, camera, Quality.of(quality), tuple(outputs), background)
-    frame = renderer.render(cloud, camera, outputs, picture.quality, background)
+    frame = renderer.render(cloud, camera, outputs, picture.quality, background=background)
     truth = truth_of(picture)
     assert all(frame[name].shape == truth[name].shape for name in outputs)
     differences = compare(frame, truth, outputs)

@@ -1,27 +1,34 @@
-"""Training of disks by fidsplat beside gsplat on one NVIDIA GPU, in the same run.
+"""Training of disks by fidsplat beside gsplat and the 2DGS authors' rasterizer on one NVIDIA GPU, in one run.
 
     pip install . torch gsplat       # 1.5.3
     python benchmarks/peers/gsplat_training.py r100k_720p r1m_1080p --json gsplat-training.json
-    python benchmarks/peers/gsplat_training.py --dataset yard --iterations 2000
+    python benchmarks/peers/gsplat_training.py --dataset yard --iterations 2000 --authors
 
-Of scenes: a step of benchmarks/training.py, SH of degree 3, in turn with gsplat's: `rasterization_2dgs`, the
-same loss in PyTorch (0.8 L1 and 0.2 D-SSIM by separable convolutions), `backward`, fused Adam of all values;
+Of scenes: a step of benchmarks/training.py, SH of degree 3, in turn with each peer's: its picture, the same
+loss in PyTorch (0.8 L1 and 0.2 D-SSIM by separable convolutions), `backward`, fused Adam of all values;
 beside it the time of its picture and `backward` alone. Of a data set: a whole training by each with the same
-constants, gsplat's by its `DefaultStrategy` as its 2DGS trainer has it; PSNR is of the views held out, both
-drawn by gsplat. (In 1.5.3 that strategy never resets opacities: its condition is never true.)
+constants and gsplat's `DefaultStrategy`; PSNR is of the views held out, each drawn by its own renderer, ours
+by gsplat too. (In gsplat 1.5.3 that strategy never resets opacities: its condition is never true. With the
+authors' rasterizer they are reset, as in the authors' trainer.)
+
+--authors wants `pip install eden-diff-surfel-rasterization`: the authors' sources of 2024, free for research
+and evaluation alone, which PyTorch compiles at the first import.
 """
 
 from __future__ import annotations
 
+import importlib
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gsplat
 import numpy as np
 import torch
+from gsplat.strategy.ops import reset_opa
 
 import fidsplat as fs
 from fidsplat.train import Dataset, Trainer, TrainSettings, load_dataset
@@ -36,17 +43,21 @@ from training import WARM, trainer_of
 
 SHARE = 0.2
 """of D-SSIM in the loss"""
+NEAR, FAR = 0.2, 100.0
+"""metres, as the authors have them"""
 
 
 class Peer:
     """gsplat's splats with an optimiser of each of their values, at the rates of a `TrainSettings`."""
 
+    resets = False
+    """whether opacities are reset"""
+
     def __init__(self, splats: Splats, settings: TrainSettings, dataset: Dataset) -> None:
         values = splats.values
-        count = len(splats)
         arrays = {
             "means": values["means"] + dataset.origin.astype(np.float32),
-            "scales": np.column_stack([values["log_scales"], np.zeros(count, np.float32)]),
+            "scales": np.column_stack([values["log_scales"], values["log_scales"][:, :1]]),
             "quats": values["quats"],
             "opacities": values["logits"],
             "sh0": values["sh"][:, :1],
@@ -87,35 +98,88 @@ class Peer:
             width=size[0],
             height=size[1],
             sh_degree=degree,
+            near_plane=NEAR,
             backgrounds=self._background,
             packed=False,
         )
         return images[0], meta
 
-    def step(self, number: int, degree: int, before: Any = None, optimise: bool = True) -> Any:
+    def step(
+        self, number: int, degree: int, before: Any = None, after: Any = None, optimise: bool = True
+    ) -> None:
         """One view: picture, loss, derivatives, and the optimisers where they are wanted.
 
-        before: called with what gsplat tells of the picture, before the derivatives.
+        before, after: called with what is told of the picture, before and after the derivatives.
         """
         view, matrix, truth = self._views[number]
         image, meta = self.draw(view, matrix, (truth.shape[1], truth.shape[0]), degree)
-        if before is not None:
-            before(meta)
-        if optimise:
-            loss_of(image, truth).backward()
-            for optimizer in self.optimizers.values():
-                optimizer.step()
-                optimizer.zero_grad(set_to_none=True)
-        else:
+        if not optimise:
             image.backward(truth)
             for value in self.params.values():
                 value.grad = None
-        return meta
+            return
+        if before is not None:
+            before(meta)
+        loss_of(image, truth).backward()
+        if after is not None:
+            after(meta)
+        for optimizer in self.optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
 
     def rate(self, iteration: int) -> None:
         """Sets the means' learning rate."""
         rate = self._settings.position_rate_at(iteration) * self._extent
         self.optimizers["means"].param_groups[0]["lr"] = rate
+
+
+class AuthorsPeer(Peer):
+    """As `Peer`, drawn by the 2DGS authors' rasterizer; principal points are the pictures' middles there."""
+
+    resets = True
+
+    def draw(self, view: torch.Tensor, matrix: torch.Tensor, size: tuple[int, int], degree: int) -> Any:
+        """A picture (h, w, 3), and what gsplat's strategy wants to know of it."""
+        surfels, values, (width, height) = authors_rasterizer(), self.params, size
+        slopes = width / (2 * float(matrix[0, 0, 0])), height / (2 * float(matrix[0, 1, 1]))
+        projection = torch.zeros((4, 4), device="cuda")
+        projection[0, 0], projection[1, 1] = 1 / slopes[0], 1 / slopes[1]
+        projection[2, 2], projection[2, 3] = FAR / (FAR - NEAR), -FAR * NEAR / (FAR - NEAR)
+        projection[3, 2] = 1
+        settings = surfels.GaussianRasterizationSettings(
+            image_height=height,
+            image_width=width,
+            tanfovx=slopes[0],
+            tanfovy=slopes[1],
+            bg=self._background[0],
+            scale_modifier=1.0,
+            viewmatrix=view[0].T.contiguous(),
+            projmatrix=(projection @ view[0]).T.contiguous(),
+            sh_degree=degree,
+            campos=torch.inverse(view[0])[:3, 3].contiguous(),
+            prefiltered=False,
+            debug=False,
+            near_n=NEAR,
+            far_n=FAR,
+        )
+        count = len(values["means"])
+        screen = torch.zeros((1, count, 2), device="cuda", requires_grad=True)
+        image, radii, _ = surfels.GaussianRasterizer(settings)(
+            means3D=values["means"],
+            means2D=torch.nn.functional.pad(screen[0], (0, 1)),
+            opacities=torch.sigmoid(values["opacities"])[:, None],
+            shs=torch.cat([values["sh0"], values["shN"]], 1),
+            scales=torch.exp(values["scales"][:, :2]),
+            rotations=torch.nn.functional.normalize(values["quats"]),
+        )
+        # its derivatives by places are in half pictures already: gsplat would multiply them by half the size
+        meta = {"gradient_2dgs": screen, "width": 2, "height": 2, "n_cameras": 1, "gaussian_ids": None}
+        return image.permute(1, 2, 0), meta | {"radii": radii[None, :, None].expand(1, count, 2)}
+
+
+def authors_rasterizer() -> Any:
+    """The authors' module."""
+    return importlib.import_module("diff_surfel_rasterization")
 
 
 def tensor(array: np.ndarray) -> Any:
@@ -153,21 +217,21 @@ def finished(work: Callable[[], Any]) -> Callable[[], float]:
     return timed
 
 
-def steps(name: str, renderer: fs.Renderer, repeats: int) -> dict[str, Any]:
+def steps(name: str, renderer: fs.Renderer, repeats: int, kinds: dict[str, type[Peer]]) -> dict[str, Any]:
     """Median milliseconds of a step by each, in turn."""
     trainer = trainer_of(name, renderer, 3, 2 * WARM + repeats)
-    peer = Peer(trainer._work.store(), trainer.settings, trainer.dataset)
+    splats = trainer._work.store()
     backend: Any = renderer.backend
 
     def own() -> None:
         trainer.step()
         backend.queue.finish()
 
-    works = {
-        "fidsplat_ms": finished(own),
-        "gsplat_ms": finished(lambda: peer.step(0, 3)),
-        "gsplat_picture_and_backward_ms": finished(lambda: peer.step(0, 3, optimise=False)),
-    }
+    works = {"fidsplat_ms": finished(own)}
+    for title, kind in kinds.items():
+        peer = kind(splats, trainer.settings, trainer.dataset)
+        works[f"{title}_ms"] = finished(partial(peer.step, 0, 3))
+        works[f"{title}_picture_and_backward_ms"] = finished(partial(peer.step, 0, 3, optimise=False))
     for work in works.values():
         for _ in range(WARM):
             work()
@@ -175,10 +239,10 @@ def steps(name: str, renderer: fs.Renderer, repeats: int) -> dict[str, Any]:
     return {"scene": name, **dict(zip(works, np.median(rounds, axis=0).tolist(), strict=True))}
 
 
-def train(dataset: Dataset, iterations: int) -> tuple[Peer, float]:
-    """A whole training by gsplat, and its seconds."""
+def train(dataset: Dataset, iterations: int, kind: type[Peer]) -> tuple[Peer, float]:
+    """A whole training by a peer, and its seconds."""
     settings = TrainSettings(iterations=iterations)
-    peer = Peer(first_splats(dataset, settings), settings, dataset)
+    peer = kind(first_splats(dataset, settings), settings, dataset)
     strategy = gsplat.DefaultStrategy(
         prune_opa=settings.prune_opacity, key_for_gradient="gradient_2dgs", verbose=False
     )
@@ -189,22 +253,27 @@ def train(dataset: Dataset, iterations: int) -> tuple[Peer, float]:
     torch.cuda.synchronize()
     begun = time.perf_counter()
     views: list[int] = []
-    for iteration in range(iterations):
+    for iteration in range(1, iterations + 1):
         views = views or order.permutation(len(dataset.views)).tolist()
-        peer.rate(iteration + 1)
+        peer.rate(iteration)
         given = peer.params, peer.optimizers, state, iteration
-        meta = peer.step(
-            views.pop(),
-            settings.degree_at(iteration + 1),
-            lambda meta, given=given: strategy.step_pre_backward(*given, meta),
+
+        def after(meta: Any, given: Any = given) -> None:
+            strategy.step_post_backward(*given, meta, packed=False)
+            if kind.resets and given[-1] % settings.reset_every == 0:
+                reset_opa(*given[:3], value=settings.reset_opacity)
+
+        # splats that are made after the last iteration would not be fitted, neither here nor there
+        makes = after if iteration < iterations else None
+        peer.step(
+            views.pop(), settings.degree_at(iteration), partial(strategy.step_pre_backward, *given), makes
         )
-        strategy.step_post_backward(*given, meta, packed=False)
     torch.cuda.synchronize()
     return peer, time.perf_counter() - begun
 
 
 def score(peer: Peer, views: tuple[TrainingView, ...]) -> float:
-    """Mean PSNR of 8-bit pictures, drawn by gsplat."""
+    """Mean PSNR of 8-bit pictures, drawn by the peer."""
     found = []
     for view in views:
         camera = view.camera
@@ -215,16 +284,17 @@ def score(peer: Peer, views: tuple[TrainingView, ...]) -> float:
     return float(np.mean(found))
 
 
-def trainings(dataset: Dataset, renderer: fs.Renderer, iterations: int) -> dict[str, Any]:
-    """Seconds, splats and PSNR of both; what is compiled is compiled before ours."""
+def trainings(
+    dataset: Dataset, renderer: fs.Renderer, iterations: int, kinds: dict[str, type[Peer]]
+) -> dict[str, Any]:
+    """Seconds, splats and PSNR of all; what is compiled is compiled before ours."""
     Trainer(dataset, renderer, iterations=8, sh_every=2).run()
     begun = time.perf_counter()
     ours = Trainer(dataset, renderer, iterations=iterations)
     ours.run()
     seconds = time.perf_counter() - begun
-    peer, its_seconds = train(dataset, iterations)
     drawn = Peer(ours._work.store(), ours.settings, dataset)
-    return {
+    found: dict[str, Any] = {
         "dataset": dataset.name,
         "iterations": iterations,
         "fidsplat": {
@@ -233,12 +303,16 @@ def trainings(dataset: Dataset, renderer: fs.Renderer, iterations: int) -> dict[
             "psnr": float(np.mean([one.psnr for one in ours.evaluate()])),
             "psnr_drawn_by_gsplat": score(drawn, dataset.held_out),
         },
-        "gsplat": {
+    }
+    for title, kind in kinds.items():
+        peer, its_seconds = train(dataset, iterations, kind)
+        found[title] = {
             "seconds": its_seconds,
             "splats": len(peer.params["means"]),
             "psnr": score(peer, dataset.held_out),
-        },
-    }
+        }
+        print(title, found[title], file=sys.stderr)
+    return found
 
 
 def main() -> None:
@@ -246,17 +320,22 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="as in benchmarks/training.py")
     parser.add_argument("--dataset", action="append", default=[], metavar="DIR", help="as of fidsplat train")
     parser.add_argument("--iterations", type=int, default=7000, help="of a training (default: 7000)")
+    parser.add_argument("--authors", action="store_true", help="beside the 2DGS authors' rasterizer too")
     given = parser.parse_args()
     if not torch.cuda.is_available():
         raise SystemExit("gsplat_training: PyTorch sees no CUDA device; gsplat draws on nothing else")
+    kinds: dict[str, type[Peer]] = {"gsplat": Peer}
+    if given.authors:
+        authors_rasterizer()
+        kinds["authors"] = AuthorsPeer
     renderer = fs.Renderer(given.device)
     found: list[dict[str, Any]] = []
     about = facts(renderer) | {"gsplat": gsplat.__version__, "torch": torch.__version__}
     for name in given.scenes:
-        found.append(steps(name, renderer, given.repeats) | about)
+        found.append(steps(name, renderer, given.repeats, kinds) | about)
         print(found[-1], file=sys.stderr)
     for folder in given.dataset:
-        found.append(trainings(load_dataset(folder), renderer, given.iterations) | about)
+        found.append(trainings(load_dataset(folder), renderer, given.iterations, kinds) | about)
         print(found[-1], file=sys.stderr)
     keep(found, given.json)
 

@@ -36,6 +36,8 @@ class DeviceInfo:
     usable: bool
     reason: str
     """Why it cannot be used; empty if it can. For a usable device, a remark (may be empty)."""
+    always_float64: bool = False
+    """whether all is computed in float64: slow, and what other devices are compared with"""
 
 
 @dataclass(frozen=True)
@@ -196,8 +198,6 @@ class Backend(Protocol):
     """An open device."""
 
     info: DeviceInfo
-    always_float64: bool
-    """whether every picture is computed in float64 throughout, whatever its quality asks for"""
 
     def limit_memory(self, budget: int) -> None:
         """Let a picture and its cloud take at most `budget` bytes of the device."""

@@ -16,9 +16,12 @@ from fidsplat.effects import FeatureSet
 class DifferentiablePipeline(Protocol):
     """The stages and their derivatives, compiled for one FeatureSet."""
 
-    def forward(self, resident: Any, view: View) -> Images:
+    def forward(self, resident: Any, view: View, waits: bool = True) -> Images:
         """Draw one picture of an uploaded cloud, with the bits of `Pipeline.render`, and keep what `backward`
         needs of it until the device draws another one.
+
+        waits: until it is known that there was room for all of it; if not, `backward` may say that there was
+        none, and nothing of the picture counts.
 
         Raises:
             DeviceError: the device runs out of memory or fails; or the picture is one of those that are drawn
@@ -47,6 +50,7 @@ class DifferentiablePipeline(Protocol):
             are the same in every bit on every run, and hold until the next call.
 
         Raises:
+            TooLittleRoom: for a picture that was not waited for; the next one has more.
             InputError: another picture has been drawn since, or a gradient is of no output or of a wrong
                 shape.
             DeviceError: the device runs out of memory or fails.

@@ -15,6 +15,10 @@ NOT_THE_LAST = (
 )
 
 
+class TooLittleRoom(Exception):
+    """A picture that nobody has waited for had more pairs of splats and tiles than there was room for."""
+
+
 def gradient_shape(name: str, view: View) -> tuple[int, ...]:
     """The shape of an output's gradient: that of its image."""
     channels = IMAGES[name].channels

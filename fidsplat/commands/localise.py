@@ -50,18 +50,17 @@ class Localise:
     json: Json = False
 
     def run(self) -> int:
-        from rich.progress import Progress
-
         import fidsplat as fs
-        from fidsplat.commands.sweeps import need_reports
+        from fidsplat.commands.sweeps import bars, need_reports
         from fidsplat.experiments.localise import VARIANTS
         from fidsplat.experiments.localise import Localise as Asked
-        from fidsplat.experiments.localise_folder import HEADS, LocaliseFolder
         from fidsplat.vision.video import check_video
+
+        need_reports()
+        from fidsplat.experiments.localise_sweep import drive_sweep, found_of, table_of, write_report
 
         asked = Asked(1, 4, self.seed) if self.quick else Asked(self.rows, self.plants, self.seed)
         names = list(self.variant) or (list(VARIANTS)[:3] if self.quick else list(VARIANTS))
-        need_reports()
         if self.video is not None:
             check_video(self.video)
         if self.log is not None:
@@ -70,19 +69,28 @@ class Localise:
             check_log(self.log, self.overwrite)
         _ = asked.house  # what is wrong with it is said before a device is opened
         renderer = fs.Renderer(self.device)
-        folder = LocaliseFolder(Path(self.out), asked, renderer.device.title, self.overwrite)
-        with Progress(console=console(True), transient=True) as progress:
-            task = progress.add_task("drive", total=1.0)
-            for words, share in folder.measure(names, renderer):
-                progress.update(task, description=words, completed=share)
-        folder.write_chart()
-        page = folder.write_page()
+        done = 0
+
+        def tell(name: str, share: float) -> None:
+            progress.update(bar, description=name, completed=done + share)
+
+        folder = Path(self.out)
+        sweep = drive_sweep(folder, asked, names, renderer, tell, self.overwrite)
+        with bars() as progress:
+            done = len(names) - len(sweep.left)
+            bar = progress.add_task("drive", total=len(names), completed=done)
+            for record in sweep.run():
+                done += 1
+                tell(record.key["variant"], 0.0)
+        found, device = found_of(sweep.results), renderer.device.title
+        page = write_report(folder, asked, device, found)
         self._record(asked, renderer)
         if self.json:
-            print_json(folder.results)
+            print_json({"run": sweep.results.run, "variants": found})
             return 0
-        where = console(False)
-        print_table(where, f"{folder.results['length_m']:.1f} m", HEADS, folder.rows())
+        where, table = console(False), table_of(found)
+        length = found[names[0]]["length_m"]
+        print_table(where, f"{length:.1f} m", table.columns, table.itertuples(index=False))
         say(where, *(name for name in (str(page), self.log, self.video) if name is not None))
         return 0
 

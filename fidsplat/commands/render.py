@@ -169,7 +169,7 @@ class Render:
         quality: "Quality | str | None",
     ) -> "Frame":
         """The picture; the reference says how far it is."""
-        if renderer.device.name == "reference" or self.every is not None:
+        if renderer.device.always_float64 or self.every is not None:
             with late_progress(console(True)) as progress:
                 step = 1 if self.every is None else self.every
                 return renderer.render_every(

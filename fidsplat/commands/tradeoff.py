@@ -11,7 +11,6 @@ from fidsplat.commands.output import Devices, Json, option, switch, tell
 from fidsplat.commands.own_scenes import Cameras, OwnScenes, own_scenes_of
 from fidsplat.commands.plots import check_plot
 from fidsplat.commands.sweeps import Folders, Overwrite, ReportTo, need_reports, run_sweeps, words
-from fidsplat.errors import InputError
 
 DEFAULT_FOLDER = "fidsplat-tradeoff"
 
@@ -104,8 +103,6 @@ class Tradeoff:
             check_plot(self.plot, ("pandas", "matplotlib"))
         folder = Path(self.out or DEFAULT_FOLDER + ("-quick" if self.quick else ""))
         devices = tuple(dict.fromkeys(self.device)) or (default_device(),)
-        if "reference" in devices:
-            raise InputError("the reference is what others are measured against; give another --device")
         own = own_pictures(own_scenes_of(self.scene, self.cameras, self.scenes))
         folders = [folder / name.replace(":", "-") for name in devices] if len(devices) > 1 else [folder]
         with ExitStack() as stack:

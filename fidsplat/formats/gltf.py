@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import codecs
 import json
 import struct
 from pathlib import Path
@@ -44,7 +45,7 @@ def load_gltf(path: Path) -> SplatCloud:
         InputError: it is damaged, holds no splats, refers to a file outside of its folder, or its nodes
             scale unevenly or mirror.
     """
-    data = content(path, "a glTF file")
+    data = content(path, "a glTF file", (b"glTF", b"{", codecs.BOM_UTF8))
     document, binary = _parts(path, data)
     try:
         reader = _Reader(path, document, binary)

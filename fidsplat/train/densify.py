@@ -57,7 +57,7 @@ def plan(splats: Splats, settings: TrainSettings, iteration: int, extent: float)
         splats.gradients, splats.seen, out=np.zeros_like(splats.gradients), where=splats.seen > 0
     )
     chosen = _within_limit(mean, mean >= settings.gradient_threshold, settings.max_splats - len(splats))
-    large = splats.scales.max(axis=1) > settings.dense_share * extent
+    large = _larger(splats.scales) > settings.dense_share * extent
     clones, splits = np.flatnonzero(chosen & ~large), np.flatnonzero(chosen & large)
     kept = np.ones(len(splats), bool)
     kept[splits] = False
@@ -66,7 +66,7 @@ def plan(splats: Splats, settings: TrainSettings, iteration: int, extent: float)
     _scatter(means, log_scales, len(rows) - COPIES * len(splits), splats, splits, settings, iteration)
     fit = sigmoid(splats.values["logits"][rows]) >= settings.prune_opacity
     if iteration > settings.reset_every:
-        fit &= np.exp(log_scales).max(axis=1) <= settings.prune_scale * extent
+        fit &= _larger(np.exp(log_scales)) <= settings.prune_scale * extent
     if not fit.any():
         raise TrainingError(
             f"no splat is left after iteration {iteration}: all are fainter than {settings.prune_opacity:g} "
@@ -86,6 +86,11 @@ def forgotten(splats: Splats) -> Splats:
     splats.gradients[:] = 0
     splats.seen[:] = 0
     return splats
+
+
+def _larger(scales: np.ndarray) -> np.ndarray:
+    """Of each row of (n, 2): as max(axis=1), which takes NumPy ten times as long."""
+    return np.maximum(scales[:, 0], scales[:, 1])
 
 
 def _within_limit(mean: np.ndarray, wanted: np.ndarray, room: int) -> np.ndarray:

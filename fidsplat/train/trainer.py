@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fidsplat.backends.derivatives import Differentiates, Trains
+from fidsplat.backends.gradients import TooLittleRoom
 from fidsplat.backends.prepare import prepare
 from fidsplat.capture import Capture
 from fidsplat.effects.differentiable import with_distortion
@@ -27,6 +28,7 @@ from fidsplat.train.checkpoint import Progressed, load_checkpoint, save_checkpoi
 from fidsplat.train.dataset import Dataset, TrainingView
 from fidsplat.train.device import DeviceWork
 from fidsplat.train.host import HostWork
+from fidsplat.train.losses import Loss
 from fidsplat.train.optimiser import rates
 from fidsplat.train.parameters import Splats, TrainingError, first_splats, splats_from
 from fidsplat.train.random_numbers import Purpose, permutation
@@ -153,21 +155,10 @@ class Trainer:
         iteration = made.iteration + 1
         number = self._view_at(iteration)
         view = self.dataset.views[number]
-        resident = self._work.resident(settings.degree_at(iteration), self.dataset.origin)
-        by_normals, by_distortions = settings.surface_weights_at(iteration)
-        features, seen = prepare(resident, (self._solid if by_normals else self._captures)[number])
-        if by_distortions:
-            features = with_distortion(features)
-        pipeline = self._differentiate(features)
-        images = pipeline.forward(resident, seen)
-        value, slope = self._work.loss(images, number)
-        slopes = {"rgb": slope}
-        if by_normals:
-            slopes |= self._work.surface(images, number, by_normals)
-        if by_distortions:
-            counts = np.ones(view.picture.shape[:2], np.float32) if view.mask is None else view.mask
-            slopes["distortion"] = counts * np.float32(by_distortions / counts.size)
-        gradients = pipeline.backward(images, slopes)
+        try:
+            value, gradients = self._compared(iteration, number, waits=False)
+        except TooLittleRoom:
+            value, gradients = self._compared(iteration, number, waits=True)
         loss = value()  # not before: the device goes on meanwhile
         if not math.isfinite(loss.value):
             raise TrainingError(
@@ -226,6 +217,30 @@ class Trainer:
         captures = [self._capture(view) for view in views]
         frames = self.renderer.render_views(self.cloud(), captures)
         return [_score(view, frame["rgb"]) for view, frame in zip(views, frames, strict=True)]
+
+    def _compared(
+        self, iteration: int, number: int, waits: bool
+    ) -> tuple[Callable[[], Loss], dict[str, Any]]:
+        """Draws a view: what waits for its loss, and the derivatives of all losses by the splats.
+
+        waits: as `DifferentiablePipeline.forward`.
+        """
+        resident = self._work.resident(self.settings.degree_at(iteration), self.dataset.origin)
+        by_normals, by_distortions = self.settings.surface_weights_at(iteration)
+        features, seen = prepare(resident, (self._solid if by_normals else self._captures)[number])
+        if by_distortions:
+            features = with_distortion(features)
+        pipeline = self._differentiate(features)
+        images = pipeline.forward(resident, seen, waits)
+        value, slope = self._work.loss(images, number)
+        slopes = {"rgb": slope}
+        if by_normals:
+            slopes |= self._work.surface(images, number, by_normals)
+        if by_distortions:
+            view = self.dataset.views[number]
+            counts = np.ones(view.picture.shape[:2], np.float32) if view.mask is None else view.mask
+            slopes["distortion"] = counts * np.float32(by_distortions / counts.size)
+        return value, pipeline.backward(images, slopes)
 
     def _stored(self) -> Splats:
         splats = self._work.store()

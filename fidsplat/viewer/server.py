@@ -107,7 +107,7 @@ class Viewer:
         self.server.gui.main_panel.dock_right()
         self._nodes = Nodes(self.server.scene)
         own = self.session.drawn.device
-        names = [d.name for d in devices() if d.usable and d.name != "reference"]
+        names = [d.name for d in devices() if d.usable and not d.always_float64]
         self._controls = Controls(self.server.gui, self.session, list(dict.fromkeys([own, *names])), self)
         self._start_camera(scene)
         self._nodes.show(scene, self._overlay)

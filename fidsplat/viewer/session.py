@@ -12,7 +12,8 @@ import numpy as np
 from fidsplat.effects import FeatureSet, select
 from fidsplat.errors import FidsplatError
 from fidsplat.frame import Frame
-from fidsplat.render import Renderer, ResidentCloud, default_device
+from fidsplat.render import Renderer, default_device
+from fidsplat.resident import ResidentCloud
 from fidsplat.scenes import Scene
 from fidsplat.viewer.settings import Settings, Viewpoint
 

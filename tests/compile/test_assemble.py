@@ -15,6 +15,7 @@ from fidsplat.backends.opencl.assemble import assemble
 from fidsplat.backends.opencl.effect_layouts import LAYOUTS
 from fidsplat.backends.opencl.shapes import cpu_shape, gpu_shape
 from fidsplat.effects import OUTPUTS, select
+from fidsplat.quality import ELLIPSOID
 
 BACKEND = "opencl"
 
@@ -22,8 +23,8 @@ SHAPE, GROUP = cpu_shape(lanes=16, cores=2), gpu_shape()
 FURTHER = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
 DIGESTS = {
-    "none": ["a8362996b771f8db", "379968451d0f7356"],
-    "screen": ["6be1758f1b37cbf2", "af86c8c11abe002c"],
+    "none": ["a8362996b771f8db", "c3e7249c6ea01671"],
+    "screen": ["6be1758f1b37cbf2", "8dc8d8d45e9b06e0"],
 }
 """of a scene that asks for nothing, by low-pass; `screen` is the default"""
 
@@ -123,6 +124,32 @@ def test_record_sizes_are_what_the_effects_declare():
     assert record(("depth",)) == record(("depth", "depth_median")) == record(("normal",)) == 96
     assert record(("depth", "normal")) == record(("depth", "label"), fs.Quality()) == 96
     assert record_bytes(select(Traits(has_planes=True), fs.Capture(quality=PLAIN))) == 96
+
+
+def test_scenes_without_3d_gaussians_have_the_text_that_they_have_without_such_a_thing():
+    """Whatever is asked of 3D Gaussians; `test_the_base_is_what_it_was` holds what that text is."""
+    words = ("thickness", "THICK_HERE", "bulge", "conjugate_disk", "slopes", "ellipsoid", "conic_facing")
+    for outputs, shape in ((("rgb",), SHAPE), (tuple(FURTHER), GROUP)):
+        plain = assemble(select(COLORS, fs.Capture(outputs=outputs)), shape)
+        assert not [word for word in words if word in plain.text]
+        for way in ELLIPSOID:
+            asked = fs.Capture(outputs=outputs, quality=fs.Quality(ellipsoid=way))
+            assert assemble(select(COLORS, asked), shape).digest == plain.digest
+            assert assemble(select(Traits(ellipsoids="some"), asked), shape).digest != plain.digest
+
+
+def test_clouds_of_3d_gaussians_alone_have_smaller_records():
+    """Every splat is a disk that faces the camera there: what all have alike is in no record."""
+    constant = {"nuy", "d0", "dx", "dy", "d_near"}
+    for shape in (SHAPE, GROUP):
+        alone, among = (
+            assemble(select(Traits(ellipsoids=which), fs.Capture(outputs=("depth",))), shape)
+            for which in ("all", "some")
+        )
+        assert constant <= set(among.records["Splat"].names or ())
+        assert not constant & set(alone.records["Splat"].names or ())
+    assert record_bytes(select(Traits(ellipsoids="all"), fs.Capture())) == 64
+    assert record_bytes(select(Traits(ellipsoids="some"), fs.Capture())) == 80
 
 
 def test_a_section_that_no_stage_has_is_refused(monkeypatch):

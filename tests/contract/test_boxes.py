@@ -46,7 +46,7 @@ def test_an_exact_marker_is_its_area_sampled_texture(renderer, px_per_module, sa
     camera = fs.Camera.pinhole(560, 540, focal, focal, *center, pose)
     background = 0.3
     quality = EXACT.with_(samples=samples)
-    frame = renderer.render(made.cloud, camera, ("rgb", "alpha"), quality, (background,) * 3)
+    frame = renderer.render(made.cloud, camera, ("rgb", "alpha"), quality, background=(background,) * 3)
     ideal = area_sampled(made, px_per_module, center, (560, 540), background)
     error = np.abs(frame["rgb"] - ideal[..., None])
     psnr = -10 * math.log10(float((error**2).mean()))

@@ -22,6 +22,10 @@ CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.3, -0.2, -0.1), (0.0, 0.1, 3.0))
 EVERYTHING = tuple(OUTPUTS)
 AROUND = random_splats(90, seed=3, depth=(-0.5, 5.0))
 MIXED = AROUND.with_boxes(np.arange(90) % 3 == 0)
+THICK = fs.SplatCloud(
+    AROUND.means, AROUND.quats, np.column_stack([AROUND.scales, AROUND.scales[::-1, 0]]), AROUND.opacities,
+    colors=AROUND.colors,
+)  # fmt: skip
 
 
 def scene_of_layers():
@@ -43,6 +47,10 @@ PICTURES = {
     "pixel": lambda: Picture(
         AROUND, CAMERA, fs.Quality(lowpass="pixel", samples=2), background=fs.Gradient((0, 0, 1), (1, 0, 0))
     ),
+    "3D Gaussians, exact": lambda: Picture(
+        fs.SplatCloud.concatenate([THICK, MIXED]), CAMERA, fs.Quality(ellipsoid="exact"), ("rgb", "depth")
+    ),
+    "3D Gaussians": lambda: Picture(THICK, CAMERA, outputs=("rgb", "depth")),
     "gsplat": lambda: Picture(AROUND, CAMERA, fs.Quality.of("gsplat"), outputs=EVERYTHING),
     **{
         name: lambda camera=CAMERAS[name]: Picture(MIXED, camera, outputs=EVERYTHING, fog=fs.Fog(0.3))

@@ -9,6 +9,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.backends.derivatives import Differentiates
+from fidsplat.backends.gradients import TooLittleRoom, on_host
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
 from fidsplat.effects.differentiable import with_distortion
@@ -127,6 +128,29 @@ def test_the_same_bits_on_every_run_and_those_of_render(backend, renderer):
     drawn = {name: images.read(name) for name in capture.outputs}
     frame = renderer.render(cloud, capture)
     assert all(np.array_equal(drawn[name], frame[name]) for name in drawn)
+
+
+def test_pictures_that_nobody_waits_for_have_the_same_derivatives(backend, renderer):
+    """Where lists are made before their length is known, one that had too little room says so when it is
+    taken back, and the next has enough."""
+    (shape,) = backend.shapes("schedule").values()
+    few, crowd = random_picture(2), random_picture(2, count=3000, scale=(0.2, 1.0))
+    pipeline = backend.differentiate(with_distortion(prepare(*few)[0]), shape=shape)
+
+    def taken_back(cloud, capture, waits):
+        features, view = prepare(cloud, capture)
+        images = pipeline.forward(backend.upload(cloud), view, waits)
+        found = pipeline.backward(images, random_loss(features, view))
+        return {name: on_host(array).tobytes() for name, array in found.items()}
+
+    first = taken_back(*few, waits=True)
+    assert taken_back(*few, waits=False) == first
+    if renderer.device.name.startswith("opencl"):
+        with pytest.raises(TooLittleRoom):
+            taken_back(*crowd, waits=False)
+    many = taken_back(*crowd, waits=True)
+    assert taken_back(*crowd, waits=False) == many
+    assert taken_back(*few, waits=False) == first
 
 
 def test_a_cloud_outlives_what_is_under_way(renderer, backend):

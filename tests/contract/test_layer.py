@@ -65,7 +65,7 @@ def differences(pipeline, resident, cloud, capture):
 def test_every_output_is_the_references(renderer, case):
     cloud, asked = CASES[case]
     capture = fs.Capture(**{"camera": CAMERA, "outputs": OUTPUTS, "layer": a_layer()} | asked)
-    resident = renderer.upload(cloud)._data
+    resident = renderer.upload(cloud).data
     pipeline = renderer.backend.pipeline(prepare(resident, capture)[0])
     wrong = [one for one in differences(pipeline, resident, cloud, capture) if not one.agrees]
     assert not wrong, wrong
@@ -74,7 +74,7 @@ def test_every_output_is_the_references(renderer, case):
 def test_both_schedules_agree(renderer):
     cloud, asked = CASES["planes, fog, 2 x 2 samples"]
     capture = fs.Capture(CAMERA, OUTPUTS, layer=a_layer()).with_(**asked)
-    resident = renderer.upload(cloud)._data
+    resident = renderer.upload(cloud).data
     for shape in renderer.backend.shapes("schedule").values():
         pipeline = renderer.backend.pipeline(prepare(resident, capture)[0], shape)
         wrong = [one for one in differences(pipeline, resident, cloud, capture) if not one.agrees]

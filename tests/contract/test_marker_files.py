@@ -42,8 +42,8 @@ def test_a_marker_s_file_is_opaque_enough_and_read(renderer, pair, tilt, azimuth
     made, read = pair
     assert PRESETS["gsplat"] == PRESETS["surfel"]
     camera = towards(tilt, azimuth)
-    ideal = renderer.render(made.cloud, camera, ALL_OUTPUTS, "gsplat", GREY)
-    shown = renderer.render(read, camera, ALL_OUTPUTS, "gsplat", GREY)
+    ideal = renderer.render(made.cloud, camera, ALL_OUTPUTS, "gsplat", background=GREY)
+    shown = renderer.render(read, camera, ALL_OUTPUTS, "gsplat", background=GREY)
     inside = ideal["alpha"] > 0.98
     assert shown["alpha"][inside].mean() > 0.94
     assert psnr(shown["rgb"], ideal["rgb"]) > 21

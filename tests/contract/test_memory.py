@@ -140,8 +140,8 @@ def test_little_memory_gives_the_same_bits(opencl, cloud, whole, mebibytes, stre
     printed plane among them, so every fragment by its own depth."""
     own = small(opencl, mebibytes, None if streamed else cloud)
     resident = own.upload(cloud)
-    resident._data._shared &= not streamed  # a CPU reads the host's arrays; make it copy them
-    resident._data.streamed = streamed
+    resident.data._shared &= not streamed  # a CPU reads the host's arrays; make it copy them
+    resident.data.streamed = streamed
     for _ in range(2):
         frame = own.render(resident, CAMERA, ALL_OUTPUTS)
         assert frame.stats == whole[1]
@@ -156,7 +156,7 @@ def test_many_big_splats_in_chunks(opencl):
     wanted = opencl.render(crowd, CAMERA, ("rgb", "depth"))
     own = small(opencl, 3.2)
     resident = own.upload(crowd)
-    resident._data._shared, resident._data.streamed = False, True
+    resident.data._shared, resident.data.streamed = False, True
     frame = own.render(resident, CAMERA, ("rgb", "depth"))
     assert "packed splats" in own.backend.pool._buffers
     assert frame.stats == wanted.stats
@@ -328,7 +328,7 @@ def test_neither_frames_nor_kernels_keep_a_cloud(opencl):
     some = random_splats(100, seed=7)
     array, before = some.means, sys.getrefcount(some.means)
     resident = opencl.upload(some)
-    data = weakref.ref(resident._data)
+    data = weakref.ref(resident.data)
     frame = opencl.render(resident, CAMERA)
     del resident
     assert data() is None

@@ -212,7 +212,7 @@ def test_splat_ids_are_indices_of_the_cloud_in_chunks_too(renderer):
     budget = 1_000_000 if renderer.device.kind == "cpu" else 3_000_000
     small = fs.Renderer(renderer.device.name, memory_budget=budget)
     resident = small.upload(cloud)
-    resident._data._shared, resident._data.streamed = False, True
+    resident.data._shared, resident.data.streamed = False, True
     assert np.array_equal(small.render(resident, CAMERA, "splat_id")["splat_id"], ids)
     assert "packed splats" in small.backend.pool._buffers
 

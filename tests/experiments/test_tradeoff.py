@@ -1,4 +1,4 @@
-"""`fidsplat tradeoff`: what is measured, how it is compared with the truth, how a run survives."""
+"""`fidsplat tradeoff`: what is measured, how it is compared with the truth."""
 
 import dataclasses
 import json
@@ -8,8 +8,6 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.backends.opencl.resident import Resident
-from fidsplat.cli import main
-from fidsplat.experiments.sweep import read_records
 from fidsplat.experiments.tradeoff import compare, run
 from fidsplat.experiments.tradeoff import session as session_module
 from fidsplat.experiments.tradeoff.hard import CELLS, cell_window, hard_scene
@@ -24,16 +22,14 @@ from fidsplat.experiments.tradeoff.points import (
     quality_of,
     thick_points,
 )
-from fidsplat.experiments.tradeoff.scenes import NAMES, TradeScene, make, scene_names
+from fidsplat.experiments.tradeoff.scenes import NAMES, TradeScene, make
 from fidsplat.experiments.tradeoff.session import QUICK, Session, memory_of, time_point
-from fidsplat.experiments.tradeoff.summary import load
 from fidsplat.hard_cases.clouds import camera, splats
 from fidsplat.quality import ELLIPSOID, PRESETS, MarkerQuality
-from fidsplat.random_clouds import SCENES, random_cloud
+from fidsplat.random_clouds import SCENES
 
 pytestmark = pytest.mark.usefixtures("optimised")
 FACING = (1.0, 0.0, 0.0, 0.0)
-WORDS = ("tradeoff", "--quick", "--scenes", "apriltag", "--knobs", "opacity_ceiling")
 
 
 @pytest.fixture(scope="module")
@@ -243,109 +239,6 @@ def test_nobody_sees_what_standard_leaves_out(session):
     assert np.abs(session.draw("hard", standard)["rgb"] - session.truth("hard", standard)).max() <= 1 / 512
 
 
-def test_an_interrupted_run_goes_on(capsys, tmp_path, monkeypatch):
-    words = [*WORDS, "-o", str(tmp_path), "--json"]
-    real, begun = run._begin, []
-
-    def stopped(session, part, quick):
-        begun.append(part)
-        if len(begun) > 2:
-            raise KeyboardInterrupt
-        return real(session, part, quick)
-
-    monkeypatch.setattr(run, "_begin", stopped)
-    monkeypatch.setattr(run.Options, "workers", 1)
-    assert main(words) == 130
-    assert "interrupted" in capsys.readouterr().err
-    file = tmp_path / run.FILE
-    first = file.read_text()
-    assert [record.key for record in read_records(file)] == begun[:2]
-
-    monkeypatch.setattr(run, "_begin", real)
-    assert main(words) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said == {"files": [str(file)], "points": len(read_records(file)), "refused": []}
-    assert file.read_text().startswith(first)
-    records = read_records(file)
-    assert {record.key["what"] for record in records} == {"point", "decode", "truth"}
-    # an installed package has no commit
-    assert all(record.run["device"] and record.run["code"] and "commit" in record.run for record in records)
-    read = {record.key["knob"]: record.result["read"] for record in records if record.key["what"] == "decode"}
-    assert read["ideal"].startswith("111")
-    assert read["base"].startswith("111")
-
-    before = file.read_bytes()
-    assert main(words) == 0  # nothing is left to do
-    assert file.read_bytes() == before
-
-
-def test_ones_own_scene_is_measured_from_each_of_its_poses(capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    scene_file = tmp_path / "own.toml"
-    fs.save_ply(random_cloud(200, 0.2), "own.ply")
-    scene_file.write_text(
-        "[camera]\nwidth = 64\nheight = 48\nfov_x_deg = 60.0\nposition = [0.0, 0.0, 0.0]\n"
-        'look_at = [0.0, 0.0, 1.0]\n[[splats]]\nfile = "own.ply"\n'
-    )
-    (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n1 0.2 0 0 0 0 0 1\n")
-    words = ["tradeoff", "--quick", "--scene", "own.toml", "--cameras", "poses.tum", "-o", "out"]
-    words += ["--knobs", "opacity_ceiling"]
-    assert main(words) == 0
-    records = read_records(tmp_path / "out" / run.FILE)
-    views = ("own.toml@0", "own.toml@1")
-    found = {(r.key["scene"], r.key["what"], r.key.get("value")): r.result for r in records}
-    assert {key[0] for key in found} == set(views)
-    assert {key[1] for key in found} == {"point", "truth"}
-    for view in views:
-        assert found[view, "truth", None]["maximum"] < 1e-5
-        assert 1e-4 < found[view, "point", "base"]["maximum"] < 0.05
-    # pictures differ, so do their errors; the ceiling lets light through
-    assert found[views[0], "point", "base"]["rmse"] != found[views[1], "point", "base"]["rmse"]
-    assert found[views[0], "point", "0.99"]["maximum"] >= found[views[0], "point", "base"]["maximum"]
-    capsys.readouterr()
-    assert load([tmp_path / "out"])[0].scenes == list(views)
-    assert main(words) == 0  # nothing is left to do
-    fs.save_ply(random_cloud(201, 0.2), "own.ply")
-    assert main(words) == 2
-    assert "holds results of another scene; give another folder" in capsys.readouterr().err
-    assert main(["tradeoff", "--scene", "own.toml", "--scenes", "hard"]) == 2
-    assert "exclude each other" in capsys.readouterr().err
-
-
-def test_several_devices_measure_into_folders_of_their_names(capsys, tmp_path, monkeypatch):
-    found = {
-        "ratio": 1.0,
-        "ratio_quartiles": [0.9, 1.1],
-        "base_ms": 2.0,
-        "maximum": 0.01,
-        "maximum_sure": 0.01,
-    }
-    begun = []
-
-    def begin(session, key, quick):
-        begun.append(session.renderer.device.name)
-        return lambda: {**found, "read": "1" * 50}
-
-    monkeypatch.setattr(run, "_begin", begin)
-    words = ["tradeoff", "--quick", "--scenes", "hard", "--knobs", "opacity_ceiling", "-o", str(tmp_path)]
-    words += ["--device", "opencl:pocl", "--device", "warp:cpu"]
-    assert main([*words, "--plot", str(tmp_path / "times.pdf")]) == 2
-    assert "--plot is" in capsys.readouterr().err
-    assert main([*words[:-1], "opencl:nowhere"]) == 2
-    assert not begun  # a device that is not there is said first
-    capsys.readouterr()
-    assert main([*words, "--plot", str(tmp_path / "both.svg"), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert said["files"] == [str(tmp_path / name / run.FILE) for name in ("opencl-pocl", "warp-cpu")]
-    records = [read_records(tmp_path / name / run.FILE) for name in ("opencl-pocl", "warp-cpu")]
-    assert said["points"] == len(begun) == sum(map(len, records))
-    assert begun == ["opencl:pocl"] * len(records[0]) + ["warp:cpu"] * len(records[1])
-    titles = [device.title for device in load([tmp_path / "opencl-pocl", tmp_path / "warp-cpu"])]
-    drawn = (tmp_path / "both.svg").read_text()
-    assert len(set(titles)) == 2
-    assert all(f"<!-- hard on {title} -->" in drawn for title in titles)
-
-
 def test_ones_own_3d_gaussians_are_held_against_themselves_as_they_are_drawn():
     """Captures look as they did to their trainer, who drew them by EWA."""
     scene = make("r100k_720p_3d", BASE.marker)
@@ -353,54 +246,3 @@ def test_ones_own_3d_gaussians_are_held_against_themselves_as_they_are_drawn():
     assert own.definition("own.ply", BASE).ellipsoid == "ewa"
     assert own.definition("own.ply", BASE.with_(ellipsoid="exact")).ellipsoid == "exact"
     assert own.definition("r100k_720p_3d", BASE).ellipsoid == "exact"
-
-
-def test_what_a_device_refuses_is_a_result(tmp_path, monkeypatch):
-    def refuse(*_):
-        raise fs.InputError("no such thing here")
-
-    monkeypatch.setattr(run, "_begin", refuse)
-    options = run.Options(tmp_path, "opencl", ("apriltag",), ("samples",), quick=True)
-    with run.prepared(options) as sweep:
-        records = list(sweep.run())
-    assert records
-    assert all(record.result == {"error": "no such thing here"} for record in records)
-
-    # it may have been the device that failed: another run tries again
-    monkeypatch.setattr(run, "_begin", lambda *_: lambda: {"maximum": 0.0})
-    for left in (len(records), 0):
-        with run.prepared(options) as sweep:
-            assert len(sweep.left) == len(list(sweep.run())) == left
-    assert [record.result for record in read_records(tmp_path / run.FILE)] == [{"maximum": 0.0}] * len(
-        records
-    )
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--scenes", "qr11"], "unknown scene 'qr11' (did you mean 'qr10'?)"),
-        (["--knobs", "alpha_cutof"], "unknown knob 'alpha_cutof' (did you mean 'alpha_cutoff'?)"),
-        (["--device", "reference"], "give another --device"),
-        (["report", "nowhere"], "no results in nowhere"),
-    ],
-)
-def test_wrong_words_are_one_line(capsys, tmp_path, monkeypatch, words, message):
-    monkeypatch.chdir(tmp_path)
-    assert main(["tradeoff", *words]) == 2
-    out, err = capsys.readouterr()
-    assert (out, err.count("\n")) == ("", 1)
-    assert message in err
-
-
-@pytest.mark.parametrize("words", [(), ("report",)])
-def test_help_teaches(capsys, words):
-    assert main(["tradeoff", *words, "--help"]) == 0
-    out = capsys.readouterr().out
-    assert f"usage: {' '.join(('fidsplat tradeoff', *words))}" in out
-    assert "  fidsplat tradeoff report cpu gpu -o docs/accuracy.md" in out
-
-
-def test_names_of_scenes():
-    assert scene_names(()) == NAMES
-    assert scene_names(("hard", "hard")) == ("hard",)

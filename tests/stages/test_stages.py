@@ -7,6 +7,7 @@ import pytest
 from agreement import ALL_OUTPUTS, random_splats
 
 import fidsplat as fs
+from fidsplat.backends.opencl.lists import GatheredLists
 from fidsplat.backends.planes import PlaneTable
 from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.probing import Reshapes
@@ -98,6 +99,33 @@ def test_every_touched_tile_has_the_splat_and_few_others_do(backend, seed, scale
             needed_in_front += len(needed)
             listed_in_front += len(listed[index])
     assert listed_in_front <= 1.05 * needed_in_front + 5
+
+
+def test_bounds_hold_the_rims_of_huge_disks(backend):
+    """Disks up to 10^8 samples wide with an edge in the picture: what a float32 place may be off is room that
+    bounds have."""
+    random = np.random.default_rng(8)
+    radius, depth = 10 ** random.uniform(4, 6, 48), random.uniform(0.7, 1.5, 48)
+    away = np.repeat([[1, 0], [-1, 0], [0, 1], [0, -1]], 12, axis=0) * radius[:, None]
+    aside = random.uniform(-0.3, 0.3, (48, 2)) * depth[:, None]
+    disks = fs.SplatCloud(
+        np.column_stack([away + aside, depth]), [[1, 0, 0, 0]] * 48, np.column_stack([radius, radius]),
+        np.ones(48), colors=np.ones((48, 3)),
+    )  # fmt: skip
+    quality = fs.Quality(alpha_cutoff=np.exp(-0.5), lowpass="none")
+    features, view = prepare(disks, fs.Capture(CAMERA, ALL_OUTPUTS, quality))
+    assert np.array_equal(view.rotation, np.eye(3))
+    pipeline = backend.pipeline(features)
+    boxes = backend.probe().boxes(pipeline, pipeline.trace(backend.upload(disks), view))
+    rows, columns = np.mgrid[0 : view.height, 0 : view.width] + 0.5
+    for (x0, x1, y0, y1), mean, radius in zip(boxes, disks.means, disks.scales[:, 0], strict=True):
+        x, y, z = mean.astype(float) + view.translation
+        right = (columns - view.center_x) / view.focal_x * z - x
+        down = (rows - view.center_y) / view.focal_y * z - y
+        inside = np.nonzero(right**2 + down**2 <= float(radius) ** 2)
+        assert 0 < len(inside[0]) < view.width * view.height
+        assert x0 <= inside[1].min() <= inside[1].max() < x1
+        assert y0 <= inside[0].min() <= inside[0].max() < y1
 
 
 def test_keys_are_depths_and_the_order_is_total(backend):
@@ -264,19 +292,39 @@ def test_both_ways_of_listing_give_the_same_lists(backend, scale):
     assert np.array_equal(tiled["rgb"], ordered["rgb"])
 
 
-@pytest.mark.parametrize("lists", ["ordered", "tiled"])
-def test_views_of_a_batch_are_listed_apart(backend, lists):
-    cloud = random_splats(2500, seed=5, scale=(1e-3, 0.5))
+@pytest.mark.parametrize(
+    ("lists", "budget"), [("ordered", 0), ("tiled", 0), ("gathered", 0), ("gathered", 5000)]
+)
+def test_views_of_a_batch_are_listed_apart(backend, monkeypatch, lists, budget):
+    """gathered: tiles so few that they are counted in local memory, by groups of 4096 splats; with a budget
+    of pairs in bands."""
+    cloud = random_splats(5000, seed=5, scale=(1e-3, 0.5))
     quality = fs.Quality(lowpass="none")
     captures = [
         fs.Capture(fs.Camera.look_at(161, 117, 1.0, (x, 0.0, -0.1), (0.0, 0.0, 3.0)), ALL_OUTPUTS, quality)
         for x in (-1.0, 0.5)
     ]
     features, batch = prepare_batch(cloud, views_of(captures))
-    pipeline, resident = backend.pipeline(features, listing(backend, lists)), backend.upload(cloud)
-    pictures = pipeline.render_batch(resident, batch).read("rgb")
-    for picture, capture in zip(pictures, captures, strict=True):
-        assert np.array_equal(picture, pipeline.trace(resident, prepare(cloud, capture)[1])["rgb"])
+    shape = listing(backend, "tiled" if lists == "gathered" else lists)
+    pipeline, resident = backend.pipeline(features, shape), backend.upload(cloud)
+    alone = [pipeline.render(resident, prepare(cloud, capture)[1]) for capture in captures]
+    gathered = GatheredLists._gather
+    launched = []
+
+    def gather(self, kernel, **given):
+        launched.append(kernel)
+        gathered(self, kernel, **given)
+
+    monkeypatch.setattr(GatheredLists, "_gather", gather)
+    if lists == "tiled":
+        monkeypatch.setattr(GatheredLists, "TILES", 0)
+    monkeypatch.setattr(backend, "pair_budget", budget or backend.pair_budget)
+    pictures = pipeline.render_batch(resident, batch)
+    assert (launched.count("emit_gathered") > (2 if budget else 0)) == (lists == "gathered")
+    for name in ("visible", "pairs"):
+        assert pictures.stats[name] == sum(picture.stats[name] for picture in alone)
+    for picture, own in zip(pictures.read("rgb"), alone, strict=True):
+        assert np.array_equal(picture, own.read("rgb"))
 
 
 def test_lists_that_outgrow_their_buffers_are_made_again(backend):

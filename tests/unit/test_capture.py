@@ -95,7 +95,7 @@ def test_a_capture_and_its_parts_draw_the_same():
     renderer = fs.Renderer("reference")
     capture = fs.Capture(CAMERA, ("rgb", "depth"), "fast", GREY, fog=fs.Fog(0.1))
     long = renderer.render(cloud, capture)
-    short = renderer.render(cloud, CAMERA, ("rgb", "depth"), "fast", GREY, fog=fs.Fog(0.1))
+    short = renderer.render(cloud, CAMERA, ("rgb", "depth"), "fast", background=GREY, fog=fs.Fog(0.1))
     words = {"outputs": ("rgb", "depth"), "quality": "fast", "background": GREY, "fog": fs.Fog(0.1)}
     named = renderer.render(cloud, camera=CAMERA, **words)
     frames = [short, named, *renderer.render_views(cloud, [capture])]

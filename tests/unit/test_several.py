@@ -37,14 +37,27 @@ def test_bands_of_devices_have_the_bits_of_one(store, two):
     assert set(ours.timings) == set(whole.timings)
 
 
+def test_splats_beside_a_band_are_not_taken_for_big_ones():
+    # what another picture has left on the device must not show where a big splat stands
+    big = fs.SplatCloud([[0.0, 0.0, 2.0]], [[1.0, 0, 0, 0]], [[3.0, 3.0]], [0.1], colors=np.ones((1, 3)))
+    cloud = fs.SplatCloud.concatenate([big, splats(1)])
+    lower, camera = (fs.Camera.look_at(320, 240, 1.0, (0, 0, 0), (0, y, 1)) for y in (0.5, 0))
+    renderer = fs.Renderer("opencl")
+    renderer.render(cloud, lower).wait()
+    for band in ((0, 20), (220, 240)):
+        whole, rows = fs.Renderer("opencl").render(cloud, camera)["rgb"], slice(*band)
+        assert np.array_equal(renderer.render_band(band, cloud, camera)["rgb"][rows], whole[rows])
+
+
 def test_a_device_holds_the_chunks_that_its_band_sees(store, two):
     given = two.upload(store)
     two._shares = np.array([0.0, 0.5, 1.0])
     two.render(given, look()).wait()
-    alone = fs.Renderer("opencl").upload(store)
-    alone._renderer.render(alone, look())
-    each = [one._data.nodes for one in given]
-    assert max(each) < alone._data.nodes <= sum(each)
+    one = fs.Renderer("opencl")
+    alone = one.upload(store)
+    one.render(alone, look())
+    each = [one.data.nodes for one in given]
+    assert max(each) < alone.data.nodes <= sum(each)
 
 
 def test_views_are_shared_out_and_come_in_their_order(store, two):

@@ -203,9 +203,8 @@ def test_data_of_another_model(rig, nbody):
     other = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
     data = mujoco.MjData(other)
     mujoco.mj_forward(other, data)
-    with pytest.raises(
-        fs.InputError, match=rf"data.xpos has {nbody + 1} poses, but the rig's model has \d; give"
-    ):
+    words = rf"data\.xpos has {nbody + 1} rows, but the model of the rig has \d; give data of that model"
+    with pytest.raises(fs.InputError, match=words):
         rig.render(data)
 
 

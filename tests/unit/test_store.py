@@ -1,64 +1,32 @@
-"""Stores: built out of core, stopped and gone on with, damaged, placed."""
+"""Stores: what they hold, damaged, placed."""
 
 import json
-import os
 import tracemalloc
-from pathlib import Path
 
 import numpy as np
 import pytest
-from full_disk import small_files
+from small_stores import COUNT, SMALL, contents, many_buckets, two_files
 
 import fidsplat as fs
-from fidsplat.random_clouds import random_splats
 from fidsplat.rotations import rigid_matrix
-from fidsplat.store import build, plan
 from fidsplat.store.layout import FAR, NODE, NPY_HEADER, header_crc
 from fidsplat.store.merge import REDUCTION
-
-COUNT = 9_000
-SMALL = {"chunk": 500, "memory": 1 << 20}
-WINDOW, NOTED = 1000, 3
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _many_buckets():
-    """Small scenes are cut as large ones are."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plan, "_LEAST_MEMORY", 0)
-        patch.setattr(plan, "WINDOW", WINDOW)
-        patch.setattr(build, "_NOTED", NOTED)
+    with many_buckets():
         yield
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """Two files: with SH of degree 1 and planes, and with labels and 3D Gaussians."""
-    folder = tmp_path_factory.mktemp("splats")
-    first = random_splats(COUNT, 1, sh_degree=1).with_labels(0)
-    first = first.with_planes(np.where(np.arange(COUNT) % 1000 < 3, np.arange(COUNT) // 3000, -1))
-    fs.save_ply(first, folder / "a.ply")
-    other = random_splats(COUNT, 2)
-    thick = np.where(np.arange(COUNT) % 2, 0.01, 0.0)[:, None]
-    other = fs.SplatCloud(
-        other.means + np.array([5.0, 0, 0]),
-        other.quats,
-        np.hstack([other.scales, thick]),
-        other.opacities,
-        colors=other.colors,
-        labels=other.labels,
-    )
-    fs.save_ply(other, folder / "b.ply")
-    return [folder / "a.ply", folder / "b.ply"]
+    return two_files(tmp_path_factory.mktemp("splats"))
 
 
 @pytest.fixture(scope="module")
 def store(files, tmp_path_factory):
     return fs.Store(fs.build_store(files, tmp_path_factory.mktemp("store") / "both.fss", **SMALL))
-
-
-def contents(folder):
-    return {file.name: file.read_bytes() for file in folder.iterdir()}
 
 
 def sorted_by_place(cloud):
@@ -118,81 +86,6 @@ def test_every_node_stands_for_the_four_below_it(store):
         assert (nodes["far_low"][number] <= children["far_low"].min(axis=0)).all()
 
 
-class Stopped(Exception):
-    pass
-
-
-STOPS = [("reading splats", NOTED + 1), ("sorting", 3), ("level of detail 1", 5), ("level of detail 2", 2)]
-
-
-@pytest.mark.parametrize(("words", "after"), STOPS)
-def test_a_build_that_is_stopped_goes_on(files, store, tmp_path, words, after):
-    calls = []
-
-    def stop(what, share):
-        calls.extend([what] * (what == words))
-        if len(calls) == after:
-            raise Stopped
-
-    with pytest.raises(Stopped):
-        fs.build_store(files, tmp_path / "both.fss", progress=stop, **SMALL)
-    assert not (tmp_path / "both.fss").exists()
-    again = []
-    fs.build_store(files, tmp_path / "both.fss", progress=lambda what, share: again.append(what), **SMALL)
-    assert contents(tmp_path / "both.fss") == contents(store.path)
-    assert list(tmp_path.iterdir()) == [tmp_path / "both.fss"]
-    left = 2 * COUNT // WINDOW - NOTED if words == "reading splats" else 0
-    assert again.count("reading splats") == left
-
-
-def test_a_build_that_was_killed_between_two_steps_leaves_nothing_behind(files, store, tmp_path, monkeypatch):
-    calls, folder = [], tmp_path / "both.fss"
-
-    def stop(what, share):
-        calls.extend([what] * (what == "sorting"))
-        if len(calls) == 3:
-            raise Stopped
-
-    with pytest.raises(Stopped):
-        fs.build_store(files, folder, progress=stop, **SMALL)
-    (tmp_path / ".both.fss.part" / "bucket-0000").touch()  # sorted and noted, and not yet removed
-    remove = Path.unlink
-
-    def killed(file, missing_ok=False):
-        remove(file, missing_ok)
-        if file.name in ("nodes", "state.json"):
-            raise Stopped
-
-    monkeypatch.setattr(Path, "unlink", killed)
-    with pytest.raises(Stopped):
-        fs.build_store(files, folder, **SMALL)
-    monkeypatch.undo()
-    fs.build_store(files, folder, **SMALL)
-    # what a process that was killed while it replaced a store has left
-    (tmp_path / ".both.fss.old").mkdir()
-    (tmp_path / ".both.fss.old" / "means.npy").touch()
-    fs.build_store(files, folder, overwrite=True, **SMALL)
-    assert contents(folder) == contents(store.path)
-    assert list(tmp_path.iterdir()) == [folder]
-
-
-@pytest.mark.parametrize("words", ["reading splats", "sorting"])
-def test_a_build_whose_files_were_lost_in_a_power_cut_is_begun_anew(files, store, tmp_path, words):
-    calls = []
-
-    def stop(what, share):
-        calls.extend([what] * (what == words))
-        if len(calls) == NOTED + 1:
-            raise Stopped
-
-    with pytest.raises(Stopped):
-        fs.build_store(files, tmp_path / "both.fss", progress=stop, **SMALL)
-    last = max((tmp_path / ".both.fss.part").glob("bucket-*"), key=lambda file: file.stat().st_size)
-    os.truncate(last, last.stat().st_size // 3)
-    fs.build_store(files, tmp_path / "both.fss", **SMALL)
-    assert contents(tmp_path / "both.fss") == contents(store.path)
-
-
 def test_labels_are_read_a_chunk_at_a_time(store):
     tracemalloc.start()
     labels = store.labels()
@@ -200,59 +93,6 @@ def test_labels_are_read_a_chunk_at_a_time(store):
     tracemalloc.stop()
     assert labels == set(store.cloud().labels.tolist())
     assert peak < len(store) * 4 / 2
-
-
-def test_two_builds_of_one_store_at_once(files, store, tmp_path):
-    refused = []
-
-    def second(what, share):
-        if not refused:
-            with pytest.raises(fs.InputError, match="another process is building"):
-                fs.build_store(files[1:], tmp_path / "both.fss", **SMALL)
-            refused.append(what)
-
-    fs.build_store(files, tmp_path / "both.fss", progress=second, **SMALL)
-    assert refused
-    assert contents(tmp_path / "both.fss") == contents(store.path)
-
-
-def test_places_hold_nothing_of_a_build_that_was_stopped(files, tmp_path):
-    def stop(what, share):
-        raise Stopped
-
-    flat = fs.build_store(files[1:], tmp_path / "one.fss", **SMALL)
-    with pytest.raises(Stopped):
-        fs.build_store(files, tmp_path / "both.fss", progress=stop, **SMALL)
-    fs.place_store(flat, tmp_path / "both.fss", [np.eye(4)])
-    assert set(contents(tmp_path / "both.fss")) == {"store.json", "places.npy"}
-
-
-def test_what_is_begun_from_other_files_is_begun_anew(files, store, tmp_path):
-    def stop(what, share):
-        if what == "sorting":
-            raise Stopped
-
-    with pytest.raises(Stopped):
-        fs.build_store(files[:1], tmp_path / "both.fss", progress=stop, **SMALL)
-    fs.build_store(files, tmp_path / "both.fss", **SMALL)
-    assert contents(tmp_path / "both.fss") == contents(store.path)
-
-
-def test_a_full_disk_is_said_and_gone_on_with(files, store, tmp_path):
-    with (
-        small_files(100_000),
-        pytest.raises(fs.InputError, match="make room, then give the same command again"),
-    ):
-        fs.build_store(files, tmp_path / "both.fss", **SMALL)
-    assert not (tmp_path / "both.fss").exists()
-    fs.build_store(files, tmp_path / "both.fss", **SMALL)
-    assert contents(tmp_path / "both.fss") == contents(store.path)
-
-
-def test_a_disk_without_room_is_said_first(files, tmp_path, monkeypatch):
-    monkeypatch.setattr(build.shutil, "disk_usage", lambda folder: type("", (), {"free": 10_000})())
-    with pytest.raises(fs.InputError, match="make room, or build elsewhere"):
-        fs.build_store(files, tmp_path / "both.fss", **SMALL)
 
 
 def copied(store, tmp_path):

@@ -37,7 +37,7 @@ class Cloud:
 
 
 class Backend:
-    info, always_float64 = INFO, False
+    info = INFO
 
     def limit_memory(self, budget):
         pass

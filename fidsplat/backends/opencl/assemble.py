@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from itertools import chain
@@ -29,7 +29,7 @@ from fidsplat.effects import FeatureSet
 from fidsplat.errors import DeviceError
 from fidsplat.kernel_files import kernels_folder
 
-_LISTS = {"ordered": ("scan", "sort", "bin"), "tiled": ("tiles",)}
+_LISTS = {"ordered": ("scan", "sort", "bin"), "tiled": ("tiles",), "gathered": ("tiles", "gathered")}
 """stages of the program `lists`, by the way of listing"""
 _DRAWN = ("prelude", "math", "splat", "bounds", "project", "pack", "blend", "schedule/{}", "resolve")
 """stages of the program `picture`, with the way in which a device walks tiles; only splats that are listed in
@@ -95,12 +95,12 @@ def layouts_of(features: FeatureSet) -> dict[str, Layout]:
 def _parts_of(names: Iterable[str]) -> set[str]:
     """What layouts need, and what that needs."""
     parts: set[str] = set()
-    todo = list(names)
-    cameras = {name for name in todo if name.startswith("camera_")}
+    chosen = list(names)
+    todo = chosen.copy()
     while todo:
         needed = LAYOUTS[todo.pop()].parts
-        for camera in cameras:
-            needed = [dict(LAYOUTS[part].behind).get(camera, part) for part in needed]
+        for slot in chosen:
+            needed = [dict(LAYOUTS[part].behind).get(slot, part) for part in needed]
         fresh = set(needed) - parts
         parts |= fresh
         todo += fresh
@@ -138,11 +138,11 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         "picture": [
             stage.format(shape.schedule)
             for stage in _DRAWN
-            if not (stage == "pack" and shape.lists == "tiled") and not (stage == "resolve" and at_once)
+            if not (stage == "pack" and shape.lists != "ordered") and not (stage == "resolve" and at_once)
         ],
     }
     _refuse_unknown_hooks(files)
-    writer = Writer(files, declared.text, numbers_of(features, shape), declared.scalars)
+    writer = Writer(files, declared, numbers_of(features, shape))
     programs = {name: writer.program(name, stages[name]) for name in stages}
     kernels = (kernel for each in programs.values() for kernel in kernels_in(each))
     arguments = {kernel: declared.arguments(kernel) for kernel in kernels}
@@ -182,20 +182,18 @@ class Writer:
     def __init__(
         self,
         files: Iterable[str],
-        declared: Callable[[str, str], str],
+        declared: Declarations,
         defines: Mapping[str, int],
-        scalars: Scalars,
     ) -> None:
-        """files: of the effects, below kernels/opencl/, in the order in which they fill a hook. declared: the
-        text of `//@@ struct NAME` or `//@@ arguments KERNEL`."""
+        """files: of the effects, below kernels/opencl/, in the order in which they fill a hook."""
         self._sections = [(file, sections_of(file)) for file in files]
-        self._declared, self._defines, self._scalars = declared, defines, scalars
+        self._declared, self._defines = declared, defines
 
     def program(self, name: str, stages: Iterable[str]) -> Text:
         """The program of these stage files."""
         files = [f"{stage}.cl" for stage in stages]
         body = "".join(f"#line 1 {_shown(file)}\n{self._expand(file, 1, lines_of(file))}" for file in files)
-        body = with_scalars(body, self._scalars.wide)
+        body = with_scalars(with_constants(body, self._declared.constants), self._declared.scalars.wide)
         bare = "\n".join(map(_without_comment, body.split("\n")))
         # a number that a program does not name must not make another program
         numbers = sorted(self._defines.items())
@@ -204,7 +202,7 @@ class Writer:
 
     def _fill(self, hook: str, subject: str) -> Iterator[str]:
         if hook in _DECLARED:
-            yield f'#line 1 "layout.py: {subject}"\n{self._declared(hook, subject)}'
+            yield f'#line 1 "layout.py: {subject}"\n{self._declared.text(hook, subject)}'
         for file, by_hook in self._sections:
             for first, lines in by_hook.get(hook, ()):
                 yield f"#line {first} {_shown(file)}\n{self._expand(file, first, lines)}"
@@ -233,9 +231,12 @@ class Declarations:
         self.samples = tuple((one, layout.averaged) for layout in layouts.values() for one in layout.samples)
         self._layouts, self._outputs, self._at_once = layouts, features.images, at_once
         every = layouts.values()
+        self.constants = dict(one for layout in every for one in layout.constant)
+        """fields of `Splat` that all splats share, and their values"""
+        splat = SPLAT.with_members(one for layout in every for one in layout.splat)
         self._structs: dict[str, Record] = {
             "View": VIEW.with_members(one for layout in every for one in layout.view),
-            "Splat": SPLAT.with_members(one for layout in every for one in layout.splat),
+            "Splat": splat.without(self.constants),
             "Bounds": BOUNDS.with_members(one for layout in every for one in layout.bounds),
         }
         self.records: dict[str, np.dtype] = {}
@@ -285,6 +286,16 @@ def _without_comment(line: str) -> str:
 def with_scalars(text: str, wide: str = "float") -> str:
     """Kernel text in which the type `wide` and its constants are those of C."""
     return _WIDE.sub(wide, _WIDE_CONSTANT.sub(r"\1" if wide == "double" else r"\1f", text))
+
+
+def with_constants(text: str, constants: Mapping[str, str]) -> str:
+    """Kernel text in which fields of `Splat` that no record holds are read as their values, and not
+    written."""
+    if not constants:
+        return text
+    names = "|".join(constants)
+    text = re.sub(rf"\brecord\.(?:{names}) = [^;\n]*;", "", text)
+    return re.sub(rf"\bs(?:->|\.)({names})\b", lambda read: constants[read[1]], text)
 
 
 def _refuse_unknown_hooks(files: list[str]) -> None:

@@ -6,7 +6,7 @@ in effect_layouts.py.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -77,6 +77,14 @@ class Record:
     def with_members(self, members: Iterable[Member]) -> Record:
         """The record with more members behind its own."""
         return Record(self.name, (*self.members, *members), self.alignment)
+
+    def without(self, names: Collection[str]) -> Record:
+        """The record without these fields, which keep their order."""
+        kept = (
+            Member(one.ctype, tuple(field for field in one.names if field[0] not in names), one.note)
+            for one in self.members
+        )
+        return Record(self.name, tuple(one for one in kept if one.names), self.alignment)
 
     def dtype(self, scalars: Scalars) -> np.dtype:
         """Its layout: that of C, by natural alignment."""
@@ -181,6 +189,8 @@ class Layout:
     parts: tuple[str, ...] = ()
     """other layouts that it needs: parts, or outputs whose samples it reads"""
     splat: tuple[Member, ...] = ()
+    constant: tuple[tuple[str, str], ...] = ()
+    """(field of `Splat`, value): every splat has it, so that no record holds it and kernels read the value"""
     bounds: tuple[Member, ...] = ()
     view: tuple[Member, ...] = ()
     project: tuple[Argument, ...] = ()
@@ -191,7 +201,7 @@ class Layout:
     averaged: bool = False
     """Whether its samples are light: the mean of what several shots leave, not one shot's."""
     behind: tuple[tuple[str, str], ...] = ()
-    """(camera, part): behind that camera that part takes this one's place"""
+    """(camera or another slot, part): where that is chosen that part takes this one's place"""
 
 
 def output_argument(output: Output) -> Argument:

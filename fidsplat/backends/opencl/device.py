@@ -72,8 +72,6 @@ def open_device(selector: str = "") -> OpenCLBackend:
 class OpenCLBackend(Workspace):
     """An open OpenCL device, and what is compiled for it."""
 
-    always_float64 = False
-
     def __init__(self, device: cl.Device) -> None:
         if "Portable Computing Language" in device.platform.name:
             pocl_cache.check_once()

@@ -13,7 +13,7 @@ _OWN_RAYS = ("camera_brown_conrady", "camera_fisheye", "camera_equirectangular")
 
 LAYOUTS: dict[str, Layout] = {
     # one of each kind
-    "camera_pinhole": Layout("slot/camera_pinhole.cl", parts=("conic", "perspective")),
+    "camera_pinhole": Layout("slot/camera_pinhole.cl", parts=("chord", "conic", "perspective")),
     "camera_brown_conrady": Layout(
         "slot/camera_brown_conrady.cl",
         parts=("perspective", "ray_map", "rays"),
@@ -33,7 +33,7 @@ LAYOUTS: dict[str, Layout] = {
     "camera_equirectangular": Layout("slot/camera_equirectangular.cl", parts=("polygon", "rays")),
     "camera_orthographic": Layout(
         "slot/camera_orthographic.cl",
-        parts=("conic",),
+        parts=("chord", "conic"),
         splat=(member("wide z0 zx zy", "depth times D = z0 + zx x + zy y"), member("wide z_near")),
     ),
     "color_rgb": Layout("slot/color_rgb.cl", project=takes("cloud float colors  // (n, 3)")),
@@ -87,7 +87,13 @@ LAYOUTS: dict[str, Layout] = {
         view=(member("real slopes[4]", "of rays, -x, x, -y, y: where derivatives are taken at most"),),
     ),
     "ellipsoid_ewa_antialiased": Layout("slot/ellipsoid_ewa_antialiased.cl", parts=("ellipsoid_ewa",)),
-    "ellipsoids_alone": Layout("slot/ellipsoids_alone.cl"),
+    "ellipsoids_alone": Layout(
+        "slot/ellipsoids_alone.cl",
+        constant=(
+            *(("nuy", "WIDE(0.0)"), ("d0", "WIDE(1.0)"), ("dx", "WIDE(0.0)"), ("dy", "WIDE(0.0)")),
+            ("d_near", "INFINITY"),
+        ),
+    ),
     "background_constant": Layout(),
     "background_gradient": Layout(
         "slot/background_gradient.cl",
@@ -123,7 +129,9 @@ LAYOUTS: dict[str, Layout] = {
     "blend_double": Layout(),
     # what several of them share
     "beside": Layout("part/beside.cl"),
-    "conic": Layout("part/conic.cl"),
+    "chord": Layout("part/chord.cl"),
+    "conic": Layout("part/conic.cl", behind=(("ellipsoids_alone", "conic_facing"),)),
+    "conic_facing": Layout("part/conic_facing.cl"),
     "perspective": Layout("part/perspective.cl"),
     "polygon": Layout("part/polygon.cl"),
     "ray_map": Layout(

@@ -11,9 +11,10 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
-from fidsplat.backends.gradients import NOT_THE_LAST, check_shape, gradient_shape
+from fidsplat.backends.gradients import NOT_THE_LAST, TooLittleRoom, check_shape, gradient_shape
 from fidsplat.backends.opencl.gradients_source import assemble_gradients, chunk_of
 from fidsplat.backends.opencl.images import OpenCLImages
+from fidsplat.backends.opencl.lists import pairs_of
 from fidsplat.backends.opencl.picture import Picture
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.program import Program
@@ -25,6 +26,7 @@ from fidsplat.errors import DeviceError, InputError
 
 _GROUP = 64  # RESERVED, POSED and ADDED of the kernels
 _F32 = np.dtype(np.float32)
+_ZERO = np.zeros(1, np.uint32)  # of floats too
 
 
 class DifferentiableImages:
@@ -66,10 +68,15 @@ class OpenCLGradients:
         self._pipeline = pipeline
         self.source = assemble_gradients(pipeline.features, pipeline.shape)
         self.program = Program(pipeline.workspace, self.source)
+        arguments = self.source.arguments
+        self._wanted = {one.name for one in arguments["blend_backward"]}
+        self._cloud_arrays = [one.name for one in arguments["project_backward"] if one.source == "cloud"]
+        self._pairs = 0
+        """most that a picture had so far, and a quarter more"""
 
-    def forward(self, resident: Resident, view: View) -> DifferentiableImages:
-        """As `DifferentiablePipeline`."""
-        return DifferentiableImages(*self._pipeline.drawn(resident, view))
+    def forward(self, resident: Resident, view: View, waits: bool = True) -> DifferentiableImages:
+        """As `DifferentiablePipeline`: GPUs need not wait where pictures were taken back before."""
+        return DifferentiableImages(*self._pipeline.drawn(resident, view, 0 if waits else self._pairs))
 
     def backward(self, images: DifferentiableImages, gradients: Mapping[str, Any]) -> dict[str, Any]:
         """As `DifferentiablePipeline`: pyopencl arrays."""
@@ -101,15 +108,17 @@ class OpenCLGradients:
         reserved = picture.take("reserved", 4)
         found = self._room_for_results(picture)
 
-        cl.enqueue_fill_buffer(picture.queue, reserved, np.zeros(1, np.uint32), 0, 4)
+        cl.enqueue_fill_buffer(picture.queue, reserved, _ZERO, 0, 4)
         if count:
             picture.launch("reserve", "reserve_slots", count, _GROUP, count=count)
         group = shape.blend_items
         ceiling = math.log(view.ceiling)
         picture.launch("blend backward", "blend_backward", picture.tiles * group, group, log_ceiling=ceiling)
+        self._ask(drawn)
         if count:
-            wanted = [one.name for one in self.source.arguments["project_backward"] if one.source == "cloud"]
-            arrays: dict[str, Any] = {name: picture.resident.part(name, 0, count) for name in wanted}
+            arrays: dict[str, Any] = {
+                name: picture.resident.part(name, 0, count) for name in self._cloud_arrays
+            }
             picture.launch("project backward", "project_backward", count, _GROUP, count=count, **arrays)
         for name, sums, rows, columns in (
             ("tile_sums", "background", picture.tiles, 3),
@@ -120,17 +129,23 @@ class OpenCLGradients:
             picture.launch("project backward", "add_up", columns * _GROUP, _GROUP, **given)
         return found
 
+    def _ask(self, drawn: Picture) -> None:
+        """Whether there was room for all pairs: with too little of it lists were left empty, and splats have
+        slots beyond the end. The device is busy meanwhile."""
+        if (pairs := pairs_of(drawn)) is None:
+            raise TooLittleRoom
+        self._pairs = max(self._pairs, pairs * 5 // 4)
+
     def _take_gradients(self, picture: Picture, gradients: Mapping[str, Any]) -> None:
         """The derivatives by the images, as arguments of the kernels."""
-        wanted = {one.name for one in self.source.arguments["blend_backward"]}
         for name in GRADIENT_OUTPUTS:
-            if f"by_{name}" not in wanted:
+            if f"by_{name}" not in self._wanted:
                 continue
             shape, given = gradient_shape(name, picture.view), gradients.get(name)
             if given is None:
                 size = 4 * math.prod(shape)
                 buffer = picture.take(f"by_{name}", size)
-                cl.enqueue_fill_buffer(picture.queue, buffer, np.zeros(1, np.float32), 0, size)
+                cl.enqueue_fill_buffer(picture.queue, buffer, _ZERO, 0, size)
                 continue
             check_shape(name, given.shape, picture.view)
             if isinstance(given, Array):
@@ -154,6 +169,6 @@ class OpenCLGradients:
         found = {}
         for name, shape in shapes.items():
             argument = name if name == "screen" else f"by_{name}"
-            buffer = picture.take(argument, 4 * math.prod(shape))
-            found[name] = Array(picture.queue, shape, _F32, data=buffer)
+            found[name] = picture.pool.array(picture.queue, argument, shape)
+            picture.held[argument] = found[name].data
         return found

@@ -31,7 +31,7 @@ def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> Source:
     files = [DRAWN[name].file for name in dict.fromkeys(slots)]
     files += [layout.file for layout in layouts]
     numbers = numbers_of(features, shape) | {"CHUNK": chunk_of(shape)}
-    writer = Writer([file for file in files if file], declared.text, numbers, declared.scalars)
+    writer = Writer([file for file in files if file], declared, numbers)
     text = writer.program("gradients", [stage.format(shape.schedule) for stage in _STAGES])
     arguments = {kernel: declared.arguments(kernel) for kernel in kernels_in(text)}
     return Source({"gradients": text}, declared.records, arguments, (), declared.scalars)

@@ -122,6 +122,11 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("in uint2 windows", "in uint keys big", "in Bounds big_bounds", "in uint starts"),
         *("out uint counts cursors", "out uint2 pairs"),
     ),
+    "tally_gathered": takes("uint count", _SIZE, "in uint2 windows", "in uint keys", "out uint tallies"),
+    "emit_gathered": takes(
+        *("uint count first_band", _SIZE, "int band_first band_end", "uint capacity"),
+        *("in uint2 windows", "in uint keys starts", "out uint counts cursors", "out uint2 pairs"),
+    ),
     "sort_tiles": takes("int band_first", "in uint starts", "out ulong pairs", "out uint lists"),
     "blend": takes(
         *("in Splat splats", "in uint lists starts"),

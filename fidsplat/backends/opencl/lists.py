@@ -25,6 +25,7 @@ from fidsplat.errors import DeviceError
 _VISIBLE, _PAIRS, _BIG, _TALLIES = 0, 2, 6, 8
 # words of the buffer `counts`, as in tiles.cl: big splats, pairs (two words), visible splats
 _COUNTS = 4
+_NO_WINDOW = np.array([0xFFFFFFFF, 0], np.uint32)
 
 
 class Lists:
@@ -56,8 +57,8 @@ class Lists:
         picture.take("keys", KEYS * places)
         windows = picture.take("windows", WINDOWS * places)
         if picture.view.band is not None and places:
-            # splats beside the band get no window of their own: one that touches no tile
-            cl.enqueue_fill_buffer(picture.queue, windows, np.zeros(1, np.uint32), 0, WINDOWS * places)
+            # splats beside the band get no window of their own: one without tiles, of no big splat
+            cl.enqueue_fill_buffer(picture.queue, windows, _NO_WINDOW, 0, WINDOWS * places)
         if count == 0:
             return
         wanted = [one.name for one in source.arguments["project"] if one.source == "cloud"]
@@ -258,12 +259,17 @@ class TiledLists(Lists):
         # what the host reads has a buffer of its own: `emit` adds to it meanwhile
         picture.lease("counts", 4 * _COUNTS)
         capacity = self.capacity(picture.workspace)
+        if picture.trusted:
+            capacity = min(capacity, picture.trusted)
         self._project()
         counted = self._starts(capacity)
         if capacity:
             self._list(0, picture.tiles, capacity, True)
             yield 0, picture.tiles
         if picture.repeats:
+            return
+        if capacity and picture.trusted:
+            picture.counted, picture.pairs = counted, capacity
             return
         big, self._pairs = self._read(counted)
         while big > self.big:
@@ -311,21 +317,66 @@ class TiledLists(Lists):
 
     def _list(self, first: int, end: int, capacity: int, first_band: bool) -> None:
         """The sorted lists of the tiles of one band."""
-        picture, items, count = self.picture, self._ITEMS, self.picture.resident.count
+        picture, items = self.picture, self._ITEMS
         picture.take("pairs", 8 * capacity)
         picture.take("lists", 4 * capacity)
-        groups, views = -(-count // items), picture.views
-        walk = {"count": count, "splat_groups": groups, "first_band": first_band}
-        band = {"band_first": first, "band_end": end, "capacity": capacity}
-        all_groups = groups + -(-self._big_groups // views)
-        picture.launch("bin", "emit", all_groups * items, items, views, **walk, **band)
+        self._emit({"band_first": first, "band_end": end, "capacity": capacity, "first_band": first_band})
         picture.launch("sort", "sort_tiles", (end - first) * items, items, band_first=first)
+
+    def _emit(self, band: dict[str, Any]) -> None:
+        """The pairs of a band."""
+        picture, items, count = self.picture, self._ITEMS, self.picture.resident.count
+        groups, views = -(-count // items), picture.views
+        all_groups = groups + -(-self._big_groups // views)
+        walk = {"count": count, "splat_groups": groups}
+        picture.launch("bin", "emit", all_groups * items, items, views, **walk, **band)
 
     def _read(self, counted: cl.Event) -> tuple[int, int]:
         """Numbers of big splats and of pairs as `counted` has left them, while later stages picture."""
-        self.picture.queue.flush()
-        side, counts = self.picture.workspace.side_queue, self.picture.held["counts"]
-        return fullness_of(read_counts(side, counts, [counted]))
+        return fullness_of(_counts_after(counted, self.picture))
+
+
+def pairs_of(picture: Picture) -> int | None:
+    """How many pairs a picture had; None where it was `trusted` to have fewer, so that nothing was drawn.
+    Waits until the device has counted, not until it has drawn."""
+    if picture.counted is None:
+        return picture.pairs
+    big, pairs = fullness_of(_counts_after(picture.counted, picture))
+    return pairs if big <= picture.held["big_capacity"] and pairs <= picture.pairs else None
+
+
+def _counts_after(counted: cl.Event, picture: Picture) -> np.ndarray:
+    picture.queue.flush()
+    return read_counts(picture.workspace.side_queue, picture.held["counts"], [counted])
+
+
+class GatheredLists(TiledLists):
+    """Kernels gathered.cl beside those of TiledLists: work-groups take many splats of a view each, and count
+    their pairs in local memory. For many views, of at most TILES tiles each.
+    """
+
+    TILES = 4096  # GATHER_TILES
+    _GATHERED = 4096  # as there
+
+    def _project(self, needed: int = 0) -> None:
+        """Projects and tallies."""
+        super()._project(needed)
+        self._gather("tally_gathered")
+
+    def _emit(self, band: dict[str, Any]) -> None:
+        """The pairs of a band: of the splats of many tiles, then of all others."""
+        picture, items, count = self.picture, self._ITEMS, self.picture.resident.count
+        big = {"count": count, "splat_groups": 0}
+        picture.launch("bin", "emit", self._big_groups * items, items, **big, **band)
+        self._gather("emit_gathered", **band)
+
+    def _gather(self, kernel: str, **given: Any) -> None:
+        """Launch of a kernel of gathered.cl."""
+        picture, count = self.picture, self.picture.resident.count
+        if count == 0:
+            return
+        groups, items = -(-count // self._GATHERED), picture.shape.scan_items
+        picture.launch("bin", kernel, groups * items, items, picture.views, count=count, **given)
 
 
 def read_counts(
@@ -347,4 +398,4 @@ def stats_of(splats: int, words: np.ndarray) -> dict[str, int]:
     return {"splats": splats, "visible": int(words[3]), "pairs": fullness_of(words)[1]}
 
 
-LISTS = {"ordered": OrderedLists, "chunked": ChunkedLists, "tiled": TiledLists}
+LISTS = {"ordered": OrderedLists, "chunked": ChunkedLists, "tiled": TiledLists, "gathered": GatheredLists}

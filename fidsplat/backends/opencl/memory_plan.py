@@ -13,7 +13,7 @@ _LARGE = 1 << 23
 """as many, where that takes a small part of the memory: the host has less to do"""
 _LEAST = 1 << 10
 
-KEYS, WINDOWS, SORTED, PAIR = 4, 8, 16, {"ordered": 4, "tiled": 12}
+KEYS, WINDOWS, SORTED, PAIR = 4, 8, 16, {"ordered": 4, "tiled": 12, "gathered": 12}
 """bytes per splat of sort keys, of tile windows, and of keys and indices being sorted; bytes per pair"""
 BIG = 1 << 12
 """big splats for which there is room at first"""
@@ -35,7 +35,7 @@ class MemoryPlan:
 
 def table_bytes(lists: str, tiles: int, chunks: int, radix_bits: int) -> int:
     """What listing takes beside splats and pairs: tables, places and tallies."""
-    if lists == "tiled":
+    if lists != "ordered":
         return 4 * 3 * tiles
     bins = 1 << radix_bits
     return 4 * ((tiles + bins) * (chunks + 2) + 3 * chunks)

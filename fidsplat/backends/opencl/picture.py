@@ -34,12 +34,15 @@ class Picture:
         plan: MemoryPlan,
         queue: cl.CommandQueue | None = None,
         stack: ViewStack | None = None,
+        trusted: int = 0,
     ) -> None:
         """
         Args:
             queue: where it is drawn without waiting for the device, as one of its kind was drawn before; None
                 for the first of its kind.
             stack: many views instead of one, with all in common that they do not say.
+            trusted: pairs of splats and tiles for which room is made without asking the device how many there
+                are, if there is room for so many anyway (`TiledLists`); 0: it is asked.
         """
         self.workspace, self.program, self.shape = workspace, program, shape
         self.resident, self.view, self.plan, self.repeats = resident, view, plan, queue is not None
@@ -72,10 +75,13 @@ class Picture:
         """what was put on the device for this view"""
         self.uploads: list[cl.Event] = []
         self.leased: list[tuple[str, cl.Buffer]] = []
+        self.trusted = trusted
+        self.counted: cl.Event | None = None
+        """when the device will have counted the pairs, where it was not asked"""
         self.in_bands = False
         """whether its lists were too long for one band"""
         self.pairs = 0
-        """of splats and tiles that were listed, where the host has been told"""
+        """of splats and tiles that were listed, where the host has been told; else for which there is room"""
         self.stats: Callable[[], dict[str, int]] = dict
         self._uniforms: dict[str, tuple[Any, ...]] = {}
 

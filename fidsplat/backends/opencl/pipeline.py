@@ -14,7 +14,7 @@ from fidsplat.backends.opencl.assemble import Source
 from fidsplat.backends.opencl.batch import OpenCLBatch, OutputBuffers, parts
 from fidsplat.backends.opencl.drawing import Slots, draw
 from fidsplat.backends.opencl.images import Drawn, OpenCLImages, Repeat, stats_later
-from fidsplat.backends.opencl.lists import TiledLists
+from fidsplat.backends.opencl.lists import GatheredLists, TiledLists
 from fidsplat.backends.opencl.memory_plan import (
     BIG,
     KEYS,
@@ -103,20 +103,22 @@ class OpenCLPipeline:
         except DeviceError:  # too little memory for any part of it
             return False
 
-    def drawn(self, resident: Resident, view: View) -> tuple[Picture, OpenCLImages]:
+    def drawn(self, resident: Resident, view: View, trusted: int = 0) -> tuple[Picture, OpenCLImages]:
         """One picture with all that its stages have left on the device, until another is drawn.
+
+        trusted: as `Picture` has it; `pairs_of` then says whether all was drawn.
 
         Raises:
             DeviceError: as `render`.
         """
         with self.workspace.lock:
-            picture = self._tried(self._whole, resident, view)
+            picture = self._tried(self._whole, resident, view, trusted)
             return picture, self._images(view, Drawn.of(picture))
 
-    def _whole(self, resident: Resident, view: View) -> Picture:
+    def _whole(self, resident: Resident, view: View, trusted: int) -> Picture:
         """A picture that is drawn at once, not in chunks or bands."""
         plan = self._plan(resident, view)
-        picture = None if plan.chunk else self._first(resident, view, plan)
+        picture = None if plan.chunk else self._first(resident, view, plan, trusted=trusted)
         if picture is None or picture.pairs > self.workspace.pair_budget:
             raise DeviceError(
                 f"{resident.count:,} splats are drawn in chunks or bands within the memory budget, and such "
@@ -139,13 +141,11 @@ class OpenCLPipeline:
         buffers = OutputBuffers(workspace, outputs, batch)
         drawn: list[Drawn] = []
         for first, end, plan in self._parts(resident, batch, buffers.nbytes):
-            shape, views = self.shape, batch.views
-            if plan.chunk and shape.lists != "ordered":
-                # as `render`
-                shape = replace(shape, lists="ordered")
+            views = batch.views
+            stack = views.part(first, end) if isinstance(views, ViewStack) and end - first > 1 else None
+            shape = self._listing(plan, stack)
             pipeline = self if shape is self.shape else self._other(self.features, shape)
             pool.make_way((pipeline, "views", resident.count, plan), workspace.memory_budget - plan.held)
-            stack = views.part(first, end) if isinstance(views, ViewStack) and end - first > 1 else None
 
             def start(view: View, pipeline=pipeline, stack=stack, plan=plan) -> Picture:
                 return Picture(workspace, pipeline.program, pipeline.shape, resident, view, plan, stack=stack)
@@ -153,6 +153,19 @@ class OpenCLPipeline:
             into = Slots(batch.slots[first:end].copy(), buffers.held())
             drawn.append(Drawn.of(draw(start, batch.one(first), outputs, into)))
         return OpenCLBatch(workspace, buffers, drawn, resident.count)
+
+    def _listing(self, plan: MemoryPlan, stack: ViewStack | None) -> DeviceShape:
+        """The shape that lists a part of a batch in the least time."""
+        if self.shape.lists != "tiled":
+            return self.shape
+        if plan.chunk:
+            return replace(self.shape, lists="ordered")  # as `render`
+        few = stack is not None and self._tiles(stack.view) <= GatheredLists.TILES
+        return replace(self.shape, lists="gathered") if few else self.shape
+
+    def _tiles(self, view: View) -> int:
+        """That a view has."""
+        return -(-view.width // self.shape.tile_width) * -(-view.height // self.shape.tile_height)
 
     def _parts(
         self, resident: Resident, batch: ViewBatch, beside: int
@@ -185,7 +198,7 @@ class OpenCLPipeline:
     def _bytes_of_view(self, resident: Resident, view: View) -> tuple[int, int]:
         """What a view of a batch takes beside its images, and its samples."""
         shape, source = self.shape, self.source
-        tiles = -(-view.width // shape.tile_width) * -(-view.height // shape.tile_height)
+        tiles = self._tiles(view)
         samples = tiles * shape.tile_width * shape.tile_height
         splat = source.records["Splat"].itemsize + KEYS + WINDOWS
         splat += SORTED if shape.lists == "ordered" else 0
@@ -218,14 +231,19 @@ class OpenCLPipeline:
         return OpenCLImages(self.workspace, self.features.images, size, drawn, repeat)
 
     def _first(
-        self, resident: Resident, view: View, plan: MemoryPlan, key: tuple[Any, ...] | None = None
+        self,
+        resident: Resident,
+        view: View,
+        plan: MemoryPlan,
+        key: tuple[Any, ...] | None = None,
+        trusted: int = 0,
     ) -> Picture:
         """Draws a picture with what room it takes; remembers its kind, if the next may be launched again."""
         pool = self.workspace.pool
         kind = self, view.width, view.height, resident.count, plan
         # what this picture takes anew is planned for; that of its own kind is there already
         pool.make_way(kind, self.workspace.memory_budget - plan.held)
-        picture = self._draw(resident, view, plan)
+        picture = self._draw(resident, view, plan, trusted)
         whole = not (plan.chunk or resident.streamed or view.shots or picture.in_bands)
         if key is not None and whole and self.shape.lists == "tiled" and resident.count:
             rasters = {each.raster for each in resident.kept.values()} - {None, view.raster}
@@ -285,9 +303,9 @@ class OpenCLPipeline:
         """The picture drawn anew, whatever it takes, and its time."""
         return Drawn.of(self._tried(self._first, resident, view, self._plan(resident, view)))
 
-    def _draw(self, resident: Resident, view: View, plan: MemoryPlan) -> Picture:
+    def _draw(self, resident: Resident, view: View, plan: MemoryPlan, trusted: int = 0) -> Picture:
         def start(view: View) -> Picture:
-            return Picture(self.workspace, self.program, self.shape, resident, view, plan)
+            return Picture(self.workspace, self.program, self.shape, resident, view, plan, trusted=trusted)
 
         return draw(start, view, self.features.images)
 

@@ -161,7 +161,7 @@ class OpenCLProbe:
         starts = buffer_of(workspace, np.empty(len(lengths) + 1, np.uint32))
         sums = buffer_of(workspace, np.zeros(8, np.uint32))
         given = {"starts": starts}
-        if pipeline.shape.lists == "tiled":
+        if pipeline.shape.lists != "ordered":
             kernel, place = "tile_starts", 1
             given |= {"tiles": len(lengths), "capacity": 2**32 - 1, "clear": 0, "counts": sums}
             tallies = buffer_of(workspace, np.concatenate([np.zeros(8, np.uint32), lengths]))

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pyopencl as cl
@@ -78,6 +79,8 @@ class OpenCLTraining:
         self._drawn: tuple[int, ResidentArrays] | None = None
         self._truths: list[_Truth] = []
         self._planes: tuple[tuple[int, int], cl.Buffer] | None = None
+        self._sights: WeakKeyDictionary[Camera, tuple[np.ndarray, dict[str, float]]] = WeakKeyDictionary()
+        """numbers by which kernels know what a camera sees, each with the origin that they are of"""
 
     def take_views(self, views: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> None:
         """As `TrainingKernels`."""
@@ -144,7 +147,7 @@ class OpenCLTraining:
         height, columns, _ = image.shape
         truth = self._truths[view]
         number, stride = truth.counted, self._stride(columns)
-        slope = Array(self._queue, image.shape, np.float32, data=self._scratch("by_rgb", 4 * image.size))
+        slope = self._array("by_rgb", image.shape)
         given = {
             **{"rgb": image.data, "truth": truth.picture, "mask": truth.mask, "masked": int(truth.masked)},
             **{"by_rgb": slope.data, "sums": self._scratch("loss sums", 12 * _SUMS)},
@@ -174,12 +177,7 @@ class OpenCLTraining:
         depth, truth = images.device_array("depth"), self._truths[view]
         height, width = depth.shape
         shapes = {"depth": (height, width), "normal": (height, width, 3)}
-        found = {
-            name: Array(
-                self._queue, shape, np.float32, data=self._scratch(f"by {name}", 4 * math.prod(shape))
-            )
-            for name, shape in shapes.items()
-        }
+        found = {name: self._array(f"by {name}", shape) for name, shape in shapes.items()}
         given = {
             **{"width": width, "height": height, "mask": truth.mask, "masked": int(truth.masked)},
             **{"inverse_x": 1 / camera.fx, "inverse_y": 1 / camera.fy},
@@ -195,14 +193,9 @@ class OpenCLTraining:
 
     def count(self, screen: Any, camera: Camera, origin: np.ndarray) -> None:
         """As `TrainingKernels`."""
-        turn = camera.world_to_camera[:3, :3]
-        names = [f"turn_{i}{j}" for i in range(3) for j in range(3)]
-        given = dict(zip(names, turn.ravel().tolist(), strict=True))
-        move = turn @ (origin - camera.position)
-        given |= dict(zip(("move_x", "move_y", "move_z"), move.tolist(), strict=True))
-        given |= {"focal_x": camera.fx, "focal_y": camera.fy, "center_x": camera.cx, "center_y": camera.cy}
-        given |= {"near": camera.near, "width": camera.width, "height": camera.height}
-        self._launch("count_seen", self._count, given | {"screen": screen.data})
+        if (known := self._sights.get(camera)) is None or known[0] is not origin:
+            known = self._sights[camera] = origin, _sight(camera, origin)
+        self._launch("count_seen", self._count, known[1] | {"screen": screen.data})
 
     def step(
         self, gradients: Mapping[str, Any], sizes: Mapping[str, float], numbers: Mapping[str, float]
@@ -263,6 +256,9 @@ class OpenCLTraining:
     def _scratch(self, name: str, size: int) -> cl.Buffer:
         return self._workspace.pool.scratch(f"training: {name}", size)
 
+    def _array(self, name: str, shape: tuple[int, ...]) -> Array:
+        return self._workspace.pool.array(self._queue, f"training: {name}", shape)
+
     def _stride(self, columns: int) -> int:
         return -(-3 * columns // self._lanes) * self._lanes + 2 * MARGIN
 
@@ -276,3 +272,14 @@ class OpenCLTraining:
         cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.float32), 0, size)
         self._planes = (height, columns), buffer
         return buffer
+
+
+def _sight(camera: Camera, origin: np.ndarray) -> dict[str, float]:
+    """Arguments of the kernel `count_seen`."""
+    turn = camera.world_to_camera[:3, :3]
+    names = [f"turn_{i}{j}" for i in range(3) for j in range(3)]
+    given = dict(zip(names, turn.ravel().tolist(), strict=True))
+    move = turn @ (origin - camera.position)
+    given |= dict(zip(("move_x", "move_y", "move_z"), move.tolist(), strict=True))
+    given |= {"focal_x": camera.fx, "focal_y": camera.fy, "center_x": camera.cx, "center_y": camera.cy}
+    return given | {"near": camera.near, "width": camera.width, "height": camera.height}

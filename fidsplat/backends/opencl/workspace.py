@@ -4,6 +4,7 @@ how much memory a picture may take.
 
 from __future__ import annotations
 
+import math
 import threading
 import weakref
 from collections.abc import Collection, Hashable, Iterator
@@ -13,6 +14,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import pyopencl as cl
+from pyopencl.array import Array
 
 from fidsplat.backends.base import DeviceInfo
 from fidsplat.backends.opencl.host_memory import HostMemory
@@ -48,6 +50,7 @@ class BufferPool:
         # records that lie anywhere are found in large pages without a walk through the tables of pages
         self._in_large_pages = bool(device.type & cl.device_type.CPU) and bool(device.host_unified_memory)
         self._buffers: dict[str, cl.Buffer] = {}
+        self._arrays: dict[str, Array] = {}
         self._contents: dict[str, weakref.ref[np.ndarray]] = {}
         self._spare: dict[str, list[cl.Buffer]] = {}
         self._zeroed: set[str] = set()
@@ -98,6 +101,7 @@ class BufferPool:
     def clear(self) -> None:
         """Lets go of all that it holds."""
         self._spare.clear()
+        self._arrays.clear()
         self._buffers.clear()
         self._contents.clear()
         self._zeroed.clear()
@@ -121,10 +125,20 @@ class BufferPool:
         self._zeroed.discard(name)
         held = self._buffers.get(name)
         if held is None or held.size < size:
+            self._arrays.pop(name, None)
             self._buffers.pop(name, None)
             self.state = object()
             held = self._buffers[name] = self.fresh(name, size)
         return held
+
+    def array(self, queue: cl.CommandQueue, name: str, shape: tuple[int, ...]) -> Array:
+        """A scratch buffer as an array of float32, the same object as long as it can be: to make one takes
+        the host longer than to launch a kernel."""
+        buffer = self.scratch(name, 4 * math.prod(shape))
+        known = self._arrays.get(name)
+        if known is None or known.base_data is not buffer or known.shape != shape or known.queue is not queue:
+            known = self._arrays[name] = Array(queue, shape, np.float32, data=buffer)
+        return known
 
     def zeroed(self, name: str, size: int, queue: cl.CommandQueue) -> cl.Buffer:
         """A scratch buffer of zeros, for somebody who leaves zeros there."""

@@ -42,6 +42,7 @@ def devices() -> list[DeviceInfo]:
             float64=True,
             usable=True,
             reason=f"slow; for comparison only ({platform.machine()})",
+            always_float64=True,
         )
     ]
 
@@ -59,8 +60,6 @@ def open_device(selector: str = "") -> ReferenceBackend:
 
 class ReferenceBackend:
     """NumPy in float64."""
-
-    always_float64 = True
 
     def __init__(self) -> None:
         self.info = devices()[0]

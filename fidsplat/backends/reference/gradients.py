@@ -27,8 +27,8 @@ class ReferenceGradients:
         self._pipeline, self._features = pipeline, features
         self._drawn: tuple[Images, FrozenPicture] | None = None
 
-    def forward(self, resident: Any, view: View) -> Images:
-        """As `DifferentiablePipeline`."""
+    def forward(self, resident: Any, view: View, waits: bool = True) -> Images:
+        """As `DifferentiablePipeline`; there is always room."""
         images = self._pipeline.render(resident, view)
         self._drawn = images, FrozenPicture(resident.cloud, view, self._features)
         return images

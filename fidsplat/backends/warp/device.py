@@ -57,8 +57,6 @@ def open_device(selector: str = "") -> WarpBackend:
 class WarpBackend(Workspace):
     """An open Warp device with what its pictures share, and compiled pipelines."""
 
-    always_float64 = False
-
     def __init__(self, device: Any) -> None:
         self.info = _describe(device)
         super().__init__(device, self.info.name, self.info.memory_bytes // 10 * 9)

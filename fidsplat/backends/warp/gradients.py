@@ -65,8 +65,8 @@ class WarpGradients:
     def __init__(self, pipeline: WarpPipeline) -> None:
         self._pipeline, self._kernels = pipeline, GradientKernels(pipeline.program)
 
-    def forward(self, resident: Resident, view: View) -> DifferentiableImages:
-        """As `DifferentiablePipeline`."""
+    def forward(self, resident: Resident, view: View, waits: bool = True) -> DifferentiableImages:
+        """As `DifferentiablePipeline`; it always waits."""
         picture, images = self._pipeline.drawn(resident, view)
         if picture.bands > 1:
             raise DeviceError(

@@ -19,7 +19,8 @@ from fidsplat.experiments.bench.catalogue import BENCH_SCENES, TIMED, BenchScene
 from fidsplat.experiments.bench.model import Counts, roofline_ms
 from fidsplat.frame import Frame
 from fidsplat.quality import Quality
-from fidsplat.render import Renderer, ResidentCloud
+from fidsplat.render import Renderer
+from fidsplat.resident import ResidentCloud
 from fidsplat.splats import SplatCloud
 from fidsplat.store.residency import Residency
 from fidsplat.timing import Timer, take_turns
@@ -199,7 +200,7 @@ def overdraw(renderer: Renderer, resident: ResidentCloud, camera: Camera, qualit
     Raises:
         FidsplatError: the device fails, or its backend has no such count.
     """
-    data = resident._data
+    data = resident.data
     assert not isinstance(data, Residency), "of splats in memory"
     features, view = prepare(data, Capture(camera, quality=quality))
     features = replace(features, outputs=("overdraw",))

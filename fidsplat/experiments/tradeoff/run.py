@@ -11,7 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from fidsplat.accuracy import TRUTH_CUTOFF
-from fidsplat.errors import FidsplatError
+from fidsplat.errors import FidsplatError, InputError
 from fidsplat.experiments.sweep import Key, Results, Sweep
 from fidsplat.experiments.tradeoff import compare, linear, points, scenes
 from fidsplat.experiments.tradeoff.own import Own, digests
@@ -60,9 +60,11 @@ def prepared(options: Options) -> Iterator[Sweep]:
         if own
         else all_points(options.scenes, options.knobs, options.quick)
     )
-    writable_folder(options.out)
     renderer = Renderer(options.device)
     info = renderer.device
+    if info.always_float64:
+        raise InputError(f"{info.name} is what others are measured against; give another --device")
+    writable_folder(options.out)
     versions = reader_versions() | metric_versions() | {"pyopencl": version("pyopencl")}
     facts = run_facts(f"{info.title}, {info.version}", scenes.SEED, versions)
     facts |= {"kind": info.kind, "title": info.title} | ({"scene": digests(own)} if own else {})

@@ -16,7 +16,8 @@ from fidsplat.experiments.tradeoff.points import BASE
 from fidsplat.experiments.tradeoff.scenes import TradeScene, make
 from fidsplat.frame import Frame
 from fidsplat.quality import MarkerQuality, Quality
-from fidsplat.render import Renderer, ResidentCloud
+from fidsplat.render import Renderer
+from fidsplat.resident import ResidentCloud
 from fidsplat.timing import frame_timer, quartiles, ratios, take_turns
 
 _SCENES, _TRUTHS = 12, 6

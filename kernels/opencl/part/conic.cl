@@ -28,17 +28,6 @@
         touched &= ~(VBITS(away) << first);
     }
 //@ cells_functions
-#define CONIC_SLACK 2e-5f
-
-typedef struct {                        // an ellipse, relative to the splat's anchor
-    bool is;                            // false: there is none, or the horizon is near, or rows or columns run along the splat
-    float middle, slope;                // middles of chords: middle + slope y
-    float y, half_height;
-    float square, bend;                 // squares of half chords: square - bend (y - its y)^2
-    float tip;                          // height above y at which it is widest to the right
-    float pad;
-} Conic;
-
 static inline Conic conic_of(local const Splat *s, float h, float far_x, float far_y) {
     float u0 = s->nu0, ux = s->nux, uy = s->nuy, v0 = s->nv0, vx = s->nvx, vy = s->nvy, d0 = s->d0, dx = s->dx, dy = s->dy;
     float u = fabs(u0) + fabs(ux) * far_x + fabs(uy) * far_y, v = fabs(v0) + fabs(vx) * far_x + fabs(vy) * far_y;
@@ -63,28 +52,8 @@ static inline Conic conic_of(local const Splat *s, float h, float far_x, float f
     c.tip = c.slope * square_height / sqrt(c.slope * c.slope * square_height + c.square + 1e-12f);
     return c;
 }
-
-static inline float conic_half_chord(const Conic *c, float y) {
-    float above = y - c->y;
-    return sqrt(fmax(c->square - c->bend * above * above, 0.0f)) + c->pad;
-}
-
-// Of the rows from y0 to y1.
-static inline void conic_chord(const Conic *c, float y0, float y1, float *x0, float *x1) {
-    if (!c->is) return;
-    if (y0 - c->y > c->half_height || c->y - y1 > c->half_height) {
-        *x0 = INFINITY;
-        *x1 = -INFINITY;
-        return;
-    }
-    float left = clamp(c->y - c->tip, y0, y1), right = clamp(c->y + c->tip, y0, y1);
-    *x0 = c->middle + c->slope * left - conic_half_chord(c, left);
-    *x1 = c->middle + c->slope * right + conic_half_chord(c, right);
-}
 //@ cells_start
     float conic_h = (float)half_r2;
 //@@ footprint_conic
     const Conic conic = conic_of(s, conic_h, fmax(fabs(shift), fabs(shift - (float)TILE_W)),
                                  fmax(fabs((float)top - (float)s->ay), fabs((float)(top + TILE_H) - (float)s->ay)));
-//@ cells_row
-            conic_chord(&conic, y0, y1, &low, &high);

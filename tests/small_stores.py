@@ -1,0 +1,50 @@
+"""Small stores that are cut as large ones are."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fidsplat as fs
+from fidsplat.random_clouds import random_splats
+from fidsplat.store import build, plan
+
+COUNT = 9_000
+SMALL = {"chunk": 500, "memory": 1 << 20}
+WINDOW, NOTED = 1000, 3
+
+
+@contextmanager
+def many_buckets() -> Iterator[None]:
+    """What is built meanwhile is sorted in many buckets and noted often, few splats though it has."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plan, "_LEAST_MEMORY", 0)
+        patch.setattr(plan, "WINDOW", WINDOW)
+        patch.setattr(build, "_NOTED", NOTED)
+        yield
+
+
+def two_files(folder: Path) -> list[Path]:
+    """Files of COUNT splats each: with SH of degree 1 and planes, and with labels and 3D Gaussians."""
+    first = random_splats(COUNT, 1, sh_degree=1).with_labels(0)
+    first = first.with_planes(np.where(np.arange(COUNT) % 1000 < 3, np.arange(COUNT) // 3000, -1))
+    fs.save_ply(first, folder / "a.ply")
+    other = random_splats(COUNT, 2)
+    thick = np.where(np.arange(COUNT) % 2, 0.01, 0.0)[:, None]
+    other = fs.SplatCloud(
+        other.means + np.array([5.0, 0, 0]),
+        other.quats,
+        np.hstack([other.scales, thick]),
+        other.opacities,
+        colors=other.colors,
+        labels=other.labels,
+    )
+    fs.save_ply(other, folder / "b.ply")
+    return [folder / "a.ply", folder / "b.ply"]
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """What the files of a folder hold, by their names."""
+    return {file.name: file.read_bytes() for file in folder.iterdir()}

@@ -1,0 +1,156 @@
+"""Stores built out of core: stopped and gone on with, on a full disk, two at once."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from full_disk import small_files
+from small_stores import COUNT, NOTED, SMALL, WINDOW, contents, many_buckets, two_files
+
+import fidsplat as fs
+from fidsplat.store import build
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _many_buckets():
+    with many_buckets():
+        yield
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    return two_files(tmp_path_factory.mktemp("splats"))
+
+
+@pytest.fixture(scope="module")
+def store(files, tmp_path_factory):
+    return fs.Store(fs.build_store(files, tmp_path_factory.mktemp("store") / "both.fss", **SMALL))
+
+
+class Stopped(Exception):
+    pass
+
+
+STOPS = [("reading splats", NOTED + 1), ("sorting", 3), ("level of detail 1", 5), ("level of detail 2", 2)]
+
+
+@pytest.mark.parametrize(("words", "after"), STOPS)
+def test_a_build_that_is_stopped_goes_on(files, store, tmp_path, words, after):
+    calls = []
+
+    def stop(what, share):
+        calls.extend([what] * (what == words))
+        if len(calls) == after:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        fs.build_store(files, tmp_path / "both.fss", progress=stop, **SMALL)
+    assert not (tmp_path / "both.fss").exists()
+    again = []
+    fs.build_store(files, tmp_path / "both.fss", progress=lambda what, share: again.append(what), **SMALL)
+    assert contents(tmp_path / "both.fss") == contents(store.path)
+    assert list(tmp_path.iterdir()) == [tmp_path / "both.fss"]
+    left = 2 * COUNT // WINDOW - NOTED if words == "reading splats" else 0
+    assert again.count("reading splats") == left
+
+
+def test_a_build_that_was_killed_between_two_steps_leaves_nothing_behind(files, store, tmp_path, monkeypatch):
+    calls, folder = [], tmp_path / "both.fss"
+
+    def stop(what, share):
+        calls.extend([what] * (what == "sorting"))
+        if len(calls) == 3:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        fs.build_store(files, folder, progress=stop, **SMALL)
+    (tmp_path / ".both.fss.part" / "bucket-0000").touch()  # sorted and noted, and not yet removed
+    remove = Path.unlink
+
+    def killed(file, missing_ok=False):
+        remove(file, missing_ok)
+        if file.name in ("nodes", "state.json"):
+            raise Stopped
+
+    monkeypatch.setattr(Path, "unlink", killed)
+    with pytest.raises(Stopped):
+        fs.build_store(files, folder, **SMALL)
+    monkeypatch.undo()
+    fs.build_store(files, folder, **SMALL)
+    # what a process that was killed while it replaced a store has left
+    (tmp_path / ".both.fss.old").mkdir()
+    (tmp_path / ".both.fss.old" / "means.npy").touch()
+    fs.build_store(files, folder, overwrite=True, **SMALL)
+    assert contents(folder) == contents(store.path)
+    assert list(tmp_path.iterdir()) == [folder]
+
+
+@pytest.mark.parametrize("words", ["reading splats", "sorting"])
+def test_a_build_whose_files_were_lost_in_a_power_cut_is_begun_anew(files, store, tmp_path, words):
+    calls = []
+
+    def stop(what, share):
+        calls.extend([what] * (what == words))
+        if len(calls) == NOTED + 1:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        fs.build_store(files, tmp_path / "both.fss", progress=stop, **SMALL)
+    last = max((tmp_path / ".both.fss.part").glob("bucket-*"), key=lambda file: file.stat().st_size)
+    os.truncate(last, last.stat().st_size // 3)
+    fs.build_store(files, tmp_path / "both.fss", **SMALL)
+    assert contents(tmp_path / "both.fss") == contents(store.path)
+
+
+def test_two_builds_of_one_store_at_once(files, store, tmp_path):
+    refused = []
+
+    def second(what, share):
+        if not refused:
+            with pytest.raises(fs.InputError, match="another process is building"):
+                fs.build_store(files[1:], tmp_path / "both.fss", **SMALL)
+            refused.append(what)
+
+    fs.build_store(files, tmp_path / "both.fss", progress=second, **SMALL)
+    assert refused
+    assert contents(tmp_path / "both.fss") == contents(store.path)
+
+
+def test_places_hold_nothing_of_a_build_that_was_stopped(files, tmp_path):
+    def stop(what, share):
+        raise Stopped
+
+    flat = fs.build_store(files[1:], tmp_path / "one.fss", **SMALL)
+    with pytest.raises(Stopped):
+        fs.build_store(files, tmp_path / "both.fss", progress=stop, **SMALL)
+    fs.place_store(flat, tmp_path / "both.fss", [np.eye(4)])
+    assert set(contents(tmp_path / "both.fss")) == {"store.json", "places.npy"}
+
+
+def test_what_is_begun_from_other_files_is_begun_anew(files, store, tmp_path):
+    def stop(what, share):
+        if what == "sorting":
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        fs.build_store(files[:1], tmp_path / "both.fss", progress=stop, **SMALL)
+    fs.build_store(files, tmp_path / "both.fss", **SMALL)
+    assert contents(tmp_path / "both.fss") == contents(store.path)
+
+
+def test_a_full_disk_is_said_and_gone_on_with(files, store, tmp_path):
+    with (
+        small_files(100_000),
+        pytest.raises(fs.InputError, match="make room, then give the same command again"),
+    ):
+        fs.build_store(files, tmp_path / "both.fss", **SMALL)
+    assert not (tmp_path / "both.fss").exists()
+    fs.build_store(files, tmp_path / "both.fss", **SMALL)
+    assert contents(tmp_path / "both.fss") == contents(store.path)
+
+
+def test_a_disk_without_room_is_said_first(files, tmp_path, monkeypatch):
+    monkeypatch.setattr(build.shutil, "disk_usage", lambda folder: type("", (), {"free": 10_000})())
+    with pytest.raises(fs.InputError, match="make room, or build elsewhere"):
+        fs.build_store(files, tmp_path / "both.fss", **SMALL)
