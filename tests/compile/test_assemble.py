@@ -23,8 +23,8 @@ SHAPE, GROUP = cpu_shape(lanes=16, cores=2), gpu_shape()
 FURTHER = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
 DIGESTS = {
-    "none": ["7bee111858d0057b", "d18403149530f06b"],
-    "screen": ["4f88a0a8cd22e79e", "9b4e70de8c5a318e"],
+    "none": ["7bee111858d0057b", "54685897a408c335"],
+    "screen": ["4f88a0a8cd22e79e", "d619ee3841bf14f4"],
 }
 """of a scene that asks for nothing, by low-pass; `screen` is the default"""
 
@@ -202,7 +202,7 @@ TAKEN = {
         "project": (14, 12, 0),
         "sort_tiles": (4, 3, 20556),
         "tally_big": (7, 3, 0),
-        "tile_starts": (7, 4, 8448),
+        "tile_starts": (7, 4, 8192),
     },
 }
 
