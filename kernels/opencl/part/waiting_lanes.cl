@@ -1,7 +1,13 @@
 // What waits at a row of pixels, for CPUs (slot/compose_pixel.cl): a queue of fragments as they come, each of one splat in some
 // of the lanes, in an order that is right in every lane. A fragment that is in front of another in one lane and behind it in the
 // next is cut in two. What can be composited is so when the queue fills.
+//
+// A tile's list is walked through in chunks, and of a chunk block after block: so what waits at a block stays in the cache, and
+// each block has the chunk's splats in the order of their least depth there. Nearly always that is the order of their fragments
+// too, and nothing waits.
 //@ compose_types
+#define BY_BLOCKS
+#define CHUNK 128
 #define LEAST_DUE min(16, WAITING)
 typedef struct {
     vfloat z[WAITING + 1];      // NaN in lanes where it does not wait
@@ -24,6 +30,51 @@ static inline void waiting_start(Waiting *waiting) {
     waiting->until = INFINITY;
     waiting->from_place = waiting->until_place = 0;
 }
+//@ blocks_parameters
+                                   , wide *nearest
+//@ blocks_nearest
+        vfloat least = s->nearest;
+//@@ camera_blocks_nearest
+//@@ plane_blocks_nearest
+        VSTORE(least, nearest + first);
+//@ walk
+    for (uint chunk = starts[tile] - base, end = starts[tile + 1] - base; chunk < end && alive; chunk += CHUNK) {
+        uint length = min(end - chunk, (uint)CHUNK);
+        // of each block its splats and their least depths there, sorted; ties as they are in the list
+        int counts[BLOCKS];
+        uchar sorted[BLOCKS][CHUNK];
+        wide depths[BLOCKS][CHUNK + 1];
+        for (int block = 0; block < BLOCKS; block++) counts[block] = 0;
+        for (uint which = 0; which < length; which++) {
+            FETCH_AHEAD(splats + lists[min(chunk + which + AHEAD_SPLATS, end - 1)]);
+            FETCH_AHEAD((global const char *)(splats + lists[min(chunk + which + AHEAD_SPLATS, end - 1)]) + 64);
+            const Splat s = splats[lists[chunk + which]];
+            wide nearest[BLOCKS];
+            for (int block = 0; block < BLOCKS; block++) nearest[block] = s.nearest;
+            for (uint touched = alive & touched_blocks(&s, x0, y0, s.log_opacity - constants.log_cut, constants.filter, nearest);
+                 touched != 0; touched &= touched - 1) {
+                int block = 31 - clz((int)(touched & -touched)), at = counts[block]++;
+                for (; at > 0 && depths[block][at - 1] > nearest[block]; at--) {
+                    depths[block][at] = depths[block][at - 1];
+                    sorted[block][at] = sorted[block][at - 1];
+                }
+                depths[block][at] = nearest[block];
+                sorted[block][at] = (uchar)which;
+            }
+        }
+        const wide after = chunk + length < end ? splats[lists[chunk + length]].nearest : INFINITY;
+        for (uint blocks = alive; blocks != 0; blocks &= blocks - 1) {
+            int block = 31 - clz((int)(blocks & -blocks));
+            depths[block][counts[block]] = INFINITY;
+            for (int number = 0; number < counts[block] && (alive >> block & 1u); number++) {
+                const uint k = chunk + sorted[block][number];
+                // nothing comes before this depth any more; nothing that follows this one
+                const wide nearest = fmin(depths[block][number], after), following = fmin(depths[block][number + 1], after);
+                const Splat s = splats[lists[k]];
+                wide half_r2 = s.log_opacity - constants.log_cut;
+                waiting_leave(&pixels[block], nearest, splats, &constants);
+//@ walk_end
+    }
 //@ compose_functions
 static inline Seen waiting_seen(const Waiting *waiting, int at, vint mask, global const Splat *splats) {
 //@@ queue_seen
@@ -34,17 +85,17 @@ static inline Seen waiting_seen(const Waiting *waiting, int at, vint mask, globa
     return seen;
 }
 
-// Composites what waits no further than `nearest`.
+// Composites what waits nearer than `nearest`.
 static inline void waiting_composite(Pixel *pixel, wide nearest, global const Splat *splats, const BlendConstants *constants) {
     Waiting *waiting = &pixel->waiting;
     int kept = 0;
     for (int k = 0; k < waiting->count; k++) {
         int at = waiting->order[k];
-        vint ready = VMASK(waiting->z[at] <= nearest);
+        vint ready = VMASK(waiting->z[at] < nearest);
         if (VANY(ready)) {
             const Seen seen = waiting_seen(waiting, at, ready, splats);
             composite(pixel, &seen, waiting->opacity[at], ready, constants);
-            if (!VANY(VMASK(waiting->z[at] > nearest))) continue;
+            if (!VANY(VMASK(waiting->z[at] >= nearest))) continue;
             waiting->z[at] = VSELECT(waiting->z[at], (vfloat)NAN, ready);
         }
         waiting->order[k] = waiting->order[kept];
@@ -53,6 +104,14 @@ static inline void waiting_composite(Pixel *pixel, wide nearest, global const Sp
     waiting->count = kept;
     // so seldom that few are looked at in vain
     waiting->due = min(kept + max(kept / 2, LEAST_DUE), WAITING);
+}
+
+// The same, where that is all that waits.
+static inline void waiting_leave(Pixel *pixel, wide nearest, global const Splat *splats, const BlendConstants *constants) {
+    Waiting *waiting = &pixel->waiting;
+    if (waiting->count == 0 || VANY(VMASK(waiting->furthest >= nearest))) return;
+    waiting_composite(pixel, nearest, splats, constants);
+    waiting->furthest = -INFINITY;
 }
 
 // Puts a fragment before the `before`-th; the last that waits is dropped if there are too many.
@@ -74,12 +133,12 @@ static inline void waiting_put(Pixel *pixel, int before, vfloat z, vfloat opacit
     waiting->bounded = 1;
 }
 
-// Whether a fragment need not wait: nothing waits, and nothing that follows can be nearer.
+// Whether a fragment need not wait: nothing waits, and nothing that follows is nearer than `nearest`.
 static inline bool waiting_not(const Waiting *waiting, wide nearest, vfloat z, vint mask) {
-    return waiting->count == 0 && !waiting->bounded && !VANY(mask & VMASK(z > nearest));
+    return waiting->count == 0 && !waiting->bounded && !VANY(mask & VMASK(z >= nearest));
 }
 
-// Takes a fragment of the splat at `place` in the list, of which none is nearer than `nearest`.
+// Takes a fragment of the splat at `place` in the list, with nothing to come before `nearest`.
 static inline void waiting_take(Pixel *pixel, wide nearest, vfloat z, vfloat opacity, uint splat, uint place, vint mask,
                                 global const Splat *splats, const BlendConstants *constants) {
     Waiting *waiting = &pixel->waiting;
@@ -91,13 +150,15 @@ static inline void waiting_take(Pixel *pixel, wide nearest, vfloat z, vfloat opa
     }
     vfloat own = VSELECT((vfloat)NAN, z, mask);
     // lanes in which it may lie before something; those in which it cannot be put further in front
-    vint lanes = VMASK(own < waiting->furthest), settled = 0;
+    vint lanes = VMASK(own <= waiting->furthest), settled = 0;
     waiting->furthest = fmax(waiting->furthest, own);
     int at = waiting->count;
     for (int k = waiting->count - 1; k >= 0 && VANY(lanes & ~settled); k--) {
-        vfloat other = waiting->z[waiting->order[k]];
-        settled |= VMASK(own >= other);
-        if (VANY(VMASK(own < other))) {
+        int ahead = waiting->order[k];
+        vfloat other = waiting->z[ahead];
+        bool first = place < waiting->place[ahead];         // of equal depths
+        settled |= first ? VMASK(own > other) : VMASK(own >= other);
+        if (VANY(first ? VMASK(own <= other) : VMASK(own < other))) {
             if (VANY(settled)) {
                 waiting_put(pixel, at, VSELECT((vfloat)NAN, own, settled), opacity, splat, place);
                 own = VSELECT(own, (vfloat)NAN, settled);
@@ -122,7 +183,7 @@ static inline vint waiting_end(Pixel *pixel, global const Splat *splats, const B
     return VMASK(pixel->waiting.from < INFINITY) & pixel_unfinished(pixel, constants);
 }
 //@ blend_arguments
-                        , splats, lists[k], k
+                        , splats, lists[k], k, following
 //@ pass
     do {
 //@ pass_end

@@ -16,6 +16,8 @@
         // out move no layer
         if (!BOX_HERE) depth_reach = reach * (PLANE_RADIUS / radius);
     }
+//@ plane_blocks_nearest
+        least = s->nearest;         // in no other order: a plane's stand together
 //@ see_depth
     seen.z = fmax(seen.z, (vfloat)s->nearest);
 //@ compose_types
