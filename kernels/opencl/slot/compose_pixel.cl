@@ -28,8 +28,4 @@
                                , global const Splat *splats, uint splat, uint place, wide following
 //@ compose
 //@@ compose_plane
-    if (waiting_not(&pixel->waiting, following, seen.z, mask)) {
-        composite(pixel, &seen, opacity, mask, constants);
-        return;
-    }
-    waiting_take(pixel, following, seen.z, opacity, splat, place, mask, splats, constants);
+    waiting_take(pixel, following, seen.z, opacity, &seen, splat, place, mask, splats, constants);
