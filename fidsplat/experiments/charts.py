@@ -32,7 +32,10 @@ _STYLE: dict[Any, Any] = {
     "grid.color": "#dddddd",
     "grid.linewidth": 0.6,
 }
-COLOURS = ("#777777", "#d1495b", "#edae49", "#00798c", "#30638e", "#7b4f9d", "#2e8b57", "#1f2d3d", "#c26a2d")
+COLOURS = (
+    *("#777777", "#d1495b", "#edae49", "#00798c", "#30638e"),
+    *("#7b4f9d", "#2e8b57", "#1f2d3d", "#c26a2d", "#a9c5a0"),
+)
 """of series in their order"""
 
 
@@ -64,9 +67,13 @@ def bars(axes: Axes, groups: Sequence[str], series: Mapping[str, Values], logari
 
 
 def legend_above(figure: Figure, axes: Axes) -> None:
-    """One legend for all panels, above them, where it covers nothing."""
+    """One legend for all panels, above them, where it covers nothing, in as few rows as there is width."""
     handles, names = axes.get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside upper center", ncols=min(len(names), 6), frameon=False)
+    for columns in range(min(len(names), 6), 0, -1):
+        legend = figure.legend(handles, names, loc="outside upper center", ncols=columns, frameon=False)
+        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            break
+        legend.remove()
 
 
 def plain_ticks(axis) -> None:

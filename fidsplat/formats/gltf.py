@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import codecs
 import json
 import struct
 from pathlib import Path
@@ -18,7 +19,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write
+from fidsplat.files import atomic_write, from_json
 from fidsplat.formats.plain import (
     HALF_TURN,
     cloud_of,
@@ -44,7 +45,7 @@ def load_gltf(path: Path) -> SplatCloud:
         InputError: it is damaged, holds no splats, refers to a file outside of its folder, or its nodes
             scale unevenly or mirror.
     """
-    data = content(path, "a glTF file")
+    data = content(path, "a glTF file", (b"glTF", b"{", codecs.BOM_UTF8))
     document, binary = _parts(path, data)
     try:
         reader = _Reader(path, document, binary)
@@ -145,8 +146,8 @@ def _parts(path: Path, data: bytes) -> tuple[dict[str, Any], memoryview | None]:
             raise InputError(f"{path}: cut short, or not binary glTF of version 2")
         text, binary = bytes(chunks[_JSON]), chunks.get(_BIN)
     try:
-        document = json.loads(text)
-    except (ValueError, RecursionError):
+        document = from_json(text)
+    except ValueError:
         raise InputError(f"{path} is not a glTF file: it is not JSON") from None
     if not isinstance(document, dict):
         raise InputError(f"{path} is not a glTF file: it is not a JSON object")

@@ -64,11 +64,17 @@ def cloud_of(
     return SplatCloud(means, quats, scales, opacities, sh=sh, labels=labels, source=str(path))
 
 
-def content(path: Path, what: str) -> bytes:
-    """A file's bytes. Raises InputError where it cannot be read."""
+def content(path: Path, what: str, begins: tuple[bytes, ...] = (b"",)) -> bytes:
+    """A file's bytes; where they begin with none of these, behind spaces, its first ones alone, from which
+    its reader sees that it is another's. Raises InputError where it cannot be read."""
     check_file(path, what)
     try:
-        return path.read_bytes()
+        with path.open("rb") as stream:
+            head = stream.read(64)
+            if not head.lstrip().startswith(begins):
+                return head
+            stream.seek(0)
+            return stream.read()
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
 

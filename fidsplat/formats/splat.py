@@ -12,7 +12,7 @@ import numpy as np
 
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
-from fidsplat.formats.plain import cloud_of, content, plain_colors, refuse_boxes, three_scales, world_means
+from fidsplat.formats.plain import check_file, cloud_of, plain_colors, refuse_boxes, three_scales, world_means
 from fidsplat.harmonics import C0
 from fidsplat.splats import SplatCloud
 
@@ -21,12 +21,13 @@ _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), (
 
 def load_splat(path: Path) -> SplatCloud:
     """Read a .splat file. Raises InputError where it is not one."""
-    data = content(path, "a .splat file")
-    if not data or len(data) % _ROW.itemsize:
+    check_file(path, "a .splat file")
+    size = path.stat().st_size
+    if not size or size % _ROW.itemsize:
         raise InputError(
-            f"{path}: {len(data)} bytes are not rows of {_ROW.itemsize}; cut short, or not a .splat file"
+            f"{path}: {size} bytes are not rows of {_ROW.itemsize}; cut short, or not a .splat file"
         )
-    rows = np.frombuffer(data, _ROW)
+    rows = np.memmap(path, _ROW, "r").view(np.ndarray)
     rgba = rows["rgba"].astype(np.float32) / 255
     quats = (rows["quat"].astype(np.float32) - 128) / 128
     sh = ((rgba[:, None, :3] - 0.5) / C0).astype(np.float32)

@@ -105,6 +105,17 @@ def test_rims_that_bulge_behind_a_fisheye(renderer, name):
     assert (alpha > 0.6).any()
 
 
+def test_a_disk_whose_middle_a_fisheye_nearly_touches(renderer):
+    """All of it is within its radius of the camera, so that it reaches around it: almost half of all rays
+    meet it, and the arcs of its bounding polygon are short nevertheless. Found at random."""
+    turn = (0.0766, 0.5008, 0.8621, -0.0097)
+    disk = fs.SplatCloud([(0.0903, 0.0785, 0.0004)], [turn], [(1, 1)], [1.0], colors=[(1, 1, 1)])
+    camera = fs.Camera.pinhole(95, 69, 35.6, 35.6, -18.6, 19.8, lens=Fisheye())
+    alpha = assert_agrees(renderer, disk, camera, quality=TO_THE_RIM)["alpha"]
+    assert (alpha > 0.6).any()
+    assert (alpha == 0).any()
+
+
 def test_a_rim_ahead_of_a_disk_that_reaches_behind_the_camera(renderer):
     """A floor, half of it behind: its far end lies between two corners of the polygon that bounds it."""
     c, s = math.cos(math.pi / 16), math.sin(math.pi / 16)

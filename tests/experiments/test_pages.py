@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from fidsplat.experiments.charts import bars, chart, legend_above
 from fidsplat.experiments.report import make_report
 from fidsplat.experiments.tradeoff.report import write_report
 
@@ -28,3 +29,13 @@ def test_data_of_pages_are_small():
         f for name in ("accuracy", "results") for f in (DOCS / name).iterdir() if f.suffix in (".svg", ".png")
     ]
     assert max(file.stat().st_size for file in pictures) < 150_000
+
+
+def test_a_legend_is_not_wider_than_its_chart(tmp_path):
+    with chart(tmp_path / "chart.svg", size=(9.0, 3.0)) as (figure, (axes,)):
+        bars(axes, ("one", "two"), {f"paper, training 2DGS, {views} views": (1.0, 2.0) for views in range(6)})
+        legend_above(figure, axes)
+        figure.canvas.draw()
+        (legend,) = figure.legends
+        place = legend.get_window_extent()
+    assert 0 <= place.x0 < place.x1 <= figure.bbox.width

@@ -101,6 +101,33 @@ def test_every_touched_tile_has_the_splat_and_few_others_do(backend, seed, scale
     assert listed_in_front <= 1.05 * needed_in_front + 5
 
 
+def test_bounds_hold_the_rims_of_huge_disks(backend):
+    """Disks up to 10^8 samples wide with an edge in the picture: what a float32 place may be off is room that
+    bounds have."""
+    random = np.random.default_rng(8)
+    radius, depth = 10 ** random.uniform(4, 6, 48), random.uniform(0.7, 1.5, 48)
+    away = np.repeat([[1, 0], [-1, 0], [0, 1], [0, -1]], 12, axis=0) * radius[:, None]
+    aside = random.uniform(-0.3, 0.3, (48, 2)) * depth[:, None]
+    disks = fs.SplatCloud(
+        np.column_stack([away + aside, depth]), [[1, 0, 0, 0]] * 48, np.column_stack([radius, radius]),
+        np.ones(48), colors=np.ones((48, 3)),
+    )  # fmt: skip
+    quality = fs.Quality(alpha_cutoff=np.exp(-0.5), lowpass="none")
+    features, view = prepare(disks, fs.Capture(CAMERA, ALL_OUTPUTS, quality))
+    assert np.array_equal(view.rotation, np.eye(3))
+    pipeline = backend.pipeline(features)
+    boxes = backend.probe().boxes(pipeline, pipeline.trace(backend.upload(disks), view))
+    rows, columns = np.mgrid[0 : view.height, 0 : view.width] + 0.5
+    for (x0, x1, y0, y1), mean, radius in zip(boxes, disks.means, disks.scales[:, 0], strict=True):
+        x, y, z = mean.astype(float) + view.translation
+        right = (columns - view.center_x) / view.focal_x * z - x
+        down = (rows - view.center_y) / view.focal_y * z - y
+        inside = np.nonzero(right**2 + down**2 <= float(radius) ** 2)
+        assert 0 < len(inside[0]) < view.width * view.height
+        assert x0 <= inside[1].min() <= inside[1].max() < x1
+        assert y0 <= inside[0].min() <= inside[0].max() < y1
+
+
 def test_keys_are_depths_and_the_order_is_total(backend):
     cloud = random_splats(3000, seed=4)
     # exact ties: their order must be that of their indices

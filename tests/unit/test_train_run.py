@@ -14,6 +14,7 @@ import pytest
 from training_scene import QUICK, scene
 
 import fidsplat as fs
+from fidsplat.backends.gradients import TooLittleRoom
 from fidsplat.train import Trainer, TrainingError, TrainSettings, splats_within
 
 ITERATIONS = 26
@@ -79,6 +80,34 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bytes(whole, dataset, tmp_pa
     done = Trainer(dataset, renderer, iterations=ITERATIONS, checkpoint=checkpoint, **QUICK)
     assert done.done
     done.save(tmp_path / "scene.ply")
+    assert sha(tmp_path / "scene.ply") == sha(whole[3])
+
+
+def test_a_picture_that_had_too_little_room_is_drawn_again(whole, dataset, tmp_path):
+    """A device that did not wait finds out when it takes the picture back: the run gives the same bytes."""
+    trainer, refused = Trainer(dataset, whole[0].renderer, iterations=ITERATIONS, **QUICK), []
+    differentiate = trainer._differentiate
+
+    class Narrow:
+        """A pipeline in which every third picture that nobody waits for has too little room."""
+
+        def __init__(self, features):
+            self.own = differentiate(features)
+
+        def forward(self, resident, view, waits=True):
+            self.waits = waits
+            return self.own.forward(resident, view, waits)
+
+        def backward(self, images, gradients):
+            if trainer.iteration % 3 == 0 and not self.waits:
+                refused.append(trainer.iteration)
+                raise TooLittleRoom
+            return self.own.backward(images, gradients)
+
+    trainer._differentiate = Narrow
+    trainer.run()
+    trainer.save(tmp_path / "scene.ply")
+    assert refused == list(range(0, ITERATIONS, 3))
     assert sha(tmp_path / "scene.ply") == sha(whole[3])
 
 

@@ -21,6 +21,16 @@ def test_floats_are_clamped_and_rounded():
         assert not to_uint8(np.full(7, np.nan)).any()
 
 
+def test_a_large_picture_is_converted_as_its_rows_are():
+    """In shares, by threads; the last share is not whole."""
+    random = np.random.default_rng(3)
+    large = random.uniform(-0.1, 1.1, (900, 857, 3)).astype(np.float32)
+    large[-1, -1] = (np.nan, np.inf, -np.inf)
+    made = to_uint8(large)
+    assert np.array_equal(made, np.stack([to_uint8(row) for row in large]))
+    assert made[-1, -1].tolist() == [0, 255, 0]
+
+
 def test_sixteen_bits_are_kept(tmp_path):
     depth = np.array([[0, 1, 65535], [300, 4000, 2]], np.uint16)
     write_png(tmp_path / "d.png", depth)
