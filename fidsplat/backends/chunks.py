@@ -11,6 +11,7 @@ import numpy as np
 
 from fidsplat.backends.base import ResidentData
 from fidsplat.backends.planes import PlaneTable
+from fidsplat.backends.view import View
 from fidsplat.effects.select import Traits
 
 
@@ -69,4 +70,14 @@ class KeepsChunks(Protocol):
 
     def chunk_cache(self, whole: WholeScene, rows: int) -> ChunkCache:
         """A cache of chunks of a scene, each of at most so many splats."""
+        ...
+
+
+@runtime_checkable
+class KnowsRoom(Protocol):
+    """A pipeline that says what it can draw at once."""
+
+    def fits(self, resident: ResidentData, view: View) -> bool:
+        """Whether the picture of these splats is drawn at once; else in parts, for each of which all of them
+        are projected."""
         ...

@@ -5,6 +5,8 @@ import copy
 import math
 import pickle
 import threading
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pyopencl as cl
@@ -13,11 +15,12 @@ from test_store import contents
 
 import fidsplat as fs
 from fidsplat.backends.opencl import chunks
+from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.seen import seen
 from fidsplat.random_clouds import random_splats
 from fidsplat.rotations import rigid_matrix
-from fidsplat.store import plan, streamed
+from fidsplat.store import bands, plan, streamed
 from fidsplat.store.sources import source_of
 from fidsplat.store.streamed import Streamed
 
@@ -45,6 +48,7 @@ def stores(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plan, "_LEAST_MEMORY", 0)
         clouds = {"disks": splats(1), "thick": splats(2, thick=True), "sh": splats(3, sh_degree=2)}
+        clouds["wall"] = random_splats(3 * COUNT, 5, depth=(3, 3.2), scale=(7e-3, 0.02), across=3.0)
         return {name: made_store(folder, cloud, name) for name, cloud in clouds.items()}
 
 
@@ -276,6 +280,73 @@ def test_a_device_without_room_for_a_view_is_sent_its_chunks_again(stores, monke
     cache.bring(every[:2])
     cache.bring(every)
     assert set(cache._slots) == {chunk.key for chunk in every[:2]}
+
+
+def before_the_wall(x=0.0):
+    return fs.Camera.look_at(120, 90, 1.4, (x, 0, -1), (x, 0, 3))
+
+
+def test_what_does_not_fit_at_once_is_drawn_in_bands_of_what_each_sees(stores, monkeypatch):
+    store, drawn, most = stores["wall"], [], 5500
+    cloud, plain, limited = store.cloud(), fs.Renderer("opencl"), fs.Renderer("opencl")
+
+    def fits(self, resident, view):
+        drawn.append(resident.count)
+        return resident.count < most
+
+    monkeypatch.setattr(OpenCLPipeline, "fits", fits)
+    resident, outputs = limited.upload(store), ("rgb", "splat_id", "depth")
+    sampled = fs.Capture(before_the_wall(), quality="samples=2", outputs=outputs)
+    moved = fs.Capture(before_the_wall(x=0.1), outputs=outputs)
+    for capture in (fs.Capture(before_the_wall(), outputs=outputs), sampled, moved):
+        drawn.clear()
+        ours, whole = limited.render(resident, capture), plain.render(cloud, capture)
+        for output in outputs:
+            assert np.array_equal(ours[output], whole[output]), output
+        assert sum(count < most for count in drawn) >= 2
+        assert ours.stats["visible"] >= whole.stats["visible"]
+        assert set(ours.timings) == set(whole.timings)
+    # the next view begins with the bands of the last, each asked for once
+    drawn.clear()
+    limited.render(resident, moved)
+    assert max(drawn) < most
+    # a band of a picture is cut as the whole
+    frame = limited.render_band((5, 80), resident, moved)
+    assert np.array_equal(frame["rgb"][5:80], plain.render(cloud, moved)["rgb"][5:80])
+    # where all rows see all, cutting is of no use
+    drawn.clear()
+    fisheye, most = CAPTURES["fisheye"].with_(camera=before_the_wall()), 1
+    fisheye = fisheye.with_(camera=replace(fisheye.camera, lens=fs.Fisheye()))
+    assert np.array_equal(limited.render(resident, fisheye)["rgb"], plain.render(cloud, fisheye)["rgb"])
+    assert len(drawn) == 1
+
+
+def test_a_budget_of_memory_makes_bands(stores):
+    store, camera = stores["wall"], before_the_wall()
+    limited, plain = fs.Renderer("opencl", memory_budget=2 << 20), fs.Renderer("opencl")
+    resident = limited.upload(store)
+    ours = limited.render(resident, camera)
+    assert np.array_equal(ours["rgb"], plain.render(store.cloud(), camera)["rgb"])
+    assert len(resident.data._bands._cuts[0, 90]) > 2
+
+
+def test_bands_that_fitted_together_are_drawn_together():
+    made = bands.Bands()
+    whole = SimpleNamespace(rows=(0, 64), count=64)
+    whole.within = lambda first, end: SimpleNamespace(
+        rows=(first, end), count=end - first, within=whole.within,
+        halves=[] if end - first < 2 else [whole.within(first, (first + end) // 2),
+                                           whole.within((first + end) // 2, end)],
+    )  # fmt: skip
+    assert [band.rows for band in made.cut(whole, lambda band: band.count <= 20)] == [
+        (0, 16), (16, 32), (32, 48), (48, 64)
+    ]  # fmt: skip
+    assert len(list(made.cut(whole, lambda band: band.count <= 20))) == 4
+    assert len(list(made.cut(whole, lambda band: band.count <= 8))) == 8
+    assert len(list(made.cut(whole, lambda band: True))) == 8
+    made._most = 33
+    list(made.cut(whole, lambda band: True))
+    assert made._cuts == {(0, 64): [0, 32, 64]}
 
 
 def test_what_is_pickled_of_a_store_is_its_path_and_of_its_cloud_the_splats(stores):
