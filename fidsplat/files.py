@@ -1,11 +1,15 @@
-"""Files written as a whole or not at all."""
+"""Files written as a whole or not at all, and read with errors of few kinds."""
 
+import json
 import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from tokenize import TokenError
+from typing import Any, BinaryIO
+
+import numpy as np
 
 from fidsplat.errors import InputError
 
@@ -40,6 +44,22 @@ def ordinary_file(path: str | os.PathLike[str]) -> Path:
     if target.exists() and not target.is_file():
         raise InputError(f"cannot write {target}: it is not an ordinary file; give the name of a file")
     return target
+
+
+def from_json(text: str | bytes) -> Any:
+    """What JSON says. Raises ValueError for all that is none, tables in a thousand tables among it."""
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("it nests too deeply") from None
+
+
+def load_array(file: Path) -> np.ndarray:
+    """The array of an .npy file. Raises OSError, EOFError or ValueError, whatever is damaged."""
+    try:
+        return np.load(file, allow_pickle=False)
+    except TokenError as error:  # of the header's Python
+        raise ValueError(f"its header is damaged: {error}") from None
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from fidsplat import __version__
 from fidsplat.cameras import Motion, Trajectory
 from fidsplat.capture import Capture
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, path_of, writable_folder
+from fidsplat.files import atomic_write, from_json, path_of, writable_folder
 from fidsplat.formats import save_trajectory
 from fidsplat.provenance import digest_of
 from fidsplat.render import Renderer
@@ -183,7 +183,7 @@ class FlightFolder:
 
     def _recorded(self) -> dict[str, Any] | None:
         try:
-            found = json.loads((self.folder / RECORD).read_text("utf-8"))
+            found = from_json((self.folder / RECORD).read_text("utf-8"))
         except FileNotFoundError:
             return None
         except (OSError, ValueError):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -193,6 +193,51 @@ class _KeptImages:
 
 def _kept_frame(arrays: dict[str, np.ndarray], timings: dict[str, float], stats: dict[str, int]) -> Frame:
     return Frame(_KeptImages(arrays, timings, stats), tuple(arrays))
+
+
+class OfRows(Protocol):
+    """A part of a picture."""
+
+    @property
+    def rows(self) -> tuple[int, int]:
+        """Of pixels, [first, end)."""
+        ...
+
+
+P = TypeVar("P", bound=OfRows)
+
+
+def stacked(parts: Iterable[P], draw: Callable[[P], Frame]) -> Frame:
+    """The picture whose bands of rows these are: drawn one after the other, so that a device holds what one
+    is drawn of, and brought to the host, each while the next is drawn. A single one stays where it is."""
+    arrays: dict[str, np.ndarray] = {}
+    timings: dict[str, float] = {}
+    stats: dict[str, int] = {}
+    last: tuple[Frame, tuple[int, int]] | None = None
+
+    def finish(frame: Frame) -> None:
+        frame.wait()
+        for sums, each in ((timings, frame.timings), (stats, frame.stats)):
+            for name, value in each.items():
+                sums[name] = sums.get(name, 0) + value
+
+    def take(frame: Frame, rows: tuple[int, int]) -> None:
+        for name in frame.outputs:
+            arrays[name] = frame.read_rows(name, *rows, arrays.get(name))
+
+    for part in parts:
+        if last is not None:
+            finish(last[0])
+        frame = draw(part)
+        if last is not None:
+            take(*last)
+        last = frame, part.rows
+    assert last is not None  # a picture has rows
+    if not arrays:
+        return last[0]
+    finish(last[0])
+    take(*last)
+    return _kept_frame(arrays, timings, stats)
 
 
 def numbered(name: str, image: np.ndarray, ids: Ids) -> np.ndarray:

@@ -25,11 +25,12 @@ from fidsplat.batch import FrameBatch, ViewByView
 from fidsplat.cameras import Camera
 from fidsplat.capture import Capture, CaptureParts, output_names
 from fidsplat.errors import InputError, unknown
-from fidsplat.frame import Frame, check_process
+from fidsplat.frame import Frame, check_process, stacked
 from fidsplat.quality import Quality, whole_number
 from fidsplat.resident import ResidentCloud
 from fidsplat.scenes import Scene
 from fidsplat.splats import SplatCloud
+from fidsplat.store.bands import PartOfView
 from fidsplat.store.residency import Residency
 from fidsplat.store.store import Store
 from fidsplat.surroundings import background_of
@@ -340,8 +341,14 @@ class Renderer:
         if band is not None:
             view = replace(view, band=(band[0] * view.samples, band[1] * view.samples))
         with self._lock:  # scratch buffers and kernels' arguments belong to one picture at a time
-            data, ids = resident.seen([view], features, [capture.quality])
-            return Frame(draw(self.backend.pipeline(features), data, view), capture.outputs, ids)
+            pipeline, data = self.backend.pipeline(features), resident.data
+            if not isinstance(data, Residency):
+                return Frame(draw(pipeline, data, view), capture.outputs)
+
+            def part(one: PartOfView) -> Frame:
+                return Frame(draw(pipeline, one.data, one.view), capture.outputs, one.ids)
+
+            return stacked(data.parts(view, features, capture.quality, pipeline), part)
 
 
 def _asked(scene: Any, capture: Capture | Camera | None, **parts: Any) -> Capture:

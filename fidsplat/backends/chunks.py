@@ -11,6 +11,7 @@ import numpy as np
 
 from fidsplat.backends.base import ResidentData
 from fidsplat.backends.planes import PlaneTable
+from fidsplat.backends.view import View
 from fidsplat.effects.select import Traits
 
 
@@ -41,6 +42,10 @@ class WholeScene(Traits, Protocol):
         """Of its splats that are printed on planes."""
         ...
 
+    def distinct(self, places: bool) -> int:
+        """How many keys its chunks have. places: whether the device moves chunks to their places."""
+        ...
+
 
 class ChunkCache(Protocol):
     """Chunks of one scene on a device: those that were used last stay, within the memory budget."""
@@ -69,4 +74,14 @@ class KeepsChunks(Protocol):
 
     def chunk_cache(self, whole: WholeScene, rows: int) -> ChunkCache:
         """A cache of chunks of a scene, each of at most so many splats."""
+        ...
+
+
+@runtime_checkable
+class KnowsRoom(Protocol):
+    """A pipeline that says what it can draw at once."""
+
+    def fits(self, resident: ResidentData, view: View) -> bool:
+        """Whether the picture of these splats is drawn at once; else in parts, for each of which all of them
+        are projected."""
         ...

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from fidsplat.backends.base import Images
 from fidsplat.backends.view import View
 from fidsplat.effects import IMAGES
 from fidsplat.errors import InputError
@@ -17,6 +19,36 @@ NOT_THE_LAST = (
 
 class TooLittleRoom(Exception):
     """A picture that nobody has waited for had more pairs of splats and tiles than there was room for."""
+
+
+class DifferentiableImages:
+    """Output images with what the stages have left, for `backward` of the device that drew them."""
+
+    picture: Any
+    images: Images
+
+    def __init__(self, picture: Any, images: Images) -> None:
+        self.picture, self.images = picture, images
+        self._number = picture.workspace.pictures
+
+    @property
+    def last(self) -> bool:
+        """Whether no other picture has been begun on the device since."""
+        return self.picture.workspace.pictures == self._number
+
+    def read(self, name: str) -> np.ndarray:
+        """The image as a NumPy array of its own."""
+        return self.images.read(name)
+
+    @property
+    def timings(self) -> Mapping[str, float]:
+        """Milliseconds by stage, those of `backward` among them."""
+        return self.images.timings
+
+    @property
+    def stats(self) -> Mapping[str, int]:
+        """As of every picture."""
+        return self.images.stats
 
 
 def gradient_shape(name: str, view: View) -> tuple[int, ...]:

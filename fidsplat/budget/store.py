@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, user_cache
+from fidsplat.files import atomic_write, from_json, user_cache
 
 
 def folder() -> Path:
@@ -36,7 +36,7 @@ def load(key: str | None) -> dict[str, Any] | None:
     if key is None:
         return None
     try:
-        kept = json.loads((folder() / f"{key}.json").read_text("utf-8"))
+        kept = from_json((folder() / f"{key}.json").read_text("utf-8"))
     except (OSError, ValueError):
         return None
     return kept if isinstance(kept, dict) else None

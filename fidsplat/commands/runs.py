@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fidsplat.errors import InputError
+from fidsplat.files import from_json
 
 if TYPE_CHECKING:
     from fidsplat.scenes import Scene
@@ -41,7 +41,7 @@ def flown(folder: Path) -> tuple[str, str]:
 
     poses = folder / "trajectory.tum"
     try:
-        source = json.loads((folder / RECORD).read_text("utf-8"))["source"]
+        source = from_json((folder / RECORD).read_text("utf-8"))["source"]
         file = folder / source
     except (OSError, ValueError, KeyError, TypeError):
         raise InputError(

@@ -15,7 +15,7 @@ import numpy as np
 from fidsplat.cameras import Camera
 from fidsplat.errors import InputError, unknown
 from fidsplat.experiments.blender import camera_facts, drawn, ready
-from fidsplat.files import atomic_write, writable_folder
+from fidsplat.files import atomic_write, from_json, writable_folder
 from fidsplat.formats import save_ply
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.quality import whole_number
@@ -140,7 +140,7 @@ def _note(wanted: Plants, folder: Path) -> None:
     # more of them, or of other kinds, may come to those that are there
     own = {name: value for name, value in asdict(wanted).items() if name not in ("kinds", "each")}
     try:
-        before = json.loads(file.read_text("utf-8"))
+        before = from_json(file.read_text("utf-8"))
     except FileNotFoundError:
         before = own
     except (OSError, ValueError) as error:

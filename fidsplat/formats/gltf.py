@@ -19,7 +19,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write
+from fidsplat.files import atomic_write, from_json
 from fidsplat.formats.plain import (
     HALF_TURN,
     cloud_of,
@@ -146,8 +146,8 @@ def _parts(path: Path, data: bytes) -> tuple[dict[str, Any], memoryview | None]:
             raise InputError(f"{path}: cut short, or not binary glTF of version 2")
         text, binary = bytes(chunks[_JSON]), chunks.get(_BIN)
     try:
-        document = json.loads(text)
-    except (ValueError, RecursionError):
+        document = from_json(text)
+    except ValueError:
         raise InputError(f"{path} is not a glTF file: it is not JSON") from None
     if not isinstance(document, dict):
         raise InputError(f"{path} is not a glTF file: it is not a JSON object")

@@ -7,7 +7,6 @@ scales, colours and SH are places in code books of 256. Axes are those of the fi
 
 from __future__ import annotations
 
-import json
 import lzma
 import zipfile
 import zlib
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError
+from fidsplat.files import from_json
 from fidsplat.formats.plain import check_file, cloud_of
 from fidsplat.splats import SplatCloud
 
@@ -45,7 +45,7 @@ def load_sog(path: Path) -> SplatCloud:
 
 
 def _cloud(path: Path, archive: zipfile.ZipFile) -> SplatCloud:
-    meta = json.loads(_part(path, archive, "meta.json", MAX_META))
+    meta = from_json(_part(path, archive, "meta.json", MAX_META))
     if meta.get("version") != 2:
         raise InputError(f"{path}: SOG of version {meta.get('version')!r}; version 2 is read")
     count = int(meta["count"])

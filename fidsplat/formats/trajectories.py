@@ -20,7 +20,7 @@ import numpy as np
 from fidsplat.cameras import Camera, Trajectory
 from fidsplat.cameras.trajectory import check_rate
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, path_of
+from fidsplat.files import atomic_write, from_json, path_of
 from fidsplat.formats.colmap import save_colmap
 from fidsplat.formats.colmap_read import image_poses
 from fidsplat.rotations import matrix_to_quaternion, rigid_matrix
@@ -224,9 +224,9 @@ def _rigid(where: str, matrix: np.ndarray) -> np.ndarray:
 
 def _transforms(file: Path, text: str) -> tuple[list[float] | None, list[np.ndarray]]:
     try:
-        frames = json.loads(text)["frames"]
+        frames = from_json(text)["frames"]
         pairs = [(frame.get("time"), np.array(frame["transform_matrix"], np.float64)) for frame in frames]
-    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
         raise InputError(
             f'{file} is not a transforms.json: it needs "frames", a list of objects with a '
             f'"transform_matrix" of 4 x 4 numbers ({type(error).__name__}: {error})'

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write
+from fidsplat.files import atomic_write, from_json
 from fidsplat.store.layout import header_crc
 
 FILE = "detail.json"
@@ -62,7 +62,7 @@ def load_details(folder: Path, identity: str) -> list[Detail]:
     is damaged."""
     file = folder / FILE
     try:
-        said = json.loads(file.read_bytes())
+        said = from_json(file.read_bytes())
         if said["crc"] != header_crc(said):
             raise ValueError
         if said["identity"] != identity:

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write
+from fidsplat.files import atomic_write, from_json, load_array
 
 FORMAT, VERSION = "fidsplat store", 1
 SUFFIX = ".fss"
@@ -106,7 +106,7 @@ def read_header(folder: Path) -> Header:
     """Raises InputError for what is no store, or one of a newer version."""
     file = folder / HEADER
     try:
-        said = json.loads(file.read_bytes())
+        said = from_json(file.read_bytes())
     except FileNotFoundError:
         raise InputError(f"{folder} is not a store: it has no {HEADER}") from None
     except OSError as error:
@@ -227,7 +227,7 @@ def read_nodes(folder: Path, crc: int) -> np.ndarray:
     """The index, (n,) of `NODE`. Raises InputError where it is missing or damaged."""
     file = folder / NODES
     try:
-        nodes = np.load(file, allow_pickle=False)
+        nodes = load_array(file)
     except OSError as error:
         raise InputError(f"cannot read {file}: {error.strerror or error}; the store is not whole") from error
     except (ValueError, EOFError):

@@ -10,14 +10,15 @@ from functools import partial
 
 import numpy as np
 
-from fidsplat.backends.base import Backend, ResidentData
-from fidsplat.backends.chunks import KeepsChunks
+from fidsplat.backends.base import Backend, Pipeline, ResidentData
+from fidsplat.backends.chunks import KeepsChunks, KnowsRoom
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.view import View
 from fidsplat.capture import Capture
 from fidsplat.effects import FeatureSet
 from fidsplat.errors import FidsplatError
 from fidsplat.quality import Quality
+from fidsplat.store.bands import Band, Bands, PartOfView
 from fidsplat.store.streamed import Selection, Streamed
 
 
@@ -30,6 +31,7 @@ class Residency:
             backend.chunk_cache(scene, scene.largest_chunk) if isinstance(backend, KeepsChunks) else None
         )
         self._there: tuple[Selection, ResidentData] | None = None
+        self._bands = Bands()
         self._fetching: threading.Thread | None = None
         self.nodes = 0
         """of the last views"""
@@ -44,6 +46,26 @@ class Residency:
         """Device memory of what is there."""
         return 0 if self._there is None else self._there[1].memory_bytes
 
+    def parts(
+        self, view: View, features: FeatureSet, quality: Quality, pipeline: Pipeline
+    ) -> Iterator[PartOfView]:
+        """What a view is drawn of: all that it sees, or, where the device cannot draw that at once, bands of
+        its rows from the top, each with what it sees. Each is asked for when the last is being drawn.
+
+        Raises:
+            InputError: the quality allows an error that was not measured.
+        """
+        whole = Band.of(self.scene, view, features, self.scene.pixels_of(quality))
+
+        def fits(band: Band) -> bool:
+            return not isinstance(pipeline, KnowsRoom) or pipeline.fits(self._data(band.selection), band.view)
+
+        self.nodes = 0
+        for band in self._bands.cut(whole, fits):
+            self.nodes += len(band.selection)
+            ids = partial(self.scene.ids, band.selection)
+            yield PartOfView(band.rows, band.view, self._data(band.selection), ids)
+
     def of(
         self, views: Sequence[View], features: FeatureSet, qualities: Iterable[Quality]
     ) -> tuple[ResidentData, Callable[[], np.ndarray]]:
@@ -56,10 +78,13 @@ class Residency:
         pixels = self.scene.pixels_of(*qualities)
         selection = self.scene.select(views, features, pixels)
         self.nodes = len(selection)
+        return self._data(selection), partial(self.scene.ids, selection)
+
+    def _data(self, selection: Selection) -> ResidentData:
         if self._there is None or self._there[0] != selection:
             self._there = None  # before the next is there, so that both need not fit
             self._there = selection, self._brought(selection)
-        return self._there[1], partial(self.scene.ids, selection)
+        return self._there[1]
 
     def _brought(self, selection: Selection) -> ResidentData:
         if self._cache is None:

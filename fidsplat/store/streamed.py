@@ -67,6 +67,8 @@ class Streamed:
             raise InputError(f"{len(self):,} splats are too many: a scene has at most {MOST_SPLATS:,}")
         self._kept: OrderedDict[tuple[int, int], dict[str, np.ndarray]] = OrderedDict()
         self._kept_bytes, self._lock = 0, threading.Lock()
+        self._chunks_of: dict[tuple[int, bool], dict[int, Chunk]] = {}
+        """of each store that were asked for, moved or not, by their numbers"""
 
     def __len__(self) -> int:
         return sum(map(len, self.stores)) + len(self.beside)
@@ -136,6 +138,12 @@ class Streamed:
         made.append(np.arange(first, first + len(self.beside), dtype=np.int32))
         return np.concatenate(made)
 
+    def count_of(self, selection: Selection) -> int:
+        """Splats of a selection."""
+        each = zip(self.stores, selection.nodes, strict=True)
+        chosen = sum(int(store.counts(np.array(nodes, np.int64)).sum()) for store, nodes in each)
+        return chosen + len(self.beside)
+
     @property
     def largest_chunk(self) -> int:
         """Splats of the largest node; those beside are taken in as large parts."""
@@ -151,20 +159,37 @@ class Streamed:
         places."""
         made = []
         for number, (store, nodes) in enumerate(zip(self.stores, selection.nodes, strict=True)):
-            counts = store.counts(np.array(nodes, np.int64)).tolist()
-            # harmonics turn with their splats, and means of another origin are rounded once more
-            moved = places and store.poses is not None and self.sh_degree < 0
-            moved = moved and not (store.origin - self.origin).any()
-            each = len(store.nodes)
-            for node, count in zip(nodes, counts, strict=True):
-                key = (number, node % each if moved else node)
-                pose = store.pose_rows[node // each] if moved else None
-                made.append(Chunk(key, count, partial(self._laid_out, key, moved), pose))
+            moved = places and self._may_move(store)
+            known = self._chunks_of.setdefault((number, moved), {})
+            for node in nodes:
+                if (chunk := known.get(node)) is None:
+                    chunk = known[node] = self._chunk_of(number, node, moved)
+                made.append(chunk)
         most, count = self.largest_chunk, len(self.beside)
         for first in range(0, count if made else max(count, 1), most):
             end = min(first + most, count)
             made.append(Chunk(("beside", first), end - first, partial(self._part_beside, first, end)))
         return made
+
+    def distinct(self, places: bool) -> int:
+        """As `WholeScene`."""
+        each = (
+            len(store.nodes) * (1 if places and self._may_move(store) else store.places)
+            for store in self.stores
+        )
+        return sum(each) + -(-len(self.beside) // self.largest_chunk)
+
+    def _may_move(self, store: Store) -> bool:
+        """Whether a device may move a store's chunks to their places: harmonics turn with their splats, and
+        means of another origin are rounded once more."""
+        return store.poses is not None and self.sh_degree < 0 and not (store.origin - self.origin).any()
+
+    def _chunk_of(self, number: int, node: int, moved: bool) -> Chunk:
+        store = self.stores[number]
+        place, own = divmod(node, len(store.nodes))
+        key = (number, own if moved else node)
+        pose = store.pose_rows[place] if moved else None
+        return Chunk(key, int(store.nodes["count"][own]), partial(self._laid_out, key, moved), pose)
 
     def _part_beside(self, first: int, end: int) -> dict[str, np.ndarray]:
         return self._on_device({name: array[first:end] for name, array in self._beside.items()})

@@ -12,7 +12,7 @@ import numpy as np
 
 from fidsplat import __version__
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write
+from fidsplat.files import atomic_write, from_json
 from fidsplat.provenance import code_hash
 from fidsplat.splats import SplatCloud
 from fidsplat.train.dataset import Dataset
@@ -75,7 +75,7 @@ def splats_of(file: Path) -> tuple[SplatCloud, tuple[float, float, float]]:
     """
     try:
         with np.load(file, allow_pickle=False) as arrays:
-            facts = json.loads(bytes(arrays["facts"]))
+            facts = from_json(bytes(arrays["facts"]))
             red, green, blue = map(float, facts["background"])
             splats = Splats.of({name: arrays[f"values.{name}"] for name in NAMES})
         cloud = splats.cloud(int(facts["settings"]["sh_degree"]), np.array(facts["origin"], np.float64))
@@ -101,7 +101,7 @@ def load_checkpoint(
     """
     try:
         with np.load(file, allow_pickle=False) as arrays:
-            facts = json.loads(bytes(arrays["facts"]))
+            facts = from_json(bytes(arrays["facts"]))
             if facts.get("format") != _FORMAT:
                 raise ValueError("it is of another version of fidsplat")
             values, first, second = ({name: arrays[f"{group}.{name}"] for name in NAMES} for group in _GROUPS)

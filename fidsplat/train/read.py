@@ -3,14 +3,13 @@ note."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import path_of
+from fidsplat.files import from_json, path_of
 from fidsplat.formats.colmap_read import has_colmap, load_colmap
 from fidsplat.train.dataset import Dataset, TrainingView
 from fidsplat.train.transforms import Found, has_transforms, load_transforms
@@ -120,7 +119,7 @@ def _background(folder: Path) -> Background:
         file = folder / name
         if file.is_file():
             try:
-                value = json.loads(file.read_text("utf-8")).get("background", 0.0)
+                value = from_json(file.read_text("utf-8")).get("background", 0.0)
                 red, green, blue = np.broadcast_to(np.asarray(value, float), 3).tolist()
             except (ValueError, AttributeError, TypeError):
                 raise InputError(f"{file} is damaged; background must be a number or three") from None

@@ -3,7 +3,6 @@ transforms_train.json with transforms_test.json. Poses are camera to world with 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +11,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera, focal_length
 from fidsplat.errors import InputError
+from fidsplat.files import from_json
 from fidsplat.formats.ply_header import read_header
 from fidsplat.train.dataset import TrainingView
 from fidsplat.vision.images import read_image, read_over
@@ -59,7 +59,7 @@ def load_transforms(path: Path, tell: Callable[[str, float], None]) -> Found:
 
 def _table(file: Path) -> dict[str, Any]:
     try:
-        table = json.loads(file.read_text("utf-8"))
+        table = from_json(file.read_text("utf-8"))
         if not isinstance(table, dict) or not isinstance(table.get("frames"), list):
             raise ValueError("it has no list of frames")
     except OSError as error:

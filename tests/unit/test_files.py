@@ -2,10 +2,12 @@
 
 import os
 
+import numpy as np
 import pytest
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, writable_folder
+from fidsplat.files import atomic_write, load_array, writable_folder
+from fidsplat.train.read import load_dataset
 
 
 def test_a_file_takes_the_place_of_the_old_one_only_when_it_is_whole(tmp_path):
@@ -63,3 +65,18 @@ def test_what_is_no_ordinary_file_is_not_replaced(tmp_path):
     with pytest.raises(InputError, match="not an ordinary file"), atomic_write(pipe):
         pass
     assert pipe.is_fifo()
+
+
+def test_tables_in_a_hundred_thousand_tables_are_no_data_set(tmp_path):
+    (tmp_path / "transforms.json").write_text("[" * 100_000)
+    with pytest.raises(InputError, match="nests too deeply"):
+        load_dataset(tmp_path)
+
+
+def test_a_damaged_header_is_a_damaged_array(tmp_path):
+    """Whatever NumPy makes of it: its Python may end within a bracket."""
+    np.save(tmp_path / "a.npy", np.zeros(3))
+    whole = (tmp_path / "a.npy").read_bytes()
+    (tmp_path / "a.npy").write_bytes(whole.replace(b"(3,)", b"(3, "))
+    with pytest.raises(ValueError, match="header"):
+        load_array(tmp_path / "a.npy")

@@ -2,9 +2,13 @@
 bit for bit."""
 
 import copy
+import gc
 import math
 import pickle
 import threading
+import weakref
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pyopencl as cl
@@ -12,12 +16,13 @@ import pytest
 from test_store import contents
 
 import fidsplat as fs
-from fidsplat.backends.opencl import chunks
+from fidsplat.backends.opencl import chunks, workspace
+from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.seen import seen
 from fidsplat.random_clouds import random_splats
 from fidsplat.rotations import rigid_matrix
-from fidsplat.store import plan, streamed
+from fidsplat.store import bands, plan, streamed
 from fidsplat.store.sources import source_of
 from fidsplat.store.streamed import Streamed
 
@@ -45,6 +50,7 @@ def stores(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plan, "_LEAST_MEMORY", 0)
         clouds = {"disks": splats(1), "thick": splats(2, thick=True), "sh": splats(3, sh_degree=2)}
+        clouds["wall"] = random_splats(3 * COUNT, 5, depth=(3, 3.2), scale=(7e-3, 0.02), across=3.0)
         return {name: made_store(folder, cloud, name) for name, cloud in clouds.items()}
 
 
@@ -257,8 +263,8 @@ def test_slots_that_cannot_become_more_keep_what_they_hold(stores, monkeypatch):
 def test_a_device_without_room_for_a_view_is_sent_its_chunks_again(stores, monkeypatch):
     renderer, store = fs.Renderer("opencl"), stores["disks"]
     # two chunks fit, and no picture is put together as a whole
-    monkeypatch.setattr(chunks, "_SHARE", renderer.backend.memory_budget // 8000)
-    monkeypatch.setattr(chunks, "_WHOLE", renderer.backend.memory_budget // 8000)
+    monkeypatch.setattr(chunks, "_SHARE", renderer.backend.memory_budget // 10000)
+    monkeypatch.setattr(chunks, "_WHOLE", renderer.backend.memory_budget // 10000)
     resident, outputs = renderer.upload(store), ("rgb", "splat_id")
     for camera in (look(), look(turn=TURNED)):
         ours, whole = (renderer.render(each, camera, outputs) for each in (resident, store.cloud()))
@@ -276,6 +282,100 @@ def test_a_device_without_room_for_a_view_is_sent_its_chunks_again(stores, monke
     cache.bring(every[:2])
     cache.bring(every)
     assert set(cache._slots) == {chunk.key for chunk in every[:2]}
+
+
+def before_the_wall(x=0.0):
+    return fs.Camera.look_at(120, 90, 1.4, (x, 0, -1), (x, 0, 3))
+
+
+def test_what_does_not_fit_at_once_is_drawn_in_bands_of_what_each_sees(stores, monkeypatch):
+    store, drawn, most = stores["wall"], [], 5500
+    cloud, plain, limited = store.cloud(), fs.Renderer("opencl"), fs.Renderer("opencl")
+
+    def fits(self, resident, view):
+        drawn.append(resident.count)
+        return resident.count < most
+
+    monkeypatch.setattr(OpenCLPipeline, "fits", fits)
+    resident, outputs = limited.upload(store), ("rgb", "splat_id", "depth")
+    sampled = fs.Capture(before_the_wall(), quality="samples=2", outputs=outputs)
+    moved = fs.Capture(before_the_wall(x=0.1), outputs=outputs)
+    for capture in (fs.Capture(before_the_wall(), outputs=outputs), sampled, moved):
+        drawn.clear()
+        ours, whole = limited.render(resident, capture), plain.render(cloud, capture)
+        for output in outputs:
+            assert np.array_equal(ours[output], whole[output]), output
+        assert sum(count < most for count in drawn) >= 2
+        assert ours.stats["visible"] >= whole.stats["visible"]
+        assert set(ours.timings) == set(whole.timings)
+    # the next view begins with the bands of the last, each asked for once
+    drawn.clear()
+    limited.render(resident, moved)
+    assert max(drawn) < most
+    # a band of a picture is cut as the whole
+    frame = limited.render_band((5, 80), resident, moved)
+    assert np.array_equal(frame["rgb"][5:80], plain.render(cloud, moved)["rgb"][5:80])
+    # where all rows see all, cutting is of no use
+    drawn.clear()
+    fisheye, most = CAPTURES["fisheye"].with_(camera=before_the_wall()), 1
+    fisheye = fisheye.with_(camera=replace(fisheye.camera, lens=fs.Fisheye()))
+    assert np.array_equal(limited.render(resident, fisheye)["rgb"], plain.render(cloud, fisheye)["rgb"])
+    assert len(drawn) == 1
+
+
+def test_a_budget_of_memory_makes_bands(stores):
+    store, camera = stores["wall"], before_the_wall()
+    limited, plain = fs.Renderer("opencl", memory_budget=2 << 20), fs.Renderer("opencl")
+    resident = limited.upload(store)
+    ours = limited.render(resident, camera)
+    assert np.array_equal(ours["rgb"], plain.render(store.cloud(), camera)["rgb"])
+    assert len(resident.data._bands._cuts[0, 90]) > 2
+
+
+def test_a_picture_and_the_chunks_that_stay_keep_to_the_budget(stores, monkeypatch):
+    live, peak, store = weakref.WeakSet(), [0], stores["wall"]
+
+    class Counted(workspace.DeviceBuffer):
+        def __init__(self, *given, **words):
+            super().__init__(*given, **words)
+            live.add(self)
+            peak[0] = max(peak[0], sum(buffer.size for buffer in live))
+
+    monkeypatch.setattr(workspace, "DeviceBuffer", Counted)
+    for budget in (2200 << 10, 3 << 20):
+        peak[0], limited = 0, fs.Renderer("opencl", memory_budget=budget)
+        resident = limited.upload(store)
+        for frame in limited.render_views(resident, [before_the_wall(x=0.05 * k) for k in range(5)]):
+            assert frame["rgb"].any()
+        assert 0.5 * budget < peak[0] <= budget
+        cache = resident.data._cache
+        assert 0 < cache.memory_bytes <= cache.reserved_bytes <= budget // 4
+        # room is left for all that the cache may come to take, whatever it holds yet
+        empty = limited.backend.chunk_cache(resident.data.scene, cache._rows)
+        gathered = empty.gather(resident.data.scene.chunks(resident.data.scene.everything(), True))
+        assert gathered.bytes_for(["means"])[0] == cache.reserved_bytes + 12 * len(store)
+        assert empty.memory_bytes == 0
+        del limited, resident, frame, cache, empty, gathered
+        gc.collect()
+
+
+def test_bands_that_fitted_together_are_drawn_together():
+    made = bands.Bands()
+    whole = SimpleNamespace(rows=(0, 64), count=64)
+    whole.within = lambda first, end: SimpleNamespace(
+        rows=(first, end), count=end - first, within=whole.within,
+        halves=[] if end - first < 2 else [whole.within(first, (first + end) // 2),
+                                           whole.within((first + end) // 2, end)],
+    )  # fmt: skip
+    assert [band.rows for band in made.cut(whole, lambda band: band.count <= 20)] == [
+        (0, 16), (16, 32), (32, 48), (48, 64)
+    ]  # fmt: skip
+    assert len(list(made.cut(whole, lambda band: band.count <= 20))) == 4
+    assert len(list(made.cut(whole, lambda band: band.count <= 8))) == 8
+    assert len(list(made.cut(whole, lambda band: True))) == 8
+    made._most = 33
+    list(made.cut(whole, lambda band: True))
+    assert made._cuts == {(0, 64): [0, 32, 64]}
 
 
 def test_what_is_pickled_of_a_store_is_its_path_and_of_its_cloud_the_splats(stores):

@@ -11,7 +11,13 @@ import numpy as np
 import pyopencl as cl
 from pyopencl.array import Array
 
-from fidsplat.backends.gradients import NOT_THE_LAST, TooLittleRoom, check_shape, gradient_shape
+from fidsplat.backends.gradients import (
+    NOT_THE_LAST,
+    DifferentiableImages,
+    TooLittleRoom,
+    check_shape,
+    gradient_shape,
+)
 from fidsplat.backends.opencl.gradients_source import assemble_gradients, chunk_of
 from fidsplat.backends.opencl.images import OpenCLImages
 from fidsplat.backends.opencl.lists import pairs_of
@@ -29,36 +35,16 @@ _F32 = np.dtype(np.float32)
 _ZERO = np.zeros(1, np.uint32)  # of floats too
 
 
-class DifferentiableImages:
-    """Output images with what the stages have left, for `OpenCLGradients.backward`."""
+class OpenCLDifferentiable(DifferentiableImages):
+    """Output images of `OpenCLGradients.forward`."""
 
-    def __init__(self, picture: Picture, images: OpenCLImages) -> None:
-        self.picture, self._images = picture, images
-        self._number = picture.workspace.pictures
-
-    @property
-    def last(self) -> bool:
-        """Whether no other picture has been begun on the device since."""
-        return self.picture.workspace.pictures == self._number
-
-    def read(self, name: str) -> np.ndarray:
-        """The image as a NumPy array of its own."""
-        return self._images.read(name)
+    picture: Picture
+    images: OpenCLImages
 
     def device_array(self, name: str) -> Array:
         """The image as an array of the device, (h, w) or (h, w, channels); no copy."""
         shape, dtype = gradient_shape(name, self.picture.view), np.dtype(IMAGES[name].dtype)
         return Array(self.picture.queue, shape, dtype, data=self.picture.held[f"{name}_out"])
-
-    @property
-    def timings(self) -> Mapping[str, float]:
-        """Milliseconds by stage, those of `backward` among them."""
-        return self._images.timings
-
-    @property
-    def stats(self) -> Mapping[str, int]:
-        """As of every picture."""
-        return self._images.stats
 
 
 class OpenCLGradients:
@@ -74,11 +60,11 @@ class OpenCLGradients:
         self._pairs = 0
         """most that a picture had so far, and a quarter more"""
 
-    def forward(self, resident: Resident, view: View, waits: bool = True) -> DifferentiableImages:
+    def forward(self, resident: Resident, view: View, waits: bool = True) -> OpenCLDifferentiable:
         """As `DifferentiablePipeline`: GPUs need not wait where pictures were taken back before."""
-        return DifferentiableImages(*self._pipeline.drawn(resident, view, 0 if waits else self._pairs))
+        return OpenCLDifferentiable(*self._pipeline.drawn(resident, view, 0 if waits else self._pairs))
 
-    def backward(self, images: DifferentiableImages, gradients: Mapping[str, Any]) -> dict[str, Any]:
+    def backward(self, images: OpenCLDifferentiable, gradients: Mapping[str, Any]) -> dict[str, Any]:
         """As `DifferentiablePipeline`: pyopencl arrays."""
         check_gradients(self._pipeline.features, gradients)
         if not images.last:

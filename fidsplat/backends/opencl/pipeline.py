@@ -96,6 +96,13 @@ class OpenCLPipeline:
                 return self._other(self.features, replace(self.shape, lists="ordered")).render(resident, view)
             return self._images(view, Drawn.of(self._tried(self._first, resident, view, plan, key)))
 
+    def fits(self, resident: Resident, view: View) -> bool:
+        """As `KnowsRoom`."""
+        try:
+            return not self._plan(resident, view).chunk
+        except DeviceError:  # too little memory for any part of it
+            return False
+
     def drawn(self, resident: Resident, view: View, trusted: int = 0) -> tuple[Picture, OpenCLImages]:
         """One picture with all that its stages have left on the device, until another is drawn.
 

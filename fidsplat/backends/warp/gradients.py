@@ -9,7 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from fidsplat.backends.gradients import NOT_THE_LAST, check_shape, gradient_shape
+from fidsplat.backends.gradients import (
+    NOT_THE_LAST,
+    DifferentiableImages,
+    check_shape,
+    gradient_shape,
+)
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.launch import Launcher
 from fidsplat.backends.warp.picture import Picture, WarpImages
@@ -24,39 +29,19 @@ _SHARES = 2048
 """threads that share a sum over the whole picture or cloud; the order of additions is theirs"""
 
 
-class DifferentiableImages:
-    """Output images with what the stages have left, for `WarpGradients.backward`."""
+class WarpDifferentiable(DifferentiableImages):
+    """Output images of `WarpGradients.forward`."""
 
-    def __init__(self, picture: Picture, images: WarpImages) -> None:
-        self.picture, self._images = picture, images
-        self._number = picture.workspace.pictures
-
-    @property
-    def last(self) -> bool:
-        """Whether no other picture has been begun on the device since."""
-        return self.picture.workspace.pictures == self._number
-
-    def read(self, name: str) -> np.ndarray:
-        """The image as a NumPy array of its own."""
-        return self._images.read(name)
+    picture: Picture
+    images: WarpImages
 
     def device_array(self, name: str) -> Any:
         """The image as a wp.array of the device; no copy."""
-        return self._images.device_array(name)
+        return self.images.device_array(name)
 
     def wait(self) -> None:
         """Until the device has drawn it."""
-        self._images.wait()
-
-    @property
-    def timings(self) -> Mapping[str, float]:
-        """Milliseconds by stage, those of `backward` among them."""
-        return self._images.timings
-
-    @property
-    def stats(self) -> Mapping[str, int]:
-        """As of every picture."""
-        return self._images.stats
+        self.images.wait()
 
 
 class WarpGradients:
@@ -65,7 +50,7 @@ class WarpGradients:
     def __init__(self, pipeline: WarpPipeline) -> None:
         self._pipeline, self._kernels = pipeline, GradientKernels(pipeline.program)
 
-    def forward(self, resident: Resident, view: View, waits: bool = True) -> DifferentiableImages:
+    def forward(self, resident: Resident, view: View, waits: bool = True) -> WarpDifferentiable:
         """As `DifferentiablePipeline`; it always waits."""
         picture, images = self._pipeline.drawn(resident, view)
         if picture.bands > 1:
@@ -73,9 +58,9 @@ class WarpGradients:
                 f"{resident.count:,} splats are drawn in bands within the memory budget, and such pictures "
                 "have no gradient; raise memory_budget, or use fewer splats or smaller pictures"
             )
-        return DifferentiableImages(picture, images)
+        return WarpDifferentiable(picture, images)
 
-    def backward(self, images: DifferentiableImages, gradients: Mapping[str, Any]) -> dict[str, Any]:
+    def backward(self, images: WarpDifferentiable, gradients: Mapping[str, Any]) -> dict[str, Any]:
         """As `DifferentiablePipeline`: wp.arrays."""
         picture = images.picture
         check_gradients(picture.program.features, gradients)

@@ -1,0 +1,123 @@
+"""Views that are drawn of more than fits a device at once: band after band of their rows, each of what it
+sees."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from fidsplat.backends.base import ResidentData
+from fidsplat.backends.view import View
+from fidsplat.effects import FeatureSet
+from fidsplat.store.streamed import Pixels, Selection, Streamed
+
+_LEAST_ROWS = 16
+"""pixels: what a device lists together at least"""
+_FUTILE = 1.6
+"""times as many splats as both halves see of a band are not worth cutting it: of a fisheye's, say, each is
+drawn of all"""
+
+
+@dataclass(frozen=True)
+class PartOfView:
+    """A band of a view on the device."""
+
+    rows: tuple[int, int]
+    """of pixels, [first, end)"""
+    view: View
+    data: ResidentData
+    ids: Callable[[], np.ndarray]
+    """the indices in the whole (n,) int32 of its splats"""
+
+
+@dataclass(frozen=True)
+class Band:
+    """Rows of pixels of a view."""
+
+    scene: Streamed
+    whole: View
+    features: FeatureSet
+    pixels: Pixels
+    """as of `Streamed.select`"""
+    rows: tuple[int, int]
+
+    @staticmethod
+    def of(scene: Streamed, view: View, features: FeatureSet, pixels: Pixels) -> Band:
+        """All rows that are wanted of a view."""
+        first, end = view.band or (0, view.height)
+        return Band(scene, view, features, pixels, (first // view.samples, end // view.samples))
+
+    def within(self, first: int, end: int) -> Band:
+        """Fewer of its rows."""
+        return replace(self, rows=(first, end))
+
+    @cached_property
+    def view(self) -> View:
+        """That wants these rows alone."""
+        first, end = (row * self.whole.samples for row in self.rows)
+        return (
+            self.whole if (first, end) == (0, self.whole.height) else replace(self.whole, band=(first, end))
+        )
+
+    @cached_property
+    def selection(self) -> Selection:
+        """What it is drawn of."""
+        return self.scene.select([self.view], self.features, self.pixels)
+
+    @cached_property
+    def count(self) -> int:
+        """Splats of that."""
+        return self.scene.count_of(self.selection)
+
+    @property
+    def halves(self) -> list[Band]:
+        """Bands of half as many rows; none, if that is of no use."""
+        first, end = self.rows
+        middle = (first + end) // 2
+        if end - first < 2 * _LEAST_ROWS or self.whole.shots:
+            return []
+        made = [self.within(first, middle), self.within(middle, end)]
+        return made if sum(half.count for half in made) <= _FUTILE * self.count else []
+
+
+class Bands:
+    """Where views are cut, from view to view: what the last was cut into is where the next begins."""
+
+    def __init__(self) -> None:
+        self._cuts: dict[tuple[int, int], list[int]] = {}
+        """by the rows that were wanted of the last view"""
+        self._most = 0
+        """splats that were drawn at once"""
+
+    def cut(self, whole: Band, fits: Callable[[Band], bool]) -> Iterator[Band]:
+        """Bands that each fit, from the top, or cannot be cut further. What fits is asked right before a band
+        is given."""
+        waiting = [whole.within(*rows) for rows in pairwise(self._cuts.get(whole.rows, whole.rows))]
+        made: list[Band] = []
+        while waiting:
+            band = waiting.pop(0)
+            fitting = fits(band)
+            if not fitting and (halves := band.halves):
+                self._most = min(self._most, band.count // 2)
+                waiting[:0] = halves
+                continue
+            if fitting:
+                self._most = max(self._most, band.count)
+            made.append(band)
+            yield band
+        self._cuts = {whole.rows: self._joined(made)}
+
+    def _joined(self, bands: list[Band]) -> list[int]:
+        """The rows at which bands begin and the last ends: neighbours together, as far as so many splats
+        fitted before."""
+        cuts, splats = [bands[0].rows[0]], 0
+        for band in bands:
+            if splats and splats + band.count > self._most:
+                cuts.append(band.rows[0])
+                splats = 0
+            splats += band.count
+        return [*cuts, bands[-1].rows[1]]
