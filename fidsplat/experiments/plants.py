@@ -110,8 +110,7 @@ def write_plants(
         tell: told what is done, and the share of all.
 
     Raises:
-        InputError: Blender is not installed, or the folder holds plants of other numbers or of other sources of
-            fidsplat.
+        InputError: Blender is not installed, or the folder holds plants of other numbers or sources.
         DeviceError: Blender fails; pictures done stay.
     """
     python = ready("standard", environment) if wanted.iterations else None
