@@ -38,7 +38,7 @@ def load(files: Iterable[Path]) -> dict[str, list[dict]]:
         content = json.loads(file.read_text("utf-8"))
         if isinstance(content, list):
             batches = "peer_batches" if "renderer" in content[0] else "batches"
-            kinds = {"way": "ways", "millions": "large", "caches": "first", "batch": batches}
+            kinds = {"way": "ways", "budget_gib": "large", "caches": "first", "batch": batches}
             for kind in (kinds[key] for key in kinds if key in content[0]):
                 found[kind] += content
             continue

@@ -62,7 +62,7 @@ kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void emit_gathere
         for (uint2 window = windows[splat]; window.y != 0; window.y &= window.y - 1) {
             int tile = window_tile(window, tiles_x);
             if (before + tile < band.first || before + tile >= band.end) continue;
-            // modulo 2^32, as emit_pair
+            // modulo 2^32, as place_of
             uint place = atomic_inc(listed + tile) - band.start;
             if (place < band.capacity) pairs[place] = (uint2)(splat, key);
         }

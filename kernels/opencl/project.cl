@@ -44,6 +44,11 @@ static inline real3_ rotate_to_camera(global const View *view, real3_ v) {
     return c;
 }
 
+typedef union {
+    Splat splat;
+    float4 words[sizeof(Splat) / 16];
+} Whole;
+
 //@@ camera
 //@@ functions
 //@@ footprint_here
@@ -58,16 +63,20 @@ kernel void project(
     keys[at] = CULLED;
 //@@ splat_view
 
+    // asked for before the first test, so that memory is waited for once; arrays begin where whole vectors may (Resident)
     real3_ mean = {means[3 * i], means[3 * i + 1], means[3 * i + 2]};
+    float4 quat = ((global const float4 *)quats)[i];
+    float2 scale_uv = ((global const float2 *)scales)[i];
+    float opacity = opacities[i];
     real3_ p = rotate_to_camera(view, mean);
     p.x += view->translation[0]; p.y += view->translation[1]; p.z += view->translation[2];
 //@@ beside
-    wide log_opacity = (wide)log((real)opacities[i]);
+    wide log_opacity = (wide)log((real)opacity);
     wide half_r2 = log_opacity - (wide)view->log_cut;
     if (!(half_r2 > 0.0f)) return;
 
     // columns of the splat's rotation, from the quaternion as it is (no unit length assumed)
-    real w = quats[4 * i], x = quats[4 * i + 1], y = quats[4 * i + 2], z = quats[4 * i + 3];
+    real w = quat.x, x = quat.y, y = quat.z, z = quat.w;
     real s = REAL(2.0) / (w * w + x * x + y * y + z * z);
     real3_ tangent_u = {1 - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y)};
     real3_ tangent_v = {s * (x * y - w * z), 1 - s * (x * x + z * z), s * (y * z + w * x)};
@@ -78,10 +87,9 @@ kernel void project(
     real3_ facet = cross3(a, b);        // unit normal
     real offset = dot3(facet, p);       // of the plane from the camera's centre
 //@@ camera_offset
-    float scale_u = scales[2 * i], scale_v = scales[2 * i + 1];
     // before fmax, which would make a number of a NaN (numerics E1)
-    if (!(scale_u >= 0.0f && scale_u < INFINITY && scale_v >= 0.0f && scale_v < INFINITY)) return;
-    real su = fmax(scale_u, SMALLEST_SCALE), sv = fmax(scale_v, SMALLEST_SCALE);
+    if (!(scale_uv.x >= 0.0f && scale_uv.x < INFINITY && scale_uv.y >= 0.0f && scale_uv.y < INFINITY)) return;
+    real su = fmax(scale_uv.x, SMALLEST_SCALE), sv = fmax(scale_uv.y, SMALLEST_SCALE);
     a.x *= su; a.y *= su; a.z *= su;
     b.x *= sv; b.y *= sv; b.z *= sv;
 //@@ lowpass_make
@@ -143,7 +151,9 @@ kernel void project(
     record.x1 = (short)min(to_pixel(floor(x1 - 0.5f) + 1.0f, width), width);
 //@@ color
 //@@ project
-    splats[at] = record;
+    // in whole vectors
+    Whole whole = {record};
+    for (uint part = 0; part < sizeof(Splat) / 16; part++) ((global float4 *)(splats + at))[part] = whole.words[part];
     uint corner, window = tile_window(&bounds, record.x0, record.x1, y0, y1, width, height, &corner);
     if (window == 0) {
         // in any order: what is kept of them is looked up by its place or sorted

@@ -2,20 +2,26 @@
 // there in any order, and a sort of each list. Keys are unique (the splat's index breaks ties), so the sorted lists are
 // the same on every run. The tiles of many views stand one view after the other.
 
-// Exclusive prefix sum of `mine` over a work-group of SCAN_ITEMS; *total is the sum of all. partial: SCAN_ITEMS values.
+#define SCAN_EACH 8              // tiles of a work-item
+#define SCAN_ROW 32              // work-items whose numbers are added up one after the other
+#define SCAN_ROWS ((SCAN_ITEMS + SCAN_ROW - 1) / SCAN_ROW)
+
+// Exclusive prefix sum of `mine` over a work-group of SCAN_ITEMS; *total is the sum of all. partial: SCAN_ITEMS + SCAN_ROWS values.
 static inline ulong scan_group(local ulong *partial, uint item, ulong mine, ulong *total) {
+    local ulong *rows = partial + SCAN_ITEMS;
     partial[item] = mine;
     barrier(CLK_LOCAL_MEM_FENCE);
-    for (uint step = 1; step < SCAN_ITEMS; step *= 2) {
-        ulong before = item >= step ? partial[item - step] : 0;
-        barrier(CLK_LOCAL_MEM_FENCE);
-        partial[item] += before;
-        barrier(CLK_LOCAL_MEM_FENCE);
-    }
-    *total = partial[SCAN_ITEMS - 1];
-    ulong exclusive = partial[item] - mine;
+    ulong before = 0, sum = 0;
+    for (uint other = item - item % SCAN_ROW; other < item; other++) before += partial[other];
+    if (item % SCAN_ROW == SCAN_ROW - 1 || item == SCAN_ITEMS - 1) rows[item / SCAN_ROW] = before + mine;
     barrier(CLK_LOCAL_MEM_FENCE);
-    return exclusive;
+    for (uint row = 0; row < SCAN_ROWS; row++) {
+        if (row == item / SCAN_ROW) before += sum;
+        sum += rows[row];
+    }
+    *total = sum;
+    barrier(CLK_LOCAL_MEM_FENCE);    // the next numbers may be written
+    return before;
 }
 
 // places in the buffer `counts`, which the host reads: numbers of big splats, of pairs (64 bits), of visible splats
@@ -28,18 +34,21 @@ enum { COUNT_BIG = 0, COUNT_PAIRS = 1, COUNT_VISIBLE = 3 };
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
 //@@ arguments tile_starts
 ) {
-    local ulong partial[SCAN_ITEMS];
+    local ulong partial[SCAN_ITEMS + SCAN_ROWS];
     uint item = get_local_id(0);
     ulong running = 0;
-    for (uint first = 0; first < tiles; first += 4 * SCAN_ITEMS) {
-        uint from = min(first + 4 * item, tiles), to = min(from + 4, tiles);
+    for (uint first = 0; first < tiles; first += SCAN_EACH * SCAN_ITEMS) {
+        uint from = first + SCAN_EACH * item, lengths[SCAN_EACH];
         ulong mine = 0, total;
-        for (uint tile = from; tile < to; tile++) mine += tallies[TALLIES + tile];
+        for (uint n = 0; n < SCAN_EACH; n++) {
+            lengths[n] = from + n < tiles ? tallies[TALLIES + from + n] : 0;
+            mine += lengths[n];
+        }
         ulong place = running + scan_group(partial, item, mine, &total);
-        for (uint tile = from; tile < to; tile++) {
-            starts[tile] = cursors[tile] = (uint)place;
-            place += tallies[TALLIES + tile];
-            if (clear) tallies[TALLIES + tile] = 0;
+        for (uint n = 0; n < SCAN_EACH && from + n < tiles; n++) {
+            starts[from + n] = cursors[from + n] = (uint)place;
+            place += lengths[n];
+            if (clear) tallies[TALLIES + from + n] = 0;
         }
         running += total;
     }
@@ -105,18 +114,21 @@ kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void tally_big(
     }
 }
 
+#define NO_PLACE 0xFFFFFFFFu
+#define NO_ENTRY 0xFFFFFFFFu
+#define WINDOW_TILES (WINDOW_W * WINDOW_H)
+#define AT_ONCE 4                // places that a work-item asks for before it waits
+
 // Lists of the tiles of the band [band_first, band_end), from 0; never beyond `capacity`.
 typedef struct {
     int tiles_x, first, end;
     uint start, capacity;
 } Band;
 
-static inline void emit_pair(int tile, const Band *band, uint key, uint splat, global uint *restrict cursors,
-                             global uint2 *restrict pairs) {
-    if (tile < band->first || tile >= band->end) return;
-    // modulo 2^32: a place within the band is right even where the picture has more pairs than that
-    uint place = atomic_inc(cursors + tile) - band->start;
-    if (place < band->capacity) pairs[place] = (uint2)(splat, key);
+// The next place in a tile's list, or one beyond all capacity. Modulo 2^32: a place within the band is right even where the picture
+// has more pairs than that.
+static inline uint place_of(int tile, const Band *band, global uint *restrict cursors) {
+    return tile < band->first || tile >= band->end ? NO_PLACE : atomic_inc(cursors + tile) - band->start;
 }
 
 // Index space: for each view `splat_groups` work-groups, a work-item per splat, and then the same number of work-groups as for
@@ -126,9 +138,13 @@ static inline void emit_pair(int tile, const Band *band, uint key, uint splat, g
 kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void emit(
 //@@ arguments emit
 ) {
-    local uint visible;
+    local uint visible, queued;
+    local ushort queue[WALK_ITEMS * WINDOW_TILES];     // of a splat of the group (by its work-item) and a tile of its window
+    local uint corners[WALK_ITEMS], depths[WALK_ITEMS];
     const Band band = {(width + TILE_W - 1) / TILE_W, band_first, band_end, starts[band_first], capacity};
     uint item = get_local_id(0), number = get_group_id(1), big_count = min(counts[COUNT_BIG], big_capacity);
+    if (item == 0) visible = queued = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
     if (get_group_id(0) >= splat_groups) {
         uint groups = get_num_groups(0) - splat_groups;
         for (uint k = number * groups + get_group_id(0) - splat_groups; k < big_count; k += groups * get_num_groups(1)) {
@@ -138,31 +154,57 @@ kernel __attribute__((reqd_work_group_size(WALK_ITEMS, 1, 1))) void emit(
             int before = (int)(splat / count) * tiles_of(width, height);
             for (int cell = item; cell < walk.cells; cell += WALK_ITEMS) {
                 int tile = walk_tile(&walk, cell, &b, width, height);
-                if (tile >= 0) emit_pair(before + tile, &band, key, splat, cursors, pairs);
+                uint place = tile < 0 ? NO_PLACE : place_of(before + tile, &band, cursors);
+                if (place < band.capacity) pairs[place] = (uint2)(splat, key);
             }
         }
-        return;   // the whole group
+    } else {
+        uint i = get_global_id(0), splat = number * count + i;
+        uint key = i < count ? keys[splat] : CULLED;
+        if (key != CULLED) {
+            if (first_band) atomic_inc(&visible);
+            uint2 window = windows[splat];
+            corners[item] = window.x;
+            depths[item] = key;
+            for (uint at = window.y != 0 ? atomic_add(&queued, popcount(window.y)) : 0; window.y != 0; window.y &= window.y - 1)
+                queue[at++] = (ushort)(item * WINDOW_TILES + 31 - clz(window.y & -window.y));
+        }
     }
-    if (item == 0) visible = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
-    uint i = get_global_id(0), splat = number * count + i;
-    uint key = i < count ? keys[splat] : CULLED;
-    if (key != CULLED) {
-        int before = (int)number * tiles_of(width, height);
-        if (first_band) atomic_inc(&visible);
-        for (uint2 window = windows[splat]; window.y != 0; window.y &= window.y - 1)
-            emit_pair(before + window_tile(window, band.tiles_x), &band, key, splat, cursors, pairs);
+    // shared out evenly, since splats touch few tiles or many, and several at once, since each waits for its place
+    int before = (int)number * tiles_of(width, height);
+    uint first_splat = number * count + (uint)get_global_id(0) - item;
+    for (uint from = item; from < queued; from += AT_ONCE * WALK_ITEMS) {
+        uint places[AT_ONCE], whose[AT_ONCE];
+        for (uint n = 0; n < AT_ONCE; n++) {
+            uint entry = from + n * WALK_ITEMS < queued ? queue[from + n * WALK_ITEMS] : NO_ENTRY;
+            whose[n] = entry / WINDOW_TILES;
+            places[n] = NO_PLACE;
+            if (entry != NO_ENTRY) {
+                uint2 one = (uint2)(corners[whose[n]], 1u << entry % WINDOW_TILES);
+                places[n] = place_of(before + window_tile(one, band.tiles_x), &band, cursors);
+            }
+        }
+        for (uint n = 0; n < AT_ONCE; n++)
+            if (places[n] < band.capacity) pairs[places[n]] = (uint2)(first_splat + whose[n], depths[whose[n]]);
     }
-    barrier(CLK_LOCAL_MEM_FENCE);
     if (item == 0 && visible != 0) atomic_add(counts + COUNT_VISIBLE, visible);
 }
 
-// Sorts each list by (depth key, splat): a bitonic network whose every comparison puts the smaller first, so a list of
-// any length is sorted as if it were followed by infinities.
+// Sorts each list by (depth key, splat), which are all different.
 // Index space: work-groups of SORT_ITEMS, one per tile of the band.
 // Reads: starts. Uses up: pairs. Writes: lists.
+//
+// A list that fits local memory is spread over ranges of depth. Where one of them is crowded, and for short and longer lists, there is
+// a bitonic network whose every comparison puts the smaller first, so that a list of any length is sorted as if it were followed by
+// infinities.
 #define SORT_ITEMS 256
 #define SORT_LOCAL 2048          // pairs that are sorted in local memory at once
+#define SHORT 64                 // pairs that the network sorts sooner
+#define RANGES 1024              // of depth
+#define CROWDED 128              // pairs of one range: more are not compared each with all
+#define ROW 16                   // work-items whose sums are added up one after the other; SORT_ITEMS is its square
+enum { SORT_EACH = SORT_LOCAL / SORT_ITEMS, OWN_RANGES = RANGES / SORT_ITEMS };   // of one work-item
 
 // The places i < j of comparator t in the step whose partners are `stride` (a power of two) apart; in the first step of a
 // block of 2 * stride places (`mirrored`) partners are mirror images.
@@ -187,13 +229,108 @@ static inline void comparator(uint t, uint stride, bool mirrored, uint *i, uint 
     }                                                                                       \
     barrier(fence)
 
+// The depth that a key stands for: `sortable`, back.
+static inline float depth_of(uint key) { return as_float((key & 0x80000000u) ? key & 0x7FFFFFFFu : ~key); }
+
+// A pair's range of depth. Every step keeps the order of depths, so a pair of a later range is further. fmax: where all depths are
+// one, or without end, the product may be no number.
+static inline uint range_of(ulong pair, float nearest, float scale) {
+    return (uint)fmin(fmax((depth_of((uint)(pair >> 32)) - nearest) * scale, 0.0f), RANGES - 1.0f);
+}
+
+typedef struct {             // in local memory, while a list is spread
+    uint least, greatest, crowded;    // keys; whether a range is
+    uint rows[ROW];                   // pairs of each row of work-items
+    uint starts[RANGES];              // pairs in each range, then where it starts
+} Spread;
+
+// The least and the greatest key of `length` pairs. ends: SORT_ITEMS values for its own use.
+static inline void find_ends(global const ulong *pairs, uint length, local uint2 *ends, local Spread *spread) {
+    uint item = get_local_id(0), least = 0xFFFFFFFFu, greatest = 0;
+    for (uint k = item; k < length; k += SORT_ITEMS) {
+        uint key = (uint)(pairs[k] >> 32);
+        least = min(least, key);
+        greatest = max(greatest, key);
+    }
+    ends[item] = (uint2)(least, greatest);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (item < 2 * ROW) {    // few, as atomics of one place wait for each other
+        for (uint k = item + 2 * ROW; k < SORT_ITEMS; k += 2 * ROW) {
+            least = min(least, ends[k].x);
+            greatest = max(greatest, ends[k].y);
+        }
+        atomic_min(&spread->least, least);
+        atomic_max(&spread->greatest, greatest);
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+}
+
+// Turns the numbers of pairs in each range into where the range starts, unless one is crowded. sums: SORT_ITEMS values for its own
+// use.
+static inline void place_ranges(local uint *sums, local Spread *spread) {
+    uint item = get_local_id(0), numbers[OWN_RANGES], sum = 0, before = 0;
+    for (uint n = 0; n < OWN_RANGES; n++) {
+        numbers[n] = spread->starts[item * OWN_RANGES + n];
+        if (numbers[n] > CROWDED) spread->crowded = 1;
+        sum += numbers[n];
+    }
+    sums[item] = sum;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint k = item - item % ROW; k < item; k++) before += sums[k];
+    if (item % ROW == ROW - 1) spread->rows[item / ROW] = before + sum;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint row = 0; row < item / ROW; row++) before += spread->rows[row];
+    for (uint n = 0; n < OWN_RANGES; n++) {
+        spread->starts[item * OWN_RANGES + n] = before;
+        before += numbers[n];
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+}
+
+// Sorts at most SORT_LOCAL pairs into `list`: puts each into its range, where it counts those before it. Returns false, for the whole
+// group, if a range is crowded. items: SORT_LOCAL values for its own use.
+static inline bool sort_spread(global const ulong *pairs, uint length, local ulong *items, local Spread *spread,
+                               global uint *restrict list) {
+    uint item = get_local_id(0), places[SORT_EACH];
+    if (item == 0) {
+        spread->least = 0xFFFFFFFFu;
+        spread->greatest = spread->crowded = 0;
+    }
+    for (uint k = item; k < RANGES; k += SORT_ITEMS) spread->starts[k] = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    find_ends(pairs, length, (local uint2 *)items, spread);
+    float nearest = depth_of(spread->least), scale = RANGES / (depth_of(spread->greatest) - nearest);
+    for (uint n = 0; n < SORT_EACH; n++) {
+        uint k = item + n * SORT_ITEMS;
+        if (k < length) places[n] = atomic_inc(spread->starts + range_of(pairs[k], nearest, scale));
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    place_ranges((local uint *)items, spread);
+    if (spread->crowded) return false;
+    for (uint n = 0; n < SORT_EACH; n++) {
+        uint k = item + n * SORT_ITEMS;
+        if (k < length) items[spread->starts[range_of(pairs[k], nearest, scale)] + places[n]] = pairs[k];
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint k = item; k < length; k += SORT_ITEMS) {
+        ulong pair = items[k];
+        uint range = range_of(pair, nearest, scale), start = spread->starts[range], place = start;
+        uint end = range + 1 < RANGES ? spread->starts[range + 1] : length;
+        for (uint other = start; other < end; other++) place += items[other] < pair;
+        list[place] = (uint)pair;
+    }
+    return true;
+}
+
 kernel __attribute__((reqd_work_group_size(SORT_ITEMS, 1, 1))) void sort_tiles(
 //@@ arguments sort_tiles
 ) {
     local ulong items[SORT_LOCAL];
+    local Spread spread;
     uint tile = band_first + get_group_id(0), item = get_local_id(0);
     uint start = starts[tile] - starts[band_first], length = starts[tile + 1] - starts[tile];
     global ulong *list = pairs + start;
+    if (length > SHORT && length <= SORT_LOCAL && sort_spread(list, length, items, &spread, lists + start)) return;
     uint padded = 1;
     while (padded < length) padded *= 2;
 

@@ -44,10 +44,14 @@ def test_a_file_of_facets_is_opaque_and_clean_by_depth_at_each_pixel(renderer, t
     fs.save_ply(made.gaussians, tmp_path / "facets.ply")
     read = fs.load_ply(tmp_path / "facets.ply")
     quality = fs.Quality(order="pixel")
-    frame = renderer.render(read, frontal(made, 8), ALL_OUTPUTS, quality, GREY)
+    frame = renderer.render(read, frontal(made, 8), ALL_OUTPUTS, quality, background=GREY)
     error = frame["rgb"][..., 0] - np.kron(1.0 - made.grid, np.ones((8, 8)))
     assert frame["alpha"].min() > 0.999
     assert -10 * math.log10(float(np.mean(error**2))) > 35
+    # by their centres facets hide each other: without the true order nothing of this holds
+    by_centre = fs.Quality(order="centre")
+    hidden = renderer.render(read, frontal(made, 8), ALL_OUTPUTS, by_centre, background=GREY)["rgb"][..., 0]
+    assert -10 * math.log10(float(np.mean((hidden - frame["rgb"][..., 0]) ** 2))) < 10
 
 
 def test_facets_are_read_from_aside(renderer):

@@ -63,7 +63,12 @@ def test_splats_that_cross_do_not_jump(renderer, name):
     assert np.abs(centre - wanted).max() > 0.1
 
 
-@pytest.mark.parametrize("cloud", [c_order.crossing(), c_order.fan()], ids=["crossing", "fan"])
+@pytest.mark.parametrize(
+    "cloud",
+    # the last has more in a tile than is looked at together
+    [c_order.crossing(), c_order.fan(), c_order.crossing(600)],
+    ids=["crossing", "fan", "many"],
+)
 def test_a_picture_does_not_depend_on_how_much_may_wait(renderer, cloud):
     """Room for one fragment at a pixel, or a few: the list is gone through again until the picture is the
     same, bit for bit."""

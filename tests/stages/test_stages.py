@@ -377,6 +377,54 @@ def test_a_list_longer_than_local_memory_is_sorted(backend):
     assert out_of_order(trace, visible[np.argsort(trace["keys"][visible], kind="stable")]) == 0
 
 
+def test_arrays_of_a_cloud_begin_anywhere(backend):
+    """Kernels read whole vectors, and a CPU reads a cloud's own arrays."""
+    base = random_splats(50, seed=6)
+    arrays = {"quats": base.quats, "scales": base.scales}
+    for name, array in arrays.items():
+        flat = np.empty(array.size + 1, np.float32)
+        flat[1:] = array.ravel()
+        flat.flags.writeable = False
+        arrays[name] = flat[1:].reshape(array.shape)
+    cloud = fs.SplatCloud(means=base.means, opacities=base.opacities, colors=base.colors, **arrays)
+    assert all(getattr(cloud, name).ctypes.data % 16 for name in arrays)
+    pictures = [traced(backend, each, fs.Quality())[0]["rgb"] for each in (base, cloud)]
+    assert np.array_equal(*pictures)
+
+
+DEPTHS = {
+    "spread": lambda n: np.linspace(1.0, 9.0, n),
+    "in pairs": lambda n: np.linspace(1.0, 9.0, n // 2).repeat(2),
+    "one": lambda n: np.full(n, 3.0),
+    "two": lambda n: np.where(np.arange(n) % 3 == 0, 8.0, 2.0),
+    "one far away": lambda n: np.r_[np.linspace(2.0, 2.001, n - 1), 1e14],
+}
+
+
+@pytest.mark.parametrize("depths", DEPTHS)
+def test_a_list_is_sorted_however_its_depths_are_spread(backend, depths):
+    """tiles.cl spreads a list over ranges of depth, and sorts it by a network where one is crowded."""
+    n, generator = 1500, np.random.default_rng(4)
+    cloud = random_splats(n, seed=4, scale=(0.05, 0.3))
+    z = generator.permutation(DEPTHS[depths](n))
+    cloud = fs.SplatCloud(
+        means=np.stack([generator.normal(size=n) * 0.02 * z, generator.normal(size=n) * 0.02 * z, z], 1),
+        quats=np.tile([1.0, 0, 0, 0], (n, 1)),
+        scales=cloud.scales * z[:, None],
+        opacities=cloud.opacities,
+        colors=cloud.colors,
+    )
+    camera = fs.Camera.pinhole(CAMERA.width, CAMERA.height, 150.0, 150.0, 80.0, 58.0)
+    features, view = prepare(cloud, fs.Capture(camera, ALL_OUTPUTS))
+    trace = backend.pipeline(features, backend.shapes("schedule")["groups"]).trace(
+        backend.upload(cloud), view
+    )
+    visible = np.flatnonzero(trace["keys"] != CULLED)
+    longest = max(np.diff(trace["starts"].astype(int)))
+    assert 1000 < longest <= 1500
+    assert out_of_order(trace, visible[np.argsort(trace["keys"][visible], kind="stable")]) == 0
+
+
 @pytest.mark.parametrize("lists", ["ordered", "tiled"])
 @pytest.mark.parametrize("budget", [1, 50, 1000])
 def test_a_small_pair_budget_gives_the_same_bits(backend, monkeypatch, budget, lists):

@@ -2,9 +2,11 @@
 bit for bit."""
 
 import copy
+import gc
 import math
 import pickle
 import threading
+import weakref
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -14,7 +16,7 @@ import pytest
 from test_store import contents
 
 import fidsplat as fs
-from fidsplat.backends.opencl import chunks
+from fidsplat.backends.opencl import chunks, workspace
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.seen import seen
@@ -261,8 +263,8 @@ def test_slots_that_cannot_become_more_keep_what_they_hold(stores, monkeypatch):
 def test_a_device_without_room_for_a_view_is_sent_its_chunks_again(stores, monkeypatch):
     renderer, store = fs.Renderer("opencl"), stores["disks"]
     # two chunks fit, and no picture is put together as a whole
-    monkeypatch.setattr(chunks, "_SHARE", renderer.backend.memory_budget // 8000)
-    monkeypatch.setattr(chunks, "_WHOLE", renderer.backend.memory_budget // 8000)
+    monkeypatch.setattr(chunks, "_SHARE", renderer.backend.memory_budget // 10000)
+    monkeypatch.setattr(chunks, "_WHOLE", renderer.backend.memory_budget // 10000)
     resident, outputs = renderer.upload(store), ("rgb", "splat_id")
     for camera in (look(), look(turn=TURNED)):
         ours, whole = (renderer.render(each, camera, outputs) for each in (resident, store.cloud()))
@@ -328,6 +330,33 @@ def test_a_budget_of_memory_makes_bands(stores):
     ours = limited.render(resident, camera)
     assert np.array_equal(ours["rgb"], plain.render(store.cloud(), camera)["rgb"])
     assert len(resident.data._bands._cuts[0, 90]) > 2
+
+
+def test_a_picture_and_the_chunks_that_stay_keep_to_the_budget(stores, monkeypatch):
+    live, peak, store = weakref.WeakSet(), [0], stores["wall"]
+
+    class Counted(workspace.DeviceBuffer):
+        def __init__(self, *given, **words):
+            super().__init__(*given, **words)
+            live.add(self)
+            peak[0] = max(peak[0], sum(buffer.size for buffer in live))
+
+    monkeypatch.setattr(workspace, "DeviceBuffer", Counted)
+    for budget in (2200 << 10, 3 << 20):
+        peak[0], limited = 0, fs.Renderer("opencl", memory_budget=budget)
+        resident = limited.upload(store)
+        for frame in limited.render_views(resident, [before_the_wall(x=0.05 * k) for k in range(5)]):
+            assert frame["rgb"].any()
+        assert 0.5 * budget < peak[0] <= budget
+        cache = resident.data._cache
+        assert 0 < cache.memory_bytes <= cache.reserved_bytes <= budget // 4
+        # room is left for all that the cache may come to take, whatever it holds yet
+        empty = limited.backend.chunk_cache(resident.data.scene, cache._rows)
+        gathered = empty.gather(resident.data.scene.chunks(resident.data.scene.everything(), True))
+        assert gathered.bytes_for(["means"])[0] == cache.reserved_bytes + 12 * len(store)
+        assert empty.memory_bytes == 0
+        del limited, resident, frame, cache, empty, gathered
+        gc.collect()
 
 
 def test_bands_that_fitted_together_are_drawn_together():

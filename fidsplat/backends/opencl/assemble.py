@@ -118,13 +118,12 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     declared = Declarations(layouts, features, at_once)
     files = [layout.file for layout in layouts.values() if layout.file]
     files.append(LAYOUTS["resolve_pixel"].file)
-    # 3D Gaussians may be drawn by a picture that is larger than they
-    if (
-        shape.schedule == "lanes"
-        and {"camera_pinhole", "lowpass_screen"} <= layouts.keys()
-        and "thickness" not in layouts
-    ):
-        files.append(LAYOUTS["beside"].file)
+    if shape.schedule == "lanes" and "camera_pinhole" in layouts:
+        # disks and 3D Gaussians among each other are not asked: their images are bounded otherwise
+        if "lowpass_screen" in layouts and "thickness" not in layouts:
+            files.append(LAYOUTS["beside"].file)
+        if "ellipsoids_alone" in layouts:
+            files.append(LAYOUTS["beside_ewa"].file)
     if at_once:
         files.append(LAYOUTS["resolve_at_once"].file)
     if shape.lists == "tiled":

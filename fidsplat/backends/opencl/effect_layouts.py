@@ -129,6 +129,7 @@ LAYOUTS: dict[str, Layout] = {
     "blend_double": Layout(),
     # what several of them share
     "beside": Layout("part/beside.cl"),
+    "beside_ewa": Layout("part/beside_ewa.cl"),
     "chord": Layout("part/chord.cl"),
     "conic": Layout("part/conic.cl", behind=(("ellipsoids_alone", "conic_facing"),)),
     "conic_facing": Layout("part/conic_facing.cl"),

@@ -16,6 +16,9 @@ from fidsplat.backends.planes import PlaneTable
 from fidsplat.errors import DeviceError
 from fidsplat.splats import SplatCloud
 
+_VECTOR = 16
+"""bytes of the vectors that kernels read of arrays"""
+
 
 class Resident:
     """A SplatCloud on the device.
@@ -112,7 +115,7 @@ class Resident:
 
     def _whole(self, name: str) -> cl.Buffer:
         if name not in self._buffers:
-            array = np.ascontiguousarray(self._array(name))
+            array = _aligned(np.ascontiguousarray(self._array(name)))
             flags = cl.mem_flags
             if array.size == 0:
                 buffer = self._workspace.pool.fresh(f"the cloud's {name}", 16)
@@ -133,3 +136,14 @@ def _finish(process: int, *queues: cl.CommandQueue) -> None:
         for queue in queues:
             with suppress(cl.Error):
                 queue.finish()
+
+
+def _aligned(array: np.ndarray) -> np.ndarray:
+    """The array, or a copy of it that begins where a vector may: a CPU reads it where it lies."""
+    if array.ctypes.data % _VECTOR == 0:
+        return array
+    room = np.empty(array.nbytes + _VECTOR, np.uint8)
+    first = -room.ctypes.data % _VECTOR
+    copy = room[first : first + array.nbytes].view(array.dtype).reshape(array.shape)
+    copy[...] = array
+    return copy

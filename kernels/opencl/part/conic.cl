@@ -25,6 +25,7 @@
         vfloat d = FMA((vfloat)s->dy, y, FMA((vfloat)s->dx, x, (vfloat)s->d0)) + around_d;
         vint away = VMASK(FMA(u, u, v * v) > conic_h * (1.0f + BLOCKS_SLACK) * (d * d)) | VMASK(d < 0.0f);
 //@@ blocks_dot
+//@@ blocks_nearest
         touched &= ~(VBITS(away) << first);
     }
 //@ cells_functions

@@ -136,12 +136,9 @@ static inline void waiting_push(Pixel *pixel, wide nearest, wide z, wide opacity
         waiting_queue(pixel, first_z, first_opacity, first_splat);
 }
 
-// All fragments go the same way.
-static inline bool waiting_not(const Waiting *waiting, wide nearest, wide z, int mask) { return false; }
-
 // Takes a fragment of a splat of which none is nearer than `nearest`; place: the splat, which says where in the list it stands.
-static inline void waiting_take(Pixel *pixel, wide nearest, wide z, wide opacity, uint splat, uint place, int mask,
-                                global const Splat *splats, const BlendConstants *constants) {
+static inline void waiting_take(Pixel *pixel, wide nearest, wide z, wide opacity, const Seen *seen, uint splat, uint place,
+                                int mask, global const Splat *splats, const BlendConstants *constants) {
     Waiting *waiting = &pixel->waiting;
     if (z > waiting->until || (z == waiting->until && !waiting_earlier(splats, place, waiting->until_splat))) return;
     if (z < waiting->from || (z == waiting->from && waiting_earlier(splats, place, waiting->from_splat))) return;
@@ -167,6 +164,7 @@ static inline int waiting_end(Pixel *pixel, global const Splat *splats, const Bl
 }
 //@ blend_arguments
                                 , splats, lists[batch + which], lists[batch + which]
+                                , staged[k + 1 < listed ? places[cell][k + 1] : length - 1].splat.nearest
 //@ pass
     local int again;
     do {

@@ -22,7 +22,9 @@ static inline uint blocks_within(int x0, int x1, int y0, int y1) {
 
 //@@ blocks_functions
 // Which blocks of the tile at (left, top) the splat can touch. Conservative; the test of each pixel decides.
-static inline uint touched_blocks(const Splat *s, int left, int top, wide half_r2, wide filter) {
+static inline uint touched_blocks(const Splat *s, int left, int top, wide half_r2, wide filter
+//@@ blocks_parameters
+) {
     int x0 = max(s->x0 - left, 0), x1 = min(s->x1 - left, TILE_W), y0 = max(s->y0 - top, 0), y1 = min(s->y1 - top, TILE_H);
     if (x0 >= x1 || y0 >= y1) return 0;
     uint touched = blocks_within(x0, x1, y0, y1);
@@ -48,6 +50,9 @@ kernel void blend(
 
     uint base = starts[band_first];
 //@@ pass
+#ifdef BY_BLOCKS
+//@@ walk
+#else
     for (uint k = starts[tile] - base, end = starts[tile + 1] - base; k < end && alive; k++) {
         FETCH_AHEAD(splats + lists[min(k + AHEAD_SPLATS, end - 1)]);
         FETCH_AHEAD((global const char *)(splats + lists[min(k + AHEAD_SPLATS, end - 1)]) + 64);
@@ -55,6 +60,7 @@ kernel void blend(
         wide half_r2 = s.log_opacity - constants.log_cut;
         for (uint touched = alive & touched_blocks(&s, x0, y0, half_r2, constants.filter); touched != 0; touched &= touched - 1) {
             int block = 31 - clz((int)(touched & -touched));
+#endif
             vfloat x = (float)(x0 + LEFT(block) - s.ax) + BLOCK_X, y = (float)(y0 + TOP(block) - s.ay) + BLOCK_Y;
             vfloat nu_x = FMA((vfloat)s.nux, x, (vfloat)s.nu0);
             vfloat nv_x = FMA((vfloat)s.nvx, x, (vfloat)s.nv0);
@@ -71,6 +77,7 @@ kernel void blend(
             if (!VANY(pixel_unfinished(&pixels[block], &constants))) alive &= ~(1u << block);
         }
     }
+//@@ walk_end
 //@@ pass_end
 
     size_t stride = (size_t)tiles_x * TILE_W, top = (size_t)number * tiles_y * TILE_H;

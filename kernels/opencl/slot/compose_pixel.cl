@@ -25,11 +25,7 @@
 //@ start
     waiting_start(&pixel->waiting);
 //@ blend_parameters
-                               , global const Splat *splats, uint splat, uint place
+                               , global const Splat *splats, uint splat, uint place, wide following
 //@ compose
 //@@ compose_plane
-    if (waiting_not(&pixel->waiting, s->nearest, seen.z, mask)) {
-        composite(pixel, &seen, opacity, mask, constants);
-        return;
-    }
-    waiting_take(pixel, s->nearest, seen.z, opacity, splat, place, mask, splats, constants);
+    waiting_take(pixel, following, seen.z, opacity, &seen, splat, place, mask, splats, constants);

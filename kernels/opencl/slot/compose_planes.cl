@@ -16,6 +16,8 @@
         // out move no layer
         if (!BOX_HERE) depth_reach = reach * (PLANE_RADIUS / radius);
     }
+//@ plane_blocks_nearest
+        least = s->nearest;         // in no other order: a plane's stand together
 //@ see_depth
     seen.z = fmax(seen.z, (vfloat)s->nearest);
 //@ compose_types
@@ -40,12 +42,6 @@ static inline Layer no_layer(void) {
     Layer open;                 // the one that still gathers
 //@ start
     pixel->open = no_layer();
-//@ queue
-    Seen layers[WAITING + 1];   // of what is none of one splat
-//@ queue_seen
-    if (waiting->splat[at] & LAYER) return waiting->layers[at];
-//@ queue_put
-    if (splat & LAYER) waiting->layers[at] = pixel->open.mean;
 //@ queued
     Seen layers[WAITING + 1];   // an index of a splat that is LAYER + k stands for the k-th
     uint layer_splats[WAITING + 1];
@@ -96,7 +92,7 @@ static inline void layer_close(Pixel *pixel, wide nearest, global const Splat *s
     const Layer *open = &pixel->open;
     if (open->plane < 0) return;
     vfloat z = fmax(FMA(fabs(open->mean.z), (vfloat)-0x1p-16f, open->mean.z), (vfloat)open->nearest);
-    waiting_take(pixel, nearest, z, open->opacity, LAYER, open->place, open->lanes, splats, constants);
+    waiting_take(pixel, nearest, z, open->opacity, &open->mean, LAYER, open->place, open->lanes, splats, constants);
     pixel->open = no_layer();
 }
 
