@@ -217,9 +217,10 @@ def stacked(parts: Iterable[P], draw: Callable[[P], Frame]) -> Frame:
 
     def finish(frame: Frame) -> None:
         frame.wait()
-        for sums, each in ((timings, frame.timings), (stats, frame.stats)):
-            for name, value in each.items():
-                sums[name] = sums.get(name, 0) + value
+        for stage, spent in frame.timings.items():
+            timings[stage] = timings.get(stage, 0.0) + spent
+        for what, number in frame.stats.items():
+            stats[what] = stats.get(what, 0) + number
 
     def take(frame: Frame, rows: tuple[int, int]) -> None:
         for name in frame.outputs:

@@ -42,6 +42,10 @@ class WholeScene(Traits, Protocol):
         """Of its splats that are printed on planes."""
         ...
 
+    def distinct(self, places: bool) -> int:
+        """How many keys its chunks have. places: whether the device moves chunks to their places."""
+        ...
+
 
 class ChunkCache(Protocol):
     """Chunks of one scene on a device: those that were used last stay, within the memory budget."""

@@ -159,9 +159,7 @@ class Streamed:
         places."""
         made = []
         for number, (store, nodes) in enumerate(zip(self.stores, selection.nodes, strict=True)):
-            # harmonics turn with their splats, and means of another origin are rounded once more
-            moved = places and store.poses is not None and self.sh_degree < 0
-            moved = moved and not (store.origin - self.origin).any()
+            moved = places and self._may_move(store)
             known = self._chunks_of.setdefault((number, moved), {})
             for node in nodes:
                 if (chunk := known.get(node)) is None:
@@ -172,6 +170,19 @@ class Streamed:
             end = min(first + most, count)
             made.append(Chunk(("beside", first), end - first, partial(self._part_beside, first, end)))
         return made
+
+    def distinct(self, places: bool) -> int:
+        """As `WholeScene`."""
+        each = (
+            len(store.nodes) * (1 if places and self._may_move(store) else store.places)
+            for store in self.stores
+        )
+        return sum(each) + -(-len(self.beside) // self.largest_chunk)
+
+    def _may_move(self, store: Store) -> bool:
+        """Whether a device may move a store's chunks to their places: harmonics turn with their splats, and
+        means of another origin are rounded once more."""
+        return store.poses is not None and self.sh_degree < 0 and not (store.origin - self.origin).any()
 
     def _chunk_of(self, number: int, node: int, moved: bool) -> Chunk:
         store = self.stores[number]

@@ -176,7 +176,7 @@ class Trainer:
         progress: called after each iteration.
 
         Raises:
-            as `step`; InputError where a checkpoint cannot be written. The last one is whole.
+            InputError: as `step`; or a checkpoint cannot be written, and the last one is whole.
         """
         last = time.monotonic()
         while not self.done:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,21 @@ _LAUNCH = 1 << 15
 _NOWHERE = 0xFFFFFFFF
 
 
+@dataclass(frozen=True)
+class Copies:
+    """What copies rows of chunks that have slots."""
+
+    pieces: cl.Buffer
+    """as `gather.cl` reads them"""
+    poses: cl.Buffer | None
+    count: int
+    """chunks"""
+    rows: int
+    """of the chunk with most"""
+    changes: int
+    """of slots, before it was made"""
+
+
 class OpenCLChunks:
     """As `ChunkCache`."""
 
@@ -42,6 +58,8 @@ class OpenCLChunks:
         self._free: list[int] = []
         self._slots: OrderedDict[Hashable, int] = OrderedDict()
         """by chunk, least recently used first"""
+        self._changes = 0
+        """how often a chunk has lost its slot"""
         self._drawn: set[Hashable] = set()
         self._lock = threading.RLock()
         self._queue = cl.CommandQueue(workspace.context)
@@ -76,16 +94,22 @@ class OpenCLChunks:
                 if chunk.key not in self._slots and not self._put(chunk.key, arrays, self._drawn | wanted):
                     return
 
-    def copy(self, name: str, chunks: Sequence[Chunk], spans: np.ndarray, target: cl.Buffer) -> None:
+    def copy(
+        self, name: str, chunks: Sequence[Chunk], spans: np.ndarray, target: cl.Buffer, known: Copies | None
+    ) -> Copies | None:
         """Rows of chunks to an array that a picture is drawn of, on the queue of pictures. spans: of each
-        chunk (k, 3) its first row, where that goes, and how many rows."""
+        chunk (k, 3) its first row, where that goes, and how many rows. known: what this has returned for the
+        same rows of another array."""
         with self._lock, self.workspace.failing("taking splats"):
-            for first, end in self._rounds(chunks):
-                slots = self._there(chunks[first:end])
-                table = np.full((end - first, 4), _NOWHERE, np.uint32)
-                table[:, 0] = np.array(slots) * self._rows + spans[first:end, 0]
-                table[:, 1:3] = spans[first:end, 1:]
-                self._launch(name, chunks[first:end], table, target)
+            if known is not None and known.changes == self._changes:
+                self._launch(name, known, target)
+                return known
+            rounds = list(self._rounds(chunks))
+            copies = None
+            for first, end in rounds:
+                copies = self._copies(chunks[first:end], spans[first:end])
+                self._launch(name, copies, target)
+            return copies if len(rounds) == 1 else None
 
     def wait(self) -> None:
         """Until all copies are done."""
@@ -103,25 +127,37 @@ class OpenCLChunks:
                 first, keys = number, {chunk.key}
         yield first, len(chunks)
 
-    def _launch(self, name: str, chunks: Sequence[Chunk], table: np.ndarray, target: cl.Buffer) -> None:
-        context, source = self.workspace.context, self._arrays[name]
-        words, flags = self.widths[name] // 4, cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
-        placed = [number for number, chunk in enumerate(chunks) if chunk.pose is not None]
-        moves = bool(placed) and name in ("means", "quats")
-        if moves:
-            table[placed, 3] = np.arange(len(placed))
-        kernel = self._kernels[f"gather_{name}" if moves else "gather"]
-        items = int(table[:, 2].max(initial=0)) * (1 if moves else words)
+    def _copies(self, chunks: Sequence[Chunk], spans: np.ndarray) -> Copies:
+        """How they are copied, once they are all there."""
+        slots = self._there(chunks)
+        table = np.full((len(chunks), 4), _NOWHERE, np.uint32)
+        table[:, 0] = np.array(slots) * self._rows + spans[:, 0]
+        table[:, 1:3] = spans[:, 1:]
+        poses = [(number, chunk.pose) for number, chunk in enumerate(chunks) if chunk.pose is not None]
+        table[[number for number, _ in poses], 3] = np.arange(len(poses))
+        return Copies(
+            pieces=self._sent(table),
+            poses=self._sent(np.stack([pose for _, pose in poses])) if poses else None,
+            count=len(chunks),
+            rows=int(table[:, 2].max(initial=0)),
+            changes=self._changes,
+        )
+
+    def _sent(self, array: np.ndarray) -> cl.Buffer:
+        flags = cl.mem_flags
+        return cl.Buffer(self.workspace.context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=array)
+
+    def _launch(self, name: str, copies: Copies, target: cl.Buffer) -> None:
+        words = self.widths[name] // 4
+        moves = copies.poses is not None and name in ("means", "quats")
+        items = copies.rows * (1 if moves else words)
         if not items:
             return
-        # held here: a kernel does not hold its arguments before it is launched
-        pieces = cl.Buffer(context, flags, hostbuf=table)
-        where: Any = np.uint32(words)
-        if moves:
-            rows = np.stack([chunk.pose for chunk in chunks if chunk.pose is not None])
-            where = cl.Buffer(context, flags, hostbuf=rows)
-        kernel.set_args(source, pieces, where, target)
-        size = -(-items // 64) * 64, len(chunks)
+        kernel = self._kernels[f"gather_{name}" if moves else "gather"]
+        kernel.set_args(
+            self._arrays[name], copies.pieces, copies.poses if moves else np.uint32(words), target
+        )
+        size = -(-items // 64) * 64, copies.count
         self._last = cl.enqueue_nd_range_kernel(self.workspace.queue, kernel, size, (64, 1))
 
     def _there(self, chunks: Sequence[Chunk]) -> list[int]:
@@ -160,14 +196,26 @@ class OpenCLChunks:
             return None
         if self._last is not None:
             self._last.wait()  # it may be read just now
+        self._changes += 1
         return self._slots.pop(oldest)
+
+    @property
+    def reserved_bytes(self) -> int:
+        """Bytes that slots may come to take: pictures leave room for all of them."""
+        return self._most * self._slot_bytes
+
+    @property
+    def _slot_bytes(self) -> int:
+        """Of a slot in all arrays, and once more in the widest: one that becomes larger is there twice for a
+        while."""
+        return self._rows * (sum(self.widths.values()) + max(self.widths.values()))
 
     @property
     def _most(self) -> int:
         """Slots, at most."""
-        share = self.workspace.memory_budget // _SHARE // (self._rows * sum(self.widths.values()))
+        share = self.workspace.memory_budget // _SHARE // self._slot_bytes
         widest = self.workspace.device.max_mem_alloc_size // (self._rows * max(self.widths.values()))
-        return max(1, self._size, min(share, widest))
+        return max(1, self._size, min(share, widest, self.whole.distinct(self.places)))
 
     def _grow(self, size: int) -> None:
         if self._last is not None:
@@ -203,14 +251,16 @@ class GatheredChunks:
         """as that of a Resident"""
         self.fixed = True
         self._buffers: dict[str, cl.Buffer] = {}
+        self._copies: tuple[int, int, Copies | None] = (0, 0, None)
+        """of splats [first, end), as they were copied last"""
         total, widest = self.count * sum(cache.widths.values()), self.count * max(cache.widths.values())
         self.streamed = (
             total > workspace.memory_budget // _WHOLE or widest > workspace.device.max_mem_alloc_size
         )
 
     def bytes_for(self, names: Iterable[str]) -> tuple[int, int]:
-        """As that of a Resident: what the cache takes stays."""
-        asked, stays = {*names, *self._buffers}, self._cache.memory_bytes
+        """As that of a Resident: what the cache may take stays."""
+        asked, stays = {*names, *self._buffers}, self._cache.reserved_bytes
         each = sum(self._width(name) for name in asked)
         return (stays, each) if self.streamed else (stays + self.count * each, 0)
 
@@ -251,4 +301,7 @@ class GatheredChunks:
         starts = ends - [chunk.count for chunk in self._chunks[lowest:highest]]
         begin, stop = np.maximum(starts, first), np.minimum(ends, end)
         spans = np.stack([begin - starts, begin - first, stop - begin], axis=1)
-        self._cache.copy(name, self._chunks[lowest:highest], spans, target)
+        begun, stopped, known = self._copies
+        known = known if (begun, stopped) == (first, end) else None
+        copies = self._cache.copy(name, self._chunks[lowest:highest], spans, target, known)
+        self._copies = first, end, copies

@@ -130,7 +130,8 @@ kernel void loss_columns_backward(
 }
 
 // Index space: any number of work-groups of SUMMED. Reads: planes 0, 1 and 10, margins of zeros too. Writes: each work-group's sums
-// of |a - b|, (a - b)^2 and the SSIM, in a fixed order: the same on every run.
+// of |a - b|, (a - b)^2 and the SSIM, in a fixed order: the same on every run. A group has a piece of the planes, so that a core that
+// takes one work-item after another stays in the same pages.
 #define SUMMED 128
 kernel __attribute__((reqd_work_group_size(SUMMED, 1, 1))) void loss_sums(
 //@@ arguments loss_sums
@@ -138,7 +139,8 @@ kernel __attribute__((reqd_work_group_size(SUMMED, 1, 1))) void loss_sums(
     local real kept[3][SUMMED];
     uint item = get_local_id(0);
     real absolute = 0, squared = 0, similar = 0;
-    for (size_t at = get_global_id(0); at < plane; at += get_global_size(0)) {
+    size_t piece = (plane + get_num_groups(0) - 1) / get_num_groups(0), first = get_group_id(0) * piece;
+    for (size_t at = first + item; at < min(first + piece, (size_t)plane); at += SUMMED) {
         float difference = planes[at] - planes[plane + at];
         absolute += fabs(difference);
         squared += difference * difference;
