@@ -5,12 +5,13 @@
 Both processes draw the scene of this tree with its constants (alpha cut-off 1/255, stop 1e-4, precise
 arithmetic), splats resident, the picture left on the device. One frame each, in turns, and which goes first
 changes from pair to pair; the figure is the median of the ratios of this tree's time to the commit's, with
-quartiles. So it is measured that the kernels of a scene without effects cost what they did before there were
-effects.
+quartiles, and beside it the stages' medians by the device's clock. So it is measured that the kernels of a
+scene without effects cost what they did before there were effects.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -28,7 +29,7 @@ from fidsplat.timing import Clock, Timer, quartiles, ratios, take_turns
 ARRAYS = ("means", "quats", "scales", "opacities", "colors", "boxes", "planes")
 ROOT = Path(__file__).resolve().parent.parent
 CHILD = """
-import hashlib, sys, time
+import hashlib, json, sys, time
 import numpy as np
 import fidsplat as fs
 scene = np.load(sys.argv[1])
@@ -50,7 +51,8 @@ for line in sys.stdin:
     frame = renderer.render(resident, *how)
     getattr(frame, "wait", lambda: frame.timings)()
     spent = time.perf_counter() - start
-    print(spent * 1e3, hashlib.sha256(frame["rgb"].tobytes()).hexdigest()[:16], flush=True)
+    picture = hashlib.sha256(frame["rgb"].tobytes()).hexdigest()[:16]
+    print(spent * 1e3, picture, json.dumps(dict(frame.timings)), flush=True)
 """
 
 
@@ -79,13 +81,16 @@ class Tree:
         )
         self.device, self.clock = self._line(), Clock()
         self.picture = ""
+        self.stages: list[dict[str, float]] = []
+        """milliseconds by stage, of each frame"""
 
     def frame(self) -> None:
         """One more frame; the clock goes on by what it took the process."""
         assert self.child.stdin is not None
         self.child.stdin.write("\n")
         self.child.stdin.flush()
-        spent, self.picture = self._line().split()
+        spent, self.picture, stages = self._line().split(maxsplit=2)
+        self.stages.append(json.loads(stages))
         self.clock.seconds += float(spent) / 1e3
 
     def _line(self) -> str:
@@ -94,6 +99,10 @@ class Tree:
         if not line:
             raise SystemExit("a process that draws has failed; its message stands above")
         return line
+
+    def medians(self) -> dict[str, float]:
+        """Milliseconds by stage."""
+        return {stage: float(np.median([one[stage] for one in self.stages])) for stage in self.stages[-1]}
 
     def close(self) -> None:
         assert self.child.stdin is not None
@@ -132,6 +141,7 @@ def measure(commit: str, scene: str, device: str, repeats: int) -> dict:
         "ratio": middle,
         "quartiles": [low, high],
         "same_bits": trees[0].picture == trees[1].picture,
+        "stages_ms": [tree.medians() for tree in trees],
     }
 
 
@@ -145,6 +155,8 @@ def main() -> None:
         return
     print("{scene} on {device}, {date}, {pairs} pairs".format(**row))
     print("{commit} {before_ms:.2f} ms, now {now_ms:.2f} ms".format(**row))
+    for name, stages in zip((asked.commit, "now"), row["stages_ms"], strict=True):
+        print(f"{name}:", ", ".join(f"{stage} {spent:.3f}" for stage, spent in stages.items()))
     print(
         "ratio {ratio:.3f}, quartiles {quartiles[0]:.3f} to {quartiles[1]:.3f}; ".format(**row)
         + ("the same bits" if row["same_bits"] else "pictures differ")

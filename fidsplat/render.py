@@ -210,7 +210,10 @@ class Renderer:
         """
         asked = _asked(scene, capture, outputs=outputs, quality=quality)
         rows = asked.camera.height if asked.camera is not None else 0
-        first, end = band
+        try:
+            first, end = band
+        except (TypeError, ValueError):
+            raise InputError(f"band is {band!r}; it must be two rows, the first and the end") from None
         whole_number("the first row of a band", first, 0, rows - 1)
         whole_number("the end of a band", end, first + 1, rows)
         return self._draw(self._resident(scene), asked, band=band)

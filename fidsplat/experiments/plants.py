@@ -18,6 +18,7 @@ from fidsplat.experiments.blender import camera_facts, drawn, ready
 from fidsplat.files import atomic_write, from_json, writable_folder
 from fidsplat.formats import save_ply
 from fidsplat.formats.colmap import save_colmap
+from fidsplat.provenance import code_hash
 from fidsplat.quality import whole_number
 from fidsplat.render import Renderer
 from fidsplat.sim.plant_meshes import GOLDEN, MESHES, Mesh
@@ -109,7 +110,7 @@ def write_plants(
         tell: told what is done, and the share of all.
 
     Raises:
-        InputError: Blender is not installed, or the folder holds plants of other numbers.
+        InputError: Blender is not installed, or the folder holds plants of other numbers or sources.
         DeviceError: Blender fails; pictures done stay.
     """
     python = ready("standard", environment) if wanted.iterations else None
@@ -139,6 +140,7 @@ def _note(wanted: Plants, folder: Path) -> None:
     file = folder / NOTE
     # more of them, or of other kinds, may come to those that are there
     own = {name: value for name, value in asdict(wanted).items() if name not in ("kinds", "each")}
+    own["sources"] = code_hash()
     try:
         before = from_json(file.read_text("utf-8"))
     except FileNotFoundError:

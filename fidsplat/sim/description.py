@@ -13,6 +13,7 @@ import numpy as np
 
 from fidsplat.cameras import Camera, focal_length
 from fidsplat.errors import InputError, unknown
+from fidsplat.files import path_of
 from fidsplat.sim.camera_element import (
     KINDS,
     OPTICAL,
@@ -71,7 +72,7 @@ def read_description(
         InputError: a file that cannot be read, an include that is not found or that includes itself, a value
             that makes no camera, two cameras of one name; it names the file and the element.
     """
-    file = Path(path)
+    file = path_of(path)
     if file.is_dir():
         file = file / "model.sdf"
     root, place = parse(file)

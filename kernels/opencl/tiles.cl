@@ -2,26 +2,20 @@
 // there in any order, and a sort of each list. Keys are unique (the splat's index breaks ties), so the sorted lists are
 // the same on every run. The tiles of many views stand one view after the other.
 
-#define SCAN_EACH 8              // tiles of a work-item
-#define SCAN_ROW 32              // work-items whose numbers are added up one after the other
-#define SCAN_ROWS ((SCAN_ITEMS + SCAN_ROW - 1) / SCAN_ROW)
-
-// Exclusive prefix sum of `mine` over a work-group of SCAN_ITEMS; *total is the sum of all. partial: SCAN_ITEMS + SCAN_ROWS values.
+// Exclusive prefix sum of `mine` over a work-group of SCAN_ITEMS; *total is the sum of all. partial: SCAN_ITEMS values.
 static inline ulong scan_group(local ulong *partial, uint item, ulong mine, ulong *total) {
-    local ulong *rows = partial + SCAN_ITEMS;
     partial[item] = mine;
     barrier(CLK_LOCAL_MEM_FENCE);
-    ulong before = 0, sum = 0;
-    for (uint other = item - item % SCAN_ROW; other < item; other++) before += partial[other];
-    if (item % SCAN_ROW == SCAN_ROW - 1 || item == SCAN_ITEMS - 1) rows[item / SCAN_ROW] = before + mine;
-    barrier(CLK_LOCAL_MEM_FENCE);
-    for (uint row = 0; row < SCAN_ROWS; row++) {
-        if (row == item / SCAN_ROW) before += sum;
-        sum += rows[row];
+    for (uint step = 1; step < SCAN_ITEMS; step *= 2) {
+        ulong before = item >= step ? partial[item - step] : 0;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        partial[item] += before;
+        barrier(CLK_LOCAL_MEM_FENCE);
     }
-    *total = sum;
-    barrier(CLK_LOCAL_MEM_FENCE);    // the next numbers may be written
-    return before;
+    *total = partial[SCAN_ITEMS - 1];
+    ulong exclusive = partial[item] - mine;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    return exclusive;
 }
 
 // places in the buffer `counts`, which the host reads: numbers of big splats, of pairs (64 bits), of visible splats
@@ -34,21 +28,18 @@ enum { COUNT_BIG = 0, COUNT_PAIRS = 1, COUNT_VISIBLE = 3 };
 kernel __attribute__((reqd_work_group_size(SCAN_ITEMS, 1, 1))) void tile_starts(
 //@@ arguments tile_starts
 ) {
-    local ulong partial[SCAN_ITEMS + SCAN_ROWS];
+    local ulong partial[SCAN_ITEMS];
     uint item = get_local_id(0);
     ulong running = 0;
-    for (uint first = 0; first < tiles; first += SCAN_EACH * SCAN_ITEMS) {
-        uint from = first + SCAN_EACH * item, lengths[SCAN_EACH];
+    for (uint first = 0; first < tiles; first += 4 * SCAN_ITEMS) {
+        uint from = min(first + 4 * item, tiles), to = min(from + 4, tiles);
         ulong mine = 0, total;
-        for (uint n = 0; n < SCAN_EACH; n++) {
-            lengths[n] = from + n < tiles ? tallies[TALLIES + from + n] : 0;
-            mine += lengths[n];
-        }
+        for (uint tile = from; tile < to; tile++) mine += tallies[TALLIES + tile];
         ulong place = running + scan_group(partial, item, mine, &total);
-        for (uint n = 0; n < SCAN_EACH && from + n < tiles; n++) {
-            starts[from + n] = cursors[from + n] = (uint)place;
-            place += lengths[n];
-            if (clear) tallies[TALLIES + from + n] = 0;
+        for (uint tile = from; tile < to; tile++) {
+            starts[tile] = cursors[tile] = (uint)place;
+            place += tallies[TALLIES + tile];
+            if (clear) tallies[TALLIES + tile] = 0;
         }
         running += total;
     }

@@ -23,8 +23,8 @@ SHAPE, GROUP = cpu_shape(lanes=16, cores=2), gpu_shape()
 FURTHER = [name for name in OUTPUTS if name != "rgb"]
 PLAIN = fs.Quality(lowpass="none")
 DIGESTS = {
-    "none": ["754b2f59f2fdaca3", "e4a1e423c3b1fce0"],
-    "screen": ["33ecc0811731743c", "223813b4b2d0a269"],
+    "none": ["754b2f59f2fdaca3", "e602d5e9680dc565"],
+    "screen": ["33ecc0811731743c", "e9eb01ba54ad88b3"],
 }
 """of a scene that asks for nothing, by low-pass; `screen` is the default"""
 
@@ -202,7 +202,7 @@ TAKEN = {
         "project": (14, 12, 0),
         "sort_tiles": (4, 3, 20556),
         "tally_big": (7, 3, 0),
-        "tile_starts": (7, 4, 8448),
+        "tile_starts": (7, 4, 8192),
     },
 }
 

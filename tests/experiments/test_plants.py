@@ -103,6 +103,14 @@ def test_a_stock_of_sampled_plants_fills_a_greenhouse(tmp_path, capsys):
         Greenhouse(1, 1, stock={"tomato": []})
 
 
+def test_plants_of_other_sources_are_not_mixed(tmp_path, monkeypatch):
+    plants._note(Plants(), tmp_path)
+    plants._note(Plants(), tmp_path)
+    monkeypatch.setattr(plants, "code_hash", lambda: "another")
+    with pytest.raises(fs.InputError, match=r"'sources': 'another'.*; give another folder"):
+        plants._note(Plants(), tmp_path)
+
+
 def test_without_blender_the_error_says_how_to_get_it(tmp_path):
     with pytest.raises(fs.InputError, match=r"fidsplat experiment blender --install"):
         list(write_plants(Plants(("lettuce",), 1), tmp_path, tmp_path / "nowhere"))

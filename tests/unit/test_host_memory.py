@@ -42,6 +42,20 @@ def test_images_that_are_kept_keep_their_memory(renderer):
     assert set(addresses(last)) & set(held)
 
 
+def test_images_of_about_the_same_size_take_the_same_memory(renderer):
+    memory = renderer.backend.host_memory
+    memory.empty((100, 100), np.float32)  # the first is in ordinary memory
+    places = set()
+    for columns in (100, 98, 101, 97, 102):
+        array = memory.empty((100, columns), np.float32)
+        array[:] = columns
+        assert array.base is not None
+        places.add(array.ctypes.data)
+        del array
+    assert len(places) == 1
+    assert memory._held < 1.25 * 4 * 100 * 102
+
+
 def test_no_more_is_locked_than_allowed(renderer, monkeypatch):
     memory, shape = renderer.backend.host_memory, (10, 10)
     monkeypatch.setattr(host_memory, "_MOST", 900)

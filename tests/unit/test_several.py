@@ -100,6 +100,8 @@ def test_what_several_devices_cannot_draw_is_said(store, two):
     for band in ((-1, 3), (3, 3), (0, 31)):
         with pytest.raises(fs.InputError, match="of a band"):
             renderer.render_band(band, store, look())
+    with pytest.raises(fs.InputError, match="band is 5; it must be two rows"):
+        renderer.render_band(5, store, look())  # type: ignore[arg-type]
 
 
 def test_pictures_come_before_the_failure_of_what_asks_for_them(store, two):

@@ -103,6 +103,10 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
         }
         for (; bits != 0; bits &= bits - 1) places[cell][before++] = (uchar)(own * SHARE + 31 - clz(bits & -bits));
         barrier(CLK_LOCAL_MEM_FENCE);
+        // not where all of a work-item's pixels are finished
+        bool unfinished = false;
+        for (int row = 0; row < ROWS; row++) unfinished |= pixel_unfinished(&pixels[row], &constants) != 0;
+        if (!unfinished) listed = 0;
         for (uint k = 0; k < listed; k++) {
             uint which = places[cell][k];
             Staged copy;

@@ -1,0 +1,183 @@
+"""The lists of splats per tile: made in two ways, however much there is to list, and in small buffers."""
+
+import numpy as np
+import pytest
+from agreement import ALL_OUTPUTS, random_splats
+from traces import CAMERA, CULLED, listing, traced
+
+import fidsplat as fs
+from fidsplat.backends.opencl.lists import GatheredLists
+from fidsplat.backends.prepare import prepare, prepare_batch
+from fidsplat.backends.view import View
+from fidsplat.effects import select
+from fidsplat.hard_cases.agreement import out_of_order
+from fidsplat.views import views_of
+
+
+@pytest.mark.parametrize("scale", [(1e-3, 0.5), (0.1, 50.0)])
+def test_both_ways_of_listing_give_the_same_lists(backend, scale):
+    """Small splats and ones that touch more tiles than a window of list/tiled.cl has."""
+    cloud = random_splats(2500, seed=5, scale=scale)
+    tiled, ordered = (
+        traced(backend, cloud, fs.Quality(lowpass="none"), shape=listing(backend, lists))[0]
+        for lists in ("tiled", "ordered")
+    )
+    assert max(np.diff(tiled["starts"].astype(int))) > 20
+    # both hold every tile that a splat touches (the test above) and may differ a little in what else
+    different = 0
+    for tile in range(len(tiled["starts"]) - 1):
+        ours, theirs = (t["lists"][t["starts"][tile] : t["starts"][tile + 1]] for t in (tiled, ordered))
+        different += len(set(theirs) ^ set(ours))
+    assert different <= 0.05 * len(ordered["lists"])
+    assert np.array_equal(tiled["rgb"], ordered["rgb"])
+
+
+@pytest.mark.parametrize(
+    ("lists", "budget"), [("ordered", 0), ("tiled", 0), ("gathered", 0), ("gathered", 5000)]
+)
+def test_views_of_a_batch_are_listed_apart(backend, monkeypatch, lists, budget):
+    """gathered: tiles so few that they are counted in local memory, by groups of 4096 splats; with a budget
+    of pairs in bands."""
+    cloud = random_splats(5000, seed=5, scale=(1e-3, 0.5))
+    quality = fs.Quality(lowpass="none")
+    captures = [
+        fs.Capture(fs.Camera.look_at(161, 117, 1.0, (x, 0.0, -0.1), (0.0, 0.0, 3.0)), ALL_OUTPUTS, quality)
+        for x in (-1.0, 0.5)
+    ]
+    features, batch = prepare_batch(cloud, views_of(captures))
+    shape = listing(backend, "tiled" if lists == "gathered" else lists)
+    pipeline, resident = backend.pipeline(features, shape), backend.upload(cloud)
+    alone = [pipeline.render(resident, prepare(cloud, capture)[1]) for capture in captures]
+    gathered = GatheredLists._gather
+    launched = []
+
+    def gather(self, kernel, **given):
+        launched.append(kernel)
+        gathered(self, kernel, **given)
+
+    monkeypatch.setattr(GatheredLists, "_gather", gather)
+    if lists == "tiled":
+        monkeypatch.setattr(GatheredLists, "TILES", 0)
+    monkeypatch.setattr(backend, "pair_budget", budget or backend.pair_budget)
+    pictures = pipeline.render_batch(resident, batch)
+    assert (launched.count("emit_gathered") > (2 if budget else 0)) == (lists == "gathered")
+    for name in ("visible", "pairs"):
+        assert pictures.stats[name] == sum(picture.stats[name] for picture in alone)
+    for picture, own in zip(pictures.read("rgb"), alone, strict=True):
+        assert np.array_equal(picture, own.read("rgb"))
+
+
+def test_lists_that_outgrow_their_buffers_are_made_again(backend):
+    """A picture that has far more pairs, or big splats, than the last one."""
+    groups = listing(backend, "tiled")
+    few, many = random_splats(30, seed=2, scale=(1e-3, 0.05)), random_splats(9000, seed=2, scale=(0.5, 5.0))
+    features, quality = select(few, fs.Capture(outputs=ALL_OUTPUTS)), fs.Quality()
+    view = View.of(fs.Capture(CAMERA, quality=quality), few.origin)
+    backend = type(backend)(backend.device)  # with buffers that no other test has made larger
+    pipeline = backend.pipeline(features, groups)
+    fresh = pipeline.render(backend.upload(many), view)
+    wanted = {name: fresh.read(name) for name in ALL_OUTPUTS}
+    backend = type(backend)(backend.device)
+    pipeline = backend.pipeline(features, groups)
+    pipeline.render(backend.upload(few), view)
+    again = pipeline.render(backend.upload(many), view)
+    assert again.stats == fresh.stats
+    assert again.stats["pairs"] > 1e5
+    for name in ALL_OUTPUTS:
+        assert np.array_equal(again.read(name), wanted[name]), name
+
+
+@pytest.mark.parametrize("spare", [1, 0, -1])
+def test_room_for_exactly_the_pairs_of_a_picture(backend, spare):
+    """Lists are made again if and only if there is no room for all of them."""
+    cloud, quality = random_splats(3000, seed=5, scale=(1e-3, 0.5)), fs.Quality()
+    groups = listing(backend, "tiled")
+    features, view = prepare(cloud, fs.Capture(CAMERA, ALL_OUTPUTS, quality))
+    drawn = []
+    for room in (None, spare):
+        own = type(backend)(backend.device)  # with buffers of its own
+        if room is not None:
+            pairs = drawn[0].stats["pairs"] + room
+            own.pool.scratch("lists", 4 * pairs)
+            own.pool.scratch("pairs", 8 * pairs)
+        drawn.append(own.pipeline(features, groups).render(own.upload(cloud), view))
+        grown = own.pool.size("pairs") > 8 * (drawn[0].stats["pairs"] + spare)
+        assert room is None or grown == (spare < 0)
+    assert drawn[0].stats == drawn[1].stats
+    for name in ALL_OUTPUTS:
+        assert np.array_equal(drawn[0].read(name), drawn[1].read(name)), name
+
+
+def test_a_list_longer_than_local_memory_is_sorted(backend):
+    """tiles.cl sorts 2048 pairs at once in local memory, longer lists in global memory as well."""
+    cloud = random_splats(11000, seed=8, depth=(1.0, 9.0), scale=(0.2, 0.3), across=0.1)
+    trace, _ = traced(backend, cloud, fs.Quality(), shape=backend.shapes("schedule")["groups"])
+    visible = np.flatnonzero(trace["keys"] != CULLED)
+    assert max(np.diff(trace["starts"].astype(int))) > 8192
+    assert out_of_order(trace, visible[np.argsort(trace["keys"][visible], kind="stable")]) == 0
+
+
+def test_arrays_of_a_cloud_begin_anywhere(backend):
+    """Kernels read whole vectors, and a CPU reads a cloud's own arrays."""
+    base = random_splats(50, seed=6)
+    arrays = {"quats": base.quats, "scales": base.scales}
+    for name, array in arrays.items():
+        flat = np.empty(array.size + 1, np.float32)
+        flat[1:] = array.ravel()
+        flat.flags.writeable = False
+        arrays[name] = flat[1:].reshape(array.shape)
+    cloud = fs.SplatCloud(means=base.means, opacities=base.opacities, colors=base.colors, **arrays)
+    assert all(getattr(cloud, name).ctypes.data % 16 for name in arrays)
+    pictures = [traced(backend, each, fs.Quality())[0]["rgb"] for each in (base, cloud)]
+    assert np.array_equal(*pictures)
+
+
+DEPTHS = {
+    "spread": lambda n: np.linspace(1.0, 9.0, n),
+    "in pairs": lambda n: np.linspace(1.0, 9.0, n // 2).repeat(2),
+    "one": lambda n: np.full(n, 3.0),
+    "two": lambda n: np.where(np.arange(n) % 3 == 0, 8.0, 2.0),
+    "one far away": lambda n: np.r_[np.linspace(2.0, 2.001, n - 1), 1e14],
+}
+
+
+@pytest.mark.parametrize("depths", DEPTHS)
+def test_a_list_is_sorted_however_its_depths_are_spread(backend, depths):
+    """tiles.cl spreads a list over ranges of depth, and sorts it by a network where one is crowded."""
+    n, generator = 1500, np.random.default_rng(4)
+    cloud = random_splats(n, seed=4, scale=(0.05, 0.3))
+    z = generator.permutation(DEPTHS[depths](n))
+    cloud = fs.SplatCloud(
+        means=np.stack([generator.normal(size=n) * 0.02 * z, generator.normal(size=n) * 0.02 * z, z], 1),
+        quats=np.tile([1.0, 0, 0, 0], (n, 1)),
+        scales=cloud.scales * z[:, None],
+        opacities=cloud.opacities,
+        colors=cloud.colors,
+    )
+    camera = fs.Camera.pinhole(CAMERA.width, CAMERA.height, 150.0, 150.0, 80.0, 58.0)
+    features, view = prepare(cloud, fs.Capture(camera, ALL_OUTPUTS))
+    trace = backend.pipeline(features, backend.shapes("schedule")["groups"]).trace(
+        backend.upload(cloud), view
+    )
+    visible = np.flatnonzero(trace["keys"] != CULLED)
+    longest = max(np.diff(trace["starts"].astype(int)))
+    assert 1000 < longest <= 1500
+    assert out_of_order(trace, visible[np.argsort(trace["keys"][visible], kind="stable")]) == 0
+
+
+@pytest.mark.parametrize("lists", ["ordered", "tiled"])
+@pytest.mark.parametrize("budget", [1, 50, 1000])
+def test_a_small_pair_budget_gives_the_same_bits(backend, monkeypatch, budget, lists):
+    """numerics E3: a picture with more pairs than fit is drawn in bands of tiles."""
+    cloud = random_splats(300, seed=12)
+    features, view = prepare(cloud, fs.Capture(CAMERA, ALL_OUTPUTS))
+    # what lists in order draws a CPU's picture too: the way in which it is mostly drawn in bands
+    shape = backend.shape if lists == "ordered" else listing(backend, lists)
+    pipeline, resident = backend.pipeline(features, shape), backend.upload(cloud)
+    whole = pipeline.render(resident, view)
+    assert whole.stats["pairs"] > 1000
+    monkeypatch.setattr(backend, "pair_budget", budget)
+    banded = pipeline.render(resident, view)
+    assert banded.stats == whole.stats
+    for name in ALL_OUTPUTS:
+        assert np.array_equal(banded.read(name), whole.read(name)), name

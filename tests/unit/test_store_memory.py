@@ -1,0 +1,201 @@
+"""What a device holds of a store: chunks that stay, within its memory budget."""
+
+import gc
+import threading
+import weakref
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pyopencl as cl
+import pytest
+from store_views import TURNED, look, made_stores
+
+import fidsplat as fs
+from fidsplat.backends.opencl import chunks, workspace
+from fidsplat.backends.opencl.pipeline import OpenCLPipeline
+from fidsplat.rotations import rigid_matrix
+from fidsplat.store import bands
+from fidsplat.store.streamed import Streamed
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory):
+    return made_stores(tmp_path_factory.mktemp("stores"))
+
+
+def test_a_device_keeps_the_chunks_that_it_was_sent(stores, tmp_path, monkeypatch):
+    sent, put = [], chunks.OpenCLChunks._put
+    monkeypatch.setattr(
+        chunks.OpenCLChunks, "_put", lambda self, key, *rest: sent.append(key) or put(self, key, *rest)
+    )
+    renderer, store = fs.Renderer("opencl"), stores["disks"]
+    resident, cameras = renderer.upload(store), [look(), look(turn=TURNED), look()]
+    for camera in cameras:
+        assert np.array_equal(
+            renderer.render(resident, camera)["rgb"], renderer.render(store.cloud(), camera)["rgb"]
+        )
+    assert 0 < len(sent) == len(set(sent)) <= store.chunks
+    # of a store of places the splats are there once
+    sent.clear()
+    placed = fs.Store(fs.place_store(store, tmp_path / "p.fss", [np.eye(4), rigid_matrix((0, 0, 0.5))]))
+    renderer.render(renderer.upload(placed), look())
+    assert len(sent) == len(set(sent)) <= store.chunks
+
+
+def test_a_part_of_what_is_gathered_may_begin_within_a_chunk(stores):
+    backend, scene = fs.Renderer("opencl").backend, Streamed([stores["disks"]])
+    gathered = backend.chunk_cache(scene, scene.largest_chunk).gather(scene.chunks(scene.everything(), True))
+    gathered.streamed = True
+    found = np.empty(130, np.float32)
+    cl.enqueue_copy(backend.queue, found, gathered.part("opacities", 70, 200))
+    assert np.array_equal(found, stores["disks"].cloud().opacities[70:200])
+
+
+def test_slots_that_cannot_become_more_keep_what_they_hold(stores, monkeypatch):
+    """Even where copies take their time, and of two arrays only the first has room."""
+    renderer, store = fs.Renderer("opencl"), stores["disks"]
+    resident = renderer.upload(store)
+    renderer.render(resident, look())
+    cache, pool, asked = resident.data._cache, renderer.backend.pool, []
+    fresh = pool.fresh
+
+    def full(name, size):
+        asked.append(name)
+        if len(asked) == 2:
+            raise fs.DeviceError("no memory")
+        return fresh(name, size)
+
+    def contents_of(name):
+        found = np.empty(before[name].size, np.uint8)
+        cl.enqueue_copy(renderer.backend.queue, found, cache._arrays[name])
+        return found
+
+    before = dict(cache._arrays)
+    wanted = {name: contents_of(name) for name in before}
+    held = cl.UserEvent(renderer.backend.context)
+    cl.enqueue_barrier(cache._queue, wait_for=[held])
+    threading.Timer(0.2, held.set_status, [cl.command_execution_status.COMPLETE]).start()
+    with monkeypatch.context() as patch:
+        patch.setattr(pool, "fresh", full)
+        with pytest.raises(fs.DeviceError, match="no memory"):
+            cache._grow(2 * cache._size)
+    assert sum(buffer is not before[name] for name, buffer in cache._arrays.items()) == 1
+    assert all(np.array_equal(contents_of(name), array) for name, array in wanted.items())
+
+
+def test_a_device_without_room_for_a_view_is_sent_its_chunks_again(stores, monkeypatch):
+    renderer, store = fs.Renderer("opencl"), stores["disks"]
+    # two chunks fit, and no picture is put together as a whole
+    monkeypatch.setattr(chunks, "_SHARE", renderer.backend.memory_budget // 10000)
+    monkeypatch.setattr(chunks, "_WHOLE", renderer.backend.memory_budget // 10000)
+    resident, outputs = renderer.upload(store), ("rgb", "splat_id")
+    for camera in (look(), look(turn=TURNED)):
+        ours, whole = (renderer.render(each, camera, outputs) for each in (resident, store.cloud()))
+        for output in outputs:
+            assert np.array_equal(ours[output], whole[output]), output
+    cache, scene = resident.data._cache, resident.data.scene
+    held = set(cache._slots)
+    assert 0 < len(held) <= 2
+    # what is drawn does not make room for what is fetched ahead
+    cache.bring(scene.chunks(scene.everything(), True))
+    assert set(cache._slots) == held
+    # nor does one chunk that is fetched ahead for another
+    every = scene.chunks(scene.everything(), True)
+    cache._drawn = set()
+    cache.bring(every[:2])
+    cache.bring(every)
+    assert set(cache._slots) == {chunk.key for chunk in every[:2]}
+
+
+def before_the_wall(x=0.0):
+    return fs.Camera.look_at(120, 90, 1.4, (x, 0, -1), (x, 0, 3))
+
+
+def test_what_does_not_fit_at_once_is_drawn_in_bands_of_what_each_sees(stores, monkeypatch):
+    store, drawn, most = stores["wall"], [], 5500
+    cloud, plain, limited = store.cloud(), fs.Renderer("opencl"), fs.Renderer("opencl")
+
+    def fits(self, resident, view):
+        drawn.append(resident.count)
+        return resident.count < most
+
+    monkeypatch.setattr(OpenCLPipeline, "fits", fits)
+    resident, outputs = limited.upload(store), ("rgb", "splat_id", "depth")
+    sampled = fs.Capture(before_the_wall(), quality="samples=2", outputs=outputs)
+    moved = fs.Capture(before_the_wall(x=0.1), outputs=outputs)
+    for capture in (fs.Capture(before_the_wall(), outputs=outputs), sampled, moved):
+        drawn.clear()
+        ours, whole = limited.render(resident, capture), plain.render(cloud, capture)
+        for output in outputs:
+            assert np.array_equal(ours[output], whole[output]), output
+        assert sum(count < most for count in drawn) >= 2
+        assert ours.stats["visible"] >= whole.stats["visible"]
+        assert set(ours.timings) == set(whole.timings)
+    # the next view begins with the bands of the last, each asked for once
+    drawn.clear()
+    limited.render(resident, moved)
+    assert max(drawn) < most
+    # a band of a picture is cut as the whole
+    frame = limited.render_band((5, 80), resident, moved)
+    assert np.array_equal(frame["rgb"][5:80], plain.render(cloud, moved)["rgb"][5:80])
+    # where all rows see all, cutting is of no use
+    drawn.clear()
+    fisheye, most = fs.Capture(replace(before_the_wall(), lens=fs.Fisheye())), 1
+    assert np.array_equal(limited.render(resident, fisheye)["rgb"], plain.render(cloud, fisheye)["rgb"])
+    assert len(drawn) == 1
+
+
+def test_a_budget_of_memory_makes_bands(stores):
+    store, camera = stores["wall"], before_the_wall()
+    limited, plain = fs.Renderer("opencl", memory_budget=2 << 20), fs.Renderer("opencl")
+    resident = limited.upload(store)
+    ours = limited.render(resident, camera)
+    assert np.array_equal(ours["rgb"], plain.render(store.cloud(), camera)["rgb"])
+    assert len(resident.data._bands._cuts[0, 90]) > 2
+
+
+def test_a_picture_and_the_chunks_that_stay_keep_to_the_budget(stores, monkeypatch):
+    live, peak, store = weakref.WeakSet(), [0], stores["wall"]
+
+    class Counted(workspace.DeviceBuffer):
+        def __init__(self, *given, **words):
+            super().__init__(*given, **words)
+            live.add(self)
+            peak[0] = max(peak[0], sum(buffer.size for buffer in live))
+
+    monkeypatch.setattr(workspace, "DeviceBuffer", Counted)
+    for budget in (2200 << 10, 3 << 20):
+        peak[0], limited = 0, fs.Renderer("opencl", memory_budget=budget)
+        resident = limited.upload(store)
+        for frame in limited.render_views(resident, [before_the_wall(x=0.05 * k) for k in range(5)]):
+            assert frame["rgb"].any()
+        assert 0.5 * budget < peak[0] <= budget
+        cache = resident.data._cache
+        assert 0 < cache.memory_bytes <= cache.reserved_bytes <= budget // 4
+        # room is left for all that the cache may come to take, whatever it holds yet
+        empty = limited.backend.chunk_cache(resident.data.scene, cache._rows)
+        gathered = empty.gather(resident.data.scene.chunks(resident.data.scene.everything(), True))
+        assert gathered.bytes_for(["means"])[0] == cache.reserved_bytes + 12 * len(store)
+        assert empty.memory_bytes == 0
+        del limited, resident, frame, cache, empty, gathered
+        gc.collect()
+
+
+def test_bands_that_fitted_together_are_drawn_together():
+    made = bands.Bands()
+    whole = SimpleNamespace(rows=(0, 64), count=64)
+    whole.within = lambda first, end: SimpleNamespace(
+        rows=(first, end), count=end - first, within=whole.within,
+        halves=[] if end - first < 2 else [whole.within(first, (first + end) // 2),
+                                           whole.within((first + end) // 2, end)],
+    )  # fmt: skip
+    assert [band.rows for band in made.cut(whole, lambda band: band.count <= 20)] == [
+        (0, 16), (16, 32), (32, 48), (48, 64)
+    ]  # fmt: skip
+    assert len(list(made.cut(whole, lambda band: band.count <= 20))) == 4
+    assert len(list(made.cut(whole, lambda band: band.count <= 8))) == 8
+    assert len(list(made.cut(whole, lambda band: True))) == 8
+    made._most = 33
+    list(made.cut(whole, lambda band: True))
+    assert made._cuts == {(0, 64): [0, 32, 64]}
