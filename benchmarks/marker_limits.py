@@ -6,9 +6,10 @@ One dimension: cells of one module, dark and light by turns, each made of n Gaus
 least mean square error, half of it as one layer and half with either colour in front, as centres may order
 them; once freely, once with every leak made costly. An axis-parallel template needs about n x n.
 
-A sheet: the dark splats of `fitted` a hundredth of a module before an opaque sheet of light Gaussians, in the
-place of the light splats. An AprilTag, 12 px a module, over grey; PSNR in dB from the picture of `exact` and
-least alpha where that is opaque, drawn by true depth (`standard`) and by the depth of centres (`gsplat`).
+A sheet: the dark splats of `fitted` before an opaque sheet of light Gaussians, in the place of the light
+splats, by a hundredth of a module or by four, so that centres keep dark in front when tilted. An AprilTag,
+12 px a module, over grey; PSNR in dB from the picture of `exact` and least alpha where that is opaque, drawn
+by true depth (`standard`) and by the depth of centres (`gsplat`).
 Needs scipy.
 """
 
@@ -27,8 +28,10 @@ from fidsplat.markers import Marker, marker
 COUNTS, STARTS, FINE = (5, 7, 9), 4, 480
 """Gaussians of a cell; random starts; samples of a period"""
 GREY = 0.5
-BEHIND = 0.01
+BEHIND = (0.01, 4.0)
 """modules"""
+TEMPLATES = (25, 41, 121)
+"""Gaussians of a rectangle; of dark ones alone before a sheet 59 make as many as 31 of both colours"""
 TILTS = (0.0, 1.0, 30.0)
 
 
@@ -83,8 +86,8 @@ def decibels(error: np.ndarray) -> float:
     return -10 * math.log10(float((error * error).mean()))
 
 
-def before_a_sheet(made: Marker) -> fs.SplatCloud:
-    """The dark splats of a marker before a sheet of light ones, a module apart and as wide."""
+def before_a_sheet(made: Marker, behind: float) -> fs.SplatCloud:
+    """The dark splats of a marker, `behind` modules before a sheet of light ones, a module apart and wide."""
     dark = made.cloud.colors[:, 0] < 0.5 if made.cloud.colors is not None else np.zeros(0, bool)
     parts = {name: getattr(made.cloud, name)[dark] for name in ("means", "quats", "scales", "opacities")}
     front = fs.SplatCloud(**parts, colors=np.zeros((int(dark.sum()), 3)))
@@ -93,7 +96,7 @@ def before_a_sheet(made: Marker) -> fs.SplatCloud:
         np.stack(np.meshgrid(np.arange(side), np.arange(side)), -1).reshape(-1, 2) + 0.5 - side / 2
     ) * made.module
     n = len(at)
-    means = np.column_stack([at, np.full(n, BEHIND * made.module)])
+    means = np.column_stack([at, np.full(n, behind * made.module)])
     quats = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
     sheet = fs.SplatCloud(means, quats, np.full((n, 2), made.module), np.ones(n), colors=np.ones((n, 3)))
     return fs.SplatCloud.concatenate([front.with_planes(0), sheet.with_planes(0)])
@@ -113,16 +116,18 @@ def sheet_rows(renderer: fs.Renderer) -> list[dict]:
     """Both colours side by side, and dark before a sheet."""
     exact = marker("apriltag:36h11:0")
     ways: dict[str, fs.SplatCloud] = {}
-    for size in (25, 41):
+    for size in TEMPLATES:
         made = marker("apriltag:36h11:0", mixture="fitted", template=size)
-        ways |= {f"both colours, {size}": made.cloud, f"dark {size} before a sheet": before_a_sheet(made)}
+        ways[f"both colours, {size}"] = made.cloud
+        for behind in BEHIND:
+            ways[f"dark {size}, {behind:g} before a sheet"] = before_a_sheet(made, behind)
     rows = []
     for name, cloud in track(ways.items(), "pictures", console=PROGRESS):
         for quality in ("standard", "gsplat"):
             for tilt in TILTS:
                 view = camera(exact, tilt)
                 ideal = renderer.render(exact.cloud, view, ("rgb", "alpha"), background=(GREY,) * 3)
-                frame = renderer.render(cloud, view, ("rgb", "alpha"), quality, (GREY,) * 3)
+                frame = renderer.render(cloud, view, ("rgb", "alpha"), quality, background=(GREY,) * 3)
                 inside = ideal["alpha"] > 0.9999
                 rows.append(
                     {

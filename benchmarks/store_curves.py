@@ -12,11 +12,11 @@ import argparse
 import json
 from pathlib import Path
 
-from fidsplat.experiments.charts import chart, legend_above
+from fidsplat.experiments.charts import chart, legend_above, plain_ticks
 
 PANELS = (
     ("next view [ms]", lambda row: 1e3 * row["s"][1]),
-    ("splats read", lambda row: row["drawn"]),
+    ("splats read [million]", lambda row: row["drawn"] / 1e6),
     ("device memory [GiB]", lambda row: row["device_bytes"] / 2**30),
 )
 
@@ -43,8 +43,11 @@ def main() -> None:
     with chart(asked.out, len(PANELS), (12.0, 4.6), one_scale=False) as (figure, panels):
         for axes, (title, value) in zip(panels, PANELS, strict=True):
             for name, rows in found.items():
-                axes.plot([row["splats"] for row in rows], [value(row) for row in rows], ".-", label=name)
-            axes.set(xscale="log", yscale="log", xlabel="splats of the scene", title=title)
+                sizes = [row["splats"] / 1e6 for row in rows]
+                axes.plot(sizes, [value(row) for row in rows], ".-", label=name)
+            axes.set(xscale="log", yscale="log", xlabel="splats of the scene [million]", title=title)
+            plain_ticks(axes.xaxis)
+            plain_ticks(axes.yaxis)
         legend_above(figure, panels[0])
 
 

@@ -265,9 +265,11 @@ class StoreDemo:
     """Make a city of 20 million splats to fly through, with its levels of detail measured.
 
     DIR/city.fss is the store; DIR/city.toml a scene with a flight through a street and up over the roofs.
+    Markers are ArUco markers of 0.8 m on the houses' walls, beside the store in the scene.
 
     Examples:
       fidsplat store demo -o city
+      fidsplat store demo -o city --markers 1000
       fidsplat fly city/city.toml -o flight --rate 2
     """
 
@@ -275,6 +277,7 @@ class StoreDemo:
     splats: Annotated[float, option("N", "of the city (default: 20e6)")] = 20e6
     houses: Annotated[int, option("N", "along a side (default: 8)")] = 8
     seed: Annotated[int, option("N", "of houses and splats (default: 0)")] = 0
+    markers: Annotated[int, option("N", "on the walls, 0 to 1,000 (default: 0)")] = 0
     views: Annotated[int, option("N", "places to measure from; 0: do not measure (default: 12)")] = 12
     device: Device = None
     overwrite: Overwrite = False
@@ -290,6 +293,8 @@ class StoreDemo:
             raise InputError(f"--splats is {self.splats:g}; give a whole number")
         if not 0 <= self.views <= 10_000:
             raise InputError(f"--views is {self.views}; give 0 to 10,000")
+        if not 0 <= self.markers <= 1000:
+            raise InputError(f"--markers is {self.markers}; give 0 to 1,000")
         city, folder = City(int(self.splats), self.houses, self.seed), writable_folder(self.out)
         begun = time.perf_counter()
         with late_progress(console(True)) as progress:
@@ -303,7 +308,15 @@ class StoreDemo:
         error = DEMO_ERROR if store.details else 0.0
         quality = fs.Quality(lowpass="pixel", alpha_cutoff=TRUTH_CUTOFF, detail_error=error)
         scene = folder / "city.toml"
-        fs.Scene(stores=(store,), camera=camera, camera_motion=motion, quality=quality).save(scene)
+        poses = city.marker_poses(self.markers)
+        placed = [
+            fs.scenes.PlacedMarker(fs.marker(f"aruco:4x4_1000:{number}", size=0.8), pose)
+            for number, pose in enumerate(poses)
+        ]
+        whole = fs.Scene(
+            markers=placed, stores=(store,), camera=camera, camera_motion=motion, quality=quality
+        )
+        whole.save(scene)
         seconds = time.perf_counter() - begun
         facts = {"store": str(path), "scene": str(scene), "splats": len(store), "seconds": seconds}
         words = f"{len(store):,} splats in {store.chunks:,} chunks, in {seconds:.0f} s: {path}"

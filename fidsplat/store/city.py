@@ -23,6 +23,8 @@ SIDE = 14.0
 """metres: edge of a house"""
 WINDOWS = 3.0
 """metres from window to window"""
+BOARD, EYES = 0.1, 1.7
+"""metres: how far before their walls markers hang, and how high"""
 OPACITY = 0.95
 OVERLAP = 0.75
 """standard deviations of a splat, in the mean distance of two"""
@@ -98,6 +100,21 @@ class City:
         return {name: np.array(rows, np.float64) for name, rows in made.items()} | {
             "windows": np.array(windows)
         }
+
+    def marker_poses(self, count: int) -> np.ndarray:
+        """(count, 4, 4) world from marker, of boards on the houses' walls at the height of a camera, evenly
+        spread and turned to the streets."""
+        walls, houses = self._walls, np.flatnonzero(self._walls["windows"])
+        poses, rows = np.tile(np.eye(4), (count, 1, 1)), -(-count // len(houses))
+        for number, pose in enumerate(poses):
+            row, wall = divmod(number, len(houses))
+            across = walls["across"][houses[wall]]
+            along, down = across / np.linalg.norm(across), np.array([0.0, 1.0, 0.0])
+            into = np.cross(along, down)
+            pose[:3, :3] = np.stack([along, down, into], axis=1)
+            pose[:3, 3] = walls["corner"][houses[wall]] + (row + 0.5) / rows * across - BOARD * into
+            pose[1, 3] -= EYES
+        return poses
 
     @cached_property
     def _frames(self) -> np.ndarray:

@@ -10,6 +10,7 @@ from training_scene import scene
 
 from fidsplat.backends.derivatives import Trains
 from fidsplat.backends.gradients import on_host
+from fidsplat.backends.opencl import training
 from fidsplat.train import TrainSettings
 from fidsplat.train.device import DeviceWork
 from fidsplat.train.host import HostWork
@@ -93,6 +94,18 @@ def test_loss(renderer, views, works, weight):
         np.testing.assert_allclose(slope.get(), wanted_slope, rtol=1e-3, atol=2e-7)
         again, same = work.loss(drawn(renderer, image), number)
         assert (again(), same.get().tobytes()) == (found, slope.get().tobytes())
+
+
+def test_the_loss_is_summed_piece_by_piece(renderer, views, works, monkeypatch):
+    """As of large pictures, where a work-item adds up more than one value."""
+    monkeypatch.setattr(training, "_SUMS", 2)
+    work, _ = works()
+    truth = views[0].picture / 255.0
+    image = (truth + np.random.default_rng(2).normal(0, 0.2, truth.shape)).astype(np.float32)
+    found = work.loss(drawn(renderer, image), 0)[0]()
+    wanted, _ = picture_loss(image.astype(np.float64), truth, views[0].mask, TrainSettings().dssim_weight)
+    assert found.value == pytest.approx(wanted.value, rel=1e-5)
+    assert found.squared == pytest.approx(wanted.squared, rel=1e-5)
 
 
 def test_masked_values_that_are_not_finite_do_not_count(renderer, views, works):

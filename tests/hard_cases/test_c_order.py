@@ -66,7 +66,7 @@ def test_splats_that_cross_do_not_jump(renderer, name):
 @pytest.mark.parametrize(
     "cloud",
     # the last has more in a tile than is looked at together
-    [c_order.crossing(), c_order.fan(), c_order.crossing(600)],
+    [c_order.crossing(), c_order.fan(), c_order.crossing(200)],
     ids=["crossing", "fan", "many"],
 )
 def test_a_picture_does_not_depend_on_how_much_may_wait(renderer, cloud):

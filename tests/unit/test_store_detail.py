@@ -18,6 +18,7 @@ from fidsplat.store.city import PITCH, City, flight
 from fidsplat.store.detail import MARGIN, Detail, load_details, save_details
 from fidsplat.store.sources import sample, splats_of
 from fidsplat.store.streamed import Streamed
+from fidsplat.vision import read_back
 
 QUALITY = fs.Quality(lowpass="pixel", alpha_cutoff=1e-8)
 
@@ -248,3 +249,19 @@ def test_a_cloud_in_memory_knows_no_detail(renderer):
     assert np.array_equal(
         exact, renderer.render(cloud, camera, quality=QUALITY.with_(detail_error=0.5))["rgb"]
     )
+
+
+def test_markers_on_the_walls_of_a_city_are_read(tmp_path, renderer, capsys):
+    words = ["store", "demo", "-o", str(tmp_path), "--splats", "20000", "--houses", "1", "--views", "0"]
+    assert main([*words, "--markers", "6"]) == 0
+    scene = fs.Scene.load(tmp_path / "city.toml")
+    assert len(scene.markers) == 6
+    for number in (0, 3, 5):
+        pose = scene.markers[number].pose
+        assert pose[1, 3] == pytest.approx(-1.7)
+        camera = fs.Camera.look_at(160, 120, 1.0, pose[:3, 3] - 3.0 * pose[:3, 2], pose[:3, 3])
+        reading = read_back(renderer.render(scene, fs.Capture(camera)), scene, camera).readings[number]
+        assert reading.detection is not None, number
+        assert reading.position_error < 0.01
+    assert main([*words, "--markers", "1001"]) == 2
+    assert "--markers is 1001" in capsys.readouterr().err

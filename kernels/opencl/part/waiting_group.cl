@@ -15,9 +15,10 @@ typedef struct {
     uint splat[IN_REGISTERS];
     Queue *queue;
     uint head, count;               // of the queue
+    bool bounded;                   // whether not all fragments are taken, but those between
 //@@ sorted
-    wide from, until;               // depths between which fragments are taken: at the first from `from_splat` on in the
-    uint from_splat, until_splat;   // list, at the second those before `until_splat`
+    wide from, until;               // these depths: at the first from `from_splat` on in the list, at the second those before
+    uint from_splat, until_splat;   // `until_splat`
 } Waiting;
 
 static inline void waiting_clear(Waiting *waiting) {
@@ -31,6 +32,7 @@ static inline void waiting_start(Waiting *waiting) {
     waiting_clear(waiting);
     waiting->head = waiting->count = 0;
 //@@ sorted_start
+    waiting->bounded = false;
     waiting->from = -INFINITY;
     waiting->until = INFINITY;
     waiting->from_splat = waiting->until_splat = 0;
@@ -84,6 +86,7 @@ static inline void waiting_queue(Pixel *pixel, wide z, wide opacity, uint splat)
 //@@ sorted_drop
         waiting->until = waiting->z[IN_REGISTERS - 1];
         waiting->until_splat = dropped;
+        waiting->bounded = true;
 #pragma unroll
         for (int k = IN_REGISTERS - 1; k > 0; k--) {
             waiting->z[k] = waiting->z[k - 1];
@@ -140,8 +143,10 @@ static inline void waiting_push(Pixel *pixel, wide nearest, wide z, wide opacity
 static inline void waiting_take(Pixel *pixel, wide nearest, wide z, wide opacity, const Seen *seen, uint splat, uint place,
                                 int mask, global const Splat *splats, const BlendConstants *constants) {
     Waiting *waiting = &pixel->waiting;
-    if (z > waiting->until || (z == waiting->until && !waiting_earlier(splats, place, waiting->until_splat))) return;
-    if (z < waiting->from || (z == waiting->from && waiting_earlier(splats, place, waiting->from_splat))) return;
+    if (waiting->bounded) {
+        if (z > waiting->until || (z == waiting->until && !waiting_earlier(splats, place, waiting->until_splat))) return;
+        if (z < waiting->from || (z == waiting->from && waiting_earlier(splats, place, waiting->from_splat))) return;
+    }
 //@@ sorted_take
     waiting_push(pixel, nearest, z, opacity, splat, splats, constants);
 }
