@@ -129,15 +129,12 @@ def test_a_moved_group_is_the_transformed_cloud(renderer):
 def test_blur_is_the_mean_of_its_poses(renderer):
     cloud, camera = random_splats(100, 5, depth=(1, 5), scale=(0.02, 0.3)), CAMERAS["pinhole"]
     shutter = fs.Shutter(time=0.1, exposure_time=0.4, sub_poses=4)
-    frame = renderer.render(
-        cloud, camera, ALL_OUTPUTS, None, background=BACKGROUND, motion=MOTION, shutter=shutter
-    )
+    frame = renderer.render(cloud, camera, ALL_OUTPUTS, background=BACKGROUND, motion=MOTION, shutter=shutter)
     single = [
         renderer.render(
             cloud,
             camera,
             ALL_OUTPUTS,
-            None,
             background=BACKGROUND,
             motion=MOTION,
             shutter=fs.Shutter(time=0.1 + t),
