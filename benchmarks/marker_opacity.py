@@ -47,7 +47,7 @@ def figures(
     side, focal = len(tag.grid) * pixels + 2 * BORDER, away * pixels
     pose = fs.Camera.look_at(side, side, 1.0, (0, 0, -away * tag.module), (0, 0, 0)).world_to_camera
     camera = fs.Camera.pinhole(side, side, focal, focal, side / 2, side / 2, pose)
-    frame = renderer.render(tag.cloud, camera, ("rgb", "alpha"), quality, (0.5, 0.5, 0.5))
+    frame = renderer.render(tag.cloud, camera, ("rgb", "alpha"), quality, background=(0.5, 0.5, 0.5))
     shown, alpha = (frame[name][BORDER:-BORDER, BORDER:-BORDER] for name in ("rgb", "alpha"))
     error = shown.mean(2) - np.kron(1.0 - tag.grid, np.ones((pixels, pixels)))
     edge, rim = max(1, math.ceil(0.02 * pixels)), pixels // 8 + 1

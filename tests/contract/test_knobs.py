@@ -40,7 +40,7 @@ def test_blending_in_double_leaves_the_rounding_of_what_is_written_alone(opencl,
         pytest.skip("the device has no float64")
     quality = DOUBLE.with_(samples=samples)
     outputs, background = ("rgb", "alpha", "depth", "normal"), (0.1, 0.2, 0.3)
-    frame = opencl.render(cloud, CAMERA, outputs, quality, background)
+    frame = opencl.render(cloud, CAMERA, outputs, quality, background=background)
     truth = reference_pixels(cloud, CAMERA, outputs, quality, background)
     roundings = (2 + samples**2) * ROUNDING
     for name in outputs:

@@ -207,7 +207,7 @@ def test_where_a_lens_sees_nothing_there_is_no_distance_and_no_gradient(renderer
         fs.Gradient((0.2, 0.4, 0.9), (0.9, 0.2, 0.1)),
     )
     frame = renderer.render(
-        picture.cloud, picture.camera, picture.outputs, picture.quality, picture.background
+        picture.cloud, picture.camera, picture.outputs, picture.quality, background=picture.background
     )
     rays = View.of(fs.Capture(picture.camera, quality=picture.quality), np.zeros(3)).raster.rays[..., 0]
     seen = (~np.isnan(rays)).reshape(picture.camera.height, 2, picture.camera.width, 2).sum((1, 3))

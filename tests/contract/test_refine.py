@@ -27,7 +27,7 @@ def shown(renderer, marker):
     pose[2, 3] = focal * marker.module / 12
     camera = fs.Camera.pinhole(side, side, focal, focal, side / 2, side / 2, pose)
     quality = fs.Quality(lowpass="none", samples=3)
-    frame = renderer.render(marker.gaussians, camera, ("rgb", "alpha"), quality, GREY)
+    frame = renderer.render(marker.gaussians, camera, ("rgb", "alpha"), quality, background=GREY)
     ideal = np.kron(1.0 - marker.grid, np.ones((12, 12)))
     return frame["rgb"].mean(2) - ideal, frame["alpha"][1:-1, 1:-1]
 

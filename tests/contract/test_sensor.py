@@ -184,7 +184,7 @@ def test_light_falls_off_from_the_principal_point(renderer, samples):
     """By the formula, at the centres of pixels; black, not negative, in the corners."""
     camera = fs.Camera.pinhole(61, 41, 50.0, 50.0, 20.0, 25.0)
     sensor = fs.Sensor(vignetting=(-1.5, 0.3, -0.1))
-    frame = renderer.render(EMPTY, camera, None, fs.Quality(samples=samples), GREY, sensor=sensor)
+    frame = renderer.render(EMPTY, camera, None, fs.Quality(samples=samples), background=GREY, sensor=sensor)
     rows, columns = np.mgrid[0:41, 0:61] + 0.5
     squared = ((columns - 20) ** 2 + (rows - 25) ** 2) / (math.hypot(61, 41) / 2) ** 2
     light = np.maximum(1 - 1.5 * squared + 0.3 * squared**2 - 0.1 * squared**3, 0)

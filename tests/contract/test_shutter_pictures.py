@@ -62,7 +62,9 @@ def truth(cloud, camera, quality, outputs, motion, shutter):
 
 def assert_exposed(renderer, cloud, camera, motion, shutter, quality=None, outputs=ALL_OUTPUTS):
     quality = Quality.of(quality)
-    frame = renderer.render(cloud, camera, outputs, quality, BACKGROUND, motion, shutter)
+    frame = renderer.render(
+        cloud, camera, outputs, quality, background=BACKGROUND, motion=motion, shutter=shutter
+    )
     differences = compare(frame, truth(cloud, camera, quality, outputs, motion, shutter), outputs)
     assert all(difference.agrees for difference in differences), differences
     return frame
@@ -127,9 +129,16 @@ def test_a_moved_group_is_the_transformed_cloud(renderer):
 def test_blur_is_the_mean_of_its_poses(renderer):
     cloud, camera = random_splats(100, 5, depth=(1, 5), scale=(0.02, 0.3)), CAMERAS["pinhole"]
     shutter = fs.Shutter(time=0.1, exposure_time=0.4, sub_poses=4)
-    frame = renderer.render(cloud, camera, ALL_OUTPUTS, None, BACKGROUND, MOTION, shutter)
+    frame = renderer.render(cloud, camera, ALL_OUTPUTS, background=BACKGROUND, motion=MOTION, shutter=shutter)
     single = [
-        renderer.render(cloud, camera, ALL_OUTPUTS, None, BACKGROUND, MOTION, fs.Shutter(time=0.1 + t))
+        renderer.render(
+            cloud,
+            camera,
+            ALL_OUTPUTS,
+            background=BACKGROUND,
+            motion=MOTION,
+            shutter=fs.Shutter(time=0.1 + t),
+        )
         for t in (-0.15, -0.05, 0.05, 0.15)
     ]
     for name in ("rgb", "alpha"):
