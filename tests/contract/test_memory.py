@@ -91,10 +91,12 @@ def test_one_pair_more_than_the_budget_makes_a_second_band(opencl, cloud, whole,
     assert all(np.array_equal(frame[name], image) for name, image in images.items())
 
 
+@pytest.mark.parametrize("scale", [(0.05, 0.1), (1.0, 2.0)], ids=["windows", "big"])
 @machines
-def test_nothing_is_written_beyond_the_room_for_lists(opencl, monkeypatch, machine):
-    """Neither where they just fit nor, on a GPU, where the picture has more pairs than there is room for."""
-    own, some = machine(opencl), random_splats(300, seed=4)
+def test_nothing_is_written_beyond_the_room_for_lists(opencl, monkeypatch, machine, scale):
+    """Neither where they just fit nor, on a GPU, where the picture has more pairs than there is room for: of
+    splats that touch few tiles, and of big ones, whose pairs are written elsewhere."""
+    own, some = machine(opencl), random_splats(300, seed=4, scale=scale)
     wanted = own.render(some, CAMERA)
     pairs, pool, queue = wanted.stats["pairs"], own.backend.pool, own.backend.queue
     words = {"lists": pairs}
