@@ -6,10 +6,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any, BinaryIO
-
-import numpy as np
 
 from fidsplat.errors import InputError
 
@@ -52,14 +49,6 @@ def from_json(text: str | bytes) -> Any:
         return json.loads(text)
     except RecursionError:
         raise ValueError("it nests too deeply") from None
-
-
-def load_array(file: Path) -> np.ndarray:
-    """The array of an .npy file. Raises OSError, EOFError or ValueError, whatever is damaged."""
-    try:
-        return np.load(file, allow_pickle=False)
-    except TokenError as error:  # of the header's Python
-        raise ValueError(f"its header is damaged: {error}") from None
 
 
 @contextmanager

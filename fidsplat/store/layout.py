@@ -19,12 +19,13 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, from_json, load_array
+from fidsplat.files import atomic_write, from_json
 
 FORMAT, VERSION = "fidsplat store", 1
 SUFFIX = ".fss"
@@ -164,6 +165,14 @@ def shapes_of(sh_degree: int) -> dict[str, tuple[int, ...]]:
     shapes: dict[str, tuple[int, ...]] = {"means": (3,), "quats": (4,), "scales": (2,), "opacities": ()}
     shapes |= {"labels": (), "planes": (), "thickness": ()}
     return shapes | ({"colors": (3,)} if sh_degree < 0 else {"sh": ((sh_degree + 1) ** 2, 3)})
+
+
+def load_array(file: Path) -> np.ndarray:
+    """The array of an .npy file. Raises OSError, EOFError or ValueError, whatever is damaged."""
+    try:
+        return np.load(file, allow_pickle=False)
+    except TokenError as error:  # of the header's Python
+        raise ValueError(f"its header is damaged: {error}") from None
 
 
 def npy_header(kind: str, shape: tuple[int, ...]) -> bytes:

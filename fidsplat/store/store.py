@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fidsplat.errors import InputError
-from fidsplat.files import load_array, path_of
+from fidsplat.files import path_of
 from fidsplat.formats.collect import Progress
 from fidsplat.quality import Quality
 from fidsplat.rotations import check_similarity, matrix_to_quaternion
@@ -286,7 +286,7 @@ class Store(Summarised):
 
 def _read_poses(folder: Path, crc: int | None) -> np.ndarray:
     try:
-        poses = load_array(folder / layout.PLACES)
+        poses = layout.load_array(folder / layout.PLACES)
     except (OSError, ValueError, EOFError) as error:
         raise InputError(
             f"{folder / layout.PLACES} cannot be read ({error}); place the store again"

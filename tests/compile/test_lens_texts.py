@@ -27,10 +27,10 @@ CAMERAS = {
 
 # of the texts as they were before there were lenses; a change here changes what every plain picture runs
 BEFORE_LENSES = {
-    ("lanes", ("rgb",)): "05ec20caf8ba0db7c042966c0440cafa953d40eaedeeb6f81ba517fa0d7aac4e",
-    ("lanes", OUTPUTS): "b3924db982e967a646c2ca707519e2d17bf39f1f872926fd047537158cee836c",
-    ("group", ("rgb",)): "d4057165b4378f5244ed463107ffb01356723c3138e28d5db79e2e599a57e242",
-    ("group", OUTPUTS): "5c31d31bc2774882f396b2bccc3cfeda259ea6692c41d8cea1b0ede18b41ce98",
+    ("lanes", ("rgb",)): "c86a594d5e085deb8fd549b537ef8c2d970d3f2812216f826a66f0bb641592e4",
+    ("lanes", OUTPUTS): "f0a3af7ea1eab7b5054c7b46dfdfe1f00592f3b135c025ae2ea880f99eaeb411",
+    ("group", ("rgb",)): "540560131e01013c2f3af646e7ce4a77efe8edb5b1beef4ce015994ed54c945c",
+    ("group", OUTPUTS): "8579f09f876099117e49560f01b771766b99cdb60b2ee8996fdb74e53c5d3be1",
 }
 
 

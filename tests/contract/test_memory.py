@@ -91,11 +91,18 @@ def test_one_pair_more_than_the_budget_makes_a_second_band(opencl, cloud, whole,
     assert all(np.array_equal(frame[name], image) for name, image in images.items())
 
 
+@pytest.mark.parametrize("views", [1, 2])
+@pytest.mark.parametrize("scale", [(0.05, 0.1), (1.0, 2.0)], ids=["windows", "big"])
 @machines
-def test_nothing_is_written_beyond_the_room_for_lists(opencl, monkeypatch, machine):
-    """Neither where they just fit nor, on a GPU, where the picture has more pairs than there is room for."""
-    own, some = machine(opencl), random_splats(300, seed=4)
-    wanted = own.render(some, CAMERA)
+def test_nothing_is_written_beyond_the_room_for_lists(opencl, monkeypatch, machine, scale, views):
+    """Neither where they just fit nor, on a GPU, where there are more pairs than there is room for: of splats
+    that touch few tiles, and of big ones, whose pairs are written elsewhere, as those of many views are."""
+    own, some = machine(opencl), random_splats(300, seed=4, scale=scale)
+
+    def drawn():
+        return own.render(some, CAMERA) if views == 1 else own.render_batch(some, [CAMERA] * views)
+
+    wanted = drawn()
     pairs, pool, queue = wanted.stats["pairs"], own.backend.pool, own.backend.queue
     words = {"lists": pairs}
     if machine is as_on_a_gpu:
@@ -119,7 +126,7 @@ def test_nothing_is_written_beyond_the_room_for_lists(opencl, monkeypatch, machi
     for name in words:
         buffer = pool.scratch(name, max(pool.size(name), 4 * pairs + 64))
         cl.enqueue_fill_buffer(queue, buffer, np.uint32([UNTOUCHED]), 0, buffer.size)
-    frame = own.render(some, CAMERA)
+    frame = drawn()
     assert np.array_equal(frame["rgb"], wanted["rgb"])
     if machine is own_device:
         look()

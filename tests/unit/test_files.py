@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, load_array, writable_folder
+from fidsplat.files import atomic_write, writable_folder
+from fidsplat.store.layout import load_array
 from fidsplat.train.read import load_dataset
 
 

@@ -11,7 +11,7 @@ CAMERA = fs.Camera.pinhole(32, 24, 30.0, 30.0, 16.0, 12.0)
 
 def test_a_still_capture_is_prepared_once_for_each_cloud():
     renderer = fs.Renderer("reference")
-    first, second = (renderer.upload(random_splats(3, seed))._data for seed in (1, 2))
+    first, second = (renderer.upload(random_splats(3, seed)).data for seed in (1, 2))
     capture = fs.Capture(CAMERA)
     assert prepare(first, capture)[1] is prepare(first, capture)[1]
     assert prepare(first, capture)[1] is not prepare(second, capture)[1]
@@ -26,7 +26,7 @@ def test_what_moves_is_asked_again():
         pose[0, 3] = next(poses)
         return pose
 
-    data = fs.Renderer("reference").upload(random_splats(3, 1))._data
+    data = fs.Renderer("reference").upload(random_splats(3, 1)).data
     for motion in (fs.Motion(stepping), fs.Motion(None, {0: stepping})):
         capture = fs.Capture(CAMERA, motion=motion)
         views = [prepare(data, capture)[1] for _ in range(2)]

@@ -130,6 +130,8 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         files.append("list/tiled.cl")
     if "compose_pixel" in layouts:
         files.append(LAYOUTS[f"waiting_{shape.schedule}"].file)
+    elif shape.schedule == "lanes":
+        files.append(LAYOUTS["walk_lanes"].file)
     if "opaque_layer" in layouts:  # behind what waits
         files.append(LAYOUTS["opaque_layer_end"].file)
     stages = {

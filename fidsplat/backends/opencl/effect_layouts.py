@@ -176,6 +176,8 @@ LAYOUTS: dict[str, Layout] = {
     # how pixels are made of samples, and by whom
     "resolve_pixel": Layout("part/resolve_pixel.cl"),
     "resolve_at_once": Layout("part/resolve_at_once.cl"),
+    # how CPUs go through a list where nothing waits
+    "walk_lanes": Layout("part/walk_lanes.cl"),
     # how fragments wait for nearer ones, by the schedule
     "waiting_lanes": Layout("part/waiting_lanes.cl"),
     "waiting_group": Layout("part/waiting_group.cl"),

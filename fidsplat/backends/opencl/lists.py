@@ -1,9 +1,10 @@
-"""The lists of splats per tile, in depth order, made in one of two ways.
+"""The lists of splats per tile, in depth order, made in one of two ways, of which one has a variant.
 
 On CPUs (`ordered`) all visible splats are sorted by depth, then listed per tile in that order, by counting
 sorts over a few contiguous pieces: long sequential walks and no atomics. On GPUs (`tiled`) every splat counts
 its tiles while it is projected, pairs are written to the tiles in any order, and each tile's list is sorted
-in local memory: few launches, all of them wide. docs/growth.md has both on both kinds of device.
+in local memory: few launches, all of them wide. Of many small views (`gathered`) tiles are counted for
+thousands of splats at a time, in local memory. docs/growth.md has both ways on both kinds of device.
 """
 
 from __future__ import annotations
@@ -234,7 +235,7 @@ class ChunkedLists(OrderedLists):
 class TiledLists(Lists):
     """Kernels tiles.cl. The buffers are as large as the last pictures needed, and all stages are launched
     before the host knows whether that is enough; if it is not, the lists are empty and it is all done again:
-    at once, or, where one of its kind was drawn before, when somebody asks (`enough`).
+    at once, or, where one of its kind was drawn before, when somebody asks for it (`Repeat.settled`).
     """
 
     _ITEMS = 256  # WALK_ITEMS and SORT_ITEMS

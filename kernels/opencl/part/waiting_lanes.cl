@@ -6,7 +6,6 @@
 // A tile's list is walked through in chunks, and of a chunk block after block: so what waits at a block stays in the cache, and
 // each block has the chunk's splats in the order of their least depth there, which is mostly that of their fragments.
 //@ compose_types
-#define BY_BLOCKS
 #define CHUNK 128
 #define NOTHING INFINITY            // the depth where nothing waits in the queue
 #define NONE (-INFINITY)            // and where nothing is held
@@ -85,6 +84,8 @@ static inline void waiting_start(Waiting *waiting) {
                 const Splat s = splats[lists[k]];
                 wide half_r2 = s.log_opacity - constants.log_cut;
 //@ walk_end
+            }
+        }
     }
 //@ compose_functions
 // Composites what waits nearer than `nearest`, but what shares an entry with something further.

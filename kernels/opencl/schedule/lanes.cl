@@ -50,17 +50,7 @@ kernel void blend(
 
     uint base = starts[band_first];
 //@@ pass
-#ifdef BY_BLOCKS
 //@@ walk
-#else
-    for (uint k = starts[tile] - base, end = starts[tile + 1] - base; k < end && alive; k++) {
-        FETCH_AHEAD(splats + lists[min(k + AHEAD_SPLATS, end - 1)]);
-        FETCH_AHEAD((global const char *)(splats + lists[min(k + AHEAD_SPLATS, end - 1)]) + 64);
-        const Splat s = splats[lists[k]];
-        wide half_r2 = s.log_opacity - constants.log_cut;
-        for (uint touched = alive & touched_blocks(&s, x0, y0, half_r2, constants.filter); touched != 0; touched &= touched - 1) {
-            int block = 31 - clz((int)(touched & -touched));
-#endif
             vfloat x = (float)(x0 + LEFT(block) - s.ax) + BLOCK_X, y = (float)(y0 + TOP(block) - s.ay) + BLOCK_Y;
             vfloat nu_x = FMA((vfloat)s.nux, x, (vfloat)s.nu0);
             vfloat nv_x = FMA((vfloat)s.nvx, x, (vfloat)s.nv0);
@@ -75,8 +65,6 @@ kernel void blend(
 //@@ blend_arguments
             );
             if (!VANY(pixel_unfinished(&pixels[block], &constants))) alive &= ~(1u << block);
-        }
-    }
 //@@ walk_end
 //@@ pass_end
 
