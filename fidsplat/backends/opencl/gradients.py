@@ -18,9 +18,9 @@ from fidsplat.backends.gradients import (
     check_shape,
     gradient_shape,
 )
+from fidsplat.backends.opencl.counts import pairs_of
 from fidsplat.backends.opencl.gradients_source import assemble_gradients, chunk_of
 from fidsplat.backends.opencl.images import OpenCLImages
-from fidsplat.backends.opencl.lists import pairs_of
 from fidsplat.backends.opencl.picture import Picture
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
 from fidsplat.backends.opencl.program import Program

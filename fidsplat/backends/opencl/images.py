@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyopencl as cl
 
-from fidsplat.backends.opencl.lists import fullness_of, read_counts, stats_of
+from fidsplat.backends.opencl.counts import fullness_of, read_counts, stats_of
 from fidsplat.backends.opencl.picture import Picture
 from fidsplat.backends.opencl.recording import Recording
 from fidsplat.backends.opencl.resident import Resident

@@ -9,7 +9,7 @@ thousands of splats at a time, in local memory. docs/growth.md has both ways on 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 import pyopencl as cl
 
 from fidsplat.backends.bands import cut
+from fidsplat.backends.opencl.counts import COUNTS, counts_after, fullness_of, read_counts, stats_of
 from fidsplat.backends.opencl.memory_plan import BIG, KEYS, WINDOWS
 from fidsplat.backends.opencl.picture import Picture
 from fidsplat.backends.opencl.workspace import Workspace
@@ -24,8 +25,6 @@ from fidsplat.errors import DeviceError
 
 # words of the buffer `tallies`, as in prelude.cl
 _VISIBLE, _PAIRS, _BIG, _TALLIES = 0, 2, 6, 8
-# words of the buffer `counts`, as in tiles.cl: big splats, pairs (two words), visible splats
-_COUNTS = 4
 _NO_WINDOW = np.array([0xFFFFFFFF, 0], np.uint32)
 
 
@@ -258,7 +257,7 @@ class TiledLists(Lists):
         picture = self.picture
         picture.put_view(0, picture.rows)
         # what the host reads has a buffer of its own: `emit` adds to it meanwhile
-        picture.lease("counts", 4 * _COUNTS)
+        picture.lease("counts", 4 * COUNTS)
         capacity = self.capacity(picture.workspace)
         if picture.trusted:
             capacity = min(capacity, picture.trusted)
@@ -334,21 +333,7 @@ class TiledLists(Lists):
 
     def _read(self, counted: cl.Event) -> tuple[int, int]:
         """Numbers of big splats and of pairs as `counted` has left them, while later stages picture."""
-        return fullness_of(_counts_after(counted, self.picture))
-
-
-def pairs_of(picture: Picture) -> int | None:
-    """How many pairs a picture had; None where it was `trusted` to have fewer, so that nothing was drawn.
-    Waits until the device has counted, not until it has drawn."""
-    if picture.counted is None:
-        return picture.pairs
-    big, pairs = fullness_of(_counts_after(picture.counted, picture))
-    return pairs if big <= picture.held["big_capacity"] and pairs <= picture.pairs else None
-
-
-def _counts_after(counted: cl.Event, picture: Picture) -> np.ndarray:
-    picture.queue.flush()
-    return read_counts(picture.workspace.side_queue, picture.held["counts"], [counted])
+        return fullness_of(counts_after(counted, self.picture))
 
 
 class GatheredLists(TiledLists):
@@ -378,25 +363,6 @@ class GatheredLists(TiledLists):
             return
         groups, items = -(-count // self._GATHERED), picture.shape.scan_items
         picture.launch("bin", kernel, groups * items, items, picture.views, count=count, **given)
-
-
-def read_counts(
-    queue: cl.CommandQueue, counts: cl.Buffer, after: Sequence[cl.Event] | None = None
-) -> np.ndarray:
-    """The words of the buffer `counts` of a picture, once it is drawn or what is given is done."""
-    words = np.empty(_COUNTS, np.uint32)
-    cl.enqueue_copy(queue, words, counts, wait_for=after)
-    return words
-
-
-def fullness_of(words: np.ndarray) -> tuple[int, int]:
-    """Numbers of big splats and of pairs of a picture's `counts`."""
-    return int(words[0]), int(words[1]) | int(words[2]) << 32
-
-
-def stats_of(splats: int, words: np.ndarray) -> dict[str, int]:
-    """What a frame tells of a picture's `counts`."""
-    return {"splats": splats, "visible": int(words[3]), "pairs": fullness_of(words)[1]}
 
 
 LISTS = {"ordered": OrderedLists, "chunked": ChunkedLists, "tiled": TiledLists, "gathered": GatheredLists}
