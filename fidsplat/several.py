@@ -120,7 +120,10 @@ class SeveralDevices:
         try:
             for line in cycle(lines):
                 try:
-                    line.ask(next(rest))
+                    capture = next(rest)
+                    if capture is None:
+                        raise InputError("no camera; give a Camera, or a Capture with one")
+                    line.ask(capture)
                 except StopIteration:
                     break
                 except Exception as error:

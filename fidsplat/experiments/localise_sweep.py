@@ -158,8 +158,11 @@ def _draw(folder: Path, found: Found) -> None:
     errors = {name: 100 * facts["ate_m"] for name, facts in found.items()}
     shown = [name for name in _SHOWN if name in errors]
     with chart(folder / CHART, panels=2, size=(11.0, 4.6), one_scale=False) as (figure, axes):
+        # the drive at its own speed, or at that of the variants that were measured
+        truth = min(folder.glob("truth*.tum"), key=lambda file: len(file.name))
         for number, name in enumerate(["truth", *shown]):
-            path = load_trajectory(folder / _tum(name)).poses[::10, :2, 3]  # every fifth of a second
+            file = folder / _tum(name) if number else truth
+            path = load_trajectory(file).poses[::10, :2, 3]  # every fifth of a second
             width, colour = (3.0, "#bbbbbb") if number == 0 else (1.0, COLOURS[number % len(COLOURS)])
             axes[0].plot(path[:, 0], path[:, 1], label=name, color=colour, linewidth=width)
         axes[0].set_aspect("equal")

@@ -15,6 +15,7 @@ from fidsplat.sim.localiser import Localiser
 mujoco = pytest.importorskip("mujoco", reason="pip install 'fidsplat[sim]'")
 
 from fidsplat.experiments.localise import Localise, errors_of, write_log  # noqa: E402 (needs MuJoCo)
+from fidsplat.experiments.localise_sweep import write_report  # noqa: E402
 from fidsplat.sim.greenhouse import Greenhouse  # noqa: E402
 from fidsplat.sim.robot import BODY, CAMERA_AT, Errors, Run, camera_at, drive, mount  # noqa: E402
 
@@ -223,3 +224,11 @@ def test_with_ideal_corners_it_knows_its_way():
     assert sum(each["tags"] for each in bins) == sum(map(len, sightings))
     back = asked.corner_errors(moved, asked.ideal(moved, off), asked.camera)
     assert [each["median_px"] for each in back] == pytest.approx([0.0, 0.0, None, None])
+
+
+def test_a_drive_at_another_speed_alone_has_a_page(tmp_path):
+    times = np.arange(20) / 10
+    fs.save_trajectory(fs.Trajectory(times, np.tile(np.eye(4), (20, 1, 1))), tmp_path / "truth-0.25-m-s.tum")
+    facts = {"ate_m": 0.01, "worst_m": 0.02, "rpe_m": 0.01, "heading_deg": 0.1, "tags": 3, "refused": 0}
+    page = write_report(tmp_path, Localise(), "a device", {"0.25 m/s, blur": facts | {"length_m": 60.2}})
+    assert "0.25 m/s, blur" in page.read_text()

@@ -125,6 +125,10 @@ def test_pictures_come_before_the_failure_of_what_asks_for_them(store, two):
     assert len(made) == 2
     with pytest.raises(fs.InputError, match="must be a list of Capture or Camera"):
         list(two.render_views(store, 3))
+    frames = two.render_views(store, [look(), None, look()])  # type: ignore[list-item]
+    assert next(frames).outputs
+    with pytest.raises(fs.InputError, match="no camera"):
+        next(frames)
 
 
 def test_views_may_be_left_before_their_end(store, two):
