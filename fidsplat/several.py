@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from itertools import cycle, pairwise
 from queue import SimpleQueue
 from threading import Thread
@@ -113,17 +114,15 @@ class SeveralDevices:
         except TypeError:
             raise InputError(f"captures is {captures!r}; it must be a list of Capture or Camera") from None
         lines = [
-            _Line(renderer, one, names, quality) for renderer, one in zip(self.renderers, given, strict=True)
+            _Line(partial(renderer.render_views, one, outputs=names, quality=quality))
+            for renderer, one in zip(self.renderers, given, strict=True)
         ]
         waiting: deque[_Line] = deque()
         failure: Exception | None = None
         try:
             for line in cycle(lines):
                 try:
-                    capture = next(rest)
-                    if capture is None:
-                        raise InputError("no camera; give a Camera, or a Capture with one")
-                    line.ask(capture)
+                    line.ask(next(rest))
                 except StopIteration:
                     break
                 except Exception as error:
@@ -133,7 +132,7 @@ class SeveralDevices:
                 if len(waiting) > _AHEAD * len(lines):
                     yield waiting.popleft().result()
             for line in lines:
-                line.ask(None)
+                line.end()
             while waiting:
                 yield waiting.popleft().result()
         finally:
@@ -170,23 +169,23 @@ class SeveralDevices:
 class _Line:
     """One device's part of many pictures, on a thread of its own."""
 
-    def __init__(
-        self,
-        renderer: Renderer,
-        scene: ResidentCloud,
-        outputs: tuple[str, ...] | None,
-        quality: Quality | str | None,
-    ) -> None:
-        self._asked: SimpleQueue[Capture | Camera | None] = SimpleQueue()
+    _END = object()
+
+    def __init__(self, draw: Callable[[Iterator[Any]], Iterator[Frame]]) -> None:
+        """draw: the pictures of captures, as `Renderer.render_views`."""
+        self._asked: SimpleQueue[Any] = SimpleQueue()
         self._made: SimpleQueue[Frame | BaseException] = SimpleQueue()
         self._stopped = False
-        given = renderer, scene, outputs, quality
-        self._thread = Thread(target=self._draw, args=given, name="fidsplat-device", daemon=True)
+        self._thread = Thread(target=self._run, args=(draw,), name="fidsplat-device", daemon=True)
         self._thread.start()
 
-    def ask(self, capture: Capture | Camera | None) -> None:
-        """For a picture; None: for no more."""
+    def ask(self, capture: Any) -> None:
+        """For a picture; what is no capture is told by its `result`."""
         self._asked.put(capture)
+
+    def end(self) -> None:
+        """No more is asked for."""
+        self._asked.put(self._END)
 
     def result(self) -> Frame:
         """The next picture, once it is on the host. Raises what drawing it has raised."""
@@ -198,22 +197,18 @@ class _Line:
     def stop(self) -> None:
         """Draw nothing more, and wait for what is being drawn."""
         self._stopped = True
-        self._asked.put(None)
+        self.end()
         self._thread.join()
 
-    def _captures(self) -> Iterator[Capture | Camera]:
-        while (capture := self._asked.get()) is not None and not self._stopped:
+    def _captures(self) -> Iterator[Any]:
+        for capture in iter(self._asked.get, self._END):
+            if self._stopped:
+                return
             yield capture
 
-    def _draw(
-        self,
-        renderer: Renderer,
-        scene: ResidentCloud,
-        outputs: tuple[str, ...] | None,
-        quality: Quality | str | None,
-    ) -> None:
+    def _run(self, draw: Callable[[Iterator[Any]], Iterator[Frame]]) -> None:
         try:
-            for frame in renderer.render_views(scene, self._captures(), outputs, quality):
+            for frame in draw(self._captures()):
                 for name in frame.outputs:
                     _ = frame[name]
                 self._made.put(frame)

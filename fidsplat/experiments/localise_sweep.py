@@ -85,8 +85,7 @@ class _Drive:
         """A drive, its truth kept beside the results."""
         if speed not in self._runs:
             run = self._runs[speed] = self._asked.run(speed)
-            name = "truth" if speed is None else f"truth {speed:g} m/s"
-            save_trajectory(Trajectory(run.times, run.poses), self._folder / _tum(name))
+            save_trajectory(Trajectory(run.times, run.poses), self._folder / _tum(_truth(speed)))
         return self._runs[speed]
 
     def _sightings(self, name: str, taken: Variant, run: Run) -> list[list[Detection]]:
@@ -158,11 +157,10 @@ def _draw(folder: Path, found: Found) -> None:
     errors = {name: 100 * facts["ate_m"] for name, facts in found.items()}
     shown = [name for name in _SHOWN if name in errors]
     with chart(folder / CHART, panels=2, size=(11.0, 4.6), one_scale=False) as (figure, axes):
-        # the drive at its own speed, or at that of the variants that were measured
-        truth = min(folder.glob("truth*.tum"), key=lambda file: len(file.name))
-        for number, name in enumerate(["truth", *shown]):
-            file = folder / _tum(name) if number else truth
-            path = load_trajectory(file).poses[::10, :2, 3]  # every fifth of a second
+        # the drive at its own speed, or at that of the first variant that was measured
+        speeds = [VARIANTS[name].speed for name in found]
+        for number, name in enumerate([_truth(None if None in speeds else speeds[0]), *shown]):
+            path = load_trajectory(folder / _tum(name)).poses[::10, :2, 3]  # every fifth of a second
             width, colour = (3.0, "#bbbbbb") if number == 0 else (1.0, COLOURS[number % len(COLOURS)])
             axes[0].plot(path[:, 0], path[:, 1], label=name, color=colour, linewidth=width)
         axes[0].set_aspect("equal")
@@ -173,6 +171,11 @@ def _draw(folder: Path, found: Found) -> None:
         axes[1].set_xlabel("absolute trajectory error [cm]")
         axes[1].grid(axis="y", visible=False)
         legend_above(figure, axes[0])
+
+
+def _truth(speed: float | None) -> str:
+    """The name of the way that was driven at a speed; None: at the drive's own."""
+    return "truth" if speed is None else f"truth {speed:g} m/s"
 
 
 def _tum(name: str) -> str:
