@@ -3,7 +3,7 @@
 import numpy as np
 
 import fidsplat as fs
-from fidsplat.train import Dataset, TrainingView
+from fidsplat.train import Dataset, Trainer, TrainingView
 from fidsplat.vision.images import to_uint8
 
 BACKGROUND = (0.2, 0.3, 0.4)
@@ -45,3 +45,18 @@ def scene(views=4, held_out=1, size=(24, 18), count=16, renderer=None):
     points = cloud.world_means() + random.normal(0, 0.02, (count, 3))
     grey = np.full((count, 3), 128, np.uint8)
     return Dataset("tiny", tuple(drawn[held_out:]), tuple(drawn[:held_out]), points, grey, BACKGROUND)
+
+
+def run_and_resumed(whole, renderer, settings, steps, folder):
+    """Bytes of the PLY of a trainer that has run, and of one that is stopped after so many steps and goes on
+    from its checkpoint."""
+    checkpoint = folder / "run.training.npz"
+    first = Trainer(whole.dataset, renderer, checkpoint=checkpoint, **settings)
+    for _ in range(steps):
+        first.step()
+    first.save_checkpoint()
+    again = Trainer(whole.dataset, renderer, checkpoint=checkpoint, **settings)
+    again.run()
+    for name, trainer in (("a", whole), ("b", again)):
+        trainer.save(folder / f"{name}.ply")
+    return [(folder / f"{name}.ply").read_bytes() for name in "ab"]

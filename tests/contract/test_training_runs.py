@@ -5,7 +5,7 @@ import hashlib
 
 import numpy as np
 import pytest
-from training_scene import QUICK, scene
+from training_scene import QUICK, run_and_resumed, scene
 
 from fidsplat.formats import load_ply
 from fidsplat.train import Trainer
@@ -38,15 +38,6 @@ def test_a_run_raises_the_psnr_and_repeats_to_the_byte(renderer, dataset, settin
     )
     assert 16 < len(whole.cloud()) <= 30
 
-    checkpoint = tmp_path / "run.training.npz"
-    first = Trainer(dataset, renderer, checkpoint=checkpoint, **settings)
-    for _ in range(21):
-        first.step()
-    first.save_checkpoint()
-    again = Trainer(dataset, renderer, checkpoint=checkpoint, **settings)
-    again.run()
-    for name, trainer in (("a", whole), ("b", again)):
-        trainer.save(tmp_path / f"{name}.ply")
-    first, second = ((tmp_path / f"{name}.ply").read_bytes() for name in "ab")
+    first, second = run_and_resumed(whole, renderer, settings, 21, tmp_path)
     assert hashlib.sha256(first).hexdigest() == hashlib.sha256(second).hexdigest()
     assert load_ply(tmp_path / "a.ply").sh_degree == 1

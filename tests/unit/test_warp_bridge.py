@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from training_scene import QUICK, scene
+from training_scene import QUICK, run_and_resumed, scene
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
@@ -131,17 +131,10 @@ def test_derivatives_that_cannot_be_taken_are_errors(renderer):
 def test_training_on_warp_repeats_to_the_byte_and_after_a_stop(renderer, tmp_path):
     """By the work of a step in NumPy, as Warp has no kernels of its own for it."""
     settings = {**QUICK, "iterations": 20, "sh_degree": 0, "growth": 1.2}
-    dataset, checkpoint = scene(), tmp_path / "run.training.npz"
+    dataset = scene()
     whole = Trainer(dataset, renderer, **settings)
     before = np.mean([each.psnr for each in whole.evaluate(dataset.views)])
     whole.run()
     assert np.mean([each.psnr for each in whole.evaluate(dataset.views)]) > before + 1
-    first = Trainer(dataset, renderer, checkpoint=checkpoint, **settings)
-    for _ in range(11):
-        first.step()
-    first.save_checkpoint()
-    again = Trainer(dataset, renderer, checkpoint=checkpoint, **settings)
-    again.run()
-    for name, trainer in (("a", whole), ("b", again)):
-        trainer.save(tmp_path / f"{name}.ply")
-    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    first, second = run_and_resumed(whole, renderer, settings, 11, tmp_path)
+    assert first == second
