@@ -41,14 +41,16 @@ JPEG = 75
 
 def check_port(host: str, port: int) -> None:
     """Raises InputError where the port cannot be had: viser would take the next one in silence; likewise for
-    a host that is empty, by which the whole network would be let in."""
+    a port that is none, and a host that is empty, by which the whole network would be let in."""
+    if not 0 <= port <= 65535:
+        raise InputError(f"--port is {port}; give a number from 1 to 65535, or 0 for any that is free")
     if not host:
         raise InputError("--host is empty; give an address to listen on, 127.0.0.1 for this machine alone")
     try:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
-    except (OSError, OverflowError, UnicodeError) as error:
+    except (OSError, UnicodeError) as error:
         why = getattr(error, "strerror", None) or error
         of_host = isinstance(error, (socket.gaierror, UnicodeError)) or error.args[0] == errno.EADDRNOTAVAIL
         remedy = "--host must be an address of this machine" if of_host else "give another --port"
