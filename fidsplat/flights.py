@@ -153,7 +153,8 @@ class FlightFolder:
         frames = renderer.render_views(resident, [self.flight.captures[k] for k in left])
         for k, frame in zip(left, frames, strict=True):
             for name in frame.outputs:
-                save_output(name, frame[name], lambda output, suffix, k=k: self.file(k, output, suffix), bits)
+                image = frame.to_uint8() if name == "rgb" and bits != 16 else frame[name]
+                save_output(name, image, lambda output, suffix, k=k: self.file(k, output, suffix), bits)
             yield k
 
     def pictures(self) -> list[Path]:

@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from fidsplat.backends.base import GivesArrays, Images, ReadsRows, Waits
+from fidsplat.backends.base import GivesArrays, GivesUint8, Images, ReadsRows, Waits
 from fidsplat.errors import InputError, MissingOutputError
 
 Ids = Callable[[], np.ndarray] | None
@@ -60,6 +60,22 @@ class Frame(Mapping):
                 "'warp:cpu', or take frame[name], which is copied to the host"
             )
         return self._images.device_array(name)
+
+    def to_uint8(self) -> np.ndarray:
+        """`rgb` as files of 8 bits have it, (h, w, 3) uint8: clamped to [0, 1], times 255, rounded to the
+        nearest; 0 where it is no number. Made on the device where that can, so that a quarter of the bytes is
+        copied; the same bits on the host of `frame["rgb"]`, where that has been read.
+
+        Raises:
+            InputError: `rgb` was not asked for.
+        """
+        self._check("rgb")
+        if "rgb" not in self._arrays and isinstance(self._images, GivesUint8):
+            check_process(self._process, "frame")
+            return self._images.read_uint8("rgb")
+        from fidsplat.vision.images import to_uint8  # late: it brings OpenCV
+
+        return to_uint8(self["rgb"])
 
     def to_torch(self, name: str = "rgb") -> Any:
         """The image as a torch tensor: without a copy on the device that drew it where that has arrays to

@@ -148,6 +148,16 @@ class GivesFloat64(Protocol):
 
 
 @runtime_checkable
+class GivesUint8(Protocol):
+    """Images whose 8-bit values the device makes, so that a quarter of the bytes is copied."""
+
+    def read_uint8(self, name: str) -> np.ndarray:
+        """An image of floats in [0, 1] as `to_uint8` (fidsplat/vision/images.py) makes it of what `read`
+        gives, bit for bit: a NumPy array of its own, (h, w) or (h, w, channels) uint8."""
+        ...
+
+
+@runtime_checkable
 class ReadsRows(Protocol):
     """Images of which some rows can be read alone."""
 

@@ -12,14 +12,16 @@ import tyro
 from fidsplat.commands.output import (
     Device,
     Json,
+    Overwrite,
     console,
     late_progress,
+    new_file,
     option,
     say,
     switch,
     tell,
-    writable_file,
 )
+from fidsplat.errors import InputError
 
 
 @dataclass
@@ -40,6 +42,7 @@ class Convert:
     target: Annotated[tyro.conf.Positional[str], option("B", "the file to write")]
     no_pictures: Annotated[bool, switch("do not draw both")] = False
     device: Device = None
+    overwrite: Overwrite = False
     json: Json = False
 
     def run(self) -> int:
@@ -48,7 +51,9 @@ class Convert:
         from fidsplat.formats.files import check_writable
 
         known = check_writable(self.target)
-        writable_file(self.target)
+        if Path(self.target).exists() and Path(self.target).samefile(self.source):
+            raise InputError(f"{self.source} and {self.target} are one file; give B another name")
+        new_file(self.target, self.overwrite)
         with late_progress(console(True)) as progress:
             cloud = fs.load_splats(self.source, progress)
         lost = losses(cloud, self.target)

@@ -13,6 +13,7 @@ import tyro
 from fidsplat.commands.output import (
     Json,
     MemoryBudget,
+    Overwrite,
     SceneDevice,
     SceneOutputs,
     SceneQuality,
@@ -28,7 +29,6 @@ from fidsplat.commands.output import (
 )
 from fidsplat.commands.remote import RayAddress, Workers, check_workers
 from fidsplat.commands.render import load_source
-from fidsplat.commands.sweeps import Overwrite
 from fidsplat.errors import InputError
 
 if TYPE_CHECKING:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from fidsplat.commands.output import Json, option, switch, tell
+from fidsplat.commands.output import Json, Overwrite, option, tell
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write, path_of, writable_folder
 
@@ -34,7 +34,7 @@ class Greenhouse:
     plants_from: Annotated[
         str | None, option("DIR", "KIND-NUMBER.ply to take plants from (default: grown as disks)")
     ] = None
-    overwrite: Annotated[bool, switch("replace the greenhouse that is there")] = False
+    overwrite: Overwrite = False
     json: Json = False
 
     def run(self) -> int:

@@ -10,12 +10,13 @@ import tyro
 
 from fidsplat.commands.output import (
     Json,
+    Overwrite,
     console,
     late_progress,
+    new_file,
     option,
     print_json,
     print_table,
-    writable_file,
 )
 from fidsplat.errors import InputError
 
@@ -81,6 +82,7 @@ class Marker:
     max_splats: Annotated[int | None, option("N", "most splats that it may become (default: a million)")] = (
         None
     )
+    overwrite: Overwrite = False
     json: Json = False
 
     def run(self) -> int:
@@ -89,7 +91,7 @@ class Marker:
 
         if self.native_2dgs and self.out is None:
             raise InputError("--native-2dgs is about the file that -o names; give -o FILE.ply")
-        file = writable_file(self.out) if self.out is not None else None
+        file = new_file(self.out, self.overwrite) if self.out is not None else None
         if file is not None and file.suffix.lower() != ".ply":
             raise InputError(f"splats are written as PLY: name {file.with_suffix('.ply')}, not {file}")
         limit = {} if self.max_splats is None else {"max_splats": self.max_splats}

@@ -62,6 +62,10 @@ def switch(text: str):
     return tyro.conf.arg(help=text, help_behavior_hint="")
 
 
+Overwrite = Annotated[bool, switch("replace what is there already")]
+"""of commands that write what may be somebody's own, or hours of work; pictures, charts and tables take the
+place of those before"""
+
 Json = Annotated[bool, switch("print one JSON object on stdout and nothing else there")]
 
 
@@ -161,6 +165,14 @@ def writable_file(path: str | Path) -> Path:
         raise InputError(f"{file} is a folder; give the name of a file")
     writable_folder(file.parent)
     return ordinary_file(file)
+
+
+def new_file(path: str | Path, overwrite: bool) -> Path:
+    """As `writable_file`, of a file that takes the place of another only where that is asked for."""
+    file = writable_file(path)
+    if file.exists() and not overwrite:
+        raise InputError(f"{file} is there already; give another name, or --overwrite")
+    return file
 
 
 def _plain(value: Any) -> Any:

@@ -12,6 +12,7 @@ import tyro
 from fidsplat.commands.output import (
     Device,
     Json,
+    Overwrite,
     bytes_of,
     console,
     late_progress,
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     import fidsplat as fs
 
 Out = Annotated[str, option("OUT.fss", "the store to write", "-o")]
-Overwrite = Annotated[bool, switch("replace the store that is there, once the new one is whole")]
 StorePath = Annotated[tyro.conf.Positional[str], option("STORE.fss", "a store")]
 
 

@@ -16,6 +16,7 @@ from fidsplat.commands.output import (
     Json,
     console,
     late_progress,
+    new_file,
     option,
     print_json,
     print_table,
@@ -100,6 +101,8 @@ class Train:
         )
         file = writable_file(self.out)
         checkpoint = file.with_suffix(".training.npz")
+        if file.exists() and not checkpoint.exists():  # it is not of this training
+            new_file(file, self.overwrite)
         where = console(self.json)
         with late_progress(console(True)) as progress:
             dataset = load_dataset(self.dataset, self.hold_out, self.random_points, self.seed, progress)

@@ -24,7 +24,6 @@ from fidsplat.sim.greenhouse import AISLE, Greenhouse
 from fidsplat.sim.localiser import Localiser
 from fidsplat.sim.robot import BODY, Errors, Run, camera_at, drive
 from fidsplat.vision.detect import Detection, detect
-from fidsplat.vision.images import to_uint8
 from fidsplat.vision.pose import marker_pose
 from fidsplat.vision.readback import corner_error
 
@@ -146,7 +145,7 @@ class Localise:
             if variant.texture:
                 layer = tag_layer(tags.values(), camera_at(self.camera, run.poses[k]), frame["rgb"])
                 frame = renderer.render(splats, capture.with_(layer=layer))
-            yield to_uint8(frame["rgb"])
+            yield frame.to_uint8()
 
     def sightings(self, variant: Variant, run: Run, renderer: Renderer) -> Iterator[list[Detection]]:
         """The tags in each picture of a variant; they are looked for while the next pictures are drawn."""

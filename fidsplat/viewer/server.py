@@ -30,7 +30,7 @@ from fidsplat.viewer.nodes import Nodes
 from fidsplat.viewer.session import Session, View
 from fidsplat.viewer.settings import Viewpoint
 from fidsplat.viewer.stream import Stream
-from fidsplat.vision.images import png_bytes, to_uint8
+from fidsplat.vision.images import png_bytes
 from fidsplat.vision.readback import read_back
 
 LOOK = 1.0
@@ -41,14 +41,16 @@ JPEG = 75
 
 def check_port(host: str, port: int) -> None:
     """Raises InputError where the port cannot be had: viser would take the next one in silence; likewise for
-    a host that is empty, by which the whole network would be let in."""
+    a port that is none, and a host that is empty, by which the whole network would be let in."""
+    if not 0 <= port <= 65535:
+        raise InputError(f"--port is {port}; give a number from 1 to 65535, or 0 for any that is free")
     if not host:
         raise InputError("--host is empty; give an address to listen on, 127.0.0.1 for this machine alone")
     try:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
-    except (OSError, OverflowError, UnicodeError) as error:
+    except (OSError, UnicodeError) as error:
         why = getattr(error, "strerror", None) or error
         of_host = isinstance(error, (socket.gaierror, UnicodeError)) or error.args[0] == errno.EADDRNOTAVAIL
         remedy = "--host must be an address of this machine" if of_host else "give another --port"
@@ -140,7 +142,7 @@ class Viewer:
         with client.gui.add_folder("What is seen"):
             self._said[client.client_id] = client.gui.add_markdown("Click into the picture.")
         stream = Stream(
-            lambda viewpoint, scale: self._send(client, viewpoint, scale),
+            lambda viewpoint, scale: self._draw(client, viewpoint, scale),
             lambda viewpoint: self._send_exact(client, viewpoint),
             self._controls.say,
             self._rate,
@@ -157,13 +159,13 @@ class Viewer:
         self._views.pop(client.client_id, None)
         self._said.pop(client.client_id, None)
 
-    def _send(self, client: Any, viewpoint: Viewpoint, scale: float) -> None:
-        frame = self.session.draw_moving(viewpoint, scale)
-        client.scene.set_background_image(to_uint8(frame["rgb"]), "jpeg", jpeg_quality=JPEG)
+    def _draw(self, client: Any, viewpoint: Viewpoint, scale: float) -> Callable[[], None]:
+        image = self.session.draw_moving(viewpoint, scale).to_uint8()
+        return partial(client.scene.set_background_image, image, "jpeg", jpeg_quality=JPEG)
 
     def _send_exact(self, client: Any, viewpoint: Viewpoint) -> None:
         view = self.session.draw(viewpoint)
-        client.scene.set_background_image(to_uint8(view.frame["rgb"]), "png")
+        client.scene.set_background_image(view.frame.to_uint8(), "png")
         if client.client_id in self._streams:  # else it has left meanwhile
             self._views[client.client_id] = view
 
@@ -238,7 +240,7 @@ class Viewer:
         if stream is None:
             return
         try:
-            image = self.session.draw(_viewpoint(client.camera)).frame["rgb"]
+            image = self.session.draw(_viewpoint(client.camera)).frame.to_uint8()
         except (FidsplatError, MemoryError) as error:
             self._controls.say(str(error) or "not enough memory for this picture")
             return

@@ -6,6 +6,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 from fidsplat.errors import FidsplatError
@@ -41,8 +42,9 @@ class Stream:
     """Decides what is drawn next for one browser.
 
     Args:
-        moving: draws and sends a picture from a viewpoint, that much smaller than the page.
-        rest: draws and sends the exact one.
+        moving: draws a picture from a viewpoint, that much smaller than the page, and returns what sends it:
+            called in another thread, so that one picture is encoded while the next is drawn.
+        rest: draws and sends the exact one, after all others.
         failed: told what went wrong with a picture; the stream goes on.
         rate: pictures a second to aim at while moving.
         clock: seconds.
@@ -50,7 +52,7 @@ class Stream:
 
     def __init__(
         self,
-        moving: Callable[[Viewpoint, float], object],
+        moving: Callable[[Viewpoint, float], Callable[[], object]],
         rest: Callable[[Viewpoint], object],
         failed: Callable[[str], object] = lambda words: None,
         rate: float = 30.0,
@@ -58,6 +60,8 @@ class Stream:
     ) -> None:
         self._moving, self._rest, self._failed, self._clock = moving, rest, failed, clock
         self.pace = Pace(rate)
+        self._sender = ThreadPoolExecutor(1, "viewer sender")
+        self._sending: Future[object] | None = None
         self._wake = threading.Condition()
         self._viewpoint: Viewpoint | None = None
         self._new = self._exact = self._closed = False
@@ -92,8 +96,11 @@ class Stream:
         begun, scale = self._clock(), self.pace.steps
         try:
             if new:
-                self._moving(viewpoint, scale)
+                send = self._moving(viewpoint, scale)
+                self._sent()
+                self._sending = self._sender.submit(send)
             else:
+                self._sent()
                 self._rest(viewpoint)
         except (FidsplatError, MemoryError) as error:
             self._failed(str(error) or "not enough memory for this picture")
@@ -102,12 +109,19 @@ class Stream:
             self.pace.took(self._clock() - begun, scale)
         return 0.0
 
+    def _sent(self) -> None:
+        """Waits until the picture before is sent; raises what went wrong with it."""
+        sending, self._sending = self._sending, None
+        if sending is not None:
+            sending.result()
+
     def run(self) -> None:
         """Draw until closed."""
         while True:
             wait = self.step()
             with self._wake:
                 if self._closed:
+                    self._sender.shutdown(wait=False)
                     return
                 if wait is None:
                     self._wake.wait_for(lambda: self._closed or self._new)

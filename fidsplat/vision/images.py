@@ -205,9 +205,11 @@ def png_bytes(image: np.ndarray) -> bytes:
     return data.tobytes()
 
 
-def encoded(image: np.ndarray, kind: str) -> bytes:
-    """A picture (h, w, 3) RGB, float in [0, 1] or uint8, as the content of a "jpeg" or "png" file."""
-    done, data = cv2.imencode(f".{kind}", cv2.cvtColor(to_uint8(image), cv2.COLOR_RGB2BGR))
+def encoded(image: np.ndarray, kind: str, quality: int = 95) -> bytes:
+    """A picture (h, w, 3) RGB, float in [0, 1] or uint8, as the content of a "jpeg" (of this quality, 0 to
+    100) or "png" file."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if kind == "jpeg" else []
+    done, data = cv2.imencode(f".{kind}", cv2.cvtColor(to_uint8(image), cv2.COLOR_RGB2BGR), options)
     if not done:
         raise ValueError(f"OpenCV could not encode an image of shape {image.shape} as {kind}")
     return data.tobytes()

@@ -70,9 +70,9 @@ static inline void pixel_blend(Pixel *pixel, const Splat *s, Crossing c, vint ma
 //@@ compose
 }
 
-// Writes LANES pixels at `at` of each channel of `raw`, which are `plane` samples long.
-#define PIXEL_STORE_BASE(pixel, raw, plane, at) \
+// Writes LANES pixels at `at` of each channel of `raw`, which are `channel_stride` samples long.
+#define PIXEL_STORE_BASE(pixel, raw, channel_stride, at) \
     BLOCK_STORE((pixel)->r, raw + (at), stride); \
-    BLOCK_STORE((pixel)->g, raw + (plane) + (at), stride); \
-    BLOCK_STORE((pixel)->b, raw + 2 * (plane) + (at), stride); \
-    BLOCK_STORE((pixel)->t, raw + 3 * (plane) + (at), stride)
+    BLOCK_STORE((pixel)->g, raw + (channel_stride) + (at), stride); \
+    BLOCK_STORE((pixel)->b, raw + 2 * (channel_stride) + (at), stride); \
+    BLOCK_STORE((pixel)->t, raw + 3 * (channel_stride) + (at), stride)

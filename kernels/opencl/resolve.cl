@@ -7,7 +7,7 @@ kernel void resolve(
     if (x >= width || y >= height) return;
     uint number = get_global_id(2);
     // after the samples of the views before
-    size_t first = number * (plane / get_global_size(2)) + (size_t)(y * SAMPLES) * stride + x * SAMPLES;
+    size_t first = number * (channel_stride / get_global_size(2)) + (size_t)(y * SAMPLES) * stride + x * SAMPLES;
 //@@ resolve_pixel
 }
 //@@ kernels

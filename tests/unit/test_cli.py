@@ -256,6 +256,26 @@ def test_marker_says_what_it_is_made_of(capsys, tmp_path):
     assert "rectangles" in capsys.readouterr().out
 
 
+def test_splats_that_are_there_are_replaced_where_that_is_asked_for(capsys, tmp_path):
+    mine, other = tmp_path / "mine.ply", tmp_path / "other.ply"
+    mine.write_bytes(b"a scan of months")
+    other.write_bytes(b"another")
+    os.link(mine, tmp_path / "the same.ply")
+    for words, why in (
+        (("marker", "qr:a", "-o", mine), f"{mine} is there already; give another name, or --overwrite"),
+        (("convert", other, mine), f"{mine} is there already; give another name, or --overwrite"),
+        (("train", tmp_path, "-o", mine), f"{mine} is there already; give another name, or --overwrite"),
+        (("convert", mine, mine), f"{mine} and {mine} are one file"),
+        (("convert", mine, tmp_path / "the same.ply", "--overwrite"), "are one file"),
+    ):
+        status, line = fails(capsys, *words)
+        assert (status, mine.read_bytes()) == (2, b"a scan of months"), words
+        assert why in line
+    prints_json(capsys, "marker", "qr:a", "-o", mine, "--overwrite")
+    prints_json(capsys, "convert", mine, other, "--overwrite", "--no-pictures")
+    assert len(fs.load_ply(other)) == len(fs.load_ply(mine)) > 0
+
+
 def test_a_marker_is_refined_on_a_device(capsys, tmp_path):
     words = ("marker", "aruco:4x4_50:7", "--mixture", "refined", "--iterations", "2", "--device", "opencl")
     facts = prints_json(capsys, *words, "-o", tmp_path / "tag.ply")
@@ -294,7 +314,8 @@ def test_work_is_shown_once_it_takes_long():
 
 def test_marker_writes_two_scales_when_asked(capsys, tmp_path):
     for words, scales in (([], 3), (["--native-2dgs"], 2)):
-        assert main(["marker", "apriltag:36h11:5", "-o", str(tmp_path / "tag.ply"), *words]) == 0
+        overwrite = ["-o", str(tmp_path / "tag.ply"), "--overwrite"]
+        assert main(["marker", "apriltag:36h11:5", *overwrite, *words]) == 0
         assert (tmp_path / "tag.ply").read_bytes().count(b"property float scale_") == scales
     capsys.readouterr()
     status, line = fails(capsys, "marker", "apriltag:36h11:5", "--native-2dgs")

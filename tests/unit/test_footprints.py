@@ -88,7 +88,8 @@ def test_the_command_writes_gaussians_and_says_so(tmp_path, capsys):
     file = tmp_path / "tag.ply"
     assert main(["marker", "apriltag:36h11:5", "--mixture", "exact", "-o", str(file)]) == 0
     assert "Gaussians (fitted): a PLY file has no boxes" in " ".join(capsys.readouterr().out.split())
-    assert main(["marker", "apriltag:36h11:5", "--mixture", "exact", "-o", str(file), "--json"]) == 0
+    again = ["-o", str(file), "--overwrite", "--json"]
+    assert main(["marker", "apriltag:36h11:5", "--mixture", "exact", *again]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert (facts["mixture"], facts["written"]["mixture"]) == ("exact", "fitted")
     assert len(fs.load_ply(file)) == facts["written"]["splats"] > facts["splats"]

@@ -56,8 +56,9 @@ def test_a_port_in_use_is_said():
         with pytest.raises(fs.InputError, match=rf"cannot listen on 127.0.0.1, port {port}: .*in use; give"):
             check_port("127.0.0.1", port)
     check_port("127.0.0.1", port)
-    with pytest.raises(fs.InputError, match="port 70000"):
-        check_port("127.0.0.1", 70000)
+    for none in (-1, 65536, 99999):
+        with pytest.raises(fs.InputError, match=f"--port is {none}; give a number from 1 to 65535, or 0"):
+            check_port("127.0.0.1", none)
 
 
 @pytest.mark.parametrize(

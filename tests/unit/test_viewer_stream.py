@@ -26,6 +26,7 @@ def looked_at(moving_takes=lambda scale: 0.0):
     def moving(viewpoint, scale):
         drawn.append((viewpoint.position[0], scale))
         clock.now += moving_takes(scale)
+        return lambda: None
 
     stream = Stream(moving, lambda viewpoint: drawn.append((viewpoint.position[0], "exact")), clock=clock)
     return stream, clock, drawn
@@ -108,9 +109,47 @@ def test_a_picture_that_is_too_large_for_the_memory_is_told():
     assert told == ["not enough memory for this picture"]
 
 
+def test_a_picture_is_sent_while_the_next_is_drawn_and_before_the_exact_one():
+    done, drawn, clock = [], [], Clock()
+    next_is_drawn = threading.Event()
+
+    def moving(viewpoint, scale):
+        number = len(drawn)
+        drawn.append(number)
+        if number == 1:
+            next_is_drawn.set()
+
+        def send():
+            assert next_is_drawn.wait(10)
+            done.append(number)
+
+        return send
+
+    stream = Stream(moving, lambda viewpoint: done.append("exact"), clock=clock)
+    for x in (1.0, 2.0, 3.0):
+        stream.look(at(x))
+        stream.step()
+    clock.now += REST
+    stream.step()
+    assert done == [0, 1, 2, "exact"]
+
+
+def test_what_goes_wrong_while_a_picture_is_sent_is_told():
+    told = []
+
+    def send():
+        raise fs.InputError("nobody takes it")
+
+    stream = Stream(lambda *_: send, lambda *_: None, told.append, clock=Clock())
+    for x in (1.0, 2.0):
+        stream.look(at(x))
+        stream.step()
+    assert told == ["nobody takes it"]
+
+
 def test_a_stream_runs_in_a_thread_until_it_is_closed():
     seen = threading.Event()
-    stream = Stream(lambda *_: None, lambda *_: seen.set())
+    stream = Stream(lambda *_: lambda: None, lambda *_: seen.set())
     thread = threading.Thread(target=stream.run)
     thread.start()
     stream.look(HERE)

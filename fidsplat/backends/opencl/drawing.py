@@ -72,7 +72,7 @@ def _blended(picture: Picture) -> Iterator[None]:
     """
     view, shape = picture.view, picture.shape
     for name, channels, _ in _buffers_of(picture):
-        picture.take(name, 4 * picture.held["plane"] * channels)
+        picture.take(name, 4 * picture.held["channel_stride"] * channels)
     # not an attribute: in a cycle, all that this picture holds would wait for the garbage collector
     lists = LISTS["chunked" if picture.plan.chunk else shape.lists](picture)
     group = shape.blend_items
@@ -96,10 +96,10 @@ def _resolve(picture: Picture) -> None:
 
 def _expose(start: Callable[[View], Picture], picture: Picture) -> None:
     """Blends the shots of a picture of several poses one after another, and gathers their samples."""
-    plane, arguments = picture.rows * picture.stride, picture.program.source.arguments
+    channel_stride, arguments = picture.rows * picture.stride, picture.program.source.arguments
     for name, channels, _ in _buffers_of(picture):
         # names of scratch buffers that no shot's own have
-        picture.held[name] = picture.pool.scratch(f"exposed {name}", 4 * plane * channels)
+        picture.held[name] = picture.pool.scratch(f"exposed {name}", 4 * channel_stride * channels)
     counts = {"splats": picture.resident.count, "visible": 0, "pairs": 0}
     # what is around is the same for all shots
     around = {
@@ -125,13 +125,17 @@ def _expose(start: Callable[[View], Picture], picture: Picture) -> None:
 
 def _gather(picture: Picture, own: Picture, shot: Shot) -> None:
     """Adds a shot's samples to the picture's."""
-    whole = {"whole_stride": picture.stride, "whole_plane": picture.rows * picture.stride, "top": shot.top}
-    whole |= {"stride": own.stride, "plane": own.rows * own.stride}
+    whole = {
+        "whole_stride": picture.stride,
+        "whole_channel_stride": picture.rows * picture.stride,
+        "top": shot.top,
+    }
+    whole |= {"stride": own.stride, "channel_stride": own.rows * own.stride}
     size = shot.view.width, shot.view.height
     for name, channels, averaged in _buffers_of(picture):
         if not (averaged or shot.middle):
             continue
-        given = whole | {"planes": channels, "raw": own.held[name], "exposed": picture.held[name]}
+        given = whole | {"channels": channels, "raw": own.held[name], "exposed": picture.held[name]}
         if averaged:
             given |= {"weight": shot.weight, "first": shot.first}
         picture.launch_grid("expose", "expose" if averaged else "expose_middle", *size, **given)

@@ -47,7 +47,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("in Splat splats", "in uint lists starts", _TILES, "in uint splat_slots"),
         "wide log_cut ceiling stop filter",
         *("float log_ceiling", "float background_r background_g background_b"),
-        *("int stride  // of the padded picture", "uint plane", "in float by_rgb  // (h, w, 3)"),
+        *("int stride  // of the padded picture", "uint channel_stride", "in float by_rgb  // (h, w, 3)"),
         "out float checkpoints  // tiles' transmittances in front of every CHUNK splats",
         "out float moments  // of the record Moments, by slots",
         "out real tile_sums  // (tiles, 3) by the background",

@@ -14,6 +14,7 @@ from fidsplat.backends.opencl.counts import fullness_of, read_counts, stats_of
 from fidsplat.backends.opencl.picture import Picture
 from fidsplat.backends.opencl.recording import Recording
 from fidsplat.backends.opencl.resident import Resident
+from fidsplat.backends.opencl.uint8 import read_uint8
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.backends.view import View
 from fidsplat.effects.catalogue import Output
@@ -125,9 +126,11 @@ class OpenCLImages:
 
     def empty(self, name: str) -> np.ndarray:
         """As `ReadsRows`."""
-        output = self._outputs[name]
-        shape = self._size if output.channels == 1 else (*self._size, output.channels)
-        return self._workspace.host_memory.empty(shape, output.dtype)
+        return self._workspace.host_memory.empty(self._shape(name), self._outputs[name].dtype)
+
+    def _shape(self, name: str) -> tuple[int, ...]:
+        channels = self._outputs[name].channels
+        return self._size if channels == 1 else (*self._size, channels)
 
     def read_rows(self, name: str, first: int, end: int, into: np.ndarray) -> None:
         """As `ReadsRows`. Raises DeviceError as `read`."""
@@ -138,6 +141,13 @@ class OpenCLImages:
             # beside what was put on its queue since: the next picture, say
             queue, image = self._workspace.read_queue, drawn.buffer(f"{name}_out")
             cl.enqueue_copy(queue, into[first:end], image, src_offset=above, wait_for=drawn.done())
+
+    def read_uint8(self, name: str) -> np.ndarray:
+        """As `GivesUint8`. Raises DeviceError as `read`."""
+        with self._workspace.failing(f"drawing {name}"):
+            drawn = self.settle()
+            image = drawn.buffer(f"{name}_out")
+            return read_uint8(self._workspace, image, self._shape(name), drawn.done())
 
     def wait(self) -> None:
         """Until the device has drawn it.

@@ -69,8 +69,8 @@ _WALK = takes(
 _EXPOSED = takes(
     _SIZE,
     "int stride  // samples per row of a shot",
-    "uint plane  // samples per channel of a shot",
-    *("int whole_stride", "uint whole_plane", "int top planes"),
+    "uint channel_stride  // samples per channel of a shot",
+    *("int whole_stride", "uint whole_channel_stride", "int top channels"),
 )
 RAY_UNIFORMS = uniforms(
     "ray",
@@ -132,13 +132,13 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         *("in Splat splats", "in uint lists starts"),
         "uint band_first  // the first tile of this launch; lists begin with its list",
         *(_SIZE, "wide log_cut ceiling stop filter"),
-        "uint plane  // samples per channel of raw, of all views",
+        "uint channel_stride  // samples per channel of raw, of all views",
         "out float raw  // 4 channels: r, g, b, transmittance",
     ),
     "expose": takes(_EXPOSED, "float weight", "int first", "in float raw", "out float exposed"),
     "expose_middle": takes(_EXPOSED, "in uint raw", "out uint exposed"),
     "backdrop": takes(
-        *(_SIZE, "int stride", "uint plane", RAY_UNIFORMS),
+        *(_SIZE, "int stride", "uint channel_stride", RAY_UNIFORMS),
         uniforms(
             "rotation",
             "float turn_00 turn_01 turn_02 turn_10 turn_11 turn_12 turn_20 turn_21 turn_22",
@@ -149,7 +149,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     "resolve": takes(
         "int width height  // of the picture",
         "int stride  // samples per row of raw",
-        "uint plane  // samples per channel of raw, of all views",
+        "uint channel_stride  // samples per channel of raw, of all views",
         "in uint slots  // of each view: its place among the output images",
         *("float background_r background_g background_b", "in float raw"),
     ),

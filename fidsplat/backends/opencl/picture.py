@@ -65,7 +65,7 @@ class Picture:
             "width": view.width,
             "height": view.height,
             "stride": self.stride,
-            "plane": self.views * self.rows * self.stride,
+            "channel_stride": self.views * self.rows * self.stride,
         }
         """buffers and numbers by the names of the arguments that take them"""
         self.events: list[tuple[str, cl.Event]] = []

@@ -137,11 +137,11 @@ class OpenCLProbe:
         names = ("exp", "log", "division", "sqrt", "fma", "fast_exp", "fast_log")
         made, count, items = np.empty((7, n), np.float32), np.uint32(n), n // workspace.shape.lanes
         try:
-            planes = run("arithmetic_float", items, made, count, *single)
-            results: dict[str, np.ndarray] = dict(zip(names, planes, strict=True))
+            parts = run("arithmetic_float", items, made, count, *single)
+            results: dict[str, np.ndarray] = dict(zip(names, parts, strict=True))
             if workspace.info.float64:
-                planes = run("arithmetic_real", n, np.empty((3, n)), count, above, below)
-                results |= dict(zip(("division64", "sqrt64", "log64"), planes, strict=True))
+                parts = run("arithmetic_real", n, np.empty((3, n)), count, above, below)
+                results |= dict(zip(("division64", "sqrt64", "log64"), parts, strict=True))
             smallest = np.array([np.finfo(np.float32).tiny, 0.5], np.float32)
             results["denormal"] = run("arithmetic_denormal", 1, np.empty(2, np.float32), smallest)
         except cl.Error as error:

@@ -13,7 +13,7 @@ import pyopencl as cl
 from pyopencl.array import Array
 
 from fidsplat.backends.opencl.program import Program
-from fidsplat.backends.opencl.training_source import MARGIN, MARGIN_ROWS, PLANES, training_source
+from fidsplat.backends.opencl.training_source import IMAGES, MARGIN, MARGIN_ROWS, training_source
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.cameras import Camera
 from fidsplat.errors import DeviceError
@@ -78,7 +78,7 @@ class OpenCLTraining:
         self._count = 0
         self._drawn: tuple[int, ResidentArrays] | None = None
         self._truths: list[_Truth] = []
-        self._planes: tuple[tuple[int, int], cl.Buffer] | None = None
+        self._loss_images: tuple[tuple[int, int], cl.Buffer] | None = None
         self._sights: WeakKeyDictionary[Camera, tuple[np.ndarray, dict[str, float]]] = WeakKeyDictionary()
         """numbers by which kernels know what a camera sees, each with the origin that they are of"""
 
@@ -153,8 +153,8 @@ class OpenCLTraining:
             **{"by_rgb": slope.data, "sums": self._scratch("loss sums", 12 * _SUMS)},
             **{"l1_share": (1 - dssim_weight) / number, "ssim_share": dssim_weight / image.size},
             **{"width": 3 * columns, "height": height, "stride": stride},
-            **{"planes": self._room_for_planes(height, columns)},
-            "plane": stride * (height + 2 * MARGIN_ROWS),
+            **{"images": self._room_for_images(height, columns)},
+            "image_stride": stride * (height + 2 * MARGIN_ROWS),
         }
         self._launch_rows("loss_take", 3 * columns, height, given)
         for name in ("loss_rows", "loss_columns", "loss_rows_backward", "loss_columns_backward"):
@@ -262,15 +262,15 @@ class OpenCLTraining:
     def _stride(self, columns: int) -> int:
         return -(-3 * columns // self._lanes) * self._lanes + 2 * MARGIN
 
-    def _room_for_planes(self, height: int, columns: int) -> cl.Buffer:
-        """Planes for pictures of this size, all zeros at first: kernels leave the margins so."""
-        if self._planes is not None and self._planes[0] == (height, columns):
-            return self._planes[1]
-        size = 4 * PLANES * self._stride(columns) * (height + 2 * MARGIN_ROWS)
-        self._planes = None  # the old ones go first
-        buffer = self._workspace.pool.fresh("the loss's planes", size)
+    def _room_for_images(self, height: int, columns: int) -> cl.Buffer:
+        """Images for pictures of this size, all zeros at first: kernels leave the margins so."""
+        if self._loss_images is not None and self._loss_images[0] == (height, columns):
+            return self._loss_images[1]
+        size = 4 * IMAGES * self._stride(columns) * (height + 2 * MARGIN_ROWS)
+        self._loss_images = None  # the old ones go first
+        buffer = self._workspace.pool.fresh("the loss's images", size)
         cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.float32), 0, size)
-        self._planes = (height, columns), buffer
+        self._loss_images = (height, columns), buffer
         return buffer
 
 

@@ -7,20 +7,20 @@ from functools import cache
 from fidsplat.backends.opencl.assemble import Source, Text, kernel_text, with_scalars
 from fidsplat.backends.opencl.declare import Argument, Scalars, takes
 
-PLANES = 11
+IMAGES = 11
 """of the loss (kernels/opencl/train/loss.cl)"""
 MARGIN, MARGIN_ROWS = 16, 5
-"""zeros around a plane, floats of a row and rows"""
+"""zeros around an image, floats of a row and rows"""
 _STEPS = ("loss", "surface", "adam", "pick", "shake")
 _FILES = ("prelude.cl", "math.cl", *(f"train/{step}.cl" for step in _STEPS))
 
 _PICTURE = takes(
     "int width height  // values of a row: three of a pixel; rows",
-    "int stride  // floats of a plane's row",
-    "uint plane  // floats of a plane",
+    "int stride  // floats of an image's row",
+    "uint image_stride  // floats of an image",
 )
 _MASK = takes("int masked", "in uchar mask  // (rows, pixels), where `masked`")
-_PLANES = takes("out float planes")
+_IMAGES = takes("out float images")
 _SURFACE = takes(
     "int width height  // of the picture",
     "float inverse_x inverse_y middle_x middle_y  // 1 / focal lengths, and the principal point [px]",
@@ -33,14 +33,14 @@ _ADAM = takes(
 _DRAWN_SH = takes("uint count drawn all", "int plain")
 
 KERNELS: dict[str, tuple[Argument, ...]] = {
-    "loss_take": takes(_PICTURE, "in float rgb", "in uchar truth", _MASK, _PLANES),
-    "loss_rows": takes(_PICTURE, _PLANES),
-    "loss_columns": takes(_PICTURE, _PLANES),
-    "loss_rows_backward": takes(_PICTURE, _PLANES),
+    "loss_take": takes(_PICTURE, "in float rgb", "in uchar truth", _MASK, _IMAGES),
+    "loss_rows": takes(_PICTURE, _IMAGES),
+    "loss_columns": takes(_PICTURE, _IMAGES),
+    "loss_rows_backward": takes(_PICTURE, _IMAGES),
     "loss_columns_backward": takes(
-        _PICTURE, "float l1_share ssim_share", _MASK, "in float planes", "out float by_rgb"
+        _PICTURE, "float l1_share ssim_share", _MASK, "in float images", "out float by_rgb"
     ),
-    "loss_sums": takes("uint plane", "in float planes", "out float sums  // (work-groups, 3)"),
+    "loss_sums": takes("uint image_stride", "in float images", "out float sums  // (work-groups, 3)"),
     "surface_normals": takes(
         _SURFACE,
         _MASK,

@@ -260,9 +260,9 @@ class RayBuffers:
         return held
 
     def _planes(self, name: str, array: np.ndarray, rows: int, columns: int) -> cl.Buffer:
-        planes = np.full((array.shape[2], rows, columns), np.nan, np.float32)
-        planes[:, : array.shape[0], : array.shape[1]] = np.moveaxis(array, 2, 0)
-        return self._put(name, planes)
+        channels = np.full((array.shape[2], rows, columns), np.nan, np.float32)
+        channels[:, : array.shape[0], : array.shape[1]] = np.moveaxis(array, 2, 0)
+        return self._put(name, channels)
 
     @staticmethod
     def bytes_of(rasters: Collection[RayRaster], tile_height: int, columns: int, slopes: bool) -> int:

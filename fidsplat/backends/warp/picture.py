@@ -21,7 +21,7 @@ from fidsplat.backends.view import Shot, View
 from fidsplat.backends.warp.launch import BLOCK, Launcher
 from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.resident import Resident
-from fidsplat.backends.warp.runtime import kernels, load
+from fidsplat.backends.warp.runtime import kernels, load, quiet
 from fidsplat.backends.warp.structs import (
     lens_of,
     memory_bytes,
@@ -81,6 +81,15 @@ class WarpImages:
         """The image as a NumPy array of its own."""
         # a CPU array's numpy() is its own memory, which device_array gives away
         return np.array(self.device_array(name).numpy())
+
+    def read_uint8(self, name: str) -> np.ndarray:
+        """As `GivesUint8`."""
+        drawn = self.device_array(name)
+        made = load().empty(drawn.size, dtype=load().uint8, device=drawn.device)
+        given = {"values": drawn.flatten(), "made": made}
+        with quiet():
+            self._launcher.launch(kernels("uint8").to_uint8, drawn.size, given)
+        return made.numpy().reshape(drawn.shape)
 
     def wait(self) -> None:
         """Until the device has drawn it."""

@@ -9,11 +9,11 @@
     pixel->depth_weight += weight;
 //@ store
         BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->depth, pixel_shown(pixel)), depth_raw + at, stride);
-        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->depth_weight, pixel_shown(pixel)), depth_raw + plane + at, stride);
+        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->depth_weight, pixel_shown(pixel)), depth_raw + channel_stride + at, stride);
 //@ resolve_start
     float depth = 0, depth_weight = 0;
 //@ resolve_sample
             depth += depth_raw[at];
-            depth_weight += depth_raw[plane + at];
+            depth_weight += depth_raw[channel_stride + at];
 //@ resolve_end
     depth_out[out] = depth_weight > 0 ? depth / depth_weight : 0.0f;

@@ -22,13 +22,13 @@
     pixel->spread_squares = FMA(spread_share * nearer, nearer, pixel->spread_squares);
 //@ store
         BLOCK_STORE(pixel->spread_first, distortion_raw + at, stride);
-        BLOCK_STORE(pixel->spread_weight, distortion_raw + plane + at, stride);
-        BLOCK_STORE(pixel->spread_sum, distortion_raw + 2 * (size_t)plane + at, stride);
-        BLOCK_STORE(pixel->spread_squares, distortion_raw + 3 * (size_t)plane + at, stride);
+        BLOCK_STORE(pixel->spread_weight, distortion_raw + channel_stride + at, stride);
+        BLOCK_STORE(pixel->spread_sum, distortion_raw + 2 * (size_t)channel_stride + at, stride);
+        BLOCK_STORE(pixel->spread_squares, distortion_raw + 3 * (size_t)channel_stride + at, stride);
 //@ resolve_start
     float distortion = 0;
 //@ resolve_sample
-            float spread_sum = distortion_raw[at + 2 * (size_t)plane];
-            distortion += distortion_raw[at + plane] * distortion_raw[at + 3 * (size_t)plane] - spread_sum * spread_sum;
+            float spread_sum = distortion_raw[at + 2 * (size_t)channel_stride];
+            distortion += distortion_raw[at + channel_stride] * distortion_raw[at + 3 * (size_t)channel_stride] - spread_sum * spread_sum;
 //@ resolve_end
     distortion_out[out] = mean * distortion;

@@ -7,9 +7,9 @@
 //@ loss_start
         loss->distortion = pixels_of(by_distortion, 1, 0, x, y, width, height);
         loss->spread_first = VLOAD(distortion_raw + at);
-        loss->spread_weight = VLOAD(distortion_raw + plane + at);
-        loss->spread_sum = VLOAD(distortion_raw + 2 * (size_t)plane + at);
-        loss->spread_squares = VLOAD(distortion_raw + 3 * (size_t)plane + at);
+        loss->spread_weight = VLOAD(distortion_raw + channel_stride + at);
+        loss->spread_sum = VLOAD(distortion_raw + 2 * (size_t)channel_stride + at);
+        loss->spread_squares = VLOAD(distortion_raw + 3 * (size_t)channel_stride + at);
 //@ worth
     vint spreads = VMASK(g->z > 0.0f);
     vfloat nearer = INVERSE_DEPTH / max(g->z, (vfloat)SPREAD_NEAR) - loss->spread_first;

@@ -28,14 +28,14 @@
     pixel->normal_z = FMA(weight, seen->nz, pixel->normal_z);
 //@ store
         BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->normal_x, pixel_shown(pixel)), normal_raw + at, stride);
-        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->normal_y, pixel_shown(pixel)), normal_raw + plane + at, stride);
-        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->normal_z, pixel_shown(pixel)), normal_raw + 2 * plane + at, stride);
+        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->normal_y, pixel_shown(pixel)), normal_raw + channel_stride + at, stride);
+        BLOCK_STORE(VSELECT((vfloat)0.0f, pixel->normal_z, pixel_shown(pixel)), normal_raw + 2 * channel_stride + at, stride);
 //@ resolve_start
     float normal_x = 0, normal_y = 0, normal_z = 0;
 //@ resolve_sample
             normal_x += normal_raw[at];
-            normal_y += normal_raw[plane + at];
-            normal_z += normal_raw[2 * (size_t)plane + at];
+            normal_y += normal_raw[channel_stride + at];
+            normal_z += normal_raw[2 * (size_t)channel_stride + at];
 //@ resolve_end
     float normal_length = sqrt(normal_x * normal_x + normal_y * normal_y + normal_z * normal_z);
     float normal_scale = normal_length > 0 ? 1.0f / normal_length : 0.0f;

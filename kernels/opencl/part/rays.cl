@@ -57,8 +57,8 @@ static inline Crossing cross_ray(const Splat *s, vfloat ray_x, vfloat ray_y, vfl
     );
 //@ backdrop_ray
     ray_x = rays[at];
-    ray_y = rays[plane + at];
-    ray_z = rays[2 * (size_t)plane + at];
+    ray_y = rays[channel_stride + at];
+    ray_z = rays[2 * (size_t)channel_stride + at];
     if (!(ray_x == ray_x)) return;           // nothing is seen there
 //@ mask
     mask &= VMASK(c.d == c.d);               // the low-pass draws nothing where there is no ray

@@ -6,9 +6,9 @@
         for (int sub_x = 0; sub_x < SAMPLES; sub_x++) {
             size_t at = first + (size_t)sub_y * stride + sub_x;
             r += raw[at];
-            g += raw[plane + at];
-            b += raw[2 * (size_t)plane + at];
-            t += raw[3 * (size_t)plane + at];
+            g += raw[channel_stride + at];
+            b += raw[2 * (size_t)channel_stride + at];
+            t += raw[3 * (size_t)channel_stride + at];
 //@@ resolve_sample
         }
     const float mean = 1.0f / (SAMPLES * SAMPLES);

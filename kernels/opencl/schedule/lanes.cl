@@ -72,7 +72,7 @@ kernel void blend(
     for (int block = 0; block < BLOCKS; block++) {
         size_t at = (top + y0 + TOP(block)) * stride + x0 + LEFT(block);
         Pixel *pixel = &pixels[block];
-        PIXEL_STORE_BASE(pixel, raw, plane, at);
+        PIXEL_STORE_BASE(pixel, raw, channel_stride, at);
 //@@ store
     }
 }

@@ -7,10 +7,10 @@ kernel void expose(
 ) {
     int x = get_global_id(0), y = get_global_id(1);
     if (x >= width || y >= height) return;
-    for (int k = 0; k < planes; k++) {
-        size_t at = k * (size_t)whole_plane + (size_t)(top + y) * whole_stride + x;
+    for (int k = 0; k < channels; k++) {
+        size_t at = k * (size_t)whole_channel_stride + (size_t)(top + y) * whole_stride + x;
         float before = first ? 0.0f : exposed[at];
-        exposed[at] = FMA(weight, raw[k * (size_t)plane + (size_t)y * stride + x], before);
+        exposed[at] = FMA(weight, raw[k * (size_t)channel_stride + (size_t)y * stride + x], before);
     }
 }
 
@@ -20,7 +20,7 @@ kernel void expose_middle(
 ) {
     int x = get_global_id(0), y = get_global_id(1);
     if (x >= width || y >= height) return;
-    for (int k = 0; k < planes; k++)
-        exposed[k * (size_t)whole_plane + (size_t)(top + y) * whole_stride + x] =
-            raw[k * (size_t)plane + (size_t)y * stride + x];
+    for (int k = 0; k < channels; k++)
+        exposed[k * (size_t)whole_channel_stride + (size_t)(top + y) * whole_stride + x] =
+            raw[k * (size_t)channel_stride + (size_t)y * stride + x];
 }

@@ -1,7 +1,7 @@
 // The loss of a picture, (1 - w) L1 + w (1 - SSIM), and its derivative by each value. Its twin in NumPy, with the formulas:
 // fidsplat/train/losses.py.
 //
-// A plane is rows of `stride` floats, the three channels of a pixel side by side, with MARGIN_ROWS rows and MARGIN floats of zeros
+// An image is rows of `stride` floats, the three channels of a pixel side by side, with MARGIN_ROWS rows and MARGIN floats of zeros
 // around the picture, so that a window that leaves it sees zeros without asking. A work-item computes LANES values of a row.
 
 #define RADIUS 5
@@ -15,7 +15,7 @@ constant float WINDOW[2 * RADIUS + 1] = {
 #define C1 1e-4f
 #define C2 9e-4f
 
-// Where a work-item's values lie in a plane, and how many of them belong to the picture.
+// Where a work-item's values lie in an image, and how many of them belong to the picture.
 #define HERE \
     int column = get_global_id(0) * LANES, row = get_global_id(1); \
     if (column >= width || row >= height) return; \
@@ -24,7 +24,7 @@ constant float WINDOW[2 * RADIUS + 1] = {
 // Values beyond the picture's last column stay 0.
 #define INSIDE(v) VSELECT((vfloat)(0.0f), v, VMASK((vfloat)((float)column) + VLANE < (vfloat)((float)width)))
 
-// Index space: one work-item per value of the picture. Reads: the picture, the truth, the mask. Writes: planes 0 and 1 of `planes`.
+// Index space: one work-item per value of the picture. Reads: the picture, the truth, the mask. Writes: images 0 and 1 of `images`.
 // Where the mask is 0 the picture is the truth.
 kernel void loss_take(
 //@@ arguments loss_take
@@ -34,11 +34,11 @@ kernel void loss_take(
     size_t from = (size_t)row * width + column, to = (size_t)(row + MARGIN_ROWS) * stride + MARGIN + column;
     float wanted = truth[from] * (1.0f / 255);
     bool counts = !masked || mask[(size_t)row * (width / 3) + column / 3];
-    planes[to] = counts ? rgb[from] : wanted;
-    planes[plane + to] = wanted;
+    images[to] = counts ? rgb[from] : wanted;
+    images[image_stride + to] = wanted;
 }
 
-// Index space: (LANES values, rows). Reads: planes 0 and 1, of a and b. Writes: planes 2 to 6, the means along rows of a, b, a a,
+// Index space: (LANES values, rows). Reads: images 0 and 1, of a and b. Writes: images 2 to 6, the means along rows of a, b, a a,
 // b b, a b.
 kernel void loss_rows(
 //@@ arguments loss_rows
@@ -46,35 +46,35 @@ kernel void loss_rows(
     HERE;
     vfloat a = 0, b = 0, aa = 0, bb = 0, ab = 0;
     for (int k = -RADIUS; k <= RADIUS; k++) {
-        vfloat x = VLOAD(planes + at + 3 * k), y = VLOAD(planes + plane + at + 3 * k), w = WINDOW[k + RADIUS];
+        vfloat x = VLOAD(images + at + 3 * k), y = VLOAD(images + image_stride + at + 3 * k), w = WINDOW[k + RADIUS];
         a += w * x;
         b += w * y;
         aa += w * (x * x);
         bb += w * (y * y);
         ab += w * (x * y);
     }
-    VSTORE(INSIDE(a), planes + 2 * plane + at);
-    VSTORE(INSIDE(b), planes + 3 * plane + at);
-    VSTORE(INSIDE(aa), planes + 4 * plane + at);
-    VSTORE(INSIDE(bb), planes + 5 * plane + at);
-    VSTORE(INSIDE(ab), planes + 6 * plane + at);
+    VSTORE(INSIDE(a), images + 2 * image_stride + at);
+    VSTORE(INSIDE(b), images + 3 * image_stride + at);
+    VSTORE(INSIDE(aa), images + 4 * image_stride + at);
+    VSTORE(INSIDE(bb), images + 5 * image_stride + at);
+    VSTORE(INSIDE(ab), images + 6 * image_stride + at);
 }
 
-// Index space: (LANES values, rows). Reads: planes 2 to 6. Writes: planes 7 to 9, the derivatives of the SSIM by the mean of a, by the
-// mean of a a, by that of a b; plane 10, the SSIM.
+// Index space: (LANES values, rows). Reads: images 2 to 6. Writes: images 7 to 9, the derivatives of the SSIM by the mean of a, by the
+// mean of a a, by that of a b; image 10, the SSIM.
 kernel void loss_columns(
 //@@ arguments loss_columns
 ) {
     HERE;
     vfloat a = 0, b = 0, aa = 0, bb = 0, ab = 0;
     for (int k = -RADIUS; k <= RADIUS; k++) {
-        global const float *from = planes + 2 * plane + at + k * stride;
+        global const float *from = images + 2 * image_stride + at + k * stride;
         vfloat w = WINDOW[k + RADIUS];
         a += w * VLOAD(from);
-        b += w * VLOAD(from + plane);
-        aa += w * VLOAD(from + 2 * plane);
-        bb += w * VLOAD(from + 3 * plane);
-        ab += w * VLOAD(from + 4 * plane);
+        b += w * VLOAD(from + image_stride);
+        aa += w * VLOAD(from + 2 * image_stride);
+        bb += w * VLOAD(from + 3 * image_stride);
+        ab += w * VLOAD(from + 4 * image_stride);
     }
     vfloat means = a * a + b * b + C1, variances = (aa - a * a) + (bb - b * b) + C2;
     vfloat top = 2.0f * a * b + C1, shared = 2.0f * (ab - a * b) + C2;
@@ -82,44 +82,44 @@ kernel void loss_columns(
     vfloat by_shared = 2.0f * top / (means * variances), by_variance = -similar / variances;
     vfloat by_mean = 2.0f * (b * shared - a * similar * variances) / (means * variances);
     by_mean -= 2.0f * a * by_variance + b * by_shared;
-    VSTORE(INSIDE(by_mean), planes + 7 * plane + at);
-    VSTORE(INSIDE(by_variance), planes + 8 * plane + at);
-    VSTORE(INSIDE(by_shared), planes + 9 * plane + at);
-    VSTORE(INSIDE(similar), planes + 10 * plane + at);
+    VSTORE(INSIDE(by_mean), images + 7 * image_stride + at);
+    VSTORE(INSIDE(by_variance), images + 8 * image_stride + at);
+    VSTORE(INSIDE(by_shared), images + 9 * image_stride + at);
+    VSTORE(INSIDE(similar), images + 10 * image_stride + at);
 }
 
-// Index space: (LANES values, rows). Reads: planes 7 to 9. Writes: planes 2 to 4, their means along rows.
+// Index space: (LANES values, rows). Reads: images 7 to 9. Writes: images 2 to 4, their means along rows.
 kernel void loss_rows_backward(
 //@@ arguments loss_rows_backward
 ) {
     HERE;
     vfloat by_mean = 0, by_variance = 0, by_shared = 0;
     for (int k = -RADIUS; k <= RADIUS; k++) {
-        global const float *from = planes + 7 * plane + at + 3 * k;
+        global const float *from = images + 7 * image_stride + at + 3 * k;
         vfloat w = WINDOW[k + RADIUS];
         by_mean += w * VLOAD(from);
-        by_variance += w * VLOAD(from + plane);
-        by_shared += w * VLOAD(from + 2 * plane);
+        by_variance += w * VLOAD(from + image_stride);
+        by_shared += w * VLOAD(from + 2 * image_stride);
     }
-    VSTORE(INSIDE(by_mean), planes + 2 * plane + at);
-    VSTORE(INSIDE(by_variance), planes + 3 * plane + at);
-    VSTORE(INSIDE(by_shared), planes + 4 * plane + at);
+    VSTORE(INSIDE(by_mean), images + 2 * image_stride + at);
+    VSTORE(INSIDE(by_variance), images + 3 * image_stride + at);
+    VSTORE(INSIDE(by_shared), images + 4 * image_stride + at);
 }
 
-// Index space: (LANES values, rows). Reads: planes 0 to 4. Writes: the derivative of the loss, of the picture's shape.
+// Index space: (LANES values, rows). Reads: images 0 to 4. Writes: the derivative of the loss, of the picture's shape.
 kernel void loss_columns_backward(
 //@@ arguments loss_columns_backward
 ) {
     HERE;
     vfloat by_mean = 0, by_variance = 0, by_shared = 0;
     for (int k = -RADIUS; k <= RADIUS; k++) {
-        global const float *from = planes + 2 * plane + at + k * stride;
+        global const float *from = images + 2 * image_stride + at + k * stride;
         vfloat w = WINDOW[k + RADIUS];
         by_mean += w * VLOAD(from);
-        by_variance += w * VLOAD(from + plane);
-        by_shared += w * VLOAD(from + 2 * plane);
+        by_variance += w * VLOAD(from + image_stride);
+        by_shared += w * VLOAD(from + 2 * image_stride);
     }
-    vfloat a = VLOAD(planes + at), b = VLOAD(planes + plane + at);
+    vfloat a = VLOAD(images + at), b = VLOAD(images + image_stride + at);
     vfloat slope = sign(a - b) * l1_share - (by_mean + 2.0f * a * by_variance + b * by_shared) * ssim_share;
     float values[LANES];
     VSTORE(slope, values);
@@ -129,8 +129,8 @@ kernel void loss_columns_backward(
     }
 }
 
-// Index space: any number of work-groups of SUMMED. Reads: planes 0, 1 and 10, margins of zeros too. Writes: each work-group's sums
-// of |a - b|, (a - b)^2 and the SSIM, in a fixed order: the same on every run. A group has a piece of the planes, so that a core that
+// Index space: any number of work-groups of SUMMED. Reads: images 0, 1 and 10, margins of zeros too. Writes: each work-group's sums
+// of |a - b|, (a - b)^2 and the SSIM, in a fixed order: the same on every run. A group has a piece of the images, so that a core that
 // takes one work-item after another stays in the same pages.
 #define SUMMED 128
 kernel __attribute__((reqd_work_group_size(SUMMED, 1, 1))) void loss_sums(
@@ -139,12 +139,12 @@ kernel __attribute__((reqd_work_group_size(SUMMED, 1, 1))) void loss_sums(
     local real kept[3][SUMMED];
     uint item = get_local_id(0);
     real absolute = 0, squared = 0, similar = 0;
-    size_t piece = (plane + get_num_groups(0) - 1) / get_num_groups(0), first = get_group_id(0) * piece;
-    for (size_t at = first + item; at < min(first + piece, (size_t)plane); at += SUMMED) {
-        float difference = planes[at] - planes[plane + at];
+    size_t piece = (image_stride + get_num_groups(0) - 1) / get_num_groups(0), first = get_group_id(0) * piece;
+    for (size_t at = first + item; at < min(first + piece, (size_t)image_stride); at += SUMMED) {
+        float difference = images[at] - images[image_stride + at];
         absolute += fabs(difference);
         squared += difference * difference;
-        similar += planes[10 * plane + at];
+        similar += images[10 * image_stride + at];
     }
     kept[0][item] = absolute;
     kept[1][item] = squared;

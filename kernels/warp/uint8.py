@@ -1,0 +1,18 @@
+"""An image as 8 bits, when somebody reads it so: bit for bit `to_uint8` of fidsplat/vision/images.py."""
+
+import warp as wp
+
+from .common import STRICT
+
+
+@wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
+def to_uint8(
+    first: int,  # value of thread 0
+    values: wp.array(dtype=wp.float32),
+    made: wp.array(dtype=wp.uint8),  # as many
+):
+    at = wp.tid() + first
+    value = values[at]
+    if not value > 0.0:  # no number, too
+        value = 0.0
+    made[at] = wp.uint8(wp.rint(wp.min(value, 1.0) * 255.0))
