@@ -328,6 +328,10 @@ def test_other_results_are_refused_by_name(tmp_path):
     (tmp_path / "b" / "notes.csv").write_text("milk,bread\n1,2\n")
     with pytest.raises(fs.InputError, match=r"notes.csv is no summary"):
         load([tmp_path / "b"])
+    for head in ("[1]", "[" * 100_000):
+        (tmp_path / "b" / "notes.csv").write_text(f"# {head}\nmilk,bread\n1,2\n")
+        with pytest.raises(fs.InputError, match=r"cannot read .*notes.csv"):
+            load([tmp_path / "b"])
 
 
 def test_a_folder_without_results_is_not_passed_over(tmp_path):
