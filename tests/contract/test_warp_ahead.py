@@ -5,10 +5,10 @@ import weakref
 
 import numpy as np
 import pytest
+from derivative_errors import random_picture
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
-from fidsplat.hard_cases.derivatives import random_picture
 
 BACKEND = "warp"
 WHOLE = random_picture(1, count=3000, degree=None, quality="surfel", outputs=("rgb",))
