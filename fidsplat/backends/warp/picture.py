@@ -10,6 +10,7 @@ A picture of a kind that was drawn before does not wait for them: it is given `R
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -34,6 +35,7 @@ from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.effects import Output
 from fidsplat.errors import DeviceError
 
+_CONVERTING = threading.Lock()
 # bytes: of one splat's bounds; of its window, keys, counts, drawn, places, sums; of one that is drawn, in
 # sort and lists; of a pair with the scratch of its sort
 _BOUNDS, _PROJECTED, _VISIBLE, _PAIR = 44, 36, 40, 24
@@ -86,9 +88,12 @@ class WarpImages:
         """As `GivesUint8`."""
         drawn = self.device_array(name)
         made = load().empty(drawn.size, dtype=load().uint8, device=drawn.device)
-        given = {"values": drawn.flatten(), "made": made}
-        with quiet():
-            self._launcher.launch(kernels("uint8").to_uint8, drawn.size, given)
+        given = [drawn.flatten(), made]
+        with _CONVERTING, quiet():  # pictures are read in any thread, and the first read compiles
+            # not by `Launcher`, whose commands would keep the image
+            load().launch(
+                kernels("uint8").to_uint8, drawn.size, given, device=drawn.device, record_tape=False
+            )
         return made.numpy().reshape(drawn.shape)
 
     def wait(self) -> None:
