@@ -70,6 +70,11 @@ class ViewStack:
         return ViewStack._of(views, {name: each for name, each in numbers.items() if (each != each[0]).any()})
 
     @staticmethod
+    def alone(view: View) -> ViewStack:
+        """A stack of one."""
+        return ViewStack._of([view], {})
+
+    @staticmethod
     def _of(views: Sequence[View], numbers: Mapping[str, np.ndarray]) -> ViewStack:
         own = [[view, *(moved for _, moved in view.groups)] for view in views]
 
