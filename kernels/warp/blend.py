@@ -10,13 +10,14 @@ import warp as wp
 from . import output
 from .bounds import Bounds, make_bounds
 from .buffers import make_samples, sample_fields
-from .common import STRICT, View, first_sample, lowest, place_of, store_line
+from .common import STRICT, View, anew, first_sample, lowest, place_of, store_line
 from .crossing import make_crossing
 from .pixel import make_pixel
 from .rays import SLOPES
 from .splat import make_splat
 from .staging import BLOCK_H, BLOCK_W, STAGED
 
+_PLAIN = frozenset({"lowpass_screen", "stop_exclusive", "arithmetic_fast"})
 NONE, ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 
 
@@ -47,9 +48,11 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         for k in range(wp.static(len(stores))):
             wp.static(stores[k])(p, at, samples)
 
+    # so many threads at once: at most 40 registers, which is what a sample takes that keeps only its light
+    launched = (threads, 1536 // threads) if not outputs and _PLAIN.issuperset(effects) else threads
     options = {"module": "unique", "module_options": STRICT, "enable_backward": False}
 
-    @wp.kernel(name=f"blend_gpu_{mark}", launch_bounds=threads, **options)
+    @wp.kernel(name=f"blend_gpu_{mark}", launch_bounds=launched, **options)
     def blend_gpu(
         band_first: int,  # tile of block 0
         views: wp.array(dtype=View),
@@ -66,7 +69,7 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         # a warp draws a block, so that a splat that misses it costs it nothing
         block, lane = item / 32, item % 32
         number, tile_column, tile_row = place_of(tile, views)
-        view = views[number]
+        view = views[anew(number)]
         across = view.tile_w / BLOCK_W
         left = tile_column * view.tile_w + (block % across) * BLOCK_W
         top = tile_row * view.tile_h + (block / across) * BLOCK_H
@@ -117,6 +120,8 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
                 again = stage(records, lines, lists, end, 0, unfinished(p, view))
         if wp.static(opaque):
             p = cover(p, x0, y0, rays, view)
+        number, tile_column, tile_row = place_of(tile, views)
+        view = views[anew(number)]
         at = first_sample(number, view) + y0 * view.tiles_x * view.tile_w + x0
         store(finish(p), at, samples)
 

@@ -58,6 +58,20 @@ class View:
     ray: wp.vec4  # a sample's ray is ((column - [2]) [0], (row - [3]) [1], 1); 0 where depths are distances
 
 
+# The compiler does not see that it is the same number, and loads again what stands there: a GPU's thread has
+# fewer registers than a view has numbers.
+@wp.func_native("""
+    int same = number;
+#if defined(__CUDA_ARCH__)
+    asm volatile("" : "+r"(same));
+#endif
+    return same;
+""")
+def anew(number: int) -> int:
+    """The number."""
+    ...
+
+
 @wp.func
 def place_of(tile: int, views: wp.array(dtype=View)):
     """Of one of all views' tiles: its view, and the column and row of tiles in it."""

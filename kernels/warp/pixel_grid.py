@@ -9,7 +9,7 @@ class PixelGrid:
 
     pixel: int  # of the images, view after view, row by row
     here: int  # of its own view
-    row: int  # of its own view
+    row: int  # of all views, one after the other
     splats: int  # of the cloud
     first: int  # place of the first sample in a buffer
     stride: int  # samples of a row of a buffer, its padding included

@@ -17,7 +17,7 @@ from . import output
 from .bounds import PAD, PAD_RELATIVE, Bounds, box_bounds, make_bounds
 from .boxes import make_boxes
 from .color import make_color
-from .common import CULLED, STRICT, View, as_bits, sortable, store_line
+from .common import CULLED, STRICT, View, anew, as_bits, sortable, store_line
 from .disk import make_disk
 from .ellipsoids import EWA, EXACT, make_ellipsoids
 from .lens import LENSES, make_lens, make_optics
@@ -120,7 +120,7 @@ def make_project(
     ):
         at = wp.tid() + first
         number = at / views[0].splats
-        view = views[number]
+        view = views[anew(number)]
         i = at - number * view.splats
         keys[at] = CULLED
         counts[at] = wp.int64(0)
@@ -273,6 +273,9 @@ def make_project(
         if tiles == 0:
             return
 
+        view = views[anew(number)]
+        fx, fy, cx, cy = real(view.focal_x), real(view.focal_y), real(view.center_x), real(view.center_y)
+        per_fx, per_fy = real(view.per_focal_x), real(view.per_focal_y)
         # affine forms about the sample of the picture that is nearest to the centre (numerics B1)
         ax = wp.clamp(wp.floor(float(center_x)), 0.0, float(view.width - 1))
         ay = wp.clamp(wp.floor(float(center_y)), 0.0, float(view.height - 1))
@@ -312,6 +315,8 @@ def make_project(
             away2 = one
         facing = wp.where(height * height > edge_on * edge_on * away2, scale, zero)
 
+        view = views[anew(number)]
+        turn, shift, eye = placing.pose(i, number, view, moving)
         rgb = color_of(i, colors, mean - eye)
         if not (wp.isfinite(rgb[0]) and wp.isfinite(rgb[1]) and wp.isfinite(rgb[2])):
             return

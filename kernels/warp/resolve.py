@@ -50,10 +50,11 @@ def make_resolve(
         grid = PixelGrid()
         grid.here = place - number * pixels
         grid.pixel = slots[number] * pixels + grid.here
-        grid.row = grid.here / width
+        own_row = grid.here / width
+        grid.row = number * (view.height / n) + own_row
         grid.splats = view.splats
         x = (grid.here % width) * n
-        y = grid.row * n
+        y = own_row * n
         grid.stride = view.tiles_x * view.tile_w
         grid.first = first_sample(number, view) + y * grid.stride + x
         grid.side = n

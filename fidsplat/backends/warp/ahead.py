@@ -79,20 +79,21 @@ class Drawing:
         # arrays that were adopted may be others when the picture has to be drawn again
         if kind is None or not workspace.ahead or view.shots or resident.adopted:
             return self.picture(resident, stack, into, beside)[1]
+        beside, room = beside or self._image_bytes(view), kind.room
         if kind.replay is not None and kind.replay.token == self._token(kind, view, beside):
-            picture, launcher = kind.replay.picture, Launcher(self._commands, timed=False)
             kind.replay.draw(stack)
-        else:
-            launcher = Launcher(self._commands)
-            beside = beside or self._image_bytes(view)
-            given = {"beside": beside, "room": kind.room, "inputs": kind.inputs}
-            picture = Picture(self.program, workspace, resident, stack, launcher, **given)
-            if not picture.fits(kind.room):
-                return self.picture(resident, stack, into, beside)[1]
-            picture.draw()
-            self._capture(kind, picture, beside)
+            workspace.pictures += 1
+            return self._pending(room, kind.replay.picture, Launcher(self._commands, timed=False), into)
+        launcher = Launcher(self._commands)
+        given = {"beside": beside, "room": room, "inputs": kind.inputs}
+        picture = Picture(self.program, workspace, resident, stack, launcher, **given)
+        if not picture.fits(room):
+            return self.picture(resident, stack, into, beside)[1]
         workspace.pictures += 1
-        return self._pending(kind.room, picture, launcher, into)
+        picture.draw()
+        images = self._pending(room, picture, launcher, into)
+        self._capture(kind, picture, beside)
+        return images
 
     def _pending(self, room: Room, picture: Picture, launcher: Launcher, into: Into | None) -> WarpImages:
         """The images of a picture that was drawn with this room."""
@@ -139,7 +140,7 @@ class Drawing:
     def _token(self, kind: _Kind, view: View, beside: int) -> tuple[Any, ...]:
         """What launches depend on beside the numbers of the views: another one, others."""
         workspace, labels = self._workspace, tuple(label for label, _ in view.groups)
-        budgets = workspace.memory_budget, workspace.pair_budget, beside or self._image_bytes(view)
+        budgets = workspace.memory_budget, workspace.pair_budget, beside
         states = workspace.pool.state, kind.inputs.state
         return kind.room, budgets, states, view.raster, view.surroundings, labels
 

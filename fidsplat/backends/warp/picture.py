@@ -23,6 +23,7 @@ from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import kernels, load
 from fidsplat.backends.warp.structs import (
+    array_of,
     lens_of,
     memory_bytes,
     moving_of,
@@ -308,7 +309,7 @@ class Picture:
         for name in program.cloud_arrays:
             setattr(out, name, self.resident.arrays[name])
         for name, dtype in program.view_arrays.items():
-            setattr(out, name, self.inputs.filled(name, view.array(name), dtype))
+            setattr(out, name, self.inputs.filled(name, array_of(self.stack, name), dtype))
         given = {"views": self.held["views"], "slots": into.slots, "samples": self.samples, "out": out}
         given["background"] = wp.vec3(*view.background)
         given["rays"] = rays_of(view, self.workspace, self.inputs, bent=program.stretched)

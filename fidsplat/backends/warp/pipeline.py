@@ -70,8 +70,7 @@ class WarpPipeline:
 
     def _goes_together(self, stack: ViewStack) -> bool:
         """Whether all that differs from view to view stands in the struct `View`."""
-        program = self.program
-        return not (program.view_arrays or (program.sensor and stack.numbers))
+        return not (self.program.sensor and stack.numbers)
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Draw one picture and return what passes between the stages.
