@@ -261,6 +261,7 @@ def make_project(
                 box.dot_r = wp.sqrt(half_r2 / view.per_pixel) * (1.0 + PAD_RELATIVE) + PAD
             if itself:
                 box.dot_r = -1.0
+        view = views[anew(number)]
         row_first, row_end = limits.rows(box, view.height)
         first_column, end_column = limits.span(box, row_first, row_end, view.width)
         if row_first >= row_end or first_column >= end_column:
