@@ -1,6 +1,7 @@
 """Files written as a whole or not at all, and read with errors of few kinds."""
 
 import json
+import math
 import os
 import tempfile
 from collections.abc import Iterator
@@ -43,12 +44,20 @@ def ordinary_file(path: str | os.PathLike[str]) -> Path:
     return target
 
 
-def from_json(text: str | bytes) -> Any:
-    """What JSON says. Raises ValueError for all that is none, tables in a thousand tables among it."""
+def from_json(text: str | bytes, finite: bool = False) -> Any:
+    """What JSON says. Raises ValueError for all that is none, tables in a thousand tables among it; finite:
+    and for numbers that are not."""
+    numbers: dict[str, Any] = {"parse_float": _finite, "parse_constant": _finite} if finite else {}
     try:
-        return json.loads(text)
+        return json.loads(text, **numbers)
     except RecursionError:
         raise ValueError("it nests too deeply") from None
+
+
+def _finite(text: str) -> float:
+    if not math.isfinite(value := float(text)):
+        raise ValueError(text)
+    return value
 
 
 @contextmanager

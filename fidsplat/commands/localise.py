@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.output import Device, Json, console, option, print_json, print_table, say, switch
+from fidsplat.commands.output import (
+    Device,
+    Json,
+    console,
+    late_progress,
+    option,
+    print_json,
+    print_table,
+    say,
+    switch,
+)
 
 if TYPE_CHECKING:
     from fidsplat.experiments.localise import Localise as Asked
@@ -51,7 +61,7 @@ class Localise:
 
     def run(self) -> int:
         import fidsplat as fs
-        from fidsplat.commands.sweeps import bars, need_reports
+        from fidsplat.commands.sweeps import need_reports
         from fidsplat.experiments.localise import VARIANTS
         from fidsplat.experiments.localise import Localise as Asked
         from fidsplat.vision.video import check_video
@@ -72,13 +82,12 @@ class Localise:
         done = 0
 
         def tell(name: str, share: float) -> None:
-            progress.update(bar, description=name, completed=done + share)
+            progress(name, (done + share) / len(names))
 
         folder = Path(self.out)
         sweep = drive_sweep(folder, asked, names, renderer, tell, self.overwrite)
-        with bars() as progress:
+        with late_progress(console(True)) as progress:
             done = len(names) - len(sweep.left)
-            bar = progress.add_task("drive", total=len(names), completed=done)
             for record in sweep.run():
                 done += 1
                 tell(record.key["variant"], 0.0)

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import tyro
 
@@ -19,6 +19,8 @@ from fidsplat.files import ordinary_file, path_of, writable_folder
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+T = TypeVar("T")
 
 
 def option(metavar: str, text: str, short: str | None = None):
@@ -142,6 +144,20 @@ def late_progress(where: Console, after: float = 1.0) -> Iterator[Callable[[str,
         timer.join()
         if shown.live.is_started:
             shown.stop()
+
+
+def counted(
+    name: str, steps: Iterable[T], total: int, done: int = 0, words: Callable[[T], str] = lambda step: ""
+) -> Iterator[T]:
+    """The steps, each once it is done, counted by a bar on stderr that says what the last was."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console(True), transient=True) as progress:
+        bar = progress.add_task(name, total=total, completed=done)
+        for step in steps:
+            progress.update(bar, advance=1, description=f"{name} {words(step)}".strip())
+            yield step
 
 
 _UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}

@@ -20,7 +20,7 @@ import pandas as pd
 
 from fidsplat.errors import InputError
 from fidsplat.experiments.sweep import Record, read_records
-from fidsplat.files import atomic_write
+from fidsplat.files import atomic_write, from_json
 
 _MARK = "# "
 Frame: TypeAlias = Any
@@ -83,7 +83,9 @@ def read_summary(file: Path) -> Summary:
     try:
         text = file.read_text("utf-8")
         lines = text.splitlines()
-        heads = [json.loads(line.removeprefix(_MARK)) for line in lines if line.startswith(_MARK)]
+        heads = [from_json(line.removeprefix(_MARK)) for line in lines if line.startswith(_MARK)]
+        if not all(isinstance(head, dict) for head in heads):
+            raise ValueError("a line before its table holds no facts")
         repeated = [name for head in heads for name in head.get("repeated", ())]
         # an empty cell alone is none: the word "None" is one, and so is a number among words
         rows = pd.read_csv(

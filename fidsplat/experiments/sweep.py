@@ -8,7 +8,6 @@ lines after it, each of which is {"key": ..., "result": ...}: what was measured,
 from __future__ import annotations
 
 import json
-import math
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fidsplat.errors import InputError
-from fidsplat.files import atomic_write, ordinary_file, writable_folder
+from fidsplat.files import atomic_write, from_json, ordinary_file, writable_folder
 
 Key = dict[str, Any]
 """a point of a sweep: plain data that names what is measured"""
@@ -158,7 +157,7 @@ def read_records(file: Path) -> list[Record]:
     run: dict[str, Any] | None = None
     for number, line in enumerate(text.split("\n")[:-1], 1):
         try:
-            value = json.loads(line, parse_float=_finite, parse_constant=_finite)
+            value = from_json(line, finite=True)
             if set(value) == {"run"}:
                 run = value["run"]
                 continue
@@ -251,13 +250,6 @@ def _header(run: dict[str, Any]) -> str:
 def _line(record: Record) -> str:
     # NaN and infinities are not JSON: a result that has them is a fault, found here
     return json.dumps({"key": record.key, "result": record.result}, allow_nan=False) + "\n"
-
-
-def _finite(text: str) -> float:
-    """A number of a result, which is neither NaN nor infinite. Raises ValueError."""
-    if not math.isfinite(value := float(text)):
-        raise ValueError(text)
-    return value
 
 
 def rounded(value: Any) -> Any:

@@ -71,6 +71,8 @@ def content(path: Path, what: str, begins: tuple[bytes, ...] = (b"",)) -> bytes:
     try:
         with path.open("rb") as stream:
             head = stream.read(64)
+            while head.isspace():
+                head = stream.read(1 << 16)
             if not head.lstrip().startswith(begins):
                 return head
             stream.seek(0)

@@ -67,7 +67,8 @@ def poses():
 @pytest.mark.parametrize(("tilt", "spin", "distance", "shift"), list(poses()))
 def test_boxes_of_a_sheet_add_up_to_it(renderer, tilt, spin, distance, shift):
     """A sheet cut into rectangles at random covers what one box of its size covers, in every pixel, and a
-    white sheet is as white: no seam at any tilt, distance and shift.
+    white sheet is as white: no seam at any tilt, distance and shift. Its depth is the plane's, as that of the
+    one box is, also where boxes end within a pixel.
     """
     generator = np.random.default_rng(7)
     bits = generator.integers(0, 2, (9, 9))
@@ -87,11 +88,13 @@ def test_boxes_of_a_sheet_add_up_to_it(renderer, tilt, spin, distance, shift):
         123, 97, looking.fx, looking.fy, looking.cx + shift[0], looking.cy + shift[1], looking.world_to_camera
     )
     quality = EXACT.with_(transmittance_stop=0.0)
-    parts = renderer.render(sheet, camera, ("rgb", "alpha"), quality)
-    one = renderer.render(whole, camera, ("rgb", "alpha"), quality)
+    outputs = ("rgb", "alpha", "depth")
+    parts, one = (renderer.render(cloud, camera, outputs, quality) for cloud in (sheet, whole))
     assert one["alpha"].max() > 0.0
     assert np.abs(parts["alpha"] - one["alpha"]).max() < SEAM
     assert np.abs(parts["rgb"] - parts["alpha"][..., None]).max() < SEAM
+    inside = one["alpha"] > 0.999
+    assert np.allclose(parts["depth"][inside], one["depth"][inside], rtol=1e-5, atol=0)
 
 
 def test_boxes_of_one_plane_that_overlap_are_no_more_than_opaque(renderer):

@@ -6,6 +6,7 @@ import weakref
 
 import numpy as np
 import pytest
+from derivative_errors import random_picture
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare, prepare_batch
@@ -13,7 +14,6 @@ from fidsplat.backends.warp import batch as batches
 from fidsplat.backends.warp import runtime
 from fidsplat.backends.warp.replay import Replay
 from fidsplat.backends.warp.shapes import WarpShape
-from fidsplat.hard_cases.derivatives import random_picture
 from fidsplat.views import views_of
 
 BACKEND = "warp"
@@ -113,7 +113,7 @@ def test_images_that_nobody_reads_leave_at_once(ahead):
     pipeline.render(resident, view)
     images = pipeline.render(resident, view)
     assert images.settle
-    array = weakref.ref(images.into.arrays["rgb"])
+    array = weakref.ref(images.arrays["rgb"])
     gc.disable()
     try:
         images = pipeline.render(resident, view)  # whose launches take the place of the others'

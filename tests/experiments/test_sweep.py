@@ -172,6 +172,7 @@ def test_numbers_are_kept_to_six_digits(tmp_path):
         ('{"run": 1}\n{"key": {}, "result": {}}\n', 2),
         ('{"run": {}}\n{"key": {}, "result": {"a": 1e999}}\n', 2),
         ('{"run": {}}\n{"key": {}, "result": {"a": NaN}}\n', 2),
+        ('{"run": {}}\n' + "[" * 100_000 + "\n", 2),
     ],
 )
 def test_files_that_are_not_ours_are_refused_and_left_alone(tmp_path, text, line):

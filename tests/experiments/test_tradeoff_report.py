@@ -328,6 +328,10 @@ def test_other_results_are_refused_by_name(tmp_path):
     (tmp_path / "b" / "notes.csv").write_text("milk,bread\n1,2\n")
     with pytest.raises(fs.InputError, match=r"notes.csv is no summary"):
         load([tmp_path / "b"])
+    for head in ("[1]", "[" * 100_000):
+        (tmp_path / "b" / "notes.csv").write_text(f"# {head}\nmilk,bread\n1,2\n")
+        with pytest.raises(fs.InputError, match=r"cannot read .*notes.csv"):
+            load([tmp_path / "b"])
 
 
 def test_a_folder_without_results_is_not_passed_over(tmp_path):
@@ -371,4 +375,4 @@ def test_without_what_makes_reports_one_line_says_what_to_install(capsys, tmp_pa
     monkeypatch.setattr("fidsplat.commands.sweeps.find_spec", lambda name: None if name == "jinja2" else True)
     for words in (["tradeoff", "report", str(tmp_path)], ["experiment", "report", str(tmp_path)]):
         assert main(words) == 2
-        assert "reports need jinja2; pip install 'fidsplat[experiments]'" in capsys.readouterr().err
+        assert "a report needs jinja2; pip install 'fidsplat[experiments]'" in capsys.readouterr().err

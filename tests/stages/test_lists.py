@@ -67,6 +67,40 @@ def test_views_of_a_batch_are_listed_apart(backend, monkeypatch, lists, budget):
         assert np.array_equal(picture, own.read("rgb"))
 
 
+@pytest.mark.parametrize("budget", [0, 5000])
+def test_neighbours_that_share_tiles_are_counted_together(backend, monkeypatch, budget):
+    """As those of a store: by groups of 4096 splats of one place, of one that is left of the picture, and of
+    all of a picture of more tiles than local memory has room for; then drawn again, as it was launched."""
+    generator = np.random.default_rng(8)
+    cloud = random_splats(3 * 4096 + 50, seed=5, scale=(1e-3, 0.03))
+    means, near = cloud.means.copy(), generator.normal(size=(2 * 4096, 3)).astype(np.float32)
+    means[: 2 * 4096] = [0.7, 0.4, 3.0] + [0.1, 0.1, 0.3] * near
+    means[4096 : 2 * 4096, 0] -= 6.0
+    cloud = fs.SplatCloud(means, cloud.quats, cloud.scales, cloud.opacities, colors=cloud.colors)
+    camera = fs.Camera.look_at(641, 549, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
+    features, view = prepare(cloud, fs.Capture(camera, ALL_OUTPUTS, fs.Quality(lowpass="none")))
+    pipeline, resident = backend.pipeline(features, listing(backend, "tiled")), backend.upload(cloud)
+    wanted = pipeline.render(resident, view)
+    assert 1000 < wanted.stats["visible"] < 2.2 * 4096
+    gathered, launched = GatheredLists._gather, []
+
+    def gather(self, kernel, **given):
+        launched.append(kernel)
+        gathered(self, kernel, **given)
+
+    monkeypatch.setattr(GatheredLists, "_gather", gather)
+    monkeypatch.setattr(backend, "pair_budget", budget or backend.pair_budget)
+    resident = backend.upload(cloud)
+    resident.neighbours = True
+    for _ in range(3):
+        picture = pipeline.render(resident, view)
+        assert picture.stats == wanted.stats
+        for name in ALL_OUTPUTS:
+            assert np.array_equal(picture.read(name), wanted.read(name)), name
+    # in bands each time; else twice, and then as it was launched before
+    assert launched.count("tally_gathered") == (3 if budget else 2)
+
+
 def test_lists_that_outgrow_their_buffers_are_made_again(backend):
     """A picture that has far more pairs, or big splats, than the last one."""
     groups = listing(backend, "tiled")

@@ -264,6 +264,17 @@ def test_a_huge_file_that_is_something_else_is_not_read_as_a_whole(tmp_path, suf
         tracemalloc.stop()
 
 
+def test_a_gltf_may_begin_with_as_many_spaces_as_it_likes(tmp_path):
+    path, cloud = tmp_path / "a.gltf", some(count=9, degree=1)
+    fs.save_splats(cloud, path)
+    for spaces in (b"\n", b" " * 63, b" " * 64, b" \r\n\t" * 50_000):
+        path.write_bytes(spaces + path.read_bytes().lstrip())
+        assert_same_bits(fs.load_splats(path), cloud)
+    path.write_bytes(b" " * 100)
+    with pytest.raises(fs.InputError, match="it is not JSON"):
+        fs.load_splats(path)
+
+
 @pytest.mark.parametrize("suffix", [".spz", ".splat", ".glb", ".gltf", *USD[:2]])
 def test_files_that_are_cut_short_or_something_else(tmp_path, suffix):
     need(suffix)

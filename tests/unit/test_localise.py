@@ -17,7 +17,17 @@ mujoco = pytest.importorskip("mujoco", reason="pip install 'fidsplat[sim]'")
 from fidsplat.experiments.localise import Localise, errors_of, write_log  # noqa: E402 (needs MuJoCo)
 from fidsplat.experiments.localise_sweep import write_report  # noqa: E402
 from fidsplat.sim.greenhouse import Greenhouse  # noqa: E402
-from fidsplat.sim.robot import BODY, CAMERA_AT, Errors, Run, camera_at, drive, mount  # noqa: E402
+from fidsplat.sim.robot import (  # noqa: E402
+    BODY,
+    CAMERA_AT,
+    CONTROL,
+    Errors,
+    Run,
+    _measured,
+    camera_at,
+    drive,
+    mount,
+)
 
 EXACT = Errors(wheels=0, slip=0, gyro_bias=0, gyro_noise=0)
 CAMERA = fs.Camera.look_at(320, 240, 1.2, (0, 0, 0), (0, 0, 1))
@@ -60,6 +70,38 @@ def test_errors_of_sensors_are_the_seeds(house):
     np.testing.assert_array_equal(one.poses, other.poses)
     assert not np.array_equal(one.wheels, other.wheels)
     assert one.gyro.std() == pytest.approx(0.002, abs=0.01)
+
+
+def test_a_wheel_slips_by_the_metre_whatever_the_step():
+    """Its distance after d metres is off by slip * sqrt(d), of small steps as of large ones."""
+    slip = 0.05
+    for steps, step in ((4000, 0.01), (4000, 0.25)):
+        rolled = step * np.arange(steps)[:, None] * np.array([1.0, -1.0])  # the right wheel rolls back
+        times, poses = np.arange(steps) * CONTROL, np.tile(np.eye(4), (steps, 1, 1))
+        made = _measured(times, poses, rolled, np.zeros(steps), replace(EXACT, slip=slip))
+        off = made.wheels - np.diff(rolled, axis=0, prepend=rolled[:1])
+        assert off[0].tolist() == [0.0, 0.0]  # what has not rolled does not slip
+        assert off[1:].std(axis=0) == pytest.approx([slip * math.sqrt(step)] * 2, rel=0.05)
+        assert off.sum(axis=0) == pytest.approx([0, 0], abs=4 * slip * math.sqrt(steps * step))
+
+
+def test_the_filter_doubts_its_wheels_by_the_metre():
+    """3 mm after a metre ahead and aside, in one step or in a hundred, forwards or back; nothing at rest."""
+    spreads = []
+    for steps, step in ((100, 0.01), (1, 1.0), (1, -1.0)):
+        filtered = Localiser(np.zeros(3))
+        filtered.covariance = np.zeros((5, 5))
+        for _ in range(steps):
+            filtered.move(np.full(2, step), 0.0, 0.0)
+        spreads.append(filtered.covariance.copy())
+        assert filtered.state[0] == pytest.approx(steps * step)
+    for spread in spreads:
+        assert math.sqrt(spread[0, 0]) == pytest.approx(0.003, rel=0.01)
+        assert math.sqrt(spread[2, 2]) == pytest.approx(1e-3, rel=0.01)
+    resting = Localiser(np.zeros(3))
+    before = np.diag(resting.covariance)[:2].copy()
+    resting.move(np.zeros(2), 0.0, 0.02)
+    np.testing.assert_array_equal(np.diag(resting.covariance)[:2], before)
 
 
 def test_a_robot_that_meets_a_bench_says_so(house):

@@ -37,6 +37,33 @@ def test_bands_of_devices_have_the_bits_of_one(store, two):
     assert set(ours.timings) == set(whole.timings)
 
 
+def _around():
+    """A panorama before a panorama."""
+    image = np.random.default_rng(0).random((8, 16, 3)).astype(np.float32)
+    return fs.Capture(fs.Camera.equirectangular(64, 32), background=fs.Panorama(image))
+
+
+def _moving():
+    """A camera and a group that move while rows are read out one after another."""
+    path = fs.Trajectory([0.0, 1.0], [look().world_to_camera, look(at=(0.4, 0.1, 0.0)).world_to_camera])
+    aside = np.eye(4) + np.eye(4, k=3) * 0.3
+    groups = {0: fs.Trajectory([0.0, 1.0], [np.eye(4), aside])}
+    shutter = fs.Shutter(time=0.5, exposure_time=0.2, sub_poses=2, readout=0.4, rows_per_band=7)
+    return fs.Capture(look(), motion=fs.Motion(path, groups), shutter=shutter)
+
+
+@pytest.mark.parametrize("capture", [_around(), _moving()], ids=["panorama", "shutter"])
+def test_bands_of_what_has_rows_of_its_own(two, capture):
+    """Rays by the row of a panorama, and poses by the row of a shutter, are those of the whole picture."""
+    cloud = splats(1).with_labels(np.arange(len(splats(1))) % 2)
+    whole = fs.Renderer("opencl").render(cloud, capture)["rgb"]
+    given = two.upload(cloud)
+    for share in (0.3, 0.6):
+        two._shares = np.array([0.0, share, 1.0])
+        assert np.array_equal(two.render(given, capture)["rgb"], whole), share
+    assert len(np.unique(whole.reshape(-1, 3), axis=0)) > 100
+
+
 def test_splats_beside_a_band_are_not_taken_for_big_ones():
     # what another picture has left on the device must not show where a big splat stands
     big = fs.SplatCloud([[0.0, 0.0, 2.0]], [[1.0, 0, 0, 0]], [[3.0, 3.0]], [0.1], colors=np.ones((1, 3)))

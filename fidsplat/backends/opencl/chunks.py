@@ -250,6 +250,7 @@ class GatheredChunks:
         self.kept: dict[Hashable, Any] = {}
         """as that of a Resident"""
         self.fixed = True
+        self.neighbours = True
         self._buffers: dict[str, cl.Buffer] = {}
         self._copies: tuple[int, int, Copies | None] = (0, 0, None)
         """of splats [first, end), as they were copied last"""

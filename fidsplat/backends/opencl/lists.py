@@ -3,8 +3,9 @@
 On CPUs (`ordered`) all visible splats are sorted by depth, then listed per tile in that order, by counting
 sorts over a few contiguous pieces: long sequential walks and no atomics. On GPUs (`tiled`) every splat counts
 its tiles while it is projected, pairs are written to the tiles in any order, and each tile's list is sorted
-in local memory: few launches, all of them wide. Of many small views (`gathered`) tiles are counted for
-thousands of splats at a time, in local memory. docs/growth.md has both ways on both kinds of device.
+in local memory: few launches, all of them wide. Of many small views and of stores (`gathered`) tiles are
+counted for thousands of splats at a time, in local memory: where neighbours in memory touch the same tile,
+atomics of its one word wait for each other. docs/growth.md has both ways on both kinds of device.
 """
 
 from __future__ import annotations
@@ -338,7 +339,8 @@ class TiledLists(Lists):
 
 class GatheredLists(TiledLists):
     """Kernels gathered.cl beside those of TiledLists: work-groups take many splats of a view each, and count
-    their pairs in local memory. For many views, of at most TILES tiles each.
+    their pairs in local memory. For many views, of at most TILES tiles each, and for splats whose neighbours
+    lie near each other.
     """
 
     TILES = 4096  # GATHER_TILES

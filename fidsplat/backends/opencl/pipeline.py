@@ -90,6 +90,9 @@ class OpenCLPipeline:
             kept = resident.kept.get(key)
             if kept is not None and (repeated := self._tried(self._repeat, resident, view, kept)) is not None:
                 return repeated
+            if resident.neighbours and self.shape.lists == "tiled":
+                gathered = replace(self.shape, lists="gathered")
+                return self._other(self.features, gathered).render(resident, view)
             plan = self._plan(resident, view)
             if plan.chunk and self.shape.lists != "ordered":
                 # one way of drawing in chunks is enough: where memory is short, sorting takes the least time
@@ -143,7 +146,7 @@ class OpenCLPipeline:
         for first, end, plan in self._parts(resident, batch, buffers.nbytes):
             views = batch.views
             stack = views.part(first, end) if isinstance(views, ViewStack) and end - first > 1 else None
-            shape = self._listing(plan, stack)
+            shape = self._listing(resident, plan, stack)
             pipeline = self if shape is self.shape else self._other(self.features, shape)
             pool.make_way((pipeline, "views", resident.count, plan), workspace.memory_budget - plan.held)
 
@@ -154,14 +157,14 @@ class OpenCLPipeline:
             drawn.append(Drawn.of(draw(start, batch.one(first), outputs, into)))
         return OpenCLBatch(workspace, buffers, drawn, resident.count)
 
-    def _listing(self, plan: MemoryPlan, stack: ViewStack | None) -> DeviceShape:
+    def _listing(self, resident: Resident, plan: MemoryPlan, stack: ViewStack | None) -> DeviceShape:
         """The shape that lists a part of a batch in the least time."""
         if self.shape.lists != "tiled":
             return self.shape
         if plan.chunk:
             return replace(self.shape, lists="ordered")  # as `render`
         few = stack is not None and self._tiles(stack.view) <= GatheredLists.TILES
-        return replace(self.shape, lists="gathered") if few else self.shape
+        return replace(self.shape, lists="gathered") if few or resident.neighbours else self.shape
 
     def _tiles(self, view: View) -> int:
         """That a view has."""
@@ -245,7 +248,7 @@ class OpenCLPipeline:
         pool.make_way(kind, self.workspace.memory_budget - plan.held)
         picture = self._draw(resident, view, plan, trusted)
         whole = not (plan.chunk or resident.streamed or view.shots or picture.in_bands)
-        if key is not None and whole and self.shape.lists == "tiled" and resident.count:
+        if key is not None and whole and self.shape.lists != "ordered" and resident.count:
             rasters = {each.raster for each in resident.kept.values()} - {None, view.raster}
             if len(resident.kept) >= _KINDS or (view.raster is not None and len(rasters) >= _RASTERS):
                 resident.kept.clear()

@@ -68,7 +68,11 @@ class Setup:
             if cloud.planes is not None:
                 radius[cloud.planes >= 0] = _PLANE_RADIUS
             with np.errstate(divide="ignore", invalid="ignore"):
-                reach = np.where(box, reach, reach * (radius / np.sqrt(2 * half_r2)))
+                further = radius / np.sqrt(2 * half_r2)
+                further[box] = (
+                    1 if cloud.planes is None else np.where(cloud.planes[box] >= 0, _PLANE_BOXES, 1)
+                )
+                reach = reach * further
             self.key = self.key - reach.astype(np.float32)
         if "compose_planes" in features.slots:
             table = PlaneTable(cloud)
@@ -140,6 +144,8 @@ _RANGE_RADIUS = math.sqrt(2 * math.log(255))
 _PLANE_RADIUS = 64.0
 """the same of splats that are printed on a plane: they lie on it wherever any cut-off and a low-pass let them
 be drawn, so that those that a cut-off leaves out move no layer"""
+_PLANE_BOXES = 8.0
+"""half sides of a box within which its fragments lie on its plane: where it ends within a pixel too"""
 _OF_SPLATS = (
     *("order", "log_opacity", "half_r2", "reach", "labels", "pz", "z_numerator"),
     *("inverse_m2", "turned"),

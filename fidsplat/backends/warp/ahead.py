@@ -45,13 +45,6 @@ class Drawing:
     def __init__(self, program: Program, workspace: Workspace, commands: Commands) -> None:
         self.program, self._workspace, self._commands = program, workspace, commands
         self._kinds: WeakKeyDictionary[Resident, dict[tuple[int, int, int], _Kind]] = WeakKeyDictionary()
-        self._alone: ViewStack | None = None
-
-    def alone(self, view: View) -> ViewStack:
-        """The view as a stack, which is the same one as long as the view is."""
-        if self._alone is None or self._alone.view is not view:
-            self._alone = ViewStack.alone(view)
-        return self._alone
 
     def picture(
         self, resident: Resident, stack: ViewStack, into: Into | None = None, beside: int = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -11,6 +12,8 @@ from fidsplat.backends.warp.launch import Launcher
 from fidsplat.backends.warp.picture import Into
 from fidsplat.backends.warp.runtime import kernels, load, quiet
 from fidsplat.effects import Output
+
+_CONVERTING = threading.Lock()
 
 
 class WarpImages:
@@ -45,6 +48,11 @@ class WarpImages:
         self._settled()
         return self._stats
 
+    @property
+    def arrays(self) -> Mapping[str, Any]:
+        """What holds the images, drawn or not."""
+        return self.into.arrays
+
     def device_array(self, name: str) -> Any:
         """The image as a wp.array (h, w) or (h, w, 3) on the device; no copy."""
         self._settled()
@@ -60,9 +68,12 @@ class WarpImages:
         """As `GivesUint8`."""
         drawn = self.device_array(name)
         made = load().empty(drawn.size, dtype=load().uint8, device=drawn.device)
-        given = {"values": drawn.flatten(), "made": made}
-        with quiet():
-            self._launcher.launch(kernels("uint8").to_uint8, drawn.size, given)
+        given = [drawn.flatten(), made]
+        with _CONVERTING, quiet():  # pictures are read in any thread, and the first read compiles
+            # not by `Launcher`, whose commands would keep the image
+            load().launch(
+                kernels("uint8").to_uint8, drawn.size, given, device=drawn.device, record_tape=False
+            )
         return made.numpy().reshape(drawn.shape)
 
     def wait(self) -> None:

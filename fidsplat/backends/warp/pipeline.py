@@ -32,7 +32,7 @@ class WarpPipeline:
             DeviceError: the device runs out of memory or fails.
         """
         with self.workspace.working("while drawing"):
-            return self._drawing.images(resident, self._drawing.alone(view))
+            return self._drawing.images(resident, ViewStack.alone(view))
 
     def drawn(self, resident: Resident, view: View) -> tuple[Picture, WarpImages]:
         """One picture with all that its stages have left on the device, until another is drawn; its images.
@@ -41,7 +41,7 @@ class WarpPipeline:
             DeviceError: as `render`.
         """
         with self.workspace.working("while drawing"):
-            return self._drawing.picture(resident, self._drawing.alone(view))
+            return self._drawing.picture(resident, ViewStack.alone(view))
 
     def render_batch(self, resident: Resident, batch: ViewBatch) -> WarpBatch:
         """Draw many views, as many at once as memory holds.
@@ -52,9 +52,7 @@ class WarpPipeline:
         with self.workspace.working("while drawing"):
             images = WarpBatch(self.workspace, self.program.images, batch, resident.count)
             for first, end in self._parts(resident, batch, images.nbytes):
-                views = batch.views
-                alone = end - first == 1 or not isinstance(views, ViewStack)
-                stack = ViewStack.alone(batch.one(first)) if alone else views.part(first, end)
+                stack = batch.part(first, end)
                 into = images.into(batch.slots[first:end])
                 images.add(self._drawing.images(resident, stack, into, images.nbytes))
             return images

@@ -49,7 +49,7 @@ class Replay:
 
     def draw(self, stack: ViewStack) -> None:
         """All stages but the last, for these views."""
-        if stack is not self.picture.stack:
+        if len(stack) > 1 or stack.view is not self.picture.view:
             self.picture.turn_to(stack)
         load().capture_launch(self._graph)
 

@@ -39,8 +39,9 @@ def _record() -> Any:
 def uniforms(stack: ViewStack, shape: WarpShape, splats: int, sloped: bool) -> np.ndarray:
     """(views,) of the struct `View`, of pictures in tiles of this shape. splats: of the cloud. sloped: its
     kernels read rays' derivatives."""
-    view, filled = stack.view, np.zeros(len(stack), _record())
-    for name in filled.dtype.names or ():
+    view = stack.view
+    filled: Any = np.zeros(len(stack), _record())
+    for name in filled.dtype.names:
         if name not in _LATER:
             derive = _DERIVED.get(name)
             filled[name] = derive(view, shape) if derive else getattr(view, name)
@@ -131,7 +132,7 @@ def moving_of(resident: Resident, stack: ViewStack, inputs: ArrayPool) -> Any:
         return _empty(kind)
     held = kind()
     labels = np.array([label for label, _ in groups], np.int32)
-    poses = np.zeros((len(stack), len(groups)), declared.Pose.numpy_dtype())
+    poses: Any = np.zeros((len(stack), len(groups)), declared.Pose.numpy_dtype())
     for name in ("rotation", "translation", "eye"):
         poses[name] = np.swapaxes(getattr(stack, name)[1:], 0, 1)
     held.labels = resident.arrays["labels"]
