@@ -274,6 +274,7 @@ def make_project(
         if tiles == 0:
             return
 
+        # loaded again, here and above, so that no registers hold them meanwhile
         view = views[anew(number)]
         fx, fy, cx, cy = real(view.focal_x), real(view.focal_y), real(view.center_x), real(view.center_y)
         per_fx, per_fy = real(view.per_focal_x), real(view.per_focal_y)
@@ -316,7 +317,6 @@ def make_project(
             away2 = one
         facing = wp.where(height * height > edge_on * edge_on * away2, scale, zero)
 
-        view = views[anew(number)]
         turn, shift, eye = placing.pose(i, number, view, moving)
         rgb = color_of(i, colors, mean - eye)
         if not (wp.isfinite(rgb[0]) and wp.isfinite(rgb[1]) and wp.isfinite(rgb[2])):
