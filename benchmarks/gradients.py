@@ -1,7 +1,7 @@
 """Derivatives: how far they are from the reference's, and how long they take (docs/gradients.md).
 
-    python benchmarks/gradients.py [--device D] [--scenes 200] [--json FILE]
-    python benchmarks/gradients.py --time r100k_720p r1m_1080p [--quality surfel] [--repeats 15]
+    PYTHONPATH=.:tests python benchmarks/gradients.py [--device D] [--scenes 200] [--json FILE]
+    PYTHONPATH=.:tests python benchmarks/gradients.py --time r100k_720p r1m_1080p [--quality surfel]
 
 Errors are of random scenes as tests/contract/test_gradients.py has them: of each parameter's whole array the
 relative error and one less its cosine, the median and the largest of all scenes; how many scenes are beyond
@@ -15,6 +15,14 @@ from __future__ import annotations
 from collections import defaultdict
 
 import numpy as np
+from derivative_errors import (
+    NORM,
+    derivatives,
+    differences,
+    last_place,
+    random_loss,
+    random_picture,
+)
 from measuring import PROGRESS, facts, keep, options, show
 from rich.progress import track
 
@@ -23,14 +31,6 @@ from fidsplat.backends.derivatives import Differentiates
 from fidsplat.backends.prepare import prepare
 from fidsplat.backends.reference.backend import ReferenceBackend
 from fidsplat.errors import InputError
-from fidsplat.hard_cases.derivatives import (
-    NORM,
-    derivatives,
-    differences,
-    last_place,
-    random_loss,
-    random_picture,
-)
 from fidsplat.random_clouds import load_scene
 from fidsplat.timing import Timer, take_turns
 

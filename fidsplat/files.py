@@ -47,7 +47,7 @@ def ordinary_file(path: str | os.PathLike[str]) -> Path:
 def from_json(text: str | bytes, finite: bool = False) -> Any:
     """What JSON says. Raises ValueError for all that is none, tables in a thousand tables among it; finite:
     and for numbers that are not."""
-    numbers = {"parse_float": _finite, "parse_constant": _finite} if finite else {}
+    numbers: dict[str, Any] = {"parse_float": _finite, "parse_constant": _finite} if finite else {}
     try:
         return json.loads(text, **numbers)
     except RecursionError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from numbers import Real
@@ -14,7 +15,7 @@ from fidsplat.budget.search import Calibration, Search
 from fidsplat.cameras import Camera
 from fidsplat.capture import Capture
 from fidsplat.errors import DeviceError, InputError
-from fidsplat.provenance import code_hash
+from fidsplat.provenance import code_hash, digest_of
 from fidsplat.quality import Quality
 from fidsplat.render import Renderer, default_device
 from fidsplat.scenes import Scene
@@ -129,7 +130,7 @@ def choose(
     splats = scene.cloud() if isinstance(scene, Scene) and streamed is None else scene
     info = renderer.device
     drawn_by = (info.name, info.title, info.platform, info.version, code_hash())
-    key = store.digest(drawn_by, (error, ms), asked, streamed.content if streamed else splats)
+    key = _key(drawn_by, (error, ms), asked, streamed.content if streamed else splats)
     kept = _kept(key, asked.quality, info.name)
     if kept is not None:
         return kept
@@ -186,6 +187,14 @@ def _drawn(candidate: Candidate, base: Quality, renderer: Renderer) -> Candidate
     except (InputError, DeviceError):
         return None if "blend_precision" in candidate.knobs else candidate.everywhere
     return candidate
+
+
+def _key(*question: object) -> str | None:
+    """None where something in a question is no data, as a function of time that moves a camera."""
+    try:
+        return digest_of(question)
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return None
 
 
 def _kept(key: str | None, base: Quality, device: str) -> Choice | None:

@@ -14,7 +14,7 @@ from fidsplat.commands.output import (
     writable_file,
 )
 from fidsplat.commands.own_scenes import Cameras, OwnScenes, own_scenes_of
-from fidsplat.commands.plots import check_plot
+from fidsplat.commands.sweeps import check_plot
 from fidsplat.errors import InputError
 from fidsplat.files import atomic_write
 

@@ -4,7 +4,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from fidsplat.commands.output import Device, Json, console, option, print_json, print_table, say
+from fidsplat.commands.output import (
+    Device,
+    Json,
+    console,
+    late_progress,
+    option,
+    print_json,
+    print_table,
+    say,
+)
 from fidsplat.errors import InputError
 from fidsplat.files import writable_folder
 
@@ -68,16 +77,13 @@ class Check:
         return 0 if result.passed else 1
 
     def _fuzz(self, renderer: "Renderer", folder: Path, where: "Console") -> int:
-        from rich.progress import Progress
-
         from fidsplat.hard_cases.fuzz import fuzz_run
 
         wanted = self.fuzz or 0
         state = None
-        with Progress(console=where, transient=True) as progress:
-            task = progress.add_task("splats", total=wanted)
+        with late_progress(where) as progress:
             for state in fuzz_run(renderer, wanted, folder / "fuzz.json"):
-                progress.update(task, completed=state.splats)
+                progress(f"{state.splats:,} splats", state.splats / wanted)
         assert state is not None
         if self.json:
             print_json({"device": renderer.device.name, "passed": state.passed, **vars(state)})

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from fidsplat.commands.experiment_files import CATEGORY_HELP, write_report
 from fidsplat.commands.localise import Localise
-from fidsplat.commands.output import Json, console, option, say, switch, tell
+from fidsplat.commands.output import Json, console, counted, option, say, switch, tell
 from fidsplat.commands.plants import Plants
 from fidsplat.commands.remote import RayAddress, measure_by
 from fidsplat.commands.sweeps import Names, Overwrite, Seed, need_reports, run_sweeps
@@ -205,8 +205,6 @@ class Pictures(Drawn, Basic):
 
 def draw_sheets(options: Options) -> list[str]:
     """Draw the sheets with a progress bar; returns the files."""
-    from rich.progress import track
-
     from fidsplat.experiments.methods import Painter
     from fidsplat.experiments.pictures import write_sheets
     from fidsplat.experiments.run import check
@@ -217,8 +215,7 @@ def draw_sheets(options: Options) -> list[str]:
     categories = chosen_categories(options.category)
     painter = Painter(Renderer(options.device), options.trained)
     sheets = write_sheets(categories, options.methods, painter, options.seed, options.out)
-    bars = track(sheets, "pictures", total=len(categories), console=console(True), transient=True)
-    return [str(file) for file in bars]
+    return [str(file) for file in counted("pictures", sheets, len(categories))]
 
 
 @dataclass

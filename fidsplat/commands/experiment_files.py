@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from fidsplat.commands.output import Device, Json, console, option, switch, tell
+from fidsplat.commands.output import Device, Json, console, counted, option, switch, tell
 from fidsplat.commands.sweeps import Folders, Names, Overwrite, ReportTo, Seed, need_reports, run_in_turn
 from fidsplat.errors import InputError
 
@@ -44,8 +44,6 @@ class Dataset:
     json: Json = False
 
     def run(self) -> int:
-        from rich.progress import Progress
-
         from fidsplat.experiments.blender import check_pictures
         from fidsplat.experiments.dataset import dataset_scenes, write_scene
         from fidsplat.experiments.setup import MARKERS, chosen_categories
@@ -60,12 +58,8 @@ class Dataset:
             check_pictures(self.blender, self.truth.removeprefix("blender-"), self.seed)
         folder = writable_folder(self.out)
         wanted = dataset_scenes(chosen_categories(self.category), self.markers)
-        with Progress(console=console(True), transient=True) as bars:
-            scenes = [
-                write_scene(part, folder, self.seed, self.truth, self.blender)
-                for part in bars.track(wanted, description="scenes")
-            ]
-        names = [scene.name for scene in scenes]
+        scenes = (write_scene(part, folder, self.seed, self.truth, self.blender) for part in wanted)
+        names = [scene.name for scene in counted("scenes", scenes, len(wanted))]
         return tell(self.json, {"folder": str(folder), "scenes": names}, f"{len(names)} scenes in {folder}")
 
 
@@ -174,8 +168,6 @@ class Blender:
     json: Json = False
 
     def run(self) -> int:
-        from rich.progress import Progress
-
         from fidsplat.experiments import blender
         from fidsplat.experiments.setup import MARKERS, chosen_categories
 
@@ -195,17 +187,14 @@ class Blender:
         folder, done = Path(self.out), 0
         for view in views:
             blender.note_pictures(folder, view, self.seed, self.samples)
-        with Progress(console=console(True), transient=True) as bars:
-            for view in views:
-                jobs = [
-                    blender.marker_job(category, index, self.seed, folder, view, self.training)
-                    for category in categories
-                    for index in range(self.markers)
-                ]
-                bar = bars.add_task(f"view {view}", total=sum(len(job["shots"]) for job in jobs))
-                for _ in blender.render(jobs, view, environment, self.samples, threads=self.threads):
-                    bars.advance(bar)
-                    done += 1
+        for view in views:
+            jobs = [
+                blender.marker_job(category, index, self.seed, folder, view, self.training)
+                for category in categories
+                for index in range(self.markers)
+            ]
+            drawn = blender.render(jobs, view, environment, self.samples, threads=self.threads)
+            done += len(list(counted(f"view {view}", drawn, sum(len(job["shots"]) for job in jobs))))
         return tell(self.json, {"folder": str(folder), "pictures": done}, f"{done} pictures in {folder}")
 
 

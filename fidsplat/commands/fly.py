@@ -19,12 +19,12 @@ from fidsplat.commands.output import (
     SceneQuality,
     bytes_of,
     console,
+    counted,
     late_progress,
     names_of,
     option,
-    print_json,
-    say,
     switch,
+    tell,
     writable_file,
 )
 from fidsplat.commands.remote import RayAddress, Workers, check_workers
@@ -32,7 +32,7 @@ from fidsplat.commands.render import load_source
 from fidsplat.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterator
 
     from rich.console import Console
 
@@ -137,17 +137,16 @@ class Fly:
             folder = FlightFolder(self.out, flight, title, self.overwrite, self.source)
             begun = time.perf_counter()
             left = len(folder.left())
-            self._steps("pictures", draw(folder), len(flight), len(flight) - left)
+            list(counted("pictures", draw(folder), len(flight), len(flight) - left))
             seconds = time.perf_counter() - begun
         sheet = folder.write_sheet()
         if self.video is not None:
-            self._steps("video", folder.write_video(self.video, self.rate), len(flight), 0)
+            list(counted("video", folder.write_video(self.video, self.rate), len(flight)))
         if self.log is not None:
-            self._steps("log", write_log(folder, self.log, self.overwrite), len(flight), 0)
+            list(counted("log", write_log(folder, self.log, self.overwrite), len(flight)))
         if self.coco is not None:
-            self._steps("truth", write_truth(folder, self.coco), len(flight), 0)
-        self._tell(folder, sheet, left, seconds)
-        return 0
+            list(counted("truth", write_truth(folder, self.coco), len(flight)))
+        return self._tell(folder, sheet, left, seconds)
 
     @contextmanager
     def _drawn_by(
@@ -171,29 +170,16 @@ class Fly:
                 engine = stack.enter_context(ray_engine(self.ray, work, self.workers))
             yield engine.title, lambda folder: draw(folder, engine, engine.workers)
 
-    def _steps(self, what: str, steps: Iterable[int], total: int, done: int) -> None:
-        from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
-
-        columns = (*Progress.get_default_columns()[:2], MofNCompleteColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=console(True), transient=True) as progress:
-            task = progress.add_task(what, total=total, completed=done)
-            for _ in steps:
-                progress.advance(task)
-
-    def _tell(self, folder: FlightFolder, sheet: Path, drawn: int, seconds: float) -> None:
+    def _tell(self, folder: FlightFolder, sheet: Path, drawn: int, seconds: float) -> int:
         frames = len(folder.flight)
-        if self.json:
-            facts: dict[str, Any] = {"source": self.source, "device": folder.device, "frames": frames}
-            facts |= {"drawn": drawn, "seconds": seconds, "folder": str(folder.folder)}
-            facts |= {"contact_sheet": str(sheet), "video": self.video, "log": self.log, "coco": self.coco}
-            print_json(facts)
-            return
+        facts: dict[str, Any] = {"source": self.source, "device": folder.device, "frames": frames}
+        facts |= {"drawn": drawn, "seconds": seconds, "folder": str(folder.folder)}
+        facts |= {"contact_sheet": str(sheet), "video": self.video, "log": self.log, "coco": self.coco}
         kept = f" ({frames - drawn} were there already)" if drawn < frames else ""
         rate = f", {drawn / seconds:.1f} a second" if drawn else ""
-        say(
-            console(False), f"{frames} pictures{kept} on {folder.device} in {seconds:.1f} s{rate}", str(sheet)
-        )
-        say(console(False), *(name for name in (self.video, self.log, self.coco) if name is not None))
+        lines = [f"{frames} pictures{kept} on {folder.device} in {seconds:.1f} s{rate}", str(sheet)]
+        more = (name for name in (self.video, self.log, self.coco) if name is not None)
+        return tell(self.json, facts, *lines, *more)
 
 
 def _own_motion(source: str, scene: Scene, smooth: bool) -> Trajectory:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.output import Device, Json, console, option, print_json, print_table, say, switch
+from fidsplat.commands.output import Device, Json, console, late_progress, option, switch, tell
 
 if TYPE_CHECKING:
     from fidsplat.experiments.localise import Localise as Asked
@@ -51,7 +51,7 @@ class Localise:
 
     def run(self) -> int:
         import fidsplat as fs
-        from fidsplat.commands.sweeps import bars, need_reports
+        from fidsplat.commands.sweeps import need_reports
         from fidsplat.experiments.localise import VARIANTS
         from fidsplat.experiments.localise import Localise as Asked
         from fidsplat.vision.video import check_video
@@ -71,28 +71,26 @@ class Localise:
         renderer = fs.Renderer(self.device)
         done = 0
 
-        def tell(name: str, share: float) -> None:
-            progress.update(bar, description=name, completed=done + share)
+        def step(name: str, share: float) -> None:
+            progress(name, (done + share) / len(names))
 
         folder = Path(self.out)
-        sweep = drive_sweep(folder, asked, names, renderer, tell, self.overwrite)
-        with bars() as progress:
+        sweep = drive_sweep(folder, asked, names, renderer, step, self.overwrite)
+        with late_progress(console(True)) as progress:
             done = len(names) - len(sweep.left)
-            bar = progress.add_task("drive", total=len(names), completed=done)
             for record in sweep.run():
                 done += 1
-                tell(record.key["variant"], 0.0)
+                step(record.key["variant"], 0.0)
         found, device = found_of(sweep.results), renderer.device.title
         page = write_report(folder, asked, device, found)
         self._record(asked, renderer)
-        if self.json:
-            print_json({"run": sweep.results.run, "variants": found})
-            return 0
-        where, table = console(False), table_of(found)
-        length = found[names[0]]["length_m"]
-        print_table(where, f"{length:.1f} m", table.columns, table.itertuples(index=False))
-        say(where, *(name for name in (str(page), self.log, self.video) if name is not None))
-        return 0
+        rows, length = table_of(found), found[names[0]]["length_m"]
+        return tell(
+            self.json,
+            {"run": sweep.results.run, "variants": found},
+            *(name for name in (str(page), self.log, self.video) if name is not None),
+            table=(f"{length:.1f} m", rows.columns, rows.itertuples(index=False)),
+        )
 
     def _record(self, asked: Asked, renderer: Renderer) -> None:
         """The log and the video."""

@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import tyro
 
@@ -19,6 +19,10 @@ from fidsplat.files import ordinary_file, path_of, writable_folder
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+T = TypeVar("T")
+Table = tuple[str, Sequence[str], Iterable[Sequence[object]]]
+"""title, heads and rows, as of `print_table`"""
 
 
 def option(metavar: str, text: str, short: str | None = None):
@@ -92,21 +96,23 @@ def say(where: Console, *lines: str) -> None:
         where.print(line, markup=False, soft_wrap=True)
 
 
-def tell(as_json: bool, facts: dict[str, Any], *lines: str) -> int:
-    """Print what a command found, as JSON or as lines; returns the exit status 0."""
+def tell(as_json: bool, facts: dict[str, Any], *lines: str, table: Table | None = None) -> int:
+    """Print what a command found, as JSON or as a table and lines; returns the exit status 0."""
     if as_json:
         print_json(facts)
     else:
+        if table is not None:
+            print_table(console(False), *table)
         say(console(False), *lines)
     return 0
 
 
 def print_table(where: Console, title: str, heads: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """A table under its title; texts are taken as they are, not as markup, and broken rather than cut."""
-    from rich.table import Table
+    from rich.table import Table as RichTable
     from rich.text import Text
 
-    table = Table(
+    table = RichTable(
         title=Text(title, "bold"),
         title_justify="left",
         show_header=any(heads),
@@ -142,6 +148,20 @@ def late_progress(where: Console, after: float = 1.0) -> Iterator[Callable[[str,
         timer.join()
         if shown.live.is_started:
             shown.stop()
+
+
+def counted(
+    name: str, steps: Iterable[T], total: int, done: int = 0, words: Callable[[T], str] = lambda step: ""
+) -> Iterator[T]:
+    """The steps, each once it is done, counted by a bar on stderr that says what the last was."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console(True), transient=True) as progress:
+        bar = progress.add_task(name, total=total, completed=done)
+        for step in steps:
+            progress.update(bar, advance=1, description=f"{name} {words(step)}".strip())
+            yield step
 
 
 _UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}

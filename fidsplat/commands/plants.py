@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from fidsplat.commands.output import Device, Json, console, option, print_json, print_table
+from fidsplat.commands.output import Device, Json, console, late_progress, option, tell
 from fidsplat.commands.sweeps import Names
 
 
@@ -42,8 +42,6 @@ class Plants:
     json: Json = False
 
     def run(self) -> int:
-        from rich.progress import Progress
-
         from fidsplat.experiments import plants
         from fidsplat.experiments.blender import default_environment
 
@@ -57,16 +55,8 @@ class Plants:
             seed=self.seed,
         )
         environment = self.environment or default_environment()
-        with Progress(console=console(True), transient=True) as progress:
-            task = progress.add_task("plants", total=1.0)
-
-            def tell(words: str, share: float) -> None:
-                progress.update(task, description=words, completed=share)
-
-            made = list(plants.write_plants(wanted, Path(self.out), environment, self.device, tell))
-        if self.json:
-            print_json({"plants": [{"file": str(file), "psnr": score} for file, score in made]})
-            return 0
+        with late_progress(console(True)) as progress:
+            made = list(plants.write_plants(wanted, Path(self.out), environment, self.device, progress))
+        facts = {"plants": [{"file": str(file), "psnr": score} for file, score in made]}
         rows = [(str(file), "" if score is None else f"{score:.1f}") for file, score in made]
-        print_table(console(False), "plants", ("file", "PSNR of test views [dB]"), rows)
-        return 0
+        return tell(self.json, facts, table=("plants", ("file", "PSNR of test views [dB]"), rows))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated
 
-from fidsplat.commands.output import option
-from fidsplat.commands.sweeps import bars, words
+from fidsplat.commands.output import counted, option
+from fidsplat.commands.sweeps import words
 from fidsplat.errors import InputError
 
 if TYPE_CHECKING:
@@ -33,13 +33,12 @@ def measure_by(ray: str, names: tuple[str, ...], options: Options) -> dict[str, 
     from fidsplat.remote.ray_engine import ray_engine
 
     work = ExperimentWork(names, options)
-    with ray_engine(ray, work) as engine, bars() as progress:
+    with ray_engine(ray, work) as engine:
         device = engine.title or None
         results = {name: results_of(name, options, device) for name in names}
         points = {name: points_of(name, options) for name in names}
         total = sum(len(each) for each in points.values())
         left = sum(len(results[name].left(points[name])) for name in names)
-        bar = progress.add_task("", total=total, completed=total - left)
-        for name, record in measure(points, results, engine, engine.workers):
-            progress.update(bar, advance=1, description=f"{name} {words(record.key)}")
+        measured = measure(points, results, engine, engine.workers)
+        list(counted("", measured, total, total - left, lambda pair: f"{pair[0]} {words(pair[1].key)}"))
     return {name: str(results[name].file) for name in names if points[name]}

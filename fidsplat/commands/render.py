@@ -18,9 +18,7 @@ from fidsplat.commands.output import (
     late_progress,
     names_of,
     option,
-    print_json,
-    print_table,
-    say,
+    tell,
 )
 from fidsplat.errors import FidsplatError, InputError
 from fidsplat.files import path_of, writable_folder
@@ -136,30 +134,24 @@ class Render:
         seconds = time.perf_counter() - begun
         bits = None if scene.sensor is None else scene.sensor.bits
         files = [file for name, image in images.items() for file in save_output(name, image, name_of, bits)]
-        if self.json:
-            print_json(
-                {
-                    "source": self.source,
-                    "device": renderer.device.name,
-                    "width": images[frame.outputs[0]].shape[1],
-                    "height": images[frame.outputs[0]].shape[0],
-                    "outputs": list(frame.outputs),
-                    "chosen": None if choice is None else choice.as_dict(),
-                    "stats": dict(frame.stats),
-                    "timings_ms": dict(frame.timings),
-                    "seconds": seconds,
-                    "files": [str(file) for file in files],
-                }
-            )
-            return 0
+        facts = {
+            "source": self.source,
+            "device": renderer.device.name,
+            "width": images[frame.outputs[0]].shape[1],
+            "height": images[frame.outputs[0]].shape[0],
+            "outputs": list(frame.outputs),
+            "chosen": None if choice is None else choice.as_dict(),
+            "stats": dict(frame.stats),
+            "timings_ms": dict(frame.timings),
+            "seconds": seconds,
+            "files": [str(file) for file in files],
+        }
         rows = [(stage, f"{ms:.2f} ms") for stage, ms in frame.timings.items()]
         rows += [(what, f"{count:,}") for what, count in frame.stats.items()]
         rows += [("with compilation and transfer", f"{seconds:.2f} s")]
-        print_table(where, f"{self.source} on {renderer.device.title}", ("", ""), rows)
-        if choice is not None:
-            say(where, f"chosen: {choice.summary}")
-        say(where, *map(str, files))
-        return 0
+        lines = [*(() if choice is None else (f"chosen: {choice.summary}",)), *facts["files"]]
+        title = f"{self.source} on {renderer.device.title}"
+        return tell(self.json, facts, *lines, table=(title, ("", ""), rows))
 
     def _drawn(
         self,

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.output import console, option, switch
+from fidsplat.commands.output import counted, option, switch, writable_file
 from fidsplat.errors import InputError
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
-
     from fidsplat.experiments.sweep import Key, Record, Sweep
 
 Names = tyro.conf.UseAppendAction[tuple[str, ...]]
@@ -26,55 +25,39 @@ ReportTo = Annotated[
 ]
 
 
-def need_reports() -> None:
-    """Raises InputError where what makes reports is not installed."""
-    missing = [name for name in ("pandas", "matplotlib", "jinja2") if find_spec(name) is None]
+def need_reports(
+    what: str = "a report", packages: Sequence[str] = ("pandas", "matplotlib", "jinja2")
+) -> None:
+    """Raises InputError where what makes it is not installed."""
+    missing = [name for name in packages if find_spec(name) is None]
     if missing:
-        raise InputError(f"reports need {' and '.join(missing)}; pip install 'fidsplat[experiments]'")
+        raise InputError(f"{what} needs {' and '.join(missing)}; pip install 'fidsplat[experiments]'")
+
+
+def check_plot(name: str, *packages: str) -> None:
+    """Raises InputError for a chart that cannot be written, before anything is measured; packages: what it
+    needs besides matplotlib."""
+    if Path(name).suffix.lower() not in (".svg", ".png"):
+        raise InputError(f"--plot is {name}; charts are written as SVG or PNG: name a file that ends so")
+    need_reports("--plot", ("matplotlib", *packages))
+    writable_file(name)
 
 
 def run_sweeps(sweeps: Iterable[Sweep]) -> list[Record]:
     """Measure what is left of each, with a progress bar on stderr; returns what was measured."""
-    found = []
-    for sweep in sweeps:
-        with bars() as progress:
-            total = len(sweep.points)
-            bar = progress.add_task(sweep.name, total=total, completed=total - len(sweep.left))
-            for record in sweep.run():
-                progress.update(bar, advance=1, description=f"{sweep.name} {words(record.key)}")
-                found.append(record)
-            progress.update(bar, description=sweep.name)
-    return found
+    return [record for sweep in sweeps for record in _counted(sweep.name, [sweep], sweep.run())]
 
 
 def run_in_turn(name: str, sweeps: Sequence[Sweep]) -> list[Record]:
     """As `run_sweeps`, the first point of each before the second of any, with one progress bar."""
     from fidsplat.experiments.sweep import in_turn
 
-    found = []
-    with bars() as progress:
-        total, left = sum(len(sweep.points) for sweep in sweeps), sum(len(sweep.left) for sweep in sweeps)
-        bar = progress.add_task(name, total=total, completed=total - left)
-        for record in in_turn(sweeps):
-            progress.update(bar, advance=1, description=f"{name} {words(record.key)}")
-            found.append(record)
-        progress.update(bar, description=name)
-    return found
+    return list(_counted(name, sweeps, in_turn(sweeps)))
 
 
-def bars() -> Progress:
-    """Progress by points, on stderr."""
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    return Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=console(True))
+def _counted(name: str, sweeps: Sequence[Sweep], records: Iterable[Record]) -> Iterator[Record]:
+    total, left = sum(len(sweep.points) for sweep in sweeps), sum(len(sweep.left) for sweep in sweeps)
+    return counted(name, records, total, total - left, lambda record: words(record.key))
 
 
 def words(key: Key) -> str:

@@ -9,8 +9,7 @@ from typing import Annotated, ClassVar
 
 from fidsplat.commands.output import Devices, Json, option, switch, tell
 from fidsplat.commands.own_scenes import Cameras, OwnScenes, own_scenes_of
-from fidsplat.commands.plots import check_plot
-from fidsplat.commands.sweeps import Folders, Overwrite, ReportTo, need_reports, run_sweeps, words
+from fidsplat.commands.sweeps import Folders, Overwrite, ReportTo, check_plot, need_reports, run_sweeps, words
 
 DEFAULT_FOLDER = "fidsplat-tradeoff"
 
@@ -100,7 +99,7 @@ class Tradeoff:
         from fidsplat.render import default_device
 
         if self.plot is not None:
-            check_plot(self.plot, ("pandas", "matplotlib"))
+            check_plot(self.plot, "pandas")
         folder = Path(self.out or DEFAULT_FOLDER + ("-quick" if self.quick else ""))
         devices = tuple(dict.fromkeys(self.device)) or (default_device(),)
         own = own_pictures(own_scenes_of(self.scene, self.cameras, self.scenes))

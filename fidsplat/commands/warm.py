@@ -3,7 +3,7 @@
 import time
 from dataclasses import dataclass
 
-from fidsplat.commands.output import Device, Json, console, tell
+from fidsplat.commands.output import Device, Json, counted, tell
 
 
 @dataclass
@@ -24,24 +24,19 @@ class Warm:
     json: Json = False
 
     def run(self) -> int:
-        from rich.progress import Progress, TextColumn
-
         from fidsplat.experiments.bench.warm import recipes, warm
         from fidsplat.render import Renderer
 
-        where = console(self.json)
         begun = time.perf_counter()
         renderer = Renderer(self.device)
         wanted = recipes()
         done: list[tuple[str, float]] = []
-        columns = (*Progress.get_default_columns(), TextColumn("{task.fields[now]}"))
+        made = warm(renderer, wanted)
         try:
-            with Progress(*columns, console=where, transient=True) as progress:
-                task = progress.add_task("sets of kernels", total=len(wanted), now=wanted[0].words)
-                for recipe, seconds in warm(renderer, wanted):
-                    done.append((recipe.words, seconds))
-                    following = wanted[len(done)].words if len(done) < len(wanted) else ""
-                    progress.update(task, advance=1, now=following)
+            for recipe, seconds in counted(
+                "sets of kernels", made, len(wanted), words=lambda one: one[0].words
+            ):
+                done.append((recipe.words, seconds))
         finally:  # what a run that is stopped has compiled stays compiled
             device, took = renderer.device, time.perf_counter() - begun
             record: dict = {"device": device.name, "title": device.title, "version": device.version}

@@ -144,11 +144,6 @@ def compare(images: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], o
     return found
 
 
-def against_reference(renderer: Renderer, picture: Picture) -> list[Difference]:
-    """Draw a picture on a device and compare every output with the reference."""
-    return compare(draw(renderer, picture), truth_of(picture), picture.outputs)
-
-
 def trace(renderer: Renderer, picture: Picture, shape=None) -> dict[str, np.ndarray]:
     """What passes between the stages of a device, with the outputs; `shape` replaces its build constants."""
     features, view = picture.prepared()

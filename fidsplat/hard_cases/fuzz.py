@@ -12,7 +12,7 @@ import json
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,7 @@ from fidsplat.files import atomic_write, from_json
 from fidsplat.hard_cases.agreement import ALL_OUTPUTS, RARE, RISKY, Picture, compare, draw, truth_of
 from fidsplat.hard_cases.clouds import quaternion
 from fidsplat.provenance import code_hash
-from fidsplat.quality import ELLIPSOID, Quality
+from fidsplat.quality import Quality
 from fidsplat.random_clouds import log_uniform
 from fidsplat.render import Renderer
 from fidsplat.rotations import quaternion_multiply, quaternion_to_matrix
@@ -96,27 +96,6 @@ def scene_of(seed: int) -> Picture:
     camera = Camera.pinhole(width, height, focal, focal, cx, cy, pose, near=near)
     quality = QUALITIES[int(generator.choice(len(QUALITIES), p=SHARES))]
     return Picture(cloud, camera, quality, ALL_OUTPUTS)
-
-
-def thick_scene_of(seed: int) -> Picture:
-    """The same with 3D Gaussians for most splats of no plane, drawn in one of the ways: a third standard
-    deviation from 1e-6 of the first two, needles and balls among them, to 100 times as large. No two splats
-    of no plane have one depth: by nothing else are they ordered, as EWA draws them."""
-    flat, generator = scene_of(seed), np.random.default_rng([seed, 2])
-    cloud, count = flat.cloud, len(flat.cloud)
-    third = cloud.scales.max(axis=1) * log_uniform(generator, 1e-6, 1e2, count)
-    needle = generator.random(count) < 0.2
-    third[needle] = cloud.scales.min(axis=1)[needle]
-    loose = np.ones(count, bool) if cloud.planes is None else cloud.planes < 0
-    chosen = (generator.random(count) < 0.8) & loose
-    scales = np.column_stack([cloud.scales, np.where(chosen, np.clip(third, 1e-7, 1e3), 0)])
-    away = 1 + np.where(loose, generator.uniform(0, 1e-3, count), 0)  # from the camera, at the origin
-    means = (cloud.world_means() * away[:, None]).astype(np.float32)
-    thick = SplatCloud(means, cloud.quats, scales, cloud.opacities, colors=cloud.colors, labels=cloud.labels)
-    if cloud.planes is not None:
-        thick = thick.with_planes(cloud.planes)
-    way = str(generator.choice(ELLIPSOID))
-    return replace(flat, cloud=thick, quality=flat.quality.with_(ellipsoid=way))
 
 
 def _edge_on(generator: np.random.Generator, mean: np.ndarray) -> np.ndarray:

@@ -7,11 +7,10 @@ from .common import STRICT
 
 @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
 def to_uint8(
-    first: int,  # value of thread 0
     values: wp.array(dtype=wp.float32),
     made: wp.array(dtype=wp.uint8),  # as many
 ):
-    at = wp.tid() + first
+    at = wp.tid()
     value = values[at]
     if not value > 0.0:  # no number, too
         value = 0.0

@@ -27,10 +27,10 @@ CAMERAS = {
 
 # of the texts as they were before there were lenses; a change here changes what every plain picture runs
 BEFORE_LENSES = {
-    ("lanes", ("rgb",)): "c86a594d5e085deb8fd549b537ef8c2d970d3f2812216f826a66f0bb641592e4",
-    ("lanes", OUTPUTS): "f0a3af7ea1eab7b5054c7b46dfdfe1f00592f3b135c025ae2ea880f99eaeb411",
-    ("group", ("rgb",)): "540560131e01013c2f3af646e7ce4a77efe8edb5b1beef4ce015994ed54c945c",
-    ("group", OUTPUTS): "8579f09f876099117e49560f01b771766b99cdb60b2ee8996fdb74e53c5d3be1",
+    ("lanes", ("rgb",)): "09adfe8658054c4379e454f3ae03d992d38168b6ae263d08bafe4ea9f93d703c",
+    ("lanes", OUTPUTS): "f04399c1f2b33cb39f987b563474be73b7bb9864ccfd84151e424c985c8359f1",
+    ("group", ("rgb",)): "b5339a1fbb64b484c5cb1ae44f20eb12fc68984b9bd7b86c7970c6f186ef4c61",
+    ("group", OUTPUTS): "b5f4b6e3244977e1b0fc6824a6eb3e7d5b1ff00ad3c990e46cb216f546ee237b",
 }
 
 

@@ -6,14 +6,7 @@ import weakref
 import numpy as np
 import pyopencl as cl
 import pytest
-
-import fidsplat as fs
-from fidsplat.backends.derivatives import Differentiates
-from fidsplat.backends.gradients import TooLittleRoom, on_host
-from fidsplat.backends.prepare import prepare
-from fidsplat.backends.reference.backend import ReferenceBackend
-from fidsplat.effects.differentiable import with_distortion
-from fidsplat.hard_cases.derivatives import (
+from derivative_errors import (
     COSINE,
     NORM,
     derivatives,
@@ -22,6 +15,13 @@ from fidsplat.hard_cases.derivatives import (
     random_loss,
     random_picture,
 )
+
+import fidsplat as fs
+from fidsplat.backends.derivatives import Differentiates
+from fidsplat.backends.gradients import TooLittleRoom, on_host
+from fidsplat.backends.prepare import prepare
+from fidsplat.backends.reference.backend import ReferenceBackend
+from fidsplat.effects.differentiable import with_distortion
 
 BACKEND = ("opencl", "warp")
 

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from agreement import ALL_OUTPUTS, assert_agrees, random_splats, reference_pixels
+from agreement import ALL_OUTPUTS, against_reference, assert_agrees, random_splats, reference_pixels
 from sampling import SAMPLES, alternate, in_turn
 from test_agreement import coplanar_cloud
 
 import fidsplat as fs
 from fidsplat.backends.view import View
 from fidsplat.cameras import BrownConrady, Fisheye
-from fidsplat.hard_cases.agreement import Picture, against_reference
+from fidsplat.hard_cases.agreement import Picture
 from fidsplat.rotations import matrix_to_quaternion
 
 POSE = fs.Camera.look_at(64, 48, 1.0, (0.3, 0.2, -0.1), (0.1, 0.0, 3.0)).world_to_camera

@@ -375,4 +375,4 @@ def test_without_what_makes_reports_one_line_says_what_to_install(capsys, tmp_pa
     monkeypatch.setattr("fidsplat.commands.sweeps.find_spec", lambda name: None if name == "jinja2" else True)
     for words in (["tradeoff", "report", str(tmp_path)], ["experiment", "report", str(tmp_path)]):
         assert main(words) == 2
-        assert "reports need jinja2; pip install 'fidsplat[experiments]'" in capsys.readouterr().err
+        assert "a report needs jinja2; pip install 'fidsplat[experiments]'" in capsys.readouterr().err

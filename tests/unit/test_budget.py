@@ -13,6 +13,7 @@ from sampling import in_turn
 import fidsplat as fs
 from fidsplat.accuracy import errors, truth
 from fidsplat.budget import choose, prices, search, store
+from fidsplat.budget.choose import _key
 from fidsplat.errors import InputError
 from fidsplat.timing import Clock, Timer
 
@@ -162,8 +163,8 @@ def test_a_folder_that_cannot_be_written_is_no_obstacle(renderer, scene, tmp_pat
 
 
 def test_functions_have_no_key():
-    assert store.digest(1, lambda: 2) is None
-    assert store.digest(1, (2.0, None)) != store.digest(1, (2.0, 0))
+    assert _key(1, lambda: 2) is None
+    assert _key(1, (2.0, None)) != _key(1, (2.0, 0))
 
 
 def test_a_scene_says_the_rest_itself(renderer, held_out):

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from derivative_errors import derivatives, random_picture
 from training_scene import QUICK, run_and_resumed, scene
 
 import fidsplat as fs
 from fidsplat.backends.prepare import prepare
-from fidsplat.hard_cases.derivatives import derivatives, random_picture
 from fidsplat.train import Trainer
 from fidsplat.train.derivatives import by_pose, drawn, moved
 
