@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -23,12 +24,15 @@ class ArrayPool:
         self._parts: dict[tuple[str, Any], Any] = {}
         self._hosts: dict[str, Any] = {}
         self._spare: dict[str, list[Any]] = {}
+        self.state = object()
+        """another one whenever a scratch array has been replaced"""
 
     def scratch(self, name: str, size: int, dtype: Any) -> Any:
         """An array of at least `size` elements whose content is undefined."""
         held = self._arrays.get((name, dtype))
         if held is None or held.size < size:
             self._arrays.pop((name, dtype), None)
+            self.state = object()
             held = self._arrays[name, dtype] = self.fresh(name, size, dtype)
         return held
 
@@ -96,12 +100,27 @@ class Workspace:
         """Most pairs of splats and tiles that are listed at once; tests make it small."""
         self.ahead = device.is_cuda
         """Whether pictures of a kind that was drawn before are drawn without waiting for what they take."""
+        self.replays = device.is_cuda
+        """Whether the launches of such pictures are captured as a graph, and the graph launched."""
         self.pictures = 0
         """how many have been begun: what they leave is there until the next"""
         self.lenses: WeakKeyDictionary[RayRaster, dict[str, Any]] = WeakKeyDictionary()
         """arrays of the whole rasters that are in use, by name"""
         self.panoramas: WeakKeyDictionary[Panorama, Any] = WeakKeyDictionary()
         """on the device, each as long as it is somewhere else"""
+
+    @cached_property
+    def first_slot(self) -> Any:
+        """Where the images of a view stand that is no part of a batch: an array of a 0."""
+        return load().zeros(1, dtype=load().int32, device=self.device)
+
+    @cached_property
+    def _side(self) -> Any:
+        return load().Stream(self.device)
+
+    def capturing(self) -> Any:
+        """The stream on which launches are captured; None where there are no streams."""
+        return self._side if self.device.is_cuda else None
 
     @contextmanager
     def working(self, doing: str) -> Iterator[None]:
