@@ -1,8 +1,7 @@
 """Small stores that are cut as large ones are."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,16 +13,6 @@ from fidsplat.store import build, plan
 COUNT = 9_000
 SMALL = {"chunk": 500, "memory": 1 << 20}
 WINDOW, NOTED = 1000, 3
-
-
-@contextmanager
-def many_buckets() -> Iterator[None]:
-    """What is built meanwhile is sorted in many buckets and noted often, few splats though it has."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plan, "_LEAST_MEMORY", 0)
-        patch.setattr(plan, "WINDOW", WINDOW)
-        patch.setattr(build, "_NOTED", NOTED)
-        yield
 
 
 def two_files(folder: Path) -> list[Path]:
@@ -43,6 +32,29 @@ def two_files(folder: Path) -> list[Path]:
     )
     fs.save_ply(other, folder / "b.ply")
     return [folder / "a.ply", folder / "b.ply"]
+
+
+def store_fixtures() -> tuple[Any, Any, Any]:
+    """Fixtures of a module: what it builds is sorted in many buckets and noted often, few splats though it
+    has; files, and their store."""
+
+    @pytest.fixture(scope="module", autouse=True)
+    def cut():
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(plan, "_LEAST_MEMORY", 0)
+            patch.setattr(plan, "WINDOW", WINDOW)
+            patch.setattr(build, "_NOTED", NOTED)
+            yield
+
+    @pytest.fixture(scope="module")
+    def files(tmp_path_factory):
+        return two_files(tmp_path_factory.mktemp("splats"))
+
+    @pytest.fixture(scope="module")
+    def store(cut, files, tmp_path_factory):
+        return fs.Store(fs.build_store(files, tmp_path_factory.mktemp("store") / "both.fss", **SMALL))
+
+    return cut, files, store
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -27,10 +27,10 @@ CAMERAS = {
 
 # of the texts as they were before there were lenses; a change here changes what every plain picture runs
 BEFORE_LENSES = {
-    ("lanes", ("rgb",)): "c86a594d5e085deb8fd549b537ef8c2d970d3f2812216f826a66f0bb641592e4",
-    ("lanes", OUTPUTS): "f0a3af7ea1eab7b5054c7b46dfdfe1f00592f3b135c025ae2ea880f99eaeb411",
-    ("group", ("rgb",)): "540560131e01013c2f3af646e7ce4a77efe8edb5b1beef4ce015994ed54c945c",
-    ("group", OUTPUTS): "8579f09f876099117e49560f01b771766b99cdb60b2ee8996fdb74e53c5d3be1",
+    ("lanes", ("rgb",)): "186afe162decca3e923d017199bf177d89767470531717249d6573902f2ee1cf",
+    ("lanes", OUTPUTS): "83b6fcf0372dbc2e40ccb5bf21d558305d0ff7042174d5baea3904d6da240402",
+    ("group", ("rgb",)): "e0be525f496a7c3ebf8c25da0395cc652b259d93aefd530c45c096ebe8514e31",
+    ("group", OUTPUTS): "ebc84f1d545407bb04522926485fab4c78f6904a150d7a22cf31d2751496c5d3",
 }
 
 

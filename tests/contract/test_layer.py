@@ -68,6 +68,11 @@ def test_every_output_is_the_references(renderer, case):
     resident = renderer.upload(cloud).data
     pipeline = renderer.backend.pipeline(prepare(resident, capture)[0])
     wrong = [one for one in differences(pipeline, resident, cloud, capture) if not one.agrees]
+    away = np.eye(4)
+    away[2, 3] = -100.0
+    behind = cloud.transformed(away)  # the layer alone is seen
+    resident = renderer.upload(behind).data
+    wrong += [one for one in differences(pipeline, resident, behind, capture) if not one.agrees]
     assert not wrong, wrong
 
 

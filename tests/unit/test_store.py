@@ -5,28 +5,14 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from small_stores import COUNT, SMALL, contents, many_buckets, two_files
+from small_stores import COUNT, SMALL, contents, store_fixtures
 
 import fidsplat as fs
 from fidsplat.rotations import rigid_matrix
 from fidsplat.store.layout import FAR, NODE, NPY_HEADER, header_crc
 from fidsplat.store.merge import REDUCTION
 
-
-@pytest.fixture(scope="module", autouse=True)
-def _many_buckets():
-    with many_buckets():
-        yield
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    return two_files(tmp_path_factory.mktemp("splats"))
-
-
-@pytest.fixture(scope="module")
-def store(files, tmp_path_factory):
-    return fs.Store(fs.build_store(files, tmp_path_factory.mktemp("store") / "both.fss", **SMALL))
+cut, files, store = store_fixtures()
 
 
 def sorted_by_place(cloud):

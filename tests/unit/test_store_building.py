@@ -6,26 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from full_disk import small_files
-from small_stores import COUNT, NOTED, SMALL, WINDOW, contents, many_buckets, two_files
+from small_stores import COUNT, NOTED, SMALL, WINDOW, contents, store_fixtures
 
 import fidsplat as fs
 from fidsplat.store import build
 
-
-@pytest.fixture(scope="module", autouse=True)
-def _many_buckets():
-    with many_buckets():
-        yield
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    return two_files(tmp_path_factory.mktemp("splats"))
-
-
-@pytest.fixture(scope="module")
-def store(files, tmp_path_factory):
-    return fs.Store(fs.build_store(files, tmp_path_factory.mktemp("store") / "both.fss", **SMALL))
+cut, files, store = store_fixtures()
 
 
 class Stopped(Exception):

@@ -114,7 +114,7 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
         DeviceError: an effect's file fills a hook that no file has.
     """
     layouts = layouts_of(features)
-    at_once = _at_once(features, shape, layouts)
+    at_once = _at_once(features, layouts)
     declared = Declarations(layouts, features, at_once)
     files = [layout.file for layout in layouts.values() if layout.file]
     files.append(LAYOUTS["resolve_pixel"].file)
@@ -150,11 +150,11 @@ def assemble(features: FeatureSet, shape: DeviceShape) -> Source:
     return Source(programs, declared.records, arguments, declared.samples, declared.scalars)
 
 
-def _at_once(features: FeatureSet, shape: DeviceShape, layouts: Mapping[str, Layout]) -> bool:
-    """Whether who has drawn a pixel on a GPU resolves it too, which saves a launch: where a pixel is one
+def _at_once(features: FeatureSet, layouts: Mapping[str, Layout]) -> bool:
+    """Whether who has drawn a pixel resolves it too, which saves a launch: where a pixel is one
     sample of one pose, and nothing but blending adds to it."""
     alone = features.samples == 1 and "background_constant" in layouts and "rays" not in layouts
-    return shape.schedule == "group" and alone and not any(name.startswith("shutter_") for name in layouts)
+    return alone and not any(name.startswith("shutter_") for name in layouts)
 
 
 def numbers_of(features: FeatureSet, shape: DeviceShape) -> dict[str, int]:

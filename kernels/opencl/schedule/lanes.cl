@@ -13,14 +13,18 @@ kernel void blend(
     uint number = tile / (uint)(tiles_x * tiles_y), here = tile - number * (uint)(tiles_x * tiles_y);
     int x0 = (int)(here % (uint)tiles_x) * TILE_W, y0 = (int)(here / (uint)tiles_x) * TILE_H;
 
+    // of a tile without splats all blocks are alike, so that one is enough
+    const uint base = starts[band_first];
+    const bool empty = starts[tile] == starts[tile + 1]
+//@@ empty
+        ;
     Pixel pixels[BLOCKS];
-    for (int block = 0; block < BLOCKS; block++) pixel_start(&pixels[block]);
+    for (int block = 0; block < (empty ? 1 : BLOCKS); block++) pixel_start(&pixels[block]);
 //@@ lanes_start
 //@@ pixels_start
-    const uint on_picture = blocks_within(0, min(width - x0, TILE_W), 0, min(height - y0, TILE_H));
+    const uint on_picture = empty ? 0 : blocks_within(0, min(width - x0, TILE_W), 0, min(height - y0, TILE_H));
     uint alive = on_picture;      // those that still let light through
 
-    uint base = starts[band_first];
 //@@ pass
 //@@ walk
             vfloat x = (float)(x0 + LEFT(block) - s.ax) + BLOCK_X, y = (float)(y0 + TOP(block) - s.ay) + BLOCK_Y;
@@ -43,8 +47,9 @@ kernel void blend(
     size_t stride = (size_t)tiles_x * TILE_W, top = (size_t)number * tiles_y * TILE_H;
     for (int block = 0; block < BLOCKS; block++) {
         size_t at = (top + y0 + TOP(block)) * stride + x0 + LEFT(block);
-        Pixel *pixel = &pixels[block];
+        Pixel *pixel = &pixels[empty ? 0 : block];
         PIXEL_STORE_BASE(pixel, raw, channel_stride, at);
 //@@ store
     }
+//@@ tile_stored
 }

@@ -15,6 +15,8 @@
                 = opaque_x < width && opaque_y < height
                       ? layer_depth[(opaque_y / SAMPLES) * (width / SAMPLES) + opaque_x / SAMPLES] : INFINITY;
         }
+//@ empty
+                       && false         // the surface is drawn everywhere
 //@ compose
     mask &= VMASK(seen.z < pixel->opaque_z);
     if (!VANY(mask)) return;
