@@ -105,7 +105,9 @@ class OpenCLGradients:
             items = shape.blend_items
             picture.launch("blend backward", "blend_light", picture.tiles * items, items, log_ceiling=ceiling)
             groups_of_tiles = chunks
-        picture.launch("blend backward", "blend_backward", groups_of_tiles * group, group, log_ceiling=ceiling)
+        picture.launch(
+            "blend backward", "blend_backward", groups_of_tiles * group, group, log_ceiling=ceiling
+        )
         self._ask(drawn)
         if count:
             arrays: dict[str, Any] = {

@@ -72,7 +72,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
 GROUP_KERNELS: dict[str, tuple[Argument, ...]] = {
     "blend_light": takes(
         *("in Splat splats", "in uint lists starts", _SIZE, _BLENDED),
-        "out float checkpoints  // of each pixel of every CHUNK splats: light in front, what it is worth behind",
+        "out float checkpoints  // of each pixel of CHUNK splats: light in front, its worth behind",
         "out uint reached  // (tiles) chunks that light comes to",
         "out uint chunk_tiles  // the tiles of chunks",
         "out real tile_sums  // (tiles, 3) by the background",

@@ -19,13 +19,24 @@ from fidsplat.backends.opencl.gradients_layout import GROUP_KERNELS, KERNELS, LA
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.effects import FeatureSet
 
-_STAGES = ("prelude", "math", "splat", "bounds", "blend_backward", "schedule/{}_cells", "schedule/{}_backward", "project_backward")
+_STAGES = (
+    "prelude",
+    "math",
+    "splat",
+    "bounds",
+    "blend_backward",
+    "schedule/{}_cells",
+    "schedule/{}_backward",
+    "project_backward",
+)
 
 
 def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> Source:
     """The source of the derivatives of these features on a device of this shape."""
     layouts = [LAYOUTS[name] for name in layouts_of(features) if name in LAYOUTS]
-    declared = _Declarations(features, layouts, KERNELS | GROUP_KERNELS if shape.schedule == "group" else KERNELS)
+    declared = _Declarations(
+        features, layouts, KERNELS | GROUP_KERNELS if shape.schedule == "group" else KERNELS
+    )
     # of what is drawn the ways of drawing are needed again, of outputs only their derivatives
     slots = (name for slot in features.slots for name in (slot, *DRAWN[slot].parts))
     files = [DRAWN[name].file for name in dict.fromkeys(slots)]
@@ -39,7 +50,8 @@ def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> Source:
 
 def chunk_of(shape: DeviceShape) -> int:
     """Splats of a tile's list that are walked forward and then back: on GPUs a column of a splat's pixels for
-    each work-item, on CPUs what a core's second cache holds the fragments of."""
+    each work-item, on CPUs at least, where they touch all of a tile: their fragments fill half of a core's
+    second cache."""
     if shape.schedule == "lanes":
         return 128
     return group_of(shape) // shape.tile_width
@@ -53,7 +65,9 @@ def group_of(shape: DeviceShape) -> int:
 class _Declarations(Declarations):
     """What gradients_layout.py declares beside the records of the picture."""
 
-    def __init__(self, features: FeatureSet, layouts: list[BackwardLayout], kernels: dict[str, tuple[Argument, ...]]) -> None:
+    def __init__(
+        self, features: FeatureSet, layouts: list[BackwardLayout], kernels: dict[str, tuple[Argument, ...]]
+    ) -> None:
         super().__init__(layouts_of(features), features)
         self._backward, self._kernels = layouts, kernels
         moments = MOMENTS.with_members(one for layout in layouts for one in layout.moments)

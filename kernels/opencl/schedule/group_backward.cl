@@ -6,6 +6,7 @@
 #define PIXELS (TILE_W * TILE_H)
 #define PARTS (GROUP + 1)                    // of one field's sums: neighbours among the fields lie in other banks
 #define AHEAD_CHUNKS 8                       // that are fetched at once
+#define AT_ONCE 2                            // splats of a cell's list
 
 static inline Splat copy_of(local const Staged *staged) {
     Staged copy;
@@ -23,21 +24,29 @@ static inline Crossing cross_at(const Splat *s, int px, int py, const BlendConst
     return cross_row(s, *nu_x, *nv_x, FMA(s->dx, *x, s->d0), *y, *half_r2);
 }
 
+typedef struct {            // of a splat at a pixel, whether light comes there or not
+    wide opacity, worth;
+    int mask;
+} Met;
+
+static inline Met meet(const Splat *s, int px, int py, const Loss *loss, const BlendConstants *constants) {
+    wide x, y, nu_x, nv_x, half_r2, screen;
+    Crossing c = cross_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
+    Met met;
+    met.mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
+    met.opacity = fragment_opacity(s, fragment_half_rho(s, c, 1.0f / c.d, screen), constants->ceiling);
+    const Geometry g = geometry_of(s, c, nu_x, nv_x, y, screen);
+    met.worth = fragment_worth(s, loss, &g);
+    return met;
+}
+
 // Lets the splat take its light at a pixel; returns its opacity there.
-static inline wide walk_fragment(const Splat *s, int px, int py, Pixel *pixel, const BlendConstants *constants, wide *light, wide *worth,
-                                 const Loss *loss) {
+static inline wide walk_fragment(const Splat *s, int px, int py, Pixel *pixel, const BlendConstants *constants) {
     wide x, y, nu_x, nv_x, half_r2, screen;
     Crossing c = cross_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
     int mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
     if (!VANY(mask)) return 0.0f;
-    wide opacity = fragment_opacity(s, fragment_half_rho(s, c, 1.0f / c.d, screen), constants->ceiling);
-    *light = pixel->t;
-    wide drawn = take_light(pixel, opacity, mask, constants);
-    if (worth) {
-        const Geometry g = geometry_of(s, c, nu_x, nv_x, y, screen);
-        *worth = FMA(*light * drawn, fragment_worth(s, loss, &g), *worth);
-    }
-    return drawn;
+    return take_light(pixel, fragment_opacity(s, fragment_half_rho(s, c, 1.0f / c.d, screen), constants->ceiling), mask, constants);
 }
 
 // Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile.
@@ -121,21 +130,29 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_light(
         barrier(CLK_LOCAL_MEM_FENCE);
         if (!unfinished) listed = 0;
         uint beyond = (batch - start + length + CHUNK - 1) / CHUNK;      // of the batch's chunks
-        for (uint k = 0; k <= listed; k++) {
-            uint which = k < listed ? places[cell][k] : 0;
-            // what the chunks hold that are over
-            for (uint next = k < listed ? (batch - start + which) / CHUNK : beyond; chunk < next; chunk++)
+        for (uint k = 0; k <= listed; k += AT_ONCE) {
+            // what they are depends on no light: side by side, where light then goes from one to the next
+            uint which[AT_ONCE];
+            Met met[AT_ONCE][ROWS];
+            for (int next = 0; next < AT_ONCE; next++) {
+                which[next] = k + next < listed ? places[cell][k + next] : 0;
+                const Splat s = copy_of(&staged[which[next]]);
+                for (int row = 0; row < ROWS; row++) met[next][row] = meet(&s, px, py + row, &losses[row], &constants);
+            }
+            for (int next = 0; next < AT_ONCE; next++) {
+                // what the chunks hold that are over
+                for (uint to = k + next < listed ? (batch - start + which[next]) / CHUNK : beyond; chunk < to; chunk++)
+                    for (int row = 0; row < ROWS; row++) {
+                        kept[(size_t)chunk * PIXELS + row * TILE_W] = (float2)(lights[row], worths[row]);
+                        if (lights[row] > stop) lit = chunk + 1;
+                        lights[row] = pixel_light(&pixels[row]);
+                        worths[row] = 0.0f;
+                    }
+                if (k + next >= listed) break;
                 for (int row = 0; row < ROWS; row++) {
-                    kept[(size_t)chunk * PIXELS + row * TILE_W] = (float2)(lights[row], worths[row]);
-                    if (lights[row] > stop) lit = chunk + 1;
-                    lights[row] = pixel_light(&pixels[row]);
-                    worths[row] = 0.0f;
+                    wide light = pixels[row].t, drawn = take_light(&pixels[row], met[next][row].opacity, met[next][row].mask, &constants);
+                    worths[row] = FMA(light * drawn, met[next][row].worth, worths[row]);
                 }
-            if (k == listed) break;
-            const Splat s = copy_of(&staged[which]);
-            for (int row = 0; row < ROWS; row++) {
-                wide light;
-                if (pixels[row].t > stop) walk_fragment(&s, px, py + row, &pixels[row], &constants, &light, &worths[row], &losses[row]);
             }
         }
     }
@@ -181,7 +198,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_light(
 #define PATCH_H (4 * EACH)
 #define PATCHES_X (TILE_W / PATCH_W)
 #define PATCHES (PIXELS / (PATCH_W * PATCH_H))
-#define SHARE_OF_SPLAT (GROUP / CHUNK)       // work-items that add up a splat's fragments
+#define SHARE_OF_SPLAT (GROUP / CHUNK)       // work-items that add up a splat's fragments: a tile's width
 #define STRIDE (PIXELS + TILE_W)             // of one splat's fragments: neighbours among the splats lie in other banks
 #define SCRATCH (2 * CHUNK * STRIDE > PARTS * FIELDS ? 2 * CHUNK * STRIDE : PARTS * FIELDS)
 
@@ -256,8 +273,10 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
         for (int each = 0; each < EACH; each++) {
             int y = y0 + top + 4 * each;
             wide light = 0.0f, opacity = 0.0f;
-            if (pixels[each].t > stop && px >= s.x0 && px < s.x1 && y >= s.y0 && y < s.y1)
-                opacity = walk_fragment(&s, px, y, &pixels[each], &constants, &light, 0, 0);
+            if (pixels[each].t > stop && px >= s.x0 && px < s.x1 && y >= s.y0 && y < s.y1) {
+                light = pixels[each].t;
+                opacity = walk_fragment(&s, px, y, &pixels[each], &constants);
+            }
             fragments[which * STRIDE + (top + 4 * each) * TILE_W + column] = (float2)(light, opacity);
         }
     }
@@ -279,15 +298,15 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
     }
     barrier(CLK_LOCAL_MEM_FENCE);
 
-    // the pixels of a splat, in turns
+    // work-items of a splat have a column each, and of narrow ones the rows by turns
     uint which = item / SHARE_OF_SPLAT;
     Sums sums = {0};
     if (which < count) {
         const Splat s = copy_of(&staged[which]);
-        int left = max(s.x0 - x0, 0), right = min(s.x1 - x0, TILE_W), below = min(s.y1 - y0, TILE_H), row = max(s.y0 - y0, 0);
-        for (int column = left + (int)(item % SHARE_OF_SPLAT);; column += SHARE_OF_SPLAT) {
-            for (; column >= right && row < below; row++) column -= right - left;
-            if (row >= below) break;
+        int left = max(s.x0 - x0, 0), right = min(s.x1 - x0, TILE_W), below = min(s.y1 - y0, TILE_H), across = right - left;
+        int turns = across > SHARE_OF_SPLAT / 2 ? 1 : across > SHARE_OF_SPLAT / 4 ? 2 : 4, columns = SHARE_OF_SPLAT / turns;
+        int share = item % SHARE_OF_SPLAT, column = left + share % columns;
+        for (int row = column < right ? max(s.y0 - y0, 0) + share / columns : below; row < below; row += turns) {
             uint at = row * TILE_W + column;
             float2 here = fragments[which * STRIDE + at];
             if (here.x == 0.0f) continue;
