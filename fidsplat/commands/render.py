@@ -24,6 +24,7 @@ from fidsplat.errors import FidsplatError, InputError
 from fidsplat.files import path_of, writable_folder
 
 if TYPE_CHECKING:
+    from fidsplat.budget import Choice
     from fidsplat.formats import Progress
     from fidsplat.frame import Frame
     from fidsplat.quality import Quality
@@ -96,7 +97,7 @@ class Render:
 
     def run(self) -> int:
         import fidsplat as fs
-        from fidsplat.budget import check_bounds, choose
+        from fidsplat.budget import check_bounds
         from fidsplat.effects import select
         from fidsplat.quality import Quality
         from fidsplat.vision.output_files import save_output
@@ -117,17 +118,7 @@ class Render:
         of_scene = _named(self.source, "render.device", self.device is None)
         with where.status("opening the device"), of_scene:
             renderer = fs.Renderer(self.device or scene.device, memory)
-        choice = None
-        if budget:
-            with where.status("measuring") as status:
-                choice = choose(
-                    self.max_error,
-                    self.max_ms,
-                    scene,
-                    scene.capture.with_(quality=self.quality),
-                    renderer,
-                    tell=status.update,
-                )
+        choice = self._measured(scene, renderer) if budget else None
         begun = time.perf_counter()
         frame = self._drawn(renderer, scene, names, self.quality if choice is None else choice.quality)
         images = {name: frame[name] for name in frame.outputs}
@@ -152,6 +143,14 @@ class Render:
         lines = [*(() if choice is None else (f"chosen: {choice.summary}",)), *facts["files"]]
         title = f"{self.source} on {renderer.device.title}"
         return tell(self.json, facts, *lines, table=(title, ("", ""), rows))
+
+    def _measured(self, scene: "Scene", renderer: "Renderer") -> "Choice":
+        """The quality that keeps to --max-error and --max-ms."""
+        from fidsplat.budget import choose
+
+        capture = scene.capture.with_(quality=self.quality)
+        with console(self.json).status("measuring") as status:
+            return choose(self.max_error, self.max_ms, scene, capture, renderer, tell=status.update)
 
     def _drawn(
         self,

@@ -109,7 +109,7 @@ class Trainer:
         backend = self.renderer.backend
         if not isinstance(backend, Differentiates):
             raise DeviceError(
-                f"{self.renderer.device.name} has no gradients to train by; use device='opencl', 'warp:cpu' "
+                f"{self.renderer.device.name} has no gradients to train by; use device='opencl', 'warp' "
                 "or 'reference'"
             )
         self._differentiate = backend.differentiate

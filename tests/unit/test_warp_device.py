@@ -5,7 +5,6 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -321,15 +320,6 @@ def test_warp_pipelines_share_kernels_that_mean_the_same():
     assert one.program.blend is two.program.blend
     assert one.program.resolve is not two.program.resolve
     assert one is backend.pipeline(FeatureSet(slots, (), 0, 1, "float64"))
-
-
-def test_derivatives_on_cuda_are_refused():
-    """Whoever asks, and before anything is compiled."""
-    backend = warp_device.open_device("cpu")
-    backend.device = SimpleNamespace(is_cuda=True)
-    slots = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "compose_ordered")
-    with pytest.raises(fs.DeviceError, match=r"no derivatives: on CUDA .* use an OpenCL device or warp:cpu"):
-        backend.differentiate(FeatureSet(slots, (), 0, 1, "float64"))
 
 
 @pytest.mark.parametrize("device", ["warp:cpu", CUDA])
