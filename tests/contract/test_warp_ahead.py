@@ -191,6 +191,10 @@ def test_what_moves_is_replayed(renderer, replayed):
     for frame, place in zip(frames, places, strict=True):
         wanted = renderer.render(cloud, capture(place))
         assert all(np.array_equal(frame[name], wanted[name]) for name in frame)
+    aside = capture(0.1).with_(camera=fs.Camera.look_at(61, 43, 1.1, (0.4, 0.0, 0.0), (0.0, 0.0, 3.0)))
+    batch = renderer.render_batch(cloud, [capture(0.1), aside])
+    wanted = renderer.render(cloud, aside)
+    assert all(np.array_equal(batch[name][1], wanted[name]) for name in batch)
 
 
 def test_a_graph_keeps_no_splats(renderer, replayed):

@@ -131,8 +131,8 @@ class Drawing:
         return images
 
     def _timed(self, resident: Resident, stack: ViewStack, where: Into) -> Callable[[], dict[str, float]]:
-        """Tells what a picture's stages take, of which a graph says nothing: it is drawn once more, and only a
-        batch's into the same images."""
+        """Tells what a picture's stages take, of which a graph says nothing: it is drawn once more, a batch's
+        into the same images."""
         into = where if len(stack) > 1 else None
 
         def timings() -> dict[str, float]:
