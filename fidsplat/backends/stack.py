@@ -80,8 +80,7 @@ class ViewStack:
         """A stack of one."""
         if view.groups:
             return ViewStack._of([view], {})
-        places = (each[None, None] for each in (view.rotation, view.translation, view.eye))
-        return ViewStack(view, *places)
+        return ViewStack(view, view.rotation[None, None], view.translation[None, None], view.eye[None, None])
 
     @staticmethod
     def _of(views: Sequence[View], numbers: Mapping[str, np.ndarray]) -> ViewStack:

@@ -193,6 +193,33 @@ def test_what_moves_is_replayed(renderer, replayed):
         assert all(np.array_equal(frame[name], wanted[name]) for name in frame)
 
 
+def test_a_graph_keeps_no_splats(renderer, replayed):
+    """They leave the device with their cloud; and scratch arrays that were replaced leave at once."""
+    resident = renderer.upload(CLOUD)
+    for _ in range(4):
+        renderer.render(resident, CAPTURE).wait()
+    assert replayed
+    pool, array = renderer.backend.pool, weakref.ref(resident.data.arrays["means"])
+    scratch = weakref.ref(pool.scratch("raw color", 1, runtime.load().vec4))
+    gc.disable()
+    try:
+        pool.scratch("raw color", scratch().size + 1, runtime.load().vec4)
+        assert scratch() is None
+        del resident
+        assert array() is None
+    finally:
+        gc.enable()
+
+
+def test_nothing_is_drawn_ahead_too(renderer, replayed):
+    """A cloud without splats."""
+    arrays = [getattr(CLOUD, name)[:0] for name in ("means", "quats", "scales", "opacities")]
+    resident = renderer.upload(fs.SplatCloud(*arrays, colors=CLOUD.colors[:0]))
+    frames = [renderer.render(resident, CAPTURE) for _ in range(4)]
+    assert all(np.array_equal(frame["rgb"], frames[0]["rgb"]) for frame in frames)
+    assert frames[-1].stats == {"splats": 0, "visible": 0, "pairs": 0}
+
+
 CROSSING = [fs.Camera.look_at(61, 43, 1.1, (0.02 * k, 0.0, 0.0), (0.0, 0.0, 3.0)) for k in range(12)]
 
 

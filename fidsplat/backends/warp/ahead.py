@@ -5,6 +5,7 @@ they are read. From the third of a kind on their launches are a graph (replay.py
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -27,7 +28,7 @@ _KINDS = 8
 """of a cloud's pictures that are kept"""
 
 
-@dataclass
+@dataclass(eq=False)
 class _Kind:
     """What is known of a cloud's pictures of one size, so many views at once."""
 
@@ -38,12 +39,17 @@ class _Kind:
     """what the launches of the last depended on"""
     replay: Replay | None = None
 
+    def forget(self) -> None:
+        """Lets go of the arrays of its graph."""
+        self.replay = None
+
 
 class Drawing:
     """Draws pictures of one program, ahead where it can."""
 
     def __init__(self, program: Program, workspace: Workspace, commands: Commands) -> None:
         self.program, self._workspace, self._commands = program, workspace, commands
+        workspace.pool.holders.add(commands)
         self._kinds: WeakKeyDictionary[Resident, dict[tuple[int, int, int], _Kind]] = WeakKeyDictionary()
 
     def picture(
@@ -70,13 +76,14 @@ class Drawing:
         workspace, view = self._workspace, stack.view
         kind = self._kinds.get(resident, {}).get(_size(stack))
         # arrays that were adopted may be others when the picture has to be drawn again
-        if kind is None or not workspace.ahead or view.shots or resident.adopted:
+        if kind is None or not workspace.ahead or view.shots or resident.adopted or not resident.count:
             return self.picture(resident, stack, into, beside)[1]
         beside, room = beside or self._image_bytes(view), kind.room
         if kind.replay is not None and kind.replay.token == self._token(kind, view, beside):
             kind.replay.draw(stack)
             workspace.pictures += 1
-            return self._pending(room, kind.replay.picture, Launcher(self._commands, timed=False), into)
+            launcher = Launcher(self._commands, timed=False)
+            return self._pending(resident, stack, room, kind.replay.picture, launcher, into)
         launcher = Launcher(self._commands)
         given = {"beside": beside, "room": room, "inputs": kind.inputs}
         picture = Picture(self.program, workspace, resident, stack, launcher, **given)
@@ -84,24 +91,33 @@ class Drawing:
             return self.picture(resident, stack, into, beside)[1]
         workspace.pictures += 1
         picture.draw()
-        images = self._pending(room, picture, launcher, into)
+        images = self._pending(resident, stack, room, picture, launcher, into)
         self._capture(kind, picture, beside)
         return images
 
-    def _pending(self, room: Room, picture: Picture, launcher: Launcher, into: Into | None) -> WarpImages:
+    def _pending(
+        self,
+        resident: Resident,
+        stack: ViewStack,
+        room: Room,
+        picture: Picture,
+        launcher: Launcher,
+        into: Into | None,
+    ) -> WarpImages:
         """The images of a picture that was drawn with this room."""
-        workspace, pool, resident, stack = self._workspace, picture.pool, picture.resident, picture.stack
+        workspace, pool = self._workspace, picture.pool
         counts = pool.lend("totals", 2, load().int64)
         load().copy(counts, picture.held["totals"])
         stats = {"splats": resident.count, "visible": 0, "pairs": 0}
         images = self._resolved(picture, launcher, stats, into)
+        # whoever has it next is written to later, even if this picture is not drawn yet
+        weakref.finalize(images, pool.give_back, "totals", counts)
         where = images.into  # not the images: nobody may ever ask them, and then they go at once
 
         def settle() -> WarpImages | None:
             with workspace.working("while drawing"):
                 launcher.finish()
                 visible, pairs = counts.numpy().tolist()
-                pool.give_back("totals", counts)
                 stats.update(visible=visible, pairs=pairs)
                 self._learn(resident, stack, visible, pairs)
                 if visible > room.visible or pairs > room.pairs:
@@ -125,9 +141,11 @@ class Drawing:
     def _capture(self, kind: _Kind, picture: Picture, beside: int) -> None:
         """Captures what the picture has launched if the last of its kind has launched the same."""
         token = self._token(kind, picture.view, beside)
-        if self._workspace.replays and token == kind.token:
+        workspace = self._workspace
+        if workspace.replays and token == kind.token:
             launcher = Launcher(self._commands, timed=False, whole=True)
             kind.replay = Replay.of(picture, token, launcher)
+            workspace.pool.holders.add(kind)
         kind.token = token
 
     def _token(self, kind: _Kind, view: View, beside: int) -> tuple[Any, ...]:

@@ -40,6 +40,10 @@ class Commands:
         self._wp = load()
         self._held: dict[tuple[Any, int], tuple[Any, list[Any], list[int]]] = {}
 
+    def forget(self) -> None:
+        """Lets go of the arrays of the last launches."""
+        self._held.clear()
+
     def launch(self, kernel: Any, count: int, args: list[Any], block: int = BLOCK) -> None:
         """`count` threads of a kernel, in blocks of `block` on a GPU."""
         held = self._held.get((kernel, block))

@@ -9,6 +9,7 @@ list of what one thread launches, which is how this is tested without a GPU.)
 from __future__ import annotations
 
 import warnings
+import weakref
 from typing import Any
 
 from fidsplat.backends.stack import ViewStack
@@ -45,6 +46,8 @@ class Replay:
             return None
         finally:
             picture.launcher = before
+        # the splats are not kept by what is kept as long as they are
+        picture.resident = weakref.proxy(picture.resident)
         return Replay(picture, token, graph)
 
     def draw(self, stack: ViewStack) -> None:

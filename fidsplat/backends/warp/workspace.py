@@ -3,11 +3,12 @@ take."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, WeakSet
 
 from fidsplat.backends.warp.runtime import load
 from fidsplat.cameras.raster import RayRaster
@@ -26,13 +27,19 @@ class ArrayPool:
         self._spare: dict[str, list[Any]] = {}
         self.state = object()
         """another one whenever a scratch array has been replaced"""
+        self.holders: WeakSet[Any] = WeakSet()
+        """what holds scratch arrays from picture to picture: told to `forget` them when one is replaced"""
 
     def scratch(self, name: str, size: int, dtype: Any) -> Any:
         """An array of at least `size` elements whose content is undefined."""
         held = self._arrays.get((name, dtype))
         if held is None or held.size < size:
-            self._arrays.pop((name, dtype), None)
-            self.state = object()
+            if held is not None:
+                del self._arrays[name, dtype], held
+                self._parts.pop((name, dtype), None)
+                self.state = object()
+                for holder in list(self.holders):
+                    holder.forget()
             held = self._arrays[name, dtype] = self.fresh(name, size, dtype)
         return held
 
@@ -92,7 +99,7 @@ class Workspace:
 
     def __init__(self, device: Any, name: str, memory_budget: int) -> None:
         """name: of the device, for errors."""
-        self.device, self.name = device, name
+        self.device, self.name, self._lock = device, name, threading.RLock()
         self.pool = ArrayPool(device)
         self.memory_budget = memory_budget
         """bytes of the device that a picture and its cloud may take"""
@@ -130,7 +137,8 @@ class Workspace:
             DeviceError: the device fails.
         """
         try:
-            with load().ScopedDevice(self.device):
+            # pictures that were drawn ahead may have to be drawn again by who reads them, in any thread
+            with self._lock, load().ScopedDevice(self.device):
                 yield
         except RuntimeError as error:
             if isinstance(error, DeviceError):
