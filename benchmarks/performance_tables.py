@@ -114,7 +114,8 @@ def aims(record: dict) -> dict[str, str]:
     """A whole frame beside what was aimed at, and how far each stage is from the device's best."""
     at_most, taken = aimed_at(record), record["frame_ms"]
     assert at_most is not None
-    return {
+    cells = {name: f"{ms(own)} ({times(record, name)})" for name, own in record["stages_ms"].items()}
+    whole = {
         "scene": record["scene"],
         "device": f"{record['device']}: {record['title']}",
         "at most": ms(at_most),
@@ -122,8 +123,8 @@ def aims(record: dict) -> dict[str, str]:
         "met": "yes" if taken <= at_most else f"no: {taken / at_most:.2f} x",
         **({"host": ms(record["host_ms"])} if "host_ms" in record else {}),
         "all stages": ms(sum(record["stages_ms"].values())),
-        **{name: f"{ms(own)} ({times(record, name)})" for name, own in record["stages_ms"].items()},
     }
+    return whole | cells
 
 
 def counts(record: dict) -> dict[str, str]:
