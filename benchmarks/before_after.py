@@ -1,12 +1,14 @@
 """A commit against this tree: frames of both in turns, each in a process of its own.
 
-    python benchmarks/before_after.py COMMIT [--scene r1m_1080p] [--device D] [--repeats 15] [--json FILE]
+    python benchmarks/before_after.py COMMIT [--scene r1m_1080p] [--device D] [--repeats 15] [--cpu-time]
+                                      [--json FILE]
 
 Both processes draw the scene of this tree with its constants (alpha cut-off 1/255, stop 1e-4, precise
 arithmetic), splats resident, the picture left on the device. One frame each, in turns, and which goes first
 changes from pair to pair; the figure is the median of the ratios of this tree's time to the commit's, with
-quartiles, and beside it the stages' medians by the device's clock. So it is measured that the kernels of a
-scene without effects cost what they did before there were effects.
+quartiles, and beside it the stages' medians by the device's clock. With --cpu-time a frame's time is what all
+threads of its process take of the cores, which other work changes less. So it is measured that the kernels of
+a scene without effects cost what they did before there were effects.
 """
 
 from __future__ import annotations
@@ -46,11 +48,12 @@ knobs = {"arithmetic": "precise"} if "arithmetic" in fs.Quality.__dataclass_fiel
 quality = fs.Quality(alpha_cutoff=1 / 255, transmittance_stop=1e-4, **knobs)
 how = (fs.Capture(camera, quality=quality),) if "Capture" in fs.__all__ else (camera, ("rgb",), quality)
 print(renderer.device.title, "|", renderer.device.version, flush=True)
+clock = getattr(time, sys.argv[3])
 for line in sys.stdin:
-    start = time.perf_counter()
+    start = clock()
     frame = renderer.render(resident, *how)
     getattr(frame, "wait", lambda: frame.timings)()
-    spent = time.perf_counter() - start
+    spent = clock() - start
     picture = hashlib.sha256(frame["rgb"].tobytes()).hexdigest()[:16]
     print(spent * 1e3, picture, json.dumps(dict(frame.timings)), flush=True)
 """
@@ -70,9 +73,10 @@ def saved_scene(name: str, file: Path) -> Path:
 class Tree:
     """A process that draws with one tree's code."""
 
-    def __init__(self, tree: Path, scene: Path, device: str) -> None:
+    def __init__(self, tree: Path, scene: Path, device: str, clock: str) -> None:
+        """clock: of the module `time`."""
         self.child = subprocess.Popen(
-            [sys.executable, "-c", CHILD, str(scene), device],
+            [sys.executable, "-c", CHILD, str(scene), device, clock],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -117,12 +121,12 @@ def checked_out(commit: str, folder: Path) -> Path:
     return folder
 
 
-def measure(commit: str, scene: str, device: str, repeats: int) -> dict:
+def measure(commit: str, scene: str, device: str, repeats: int, clock: str) -> dict:
     """Both trees' times and the ratio of this tree's to the commit's."""
     with tempfile.TemporaryDirectory() as folder:
         old = Path(commit).resolve() if Path(commit).is_dir() else checked_out(commit, Path(folder))
         file = saved_scene(scene, Path(folder) / "scene.npz")
-        trees = [Tree(old, file, device), Tree(ROOT, file, device)]
+        trees = [Tree(old, file, device, clock), Tree(ROOT, file, device, clock)]
         before, now = (Timer(tree.frame, tree.clock) for tree in trees)
         with Progress(console=PROGRESS) as progress:
             task = progress.add_task(scene, total=2 * repeats)
@@ -136,6 +140,7 @@ def measure(commit: str, scene: str, device: str, repeats: int) -> dict:
         "date": date.today().isoformat(),
         "commit": commit,
         "pairs": repeats,
+        "clock": clock,
         "before_ms": before.median,
         "now_ms": now.median,
         "ratio": middle,
@@ -149,8 +154,10 @@ def main() -> None:
     parser = options(__doc__, repeats=15)
     parser.add_argument("commit", help="any name that git knows, or a folder with its files")
     parser.add_argument("--scene", default="r1m_1080p", choices=BENCH_SCENES)
+    parser.add_argument("--cpu-time", action="store_true", help="of all threads, not the time that passes")
     asked = parser.parse_args()
-    row = measure(asked.commit, asked.scene, asked.device, max(asked.repeats, 2))
+    clock = "process_time" if asked.cpu_time else "perf_counter"
+    row = measure(asked.commit, asked.scene, asked.device, max(asked.repeats, 2), clock)
     if keep(row, asked.json):
         return
     print("{scene} on {device}, {date}, {pairs} pairs".format(**row))

@@ -1,4 +1,4 @@
-"""A splat file fitted anew from pictures of it, drawn here: what training gets back of a scene that is known.
+"""A splat file fitted again from pictures of it, drawn here: what training gets back of a known scene.
 
     python benchmarks/refit.py FILE.ply [--device opencl] [--views 60] [--points 5000] [-o OUT]
 

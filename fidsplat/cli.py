@@ -10,6 +10,7 @@ import inspect
 import io
 import operator
 import os
+import re
 import sys
 import traceback
 import warnings
@@ -162,6 +163,9 @@ def _any_of(commands: dict[str, type]) -> Any:
     )
 
 
+_NO_NUMBER = re.compile(r"Error parsing (\S+): .*(int\(\) with base 10|string to float): ('.*?')")
+
+
 def _one_line(box: str) -> str:
     """tyro's boxed message as one line: what is wrong, the nearest option if it names one, where to read
     more."""
@@ -175,6 +179,9 @@ def _one_line(box: str) -> str:
             parts[-1].append(line)
     parts = parts[1:]
     message = " ".join(parts[0]) or "these words make no command"
+    if found := _NO_NUMBER.search(message):
+        kind = "a whole number" if found[2].startswith("int") else "a number"
+        message = f"{found[1]} is {found[3]}; give {kind}"
     for part in parts[1:]:
         if part and part[0].startswith("Perhaps you meant"):
             message += f"; perhaps {part[1]}"

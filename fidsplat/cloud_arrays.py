@@ -159,7 +159,7 @@ def unit_quaternions(quats: np.ndarray) -> np.ndarray:
 def with_thinnest_last(quats: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The same 3D Gaussians in frames whose third axis is the thinnest; the third wins ties.
 
-    quats (n, 4) wxyz, scales (n, 3), none of them NaN -> both anew.
+    quats (n, 4) wxyz, scales (n, 3), none of them NaN -> both new.
     """
     thin = 2 - np.argmin(scales[:, ::-1], axis=1)
     turned = thin != 2

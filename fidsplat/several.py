@@ -27,7 +27,7 @@ from fidsplat.splats import SplatCloud
 from fidsplat.store.store import Store
 
 _UNEVEN = 1.1
-"""how many times as long as the mean the slowest band may take before the bands are cut anew"""
+"""how many times as long as the mean the slowest band may take before the bands are cut again"""
 
 _AHEAD = 3
 """pictures that each device is asked for before the first of them is waited for: one that is brought to the

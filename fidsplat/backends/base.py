@@ -254,5 +254,5 @@ class Measurable(Protocol):
         ...
 
     def rates(self) -> Rates:
-        """What the device can do at best; measured anew at each call."""
+        """What the device can do at best; measured again at each call."""
         ...

@@ -43,7 +43,7 @@ def ensure_caches() -> None:
     weakref.finalize(ensure_caches, _remove, place, os.getpid())
     os.environ.update({name: str(place / name.lower()) for name in lacking})
     warnings.warn(
-        f"kernels are compiled anew in this run: {'; '.join(lacking.values())}; "
+        f"kernels are compiled again in this run: {'; '.join(lacking.values())}; "
         f"set {' and '.join(lacking)} to a folder with room",
         stacklevel=2,
     )

@@ -16,7 +16,7 @@ FAMILIES = {
     "warp": "fidsplat.backends.warp",
     "reference": "fidsplat.backends.reference",
 }
-"""family: its module; another family is one more entry, from outside too"""
+"""family: its module; another family is one more entry; from outside, of one process"""
 
 _STARTED_BY: dict[str, int] = {}
 """family: the process that was the first here to ask its driver for something"""

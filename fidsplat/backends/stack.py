@@ -33,6 +33,12 @@ class ViewBatch:
         """A view that is drawn."""
         return self.views.one(number) if isinstance(self.views, ViewStack) else self.views[number]
 
+    def part(self, first: int, end: int) -> ViewStack:
+        """Views [first, end) that are drawn, which are stacked unless it is one."""
+        if isinstance(self.views, ViewStack) and end - first > 1:
+            return self.views.part(first, end)
+        return ViewStack.alone(self.one(first))
+
 
 @dataclass(frozen=True)
 class ViewStack:
@@ -68,6 +74,13 @@ class ViewStack:
                 return None
         numbers = {name: np.array([getattr(view, name) for view in views], np.float64) for name in _OWN}
         return ViewStack._of(views, {name: each for name, each in numbers.items() if (each != each[0]).any()})
+
+    @staticmethod
+    def alone(view: View) -> ViewStack:
+        """A stack of one."""
+        if view.groups:
+            return ViewStack._of([view], {})
+        return ViewStack(view, view.rotation[None, None], view.translation[None, None], view.eye[None, None])
 
     @staticmethod
     def _of(views: Sequence[View], numbers: Mapping[str, np.ndarray]) -> ViewStack:

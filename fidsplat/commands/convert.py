@@ -17,7 +17,6 @@ from fidsplat.commands.output import (
     late_progress,
     new_file,
     option,
-    say,
     switch,
     tell,
 )
@@ -51,7 +50,8 @@ class Convert:
         from fidsplat.formats.files import check_writable
 
         known = check_writable(self.target)
-        if Path(self.target).exists() and Path(self.target).samefile(self.source):
+        source, target = Path(self.source), Path(self.target)
+        if source.exists() and target.exists() and source.samefile(target):
             raise InputError(f"{self.source} and {self.target} are one file; give B another name")
         new_file(self.target, self.overwrite)
         with late_progress(console(True)) as progress:
@@ -64,18 +64,13 @@ class Convert:
         if not self.no_pictures and len(cloud):
             with console(True).status("drawing both"):
                 facts["error"] = picture_error(cloud, fs.load_splats(self.target), self.device)
-        if self.json:
-            return tell(True, facts)
-        where = console(False)
-        say(where, f"{len(cloud):,} splats, {sizes[0]:,} to {sizes[1]:,} bytes, {known.name}: {self.target}")
-        say(where, *(f"not kept: {words}" if not words.startswith("rounds") else words for words in lost))
+        lines = [f"{len(cloud):,} splats, {sizes[0]:,} to {sizes[1]:,} bytes, {known.name}: {self.target}"]
+        lines += [f"not kept: {words}" if not words.startswith("rounds") else words for words in lost]
         if error := facts["error"]:
             psnr = "the same bits" if math.isinf(error["psnr"]) else f"{error['psnr']:.1f} dB"
-            say(
-                where,
-                f"pictures differ by {error['largest']:.2g} at most, {error['mean']:.2g} in the mean; {psnr}",
-            )
-        return 0
+            apart = f"pictures differ by {error['largest']:.2g} at most, {error['mean']:.2g} in the mean"
+            lines.append(f"{apart}; {psnr}")
+        return tell(self.json, facts, *lines)
 
 
 def picture_error(before, after, device: str | None) -> dict[str, float]:

@@ -3,7 +3,7 @@
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
-from fidsplat.commands.output import Json, console, print_json, print_table
+from fidsplat.commands.output import Json, tell
 
 if TYPE_CHECKING:
     from fidsplat.backends.base import DeviceInfo
@@ -26,13 +26,8 @@ class Devices:
         import fidsplat as fs
 
         found = fs.devices()
-        if self.json:
-            print_json({"devices": [asdict(info) for info in found]})
-            return 0
-        print_table(
-            console(False), "Devices", ("device", "what it is", "memory", "can draw"), map(_row, found)
-        )
-        return 0
+        table = "Devices", ("device", "what it is", "memory", "can draw"), map(_row, found)
+        return tell(self.json, {"devices": [asdict(info) for info in found]}, table=table)
 
 
 def _row(info: "DeviceInfo") -> tuple[str, ...]:

@@ -23,9 +23,8 @@ from fidsplat.commands.output import (
     late_progress,
     names_of,
     option,
-    print_json,
-    say,
     switch,
+    tell,
     writable_file,
 )
 from fidsplat.commands.remote import RayAddress, Workers, check_workers
@@ -147,8 +146,7 @@ class Fly:
             list(counted("log", write_log(folder, self.log, self.overwrite), len(flight)))
         if self.coco is not None:
             list(counted("truth", write_truth(folder, self.coco), len(flight)))
-        self._tell(folder, sheet, left, seconds)
-        return 0
+        return self._tell(folder, sheet, left, seconds)
 
     @contextmanager
     def _drawn_by(
@@ -172,20 +170,16 @@ class Fly:
                 engine = stack.enter_context(ray_engine(self.ray, work, self.workers))
             yield engine.title, lambda folder: draw(folder, engine, engine.workers)
 
-    def _tell(self, folder: FlightFolder, sheet: Path, drawn: int, seconds: float) -> None:
+    def _tell(self, folder: FlightFolder, sheet: Path, drawn: int, seconds: float) -> int:
         frames = len(folder.flight)
-        if self.json:
-            facts: dict[str, Any] = {"source": self.source, "device": folder.device, "frames": frames}
-            facts |= {"drawn": drawn, "seconds": seconds, "folder": str(folder.folder)}
-            facts |= {"contact_sheet": str(sheet), "video": self.video, "log": self.log, "coco": self.coco}
-            print_json(facts)
-            return
+        facts: dict[str, Any] = {"source": self.source, "device": folder.device, "frames": frames}
+        facts |= {"drawn": drawn, "seconds": seconds, "folder": str(folder.folder)}
+        facts |= {"contact_sheet": str(sheet), "video": self.video, "log": self.log, "coco": self.coco}
         kept = f" ({frames - drawn} were there already)" if drawn < frames else ""
         rate = f", {drawn / seconds:.1f} a second" if drawn else ""
-        say(
-            console(False), f"{frames} pictures{kept} on {folder.device} in {seconds:.1f} s{rate}", str(sheet)
-        )
-        say(console(False), *(name for name in (self.video, self.log, self.coco) if name is not None))
+        lines = [f"{frames} pictures{kept} on {folder.device} in {seconds:.1f} s{rate}", str(sheet)]
+        more = (name for name in (self.video, self.log, self.coco) if name is not None)
+        return tell(self.json, facts, *lines, *more)
 
 
 def _own_motion(source: str, scene: Scene, smooth: bool) -> Trajectory:

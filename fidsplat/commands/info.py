@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from fidsplat.commands.output import Json, console, late_progress, option, print_json, print_table
+from fidsplat.commands.output import Json, console, late_progress, option, tell
 
 if TYPE_CHECKING:
     from fidsplat.splats import SplatCloud
@@ -47,11 +47,7 @@ class Info:
         with late_progress(console(True)) as progress:
             cloud = fs.load_splats(self.file, progress)
         facts = {"file": self.file, "bytes": Path(self.file).stat().st_size, **describe(cloud)}
-        if self.json:
-            print_json(facts)
-            return 0
-        print_table(console(False), self.file, ("", ""), _rows(facts))
-        return 0
+        return tell(self.json, facts, table=(self.file, ("", ""), _rows(facts)))
 
 
 def describe(cloud: SplatCloud) -> dict[str, Any]:

@@ -8,17 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from fidsplat.commands.output import (
-    Device,
-    Json,
-    console,
-    late_progress,
-    option,
-    print_json,
-    print_table,
-    say,
-    switch,
-)
+from fidsplat.commands.output import Device, Json, console, late_progress, option, switch, tell
 
 if TYPE_CHECKING:
     from fidsplat.experiments.localise import Localise as Asked
@@ -81,27 +71,26 @@ class Localise:
         renderer = fs.Renderer(self.device)
         done = 0
 
-        def tell(name: str, share: float) -> None:
+        def step(name: str, share: float) -> None:
             progress(name, (done + share) / len(names))
 
         folder = Path(self.out)
-        sweep = drive_sweep(folder, asked, names, renderer, tell, self.overwrite)
+        sweep = drive_sweep(folder, asked, names, renderer, step, self.overwrite)
         with late_progress(console(True)) as progress:
             done = len(names) - len(sweep.left)
             for record in sweep.run():
                 done += 1
-                tell(record.key["variant"], 0.0)
+                step(record.key["variant"], 0.0)
         found, device = found_of(sweep.results), renderer.device.title
         page = write_report(folder, asked, device, found)
         self._record(asked, renderer)
-        if self.json:
-            print_json({"run": sweep.results.run, "variants": found})
-            return 0
-        where, table = console(False), table_of(found)
-        length = found[names[0]]["length_m"]
-        print_table(where, f"{length:.1f} m", table.columns, table.itertuples(index=False))
-        say(where, *(name for name in (str(page), self.log, self.video) if name is not None))
-        return 0
+        rows, length = table_of(found), found[names[0]]["length_m"]
+        return tell(
+            self.json,
+            {"run": sweep.results.run, "variants": found},
+            *(name for name in (str(page), self.log, self.video) if name is not None),
+            table=(f"{length:.1f} m", rows.columns, rows.itertuples(index=False)),
+        )
 
     def _record(self, asked: Asked, renderer: Renderer) -> None:
         """The log and the video."""

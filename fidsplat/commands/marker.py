@@ -15,8 +15,7 @@ from fidsplat.commands.output import (
     late_progress,
     new_file,
     option,
-    print_json,
-    print_table,
+    tell,
 )
 from fidsplat.errors import InputError
 
@@ -130,9 +129,6 @@ class Marker:
             "module_m": made.module,
             "file": str(file) if file else None,
         }
-        if self.json:
-            print_json(facts)
-            return 0
         rows = [
             ("modules", f"{made.bits.shape[0]} x {made.bits.shape[1]}, quiet zone {made.quiet_zone}"),
             ("size", f"{made.size:g} m, a module {made.module * 1e3:.4g} mm"),
@@ -147,8 +143,7 @@ class Marker:
             rows.append(("", f"as {len(made.gaussians)} Gaussians (fitted): a PLY file has no boxes"))
         if file is not None and made.mixture == "facets":
             rows.append(("", "for --quality order=pixel: by the depth of centres they hide each other"))
-        print_table(console(False), made.spec, ("", ""), rows)
-        return 0
+        return tell(self.json, facts, table=(made.spec, ("", ""), rows))
 
     def _refined(self, made: fs.Marker, progress: Callable[[str, float], None]) -> fs.Marker:
         """The marker's Gaussians, optimised on a device."""

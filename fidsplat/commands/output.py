@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 T = TypeVar("T")
+Table = tuple[str, Sequence[str], Iterable[Sequence[object]]]
+"""title, heads and rows, as of `print_table`"""
 
 
 def option(metavar: str, text: str, short: str | None = None):
@@ -94,21 +96,23 @@ def say(where: Console, *lines: str) -> None:
         where.print(line, markup=False, soft_wrap=True)
 
 
-def tell(as_json: bool, facts: dict[str, Any], *lines: str) -> int:
-    """Print what a command found, as JSON or as lines; returns the exit status 0."""
+def tell(as_json: bool, facts: dict[str, Any], *lines: str, table: Table | None = None) -> int:
+    """Print what a command found, as JSON or as a table and lines; returns the exit status 0."""
     if as_json:
         print_json(facts)
     else:
+        if table is not None:
+            print_table(console(False), *table)
         say(console(False), *lines)
     return 0
 
 
 def print_table(where: Console, title: str, heads: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """A table under its title; texts are taken as they are, not as markup, and broken rather than cut."""
-    from rich.table import Table
+    from rich.table import Table as RichTable
     from rich.text import Text
 
-    table = Table(
+    table = RichTable(
         title=Text(title, "bold"),
         title_justify="left",
         show_header=any(heads),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from fidsplat.commands.output import Device, Json, console, late_progress, option, print_json, print_table
+from fidsplat.commands.output import Device, Json, console, late_progress, option, tell
 from fidsplat.commands.sweeps import Names
 
 
@@ -57,9 +57,6 @@ class Plants:
         environment = self.environment or default_environment()
         with late_progress(console(True)) as progress:
             made = list(plants.write_plants(wanted, Path(self.out), environment, self.device, progress))
-        if self.json:
-            print_json({"plants": [{"file": str(file), "psnr": score} for file, score in made]})
-            return 0
+        facts = {"plants": [{"file": str(file), "psnr": score} for file, score in made]}
         rows = [(str(file), "" if score is None else f"{score:.1f}") for file, score in made]
-        print_table(console(False), "plants", ("file", "PSNR of test views [dB]"), rows)
-        return 0
+        return tell(self.json, facts, table=("plants", ("file", "PSNR of test views [dB]"), rows))

@@ -18,14 +18,13 @@ from fidsplat.commands.output import (
     late_progress,
     names_of,
     option,
-    print_json,
-    print_table,
-    say,
+    tell,
 )
 from fidsplat.errors import FidsplatError, InputError
 from fidsplat.files import path_of, writable_folder
 
 if TYPE_CHECKING:
+    from fidsplat.budget import Choice
     from fidsplat.formats import Progress
     from fidsplat.frame import Frame
     from fidsplat.quality import Quality
@@ -98,7 +97,7 @@ class Render:
 
     def run(self) -> int:
         import fidsplat as fs
-        from fidsplat.budget import check_bounds, choose
+        from fidsplat.budget import check_bounds
         from fidsplat.effects import select
         from fidsplat.quality import Quality
         from fidsplat.vision.output_files import save_output
@@ -119,47 +118,39 @@ class Render:
         of_scene = _named(self.source, "render.device", self.device is None)
         with where.status("opening the device"), of_scene:
             renderer = fs.Renderer(self.device or scene.device, memory)
-        choice = None
-        if budget:
-            with where.status("measuring") as status:
-                choice = choose(
-                    self.max_error,
-                    self.max_ms,
-                    scene,
-                    scene.capture.with_(quality=self.quality),
-                    renderer,
-                    tell=status.update,
-                )
+        choice = self._measured(scene, renderer) if budget else None
         begun = time.perf_counter()
         frame = self._drawn(renderer, scene, names, self.quality if choice is None else choice.quality)
         images = {name: frame[name] for name in frame.outputs}
         seconds = time.perf_counter() - begun
         bits = None if scene.sensor is None else scene.sensor.bits
         files = [file for name, image in images.items() for file in save_output(name, image, name_of, bits)]
-        if self.json:
-            print_json(
-                {
-                    "source": self.source,
-                    "device": renderer.device.name,
-                    "width": images[frame.outputs[0]].shape[1],
-                    "height": images[frame.outputs[0]].shape[0],
-                    "outputs": list(frame.outputs),
-                    "chosen": None if choice is None else choice.as_dict(),
-                    "stats": dict(frame.stats),
-                    "timings_ms": dict(frame.timings),
-                    "seconds": seconds,
-                    "files": [str(file) for file in files],
-                }
-            )
-            return 0
+        facts = {
+            "source": self.source,
+            "device": renderer.device.name,
+            "width": images[frame.outputs[0]].shape[1],
+            "height": images[frame.outputs[0]].shape[0],
+            "outputs": list(frame.outputs),
+            "chosen": None if choice is None else choice.as_dict(),
+            "stats": dict(frame.stats),
+            "timings_ms": dict(frame.timings),
+            "seconds": seconds,
+            "files": [str(file) for file in files],
+        }
         rows = [(stage, f"{ms:.2f} ms") for stage, ms in frame.timings.items()]
         rows += [(what, f"{count:,}") for what, count in frame.stats.items()]
         rows += [("with compilation and transfer", f"{seconds:.2f} s")]
-        print_table(where, f"{self.source} on {renderer.device.title}", ("", ""), rows)
-        if choice is not None:
-            say(where, f"chosen: {choice.summary}")
-        say(where, *map(str, files))
-        return 0
+        lines = [*(() if choice is None else (f"chosen: {choice.summary}",)), *facts["files"]]
+        title = f"{self.source} on {renderer.device.title}"
+        return tell(self.json, facts, *lines, table=(title, ("", ""), rows))
+
+    def _measured(self, scene: "Scene", renderer: "Renderer") -> "Choice":
+        """The quality that keeps to --max-error and --max-ms."""
+        from fidsplat.budget import choose
+
+        capture = scene.capture.with_(quality=self.quality)
+        with console(self.json).status("measuring") as status:
+            return choose(self.max_error, self.max_ms, scene, capture, renderer, tell=status.update)
 
     def _drawn(
         self,

@@ -42,7 +42,7 @@ class View:
     Only this machine reaches the page. From elsewhere: ssh -L 8080:localhost:8080 THAT_MACHINE
 
     A RUN is a folder of `fidsplat fly`, whose poses stand there as keyframes, or of `fidsplat train`, or its
-    checkpoint, whose splats are shown anew as they grow.
+    checkpoint, whose splats are shown as they grow.
 
     Examples:
       fidsplat view                                                      the demo's scene

@@ -173,7 +173,7 @@ def train_marker(
         folder: of the data set; the scene is written where it is missing, with the ideal pictures.
         out: gets 2dgs-17/small-0.ply and the like, of other seeds than 0 in seed-1 and so on.
         texts: seed of the marker's text and views.
-        restart: begin anew though there is a checkpoint.
+        restart: begin again though there is a checkpoint.
 
     Returns:
         `splats`, `seconds` of the training, `iterations` that these took, and of the views held out the means

@@ -17,6 +17,8 @@ from fidsplat.harmonics import C0
 from fidsplat.splats import SplatCloud
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+_SEEN = 4096
+"""rows that are looked at before the others are read: nothing else tells what the file is"""
 
 
 def load_splat(path: Path) -> SplatCloud:
@@ -28,6 +30,9 @@ def load_splat(path: Path) -> SplatCloud:
             f"{path}: {size} bytes are not rows of {_ROW.itemsize}; cut short, or not a .splat file"
         )
     rows = np.memmap(path, _ROW, "r").view(np.ndarray)
+    means, scales = rows["means"][:_SEEN], rows["scales"][:_SEEN]
+    if not (np.isfinite(means).all(1) & np.isfinite(scales).all(1) & (scales > 0).any(1)).any():
+        raise InputError(f"{path} is not a .splat file: none of its first {len(means)} rows is a splat")
     rgba = rows["rgba"].astype(np.float32) / 255
     quats = (rows["quat"].astype(np.float32) - 128) / 128
     sh = ((rgba[:, None, :3] - 0.5) / C0).astype(np.float32)

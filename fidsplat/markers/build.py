@@ -32,6 +32,7 @@ from fidsplat.markers.printing import (
     refuse_more,
 )
 from fidsplat.markers.regions import label_components, polygons
+from fidsplat.markers.spec import Spec
 from fidsplat.quality import MIXTURES, MarkerQuality, whole_number
 from fidsplat.scalars import PickledByFields
 
@@ -209,20 +210,12 @@ def marker(
     if not isinstance(duplicates, bool | None):
         raise InputError(f"duplicates is {duplicates!r}; it must be True or False")
     chosen = _chosen(MarkerQuality() if quality is None else quality, mixture, duplicates, given)
-    exact = chosen.mixture == "exact"
     templates, growth = _mixture(chosen, bool(duplicates))
     _check_size(size)
     parsed, bits = bits_of(parsed)
-    quiet = kind_of(parsed).quiet_zone if quiet_zone is None else quiet_zone
-    longest = MAX_MODULES - max(bits.shape)
-    if longest < 0:
-        raise InputError(
-            f"{spec} has {bits.shape[1]} x {bits.shape[0]} modules; at most {MAX_MODULES} a side are made"
-        )
-    quiet = whole_number("the quiet zone", quiet, 0, longest // 2)
-
+    quiet = _quiet_zone(spec, parsed, bits, quiet_zone)
     grid = np.pad(bits, quiet)
-    each = 1 if exact else min(len(template.gaussians) for template in templates)
+    each = 1 if chosen.mixture == "exact" else min(len(template.gaussians) for template in templates)
     palette = np.array(parsed.colors or ((1, 1, 1), (0, 0, 0)), np.float32)
     if chosen.mixture == "facets":
         refuse_more(spec, count_facets(grid.shape), max_splats)
@@ -231,21 +224,13 @@ def marker(
     progress("components", 0.0)
     labels, components = label_components(grid)
     progress("rectangles", 0.0)
-    regions, turns = parsed.regions, None
-    if regions is None:
-        boxes = partition_colors(grid)
-        values = grid[boxes[:, 1], boxes[:, 0]]
-    else:
-        from fidsplat.markers.cover import cover_all  # late, as shapely is
-        from fidsplat.markers.shapes import with_margin
-
-        regions = with_margin(regions, quiet, grid.shape)
+    printed = _printed(grid, parsed, quiet, size / bits.shape[1], palette)
+    boxes, values, turns, regions = printed.boxes, printed.values, printed.turns, printed.regions
+    if regions is not None:
         components = sum(len(region.geoms) for region in regions)
-        boxes, turns, values = cover_all(regions, grid.shape)
-    printed = Printed(grid, boxes, values, turns, regions, size / bits.shape[1], palette)
     if chosen.mixture == "facets":
         cloud = facet_cloud(spec, printed, progress)
-    elif exact:
+    elif chosen.mixture == "exact":
         refuse_more(spec, len(boxes), max_splats)
         cloud = box_cloud(printed, progress)
     else:
@@ -277,6 +262,30 @@ def marker(
         seconds=time.perf_counter() - start,
         max_splats=max_splats,
     )
+
+
+def _quiet_zone(spec: str, parsed: Spec, bits: np.ndarray, modules: int | None) -> int:
+    """Modules of white around these; None: as many as the kind has."""
+    longest = MAX_MODULES - max(bits.shape)
+    if longest < 0:
+        raise InputError(
+            f"{spec} has {bits.shape[1]} x {bits.shape[0]} modules; at most {MAX_MODULES} a side are made"
+        )
+    wanted = kind_of(parsed).quiet_zone if modules is None else modules
+    return whole_number("the quiet zone", wanted, 0, longest // 2)
+
+
+def _printed(grid: np.ndarray, parsed: Spec, quiet: int, module: float, palette: np.ndarray) -> Printed:
+    """The modules cut into rectangles, or what covers a drawing's shapes."""
+    if parsed.regions is None:
+        boxes = partition_colors(grid)
+        return Printed(grid, boxes, grid[boxes[:, 1], boxes[:, 0]], None, None, module, palette)
+    from fidsplat.markers.cover import cover_all  # late, as shapely is
+    from fidsplat.markers.shapes import with_margin
+
+    regions = with_margin(parsed.regions, quiet, grid.shape)
+    boxes, turns, values = cover_all(regions, grid.shape)
+    return Printed(grid, boxes, values, turns, regions, module, palette)
 
 
 def _unseen(words: str, share: float) -> None:

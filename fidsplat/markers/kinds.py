@@ -14,7 +14,7 @@ _kinds = {kind.name: kind for module in (tags, qr, images, drawing, boards) for 
 
 
 def register(kind: Kind) -> None:
-    """Let specs name one more kind of marker.
+    """Let specs name one more kind of marker, in this process.
 
     Raises:
         InputError: its name is taken, or cannot begin a spec.

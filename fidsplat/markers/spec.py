@@ -34,7 +34,7 @@ class Spec:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of marker. `fidsplat.markers.register` adds one, after which its specs work everywhere."""
+    """A kind of marker. `fidsplat.markers.register` adds one, after which its specs work in that process."""
 
     name: str
     """what its specs begin with, in lower case; options may follow after a dash: "qr", "qr-v22-L\""""

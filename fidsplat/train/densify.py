@@ -82,7 +82,7 @@ def reset_logits(logits: np.ndarray, settings: TrainSettings) -> np.ndarray:
 
 
 def forgotten(splats: Splats) -> Splats:
-    """The splats with their sums of gradients begun anew."""
+    """The splats with their sums of gradients begun again."""
     splats.gradients[:] = 0
     splats.seen[:] = 0
     return splats

@@ -36,7 +36,7 @@ def drawn(
     backend = renderer.backend
     if not isinstance(backend, Differentiates):
         raise DeviceError(
-            f"{renderer.device.name} has no gradients; use device='opencl', 'warp:cpu' or 'reference'"
+            f"{renderer.device.name} has no gradients; use device='opencl', 'warp' or 'reference'"
         )
     resident = backend.upload(cloud)
     features, view = prepare(resident, capture)

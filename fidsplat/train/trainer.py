@@ -83,7 +83,7 @@ class Trainer:
         renderer: opens the device that draws; None: the default device.
         settings: of the run; None: the defaults. `changes` are fields of it, given by name.
         checkpoint: a file that the run goes on from if it is there, and that `run` writes.
-        restart: begin anew though there is a checkpoint, which stays until the first new one replaces it.
+        restart: begin again though there is a checkpoint, which stays until the first new one replaces it.
         start: splats to begin with, in place of one at each of the data set's points; SH grow from degree 0
             all the same.
 
@@ -109,7 +109,7 @@ class Trainer:
         backend = self.renderer.backend
         if not isinstance(backend, Differentiates):
             raise DeviceError(
-                f"{self.renderer.device.name} has no gradients to train by; use device='opencl', 'warp:cpu' "
+                f"{self.renderer.device.name} has no gradients to train by; use device='opencl', 'warp' "
                 "or 'reference'"
             )
         self._differentiate = backend.differentiate
@@ -304,7 +304,7 @@ class Trainer:
 
     def _change(self, gradients: dict[str, Any], iteration: int, view: TrainingView) -> None:
         """The optimiser's step; none where the default rule makes splats next, as in the authors' trainer, in
-        which splats that are made anew have no gradient yet."""
+        which new splats have no gradient yet."""
         settings, mcmc_runs = self.settings, self.settings.strategy == "mcmc"
         if not mcmc_runs:
             if iteration < settings.densify_until:

@@ -13,7 +13,7 @@ from fidsplat.errors import FidsplatError
 from fidsplat.viewer.settings import Viewpoint
 
 SMALLEST, STEPS = 1 / 4, 32
-"""least scale, and in how many steps it goes to 1: buffers are not made anew for every picture"""
+"""least scale, and in how many steps it goes to 1: buffers are not made again for every picture"""
 REST = 0.15
 """seconds without a change after which the exact picture is drawn"""
 

@@ -23,11 +23,12 @@ static inline Bounds box_bounds(real x0, real x1, real y0, real y1) {
 // (numerics A4). tu, tv are relative to the projected centre (their z is 0).
 static inline Bounds ellipse_bounds(real3_ tu, real3_ tv, real3_ tw, real center_x, real center_y, real r2) {
     real d = r2 * (tw.x * tw.x + tw.y * tw.y) - tw.z * tw.z;   // < 0
-    real mx = r2 * (tu.x * tw.x + tu.y * tw.y) / d;
-    real my = r2 * (tv.x * tw.x + tv.y * tw.y) / d;
-    real qxx = fmax(mx * mx - r2 * (tu.x * tu.x + tu.y * tu.y) / d, REAL(0.0));
-    real qyy = fmax(my * my - r2 * (tv.x * tv.x + tv.y * tv.y) / d, REAL(0.0));
-    real qxy = mx * my - r2 * (tu.x * tv.x + tu.y * tv.y) / d;
+    real r2_d = r2 / d;
+    real mx = r2_d * (tu.x * tw.x + tu.y * tw.y);
+    real my = r2_d * (tv.x * tw.x + tv.y * tw.y);
+    real qxx = fmax(mx * mx - r2_d * (tu.x * tu.x + tu.y * tu.y), REAL(0.0));
+    real qyy = fmax(my * my - r2_d * (tv.x * tv.x + tv.y * tv.y), REAL(0.0));
+    real qxy = mx * my - r2_d * (tu.x * tv.x + tu.y * tv.y);
     real hx = sqrt(qxx), hy = sqrt(qyy);
     Bounds b;
     b.ex = (float)(center_x + mx);
@@ -65,8 +66,8 @@ static inline void bounds_span(const Bounds *b, float y0, float y1, float *x0, f
 static inline void bounds_rows(const Bounds *b, int height, int *y0, int *y1) {
     float low = b->ey - b->hy, high = b->ey + b->hy;
 //@@ bounds_rows
-    *y0 = max(to_pixel(ceil(low - 0.5f), height), 0);
-    *y1 = min(to_pixel(floor(high - 0.5f) + 1.0f, height), height);
+    *y0 = max(pixel_above(low - 0.5f, height), 0);
+    *y1 = min(pixel_below(high - 0.5f, height) + 1, height);
 }
 
 typedef struct { int first, last; } TileSpan;   // inclusive; empty if first > last
@@ -76,7 +77,7 @@ static inline TileSpan tile_span(const Bounds *b, int tile_row, int width, int h
     float y0 = (float)(tile_row * TILE_H) + 0.5f, y1 = (float)min(tile_row * TILE_H + TILE_H, height) - 0.5f;
     float x0, x1;
     bounds_span(b, y0, y1, &x0, &x1);
-    int first = max(to_pixel(ceil(x0 - 0.5f), width), 0), last = min(to_pixel(floor(x1 - 0.5f), width), width - 1);
+    int first = max(pixel_above(x0 - 0.5f, width), 0), last = min(pixel_below(x1 - 0.5f, width), width - 1);
     TileSpan span = {first / TILE_W, first <= last ? last / TILE_W : -1};
     return span;
 }

@@ -101,8 +101,23 @@ static inline uint sortable(float x) {
     return (bits & 0x80000000u) ? ~bits : (bits | 0x80000000u);
 }
 
-// Pixel coordinate to int without the undefined conversions of huge values (numerics E2).
-static inline int to_pixel(float x, int limit) { return (int)clamp(x, -1.0f, (float)limit + 1.0f); }
+// The whole number at x or the next above, below it, as far as a picture of `limit` pixels reaches: without the undefined
+// conversions of huge values (numerics E2). On CPUs without PoCL's `ceil` and `floor`, a dozen instructions each.
+#if LANES > 1
+static inline int pixel_above(float x, int limit) {
+    float within = clamp(x, -1.0f, (float)limit + 1.0f);
+    int whole = (int)within;
+    return whole + (int)((float)whole < within);
+}
+static inline int pixel_below(float x, int limit) {
+    float within = clamp(x, -1.0f, (float)limit + 1.0f);
+    int whole = (int)within;
+    return whole - (int)((float)whole > within);
+}
+#else
+static inline int pixel_above(float x, int limit) { return (int)clamp(ceil(x), -1.0f, (float)limit + 1.0f); }
+static inline int pixel_below(float x, int limit) { return (int)clamp(floor(x), -1.0f, (float)limit + 1.0f); }
+#endif
 
 // A hint on CPUs whose compiler has one: they then wait less for what lies at an unforeseeable place.
 #if LANES > 1 && defined(__has_builtin)

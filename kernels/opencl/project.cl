@@ -112,8 +112,8 @@ kernel void project(
     float x0, x1;
     bounds_span(&bounds, (float)y0 + 0.5f, (float)y1 - 0.5f, &x0, &x1);
     // also what lies between two columns of samples; written so that a NaN is culled (numerics E1)
-    float first = ceil(x0 - 0.5f), last = floor(x1 - 0.5f);
-    if (!(y0 < y1 && first <= (float)(width - 1) && last >= 0.0f && first <= last)) return;
+    int first = pixel_above(x0 - 0.5f, width), last = pixel_below(x1 - 0.5f, width);
+    if (!(y0 < y1 && x0 <= x1 && first < width && last >= 0 && first <= last)) return;
 
     if (y1 <= (int)view->band || y0 >= (int)view->band_end) {
         keys[at] = OUTSIDE;
@@ -121,8 +121,8 @@ kernel void project(
     }
 
     // re-anchor at the pixel of the picture that is nearest to the centre
-    int anchor_i = (int)clamp(floor((float)center_x), 0.0f, (float)(width - 1));
-    int anchor_j = (int)clamp(floor((float)center_y), 0.0f, (float)(height - 1));
+    int anchor_i = (int)clamp((float)center_x, 0.0f, (float)(width - 1));
+    int anchor_j = (int)clamp((float)center_y, 0.0f, (float)(height - 1));
     real anchor_x = anchor_i + REAL(0.5), anchor_y = anchor_j + REAL(0.5);
 //@@ camera_forms
     real steepest = fmax(fmax(fabs(kx.x), fabs(ky.x)), fmax(fabs(kx.y), fabs(ky.y)));
@@ -147,8 +147,8 @@ kernel void project(
     record.ay = (float)anchor_j;
     record.y0 = (short)y0;
     record.y1 = (short)y1;
-    record.x0 = (short)max(to_pixel(ceil(x0 - 0.5f), width), 0);
-    record.x1 = (short)min(to_pixel(floor(x1 - 0.5f) + 1.0f, width), width);
+    record.x0 = (short)max(first, 0);
+    record.x1 = (short)min(last + 1, width);
 //@@ color
 //@@ project
     // in whole vectors

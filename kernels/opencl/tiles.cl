@@ -69,7 +69,7 @@ static inline Walk walk_of(const Bounds *b, int width, int height) {
     float x0, x1;
     bounds_rows(b, height, &y0, &y1);
     bounds_span(b, -INFINITY, INFINITY, &x0, &x1);
-    int first = clamp(to_pixel(ceil(x0 - 0.5f), width), 0, width - 1), last = clamp(to_pixel(floor(x1 - 0.5f), width), first, width - 1);
+    int first = clamp(pixel_above(x0 - 0.5f, width), 0, width - 1), last = clamp(pixel_below(x1 - 0.5f, width), first, width - 1);
     Walk walk = {y0 / TILE_H, first / TILE_W, last / TILE_W - first / TILE_W + 1, 0, (width + TILE_W - 1) / TILE_W};
     walk.cells = ((y1 - 1) / TILE_H - walk.top + 1) * walk.columns;
     return walk;

@@ -10,13 +10,14 @@ import warp as wp
 from . import output
 from .bounds import Bounds, make_bounds
 from .buffers import make_samples, sample_fields
-from .common import STRICT, View, lowest, store_line
+from .common import STRICT, View, anew, first_sample, lowest, place_of, store_line
 from .crossing import make_crossing
 from .pixel import make_pixel
 from .rays import SLOPES
 from .splat import make_splat
 from .staging import BLOCK_H, BLOCK_W, STAGED
 
+_PLAIN = frozenset({"lowpass_screen", "stop_exclusive", "arithmetic_fast"})
 NONE, ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 
 
@@ -47,12 +48,14 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         for k in range(wp.static(len(stores))):
             wp.static(stores[k])(p, at, samples)
 
+    # so many threads at once: at most 40 registers, which is what a sample takes that keeps only its light
+    launched = (threads, 1536 // threads) if not outputs and _PLAIN.issuperset(effects) else threads
     options = {"module": "unique", "module_options": STRICT, "enable_backward": False}
 
-    @wp.kernel(name=f"blend_gpu_{mark}", launch_bounds=threads, **options)
+    @wp.kernel(name=f"blend_gpu_{mark}", launch_bounds=launched, **options)
     def blend_gpu(
         band_first: int,  # tile of block 0
-        view: View,
+        views: wp.array(dtype=View),
         rays: Rays,
         lines: wp.array(dtype=wp.vec4),
         planes: wp.array(dtype=wp.int32),
@@ -65,9 +68,11 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         item = thread % threads
         # a warp draws a block, so that a splat that misses it costs it nothing
         block, lane = item / 32, item % 32
+        number, tile_column, tile_row = place_of(tile, views)
+        view = views[anew(number)]
         across = view.tile_w / BLOCK_W
-        left = (tile % view.tiles_x) * view.tile_w + (block % across) * BLOCK_W
-        top = (tile / view.tiles_x) * view.tile_h + (block / across) * BLOCK_H
+        left = tile_column * view.tile_w + (block % across) * BLOCK_W
+        top = tile_row * view.tile_h + (block / across) * BLOCK_H
         x0 = left + lane % BLOCK_W
         y0 = top + lane / BLOCK_W
         p = start(x0, y0, rays, view)
@@ -115,13 +120,15 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
                 again = stage(records, lines, lists, end, 0, unfinished(p, view))
         if wp.static(opaque):
             p = cover(p, x0, y0, rays, view)
-        at = y0 * view.tiles_x * view.tile_w + x0
+        number, tile_column, tile_row = place_of(tile, views)
+        view = views[anew(number)]
+        at = first_sample(number, view) + y0 * view.tiles_x * view.tile_w + x0
         store(finish(p), at, samples)
 
     @wp.kernel(name=f"blend_cpu_{mark}", **options)
     def blend_cpu(
         band_first: int,  # tile of thread 0
-        view: View,
+        views: wp.array(dtype=View),
         rays: Rays,
         lines: wp.array(dtype=wp.vec4),
         planes: wp.array(dtype=wp.int32),
@@ -135,8 +142,10 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         state_first: int,
     ):
         tile = band_first + wp.tid()
-        x0 = (tile % view.tiles_x) * view.tile_w
-        y0 = (tile / view.tiles_x) * view.tile_h
+        number, tile_column, tile_row = place_of(tile, views)
+        view = views[number]
+        x0 = tile_column * view.tile_w
+        y0 = tile_row * view.tile_h
         for k in range(view.tile_w * view.tile_h):
             state[state_first + k] = start(x0 + k % view.tile_w, y0 + k / view.tile_w, rays, view)
         x_end = wp.min(x0 + view.tile_w, view.width)
@@ -185,12 +194,13 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
                     state[at] = p
                 again = alive > 0
         stride = view.tiles_x * view.tile_w
-        for row in range(view.tile_h):
-            for column in range(view.tile_w):
-                p = state[state_first + row * view.tile_w + column]
+        corner = first_sample(number, view) + y0 * stride + x0
+        for down in range(view.tile_h):
+            for across in range(view.tile_w):
+                p = state[state_first + down * view.tile_w + across]
                 if wp.static(opaque):
-                    p = cover(p, x0 + column, y0 + row, rays, view)
-                at = (y0 + row) * stride + x0 + column
+                    p = cover(p, x0 + across, y0 + down, rays, view)
+                at = corner + down * stride + across
                 store(finish(p), at, samples)
 
     return (blend_gpu if on_gpu else blend_cpu), Pixel

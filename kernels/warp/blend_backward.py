@@ -88,7 +88,7 @@ def make_slots(screen: bool):
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def find_slots(
         first: int,
-        view: View,
+        views: wp.array(dtype=View),  # (1)
         tiles: wp.array(dtype=wp.int32),  # (pairs) as they are listed
         lists: wp.array(dtype=wp.int32),
         windows: wp.array(dtype=wp.uint64),
@@ -97,6 +97,7 @@ def make_slots(screen: bool):
         ends_by_index: wp.array(dtype=wp.int64),  # inclusive sums
         slots: wp.array(dtype=wp.int32),  # (pairs) out
     ):
+        view = views[0]
         k = first + wp.tid()
         index, tile = lists[k], tiles[k]
         corner = int(windows[index] >> _WINDOW)
@@ -181,7 +182,7 @@ def make_blend_backward(
     @wp.kernel(launch_bounds=threads, **options)
     def blend_backward_gpu(
         band_first: int,  # tile of block 0
-        view: View,
+        views: wp.array(dtype=View),  # (1)
         background: wp.vec3,
         log_ceiling: float,
         lines: wp.array(dtype=wp.vec4),
@@ -193,6 +194,7 @@ def make_blend_backward(
         checkpoints: wp.array(dtype=wp.float32),  # scratch: light in front of every CHUNK splats of a tile
         moments: wp.array(dtype=Moments),  # out, 0 before
     ):
+        view = views[0]
         thread = wp.tid()
         tile = band_first + thread / threads
         item = thread % threads
@@ -293,7 +295,7 @@ def make_blend_backward(
     @wp.kernel(**options)
     def blend_backward_cpu(
         band_first: int,  # tile of thread 0
-        view: View,
+        views: wp.array(dtype=View),  # (1)
         background: wp.vec3,
         log_ceiling: float,
         lines: wp.array(dtype=wp.vec4),
@@ -309,6 +311,7 @@ def make_blend_backward(
         fragments: wp.array(dtype=wp.vec2),  # the same, CHUNK for each sample: light and opacity
         state_first: int,
     ):
+        view = views[0]
         tile = band_first + wp.tid()
         x0 = (tile % view.tiles_x) * view.tile_w
         y0 = (tile / view.tiles_x) * view.tile_h

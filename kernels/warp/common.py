@@ -23,7 +23,9 @@ _NONE = wp.constant(wp.uint32(0))
 
 @wp.struct
 class View:
-    """Uniforms of one picture. Lengths in metres, pixels are samples of the grid."""
+    """Uniforms of one view. Lengths in metres, pixels are samples of the grid. Kernels have an array of them,
+    one for each view that is drawn: the integers are the same in all.
+    """
 
     rotation: wp.mat33d  # world to camera
     translation: wp.vec3d  # where the cloud's origin lies in the camera frame
@@ -52,7 +54,36 @@ class View:
     fog_density: float  # 1 / metres
     slopes: wp.vec4d  # of rays, -x, x, -y, y: EWA takes derivatives there where a centre lies further out
     ray_step: wp.float64  # behind a lens, where there are boxes: from a ray to the next sample's, at most
+    splats: int  # of the cloud
     ray: wp.vec4  # a sample's ray is ((column - [2]) [0], (row - [3]) [1], 1); 0 where depths are distances
+
+
+# The compiler does not see that it is the same number, and loads again what stands there: a GPU's thread has
+# fewer registers than a view has numbers.
+@wp.func_native("""
+    int same = number;
+#if defined(__CUDA_ARCH__)
+    asm volatile("" : "+r"(same));
+#endif
+    return same;
+""")
+def anew(number: int) -> int:
+    """The number."""
+    ...
+
+
+@wp.func
+def place_of(tile: int, views: wp.array(dtype=View)):
+    """Of one of all views' tiles: its view, and the column and row of tiles in it."""
+    view = views[0]
+    row = tile / view.tiles_x
+    return row / view.tiles_y, tile % view.tiles_x, row % view.tiles_y
+
+
+@wp.func
+def first_sample(number: int, view: View) -> int:
+    """Where the samples of a view begin in sample buffers."""
+    return number * (view.tiles_x * view.tile_w) * (view.tiles_y * view.tile_h)
 
 
 def struct_of(name: str, words: str, fields: dict):

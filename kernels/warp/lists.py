@@ -83,35 +83,43 @@ def window_of(window: wp.uint64):
     return int(window >> wp.uint64(32)), wp.uint32(window & wp.uint64(0xFFFFFFFF))
 
 
+@wp.func
+def first_tile(index: int, view: View) -> int:
+    """Of the view to which this of all views' splats belongs."""
+    return index / view.splats * (view.tiles_x * view.tiles_y)
+
+
 @cache
 def make_lists(screen: bool) -> SimpleNamespace:
     """count, histogram and emit, with or without the low-pass dot in the bounds."""
     limits = make_bounds(screen)
 
     @wp.func
-    def band_span(b: Bounds, row: int, view: View, band_first: int, band_end: int):
+    def band_span(b: Bounds, row: int, base: int, view: View, band_first: int, band_end: int):
         left, right = limits.tile_span(b, row, view)
-        base = row * view.tiles_x
-        return wp.max(left + base, band_first), wp.min(right + base, band_end)
+        start = base + row * view.tiles_x
+        return wp.max(left + start, band_first), wp.min(right + start, band_end)
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def histogram(
         first: int,
-        view: View,
+        views: wp.array(dtype=View),
         order: wp.array(dtype=wp.int32),
         windows: wp.array(dtype=wp.uint64),
         bounds: wp.array(dtype=Bounds),
         tile_totals: wp.array(dtype=wp.int32),  # out: lengths of lists; sums of integers have no order
     ):
+        view = views[0]
         index = order[wp.tid() + first]
         corner, bits = window_of(windows[index])
         if bits == NONE:
             b = bounds[index]
+            base = first_tile(index, view)
             row, end = limits.tile_rows(b, view)
             while row < end:
                 left, right = limits.tile_span(b, row, view)
                 for column in range(left, right):
-                    wp.atomic_add(tile_totals, row * view.tiles_x + column, 1)
+                    wp.atomic_add(tile_totals, base + row * view.tiles_x + column, 1)
                 row += 1
         while bits != NONE:
             wp.atomic_add(tile_totals, window_tile(corner, lowest(bits), view), 1)
@@ -120,7 +128,7 @@ def make_lists(screen: bool) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def count(
         first: int,
-        view: View,
+        views: wp.array(dtype=View),
         band_first: int,
         band_end: int,
         order: wp.array(dtype=wp.int32),
@@ -128,15 +136,17 @@ def make_lists(screen: bool) -> SimpleNamespace:
         bounds: wp.array(dtype=Bounds),
         lengths: wp.array(dtype=wp.int64),  # out: pairs of each splat in the band, in depth order
     ):
+        view = views[0]
         k = wp.tid() + first
         index = order[k]
         corner, bits = window_of(windows[index])
         total = int(0)
         if bits == NONE:
             b = bounds[index]
+            base = first_tile(index, view)
             row, end = limits.tile_rows(b, view)
             while row < end:
-                left, right = band_span(b, row, view, band_first, band_end)
+                left, right = band_span(b, row, base, view, band_first, band_end)
                 total += wp.max(right - left, 0)
                 row += 1
         while bits != NONE:
@@ -149,7 +159,7 @@ def make_lists(screen: bool) -> SimpleNamespace:
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def emit(
         first: int,
-        view: View,
+        views: wp.array(dtype=View),
         band_first: int,
         band_end: int,
         order: wp.array(dtype=wp.int32),
@@ -163,14 +173,16 @@ def make_lists(screen: bool) -> SimpleNamespace:
         k = wp.tid() + first
         if lengths[k] == wp.int64(0):
             return  # what `order` has here may be nothing
+        view = views[0]
         index = order[k]
         place = int(ends[k] - lengths[k])
         corner, bits = window_of(windows[index])
         if bits == NONE:
             b = bounds[index]
+            base = first_tile(index, view)
             row, end = limits.tile_rows(b, view)
             while row < end:
-                left, right = band_span(b, row, view, band_first, band_end)
+                left, right = band_span(b, row, base, view, band_first, band_end)
                 for tile in range(left, right):
                     tiles[place] = tile
                     lists[place] = index

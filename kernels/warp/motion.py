@@ -25,7 +25,7 @@ def make_motion(moves: bool) -> SimpleNamespace:
     fields = {
         "labels": wp.array(dtype=wp.int32),  # (n)
         "groups": wp.array(dtype=wp.int32),  # (groups) their labels
-        "poses": wp.array(dtype=Pose),  # (groups)
+        "poses": wp.array(dtype=Pose),  # (views groups)
     }
     Moving = struct_of("Moving", "What moves, and how.", fields if moves else {})
 

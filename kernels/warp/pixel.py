@@ -169,7 +169,7 @@ def make_pixel(effects: tuple[str, ...], outputs: tuple[str, ...], room: int) ->
             p = pixel
             if not (opacity > 0.0):
                 return p  # of no optical depth: a mean over it would be 0 / 0
-            nearest, plane = nearest_of(lines, index), planes[index]
+            nearest, plane = nearest_of(lines, index), planes[index % view.splats]
             if plane != p.queue.open.plane:
                 p = waiting.close(p, nearest, lines, lists, view)
                 p.queue.open = layer.begun(plane, place, nearest)

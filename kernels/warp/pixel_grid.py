@@ -7,8 +7,10 @@ import warp as wp
 class PixelGrid:
     """The samples of one pixel."""
 
-    pixel: int  # of the picture, row by row
-    row: int  # of the picture
+    pixel: int  # of the images, view after view, row by row
+    here: int  # of its own view
+    row: int  # of all views, one after the other
+    splats: int  # of the cloud
     first: int  # place of the first sample in a buffer
     stride: int  # samples of a row of a buffer, its padding included
     side: int  # samples along a side

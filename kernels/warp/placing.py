@@ -23,13 +23,15 @@ def make_placing(effects: tuple[str, ...], real) -> SimpleNamespace:
     Moving = motion.Moving
 
     @wp.func
-    def pose(i: int, view: View, moving: Moving):
-        """Rotation and translation to the camera, and the camera's centre relative to the cloud's origin."""
+    def pose(i: int, number: int, view: View, moving: Moving):
+        """Rotation and translation to the camera, and the camera's centre relative to the cloud's origin, in
+        the view of this number.
+        """
         turn, shift, eye = mat33(view.rotation), vec3(view.translation), vec3(view.eye)
         if wp.static(moves):
             group = motion.group_of(moving, i)
             if group >= 0:
-                own = moving.poses[group]
+                own = moving.poses[number * moving.groups.shape[0] + group]
                 turn, shift, eye = mat33(own.rotation), vec3(own.translation), vec3(own.eye)
         return turn, shift, eye
 

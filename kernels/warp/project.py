@@ -17,7 +17,7 @@ from . import output
 from .bounds import PAD, PAD_RELATIVE, Bounds, box_bounds, make_bounds
 from .boxes import make_boxes
 from .color import make_color
-from .common import CULLED, STRICT, View, as_bits, sortable, store_line
+from .common import CULLED, STRICT, View, anew, as_bits, sortable, store_line
 from .disk import make_disk
 from .ellipsoids import EWA, EXACT, make_ellipsoids
 from .lens import LENSES, make_lens, make_optics
@@ -93,8 +93,8 @@ def make_project(
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False, launch_bounds=LIMITS)
     def project(
-        first: int,  # splat of thread 0
-        view: View,
+        first: int,  # of thread 0, of the splats of the first view, then the next
+        views: wp.array(dtype=View),
         moving: Moving,
         lens: Lens,
         means: wp.array(dtype=wp.vec3),  # (n) [m], relative to the cloud's origin
@@ -103,22 +103,28 @@ def make_project(
         opacities: wp.array(dtype=wp.float32),  # (n)
         colors: wp.array(dtype=wp.vec3),  # (n), or (n sh_terms)
         planes: wp.array(dtype=wp.int32),  # (n) index of the splat's plane; -1: none
-        plane_keys: wp.array(dtype=wp.float32),  # (planes) depth at which a plane's splats are sorted in [m]
+        plane_keys: wp.array(
+            dtype=wp.float32
+        ),  # (views planes) depth at which a plane's splats are sorted [m]
+        plane_count: int,
         boxes: wp.array(dtype=wp.int32),  # (n) 1: a box, of a cloud that has boxes and others
         thickness: wp.array(dtype=wp.float32),  # (n) [m], of a cloud that has 3D Gaussians; 0: a disk
-        lines: wp.array(dtype=wp.vec4),  # (n lines_each) out: records of splats that are drawn
-        bounds: wp.array(dtype=Bounds),  # (n) out: as `every_bounds` says
+        lines: wp.array(dtype=wp.vec4),  # (views n lines_each) out: records of splats that are drawn
+        bounds: wp.array(dtype=Bounds),  # (views n) out: as `every_bounds` says
         windows: wp.array(
             dtype=wp.uint64
-        ),  # (n) out: bits of the tiles, below the window's first tile; 0: more
-        keys: wp.array(dtype=wp.uint32),  # (n) out: depth key, or CULLED
-        counts: wp.array(dtype=wp.int64),  # (n) out: tiles that the splat can touch
-        drawn: wp.array(dtype=wp.int32),  # (n) out: 1 or 0
+        ),  # (views n) out: bits of the tiles, below the window's first tile; 0: more
+        keys: wp.array(dtype=wp.uint32),  # (views n) out: depth key, or CULLED
+        counts: wp.array(dtype=wp.int64),  # (views n) out: tiles that the splat can touch
+        drawn: wp.array(dtype=wp.int32),  # (views n) out: 1 or 0
     ):
-        i = wp.tid() + first
-        keys[i] = CULLED
-        counts[i] = wp.int64(0)
-        drawn[i] = 0
+        at = wp.tid() + first
+        number = at / views[0].splats
+        view = views[anew(number)]
+        i = at - number * view.splats
+        keys[at] = CULLED
+        counts[at] = wp.int64(0)
+        drawn[at] = 0
         # conditions are written so that a NaN culls (numerics E1)
         log_opacity = float(wp.log(real(opacities[i])))
         half_r2 = log_opacity - view.log_cut
@@ -133,7 +139,7 @@ def make_project(
         su = real(wp.max(size[0], SMALLEST_SCALE))
         sv = real(wp.max(size[1], SMALLEST_SCALE))
 
-        turn, shift, eye = placing.pose(i, view, moving)
+        turn, shift, eye = placing.pose(i, number, view, moving)
         tangent_u, tangent_v = placing.tangents(turn, quats[i])
         center = means[i]
         mean = vec3(real(center[0]), real(center[1]), real(center[2]))
@@ -255,6 +261,7 @@ def make_project(
                 box.dot_r = wp.sqrt(half_r2 / view.per_pixel) * (1.0 + PAD_RELATIVE) + PAD
             if itself:
                 box.dot_r = -1.0
+        view = views[anew(number)]
         row_first, row_end = limits.rows(box, view.height)
         first_column, end_column = limits.span(box, row_first, row_end, view.width)
         if row_first >= row_end or first_column >= end_column:
@@ -267,6 +274,10 @@ def make_project(
         if tiles == 0:
             return
 
+        # loaded again, here and above, so that no registers hold them meanwhile
+        view = views[anew(number)]
+        fx, fy, cx, cy = real(view.focal_x), real(view.focal_y), real(view.center_x), real(view.center_y)
+        per_fx, per_fy = real(view.per_focal_x), real(view.per_focal_y)
         # affine forms about the sample of the picture that is nearest to the centre (numerics B1)
         ax = wp.clamp(wp.floor(float(center_x)), 0.0, float(view.width - 1))
         ay = wp.clamp(wp.floor(float(center_y)), 0.0, float(view.height - 1))
@@ -306,6 +317,7 @@ def make_project(
             away2 = one
         facing = wp.where(height * height > edge_on * edge_on * away2, scale, zero)
 
+        turn, shift, eye = placing.pose(i, number, view, moving)
         rgb = color_of(i, colors, mean - eye)
         if not (wp.isfinite(rgb[0]) and wp.isfinite(rgb[1]) and wp.isfinite(rgb[2])):
             return
@@ -379,21 +391,21 @@ def make_project(
             key = float(depth) - float(depth_reach)  # as blending bounds depths
             if wp.static(layers):
                 if planes[i] >= 0:
-                    key = plane_keys[planes[i]]
+                    key = plane_keys[number * plane_count + planes[i]]
             record[at_nearest] = key
         for k in range(wp.static(len(projects))):
             record = wp.static(projects[k])(record, wp.static(places[k]), normal, height)
         for line in range(wp.static(lines_each)):
             k = 4 * line
             store_line(
-                lines, i * lines_each + line, wp.vec4(record[k], record[k + 1], record[k + 2], record[k + 3])
+                lines, at * lines_each + line, wp.vec4(record[k], record[k + 1], record[k + 2], record[k + 3])
             )
         if wp.static(every_bounds) or bits == NONE:
-            bounds[i] = box
-        corner = wp.uint64(top * view.tiles_x + left)
-        windows[i] = (corner << BITS) | wp.uint64(bits)
-        keys[i] = sortable(key)
-        counts[i] = wp.int64(tiles)
-        drawn[i] = 1
+            bounds[at] = box
+        corner = wp.uint64((number * view.tiles_y + top) * view.tiles_x + left)
+        windows[at] = (corner << BITS) | wp.uint64(bits)
+        keys[at] = sortable(key)
+        counts[at] = wp.int64(tiles)
+        drawn[at] = 1
 
     return project

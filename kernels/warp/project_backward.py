@@ -79,7 +79,7 @@ def make_project_backward(
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def project_backward(
         first: int,  # splat of thread 0
-        view: View,
+        views: wp.array(dtype=View),  # (1)
         means: wp.array(dtype=wp.vec3),
         quats: wp.array(dtype=wp.vec4),
         scales: wp.array(dtype=wp.vec2),
@@ -98,6 +98,7 @@ def make_project_backward(
         screen: wp.array(dtype=wp.float32),  # norm of that by the projected centre, in half pictures
         by_poses: wp.array(dtype=SIX),
     ):
+        view = views[0]
         i = first + wp.tid()
         by_means[i] = wp.vec3()
         by_quats[i] = wp.vec4()

@@ -6,7 +6,7 @@ import warp as wp
 
 from . import output
 from .buffers import make_images, make_samples, sample_fields
-from .common import STRICT, View, fma
+from .common import STRICT, View, first_sample, fma
 from .pixel_grid import PixelGrid, sample_at
 from .rays import make_rays
 
@@ -33,22 +33,30 @@ def make_resolve(
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def resolve(
-        first_pixel: int,  # of thread 0
-        view: View,
-        width: int,  # of the picture
+        first_pixel: int,  # of thread 0, of those of the pictures, view after view, row by row
+        views: wp.array(dtype=View),
+        slots: wp.array(dtype=wp.int32),  # (views) place of each view's images among all
         background: wp.vec3,
         rays: Rays,
         samples: Samples,
         out: Images,
     ):
-        pixel = wp.tid() + first_pixel
-        x = (pixel % width) * n
-        y = (pixel / width) * n
+        place = wp.tid() + first_pixel
+        view = views[0]
+        width = view.width / n
+        pixels = width * (view.height / n)
+        number = place / pixels
+        view = views[number]
         grid = PixelGrid()
-        grid.pixel = pixel
-        grid.row = pixel / width
+        grid.here = place - number * pixels
+        grid.pixel = slots[number] * pixels + grid.here
+        own_row = grid.here / width
+        grid.row = number * (view.height / n) + own_row
+        grid.splats = view.splats
+        x = (grid.here % width) * n
+        y = own_row * n
         grid.stride = view.tiles_x * view.tile_w
-        grid.first = y * grid.stride + x
+        grid.first = first_sample(number, view) + y * grid.stride + x
         grid.side = n
         grid.count = wp.static(n * n)
         grid.mean = mean
@@ -62,7 +70,7 @@ def make_resolve(
         for k in range(wp.static(len(hiddens))):
             left += wp.static(hiddens[k])(grid, samples)
         for channel in range(3):
-            out.rgb[3 * pixel + channel] = fma(left, background[channel], total[channel] * mean)
+            out.rgb[3 * grid.pixel + channel] = fma(left, background[channel], total[channel] * mean)
         for k in range(wp.static(len(resolves))):
             wp.static(resolves[k])(grid, samples, lengths, out)
 

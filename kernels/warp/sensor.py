@@ -19,16 +19,20 @@ def make_sensor(steps: tuple[str, ...]):
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def sensor(
-        first: int,  # pixel of thread 0
+        first: int,  # pixel of thread 0, of the pictures, view after view
         settings: Settings,
-        width: int,  # of the picture
-        rgb: wp.array(dtype=wp.float32),  # (h w 3) in and out
+        width: int,  # of a picture
+        pixels: int,  # of a picture
+        slots: wp.array(dtype=wp.int32),  # (views) place of each view's images among all
+        rgb: wp.array(dtype=wp.float32),  # (images h w 3) in and out
     ):
-        at = wp.tid() + first
+        place = wp.tid() + first
+        here = place % pixels
+        at = slots[place / pixels] * pixels + here
         for channel in range(3):
             v = rgb[3 * at + channel]
             for k in range(wp.static(len(applied))):
-                v = wp.static(applied[k])(v, at % width, at / width, channel, settings)
+                v = wp.static(applied[k])(v, here % width, here / width, channel, settings)
             rgb[3 * at + channel] = v
 
     return sensor, Settings

@@ -6,7 +6,7 @@ from functools import cache
 
 import warp as wp
 
-from .common import STRICT, View, fma, store_line, struct_of
+from .common import STRICT, View, first_sample, fma, store_line, struct_of
 from .rays import make_rays
 
 TURN = wp.constant(0.15915494309189535)
@@ -62,17 +62,20 @@ def make_backdrop(kind: str, bent: bool):
 
     @wp.kernel(module="unique", module_options=STRICT, enable_backward=False)
     def backdrop(
-        first: int,  # sample of thread 0, of those of the picture, row by row
-        view: View,
+        first: int,  # sample of thread 0, of those of the pictures, view after view, row by row
+        views: wp.array(dtype=View),
         surroundings: Surroundings,
         rays: Rays,
         color: wp.array(dtype=wp.vec4),  # in and out: r, g, b, transmittance
     ):
         sample = wp.tid() + first
-        column, row = sample % view.width, sample / view.width
+        view = views[0]
+        number = sample / (view.width * view.height)
+        view = views[number]
+        column, row = sample % view.width, sample / view.width % view.height
         ray = ray_of(column, row, rays, view)
         if ray[0] == ray[0]:
-            at = row * view.tiles_x * view.tile_w + column
+            at = first_sample(number, view) + row * view.tiles_x * view.tile_w + column
             light = color[at]
             # in the axes of the world
             seen = behind(surroundings, wp.transpose(wp.mat33(view.rotation)) * ray)

@@ -55,8 +55,6 @@ CASES = {
 @pytest.fixture
 def backend(renderer):
     assert isinstance(renderer.backend, Differentiates)
-    if renderer.device.name.startswith("warp:cuda"):
-        pytest.skip("refused on CUDA: tests/unit/test_warp_device.py")
     return renderer.backend
 
 

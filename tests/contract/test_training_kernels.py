@@ -174,7 +174,7 @@ def test_adam_and_what_is_drawn(renderer, works, strategy, sparse):
 
 
 def test_what_is_drawn_is_that_of_a_run_that_goes_on(renderer, works):
-    """In every bit: after a stop it is made anew from the values."""
+    """In every bit: after a stop it is made again from the values."""
     random, rate = np.random.default_rng(4), rates(TrainSettings(), 100, 1.5)
     device, _ = works(sh_degree=2)
     names = ("means", "quats", "scales", "opacities", "sh")

@@ -27,8 +27,6 @@ def settings(request):
 def test_a_run_raises_the_psnr_and_repeats_to_the_byte(renderer, dataset, settings, tmp_path):
     """By 3 dB on the views that are trained on, with noise by half of that; the second run is stopped, and
     goes on from its checkpoint."""
-    if renderer.device.name.startswith("warp:cuda"):
-        pytest.skip("refused on CUDA: tests/unit/test_warp_device.py")
     whole = Trainer(dataset, renderer, **settings)
     before = whole.evaluate(dataset.views)
     whole.run()

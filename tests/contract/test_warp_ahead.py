@@ -1,4 +1,5 @@
-"""Warp's pictures that are drawn without waiting for what their lists take: CUDA's, here on the CPU too."""
+"""Warp's pictures that are drawn without waiting for what their lists take, and those that a captured graph
+draws: CUDA's, here on the CPU too."""
 
 import gc
 import weakref
@@ -8,7 +9,12 @@ import pytest
 from derivative_errors import random_picture
 
 import fidsplat as fs
-from fidsplat.backends.prepare import prepare
+from fidsplat.backends.prepare import prepare, prepare_batch
+from fidsplat.backends.warp import batch as batches
+from fidsplat.backends.warp import runtime
+from fidsplat.backends.warp.replay import Replay
+from fidsplat.backends.warp.shapes import WarpShape
+from fidsplat.views import views_of
 
 BACKEND = "warp"
 WHOLE = random_picture(1, count=3000, degree=None, quality="surfel", outputs=("rgb",))
@@ -115,3 +121,150 @@ def test_images_that_nobody_reads_leave_at_once(ahead):
     finally:
         gc.enable()
     assert images.settle
+
+
+@pytest.fixture
+def replayed(ahead, monkeypatch):
+    """What graphs have drawn, of its backend, which captures what it launches."""
+    drawn, own = [], Replay.draw
+
+    def counted(replay, stack):
+        drawn.append(stack)
+        own(replay, stack)
+
+    monkeypatch.setattr(ahead, "replays", True)
+    monkeypatch.setattr(Replay, "draw", counted)
+    return drawn
+
+
+def assert_drawn(renderer, frames, cameras):
+    for frame, wanted in zip(frames, waiting(renderer, cameras), strict=True):
+        assert np.array_equal(frame["rgb"], wanted["rgb"])
+        assert frame.stats == wanted.stats
+
+
+def test_pictures_of_a_kind_are_replayed(renderer, replayed):
+    """From the fourth on, whatever the camera."""
+    near = CAPTURE.camera
+    cameras, resident = [near, near, near, ELSEWHERE, near, near], renderer.upload(CLOUD)
+    frames = [renderer.render(resident, CAPTURE.with_(camera=camera)) for camera in cameras]
+    assert len(replayed) == 3
+    assert_drawn(renderer, frames, cameras)
+    assert set(frames[-1].timings) == {"project", "sort", "bin", "blend", "resolve"}
+
+
+def test_a_replay_without_room_is_drawn_again_and_captured_anew(renderer, replayed):
+    cameras, resident = [FAR] * 4 + [CAPTURE.camera], renderer.upload(CLOUD)
+    frames = [renderer.render(resident, CAPTURE.with_(camera=camera)) for camera in cameras]
+    assert len(replayed) == 2
+    assert_drawn(renderer, frames, cameras)
+    more = [renderer.render(resident, CAPTURE) for _ in range(3)]
+    assert len(replayed) == 3  # the room has grown: two are launched kernel by kernel
+    assert_drawn(renderer, more, [CAPTURE.camera] * 3)
+
+
+def test_what_another_kind_took_anew_is_not_replayed(renderer, replayed):
+    """Arrays that a larger picture has replaced are not those of the graph."""
+    resident, large = (
+        renderer.upload(CLOUD),
+        fs.Camera.look_at(200, 160, 1.1, (0.0, 0.0, 0.0), (0.0, 0.0, 3.0)),
+    )
+    small = [renderer.render(resident, CAPTURE) for _ in range(4)]
+    renderer.render(resident, CAPTURE.with_(camera=large))
+    small += [renderer.render(resident, CAPTURE) for _ in range(2)]
+    assert len(replayed) == 1
+    assert_drawn(renderer, small, [CAPTURE.camera] * 6)
+
+
+def test_what_moves_is_replayed(renderer, replayed):
+    """Groups, planes and what resolving reads are filled for each picture."""
+    cloud = CLOUD.with_labels(np.arange(3000) % 2).with_planes(np.arange(3000) // 2900 - 1)
+    resident, places = renderer.upload(cloud), (0.0, 0.1, 0.2, 0.3, 0.4)
+
+    def capture(place):
+        motion = fs.Motion(groups={1: lambda time: np.eye(4) + place * np.eye(4, k=3)})
+        return CAPTURE.with_(outputs=("rgb", "normal_world", "splat_id"), motion=motion)
+
+    frames = [renderer.render(resident, capture(place)) for place in places]
+    assert len(replayed) == 2
+    renderer.backend.ahead = False
+    for frame, place in zip(frames, places, strict=True):
+        wanted = renderer.render(cloud, capture(place))
+        assert all(np.array_equal(frame[name], wanted[name]) for name in frame)
+
+
+def test_a_graph_keeps_no_splats(renderer, replayed):
+    """They leave the device with their cloud; and scratch arrays that were replaced leave at once."""
+    resident = renderer.upload(CLOUD)
+    for _ in range(4):
+        renderer.render(resident, CAPTURE).wait()
+    assert replayed
+    pool, array = renderer.backend.pool, weakref.ref(resident.data.arrays["means"])
+    scratch = weakref.ref(pool.scratch("raw color", 1, runtime.load().vec4))
+    gc.disable()
+    try:
+        pool.scratch("raw color", scratch().size + 1, runtime.load().vec4)
+        assert scratch() is None
+        del resident
+        assert array() is None
+    finally:
+        gc.enable()
+
+
+def test_nothing_is_drawn_ahead_too(renderer, replayed):
+    """A cloud without splats."""
+    arrays = [getattr(CLOUD, name)[:0] for name in ("means", "quats", "scales", "opacities")]
+    resident = renderer.upload(fs.SplatCloud(*arrays, colors=CLOUD.colors[:0]))
+    frames = [renderer.render(resident, CAPTURE) for _ in range(4)]
+    assert all(np.array_equal(frame["rgb"], frames[0]["rgb"]) for frame in frames)
+    assert frames[-1].stats == {"splats": 0, "visible": 0, "pairs": 0}
+
+
+CROSSING = [fs.Camera.look_at(61, 43, 1.1, (0.02 * k, 0.0, 0.0), (0.0, 0.0, 3.0)) for k in range(12)]
+
+
+def test_parts_of_a_batch_are_replayed(renderer, replayed, monkeypatch):
+    """Two views at a time, each with the bits of itself alone."""
+    monkeypatch.setitem(batches._MOST, False, 1_300_000)
+    captures, resident = [CAPTURE.with_(camera=camera) for camera in CROSSING], renderer.upload(CLOUD)
+    batch = renderer.render_batch(resident, captures)
+    assert [len(stack) for stack in replayed] == [2, 2, 2]
+    for drawn, wanted in zip(batch["rgb"], waiting(renderer, CROSSING), strict=True):
+        assert np.array_equal(drawn, wanted["rgb"])
+    assert batch.stats["pairs"] == sum(each.stats["pairs"] for each in waiting(renderer, CROSSING))
+
+
+def test_views_together_in_blocks_of_threads(renderer):
+    """The GPU's schedule of a batch: all views at once, more than the budget in bands of tiles."""
+    backend = renderer.backend
+    resident, captures = backend.upload(CLOUD), [CAPTURE.with_(camera=camera) for camera in CROSSING[:3]]
+    features, views = prepare_batch(resident, views_of(captures, None, None, None))
+    pipeline = backend.pipeline(features, WarpShape("group", 8, 8))
+    whole = pipeline.render_batch(resident, views).read("rgb")
+    before, backend.pair_budget = backend.pair_budget, 4000
+    try:
+        banded = pipeline.render_batch(resident, views).read("rgb")
+    finally:
+        backend.pair_budget = before
+    for k, wanted in enumerate(waiting(renderer, CROSSING[:3])):
+        assert np.array_equal(whole[k], wanted["rgb"])
+        assert np.array_equal(banded[k], wanted["rgb"])
+
+
+def test_a_device_that_captures_nothing_draws_all_the_same(renderer, replayed, monkeypatch):
+    """That is said once."""
+
+    wp, resident = runtime.load(), renderer.upload(CLOUD)
+    own = wp.utils.array_scan
+
+    def refused(*given, **how):
+        if wp.get_device("cpu").is_capturing:
+            raise RuntimeError("operation not permitted when stream is capturing")
+        own(*given, **how)
+
+    monkeypatch.setattr(wp.utils, "array_scan", refused)
+    with pytest.warns(UserWarning, match="captures no graphs .operation not permitted") as said:
+        frames = [renderer.render(resident, CAPTURE) for _ in range(6)]
+    assert len(said) == 1
+    assert not replayed
+    assert_drawn(renderer, frames, [CAPTURE.camera] * 6)

@@ -44,7 +44,7 @@ def test_what_can_be_written_stays(ensure, tmp_path):
 def test_a_cache_that_cannot_be_written_is_replaced(ensure, name):
     said = ensure(**{name: "/dev/null/nowhere"})
     assert said.startswith(
-        "kernels are compiled anew in this run: cannot write into the folder /dev/null/nowhere"
+        "kernels are compiled again in this run: cannot write into the folder /dev/null/nowhere"
     )
     assert said.endswith(f"; set {name} to a folder with room")
     assert Path(os.environ[name]).parent.name.startswith("fidsplat-cache-")
@@ -81,5 +81,5 @@ def test_a_picture_is_drawn_all_the_same(tmp_path):
     if "no OpenCL" in done.stderr:
         pytest.skip("there is no PoCL here")
     assert done.stdout == "(8, 8, 3)\n", done.stderr
-    assert "kernels are compiled anew" in done.stderr
+    assert "kernels are compiled again" in done.stderr
     assert list(tmp_path.glob("fidsplat-cache-*")) == []

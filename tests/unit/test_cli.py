@@ -2,7 +2,6 @@
 contract."""
 
 import io
-import json
 import os
 import subprocess
 import sys
@@ -11,6 +10,7 @@ import time
 import cv2
 import numpy as np
 import pytest
+from command_line import fails, prints_json
 from ideal_picture import draw, photographed, pose, qr_bits, turned
 from rich.console import Console
 
@@ -18,26 +18,10 @@ import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.commands import COMMANDS
 from fidsplat.commands.output import late_progress
-from fidsplat.quality import LADDER
 from fidsplat.vision.dictionaries import dictionary_bits
 from fidsplat.vision.images import read_image, write_png
 
 CAMERA = fs.Camera.pinhole(320, 240, 400, 400, 160, 120)
-
-
-def fails(capsys, *words) -> tuple[int, str]:
-    """Run and return exit status and the one line on stderr; nothing stands on stdout."""
-    status = main([str(word) for word in words])
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.startswith("fidsplat: "), err
-    assert err.count("\n") == 1, f"one line, not {err!r}"
-    return status, err
-
-
-def prints_json(capsys, *words) -> dict:
-    assert main([*map(str, words), "--json"]) == 0
-    return json.loads(capsys.readouterr().out)
 
 
 @pytest.fixture
@@ -81,7 +65,9 @@ def test_help_loads_nothing_heavy():
         (["mraker"], "Available subcommands: demo, devices"),
         (["marker"], "SPEC"),
         (["marker", "qr:a", "--sise", "1"], "perhaps --size M; see fidsplat marker --help"),
-        (["marker", "qr:a", "--size", "big"], "--size"),
+        (["marker", "qr:a", "--size", "big"], "--size is 'big'; give a number; see fidsplat marker"),
+        (["view", "--port", "abc"], "--port is 'abc'; give a whole number; see fidsplat view --help"),
+        (["check", "--fuzz", "1e5"], "--fuzz is '1e5'; give a whole number; see"),
         (["marker", "qr:a", "qr:b"], "Unrecognized options: qr:b"),
         (["render"], "SCENE.toml"),
         (["detect", "--json"], "IMAGE"),
@@ -228,7 +214,7 @@ def test_warnings_are_one_line_each_and_leave_no_trace(capsys, monkeypatch):
     assert warnings.showwarning is before
 
 
-# --- devices, marker, detect
+# --- devices, info, detect
 
 
 def test_devices(capsys):
@@ -237,68 +223,6 @@ def test_devices(capsys):
     assert {"platform", "version", "memory_bytes", "float64", "usable", "reason"} <= set(found[0])
     assert main(["devices"]) == 0
     assert "reference" in capsys.readouterr().out
-
-
-def test_marker_says_what_it_is_made_of(capsys, tmp_path):
-    file = tmp_path / "new" / "tag.ply"
-    facts = prints_json(capsys, "marker", "apriltag:36h11:5", "--size", "0.16", "-o", file)
-    made = fs.marker("apriltag:36h11:5", size=0.16)
-    assert facts["shape"] == [8, 8]
-    assert facts["components"] == made.components
-    assert sum(facts["rectangles"].values()) == len(made.rectangles)
-    assert facts["splats"] == len(made.cloud) == len(made.boxes)
-    assert facts["mixture"] == "exact"
-    assert facts["written"] == {"mixture": "fitted", "splats": len(made.gaussians)}
-    assert len(made.gaussians) == len(fs.load_ply(file))
-    assert facts["size_m"] == 0.16
-    assert 0 < facts["seconds"] < 30
-    assert main(["marker", "apriltag:36h11:5"]) == 0
-    assert "rectangles" in capsys.readouterr().out
-
-
-def test_splats_that_are_there_are_replaced_where_that_is_asked_for(capsys, tmp_path):
-    mine, other = tmp_path / "mine.ply", tmp_path / "other.ply"
-    mine.write_bytes(b"a scan of months")
-    other.write_bytes(b"another")
-    os.link(mine, tmp_path / "the same.ply")
-    for words, why in (
-        (("marker", "qr:a", "-o", mine), f"{mine} is there already; give another name, or --overwrite"),
-        (("convert", other, mine), f"{mine} is there already; give another name, or --overwrite"),
-        (("train", tmp_path, "-o", mine), f"{mine} is there already; give another name, or --overwrite"),
-        (("convert", mine, mine), f"{mine} and {mine} are one file"),
-        (("convert", mine, tmp_path / "the same.ply", "--overwrite"), "are one file"),
-    ):
-        status, line = fails(capsys, *words)
-        assert (status, mine.read_bytes()) == (2, b"a scan of months"), words
-        assert why in line
-    prints_json(capsys, "marker", "qr:a", "-o", mine, "--overwrite")
-    prints_json(capsys, "convert", mine, other, "--overwrite", "--no-pictures")
-    assert len(fs.load_ply(other)) == len(fs.load_ply(mine)) > 0
-
-
-def test_a_marker_is_refined_on_a_device(capsys, tmp_path):
-    words = ("marker", "aruco:4x4_50:7", "--mixture", "refined", "--iterations", "2", "--device", "opencl")
-    facts = prints_json(capsys, *words, "-o", tmp_path / "tag.ply")
-    more = fs.marker("aruco:4x4_50:7", mixture="fitted", template=LADDER)
-    assert facts["mixture"] == "refined"
-    assert facts["written"] == {"mixture": "refined", "splats": len(more.cloud)}
-    assert len(fs.load_ply(tmp_path / "tag.ply")) == len(more.cloud)
-    few = prints_json(capsys, *words, "--quality", "marker.template=5")
-    assert few["splats"] < len(more.cloud)
-    status, line = fails(capsys, "marker", "aruco:4x4_50:7", "--iterations", "2")
-    assert status == 2
-    assert "--mixture refined" in line
-
-
-def test_a_marker_of_more_splats_than_allowed(capsys, tmp_path):
-    bits = np.random.default_rng(0).random((350, 350)) < 0.5
-    spec = f"image:{write_png(tmp_path / 'noise.png', bits)}"
-    status, line = fails(capsys, "marker", spec, "--mixture", "fitted")
-    assert status == 2
-    assert "more than 1,000,000" in line
-    assert "--max-splats" in line
-    facts = prints_json(capsys, "marker", "qr:a", "--max-splats", "10000000")
-    assert facts["splats"] > 0
 
 
 def test_work_is_shown_once_it_takes_long():
@@ -310,21 +234,6 @@ def test_work_is_shown_once_it_takes_long():
             while not after and "squares" not in shown.getvalue() and time.monotonic() < deadline:
                 time.sleep(0.01)
         assert ("squares" in shown.getvalue()) == (after == 0)
-
-
-def test_marker_writes_two_scales_when_asked(capsys, tmp_path):
-    for words, scales in (([], 3), (["--native-2dgs"], 2)):
-        overwrite = ["-o", str(tmp_path / "tag.ply"), "--overwrite"]
-        assert main(["marker", "apriltag:36h11:5", *overwrite, *words]) == 0
-        assert (tmp_path / "tag.ply").read_bytes().count(b"property float scale_") == scales
-    capsys.readouterr()
-    status, line = fails(capsys, "marker", "apriltag:36h11:5", "--native-2dgs")
-    assert status == 2
-    assert "-o FILE.ply" in line
-
-
-def test_marker_with_the_mixture_of_the_paper(capsys):
-    assert prints_json(capsys, "marker", "qr:hello", "--mixture", "paper")["mixture"] == "paper"
 
 
 def test_info(capsys, tmp_path):

@@ -5,7 +5,6 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -323,15 +322,6 @@ def test_warp_pipelines_share_kernels_that_mean_the_same():
     assert one is backend.pipeline(FeatureSet(slots, (), 0, 1, "float64"))
 
 
-def test_derivatives_on_cuda_are_refused():
-    """Whoever asks, and before anything is compiled."""
-    backend = warp_device.open_device("cpu")
-    backend.device = SimpleNamespace(is_cuda=True)
-    slots = ("camera_pinhole", "color_rgb", "lowpass_screen", "stop_inclusive", "compose_ordered")
-    with pytest.raises(fs.DeviceError, match=r"no derivatives: on CUDA .* use an OpenCL device or warp:cpu"):
-        backend.differentiate(FeatureSet(slots, (), 0, 1, "float64"))
-
-
 @pytest.mark.parametrize("device", ["warp:cpu", CUDA])
 def test_the_example_draws_each_step(device):
     example = Path(__file__).resolve().parents[2] / "examples" / "warp_loop.py"
@@ -364,7 +354,7 @@ def test_a_memory_budget_counts_rays_and_the_planes_of_all_poses():
     poses = fs.Trajectory([-1.0, 1.0], np.stack([start, end]))
     exposed = {"motion": fs.Motion(poses), "shutter": fs.Shutter(exposure_time=0.3, sub_poses=2)}
     wanted = fs.Renderer("warp:cpu").render(cloud, view, ("rgb", "depth"), **exposed)
-    own = fs.Renderer("warp:cpu", memory_budget=7_400_000)
+    own = fs.Renderer("warp:cpu", memory_budget=6_170_000)
     frame = own.render(cloud, view, ("rgb", "depth"), **exposed)
     assert own.backend.pool._arrays["tile_totals", wp.int32].size == 300, "it was drawn in bands"
     assert all(np.array_equal(frame[name], wanted[name]) for name in ("rgb", "depth"))

@@ -153,7 +153,7 @@ class OpenCLBackend(Workspace):
         self.pool.clear()
 
     def rates(self) -> Rates:
-        """What the device can do at best; measured anew at each call."""
+        """What the device can do at best; measured again at each call."""
         return measure_rates(self)
 
     def probe(self) -> OpenCLProbe:

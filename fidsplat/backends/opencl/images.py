@@ -72,7 +72,7 @@ class Repeat:
         view: View,
         recording: Recording,
     ) -> None:
-        """draw: draws it anew, with the room that it needs. time: tells how long its stages take."""
+        """draw: draws it again, with the room that it needs. time: tells how long its stages take."""
         self._draw, self._time, self._view, self._recording = draw, time, view, recording
         self._workspace = workspace
         self._room = recording.big, recording.capacity

@@ -244,7 +244,7 @@ class OpenCLPipeline:
         """Draws a picture with what room it takes; remembers its kind, if the next may be launched again."""
         pool = self.workspace.pool
         kind = self, view.width, view.height, resident.count, plan
-        # what this picture takes anew is planned for; that of its own kind is there already
+        # what this picture takes besides is planned for; that of its own kind is there already
         pool.make_way(kind, self.workspace.memory_budget - plan.held)
         picture = self._draw(resident, view, plan, trusted)
         whole = not (plan.chunk or resident.streamed or view.shots or picture.in_bands)
@@ -303,7 +303,7 @@ class OpenCLPipeline:
         return drawn
 
     def _redrawn(self, resident: Resident, view: View) -> Drawn:
-        """The picture drawn anew, whatever it takes, and its time."""
+        """The picture drawn again, whatever it takes, and its time."""
         return Drawn.of(self._tried(self._first, resident, view, self._plan(resident, view)))
 
     def _draw(self, resident: Resident, view: View, plan: MemoryPlan, trusted: int = 0) -> Picture:

@@ -20,7 +20,7 @@ from fidsplat.errors import DeviceError
 def load_invoker() -> None:
     """Imports the part of pyopencl that sets arguments, which opens a database in the user's cache folder.
 
-    Where that is damaged this process does without it, and makes anew what it holds.
+    Where that is damaged this process does without it, and makes again what it holds.
     """
     try:
         importlib.import_module("pyopencl.invoker")

@@ -1,7 +1,7 @@
 """Launches of a picture, kept to be launched again for the next of its kind.
 
 A picture of a kind that was drawn before needs the same kernels with the same arguments, but for the images
-that it gives away and the numbers of its view: only those are set anew. That takes the host a fraction of
+that it gives away and the numbers of its view: only those are set again. That takes the host a fraction of
 what it takes to plan the picture, and nothing waits for the device.
 """
 

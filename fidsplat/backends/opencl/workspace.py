@@ -37,7 +37,7 @@ class DeviceBuffer(cl.Buffer):
 
 
 def token_of(buffer: cl.Buffer) -> object:
-    """What tells a buffer from every other; a part of one is made anew each time."""
+    """What tells a buffer from every other; a part of one is made again each time."""
     return buffer.token if type(buffer) is DeviceBuffer else object()
 
 

@@ -1,19 +1,43 @@
-"""Many views of one cloud on a Warp device: drawn one after another into one array of each output."""
+"""Many views of one cloud on a Warp device: parts of as many as memory holds, each one submission."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from fidsplat.backends.blank import blank
 from fidsplat.backends.stack import ViewBatch
-from fidsplat.backends.warp.picture import WarpImages
+from fidsplat.backends.warp.images import WarpImages
+from fidsplat.backends.warp.picture import Into
 from fidsplat.backends.warp.runtime import load
 from fidsplat.backends.warp.workspace import Workspace
 from fidsplat.effects import Output
 from fidsplat.errors import DeviceError
+
+_MOST = {True: 1 << 31, False: 1 << 28}
+"""bytes that the views of a part take together on CUDA, and on the CPU: more is no faster"""
+_MOST_NUMBERED = 1 << 30
+"""samples, and lines of records, of all views of a part; kernels number them in 32 bits"""
+
+
+def parts(
+    views: int, each: int, samples: int, lines: int, workspace: Workspace, free: int
+) -> Iterator[tuple[int, int]]:
+    """Ranges of views (first, end) that are drawn together.
+
+    Args:
+        each: bytes that a view takes. samples, lines: of a view. free: bytes that there are.
+    """
+    # half is for the lists
+    room = min(free // 2, _MOST[workspace.device.is_cuda]) // each
+    together = max(1, min(room, _MOST_NUMBERED // max(samples, lines)))
+    # of equal size, so that launches of one are those of the next
+    count = -(-views // together)
+    return pairwise([views * k // count for k in range(count + 1)])
 
 
 class WarpBatch:
@@ -43,16 +67,14 @@ class WarpBatch:
             self._images[output.name] = output, array
         self._pictures: list[WarpImages] = []
 
-    def part(self, slot: int) -> dict[str, Any]:
-        """Where the images of one view go, by name."""
-        pixels = self._size[0] * self._size[1]
-        return {
-            name: array[slot * pixels * output.channels : (slot + 1) * pixels * output.channels]
-            for name, (output, array) in self._images.items()
-        }
+    def into(self, slots: np.ndarray) -> Into:
+        """Where the images of these views go."""
+        wp = load()
+        numbers = wp.array(slots.astype(np.int32), dtype=wp.int32, device=self._workspace.device)
+        return Into({name: array for name, (_, array) in self._images.items()}, numbers)
 
     def add(self, images: WarpImages) -> None:
-        """A view that was drawn."""
+        """Views that were drawn together."""
         self._pictures.append(images)
 
     def _settle(self) -> None:
@@ -74,9 +96,10 @@ class WarpBatch:
     def read_one(self, name: str, number: int) -> np.ndarray:
         """The image of one view."""
         self._settle()
-        output = self._images[name][0]
+        output, array = self._images[name]
         shape = self._size if output.channels == 1 else (*self._size, output.channels)
-        return np.array(self.part(number)[name].numpy()).reshape(shape)
+        size = math.prod(shape)
+        return np.array(array[number * size : (number + 1) * size].numpy()).reshape(shape)
 
     def wait(self) -> None:
         """Until the device has drawn all views."""

@@ -16,8 +16,9 @@ from fidsplat.backends.gradients import (
     gradient_shape,
 )
 from fidsplat.backends.view import View
+from fidsplat.backends.warp.images import WarpImages
 from fidsplat.backends.warp.launch import Launcher
-from fidsplat.backends.warp.picture import Picture, WarpImages
+from fidsplat.backends.warp.picture import Picture
 from fidsplat.backends.warp.pipeline import WarpPipeline
 from fidsplat.backends.warp.program import GradientKernels
 from fidsplat.backends.warp.resident import Resident

@@ -40,6 +40,10 @@ class Commands:
         self._wp = load()
         self._held: dict[tuple[Any, int], tuple[Any, list[Any], list[int]]] = {}
 
+    def forget(self) -> None:
+        """Lets go of the arrays of the last launches."""
+        self._held.clear()
+
     def launch(self, kernel: Any, count: int, args: list[Any], block: int = BLOCK) -> None:
         """`count` threads of a kernel, in blocks of `block` on a GPU."""
         held = self._held.get((kernel, block))
@@ -62,10 +66,11 @@ class Commands:
 class Launcher:
     """Launches of one picture. Arguments are given by the names that a kernel's signature has for them."""
 
-    def __init__(self, commands: Commands) -> None:
-        self._wp = load()
+    def __init__(self, commands: Commands, timed: bool = True, whole: bool = False) -> None:
+        """timed: its stages are. whole: launches on the CPU are not cut, since a capture sees one thread."""
+        self._wp, self.timed = load(), timed
         self._device, self._workers, self._commands = commands.device, commands.workers, commands
-        self.pieces = 8 * commands.threads
+        self.pieces = 1 if whole else 8 * commands.threads
         """into which a CPU launch is cut, so that threads share uneven work"""
         self._stream = None if self._workers else self._device.stream  # which may be another one later
         self._marks: list[tuple[str | None, Any]] = []
@@ -118,6 +123,8 @@ class Launcher:
 
     def stage(self, name: str | None) -> None:
         """What is launched from here on belongs to the stage `name`; None ends the last."""
+        if not self.timed:
+            return
         if self._workers is None:
             mark = self._wp.Event(self._device, enable_timing=True)
             self._wp.record_event(mark)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
-from fidsplat.backends.stack import ViewBatch
+from fidsplat.backends.stack import ViewBatch, ViewStack
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.ahead import Drawing
-from fidsplat.backends.warp.batch import WarpBatch
+from fidsplat.backends.warp.batch import WarpBatch, parts
+from fidsplat.backends.warp.images import WarpImages
 from fidsplat.backends.warp.launch import Commands
-from fidsplat.backends.warp.picture import Picture, WarpImages
+from fidsplat.backends.warp.picture import Picture, view_bytes
 from fidsplat.backends.warp.program import Program
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.workspace import Workspace
@@ -29,7 +32,7 @@ class WarpPipeline:
             DeviceError: the device runs out of memory or fails.
         """
         with self.workspace.working("while drawing"):
-            return self._drawing.images(resident, view)
+            return self._drawing.images(resident, ViewStack.alone(view))
 
     def drawn(self, resident: Resident, view: View) -> tuple[Picture, WarpImages]:
         """One picture with all that its stages have left on the device, until another is drawn; its images.
@@ -38,20 +41,34 @@ class WarpPipeline:
             DeviceError: as `render`.
         """
         with self.workspace.working("while drawing"):
-            return self._drawing.picture(resident, view)
+            return self._drawing.picture(resident, ViewStack.alone(view))
 
     def render_batch(self, resident: Resident, batch: ViewBatch) -> WarpBatch:
-        """Draw many views, one after another.
+        """Draw many views, as many at once as memory holds.
 
         Raises:
             DeviceError: the device runs out of memory or fails.
         """
         with self.workspace.working("while drawing"):
             images = WarpBatch(self.workspace, self.program.images, batch, resident.count)
-            for number, slot in enumerate(batch.slots.tolist()):
-                given = {"beside": images.nbytes, "into": images.part(slot)}
-                images.add(self._drawing.images(resident, batch.one(number), **given))
+            for first, end in self._parts(resident, batch, images.nbytes):
+                stack = batch.part(first, end)
+                into = images.into(batch.slots[first:end])
+                images.add(self._drawing.images(resident, stack, into, images.nbytes))
             return images
+
+    def _parts(self, resident: Resident, batch: ViewBatch, beside: int) -> Iterator[tuple[int, int]]:
+        """Ranges of views (first, end) that are drawn at once. beside: bytes of all their images."""
+        count, views, workspace = len(batch.slots), batch.views, self.workspace
+        if not (count and isinstance(views, ViewStack) and self._goes_together(views)):
+            return iter([(k, k + 1) for k in range(count)])
+        each, samples = view_bytes(self.program, resident, views.view)
+        free = workspace.memory_budget - resident.memory_bytes - beside
+        return parts(count, each, samples, resident.count * self.program.layout.lines, self.workspace, free)
+
+    def _goes_together(self, stack: ViewStack) -> bool:
+        """Whether all that differs from view to view stands in the struct `View`."""
+        return not (self.program.sensor and stack.numbers)
 
     def trace(self, resident: Resident, view: View) -> dict[str, np.ndarray]:
         """Draw one picture and return what passes between the stages.

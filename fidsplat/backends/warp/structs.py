@@ -9,63 +9,67 @@ from typing import Any
 
 import numpy as np
 
+from fidsplat.backends.stack import ViewStack
 from fidsplat.backends.view import View
 from fidsplat.backends.warp.resident import Resident
 from fidsplat.backends.warp.runtime import kernels, load
 from fidsplat.backends.warp.shapes import WarpShape
-from fidsplat.backends.warp.workspace import Workspace, nbytes
+from fidsplat.backends.warp.workspace import ArrayPool, Workspace, nbytes
 from fidsplat.cameras.raster import RayRaster
 from fidsplat.errors import DeviceError
 from fidsplat.surroundings import Gradient, Panorama
 
-
-def _ray(view: View) -> tuple[float, ...]:
-    focal_x, focal_y, center_x, center_y = view.uniform("ray")
-    return 1 / focal_x, 1 / focal_y, center_x, center_y
-
-
 _DERIVED: dict[str, Callable[[View, WarpShape], Any]] = {
-    "per_focal_x": lambda view, shape: 1.0 / view.focal_x,
-    "per_focal_y": lambda view, shape: 1.0 / view.focal_y,
-    "per_near": lambda view, shape: 1.0 / view.near,
     "tile_w": lambda view, shape: shape.tile_width,
     "tile_h": lambda view, shape: shape.tile_height,
     "tiles_x": lambda view, shape: -(-view.width // shape.tile_width),
     "tiles_y": lambda view, shape: -(-view.height // shape.tile_height),
     "per_pixel": lambda view, shape: 1.0 / view.samples**2,
-    "ray_step": lambda view, shape: 0.0,
-    "ray": lambda view, shape: _ray(view),
 }
 """fields that a view does not have by their names"""
+_LATER = frozenset({"per_focal_x", "per_focal_y", "per_near", "ray", "ray_step", "splats"})
+"""those that follow from others, or from what a view does not know"""
 
 
 @cache
-def _fields() -> tuple[tuple[str, Any, Any], ...]:
-    """Name of each field, where it comes from if it is derived, and its type if it is a vector or matrix."""
-    types = load().types
-    kinds = {name: field.type for name, field in kernels("common").View.vars.items()}
-    wide = {name for name, kind in kinds.items() if types.type_is_vector(kind) or types.type_is_matrix(kind)}
-    return tuple((name, _DERIVED.get(name), kind if name in wide else None) for name, kind in kinds.items())
+def _record() -> Any:
+    return np.dtype(kernels("common").View.numpy_dtype())
 
 
-def uniforms(view: View, shape: WarpShape, sloped: bool) -> Any:
-    """The struct `View` of a picture in tiles of this shape; sloped: its kernels read rays' derivatives."""
-    filled = kernels("common").View()
-    for name, derive, wide in _fields():
-        value: Any = derive(view, shape) if derive else getattr(view, name)
-        if wide:
-            value = wide(*(value.ravel().tolist() if isinstance(value, np.ndarray) else value))
-        setattr(filled, name, value)
+def uniforms(stack: ViewStack, shape: WarpShape, splats: int, sloped: bool) -> np.ndarray:
+    """(views,) of the struct `View`, of pictures in tiles of this shape. splats: of the cloud. sloped: its
+    kernels read rays' derivatives."""
+    view = stack.view
+    filled: Any = np.zeros(len(stack), _record())
+    for name in filled.dtype.names:
+        if name not in _LATER:
+            derive = _DERIVED.get(name)
+            filled[name] = derive(view, shape) if derive else getattr(view, name)
+    for name in ("rotation", "translation", "eye"):
+        filled[name] = getattr(stack, name)[0]
+    for name, numbers in stack.numbers.items():
+        filled[name] = numbers
+    for name in ("focal_x", "focal_y", "near"):
+        filled[f"per_{name}"] = 1.0 / filled[name]
+    if not (view.along_ray or view.parallel):  # else depths are distances already, and the ray is 0
+        own = (filled["per_focal_x"], filled["per_focal_y"], filled["center_x"], filled["center_y"])
+        filled["ray"] = np.stack(own, axis=1)
+    filled["splats"] = splats
     if sloped and view.raster:
-        filled.ray_step = view.raster.step  # of which it takes long to ask
+        filled["ray_step"] = view.raster.step  # of which it takes long to ask
     return filled
 
 
 def rays_of(
-    view: View, workspace: Workspace, bent: bool = True, sloped: bool = False, opaque: bool = False
+    view: View,
+    workspace: Workspace,
+    inputs: ArrayPool,
+    bent: bool = True,
+    sloped: bool = False,
+    opaque: bool = False,
 ) -> Any:
     """The struct `Rays` of a view, with derivatives if `sloped`, with its layer if `opaque`; without rays if
-    it has no raster, or unless `bent`.
+    it has no raster, or unless `bent`. inputs: of the layer.
 
     Raises:
         DeviceError: the device has no memory for them.
@@ -77,7 +81,7 @@ def rays_of(
     rays = kind()
     if opaque:
         for name, dtype in (("layer_depth", wp.float32), ("layer_rgb", wp.vec3)):
-            setattr(rays, name, workspace.pool.filled(name, view.array(name), dtype))
+            setattr(rays, name, inputs.filled(name, view.array(name), dtype))
     if raster is None:
         return rays
     arrays = _arrays(raster, workspace)
@@ -89,6 +93,14 @@ def rays_of(
             arrays["slopes"] = _fresh("ray slopes", slopes, kernels("rays").SLOPES, workspace)
         rays.slopes = arrays["slopes"][first:]
     return rays
+
+
+def array_of(stack: ViewStack, name: str) -> np.ndarray:
+    """An array of an effect, which all views have in common, or the rows of one view after the other's."""
+    view = stack.view
+    if name != "turns" or len(stack) == 1:
+        return view.array(name)
+    return np.repeat(stack.rotation[0].astype(np.float32), view.height // view.samples, axis=0)
 
 
 def lens_of(view: View, workspace: Workspace) -> Any:
@@ -112,18 +124,20 @@ def lens_of(view: View, workspace: Workspace) -> Any:
     return lens
 
 
-def moving_of(resident: Resident, view: View, workspace: Workspace) -> Any:
-    """The struct `Moving` of a picture; an empty one if nothing moves."""
-    declared, pool = kernels("motion"), workspace.pool
-    kind = declared.make_motion(bool(view.groups)).Moving
-    if not view.groups:
+def moving_of(resident: Resident, stack: ViewStack, inputs: ArrayPool) -> Any:
+    """The struct `Moving` of a picture; an empty one if nothing moves. inputs: of its arrays."""
+    declared, groups = kernels("motion"), stack.view.groups
+    kind = declared.make_motion(bool(groups)).Moving
+    if not groups:
         return _empty(kind)
     held = kind()
-    labels = np.array([label for label, _ in view.groups], np.int32)
-    poses = [(own.rotation, own.translation, own.eye) for _, own in view.groups]
+    labels = np.array([label for label, _ in groups], np.int32)
+    poses: Any = np.zeros((len(stack), len(groups)), declared.Pose.numpy_dtype())
+    for name in ("rotation", "translation", "eye"):
+        poses[name] = np.swapaxes(getattr(stack, name)[1:], 0, 1)
     held.labels = resident.arrays["labels"]
-    held.groups = pool.filled("groups", labels, load().int32)
-    held.poses = pool.filled("poses", np.array(poses, declared.Pose.numpy_dtype()), declared.Pose)
+    held.groups = inputs.filled("groups", labels, load().int32)
+    held.poses = inputs.filled("poses", poses.ravel(), declared.Pose)
     return held
 
 

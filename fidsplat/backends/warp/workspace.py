@@ -3,10 +3,12 @@ take."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from typing import Any
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, WeakSet
 
 from fidsplat.backends.warp.runtime import load
 from fidsplat.cameras.raster import RayRaster
@@ -23,12 +25,21 @@ class ArrayPool:
         self._parts: dict[tuple[str, Any], Any] = {}
         self._hosts: dict[str, Any] = {}
         self._spare: dict[str, list[Any]] = {}
+        self.state = object()
+        """another one whenever a scratch array has been replaced"""
+        self.holders: WeakSet[Any] = WeakSet()
+        """what holds scratch arrays from picture to picture: told to `forget` them when one is replaced"""
 
     def scratch(self, name: str, size: int, dtype: Any) -> Any:
         """An array of at least `size` elements whose content is undefined."""
         held = self._arrays.get((name, dtype))
         if held is None or held.size < size:
-            self._arrays.pop((name, dtype), None)
+            if held is not None:
+                del self._arrays[name, dtype], held
+                self._parts.pop((name, dtype), None)
+                self.state = object()
+                for holder in list(self.holders):
+                    holder.forget()
             held = self._arrays[name, dtype] = self.fresh(name, size, dtype)
         return held
 
@@ -88,7 +99,7 @@ class Workspace:
 
     def __init__(self, device: Any, name: str, memory_budget: int) -> None:
         """name: of the device, for errors."""
-        self.device, self.name = device, name
+        self.device, self.name, self._lock = device, name, threading.RLock()
         self.pool = ArrayPool(device)
         self.memory_budget = memory_budget
         """bytes of the device that a picture and its cloud may take"""
@@ -96,12 +107,27 @@ class Workspace:
         """Most pairs of splats and tiles that are listed at once; tests make it small."""
         self.ahead = device.is_cuda
         """Whether pictures of a kind that was drawn before are drawn without waiting for what they take."""
+        self.replays = device.is_cuda
+        """Whether the launches of such pictures are captured as a graph, and the graph launched."""
         self.pictures = 0
         """how many have been begun: what they leave is there until the next"""
         self.lenses: WeakKeyDictionary[RayRaster, dict[str, Any]] = WeakKeyDictionary()
         """arrays of the whole rasters that are in use, by name"""
         self.panoramas: WeakKeyDictionary[Panorama, Any] = WeakKeyDictionary()
         """on the device, each as long as it is somewhere else"""
+
+    @cached_property
+    def first_slot(self) -> Any:
+        """Where the images of a view stand that is no part of a batch: an array of a 0."""
+        return load().zeros(1, dtype=load().int32, device=self.device)
+
+    @cached_property
+    def _side(self) -> Any:
+        return load().Stream(self.device)
+
+    def capturing(self) -> Any:
+        """The stream on which launches are captured; None where there are no streams."""
+        return self._side if self.device.is_cuda else None
 
     @contextmanager
     def working(self, doing: str) -> Iterator[None]:
@@ -111,7 +137,8 @@ class Workspace:
             DeviceError: the device fails.
         """
         try:
-            with load().ScopedDevice(self.device):
+            # pictures that were drawn ahead may have to be drawn again by who reads them, in any thread
+            with self._lock, load().ScopedDevice(self.device):
                 yield
         except RuntimeError as error:
             if isinstance(error, DeviceError):

@@ -1,4 +1,4 @@
-// Adam on the splats' values before their activations, which it computes anew: the derivatives by what is drawn come in, what is drawn
+// Adam on the splats' values before their activations, which it computes again: the derivatives by what is drawn come in, what is drawn
 // next goes out. Its twin in NumPy, with the formulas: fidsplat/train/optimiser.py.
 
 #define SH_C0 0.28209479177387814f

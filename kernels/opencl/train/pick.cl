@@ -1,4 +1,4 @@
-// Splats that are chosen anew: the twin of fidsplat/train/densify.py's Plan.
+// The splats that go on, and those that come: the twin of fidsplat/train/densify.py's Plan.
 
 // Index space: one work-item per number of an array (count, row) that is made. Reads: the array that there was, rows (count). Writes:
 // its rows in this order, zeros from the row `kept` on.

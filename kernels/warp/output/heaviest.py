@@ -64,7 +64,7 @@ def store(pixel: Any, at: int, samples: Any):
 
 @wp.func
 def heaviest_of(grid: PixelGrid, samples: Any) -> int:
-    """Of all samples of the pixel."""
+    """Of all samples of the pixel: its index in the cloud."""
     weight = float(0.0)
     which = int(-1)
     for k in range(grid.count):
@@ -72,11 +72,13 @@ def heaviest_of(grid: PixelGrid, samples: Any) -> int:
         if samples.weight[at] > weight:
             weight = samples.weight[at]
             which = samples.heaviest[at]
+    if which >= 0:
+        which = which % grid.splats
     return which
 
 
 OUTPUT = Output(
-    seen={"heaviest": wp.int32},  # index; a layer's of its splat of greatest optical depth
+    seen={"heaviest": wp.int32},  # among all views' splats; a layer's is that of greatest optical depth
     see=see,
     layer={"thickest": wp.float32},
     gather=gather,

@@ -1,0 +1,90 @@
+"""`fidsplat marker`, and the splat files that commands write."""
+
+import os
+
+import numpy as np
+from command_line import fails, prints_json
+
+import fidsplat as fs
+from fidsplat.cli import main
+from fidsplat.quality import LADDER
+from fidsplat.vision.images import write_png
+
+
+def test_marker_says_what_it_is_made_of(capsys, tmp_path):
+    file = tmp_path / "new" / "tag.ply"
+    facts = prints_json(capsys, "marker", "apriltag:36h11:5", "--size", "0.16", "-o", file)
+    made = fs.marker("apriltag:36h11:5", size=0.16)
+    assert facts["shape"] == [8, 8]
+    assert facts["components"] == made.components
+    assert sum(facts["rectangles"].values()) == len(made.rectangles)
+    assert facts["splats"] == len(made.cloud) == len(made.boxes)
+    assert facts["mixture"] == "exact"
+    assert facts["written"] == {"mixture": "fitted", "splats": len(made.gaussians)}
+    assert len(made.gaussians) == len(fs.load_ply(file))
+    assert facts["size_m"] == 0.16
+    assert 0 < facts["seconds"] < 30
+    assert main(["marker", "apriltag:36h11:5"]) == 0
+    assert "rectangles" in capsys.readouterr().out
+
+
+def test_splats_that_are_there_are_replaced_where_that_is_asked_for(capsys, tmp_path):
+    mine, other = tmp_path / "mine.ply", tmp_path / "other.ply"
+    mine.write_bytes(b"a scan of months")
+    other.write_bytes(b"another")
+    os.link(mine, tmp_path / "the same.ply")
+    for words, why in (
+        (("marker", "qr:a", "-o", mine), f"{mine} is there already; give another name, or --overwrite"),
+        (("convert", other, mine), f"{mine} is there already; give another name, or --overwrite"),
+        (("train", tmp_path, "-o", mine), f"{mine} is there already; give another name, or --overwrite"),
+        (("convert", tmp_path / "nowhere.ply", mine), f"{mine} is there already"),
+        (("convert", tmp_path / "nowhere.ply", mine, "--overwrite"), "cannot read"),
+        (("convert", mine, mine), f"{mine} and {mine} are one file"),
+        (("convert", mine, tmp_path / "the same.ply", "--overwrite"), "are one file"),
+    ):
+        status, line = fails(capsys, *words)
+        assert (status, mine.read_bytes()) == (2, b"a scan of months"), words
+        assert why in line
+    prints_json(capsys, "marker", "qr:a", "-o", mine, "--overwrite")
+    prints_json(capsys, "convert", mine, other, "--overwrite", "--no-pictures")
+    assert len(fs.load_ply(other)) == len(fs.load_ply(mine)) > 0
+
+
+def test_a_marker_is_refined_on_a_device(capsys, tmp_path):
+    words = ("marker", "aruco:4x4_50:7", "--mixture", "refined", "--iterations", "2", "--device", "opencl")
+    facts = prints_json(capsys, *words, "-o", tmp_path / "tag.ply")
+    more = fs.marker("aruco:4x4_50:7", mixture="fitted", template=LADDER)
+    assert facts["mixture"] == "refined"
+    assert facts["written"] == {"mixture": "refined", "splats": len(more.cloud)}
+    assert len(fs.load_ply(tmp_path / "tag.ply")) == len(more.cloud)
+    few = prints_json(capsys, *words, "--quality", "marker.template=5")
+    assert few["splats"] < len(more.cloud)
+    status, line = fails(capsys, "marker", "aruco:4x4_50:7", "--iterations", "2")
+    assert status == 2
+    assert "--mixture refined" in line
+
+
+def test_a_marker_of_more_splats_than_allowed(capsys, tmp_path):
+    bits = np.random.default_rng(0).random((350, 350)) < 0.5
+    spec = f"image:{write_png(tmp_path / 'noise.png', bits)}"
+    status, line = fails(capsys, "marker", spec, "--mixture", "fitted")
+    assert status == 2
+    assert "more than 1,000,000" in line
+    assert "--max-splats" in line
+    facts = prints_json(capsys, "marker", "qr:a", "--max-splats", "10000000")
+    assert facts["splats"] > 0
+
+
+def test_marker_writes_two_scales_when_asked(capsys, tmp_path):
+    for words, scales in (([], 3), (["--native-2dgs"], 2)):
+        overwrite = ["-o", str(tmp_path / "tag.ply"), "--overwrite"]
+        assert main(["marker", "apriltag:36h11:5", *overwrite, *words]) == 0
+        assert (tmp_path / "tag.ply").read_bytes().count(b"property float scale_") == scales
+    capsys.readouterr()
+    status, line = fails(capsys, "marker", "apriltag:36h11:5", "--native-2dgs")
+    assert status == 2
+    assert "-o FILE.ply" in line
+
+
+def test_marker_with_the_mixture_of_the_paper(capsys):
+    assert prints_json(capsys, "marker", "qr:hello", "--mixture", "paper")["mixture"] == "paper"
