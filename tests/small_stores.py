@@ -42,6 +42,7 @@ def store_fixtures() -> tuple[Any, Any, Any]:
     def cut():
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(plan, "_LEAST_MEMORY", 0)
+            patch.setattr(plan, "_MERGING", (0, 0.01))
             patch.setattr(plan, "WINDOW", WINDOW)
             patch.setattr(build, "_NOTED", NOTED)
             yield

@@ -264,7 +264,11 @@ def _trained(rows: Frame, seen: Frame | None, scans: Frame | None) -> dict:
                     "seconds, several at once": fixed(own["seconds"].median(), 1),
                 }
             )
-    found = {"rows": pd.DataFrame(table), "trainings": trainings, "iterations": int(every["amount"].max())}
+    found: dict = {"rows": pd.DataFrame(table), "trainings": trainings, "markers": ""}
+    found["iterations"] = int(every["amount"].max())
+    if len(numbers := set(found["rows"]["markers"])) == 1:  # that needs no column
+        found["markers"] = f", {numbers.pop()} of each"
+        found["rows"] = found["rows"].drop(columns="markers")
     return found | {"spread": _spread(every), "enough": _enough(found["rows"])}
 
 

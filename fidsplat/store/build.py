@@ -133,13 +133,18 @@ class _Build:
             stream.write(json.dumps(self.state).encode())
 
     def _in_turn(
-        self, pool: ThreadPoolExecutor, work: Callable[[Any], Any], given: Iterable[Any]
+        self,
+        pool: ThreadPoolExecutor,
+        work: Callable[[Any], Any],
+        given: Iterable[Any],
+        most: int | None = None,
     ) -> Iterator[Any]:
-        """Results in the order of what is given, worked out by threads a little ahead."""
+        """Results in the order of what is given, worked out by threads a little ahead. most: how many at
+        once; None: one for each thread, and results that wait."""
         waiting: deque[Future] = deque()
         for one in given:
             waiting.append(pool.submit(work, one))
-            if len(waiting) > self.workers:
+            if len(waiting) > (self.workers if most is None else most - 1):
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
@@ -246,7 +251,8 @@ class _Build:
             if not groups or (len(groups[0]) == 1 and _settled(nodes, level)):
                 return
             rows = int(nodes["first"][-1] + nodes["count"][-1])
-            work = self._in_turn(pool, self._merged, (nodes[group] for group in groups[done:]))
+            most = min(self.workers, max(1, self.plan.memory // self.plan.merge_bytes))
+            work = self._in_turn(pool, self._merged, (nodes[group] for group in groups[done:]), most)
             for number, (made, size) in enumerate(work, done + 1):
                 node = nodes_of(made, rows)
                 node["level"], node["size"] = level + 1, size

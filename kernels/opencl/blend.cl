@@ -50,9 +50,14 @@ static inline void composite(Pixel *pixel, const Seen *seen, vfloat opacity, vin
     pixel->t = pixel->t - weight;
 }
 
+// Whether light comes through to what follows.
+static inline vint pixel_lit(const Pixel *pixel, const BlendConstants *constants) {
+    return VMASK(pixel->t > constants->stop);
+}
+
 // Whether anything that follows can still be seen.
 static inline vint pixel_unfinished(const Pixel *pixel, const BlendConstants *constants) {
-    return VMASK(pixel->t > constants->stop)
+    return pixel_lit(pixel, constants)
 //@@ unfinished
         ;
 }

@@ -10,7 +10,7 @@ import warp as wp
 from . import output
 from .bounds import Bounds, make_bounds
 from .buffers import make_samples, sample_fields
-from .common import STRICT, View, anew, first_sample, lowest, place_of, store_line
+from .common import STRICT, View, first_sample, lowest, place_of, reread, store_line
 from .crossing import make_crossing
 from .pixel import make_pixel
 from .rays import SLOPES
@@ -69,7 +69,7 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         # a warp draws a block, so that a splat that misses it costs it nothing
         block, lane = item / 32, item % 32
         number, tile_column, tile_row = place_of(tile, views)
-        view = views[anew(number)]
+        view = views[reread(number)]
         across = view.tile_w / BLOCK_W
         left = tile_column * view.tile_w + (block % across) * BLOCK_W
         top = tile_row * view.tile_h + (block / across) * BLOCK_H
@@ -121,7 +121,7 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         if wp.static(opaque):
             p = cover(p, x0, y0, rays, view)
         number, tile_column, tile_row = place_of(tile, views)
-        view = views[anew(number)]
+        view = views[reread(number)]
         at = first_sample(number, view) + y0 * view.tiles_x * view.tile_w + x0
         store(finish(p), at, samples)
 

@@ -67,7 +67,7 @@ class View:
 #endif
     return same;
 """)
-def anew(number: int) -> int:
+def reread(number: int) -> int:
     """The number."""
     ...
 

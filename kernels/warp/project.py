@@ -17,7 +17,7 @@ from . import output
 from .bounds import PAD, PAD_RELATIVE, Bounds, box_bounds, make_bounds
 from .boxes import make_boxes
 from .color import make_color
-from .common import CULLED, STRICT, View, anew, as_bits, sortable, store_line
+from .common import CULLED, STRICT, View, as_bits, reread, sortable, store_line
 from .disk import make_disk
 from .ellipsoids import EWA, EXACT, make_ellipsoids
 from .lens import LENSES, make_lens, make_optics
@@ -120,7 +120,7 @@ def make_project(
     ):
         at = wp.tid() + first
         number = at / views[0].splats
-        view = views[anew(number)]
+        view = views[reread(number)]
         i = at - number * view.splats
         keys[at] = CULLED
         counts[at] = wp.int64(0)
@@ -261,7 +261,7 @@ def make_project(
                 box.dot_r = wp.sqrt(half_r2 / view.per_pixel) * (1.0 + PAD_RELATIVE) + PAD
             if itself:
                 box.dot_r = -1.0
-        view = views[anew(number)]
+        view = views[reread(number)]
         row_first, row_end = limits.rows(box, view.height)
         first_column, end_column = limits.span(box, row_first, row_end, view.width)
         if row_first >= row_end or first_column >= end_column:
@@ -275,7 +275,7 @@ def make_project(
             return
 
         # loaded again, here and above, so that no registers hold them meanwhile
-        view = views[anew(number)]
+        view = views[reread(number)]
         fx, fy, cx, cy = real(view.focal_x), real(view.focal_y), real(view.center_x), real(view.center_y)
         per_fx, per_fy = real(view.per_focal_x), real(view.per_focal_y)
         # affine forms about the sample of the picture that is nearest to the centre (numerics B1)

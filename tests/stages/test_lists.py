@@ -1,5 +1,7 @@
 """The lists of splats per tile: made in two ways, however much there is to list, and in small buffers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from agreement import ALL_OUTPUTS, random_splats
@@ -70,7 +72,8 @@ def test_views_of_a_batch_are_listed_apart(backend, monkeypatch, lists, budget):
 @pytest.mark.parametrize("budget", [0, 5000])
 def test_neighbours_that_share_tiles_are_counted_together(backend, monkeypatch, budget):
     """As those of a store: by groups of 4096 splats of one place, of one that is left of the picture, and of
-    all of a picture of more tiles than local memory has room for; then drawn again, as it was launched."""
+    all of a picture of more tiles than local memory has room for; then drawn again, as it was launched, and
+    as one of two views."""
     generator = np.random.default_rng(8)
     cloud = random_splats(3 * 4096 + 50, seed=5, scale=(1e-3, 0.03))
     means, near = cloud.means.copy(), generator.normal(size=(2 * 4096, 3)).astype(np.float32)
@@ -78,7 +81,8 @@ def test_neighbours_that_share_tiles_are_counted_together(backend, monkeypatch, 
     means[4096 : 2 * 4096, 0] -= 6.0
     cloud = fs.SplatCloud(means, cloud.quats, cloud.scales, cloud.opacities, colors=cloud.colors)
     camera = fs.Camera.look_at(641, 549, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
-    features, view = prepare(cloud, fs.Capture(camera, ALL_OUTPUTS, fs.Quality(lowpass="none")))
+    capture = fs.Capture(camera, ALL_OUTPUTS, fs.Quality(lowpass="none"))
+    features, view = prepare(cloud, capture)
     pipeline, resident = backend.pipeline(features, listing(backend, "tiled")), backend.upload(cloud)
     wanted = pipeline.render(resident, view)
     assert 1000 < wanted.stats["visible"] < 2.2 * 4096
@@ -99,6 +103,12 @@ def test_neighbours_that_share_tiles_are_counted_together(backend, monkeypatch, 
             assert np.array_equal(picture.read(name), wanted.read(name)), name
     # in bands each time; else twice, and then as it was launched before
     assert launched.count("tally_gathered") == (3 if budget else 2)
+    moved = replace(capture, camera=fs.Camera.look_at(641, 549, 1.0, (0.3, 0.0, 0.0), (0.0, 0.0, 3.0)))
+    pictures = pipeline.render_batch(resident, prepare_batch(cloud, views_of([moved, capture]))[1])
+    other = pipeline.render(backend.upload(cloud), prepare(cloud, moved)[1])
+    for picture, own in zip(pictures.read("rgb"), (other, wanted), strict=True):
+        assert np.array_equal(picture, own.read("rgb"))
+    assert launched.count("tally_gathered") > (3 if budget else 2)
 
 
 def test_lists_that_outgrow_their_buffers_are_made_again(backend):

@@ -1,7 +1,10 @@
 """Stores built out of core: stopped and gone on with, on a full disk, two at once."""
 
 import os
+import re
+import time
 from pathlib import Path
+from threading import Lock
 
 import numpy as np
 import pytest
@@ -9,7 +12,7 @@ from full_disk import small_files
 from small_stores import COUNT, NOTED, SMALL, WINDOW, contents, store_fixtures
 
 import fidsplat as fs
-from fidsplat.store import build
+from fidsplat.store import build, plan
 
 cut, files, store = store_fixtures()
 
@@ -87,6 +90,32 @@ def test_a_build_whose_files_were_lost_in_a_power_cut_is_begun_anew(files, store
     os.truncate(last, last.stat().st_size // 3)
     fs.build_store(files, tmp_path / "both.fss", **SMALL)
     assert contents(tmp_path / "both.fss") == contents(store.path)
+
+
+def test_chunks_whose_levels_take_more_than_the_memory_are_refused(files, tmp_path, monkeypatch):
+    """What is said to do is done, and one node is made at a time where memory is for one."""
+    under_way, most, lock, made = 0, 0, Lock(), build.merged
+
+    def merged(*given):
+        nonlocal under_way, most
+        with lock:
+            under_way += 1
+            most = max(most, under_way)
+        time.sleep(0.002)
+        try:
+            return made(*given)
+        finally:
+            with lock:
+                under_way -= 1
+
+    monkeypatch.setattr(plan, "_MERGING", (400, 6))
+    monkeypatch.setattr(build, "merged", merged)
+    with pytest.raises(fs.InputError, match=r"chunk is 500; .* and memory is 1 MiB") as refused:
+        fs.build_store(files, tmp_path / "both.fss", **SMALL)
+    fitting = int(re.findall("take ([0-9]+) at most", str(refused.value))[0])
+    fs.build_store(files, tmp_path / "both.fss", **SMALL | {"chunk": fitting})
+    assert (64 < fitting < 500, most) == (True, 1)
+    fs.build_store(files, tmp_path / "plain.fss", levels=False, **SMALL)
 
 
 def test_two_builds_of_one_store_at_once(files, store, tmp_path):

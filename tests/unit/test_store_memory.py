@@ -124,10 +124,16 @@ def test_what_does_not_fit_at_once_is_drawn_in_bands_of_what_each_sees(stores, m
     resident, outputs = limited.upload(store), ("rgb", "splat_id", "depth")
     sampled = fs.Capture(before_the_wall(), quality="samples=2", outputs=outputs)
     moved = fs.Capture(before_the_wall(x=0.1), outputs=outputs)
-    for capture in (fs.Capture(before_the_wall(), outputs=outputs), sampled, moved):
+    # what hangs on a pixel's place in the picture
+    sensor = fs.Sensor(gain=0.8, full_well=500, read_noise=3, vignetting=(-0.5,))
+    more = ("rgb", "alpha", "depth_median", "normal", "label")
+    by_pixel = fs.Capture(
+        before_the_wall(), more, "order=pixel", fog=fs.Fog(0.2, (0.5, 0.6, 0.7)), sensor=sensor
+    )
+    for capture in (fs.Capture(before_the_wall(), outputs=outputs), sampled, by_pixel, moved):
         drawn.clear()
         ours, whole = limited.render(resident, capture), plain.render(cloud, capture)
-        for output in outputs:
+        for output in capture.outputs:
             assert np.array_equal(ours[output], whole[output]), output
         assert sum(count < most for count in drawn) >= 2
         assert ours.stats["visible"] >= whole.stats["visible"]

@@ -72,9 +72,10 @@ class Repeat:
         view: View,
         recording: Recording,
     ) -> None:
-        """draw: draws it again, with the room that it needs. time: tells how long its stages take."""
+        """Made when the picture is launched. draw: draws it again, with the room that it needs. time: tells
+        how long its stages take."""
         self._draw, self._time, self._view, self._recording = draw, time, view, recording
-        self._workspace = workspace
+        self._workspace, self._number = workspace, workspace.pictures
         self._room = recording.big, recording.capacity
         self._resident: Resident | None = resident
         self._known = weakref.ref(resident)
@@ -84,8 +85,10 @@ class Repeat:
         resident = self._resident
         if resident is None:
             return None
-        counts = read_counts(self._workspace.read_queue, drawn.buffer("counts"), drawn.done())
-        big, pairs = fullness_of(counts)
+        queue, after = drawn.queue, None  # sooner than a queue that waits for another
+        if self._workspace.pictures != self._number:  # beside those that were begun since
+            queue, after = self._workspace.read_queue, drawn.done()
+        big, pairs = fullness_of(read_counts(queue, drawn.buffer("counts"), after))
         again = None if big <= self._room[0] and pairs <= self._room[1] else self._draw(resident, self._view)
         self._resident = None  # it is held no longer than it may be needed
         return again

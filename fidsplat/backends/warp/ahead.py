@@ -115,8 +115,9 @@ class Drawing:
         where = images.into  # not the images: nobody may ever ask them, and then they go at once
 
         def settle() -> WarpImages | None:
-            with workspace.working("while drawing"):
+            with workspace.failing("while drawing"):
                 launcher.finish()
+            with workspace.working("while drawing"):
                 visible, pairs = counts.numpy().tolist()
                 stats.update(visible=visible, pairs=pairs)
                 self._learn(resident, stack, visible, pairs)
@@ -130,11 +131,13 @@ class Drawing:
         return images
 
     def _timed(self, resident: Resident, stack: ViewStack, where: Into) -> Callable[[], dict[str, float]]:
-        """Tells what a picture's stages take, of which a graph says nothing: it is drawn once more."""
+        """Tells what a picture's stages take, of which a graph says nothing: it is drawn once more, a batch's
+        into the same images."""
+        into = where if len(stack) > 1 else None
 
         def timings() -> dict[str, float]:
             with self._workspace.working("while drawing"):
-                return self.picture(resident, stack, where)[1].timings
+                return self.picture(resident, stack, into)[1].timings
 
         return timings
 

@@ -131,15 +131,24 @@ class Workspace:
 
     @contextmanager
     def working(self, doing: str) -> Iterator[None]:
-        """On the device, whose failures are those of what is done there.
+        """On the device, which is one thread's at a time: pictures that were drawn ahead may have to be drawn
+        again by who reads them.
+
+        Raises:
+            DeviceError: as `failing`.
+        """
+        with self._lock, self.failing(doing), load().ScopedDevice(self.device):
+            yield
+
+    @contextmanager
+    def failing(self, doing: str) -> Iterator[None]:
+        """Failures of the device are those of what is done there.
 
         Raises:
             DeviceError: the device fails.
         """
         try:
-            # pictures that were drawn ahead may have to be drawn again by who reads them, in any thread
-            with self._lock, load().ScopedDevice(self.device):
-                yield
+            yield
         except RuntimeError as error:
             if isinstance(error, DeviceError):
                 raise

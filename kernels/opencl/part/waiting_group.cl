@@ -127,7 +127,7 @@ static inline void waiting_push(Pixel *pixel, wide nearest, wide z, wide opacity
 #pragma unroll
     for (int k = 0; k < IN_REGISTERS; k++) {
         int from = min(k + 1, IN_REGISTERS - 1);
-        bool moves = k + 1 < IN_REGISTERS && waiting->z[from] <= z, here = !moves && waiting->z[k] <= z;
+        bool moves = k + 1 < IN_REGISTERS && waiting->z[from] <= z, here = waiting->z[k] <= z;
         waiting->opacity[k] = moves ? waiting->opacity[from] : here ? opacity : waiting->opacity[k];
         waiting->splat[k] = moves ? waiting->splat[from] : here ? splat : waiting->splat[k];
         waiting->z[k] = moves ? waiting->z[from] : here ? z : waiting->z[k];
@@ -165,11 +165,12 @@ static inline int waiting_end(Pixel *pixel, global const Splat *splats, const Bl
     waiting->from = waiting->until;
     waiting->from_splat = waiting->until_splat;
     waiting->until = INFINITY;
+    waiting->bounded = true;        // where nothing was dropped nothing is taken, if the list is gone through again for others
     return pixel_unfinished(pixel, constants);
 }
 //@ blend_arguments
                                 , splats, lists[batch + which], lists[batch + which]
-                                , staged[k + 1 < listed ? places[cell][k + 1] : length - 1].splat.nearest
+                                , staged[next].splat.nearest
 //@ pass
     local int again;
     do {

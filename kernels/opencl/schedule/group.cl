@@ -12,7 +12,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
     local Staged staged[STAGED];
     local uint cells[CELLS_Y * CELLS_STRIDE / 4];           // by row of cells, a byte for each splat: bits of the cells that it can touch
     local uint touched[CELLS_X * CELLS_Y][ITEMS];           // by cell and work-item: bits of a share of the staged splats
-    local uchar places[CELLS_X * CELLS_Y][STAGED];          // those that can touch a cell, in order
+    local uchar places[CELLS_X * CELLS_Y][CELLS_STRIDE];    // those that can touch a cell, in order
     local int alive;
     const BlendConstants constants = {log_cut, ceiling, stop, filter};
     uint tile = band_first + get_group_id(0), item = get_local_id(0);
@@ -70,8 +70,10 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
         bool unfinished = false;
         for (int row = 0; row < ROWS; row++) unfinished |= pixel_unfinished(&pixels[row], &constants) != 0;
         if (!unfinished) listed = 0;
+        uint next = places[cell][0];        // read one ahead; after the cell's last, the last of all
         for (uint k = 0; k < listed; k++) {
-            uint which = places[cell][k];
+            uint which = next;
+            next = k + 1 < listed ? places[cell][k + 1] : length - 1;
             Staged copy;
             for (int part = 0; part < VECTORS; part++) copy.words[part] = staged[which].words[part];
             const Splat s = copy.splat;
@@ -79,7 +81,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
             wide x = (wide)(px - s.ax);
             wide nu_x = FMA(s.nux, x, s.nu0), nv_x = FMA(s.nvx, x, s.nv0), d_x = FMA(s.dx, x, s.d0);
             for (int row = 0; row < ROWS; row++) {
-                if (!pixel_unfinished(&pixels[row], &constants)) continue;
+                if (!pixel_lit(&pixels[row], &constants)) continue;
                 wide y = (wide)(py + row - s.ay);
                 Crossing c = cross_row(&s, nu_x, nv_x, d_x, y, half_r2);
 //@@ cross

@@ -9,7 +9,7 @@
 #define BLOCK_X (CELLS_X / CELL_W)           // cells side by side of 8 that go in step, which are 8 pixels wide
 #define STAGED 128
 #define SHARE (STAGED / ITEMS)               // of the staged splats: 32
-#define CELLS_STRIDE (STAGED + 4)             // bytes; rows of cells lie in other banks
+#define CELLS_STRIDE (STAGED + 4)             // bytes; the next row, of one row of cells or one cell, lies in other banks
 #define CELLS_PAD 0.02f                      // of chords, in samples
 enum { VECTORS = sizeof(Splat) / 16 };       // of 16 bytes, in a record
 

@@ -1,6 +1,6 @@
 // For CPUs: one work-item draws one tile, a block of LANES pixels at a time; no barriers, no local memory.
 // Index space: one work-item (and work-group) per tile of each view.
-// Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 channels: r, g, b, transmittance) and the outputs' samples, whole tiles.
+// Reads:  splats, lists, starts[tiles + 1]. Writes: raw (4 channels: r, g, b, transmittance) and the outputs' samples, whole tiles; images where it resolves.
 // Splats of a tile lie anywhere in memory; the ones to come are fetched ahead.
 #define AHEAD_SPLATS 8
 
