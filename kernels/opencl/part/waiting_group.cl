@@ -170,7 +170,7 @@ static inline int waiting_end(Pixel *pixel, global const Splat *splats, const Bl
 }
 //@ blend_arguments
                                 , splats, lists[batch + which], lists[batch + which]
-                                , staged[next].splat.nearest
+                                , staged[k + 1 < listed ? places[cell][k + 1] : length - 1].splat.nearest
 //@ pass
     local int again;
     do {

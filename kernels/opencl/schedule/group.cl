@@ -70,10 +70,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
         bool unfinished = false;
         for (int row = 0; row < ROWS; row++) unfinished |= pixel_unfinished(&pixels[row], &constants) != 0;
         if (!unfinished) listed = 0;
-        uint next = places[cell][0];        // read one ahead; after the cell's last, the last of all
         for (uint k = 0; k < listed; k++) {
-            uint which = next;
-            next = k + 1 < listed ? places[cell][k + 1] : length - 1;
+            uint which = places[cell][k];
             Staged copy;
             for (int part = 0; part < VECTORS; part++) copy.words[part] = staged[which].words[part];
             const Splat s = copy.splat;
