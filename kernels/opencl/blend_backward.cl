@@ -51,19 +51,18 @@ typedef struct {            // of a pixel: the loss's derivatives
 //@@ loss
 } Loss;
 
-// LANES pixels of an image (h, w, channels) from column x on; 0 outside of it.
+// The pixels of a block at (x, y), of an image (h, w, channels); 0 outside of it.
 static inline vfloat pixels_of(global const float *image, int channels, int channel, int x, int y, int width, int height) {
-    float row[LANES];
-    global const float *from = image + (size_t)channels * (y * (size_t)width + x) + channel;
-    if (y < height && x + LANES <= width)
-        for (int lane = 0; lane < LANES; lane++) row[lane] = from[channels * lane];
-    else
-        for (int lane = 0; lane < LANES; lane++) row[lane] = y < height && x + lane < width ? from[channels * lane] : 0.0f;
-    return VLOAD(row);
+    float block[LANES];
+    for (int lane = 0; lane < LANES; lane++) {
+        int px = x + lane % BLOCK_W, py = y + lane / BLOCK_W;
+        block[lane] = px < width && py < height ? image[channels * (py * (size_t)width + px) + channel] : 0.0f;
+    }
+    return VLOAD(block);
 }
 
-typedef struct {            // sums over fragments of one column of pixels in each lane
-    vfloat nu, nu_y, nv, nv_y, d, d_y;
+typedef struct {            // sums over a lane's fragments
+    vfloat nu, nu_x, nu_y, nv, nv_x, nv_y, d, d_x, d_y;
     vfloat log_opacity, r, g, b;
 //@@ sums
 } Sums;
@@ -77,10 +76,10 @@ typedef struct {
 
 //@@ fragment_functions
 // The fragment's place on the splat, of the rows' forms and the low-pass's own.
-static inline Geometry geometry_of(const Splat *s, Crossing c, vfloat nu_x, vfloat nv_x, wide y, vfloat screen) {
+static inline Geometry geometry_of(const Splat *s, Crossing c, vfloat nu_x, vfloat nv_x, vfloat y, vfloat screen) {
     Geometry g;
-    g.nu = FMA((vfloat)s->nuy, (vfloat)y, nu_x);
-    g.nv = FMA((vfloat)s->nvy, (vfloat)y, nv_x);
+    g.nu = FMA((vfloat)s->nuy, y, nu_x);
+    g.nv = FMA((vfloat)s->nvy, y, nv_x);
     g.inverse_d = VSELECT((vfloat)0.0f, 1.0f / c.d, VMASK(c.d > 0.0f));
     g.half_rho = (c.q * g.inverse_d) * g.inverse_d;
     g.on_plane = fragment_on_plane(s, c, g.half_rho, screen);
@@ -102,9 +101,9 @@ static inline vfloat take_back(Loss *loss, vfloat worth, vfloat weight, vfloat o
     return weight * gain;
 }
 
-// Adds a fragment's derivatives. by_log: by ln(opacity); at: its row, relative to the anchor.
+// Adds a fragment's derivatives. by_log: by ln(opacity); (x, y): its place, relative to the anchor.
 static inline void add_fragment(Sums *sums, const Splat *s, const Loss *loss, const Geometry *g, vfloat weight, vfloat by_log,
-                                vfloat screen, wide y, const BlendConstants *constants) {
+                                vfloat screen, vfloat x, vfloat y, const BlendConstants *constants) {
     sums->r = FMA(weight, loss->r, sums->r);
     sums->g = FMA(weight, loss->g, sums->g);
     sums->b = FMA(weight, loss->b, sums->b);
@@ -116,11 +115,14 @@ static inline void add_fragment(Sums *sums, const Splat *s, const Loss *loss, co
     vfloat by_d = VSELECT((vfloat)0.0f, plane * g->half_rho, g->on_plane);
 //@@ fragment_backward
     sums->nu += by_nu;
-    sums->nu_y = FMA(by_nu, (vfloat)y, sums->nu_y);
+    sums->nu_x = FMA(by_nu, x, sums->nu_x);
+    sums->nu_y = FMA(by_nu, y, sums->nu_y);
     sums->nv += by_nv;
-    sums->nv_y = FMA(by_nv, (vfloat)y, sums->nv_y);
+    sums->nv_x = FMA(by_nv, x, sums->nv_x);
+    sums->nv_y = FMA(by_nv, y, sums->nv_y);
     sums->d += by_d;
-    sums->d_y = FMA(by_d, (vfloat)y, sums->d_y);
+    sums->d_x = FMA(by_d, x, sums->d_x);
+    sums->d_y = FMA(by_d, y, sums->d_y);
 }
 
 #if LANES == 16
@@ -140,17 +142,16 @@ static inline float lane_sum(vfloat x) { return (x.x + x.z) + (x.y + x.w); }
 #define lane_sum(x) (x)
 #endif
 
-// x: the lanes' columns, relative to the anchor.
-static inline Moments moments_of(const Sums *sums, const Splat *s, vfloat x, const BlendConstants *constants) {
+static inline Moments moments_of(const Sums *sums, const BlendConstants *constants) {
     Moments m = {0};        // padding too
     m.nu0 = lane_sum(sums->nu);
-    m.nux = lane_sum(sums->nu * x);
+    m.nux = lane_sum(sums->nu_x);
     m.nuy = lane_sum(sums->nu_y);
     m.nv0 = lane_sum(sums->nv);
-    m.nvx = lane_sum(sums->nv * x);
+    m.nvx = lane_sum(sums->nv_x);
     m.nvy = lane_sum(sums->nv_y);
     m.d0 = lane_sum(sums->d);
-    m.dx = lane_sum(sums->d * x);
+    m.dx = lane_sum(sums->d_x);
     m.dy = lane_sum(sums->d_y);
     m.log_opacity = lane_sum(sums->log_opacity);
     m.r = lane_sum(sums->r);

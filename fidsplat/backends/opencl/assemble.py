@@ -31,7 +31,18 @@ from fidsplat.kernel_files import kernels_folder
 
 _LISTS = {"ordered": ("scan", "sort", "bin"), "tiled": ("tiles",), "gathered": ("tiles", "gathered")}
 """stages of the program `lists`, by the way of listing"""
-_DRAWN = ("prelude", "math", "splat", "bounds", "project", "pack", "blend", "schedule/{}", "resolve")
+_DRAWN = (
+    "prelude",
+    "math",
+    "splat",
+    "bounds",
+    "project",
+    "pack",
+    "blend",
+    "schedule/{}_cells",
+    "schedule/{}",
+    "resolve",
+)
 """stages of the program `picture`, with the way in which a device walks tiles; only splats that are listed in
 order are packed"""
 _HOOK = re.compile(r"[ \t]*//@@ (\w+)(?: (\w+))?[ \t]*")

@@ -19,7 +19,7 @@ from fidsplat.backends.gradients import (
     gradient_shape,
 )
 from fidsplat.backends.opencl.counts import pairs_of
-from fidsplat.backends.opencl.gradients_source import assemble_gradients, chunk_of
+from fidsplat.backends.opencl.gradients_source import assemble_gradients, chunk_of, group_of
 from fidsplat.backends.opencl.images import OpenCLImages
 from fidsplat.backends.opencl.picture import Picture
 from fidsplat.backends.opencl.pipeline import OpenCLPipeline
@@ -88,7 +88,8 @@ class OpenCLGradients:
         tile = shape.tile_width * shape.tile_height
         picture.take("splat_slots", 4 * count)
         picture.take("moments", record * pairs)
-        picture.take("checkpoints", 4 * tile * (pairs // chunk_of(shape) + picture.tiles + 1))
+        chunks, in_groups = pairs // chunk_of(shape) + picture.tiles, shape.schedule == "group"
+        picture.take("checkpoints", (8 * tile if in_groups else 4 * (tile + shape.lanes)) * chunks)
         picture.take("tile_sums", 3 * real * picture.tiles)
         picture.take("group_sums", 6 * real * groups)
         reserved = picture.take("reserved", 4)
@@ -97,9 +98,16 @@ class OpenCLGradients:
         cl.enqueue_fill_buffer(picture.queue, reserved, _ZERO, 0, 4)
         if count:
             picture.launch("reserve", "reserve_slots", count, _GROUP, count=count)
-        group = shape.blend_items
-        ceiling = math.log(view.ceiling)
-        picture.launch("blend backward", "blend_backward", picture.tiles * group, group, log_ceiling=ceiling)
+        group, ceiling, groups_of_tiles = group_of(shape), math.log(view.ceiling), picture.tiles
+        if in_groups:
+            picture.take("reached", 4 * picture.tiles)
+            picture.take("chunk_tiles", 4 * chunks)
+            items = shape.blend_items
+            picture.launch("blend backward", "blend_light", picture.tiles * items, items, log_ceiling=ceiling)
+            groups_of_tiles = chunks
+        picture.launch(
+            "blend backward", "blend_backward", groups_of_tiles * group, group, log_ceiling=ceiling
+        )
         self._ask(drawn)
         if count:
             arrays: dict[str, Any] = {

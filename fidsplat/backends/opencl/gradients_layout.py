@@ -37,6 +37,12 @@ class BackwardLayout:
 _SIZE = takes("int width height  // of the picture")
 _TILES = takes("in uint2 windows", "uint big_capacity", "in Bounds big_bounds", _SIZE)
 
+_BLENDED = takes(
+    "wide log_cut ceiling stop filter",
+    *("float log_ceiling", "float background_r background_g background_b"),
+    *("int stride  // of the padded picture", "uint channel_stride", "in float by_rgb  // (h, w, 3)"),
+)
+
 KERNELS: dict[str, tuple[Argument, ...]] = {
     "reserve_slots": takes(
         *("uint count", "in uint keys", _TILES),
@@ -45,9 +51,7 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     "blend_backward": takes(
         *("in Splat splats", "in uint lists starts", _TILES, "in uint splat_slots"),
-        "wide log_cut ceiling stop filter",
-        *("float log_ceiling", "float background_r background_g background_b"),
-        *("int stride  // of the padded picture", "uint channel_stride", "in float by_rgb  // (h, w, 3)"),
+        _BLENDED,
         "out float checkpoints  // tiles' transmittances in front of every CHUNK splats",
         "out float moments  // of the record Moments, by slots",
         "out real tile_sums  // (tiles, 3) by the background",
@@ -64,6 +68,22 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
     ),
     "add_up": takes("uint rows columns", "in real parts  // (rows, columns)", "out float sums  // (columns)"),
 }
+
+GROUP_KERNELS: dict[str, tuple[Argument, ...]] = {
+    "blend_light": takes(
+        *("in Splat splats", "in uint lists starts", _SIZE, _BLENDED),
+        "out float checkpoints  // of each pixel of CHUNK splats: light in front, its worth behind",
+        "out uint reached  // (tiles) chunks that light comes to",
+        "out uint chunk_tiles  // the tiles of chunks",
+        "out real tile_sums  // (tiles, 3) by the background",
+    ),
+    "blend_backward": takes(
+        *("in Splat splats", "in uint lists starts", _TILES, "in uint splat_slots", _BLENDED),
+        *("in float checkpoints", "in uint reached chunk_tiles"),
+        "out float moments  // of the record Moments, by slots",
+    ),
+}
+"""Where work-groups share a tile."""
 
 LAYOUTS: dict[str, BackwardLayout] = {
     "camera_pinhole": BackwardLayout(),

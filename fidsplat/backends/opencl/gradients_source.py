@@ -15,22 +15,33 @@ from fidsplat.backends.opencl.assemble import (
 )
 from fidsplat.backends.opencl.declare import Argument, Record, member
 from fidsplat.backends.opencl.effect_layouts import LAYOUTS as DRAWN
-from fidsplat.backends.opencl.gradients_layout import KERNELS, LAYOUTS, MOMENTS, BackwardLayout
+from fidsplat.backends.opencl.gradients_layout import GROUP_KERNELS, KERNELS, LAYOUTS, MOMENTS, BackwardLayout
 from fidsplat.backends.opencl.shapes import DeviceShape
 from fidsplat.effects import FeatureSet
 
-_STAGES = ("prelude", "math", "splat", "bounds", "blend_backward", "schedule/{}_backward", "project_backward")
+_STAGES = (
+    "prelude",
+    "math",
+    "splat",
+    "bounds",
+    "blend_backward",
+    "schedule/{}_cells",
+    "schedule/{}_backward",
+    "project_backward",
+)
 
 
 def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> Source:
     """The source of the derivatives of these features on a device of this shape."""
     layouts = [LAYOUTS[name] for name in layouts_of(features) if name in LAYOUTS]
-    declared = _Declarations(features, layouts)
+    declared = _Declarations(
+        features, layouts, KERNELS | GROUP_KERNELS if shape.schedule == "group" else KERNELS
+    )
     # of what is drawn the ways of drawing are needed again, of outputs only their derivatives
     slots = (name for slot in features.slots for name in (slot, *DRAWN[slot].parts))
     files = [DRAWN[name].file for name in dict.fromkeys(slots)]
     files += [layout.file for layout in layouts]
-    numbers = numbers_of(features, shape) | {"CHUNK": chunk_of(shape)}
+    numbers = numbers_of(features, shape) | {"BACK_ITEMS": group_of(shape), "CHUNK": chunk_of(shape)}
     writer = Writer([file for file in files if file], declared, numbers)
     text = writer.program("gradients", [stage.format(shape.schedule) for stage in _STAGES])
     arguments = {kernel: declared.arguments(kernel) for kernel in kernels_in(text)}
@@ -39,16 +50,26 @@ def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> Source:
 
 def chunk_of(shape: DeviceShape) -> int:
     """Splats of a tile's list that are walked forward and then back: on GPUs a column of a splat's pixels for
-    each work-item, on CPUs what a core's second cache holds the fragments of."""
-    return 128 if shape.schedule == "lanes" else shape.blend_items // shape.tile_width
+    each work-item, on CPUs at least, where they touch all of a tile: their fragments fill half of a core's
+    second cache."""
+    if shape.schedule == "lanes":
+        return 128
+    return group_of(shape) // shape.tile_width
+
+
+def group_of(shape: DeviceShape) -> int:
+    """Work-items that take a chunk of a tile's list back."""
+    return 1 if shape.schedule == "lanes" else min(shape.tile_width * shape.tile_height, 256)
 
 
 class _Declarations(Declarations):
     """What gradients_layout.py declares beside the records of the picture."""
 
-    def __init__(self, features: FeatureSet, layouts: list[BackwardLayout]) -> None:
+    def __init__(
+        self, features: FeatureSet, layouts: list[BackwardLayout], kernels: dict[str, tuple[Argument, ...]]
+    ) -> None:
         super().__init__(layouts_of(features), features)
-        self._backward = layouts
+        self._backward, self._kernels = layouts, kernels
         moments = MOMENTS.with_members(one for layout in layouts for one in layout.moments)
         names = [name for one in moments.members for name, _ in one.names]
         # with as many fields of padding
@@ -59,6 +80,7 @@ class _Declarations(Declarations):
     def arguments(self, kernel: str) -> tuple[Argument, ...]:
         """Its own, then those of the effects in their order."""
         added: list[Argument] = []
-        if kernel in ("blend_backward", "project_backward"):
-            added += (one for layout in self._backward for one in getattr(layout, kernel))
-        return (*KERNELS[kernel], *added)
+        if kernel in ("blend_light", "blend_backward", "project_backward"):
+            stage = "blend_backward" if kernel == "blend_light" else kernel
+            added += (one for layout in self._backward for one in getattr(layout, stage))
+        return (*self._kernels[kernel], *added)

@@ -2,7 +2,7 @@
 //@ loss
     vfloat depth, depth_weight;
 //@ loss_start
-        vfloat depth_sum = VLOAD(depth_raw + at), weight_sum = VLOAD(depth_raw + channel_stride + at);
+        vfloat depth_sum = BLOCK_LOAD(depth_raw + at, stride), weight_sum = BLOCK_LOAD(depth_raw + channel_stride + at, stride);
         vint has_depth = VMASK(weight_sum > 0.0f);
         weight_sum = VSELECT((vfloat)1.0f, weight_sum, has_depth);
         loss->depth = VSELECT((vfloat)0.0f, pixels_of(by_depth, 1, 0, x, y, width, height) / weight_sum, has_depth);

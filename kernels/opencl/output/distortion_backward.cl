@@ -6,10 +6,10 @@
     vfloat distortion, spread_first, spread_weight, spread_sum, spread_squares;
 //@ loss_start
         loss->distortion = pixels_of(by_distortion, 1, 0, x, y, width, height);
-        loss->spread_first = VLOAD(distortion_raw + at);
-        loss->spread_weight = VLOAD(distortion_raw + channel_stride + at);
-        loss->spread_sum = VLOAD(distortion_raw + 2 * (size_t)channel_stride + at);
-        loss->spread_squares = VLOAD(distortion_raw + 3 * (size_t)channel_stride + at);
+        loss->spread_first = BLOCK_LOAD(distortion_raw + at, stride);
+        loss->spread_weight = BLOCK_LOAD(distortion_raw + channel_stride + at, stride);
+        loss->spread_sum = BLOCK_LOAD(distortion_raw + 2 * (size_t)channel_stride + at, stride);
+        loss->spread_squares = BLOCK_LOAD(distortion_raw + 3 * (size_t)channel_stride + at, stride);
 //@ worth
     vint spreads = VMASK(g->z > 0.0f);
     vfloat nearer = INVERSE_DEPTH / max(g->z, (vfloat)SPREAD_NEAR) - loss->spread_first;

@@ -2,8 +2,8 @@
 //@ loss
     vfloat normal_x, normal_y, normal_z;
 //@ loss_start
-        vfloat nx = VLOAD(normal_raw + at), ny = VLOAD(normal_raw + channel_stride + at);
-        vfloat nz = VLOAD(normal_raw + 2 * (size_t)channel_stride + at);
+        vfloat nx = BLOCK_LOAD(normal_raw + at, stride), ny = BLOCK_LOAD(normal_raw + channel_stride + at, stride);
+        vfloat nz = BLOCK_LOAD(normal_raw + 2 * (size_t)channel_stride + at, stride);
         vfloat normal_length = sqrt(nx * nx + ny * ny + nz * nz);
         vint has_normal = VMASK(normal_length > 0.0f);
         vfloat normal_scale = VSELECT((vfloat)0.0f, 1.0f / normal_length, has_normal);

@@ -1,17 +1,18 @@
-// For GPUs: one work-group takes a tile back, CHUNK splats at a time of STAGED that are fetched at once. A work-item walks its ROWS
-// pixels through the chunk, forward and back, and leaves in local memory what each fragment takes and what its opacity is worth; then
-// it adds up one column of pixels of one splat. So no sum runs across work-items but that of a splat's columns, in a fixed order and
-// without atomics. Most splats have few of a tile's pixels: each walks through those alone in whose bounds it lies, and columns
-// beyond a splat's are not added. Barriers stand in loops whose bounds are the same for the whole group.
-// Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile.
-// Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, splat_slots, and the images' derivatives.
-// Writes: moments, a slot for each splat of the tile; tile_sums. Uses up: checkpoints.
-#define GROUP (TILE_W * TILE_H / ROWS)
-#define STAGED (CHUNK < 8 ? 4 * CHUNK : 32) // no more than GROUP, and bits of a word
-#define OF_CHUNK ((2u << (CHUNK - 1)) - 1u)
+// For GPUs, in two kernels. `blend_light` walks each tile's list once, as blending does, and keeps of every CHUNK splats, pixel by pixel,
+// the light that comes to them and what light is worth that passes them. Those known, chunks have nothing to do with each other: of
+// `blend_backward` a work-group takes one of them back, so that a long list occupies as many groups as it has chunks. No sum
+// runs across work-items but those of a splat's parts, in a fixed order and without atomics.
+// Barriers stand where the whole group comes to them.
 #define PIXELS (TILE_W * TILE_H)
-#define STRIDE (PIXELS + TILE_W)   // of one splat's fragments: neighbours among the splats lie in other banks
-#define PARTS (GROUP + 1)          // of one field's sums: neighbours among the fields lie in other banks
+#define PARTS (GROUP + 1)                    // of one field's sums: neighbours among the fields lie in other banks
+#define AHEAD_CHUNKS 8                       // that are fetched at once
+#define AT_ONCE 2                            // splats of a cell's list
+
+static inline Splat copy_of(local const Staged *staged) {
+    Staged copy;
+    for (int part = 0; part < VECTORS; part++) copy.words[part] = staged->words[part];
+    return copy.splat;
+}
 
 static inline Crossing cross_at(const Splat *s, int px, int py, const BlendConstants *constants, wide *x, wide *y,
                                 wide *nu_x, wide *nv_x, wide *half_r2) {
@@ -23,50 +24,59 @@ static inline Crossing cross_at(const Splat *s, int px, int py, const BlendConst
     return cross_row(s, *nu_x, *nv_x, FMA(s->dx, *x, s->d0), *y, *half_r2);
 }
 
+typedef struct {            // of a splat at a pixel, whether light comes there or not
+    wide opacity, worth;
+    int mask;
+} Met;
+
+static inline Met meet(const Splat *s, int px, int py, const Loss *loss, const BlendConstants *constants) {
+    wide x, y, nu_x, nv_x, half_r2, screen;
+    Crossing c = cross_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
+    Met met;
+    met.mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
+    met.opacity = fragment_opacity(s, fragment_half_rho(s, c, 1.0f / c.d, screen), constants->ceiling);
+    const Geometry g = geometry_of(s, c, nu_x, nv_x, y, screen);
+    met.worth = fragment_worth(s, loss, &g);
+    return met;
+}
+
 // Lets the splat take its light at a pixel; returns its opacity there.
 static inline wide walk_fragment(const Splat *s, int px, int py, Pixel *pixel, const BlendConstants *constants) {
-    if (px < s->x0 || px >= s->x1 || py < s->y0 || py >= s->y1 || !(pixel->t > constants->stop)) return 0.0f;
     wide x, y, nu_x, nv_x, half_r2, screen;
     Crossing c = cross_at(s, px, py, constants, &x, &y, &nu_x, &nv_x, &half_r2);
     int mask = fragment_mask(s, c, x, y, half_r2, constants->filter, &screen);
     if (!VANY(mask)) return 0.0f;
-    wide opacity = fragment_opacity(s, fragment_half_rho(s, c, 1.0f / c.d, screen), constants->ceiling);
-    return take_light(pixel, opacity, mask, constants);
+    return take_light(pixel, fragment_opacity(s, fragment_half_rho(s, c, 1.0f / c.d, screen), constants->ceiling), mask, constants);
 }
 
-// For each column of the tile, then each row, the staged splats in whose bounds it lies, as bits.
-static inline void find_bounds(local const Splat *staged, uint length, int left, int top, uint item, local uint *bounds) {
-    for (uint k = item; k < TILE_W + TILE_H; k += GROUP) {
-        bool across = k < TILE_W;
-        int at = across ? left + (int)k : top + (int)k - TILE_W;
-        uint bits = 0;
-        for (uint place = 0; place < length; place++) {
-            local const Splat *s = &staged[place];
-            int low = across ? s->x0 : s->y0, high = across ? s->x1 : s->y1;
-            if (at >= low && at < high) bits |= 1u << place;
-        }
-        bounds[k] = bits;
-    }
-}
-
-kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
-//@@ arguments blend_backward
+// Index space: work-groups of TILE_W * TILE_H / ROWS, one per tile.
+// Reads:  splats, lists, starts[tiles + 1], and the images' derivatives.
+// Writes: checkpoints, of each pixel of each chunk that light comes to; reached, chunk_tiles; tile_sums.
+kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_light(
+//@@ arguments blend_light
 ) {
-    local Splat staged[STAGED];
-    local float weights[CHUNK * STRIDE], by_logs[CHUNK * STRIDE];   // by splat and pixel: opacity and light, then these
-    local float parts[PARTS * FIELDS];
-    local Loss shared[PIXELS];
-    local uint places[STAGED], bounds[TILE_W + TILE_H], reached;
+    local Staged staged[STAGED];
+    local uint cells[CELLS_Y * CELLS_STRIDE / 4];           // by row of cells, a byte for each splat: bits of the cells that it can touch
+    local uint touched[CELLS_X * CELLS_Y][ITEMS];           // by cell and work-item: bits of a share of the staged splats
+    local uchar places[CELLS_X * CELLS_Y][STAGED];          // those that can touch a cell, in order
+    local float parts[3 * PARTS];
     local int alive;
+    local uint most;
     const BlendConstants constants = {log_cut, ceiling, stop, filter, log_ceiling};
     uint number = get_group_id(0), item = get_local_id(0);
     int tiles_x = (width + TILE_W - 1) / TILE_W;
-    int tile_column = (int)(number % (uint)tiles_x), tile_row = (int)(number / (uint)tiles_x);
-    uint start = starts[number], end = starts[number + 1];
-    // neighbours in a group take neighbours in a row; its pixels lie one below the other
-    int column = item % TILE_W, top = item / TILE_W * ROWS, px = tile_column * TILE_W + column, py = tile_row * TILE_H + top;
+    int x0 = (int)(number % (uint)tiles_x) * TILE_W, y0 = (int)(number / (uint)tiles_x) * TILE_H;
+    uint block = item / 32, part = item % 32 / ITEMS, own = item % ITEMS;
+    uint cell_x = block % CELL_W * BLOCK_X + part % BLOCK_X, cell_y = block / CELL_W * CELL_W + part / BLOCK_X;
+    uint cell = cell_y * CELLS_X + cell_x;
+    int column = (int)(cell_x * CELL_W + own % CELL_W), top = (int)(cell_y * CELL_H + own / CELL_W * ROWS);
+    int px = x0 + column, py = y0 + top;
+    uint start = starts[number], end = starts[number + 1], first_chunk = start / CHUNK + number;
+    for (uint k = first_chunk + item; k <= end / CHUNK + number; k += GROUP) chunk_tiles[k] = number;
 
     Loss losses[ROWS];
+    Pixel pixels[ROWS];
+    vfloat lights[ROWS], worths[ROWS];
     for (int row = 0; row < ROWS; row++) {
         Loss *loss = &losses[row];
         int x = px, y = py + row;
@@ -76,45 +86,91 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
         loss->b = pixels_of(by_rgb, 3, 2, x, y, width, height);
         loss->behind = FMA(loss->r, (vfloat)background_r, FMA(loss->g, (vfloat)background_g, loss->b * background_b));
 //@@ loss_start
-        shared[(top + row) * TILE_W + column] = *loss;
+        // outside of the picture nothing is drawn
+        pixel_start(&pixels[row], x < width && y < height ? 1.0f : 0.0f);
+        lights[row] = pixels[row].t;
+        worths[row] = 0.0f;
     }
+    global float2 *kept = (global float2 *)checkpoints + (size_t)first_chunk * PIXELS + top * TILE_W + column;
+    uint chunk = 0, lit = 0;        // the chunk that is walked; those that light of this work-item's pixels comes to
+    if (item == 0) most = 0;
 
-    // forward: the light in front of each chunk
-    Pixel pixels[ROWS];
-    for (int row = 0; row < ROWS; row++) pixel_start(&pixels[row], 1.0f);
-    global float *own = checkpoints + (size_t)(start / CHUNK + number) * PIXELS + top * TILE_W + column;
-    uint lit = 0;               // chunks that light of this work-item's pixels comes to
-    if (item == 0) reached = 0;
-    for (uint first = start; first < end; first += STAGED) {
-        uint length = min(end - first, (uint)STAGED);
+    for (uint batch = start; batch < end; batch += STAGED) {
+        uint length = min(end - batch, (uint)STAGED);
         barrier(CLK_LOCAL_MEM_FENCE);
         if (item == 0) alive = 0;
+        for (uint word = item; word < length * VECTORS; word += GROUP) {
+            uint which = word / VECTORS, part = word % VECTORS;
+            staged[which].words[part] = ((global const float4 *)(splats + lists[batch + which]))[part];
+        }
         barrier(CLK_LOCAL_MEM_FENCE);
-        if (item < length) staged[item] = splats[lists[first + item]];
-        for (int row = 0; row < ROWS; row++)
-            if (px < width && py + row < height && pixels[row].t > stop) alive = 1;
+        bool unfinished = false;
+        for (int row = 0; row < ROWS; row++) unfinished |= pixels[row].t > stop;
+        if (unfinished) alive = 1;
+        for (uint which = item; which < length; which += GROUP) {
+            local const Splat *s = &staged[which].splat;
+            touched_cells(s, x0, y0, s->log_opacity - constants.log_cut, constants.filter, (local uchar *)cells + which);
+        }
         barrier(CLK_LOCAL_MEM_FENCE);
         if (!alive) break;
-        find_bounds(staged, length, tile_column * TILE_W, tile_row * TILE_H, item, bounds);
+        uint bits = 0, listed = 0, before = 0;
+        for (uint k = 0; k < SHARE / 4; k++) {
+            uint four = cells[cell_y * (CELLS_STRIDE / 4) + own * (SHARE / 4) + k] >> cell_x & 0x01010101u;
+            bits |= (four * 0x01020408u >> 24 & 15u) << (4 * k);
+        }
+        uint first = own * SHARE, rest = max(length, first) - first;
+        if (rest < SHARE) bits &= (1u << rest) - 1u;
+        touched[cell][own] = bits;
         barrier(CLK_LOCAL_MEM_FENCE);
-        uint mine = 0;
-        for (int row = 0; row < ROWS; row++) mine |= bounds[TILE_W + top + row];
-        mine &= bounds[column];
-        for (uint base = 0; base < length; base += CHUNK) {
-            uint chunk = (first - start + base) / CHUNK;
-            for (int row = 0; row < ROWS; row++) {
-                own[(size_t)chunk * PIXELS + row * TILE_W] = pixel_light(&pixels[row]);
-                if (px < width && py + row < height && pixels[row].t > stop) lit = chunk + 1;
+        for (uint other = 0; other < ITEMS; other++) {
+            if (other == own) before = listed;
+            listed += popcount(touched[cell][other]);
+        }
+        for (; bits != 0; bits &= bits - 1) places[cell][before++] = (uchar)(own * SHARE + 31 - clz(bits & -bits));
+        barrier(CLK_LOCAL_MEM_FENCE);
+        if (!unfinished) listed = 0;
+        uint beyond = (batch - start + length + CHUNK - 1) / CHUNK;      // of the batch's chunks
+        for (uint k = 0; k <= listed; k += AT_ONCE) {
+            // what they are depends on no light: side by side, where light then goes from one to the next
+            uint which[AT_ONCE];
+            Met met[AT_ONCE][ROWS];
+            for (int next = 0; next < AT_ONCE; next++) {
+                which[next] = k + next < listed ? places[cell][k + next] : 0;
+                const Splat s = copy_of(&staged[which[next]]);
+                for (int row = 0; row < ROWS; row++) met[next][row] = meet(&s, px, py + row, &losses[row], &constants);
             }
-            for (uint bits = mine >> base & OF_CHUNK; bits != 0; bits &= bits - 1) {
-                const Splat s = staged[base + 31 - clz(bits & -bits)];
-                for (int row = 0; row < ROWS; row++) walk_fragment(&s, px, py + row, &pixels[row], &constants);
+            for (int next = 0; next < AT_ONCE; next++) {
+                // what the chunks hold that are over
+                for (uint to = k + next < listed ? (batch - start + which[next]) / CHUNK : beyond; chunk < to; chunk++)
+                    for (int row = 0; row < ROWS; row++) {
+                        kept[(size_t)chunk * PIXELS + row * TILE_W] = (float2)(lights[row], worths[row]);
+                        if (lights[row] > stop) lit = chunk + 1;
+                        lights[row] = pixel_light(&pixels[row]);
+                        worths[row] = 0.0f;
+                    }
+                if (k + next >= listed) break;
+                for (int row = 0; row < ROWS; row++) {
+                    wide light = pixels[row].t, drawn = take_light(&pixels[row], met[next][row].opacity, met[next][row].mask, &constants);
+                    worths[row] = FMA(light * drawn, met[next][row].worth, worths[row]);
+                }
             }
         }
     }
-    atomic_max(&reached, lit);
+    atomic_max(&most, lit);
     barrier(CLK_LOCAL_MEM_FENCE);
-    const uint chunks = reached;
+    // what light is worth behind each chunk: where a pixel is finished, what there is behind all splats
+    for (int row = 0; row < ROWS; row++) {
+        vfloat behind = losses[row].behind, shown = pixels[row].t * behind;
+        for (int last = (int)most - 1; last >= 0; last -= AHEAD_CHUNKS) {
+            float2 known[AHEAD_CHUNKS];
+            for (int k = 0; k < AHEAD_CHUNKS; k++) known[k] = kept[(size_t)max(last - k, 0) * PIXELS + row * TILE_W];
+            for (int k = 0; k < min(AHEAD_CHUNKS, last + 1); k++) {
+                kept[(size_t)(last - k) * PIXELS + row * TILE_W].y = behind;
+                shown += known[k].y;
+                behind = known[k].x > stop ? shown / known[k].x : losses[row].behind;
+            }
+        }
+    }
     float behind_r = 0, behind_g = 0, behind_b = 0;
     for (int row = 0; row < ROWS; row++) {
         behind_r = FMA((float)pixels[row].t, (float)losses[row].r, behind_r);
@@ -125,88 +181,151 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
     parts[PARTS + item] = behind_g;
     parts[2 * PARTS + item] = behind_b;
     barrier(CLK_LOCAL_MEM_FENCE);
+    if (item == 0) reached[number] = most;
     if (item < 3) {
         real sum = 0;
         for (uint other = 0; other < GROUP; other++) sum += parts[item * PARTS + other];
         tile_sums[3 * number + item] = sum;
     }
+}
 
-    // splats behind the last chunk have nothing to do with the picture
-    for (uint k = start + chunks * CHUNK + item; k < end; k += GROUP) {
-        uint slot = splat_slots[lists[k]] + tile_rank(windows[lists[k]], big_bounds, tile_column, tile_row, width, height);
-        for (uint field = 0; field < FIELDS; field++) moments[(size_t)slot * FIELDS + field] = 0.0f;
+#undef GROUP
+#undef PARTS
+#define GROUP BACK_ITEMS
+#define PARTS (GROUP + 1)
+#define EACH (PIXELS / GROUP)                // pixels of a work-item
+#define PATCH_W 8                            // of 32 work-items, which go in step
+#define PATCH_H (4 * EACH)
+#define PATCHES_X (TILE_W / PATCH_W)
+#define PATCHES (PIXELS / (PATCH_W * PATCH_H))
+#define SHARE_OF_SPLAT (GROUP / CHUNK)       // work-items that add up a splat's fragments: a tile's width
+#define STRIDE (PIXELS + TILE_W)             // of one splat's fragments: neighbours among the splats lie in other banks
+#define SCRATCH (2 * CHUNK * STRIDE > PARTS * FIELDS ? 2 * CHUNK * STRIDE : PARTS * FIELDS)
+
+// Index space: work-groups of GROUP, one per chunk of a tile's list.
+// Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, splat_slots, checkpoints, reached, chunk_tiles, and the images'
+// derivatives. Writes: moments, a slot for each splat of each tile.
+kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_backward(
+//@@ arguments blend_backward
+) {
+    local Staged staged[CHUNK];
+    local float scratch[SCRATCH];
+    local float2 *fragments = (local float2 *)scratch;      // by splat and pixel: light and opacity, then weight and derivative
+    local Loss shared[PIXELS];
+    local uint slots[CHUNK], within[PATCHES];               // as bits, the splats whose bounds meet a patch
+    const BlendConstants constants = {log_cut, ceiling, stop, filter, log_ceiling};
+    uint id = get_group_id(0), item = get_local_id(0);
+    int tiles_x = (width + TILE_W - 1) / TILE_W, tiles_y = (height + TILE_H - 1) / TILE_H, tiles = tiles_x * tiles_y;
+    if (id >= starts[tiles] / CHUNK + tiles) return;
+    uint number = chunk_tiles[id], start = starts[number], end = starts[number + 1];
+    uint chunk = id - (start / CHUNK + number), first = start + chunk * CHUNK;
+    if (first >= end) return;
+    uint count = min(end - first, (uint)CHUNK);
+    int tile_column = (int)(number % (uint)tiles_x), tile_row = (int)(number / (uint)tiles_x);
+    int x0 = tile_column * TILE_W, y0 = tile_row * TILE_H;
+
+    for (uint word = item; word < count * VECTORS; word += GROUP) {
+        uint which = word / VECTORS, part = word % VECTORS;
+        staged[which].words[part] = ((global const float4 *)(splats + lists[first + which]))[part];
     }
-    // back, chunk by chunk
-    for (uint block = (chunks * CHUNK + STAGED - 1) / STAGED; block-- > 0;) {
-        uint first = start + block * STAGED, length = min(min(end, start + chunks * CHUNK) - first, (uint)STAGED);
-        barrier(CLK_LOCAL_MEM_FENCE);
-        if (item < length) {
-            uint index = lists[first + item];
-            staged[item] = splats[index];
-            places[item] = splat_slots[index] + tile_rank(windows[index], big_bounds, tile_column, tile_row, width, height);
+    for (uint which = GROUP - 1 - item; which < count; which += GROUP) {
+        uint index = lists[first + which];
+        slots[which] = splat_slots[index] + tile_rank(windows[index], big_bounds, tile_column, tile_row, width, height);
+    }
+    if (item < PATCHES) within[item] = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (chunk >= reached[number]) {          // no light comes here
+        for (uint cell = item; cell < count * FIELDS; cell += GROUP)
+            moments[(size_t)slots[cell / FIELDS] * FIELDS + cell % FIELDS] = 0.0f;
+        return;
+    }
+    for (uint cell = item; cell < PATCHES * count; cell += GROUP) {
+        uint patch = cell % PATCHES, which = cell / PATCHES;
+        int left = x0 + (int)(patch % PATCHES_X) * PATCH_W, top = y0 + (int)(patch / PATCHES_X) * PATCH_H;
+        local const Splat *s = &staged[which].splat;
+        if (s->x0 < left + PATCH_W && s->x1 > left && s->y0 < top + PATCH_H && s->y1 > top) atomic_or(&within[patch], 1u << which);
+    }
+    uint patch = item / 32, in_patch = item % 32;
+    int column = (int)(patch % PATCHES_X * PATCH_W + in_patch % PATCH_W), px = x0 + column;
+    int top = (int)(patch / PATCHES_X * PATCH_H + in_patch / PATCH_W);
+    Loss losses[EACH];
+    Pixel pixels[EACH];
+    for (int each = 0; each < EACH; each++) {
+        Loss *loss = &losses[each];
+        int x = px, y = y0 + top + 4 * each;
+        size_t at = y * (size_t)stride + x, mine = (top + 4 * each) * TILE_W + column;
+        loss->r = pixels_of(by_rgb, 3, 0, x, y, width, height);
+        loss->g = pixels_of(by_rgb, 3, 1, x, y, width, height);
+        loss->b = pixels_of(by_rgb, 3, 2, x, y, width, height);
+        loss->behind = FMA(loss->r, (vfloat)background_r, FMA(loss->g, (vfloat)background_g, loss->b * background_b));
+//@@ loss_start
+        float2 kept = ((global const float2 *)checkpoints)[(size_t)id * PIXELS + mine];
+        loss->behind = kept.y;
+        shared[mine] = *loss;
+        pixel_start(&pixels[each], kept.x);
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+
+    const uint mine = within[patch];
+    for (uint bits = mine; bits != 0; bits &= bits - 1) {
+        uint which = 31 - clz((int)(bits & -bits));
+        const Splat s = copy_of(&staged[which]);
+        for (int each = 0; each < EACH; each++) {
+            int y = y0 + top + 4 * each;
+            wide light = 0.0f, opacity = 0.0f;
+            if (pixels[each].t > stop && px >= s.x0 && px < s.x1 && y >= s.y0 && y < s.y1) {
+                light = pixels[each].t;
+                opacity = walk_fragment(&s, px, y, &pixels[each], &constants);
+            }
+            fragments[which * STRIDE + (top + 4 * each) * TILE_W + column] = (float2)(light, opacity);
         }
-        barrier(CLK_LOCAL_MEM_FENCE);
-        find_bounds(staged, length, tile_column * TILE_W, tile_row * TILE_H, item, bounds);
-        barrier(CLK_LOCAL_MEM_FENCE);
-        for (uint chunk = (length + CHUNK - 1) / CHUNK; chunk-- > 0;) {
-            uint base = chunk * CHUNK, count = min(length - base, (uint)CHUNK);
-            for (int row = 0; row < ROWS; row++) {
-                uint mine = (top + row) * TILE_W + column;
-                uint within = (bounds[column] & bounds[TILE_W + top + row]) >> base & OF_CHUNK;
-                Pixel pixel;
-                pixel_start(&pixel, own[(size_t)(block * (STAGED / CHUNK) + chunk) * PIXELS + row * TILE_W]);
-                for (uint bits = within; bits != 0; bits &= bits - 1) {
-                    uint place = 31 - clz(bits & -bits);
-                    const Splat s = staged[base + place];
-                    weights[place * STRIDE + mine] = pixel.t;
-                    by_logs[place * STRIDE + mine] = walk_fragment(&s, px, py + row, &pixel, &constants);
-                }
-                for (uint bits = within, place; bits != 0; bits ^= 1u << place) {
-                    place = 31 - clz(bits);
-                    wide opacity = by_logs[place * STRIDE + mine], weight = weights[place * STRIDE + mine] * opacity, by_log = 0.0f;
-                    if (opacity > 0.0f) {
-                        const Splat s = staged[base + place];
-                        wide x, y, nu_x, nv_x, half_r2, screen;
-                        Crossing c = cross_at(&s, px, py + row, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
-                        fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
-                        const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, screen);
-                        by_log = take_back(&losses[row], fragment_worth(&s, &losses[row], &g), weight, opacity);
-                    }
-                    weights[place * STRIDE + mine] = weight;
-                    by_logs[place * STRIDE + mine] = by_log;
-                }
-            }
-            barrier(CLK_LOCAL_MEM_FENCE);
-            // a column of a splat
-            uint place = item / TILE_W;
-            if (place < count && (bounds[column] >> (base + place) & 1u)) {
-                const Splat s = staged[base + place];
-                Sums sums = {0};
-                wide x = (wide)(px - s.ax);
-                int above = tile_row * TILE_H, last = min(s.y1 - above, TILE_H);
-                for (int row = max(s.y0 - above, 0); row < last; row++) {
-                    uint at = row * TILE_W + column;
-                    wide weight = weights[place * STRIDE + at], by_log = by_logs[place * STRIDE + at];
-                    if (weight == 0.0f) continue;
-                    wide y, nu_x, nv_x, half_r2, screen;
-                    Crossing c = cross_at(&s, px, above + row, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
-                    fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
-                    const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, screen);
-                    const Loss loss = shared[at];
-                    add_fragment(&sums, &s, &loss, &g, weight, by_log, screen, y, &constants);
-                }
-                const Moments m = moments_of(&sums, &s, x, &constants);
-                for (uint field = 0; field < FIELDS; field++) parts[field * PARTS + item] = ((const float *)&m)[field];
-            }
-            barrier(CLK_LOCAL_MEM_FENCE);
-            for (uint cell = item; cell < count * FIELDS; cell += GROUP) {
-                uint field = cell % FIELDS, splat = cell / FIELDS;
-                int before = tile_column * TILE_W, beyond = min(staged[base + splat].x1 - before, TILE_W);
-                float sum = 0;
-                for (int other = max(staged[base + splat].x0 - before, 0); other < beyond; other++)
-                    sum += parts[field * PARTS + splat * TILE_W + other];
-                moments[(size_t)places[base + splat] * FIELDS + field] = sum;
-            }
+    }
+    for (uint bits = mine, which; bits != 0; bits ^= 1u << which) {
+        which = 31 - clz((int)bits);
+        for (int each = 0; each < EACH; each++) {
+            local float2 *at = &fragments[which * STRIDE + (top + 4 * each) * TILE_W + column];
+            float2 here = *at;
+            if (here.y > 0.0f) {
+                const Splat s = staged[which].splat;
+                wide weight = here.x * here.y, x, y, nu_x, nv_x, half_r2, screen;
+                Crossing c = cross_at(&s, px, y0 + top + 4 * each, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
+                fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
+                const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, screen);
+                *at = (float2)(weight, take_back(&losses[each], fragment_worth(&s, &losses[each], &g), weight, here.y));
+            } else
+                (*at).x = 0.0f;
         }
+    }
+    barrier(CLK_LOCAL_MEM_FENCE);
+
+    // work-items of a splat have a column each, and of narrow ones the rows by turns
+    uint which = item / SHARE_OF_SPLAT;
+    Sums sums = {0};
+    if (which < count) {
+        const Splat s = copy_of(&staged[which]);
+        int left = max(s.x0 - x0, 0), right = min(s.x1 - x0, TILE_W), below = min(s.y1 - y0, TILE_H), across = right - left;
+        int turns = across > SHARE_OF_SPLAT / 2 ? 1 : across > SHARE_OF_SPLAT / 4 ? 2 : 4, columns = SHARE_OF_SPLAT / turns;
+        int share = item % SHARE_OF_SPLAT, column = left + share % columns;
+        for (int row = column < right ? max(s.y0 - y0, 0) + share / columns : below; row < below; row += turns) {
+            uint at = row * TILE_W + column;
+            float2 here = fragments[which * STRIDE + at];
+            if (here.x == 0.0f) continue;
+            wide x, y, nu_x, nv_x, half_r2, screen;
+            Crossing c = cross_at(&s, x0 + column, y0 + row, &constants, &x, &y, &nu_x, &nv_x, &half_r2);
+            fragment_mask(&s, c, x, y, half_r2, constants.filter, &screen);
+            const Geometry g = geometry_of(&s, c, nu_x, nv_x, y, screen);
+            const Loss loss = shared[at];
+            add_fragment(&sums, &s, &loss, &g, here.x, here.y, screen, x, y, &constants);
+        }
+    }
+    const Moments m = moments_of(&sums, &constants);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint field = 0; field < FIELDS; field++) scratch[field * PARTS + item] = ((const float *)&m)[field];
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint cell = item; cell < count * FIELDS; cell += GROUP) {
+        uint field = cell % FIELDS, splat = cell / FIELDS;
+        float sum = 0;
+        for (uint other = 0; other < SHARE_OF_SPLAT; other++) sum += scratch[field * PARTS + splat * SHARE_OF_SPLAT + other];
+        moments[(size_t)slots[splat] * FIELDS + field] = sum;
     }
 }

@@ -1,14 +1,20 @@
-// For CPUs: one work-item takes a tile back, a row of LANES pixels at a time.
+// For CPUs: one work-item takes a tile back, a block of LANES pixels at a time.
 // Index space: one work-item (and work-group) per tile.
 // Reads:  splats, lists, starts[tiles + 1], windows, big_bounds, splat_slots, and the images' derivatives.
 // Writes: moments, a slot for each splat of the tile; tile_sums. Uses up: checkpoints.
 // Splats of a tile lie anywhere in memory; the ones to come are fetched ahead.
 #define AHEAD_SPLATS 8
 
-typedef struct {            // fragments of a chunk, by splat and row
-    vfloat light[CHUNK][TILE_H], opacity[CHUNK][TILE_H];
-    uint rows[CHUNK];       // bits: rows where anything is drawn
-    uint slots[CHUNK];
+// Of a tile's list as many splats are walked forward and then back as the tape has room for: CHUNK at least, MOST at most.
+#define MOST (8 * CHUNK)
+#define ROOM (CHUNK * BLOCKS)
+#define RECORD (TILE_W * TILE_H + LANES)        // of a checkpoint: the light of each pixel, and the first splat
+
+typedef struct {            // fragments in the order in which they were drawn, block by block
+    vfloat light[ROOM], opacity[ROOM];
+    uint blocks[MOST];      // of a splat, as bits: blocks where anything is drawn
+    uint slots[MOST];
+    uint length;            // blocks
 } Tape;
 
 typedef struct {
@@ -16,63 +22,57 @@ typedef struct {
     const BlendConstants *constants;
 } Tile;
 
-typedef struct {            // a splat in a tile: its forms in the first row of pixels, whose y is 0
-    vfloat x, nu_x, nv_x, d_x;
-    wide half_r2;
-} Columns;
+typedef struct {            // of a splat in a block: places relative to its anchor, and its forms
+    vfloat x, y, nu_x, nv_x, screen;
+    vint mask;
+    Crossing crossing;
+} Block;
 
-static inline Columns columns_of(const Splat *s, const Tile *tile) {
-    Columns c;
-    c.x = (vfloat)(float)(tile->x0 - s->ax) + VLANE;
-    c.nu_x = FMA((vfloat)s->nux, c.x, (vfloat)s->nu0);
-    c.nv_x = FMA((vfloat)s->nvx, c.x, (vfloat)s->nv0);
-    c.d_x = FMA((vfloat)s->dx, c.x, (vfloat)s->d0);
-    c.half_r2 = s->log_opacity - tile->constants->log_cut;
-    return c;
+static inline Block block_of(const Splat *s, const Tile *tile, int block) {
+    Block b;
+    wide half_r2 = s->log_opacity - tile->constants->log_cut;
+    b.x = (float)(tile->x0 + LEFT(block) - s->ax) + BLOCK_X;
+    b.y = (float)(tile->y0 + TOP(block) - s->ay) + BLOCK_Y;
+    b.nu_x = FMA((vfloat)s->nux, b.x, (vfloat)s->nu0);
+    b.nv_x = FMA((vfloat)s->nvx, b.x, (vfloat)s->nv0);
+    b.crossing = cross_row(s, b.nu_x, b.nv_x, FMA((vfloat)s->dx, b.x, (vfloat)s->d0), b.y, half_r2);
+    b.mask = fragment_mask(s, b.crossing, b.x, b.y, half_r2, tile->constants->filter, &b.screen);
+    return b;
 }
 
-// Lets the splat take its light in the rows that are alive; keeps on the tape what it took there. Returns which rows stay alive.
+// Lets the splat take its light in the blocks that are alive; keeps on the tape what it took there. Returns which stay alive.
 static inline uint walk_splat(const Splat *s, const Tile *tile, Pixel *pixels, uint alive, Tape *tape, uint place) {
     const BlendConstants *constants = tile->constants;
-    const Columns columns = columns_of(s, tile);
-    int first = max(s->y0 - tile->y0, 0), last = min(s->y1 - tile->y0, TILE_H);
-    uint touched = 0;
-    for (int row = first; row < last; row++) {
-        if (!(alive >> row & 1u)) continue;
-        wide y = (wide)(tile->y0 + row - s->ay);
-        Crossing c = cross_row(s, columns.nu_x, columns.nv_x, columns.d_x, (vfloat)y, columns.half_r2);
-        vfloat screen;
-        vint mask = fragment_mask(s, c, columns.x, (vfloat)y, columns.half_r2, constants->filter, &screen);
-        if (!VANY(mask)) continue;
-        vfloat opacity = fragment_opacity(s, fragment_half_rho(s, c, 1.0f / c.d, screen), constants->ceiling);
-        vfloat light = pixels[row].t;
-        vfloat drawn = take_light(&pixels[row], opacity, mask, constants);
-        touched |= 1u << row;
-        tape->light[place][row] = light;
-        tape->opacity[place][row] = drawn;
-        if (!VANY(VMASK(pixels[row].t > constants->stop))) alive &= ~(1u << row);
+    uint touched = alive & touched_blocks(s, tile->x0, tile->y0, s->log_opacity - constants->log_cut, constants->filter), drawn_in = 0;
+    for (; touched != 0; touched &= touched - 1) {
+        int block = 31 - clz((int)(touched & -touched));
+        const Block b = block_of(s, tile, block);
+        if (!VANY(b.mask)) continue;
+        vfloat half_rho = fragment_half_rho(s, b.crossing, 1.0f / b.crossing.d, b.screen);
+        vfloat opacity = fragment_opacity(s, half_rho, constants->ceiling);
+        tape->light[tape->length] = pixels[block].t;
+        tape->opacity[tape->length++] = take_light(&pixels[block], opacity, b.mask, constants);
+        drawn_in |= 1u << block;
+        if (!VANY(VMASK(pixels[block].t > constants->stop))) alive &= ~(1u << block);
     }
-    tape->rows[place] = touched;
+    tape->blocks[place] = drawn_in;
     return alive;
 }
 
-// Takes the splat's fragments on the tape back.
-static inline Moments back_splat(const Splat *s, const Tile *tile, const Tape *tape, uint place, Loss *losses) {
+// Takes the splat's fragments, the last ones on the tape, back and off it.
+static inline Moments back_splat(const Splat *s, const Tile *tile, Tape *tape, uint place, Loss *losses) {
     const BlendConstants *constants = tile->constants;
-    const Columns columns = columns_of(s, tile);
     Sums sums = {0};
-    for (uint rows = tape->rows[place]; rows != 0; rows &= rows - 1) {
-        int row = 31 - clz(rows & -rows);
-        wide y = (wide)(tile->y0 + row - s->ay);
-        Crossing c = cross_row(s, columns.nu_x, columns.nv_x, columns.d_x, (vfloat)y, columns.half_r2);
-        vfloat screen;
-        fragment_mask(s, c, columns.x, (vfloat)y, columns.half_r2, constants->filter, &screen);
-        const Geometry g = geometry_of(s, c, columns.nu_x, columns.nv_x, y, screen);
-        vfloat opacity = tape->opacity[place][row], weight = tape->light[place][row] * opacity;
-        vfloat by_log = take_back(&losses[row], fragment_worth(s, &losses[row], &g), weight, opacity);
-        add_fragment(&sums, s, &losses[row], &g, weight, by_log, screen, y, constants);
+    uint blocks = tape->blocks[place], at = tape->length -= popcount(blocks);
+    for (; blocks != 0; blocks &= blocks - 1, at++) {
+        int block = 31 - clz((int)(blocks & -blocks));
+        const Block b = block_of(s, tile, block);
+        const Geometry g = geometry_of(s, b.crossing, b.nu_x, b.nv_x, b.y, b.screen);
+        vfloat opacity = tape->opacity[at], weight = tape->light[at] * opacity;
+        vfloat by_log = take_back(&losses[block], fragment_worth(s, &losses[block], &g), weight, opacity);
+        add_fragment(&sums, s, &losses[block], &g, weight, by_log, b.screen, b.x, b.y, constants);
     }
-    return moments_of(&sums, s, columns.x, constants);
+    return moments_of(&sums, constants);
 }
 
 static inline void leave_nothing(global float *moments, uint slot) {
@@ -98,10 +98,10 @@ kernel void blend_backward(
     uint start = starts[number], end = starts[number + 1];
 
     // the derivatives of the tile's pixels; there is nothing outside of the picture
-    Loss losses[TILE_H];
-    for (int row = 0; row < TILE_H; row++) {
-        Loss *loss = &losses[row];
-        int x = tile.x0, y = tile.y0 + row;
+    Loss losses[BLOCKS];
+    for (int block = 0; block < BLOCKS; block++) {
+        Loss *loss = &losses[block];
+        int x = tile.x0 + LEFT(block), y = tile.y0 + TOP(block);
         size_t at = y * (size_t)stride + x;
         loss->r = pixels_of(by_rgb, 3, 0, x, y, width, height);
         loss->g = pixels_of(by_rgb, 3, 1, x, y, width, height);
@@ -111,28 +111,33 @@ kernel void blend_backward(
     }
 
     // forward: the light in front of each chunk; of the last one the fragments stay on the tape
-    Pixel pixels[TILE_H];
+    Pixel pixels[BLOCKS];
     Tape tape;
-    for (int row = 0; row < TILE_H; row++) pixel_start(&pixels[row], (vfloat)1.0f);
-    int rows = min(height - tile.y0, TILE_H);
-    uint alive = rows == 32 ? 0xFFFFFFFFu : (1u << rows) - 1u, walked = start;
-    global float *own = checkpoints + (size_t)(start / CHUNK + number) * (TILE_W * TILE_H);
+    for (int block = 0; block < BLOCKS; block++) pixel_start(&pixels[block], (vfloat)1.0f);
+    const uint on_picture = blocks_within(0, min(width - tile.x0, TILE_W), 0, min(height - tile.y0, TILE_H));
+    uint alive = on_picture, walked = start, first = start, chunk = 0;
+    global float *own = checkpoints + (size_t)(start / CHUNK + number) * RECORD;
+    tape.length = 0;
     for (; walked < end && alive; walked++) {
-        uint place = (walked - start) % CHUNK, chunk = (walked - start) / CHUNK;
-        for (int row = 0; place == 0 && row < TILE_H; row++)
-            VSTORE(pixel_light(&pixels[row]), own + (size_t)chunk * (TILE_W * TILE_H) + row * TILE_W);
+        if (walked == start || tape.length + BLOCKS > ROOM || walked - first == MOST) {
+            chunk += walked != start;
+            first = walked;
+            tape.length = 0;
+            for (int block = 0; block < BLOCKS; block++) VSTORE(pixel_light(&pixels[block]), own + (size_t)chunk * RECORD + block * LANES);
+            ((global uint *)own)[(size_t)chunk * RECORD + TILE_W * TILE_H] = first;
+        }
         FETCH_SPLAT(min(walked + AHEAD_SPLATS, end - 1));
-        uint index = lists[walked];
+        uint index = lists[walked], place = walked - first;
         tape.slots[place] = splat_slots[index] + tile_rank(windows[index], big_bounds, column, tile_row, width, height);
         FETCH_AHEAD(moments + (size_t)tape.slots[place] * FIELDS);
         const Splat s = splats[index];
         alive = walk_splat(&s, &tile, pixels, alive, &tape, place);
     }
     vfloat behind_r = 0.0f, behind_g = 0.0f, behind_b = 0.0f;
-    for (int row = 0; row < TILE_H; row++) {
-        behind_r = FMA(pixels[row].t, losses[row].r, behind_r);
-        behind_g = FMA(pixels[row].t, losses[row].g, behind_g);
-        behind_b = FMA(pixels[row].t, losses[row].b, behind_b);
+    for (int block = 0; block < BLOCKS; block++) {
+        behind_r = FMA(pixels[block].t, losses[block].r, behind_r);
+        behind_g = FMA(pixels[block].t, losses[block].g, behind_g);
+        behind_b = FMA(pixels[block].t, losses[block].b, behind_b);
     }
     tile_sums[3 * number] = lane_sum(behind_r);
     tile_sums[3 * number + 1] = lane_sum(behind_g);
@@ -145,28 +150,31 @@ kernel void blend_backward(
         uint slot = splat_slots[lists[k]] + tile_rank(windows[lists[k]], big_bounds, column, tile_row, width, height);
         leave_nothing(moments, slot);
     }
-    uint chunks = (walked - start + CHUNK - 1) / CHUNK;
-    for (uint chunk = chunks; chunk-- > 0;) {
-        uint first = start + chunk * CHUNK, length = min(walked - first, (uint)CHUNK);
-        if (chunk + 1 < chunks) {
-            alive = 0;
-            for (int row = 0; row < rows; row++) {
-                pixel_start(&pixels[row], VLOAD(own + (size_t)chunk * (TILE_W * TILE_H) + row * TILE_W));
-                if (VANY(VMASK(pixels[row].t > constants.stop))) alive |= 1u << row;
+    for (bool again = false; walked > start; again = true) {
+        if (again) {
+            chunk--;
+            first = ((global const uint *)own)[(size_t)chunk * RECORD + TILE_W * TILE_H];
+            tape.length = 0;
+            alive = on_picture;
+            for (int block = 0; block < BLOCKS; block++) {
+                pixel_start(&pixels[block], VLOAD(own + (size_t)chunk * RECORD + block * LANES));
+                if (!VANY(VMASK(pixels[block].t > constants.stop))) alive &= ~(1u << block);
             }
-            for (uint place = 0; place < length; place++) {
-                uint index = lists[first + place];
-                tape.slots[place] = splat_slots[index] + tile_rank(windows[index], big_bounds, column, tile_row, width, height);
+            for (uint k = first; k < walked; k++) {
+                FETCH_SPLAT(min(k + AHEAD_SPLATS, end - 1));
+                uint index = lists[k];
+                tape.slots[k - first] = splat_slots[index] + tile_rank(windows[index], big_bounds, column, tile_row, width, height);
                 const Splat s = splats[index];
-                alive = walk_splat(&s, &tile, pixels, alive, &tape, place);
+                alive = walk_splat(&s, &tile, pixels, alive, &tape, k - first);
             }
         }
-        for (uint place = length; place-- > 0;) {
-            if (tape.rows[place] == 0) {
+        for (; walked > first; walked--) {
+            uint place = walked - 1 - first;
+            if (tape.blocks[place] == 0) {
                 leave_nothing(moments, tape.slots[place]);
                 continue;
             }
-            const Splat s = splats[lists[first + place]];
+            const Splat s = splats[lists[walked - 1]];
             ((global Moments *)moments)[tape.slots[place]] = back_splat(&s, &tile, &tape, place, losses);
         }
     }

@@ -4,13 +4,13 @@ static inline vint fragment_on_plane(const Splat *s, Crossing c, vfloat half_rho
     return HAS_DOT(s) ? c.inside & VMASK(half_rho <= screen) : c.inside;
 }
 //@ sums
-    vfloat dot, dot_y;
+    vfloat dot_x, dot_y;
 //@ fragment_backward
     vfloat by_dot = VSELECT(by_log, (vfloat)0.0f, g->on_plane);
-    sums->dot += by_dot;
-    sums->dot_y = FMA(by_dot, (vfloat)(y - s->dot_y), sums->dot_y);
+    sums->dot_x = FMA(by_dot, x - s->dot_x, sums->dot_x);
+    sums->dot_y = FMA(by_dot, y - s->dot_y, sums->dot_y);
 //@ moments
-    m.dot_x = 2.0f * constants->filter * lane_sum(sums->dot * (x - s->dot_x));
+    m.dot_x = 2.0f * constants->filter * lane_sum(sums->dot_x);
     m.dot_y = 2.0f * constants->filter * lane_sum(sums->dot_y);
 //@ camera_backward
         // the dot's place is tu.z / pz
