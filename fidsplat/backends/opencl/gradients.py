@@ -88,7 +88,10 @@ class OpenCLGradients:
         tile = shape.tile_width * shape.tile_height
         picture.take("splat_slots", 4 * count)
         picture.take("moments", record * pairs)
-        chunks, in_groups = pairs // chunk_of(shape) + picture.tiles, shape.schedule == "group"
+        chunks, in_groups = (
+            pairs // chunk_of(self._pipeline.features, shape) + picture.tiles,
+            shape.schedule == "group",
+        )
         picture.take("checkpoints", (8 * tile if in_groups else 4 * (tile + shape.lanes)) * chunks)
         picture.take("tile_sums", 3 * real * picture.tiles)
         picture.take("group_sums", 6 * real * groups)
@@ -98,7 +101,11 @@ class OpenCLGradients:
         cl.enqueue_fill_buffer(picture.queue, reserved, _ZERO, 0, 4)
         if count:
             picture.launch("reserve", "reserve_slots", count, _GROUP, count=count)
-        group, ceiling, groups_of_tiles = group_of(shape), math.log(view.ceiling), picture.tiles
+        group, ceiling, groups_of_tiles = (
+            group_of(self._pipeline.features, shape),
+            math.log(view.ceiling),
+            picture.tiles,
+        )
         if in_groups:
             picture.take("reached", 4 * picture.tiles)
             picture.take("chunk_tiles", 4 * chunks)

@@ -41,25 +41,31 @@ def assemble_gradients(features: FeatureSet, shape: DeviceShape) -> Source:
     slots = (name for slot in features.slots for name in (slot, *DRAWN[slot].parts))
     files = [DRAWN[name].file for name in dict.fromkeys(slots)]
     files += [layout.file for layout in layouts]
-    numbers = numbers_of(features, shape) | {"BACK_ITEMS": group_of(shape), "CHUNK": chunk_of(shape)}
+    numbers = numbers_of(features, shape) | {
+        "BACK_ITEMS": group_of(features, shape),
+        "CHUNK": chunk_of(features, shape),
+    }
     writer = Writer([file for file in files if file], declared, numbers)
     text = writer.program("gradients", [stage.format(shape.schedule) for stage in _STAGES])
     arguments = {kernel: declared.arguments(kernel) for kernel in kernels_in(text)}
     return Source({"gradients": text}, declared.records, arguments, (), declared.scalars)
 
 
-def chunk_of(shape: DeviceShape) -> int:
+def chunk_of(features: FeatureSet, shape: DeviceShape) -> int:
     """Splats of a tile's list that are walked forward and then back: on GPUs a column of a splat's pixels for
     each work-item, on CPUs at least, where they touch all of a tile: their fragments fill half of a core's
     second cache."""
     if shape.schedule == "lanes":
         return 128
-    return group_of(shape) // shape.tile_width
+    return group_of(features, shape) // shape.tile_width
 
 
-def group_of(shape: DeviceShape) -> int:
-    """Work-items that take a chunk of a tile's list back."""
-    return 1 if shape.schedule == "lanes" else min(shape.tile_width * shape.tile_height, 256)
+def group_of(features: FeatureSet, shape: DeviceShape) -> int:
+    """Work-items that take a chunk of a tile's list back. With what distortion keeps of pixels 256 would not
+    fit into the 48 KiB of local memory that NVIDIA's OpenCL has."""
+    if shape.schedule == "lanes":
+        return 1
+    return min(shape.tile_width * shape.tile_height, 128 if "distortion" in features.outputs else 256)
 
 
 class _Declarations(Declarations):
