@@ -82,39 +82,31 @@ class OpenCLGradients:
         picture.program = self.program
         view, shape, count, pairs = picture.view, self._pipeline.shape, picture.resident.count, picture.pairs
         self._take_gradients(picture, gradients)
-        groups = -(-count // _GROUP)
+        posed = -(-count // _GROUP)  # work-groups that sum up the pose
         record = self.source.records["Moments"].itemsize
         real = self.source.scalars.dtype("real").itemsize
         tile = shape.tile_width * shape.tile_height
         picture.take("splat_slots", 4 * count)
         picture.take("moments", record * pairs)
-        chunks, in_groups = (
-            pairs // chunk_of(self._pipeline.features, shape) + picture.tiles,
-            shape.schedule == "group",
-        )
+        features, in_groups = self._pipeline.features, shape.schedule == "group"
+        chunks = pairs // chunk_of(features, shape) + picture.tiles
         picture.take("checkpoints", (8 * tile if in_groups else 4 * (tile + shape.lanes)) * chunks)
         picture.take("tile_sums", 3 * real * picture.tiles)
-        picture.take("group_sums", 6 * real * groups)
+        picture.take("group_sums", 6 * real * posed)
         reserved = picture.take("reserved", 4)
         found = self._room_for_results(picture)
 
         cl.enqueue_fill_buffer(picture.queue, reserved, _ZERO, 0, 4)
         if count:
             picture.launch("reserve", "reserve_slots", count, _GROUP, count=count)
-        group, ceiling, groups_of_tiles = (
-            group_of(self._pipeline.features, shape),
-            math.log(view.ceiling),
-            picture.tiles,
-        )
+        ceiling, groups = math.log(view.ceiling), chunks if in_groups else picture.tiles
         if in_groups:
             picture.take("reached", 4 * picture.tiles)
             picture.take("chunk_tiles", 4 * chunks)
             items = shape.blend_items
             picture.launch("blend backward", "blend_light", picture.tiles * items, items, log_ceiling=ceiling)
-            groups_of_tiles = chunks
-        picture.launch(
-            "blend backward", "blend_backward", groups_of_tiles * group, group, log_ceiling=ceiling
-        )
+        items = group_of(features, shape)
+        picture.launch("blend backward", "blend_backward", groups * items, items, log_ceiling=ceiling)
         self._ask(drawn)
         if count:
             arrays: dict[str, Any] = {
@@ -123,7 +115,7 @@ class OpenCLGradients:
             picture.launch("project backward", "project_backward", count, _GROUP, count=count, **arrays)
         for name, sums, rows, columns in (
             ("tile_sums", "background", picture.tiles, 3),
-            ("group_sums", "pose", groups, 6),
+            ("group_sums", "pose", posed, 6),
         ):
             given: dict[str, Any] = {"parts": picture.held[name], "sums": found[sums].data}
             given |= {"rows": rows, "columns": columns}
