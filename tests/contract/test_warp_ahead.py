@@ -12,6 +12,7 @@ import fidsplat as fs
 from fidsplat.backends.prepare import prepare, prepare_batch
 from fidsplat.backends.warp import batch as batches
 from fidsplat.backends.warp import runtime
+from fidsplat.backends.warp.picture import Picture
 from fidsplat.backends.warp.replay import Replay
 from fidsplat.backends.warp.shapes import WarpShape
 from fidsplat.views import views_of
@@ -195,6 +196,54 @@ def test_what_moves_is_replayed(renderer, replayed):
     batch = renderer.render_batch(cloud, [capture(0.1), aside])
     wanted = renderer.render(cloud, aside)
     assert all(np.array_equal(batch[name][1], wanted[name]) for name in batch)
+
+
+def budget(renderer, pairs):
+    renderer.backend.pair_budget = pairs
+    return CAPTURE
+
+
+BEHIND = [fs.Gradient((0.1, 0.2, 0.3), (0.4, 0.3, 0.2)), fs.Gradient((0.9, 0.2, 0.3), (0.4, 0.9, 0.2))]
+OTHERS = {
+    "budgets": [lambda renderer, pairs=pairs: budget(renderer, pairs) for pairs in (10**9, 10**8)],
+    "what lies behind": [
+        lambda renderer, behind=behind: CAPTURE.with_(background=behind) for behind in BEHIND
+    ],
+}
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_a_picture_between_replays_leaves_its_view_to_none(renderer, replayed, monkeypatch, kind):
+    """Of a picture of the same size that was launched kernel by kernel, as it is no picture of the graph's,
+    the next of these has nothing: the view is the same object as before it."""
+    monkeypatch.setattr(renderer.backend, "pair_budget", renderer.backend.pair_budget)
+    mine, other = OTHERS[kind]
+    resident, capture = renderer.upload(CLOUD), mine(renderer)
+    frames = [renderer.render(resident, capture)["rgb"] for _ in range(4)]
+    assert replayed
+    elsewhere = renderer.render(resident, other(renderer).with_(camera=ELSEWHERE))["rgb"]
+    mine(renderer)
+    frames += [renderer.render(resident, capture)["rgb"] for _ in range(4)]
+    assert not np.array_equal(elsewhere, frames[0])
+    assert all(np.array_equal(frame, frames[0]) for frame in frames)
+
+
+def test_a_replay_that_fails_half_filled_is_not_launched_again(renderer, replayed, monkeypatch):
+    """The view that it was to show is drawn anew."""
+    resident, there = renderer.upload(CLOUD), CAPTURE.with_(camera=ELSEWHERE)
+    wanted = renderer.render(resident, there)["rgb"]
+    for _ in range(4):
+        renderer.render(resident, CAPTURE)["rgb"]
+    assert replayed
+
+    def refused(picture):
+        raise RuntimeError("no copy")
+
+    with monkeypatch.context() as failing:
+        failing.setattr(Picture, "_fill_views", refused)
+        with pytest.raises(fs.DeviceError, match="no copy"):
+            renderer.render(resident, there)
+    assert np.array_equal(renderer.render(resident, there)["rgb"], wanted)
 
 
 def test_a_graph_keeps_no_splats(renderer, replayed):

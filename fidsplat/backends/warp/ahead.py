@@ -79,11 +79,14 @@ class Drawing:
         if kind is None or not workspace.ahead or view.shots or resident.adopted or not resident.count:
             return self.picture(resident, stack, into, beside)[1]
         beside, room = beside or self._image_bytes(view), kind.room
-        if kind.replay is not None and kind.replay.token == self._token(kind, view, beside):
-            kind.replay.draw(stack)
+        # whatever fills the inputs else, or fails while it fills them, leaves others there than it remembers
+        replay, kind.replay = kind.replay, None
+        if replay is not None and replay.token == self._token(kind, view, beside):
+            replay.draw(stack)
+            kind.replay = replay
             workspace.pictures += 1
             launcher = Launcher(self._commands, timed=False)
-            return self._pending(resident, stack, room, kind.replay.picture, launcher, into)
+            return self._pending(resident, stack, room, replay.picture, launcher, into)
         launcher = Launcher(self._commands)
         given = {"beside": beside, "room": room, "inputs": kind.inputs}
         picture = Picture(self.program, workspace, resident, stack, launcher, **given)
