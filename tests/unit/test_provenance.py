@@ -83,7 +83,8 @@ def test_data_have_the_digest_of_what_they_hold():
     def digest(height):
         pose = np.eye(4)
         pose[1, 3] = height
-        return provenance.digest_of((fs.Capture(motion=Motion(Trajectory([0, 1], np.stack([pose, pose])))), np.ones(3)))
+        path = Trajectory([0, 1], np.stack([pose, pose]))
+        return provenance.digest_of((fs.Capture(motion=Motion(path)), np.ones(3)))
 
     assert digest(1.0) == digest(1.0)
     assert digest(1.0) != digest(2.0)
