@@ -84,8 +84,8 @@ def plain_ticks(axis) -> None:
 
 
 def label_points(figure: Figure, axes: Axes, points: Sequence[tuple[float, float, str]]) -> None:
-    """Names beside points, each at the nearest place where it covers no other name, no named point, no text that
-    is there and no line right across the panel."""
+    """Names beside points, each at the nearest place where it covers no other name, no named point, no text
+    that is there and no line right across the panel."""
     figure.canvas.draw()
     inside = axes.get_window_extent()
     dots = [axes.transData.transform((x, y)) for x, y, _ in points]
