@@ -69,8 +69,8 @@ def derivatives(
 ) -> dict[str, np.ndarray]:
     """A picture's derivatives in NumPy; those of a random loss unless `by_images` says by which images.
 
-    distorted: pictures of depths have their distortion too. build: further arguments of `Differentiates.differentiate`,
-    that some backends have.
+    distorted: pictures of depths have their distortion too. build: further arguments of
+    `Differentiates.differentiate`, that some backends have.
     """
     features, view = prepare(cloud, capture)
     if distorted and "depth" in features.names:
