@@ -151,14 +151,15 @@ def peers(pair: tuple[dict, dict]) -> dict[str, str]:
 def first(record: dict) -> dict[str, str]:
     """First frames of new processes."""
     low, high = record["range"]
+    parts: dict[str, float] = {**record["seconds"]}
+    total = parts.pop("total")
     heads = {"scene": "scene made", "device": "device opened"}
-    seconds = {heads.get(part, part): f"{taken:.2f}" for part, taken in record["seconds"].items()}
-    del seconds["total"]
+    seconds = {heads.get(part, part): f"{taken:.2f}" for part, taken in parts.items()}
     return {
         "scene": record["scene"],
         "device": record["device"],
         "caches": record["caches"],
-        "first frame": f"{record['seconds']['total']:.2f} s ({low:.2f} to {high:.2f})",
+        "first frame": f"{total:.2f} s ({low:.2f} to {high:.2f})",
         **seconds,
         "date": record["date"],
     }

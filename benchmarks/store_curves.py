@@ -1,9 +1,9 @@
-"""Curves of docs/large-scenes.md: splats of a store against time, splats that are drawn, and memory.
+"""Curves of docs/large-scene-figures.md: splats of a store against time, splats that are drawn, and memory.
 
     python benchmarks/store_curves.py benchmarks/results/stores-h100.json docs/images/store-curves.svg
 
-Takes what `benchmarks/store_views.py --json` has written: a point for each size of a scene, a line for each
-view at the default quality and at each allowed error.
+Takes what `benchmarks/store_views.py --json` has written: a point for each size of a scene, a colour for each
+view, a dash for the default quality and for each allowed error. A line that several have is drawn once.
 """
 
 from __future__ import annotations
@@ -12,24 +12,37 @@ import argparse
 import json
 from pathlib import Path
 
-from fidsplat.experiments.charts import chart, legend_above, plain_ticks
+from fidsplat.experiments.charts import COLOURS, chart, legend_above, plain_ticks
 
 PANELS = (
     ("next view [ms]", lambda row: 1e3 * row["s"][1]),
     ("splats read [million]", lambda row: row["drawn"] / 1e6),
     ("device memory [GiB]", lambda row: row["device_bytes"] / 2**30),
 )
+SHARED = "several of these alike"
+DASHES = ("-", "--", ":")
+
+Series = dict[tuple[str, str], list[dict]]
 
 
-def series(rows: list[dict]) -> dict[str, list[dict]]:
-    """Rows that were drawn, by view and error, in the order of their scenes' sizes."""
-    found: dict[str, list[dict]] = {}
+def series(rows: list[dict]) -> Series:
+    """Rows that were drawn, by view and quality, in the order of their scenes' sizes."""
+    found: Series = {}
     for row in sorted(rows, key=lambda row: row["splats"]):
         error = row["error"]
-        allowed = "default quality" if error == "standard" else f"error {error:g}" if error else "exact"
+        quality = "default quality" if error == "standard" else f"error {error:g}" if error else "exact"
         if "s" in row:
-            found.setdefault(f"{row['view']}, {allowed}", []).append(row)
+            found.setdefault((row["view"], quality), []).append(row)
     return found
+
+
+def lines(found: Series, value) -> dict[tuple[tuple[float, float], ...], list[tuple[str, str]]]:
+    """Lines of (splats in million, value), each with the views and qualities that have it."""
+    owners: dict[tuple[tuple[float, float], ...], list[tuple[str, str]]] = {}
+    for name, rows in found.items():
+        line = tuple((row["splats"] / 1e6, value(row)) for row in rows)
+        owners.setdefault(line, []).append(name)
+    return owners
 
 
 def main() -> None:
@@ -40,11 +53,24 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     asked = parser.parse_args()
     found = series(json.loads(asked.results.read_text())["rows"])
+    views, qualities = (list(dict.fromkeys(names)) for names in zip(*found, strict=True))
+    colours = dict(zip((SHARED, *views), COLOURS, strict=False))
+    dashes = dict(zip(qualities, DASHES, strict=True))
     with chart(asked.out, len(PANELS), (12.0, 4.6), one_scale=False) as (figure, panels):
+        for view in (*views, SHARED):
+            panels[0].plot([], [], ".-", color=colours[view], label=view)
+        for quality in qualities:
+            panels[0].plot([], [], dashes[quality], color="black", label=quality)
         for axes, (title, value) in zip(panels, PANELS, strict=True):
-            for name, rows in found.items():
-                sizes = [row["splats"] / 1e6 for row in rows]
-                axes.plot(sizes, [value(row) for row in rows], ".-", label=name)
+            for line, owners in lines(found, value).items():
+                view, quality = owners[0]
+                alike = len(owners) > 1
+                axes.plot(
+                    *zip(*line, strict=True),
+                    marker=".",
+                    color=colours[SHARED if alike else view],
+                    linestyle="-" if alike else dashes[quality],
+                )
             axes.set(xscale="log", yscale="log", xlabel="splats of the scene [million]", title=title)
             plain_ticks(axes.xaxis)
             plain_ticks(axes.yaxis)

@@ -18,6 +18,8 @@ from fidsplat import __version__
 from fidsplat.kernel_files import kernels_folder
 
 _PACKAGE = Path(__file__).resolve().parent
+_REBUILDING = {"fidsplat", "numpy", "copyreg"}
+"""packages by whose functions pickle makes data again"""
 _WITHOUT_SOURCES = {"__pycache__", "_kernels"}
 """folders of the package whose files are not sources of its own; a wheel carries the kernels in one"""
 
@@ -25,11 +27,21 @@ _WITHOUT_SOURCES = {"__pycache__", "_kernels"}
 def digest_of(content: object) -> str:
     """16 hexadecimal digits of all that plain data hold; large arrays are not copied.
 
-    Raises what pickle does for content that is no data: PicklingError, AttributeError, TypeError.
+    Raises PicklingError, AttributeError or TypeError, as pickle does, for content that is no data.
     """
     digest = _Digest()
-    pickle.Pickler(digest, protocol=5).dump(content)
+    _DataPickler(digest, protocol=5).dump(content)
     return digest.sha.hexdigest()[:16]
+
+
+class _DataPickler(pickle.Pickler):
+    """Refuses functions of others and what is called like one: pickle knows them by their names, by which
+    another one may be found tomorrow."""
+
+    def persistent_id(self, obj: Any) -> None:
+        known = (getattr(obj, "__module__", None) or "").partition(".")[0] in _REBUILDING
+        if callable(obj) and not isinstance(obj, type) and not known:
+            raise pickle.PicklingError(f"{obj!r} is a function, not data")
 
 
 class _Digest:

@@ -84,11 +84,15 @@ def plain_ticks(axis) -> None:
 
 
 def label_points(figure: Figure, axes: Axes, points: Sequence[tuple[float, float, str]]) -> None:
-    """Names beside points, each at the nearest place where it covers no other name and no named point."""
+    """Names beside points, each at the nearest place where it covers no other name, no named point, no text
+    that is there and no line right across the panel."""
     figure.canvas.draw()
     inside = axes.get_window_extent()
     dots = [axes.transData.transform((x, y)) for x, y, _ in points]
     taken = [Bbox.from_bounds(x - 5, y - 5, 10, 10) for x, y in dots]
+    taken += [text.get_window_extent() for text in axes.texts]
+    across = [line for line in axes.lines if line.get_transform() == axes.get_yaxis_transform(which="grid")]
+    taken += [line.get_window_extent() for line in across]
     for x, y, name in points:
         for far, (right, up) in product((9, 18, 30, 44, 60, 80), _DIRECTIONS):
             label = axes.annotate(

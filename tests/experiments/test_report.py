@@ -339,10 +339,13 @@ def test_labels_of_a_chart_do_not_overlap(tmp_path):
     points = [(10 + 0.1 * i, 1.0 + 0.01 * i, f"a name {i}") for i in range(8)]
     with charts.chart(tmp_path / "a.svg") as (figure, (axes,)):
         axes.plot([1, 100], [0.1, 10])
+        across = axes.axhline(1.3)
+        axes.annotate("what the line is", (0, 1.3), (4, 3), ("axes fraction", "data"), "offset points")
         charts.label_points(figure, axes, points)
         boxes = [text.get_bbox_patch() or text for text in axes.texts]
-        assert [text.get_text() for text in axes.texts] == [name for _, _, name in points]
+        assert [text.get_text() for text in axes.texts[1:]] == [name for _, _, name in points]
         renderer = figure.canvas.get_renderer()
         extents = [super(type(text), text).get_window_extent(renderer) for text in boxes]
+        extents.insert(1, across.get_window_extent(renderer))  # its own words may come close to it
         for i, one in enumerate(extents):
-            assert not any(one.overlaps(other) for other in extents[:i])
+            assert i == 1 or not any(one.overlaps(other) for other in extents[:i])

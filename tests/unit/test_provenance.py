@@ -1,12 +1,16 @@
 """The hash under which results are kept covers every source that may change them."""
 
 import json
+import pickle
 import shutil
+from functools import partial
 
+import numpy as np
 import pytest
 
 import fidsplat as fs
 from fidsplat import provenance
+from fidsplat.cameras import Motion, Trajectory
 
 
 @pytest.fixture(scope="module")
@@ -57,3 +61,30 @@ def test_facts_name_what_numbers_depend_on():
     assert facts["versions"]["fidsplat"] == fs.__version__
     assert facts["versions"]["opencv"] == "5"
     assert facts["code"] == provenance.code_hash()
+
+
+def resting(time):
+    """A pose that anybody may write otherwise under the same name."""
+    return np.eye(4)
+
+
+class Resting:
+    def __call__(self, time):
+        return resting(time)
+
+
+@pytest.mark.parametrize("pose", [resting, partial(resting), Resting(), Resting().__call__])
+def test_what_is_known_by_its_name_alone_has_no_digest(pose):
+    with pytest.raises(pickle.PicklingError, match="a function, not data"):
+        provenance.digest_of(fs.Capture(motion=Motion(pose)))
+
+
+def test_data_have_the_digest_of_what_they_hold():
+    def digest(height):
+        pose = np.eye(4)
+        pose[1, 3] = height
+        path = Trajectory([0, 1], np.stack([pose, pose]))
+        return provenance.digest_of((fs.Capture(motion=Motion(path)), np.ones(3)))
+
+    assert digest(1.0) == digest(1.0)
+    assert digest(1.0) != digest(2.0)
