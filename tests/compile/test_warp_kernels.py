@@ -93,8 +93,8 @@ def resolving(stretched, samples):
 
 
 LONG = pytest.mark.exhaustive
-"""of blending layers with every output: 13 s each. Plain runs compile layers with two outputs (8 s), and every
-output without layers (1 s), in tests below"""
+"""of blending layers with every output: 13 s each. Plain runs compile layers with two outputs (8 s), and
+every output without layers (1 s), in tests below"""
 
 
 @pytest.fixture(autouse=True)
