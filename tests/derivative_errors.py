@@ -64,15 +64,16 @@ def derivatives(
     cloud: SplatCloud,
     capture: Capture,
     by_images: Mapping[str, np.ndarray] | None = None,
+    distorted: bool = True,
     **build: Any,
 ) -> dict[str, np.ndarray]:
     """A picture's derivatives in NumPy; those of a random loss unless `by_images` says by which images.
 
-    Pictures of depths have their distortion too. build: further arguments of `Differentiates.differentiate`,
-    that some backends have.
+    distorted: pictures of depths have their distortion too. build: further arguments of
+    `Differentiates.differentiate`, that some backends have.
     """
     features, view = prepare(cloud, capture)
-    if "depth" in features.names:
+    if distorted and "depth" in features.names:
         features = with_distortion(features)
     pipeline = backend.differentiate(features, **build)
     images = pipeline.forward(backend.upload(cloud), view)

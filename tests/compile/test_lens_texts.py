@@ -29,8 +29,8 @@ CAMERAS = {
 BEFORE_LENSES = {
     ("lanes", ("rgb",)): "4bd77e84efe12397d8ef18cc35a44dbbdf43d68615edbd1971d52c25023afab2",
     ("lanes", OUTPUTS): "8ae4a05b68adf900bc5d1171ff74600f566b56194d8c901d969aae610411f143",
-    ("group", ("rgb",)): "9ca776e0ec2f0515c38e369eae917dc55519c2fa3153cf46b23553379997a0ae",
-    ("group", OUTPUTS): "65c942bcaf7a54ca9a5485942da9ce02ae7e34cf82b52d91a72ab319e680d650",
+    ("group", ("rgb",)): "2788060d7d927a3e83d5aeb523fc1bdce0c98054b79cb5b7b7dbe9c1272568d2",
+    ("group", OUTPUTS): "b1092a3221b3ff949c0c820254f3093b7061787d7c2db38385fe6d6aee6ac538",
 }
 
 

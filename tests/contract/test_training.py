@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from derivative_errors import COSINE, NORM, derivatives, differences, random_picture
 from training_scene import QUICK, scene
 
 import fidsplat as fs
 from fidsplat.backends.derivatives import Differentiates
 from fidsplat.backends.prepare import prepare
+from fidsplat.backends.reference.backend import ReferenceBackend
 from fidsplat.effects.differentiable import with_distortion
 from fidsplat.train import Trainer, TrainSettings, densify
 from fidsplat.train.host import HostWork
@@ -61,6 +63,17 @@ def test_splats_are_made_by_kernels_as_by_numpy(renderer, dataset):
     assert found.first["sh"][:, 1:].any()
     assert found.opacities.max() <= 0.5 + 1e-6
     assert all(not array.any() for array in (found.first["logits"], found.gradients, found.seen))
+
+
+def test_depths_and_normals_without_distortions_have_the_references_derivatives(renderer):
+    """As the loss of normals asks for them, whose kernels are others than those of distortions."""
+    cloud, capture = random_picture(8, degree=None, quality="surfel")
+    expected = derivatives(ReferenceBackend(), cloud, capture, distorted=False)
+    backend = renderer.backend
+    for shape in (None, *backend.shapes("schedule").values()):
+        found = derivatives(backend, cloud, capture, distorted=False, shape=shape)
+        off = list(differences(found, expected))
+        assert all(one.norm < NORM and one.turned < COSINE for one in off), (shape, off)
 
 
 def test_the_loss_of_normals_does_what_it_is_for(renderer, dataset):

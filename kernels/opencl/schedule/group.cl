@@ -50,22 +50,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend(
         barrier(CLK_LOCAL_MEM_FENCE);
         // uniform: every work-item reads the same vote, taken before this batch is drawn
         if (!alive) break;
-        // the list of each cell, by its work-items; a word's lowest byte is its first, as on every device
-        uint bits = 0, listed = 0, before = 0;
-        for (uint k = 0; k < SHARE / 4; k++) {
-            uint four = cells[cell_y * (CELLS_STRIDE / 4) + own * (SHARE / 4) + k] >> cell_x & 0x01010101u;
-            bits |= (four * 0x01020408u >> 24 & 15u) << (4 * k);
-        }
-        uint first = own * SHARE, rest = max(length, first) - first;
-        if (rest < SHARE) bits &= (1u << rest) - 1u;     // bytes that an earlier batch has left
-        touched[cell][own] = bits;
-        barrier(CLK_LOCAL_MEM_FENCE);
-        for (uint other = 0; other < ITEMS; other++) {
-            if (other == own) before = listed;
-            listed += popcount(touched[cell][other]);
-        }
-        for (; bits != 0; bits &= bits - 1) places[cell][before++] = (uchar)(own * SHARE + 31 - clz(bits & -bits));
-        barrier(CLK_LOCAL_MEM_FENCE);
+        uint listed = list_cell(cells, cell_x, cell_y, own, length, touched[cell], places[cell]);
         // not where all of a work-item's pixels are finished
         bool unfinished = false;
         for (int row = 0; row < ROWS; row++) unfinished |= pixel_unfinished(&pixels[row], &constants) != 0;

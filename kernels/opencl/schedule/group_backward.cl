@@ -113,21 +113,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_light(
         }
         barrier(CLK_LOCAL_MEM_FENCE);
         if (!alive) break;
-        uint bits = 0, listed = 0, before = 0;
-        for (uint k = 0; k < SHARE / 4; k++) {
-            uint four = cells[cell_y * (CELLS_STRIDE / 4) + own * (SHARE / 4) + k] >> cell_x & 0x01010101u;
-            bits |= (four * 0x01020408u >> 24 & 15u) << (4 * k);
-        }
-        uint first = own * SHARE, rest = max(length, first) - first;
-        if (rest < SHARE) bits &= (1u << rest) - 1u;
-        touched[cell][own] = bits;
-        barrier(CLK_LOCAL_MEM_FENCE);
-        for (uint other = 0; other < ITEMS; other++) {
-            if (other == own) before = listed;
-            listed += popcount(touched[cell][other]);
-        }
-        for (; bits != 0; bits &= bits - 1) places[cell][before++] = (uchar)(own * SHARE + 31 - clz(bits & -bits));
-        barrier(CLK_LOCAL_MEM_FENCE);
+        uint listed = list_cell(cells, cell_x, cell_y, own, length, touched[cell], places[cell]);
         if (!unfinished) listed = 0;
         uint beyond = (batch - start + length + CHUNK - 1) / CHUNK;      // of the batch's chunks
         for (uint k = 0; k <= listed; k += AT_ONCE) {

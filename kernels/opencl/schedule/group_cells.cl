@@ -37,3 +37,26 @@ static inline void touched_cells(local const Splat *s, int left, int top, wide h
         if (first <= last) cells[cell_row * CELLS_STRIDE] = (uchar)((2u << (last / CELL_W)) - (1u << (first / CELL_W)));
     }
 }
+
+// The staged splats that can touch a cell, in order, as its ITEMS work-items find them, of which this is the `own`-th; the whole
+// group comes here, where `cells` is made of all `length`. touched, places: of this cell. Returns how many there are.
+static inline uint list_cell(local const uint *cells, uint cell_x, uint cell_y, uint own, uint length, local uint *touched,
+                             local uchar *places) {
+    uint bits = 0, listed = 0, before = 0;
+    // a word's lowest byte is its first, as on every device
+    for (uint k = 0; k < SHARE / 4; k++) {
+        uint four = cells[cell_y * (CELLS_STRIDE / 4) + own * (SHARE / 4) + k] >> cell_x & 0x01010101u;
+        bits |= (four * 0x01020408u >> 24 & 15u) << (4 * k);
+    }
+    uint first = own * SHARE, rest = max(length, first) - first;
+    if (rest < SHARE) bits &= (1u << rest) - 1u;     // bytes that an earlier batch has left
+    touched[own] = bits;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (uint other = 0; other < ITEMS; other++) {
+        if (other == own) before = listed;
+        listed += popcount(touched[other]);
+    }
+    for (; bits != 0; bits &= bits - 1) places[before++] = (uchar)(own * SHARE + 31 - clz(bits & -bits));
+    barrier(CLK_LOCAL_MEM_FENCE);
+    return listed;
+}
