@@ -213,9 +213,6 @@ class Picture:
         # the sort takes the second half as its scratch
         keys = self._take("sorted_keys", 2 * visible, self.wp.uint32)
         order = self._take("order", 2 * visible, self.wp.int32)
-        if self.room:
-            # behind all that are drawn; not the scratch
-            self.pool.exact("sorted_keys", visible, self.wp.uint32).fill_(0xFFFFFFFF)
         self._launch(self.program.sort.compact, self.splats, room=visible)
         self.wp.utils.radix_sort_pairs(keys, order, visible)
 
@@ -273,9 +270,7 @@ class Picture:
             lengths, ends = (self._exact(name, visible, wp.int64) for name in ("lengths", "ends"))
             self._launch(sort.gather if whole else lists.count, visible, **band, room=visible, pairs=pairs)
             wp.utils.array_scan(lengths, ends, inclusive=True)
-            if self.room:
-                self.pool.exact("tiles", pairs, wp.int32).fill_(self.tiles)  # behind the last
-            self._launch(lists.emit, visible, **band)
+            self._launch(lists.emit, visible, **band, room=visible, pairs=pairs, beyond=self.tiles)
             wp.utils.radix_sort_pairs(tiles, listed, pairs, 0, self.tiles.bit_length())
         self._launch(sort.find_starts, end - first + 1, **band, pairs=pairs)
 
