@@ -40,10 +40,8 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
     splats, crossing = make_splat(effects, outputs), make_crossing(effects, outputs)
     each = samples_each(effects)
     threads, items, pair = area // each, _CELL // each, each == 2
-    staging, touched = (
-        make_staging(Layout(effects, outputs), area // _CELL, items),
-        make_cells(effects, outputs),
-    )
+    staging = make_staging(Layout(effects, outputs), area // _CELL, items)
+    touched = make_cells(effects, outputs)
     pool, stage, mark, listed, place_in = (
         *(staging.pool, staging.stage, staging.mark),
         *(staging.listed, staging.place),
