@@ -114,9 +114,9 @@ class OpenCLGradients:
                 name: picture.resident.part(name, 0, count) for name in self._cloud_arrays
             }
             picture.launch("project backward", "project_backward", count, _GROUP, count=count, **arrays)
-        sums = {"background": found["background"].data, "pose": found["pose"].data}
-        columns, rows = 3 + 6, {"tiles": picture.tiles, "groups": posed}
-        picture.launch("project backward", "add_up", columns * _GROUP, _GROUP, **rows, **sums)
+        given: dict[str, Any] = {name: found[name].data for name in ("background", "pose")}
+        given |= {"tiles": picture.tiles, "groups": posed}
+        picture.launch("project backward", "add_up", (3 + 6) * _GROUP, _GROUP, **given)
         return found
 
     def _ask(self, drawn: Picture) -> None:
