@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
-from fidsplat.commands.experiment_files import CATEGORY_HELP, write_report
+from fidsplat.commands.experiment_files import (
+    CATEGORY_HELP,
+    Baseline,
+    Blender,
+    Dataset,
+    Merge,
+    Report,
+    write_report,
+)
 from fidsplat.commands.localise import Localise
 from fidsplat.commands.output import Json, console, counted, option, say, switch, tell
 from fidsplat.commands.plants import Plants
 from fidsplat.commands.remote import RayAddress, measure_by
-from fidsplat.commands.sweeps import Names, Overwrite, Seed, need_reports, run_sweeps
+from fidsplat.commands.sweeps import Names, Overwrite, Seed, asked, need_reports, run_sweeps
 from fidsplat.errors import InputError
 
 if TYPE_CHECKING:
     from fidsplat.experiments.run import Options
-from typing import ClassVar
-
-from fidsplat.commands.experiment_files import Baseline, Blender, Dataset, Merge, Report
 
 
 @dataclass
@@ -38,14 +43,12 @@ class Basic:
     json: Json = False
 
     def options(self) -> Options:
-        """The options as the experiments take them; those that a word does not have are left out."""
+        """The options as the experiments take them."""
         from fidsplat.experiments.run import Options
 
         # rough results and full ones do not mix
         out = self.out or "fidsplat-experiments" + ("-quick" if getattr(self, "quick", False) else "")
-        given: dict[str, Any] = {field.name: getattr(self, field.name, None) for field in fields(Options)}
-        given["out"] = Path(out)
-        return Options(**{name: value for name, value in given.items() if value is not None})
+        return asked(Options, self, out=Path(out))
 
 
 @dataclass

@@ -10,7 +10,16 @@ from typing import Annotated
 import tyro
 
 from fidsplat.commands.output import Device, Json, console, counted, option, switch, tell
-from fidsplat.commands.sweeps import Folders, Names, Overwrite, ReportTo, Seed, need_reports, run_in_turn
+from fidsplat.commands.sweeps import (
+    Folders,
+    Names,
+    Overwrite,
+    ReportTo,
+    Seed,
+    asked,
+    need_reports,
+    run_in_turn,
+)
 from fidsplat.errors import InputError
 
 CATEGORY_HELP = "apriltag, small, medium, large or huge, once more for each (default: all)"
@@ -101,35 +110,12 @@ class Baseline:
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.experiments.setup import COLLECTIONS, MARKERS, chosen_categories
         from fidsplat.experiments.trained import Baseline as Wanted
         from fidsplat.experiments.trained import baseline_sweeps
         from fidsplat.render import Renderer
-        from fidsplat.train import TrainSettings
 
-        if not 1 <= self.markers <= MARKERS:
-            raise InputError(f"--markers is {self.markers}; each category has 1 to {MARKERS}")
-        for number in self.views:
-            if number not in COLLECTIONS:
-                raise InputError(f"--views is {number}; known: {', '.join(map(str, COLLECTIONS))}")
-        if self.seeds < 1 or self.workers < 1:
-            raise InputError(
-                f"--seeds is {self.seeds} and --workers is {self.workers}; both must be at least 1"
-            )
-        TrainSettings(iterations=self.iterations)  # says what is wrong before the device is opened
-        wanted = Wanted(
-            Path(self.out),
-            self.dataset,
-            chosen_categories(self.category),
-            self.markers,
-            self.views or COLLECTIONS,
-            self.iterations,
-            self.seeds,
-            self.seed,
-            self.shard,
-            self.workers,
-            self.overwrite,
-        )
+        wanted = asked(Wanted, self, out=Path(self.out))
+        wanted.check()  # says what is wrong before the device is opened
         with baseline_sweeps(wanted, Renderer(self.device)) as sweeps:
             run_in_turn("baseline", sweeps)
             files = {sweep.name: str(sweep.results.file) for sweep in sweeps}

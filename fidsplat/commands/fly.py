@@ -18,6 +18,7 @@ from fidsplat.commands.output import (
     SceneOutputs,
     SceneQuality,
     bytes_of,
+    check_words,
     console,
     counted,
     late_progress,
@@ -105,13 +106,11 @@ class Fly:
         import fidsplat as fs
         from fidsplat.cameras.trajectory import check_rate
         from fidsplat.commands.flight_records import write_log, write_truth
-        from fidsplat.effects import select
         from fidsplat.flights import Flight, FlightFolder
         from fidsplat.vision.video import check_video
 
         names = names_of(self.outputs)
-        # what is wrong with the words is said before anything is read or opened
-        select(fs.SplatCloud.empty(), fs.Capture(outputs=names or "rgb", quality=fs.Quality.of(self.quality)))
+        check_words(names, self.quality)
         budget = bytes_of("--memory-budget", self.memory_budget)
         check_workers(self.ray, self.workers)
         if self.out.endswith(".mcap"):

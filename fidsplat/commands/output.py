@@ -55,6 +55,14 @@ def names_of(text: str | None) -> tuple[str, ...] | None:
     return None if text is None else tuple(name.strip() for name in text.split(","))
 
 
+def check_words(outputs: tuple[str, ...] | None, quality: str | None) -> None:
+    """Raises InputError for outputs or a quality that no scene could have, before anything is opened."""
+    import fidsplat as fs
+    from fidsplat.effects import select
+
+    select(fs.SplatCloud.empty(), fs.Capture(outputs=outputs or "rgb", quality=fs.Quality.of(quality)))
+
+
 MemoryBudget = Annotated[
     str | None,
     option("SIZE", "of the device, for a picture and its splats, e.g. 2GiB (default: nine tenths of it)"),

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from fidsplat.commands.output import Device, Json, console, late_progress, option, tell
-from fidsplat.commands.sweeps import Names
+from fidsplat.commands.sweeps import Names, asked
 
 
 @dataclass
@@ -45,15 +45,7 @@ class Plants:
         from fidsplat.experiments import plants
         from fidsplat.experiments.blender import default_environment
 
-        wanted = plants.Plants(
-            kinds=self.kind or plants.Plants.kinds,
-            each=self.each,
-            views=self.views,
-            samples=self.samples,
-            splats=self.splats,
-            iterations=self.iterations,
-            seed=self.seed,
-        )
+        wanted = asked(plants.Plants, self, kinds=self.kind or None)
         environment = self.environment or default_environment()
         with late_progress(console(True)) as progress:
             made = list(plants.write_plants(wanted, Path(self.out), environment, self.device, progress))

@@ -14,6 +14,7 @@ from fidsplat.commands.output import (
     MemoryBudget,
     SceneDevice,
     bytes_of,
+    check_words,
     console,
     late_progress,
     names_of,
@@ -98,13 +99,10 @@ class Render:
     def run(self) -> int:
         import fidsplat as fs
         from fidsplat.budget import check_bounds
-        from fidsplat.effects import select
-        from fidsplat.quality import Quality
         from fidsplat.vision.output_files import save_output
 
         names = names_of(self.outputs)
-        # what is wrong with the words is said before anything is read or opened
-        select(fs.SplatCloud.empty(), fs.Capture(outputs=names or "rgb", quality=Quality.of(self.quality)))
+        check_words(names, self.quality)
         memory = bytes_of("--memory-budget", self.memory_budget)
         budget = self.max_error is not None or self.max_ms is not None
         if budget:
@@ -114,7 +112,7 @@ class Render:
         with late_progress(console(True)) as progress:
             scene = load_source(self.source, self.quality, progress)
         with _named(self.source, "render.outputs", names is None):
-            select(fs.SplatCloud.empty(), fs.Capture(outputs=scene.outputs))
+            check_words(scene.outputs, None)
         of_scene = _named(self.source, "render.device", self.device is None)
         with where.status("opening the device"), of_scene:
             renderer = fs.Renderer(self.device or scene.device, memory)

@@ -19,7 +19,6 @@ from fidsplat.commands.output import (
     option,
     print_json,
     print_table,
-    say,
     switch,
     tell,
 )
@@ -167,11 +166,7 @@ def tell_store(path: str, as_json: bool) -> int:
     from fidsplat.store.store import Store
 
     facts = _facts(Store(path))
-    if as_json:
-        print_json(facts)
-    else:
-        _print_facts(path, facts)
-    return 0
+    return tell(as_json, facts, table=(path, ("", ""), _rows(facts)))
 
 
 def _facts(store: fs.Store) -> dict[str, Any]:
@@ -198,7 +193,7 @@ def _facts(store: fs.Store) -> dict[str, Any]:
 _KINDS = {"none": "2D", "all": "3D", "some": "2D and 3D"}
 
 
-def _print_facts(name: str, facts: dict[str, Any]) -> None:
+def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     rows = [("splats", f"{facts['splats']:,} ({facts['kind']}), SH degree {facts['sh_degree']}")]
     if facts["placed"] is not None:
         rows.append(("places", f"{facts['places']:,} of {facts['placed']}"))
@@ -216,7 +211,7 @@ def _print_facts(name: str, facts: dict[str, Any]) -> None:
     if facts["bounds"]:
         corners = ("(" + ", ".join(f"{value:.4g}" for value in corner) + ")" for corner in facts["bounds"])
         rows.append(("bounds", " to ".join(corners) + " m"))
-    print_table(console(False), name, ("", ""), rows)
+    return rows
 
 
 @dataclass
@@ -345,10 +340,7 @@ class Verify:
         with late_progress(console(True)) as progress:
             wrong = store.verify(progress)
         facts = {"store": self.store, "nodes": len(store.nodes), "damaged": wrong}
-        if self.json:
-            print_json(facts)
-        else:
-            say(console(False), *(wrong or [f"{self.store} is whole: {len(store.nodes):,} nodes"]))
+        tell(self.json, facts, *(wrong or [f"{self.store} is whole: {len(store.nodes):,} nodes"]))
         return 1 if wrong else 0
 
 

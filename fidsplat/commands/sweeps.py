@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import tyro
 
@@ -15,6 +16,8 @@ from fidsplat.errors import InputError
 if TYPE_CHECKING:
     from fidsplat.experiments.sweep import Key, Record, Sweep
 
+T = TypeVar("T")
+
 Names = tyro.conf.UseAppendAction[tuple[str, ...]]
 """an option that may be given several times"""
 Folders = tyro.conf.Positional[tuple[str, ...]]
@@ -23,6 +26,14 @@ Overwrite = Annotated[bool, switch("measure again what is in the results' folder
 ReportTo = Annotated[
     str | None, option("DIR|FILE.md", "folder or file for the report (default: the first folder)", "-o")
 ]
+
+
+def asked(kind: type[T], command: object, **others: object) -> T:
+    """What a command was asked for, as its work takes it: a dataclass of that kind, whose values are `others`
+    and the options of its fields' names. What is None, or no option, is left to its default."""
+    names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
+    given: dict[str, Any] = {name: getattr(command, name, None) for name in names}
+    return kind(**{name: value for name, value in (given | others).items() if value is not None})
 
 
 def need_reports(

@@ -9,7 +9,16 @@ from typing import Annotated, ClassVar
 
 from fidsplat.commands.output import Devices, Json, option, switch, tell
 from fidsplat.commands.own_scenes import Cameras, OwnScenes, own_scenes_of
-from fidsplat.commands.sweeps import Folders, Overwrite, ReportTo, check_plot, need_reports, run_sweeps, words
+from fidsplat.commands.sweeps import (
+    Folders,
+    Overwrite,
+    ReportTo,
+    asked,
+    check_plot,
+    need_reports,
+    run_sweeps,
+    words,
+)
 
 DEFAULT_FOLDER = "fidsplat-tradeoff"
 
@@ -94,8 +103,8 @@ class Tradeoff:
     json: Json = False
 
     def run(self) -> int:
-        from fidsplat.experiments.tradeoff.own import own_pictures
         from fidsplat.experiments.tradeoff.run import Options, prepared
+        from fidsplat.experiments.tradeoff.scenes import own_pictures
         from fidsplat.render import default_device
 
         if self.plot is not None:
@@ -107,9 +116,7 @@ class Tradeoff:
         with ExitStack() as stack:
             # all are opened first: one that is not there is said before minutes of another
             sweeps = [
-                stack.enter_context(
-                    prepared(Options(out, device, self.scenes, self.knobs, self.quick, self.overwrite, own))
-                )
+                stack.enter_context(prepared(asked(Options, self, out=out, device=device, own=own)))
                 for out, device in zip(folders, devices, strict=True)
             ]
             measured = run_sweeps(sweeps)

@@ -18,19 +18,15 @@ from fidsplat.commands.output import (
     late_progress,
     new_file,
     option,
-    print_json,
-    print_table,
-    say,
     switch,
+    tell,
     writable_file,
 )
-from fidsplat.commands.sweeps import need_reports
+from fidsplat.commands.sweeps import asked, need_reports
 from fidsplat.errors import InputError
 from fidsplat.files import path_of
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from fidsplat.train import Step, Trainer, ViewScore
 
 
@@ -92,13 +88,7 @@ class Train:
             raise InputError(f"--random-points is {self.random_points}; give at least 1, or 0 for none")
         if self.report is not None:
             need_reports()
-        settings = TrainSettings(
-            iterations=self.iterations,
-            strategy=self.strategy,
-            max_splats=self.max_splats,
-            sh_degree=self.sh_degree,
-            seed=self.seed,
-        )
+        settings = asked(TrainSettings, self)
         file = writable_file(self.out)
         checkpoint = file.with_suffix(".training.npz")
         if file.exists() and not checkpoint.exists():  # it is not of this training
@@ -112,8 +102,8 @@ class Train:
             renderer = Renderer(self.device)
         trainer = Trainer(dataset, renderer, settings, checkpoint, restart=self.overwrite)
         before, begun = trainer.iteration, time.perf_counter()
-        with _bar(trainer) as tell:
-            trainer.run(tell)
+        with _bar(trainer) as step:
+            trainer.run(step)
         seconds = time.perf_counter() - begun
         trainer.save(file)
         scores = trainer.evaluate()
@@ -124,11 +114,15 @@ class Train:
 
             pages = write_training_page(trainer, scores, facts, Path(self.report))
             facts["report"] = [str(page) for page in pages]
-        if self.json:
-            print_json(facts)
-            return 0
-        _tell(where, trainer, scores, facts)
-        return 0
+        rows = [(score.name, f"{score.psnr:.2f}", f"{score.ssim:.4f}") for score in scores]
+        if scores:
+            rows.append(("mean", f"{facts['psnr']:.2f}", f"{facts['ssim']:.4f}"))
+        title = f"{dataset.name} on {facts['device']}: views held out"
+        rate = facts["iterations_per_second"]
+        speed = "nothing was left to do" if rate is None else f"{seconds:.1f} s, {rate:.1f} it/s"
+        words = f"{facts['splats']:,} splats after {trainer.iteration:,} iterations ({speed})"
+        table = title, ("view", "PSNR, dB", "SSIM"), rows
+        return tell(self.json, facts, words, facts["file"], *facts.get("report", []), table=table)
 
 
 def _bytes(gibibytes: float) -> int:
@@ -151,7 +145,7 @@ def _bar(trainer: Trainer) -> Iterator:
         first, begun = trainer.iteration, time.perf_counter()
         mean = {"loss": 0.0, "psnr": 0.0}
 
-        def tell(step: Step) -> None:
+        def show(step: Step) -> None:
             share = max(0.02, 1 / (step.iteration - first))  # of the last in the mean that is shown
             mean["loss"] += share * (step.loss - mean["loss"])
             mean["psnr"] += share * (min(step.psnr, 100.0) - mean["psnr"])
@@ -159,7 +153,7 @@ def _bar(trainer: Trainer) -> Iterator:
             words = f"loss {mean['loss']:.4f}  {mean['psnr']:.1f} dB  {step.splats:,} splats  {rate:.1f} it/s"
             bars.update(task, completed=step.iteration, description=words)
 
-        yield tell
+        yield show
 
 
 def _facts(trainer: Trainer, scores: list[ViewScore], seconds: float, done: int) -> dict:
@@ -175,15 +169,3 @@ def _facts(trainer: Trainer, scores: list[ViewScore], seconds: float, done: int)
         "ssim": sum(score.ssim for score in scores) / count if scores else None,
         "views": [{"name": score.name, "psnr": score.psnr, "ssim": score.ssim} for score in scores],
     }
-
-
-def _tell(where: Console, trainer: Trainer, scores: list[ViewScore], facts: dict) -> None:
-    rows = [(score.name, f"{score.psnr:.2f}", f"{score.ssim:.4f}") for score in scores]
-    if scores:
-        rows.append(("mean", f"{facts['psnr']:.2f}", f"{facts['ssim']:.4f}"))
-    title = f"{trainer.dataset.name} on {facts['device']}: views held out"
-    print_table(where, title, ("view", "PSNR, dB", "SSIM"), rows)
-    rate = facts["iterations_per_second"]
-    speed = "nothing was left to do" if rate is None else f"{facts['seconds']:.1f} s, {rate:.1f} it/s"
-    say(where, f"{facts['splats']:,} splats after {facts['iterations']:,} iterations ({speed})")
-    say(where, facts["file"], *facts.get("report", []))

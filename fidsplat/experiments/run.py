@@ -29,48 +29,68 @@ QUICK_VIEWS = 1
 
 
 @dataclass(frozen=True)
-class Options:
-    """What a run is to measure, by the names that the command line has for it."""
+class Part:
+    """Which markers a run takes, and where its results go, by the names that the command line has for it."""
 
     out: Path
+    seed: int = SEED
+    """of texts and views"""
+    category: tuple[str, ...] = ()
+    markers: int | None = None
+    """of each category; None for 5, or 1 in a quick run"""
+    shard: str | None = None
+    """"i/n\""""
+    workers: int = field(default_factory=lambda: os.cpu_count() or 1)
+    """threads that look at pictures"""
+    overwrite: bool = False
+
+    def file(self, name: str) -> Path:
+        """Where the results of an experiment go."""
+        ending = "" if self.shard is None else "-" + self.shard.replace("/", "-of-")
+        return self.out / f"{name}{ending}.jsonl"
+
+    @property
+    def marker_count(self) -> int:
+        """Markers of each category."""
+        return MARKERS if self.markers is None else self.markers
+
+    def check(self) -> None:
+        """Raises InputError for an unknown category, or numbers that cannot be."""
+        chosen_categories(self.category)
+        if not 1 <= self.marker_count <= MARKERS:
+            raise InputError(f"--markers is {self.markers}; each category has 1 to {MARKERS}")
+        if self.workers < 1:
+            raise InputError(f"--workers is {self.workers}; at least 1 thread looks at pictures")
+
+
+@dataclass(frozen=True)
+class Options(Part):
+    """What a run of the experiments is to measure."""
+
     device: str = "opencl"
     quick: bool = False
     """one marker of each category, few tilts and views"""
-    seed: int = SEED
-    category: tuple[str, ...] = ()
     mixture: tuple[str, ...] = ()
     protocol: tuple[str, ...] = ()
     tilts: str | None = None
-    markers: int | None = None
-    """of each category; None for 5, or 1 in a quick run"""
     trained: Path | None = None
     """folder with trained models, see `Painter`"""
     blender: Path | None = None
     """folder with Blender's pictures; None for "blender" in ``out``"""
     lpips: Path | None = None
     """file with LPIPS weights, see `fidsplat.vision.metrics.load_lpips`"""
-    shard: str | None = None
-    """"i/n\""""
-    workers: int = field(default_factory=lambda: os.cpu_count() or 1)
-    """threads that look at pictures"""
-    overwrite: bool = False
     ideal: bool = False
     """only the ceiling: no splat is drawn and no device opened"""
 
     @property
     def marker_count(self) -> int:
         """Markers of each category."""
-        return (1 if self.quick else MARKERS) if self.markers is None else self.markers
+        return 1 if self.quick and self.markers is None else super().marker_count
 
     @property
     def methods(self) -> tuple[str, ...]:
         """Rows of the tables."""
         return (IDEAL,) if self.ideal else method_names(self.mixture, self.trained)
-
-    def file(self, name: str) -> Path:
-        """Where the results of an experiment go."""
-        ending = "" if self.shard is None else "-" + self.shard.replace("/", "-of-")
-        return self.out / f"{name}{ending}.jsonl"
 
     @property
     def blender_folder(self) -> Path:
@@ -116,7 +136,7 @@ def device_words(renderer: Renderer) -> str:
     return f"{renderer.device.title}, {renderer.device.version}"
 
 
-def results_of(name: str, options: Options, device: str | None) -> Results:
+def results_of(name: str, options: Part, device: str | None) -> Results:
     """The file of an experiment's results; device: `device_words` of what draws, None where nothing does."""
     versions = reader_versions() | (metric_versions() if name == views.NAME else {})
     return Results(options.file(name), run_facts(device, options.seed, versions), options.overwrite)
@@ -124,14 +144,10 @@ def results_of(name: str, options: Options, device: str | None) -> Results:
 
 def check(options: Options) -> None:
     """Raises InputError for options that cannot be used."""
-    chosen_categories(options.category)
+    options.check()
     for name in options.protocol:
         if name not in PROTOCOLS:
             raise InputError(f"unknown protocol {name!r}; known: {', '.join(PROTOCOLS)}")
-    if not 1 <= options.marker_count <= MARKERS:
-        raise InputError(f"--markers is {options.markers}; each category has 1 to {MARKERS}")
-    if options.workers < 1:
-        raise InputError(f"--workers is {options.workers}; at least 1 thread looks at pictures")
     _check_trained(options)
     if options.blender is not None and not options.blender.is_dir():
         raise InputError(

@@ -17,14 +17,13 @@ from fidsplat.errors import InputError
 from fidsplat.experiments import angles, views
 from fidsplat.experiments.dataset import write_scene
 from fidsplat.experiments.methods import Painter
-from fidsplat.experiments.setup import COLLECTIONS, SEED, TEST_VIEWS, Category
-from fidsplat.experiments.sweep import Key, Results, Sweep, shard
+from fidsplat.experiments.run import Part, device_words, results_of
+from fidsplat.experiments.setup import COLLECTIONS, TEST_VIEWS, chosen_categories
+from fidsplat.experiments.sweep import Key, Sweep, shard
 from fidsplat.files import writable_folder
-from fidsplat.provenance import run_facts
 from fidsplat.render import Renderer
 from fidsplat.train import Step, Trainer, TrainSettings, load_dataset
-from fidsplat.vision.metrics import has_flip, metric_versions
-from fidsplat.vision.readers import reader_versions
+from fidsplat.vision.metrics import has_flip
 
 NAME = "trained"
 _TILTS = "0:40:5,40.2:89.8:0.2"
@@ -34,31 +33,26 @@ _PROTOCOL = "fixed-plane"
 
 
 @dataclass(frozen=True)
-class Baseline:
+class Baseline(Part):
     """What is to be trained, and where it goes."""
 
-    out: Path
-    dataset: Path
+    dataset: Path = Path("fidsplat-dataset")
     """folder of the scenes"""
-    categories: tuple[Category, ...]
-    markers: int
-    """of each category"""
-    collections: tuple[int, ...] = COLLECTIONS
+    views: tuple[int, ...] = ()
+    """of each training; none for all of `COLLECTIONS`"""
     iterations: int = 7000
     seeds: int = 1
     """trainings of each, by random numbers of their own; the first is shown to the detectors"""
-    texts: int = SEED
-    """seed of texts and views"""
-    shard: str | None = None
-    """"i/n\""""
-    workers: int = 1
-    """threads that look at pictures"""
-    overwrite: bool = False
 
-    def file(self, name: str) -> Path:
-        """Where the results of an experiment go."""
-        ending = "" if self.shard is None else "-" + self.shard.replace("/", "-of-")
-        return self.out / f"{name}{ending}.jsonl"
+    def check(self) -> None:
+        """Raises InputError for what cannot be trained."""
+        super().check()
+        for number in self.views:
+            if number not in COLLECTIONS:
+                raise InputError(f"--views is {number}; known: {', '.join(map(str, COLLECTIONS))}")
+        if self.seeds < 1:
+            raise InputError(f"--seeds is {self.seeds}; at least 1 training is made of each")
+        TrainSettings(iterations=self.iterations)
 
     @property
     def points(self) -> list[Key]:
@@ -69,9 +63,9 @@ class Baseline:
                 **{"iterations": self.iterations, "seed": seed},
             }
             for seed in range(self.seeds)
-            for index in range(self.markers)
-            for category in self.categories
-            for number in self.collections
+            for index in range(self.marker_count)
+            for category in chosen_categories(self.category)
+            for number in self.views or COLLECTIONS
         ]
         return shard(every, self.shard)
 
@@ -87,13 +81,8 @@ def baseline_sweeps(wanted: Baseline, renderer: Renderer) -> Iterator[list[Sweep
     points = wanted.points
     shown = [point for point in points if point["seed"] == 0]
     folder, painter = writable_folder(wanted.out), Painter(renderer, wanted.out)
-    device = f"{renderer.device.title}, {renderer.device.version}"
-
-    def results(name: str, versions: dict[str, str] | None = None) -> Results:
-        facts = run_facts(device, wanted.texts, versions)
-        return Results(wanted.file(name), facts, wanted.overwrite)
-
-    trainings = results(NAME)
+    device = device_words(renderer)
+    trainings = results_of(NAME, wanted, device)
     if other := {record.key["iterations"] for record in trainings.done.values()} - {wanted.iterations}:
         # of views and tilts the files do not say after how many they were
         raise InputError(
@@ -105,31 +94,26 @@ def baseline_sweeps(wanted: Baseline, renderer: Renderer) -> Iterator[list[Sweep
         train_marker,
         folder=wanted.dataset,
         out=folder,
-        texts=wanted.texts,
+        texts=wanted.seed,
         renderer=renderer,
         restart=wanted.overwrite,
     )
     look = partial(
-        views.measure_views, painter=painter, seed=wanted.texts, blender=Path(), pool=pool, kept=kept
+        views.measure_views, painter=painter, seed=wanted.seed, blender=Path(), pool=pool, kept=kept
     )
     scan = partial(
-        angles.measure_angles, painter=painter, seed=wanted.texts, pool=pool, workers=wanted.workers
+        angles.measure_angles, painter=painter, seed=wanted.seed, pool=pool, workers=wanted.workers
     )
-    readers = reader_versions()
     try:
+        seen = (
+            (views.NAME, [_view_point(point) for point in shown], look),
+            (angles.NAME, [_angle_point(point) for point in shown], scan),
+        )
         yield [
             Sweep(NAME, trainings, points, partial(partial, train)),
-            Sweep(
-                views.NAME,
-                results(views.NAME, readers | metric_versions()),
-                [_view_point(p) for p in shown],
-                partial(partial, look),
-            ),
-            Sweep(
-                angles.NAME,
-                results(angles.NAME, readers),
-                [_angle_point(p) for p in shown],
-                partial(partial, scan),
+            *(
+                Sweep(name, results_of(name, wanted, device), own, partial(partial, measure))
+                for name, own, measure in seen
             ),
         ]
     finally:

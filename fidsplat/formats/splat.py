@@ -40,8 +40,10 @@ def load_splat(path: Path) -> SplatCloud:
 
 
 def save_splat(cloud: SplatCloud, path: Path) -> None:
-    """Write a .splat file. Raises InputError for boxes, or where it cannot be written."""
+    """Write a .splat file. Raises InputError for boxes, for no splats, or where it cannot be written."""
     refuse_boxes(cloud, "a .splat file")
+    if not len(cloud):
+        raise InputError("a .splat file cannot hold an empty cloud: it would be no file of any kind")
     rows = np.zeros(len(cloud), _ROW)
     rows["means"], rows["scales"] = world_means(cloud), three_scales(cloud)
     rgba = np.column_stack([plain_colors(cloud), cloud.opacities])

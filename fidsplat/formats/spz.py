@@ -72,7 +72,7 @@ def load_spz(path: Path) -> SplatCloud:
     quats = _smallest_three(parts["quats"]) if version == 3 else _first_three(parts["quats"])
     scales = np.exp(parts["scales"] / 16.0 - 10.0)
     dc = ((parts["colors"] / 255.0 - 0.5) / _COLOR).astype(np.float32)
-    rest = (parts["rest"].reshape(n, -1, 3).astype(np.float32) - 128) / 128
+    rest = (parts["rest"].reshape(n, _REST[degree], 3).astype(np.float32) - 128) / 128
     sh = np.concatenate([dc[:, None], rest], axis=1)
     opacities = (parts["opacities"][:, 0] / 255.0).astype(np.float32)
     return cloud_of(path, means, quats, scales, opacities, sh, _LEAST).transformed(HALF_TURN)

@@ -330,6 +330,13 @@ def test_a_disk_that_is_full_leaves_the_old_file(tmp_path, suffix):
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz"])
+def test_no_splats_are_read_as_none(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    fs.save_splats(fs.SplatCloud.empty(), path)
+    assert len(fs.load_splats(path)) == 0
+
+
 def test_what_cannot_be_written(tmp_path):
     tag = fs.marker("aruco:4x4_50:7", size=0.4)
     for suffix in (suffix for suffix, known in FORMATS.items() if known.save):
@@ -340,8 +347,9 @@ def test_what_cannot_be_written(tmp_path):
             fs.save_splats(tag.gaussians, tmp_path / f"none/a{suffix}")
     with pytest.raises(fs.InputError, match=r"unknown ending of a splat file '.obj'"):
         fs.save_splats(tag.gaussians, tmp_path / "a.obj")
-    with pytest.raises(fs.InputError, match="empty cloud"):
-        fs.save_splats(fs.SplatCloud.empty(), tmp_path / "a.glb")
+    for name in ("a.glb", "a.gltf", "a.splat"):
+        with pytest.raises(fs.InputError, match="empty cloud"):
+            fs.save_splats(fs.SplatCloud.empty(), tmp_path / name)
     far = fs.SplatCloud([[1e8, 0, 0]], [[1, 0, 0, 0]], [[1, 1]], [1], colors=[[1, 1, 1]])
     with pytest.raises(fs.InputError, match="SPZ holds coordinates up to 8,388,608 m"):
         fs.save_splats(far, tmp_path / "a.spz")

@@ -1,6 +1,7 @@
 """The Warp backend: its devices, what it says when it is missing, arrays that are shared without a copy."""
 
 import gc
+import os
 import re
 import subprocess
 import sys
@@ -306,6 +307,13 @@ def test_gpu_planes_are_tensors_on_the_same_device(library):
 def test_arrays_of_another_device_are_refused():
     with pytest.raises(fs.InputError, match="means lies on cpu, but this renderer draws on cuda"):
         fs.Renderer(GPUS[0]).adopt(**arrays_of(CLOUD, "cpu"))
+
+
+def test_debug_builds_are_launched_by_one_thread(monkeypatch):
+    """What they share among threads they would crash by."""
+    assert fs.Renderer("warp:cpu").backend._commands.threads > 1 or len(os.sched_getaffinity(0)) == 1
+    monkeypatch.setattr(wp.config, "mode", "debug")
+    assert fs.Renderer("warp:cpu").backend._commands.threads == 1
 
 
 def test_warp_pipelines_share_kernels_that_mean_the_same():

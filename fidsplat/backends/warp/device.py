@@ -61,7 +61,9 @@ class WarpBackend(Workspace):
         self.info = _describe(device)
         super().__init__(device, self.info.name, self.info.memory_bytes // 10 * 9)
         self.shape = shape_for(device)
-        self._commands = Commands(device, 1 if device.is_cuda else self.info.compute_units)
+        # debug builds of Warp's CPU kernels share a pointer among threads, and crash (warp/native/tile.h)
+        alone = device.is_cuda or runtime.load().config.mode == "debug"
+        self._commands = Commands(device, 1 if alone else self.info.compute_units)
         self._pipelines: dict[tuple[FeatureSet, WarpShape], WarpPipeline] = {}
         self._gradients: dict[tuple[FeatureSet, WarpShape], WarpGradients] = {}
 

@@ -14,7 +14,6 @@ from fidsplat.accuracy import TRUTH_CUTOFF
 from fidsplat.errors import FidsplatError, InputError
 from fidsplat.experiments.sweep import Key, Results, Sweep
 from fidsplat.experiments.tradeoff import compare, linear, points, scenes
-from fidsplat.experiments.tradeoff.own import Own, digests
 from fidsplat.experiments.tradeoff.points import ALONE, BASE, MARKER_KNOB, PRESETS_KNOB
 from fidsplat.experiments.tradeoff.session import DEFINITION, FULL, QUICK, Session, time_point
 from fidsplat.files import writable_folder
@@ -42,7 +41,7 @@ class Options:
     knobs: tuple[str, ...] = ()
     quick: bool = False
     overwrite: bool = False
-    own: Own = field(default_factory=dict)
+    own: scenes.Own = field(default_factory=dict)
     """one's own pictures, instead of scenes"""
     workers: int = min(_BATCH, os.cpu_count() or 1)
     """threads that look at pictures, while nothing is timed"""
@@ -67,7 +66,7 @@ def prepared(options: Options) -> Iterator[Sweep]:
     writable_folder(options.out)
     versions = reader_versions() | metric_versions() | {"pyopencl": version("pyopencl")}
     facts = run_facts(f"{info.title}, {info.version}", scenes.SEED, versions)
-    facts |= {"kind": info.kind, "title": info.title} | ({"scene": digests(own)} if own else {})
+    facts |= {"kind": info.kind, "title": info.title} | ({"scene": scenes.digests(own)} if own else {})
     results = Results(options.out / FILE, facts, options.overwrite)
     session = Session(renderer, own)
 

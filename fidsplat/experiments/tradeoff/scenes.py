@@ -1,18 +1,20 @@
-"""The scenes of `fidsplat tradeoff`: random ones, of 3D Gaussians too, the hard cases, and markers at three
-tilts."""
+"""The scenes of `fidsplat tradeoff`: random ones, of 3D Gaussians too, the hard cases, markers at three
+tilts, and one's own: splats from a file, seen from one's own cameras."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 from fidsplat.cameras import Camera
 from fidsplat.capture import Capture
 from fidsplat.errors import InputError, unknown
+from fidsplat.experiments.bench.catalogue import BenchScene
 from fidsplat.experiments.setup import BACKGROUND, CATEGORIES, PROTOCOLS
 from fidsplat.experiments.tradeoff.hard import hard_scene
 from fidsplat.markers import Marker, marker
+from fidsplat.provenance import digest_of
 from fidsplat.quality import MarkerQuality
 from fidsplat.random_clouds import load_scene
 from fidsplat.splats import SplatCloud
@@ -98,3 +100,19 @@ def made_marker(name: str, knobs: MarkerQuality) -> Marker:
     plain = marker(spec)
     module = PROTOCOL.module(plain.grid.shape[0])
     return marker(spec, module * plain.bits.shape[1], quality=knobs)
+
+
+Own = Mapping[str, TradeScene]
+"""one's own pictures, by the names of their views"""
+
+
+def own_pictures(views: Mapping[str, BenchScene]) -> dict[str, TradeScene]:
+    """The pictures of `fidsplat bench`'s own scenes: splats alone, on black."""
+    return {name: TradeScene(name, *view.make()) for name, view in views.items()}
+
+
+def digests(own: Own) -> dict[str, str]:
+    """16 hexadecimal digits of each picture's splats and camera, by its name: results are of these alone."""
+    clouds = {id(scene.cloud): scene.cloud for scene in own.values()}
+    splats = {number: digest_of(cloud) for number, cloud in clouds.items()}
+    return {name: digest_of((splats[id(scene.cloud)], scene.camera)) for name, scene in own.items()}

@@ -11,9 +11,8 @@ import numpy as np
 from fidsplat.accuracy import full_precision, reference_for, truth
 from fidsplat.backends.base import Measurable
 from fidsplat.capture import Capture
-from fidsplat.experiments.tradeoff.own import Own
 from fidsplat.experiments.tradeoff.points import BASE
-from fidsplat.experiments.tradeoff.scenes import TradeScene, make
+from fidsplat.experiments.tradeoff.scenes import Own, TradeScene, make
 from fidsplat.frame import Frame
 from fidsplat.quality import MarkerQuality, Quality
 from fidsplat.render import Renderer
