@@ -23,7 +23,7 @@ from .slopes import make_slopes
 SMALLEST_SCALE = wp.constant(wp.float32(1e-20))
 BLOCK = 128
 """threads of a block on a GPU"""
-LIMITS = (BLOCK, 6)  # so many blocks at once: at most 80 registers, of 108 that it would take
+LIMITS = (BLOCK, 5)  # so many blocks at once: at most 96 registers, of 116 that it would take
 NONE, BITS = wp.constant(wp.uint32(0)), wp.constant(wp.uint64(32))
 
 
