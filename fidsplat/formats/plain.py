@@ -67,6 +67,8 @@ def cloud_of(
     cloud = SplatCloud(means, quats, scales, opacities, sh=sh, labels=labels, source=str(path))
     if planes is None:
         return cloud
+    if planes.shape != (len(means),):
+        raise InputError(f"{path}: its planes have the shape {planes.shape}, for {len(means)} splats")
     if cloud.dropped:
         given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
         kept, _ = find_defects({name: np.asarray(array, np.float32) for name, array in given.items()})

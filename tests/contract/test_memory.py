@@ -238,12 +238,11 @@ def test_a_pool_keeps_to_the_budget_whatever_was_drawn_before(opencl, machine):
     the next."""
     budget = 8 * 2**20
     own, opencl = machine(opencl, budget), machine(opencl)
-    camera = fs.Camera.look_at(81, 59, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
-    for count, outputs in ((35000, ("rgb",)), (130000, ALL_OUTPUTS), (50000, ("rgb",)), (130000, ("rgb",))):
+    for count, outputs in ((35000, ("rgb",)), (200000, ALL_OUTPUTS), (50000, ("rgb",)), (200000, ("rgb",))):
         crowd = random_splats(count, seed=6, scale=(1e-4, 1e-2))
         resident = own.upload(crowd)
-        wanted = opencl.render(crowd, camera, outputs)
-        frame = own.render(resident, camera, outputs)
+        wanted = opencl.render(crowd, CAMERA, outputs)
+        frame = own.render(resident, CAMERA, outputs)
         if count != 50000:  # of which a processor has room for all, a GPU not
             assert ("packed splats" in own.backend.pool._buffers) == (count > 50000), "it was drawn in chunks"
         assert all(np.array_equal(frame[name], wanted[name]) for name in outputs)
