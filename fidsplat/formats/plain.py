@@ -96,6 +96,16 @@ def content(path: Path, what: str, begins: tuple[bytes, ...] = (b"",)) -> bytes:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
 
 
+def beginning(path: Path, what: str, size: int) -> bytes:
+    """As many of a file's first bytes, or all there are. Raises InputError where it cannot be read."""
+    check_file(path, what)
+    try:
+        with path.open("rb") as stream:
+            return stream.read(size)
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+
+
 def check_file(path: Path, what: str) -> None:
     """Raises InputError where there is no file that can be opened."""
     try:
