@@ -38,8 +38,8 @@ def pytest_configure(config):
 def counting(pixels):
     """`ReferencePipeline.pixels`, through which each picture of the reference is drawn, and counted here."""
 
-    def counted(self, resident, view, rows, columns):
-        images = pixels(self, resident, view, rows, columns)
+    def counted(self, resident, view, rows, columns, **how):
+        images = pixels(self, resident, view, rows, columns, **how)
         bound = images["certificate"]
         above = [np.count_nonzero(bound > threshold) for threshold in THRESHOLDS]
         _found[os.environ.get("PYTEST_CURRENT_TEST", "").split("::")[0]] += [1, bound.size, *above]

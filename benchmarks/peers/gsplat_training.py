@@ -225,7 +225,7 @@ def steps(name: str, renderer: fs.Renderer, repeats: int, kinds: dict[str, type[
 
     def own() -> None:
         trainer.step()
-        backend.queue.finish()
+        backend.finish()
 
     works = {"fidsplat_ms": finished(own)}
     for title, kind in kinds.items():

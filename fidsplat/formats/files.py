@@ -39,7 +39,7 @@ class Format:
 
 
 _USD = Format("OpenUSD ParticleField", load_usd, save_usd, labels=True, planes=True)
-_GLTF = Format("glTF KHR_gaussian_splatting", load_gltf, save_gltf, labels=True)
+_GLTF = Format("glTF KHR_gaussian_splatting", load_gltf, save_gltf, labels=True, planes=True)
 FORMATS = {
     ".ply": Format("PLY", load_ply, save_ply, labels=True, planes=True, origin=True),
     ".splat": Format(

@@ -22,6 +22,7 @@ from fidsplat.errors import InputError
 from fidsplat.files import atomic_write, from_json
 from fidsplat.formats.plain import (
     HALF_TURN,
+    beginning,
     cloud_of,
     coefficients,
     content,
@@ -60,7 +61,8 @@ def load_gltf(path: Path) -> SplatCloud:
 
 
 def save_gltf(cloud: SplatCloud, path: Path) -> None:
-    """Write a .glb file, or a .gltf one with its data inside. Labels stand in the attribute _LABEL.
+    """Write a .glb file, or a .gltf one with its data inside. Labels and planes stand in attributes of
+    ours, _LABEL and _PLANE.
 
     Raises InputError for boxes, or where it cannot be written.
     """
@@ -74,10 +76,12 @@ def save_gltf(cloud: SplatCloud, path: Path) -> None:
     for k in range(sh.shape[1]):
         degree = int(np.sqrt(k))
         arrays[f"{prefix}SH_DEGREE_{degree}_COEF_{k - degree * degree}"] = sh[:, k]
-    if cloud.labels.any():
-        if np.abs(cloud.labels.astype(np.int64)).max() >= 2**24:
-            raise InputError("glTF holds labels as floats, so up to 2^24; give smaller ones")
-        arrays["_LABEL"] = cloud.labels[:, None].astype(np.float32)
+    for name, whole in (("label", cloud.labels if cloud.labels.any() else None), ("plane", cloud.planes)):
+        if whole is None:
+            continue
+        if np.abs(whole.astype(np.int64)).max() >= 2**24:
+            raise InputError(f"glTF holds {name}s as floats, so up to 2^24; give smaller ones")
+        arrays[f"_{name.upper()}"] = whole[:, None].astype(np.float32)
     views, accessors, chunks, place = [], [], [], 0
     for array in arrays.values():
         chunk = np.ascontiguousarray(array, "<f4").tobytes()
@@ -197,10 +201,21 @@ class _Reader:
         count = sum(name.startswith(f"{prefix}SH_DEGREE_") for name in arrays)
         names = [f"{prefix}SH_DEGREE_{(d := int(np.sqrt(k)))}_COEF_{k - d * d}" for k in range(count)]
         sh = np.stack([arrays[name] for name in names], axis=1)
-        labels = arrays["_LABEL"][:, 0].astype(np.int32) if "_LABEL" in arrays else None
+        labels, planes = (self._whole(arrays, name) for name in ("_LABEL", "_PLANE"))
         quats = arrays[f"{prefix}ROTATION"][:, [3, 0, 1, 2]]
         scales, opacities = arrays[f"{prefix}SCALE"], arrays[f"{prefix}OPACITY"][:, 0]
-        return cloud_of(self._path, arrays["POSITION"], quats, scales, opacities, sh, labels=labels)
+        return cloud_of(
+            self._path, arrays["POSITION"], quats, scales, opacities, sh, labels=labels, planes=planes
+        )
+
+    def _whole(self, arrays: dict[str, np.ndarray], name: str) -> np.ndarray | None:
+        """(n,) int32 of an attribute of ours that holds whole numbers as floats, if it is there."""
+        if name not in arrays:
+            return None
+        values = arrays[name][:, 0]
+        if not (np.abs(values) < 2**24).all() or (values % 1).any():
+            raise InputError(f"{self._path}: its attribute {name} must hold whole numbers below 2^24")
+        return values.astype(np.int32)
 
     def _array(self, number: int) -> np.ndarray:
         """(n, width) float32 of an accessor."""
@@ -243,7 +258,9 @@ class _Reader:
         file = (folder / unquote(uri)).resolve()
         if "://" in uri or not file.is_relative_to(folder):
             raise InputError(f"{self._path} refers to {uri!r}, outside of its folder; it is not read")
-        return content(file, "the data of a glTF file")
+        views = [view for view in self._document["bufferViews"] if view["buffer"] == number]
+        size = max(int(view.get("byteOffset", 0)) + int(view["byteLength"]) for view in views)
+        return beginning(file, "the data of a glTF file", max(size, 0))  # whatever else the file holds
 
 
 def _matrix(node: dict[str, Any]) -> np.ndarray:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fidsplat.cloud_arrays import find_defects
 from fidsplat.errors import InputError
 from fidsplat.harmonics import C0
 from fidsplat.splats import SplatCloud
@@ -53,15 +54,29 @@ def plain_colors(cloud: SplatCloud) -> np.ndarray:
 
 
 def cloud_of(
-    path: Path, means, quats, scales, opacities, sh, disk: float = float(PADDED), labels=None
+    path: Path, means, quats, scales, opacities, sh, disk: float = float(PADDED), labels=None, planes=None
 ) -> SplatCloud:
     """The cloud of a file's arrays, scales (n, 3) in metres; what cannot be drawn is left out and counted.
 
     disk: third scales up to this, but for rounding, are those of disks.
+
+    Raises InputError for arrays that make no splats, or planes that cannot be.
     """
     scales = np.array(scales, np.float32)
     scales[scales[:, 2] <= np.float32(disk * (1 + 1e-5)), 2] = 0
-    return SplatCloud(means, quats, scales, opacities, sh=sh, labels=labels, source=str(path))
+    cloud = SplatCloud(means, quats, scales, opacities, sh=sh, labels=labels, source=str(path))
+    if planes is None:
+        return cloud
+    if planes.shape != (len(means),):
+        raise InputError(f"{path}: its planes have the shape {planes.shape}, for {len(means)} splats")
+    if cloud.dropped:
+        given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
+        kept, _ = find_defects({name: np.asarray(array, np.float32) for name, array in given.items()})
+        planes = planes[kept]
+    try:
+        return cloud.with_planes(planes)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def content(path: Path, what: str, begins: tuple[bytes, ...] = (b"",)) -> bytes:
@@ -77,6 +92,16 @@ def content(path: Path, what: str, begins: tuple[bytes, ...] = (b"",)) -> bytes:
                 return head
             stream.seek(0)
             return stream.read()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+
+
+def beginning(path: Path, what: str, size: int) -> bytes:
+    """As many of a file's first bytes, or all there are. Raises InputError where it cannot be read."""
+    check_file(path, what)
+    try:
+        with path.open("rb") as stream:
+            return stream.read(size)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
 

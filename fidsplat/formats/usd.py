@@ -130,9 +130,9 @@ def _cloud(path: Path, prim: Any) -> SplatCloud:
         raise InputError(f"{path}: {prim.GetPath()} has {len(sh)} SH coefficients for {n} splats of {k}")
     labels, planes = (prim.GetAttribute(f"fidsplat:{name}").Get() for name in ("labels", "planes"))
     quats = imaginary_first[:, [3, 0, 1, 2]]
-    labels = None if labels is None else np.array(labels)
-    cloud = cloud_of(path, means, quats, scales, array("opacities"), sh.reshape(n, k, 3), labels=labels)
-    return cloud if planes is None or cloud.dropped else cloud.with_planes(np.array(planes))
+    labels, planes = (None if each is None else np.array(each) for each in (labels, planes))
+    sh = sh.reshape(n, k, 3)
+    return cloud_of(path, means, quats, scales, array("opacities"), sh, labels=labels, planes=planes)
 
 
 def _pxr() -> Any:

@@ -136,19 +136,22 @@ kernel __attribute__((reqd_work_group_size(POSED, 1, 1))) void project_backward(
 }
 
 // Sums of rows, in a fixed order.
-// Index space: work-groups of ADDED, one per column. Reads: parts. Writes: sums.
+// Index space: work-groups of ADDED, one per column: three of tile_sums, then six of group_sums. Writes: background, pose.
 #define ADDED 64
 kernel __attribute__((reqd_work_group_size(ADDED, 1, 1))) void add_up(
 //@@ arguments add_up
 ) {
     local real kept[ADDED];
-    uint item = get_local_id(0), column = get_group_id(0);
+    bool of_tiles = get_group_id(0) < 3;
+    global const real *parts = of_tiles ? tile_sums : group_sums;
+    uint item = get_local_id(0), column = get_group_id(0) - (of_tiles ? 0 : 3);
+    uint rows = of_tiles ? tiles : groups, columns = of_tiles ? 3 : 6;
     real sum = 0;
     for (uint row = item; row < rows; row += ADDED) sum += parts[(size_t)row * columns + column];
     kept[item] = sum;
     barrier(CLK_LOCAL_MEM_FENCE);
     if (item == 0) {
         for (uint other = 1; other < ADDED; other++) sum += kept[other];
-        sums[column] = (float)sum;
+        (of_tiles ? background : pose)[column] = (float)sum;
     }
 }

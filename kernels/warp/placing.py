@@ -18,7 +18,7 @@ def make_placing(effects: tuple[str, ...], real) -> SimpleNamespace:
     boxes_too = any(name in effects for name in BOXES)
     vec3, mat33 = wp.types.vector(3, real), wp.types.matrix((3, 3), real)
     one, two = real(1.0), real(2.0)
-    range_radius, plane_radius, plane_boxes = real(math.sqrt(2.0 * math.log(255.0))), real(64.0), real(8.0)
+    range_radius, plane_radius = real(math.sqrt(2.0 * math.log(255.0))), real(64.0)
     motion = make_motion(moves)
     Moving = motion.Moving
 
@@ -61,7 +61,7 @@ def make_placing(effects: tuple[str, ...], real) -> SimpleNamespace:
                     found = reach
                     if wp.static(layers):
                         if plane >= 0:
-                            found = reach * plane_boxes
+                            found = reach * plane_radius
         return found
 
     return SimpleNamespace(Moving=Moving, pose=pose, tangents=tangents, depth_reach=depth_reach)

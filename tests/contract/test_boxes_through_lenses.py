@@ -37,7 +37,7 @@ def test_boxes_end_at_the_near_plane_and_the_far(renderer, camera):
     cloud = random_splats(80, 2, depth=(-3.0, 5.0), scale=(0.02, 1.0), across=1.5).with_boxes()
     cut_off = replace(camera, near=1.0, far=3.0)
     frame = assert_agrees(renderer, cloud, cut_off, quality=EXACT)
-    whole = renderer.render(cloud, camera, quality=EXACT)
+    whole = renderer.render(cloud, camera, ALL_OUTPUTS, EXACT)
     assert np.abs(frame["rgb"] - whole["rgb"]).max() > 0.1
 
 
@@ -124,7 +124,7 @@ def test_boxes_of_a_sheet_add_up_to_it(renderer, camera, tilt, distance):
     # parallel rays would see the near plane cut the sheet
     looking = seen_from(camera, tilt, 0.7 if camera.lens.kind == "orthographic" else distance)
     quality = EXACT.with_(transmittance_stop=0.0)
-    parts, one = (renderer.render(cloud, looking, ("rgb", "alpha"), quality) for cloud in (sheet, whole))
+    parts, one = (renderer.render(cloud, looking, ALL_OUTPUTS, quality) for cloud in (sheet, whole))
     assert one["alpha"].max() > 0.3
     even = ~widened(looking)
     assert even.mean() > 0.9
@@ -132,6 +132,7 @@ def test_boxes_of_a_sheet_add_up_to_it(renderer, camera, tilt, distance):
     assert np.abs(parts["rgb"] - parts["alpha"][..., None])[even].max() < SEAM
 
 
+@in_turn()
 @each_camera
 @pytest.mark.parametrize("size", [0.004, 0.2])
 def test_light_is_that_of_the_image(renderer, camera, size):

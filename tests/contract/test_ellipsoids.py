@@ -116,7 +116,7 @@ def test_antialiased_splats_fade_where_they_are_widened(renderer):
         colors=np.ones((2, 3)),
     )
     plain, faded = (
-        renderer.render(cloud, CAMERA, ("alpha",), fs.Quality(ellipsoid=way))["alpha"]
+        renderer.render(cloud, CAMERA, ALL_OUTPUTS, fs.Quality(ellipsoid=way))["alpha"]
         for way in ("ewa", "ewa_antialiased")
     )
     left = np.s_[:, :24]

@@ -54,7 +54,7 @@ PICTURES = {
     "gsplat": lambda: Picture(AROUND, CAMERA, fs.Quality.of("gsplat"), outputs=EVERYTHING),
     **{
         name: lambda camera=CAMERAS[name]: Picture(MIXED, camera, outputs=EVERYTHING, fog=fs.Fog(0.3))
-        for name in ("distortion", "fisheye 200", "panorama", "parallel")
+        for name in ("fisheye 200", "distortion", "panorama", "parallel")
     },
 }
 

@@ -35,10 +35,10 @@ def works(renderer, views):
     """What makes the kernels' work and its twin, with the same splats."""
     assert isinstance(renderer.backend, Trains)
 
-    def make(**changes):
+    def make(lanes=0, **changes):
         settings = TrainSettings(iterations=5, **changes)
         found = (
-            DeviceWork(renderer.backend.training(), views, settings),
+            DeviceWork(training.OpenCLTraining(renderer.backend, lanes), views, settings),
             HostWork(renderer.backend, views, settings),
         )
         for work in found:
@@ -78,10 +78,10 @@ def agree(device, host, rtol=2e-5, atol=2e-6):
     np.testing.assert_array_equal(device.seen, host.seen)
 
 
-@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
-def test_loss(renderer, views, works, weight):
-    """Of pictures of two sizes in turn, as planes are kept, against float64."""
-    work, _ = works(dssim_weight=weight)
+@pytest.mark.parametrize(("weight", "lanes"), [(0.0, 0), (0.2, 0), (1.0, 0), (0.2, 1)])
+def test_loss(renderer, views, works, weight, lanes):
+    """Of pictures of two sizes in turn, as planes are kept, against float64; also one by one, as on GPUs."""
+    work, _ = works(lanes, dssim_weight=weight)
     random = np.random.default_rng(1)
     for number in (0, 1, 0):
         truth = views[number].picture / 255.0
@@ -192,7 +192,7 @@ def test_what_is_drawn_is_that_of_a_run_that_goes_on(renderer, works):
 def read(renderer, resident, name):
     buffer = resident.part(name, 0, COUNT)
     array = np.empty(buffer.size // 4, np.float32)
-    renderer.backend.queue.finish()
+    renderer.backend.finish()
     pyopencl.enqueue_copy(renderer.backend.queue, array, buffer)
     return array
 

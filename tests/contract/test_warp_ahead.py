@@ -229,7 +229,7 @@ def test_a_picture_between_replays_leaves_its_view_to_none(renderer, replayed, m
 
 
 def test_a_replay_that_fails_half_filled_is_not_launched_again(renderer, replayed, monkeypatch):
-    """The view that it was to show is drawn anew."""
+    """The view that it was to show is drawn again."""
     resident, there = renderer.upload(CLOUD), CAPTURE.with_(camera=ELSEWHERE)
     wanted = renderer.render(resident, there)["rgb"]
     for _ in range(4):

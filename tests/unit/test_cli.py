@@ -66,6 +66,7 @@ def test_help_loads_nothing_heavy():
         (["marker"], "SPEC"),
         (["marker", "qr:a", "--sise", "1"], "perhaps --size M; see fidsplat marker --help"),
         (["marker", "qr:a", "--size", "big"], "--size is 'big'; give a number; see fidsplat marker"),
+        (["marker", "qr:a", "--size", "it's"], '--size is "it\'s"; give a number; see fidsplat marker'),
         (["view", "--port", "abc"], "--port is 'abc'; give a whole number; see fidsplat view --help"),
         (["check", "--fuzz", "1e5"], "--fuzz is '1e5'; give a whole number; see"),
         (["marker", "qr:a", "qr:b"], "Unrecognized options: qr:b"),

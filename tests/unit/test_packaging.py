@@ -63,10 +63,8 @@ def clean() -> dict[str, str]:
 
 
 def install(source, target, *options):
-    run(
-        [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", target, *options, source],
-        target,
-    )
+    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-compile"]
+    run([*pip, "--target", target, *options, source], target)
 
 
 def kernels_seen_from(target) -> tuple[Path, set[str]]:

@@ -57,6 +57,23 @@ def test_a_splat_that_is_left_out_of_a_tile_is_not_seen_there(monkeypatch, camer
     assert np.mean(shares) < 0.8
 
 
+def test_pixels_that_are_far_apart_are_those_of_the_whole_picture(monkeypatch):
+    """Splats are chosen for many of them together."""
+    monkeypatch.setattr(backend, "_BLOCK", 1000)
+    chosen, choose = [], backend.may_see
+    monkeypatch.setattr(backend, "may_see", lambda *asked: chosen.append(choose(*asked)) or chosen[-1])
+    camera = fs.Camera.look_at(200, 150, 1.0, (0, 0, -2), (0, 0, 0))
+    picture = Picture(random_splats(100, 3, depth=(-0.5, 1.0)), camera, outputs=("rgb", "depth"))
+    whole = truth_of(picture)
+    rows, columns = np.random.default_rng(1).integers(0, (150, 200), (50, 2)).T
+    tiles = len(np.unique(rows // 16 * 200 + columns // 16))
+    chosen.clear()
+    for name, values in truth_of(picture, (rows, columns)).items():
+        assert np.allclose(values, whole[name][rows, columns], rtol=1e-11, atol=1e-11), name
+    assert 1 < len(chosen) < tiles / 3
+    assert np.mean(chosen) < 0.9
+
+
 @pytest.mark.parametrize("exposed", [False, True])
 def test_every_third_pixel_is_that_of_the_whole_picture(monkeypatch, exposed):
     monkeypatch.setattr(backend, "_BLOCK", 500)

@@ -206,7 +206,7 @@ class Writer:
         files = [f"{stage}.cl" for stage in stages]
         body = "".join(f"#line 1 {_shown(file)}\n{self._expand(file, 1, lines_of(file))}" for file in files)
         body = with_scalars(with_constants(body, self._declared.constants), self._declared.scalars.wide)
-        bare = "\n".join(map(_without_comment, body.split("\n")))
+        bare = "\n".join(_without_comment(line) if "//" in line else line for line in body.split("\n"))
         # a number that a program does not name must not make another program
         numbers = sorted(self._defines.items())
         head = "".join(f"#define {name} {value}\n" for name, value in numbers if name in bare)
@@ -222,9 +222,12 @@ class Writer:
     def _expand(self, file: str, first: int, lines: tuple[str, ...]) -> str:
         made = []
         for number, line in enumerate(lines, first):
-            hook = _HOOK.fullmatch(line)
-            filled = "".join(self._fill(hook[1], hook[2] or "")) if hook else ""
-            made.append(f"{filled}#line {number + 1} {_shown(file)}" if filled else "" if hook else line)
+            hook = _HOOK.fullmatch(line) if "//@@" in line else None
+            if hook is None:
+                made.append(line)
+                continue
+            filled = "".join(self._fill(hook[1], hook[2] or ""))
+            made.append(f"{filled}#line {number + 1} {_shown(file)}" if filled else "")
         return "\n".join(made) + "\n"
 
 
@@ -285,14 +288,14 @@ class Declarations:
         return "".join(f"{line}{note}\n" for line, note in zip(lines, notes, strict=True))
 
 
+@cache
 def _shown(file: str) -> str:
     """What `#line` calls a file: its path below kernels/, or its name if it is not from there."""
     return f'"{Path(file).name}"' if Path(file).is_absolute() else f'"opencl/{file}"'
 
 
 def _without_comment(line: str) -> str:
-    start = line.find("//")
-    return line if start < 0 else line[:start].rstrip(" \t")
+    return line[: line.index("//")].rstrip(" \t")
 
 
 def with_scalars(text: str, wide: str = "float") -> str:

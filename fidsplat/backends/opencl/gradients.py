@@ -80,6 +80,7 @@ class OpenCLGradients:
     def _backward(self, drawn: Picture, gradients: Mapping[str, Any]) -> dict[str, Any]:
         picture = copy(drawn)  # its buffers and events, with other kernels
         picture.program = self.program
+        picture.workspace.turn_to(picture.queue)  # the gradients may be on another
         view, shape, count, pairs = picture.view, self._pipeline.shape, picture.resident.count, picture.pairs
         self._take_gradients(picture, gradients)
         posed = -(-count // _GROUP)  # work-groups that sum up the pose
@@ -113,13 +114,9 @@ class OpenCLGradients:
                 name: picture.resident.part(name, 0, count) for name in self._cloud_arrays
             }
             picture.launch("project backward", "project_backward", count, _GROUP, count=count, **arrays)
-        for name, sums, rows, columns in (
-            ("tile_sums", "background", picture.tiles, 3),
-            ("group_sums", "pose", posed, 6),
-        ):
-            given: dict[str, Any] = {"parts": picture.held[name], "sums": found[sums].data}
-            given |= {"rows": rows, "columns": columns}
-            picture.launch("project backward", "add_up", columns * _GROUP, _GROUP, **given)
+        given: dict[str, Any] = {name: found[name].data for name in ("background", "pose")}
+        given |= {"tiles": picture.tiles, "groups": posed}
+        picture.launch("project backward", "add_up", (3 + 6) * _GROUP, _GROUP, **given)
         return found
 
     def _ask(self, drawn: Picture) -> None:

@@ -66,7 +66,10 @@ KERNELS: dict[str, tuple[Argument, ...]] = {
         "out float screen  // (n)",
         "out real group_sums  // (work-groups, 6) by the pose",
     ),
-    "add_up": takes("uint rows columns", "in real parts  // (rows, columns)", "out float sums  // (columns)"),
+    "add_up": takes(
+        *("uint tiles groups", "in real tile_sums group_sums  // (tiles, 3), (groups, 6)"),
+        "out float background pose",
+    ),
 }
 
 GROUP_KERNELS: dict[str, tuple[Argument, ...]] = {

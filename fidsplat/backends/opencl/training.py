@@ -68,10 +68,11 @@ class ResidentArrays:
 class OpenCLTraining:
     """As `TrainingKernels`."""
 
-    def __init__(self, workspace: Workspace) -> None:
+    def __init__(self, workspace: Workspace, lanes: int = 0) -> None:
+        """lanes: of vectors, in place of the device's own (tests)."""
         self._workspace = workspace
-        lanes = workspace.shape.lanes if workspace.shape.schedule == "lanes" else 1
-        self._lanes = lanes
+        lanes = lanes or (workspace.shape.lanes if workspace.shape.schedule == "lanes" else 1)
+        self._lanes, self._each_rows = lanes, 4 if lanes == 1 else 1  # EACH_ROWS of loss.cl
         self._program = Program(workspace, training_source(lanes, workspace.info.float64))
         self._held: dict[str, Any] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
@@ -158,7 +159,8 @@ class OpenCLTraining:
         }
         self._launch_rows("loss_take", 3 * columns, height, given)
         for name in ("loss_rows", "loss_columns", "loss_rows_backward", "loss_columns_backward"):
-            self._launch_rows(name, -(-3 * columns // self._lanes), height, given)
+            each = self._each_rows if "columns" in name else 1
+            self._launch_rows(name, -(-3 * columns // self._lanes), -(-height // each), given)
         added = self._enqueue("loss_sums", (_SUMS * _SUMMED,), (_SUMMED,), given)
 
         def value() -> tuple[float, float]:
@@ -225,8 +227,8 @@ class OpenCLTraining:
 
     @property
     def _queue(self) -> cl.CommandQueue:
-        """The queue on which pictures with derivatives are drawn, after all that is on others."""
-        return self._workspace.turn_to(self._workspace.queue)
+        """The queue of pictures that nobody waits for, after all that is on others."""
+        return self._workspace.turn_to(self._workspace.repeat_queue)
 
     def _launch(self, kernel: str, items: int, given: Mapping[str, Any] | None = None) -> None:
         size = max(_GROUP, -(-items // _GROUP) * _GROUP)

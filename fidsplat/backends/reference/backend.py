@@ -24,6 +24,8 @@ from fidsplat.splats import SplatCloud
 
 _BLOCK = 1 << 16  # (sample, splat) pairs that are evaluated at once: half a megabyte each, which caches hold
 _TILE = 16  # samples along a side of those for which splats are chosen together
+_WIDEST = 128  # the same of samples that are far apart, at most
+_FEW = 16  # samples: tiles of fewer are made wider, as choosing takes longer than drawing more splats
 
 
 def devices() -> list[DeviceInfo]:
@@ -143,7 +145,8 @@ class ReferencePipeline:
         ]
         start = time.perf_counter()
         self._progress = _Progress(tell, rows.size * view.samples**2)
-        flat = self.pixels(resident, view, rows.ravel(), columns.ravel())
+        # tiles as those of a whole picture: the same splats, added up alike
+        flat = self.pixels(resident, view, rows.ravel(), columns.ravel(), widest=_TILE)
         images = {name: image.reshape(*rows.shape, *image.shape[1:]) for name, image in flat.items()}
         took = (time.perf_counter() - start) * 1e3
         count = len(resident.cloud)
@@ -155,31 +158,36 @@ class ReferencePipeline:
         return {"order": splats.order, "keys": splats.key, **self.render(resident, view).images}
 
     def pixels(
-        self, resident: ReferenceCloud, view: View, rows: np.ndarray, columns: np.ndarray
+        self,
+        resident: ReferenceCloud,
+        view: View,
+        rows: np.ndarray,
+        columns: np.ndarray,
+        widest: int = _WIDEST,
     ) -> dict[str, np.ndarray]:
         """Outputs at pixels (row, column), each (k,) or (k, 3) float64; `certificate` (k,) beside those asked
-        for.
+        for. widest: samples along a side of those for which splats are chosen together, at most.
         """
         n = view.samples
         sub_rows, sub_columns = np.mgrid[0:n, 0:n]
         y = (np.asarray(rows)[:, None] * n + sub_rows.ravel() + 0.5).ravel()
         x = (np.asarray(columns)[:, None] * n + sub_columns.ravel() + 0.5).ravel()
-        flat = self._exposed(resident, view, x, y) if view.shots else self._samples(resident, view, x, y)
+        sampled = self._exposed if view.shots else self._samples
+        flat = sampled(resident, view, x, y, widest)
         samples = {name: values.reshape(-1, n * n, *values.shape[1:]) for name, values in flat.items()}
         samples |= {"x": x.reshape(-1, n * n), "y": y.reshape(-1, n * n)}
         return resolve(samples, view, self.features)
 
     def _samples(
-        self, resident: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray
+        self, resident: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray, widest: int
     ) -> dict[str, np.ndarray]:
         """What blending leaves (k, ...) at grid positions x, y (k,)."""
         splats = Setup(resident.cloud, view, self.features)
         if len(x) * len(splats.order) <= _BLOCK:
             return composite(splats, view, self.features, x, y)
-        tile = y // _TILE * view.width + x // _TILE
-        places = np.argsort(tile, kind="stable")
+        places, starts = _by_tile(view, x, y, widest)
         parts = []
-        for mine in np.split(places, np.flatnonzero(np.diff(tile[places])) + 1):
+        for mine in np.split(places, starts):
             seen = splats.among(may_see(splats, view, x[mine], y[mine]))
             step = max(1, _BLOCK // max(1, len(seen.order)))
             for k in range(0, len(mine), step):
@@ -190,7 +198,7 @@ class ReferencePipeline:
         return {name: np.concatenate([part[name] for part in parts])[back] for name in parts[0]}
 
     def _exposed(
-        self, resident: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray
+        self, resident: ReferenceCloud, view: View, x: np.ndarray, y: np.ndarray, widest: int
     ) -> dict[str, np.ndarray]:
         """The same of a picture of several shots: the mean of colours, fog and transmittances, all else from
         the middle one; `certificate_middle` is that one's certificate."""
@@ -198,7 +206,7 @@ class ReferencePipeline:
         seen_by = [(y > shot.top) & (y < shot.top + shot.view.height) for shot in view.shots]
         self._progress.total = sum(int(mine.sum()) for mine in seen_by)
         for shot, mine in zip(view.shots, seen_by, strict=True):
-            seen = self._samples(resident, shot.view, x[mine], y[mine] - shot.top)
+            seen = self._samples(resident, shot.view, x[mine], y[mine] - shot.top, widest)
             seen["certificate_middle"] = seen["certificate"]
             for name, values in seen.items():
                 plane = out.setdefault(name, np.zeros((len(x), *values.shape[1:]), values.dtype))
@@ -207,6 +215,19 @@ class ReferencePipeline:
                 elif shot.middle:
                     plane[mine] = values
         return out
+
+
+def _by_tile(view: View, x: np.ndarray, y: np.ndarray, widest: int) -> tuple[np.ndarray, np.ndarray]:
+    """The places of samples (k,) tile by tile, and where each tile but the first begins in them. Samples that
+    are far apart have wider tiles, up to `widest` along a side."""
+    side = _TILE
+    while True:
+        tile = y // side * view.width + x // side
+        places = np.argsort(tile, kind="stable")
+        starts = np.flatnonzero(np.diff(tile[places])) + 1
+        if side >= widest or len(x) >= _FEW * len(starts):
+            return places, starts
+        side *= 2
 
 
 @dataclass

@@ -70,7 +70,7 @@ class Setup:
             with np.errstate(divide="ignore", invalid="ignore"):
                 further = radius / np.sqrt(2 * half_r2)
                 further[box] = (
-                    1 if cloud.planes is None else np.where(cloud.planes[box] >= 0, _PLANE_BOXES, 1)
+                    1 if cloud.planes is None else np.where(cloud.planes[box] >= 0, _PLANE_RADIUS, 1)
                 )
                 reach = reach * further
             self.key = self.key - reach.astype(np.float32)
@@ -143,9 +143,8 @@ _RANGE_RADIUS = math.sqrt(2 * math.log(255))
 """radius, in standard deviations, of the part of a splat whose depths bound those of all of it"""
 _PLANE_RADIUS = 64.0
 """the same of splats that are printed on a plane: they lie on it wherever any cut-off and a low-pass let them
-be drawn, so that those that a cut-off leaves out move no layer"""
-_PLANE_BOXES = 8.0
-"""half sides of a box within which its fragments lie on its plane: where it ends within a pixel too"""
+be drawn, so that those that a cut-off leaves out move no layer; of boxes half sides, so that those that are a
+small part of a pixel move none"""
 _OF_SPLATS = (
     *("order", "log_opacity", "half_r2", "reach", "labels", "pz", "z_numerator"),
     *("inverse_m2", "turned"),

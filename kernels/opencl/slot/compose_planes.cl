@@ -8,14 +8,13 @@
 //@ project
     record.plane = planes[i];
 //@ functions
-#define PLANE_RADIUS REAL(64.0)       // standard deviations
-#define PLANE_BOXES REAL(8.0)         // half sides
+#define PLANE_RADIUS REAL(64.0)       // standard deviations; of boxes half sides
 //@ plane_nearest
     if (planes[i] >= 0) {
         record.nearest = (wide)plane_keys[planes[i] * get_global_size(1) + number];
         // its fragments lie on the plane as far out as any cut-off and a low-pass let them be drawn: so those that a cut-off leaves
-        // out move no layer, nor do boxes that end within a pixel
-        depth_reach = reach * (BOX_HERE ? PLANE_BOXES : PLANE_RADIUS / radius);
+        // out move no layer, nor do boxes that are a small part of a pixel
+        depth_reach = reach * (BOX_HERE ? PLANE_RADIUS : PLANE_RADIUS / radius);
     }
 //@ plane_blocks_nearest
         least = s->nearest;         // in no other order: a plane's stand together

@@ -14,10 +14,12 @@ constant float WINDOW[2 * RADIUS + 1] = {
 };
 #define C1 1e-4f
 #define C2 9e-4f
+// Rows that a work-item computes in the passes over columns, which share what they read. A CPU has no registers for more than one.
+#define EACH_ROWS (LANES == 1 ? 4 : 1)
 
-// Where a work-item's values lie in an image, and how many of them belong to the picture.
-#define HERE \
-    int column = get_global_id(0) * LANES, row = get_global_id(1); \
+// Where a work-item's values lie in an image, `rows` rows of them.
+#define HERE(rows) \
+    int column = get_global_id(0) * LANES, row = get_global_id(1) * (rows); \
     if (column >= width || row >= height) return; \
     size_t at = (size_t)(row + MARGIN_ROWS) * stride + MARGIN + column
 
@@ -43,7 +45,7 @@ kernel void loss_take(
 kernel void loss_rows(
 //@@ arguments loss_rows
 ) {
-    HERE;
+    HERE(1);
     vfloat a = 0, b = 0, aa = 0, bb = 0, ab = 0;
     for (int k = -RADIUS; k <= RADIUS; k++) {
         vfloat x = VLOAD(images + at + 3 * k), y = VLOAD(images + image_stride + at + 3 * k), w = WINDOW[k + RADIUS];
@@ -60,39 +62,50 @@ kernel void loss_rows(
     VSTORE(INSIDE(ab), images + 6 * image_stride + at);
 }
 
-// Index space: (LANES values, rows). Reads: images 2 to 6. Writes: images 7 to 9, the derivatives of the SSIM by the mean of a, by the
-// mean of a a, by that of a b; image 10, the SSIM.
+// Means along columns of `count` images from `from` on, for EACH_ROWS rows. The rows that are read below the last margin belong to
+// rows that the picture has not: they lie in the next image.
+static inline void columns_of(global const float *from, int count, int stride, uint image_stride, vfloat means[][5]) {
+    for (int each = 0; each < EACH_ROWS; each++)
+        for (int image = 0; image < count; image++) means[each][image] = 0;
+#pragma unroll
+    for (int k = -RADIUS; k < RADIUS + EACH_ROWS; k++)
+#pragma unroll
+        for (int image = 0; image < count; image++) {
+            vfloat value = VLOAD(from + image * (size_t)image_stride + k * stride);
+#pragma unroll
+            for (int each = 0; each < EACH_ROWS; each++)
+                if (k - each >= -RADIUS && k - each <= RADIUS) means[each][image] += WINDOW[k - each + RADIUS] * value;
+        }
+}
+
+// Index space: (LANES values, EACH_ROWS rows). Reads: images 2 to 6. Writes: images 7 to 9, the derivatives of the SSIM by the mean of
+// a, by the mean of a a, by that of a b; image 10, the SSIM.
 kernel void loss_columns(
 //@@ arguments loss_columns
 ) {
-    HERE;
-    vfloat a = 0, b = 0, aa = 0, bb = 0, ab = 0;
-    for (int k = -RADIUS; k <= RADIUS; k++) {
-        global const float *from = images + 2 * image_stride + at + k * stride;
-        vfloat w = WINDOW[k + RADIUS];
-        a += w * VLOAD(from);
-        b += w * VLOAD(from + image_stride);
-        aa += w * VLOAD(from + 2 * image_stride);
-        bb += w * VLOAD(from + 3 * image_stride);
-        ab += w * VLOAD(from + 4 * image_stride);
+    HERE(EACH_ROWS);
+    vfloat found[EACH_ROWS][5];
+    columns_of(images + 2 * image_stride + at, 5, stride, image_stride, found);
+    for (int each = 0; each < EACH_ROWS && row + each < height; each++, at += stride) {
+        vfloat a = found[each][0], b = found[each][1], aa = found[each][2], bb = found[each][3], ab = found[each][4];
+        vfloat means = a * a + b * b + C1, variances = (aa - a * a) + (bb - b * b) + C2;
+        vfloat top = 2.0f * a * b + C1, shared = 2.0f * (ab - a * b) + C2;
+        vfloat similar = top * shared / (means * variances);
+        vfloat by_shared = 2.0f * top / (means * variances), by_variance = -similar / variances;
+        vfloat by_mean = 2.0f * (b * shared - a * similar * variances) / (means * variances);
+        by_mean -= 2.0f * a * by_variance + b * by_shared;
+        VSTORE(INSIDE(by_mean), images + 7 * image_stride + at);
+        VSTORE(INSIDE(by_variance), images + 8 * image_stride + at);
+        VSTORE(INSIDE(by_shared), images + 9 * image_stride + at);
+        VSTORE(INSIDE(similar), images + 10 * image_stride + at);
     }
-    vfloat means = a * a + b * b + C1, variances = (aa - a * a) + (bb - b * b) + C2;
-    vfloat top = 2.0f * a * b + C1, shared = 2.0f * (ab - a * b) + C2;
-    vfloat similar = top * shared / (means * variances);
-    vfloat by_shared = 2.0f * top / (means * variances), by_variance = -similar / variances;
-    vfloat by_mean = 2.0f * (b * shared - a * similar * variances) / (means * variances);
-    by_mean -= 2.0f * a * by_variance + b * by_shared;
-    VSTORE(INSIDE(by_mean), images + 7 * image_stride + at);
-    VSTORE(INSIDE(by_variance), images + 8 * image_stride + at);
-    VSTORE(INSIDE(by_shared), images + 9 * image_stride + at);
-    VSTORE(INSIDE(similar), images + 10 * image_stride + at);
 }
 
 // Index space: (LANES values, rows). Reads: images 7 to 9. Writes: images 2 to 4, their means along rows.
 kernel void loss_rows_backward(
 //@@ arguments loss_rows_backward
 ) {
-    HERE;
+    HERE(1);
     vfloat by_mean = 0, by_variance = 0, by_shared = 0;
     for (int k = -RADIUS; k <= RADIUS; k++) {
         global const float *from = images + 7 * image_stride + at + 3 * k;
@@ -106,26 +119,23 @@ kernel void loss_rows_backward(
     VSTORE(INSIDE(by_shared), images + 4 * image_stride + at);
 }
 
-// Index space: (LANES values, rows). Reads: images 0 to 4. Writes: the derivative of the loss, of the picture's shape.
+// Index space: (LANES values, EACH_ROWS rows). Reads: images 0 to 4. Writes: the derivative of the loss, of the picture's shape.
 kernel void loss_columns_backward(
 //@@ arguments loss_columns_backward
 ) {
-    HERE;
-    vfloat by_mean = 0, by_variance = 0, by_shared = 0;
-    for (int k = -RADIUS; k <= RADIUS; k++) {
-        global const float *from = images + 2 * image_stride + at + k * stride;
-        vfloat w = WINDOW[k + RADIUS];
-        by_mean += w * VLOAD(from);
-        by_variance += w * VLOAD(from + image_stride);
-        by_shared += w * VLOAD(from + 2 * image_stride);
-    }
-    vfloat a = VLOAD(images + at), b = VLOAD(images + image_stride + at);
-    vfloat slope = sign(a - b) * l1_share - (by_mean + 2.0f * a * by_variance + b * by_shared) * ssim_share;
-    float values[LANES];
-    VSTORE(slope, values);
-    for (int k = 0; k < LANES && column + k < width; k++) {
-        bool counts = !masked || mask[(size_t)row * (width / 3) + (column + k) / 3];
-        by_rgb[(size_t)row * width + column + k] = counts ? values[k] : 0.0f;
+    HERE(EACH_ROWS);
+    vfloat found[EACH_ROWS][5];
+    columns_of(images + 2 * image_stride + at, 3, stride, image_stride, found);
+    for (int each = 0; each < EACH_ROWS && row < height; each++, row++, at += stride) {
+        vfloat by_mean = found[each][0], by_variance = found[each][1], by_shared = found[each][2];
+        vfloat a = VLOAD(images + at), b = VLOAD(images + image_stride + at);
+        vfloat slope = sign(a - b) * l1_share - (by_mean + 2.0f * a * by_variance + b * by_shared) * ssim_share;
+        float values[LANES];
+        VSTORE(slope, values);
+        for (int k = 0; k < LANES && column + k < width; k++) {
+            bool counts = !masked || mask[(size_t)row * (width / 3) + (column + k) / 3];
+            by_rgb[(size_t)row * width + column + k] = counts ? values[k] : 0.0f;
+        }
     }
 }
 
