@@ -163,7 +163,7 @@ def _any_of(commands: dict[str, type]) -> Any:
     )
 
 
-_NO_NUMBER = re.compile(r"Error parsing (\S+): .*(int\(\) with base 10|string to float): ('.*?')")
+_NO_NUMBER = re.compile(r"Error parsing (\S+): .*(int\(\) with base 10|string to float): ('.*?'|\".*?\")")
 
 
 def _one_line(box: str) -> str:

@@ -22,6 +22,7 @@ from fidsplat.errors import InputError
 from fidsplat.files import atomic_write, from_json
 from fidsplat.formats.plain import (
     HALF_TURN,
+    beginning,
     cloud_of,
     coefficients,
     content,
@@ -257,7 +258,9 @@ class _Reader:
         file = (folder / unquote(uri)).resolve()
         if "://" in uri or not file.is_relative_to(folder):
             raise InputError(f"{self._path} refers to {uri!r}, outside of its folder; it is not read")
-        return content(file, "the data of a glTF file")
+        views = [view for view in self._document["bufferViews"] if view["buffer"] == number]
+        size = max(int(view.get("byteOffset", 0)) + int(view["byteLength"]) for view in views)
+        return beginning(file, "the data of a glTF file", max(size, 0))  # whatever else the file holds
 
 
 def _matrix(node: dict[str, Any]) -> np.ndarray:

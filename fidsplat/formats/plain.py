@@ -67,6 +67,8 @@ def cloud_of(
     cloud = SplatCloud(means, quats, scales, opacities, sh=sh, labels=labels, source=str(path))
     if planes is None:
         return cloud
+    if planes.shape != (len(means),):
+        raise InputError(f"{path}: its planes have the shape {planes.shape}, for {len(means)} splats")
     if cloud.dropped:
         given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
         kept, _ = find_defects({name: np.asarray(array, np.float32) for name, array in given.items()})
@@ -90,6 +92,16 @@ def content(path: Path, what: str, begins: tuple[bytes, ...] = (b"",)) -> bytes:
                 return head
             stream.seek(0)
             return stream.read()
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+
+
+def beginning(path: Path, what: str, size: int) -> bytes:
+    """As many of a file's first bytes, or all there are. Raises InputError where it cannot be read."""
+    check_file(path, what)
+    try:
+        with path.open("rb") as stream:
+            return stream.read(size)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
 

@@ -100,10 +100,10 @@ def layered(
     """
     # with a cut-off above 1/255 all that is drawn has a depth
     quality = Quality(alpha_cutoff=1 / 250, transmittance_stop=0.0, order=order)
-    outputs = ("rgb", "alpha", "depth")
-    alone = [draw(renderer, Picture(part, camera, quality, outputs, (0, 0, 0))) for part in parts]
-    whole = Picture(SplatCloud.concatenate(parts), camera, quality, outputs, (0, 0, 0))
-    rgb, alpha, depth = (np.stack([frame[name] for frame in alone]) for name in outputs)
+    # more outputs than are looked at: with these the kernels are compiled anyway
+    alone = [draw(renderer, Picture(part, camera, quality, ALL_OUTPUTS, (0, 0, 0))) for part in parts]
+    whole = Picture(SplatCloud.concatenate(parts), camera, quality, ALL_OUTPUTS, (0, 0, 0))
+    rgb, alpha, depth = (np.stack([frame[name] for frame in alone]) for name in ("rgb", "alpha", "depth"))
     ranks = np.argsort(np.where(alpha > 0, depth, np.inf), axis=0)
     light, wanted = np.ones(alpha.shape[1:]), np.zeros(rgb.shape[1:])
     for k in ranks:

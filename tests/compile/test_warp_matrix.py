@@ -32,11 +32,12 @@ def test_each_effect_alone(renderer, name):
     assert_drawn(renderer, (name,))
 
 
-@pytest.mark.parametrize("lens", [None, *LENSES])
+# the others with other effects beside them in test_combinations.py and test_gpu_schedule.py of tests/contract
+@pytest.mark.parametrize("lens", sampled([None, *LENSES], 3, 2))
 def test_all_effects(renderer, lens):
     assert_drawn(renderer, [name for name in everything(lens) if has(name)])
 
 
-@pytest.mark.parametrize("pair", sampled(PAIRS, 4, 12), ids=" and ".join)
+@pytest.mark.parametrize("pair", sampled(PAIRS, 3, 12), ids=" and ".join)
 def test_pairs(renderer, pair):
     assert_drawn(renderer, pair)

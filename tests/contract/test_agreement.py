@@ -70,7 +70,7 @@ def test_splats_much_smaller_than_a_pixel(renderer):
 )
 def test_lowpass_and_samples(renderer, lowpass, samples):
     quality = fs.Quality(lowpass=lowpass, samples=samples)
-    camera = CAMERA if samples < 3 else SMALL
+    camera = CAMERA if samples == 1 else SMALL
     assert_agrees(renderer, random_splats(100, seed=5), camera, quality=quality)
 
 
@@ -190,7 +190,7 @@ def rotation_about(axis):
     return np.eye(3) + math.sin(angle) * skew + (1 - math.cos(angle)) * skew @ skew
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1, pytest.param(2, marks=pytest.mark.exhaustive)])
 @pytest.mark.parametrize(("samples", "camera"), [(1, CAMERA), (2, SMALL)], ids=["1 sample", "2 x 2 samples"])
 def test_coplanar_splats_are_one_layer(renderer, seed, samples, camera):
     cloud = coplanar_cloud(seed)

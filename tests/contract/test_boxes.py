@@ -40,14 +40,15 @@ def test_an_exact_marker_is_its_area_sampled_texture(renderer, px_per_module, sa
     """QR version 22, frontal: no worse than 80 dB (rounding alone), where `fitted` has 26."""
     made = fs.marker("qr-v22-L:" + "fidsplat" * 100, mixture="exact")
     focal = 4 * px_per_module / made.module
-    center = (281.3, 270.8)
+    size = math.ceil(px_per_module * made.grid.shape[1]) + 40, math.ceil(px_per_module * len(made.grid)) + 30
+    center = (size[0] / 2 + 1.3, size[1] / 2 - 0.2)
     pose = np.eye(4)
     pose[2, 3] = 4
-    camera = fs.Camera.pinhole(560, 540, focal, focal, *center, pose)
+    camera = fs.Camera.pinhole(*size, focal, focal, *center, pose)
     background = 0.3
     quality = EXACT.with_(samples=samples)
-    frame = renderer.render(made.cloud, camera, ("rgb", "alpha"), quality, background=(background,) * 3)
-    ideal = area_sampled(made, px_per_module, center, (560, 540), background)
+    frame = renderer.render(made.cloud, camera, ALL_OUTPUTS, quality, background=(background,) * 3)
+    ideal = area_sampled(made, px_per_module, center, size, background)
     error = np.abs(frame["rgb"] - ideal[..., None])
     psnr = -10 * math.log10(float((error**2).mean()))
     print(f"{px_per_module} px per module, {samples} x {samples}: {psnr:.1f} dB, {error.max():.1e}")
@@ -88,8 +89,7 @@ def test_boxes_of_a_sheet_add_up_to_it(renderer, tilt, spin, distance, shift):
         123, 97, looking.fx, looking.fy, looking.cx + shift[0], looking.cy + shift[1], looking.world_to_camera
     )
     quality = EXACT.with_(transmittance_stop=0.0)
-    outputs = ("rgb", "alpha", "depth")
-    parts, one = (renderer.render(cloud, camera, outputs, quality) for cloud in (sheet, whole))
+    parts, one = (renderer.render(cloud, camera, ALL_OUTPUTS, quality) for cloud in (sheet, whole))
     assert one["alpha"].max() > 0.0
     assert np.abs(parts["alpha"] - one["alpha"]).max() < SEAM
     assert np.abs(parts["rgb"] - parts["alpha"][..., None]).max() < SEAM
@@ -100,15 +100,11 @@ def test_boxes_of_a_sheet_add_up_to_it(renderer, tilt, spin, distance, shift):
 def test_depth_over_boxes_that_are_a_small_part_of_a_pixel_is_their_planes(renderer):
     """As over the modules of a large code from afar, steeply aside: 0.3 x 0.06 pixels."""
     middle = (np.indices((96, 96)).reshape(2, -1).T - 47.5) / 96
-    sheet, whole = (
-        boxes_of(middle, np.full((96 * 96, 2), 0.5 / 96)),
-        boxes_of(np.zeros((1, 2)), np.full((1, 2), 0.5)),
-    )
-    tilt = math.radians(80)
+    sheet = boxes_of(middle, np.full((96 * 96, 2), 0.5 / 96))
+    whole = boxes_of(np.zeros((1, 2)), np.full((1, 2), 0.5))
+    tilt, quality = math.radians(80), EXACT.with_(transmittance_stop=0.0)
     camera = fs.Camera.look_at(123, 97, 0.9, (0, -4 * math.sin(tilt), -4 * math.cos(tilt)), (0, 0, 0))
-    parts, one = (
-        renderer.render(cloud, camera, ("rgb", "alpha", "depth"), EXACT) for cloud in (sheet, whole)
-    )
+    parts, one = (renderer.render(cloud, camera, ALL_OUTPUTS, quality) for cloud in (sheet, whole))
     inside = one["alpha"] > 0.999
     assert inside.sum() > 50
     assert np.allclose(parts["depth"][inside], one["depth"][inside], rtol=1e-6, atol=0)
@@ -118,7 +114,7 @@ def test_boxes_of_one_plane_that_overlap_are_no_more_than_opaque(renderer):
     """Their areas add up, but not beyond the whole."""
     twice = boxes_of(np.zeros((2, 2)), np.full((2, 2), 0.5))
     camera = fs.Camera.look_at(123, 97, 0.9, (0, 0, -3), (0, 0, 0))
-    frame = renderer.render(twice, camera, ("rgb", "alpha"), EXACT.with_(transmittance_stop=0.0))
+    frame = renderer.render(twice, camera, ALL_OUTPUTS, EXACT.with_(transmittance_stop=0.0))
     assert frame["alpha"].max() == frame["rgb"].max() == 1
     assert frame["alpha"].min() == 0
 

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 from ideal_effects import assert_as_good, ideal_picture
-from sampling import in_turn
+from sampling import alternate, in_turn
 
 import fidsplat as fs
 from fidsplat.vision.detect import detect
@@ -107,8 +107,9 @@ def test_a_tag_that_moves_is_found_in_blur_and_noise_through_every_lens(renderer
 
 
 @in_turn(1)
-@pytest.mark.parametrize("blurred", [False, True])
-@pytest.mark.parametrize("turn_deg", [0, 30])
+@pytest.mark.parametrize(
+    ("turn_deg", "blurred"), alternate({"0": 0, "30": 30}, {"sharp": False, "blurred": True})
+)
 def test_parallel_rays_show_where_a_tag_is_across_them_and_how_it_is_turned(renderer, turn_deg, blurred):
     """How far along the rays it is and to which side it leans, they do not show. The affine map from the tag
     to the picture has its place, its turn in the picture and the cosine of its lean."""
@@ -167,6 +168,7 @@ def test_exact_corners_give_the_exact_pose(name):
     assert angle < 1e-6
 
 
+@in_turn(1)
 def test_a_rolling_shutter_shows_the_tag_at_its_rows_time(renderer):
     """The camera turns, so the picture is sheared; rows at the tag's height are read at a known time."""
     camera, position = CASES["pinhole"]

@@ -8,6 +8,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 from agreement import ALL_OUTPUTS, random_splats, some_thick
+from sampling import alternate
 
 import fidsplat as fs
 from fidsplat.backends.bands import cut
@@ -60,7 +61,8 @@ def as_on_a_gpu(renderer, budget=None):
     return made
 
 
-machines = pytest.mark.parametrize("machine", [own_device, as_on_a_gpu], ids=["own", "gpu"])
+MACHINES = {"own": own_device, "gpu": as_on_a_gpu}
+machines = pytest.mark.parametrize("machine", MACHINES.values(), ids=MACHINES)
 
 
 @pytest.fixture(scope="module")
@@ -238,12 +240,11 @@ def test_a_pool_keeps_to_the_budget_whatever_was_drawn_before(opencl, machine):
     the next."""
     budget = 8 * 2**20
     own, opencl = machine(opencl, budget), machine(opencl)
-    camera = fs.Camera.look_at(81, 59, 1.0, (0.0, 0.0, -0.1), (0.0, 0.0, 3.0))
-    for count, outputs in ((35000, ("rgb",)), (130000, ALL_OUTPUTS), (50000, ("rgb",)), (130000, ("rgb",))):
+    for count, outputs in ((35000, ("rgb",)), (200000, ALL_OUTPUTS), (50000, ("rgb",)), (200000, ("rgb",))):
         crowd = random_splats(count, seed=6, scale=(1e-4, 1e-2))
         resident = own.upload(crowd)
-        wanted = opencl.render(crowd, camera, outputs)
-        frame = own.render(resident, camera, outputs)
+        wanted = opencl.render(crowd, CAMERA, outputs)
+        frame = own.render(resident, CAMERA, outputs)
         if count != 50000:  # of which a processor has room for all, a GPU not
             assert ("packed splats" in own.backend.pool._buffers) == (count > 50000), "it was drawn in chunks"
         assert all(np.array_equal(frame[name], wanted[name]) for name in outputs)
@@ -262,9 +263,12 @@ PICTURES = {
 }
 
 
-@machines
-@pytest.mark.parametrize("mebibytes", [7, 64], ids=["in chunks", "at once"])
-@pytest.mark.parametrize("name", PICTURES)
+@pytest.mark.parametrize(
+    ("name", "mebibytes", "machine"),
+    alternate(
+        {name: name for name in PICTURES}, {"in chunks": 7, "at once": 64}, dict(reversed(MACHINES.items()))
+    ),
+)
 def test_a_plan_counts_all_that_a_picture_takes(opencl, monkeypatch, machine, mebibytes, name):
     """Everything that is new on the device, the cloud and a lens's rays included."""
     own = machine(opencl, mebibytes * 2**20)

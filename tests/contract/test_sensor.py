@@ -16,6 +16,7 @@ from fidsplat.backends.view import View
 from fidsplat.hard_cases.agreement import Picture
 
 CAMERA = fs.Camera.look_at(81, 59, 1.0, (0.3, -0.2, -0.1), (0.0, 0.1, 3.0))
+IN_FOG = ("rgb", "alpha", "depth", "distance")
 CLOUD = random_splats(120, 3)
 GREY = (0.4, 0.4, 0.4)
 NOISY = fs.Sensor(full_well=5000, read_noise=12, seed=7)
@@ -60,9 +61,7 @@ def test_fog(renderer, density, samples):
     )
     fog = fs.Fog(density, (0.6, 0.7, 0.8))
     for cloud in (CLOUD, fs.SplatCloud.concatenate([tag, random_splats(30, 4)])):
-        agree(
-            renderer, Picture(cloud, CAMERA, fs.Quality(samples=samples), ("rgb", "alpha", "depth"), fog=fog)
-        )
+        agree(renderer, Picture(cloud, CAMERA, fs.Quality(samples=samples), IN_FOG, fog=fog))
 
 
 SKIES = {"gradient": fs.Gradient((0.2, 0.4, 0.9), (0.3, 0.2, 0.1), (0.1, -2, 0.3)), "panorama": panorama()}
@@ -90,7 +89,7 @@ def test_a_wall_fades_by_its_distance_along_the_ray(renderer):
     wall = fs.SplatCloud([(0, 0, 4)], [(1, 0, 0, 0)], [(500, 500)], [1.0], colors=[(1, 1, 1)])
     camera = fs.Camera.pinhole(61, 41, 30.0, 30.0, 30.5, 20.5)
     color = np.array([0.2, 0.3, 0.4])
-    frame = renderer.render(wall, camera, ("rgb", "distance", "alpha"), fog=fs.Fog(0.1, tuple(color)))
+    frame = renderer.render(wall, camera, IN_FOG, fog=fs.Fog(0.1, tuple(color)))
     left = np.exp(-0.1 * frame["distance"][..., None]) * frame["alpha"][..., None]
     assert frame["rgb"] == pytest.approx(left + (1 - left) * color, abs=1e-5)
     nothing = renderer.render(EMPTY, camera, fog=fs.Fog(0.1, tuple(color)), background=(1, 0, 0))

@@ -8,7 +8,7 @@ import pytest
 import fidsplat as fs
 from fidsplat.cli import main
 from fidsplat.commands.experiment import Experiment
-from fidsplat.experiments import angles, localisation
+from fidsplat.experiments import angles, localisation, views
 from fidsplat.experiments import run as run_module
 from fidsplat.experiments.blender import check_pictures, note_pictures
 from fidsplat.experiments.run import Options
@@ -106,8 +106,10 @@ def test_a_quick_run_has_few_tilts_and_distances(tmp_path):
 
 
 def test_everything_quick_and_its_report(capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr(angles, "QUICK_TILTS", "0:80:40")
+    monkeypatch.setattr(angles, "QUICK_TILTS", "0:40:40")
     monkeypatch.setattr(localisation, "QUICK_DISTANCES", (1.0,))
+    monkeypatch.setattr(localisation, "QUICK_TILTS", (0.0, 40.0))
+    monkeypatch.setattr(views, "flip", lambda ours, theirs: abs(ours - theirs).mean())
     words = ("all", "--quick", *SMALL, "--mixture", "fitted", "-o", tmp_path)
     status, out, err = run(capsys, *words, "--device", "opencl")
     assert status == 0, err

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from agreement import against_reference, assert_agrees, random_splats
+from agreement import ALL_OUTPUTS, against_reference, assert_agrees, random_splats
 
 import fidsplat as fs
 from fidsplat.cameras import Camera
@@ -72,7 +72,7 @@ def test_splats_that_cross_do_not_jump(renderer, name):
 def test_a_picture_does_not_depend_on_how_much_may_wait(renderer, cloud):
     """Room for one fragment at a pixel, or a few: the list is gone through again until the picture is the
     same, bit for bit."""
-    picture = Picture(cloud, clouds.camera(50, 40, 40.0), fs.Quality(order="pixel"), ("rgb", "depth"))
+    picture = Picture(cloud, clouds.camera(50, 40, 40.0), fs.Quality(order="pixel"), ALL_OUTPUTS)
     shapes = renderer.backend.shapes("waiting")
     wanted = trace(renderer, picture)
     for name, shape in shapes.items():

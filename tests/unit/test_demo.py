@@ -7,6 +7,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.cli import main
+from fidsplat.experiments import demo
 from fidsplat.experiments.demo_scene import demo_scene
 from fidsplat.vision.images import read_image
 
@@ -16,6 +17,27 @@ pytestmark = pytest.mark.usefixtures("optimised")
 @pytest.fixture(scope="module")
 def scene():
     return demo_scene()
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    """What the demo has drawn, by the camera's place."""
+    return {}
+
+
+@pytest.fixture(autouse=True)
+def drawn_once(pictures, monkeypatch):
+    """One frame of each view is timed, and none is drawn again for a second demo."""
+    draw = demo._draw
+
+    def kept(renderer, resident, scene, camera):
+        place = tuple(camera.position)
+        if place not in pictures:
+            pictures[place] = draw(renderer, resident, scene, camera)
+        return pictures[place]
+
+    monkeypatch.setattr(demo, "_FRAMES", 1)
+    monkeypatch.setattr(demo, "_draw", kept)
 
 
 def test_the_demo_passes_and_writes_what_it_made(tmp_path, capsys):

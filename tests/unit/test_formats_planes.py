@@ -1,6 +1,7 @@
 """Splats that are printed on planes, through files beside PLY that keep them."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from test_formats import USD, assert_same_bits, need, some
 
 import fidsplat as fs
 from fidsplat.formats import losses
+from fidsplat.formats.plain import cloud_of
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".gltf", *USD])
@@ -45,3 +47,15 @@ def test_planes_that_cannot_be(tmp_path, thick, plane, words):
     (tmp_path / "a.glb").write_bytes(data.replace(seven, other))
     with pytest.raises(fs.InputError, match=rf"a\.glb: .*{words}"):
         fs.load_splats(tmp_path / "a.glb")
+
+
+@pytest.mark.filterwarnings("ignore:.*left out")
+@pytest.mark.parametrize("opacity", [0.5, math.nan])
+@pytest.mark.parametrize("shape", [(3,), (5, 2), ()])
+def test_planes_of_other_splats_than_the_files(shape, opacity):
+    """As a USD file may have them, whether all splats can be drawn or not."""
+    cloud, opacities = some(5, thick=False), np.full(5, 0.5, np.float32)
+    opacities[0] = opacity
+    arrays = cloud.means, cloud.quats, np.pad(cloud.scales, [(0, 0), (0, 1)]), opacities, cloud.sh
+    with pytest.raises(fs.InputError, match=r"a.usda: its planes have the shape"):
+        cloud_of(Path("a.usda"), *arrays, planes=np.zeros(shape, np.int32))

@@ -27,28 +27,48 @@ def test_inputs_at_random(seed):
     assert done.stdout.count("\n| ") == len(KINDS)
 
 
-@pytest.mark.parametrize(
-    ("broken", "ending"),
-    [
-        ("raise TypeError('from inside')", "fault"),
-        ("raise fidsplat.InputError('one line\\ntwo') from None", "one line"),
-        ("__import__('warnings').warn('numpy', RuntimeWarning)", "fault"),
-        ("bytearray(1 << 40)", "memory"),
-        ("__import__('os')._exit(3)", "crash"),
-    ],
+WAYS = (
+    ("raise TypeError('from inside')", "fault"),
+    ("raise fidsplat.InputError('one line\\ntwo') from None", "one line"),
+    ("__import__('warnings').warn('numpy', RuntimeWarning)", "fault"),
+    ("__import__('os')._exit(3)", "crash"),
+    ("bytearray(1 << 40)", "memory"),
 )
-def test_each_way_to_end_is_told(tmp_path, broken, ending):
-    """The runner of the tool itself, with a loader of scenes that ends in each way."""
-    (tmp_path / "sitecustomize.py").write_text(
-        "import fidsplat, fidsplat.scenes\n"
-        f"def load(path):\n    {broken}\n"
+
+
+def with_broken_loader(folder, first, *words):
+    """A run of the tool whose loader of scenes ends in one of the WAYS after the other, from number `first`
+    on."""
+    count = folder / "count"
+    count.write_text("x" * first)
+    (folder / "sitecustomize.py").write_text(
+        "import fidsplat, fidsplat.scenes, pathlib\n"
+        f"WAYS, count = {[broken for broken, _ in WAYS]!r}, pathlib.Path({str(count)!r})\n"
+        "def load(path):\n"
+        "    done = count.read_text()\n"
+        "    count.write_text(done + 'x')\n"
+        "    exec(WAYS[len(done)])\n"
         "fidsplat.scenes.Scene.load = staticmethod(load)\n"
     )
-    command = [sys.executable, str(ROOT / "tools" / "hostile.py"), "--kinds", "scenes", "--only", "3"]
-    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
-    done = subprocess.run(command, capture_output=True, text=True, env=env)
-    assert f"scenes 3: {ending} " in done.stdout, done.stdout + done.stderr
-    assert done.returncode == (0 if ending == "one line" else 1)
+    command = [sys.executable, str(ROOT / "tools" / "hostile.py"), "--kinds", "scenes", *words]
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])}
+    return subprocess.run(command, capture_output=True, text=True, env=env)
+
+
+def test_each_way_to_end_is_told(tmp_path):
+    """By the runner of the tool itself."""
+    done = with_broken_loader(tmp_path, 0, "--count", str(len(WAYS)))
+    told = [line.partition(" after")[0] for line in done.stdout.splitlines() if line.startswith("scenes ")]
+    bad = [f"scenes {i}: {ending}" for i, (_, ending) in enumerate(WAYS) if ending != "one line"]
+    assert told == bad, done.stdout + done.stderr
+    assert "| scenes | 0 | 1 | 2 | 0 | 1 | 1 |" in done.stdout
+    assert done.returncode == 1
+
+
+def test_the_one_that_is_asked_for_is_told_though_it_ends_well(tmp_path):
+    done = with_broken_loader(tmp_path, 1, "--only", "3")
+    assert "scenes 3: one line " in done.stdout, done.stdout + done.stderr
+    assert done.returncode == 0
 
 
 def test_an_error_may_follow_a_bar_and_nothing_else():

@@ -122,7 +122,7 @@ def fewest_rectangles(cells: frozenset) -> int:
     return fewest(cells)
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=250, deadline=None)
 @given(SMALL)
 @example(CHECKERBOARD)
 @example(PLUS)
@@ -136,7 +136,7 @@ def test_small_grids_are_exact_and_match_the_formula(grid):
     check_formula(grid, boxes)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(arrays(np.uint8, st.tuples(st.integers(2, 5), st.integers(2, 5)), elements=st.integers(0, 1)))
 @example(PLUS)
 @example(TOUCHING)

@@ -14,10 +14,12 @@ from fidsplat.viewer.stream import Stream
 
 
 @pytest.fixture
-def viewer(tmp_path):
+def viewer(tmp_path, monkeypatch):
     pytest.importorskip("viser", reason="the extra viewer is not installed")
+    from fidsplat.viewer import server
     from fidsplat.viewer.server import Viewer
 
+    monkeypatch.setattr(server, "LOOK", 0.1)
     (tmp_path / "scene.toml").write_text(
         '[[markers]]\nspec = "aruco:4x4_50:7"\nsize = 0.4\n[render]\nbackground = [0.2, 0.3, 0.4]\n'
     )
