@@ -185,7 +185,8 @@ def main() -> None:
         store = fs.Store(fs.build_store([city.source], Path(folder) / "city.fss", chunk=512))
         numbers = np.flatnonzero(store.nodes["level"] == 1)[: asked.nodes]
         rows = [measure(store, int(number), renderer, asked) for number in numbers]
-    keep({**facts(renderer), **vars(asked), "evaluated": EVALUATED, "rows": rows}, asked.json)
+    about = {name: value for name, value in vars(asked).items() if name not in ("device", "json")}
+    keep({**facts(renderer), **about, "evaluated": EVALUATED, "rows": rows}, asked.json)
     show(
         f"{len(rows)} nodes, refined at {asked.sizes} samples, {asked.steps} steps, {renderer.device.title}",
         ("largest error by cells of", *(f"{size:.3f} px" for size in EVALUATED), "seconds a node"),

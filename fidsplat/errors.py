@@ -56,5 +56,6 @@ def unknown(what: str, name: object, known: Iterable[str], within: str = "", lik
     near = difflib.get_close_matches(str(name)[:100].lower(), names, 1, likeness)
     hint = f" (did you mean {near[0]!r}?)" if near else ""
     shown = repr(within + name if isinstance(name, str) else name)
-    valid = f"known: {', '.join(names)}" if names else "none is known here"
+    listed = (repr(name) if ", " in name else name for name in names)
+    valid = f"known: {', '.join(listed)}" if names else "none is known here"
     return f"unknown {what} {shown}{hint}; {valid}"

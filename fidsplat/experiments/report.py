@@ -74,7 +74,7 @@ def make_report(folders: Sequence[Path], out: Path) -> list[Path]:
         "kinds": _kinds(reached),
         "sheets": [sheet.name for sheet in sheets],
         "runs": provenance(
-            {f"`experiment {_COMMANDS.get(name, name)}`": summary for name, summary in summaries.items()}
+            {f"`{_COMMANDS.get(name, name)}`": summary for name, summary in summaries.items()}
         ),
         "training_seconds": TRAINING_SECONDS,
     }

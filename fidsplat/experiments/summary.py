@@ -133,7 +133,7 @@ def provenance(summaries: Mapping[str, Summary]) -> Frame:
     return pd.DataFrame(
         [
             {
-                "measured": f"{name}, {run['points']} points",
+                "measured, points": f"{name}, {run['points']}",
                 "on": run["device"] or run["machine"],
                 "commit/code": f"{run['commit'] or 'no'}/{run['code']}",
                 "date": run["date"],

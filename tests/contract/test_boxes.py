@@ -100,15 +100,11 @@ def test_boxes_of_a_sheet_add_up_to_it(renderer, tilt, spin, distance, shift):
 def test_depth_over_boxes_that_are_a_small_part_of_a_pixel_is_their_planes(renderer):
     """As over the modules of a large code from afar, steeply aside: 0.3 x 0.06 pixels."""
     middle = (np.indices((96, 96)).reshape(2, -1).T - 47.5) / 96
-    sheet, whole = (
-        boxes_of(middle, np.full((96 * 96, 2), 0.5 / 96)),
-        boxes_of(np.zeros((1, 2)), np.full((1, 2), 0.5)),
-    )
-    tilt = math.radians(80)
+    sheet = boxes_of(middle, np.full((96 * 96, 2), 0.5 / 96))
+    whole = boxes_of(np.zeros((1, 2)), np.full((1, 2), 0.5))
+    tilt, quality = math.radians(80), EXACT.with_(transmittance_stop=0.0)
     camera = fs.Camera.look_at(123, 97, 0.9, (0, -4 * math.sin(tilt), -4 * math.cos(tilt)), (0, 0, 0))
-    parts, one = (
-        renderer.render(cloud, camera, ("rgb", "alpha", "depth"), EXACT) for cloud in (sheet, whole)
-    )
+    parts, one = (renderer.render(cloud, camera, ALL_OUTPUTS, quality) for cloud in (sheet, whole))
     inside = one["alpha"] > 0.999
     assert inside.sum() > 50
     assert np.allclose(parts["depth"][inside], one["depth"][inside], rtol=1e-6, atol=0)

@@ -132,6 +132,7 @@ def test_boxes_of_a_sheet_add_up_to_it(renderer, camera, tilt, distance):
     assert np.abs(parts["rgb"] - parts["alpha"][..., None])[even].max() < SEAM
 
 
+@in_turn()
 @each_camera
 @pytest.mark.parametrize("size", [0.004, 0.2])
 def test_light_is_that_of_the_image(renderer, camera, size):

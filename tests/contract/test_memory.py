@@ -8,6 +8,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 from agreement import ALL_OUTPUTS, random_splats, some_thick
+from sampling import alternate
 
 import fidsplat as fs
 from fidsplat.backends.bands import cut
@@ -60,7 +61,8 @@ def as_on_a_gpu(renderer, budget=None):
     return made
 
 
-machines = pytest.mark.parametrize("machine", [own_device, as_on_a_gpu], ids=["own", "gpu"])
+MACHINES = {"own": own_device, "gpu": as_on_a_gpu}
+machines = pytest.mark.parametrize("machine", MACHINES.values(), ids=MACHINES)
 
 
 @pytest.fixture(scope="module")
@@ -261,9 +263,12 @@ PICTURES = {
 }
 
 
-@machines
-@pytest.mark.parametrize("mebibytes", [7, 64], ids=["in chunks", "at once"])
-@pytest.mark.parametrize("name", PICTURES)
+@pytest.mark.parametrize(
+    ("name", "mebibytes", "machine"),
+    alternate(
+        {name: name for name in PICTURES}, {"in chunks": 7, "at once": 64}, dict(reversed(MACHINES.items()))
+    ),
+)
 def test_a_plan_counts_all_that_a_picture_takes(opencl, monkeypatch, machine, mebibytes, name):
     """Everything that is new on the device, the cloud and a lens's rays included."""
     own = machine(opencl, mebibytes * 2**20)

@@ -128,7 +128,7 @@ def test_the_report_says_what_was_measured(reported):
         "FLIP is of 5 of 5\ncases, LPIPS of 0 (",
         "means over a category's markers, 2 of each.",
         "| QR Small, 1 m | 0.5 (1/2) |",
-        "`experiment angles`, 8 points | a device |",
+        "`angles`, 8 | a device |",
         "3 trainings of 7000 iterations",
         "other random numbers (QR Small on 9 views) end 0.50 dB apart\n(median), at most 0.50",
         "| QR Small, 9 | 33.8/0.99 | 33.5/0.990 | 0.050 | 75.4 | 80.0 | 82.0 | 5000 | 386 | 7.0 |",

@@ -23,7 +23,7 @@ from fidsplat.experiments.tradeoff.points import (
     thick_points,
 )
 from fidsplat.experiments.tradeoff.scenes import NAMES, TradeScene, make
-from fidsplat.experiments.tradeoff.session import QUICK, Session, memory_of, time_point
+from fidsplat.experiments.tradeoff.session import QUICK, Effort, Session, memory_of, time_point
 from fidsplat.hard_cases.clouds import camera, splats
 from fidsplat.quality import ELLIPSOID, PRESETS, MarkerQuality
 from fidsplat.random_clouds import SCENES
@@ -197,7 +197,7 @@ def test_a_marker_is_held_against_the_printed_texture(session):
 
 def test_memory_is_that_of_the_setting_alone(session):
     def memory(quality):
-        return time_point(session, "apriltag@0", quality, QUICK)[1]["memory_bytes"]
+        return time_point(session, "apriltag@0", quality, Effort(1, 1, 0.0))[1]["memory_bytes"]
 
     small = memory(BASE)
     assert memory(BASE.with_(samples=3, lowpass="none")) > 2 * small

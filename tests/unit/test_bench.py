@@ -8,6 +8,7 @@ import pytest
 
 import fidsplat as fs
 from fidsplat.backends.base import Measurable
+from fidsplat.backends.opencl.device import OpenCLBackend
 from fidsplat.cli import main
 from fidsplat.experiments.bench import catalogue, measure
 from fidsplat.experiments.bench.catalogue import BENCH_SCENES, BenchScene, scene_names
@@ -41,6 +42,25 @@ def small_scenes(monkeypatch):
     for name in ("small", "other"):
         scene = BenchScene("200 splats", lambda: (random_cloud(200, 0.2), CAMERA))
         monkeypatch.setitem(BENCH_SCENES, name, scene)
+
+
+@pytest.fixture(scope="module")
+def known_rates():
+    return {}
+
+
+@pytest.fixture
+def rates_once(known_rates, monkeypatch):
+    """The rates of a device are measured for the first test alone that needs any."""
+    measured = OpenCLBackend.rates
+
+    def rates(self):
+        name = self.info.name
+        if name not in known_rates:
+            known_rates[name] = measured(self)
+        return known_rates[name]
+
+    monkeypatch.setattr(OpenCLBackend, "rates", rates)
 
 
 def bench(*words) -> int:
@@ -128,6 +148,7 @@ def test_memory_is_that_of_cloud_buffers_and_picture(renderer):
     assert renderer.backend.memory_bytes >= held  # an image that is given back is kept for the next picture
 
 
+@pytest.mark.usefixtures("rates_once")
 def test_devices_take_turns(monkeypatch):
     turns = []
     draw = measure.SceneRun.draw
@@ -152,6 +173,7 @@ def test_devices_take_turns(monkeypatch):
 # --- the command
 
 
+@pytest.mark.usefixtures("rates_once")
 def test_json_on_stdout_is_all_that_stands_there(capsys):
     assert bench("--scenes", "small", "other", "--json", "-") == 0
     content = json.loads(capsys.readouterr().out)
@@ -173,6 +195,7 @@ def test_json_on_stdout_is_all_that_stands_there(capsys):
         )
 
 
+@pytest.mark.usefixtures("rates_once")
 def test_a_table_for_people_and_a_file_for_programs(capsys, tmp_path):
     file = tmp_path / "figures.json"
     assert bench("--scenes", "small", "--json", file) == 0
@@ -182,6 +205,7 @@ def test_a_table_for_people_and_a_file_for_programs(capsys, tmp_path):
     assert json.loads(file.read_text())["results"][0]["scene"] == "small"
 
 
+@pytest.mark.usefixtures("rates_once")
 def test_an_interrupt_keeps_what_was_measured(capsys, tmp_path, monkeypatch):
     draws = []
 
@@ -203,6 +227,7 @@ def test_an_interrupt_keeps_what_was_measured(capsys, tmp_path, monkeypatch):
     assert [record["repeats"] for record in content["results"]] == [3, 1]
 
 
+@pytest.mark.usefixtures("rates_once")
 def test_what_a_device_cannot_draw_is_said_and_the_rest_is_drawn(capsys, monkeypatch):
     def refuse_empty(self, scene, upload=fs.Renderer.upload):
         if len(scene) == 0:
@@ -305,6 +330,7 @@ def test_ones_own_scene_from_ones_own_cameras(tmp_path, monkeypatch, capsys):
         assert why in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("rates_once")
 def test_the_plot_has_a_bar_for_each_scene_and_device(tmp_path):
     pytest.importorskip("matplotlib", reason="the extra experiments is not installed")
     file = tmp_path / "times.svg"

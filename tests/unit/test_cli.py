@@ -187,13 +187,14 @@ def test_debug_anywhere_shows_the_traceback(words, capsys):
 def test_output_that_nobody_reads_any_more_is_no_traceback(picture):
     # the reader is gone before the first word is written
     words = ["detect", str(picture)]
-    code = f"import time, sys; time.sleep(1); from fidsplat.cli import main; sys.exit(main({words}))"
-    done = subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    code = f"import sys; sys.stdin.read(); from fidsplat.cli import main; sys.exit(main({words}))"
+    pipe = subprocess.PIPE
+    done = subprocess.Popen([sys.executable, "-c", code], stdin=pipe, stdout=pipe, stderr=pipe, text=True)
+    assert done.stdin is not None
     assert done.stdout is not None
     assert done.stderr is not None
     done.stdout.close()
+    done.stdin.close()
     err = done.stderr.read()
     done.stderr.close()
     assert done.wait() == 1

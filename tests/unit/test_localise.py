@@ -196,7 +196,9 @@ def test_the_command_measures_once(tmp_path, monkeypatch, capsys):
     assert main([*whole, "--rows", "1", "--plants", "3"]) == 2
     assert "localise.jsonl holds results of another scene" in capsys.readouterr().err
     assert main([*words[:-1], "odometri"]) == 2
-    assert "unknown variant 'odometri' (did you mean 'odometry'?)" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "unknown variant 'odometri' (did you mean 'odometry'?)" in said
+    assert ", all of these, '0.25 m/s, blur', '1 m/s, blur', up to 1 m, " in said
     file = tmp_path / "out/localise.jsonl"
     file.write_text(file.read_text().replace(first["run"]["code"], "yesterday's"))
     assert main(words) == 2

@@ -94,6 +94,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void blend_light(
     global float2 *kept = (global float2 *)checkpoints + (size_t)first_chunk * PIXELS + top * TILE_W + column;
     uint chunk = 0, lit = 0;        // the chunk that is walked; those that light of this work-item's pixels comes to
     if (item == 0) most = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
 
     for (uint batch = start; batch < end; batch += STAGED) {
         uint length = min(end - batch, (uint)STAGED);
