@@ -1,5 +1,6 @@
-"""Tiles from their lists: on a GPU a block of threads per tile, a sample per thread, records staged in shared
-memory; on a CPU a thread per tile that walks each splat's box within it.
+"""Tiles from their lists: on a GPU a block of threads per tile, records staged in shared memory, and threads
+that are neighbours draw a cell of 2 x 4 samples, for which they walk those of the staged splats alone that
+can touch it; on a CPU a thread per tile that walks each splat's box within it.
 The same functions see every sample, so both take the same decisions.
 """
 
@@ -10,36 +11,55 @@ import warp as wp
 from . import output
 from .bounds import Bounds, make_bounds
 from .buffers import make_samples, sample_fields
-from .common import STRICT, View, first_sample, lowest, place_of, reread, store_line
+from .cells import CELL_H, CELL_W, make_cells
+from .common import STRICT, View, first_sample, place_of, reread, store_line
 from .crossing import make_crossing
 from .pixel import make_pixel
 from .rays import SLOPES
+from .records import Layout
 from .splat import make_splat
-from .staging import BLOCK_H, BLOCK_W, STAGED
+from .staging import STAGED, alone, make_staging
 
 _PLAIN = frozenset({"lowpass_screen", "stop_exclusive", "arithmetic_fast"})
-NONE, ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
+_CELL = CELL_W * CELL_H
+_NONE, _ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
+
+
+def samples_each(effects: tuple[str, ...]) -> int:
+    """Samples of a row that a thread of a GPU draws: two, for which it reads a record once, unless each has a
+    ray of its own or fragments that wait.
+    """
+    return CELL_W if {"rays", "compose_pixel"}.isdisjoint(effects) else 1
 
 
 @cache
-def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool, threads: int, room: int):
-    """The kernel for these effects of splats and samples, and these outputs, and the struct that a sample
-    keeps; threads: of a block on a GPU, one for each of a tile's samples; room: for fragments that wait.
+def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool, area: int, room: int):
+    """The kernel for these effects of splats and samples, and these outputs, the struct that a sample keeps,
+    and on a GPU the threads of a block; area: samples of a tile; room: for fragments that wait.
     """
     splats, crossing = make_splat(effects, outputs), make_crossing(effects, outputs)
-    pool, stage, touched = splats.staging.pool, splats.staging.stage, splats.staging.touched
-    load = splats.load
+    each = samples_each(effects)
+    threads, items, pair = area // each, _CELL // each, each == 2
+    staging = make_staging(Layout(effects, outputs), area // _CELL, items)
+    touched = make_cells(effects, outputs)
+    pool, stage, mark, listed, place_in = (
+        *(staging.pool, staging.stage, staging.mark),
+        *(staging.listed, staging.place),
+    )
+    staged = splats.reading(staging.line)
+    load, box_of, read = staged.load, staged.box_of, splats.read
     row_of, cross, cross_ray, cross_slopes = (
         *(crossing.row, crossing.cross),
         *(crossing.cross_ray, crossing.cross_slopes),
     )
     pixels = make_pixel(effects, outputs, room)
-    Rays, Pixel, start, unfinished = pixels.Rays, pixels.Pixel, pixels.start, pixels.unfinished
+    Splat, Rays, Pixel = splats.Splat, pixels.Rays, pixels.Pixel
+    start, unfinished = pixels.start, pixels.unfinished
     blend_one, end_pass, cover, finish = pixels.blend, pixels.end, pixels.cover, pixels.finish
     repeats, opaque = end_pass is not None, cover is not None
     limits = make_bounds("lowpass_screen" in effects)
     Samples = make_samples(tuple(sample_fields(outputs).items()))
-    stores, mark = output.functions(outputs, "store"), output.digest(outputs)
+    stores, words = output.functions(outputs, "store"), output.digest(outputs)
     bent, curved = "rays" in effects, cross_slopes is not None
 
     @wp.func
@@ -48,11 +68,47 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         for k in range(wp.static(len(stores))):
             wp.static(stores[k])(p, at, samples)
 
-    # so many threads at once: at most 40 registers, which is what a sample takes that keeps only its light
-    launched = (threads, 1536 // threads) if not outputs and _PLAIN.issuperset(effects) else threads
+    @wp.func
+    def begun(x: int, y: int, rays: Rays, view: View):
+        """A sample before anything is drawn; one beyond the picture is finished from the start."""
+        p = start(x, y, rays, view)
+        if x >= view.width or y >= view.height:
+            p.t = 0.0
+        return p
+
+    @wp.func
+    def drawn(
+        pixel: Pixel,
+        s: Splat,
+        row: wp.vec3,  # of the three forms, along the sample's row
+        ray: wp.vec3,
+        slopes: SLOPES,
+        x: float,  # from the anchor
+        y: float,
+        place: int,
+        lines: wp.array(dtype=wp.vec4),
+        lists: wp.array(dtype=wp.int32),
+        planes: wp.array(dtype=wp.int32),
+        view: View,
+    ):
+        """The sample after the splat at `place` in the list."""
+        p = pixel
+        if unfinished(p, view):
+            if wp.static(curved):
+                c = cross_slopes(s, ray, slopes, x, y, view)
+            elif wp.static(bent):
+                c = cross_ray(s, ray, x, y, view)
+            else:
+                c = cross(s, row[0], row[1], row[2], x, y, view)
+            if c.drawn:
+                p = blend_one(p, s, c, place, lines, lists, planes, view)
+        return p
+
+    # so many threads at once: at most 64 registers, which is what two samples take that keep only their light
+    launched = (threads, 1024 // threads) if not outputs and _PLAIN.issuperset(effects) else threads
     options = {"module": "unique", "module_options": STRICT, "enable_backward": False}
 
-    @wp.kernel(name=f"blend_gpu_{mark}", launch_bounds=launched, **options)
+    @wp.kernel(name=f"blend_gpu_{words}", launch_bounds=launched, **options)
     def blend_gpu(
         band_first: int,  # tile of block 0
         views: wp.array(dtype=View),
@@ -66,24 +122,27 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
         thread = wp.tid()
         tile = band_first + thread / threads
         item = thread % threads
-        # a warp draws a block, so that a splat that misses it costs it nothing
-        block, lane = item / 32, item % 32
         number, tile_column, tile_row = place_of(tile, views)
         view = views[reread(number)]
-        across = view.tile_w / BLOCK_W
-        left = tile_column * view.tile_w + (block % across) * BLOCK_W
-        top = tile_row * view.tile_h + (block / across) * BLOCK_H
-        x0 = left + lane % BLOCK_W
-        y0 = top + lane / BLOCK_W
-        p = start(x0, y0, rays, view)
-        if x0 >= view.width or y0 >= view.height:
-            p.t = 0.0  # what lies beyond the picture is finished from the start
+        left, top = tile_column * view.tile_w, tile_row * view.tile_h
+        # a warp draws `each` rows of four cells
+        warp, lane = item / 32, item % 32
+        across, own = view.tile_w / (4 * CELL_W), lane % items
+        cell_x = warp % across * 4 + lane / items % 4
+        cell_y = warp / across * each + lane / items / 4
+        cell = cell_y * (4 * across) + cell_x
+        x0 = left + cell_x * CELL_W + own % (CELL_W / each) * each
+        y0 = top + cell_y * CELL_H + own / (CELL_W / each)
+        p = begun(x0, y0, rays, view)
+        open = unfinished(p, view)
+        if wp.static(pair):
+            q = begun(x0 + 1, y0, rays, view)
+            open = open or unfinished(q, view)
+        ray, slopes = wp.vec3(), SLOPES()
         if wp.static(bent):
-            ray = wp.vec3()
             if p.t > 0.0:
                 ray = rays.rays[y0 * view.width + x0]
         if wp.static(curved):
-            slopes = SLOPES()
             if p.t > 0.0:
                 slopes = rays.slopes[y0 * view.width + x0]
         records = pool()
@@ -93,39 +152,59 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
             k = starts[tile]
             while k < end:
                 length = wp.min(end - k, STAGED)
-                if not stage(records, lines, lists, k, length, unfinished(p, view)):
+                if not stage(records, lines, lists, k, length, open):
                     break
-                word = int(0)
+                view = views[reread(number)]
+                word = warp
                 while 32 * word < length:
-                    bits = touched(records, word, length, left, top, unfinished(p, view))
-                    while bits != NONE:
-                        which = 32 * word + lowest(bits)
-                        bits = bits & (bits - ONE)
-                        s = load(records, lines, lists, k, which, view)
-                        if unfinished(p, view):
-                            x, y = float(x0) - s.d[3], float(y0) - s.c[0]
-                            if wp.static(curved):
-                                c = cross_slopes(s, ray, slopes, x, y, view)
-                            elif wp.static(bent):
-                                c = cross_ray(s, ray, x, y, view)
-                            else:
-                                c = cross(s, row_of(s.u, y), row_of(s.v, y), row_of(s.d, y), x, y, view)
-                            if c.drawn:
-                                p = blend_one(p, s, c, k + which, lines, lists, planes, view)
-                    word += 1
+                    which = 32 * word + lane
+                    for group in range(wp.static(-(-area // (32 * _CELL)))):
+                        cells = _NONE
+                        if which < length:
+                            s = load(records, lines, lists, k, which, view)
+                            cells = touched(
+                                s, box_of(records, lines, lists, k, which), left, top, group, view
+                            )
+                        mark(records, word, group, cells)
+                    word += wp.static(threads // 32)
+                view = views[reread(number)]
+                count = listed(records, length, cell)
+                if not open:
+                    count = 0
+                for n in range(count):
+                    which = place_in(records, cell, n)
+                    s = load(records, lines, lists, k, which, view)
+                    if alone():
+                        box = box_of(records, lines, lists, k, which)
+                        cells = touched(s, box, left, top, cell / 32, view)
+                        if (cells >> wp.uint32(cell % 32) & _ONE) == _NONE:
+                            continue
+                    x, y = float(x0) - s.d[3], float(y0) - s.c[0]
+                    row = wp.vec3(row_of(s.u, y), row_of(s.v, y), row_of(s.d, y))
+                    p = drawn(p, s, row, ray, slopes, x, y, k + which, lines, lists, planes, view)
+                    if wp.static(pair):
+                        q = drawn(q, s, row, ray, slopes, x + 1.0, y, k + which, lines, lists, planes, view)
+                open = unfinished(p, view)
+                if wp.static(pair):
+                    open = open or unfinished(q, view)
                 k += length
             again = False
             if wp.static(repeats):
                 p = end_pass(p, lines, lists, view)
-                again = stage(records, lines, lists, end, 0, unfinished(p, view))
-        if wp.static(opaque):
-            p = cover(p, x0, y0, rays, view)
+                open = unfinished(p, view)
+                again = stage(records, lines, lists, end, 0, open)
         number, tile_column, tile_row = place_of(tile, views)
         view = views[reread(number)]
         at = first_sample(number, view) + y0 * view.tiles_x * view.tile_w + x0
+        if wp.static(opaque):
+            p = cover(p, x0, y0, rays, view)
         store(finish(p), at, samples)
+        if wp.static(pair):
+            if wp.static(opaque):
+                q = cover(q, x0 + 1, y0, rays, view)
+            store(finish(q), at + 1, samples)
 
-    @wp.kernel(name=f"blend_cpu_{mark}", **options)
+    @wp.kernel(name=f"blend_cpu_{words}", **options)
     def blend_cpu(
         band_first: int,  # tile of thread 0
         views: wp.array(dtype=View),
@@ -157,7 +236,7 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
             k = starts[tile]
             while k < end and alive > 0:
                 index = lists[k]
-                s = load(wp.uint64(0), lines, lists, k, 0, view)
+                s = read(lines, lists, k, view)
                 k += 1
                 b = bounds[index]
                 top, bottom = limits.rows(b, view.height)
@@ -203,4 +282,4 @@ def make_blend(effects: tuple[str, ...], outputs: tuple[str, ...], on_gpu: bool,
                 at = corner + down * stride + across
                 store(finish(p), at, samples)
 
-    return (blend_gpu if on_gpu else blend_cpu), Pixel
+    return (blend_gpu if on_gpu else blend_cpu), Pixel, threads

@@ -14,10 +14,12 @@ import warp as wp
 from .bounds import Bounds, make_bounds, window_tile
 from .common import STRICT, View, lowest
 from .fragment_backward import make_fragments
-from .staging import BLOCK_H, BLOCK_W, with_numbers
+from .staging import with_numbers
 
 CHUNK = 32
 """splats of a tile's list that are walked forward and then back"""
+BLOCK_W, BLOCK_H = 8, 4
+"""samples that the 32 threads of a warp draw, one each"""
 NONE, ONE = wp.constant(wp.uint32(0)), wp.constant(wp.uint32(1))
 _WINDOW, _BITS = wp.constant(wp.uint64(32)), wp.constant(wp.uint64(0xFFFFFFFF))
 

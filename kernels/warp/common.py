@@ -167,6 +167,13 @@ def as_bits(low: int, high: int) -> float:
 
 
 @wp.func
+def of_bits(bits: float):
+    """The two numbers of `as_bits`."""
+    both = wp.cast(bits, wp.uint32)
+    return int(both & wp.uint32(0xFFFF)), int(both >> wp.uint32(16))
+
+
+@wp.func
 def to_sample(x: float, limit: int) -> int:
     """A sample's coordinate to int; clamped as a float, since conversions of huge values are undefined
     (numerics E2).

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .buffers import make_samples, sample_fields
-from .common import View, fma, line_of, struct_of
+from .common import View, fma, line_of, of_bits, struct_of
 from .crossing import make_crossing
 from .output.distortion import INVERSE_DEPTH, SPREAD_NEAR
 from .records import Layout
@@ -65,10 +65,9 @@ def make_fragments(effects: tuple[str, ...], outputs: tuple[str, ...], losses: t
     @wp.func
     def box_of(lines: wp.array(dtype=wp.vec4), index: int) -> wp.vec4i:
         """Samples that the splat can touch: first and end of columns, then of rows."""
-        columns = wp.cast(line_of(lines, index * each + box_line)[box_lane], wp.uint32)
-        rows = wp.cast(line_of(lines, index * each + rows_line)[rows_lane], wp.uint32)
-        low, half = wp.uint32(0xFFFF), wp.uint32(16)
-        return wp.vec4i(int(columns & low), int(columns >> half), int(rows & low), int(rows >> half))
+        left, end = of_bits(line_of(lines, index * each + box_line)[box_lane])
+        top, bottom = of_bits(line_of(lines, index * each + rows_line)[rows_lane])
+        return wp.vec4i(left, end, top, bottom)
 
     @wp.func
     def loss_at(x: int, y: int, by: By, samples: Samples, background: wp.vec3, view: View):

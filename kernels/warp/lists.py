@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .bounds import Bounds, make_bounds, window_tile
-from .common import STRICT, View, lowest
+from .common import CULLED, STRICT, View, lowest
 
 # kernels that are the same for all feature sets are one module: the first picture compiles it once
 wp.set_module_options(STRICT)
@@ -25,8 +25,9 @@ def compact(
     keys: wp.array(dtype=wp.uint32),  # (n)
     drawn: wp.array(dtype=wp.int32),  # (n)
     places: wp.array(dtype=wp.int32),  # (n) inclusive sums of drawn
-    room: int,  # for so many of those drawn; the rest is left out
-    sorted_keys: wp.array(dtype=wp.uint32),  # out: keys of those drawn, by index
+    totals: wp.array(dtype=wp.int64),  # (2) splats drawn, pairs
+    room: int,  # for so many of those drawn, at most n; the rest is left out
+    sorted_keys: wp.array(dtype=wp.uint32),  # out: keys of those drawn, by index; behind them the last of all
     order: wp.array(dtype=wp.int32),  # out: their indices
 ):
     i = wp.tid() + first
@@ -35,6 +36,8 @@ def compact(
         if k < room:
             sorted_keys[k] = keys[i]
             order[k] = i
+    if i < room and wp.int64(i) >= totals[0]:
+        sorted_keys[i] = CULLED
 
 
 @wp.kernel(enable_backward=False)
@@ -167,10 +170,17 @@ def make_lists(screen: bool) -> SimpleNamespace:
         bounds: wp.array(dtype=Bounds),
         ends: wp.array(dtype=wp.int64),  # inclusive sums of lengths
         lengths: wp.array(dtype=wp.int64),
-        tiles: wp.array(dtype=wp.int32),  # out: pairs in depth order
+        room: int,  # splats in `ends`
+        pairs: int,  # for which there is room
+        beyond: int,  # behind the last tile
+        tiles: wp.array(dtype=wp.int32),  # out: pairs in depth order; behind them what lies beyond
         lists: wp.array(dtype=wp.int32),  # out: their splats
     ):
         k = wp.tid() + first
+        rest = int(ends[room - 1]) + k
+        while rest < pairs:
+            tiles[rest] = beyond
+            rest += room
         if lengths[k] == wp.int64(0):
             return  # what `order` has here may be nothing
         view = views[0]

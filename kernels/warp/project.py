@@ -23,7 +23,7 @@ from .slopes import make_slopes
 SMALLEST_SCALE = wp.constant(wp.float32(1e-20))
 BLOCK = 128
 """threads of a block on a GPU"""
-LIMITS = (BLOCK, 6)  # so many blocks at once: at most 80 registers, of 108 that it would take
+LIMITS = (BLOCK, 5)  # so many blocks at once: at most 96 registers, of 116 that it would take
 NONE, BITS = wp.constant(wp.uint32(0)), wp.constant(wp.uint64(32))
 
 
@@ -107,15 +107,17 @@ def make_project(
         number = at / views[0].splats
         view = views[reread(number)]
         i = at - number * view.splats
+        # copied, so that all are asked for at once; before anything is stored that they might alias
+        opacity, size = float(opacities[i]), wp.vec2(scales[i])
+        quat, center = wp.vec4(quats[i]), wp.vec3(means[i])
         keys[at] = CULLED
         counts[at] = wp.int64(0)
         drawn[at] = 0
         # conditions are written so that a NaN culls (numerics E1)
-        log_opacity = float(wp.log(real(opacities[i])))
+        log_opacity = float(wp.log(real(opacity)))
         half_r2 = log_opacity - view.log_cut
-        if not (half_r2 > 0.0 and opacities[i] <= 1.0):
+        if not (half_r2 > 0.0 and opacity <= 1.0):
             return
-        size = scales[i]
         if not (size[0] >= 0.0 and size[0] < wp.inf and size[1] >= 0.0 and size[1] < wp.inf):
             return
         if wp.static(thick_too):
@@ -125,8 +127,7 @@ def make_project(
         sv = real(wp.max(size[1], SMALLEST_SCALE))
 
         turn, shift, eye = placing.pose(i, number, view, moving)
-        tangent_u, tangent_v = placing.tangents(turn, quats[i])
-        center = means[i]
+        tangent_u, tangent_v = placing.tangents(turn, quat)
         mean = vec3(real(center[0]), real(center[1]), real(center[2]))
         p = turn * mean + shift
         a, b = tangent_u * su, tangent_v * sv

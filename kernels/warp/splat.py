@@ -1,24 +1,22 @@
-"""What a sample reads of a splat: of its record in memory, or in a GPU block's shared memory."""
+"""What a sample reads of a splat: of its record, wherever that lies."""
 
 from functools import cache
 from types import SimpleNamespace
 
 import warp as wp
 
-from .common import View, line_of, struct_of
+from .common import View, line_of, of_bits, struct_of
 from .ellipsoids import EXACT
 from .records import BOXES, Layout
-from .staging import make_staging
 
 
 @cache
 def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleNamespace:
-    """Splat; load, of the splat lists[first + which]; and `staging`, what brings splats to the threads of a
-    GPU block. There `load` finds what was staged, and nothing else; on the CPU it reads records where they
-    lie, whatever the pool. read, of the splat lists[k], finds its record where it lies, on every device.
+    """Splat; reading(line), what a function that finds the lines of records makes of them; read, of the splat
+    lists[k], finds its record in memory.
     """
     layout = Layout(effects, outputs)
-    each, staging = layout.lines, make_staging(layout)
+    each = layout.lines
     screen, bent, parallel = (name in effects for name in ("lowpass_screen", "rays", "camera_orthographic"))
     edged = not bent and any(name in effects for name in BOXES)
     flagged = bent and "footprint_mixed" in effects
@@ -39,10 +37,11 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
     edge_line = layout.place("edge_u0")[0]
     boxed_line, boxed_lane = layout.place("boxed")
     bulge_line, bulge_lane = layout.place("bulge")
+    box_line, box_lane = layout.place("columns")  # and rows
     ray_line, plane_line = layout.place("nuz")[0], layout.place("plane_z0")[0]
 
-    def made_of(line):
-        """`load` with a function that finds the record's lines."""
+    def reading(line) -> SimpleNamespace:
+        """load, of the splat lists[first + which], and box_of, the samples that it can touch."""
 
         @wp.func
         def load(
@@ -77,7 +76,21 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
             s.half_r2 = s.u[3] - view.log_cut
             return s
 
-        return load
+        @wp.func
+        def box_of(
+            pool: wp.uint64,
+            lines: wp.array(dtype=wp.vec4),
+            lists: wp.array(dtype=wp.int32),
+            first: int,
+            which: int,
+        ) -> wp.vec4i:
+            """First and end of columns, then of rows."""
+            box = line(pool, lines, lists, first, which, box_line)
+            left, right = of_bits(box[box_lane])
+            top, bottom = of_bits(box[box_lane + 1])
+            return wp.vec4i(left, right, top, bottom)
+
+        return SimpleNamespace(load=load, box_of=box_of)
 
     @wp.func
     def lying(
@@ -90,10 +103,10 @@ def make_splat(effects: tuple[str, ...], outputs: tuple[str, ...]) -> SimpleName
     ) -> wp.vec4:
         return line_of(lines, lists[first + which] * each + line)
 
-    load_lying = made_of(lying)
+    load_lying = reading(lying).load
 
     @wp.func
     def read(lines: wp.array(dtype=wp.vec4), lists: wp.array(dtype=wp.int32), k: int, view: View):
         return load_lying(wp.uint64(0), lines, lists, k, 0, view)
 
-    return SimpleNamespace(Splat=Splat, load=made_of(staging.line), read=read, staging=staging)
+    return SimpleNamespace(Splat=Splat, reading=reading, read=read)

@@ -1,7 +1,8 @@
-"""Records of a batch of splats in a GPU block's shared memory, and which of them can touch a warp's samples.
+"""A batch of splats in a GPU block's shared memory: their records, and for each cell of the tile the list of
+those that can touch it (cells.py says which).
 
-Warp's own tiles have no 16-byte reads, votes or ballots, so these few functions are CUDA. On the CPU, where a
-block is one thread, they read the records where they lie and let every splat through.
+Warp's own tiles have no 16-byte reads, shuffles or bytes in shared memory, so these few functions are CUDA.
+On the CPU, where a block is one thread, they read the records where they lie, and a cell's list is the batch.
 """
 
 import re
@@ -11,15 +12,14 @@ import warp as wp
 
 from .records import Layout
 
-STAGED = 256
-"""splats of a batch, a multiple of 32; larger ones gain nothing"""
-BLOCK_W, BLOCK_H = 8, 4
-"""samples that the 32 threads of a warp draw, one each"""
+STAGED = 128
+"""splats of a batch"""
 
 
 _POOL = """
 #if defined(__CUDA_ARCH__)
-    __shared__ float4 staged[SPLATS * LINES];
+    // records; 16 bytes for each cell, a bit for each splat that can touch it; its list, a byte for each
+    __shared__ float4 staged[SPLATS * LINES + CELLS + (CELLS * STRIDE + 15) / 16];
     return static_cast<wp::uint64>(__cvta_generic_to_shared(staged));
 #else
     return 0;
@@ -40,22 +40,59 @@ _STAGE = """
     return open;
 #endif
 """
-_TOUCHED = """
+_MARK = """
 #if defined(__CUDA_ARCH__)
-    if (!__any_sync(0xffffffffu, open)) return 0;
-    const float4* staged = reinterpret_cast<const float4*>(__cvta_shared_to_generic(pool));
-    const int which = 32 * word + (threadIdx.x & 31);
-    bool hit = false;
-    if (which < length) {
-        const float* record = reinterpret_cast<const float*>(staged + which * LINES);
-        const uint2 box = *reinterpret_cast<const uint2*>(record + BOX);
-        hit = static_cast<int>(box.x & 0xffffu) < left + BLOCK_W && static_cast<int>(box.x >> 16) > left
-           && static_cast<int>(box.y & 0xffffu) < top + BLOCK_H && static_cast<int>(box.y >> 16) > top;
+    float4* staged = reinterpret_cast<float4*>(__cvta_shared_to_generic(pool));
+    unsigned int* touched = reinterpret_cast<unsigned int*>(staged + SPLATS * LINES);
+    const unsigned int lane = threadIdx.x & 31;
+    // 32 splats by 32 cells, turned: in each step squares of bits change places across the diagonal
+    unsigned int bits = cells;
+#pragma unroll
+    for (unsigned int side = 16, low = 0xffffu; side != 0; side /= 2, low ^= low << side) {
+        const unsigned int other = __shfl_xor_sync(0xffffffffu, bits, side);
+        bits = lane & side ? (bits & ~low) | (other >> side & low) : (bits & low) | (other << side & ~low);
     }
-    return __ballot_sync(0xffffffffu, hit);
+    const unsigned int cell = 32 * group + lane;
+    if (cell < CELLS) touched[4 * cell + word] = bits;
+#endif
+"""
+_LISTED = """
+#if defined(__CUDA_ARCH__)
+    // all are marked by then
+    __syncthreads();
+    const uint4* touched = reinterpret_cast<const uint4*>(__cvta_shared_to_generic(pool)) + SPLATS * LINES;
+    unsigned char* list = reinterpret_cast<unsigned char*>(__cvta_shared_to_generic(pool))
+                          + 16 * (SPLATS * LINES + CELLS) + cell * STRIDE;
+    const uint4 bits = touched[cell];
+    // words that a longer batch has left
+    const unsigned int words[4] = {
+        bits.x, length > 32 ? bits.y : 0, length > 64 ? bits.z : 0, length > 96 ? bits.w : 0
+    };
+    const unsigned int own = threadIdx.x % ITEMS;
+    unsigned int mine = 0, before = 0, count = 0;
+#pragma unroll
+    for (unsigned int word = 0; word < 4; word++) {
+        if (word == own) {
+            mine = words[word];
+            before = count;
+        }
+        count += __popc(words[word]);
+    }
+    for (; mine != 0; mine &= mine - 1)
+        list[before++] = static_cast<unsigned char>(32 * own + __ffs(mine) - 1);
+    // its threads are of one warp
+    __syncwarp();
+    return count;
 #else
-    const int rest = length - 32 * word;
-    return rest >= 32 ? 0xffffffffu : (1u << rest) - 1u;
+    return length;
+#endif
+"""
+_PLACE = """
+#if defined(__CUDA_ARCH__)
+    return (reinterpret_cast<const unsigned char*>(__cvta_shared_to_generic(pool))
+            + 16 * (SPLATS * LINES + CELLS))[cell * STRIDE + k];
+#else
+    return k;
 #endif
 """
 _LINE = """
@@ -67,6 +104,13 @@ _LINE = """
     return lines.data[lists.data[first + which] * LINES + line];
 #endif
 """
+_ALONE = """
+#if defined(__CUDA_ARCH__)
+    return false;
+#else
+    return true;
+#endif
+"""
 
 
 def with_numbers(text: str, numbers: dict[str, int]) -> str:
@@ -74,14 +118,22 @@ def with_numbers(text: str, numbers: dict[str, int]) -> str:
     return re.sub("|".join(numbers), lambda name: str(numbers[name[0]]), text)
 
 
-def make_staging(layout: Layout) -> SimpleNamespace:
-    """pool; then, for each batch, stage, touched, line. For records of this layout."""
-    numbers = {"SPLATS": STAGED, "LINES": layout.lines, "BOX": layout.names.index("columns")}
-    numbers |= {"BLOCK_W": BLOCK_W, "BLOCK_H": BLOCK_H}
+@wp.func_native(_ALONE)
+def alone() -> bool:
+    """Whether a block is one thread, which is told of all cells."""
+    ...
+
+
+def make_staging(layout: Layout, cells: int, items: int) -> SimpleNamespace:
+    """pool; then, for each batch, stage, mark, listed; place and line. For records of this layout, of tiles
+    of so many cells, each drawn by so many threads of a warp.
+    """
+    # lists lie in different banks, word by word
+    numbers = {"SPLATS": STAGED, "LINES": layout.lines, "CELLS": cells, "ITEMS": items, "STRIDE": STAGED + 4}
 
     @wp.func_native(with_numbers(_POOL, numbers))
     def pool() -> wp.uint64:
-        """Where the block's records lie in shared memory."""
+        """Where all that is the block's lies in shared memory."""
         ...
 
     @wp.func_native(with_numbers(_STAGE, numbers))
@@ -98,11 +150,21 @@ def make_staging(layout: Layout) -> SimpleNamespace:
         """
         ...
 
-    @wp.func_native(with_numbers(_TOUCHED, numbers))
-    def touched(pool: wp.uint64, word: int, length: int, left: int, top: int, open: bool) -> wp.uint32:
-        """Bits of those of the staged splats 32 word to 32 word + 31 that can touch the warp's samples, whose
-        first is (left, top); none if nobody in the warp is open.
+    @wp.func_native(with_numbers(_MARK, numbers))
+    def mark(pool: wp.uint64, word: int, group: int, cells: wp.uint32):
+        """Of the staged splats 32 word to 32 word + 31, one for each thread of a warp: which of the cells 32
+        group to 32 group + 31 they can touch.
         """
+        ...
+
+    @wp.func_native(with_numbers(_LISTED, numbers))
+    def listed(pool: wp.uint64, length: int, cell: int) -> int:
+        """Once all are marked: how many of the batch can touch the cell, which is that of the thread."""
+        ...
+
+    @wp.func_native(with_numbers(_PLACE, numbers))
+    def place(pool: wp.uint64, cell: int, k: int) -> int:
+        """Which of the staged splats is the k-th of them."""
         ...
 
     @wp.func_native(with_numbers(_LINE, numbers))
@@ -117,4 +179,4 @@ def make_staging(layout: Layout) -> SimpleNamespace:
         """A line of the record of the staged splat `which`."""
         ...
 
-    return SimpleNamespace(pool=pool, stage=stage, touched=touched, line=line)
+    return SimpleNamespace(pool=pool, stage=stage, mark=mark, listed=listed, place=place, line=line)

@@ -213,8 +213,6 @@ class Picture:
         # the sort takes the second half as its scratch
         keys = self._take("sorted_keys", 2 * visible, self.wp.uint32)
         order = self._take("order", 2 * visible, self.wp.int32)
-        if self.room:
-            keys.fill_(0xFFFFFFFF)  # behind all that are drawn
         self._launch(self.program.sort.compact, self.splats, room=visible)
         self.wp.utils.radix_sort_pairs(keys, order, visible)
 
@@ -272,9 +270,7 @@ class Picture:
             lengths, ends = (self._exact(name, visible, wp.int64) for name in ("lengths", "ends"))
             self._launch(sort.gather if whole else lists.count, visible, **band, room=visible, pairs=pairs)
             wp.utils.array_scan(lengths, ends, inclusive=True)
-            if self.room:
-                tiles.fill_(self.tiles)  # behind the last
-            self._launch(lists.emit, visible, **band)
+            self._launch(lists.emit, visible, **band, room=visible, pairs=pairs, beyond=self.tiles)
             wp.utils.radix_sort_pairs(tiles, listed, pairs, 0, self.tiles.bit_length())
         self._launch(sort.find_starts, end - first + 1, **band, pairs=pairs)
 
@@ -293,8 +289,8 @@ class Picture:
         given = {**self.held, "rays": self._rays, "samples": samples, "planes": planes}
         area = shape.tile_width * shape.tile_height
         if shape.schedule == "group":
-            count = (end - first) * program.block_dim
-            self.launcher.once(program.blend, count, given | {"band_first": first}, program.block_dim)
+            count = (end - first) * program.blend_block
+            self.launcher.once(program.blend, count, given | {"band_first": first}, program.blend_block)
             return
         given["state"] = self._take("state", self.launcher.pieces * area, program.state)
         self.launcher.tiles(program.blend, first, end, area, given)

@@ -104,8 +104,8 @@ class Program:
         self.images = tuple(each for each in features.images if each.name in {"rgb", *features.outputs})
         """the output images"""
         self.project_block = kernels("project").BLOCK
-        self.block_dim = shape.tile_width * shape.tile_height
-        """threads that draw a tile on a GPU"""
+        self.tile_area = shape.tile_width * shape.tile_height
+        """samples"""
         self.needs = needs = _Needs.of(features)
         with quiet():
             self._make_lists(features, needs)
@@ -114,7 +114,7 @@ class Program:
             made = (self.project, self.lists.emit, self.blend, self.resolve, *self.expose.values())
             common = (self.sort.compact, self.sort.gather, self.sort.find_starts, self.sort.sum_up)
             further = (self.backdrop, self.sensor and self.sensor.kernel)
-            blocks = {self.blend: self.block_dim, self.project: self.project_block}
+            blocks = {self.blend: self.blend_block, self.project: self.project_block}
             for kernel in (*made, *common, *filter(None, further)):
                 self.compile(kernel, blocks.get(kernel, BLOCK))
 
@@ -138,9 +138,11 @@ class Program:
         """whether blending reads the derivatives of a lens's rays"""
         self.opaque = "opaque_layer" in needs.effects
         """whether it reads a layer of another renderer"""
-        self.blend, self.state = kernels("blend").make_blend(
-            needs.among(_SAMPLE), blending, self.shape.schedule == "group", self.block_dim, self.shape.waiting
+        grouped = self.shape.schedule == "group"
+        self.blend, self.state, self.blend_block = kernels("blend").make_blend(
+            needs.among(_SAMPLE), blending, grouped, self.tile_area, self.shape.waiting
         )
+        """its kernel, the struct of a sample, and the threads that draw a tile on a GPU"""
         self.sample_fields = buffers.sample_fields(blending)
         """sample buffers: type of an element"""
         self.samples_type = buffers.make_samples(tuple(self.sample_fields.items()))
@@ -203,7 +205,7 @@ class GradientKernels:
         self.sh_terms = (features.sh_degree + 1) ** 2 if "color_sh" in needs.effects else 0
         effects, outputs = needs.among(_SAMPLE), needs.blending
         backward, names = kernels("blend_backward"), kernels("fragment_backward").moments_of(effects, outputs)
-        grouped, block = shape.schedule == "group", program.block_dim
+        grouped, block = shape.schedule == "group", program.tile_area
         with quiet():
             self.blend = backward.make_blend_backward(effects, outputs, self.losses, grouped, block)
             self.slots = backward.make_slots("lowpass_screen" in effects)

@@ -13,7 +13,7 @@ class WarpShape:
     schedule: str
     """`tiles`: a thread draws a tile (CPU). `group`: a block of threads draws a tile (CUDA)."""
     tile_width: int
-    """samples, a multiple of 4"""
+    """samples: 8, 16 or 32, as its height"""
     tile_height: int
     waiting: int = 8
     """fragments for which there is room where they are composited by their own depth"""
