@@ -248,7 +248,6 @@ def test_a_replay_that_fails_half_filled_is_not_launched_again(renderer, replaye
 
 def test_a_graph_keeps_no_splats(renderer, replayed):
     """They leave the device with their cloud; and scratch arrays that were replaced leave at once."""
-    gc.collect()  # what tests before have left, of errors say
     resident = renderer.upload(CLOUD)
     for _ in range(4):
         renderer.render(resident, CAPTURE).wait()
