@@ -21,7 +21,7 @@ class DifferentiablePipeline(Protocol):
         needs of it until the device draws another one.
 
         waits: until it is known that there was room for all of it; if not, `backward` may say that there was
-        none, and nothing of the picture counts; nor is its time taken.
+        none, and nothing of the picture counts.
 
         Raises:
             DeviceError: the device runs out of memory or fails; or the picture is one of those that are drawn

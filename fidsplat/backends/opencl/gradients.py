@@ -80,7 +80,6 @@ class OpenCLGradients:
     def _backward(self, drawn: Picture, gradients: Mapping[str, Any]) -> dict[str, Any]:
         picture = copy(drawn)  # its buffers and events, with other kernels
         picture.program = self.program
-        picture.workspace.turn_to(picture.queue)  # the gradients may be on another
         view, shape, count, pairs = picture.view, self._pipeline.shape, picture.resident.count, picture.pairs
         self._take_gradients(picture, gradients)
         posed = -(-count // _GROUP)  # work-groups that sum up the pose

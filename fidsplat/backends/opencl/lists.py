@@ -36,8 +36,6 @@ class Lists:
         self.picture, self.shape = picture, picture.shape
         self.big = 0
         """big splats for which there is room"""
-        self.clears = picture.repeats
-        """whether tallies are left as zeros for the next picture"""
 
     def make_room(self, words: int, needed: int = 0) -> None:
         """Takes `words` words of zeroed tallies, and room for at least `needed` big splats."""
@@ -46,7 +44,7 @@ class Lists:
         picture.held["big_capacity"] = self.big
         picture.take("big", 4 * self.big)
         picture.take("big_bounds", picture.program.source.records["Bounds"].itemsize * self.big)
-        if self.clears:
+        if picture.repeats:
             picture.held["tallies"] = picture.pool.zeroed("tallies", 4 * words, picture.queue)
             return
         tallies = picture.take("tallies", 4 * words)
@@ -262,8 +260,8 @@ class TiledLists(Lists):
         # what the host reads has a buffer of its own: `emit` adds to it meanwhile
         picture.lease("counts", 4 * COUNTS)
         capacity = self.capacity(picture.workspace)
-        if capacity and picture.trusted:
-            capacity, self.clears = min(capacity, picture.trusted), True
+        if picture.trusted:
+            capacity = min(capacity, picture.trusted)
         self._project()
         counted = self._starts(capacity)
         if capacity:
@@ -315,7 +313,7 @@ class TiledLists(Lists):
         picture, items = self.picture, self.picture.shape.scan_items
         picture.take("starts", 4 * (picture.tiles + 1))
         picture.take("cursors", 4 * picture.tiles)
-        given = {"tiles": picture.tiles, "capacity": capacity, "clear": self.clears}
+        given = {"tiles": picture.tiles, "capacity": capacity, "clear": picture.repeats}
         return picture.launch("bin", "tile_starts", items, items, **given)
 
     def _list(self, first: int, end: int, capacity: int, first_band: bool) -> None:

@@ -47,9 +47,7 @@ class Picture:
         self.workspace, self.program, self.shape = workspace, program, shape
         self.resident, self.view, self.plan, self.repeats = resident, view, plan, queue is not None
         self.stack, self.views = stack, 1 if stack is None else len(stack)
-        # where nobody waits nobody takes the time
-        own = workspace.repeat_queue if trusted else workspace.queue
-        self.queue = workspace.turn_to(own) if queue is None else queue
+        self.queue = workspace.turn_to(workspace.queue) if queue is None else queue
         self.pool = workspace.pool
         workspace.pictures += 1
         self.tiles_x = -(-view.width // shape.tile_width)

@@ -116,7 +116,7 @@ class OpenCLPipeline:
         """
         with self.workspace.lock:
             picture = self._tried(self._whole, resident, view, trusted)
-            return picture, self._images(view, Drawn.of(picture, timed=not trusted))
+            return picture, self._images(view, Drawn.of(picture))
 
     def _whole(self, resident: Resident, view: View, trusted: int) -> Picture:
         """A picture that is drawn at once, not in chunks or bands."""

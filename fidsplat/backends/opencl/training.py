@@ -227,8 +227,8 @@ class OpenCLTraining:
 
     @property
     def _queue(self) -> cl.CommandQueue:
-        """The queue of pictures that nobody waits for, after all that is on others."""
-        return self._workspace.turn_to(self._workspace.repeat_queue)
+        """The queue on which pictures with derivatives are drawn, after all that is on others."""
+        return self._workspace.turn_to(self._workspace.queue)
 
     def _launch(self, kernel: str, items: int, given: Mapping[str, Any] | None = None) -> None:
         size = max(_GROUP, -(-items // _GROUP) * _GROUP)
