@@ -28,8 +28,9 @@ from fidsplat.files import atomic_write
 
 
 def load(files: Iterable[Path]) -> dict[str, list[dict]]:
-    """Records by kind; of `peers` and `peer_batches`, a fidsplat's is followed by the peer's."""
-    kinds = ("frames", "peers", "first", "ways", "large", "growth", "batches", "peer_batches")
+    """Records by kind; of `peers` and `peer_batches`, a fidsplat's is followed by the peer's; of `backends`,
+    which are those of a file where two drew each scene on one machine, OpenCL's by Warp's."""
+    kinds = ("frames", "backends", "peers", "first", "ways", "large", "growth", "batches", "peer_batches")
     found: dict[str, list[dict]] = {kind: [] for kind in kinds}
     for file in files:
         if file.suffix == ".jsonl":
@@ -44,9 +45,14 @@ def load(files: Iterable[Path]) -> dict[str, list[dict]]:
             continue
         results = [record for record in content.get("results", ()) if record.get("frame_ms")]
         with_peer = any(record["renderer"] != "fidsplat" for record in results)
-        found["peers" if with_peer else "frames"] += results
+        both = len({(record["scene"], record["title"]) for record in results}) < len(results)
+        found["peers" if with_peer else "backends" if both else "frames"] += results
     scenes = list(BENCH_SCENES)
-    for kind in ("frames", "peers"):  # devices of one scene stand together, whichever file they come from
+    for kind in (
+        "frames",
+        "backends",
+        "peers",
+    ):  # devices of one scene stand together, whichever file they come from
         found[kind].sort(key=lambda record: scenes.index(record["scene"]))
     return found
 
@@ -145,6 +151,27 @@ def peers(pair: tuple[dict, dict]) -> dict[str, str]:
         "its / ours": f"{its['times_ours']:.3g}",
         "PSNR of the two pictures": f"{its['psnr_db']:.1f} dB",
         "date": its["date"],
+    }
+
+
+def backends(pair: tuple[dict, dict]) -> dict[str, str]:
+    """Two backends on one machine in one run; in brackets the host's part of frames, the first's stages."""
+    names = [record["device"].removesuffix(":0") for record in pair]
+    of_stages = [record["stages_ms"] for record in pair]
+    lists = {"project": ("project",), "sort and bin": ("sort", "bin"), "blend": ("blend", "resolve")}
+    first, second = (
+        {head: sum(taken.get(part, 0) for part in parts) for head, parts in lists.items()}
+        for taken in of_stages
+    )
+    frames = {
+        name: f"{ms(one['frame_ms'])} ({ms(one['host_ms'])})" for name, one in zip(names, pair, strict=True)
+    }
+    return {
+        "scene": pair[0]["scene"],
+        **frames,
+        "ratio": f"{pair[1]['frame_ms'] / pair[0]['frame_ms']:.2f}",
+        **{head: f"{ms(second[head])} ({ms(first[head])})" for head in lists},
+        "date": pair[0]["date"],
     }
 
 
@@ -252,6 +279,7 @@ def tables(records: dict[str, list[dict]]) -> dict[str, str]:
         "counts": map(counts, first_of_each_scene(drawn)),
         "rates": map(rates, {record["title"]: record for record in drawn if record.get("rates")}.values()),
         "frames": map(frames, drawn),
+        "backends": map(backends, zip(records["backends"][::2], records["backends"][1::2], strict=True)),
         "aims": map(aims, (record for record in drawn if aimed_at(record) is not None)),
         "stages": map(stages, drawn),
         "peers": map(peers, pairs),
@@ -266,7 +294,19 @@ def tables(records: dict[str, list[dict]]) -> dict[str, str]:
 
 
 TABLES = (
-    *("counts", "rates", "frames", "aims", "stages", "peers", "first", "ways", "large", "batches"),
+    *(
+        "counts",
+        "rates",
+        "frames",
+        "backends",
+        "aims",
+        "stages",
+        "peers",
+        "first",
+        "ways",
+        "large",
+        "batches",
+    ),
     *("peer_batches", "growth"),
 )
 

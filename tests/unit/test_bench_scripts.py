@@ -56,6 +56,13 @@ BATCH = {
     **{"alone_us_per_view": 5000.0, "stages_us": {"blend": 600.0}},
 }
 
+OTHER = {
+    "device": "warp:cuda:0",
+    "frame_ms": 1.851,
+    "host_ms": 0.25,
+    "stages_ms": {"project": 0.5, "sort": 0.25, "bin": 0.125, "blend": 1.0, "resolve": 0.5},
+}
+
 PEER_BATCH = {"outputs": ["rgb"], "us_per_view": 1800.0, "times_ours": 2.0, "psnr_same_constants_db": 69.6}
 
 
@@ -72,6 +79,7 @@ def files(tmp_path):
     kinds = {
         "bench.json": {"results": [RECORD, failed]},
         "peer.json": {"results": [RECORD | {"frame_ms": 1.2}, PEER]},
+        "backends.json": {"results": [RECORD | {"host_ms": 0.5}, RECORD | OTHER]},
         "first.json": [FIRST],
         "batches.json": [BATCH],
         "peer_batches.json": [
@@ -109,6 +117,9 @@ def test_each_kind_of_figures_becomes_its_table(files):
     assert rows(made["rates"]) == ["| a CPU | 45 GB/s | 250 G/s | 12.5 G/s | 50 G/s |"]
     assert rows(made["frames"]) == [
         "| tag | d: a CPU | 1.23 (1.1 to 1.5) | 12.2 | 0.56 M | 1 GiB | 2026-11-21 |"
+    ]
+    assert rows(made["backends"]) == [
+        "| tag | 1.23 (0.5) | 1.85 (0.25) | 1.50 | 0.5 (0.25) | 0.375 (0) | 1.5 (0.75) | 2026-11-21 |"
     ]
     assert rows(made["stages"]) == ["| tag | d: a CPU | 0.25 (-) | 0.75 (15.5) |"]
     assert rows(made["peers"]) == [
