@@ -51,12 +51,8 @@ def make_slopes(camera: str | None, real):
         per_z = one / p[2]
         by_a = vec3(a_x, a_y, -(x * a_x + y * a_y)) * per_z
         by_b = vec3(b_x, b_y, -(x * b_x + y * b_y)) * per_z
-        return (
-            real(view.focal_x) * by_a,
-            real(view.focal_y) * by_b,
-            vec3(zero, zero, per_z),
-            q < real(lens.limit),
-        )
+        by_depth = vec3(zero, zero, per_z)
+        return real(view.focal_x) * by_a, real(view.focal_y) * by_b, by_depth, q < real(lens.limit)
 
     @wp.func
     def slopes_fisheye(p: vec3, view: View, lens: Lens):
@@ -74,12 +70,8 @@ def make_slopes(camera: str | None, real):
         away = vec3(p[2] * cos, p[2] * sin, -across) * (by_angle / wp.dot(p, p))
         around = vec3(-sin, cos, zero) * per_across
         by_x, by_y = cos * away - sin * around, sin * away + cos * around
-        return (
-            real(view.focal_x) * by_x,
-            real(view.focal_y) * by_y,
-            p / wp.dot(p, p),
-            angle <= real(lens.limit),
-        )
+        by_depth = p / wp.dot(p, p)
+        return real(view.focal_x) * by_x, real(view.focal_y) * by_y, by_depth, angle <= real(lens.limit)
 
     @wp.func
     def slopes_panorama(p: vec3, view: View, lens: Lens):
