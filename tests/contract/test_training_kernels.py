@@ -24,8 +24,8 @@ COUNT = 70
 
 @pytest.fixture(scope="module")
 def views():
-    """Of three sizes, none a multiple of a vector; the second has a mask, the third is more than a CPU takes in
-    one piece."""
+    """Of three sizes, none a multiple of a vector; the second has a mask, the third is more than one piece on
+    CPUs."""
     sizes = (11, 9), (31, 18), (53, 71)
     small, wide, large = (scene(views=2, held_out=0, size=size).views[0] for size in sizes)
     mask = np.random.default_rng(0).uniform(size=(18, 31)) < 0.7
