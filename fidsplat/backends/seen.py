@@ -21,7 +21,7 @@ from fidsplat.effects import FeatureSet
 Boxes = Callable[[float], tuple[np.ndarray, np.ndarray]]
 """corners (n, 3) float64 [m], lowest and highest, of boxes around splats to so many standard deviations"""
 
-_ROOM = 1.01
+ROOM = 1.01
 """how much further splats are taken to reach: for rounding, and what bounds are padded with"""
 _ROUNDING = 1e-5
 """of a coordinate: what a set-up in float32 may be off"""
@@ -46,11 +46,11 @@ def seen(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) -> n
 
 
 def _seen_by(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) -> np.ndarray:
-    radius = _ROOM * math.sqrt(max(-2.0 * view.log_cut, 0.0))
+    radius = ROOM * math.sqrt(max(-2.0 * view.log_cut, 0.0))
     spread = "lowpass_pixel" in features.names
     ewa = bool({"ellipsoid_ewa", "ellipsoid_ewa_antialiased"} & features.names)
-    centers = _Turned(view, *boxes(0.0))
-    whole = _Turned(view, *boxes(radius))
+    centers = Turned(view, *boxes(0.0))
+    whole = Turned(view, *boxes(radius))
     # a dot of the low-pass, or what it widens a splat by, in samples
     margin = radius * view.samples + 2.0
     if spread:
@@ -83,7 +83,7 @@ def _seen_by(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray) 
     return made
 
 
-class _Turned:
+class Turned:
     """Boxes in the camera's frame."""
 
     def __init__(self, view: View, low: np.ndarray, high: np.ndarray) -> None:
@@ -174,7 +174,7 @@ def sizes(view: View, boxes: Boxes, edges: np.ndarray) -> np.ndarray:
         if one.parallel:
             made = np.maximum(made, edges * focal)
             continue
-        turned = _Turned(one, *boxes(0.0))
+        turned = Turned(one, *boxes(0.0))
         panorama = one.raster is not None and isinstance(one.raster.lens, Equirectangular)
         nearest = turned.off_axis() if panorama else turned.nearest(one)
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,6 +1,7 @@
 // The way through a tile's list splat by splat, for CPUs: each splat at all blocks that it touches.
 //@ walk
     for (uint k = starts[tile] - base, end = starts[tile + 1] - base; k < end && alive; k++) {
+//@@ walked
         FETCH_AHEAD(splats + lists[min(k + AHEAD_SPLATS, end - 1)]);
         FETCH_AHEAD((global const char *)(splats + lists[min(k + AHEAD_SPLATS, end - 1)]) + 64);
         const Splat s = splats[lists[k]];
