@@ -8,6 +8,17 @@
 #define LANE_X(block, lane) (LEFT(block) + (lane) % BLOCK_W)
 #define LANE_Y(block, lane) (TOP(block) + (lane) / BLOCK_W)
 
+// A condition that hardly ever holds. So compilers branch, and the processor goes on with the next splat meanwhile: what they would
+// select instead, it could not go on without.
+#ifdef __has_builtin
+#if __has_builtin(__builtin_expect)
+#define RARELY(condition) __builtin_expect(condition, 0)
+#endif
+#endif
+#ifndef RARELY
+#define RARELY(condition) (condition)
+#endif
+
 // A bit for each block whose columns meet [x0, x1) and whose rows meet [y0, y1), of the tile and not empty.
 static inline uint blocks_within(int x0, int x1, int y0, int y1) {
     uint columns = (2u << (x1 - 1) / BLOCK_W) - (1u << x0 / BLOCK_W);
