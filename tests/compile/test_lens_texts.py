@@ -29,8 +29,8 @@ CAMERAS = {
 BEFORE_LENSES = {
     ("lanes", ("rgb",)): "735f9434e21436e09e8c6403ead3fef8db86529e6900d71b2baf1b60cd29f358",
     ("lanes", OUTPUTS): "182e8c39b4dafd7a77cfe837bf5eae371b482b1113cdac19bd1badf575bb638a",
-    ("group", ("rgb",)): "c2b0e9552fc4114b7c224ab85a8a03882be1f28b4e6f1766c6a79d4d650fc850",
-    ("group", OUTPUTS): "9ebdf4231f04fb61814763202cd23a93aae7c9cfefe3b83dfebf3c2473eb5d5b",
+    ("group", ("rgb",)): "8a008580fb28069a0f41cfb518772174a1204a4387eb69951e85e815b100adf0",
+    ("group", OUTPUTS): "5bdb5840dccc20f66a1414b8429b538069bc5d08198417ea9b094c62cea6bfc8",
 }
 
 
