@@ -16,7 +16,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from fidsplat.backends.seen import ROOM, Boxes, Turned
+from fidsplat.backends.seen import BRIGHTEST, ROOM, Boxes, Extent, Turned
 from fidsplat.backends.view import View
 from fidsplat.effects import FeatureSet
 
@@ -55,14 +55,16 @@ class GivesTileEnds(Protocol):
 def can_hide(view: View, features: FeatureSet) -> bool:
     """Whether what is hidden can be told: of one pose, where nothing moves by itself, and where splats have
     bounds on the picture."""
-    return not (view.shots or view.groups or "lowpass_pixel" in features.names)
+    return not (view.shots or view.groups) and _extent(view, features) is not None
 
 
 def least_keys(view: View, features: FeatureSet, boxes: Boxes) -> np.ndarray:
     """(n,) metres: below the sort keys of all splats in boxes."""
+    extent = _extent(view, features)
+    assert extent is not None  # `can_hide`
     if "compose_ordered" in features.names:
         return Turned(view, *boxes(0.0)).nearest(view)
-    return Turned(view, *boxes(max(_radius(view), _RANGE * ROOM))).nearest(view)
+    return extent.nearest(view, boxes)
 
 
 def hidden(view: View, features: FeatureSet, boxes: Boxes, reach: np.ndarray, ends: TileEnds) -> np.ndarray:
@@ -92,10 +94,10 @@ def _everywhere(count: int, band: tuple[int, int], columns: int) -> tuple[np.nda
     return tuple(np.full(count, side, np.int64) for side in (*band, 0, columns))
 
 
-def _radius(view: View) -> float:
-    """Standard deviations that a splat is drawn to at most: those that stand for others have opacities up to
-    4."""
-    return ROOM * math.sqrt(max(2.0 * (math.log(4.0) - view.log_cut), 0.0))
+def _extent(view: View, features: FeatureSet) -> Extent | None:
+    """How far splats show, those that stand for others too."""
+    radius = ROOM * math.sqrt(max(2.0 * (math.log(BRIGHTEST) - view.log_cut), 0.0))
+    return Extent.of(view, features, max(radius, _RANGE * ROOM))
 
 
 def _on_picture(
@@ -103,8 +105,9 @@ def _on_picture(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n, 2) samples each: the least and the largest x, y that splats of boxes reach on the picture of a
     pinhole or of parallel rays; infinite where a box reaches to the camera."""
-    radius = _radius(view)
-    margin = radius * view.samples + 2.0  # as `seen` has it: a dot of the low-pass, or what it widens by
+    extent = _extent(view, features)
+    assert extent is not None  # `can_hide`
+    radius, margin = extent.radius, extent.margin
     low, high = _projected(view, *boxes(radius))
     if {"ellipsoid_ewa", "ellipsoid_ewa_antialiased"} & features.names:
         # the derivative at the centre may draw a splat larger than it is
