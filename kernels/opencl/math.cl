@@ -29,7 +29,7 @@ typedef GLUE(int, LANES) vint;
 // `any`, a lane each, and one test of its own reduction.
 #if defined(__has_builtin)
 #if LANES == 16 && defined(__AVX512DQ__) && __has_builtin(__builtin_ia32_cvtd2mask512)
-#define VBITS(mask) ((uint)__builtin_ia32_cvtd2mask512(mask))
+#define VBITS(mask) ((uint)(ushort)__builtin_ia32_cvtd2mask512((__attribute__((__vector_size__(64))) int)(mask)))
 #elif LANES == 8 && defined(__AVX__) && __has_builtin(__builtin_ia32_movmskps256)
 #define VBITS(mask) ((uint)__builtin_ia32_movmskps256(as_float8(mask)))
 #elif LANES == 4 && defined(__SSE__) && __has_builtin(__builtin_ia32_movmskps)

@@ -27,10 +27,10 @@ CAMERAS = {
 
 # of the texts as they were before there were lenses; a change here changes what every plain picture runs
 BEFORE_LENSES = {
-    ("lanes", ("rgb",)): "21e2d8d1522e8df921e5d7b5e457f84e036487d40f35d072e38d70a8c061a881",
-    ("lanes", OUTPUTS): "554d8e85d9c7d29a28ddccd9e082c0142c052dc2e06e15e8a81da61d4841f205",
-    ("group", ("rgb",)): "bf21fe945b415456c224a37817ceff6caa57adfde39149cd9c53363aaeedf588",
-    ("group", OUTPUTS): "02ba9677bef6d67df854cbb40745e7b2769811982cf8812ca5e49dc81b1b6cbd",
+    ("lanes", ("rgb",)): "bb41da3ff0cd42248ce4b0f38a2e44b46ff98bfc0edb2298ed9bceb5a4a4786b",
+    ("lanes", OUTPUTS): "ce4e6d51d9e195314a86609f4d27eac0db493da84d24136e3fd2247e18bd1886",
+    ("group", ("rgb",)): "af23be2629b8f248d74720a4095e5cea92317bc1d77ffae34cac6e1a9b14e336",
+    ("group", OUTPUTS): "6387be3d421a748e7419c7e2ba77b471e723964d049dad8069821eac7b3c9302",
 }
 
 

@@ -3,8 +3,8 @@
 #define BLOCK_H (LANES / BLOCK_W)
 #define BLOCKS_X (TILE_W / BLOCK_W)
 #define BLOCKS (TILE_H / BLOCK_H * BLOCKS_X)          // 32 at most
-#define LEFT(block) ((block) % BLOCKS_X * BLOCK_W)    // in the tile
-#define TOP(block) ((block) / BLOCKS_X * BLOCK_H)
+#define LEFT(block) ((int)((uint)(block) % BLOCKS_X) * BLOCK_W)    // in the tile
+#define TOP(block) ((int)((uint)(block) / BLOCKS_X) * BLOCK_H)
 #define LANE_X(block, lane) (LEFT(block) + (lane) % BLOCK_W)
 #define LANE_Y(block, lane) (TOP(block) + (lane) / BLOCK_W)
 
