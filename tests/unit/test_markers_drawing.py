@@ -279,6 +279,16 @@ def test_round_corners(tmp_path):
     assert made.regions[1].bounds == pytest.approx((10, 0, 30, 10))
 
 
+def test_curves_that_touch_make_no_heaps_of_gaussians(tmp_path):
+    """Between them lie slivers of paper ten thousand times as long as wide."""
+    body = '<rect width="40" height="20" rx="6" fill="red"/>'
+    made = drawn(tmp_path, body)
+    thin = (made.boxes[:, 2:] - made.boxes[:, :2]).min(1) < 1 / 64
+    assert thin.sum() > 20
+    assert len(made.gaussians) < 20_000
+    assert np.array_equal(drawn(tmp_path, body, mixture="fitted").cloud.means, made.gaussians.means)
+
+
 def test_scribbles_are_refused(tmp_path):
     places = " ".join(f"{7919 * i % 400 / 10} {104729 * i % 200 / 10}" for i in range(300))
     with pytest.raises(fs.InputError, match="cross in over 5000 places: simplify"):
