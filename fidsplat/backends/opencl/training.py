@@ -13,7 +13,14 @@ import pyopencl as cl
 from pyopencl.array import Array
 
 from fidsplat.backends.opencl.program import Program
-from fidsplat.backends.opencl.training_source import IMAGES, MARGIN, MARGIN_ROWS, training_source
+from fidsplat.backends.opencl.training_source import (
+    MARGIN,
+    MARGIN_ROWS,
+    PANEL,
+    STRIP,
+    images_of,
+    training_source,
+)
 from fidsplat.backends.opencl.workspace import Workspace
 from fidsplat.cameras import Camera
 from fidsplat.errors import DeviceError
@@ -21,6 +28,8 @@ from fidsplat.errors import DeviceError
 _GROUP = 64
 _SUMS, _SUMMED = 512, 128
 """work-groups that add up the loss, and their work-items (SUMMED of kernels/opencl/train/loss.cl)"""
+_EACH_ROWS = 4
+"""that a work-item of its passes over columns takes (EACH_ROWS there)"""
 _REMEMBERED = ("first_", "second_")
 
 
@@ -72,8 +81,9 @@ class OpenCLTraining:
         """lanes: of vectors, in place of the device's own (tests)."""
         self._workspace = workspace
         lanes = lanes or (workspace.shape.lanes if workspace.shape.schedule == "lanes" else 1)
-        self._lanes, self._each_rows = lanes, 4 if lanes == 1 else 1  # EACH_ROWS of loss.cl
-        self._program = Program(workspace, training_source(lanes, workspace.info.float64))
+        self._lanes = lanes
+        source = training_source(lanes, workspace.info.float64, workspace.shape.fast_fma)
+        self._program = Program(workspace, source)
         self._held: dict[str, Any] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
         self._count = 0
@@ -151,20 +161,29 @@ class OpenCLTraining:
         slope = self._array("by_rgb", image.shape)
         given = {
             **{"rgb": image.data, "truth": truth.picture, "mask": truth.mask, "masked": int(truth.masked)},
-            **{"by_rgb": slope.data, "sums": self._scratch("loss sums", 12 * _SUMS)},
+            "by_rgb": slope.data,
             **{"l1_share": (1 - dssim_weight) / number, "ssim_share": dssim_weight / image.size},
             **{"width": 3 * columns, "height": height, "stride": stride},
             **{"images": self._room_for_images(height, columns)},
             "image_stride": stride * (height + 2 * MARGIN_ROWS),
         }
-        self._launch_rows("loss_take", 3 * columns, height, given)
-        for name in ("loss_rows", "loss_columns", "loss_rows_backward", "loss_columns_backward"):
-            each = self._each_rows if "columns" in name else 1
-            self._launch_rows(name, -(-3 * columns // self._lanes), -(-height // each), given)
-        added = self._enqueue("loss_sums", (_SUMS * _SUMMED,), (_SUMMED,), given)
+        if self._lanes == 1:
+            groups = _SUMS
+            given["sums"] = self._scratch("loss sums", 12 * groups)
+            self._launch_rows("loss_take", 3 * columns, height, given)
+            for name in ("loss_rows", "loss_columns", "loss_rows_backward", "loss_columns_backward"):
+                each = _EACH_ROWS if "columns" in name else 1
+                self._launch_rows(name, 3 * columns, -(-height // each), given)
+            added = self._enqueue("loss_sums", (_SUMS * _SUMMED,), (_SUMMED,), given)
+        else:
+            size = -(-3 * columns // PANEL), -(-height // STRIP)
+            groups = math.prod(size)
+            given["sums"] = self._scratch("loss sums", 12 * groups)
+            added = self._enqueue("loss_strips", size, (1, 1), given)
+            self._enqueue("loss_strips_backward", size, (1, 1), given)
 
         def value() -> tuple[float, float]:
-            sums = np.empty((_SUMS, 3), np.float32)
+            sums = np.empty((groups, 3), np.float32)
             self._queue.flush()
             with self._workspace.failing("training"):
                 cl.enqueue_copy(self._workspace.side_queue, sums, given["sums"], wait_for=[added])
@@ -268,7 +287,7 @@ class OpenCLTraining:
         """Images for pictures of this size, all zeros at first: kernels leave the margins so."""
         if self._loss_images is not None and self._loss_images[0] == (height, columns):
             return self._loss_images[1]
-        size = 4 * IMAGES * self._stride(columns) * (height + 2 * MARGIN_ROWS)
+        size = 4 * images_of(self._lanes) * self._stride(columns) * (height + 2 * MARGIN_ROWS)
         self._loss_images = None  # the old ones go first
         buffer = self._workspace.pool.fresh("the loss's images", size)
         cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.float32), 0, size)
