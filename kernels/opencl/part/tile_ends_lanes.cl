@@ -3,6 +3,6 @@
 //@ lanes_start
     uint walked = UINT_MAX;     // the last place in `lists` that was looked at
 //@ walked
-        walked = k;
+        walked = chunk + length - 1;
 //@ pass_end
     tile_ends[tile] = !alive && walked != UINT_MAX ? keys[lists[walked]] : UINT_MAX;
