@@ -11,7 +11,7 @@ import fidsplat as fs
 from fidsplat.backends import ends
 from fidsplat.backends.prepare import prepare
 from fidsplat.rotations import rigid_matrix
-from fidsplat.store import hidden
+from fidsplat.store import hidden, pieces
 from fidsplat.store.streamed import Streamed
 
 
@@ -53,6 +53,7 @@ def asked(monkeypatch):
     monkeypatch.setattr(hidden, "_FIRST", 3000)
     monkeypatch.setattr(hidden, "_SMALL", 1)
     monkeypatch.setattr(hidden, "_RESTS", 0)
+    monkeypatch.setattr(pieces, "ROWS", 24)
 
     def noted(self, whole, fits, draw):
         made = drawn(self, whole, fits, draw)
