@@ -140,7 +140,7 @@ def test_of_what_lets_light_through_nothing_is_hidden(tmp_path, asked, monkeypat
     for _ in range(4):
         assert np.array_equal(renderer.render(resident, look())["rgb"], renderer.render(faint, look())["rgb"])
     assert len(asked) == 2  # and then not for two views
-    assert all(count == of for count, of in asked)
+    assert all(count > 0.6 * of for count, of in asked)  # pieces beside the picture are left out
 
 
 def test_levels_of_detail_and_places_are_hidden_too(town, tmp_path, asked, monkeypatch):
