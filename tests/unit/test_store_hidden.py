@@ -243,7 +243,6 @@ def test_a_needle_that_ewa_draws_into_a_wide_picture_is_on_it():
     means = np.array([[-7.3, 0, 1]], np.float32)
     needle = fs.SplatCloud(means, [[1, 0, 0, 0]], sigmas, [0.99], colors=[[1, 1, 1]])
     nowhere_finished = ends.TileEnds(np.full((1, 125), np.inf, np.float32), (16, 16))
-    for ellipsoid, beside in (("ewa", False), ("exact", True)):
-        features, shot = prepare(needle, fs.Capture(camera, quality=fs.Quality(ellipsoid=ellipsoid)))
-        given = shot, features, lambda count: (means - count * sigmas, means + count * sigmas)
-        assert ends.hidden(*given, sigmas.max(axis=1), nowhere_finished).all() == beside
+    features, shot = prepare(needle, fs.Capture(camera, quality=fs.Quality(ellipsoid="ewa")))
+    given = shot, features, lambda count: (means - count * sigmas, means + count * sigmas)
+    assert not ends.hidden(*given, sigmas.max(axis=1), nowhere_finished).any()
